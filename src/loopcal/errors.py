@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The one tree of errors: every mistake of a user raises a `LoopcalError` whose text is one clear sentence.
+
+The sentence says what was found, what is allowed and what to do next. The command line prints it and exits with 1;
+anything that is not a `LoopcalError` is a mistake of our own.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+
+
+class LoopcalError(Exception):
+    """Base of all errors that a user can cause and repair."""
+
+
+class UnitError(LoopcalError):
+    """A unit that is missing, unknown or of the wrong dimension."""
+
+
+class MechanismError(LoopcalError):
+    """A robot that cannot be built as described (mobility, joints, dimensions)."""
+
+
+class DataError(LoopcalError):
+    """Measurements that do not fit the robot, or are too few, or contradict themselves."""
+
+
+class EstimationError(LoopcalError):
+    """An estimate that cannot be made from these data with this method."""
+
+
+class FileError(LoopcalError):
+    """A file that cannot be read or written; `str` gives `path:line: sentence`.
+
+    Parameters
+    ----------
+    sentence : str
+        What was found, what is allowed, what to do.
+    path : str or Path
+        The file (or folder) as the user named it.
+    line : int, optional
+        Line number, counted from 1; None where the whole file is meant.
+    """
+
+    def __init__(self, sentence: str, path: str | Path, line: int | None = None) -> None:
+        super().__init__(sentence, path, line)
+        self.sentence = sentence
+        self.path = Path(path)
+        self.line = line
+
+    def __str__(self) -> str:
+        place = f"{self.path}" if self.line is None else f"{self.path}:{self.line}"
+        return f"{place}: {self.sentence}"
+
+
+def nearest(name: str, allowed: Iterable[str], n: int = 3) -> str:
+    """Return ` (did you mean 'a' or 'b'?)` with the allowed names closest to `name`, or nothing where none is close."""
+    close = difflib.get_close_matches(name, list(allowed), n=n, cutoff=0.6)
+    return f" (did you mean {' or '.join(repr(c) for c in close)}?)" if close else ""

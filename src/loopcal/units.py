@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Units exist at the edge of files and tables only; inside, everything is in SI (metre, radian).
+
+A record annotates its numbers with `Length`, `Angle` or `Ratio`; the reader of files multiplies them by the factor of
+the unit that the file states, the writer divides by it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Annotated
+
+from loopcal.errors import UnitError, nearest
+
+
+class Dimension(Enum):
+    """What a number measures."""
+
+    LENGTH = "length"
+    ANGLE = "angle"
+    RATIO = "ratio"
+
+
+Length = Annotated[float, Dimension.LENGTH]
+Angle = Annotated[float, Dimension.ANGLE]
+Ratio = Annotated[float, Dimension.RATIO]
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit: `SI value = value * factor_to_si`.
+
+    Parameters
+    ----------
+    symbol : str
+        As written in files, e.g. "mm".
+    dimension : Dimension
+        What it measures.
+    factor_to_si : float
+        Metres, radians or 1 per unit.
+    """
+
+    symbol: str
+    dimension: Dimension
+    factor_to_si: float
+
+    def __str__(self) -> str:
+        return self.symbol
+
+
+UNITS: Mapping[str, Unit] = {
+    u.symbol: u
+    for u in (
+        Unit("m", Dimension.LENGTH, 1.0),
+        Unit("mm", Dimension.LENGTH, 1e-3),
+        Unit("um", Dimension.LENGTH, 1e-6),
+        Unit("nm", Dimension.LENGTH, 1e-9),
+        Unit("in", Dimension.LENGTH, 0.0254),
+        Unit("rad", Dimension.ANGLE, 1.0),
+        Unit("mrad", Dimension.ANGLE, 1e-3),
+        Unit("urad", Dimension.ANGLE, 1e-6),
+        Unit("deg", Dimension.ANGLE, math.pi / 180.0),
+        Unit("arcmin", Dimension.ANGLE, math.pi / 10800.0),
+        Unit("arcsec", Dimension.ANGLE, math.pi / 648000.0),
+        Unit("1", Dimension.RATIO, 1.0),
+    )
+}
+
+# What tables show where a robot's file does not say otherwise.
+DISPLAY_UNITS: Mapping[Dimension, Unit] = {
+    Dimension.LENGTH: UNITS["mm"],
+    Dimension.ANGLE: UNITS["deg"],
+    Dimension.RATIO: UNITS["1"],
+}
+
+# How a quantity is written, for messages.
+EXAMPLES: Mapping[Dimension, str] = {Dimension.LENGTH: "0.02mm", Dimension.ANGLE: "0.01deg", Dimension.RATIO: "1.5 1"}
+
+
+def symbols(dimension: Dimension | None = None) -> tuple[str, ...]:
+    """Return the allowed unit symbols, of one dimension or of all."""
+    return tuple(s for s, u in UNITS.items() if dimension is None or u.dimension is dimension)
+
+
+def unit(symbol: str, dimension: Dimension | None = None) -> Unit:
+    """Return the unit with this symbol.
+
+    Parameters
+    ----------
+    symbol : str
+        One of `symbols()`.
+    dimension : Dimension, optional
+        Refuse units of another dimension.
+
+    Raises
+    ------
+    UnitError
+        Unknown symbol, or a unit of another dimension; the text lists the allowed ones.
+    """
+    found = UNITS.get(symbol)
+    allowed = symbols(dimension)
+    if found is None:
+        raise UnitError(f"unknown unit {symbol!r}{nearest(symbol, allowed)}; allowed are {', '.join(allowed)}")
+    if dimension is not None and found.dimension is not dimension:
+        raise UnitError(
+            f"{symbol!r} is a unit of {found.dimension.value}, but a {dimension.value} is needed; "
+            f"allowed are {', '.join(allowed)}"
+        )
+    return found
+
+
+def quantity(text: str, dimension: Dimension | None = None) -> float:
+    """Return the SI value of a number with its unit, such as `0.02mm` or `5 urad`.
+
+    Raises
+    ------
+    UnitError
+        Not a finite number, unit missing, unknown, or of another dimension.
+    """
+    stripped = text.strip()
+    cut = len(stripped)
+    while cut > 0 and not _is_number(stripped[:cut]):
+        cut -= 1
+    example = EXAMPLES[dimension or Dimension.LENGTH]
+    if cut == 0:
+        raise UnitError(f"{text!r} is not a number with a unit; write for example {example}")
+    value, symbol = float(stripped[:cut]), stripped[cut:].strip()
+    if not math.isfinite(value):
+        raise UnitError(f"{text!r} is not finite; write a finite number with a unit, for example {example}")
+    if not symbol:
+        raise UnitError(f"{text!r} has no unit; add one of {', '.join(symbols(dimension))}, for example {example}")
+    return value * unit(symbol, dimension).factor_to_si
+
+
+def _is_number(text: str) -> bool:
+    """Tell whether Python reads `text` as a float."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return "_" not in text
