@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+# Everything that loopcal's own developers run. `make` alone lists the targets.
+# Needs git, make and a Python >= 3.11 with venv; PYTHON=/path/to/python chooses one.
+
+BIN := .venv/bin
+ROBOT := src/loopcal/robots/hexapod-42.yaml
+DATA := examples/hexapod-42/measurements.csv
+export PYTHON
+
+.PHONY: help demo test quick evidence docs bench bench-update check format constraints clean
+
+help:  ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
+
+demo: .venv/core.stamp  ## calibrate the shipped hexapod from its measurement file into runs/demo
+	$(BIN)/loopcal calibrate $(ROBOT) $(DATA) --hold-out 0.25 --output runs/demo --force
+
+test: .venv/dev.stamp  ## every test except the full-size statistics
+	$(BIN)/pytest -n 2 -m "not evidence"
+
+quick: .venv/dev.stamp  ## the tests that together take under 30 s
+	$(BIN)/pytest -n 2 -m "quick or not (slow or evidence)"
+
+evidence: .venv/dev.stamp  ## statistics at full size: docs/evidence/*.json, the tables made from them, their tests
+	$(BIN)/python tools/evidence.py
+	$(BIN)/pytest -m evidence
+
+docs: .venv/dev.stamp  ## rewrite the tables in the documentation from docs/evidence/*.json
+	$(BIN)/python tools/evidence.py --tables
+
+bench: .venv/dev.stamp  ## benchmarks against the committed baseline; fails when one got worse
+	$(BIN)/python benchmarks/run.py --gate
+
+bench-update: .venv/dev.stamp  ## measure again and rewrite benchmarks/baseline.json
+	$(BIN)/python benchmarks/run.py --update
+
+check: .venv/dev.stamp  ## lint, format, types, layers, sizes
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+	$(BIN)/python tools/check_sizes.py
+
+format: .venv/dev.stamp  ## let ruff sort imports and lay out the code
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+constraints: .venv/dev.stamp  ## regenerate constraints/python3.XX.txt for every Python found among 3.11 to 3.14
+	$(BIN)/python tools/constraints.py
+
+clean:  ## remove the environment and what the tools left behind
+	rm -rf .venv runs build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+
+.venv/core.stamp: pyproject.toml $(wildcard constraints/*.txt)
+	@tools/setup.sh core
+	@touch $@
+
+.venv/dev.stamp: pyproject.toml $(wildcard constraints/*.txt)
+	@tools/setup.sh dev
+	@touch .venv/core.stamp $@
