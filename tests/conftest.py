@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every test relies on: one BLAS thread, 64-bit jax, reproducible hypothesis, the outside data, and strictness.
+
+Under LOOPCAL_STRICT=1 a skip is a failure, so that nothing is left out in silence where everything should be there.
+"""
+
+import os
+from collections.abc import Generator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+# Small matrices only: more threads cost more than they bring. Set before numpy is imported for the first time.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+from hypothesis import HealthCheck, settings  # noqa: E402  (it may import numpy)
+
+# The same examples in every run; no deadline, because machines differ.
+settings.register_profile("loopcal", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("loopcal")
+
+ROOT = Path(__file__).resolve().parent.parent
+STRICT = os.environ.get("LOOPCAL_STRICT") == "1"
+
+
+@pytest.fixture(scope="session")
+def root() -> Path:
+    """Return the folder of the repository."""
+    return ROOT
+
+
+@pytest.fixture(scope="session")
+def data_folder() -> Path:
+    """Return the folder of measured data and reference numbers that are not part of the project."""
+    folder = Path(os.environ.get("LOOPCAL_DATA") or ROOT.parent / "shared" / "data")
+    folder = folder if folder.is_absolute() else ROOT / folder
+    if not folder.is_dir():
+        pytest.skip(f"no reference data in {folder}: set LOOPCAL_DATA to its folder")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def jax() -> ModuleType:
+    """Return jax set to 64 bits, for derivatives that are independent of ours."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    return jax
+
+
+def _refuse_skip(report: pytest.TestReport | pytest.CollectReport) -> None:
+    """Turn a skip into a failure under LOOPCAL_STRICT=1; an expected failure (xfail) stays what it is."""
+    if STRICT and report.outcome == "skipped" and not hasattr(report, "wasxfail"):
+        reason = report.longrepr[-1] if isinstance(report.longrepr, tuple) else report.longrepr
+        report.outcome = "failed"
+        report.longrepr = f"LOOPCAL_STRICT=1 allows no skip: {reason}"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Apply `_refuse_skip` to each test."""
+    report = yield
+    _refuse_skip(report)
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """Apply `_refuse_skip` to modules that skip themselves as a whole."""
+    report = yield
+    _refuse_skip(report)
+    return report
