@@ -1,4 +1,77 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Geometric calibration of parallel robots."""
+"""Geometric calibration of robots with closed kinematic loops.
+
+These names are the public API; every other module may change. Each is imported when it is first used, so that
+`import loopcal` costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from loopcal.calibrate import MAP as MAP
+    from loopcal.calibrate import Identification as Identification
+    from loopcal.calibrate import LeastSquares as LeastSquares
+    from loopcal.calibrate import Ridge as Ridge
+    from loopcal.calibrate import TruncatedSVD as TruncatedSVD
+    from loopcal.calibrate import Validation as Validation
+    from loopcal.calibrate import identifiability as identifiability
+    from loopcal.calibrate import identify as identify
+    from loopcal.calibrate import validate as validate
+    from loopcal.errors import LoopcalError as LoopcalError
+    from loopcal.io import load_measurements as load_measurements
+    from loopcal.io import load_robot as load_robot
+    from loopcal.io import save_measurements as save_measurements
+    from loopcal.io import save_robot as save_robot
+    from loopcal.measure import Instrument as Instrument
+    from loopcal.measure import Measurements as Measurements
+    from loopcal.measure import simulate as simulate
+    from loopcal.mechanism import Mechanism as Mechanism
+    from loopcal.mechanism import Solution as Solution
+    from loopcal.mechanism import Status as Status
+    from loopcal.mechanism import forward as forward
+    from loopcal.mechanism import inverse as inverse
 
 __version__ = "0.1.0.dev0"
+
+_WHERE = {
+    name: module
+    for module, names in {
+        "loopcal.calibrate": (
+            "MAP",
+            "Identification",
+            "LeastSquares",
+            "Ridge",
+            "TruncatedSVD",
+            "Validation",
+            "identifiability",
+            "identify",
+            "validate",
+        ),
+        "loopcal.errors": ("LoopcalError",),
+        "loopcal.io": ("load_measurements", "load_robot", "save_measurements", "save_robot"),
+        "loopcal.measure": ("Instrument", "Measurements", "simulate"),
+        "loopcal.mechanism": ("Mechanism", "Solution", "Status", "forward", "inverse"),
+    }.items()
+    for name in names
+}
+
+__all__ = ["__version__", *sorted(_WHERE)]  # noqa: PLE0604  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used."""
+    if name not in _WHERE:
+        raise AttributeError(
+            f"module 'loopcal' has no attribute {name!r}; public names are {', '.join(sorted(_WHERE))}"
+        )
+    value = getattr(import_module(_WHERE[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names."""
+    return __all__

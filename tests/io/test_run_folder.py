@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Run folders: whole or absent, never over something else, JSON without NaN."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from loopcal.errors import FileError
+from loopcal.io.json_text import to_json
+from loopcal.io.run_folder import MADE_BY, made_by, read_run_folder, write_run_folder
+from loopcal.units import Dimension
+
+
+def write(folder, force: bool = False, value: float = 1.5):
+    return write_run_folder(folder, {"value": value}, {"a": np.arange(3.0)}, "name: h\n", force)
+
+
+def test_what_is_written_is_read_back(tmp_path) -> None:
+    run = read_run_folder(write(tmp_path / "deep" / "run"))
+    assert run.result == {"format": 1, "value": 1.5}
+    assert run.arrays["a"].tolist() == [0.0, 1.0, 2.0]
+    assert run.robot_path.read_text() == "name: h\n"
+    assert [p.name for p in (tmp_path / "deep").iterdir()] == ["run"]
+
+
+def test_a_run_is_replaced_only_with_force(tmp_path) -> None:
+    write(tmp_path / "run")
+    with pytest.raises(FileError, match="not empty; choose another name, or replace the run in it with --force"):
+        write(tmp_path / "run", value=2.5)
+    assert read_run_folder(tmp_path / "run").result["value"] == 1.5
+    write(tmp_path / "run", force=True, value=2.5)
+    assert read_run_folder(tmp_path / "run").result["value"] == 2.5
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+
+
+def test_force_does_not_replace_what_is_not_a_run(tmp_path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(FileError, match="something other than a run"):
+        write(tmp_path, force=True)
+    with pytest.raises(FileError, match="this is a file where a run folder"):
+        write(tmp_path / "thesis.tex", force=True)
+
+
+def test_an_empty_folder_is_used(tmp_path) -> None:
+    (tmp_path / "run").mkdir()
+    assert read_run_folder(write(tmp_path / "run")).result["value"] == 1.5
+
+
+def test_nothing_is_left_when_writing_fails(tmp_path) -> None:
+    with pytest.raises(ValueError, match="Object arrays"):
+        write_run_folder(tmp_path / "run", {}, {"a": np.array([object()])}, "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_run_is_refused(tmp_path) -> None:
+    with pytest.raises(FileError, match="not a run folder"):
+        read_run_folder(tmp_path)
+    write(tmp_path / "run")
+    (tmp_path / "run" / "result.json").write_text("{")
+    with pytest.raises(FileError, match="damaged"):
+        read_run_folder(tmp_path / "run")
+    (tmp_path / "run" / "result.json").write_text('{"format": 99}')
+    with pytest.raises(FileError, match="newer"):
+        read_run_folder(tmp_path / "run")
+
+
+def test_json_has_null_and_a_reason_where_a_number_is_not_finite() -> None:
+    text = to_json(
+        {"rows": [{"sd": math.inf}, {"sd": np.float64(0.5)}], "a": np.array([math.nan]), "d": Dimension.ANGLE}
+    )
+    document = json.loads(text)
+    assert document["rows"] == [{"sd": None}, {"sd": 0.5}]
+    assert document["d"] == "angle"
+    assert set(document["nulls"]) == {"rows/0/sd", "a/0"}
+    assert document["nulls"]["rows/0/sd"].startswith("infinite")
+
+
+def test_a_run_says_how_it_was_made(tmp_path) -> None:
+    data = tmp_path / "data.csv"
+    data.write_bytes(b"abc")
+    origin = made_by(["loopcal", "calibrate"], {"data": data}, {"split": 1})
+    assert set(origin) == set(MADE_BY)
+    assert origin["inputs"]["data"]["sha256"].startswith("ba7816bf8f01cfea")  # SHA-256 of "abc", FIPS 180-2 B.1
+    assert set(origin["versions"]) == {"loopcal", "python", "numpy", "scipy"}

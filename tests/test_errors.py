@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The error tree: one base, texts with their place."""
+
+import inspect
+
+import pytest
+
+from loopcal import errors
+from loopcal.errors import FileError, LoopcalError, nearest
+
+
+def test_every_error_of_the_tree_is_a_loopcal_error() -> None:
+    classes = [c for _, c in inspect.getmembers(errors, inspect.isclass) if issubclass(c, Exception)]
+    assert len(classes) == 6
+    assert all(issubclass(c, LoopcalError) for c in classes)
+
+
+@pytest.mark.parametrize(("line", "text"), [(7, "robot.yaml:7: bad key"), (None, "robot.yaml: bad key")])
+def test_a_file_error_names_path_and_line(line: int | None, text: str) -> None:
+    error = FileError("bad key", "robot.yaml", line)
+    assert str(error) == text
+    assert (str(error.path), error.line) == ("robot.yaml", line)
+
+
+def test_nearest_names_close_names_only() -> None:
+    assert nearest("lenght", ["length", "angle"]) == " (did you mean 'length'?)"
+    assert nearest("zzz", ["length", "angle"]) == ""

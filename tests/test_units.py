@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Units: factors to SI, and refusals that list what is allowed."""
+
+import math
+
+import pytest
+
+from loopcal.errors import UnitError
+from loopcal.units import Dimension, quantity, symbols, unit
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("0.02mm", 2e-5),
+        ("5 urad", 5e-6),
+        ("1e-3 m", 1e-3),
+        ("-2in", -0.0508),
+        ("180deg", math.pi),
+        ("60 arcmin", math.pi / 180),
+        ("3600arcsec", math.pi / 180),
+        ("7 1", 7.0),
+        ("10nm", 1e-8),
+    ],
+)
+def test_a_quantity_is_its_number_times_the_factor_of_its_unit(text: str, value: float) -> None:
+    assert quantity(text) == pytest.approx(value, rel=4e-16)  # one rounding of the product
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("5", "has no unit; add one of m, mm"),
+        ("mm", "not a number with a unit"),
+        ("5 deg", "unit of angle, but a length is needed"),
+        ("5 mmm", "unknown unit 'mmm' .did you mean 'mm'"),
+        ("nan mm", "not finite"),
+        ("", "not a number with a unit"),
+        ("1_0mm", "unknown unit"),
+    ],
+)
+def test_a_bad_quantity_is_refused_with_what_is_allowed(text: str, message: str) -> None:
+    with pytest.raises(UnitError, match=message):
+        quantity(text, Dimension.LENGTH)
+
+
+def test_every_unit_is_found_by_its_symbol() -> None:
+    for dimension in Dimension:
+        for symbol in symbols(dimension):
+            assert unit(symbol, dimension).dimension is dimension
+            assert str(unit(symbol)) == symbol
