@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The one Jacobian checker of the whole test suite: central differences with an error bound, and automatic derivatives.
+
+A difference proves as much as its own error allows, so the step is chosen by the smallest bound (truncation seen
+between neighbouring steps, plus rounding), the bound is part of the tolerance, and a bound too large to prove anything
+fails the test. The automatic derivative comes from jax: either from a function written for it, or from our own source
+run with jax.numpy in the place of numpy (`under_jax`), which leaves the derivative independent of ours.
+"""
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+# Steps as fractions of the scale. Fourth-order differences are best near eps^(1/5) = 7e-4; the ladder surrounds it.
+_LADDER = 10.0 ** np.arange(-1.0, -5.1, -0.5)
+# Rounding of the 4-point formula: (8 + 8 + 1 + 1) / 12 ulps of the function over the step, times 4 for its own error.
+_ROUNDING = 6.0 * np.finfo(float).eps
+# The truncation of a step is judged by its change to the next; ten covers outputs that agree there by chance.
+_SAFETY = 10.0
+# A bound above this fraction of the largest scaled column proves nothing.
+_USEFUL = 1e-6
+# Automatic derivatives carry rounding only, over a few hundred operations.
+_AUTOMATIC = 1e-11
+
+
+def central_difference(function: Callable[[Array], ArrayLike], x: Array, scale: Array) -> tuple[Array, Array]:
+    """Derivative of a function by fourth-order central differences, with an error bound.
+
+    `f' = (8 (f(h) - f(-h)) - (f(2h) - f(-2h))) / 12h`, the step of each unknown chosen from a ladder.
+
+    Parameters
+    ----------
+    function : callable
+        From (k,) to an array (...) of any shape.
+    x : (k,)
+    scale : (k,)
+        Change of each unknown over which the function bends noticeably (1 rad, the size of the robot).
+
+    Returns
+    -------
+    derivative : (..., k)
+    bound : (k,)
+        Largest error to be expected in each column.
+    """
+    columns, bounds = [], []
+    for k, unit in enumerate(np.eye(x.size)):
+        tries, size = [], 0.0
+        for step in scale[k] * _LADDER:
+            far, near, back, behind = (np.asarray(function(x + f * step * unit)) for f in (2.0, 1.0, -1.0, -2.0))
+            tries.append((8.0 * (near - back) - (far - behind)) / (12.0 * step))
+            size = max(size, float(np.max(np.abs(near))))
+        errors = [
+            float(np.max(np.abs(tries[i] - tries[i + 1]))) + _ROUNDING * size / (scale[k] * _LADDER[i + 1])
+            for i in range(len(tries) - 1)
+        ]
+        best = int(np.argmin(errors))
+        columns.append(tries[best])
+        bounds.append(_SAFETY * errors[best])
+    return np.stack(columns, axis=-1), np.array(bounds)
+
+
+def check_jacobian(
+    function: Callable[[Array], ArrayLike],
+    jacobian: ArrayLike,
+    x: ArrayLike,
+    *,
+    scale: ArrayLike,
+    atol: float = 0.0,
+    atol_reason: str = "none beyond the error of the reference itself",
+    automatic: Callable[..., object] | None = None,
+    package: str = "loopcal",
+) -> None:
+    """Fail unless an analytic Jacobian agrees with central differences and, where given, with jax.
+
+    Parameters
+    ----------
+    function : callable
+        From (k,) to an array of any shape; perturb a whole batch at once by one common x.
+    jacobian : array (..., k)
+        The analytic derivative at `x`.
+    x : (k,)
+    scale : (k,) or number
+        Change of each unknown over which the function bends noticeably.
+    atol : float
+        Error allowed on top of the error of the reference, in the unit of function * scale / x.
+    atol_reason : str
+        Why `atol` is what it is; printed on failure.
+    automatic : callable, optional
+        The function for jax: another one, or `function` itself where it only calls loopcal and takes jax arrays.
+    package : str
+        Modules whose numpy is replaced while jax traces `automatic`.
+    """
+    point = np.asarray(x, dtype=float)
+    scales = np.broadcast_to(np.asarray(scale, dtype=float), point.shape)
+    analytic = np.asarray(jacobian) * scales
+    largest = max(float(np.max(np.abs(analytic))), float(np.finfo(float).tiny))
+    difference, bound = central_difference(function, point, scales)
+    if analytic.shape != difference.shape:
+        raise AssertionError(f"Jacobian of shape {analytic.shape}, differences of shape {difference.shape}")
+    scaled_bound = bound * scales
+    if np.max(scaled_bound) > max(_USEFUL * largest, atol):
+        raise AssertionError(
+            f"differences too coarse to prove anything: bound {scaled_bound}, entries to {largest:.3g}"
+        )
+    _compare("central differences", analytic, difference * scales, scaled_bound + atol, atol_reason)
+    if automatic is not None:
+        reference = automatic_derivative(automatic, point, package) * scales
+        _compare("jax", analytic, reference, np.full(point.size, _AUTOMATIC * largest + atol), atol_reason)
+
+
+def _compare(name: str, analytic: Array, reference: Array, tolerance: Array, reason: str) -> None:
+    error = np.abs(analytic - reference)
+    wrong = ~(error <= tolerance)  # a NaN is wrong
+    if np.any(wrong):
+        place = tuple(int(i) for i in np.argwhere(wrong)[0])
+        raise AssertionError(
+            f"{int(np.sum(wrong))} entries differ from {name}, the first at {place}: {analytic[place]:.12g} against"
+            f" {reference[place]:.12g}, error {error[place]:.2e}, allowed {tolerance[place[-1]]:.2e} (atol: {reason})"
+        )
+
+
+def automatic_derivative(function: Callable[..., object], x: Array, package: str = "loopcal") -> Array:
+    """Forward-mode derivative (..., k) of a function at x (k,), in double precision."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    with under_jax(package):
+        return np.asarray(jax.jacfwd(function)(jax.numpy.asarray(x)))
+
+
+@contextmanager
+def under_jax(package: str = "loopcal") -> Iterator[None]:
+    """Let every loaded module of a package find jax.numpy under the name `np`, and put numpy back at the end."""
+    import jax.numpy
+
+    modules = [
+        module
+        for name, module in list(sys.modules.items())
+        if (name == package or name.startswith(package + ".")) and getattr(module, "np", None) is np
+    ]
+    for module in modules:
+        vars(module)["np"] = jax.numpy
+    try:
+        yield
+    finally:
+        for module in modules:
+            vars(module)["np"] = np
