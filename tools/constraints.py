@@ -42,7 +42,7 @@ def main() -> int:
     """Write the constraints of every Python found; exit 1 when there is none."""
     found = {minor: python for minor in MINORS if (python := find_python(minor))}
     for minor, python in found.items():
-        header = f"# Versions that loopcal[dev] was tested with on Python {minor}; made by `make constraints`."
+        header = f"# One complete install of loopcal[dev] on Python {minor}, frozen by `make constraints`."
         path = ROOT / "constraints" / f"python{minor}.txt"
         path.write_text("\n".join([header, *freeze(python), ""]), encoding="utf-8")
         print(f"constraints: wrote {path.relative_to(ROOT)}")

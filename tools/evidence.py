@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Run evidence/*.py, write docs/evidence/*.json, and make the tables of the documentation from those files.
+
+`--tables` makes the tables only; names choose scripts. evidence/README.md says what a script returns.
+"""
+
+import argparse
+import importlib.util
+import json
+import re
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from machine import describe_machine
+
+ROOT = Path(__file__).resolve().parent.parent
+BLOCK = re.compile(r"(<!-- evidence: (?P<name>[\w-]+)\.(?P<table>[\w-]+) -->\n)(?P<body>.*?)(<!-- end -->)", re.DOTALL)
+
+
+def collect(script: Path) -> dict[str, Any]:
+    """Run the `collect` function of one evidence script."""
+    spec = importlib.util.spec_from_file_location(f"evidence_{script.stem}", script)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{script} is not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look for the module that defines them
+    spec.loader.exec_module(module)
+    return module.collect()
+
+
+def write_json(path: Path, document: dict[str, Any]) -> None:
+    """Write JSON without NaN under a temporary name and rename it, so that a reader never sees half a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    temporary.replace(path)
+
+
+def render_table(table: dict[str, Any]) -> str:
+    """Return a Markdown table; a missing value is a dash."""
+    columns = table["columns"]
+    formats = table.get("formats", [""] * len(columns))
+    lines = [columns, ["---"] * len(columns)]
+    for row in table["rows"]:
+        cells = zip(row, formats, strict=True)
+        lines.append(["-" if cell is None else format(cell, spec) for cell, spec in cells])
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def fill_tables(text: str, folder: Path) -> str:
+    """Return a page with each of its evidence blocks made anew from the JSON files in `folder`."""
+
+    def fill(match: re.Match[str]) -> str:
+        document = json.loads((folder / f"{match['name']}.json").read_text(encoding="utf-8"))
+        return match[1] + render_table(document["tables"][match["table"]]) + match[5]
+
+    return BLOCK.sub(fill, text)
+
+
+def find_pages(root: Path) -> list[Path]:
+    """Return the Markdown pages that may hold evidence blocks."""
+    return [root / "README.md", *sorted((root / "docs").rglob("*.md"))]
+
+
+def find_outdated(root: Path) -> dict[Path, str]:
+    """Return the pages whose tables differ from the JSON files, with the text they should have."""
+    pages = {page: page.read_text(encoding="utf-8") for page in find_pages(root)}
+    filled = {page: fill_tables(text, root / "docs" / "evidence") for page, text in pages.items()}
+    return {page: text for page, text in filled.items() if text != pages[page]}
+
+
+def main() -> int:
+    """Run the scripts, then write the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", help="evidence/NAME.py scripts to run; all without")
+    parser.add_argument("--tables", action="store_true", help="run no script")
+    options = parser.parse_args()
+
+    scripts = [ROOT / "evidence" / f"{name}.py" for name in options.names] or sorted((ROOT / "evidence").glob("*.py"))
+    start = time.perf_counter()
+    for script in [] if options.tables else scripts:
+        begin = time.perf_counter()
+        document = collect(script)
+        seconds = round(time.perf_counter() - begin, 1)
+        made = {"script": f"evidence/{script.name}", "seconds": seconds, "machine": describe_machine()}
+        write_json(ROOT / "docs" / "evidence" / f"{script.stem}.json", {"made": made, **document})
+        print(f"evidence: {script.stem} took {seconds} s", flush=True)
+    for page, text in find_outdated(ROOT).items():
+        page.write_text(text, encoding="utf-8")
+        print(f"evidence: wrote the tables of {page.relative_to(ROOT)}")
+    print(f"evidence: {time.perf_counter() - start:.1f} s in total")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
