@@ -22,31 +22,31 @@ quick: .venv/dev.stamp  ## the tests that together take under 30 s
 	$(BIN)/pytest -n 2 -m "quick or not (slow or evidence)"
 
 evidence: .venv/dev.stamp  ## statistics at full size: docs/evidence/*.json, the tables made from them, their tests
-	$(BIN)/python tools/evidence.py
+	$(BIN)/python -m tools.evidence
 	$(BIN)/pytest -m evidence
 
 docs: .venv/dev.stamp  ## rewrite the tables in the documentation from docs/evidence/*.json
-	$(BIN)/python tools/evidence.py --tables
+	$(BIN)/python -m tools.evidence --tables
 
 bench: .venv/dev.stamp  ## benchmarks against the committed baseline; fails when one got worse
-	$(BIN)/python benchmarks/run.py --gate
+	$(BIN)/python -m benchmarks.run --gate
 
 bench-update: .venv/dev.stamp  ## measure again and rewrite benchmarks/baseline.json
-	$(BIN)/python benchmarks/run.py --update
+	$(BIN)/python -m benchmarks.run --update
 
 check: .venv/dev.stamp  ## lint, format, types, layers, sizes
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
 	$(BIN)/lint-imports
-	$(BIN)/python tools/check_sizes.py
+	$(BIN)/python -m tools.check_sizes
 
 format: .venv/dev.stamp  ## let ruff sort imports and lay out the code
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
 constraints: .venv/dev.stamp  ## regenerate constraints/python3.XX.txt for every Python found among 3.11 to 3.14
-	$(BIN)/python tools/constraints.py
+	$(BIN)/python -m tools.constraints
 
 clean:  ## remove the environment and what the tools left behind
 	rm -rf .venv runs build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache

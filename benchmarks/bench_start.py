@@ -5,7 +5,7 @@ import functools
 import subprocess
 import sys
 
-from harness import Metric, measure_ratio
+from benchmarks.harness import Metric, measure_ratio
 
 
 def _python(*arguments: str) -> None:

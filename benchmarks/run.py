@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run the benchmarks: every function `bench_*` of every file `bench_*.py` here returns a Metric or several.
+"""Run the benchmarks: each function `bench_*` of each file benchmarks/bench_*.py returns one Metric or several.
 
-`--gate` exits 1 when a metric is beyond its limit or worse than the committed baseline by more than its tolerance;
-what fails is measured a second time first, since other programs may have been in the way. `--update` rewrites
-the baseline. Names given as arguments choose files: `run.py kinematics` runs bench_kinematics.py alone.
+Run as `python -m benchmarks.run`, from the root. Names given as arguments choose files: `kinematics` stands for
+bench_kinematics.py. `--gate` exits 1 when a metric is beyond its limit or worse than the committed baseline by more
+than its tolerance; what fails is measured a second time first, since other programs may have been in the way.
+`--update` rewrites the baseline.
 """
 
 import argparse
@@ -13,15 +14,15 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
-BASELINE = HERE / "baseline.json"
 # Before numpy: the references are single-threaded too, so that a ratio means the same on every machine.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
-sys.path[:0] = [str(HERE), str(HERE.parent / "tools")]
 
-from harness import Metric, find_faults, keep_better, read_baseline, write_baseline  # noqa: E402
-from machine import describe_machine  # noqa: E402
+from benchmarks.harness import Metric, find_faults, keep_better, read_baseline, write_baseline  # noqa: E402
+from tools.machine import describe_machine  # noqa: E402
+
+HERE = Path(__file__).resolve().parent
+BASELINE = HERE / "baseline.json"
 
 Benchmark = Callable[[], Metric | list[Metric]]
 
@@ -29,7 +30,7 @@ Benchmark = Callable[[], Metric | list[Metric]]
 def find_benchmarks(chosen: list[str]) -> list[Benchmark]:
     """Return the functions `bench_*` of all files `bench_*.py`, or of the chosen ones, in order of name."""
     names = [f"bench_{name}" for name in chosen] or sorted(path.stem for path in HERE.glob("bench_*.py"))
-    modules = [importlib.import_module(name) for name in names]
+    modules = [importlib.import_module(f"benchmarks.{name}") for name in names]
     return [
         function
         for module in modules

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run evidence/*.py, write docs/evidence/*.json, and make the tables of the documentation from those files.
 
-`--tables` makes the tables only; names choose scripts. evidence/README.md says what a script returns.
+Run as `python -m tools.evidence`. `--tables` makes the tables only; names choose scripts. evidence/README.md says
+what a script returns.
 """
 
 import argparse
@@ -13,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from machine import describe_machine
+from tools.machine import describe_machine
 
 ROOT = Path(__file__).resolve().parent.parent
 BLOCK = re.compile(r"(<!-- evidence: (?P<name>[\w-]+)\.(?P<table>[\w-]+) -->\n)(?P<body>.*?)(<!-- end -->)", re.DOTALL)

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables in the documentation come from docs/evidence/*.json, and say what these files say."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tools import evidence
+
+TABLE = {"columns": ["step", "median [mm]"], "formats": ["d", ".2g"], "rows": [[1, 0.3123], [2, None]]}
+
+
+def test_a_missing_value_is_shown_as_a_dash() -> None:
+    assert evidence.render_table(TABLE) == "| step | median [mm] |\n| --- | --- |\n| 1 | 0.31 |\n| 2 | - |\n"
+
+
+def test_a_block_is_made_anew_and_the_text_around_it_kept(tmp_path: Path) -> None:
+    evidence.write_json(tmp_path / "recovery.json", {"tables": {"steps": TABLE}})
+    page = "before\n<!-- evidence: recovery.steps -->\nold\n<!-- end -->\nafter\n"
+    filled = evidence.fill_tables(page, tmp_path)
+    assert filled == page.replace("old\n", evidence.render_table(TABLE))
+    assert evidence.fill_tables(filled, tmp_path) == filled
+
+
+def test_not_a_number_is_refused_and_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    evidence.write_json(path, {"value": 1})
+    with pytest.raises(ValueError, match="JSON compliant"):
+        evidence.write_json(path, {"value": float("nan")})
+    assert json.loads(path.read_text("utf-8")) == {"value": 1}
+
+
+def test_tables_in_the_pages_agree_with_the_evidence_files(root: Path) -> None:
+    assert list(evidence.find_outdated(root)) == [], "run `make docs`"
+
+
+@pytest.mark.evidence
+def test_every_evidence_file_comes_from_a_script_and_names_its_machine(root: Path) -> None:
+    written = {path.stem: path for path in (root / "docs" / "evidence").glob("*.json")}
+    assert set(written) == {path.stem for path in (root / "evidence").glob("*.py")}
+    for path in written.values():
+        assert json.loads(path.read_text("utf-8"))["made"]["machine"]["processor"]
+
+
+@pytest.mark.evidence
+def test_tables_in_the_pages_agree_with_the_new_evidence(root: Path) -> None:
+    assert list(evidence.find_outdated(root)) == []
