@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compile an assembly: group its limbs, lay out displacements and joint values, find home, check mobility."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from loopcal import engine
+from loopcal.engine import Array, Group, Program, Slot, State
+from loopcal.errors import MechanismError
+from loopcal.mechanism import coordinates, mobility
+from loopcal.mechanism.assembly import AXES, Actuator, Address, Assembly, Joint, Limb
+from loopcal.mechanism.model import Mechanism, SlotMap
+from loopcal.mechanism.transmission import TERMS, frequency, joint_values, nominal_terms
+from loopcal.mechanism.trials import inverse_trials
+from loopcal.parameters import ParameterTable
+from loopcal.units import Dimension
+
+DEFAULT_UNITS = {Dimension.LENGTH: "mm", Dimension.ANGLE: "deg", Dimension.RATIO: "1"}
+ROWS = {"rigid": 6, "ball": 3, "distance": 1}
+
+
+def build(assembly: Assembly, units: Mapping[Dimension, str] | None = None, record: Any = None) -> Mechanism:
+    """Compile a mechanism for the engine and find its home position.
+
+    Parameters
+    ----------
+    assembly : what a family's `expand` returned.
+    units : display units of its file. record : the family record, kept for writing the file back.
+
+    Returns
+    -------
+    Mechanism at its nominal values.
+
+    Raises
+    ------
+    MechanismError
+        A name that is used twice or not known, a mechanism that cannot close at home, wrong mobility (with the freedoms
+        that are too many or too few), a coordinate nobody controls.
+    """
+    _check_names(assembly)
+    coordinates.check_names(assembly.controlled)
+    table = ParameterTable(assembly.parameters)
+    wanted = {m.address for m in assembly.maps} | {a for s in assembly.shared for a in s.outputs}
+    _check_addresses(assembly, wanted)
+    groups, places, count = _groups(assembly, wanted)
+    freedoms = tuple(AXES.index(f) for f in AXES if f in assembly.freedoms)
+    size = characteristic_length(assembly)
+    program = Program(groups, freedoms, size, count, len(assembly.actuators))
+    slots = _slot_map(assembly, table, places, count)
+    units = {**DEFAULT_UNITS, **(units or {})}
+    robot = Mechanism(assembly, table, table.nominal, program, slots, size, _guess(assembly, groups), units, record=record)
+    home = _home(robot)
+    robot = Mechanism(assembly, table, table.nominal, program, slots, size, home, units, record=record)
+    return mobility.checked(robot)
+
+
+def characteristic_length(assembly: Assembly) -> float:
+    """Root mean square distance [m] between the points where limbs leave the base and those where they meet the platform."""
+    home = assembly.home
+    gaps = [(home @ limb.attachment.transform)[:3, 3] - limb.links[0].transform[:3, 3] for limb in assembly.limbs]
+    reach = [limb.attachment.transform[:3, 3] for limb in assembly.limbs]
+    feet = [limb.links[0].transform[:3, 3] for limb in assembly.limbs]
+    spread = np.concatenate([gaps, reach, np.subtract(feet, np.mean(feet, axis=0))])
+    return float(np.sqrt((spread**2).sum() / len(gaps)))
+
+
+def _check_names(assembly: Assembly) -> None:
+    names = [limb.name for limb in assembly.limbs]
+    for kind, found in (("limb", names), ("actuator", [a.name for a in assembly.actuators])):
+        for name in found:
+            if found.count(name) > 1:
+                raise MechanismError(f"two {kind}s are called {name!r}; every {kind} needs its own name")
+    driven = [name for limb in assembly.limbs for name in (*(j.actuator for j in limb.joints), limb.actuator) if name]
+    for actuator in assembly.actuators:
+        if driven.count(actuator.name) != 1:
+            raise MechanismError(
+                f"actuator {actuator.name!r} drives {driven.count(actuator.name)} joints; it must drive exactly one"
+            )
+    unknown = sorted(set(driven) - {a.name for a in assembly.actuators})
+    if unknown:
+        raise MechanismError(f"a joint is driven by {unknown[0]!r}, which is not among the actuators; add it or mend the name")
+    for limb in assembly.limbs:
+        if limb.ending not in ROWS:
+            raise MechanismError(f"limb {limb.name!r} ends in {limb.ending!r}; allowed endings are {', '.join(ROWS)}")
+        if len(limb.links) != len(limb.joints) + 1:
+            raise MechanismError(
+                f"limb {limb.name!r} has {len(limb.joints)} joints and {len(limb.links)} links; links are one more than joints"
+            )
+    wrong = [f for f in assembly.freedoms if f not in AXES]
+    if wrong:
+        raise MechanismError(f"{wrong[0]!r} is not a freedom of a platform; allowed are {', '.join(AXES)}")
+
+
+def _check_addresses(assembly: Assembly, wanted: set[Address]) -> None:
+    limbs = {limb.name: limb for limb in assembly.limbs}
+    actuators = {a.name for a in assembly.actuators}
+    for address in sorted(wanted, key=str):
+        if address.owner in actuators and address.element == "transmission" and address.axis in TERMS:
+            continue
+        if address.owner in limbs and _slot(limbs[address.owner], address) is not None:
+            continue
+        raise MechanismError(f"a parameter is mapped onto {address}, which this mechanism does not have; mend the map")
+
+
+def _slot(limb: Limb, address: Address) -> Slot | None:
+    """The slot of an address in a limb, None where there is none."""
+    joints = [j.name for j in limb.joints]
+    if address.axis == "length":
+        return Slot(len(joints), engine.LENGTH) if limb.ending == "distance" and address.element == "rod" else None
+    if address.axis == "pitch":
+        turning = address.element in joints and limb.joints[joints.index(address.element)].kind == "R"
+        return Slot(joints.index(address.element), engine.PITCH) if turning else None
+    links = [*(link.name for link in limb.links), limb.attachment.name]
+    if address.element not in links or address.axis not in AXES:
+        return None
+    return Slot(links.index(address.element), AXES.index(address.axis))
+
+
+def _groups(assembly: Assembly, wanted: set[Address]) -> tuple[tuple[Group, ...], dict[Address, int], int]:
+    """Group limbs of one structure; give every displacement its place in e."""
+    column = {a.name: i for i, a in enumerate(assembly.actuators)}
+    alike: dict[tuple, list[int]] = {}
+    for i, limb in enumerate(assembly.limbs):
+        drive = tuple(bool(j.actuator) for j in limb.joints), bool(limb.actuator)
+        alike.setdefault((limb.ending, tuple(j.kind for j in limb.joints), drive), []).append(i)
+    groups, places, count = [], {}, 0
+    for (ending, kinds, _), members in alike.items():
+        limbs = [assembly.limbs[i] for i in members]
+        own = [{a: _slot(limb, a) for a in wanted if a.owner == limb.name} for limb in limbs]
+        slots = tuple(sorted({s for found in own for s in found.values() if s}, key=lambda s: (s.element, s.axis)))
+        for found in own:
+            places |= {a: count + slots.index(s) for a, s in found.items() if s}
+            count += len(slots)
+        drives = [[*(column[j.actuator] if j.actuator else -1 for j in limb.joints), column.get(limb.actuator or "", -1)] for limb in limbs]
+        groups.append(
+            Group(
+                tuple(members),
+                "".join(kinds),
+                np.array(drives, dtype=np.int64).T.reshape(len(kinds) + 1, len(limbs)),
+                mobility.held_joints(assembly, limbs[0]),
+                ending,
+                _rows(ending, assembly.freedoms),
+                np.array([[link.transform for link in (*limb.links, limb.attachment)] for limb in limbs]),
+                np.array([[j.pitch for j in limb.joints] for limb in limbs]).reshape(len(limbs), len(kinds)),
+                np.array([limb.length for limb in limbs]),
+                slots,
+                slice(count - len(slots) * len(limbs), count),
+            )
+        )
+    return tuple(groups), places, count
+
+
+def _rows(ending: str, freedoms: tuple[str, ...]) -> tuple[int, ...]:
+    """Rows of an ending that lie in the platform's freedoms: closure of a planar machine is asked for in its plane."""
+    if ending == "distance":
+        return (0,)
+    axes = AXES if ending == "rigid" else AXES[3:]
+    return tuple(i for i, axis in enumerate(axes) if axis in freedoms)
+
+
+def _slot_map(assembly: Assembly, table: ParameterTable, places: dict[Address, int], count: int) -> SlotMap:
+    """The maps as one matrix and the shared functions with their places."""
+    actuators = {a.name: i for i, a in enumerate(assembly.actuators)}
+
+    def place(address: Address) -> int:
+        if address in places:
+            return places[address]
+        return count + len(TERMS) * actuators[address.owner] + TERMS.index(address.axis)
+
+    matrix = np.zeros((count + len(TERMS) * len(actuators), len(table)))
+    for entry in assembly.maps:
+        matrix[place(entry.address), table.index(entry.parameter)] += entry.coefficient
+    shared = tuple(
+        (s, tuple(table.index(name) for name in s.inputs), tuple(place(a) for a in s.outputs)) for s in assembly.shared
+    )
+    terms, w = nominal_terms(assembly.actuators), frequency(assembly.actuators)
+    return SlotMap(matrix, shared, table.nominal, count, terms, w)
+
+
+def _guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
+    """The start of the search for home: the home pose with every joint at its `start`."""
+    joints = []
+    for group in groups:
+        limbs = [assembly.limbs[i] for i in group.limbs]
+        joints.append(np.array([[*(j.start for j in limb.joints), 0.0] for limb in limbs])[None, None])
+    zero = np.zeros((1, 1))
+    return State(assembly.home[None, None], tuple(joints), zero.astype(np.int8), zero, zero.astype(np.int64), zero.astype(np.int8))
+
+
+def _home(robot: Mechanism) -> State:
+    """The closed state at the home pose's controlled coordinates; raises MechanismError where the loops cannot close."""
+    values = robot.values[None]
+    target = coordinates.read(robot.assembly.home[None, None], robot.controlled)
+    state = inverse_trials(robot, values, target)
+    if state.status[0, 0] != engine.CONVERGED:
+        raise MechanismError(
+            f"{robot.name} cannot close at its home pose: the loops stay {state.residual[0, 0] * 1e3:.3g} mm open; "
+            "check the joint centres, lengths and home"
+        )
+    e, tau = robot.slots(values)
+    q = trial_readings(robot, state)
+    return engine.solve(robot.program, e, joint_values(q, tau, robot.slots.frequency), state)
+
+
+def trial_readings(robot: Mechanism, state: State) -> Array:
+    """Readings (t, n, a) of a state at the present values."""
+    from loopcal.mechanism.trials import readings_at
+
+    return readings_at(robot, robot.values[None], state)
+
+
+__all__ = ["Actuator", "Joint", "build", "characteristic_length"]

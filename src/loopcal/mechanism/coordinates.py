@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coordinates a machine is commanded in, and their slopes in the platform's twist.
+
+Names: `x y z` of the platform's origin in base; `phi theta psi` tilt-and-torsion, R = Rz(phi) Ry(theta) Rz(psi - phi);
+`roll pitch yaw`, R = Rz(yaw) Ry(pitch) Rx(roll). phi and theta together are asked for as a unit normal, which stays
+regular at zero tilt. Formulas: docs/theory/conventions.md.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from loopcal import se3
+from loopcal.engine import Array
+from loopcal.errors import MechanismError
+
+POSITION = ("x", "y", "z")
+TILT = ("phi", "theta", "psi")
+EULER = ("roll", "pitch", "yaw")
+NAMES = (*POSITION, *EULER, *TILT)
+
+
+def check_names(names: tuple[str, ...]) -> None:
+    """Refuse unknown, repeated or mixed coordinates; raises MechanismError."""
+    wrong = [n for n in names if n not in NAMES]
+    if wrong:
+        raise MechanismError(f"{wrong[0]!r} is not a coordinate; allowed are {', '.join(NAMES)}")
+    if len(set(names)) < len(names):
+        raise MechanismError(f"a coordinate is named twice in {', '.join(names)}; name each once")
+    if set(names) & set(TILT) and set(names) & set(EULER):
+        raise MechanismError(
+            f"{', '.join(names)} mixes roll-pitch-yaw with phi-theta-psi; describe the orientation by one of the two"
+        )
+    if ("phi" in names) != ("theta" in names):
+        raise MechanismError("phi and theta are the direction of one normal; name both or neither")
+
+
+def read(T: Array, names: tuple[str, ...]) -> Array:
+    """Values of these coordinates (.., c) at poses T (.., 4, 4) [m, rad]."""
+    found = {name: T[..., i, 3] for i, name in enumerate(POSITION)}
+    if set(names) & set(TILT):
+        found |= dict(zip(TILT, se3.matrix_to_tilt_torsion(T[..., :3, :3]), strict=True))
+    if set(names) & set(EULER):
+        angles = se3.matrix_to_euler(T[..., :3, :3], "xyz")
+        found |= {name: angles[..., i] for i, name in enumerate(EULER)}
+    return np.stack([found[name] for name in names], axis=-1)
+
+
+def pose(values: Array, names: tuple[str, ...], base: Array) -> Array:
+    """Poses (.., 4, 4) with these coordinates; the coordinates not named stay as in `base` (4, 4)."""
+    T = np.array(np.broadcast_to(base, (*values.shape[:-1], 4, 4)))
+    given = {name: values[..., i] for i, name in enumerate(names)}
+    for i, name in enumerate(POSITION):
+        if name in given:
+            T[..., i, 3] = given[name]
+    zero = np.zeros(values.shape[:-1])
+    if set(names) & set(TILT):
+        T[..., :3, :3] = se3.tilt_torsion_to_matrix(*(given.get(name, zero) for name in TILT))
+    if set(names) & set(EULER):
+        angles = np.stack([given.get(name, zero) for name in EULER], axis=-1)
+        T[..., :3, :3] = se3.euler_to_matrix(angles, "xyz")
+    return T
+
+
+def demands(T: Array, target: Array, names: tuple[str, ...], size: float) -> tuple[Array, Array]:
+    """How far poses are from the coordinates asked for, and the slopes of that in the twist.
+
+    Parameters
+    ----------
+    T : (N, 4, 4). target : (N, c) coordinates. size : angles are multiplied by it [m].
+
+    Returns
+    -------
+    residual : (N, c) [m], present - target. columns : (N, c, 6) per twist (rotation, translation).
+    """
+    residual = np.zeros(target.shape)
+    columns = np.zeros((*target.shape, 6))
+    for i, name in enumerate(names):
+        if name in POSITION:
+            axis = POSITION.index(name)
+            residual[:, i] = T[:, axis, 3] - target[:, i]
+            columns[:, i, 3 + axis] = 1.0
+    rotation, wanted = T[:, :3, :3], {name: target[:, i] for i, name in enumerate(names)}
+    if "phi" in wanted:
+        places = [names.index("phi"), names.index("theta")]
+        residual[:, places], columns[:, places, :3] = _normal(rotation, wanted["phi"], wanted["theta"], size)
+    if "psi" in wanted:
+        _angle(residual, columns, names.index("psi"), rotation, wanted["psi"], size, "psi")
+    for name in EULER:
+        if name in wanted:
+            _angle(residual, columns, names.index(name), rotation, wanted[name], size, name)
+    return residual, columns
+
+
+def _normal(rotation: Array, phi: Array, theta: Array, size: float) -> tuple[Array, Array]:
+    """The unit normal against the one asked for, in two directions across it."""
+    s, c = np.sin(theta), np.cos(theta)
+    across = np.stack(
+        [
+            np.stack([c * np.cos(phi), c * np.sin(phi), -s], axis=-1),
+            np.stack([-np.sin(phi), np.cos(phi), np.zeros_like(phi)], axis=-1),
+        ],
+        axis=1,
+    )
+    normal = rotation[:, :, 2]
+    residual = np.einsum("nij,nj->ni", across, normal)
+    # d normal = omega x normal, so d (a . normal) = (normal x a) . omega
+    return size * residual, size * np.cross(normal[:, None], across)
+
+
+def _angle(residual: Array, columns: Array, place: int, rotation: Array, target: Array, size: float, name: str) -> None:
+    """One wrapped angle and its slope in the angular velocity, written in place."""
+    if name == "psi":
+        angle = se3.matrix_to_tilt_torsion(rotation)[2]
+        # d psi = (ez + n) . omega / (1 + cos theta): across everything that phi and theta turn about
+        normal = rotation[:, :, 2]
+        row = (normal + np.array([0.0, 0.0, 1.0])) / (1.0 + normal[:, 2:])
+    else:
+        angles, index = se3.matrix_to_euler(rotation, "xyz"), EULER.index(name)
+        angle, row = angles[:, index], se3.euler_rates_inverse(angles, "xyz")[:, index]
+    residual[:, place] = size * se3.wrap(angle - target)
+    columns[:, place, :3] = size * row

@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Families of robots: one file each, a record of what the robot file says and its expansion into limbs and parameters.
+
+Adding a family touches its own file and one line here; nothing below this package knows any family.
+"""
+
+from collections.abc import Mapping
+
+from loopcal.mechanism.families.gough import Gough
+from loopcal.mechanism.families.linear_delta import LinearDelta
+from loopcal.mechanism.records import Robot
+
+FAMILIES: Mapping[str, type[Robot]] = {"gough": Gough, "linear-delta": LinearDelta}

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Forward and inverse kinematics of any mechanism: one solution type, a status for every row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from loopcal import se3
+from loopcal.engine import Array, State
+from loopcal.errors import DataError
+from loopcal.mechanism import coordinates
+from loopcal.mechanism.model import Mechanism, Status
+from loopcal.mechanism.projection import nearest_reachable
+from loopcal.mechanism.trials import forward_trials, inverse_trials, readings_at
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Poses and joints of n rows.
+
+    Attributes
+    ----------
+    T : (n, 4, 4) platform in base [m]. q : (n, a) readings [m or rad].
+    passive : (n, j) passive joint values, limb by limb [m or rad]; `passive_names` names them.
+    status : (n,) members of Status. residual : (n,) closure residual [m]. iterations : (n,) Newton steps.
+    """
+
+    T: Array
+    q: Array
+    passive: Array
+    passive_names: tuple[str, ...]
+    status: NDArray[np.int8]
+    residual: Array
+    iterations: NDArray[np.int64]
+    state: State
+
+    @property
+    def converged(self) -> NDArray[np.bool_]:
+        """(n,) True where the loops are closed in the mode of the start."""
+        return self.status == Status.CONVERGED
+
+    def explain(self, row: int) -> str:
+        """What became of a row, in a sentence."""
+        status = Status(int(self.status[row]))
+        return f"row {row}: {status.sentence} ({self.residual[row] * 1e3:.3g} mm open after {self.iterations[row]} steps)"
+
+
+def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> Solution:
+    """Poses that readings lead to, by Newton on the loop closure from `start` (default: home).
+
+    Parameters
+    ----------
+    q : (n, a) readings [m or rad]. start : a solution of one row or n rows that chooses the assembly mode.
+
+    Returns
+    -------
+    Solution; rows that fail are marked in `status`, never raised.
+
+    Raises
+    ------
+    DataError
+        q has another number of columns than the robot has actuators.
+    """
+    readings = np.atleast_2d(np.asarray(q, dtype=float))
+    if readings.ndim != 2 or readings.shape[1] != len(robot.actuators):
+        raise DataError(
+            f"{readings.shape[-1]} readings a row were given, but {robot.name} has {len(robot.actuators)} actuators "
+            f"({', '.join(a.name for a in robot.actuators)})"
+        )
+    state = forward_trials(robot, robot.values[None], readings[None], None if start is None else start.state)
+    return _solution(robot, state, readings)
+
+
+def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) -> Solution:
+    """Readings that lead to poses.
+
+    Parameters
+    ----------
+    target : (n, 4, 4) platform in base, or (n, c) controlled coordinates in the order of `robot.controlled` [m, rad]. A
+        pose that the machine has too few freedoms for is projected: of the reachable poses the one is taken that minimises
+        |log(R R_target')|^2 size^2 + |t - t_target|^2, with `robot.size`.
+    start : solution that chooses the working mode (default: home).
+
+    Returns
+    -------
+    Solution; rows that fail are marked in `status`.
+
+    Raises
+    ------
+    DataError
+        The target has another shape.
+    """
+    wanted = np.asarray(target, dtype=float)
+    c = len(robot.controlled)
+    values, begin = robot.values[None], None if start is None else start.state
+    if wanted.ndim >= 2 and wanted.shape[-2:] == (4, 4):
+        T = wanted.reshape(-1, 4, 4)
+        state = nearest_reachable(robot, values, T[None], begin)
+    elif wanted.ndim in (1, 2) and wanted.shape[-1] == c:
+        state = inverse_trials(robot, values, np.atleast_2d(wanted)[None], begin)
+    else:
+        raise DataError(
+            f"a target of shape {wanted.shape} was given; allowed are (n, 4, 4) poses or (n, {c}) coordinates "
+            f"({', '.join(robot.controlled)})"
+        )
+    return _solution(robot, state, readings_at(robot, values, state)[0])
+
+
+def _solution(robot: Mechanism, state: State, q: Array) -> Solution:
+    names, columns = [], []
+    for group, joints in zip(robot.program.groups, state.joints, strict=True):
+        for k, limb in enumerate(group.limbs):
+            for j, joint in enumerate(robot.assembly.limbs[limb].joints):
+                if joint.actuator is None:
+                    names.append((limb, f"{robot.assembly.limbs[limb].name}.{joint.name}"))
+                    columns.append(joints[0, :, k, j])
+    order = sorted(range(len(names)), key=lambda i: names[i][0])
+    passive = np.stack([columns[i] for i in order], axis=-1) if order else np.zeros((len(q), 0))
+    return Solution(
+        state.T[0],
+        q,
+        passive,
+        tuple(names[i][1] for i in order),
+        state.status[0],
+        state.residual[0],
+        state.iterations[0],
+        state,
+    )
+
+
+__all__ = ["Solution", "coordinates", "forward", "inverse", "se3"]
