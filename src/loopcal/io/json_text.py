@@ -44,8 +44,9 @@ def _jsonable(value: Any, place: tuple[str, ...], nulls: dict[str, str]) -> Any:
         return value.name.lower()
     if value is None or isinstance(value, (bool, str)):
         return value
-    if hasattr(value, "tolist"):  # numpy arrays and numpy numbers
-        return _jsonable(value.tolist(), place, nulls)
+    to_list = getattr(value, "tolist", None)  # numpy arrays and numpy numbers
+    if to_list is not None:
+        return _jsonable(to_list(), place, nulls)
     if isinstance(value, int):
         return int(value)
     if isinstance(value, float):

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from loopcal.errors import FileError, nearest
-from loopcal.io.yaml_file import Location, YamlFile, refuse_unknown_keys, words
+from loopcal.io.yaml_file import Location, YamlFile, has_child, refuse_unknown_keys, words
 from loopcal.units import Dimension, Unit, symbols, unit
 
 T = TypeVar("T")
@@ -188,8 +188,7 @@ def _existing(loc: tuple[str | int, ...], content: Any) -> tuple[Location, Any]:
     location: list[str | int] = []
     node = content
     for step in loc:
-        is_index = isinstance(node, list) and isinstance(step, int) and 0 <= step < len(node)
-        if is_index or (isinstance(node, dict) and step in node):
+        if has_child(node, step):
             node = node[step]
             location.append(step)
     return tuple(location), node

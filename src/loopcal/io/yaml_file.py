@@ -48,15 +48,9 @@ class YamlFile:
         """Return the line of the node at `location`; parts that do not exist in the file are ignored."""
         node, line = self.tree, 0
         for step in location:
-            if isinstance(node, Mapping) and step in node:
+            if has_child(node, step):
                 line = _line_of(node, step, line)
-            elif isinstance(node, Sequence) and not isinstance(node, str) and isinstance(step, int):
-                if not 0 <= step < len(node):
-                    break
-                line = _line_of(node, step, line)
-            else:
-                continue
-            node = node[step]
+                node = node[step]
         return line + self.first_line
 
     def error(self, sentence: str, location: Location = ()) -> FileError:
@@ -133,6 +127,13 @@ def refuse_unknown_keys(file: YamlFile, keys: Sequence[str], allowed: Sequence[s
             raise file.error(f"unknown key {key!r}{_inside(location)}{hint}; correct or remove it", (*location, key))
 
 
+def has_child(node: Any, step: str | int) -> bool:
+    """Tell whether a mapping has the key, or a list the index, `step`."""
+    if isinstance(node, Mapping):
+        return step in node
+    return isinstance(node, list) and isinstance(step, int) and 0 <= step < len(node)
+
+
 def words(location: Location) -> str:
     """Return a location in words that count from 1: `base entry 3` for ("base", 2)."""
     parts: list[str] = []
@@ -152,7 +153,8 @@ def _inside(location: Location) -> str:
 def _line_of(node: Any, step: str | int, line: int) -> int:
     """Return the line (from 0) of a child: of the key in a mapping, of the item in a sequence; `line` where unknown."""
     try:
-        return int(node.lc.key(step)[0] if isinstance(node, Mapping) else node.lc.item(step)[0])
+        positions = node.lc
+        return int(positions.key(step)[0] if isinstance(node, Mapping) else positions.item(step)[0])
     except (AttributeError, KeyError, TypeError, IndexError):
         return line
 

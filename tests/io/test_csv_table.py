@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""CSV tables: units in the header, settings in front or beside, one sentence with the line for each mistake."""
+
+import math
+
+import pytest
+
+from loopcal.errors import FileError
+from loopcal.io.csv_table import read_table, require_columns
+from loopcal.units import Dimension
+
+GOOD = """# kind: pose
+# noise: {x: 0.001 mm}
+## a remark
+pose,q.leg1 [mm],rx [mrad]
+p1,233.5,1e-3
+# skipped
+
+p2,234.5,
+"""
+
+
+def write(folder, text: str | bytes):
+    path = folder / "data.csv"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return path
+
+
+def read_all(path):
+    table = read_table(path)
+    require_columns(table, ["q.leg1"], "is a reading")
+    return table.numbers("q.leg1", Dimension.LENGTH, empty=False), table.numbers("rx", Dimension.ANGLE)
+
+
+def test_columns_come_in_si_with_nan_for_what_was_not_measured(tmp_path) -> None:
+    path = write(tmp_path, GOOD)
+    readings, angles = read_all(path)
+    assert readings.tolist() == pytest.approx([0.2335, 0.2345], rel=4e-16)
+    assert angles[0] == pytest.approx(1e-6, rel=4e-16)
+    assert math.isnan(angles[1])
+    table = read_table(path)
+    assert table.text("pose") == ("p1", "p2")
+    assert table.settings.content == {"kind": "pose", "noise": {"x": "0.001 mm"}}
+    assert (table.header_line, table.lines) == (4, (5, 8))
+
+
+def test_a_byte_order_mark_and_windows_line_ends_are_accepted(tmp_path) -> None:
+    path = write(tmp_path, b"\xef\xbb\xbf" + GOOD.replace("\n", "\r\n").encode())
+    assert read_all(path)[0].tolist() == pytest.approx([0.2335, 0.2345], rel=4e-16)
+
+
+def test_a_sidecar_holds_the_settings_and_makes_comments_of_what_begins_with_a_hash(tmp_path) -> None:
+    path = write(tmp_path, GOOD.replace("# kind: pose", "# measured on a cold day"))
+    (tmp_path / "data.yaml").write_text("kind: component\n")
+    assert read_table(path).settings.content == {"kind": "component"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "message"),
+    [
+        (GOOD, "", None, "is empty"),
+        (GOOD, "# kind: pose\n", None, "no header and no rows"),
+        ("p1,233.5,1e-3\n# skipped\n\np2,234.5,\n", "", 4, "a header but no rows"),
+        ("# kind: pose", "# cold day", 2, "begin a remark with ##"),
+        ("# kind: pose", "# kind: pose\n# kind: pose", 2, "second time"),
+        ("q.leg1 [mm]", "q.leg1", 4, "column 'q.leg1' has no unit; write it in brackets"),
+        ("q.leg1 [mm]", "q.leg1 []", 4, "column 'q.leg1': unknown unit ''"),
+        ("q.leg1 [mm]", "q.leg1 [mmm]", 4, "column 'q.leg1': unknown unit 'mmm' .did you mean 'mm'"),
+        ("q.leg1 [mm]", "q.leg1 [deg]", 4, "'deg' is a unit of angle, but a length is needed"),
+        ("q.leg1 [mm]", "q.leg2 [mm]", 4, "no column 'q.leg1' .did you mean 'q.leg2'"),
+        ("q.leg1 [mm]", "q.leg1 [mm", 4, "column 2 is headed 'q.leg1 .mm'"),
+        ("q.leg1 [mm]", "", 4, "column 2 is headed ''"),
+        ("rx [mrad]", "q.leg1 [mm]", 4, "column 'q.leg1' stands here for the second time"),
+        ("p1,233.5,1e-3", "p1,233.5", 5, "has 2 cells, but the header names 3 columns"),
+        ("p1,233.5,1e-3", "p1,233,5,1e-3", 5, "has 4 cells, but the header names 3 columns"),
+        ("p1,233.5,1e-3", "p1,,1e-3", 5, "column 'q.leg1' is empty"),
+        ("p1,233.5,1e-3", "p1,233.5mm,1e-3", 5, "is '233.5mm' where a number is needed"),
+        ("p1,233.5,1e-3", "p1,2_3,1e-3", 5, "is '2_3' where a number is needed"),
+        ("p2,234.5,", "p2,234.5,NaN", 8, "is 'NaN', which is not a finite number; leave empty"),
+        ("p2,234.5,", "p2,234.5,inf", 8, "not a finite number"),
+        ("p2,234.5,", 'p2,"234.5,', 8, "not CSV"),
+        ("pose,q.leg1 [mm],rx [mrad]", "pose;q.leg1 [mm];rx [mrad]", 4, "separated by semicolons; use commas"),
+    ],
+)
+def test_a_mistake_is_one_sentence_with_its_line(tmp_path, old: str, new: str, line: int | None, message: str) -> None:
+    path = write(tmp_path, GOOD.replace(old, new, 1))
+    with pytest.raises(FileError, match=message) as caught:
+        read_all(path)
+    assert caught.value.line == line
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_not_utf8_is_refused_with_its_line(tmp_path) -> None:
+    with pytest.raises(FileError, match="not UTF-8 text .byte 0xb5.; save it as UTF-8") as caught:
+        read_table(write(tmp_path, GOOD.replace("mrad", "µrad").encode("latin-1")))
+    assert caught.value.line == 4
+
+
+def test_a_folder_is_refused(tmp_path) -> None:
+    with pytest.raises(FileError, match="this is a folder where a measurement file is needed"):
+        read_table(tmp_path)
