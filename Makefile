@@ -13,7 +13,7 @@ help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
 
 demo: .venv/core.stamp  ## calibrate the shipped hexapod from its measurement file into runs/demo
-	$(BIN)/loopcal calibrate $(ROBOT) $(DATA) --hold-out 0.25 --output runs/demo --force
+	$(BIN)/loopcal calibrate $(ROBOT) $(DATA) -o runs/demo --hold-out 0.25 --force
 
 test: .venv/dev.stamp  ## every test except the full-size statistics
 	$(BIN)/pytest -n 2 -m "not evidence"
