@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -70,7 +70,7 @@ def load_robot(source: str | Path) -> Mechanism:
     MechanismError
         The robot that it describes cannot be built; with its file.
     """
-    from loopcal.mechanism.families import FAMILIES, build
+    from loopcal.mechanism import FAMILIES, build
 
     file = read_yaml(robot_path(source), WHAT)
     check_format(file, FORMAT)
@@ -79,9 +79,8 @@ def load_robot(source: str | Path) -> Mechanism:
     content = {key: value for key, value in file.content.items() if key not in HEADER}
     with _naming(file):
         record = read_record(file, content, FAMILIES[family], units)
-        robot = build(record)
         symbols = {dimension: found.symbol for dimension, found in units.items()}
-        robot = replace(robot, units=symbols, record=RobotSource(file.path, nominal_text(file), record))
+        robot = build(record.expand(), symbols, RobotSource(file.path, nominal_text(file), record))
     return robot.with_values(table_values(file, robot)) if TABLE in file.content else robot
 
 
