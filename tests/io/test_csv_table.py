@@ -91,7 +91,7 @@ def test_a_mistake_is_one_sentence_with_its_line(tmp_path, old: str, new: str, l
 
 
 def test_what_is_not_utf8_is_refused_with_its_line(tmp_path) -> None:
-    with pytest.raises(FileError, match="not UTF-8 text .byte 0xb5.; save it as UTF-8") as caught:
+    with pytest.raises(FileError, match=r"not UTF-8 text .byte 0xb5.; save it as UTF-8") as caught:
         read_table(write(tmp_path, GOOD.replace("mrad", "µrad").encode("latin-1")))
     assert caught.value.line == 4
 

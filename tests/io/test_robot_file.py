@@ -94,7 +94,7 @@ def test_a_robot_that_came_from_no_file_cannot_be_saved(tmp_path, robot) -> None
         ("home: {z: 200}", "home: {z: 200}\nhome: {z: 200}", "key 'home' stands here for the second time"),
         ("home: {z: 200}", "home: {zz: 200}", "unknown key 'zz' in 'home'"),
         ("lengths: 233.238076 ", "lengths: long ", "'lengths' is the text 'long' where a number is needed"),
-        ("legs: rod", "legs: ups", "'legs' is 'ups'; allowed: 'rod'"),
+        ("legs: rod", "legs: pole", "'legs' is 'pole'.*; allowed: 'rod'"),
     ],
 )
 def test_a_mistake_in_a_robot_file_names_its_line(tmp_path, old: str, new: str, message: str) -> None:
@@ -108,10 +108,7 @@ def test_a_mistake_in_a_robot_file_names_its_line(tmp_path, old: str, new: str, 
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        (
-            "{name: leg1.base.q, value: 1, unit: mm}",
-            "'leg1.base.q' is not a parameter of this robot .did you mean 'leg1.base",
-        ),
+        ("{name: leg1.base.q, value: 1, unit: mm}", "'leg1.base.q' is not a parameter of this robot .did you mean 'leg1.base"),
         ("{name: leg1.base.x, value: 1, unit: deg}", "the unit of 'leg1.base.x': 'deg' is a unit of angle"),
         ("{name: leg1.base.x, value: a, unit: mm}", "the value of 'leg1.base.x' is 'a' where a number"),
         ("{name: leg1.base.x, value: 1}", "has no 'unit'"),
@@ -128,10 +125,10 @@ def test_a_mistake_in_the_identified_table_names_its_line(tmp_path, row: str, me
 
 def test_a_robot_that_cannot_be_built_names_its_file(tmp_path) -> None:
     path = write(tmp_path, HEXAPOD.replace("  - [120, 140, 0]\n", ""))
-    with pytest.raises(LoopcalError, match="robot.yaml: hexapod-42 has 5 base and 6 platform centres"):
+    with pytest.raises(LoopcalError, match=r"robot.yaml: hexapod-42 has 5 base and 6 platform centres"):
         load_robot(path)
 
 
 def test_a_robot_that_is_nowhere_lists_the_shipped_ones() -> None:
-    with pytest.raises(FileError, match="no such robot file .did you mean 'hexapod-42'.*shipped robots: .*hexapod-42"):
+    with pytest.raises(FileError, match=r"no such robot file .did you mean 'hexapod-42'.*shipped robots: .*hexapod-42"):
         load_robot("hexapod-43")

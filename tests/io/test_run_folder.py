@@ -67,9 +67,7 @@ def test_what_is_no_run_is_refused(tmp_path) -> None:
 
 
 def test_json_has_null_and_a_reason_where_a_number_is_not_finite() -> None:
-    text = to_json(
-        {"rows": [{"sd": math.inf}, {"sd": np.float64(0.5)}], "a": np.array([math.nan]), "d": Dimension.ANGLE}
-    )
+    text = to_json({"rows": [{"sd": math.inf}, {"sd": np.float64(0.5)}], "a": np.array([math.nan]), "d": Dimension.ANGLE})
     document = json.loads(text)
     assert document["rows"] == [{"sd": None}, {"sd": 0.5}]
     assert document["d"] == "angle"

@@ -92,7 +92,7 @@ class Table:
         import numpy as np
 
         factor = self.factor(name, dimension)
-        return np.array([self._number(name, i, cell, empty) for i, cell in enumerate(self.text(name))]) * factor
+        return np.array([self.number(name, i, cell, empty) for i, cell in enumerate(self.text(name))]) * factor
 
     def factor(self, name: str, dimension: Dimension) -> float:
         """Return SI per unit of a column; see `numbers`."""
@@ -113,7 +113,7 @@ class Table:
         """Return an error at the line of a row."""
         return FileError(sentence, self.path, self.lines[row])
 
-    def _number(self, name: str, row: int, cell: str, empty: bool) -> float:
+    def number(self, name: str, row: int, cell: str, empty: bool) -> float:
         """Return one cell as a number, NaN for an empty one."""
         if not cell:
             if empty:
@@ -124,9 +124,7 @@ class Table:
         except ValueError:
             value = None
         if value is None or "_" in cell:
-            raise self.row_error(
-                row, f"column {name!r} is {cell!r} where a number is needed; write it like 12.5 or 1e-3"
-            )
+            raise self.row_error(row, f"column {name!r} is {cell!r} where a number is needed; write it like 12.5 or 1e-3")
         if not math.isfinite(value):
             raise self.row_error(
                 row, f"column {name!r} is {cell!r}, which is not a finite number; leave empty what was not measured"
@@ -145,9 +143,7 @@ def read_table(path: str | Path) -> Table:
     path = Path(path)
     lines = [line.rstrip("\r") for line in read_text(path, WHAT).split("\n")]
     settings, first = _settings(path, lines)
-    numbered = [
-        (i + 1, line) for i, line in enumerate(lines) if i >= first and line.strip() and not line.startswith("#")
-    ]
+    numbered = [(i + 1, line) for i, line in enumerate(lines) if i >= first and line.strip() and not line.startswith("#")]
     if not numbered:
         raise FileError("this file has no header and no rows; the first line names the columns and their units", path)
     header_line, header = numbered[0]

@@ -8,6 +8,7 @@ import math
 from typing import TYPE_CHECKING
 
 from loopcal.errors import UnitError, nearest
+from loopcal.io.numbers import shortest
 from loopcal.io.yaml_file import YamlFile, refuse_unknown_keys
 from loopcal.units import unit
 
@@ -58,9 +59,7 @@ def table_values(file: YamlFile, robot: Mechanism) -> np.ndarray:
     """
     rows = file.content[TABLE]
     if not isinstance(rows, list):
-        raise file.error(
-            "this table must be a list of '{name: .., value: .., unit: ..}'; see the file reference", (TABLE,)
-        )
+        raise file.error("this table must be a list of '{name: .., value: .., unit: ..}'; see the file reference", (TABLE,))
     values, seen = robot.values.copy(), set()
     for i, row in enumerate(rows):
         place = (TABLE, i)
@@ -103,11 +102,4 @@ def _row_text(name: str, value: float, plus_minus: float, factor: float, symbol:
     """Return one line of the table; the value in the file's unit comes back to the same double where it can."""
     deviation = f"{plus_minus / factor:.2g}" if math.isfinite(plus_minus) else "null"
     quoted = json.dumps(symbol) if symbol[0].isdigit() else symbol
-    return f"  - {{name: {name}, value: {_shortest(value, factor)}, {PLUS_MINUS}: {deviation}, unit: {quoted}}}\n"
-
-
-def _shortest(value: float, factor: float) -> str:
-    """Return value / factor with the fewest digits (at least 12) that read back as `value`, else all of them."""
-    scaled = value / factor
-    texts = (f"{scaled:.{digits}g}" for digits in range(12, 18))
-    return next((text for text in texts if float(text) * factor == value), repr(scaled))
+    return f"  - {{name: {name}, value: {shortest(value, factor)}, {PLUS_MINUS}: {deviation}, unit: {quoted}}}\n"

@@ -167,9 +167,7 @@ def _translated(error: Any, file: YamlFile, content: Mapping[str, Any]) -> FileE
     ranked = sorted(findings, key=lambda f: -len(_existing(f["loc"], content)[0]))
     finding = ranked[0] if _has_union(findings, content) else min(findings, key=lambda f: _rank(f, file, content))
     location, node = _existing(finding["loc"], content)
-    needed = max(
-        [f["loc"][-1] + 1 for f in findings if f["loc"][:-1] == finding["loc"][:-1] and _is_index(f)], default=0
-    )
+    needed = max([f["loc"][-1] + 1 for f in findings if f["loc"][:-1] == finding["loc"][:-1] and _is_index(f)], default=0)
     return file.error(_sentence(finding, location, node, needed), location)
 
 

@@ -116,9 +116,7 @@ def robot_text(robot: Mechanism, plus_minus: np.ndarray | None = None) -> str:
     """
     source = robot.record
     if not isinstance(source, RobotSource):
-        raise MechanismError(
-            f"{robot.name} was not read from a robot file, so there is none to correct; use load_robot"
-        )
+        raise MechanismError(f"{robot.name} was not read from a robot file, so there is none to correct; use load_robot")
     return source.text + table_text(robot, plus_minus)
 
 
@@ -162,8 +160,7 @@ def check_format(file: YamlFile, newest: int) -> None:
         raise file.error(f"'format' is {found!r} where a whole number is needed; write 'format: {newest}'", ("format",))
     if found > newest:
         raise file.error(
-            f"this file has format {found}, but this loopcal reads formats up to {newest}; use a newer loopcal",
-            ("format",),
+            f"this file has format {found}, but this loopcal reads formats up to {newest}; use a newer loopcal", ("format",)
         )
 
 

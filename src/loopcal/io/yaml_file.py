@@ -54,8 +54,9 @@ class YamlFile:
         return line + self.first_line
 
     def error(self, sentence: str, location: Location = ()) -> FileError:
-        """Return the error that puts `sentence` at the line of `location` (no line for the whole file)."""
-        return FileError(sentence, self.path, self.line(location) if location else None)
+        """Return the error that puts `sentence` at the line of `location`; no line where the file has nothing there."""
+        known = bool(location) and has_child(self.tree, location[0])
+        return FileError(sentence, self.path, self.line(location) if known else None)
 
 
 def read_yaml(path: str | Path, what: str) -> YamlFile:
@@ -92,9 +93,7 @@ def parse_yaml(text: str, path: str | Path, what: str, first_line: int = 1) -> Y
         mark = error.problem_mark or error.context_mark
         problem = " ".join(str(error.problem or error.context or "not YAML").split())
         line = mark.line + first_line if mark else None
-        raise FileError(
-            f"this is not valid YAML ({problem}); check indentation, brackets and colons", path, line
-        ) from None
+        raise FileError(f"this is not valid YAML ({problem}); check indentation, brackets and colons", path, line) from None
     except (YAMLError, ValueError, RecursionError) as error:
         raise FileError(f"this is not valid YAML ({' '.join(str(error).split())}); check its form", path) from None
     if not isinstance(tree, Mapping):

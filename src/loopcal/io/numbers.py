@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers as text: the fewest digits that read back as the same double."""
+
+from __future__ import annotations
+
+
+def shortest(value: float, factor: float) -> str:
+    """Return value / factor with the fewest digits (12 at least) whose product with factor is `value` again.
+
+    Parameters
+    ----------
+    value : float
+        In SI.
+    factor : float
+        SI per unit of what is written.
+
+    Returns
+    -------
+    str
+        All 17 digits where rounding keeps every shorter text from coming back.
+    """
+    scaled = value / factor
+    texts = (f"{scaled:.{digits}g}" for digits in range(12, 18))
+    return next((text for text in texts if float(text) * factor == value), repr(scaled))

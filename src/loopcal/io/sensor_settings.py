@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A sensor in the settings of a measurement file: its kind, what is fixed about the kind, and its noise.
+
+    kind: pose                                the name of a kind, of `loopcal.measure.KINDS`
+    orientation: euler-xyz                    then the kind's own settings: the fields of its dataclass
+    T_base_frame: {x: 12 mm, yaw: 90 deg}     poses: x y z and R = Rz(yaw) Ry(pitch) Rx(roll), each with its unit
+    noise: {x: 1 um, y: 1 um, z: 1 um, a: 5 urad, b: 5 urad, c: 5 urad}     standard deviations of the noise columns
+
+A new kind needs nothing here: its fields are its settings.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import typing
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from loopcal.errors import DataError, UnitError, nearest
+from loopcal.io.numbers import shortest
+from loopcal.io.yaml_file import Location, YamlFile, refuse_unknown_keys, words
+from loopcal.units import EXAMPLES, Dimension, quantity
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from loopcal.measure import Kind
+
+POSE_KEYS = {**dict.fromkeys(("x", "y", "z"), Dimension.LENGTH), **dict.fromkeys(("roll", "pitch", "yaw"), Dimension.ANGLE)}
+SYMBOLS = {Dimension.LENGTH: ("mm", 1e-3), Dimension.ANGLE: ("deg", math.pi / 180.0), Dimension.RATIO: ("1", 1.0)}
+
+
+def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Kind:
+    """Return the kind that settings describe.
+
+    Parameters
+    ----------
+    file : YamlFile
+        For lines.
+    node : mapping
+        The sensor's settings; keys that are not the kind's are left to the caller.
+    location : Location
+        Of `node` in the file.
+
+    Raises
+    ------
+    FileError
+        No or an unknown kind, a setting that does not fit it.
+    """
+    from loopcal.measure import KINDS
+
+    name, known = node.get("kind"), ", ".join(KINDS)
+    if name is None:
+        example = "write '# kind: pose' at the top, or 'kind: pose' in a .yaml file of the same name"
+        raise file.error(f"these settings do not say what kind of measurement this is; {example} (kinds: {known})", location)
+    if name not in KINDS:
+        hint = nearest(str(name), KINDS)
+        raise file.error(f"{name!r} is not a kind of measurement{hint}; known are {known}", (*location, "kind"))
+    kind = KINDS[name]
+    settings = {}
+    for key, annotation in kind_settings(kind).items():
+        if key in node:
+            settings[key] = _setting(file, node[key], annotation, (*location, key))
+    try:
+        return kind(**settings)
+    except DataError as error:
+        raise file.error(f"{error}", (*location, next(iter(settings), "kind"))) from None
+
+
+def kind_settings(kind: type[Kind]) -> dict[str, Any]:
+    """Return name -> annotation of what can be set about a kind."""
+    hints = typing.get_type_hints(kind)
+    return {f.name: hints[f.name] for f in dataclasses.fields(typing.cast(Any, kind)) if f.init}
+
+
+def read_noise(file: YamlFile, node: Mapping[str, Any], kind: Kind, location: Location) -> dict[str, float]:
+    """Return noise column -> standard deviation [SI] of the columns for which the settings state one.
+
+    Raises
+    ------
+    FileError
+        An unknown column, no unit or a wrong one, or a number that is not above zero.
+    """
+    stated = node.get("noise", {})
+    place = (*location, "noise")
+    dimensions = {column.name: column.dimension for column in kind.noise_columns}
+    if not isinstance(stated, dict):
+        example = ", ".join(f"{name}: {EXAMPLES[d]}" for name, d in dimensions.items())
+        raise file.error(f"'noise' must state a standard deviation for each column; write 'noise: {{{example}}}'", place)
+    refuse_unknown_keys(file, list(stated), list(dimensions), place)
+    noise = {name: _quantity(file, text, dimensions[name], (*place, name)) for name, text in stated.items()}
+    for name, sigma in noise.items():
+        if not sigma > 0:
+            raise file.error(f"the noise of {name!r} is {stated[name]}; give a number above zero", (*place, name))
+    return noise
+
+
+def write_sensor(kind: Kind, noise: Mapping[str, float]) -> dict[str, str]:
+    """Return key -> text of a sensor's settings, only those that differ from the kind's defaults."""
+    lines = {"kind": kind.name}
+    default = type(kind)()
+    for key, annotation in kind_settings(type(kind)).items():
+        value, usual = getattr(kind, key), getattr(default, key)
+        if _is_pose(annotation):
+            if value is not None and (usual is None or (value != usual).any()):
+                lines[key] = _pose_text(value)
+        elif value is not None:
+            lines[key] = f"[{', '.join(value)}]" if isinstance(value, tuple) else str(value)
+    if noise:
+        dimensions = {column.name: column.dimension for column in kind.noise_columns}
+        texts = [f"{name}: {_text(sigma, dimensions[name])}" for name, sigma in noise.items()]
+        lines["noise"] = f"{{{', '.join(texts)}}}"
+    return lines
+
+
+def _setting(file: YamlFile, value: Any, annotation: Any, location: Location) -> Any:
+    """Return one setting of a kind as its field wants it: a pose, a tuple of text, or text."""
+    if _is_pose(annotation):
+        return _pose(file, value, location)
+    if isinstance(value, list) and all(isinstance(item, str) for item in value):
+        return tuple(value)
+    if isinstance(value, str):
+        return (value,) if "tuple" in str(annotation) else value
+    raise file.error(f"{words(location)!r} is {value!r} where text is needed; see the kinds in the file reference", location)
+
+
+def _is_pose(annotation: Any) -> bool:
+    """Tell whether a field holds a pose (an array) and not text."""
+    return "ndarray" in str(annotation)
+
+
+def _pose(file: YamlFile, node: Any, location: Location) -> np.ndarray:
+    """Return T (4, 4) of `{x: 1 mm, ..., yaw: 90 deg}`."""
+    import numpy as np
+
+    from loopcal import se3
+
+    if not isinstance(node, dict):
+        raise file.error(f"{words(location)!r} must be a pose such as {{x: 12 mm, yaw: 90 deg}}; correct it", location)
+    refuse_unknown_keys(file, list(node), list(POSE_KEYS), location)
+    found = {key: _quantity(file, node[key], d, (*location, key)) if key in node else 0.0 for key, d in POSE_KEYS.items()}
+    angles = np.array([found[key] for key in ("roll", "pitch", "yaw")])
+    return se3.pose(se3.euler_to_matrix(angles, "xyz"), np.array([found[key] for key in ("x", "y", "z")]))
+
+
+def _pose_text(T: np.ndarray) -> str:
+    """Return a pose as text that `_pose` reads."""
+    from loopcal import se3
+
+    numbers = (*T[:3, 3], *se3.matrix_to_euler(T[:3, :3], "xyz"))
+    texts = [f"{key}: {_text(float(v), POSE_KEYS[key])}" for key, v in zip(POSE_KEYS, numbers, strict=True)]
+    return f"{{{', '.join(texts)}}}"
+
+
+def _quantity(file: YamlFile, node: Any, dimension: Dimension, location: Location) -> float:
+    """Return the SI value of a number with its unit."""
+    try:
+        return quantity(str(node), dimension)
+    except UnitError as error:
+        raise file.error(f"{words(location)!r}: {error}", location) from None
+
+
+def _text(value: float, dimension: Dimension) -> str:
+    """Return a number with its unit."""
+    symbol, factor = SYMBOLS[dimension]
+    return f"{shortest(value, factor)} {symbol}"

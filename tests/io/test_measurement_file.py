@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measurement files: every kind comes back as it was written, and every mistake is one sentence with its line."""
+
+import numpy as np
+import pytest
+
+from loopcal.errors import DataError, LoopcalError
+from loopcal.io import load_measurements, load_robot, save_measurements
+from loopcal.io.csv_table import read_table
+from loopcal.io.measurement_file import load_poses
+from loopcal.io.measurement_writer import template_text
+from loopcal.io.numbers import shortest
+from loopcal.io.sensor_settings import SYMBOLS
+from loopcal.measure import KINDS, Component, Gaussian, Instrument, Observations, Pose, Sensor, Uniform, simulate
+from loopcal.mechanism import inverse
+
+EXAMPLES = [kind for cls in KINDS.values() for kind in cls.examples()]
+IDS = [f"{kind.name}-{i}" for i, kind in enumerate(EXAMPLES)]
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot("hexapod-42")
+
+
+@pytest.fixture(scope="module")
+def poses():
+    generator = np.random.default_rng(5)
+    low, high = np.array([-20, -20, 185, -8, -8, -8]), np.array([20, 20, 215, 8, 8, 8])
+    return generator.uniform(low, high, (6, 6)) * np.repeat([1e-3, np.pi / 180], 3)
+
+
+def sensor(kind) -> Sensor:
+    return Sensor(kind, Gaussian(np.linspace(1e-6, 2e-6, len(kind.noise_columns))))
+
+
+def assert_same(data, again) -> None:
+    np.testing.assert_allclose(again.readings, data.readings, rtol=1e-15, atol=0)  # one rounding in and out of the unit
+    assert again.block.tolist() == data.block.tolist()
+    assert again.labels == data.labels
+    for old, new in zip(data.observations, again.observations, strict=True):
+        assert (old.kind.name, old.kind.columns) == (new.kind.name, new.kind.columns)
+        assert old.rows.tolist() == new.rows.tolist()
+        np.testing.assert_allclose(new.measured, old.measured, rtol=1e-15, atol=0)
+        scale = np.sqrt(np.einsum("rii,rjj->rij", old.covariance, old.covariance))
+        np.testing.assert_allclose(new.covariance / scale, old.covariance / scale, atol=1e-9)  # the writer's EQUAL
+
+
+@pytest.mark.parametrize("kind", EXAMPLES, ids=IDS)
+def test_measurements_of_every_kind_come_back_as_they_were_written(tmp_path, robot, poses, kind) -> None:
+    data = simulate(robot, poses, Instrument((sensor(kind),)), seed=1)
+    save_measurements(data, tmp_path / "data.csv", robot, "a test")
+    assert_same(data, load_measurements(tmp_path / "data.csv", robot))
+
+
+def test_several_kinds_share_a_file(tmp_path, robot, poses) -> None:
+    instrument = Instrument((sensor(Component(("z",))), sensor(Pose("quaternion")), sensor(Component(("x", "z")))))
+    data = simulate(robot, poses, instrument, seed=1)
+    save_measurements(data, tmp_path / "data.csv", robot)
+    assert_same(data, load_measurements(tmp_path / "data.csv", robot))
+
+
+def test_frame_tool_repeats_absence_and_correlated_noise_come_back(tmp_path, robot, poses) -> None:
+    frame = np.array([[0, -1, 0, 0.1], [1, 0, 0, -0.2], [0, 0, 1, 0.03], [0, 0, 0, 1.0]])
+    kind = Pose("euler-ZYX", T_base_frame=frame, T_platform_tool=np.linalg.inv(frame))
+    data = simulate(robot, poses, Instrument((Sensor(kind, Gaussian(np.full(6, 1e-6))),)), seed=1)
+    rows = data.observations[0]
+    root = np.random.default_rng(7).normal(size=(6, 6, 6)) * 1e-6
+    covariance = root @ np.swapaxes(root, 1, 2) + np.eye(6) * 1e-12
+    measured = rows.measured.copy()
+    measured[2, 4] = np.nan
+    again = np.concatenate([rows.rows, [3]])
+    repeated = np.concatenate([measured, measured[3:4] + 1e-7])
+    several = Observations(rows.kind, again, repeated, np.concatenate([covariance, covariance[:1]]))
+    data = type(data)(robot.name, data.readings, (several,), np.array([0, 0, 1, 1, 2, 3]), tuple("abcdef"))
+    save_measurements(data, tmp_path / "data.csv", robot)
+    loaded = load_measurements(tmp_path / "data.csv", robot)
+    assert_same(data, loaded)
+    assert loaded.observations[0].present.tolist() == several.present.tolist()
+    read = loaded.observations[0].kind
+    assert isinstance(read, Pose)
+    np.testing.assert_allclose(read.T_base_frame, frame, atol=1e-15)
+    assert read.T_platform_tool is not None
+    np.testing.assert_allclose(read.T_platform_tool, np.linalg.inv(frame), atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", EXAMPLES, ids=IDS)
+def test_a_template_lacks_only_the_rows(tmp_path, robot, poses, kind) -> None:
+    path = tmp_path / "data.csv"
+    instrument = Instrument((Sensor(kind, Uniform(np.full(len(kind.noise_columns), 1e-6))),))
+    path.write_text(template_text(robot, instrument))
+    with pytest.raises(LoopcalError, match="a header but no rows"):
+        load_measurements(path, robot)
+    names = [a.name for a in robot.actuators] + [c.name for c in kind.columns]
+    seen = kind.mounted(robot.tool).measure(inverse(robot, poses).T[None], np.zeros((1, len(poses), len(kind.noise_columns))))[
+        0, 0
+    ]
+    cells = [shortest(v, SYMBOLS[c.dimension][1]) for v, c in zip(seen, kind.columns, strict=True)]
+    path.write_text(template_text(robot, instrument) + ",".join(["p", *["0"] * 6, *cells]))
+    assert read_table(path).names == ("pose", *names)
+    np.testing.assert_allclose(load_measurements(path, robot).observations[0].measured[0], seen, rtol=1e-15, atol=0)
+
+
+HEADER = "pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm],z [mm]"
+GOOD = f"""# kind: component
+# components: [z]
+# noise: {{z: 1 um}}
+{HEADER}
+a,0,0,0,0,0,0,200
+b,1,1,1,1,1,1,201.1
+"""
+
+
+def write(folder, text: str):
+    path = folder / "data.csv"
+    path.write_text(text)
+    return path
+
+
+def test_commanded_coordinates_become_readings_of_the_controller(tmp_path, robot) -> None:
+    names = "commanded.x [mm],commanded.y [mm],commanded.z [mm],commanded.roll [deg],commanded.pitch [deg],commanded.yaw [deg]"
+    text = GOOD.replace(HEADER, f"pose,{names},z [mm]").replace("a,0,0,0,0,0,0", "a,0,0,200,0,0,0")
+    text = text.replace("b,1,1,1,1,1,1", "b,0,0,200,0,0,5")
+    data = load_measurements(write(tmp_path, text), robot.with_values(robot.values + 1e-3))
+    np.testing.assert_allclose(data.readings[0], 0, atol=1e-8)  # [m]: the file's numbers have eight digits
+    controller = robot.record.text.replace("lengths: 233.238076", "lengths: 223.238076")
+    (tmp_path / "controller.yaml").write_text(controller)
+    data = load_measurements(write(tmp_path, "# controller: controller.yaml\n" + text), robot)
+    np.testing.assert_allclose(data.readings[0], 0.01, atol=1e-8)  # [m]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "message"),
+    [
+        ("# kind: component\n", "", None, "do not say what kind of measurement this is; write '# kind: pose'"),
+        ("component\n", "komponent\n", 1, "'komponent' is not a kind of measurement .did you mean 'component'"),
+        ("[z]", "[q]", 2, "component 'q' is unknown"),
+        ("[z]", "[3]", 2, "'components' is .3. where text is needed"),
+        ("# components", "# componets", 2, "unknown key 'componets' .did you mean 'components'"),
+        ("1 um", "1", 3, "'noise.z': '1' has no unit; add one of m, mm, um"),
+        ("1 um", "1 urad", 3, "'noise.z': 'urad' is a unit of angle"),
+        ("1 um", "-1 um", 3, "the noise of 'z' is -1 um; give a number above zero"),
+        ("z: 1 um", "zz: 1 um", 3, "unknown key 'zz' in 'noise'"),
+        ("# noise: {z: 1 um}\n", "", None, "no noise is stated for 'z'"),
+        ("# kind", "# format: 9\n# kind", 1, "has format 9"),
+        ("z [mm]", "z", 4, "column 'z' has no unit"),
+        ("z [mm]", "zz [mm]", 4, "column 'zz' is unknown .did you mean 'z'"),
+        ("q3 [mm]", "note [mm]", 4, "there is no column 'q3'.*which is the reading of an actuator of hexapod-42"),
+        ("z [mm]", "commanded.z [mm]", 4, "there are readings .'q1'. and commanded coordinates"),
+        ("b,1,", "a,1,", 6, "pose 'a' has other readings here than in line 5"),
+        ("b,1,", ",1,", 6, "column 'pose' is empty"),
+        ("b,1,", "b,,", 6, "column 'q1' is empty"),
+        ("201.1", "201,1", 6, "this row has 9 cells, but the header names 8 columns"),
+        ("201.1", "nan", 6, "column 'z' is 'nan', which is not a finite number"),
+    ],
+)
+def test_a_mistake_is_one_sentence_with_its_line(tmp_path, robot, old, new, line, message) -> None:
+    path = write(tmp_path, GOOD.replace(old, new, 1))
+    with pytest.raises(LoopcalError, match=message) as caught:
+        load_measurements(path, robot)
+    assert str(caught.value).startswith(f"{path}:{line}: " if line else f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_readings_outside_the_stroke_and_duplicates_need_to_be_allowed(tmp_path, robot) -> None:
+    path = write(tmp_path, GOOD.replace("b,1,", "b,90,"))
+    with pytest.raises(DataError, match=r"data.csv: pose 'b': q1 reads 90 mm.*use --allow-outside-stroke"):
+        load_measurements(path, robot)
+    assert load_measurements(path, robot, allow_outside_stroke=True).n_poses == 2
+    path = write(tmp_path, GOOD.replace("b,1,1,1,1,1,1,201.1", "b,0,0,0,0,0,0,200"))
+    with pytest.raises(DataError, match=r"'a' and 'b' have the same readings.*use --allow-duplicates"):
+        load_measurements(path, robot)
+    assert load_measurements(path, robot, allow_duplicates=True).n_poses == 2
+
+
+def test_sigma_columns_override_the_noise_of_the_settings(tmp_path, robot) -> None:
+    text = GOOD.replace("z [mm]", "z [mm],sigma.z [um]").replace("200\n", "200,\n").replace("201.1", "201.1,3")
+    data = load_measurements(write(tmp_path, text), robot)
+    np.testing.assert_allclose(np.sqrt(data.observations[0].covariance[:, 0, 0]), [1e-6, 3e-6], rtol=1e-15)
+
+
+def test_poses_are_read_in_the_order_of_the_robots_coordinates(tmp_path, robot) -> None:
+    path = write(tmp_path, "yaw [deg],x [mm],y [mm],z [mm],roll [deg],pitch [deg]\n180,1,2,3,0,0\n")
+    np.testing.assert_allclose(load_poses(path, robot), [[1e-3, 2e-3, 3e-3, 0, 0, np.pi]], rtol=1e-15)
