@@ -7,10 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
-from tests.jacobians import check_jacobian
 
 from loopcal import se3
 from loopcal.errors import DataError
+from tests.jacobians import check_jacobian
 
 ROUNDING = 5e-15  # [1], a few ulps over three products of rotations
 turn = st.floats(-np.pi, np.pi)

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.linalg import expm
-from tests.jacobians import check_jacobian
 
 from loopcal import se3
+from tests.jacobians import check_jacobian
 
 ROUNDING = 2e-14  # [1] and [m], double rounding over three products of poses of a few metres
 coordinate = st.floats(-1.7, 1.7)

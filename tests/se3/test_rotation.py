@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
-from tests.jacobians import check_jacobian
 
 from loopcal import se3
+from tests.jacobians import check_jacobian
 
 ROUNDING = 4e-15  # [1] or [rad], a few ulps over one product of rotations
 coordinate = st.floats(-1.0, 1.0)

@@ -170,6 +170,11 @@ def euler_rates(angles: Array, order: str) -> Array:
     return np.stack(columns[::-1] if fixed else columns, axis=-1)
 
 
+def _nonzero(divisor: Array) -> Array:
+    """A divisor with exact zeros replaced, so that singular rows of a batch become huge and the others stay right."""
+    return np.where(divisor == 0.0, 1e-100, divisor)
+
+
 def tilt_torsion_to_matrix(phi: Array | float, theta: Array | float, psi: Array | float) -> Array:
     """Rotation of azimuth, tilt and torsion: `R = Rz(phi) Ry(theta) Rz(psi - phi)`.
 
@@ -211,7 +216,7 @@ def matrix_to_tilt_torsion(rotation: Array) -> tuple[Array, Array, Array]:
 
 
 def euler_rates_inverse(angles: Array, order: str) -> Array:
-    """Matrix with `d(angles) = E^-1 omega`, the inverse of `euler_rates`; infinite where two axes are parallel.
+    """Matrix with `d(angles) = E^-1 omega`, the inverse of `euler_rates`; huge where two axes are parallel.
 
     The rows are cross products of the columns of E over its determinant, +-cos(a2) or +-sin(a2).
 
@@ -233,7 +238,7 @@ def euler_rates_inverse(angles: Array, order: str) -> Array:
     rates = euler_rates(angles, order)
     first, second, third = (rates[..., :, i] for i in range(3))
     rows = np.stack([np.cross(second, third), np.cross(third, first), np.cross(first, second)], axis=-2)
-    return rows / np.sum(rows[..., 0, :] * first, axis=-1)[..., None, None]
+    return rows / _nonzero(np.sum(rows[..., 0, :] * first, axis=-1))[..., None, None]
 
 
 def tilt_torsion_rates(phi: Array | float, theta: Array | float, psi: Array | float) -> Array:
@@ -258,7 +263,7 @@ def tilt_torsion_rates_inverse(phi: Array | float, theta: Array | float, psi: Ar
 
     With the normal n and its derivative e in theta, which with `Rz(phi) ey` are three orthogonal directions:
     `dphi = -e . omega / sin(theta)`, `dtheta = Rz(phi) ey . omega`, `dpsi = (n - tan(theta/2) e) . omega`.
-    The first row alone is infinite at zero tilt.
+    The first row alone is huge at zero tilt.
 
     Parameters
     ----------
@@ -272,9 +277,10 @@ def tilt_torsion_rates_inverse(phi: Array | float, theta: Array | float, psi: Ar
     cphi, sphi, ctheta, stheta = np.cos(phi), np.sin(phi), np.cos(theta), np.sin(theta)
     half = np.tan(0.5 * theta) + 0.0 * psi
     ex, ey, ez = cphi * ctheta, sphi * ctheta, -stheta
+    sine = _nonzero(stheta)
     return matrix(
         (
-            (-ex / stheta, -ey / stheta, -ez / stheta),
+            (-ex / sine, -ey / sine, -ez / sine),
             (-sphi, cphi, 0.0),
             (cphi * stheta - half * ex, sphi * stheta - half * ey, ctheta - half * ez),
         )

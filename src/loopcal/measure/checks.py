@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What measurements must satisfy beside their robot: refused with the evidence, unless the caller overrides it."""
+
+import numpy as np
+
+from loopcal.errors import DataError
+from loopcal.measure.measurements import Measurements
+from loopcal.mechanism import Mechanism
+from loopcal.units import unit
+
+
+def check_actuators(measurements: Measurements, robot: Mechanism) -> None:
+    """Refuse readings that do not have one column for each actuator.
+
+    Raises
+    ------
+    DataError
+        Naming the actuators.
+    """
+    found, names = measurements.readings.shape[1], [actuator.name for actuator in robot.actuators]
+    if found != len(names):
+        raise DataError(f"the readings have {found} columns, but {robot.name!r} has {len(names)} actuators: {', '.join(names)}")
+
+
+def check_strokes(measurements: Measurements, robot: Mechanism, *, allow: bool = False, override: str = "") -> None:
+    """Refuse readings outside the stroke of their actuator.
+
+    Parameters
+    ----------
+    measurements : Measurements
+    robot : Mechanism
+    allow : bool
+        True accepts them.
+    override : str
+        How a user of the caller says so (a flag or argument); closes the message.
+
+    Raises
+    ------
+    DataError
+        Naming the pose, the actuator, the reading, the stroke and how many there are.
+    """
+    check_actuators(measurements, robot)
+    if allow:
+        return
+    strokes = [actuator.stroke or (-np.inf, np.inf) for actuator in robot.actuators]
+    low, high = np.array(strokes).T
+    outside = np.argwhere((measurements.readings < low) | (measurements.readings > high))
+    if len(outside):
+        pose, column = (int(i) for i in outside[0])
+        actuator = robot.actuators[column]
+        shown = unit(robot.units[actuator.dimension])
+        value, least, most = (
+            f"{number / shown.factor_to_si:.7g}" for number in (measurements.readings[pose, column], *strokes[column])
+        )
+        others = "" if len(outside) == 1 else f" ({len(outside)} readings are outside)"
+        raise DataError(
+            f"pose {measurements.labels[pose]!r}: {actuator.name} reads {value} {shown}, outside its stroke of"
+            f" {least} to {most} {shown}{others}; correct the reading, its unit or the stroke" + _or_use(override)
+        )
+
+
+def check_duplicates(measurements: Measurements, *, allow: bool = False, override: str = "") -> None:
+    """Refuse a row that repeats another one to the last bit: the same readings, the same kind, the same values.
+
+    Two rows of one measurement pretend to twice the information. True repeats differ in their noise; a coarse
+    instrument that shows the same number again is what `allow` is for.
+
+    Parameters
+    ----------
+    measurements : Measurements
+    allow : bool
+        True accepts them.
+    override : str
+        How a user of the caller says so; closes the message.
+
+    Raises
+    ------
+    DataError
+        Naming the two poses.
+    """
+    if allow:
+        return
+    for rows in measurements.observations:
+        poses = rows.rows.reshape(len(rows), -1)
+        content = np.concatenate([measurements.readings[poses].reshape(len(rows), -1), rows.measured], axis=1)
+        _, first, kinds = np.unique(np.nan_to_num(content, nan=1e300), axis=0, return_index=True, return_inverse=True)
+        again = np.flatnonzero(first[kinds.ravel()] != np.arange(len(rows)))
+        if len(again):
+            second = int(again[0])
+            names = [measurements.labels[poses[i, 0]] for i in (int(first[kinds.ravel()[second]]), second)]
+            raise DataError(
+                f"poses {names[0]!r} and {names[1]!r} have the same readings and the same {rows.kind.name} values to"
+                " the last digit; remove one of them" + _or_use(override)
+            )
+
+
+def _or_use(override: str) -> str:
+    return f", or use {override}" if override else ""

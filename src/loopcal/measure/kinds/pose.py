@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kind `pose`: position and full orientation of the tool in a known frame."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopcal import se3
+from loopcal.measure.kinds.kind import Bools, Column, Evaluation
+from loopcal.measure.kinds.tool import ToolKind, position_columns
+from loopcal.measure.orientation import Orientation, orientation
+from loopcal.units import Dimension
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Pose(ToolKind):
+    """Full pose of the tool. Residual `(log(R_predicted R_measured'), t_predicted - t_measured)`, in axes of the frame.
+
+    With r the rotation part, Q the turn from base to frame and a the arm from platform origin to tool,
+    `d r = J_left^-1(r) Q omega` and `d t = Q (v + omega x a)`.
+
+    Parameters
+    ----------
+    orientation : str
+        Form of the orientation columns, see `loopcal.measure.orientation`. Noise of a rotation vector or a quaternion
+        is a rotation error rx ry rz about the axes of the frame; noise of angles is theirs, and is mapped.
+    form
+        The same as an object.
+    T_base_frame, T_platform_tool
+        See `ToolKind`.
+
+    Raises
+    ------
+    DataError
+        If the orientation is unknown or a frame is not a pose.
+    """
+
+    orientation: str = "rotation-vector"
+    form: Orientation = field(init=False, repr=False)
+
+    name: ClassVar[str] = "pose"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "form", orientation(self.orientation))
+
+    @classmethod
+    def examples(cls) -> tuple[Self, ...]:
+        """One of each form of orientation."""
+        names = ("rotation-vector", "quaternion", "tilt-torsion", "euler-xyz", "euler-ZYX", "euler-ZXZ")
+        return tuple(cls(name) for name in names)
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Orientation, then x y z."""
+        return tuple(Column(name, self.form.dimension) for name in self.form.columns) + position_columns()
+
+    @property
+    def noise_columns(self) -> tuple[Column, ...]:
+        """Three rotations or angles, then x y z."""
+        return tuple(Column(name, Dimension.ANGLE) for name in self.form.noise_columns) + position_columns()
+
+    def present(self, measured: Array) -> Bools:
+        """Orientation is there as a whole or not at all, x y z each for itself."""
+        whole = ~np.any(np.isnan(measured[..., :-3]), axis=-1, keepdims=True)
+        return np.concatenate([np.repeat(whole, 3, axis=-1), ~np.isnan(measured[..., -3:])], axis=-1)
+
+    def doubts(self, measured: Array) -> tuple[tuple[int, str], ...]:
+        """Rows with a part of an orientation, or with a quaternion that is not of length one."""
+        turned = measured[..., :-3]
+        missing = np.isnan(turned)
+        partly = np.any(missing, axis=-1) & ~np.all(missing, axis=-1)
+        found = [
+            (int(i), "has only a part of its orientation; give all of it or none, or use the kind 'component'")
+            for i in np.flatnonzero(partly)
+        ]
+        if self.orientation == "quaternion":
+            length = np.linalg.norm(turned, axis=-1)
+            found += [
+                (int(i), f"has a quaternion of length {length[i]:.6g}; it must be 1 to 1e-3, scalar first")
+                for i in np.flatnonzero(np.abs(length - 1.0) > 1e-3)
+            ]
+        return tuple(found)
+
+    def _evaluate(self, T: Array, measured: Array, unknowns: Array | None) -> Evaluation:
+        seen = self.seen(T)
+        turned = self.form.to_matrix(self._filled(measured))
+        rotation = se3.log_so3(seen[..., :3, :3] @ np.swapaxes(turned, -1, -2))
+        residual = np.concatenate([rotation, seen[..., :3, 3] - measured[..., -3:]], axis=-1)
+        moved = self.transport(T)
+        turning = se3.left_jacobian_inverse_so3(rotation) @ moved[..., :3, :]
+        return Evaluation(residual, np.concatenate([turning, moved[..., 3:, :]], axis=-2))
+
+    def measure(self, T: Array, noise: Array, unknowns: Array | None = None) -> Array:
+        """Columns (t, r, c) of the tool pose with noise (t, r, 6): a rotation error, or added to the angles."""
+        seen = self.seen(T)
+        if self.form.angles:
+            turned = self.form.from_matrix(seen[..., :3, :3])
+            turned = turned + noise[..., :3]
+        else:
+            turned = self.form.from_matrix(se3.exp_so3(noise[..., :3]) @ seen[..., :3, :3])
+        return np.concatenate([turned, seen[..., :3, 3] + noise[..., 3:]], axis=-1)
+
+    def noise_map(self, measured: Array) -> Array:
+        """Matrix (..., 6, 6): E of the angles for the rotation, the identity for x y z."""
+        rates = self.form.rates(self._filled(measured))
+        zero = np.zeros_like(rates)
+        identity = np.broadcast_to(np.eye(3), rates.shape)
+        top = np.concatenate([rates, zero], axis=-1)
+        return np.concatenate([top, np.concatenate([zero, identity], axis=-1)], axis=-2)
+
+    def _filled(self, measured: Array) -> Array:
+        """Orientation columns, with the identity where they were not measured."""
+        neutral = np.array([1.0, 0.0, 0.0, 0.0] if self.orientation == "quaternion" else [0.0, 0.0, 0.0])
+        turned = measured[..., :-3]
+        return np.where(np.any(np.isnan(turned), axis=-1, keepdims=True), neutral, turned)

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Noise of an instrument's columns, and the random streams that draw it."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from loopcal.errors import DataError
+from loopcal.measure.arrays import stored
+
+Array = NDArray[np.float64]
+
+
+class Noise(ABC):
+    """Independent noise of m columns."""
+
+    @property
+    @abstractmethod
+    def sigma(self) -> Array:
+        """Standard deviations (m,) [SI]."""
+
+    @abstractmethod
+    def draw(self, generator: np.random.Generator, n: int) -> Array:
+        """Noise of n rows, (n, m) [SI]."""
+
+
+def _positive(value: ArrayLike, what: str) -> Array:
+    array = stored(value, what, (None,))
+    if np.any(array <= 0.0):
+        raise DataError(f"{what} holds {float(np.min(array)):.6g}; give a number above 0 for each column")
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussian(Noise):
+    """Normal noise with standard deviations `sd` (m,) [SI]; DataError unless each is above 0."""
+
+    sd: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sd", _positive(self.sd, "the sigma of the noise"))
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (m,) [SI]."""
+        return self.sd
+
+    def draw(self, generator: np.random.Generator, n: int) -> Array:
+        """Noise of n rows, (n, m) [SI]."""
+        return generator.standard_normal((n, len(self.sd))) * self.sd
+
+
+@dataclass(frozen=True, eq=False)
+class Uniform(Noise):
+    """Noise anywhere between -limit and +limit (m,) [SI]: sigma = limit / sqrt(3); DataError unless each is above 0."""
+
+    limit: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "limit", _positive(self.limit, "the limits of the noise"))
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (m,) [SI]."""
+        return self.limit / np.sqrt(3.0)
+
+    def draw(self, generator: np.random.Generator, n: int) -> Array:
+        """Noise of n rows, (n, m) [SI]."""
+        return generator.uniform(-1.0, 1.0, (n, len(self.limit))) * self.limit
+
+
+def stream(seed: int, trial: int, purpose: int = 0) -> np.random.Generator:
+    """Generator of one trial of a study; depends on nothing but these three numbers.
+
+    Parameters
+    ----------
+    seed : int
+        Of the study.
+    trial : int
+        Counted from 0; a trial gets the same numbers however many others there are.
+    purpose : int
+        Keeps apart what one trial draws: 0 noise, 1 true values.
+
+    Returns
+    -------
+    generator : numpy.random.Generator
+    """
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(trial, purpose)))

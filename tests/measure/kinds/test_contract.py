@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every kind must satisfy. The tests loop over `KINDS` and the examples of each, so a new kind is in at once."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from loopcal import se3
+from loopcal.errors import DataError
+from loopcal.measure import KINDS, Observations
+from loopcal.units import Dimension
+from tests.jacobians import check_jacobian
+
+EXAMPLES = [pytest.param(kind, id=f"{name}-{i}") for name, cls in KINDS.items() for i, kind in enumerate(cls.examples())]
+T_BASE_FRAME = se3.exp_update(np.eye(4), np.array([0.5, 0.1, -0.9, 1.1, -0.7, 0.3]))
+T_PLATFORM_TOOL = se3.exp_update(np.eye(4), np.array([0.3, -0.5, 0.2, 0.02, -0.05, 0.11]))
+every_kind = pytest.mark.parametrize("kind", EXAMPLES)
+
+
+def platform_poses(kind, t, r, seed=0, spread=0.4):
+    """Random platform poses (t, r, 4, 4), with an axis of links where the kind has them."""
+    shape = (t, r, 6) if kind.links == 1 else (t, r, kind.links, 6)
+    return se3.exp_update(np.eye(4), np.random.default_rng(seed).uniform(-spread, spread, shape))
+
+
+def placed(kind):
+    """The kind on a robot with a tool, seen from a frame of its own where the kind has one."""
+    fields = {f.name for f in dataclasses.fields(kind)}
+    if "T_base_frame" in fields:
+        kind = dataclasses.replace(kind, T_base_frame=T_BASE_FRAME)
+    return kind.mounted(T_PLATFORM_TOOL)
+
+
+def own_unknowns(kind):
+    """Nominal values of the kind's unknowns (1, 1, u), None where it has none."""
+    return np.array([p.nominal for p in kind.unknowns])[None, None] if kind.unknowns else None
+
+
+def measured_near(kind, T, size, seed=1):
+    """Readings of the true poses with errors of this size in the noise columns."""
+    noise = size * np.random.default_rng(seed).uniform(-1.0, 1.0, (*T.shape[:2], len(kind.noise_columns)))
+    return kind.measure(T, noise, own_unknowns(kind)), noise
+
+
+@every_kind
+def test_a_kind_is_registered_under_its_name_and_says_what_its_columns_measure(kind):
+    assert KINDS[kind.name] is type(kind)
+    assert len({c.name for c in kind.columns}) == len(kind.columns) > 0
+    assert all(isinstance(c.dimension, Dimension) for c in (*kind.columns, *kind.noise_columns))
+    assert all(p.scope in ("machine", "session", "group", "pose") for p in kind.unknowns)
+
+
+@every_kind
+def test_shapes_follow_trials_and_rows(kind):
+    kind = placed(kind)
+    T = platform_poses(kind, 3, 5)
+    measured, _ = measured_near(kind, T, 1e-3)
+    m, links = len(kind.noise_columns), () if kind.links == 1 else (kind.links,)
+    assert measured.shape == (3, 5, len(kind.columns))
+    assert kind.present(measured).shape == (3, 5, m)
+    assert kind.noise_map(measured).shape == (3, 5, m, m)
+    for rows in (measured, measured[:1]):
+        result = kind.evaluate(T, rows, own_unknowns(kind))
+        assert result.residual.shape == (3, 5, m)
+        assert result.jacobian.shape == (3, 5, *links, m, 6)
+        assert (result.own is None) == (not kind.unknowns)
+
+
+@every_kind
+def test_the_residual_of_a_noise_free_reading_is_zero(kind):
+    kind = placed(kind)
+    T = platform_poses(kind, 2, 50)
+    measured, _ = measured_near(kind, T, 0.0)
+    residual = kind.evaluate(T, measured, own_unknowns(kind)).residual
+    assert_allclose(residual, 0.0, atol=1e-13)  # [m, rad], ulps over the sine of the smallest tilt, about 0.01
+
+
+@every_kind
+def test_the_residual_of_a_noisy_reading_is_the_mapped_noise_with_the_sign_turned(kind):
+    kind = placed(kind)
+    T = platform_poses(kind, 2, 50)
+    measured, noise = measured_near(kind, T, 1e-6)
+    residual = kind.evaluate(T, measured, own_unknowns(kind)).residual
+    expected = -(kind.noise_map(measured) @ noise[..., None])[..., 0]
+    assert_allclose(residual, expected, atol=1e-11)  # [m, rad], the square of the noise times the bend of the angles
+
+
+def check_twist_jacobian(kind, error, *, with_jax):
+    kind = placed(kind)
+    T = platform_poses(kind, 2, 4, seed=5)
+    measured, _ = measured_near(kind, T, error)
+    jacobian = kind.evaluate(T, measured, own_unknowns(kind)).jacobian
+    for link in range(kind.links):
+        unit = np.zeros((6, kind.links, 6))
+        unit[:, link] = np.eye(6)
+        shape = (6,) if kind.links == 1 else (kind.links, 6)
+
+        def residual(x, unit=unit, shape=shape):
+            twist = (x @ unit.reshape(6, -1)).reshape(shape)  # the same small motion in every row and trial
+            return kind.evaluate(se3.exp_update(T, twist), measured, own_unknowns(kind)).residual
+
+        part = jacobian if kind.links == 1 else jacobian[:, :, link]
+        reason = "[rad] per 0.05 rad, rounding of angles near small tilt"
+        automatic = residual if with_jax else None
+        check_jacobian(residual, part, np.zeros(6), scale=0.05, automatic=automatic, atol=1e-13, atol_reason=reason)
+
+
+@every_kind
+@pytest.mark.parametrize("error", [1e-4, 0.3])
+def test_the_jacobian_by_the_platform_twist_agrees_with_differences(kind, error):
+    check_twist_jacobian(kind, error, with_jax=False)
+
+
+@every_kind
+@pytest.mark.slow
+def test_the_jacobian_by_the_platform_twist_agrees_with_an_automatic_derivative(kind):
+    check_twist_jacobian(kind, 0.1, with_jax=True)
+
+
+@every_kind
+def test_the_jacobian_by_the_own_unknowns(kind):
+    if not kind.unknowns:
+        return
+    kind = placed(kind)
+    T = platform_poses(kind, 2, 4, seed=5)
+    measured, _ = measured_near(kind, T, 1e-3)
+    nominal = own_unknowns(kind)
+
+    def residual(x):
+        return kind.evaluate(T, measured, nominal + x).residual
+
+    own = kind.evaluate(T, measured, nominal).own
+    check_jacobian(residual, own, np.zeros(len(kind.unknowns)), scale=0.05, automatic=residual)
+
+
+@every_kind
+def test_components_not_measured_are_zero_and_leave_the_others_as_they_were(kind):
+    kind = placed(kind)
+    T = platform_poses(kind, 2, 20)
+    measured, _ = measured_near(kind, T, 1e-3)
+    whole = kind.evaluate(T, measured, own_unknowns(kind))
+    for column in range(len(kind.columns)):
+        holed = measured.copy()
+        holed[:, ::2, column] = np.nan
+        present = kind.present(holed)
+        part = kind.evaluate(T, holed, own_unknowns(kind))
+        assert not present[:, ::2].all()
+        assert present[:, 1::2].all()
+        assert_allclose(part.residual[~present], 0.0, atol=0.0)
+        assert_allclose(part.jacobian[np.broadcast_to(~present[..., None], part.jacobian.shape)], 0.0, atol=0.0)
+        assert_allclose(part.residual[:, 1::2], whole.residual[:, 1::2], atol=0.0)
+        assert np.isfinite(part.residual).all()
+        assert np.isfinite(part.jacobian).all()
+
+
+@every_kind
+def test_rows_do_not_depend_on_their_batch(kind):
+    kind = placed(kind)
+    T = platform_poses(kind, 3, 6)
+    measured, _ = measured_near(kind, T, 1e-3)
+    together = kind.evaluate(T, measured, own_unknowns(kind))
+    for i, j in ((0, 0), (2, 5)):
+        alone = kind.evaluate(T[i : i + 1, j : j + 1], measured[i : i + 1, j : j + 1], own_unknowns(kind))
+        # numpy takes another path through vectorised sines and small products for other lengths: a rounding each
+        assert_allclose(alone.residual[0, 0], together.residual[i, j], atol=1e-14)
+        assert_allclose(alone.jacobian[0, 0], together.jacobian[i, j], atol=1e-12)
+
+
+@every_kind
+def test_a_kind_that_needs_a_tool_says_so_and_keeps_its_own(kind):
+    if kind.is_mounted:
+        assert kind.mounted(T_PLATFORM_TOOL) is kind
+        return
+    with pytest.raises(DataError, match=r"use kind\.mounted\(robot\.tool\)"):
+        Observations(kind, np.array([0]), np.zeros((1, len(kind.columns))), np.eye(len(kind.noise_columns)))
+    once = kind.mounted(T_PLATFORM_TOOL)
+    assert once.is_mounted
+    assert once.mounted(np.eye(4)) is once
+
+
+@every_kind
+def test_nothing_the_kind_stores_can_be_changed(kind):
+    for value in vars(kind.mounted(T_PLATFORM_TOOL)).values():
+        assert not isinstance(value, np.ndarray) or not value.flags.writeable

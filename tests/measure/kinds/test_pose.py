@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kind `pose`: its residual, the forms of orientation, and what it refuses."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from loopcal import se3
+from loopcal.errors import DataError
+from loopcal.measure import Observations, Pose
+
+
+def test_the_residual_is_the_logarithm_of_predicted_times_measured_transposed_and_predicted_minus_measured():
+    T = se3.exp_update(np.eye(4), np.array([0.2, 0.0, 0.0, 1.0, 2.0, 3.0]))[None, None]
+    measured = np.array([[[0.1, 0.0, 0.0, 1.0, 2.0, 2.5]]])
+    residual = Pose(T_platform_tool=np.eye(4)).evaluate(T, measured).residual
+    assert_allclose(residual[0, 0], [0.1, 0.0, 0.0, 0.0, 0.0, 0.5], atol=1e-15)
+
+
+def test_all_forms_of_orientation_give_the_same_residual_in_every_frame():
+    rng = np.random.default_rng(2)
+    T, T_measured = se3.exp_update(np.eye(4), rng.uniform(-1, 1, (2, 1, 30, 6)))
+    T_base_frame = se3.exp_update(np.eye(4), rng.normal(size=6))
+    reference = Pose(T_platform_tool=np.eye(4))
+    seen = np.concatenate([se3.log_so3(T_measured[..., :3, :3]), T_measured[..., :3, 3]], axis=-1)
+    expected = reference.evaluate(T, seen).residual
+    turned = np.concatenate([expected[..., :3] @ T_base_frame[:3, :3], expected[..., 3:] @ T_base_frame[:3, :3]], axis=-1)
+    for name in ("rotation-vector", "quaternion", "tilt-torsion", "euler-xyz", "euler-ZXZ"):
+        kind = Pose(name, T_platform_tool=np.eye(4), T_base_frame=T_base_frame)
+        measured = kind.measure(T_measured, np.zeros((1, 30, 6)))
+        assert_allclose(kind.evaluate(T, measured).residual, turned, atol=1e-13)  # [m, rad], ulps over the tilt
+
+
+def test_the_length_and_sign_of_a_quaternion_do_not_matter():
+    kind = Pose("quaternion", T_platform_tool=np.eye(4))
+    T = se3.exp_update(np.eye(4), np.full(6, 0.2))[None, None]
+    measured = kind.measure(T, np.zeros((1, 1, 6)))
+    measured[..., :4] *= -1.0005
+    assert_allclose(kind.evaluate(T, measured).residual, 0.0, atol=1e-15)
+
+
+def test_a_sigma_of_euler_angles_becomes_that_of_the_rotation_error():
+    kind = Pose("euler-xyz", T_platform_tool=np.eye(4))
+    measured = np.array([[0.3, 1.0, -0.4, 0.0, 0.0, 0.0]])
+    sigma = np.array([1e-5, 2e-5, 3e-5, 1e-6, 2e-6, 3e-6])
+    data = Observations.from_sigma(kind, np.array([0]), measured, sigma)
+    E = se3.euler_rates(measured[0, :3], "xyz")
+    assert_allclose(data.covariance[0, :3, :3], E @ np.diag(sigma[:3] ** 2) @ E.T, rtol=1e-12)
+    assert_allclose(data.covariance[0, 3:, 3:], np.diag(sigma[3:] ** 2), rtol=1e-12)
+    assert_allclose(data.covariance[0, :3, 3:], 0.0, atol=0.0)
+
+
+def test_half_an_orientation_is_refused():
+    with pytest.raises(DataError, match="row 2 of kind 'pose' has only a part of its orientation"):
+        Observations.from_sigma(
+            Pose(T_platform_tool=np.eye(4)), np.arange(2), [[0.0] * 6, [0.0, np.nan, 0.0, 1.0, 2.0, 3.0]], 1e-3
+        )
+
+
+def test_a_quaternion_that_is_none_is_refused():
+    with pytest.raises(DataError, match="has a quaternion of length 0; it must be 1"):
+        Observations.from_sigma(Pose("quaternion", T_platform_tool=np.eye(4)), [0], np.zeros((1, 7)), 1e-3)
+
+
+def test_a_frame_that_is_no_pose_is_refused():
+    mirrored = np.diag([1.0, 1.0, -1.0, 1.0])
+    with pytest.raises(DataError, match="T_base_frame is not a pose"):
+        Pose(T_base_frame=mirrored)
+    with pytest.raises(DataError, match=r"T_platform_tool has shape \(3, 3\)"):
+        Pose(T_platform_tool=np.eye(3))

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Splitting, taking and weighing measurements, and refusing those that do not hold together."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from loopcal.errors import DataError
+from loopcal.measure import Component, Measurements, Observations
+
+HEIGHT = Component(("z",), T_platform_tool=np.eye(4))
+POINT = Component(("x", "y", "z"), T_platform_tool=np.eye(4))
+
+
+def heights(n, block=None, rows=None):
+    """Measurements whose readings, values and labels all tell the index of the pose."""
+    seen = np.arange(n) if rows is None else np.asarray(rows)
+    observations = Observations.from_sigma(HEIGHT, seen, 10.0 * seen[:, None], 1e-3)
+    labels = tuple(f"p{i}" for i in range(n))
+    extra = {} if block is None else {"block": np.asarray(block)}
+    return Measurements("toy", np.arange(2.0 * n).reshape(n, 2), (observations,), labels=labels, **extra)
+
+
+def poses_of(data):
+    """Original indices, after checking that readings, labels, rows and values still belong together."""
+    original = (data.readings[:, 0] / 2).astype(int)
+    assert data.labels == tuple(f"p{i}" for i in original)
+    rows = data.observations[0]
+    assert np.array_equal(rows.measured[:, 0], 10.0 * original[rows.rows])
+    return original
+
+
+def test_numbers_of_poses_and_residuals():
+    data = heights(7)
+    holed = Observations.from_sigma(POINT, [0, 3], [[0.0, np.nan, 1.0], [1.0, 2.0, 3.0]], 1.0)
+    both = Measurements("toy", data.readings, (*data.observations, holed))
+    assert (both.n_poses, both.n_rows) == (7, 7 + 5)
+    assert both.labels == ("1", "2", "3", "4", "5", "6", "7")
+    assert np.array_equal(both.block, np.arange(7))
+
+
+def test_a_split_at_three_quarters_gives_thirty_and_ten_of_forty():
+    fit, held_out = heights(40).split(0.75, seed=1)
+    assert (fit.n_poses, held_out.n_poses) == (30, 10)
+    assert sorted([*poses_of(fit), *poses_of(held_out)]) == list(range(40))
+    assert list(poses_of(fit)) == sorted(poses_of(fit))
+
+
+@given(st.lists(st.integers(0, 6), min_size=2, max_size=40), st.floats(0.01, 0.99), st.integers(0, 99))
+def test_a_split_keeps_blocks_whole_and_loses_nothing(block, fraction, seed):
+    data = heights(len(block), block)
+    if len(set(block)) == 1:
+        with pytest.raises(DataError, match="single block"):
+            data.split(fraction, seed)
+        return
+    fit, held_out = data.split(fraction, seed)
+    assert not set(fit.block) & set(held_out.block)
+    assert sorted([*poses_of(fit), *poses_of(held_out)]) == list(range(len(block)))
+    assert fit.n_poses > 0
+    assert held_out.n_poses > 0
+
+
+def test_a_split_is_repeatable_and_changes_with_the_seed():
+    parts = [poses_of(heights(40).split(0.5, seed)[0]).tolist() for seed in (3, 3, 4)]
+    assert parts[0] == parts[1] != parts[2]
+
+
+@pytest.mark.parametrize("fraction", [0.0, 1.0, 75.0, -0.1, np.nan])
+def test_a_fraction_that_is_none_is_refused(fraction):
+    with pytest.raises(DataError, match=r"above 0 and below 1, such as 0\.75"):
+        heights(4).split(fraction, seed=0)
+
+
+def test_taking_poses_renumbers_the_rows_and_drops_those_that_need_others():
+    data = heights(5, rows=[4, 0, 4, 2])
+    part = data.take([4, 1])
+    assert poses_of(part).tolist() == [4, 1]
+    assert part.observations[0].rows.tolist() == [0, 0]
+    assert poses_of(data.take(np.array([True, False, False, False, True]))).tolist() == [0, 4]
+
+
+@pytest.mark.parametrize("poses", [[5], [-1], [1, 1], []])
+def test_taking_what_is_not_there_is_refused(poses):
+    with pytest.raises(DataError, match="name some of 0 to 4, each once"):
+        heights(5).take(poses)
+
+
+def test_weights_of_poses_reach_their_rows_in_the_same_shape():
+    data = heights(4, rows=[0, 1, 1, 3]).reweighted([1.0, 0.0, 1.0, 0.25])
+    assert data.observations[0].weight.tolist() == [1.0, 0.0, 0.0, 0.25]
+    assert data.observations[0].whitener.shape == (4, 1, 1)
+    assert data.n_rows == 2
+    with pytest.raises(DataError, match=r"weight of the poses has shape \(3,\)"):
+        heights(4).reweighted([1.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"readings": [[1.0, np.nan], [0.0, 0.0]]}, "readings: row 1, column 2 is nan; give a finite number"),
+        ({"readings": [1.0, 2.0]}, r"readings has shape \(2,\)"),
+        ({"readings": np.empty((0, 2))}, "there is no pose"),
+        ({"readings": [[1.0, 2.0]]}, "row 2 of kind 'component' refers to pose 1, but the 1 poses are 0 to 0"),
+        ({"block": np.array([1])}, "give one whole number for each pose"),
+        ({"labels": ("a",)}, "there are 1 labels for 2 poses"),
+    ],
+)
+def test_a_mistake_is_one_sentence(change, sentence):
+    rows = Observations.from_sigma(HEIGHT, [0, 1], np.zeros((2, 1)), 1.0)
+    right = {"robot_name": "toy", "readings": np.zeros((2, 2)), "observations": (rows,)}
+    with pytest.raises(DataError, match=sentence):
+        Measurements(**(right | change))

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows of one kind: whitening against closed forms, absence, and refusals."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from loopcal import se3
+from loopcal.errors import DataError
+from loopcal.measure import Component, Observations, Pose
+
+POINT = Component(("x", "y", "z"), T_platform_tool=np.eye(4))
+POSE = Pose(T_platform_tool=np.eye(4))
+
+
+def covariances(r, m, seed=0):
+    A = np.random.default_rng(seed).normal(size=(r, m, m))
+    scale = 10.0 ** np.linspace(-6, -3, m)  # mixed units: micrometres beside millimetres
+    return (A @ np.swapaxes(A, 1, 2) + 0.1 * np.eye(m)) * np.outer(scale, scale)
+
+
+def test_the_whitener_is_the_inverse_lower_cholesky_factor():
+    C = covariances(20, 6)
+    data = Observations(POSE, np.arange(20), np.zeros((20, 6)), C)
+    W = data.whitener
+    expected = np.tril(np.linalg.inv(np.linalg.cholesky(C)))
+    size = np.abs(expected).max(axis=2, keepdims=True)
+    assert_allclose(W / size, expected / size, atol=1e-10)  # [1], ulps times a condition of up to 1e5
+    assert_allclose(W @ C @ np.swapaxes(W, 1, 2), np.broadcast_to(np.eye(6), C.shape), atol=1e-10)
+
+
+@given(st.lists(st.booleans(), min_size=3, max_size=3), st.integers(0, 1000))
+def test_missing_components_equal_leaving_them_out_of_the_covariance(there, seed):
+    here = np.flatnonzero(there)
+    C = covariances(1, 3, seed)
+    measured = np.where(there, np.random.default_rng(seed).normal(size=3), np.nan)[None]
+    data = Observations(POINT, np.array([0]), measured, C)
+    T = se3.exp_update(np.eye(4), np.random.default_rng(seed).normal(size=6))[None, None]
+    result = data.evaluate(T)
+    white, slopes = data.whitener[0] @ result.residual[0, 0], data.whitener[0] @ result.jacobian[0, 0]
+    assert_allclose(np.delete(white, here), 0.0, atol=0.0)
+    assert_allclose(np.delete(slopes, here, axis=0), 0.0, atol=0.0)
+    W = np.linalg.inv(np.linalg.cholesky(C[0][np.ix_(here, here)]))
+    assert_allclose(white[here], W @ (T[0, 0, here, 3] - measured[0, here]), rtol=1e-9)
+    assert data.n_residuals == len(here)
+
+
+def test_what_is_written_in_a_covariance_beside_a_missing_component_does_not_matter():
+    C = covariances(1, 3)
+    measured = np.array([[1.0, np.nan, 2.0]])
+    broken = C.copy()
+    broken[:, 1, :] = broken[:, :, 1] = np.nan
+    first, second = (Observations(POINT, np.array([0]), measured, c) for c in (C, broken))
+    assert np.array_equal(first.whitener, second.whitener)
+
+
+def test_a_weight_multiplies_the_square_and_zero_makes_a_row_absent_in_the_same_shape():
+    C = covariances(3, 3)
+    one = Observations(POINT, np.arange(3), np.zeros((3, 3)), C)
+    weighed = one.reweighted([1.0, 0.25, 0.0])
+    assert_allclose(weighed.whitener, one.whitener * np.array([1.0, 0.5, 0.0])[:, None, None], rtol=1e-15)
+    assert (one.n_residuals, weighed.n_residuals) == (9, 6)
+
+
+def test_sigma_may_be_one_number_one_per_column_or_one_per_row_and_column():
+    rows, measured = np.arange(2), np.zeros((2, 3))
+    for sigma in (2.0, [2.0, 2.0, 2.0], np.full((2, 3), 2.0)):
+        data = Observations.from_sigma(POINT, rows, measured, sigma)
+        assert_allclose(data.covariance, np.broadcast_to(4.0 * np.eye(3), (2, 3, 3)), rtol=1e-15)
+
+
+def test_arrays_are_copies_that_cannot_be_written():
+    measured = np.zeros((2, 3))
+    data = Observations.from_sigma(POINT, np.arange(2), measured, 1.0)
+    measured[0, 0] = 7.0
+    assert data.measured[0, 0] == 0.0
+    for name in ("rows", "measured", "covariance", "weight", "present", "whitener"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(data, name)[0] = 1
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"measured": np.zeros((2, 4))}, r"measured values of kind 'component' has shape \(2, 4\); give .*\(2, 3\)"),
+        ({"measured": [[1.0, np.inf, 0.0], [0.0] * 3]}, "row 1, column 2 is inf; give a finite number or NaN"),
+        ({"rows": [0.5, 1.0]}, "give whole numbers of shape"),
+        ({"rows": [0]}, "has shape"),
+        ({"covariance": np.diag([1.0, 0.0, 1.0])}, "covariance of row 1 has a variance that is not above 0"),
+        ({"covariance": [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}, "row 1 is not positive definite"),
+        ({"covariance": [[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}, "row 1 is not positive definite"),
+        ({"covariance": [[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}, "row 1 is not symmetric"),
+        ({"weight": [1.0, -1.0]}, "weight of row 2 is -1; use 0 to leave a row out"),
+        ({"weight": [1.0, np.nan]}, "the weight: row 2 is nan"),
+        ({"covariance": np.eye(2)}, r"covariance has shape \(2, 2\); give \(2, 3, 3\) or \(3, 3\)"),
+        ({"weight": [1.0, 1.0, 1.0]}, r"the weight has shape \(3,\); give one number for each of 2 rows"),
+    ],
+)
+def test_a_mistake_is_one_sentence(change, sentence):
+    right = {"kind": POINT, "rows": [0, 1], "measured": np.zeros((2, 3)), "covariance": np.eye(3)}
+    with pytest.raises(DataError, match=sentence):
+        Observations(**(right | change))
+
+
+def test_the_row_with_the_broken_covariance_is_named():
+    C = np.repeat(np.eye(3)[None], 5, axis=0)
+    C[3, 0, 1] = C[3, 1, 0] = 1.5
+    with pytest.raises(DataError, match="covariance of row 4 is not positive definite"):
+        Observations(POINT, np.arange(5), np.zeros((5, 3)), C)
+
+
+def test_a_sigma_of_the_wrong_length_names_the_columns():
+    with pytest.raises(DataError, match=r"sigma has shape \(2,\); give one number, or one for each of rx, ry, rz, x, y, z"):
+        Observations.from_sigma(POSE, [0], np.zeros((1, 6)), [1.0, 2.0])
+    with pytest.raises(DataError, match=r"give \(r, 6\): rx, ry, rz, x, y, z"):
+        Observations.from_sigma(POSE, [0], np.zeros((1, 5)), 1.0)
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_rows_are_whitened_without_a_loop():
+    data = Observations.from_sigma(POSE, np.arange(100_000), np.zeros((100_000, 6)), 1e-3)
+    assert_allclose(data.whitener[99_999], 1e3 * np.eye(6), rtol=1e-12)

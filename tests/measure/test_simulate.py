@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated measurements: noise, streams, commanded poses, and checks against the robot."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from loopcal import se3
+from loopcal.errors import DataError
+from loopcal.measure import (
+    Component,
+    Gaussian,
+    Instrument,
+    Measurements,
+    Observations,
+    Pose,
+    Sensor,
+    Uniform,
+    check_actuators,
+    check_duplicates,
+    check_strokes,
+    readings_from_commanded,
+    sample_truth,
+    simulate,
+    simulate_trials,
+    stream,
+)
+from loopcal.mechanism import inverse
+from loopcal.parameters import ParameterTable
+from tests import zoo
+
+SIGMA = np.array([5e-6, 5e-6, 5e-6, 1e-6, 1e-6, 1e-6])
+COMMANDED = zoo.poses_of(
+    np.random.default_rng(4).uniform(-1.0, 1.0, (12, 6)) * [0.01, 0.01, 0.01, 0.05, 0.05, 0.05] + [0, 0, 0.2, 0, 0, 0]
+)
+TRACKER = Instrument((Sensor(Pose(), Gaussian(SIGMA)), Sensor(Component(("z",)), Uniform(np.array([1e-6])))))
+
+
+@pytest.fixture(scope="module")
+def robot():
+    robot = zoo.hexapod()
+    return replace(robot, parameters=ParameterTable(tuple(replace(p, tolerance=5e-5) for p in robot.parameters.entries)))
+
+
+@pytest.fixture(scope="module")
+def truth(robot):
+    return robot.with_values(sample_truth(robot, 1, seed=5)[0])
+
+
+def test_commanded_poses_become_the_readings_of_the_controllers_geometry(robot, truth):
+    assert_allclose(readings_from_commanded(robot, COMMANDED), inverse(robot, COMMANDED).q, atol=0.0)
+    assert_allclose(simulate(truth, COMMANDED, TRACKER, seed=1).readings, inverse(robot, COMMANDED).q, atol=0.0)
+    own = simulate(truth, COMMANDED, TRACKER, seed=1, controller=truth).readings
+    assert_allclose(own, inverse(truth, COMMANDED).q, atol=0.0)
+
+
+def test_a_perfect_machine_is_seen_where_it_was_commanded_within_the_noise(robot):
+    data = simulate(robot, COMMANDED, TRACKER, seed=1)
+    for rows in data.observations:
+        white = (rows.whitener @ rows.evaluate(COMMANDED[None]).residual[0, ..., None])[..., 0]
+        assert 0.0 < np.abs(white).max() < 5.0
+    assert data.n_rows == 7 * len(COMMANDED)
+    assert data.robot_name == robot.name
+
+
+def test_a_true_machine_is_seen_where_its_own_geometry_puts_it(robot, truth):
+    trials = simulate_trials(robot, truth.values, COMMANDED, TRACKER, seed=1)
+    white = (trials.trial(0).observations[0].whitener @ _residual(trials)[..., None])[..., 0]
+    assert np.abs(white).max() < 5.0
+    moved = se3.difference(trials.T[0], COMMANDED)
+    assert np.abs(moved[:, 3:]).max() > 20 * SIGMA[-1]
+    # The rods of the true machine are as long as its readings say.
+    assert_allclose(inverse(truth, trials.T[0]).q, trials.readings, atol=1e-12)
+
+
+def _residual(trials):
+    return trials.trial(0).observations[0].evaluate(trials.T[:1]).residual[0]
+
+
+def test_trial_i_is_the_same_in_every_study_and_simulate_is_trial_0(robot):
+    values = sample_truth(robot, 5, seed=9)
+    assert np.array_equal(values[:2], sample_truth(robot, 2, seed=9))
+    five = simulate_trials(robot, values, COMMANDED, TRACKER, seed=3)
+    two = simulate_trials(robot, values[:2], COMMANDED, TRACKER, seed=3)
+    one = simulate(robot.with_values(values[0]), COMMANDED, TRACKER, seed=3)
+    assert (len(five), five.measured[0].shape) == (5, (5, len(COMMANDED), 6))
+    for k in range(2):
+        # [m, rad] machines solved in batches of other sizes may differ by a rounding
+        assert_allclose(five.measured[k][:2], two.measured[k], atol=1e-14)
+        assert_allclose(five.measured[k][0], one.observations[k].measured, atol=1e-14)
+    assert not np.allclose(five.measured[0][0], five.measured[0][1], atol=1e-9)
+
+
+def test_a_second_sensor_does_not_change_the_noise_of_the_first(robot):
+    alone = simulate(robot, COMMANDED, Instrument(TRACKER.sensors[:1]), seed=3)
+    assert np.array_equal(alone.observations[0].measured, simulate(robot, COMMANDED, TRACKER, seed=3).observations[0].measured)
+
+
+def test_true_values_have_the_tolerances_as_standard_deviations(robot):
+    drawn = sample_truth(robot, 4000, seed=2)
+    scatter = (drawn - robot.parameters.nominal).std(axis=0) / robot.parameters.tolerance
+    # Relative sd of a standard deviation from 4000 draws is 1 / sqrt(8000) = 1.1 %; 42 of them stay within 4.5 of those.
+    assert np.all(np.abs(scatter - 1.0) < 0.05)
+
+
+def test_noise_has_the_spread_it_states():
+    for noise in (Gaussian(SIGMA), Uniform(SIGMA)):
+        drawn = noise.draw(stream(1, 0), 20000)
+        # 1 / sqrt(40000) = 0.5 % for the normal one, less for the uniform one; six columns within five of those
+        assert_allclose(drawn.std(axis=0), noise.sigma, rtol=0.025)
+    assert np.all(np.abs(Uniform(SIGMA).draw(stream(1, 0), 20000)) <= SIGMA)
+
+
+@pytest.mark.parametrize("sigma", [[0.0], [-1.0], [np.nan]])
+def test_noise_that_is_none_is_refused(sigma):
+    with pytest.raises(DataError, match="the sigma of the noise"):
+        Gaussian(np.array(sigma))
+
+
+def test_a_noise_of_the_wrong_length_names_the_columns():
+    with pytest.raises(DataError, match="give one for each of rx, ry, rz, x, y, z"):
+        Sensor(Pose(), Gaussian(np.ones(1)))
+    with pytest.raises(DataError, match="at least one sensor"):
+        Instrument(())
+
+
+def test_a_pose_the_controller_cannot_reach_is_named(robot):
+    far = COMMANDED.copy()
+    far[2, 0, 3] = np.nan
+    with pytest.raises(DataError, match="cannot be commanded to pose '3'"):
+        simulate(robot, far, TRACKER, seed=1)
+    labels = tuple("abcdefghijklmnopqrst"[: len(far)])
+    with pytest.raises(DataError, match="pose 'c'"):
+        readings_from_commanded(robot, far, labels)
+
+
+def test_a_machine_that_cannot_follow_is_absent_from_its_trial_only(robot):
+    values = np.stack([robot.values, robot.values])
+    values[1, robot.parameters.index("leg1.length")] += 10.0
+    trials = simulate_trials(robot, values, COMMANDED, TRACKER, seed=1)
+    assert np.isfinite(trials.measured[0][0]).all()
+    assert np.isnan(trials.measured[0][1]).all()
+    assert trials.trial(1).n_rows == 0
+    with pytest.raises(DataError, match="the true machine cannot follow the readings of pose 1"):
+        simulate(robot.with_values(values[1]), COMMANDED, TRACKER, seed=1)
+
+
+def test_readings_outside_the_stroke_are_refused_by_name_value_and_stroke(robot):
+    data = simulate(robot, COMMANDED, TRACKER, seed=1)
+    check_strokes(data, robot)
+    high = robot.actuators[1].stroke[1]
+    readings = data.readings.copy()
+    readings[3, 1] = high + 0.002
+    outside = Measurements(robot.name, readings, data.observations)
+    with pytest.raises(DataError, match=r"pose '4': .* reads .* mm, outside its stroke of .* mm; .* or use --here"):
+        check_strokes(outside, robot, override="--here")
+    check_strokes(outside, robot, allow=True)
+
+
+def test_readings_of_another_robot_are_refused_with_the_actuators(robot):
+    data = Measurements("delta", np.zeros((2, 3)), ())
+    with pytest.raises(DataError, match=f"3 columns, but '{robot.name}' has 6 actuators: {robot.actuators[0].name}"):
+        check_actuators(data, robot)
+
+
+def test_a_row_given_twice_is_refused():
+    kind = Component(("z",), T_platform_tool=np.eye(4))
+    rows = Observations.from_sigma(kind, [0, 1, 2], [[1.0], [2.0], [1.0]], 1.0)
+    once = Measurements("toy", np.array([[1.0], [1.0], [2.0]]), (rows,))
+    check_duplicates(once)
+    twice = Measurements("toy", np.ones((3, 1)), (rows,))
+    with pytest.raises(DataError, match="poses '1' and '3' have the same readings and the same component values"):
+        check_duplicates(twice)
+    check_duplicates(twice, allow=True)
