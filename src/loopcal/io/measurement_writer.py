@@ -135,10 +135,10 @@ def _settings(robot: Mechanism, sensors: Sequence[tuple[str, Kind, Mapping[str, 
     lines += [f"# format: {FORMAT}", f"# robot: {robot.name}"]
     if len(sensors) == 1:
         _, kind, noise = sensors[0]
-        return lines + [f"# {key}: {text}" for key, text in write_sensor(kind, noise).items()]
+        return lines + [f"# {key}: {text}" for key, text in write_sensor(kind, noise, robot.tool).items()]
     lines.append("# kinds:")
     for label, kind, noise in sensors:
-        settings = ", ".join(f"{key}: {text}" for key, text in write_sensor(kind, noise).items())
+        settings = ", ".join(f"{key}: {text}" for key, text in write_sensor(kind, noise, robot.tool).items())
         lines.append(f"#   '{label}': {{{settings}}}")
     return lines
 

@@ -21,4 +21,4 @@ def shortest(value: float, factor: float) -> str:
     """
     scaled = value / factor
     texts = (f"{scaled:.{digits}g}" for digits in range(12, 18))
-    return next((text for text in texts if float(text) * factor == value), repr(scaled))
+    return next((text for text in texts if float(text) * factor == value), repr(float(scaled)))

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from loopcal.measure import Kind
 
 POSE_KEYS = {**dict.fromkeys(("x", "y", "z"), Dimension.LENGTH), **dict.fromkeys(("roll", "pitch", "yaw"), Dimension.ANGLE)}
+NOISE_SYMBOLS = {Dimension.LENGTH: ("um", 1e-6), Dimension.ANGLE: ("urad", 1e-6), Dimension.RATIO: ("1", 1.0)}
 SYMBOLS = {Dimension.LENGTH: ("mm", 1e-3), Dimension.ANGLE: ("deg", math.pi / 180.0), Dimension.RATIO: ("1", 1.0)}
 
 
@@ -96,20 +97,20 @@ def read_noise(file: YamlFile, node: Mapping[str, Any], kind: Kind, location: Lo
     return noise
 
 
-def write_sensor(kind: Kind, noise: Mapping[str, float]) -> dict[str, str]:
-    """Return key -> text of a sensor's settings, only those that differ from the kind's defaults."""
+def write_sensor(kind: Kind, noise: Mapping[str, float], tool: np.ndarray) -> dict[str, str]:
+    """Return key -> text of a sensor's settings; a pose only where it differs from its default, or the robot's `tool`."""
     lines = {"kind": kind.name}
     default = type(kind)()
     for key, annotation in kind_settings(type(kind)).items():
-        value, usual = getattr(kind, key), getattr(default, key)
+        value, usual = getattr(kind, key), tool if key == "T_platform_tool" else getattr(default, key)
         if _is_pose(annotation):
-            if value is not None and (usual is None or (value != usual).any()):
+            if value is not None and (value != usual).any():
                 lines[key] = _pose_text(value)
         elif value is not None:
             lines[key] = f"[{', '.join(value)}]" if isinstance(value, tuple) else str(value)
     if noise:
         dimensions = {column.name: column.dimension for column in kind.noise_columns}
-        texts = [f"{name}: {_text(sigma, dimensions[name])}" for name, sigma in noise.items()]
+        texts = [f"{name}: {_text(sigma, NOISE_SYMBOLS[dimensions[name]])}" for name, sigma in noise.items()]
         lines["noise"] = f"{{{', '.join(texts)}}}"
     return lines
 
@@ -149,7 +150,7 @@ def _pose_text(T: np.ndarray) -> str:
     from loopcal import se3
 
     numbers = (*T[:3, 3], *se3.matrix_to_euler(T[:3, :3], "xyz"))
-    texts = [f"{key}: {_text(float(v), POSE_KEYS[key])}" for key, v in zip(POSE_KEYS, numbers, strict=True)]
+    texts = [f"{key}: {_text(float(v) + 0.0, SYMBOLS[POSE_KEYS[key]])}" for key, v in zip(POSE_KEYS, numbers, strict=True)]
     return f"{{{', '.join(texts)}}}"
 
 
@@ -161,7 +162,7 @@ def _quantity(file: YamlFile, node: Any, dimension: Dimension, location: Locatio
         raise file.error(f"{words(location)!r}: {error}", location) from None
 
 
-def _text(value: float, dimension: Dimension) -> str:
-    """Return a number with its unit."""
-    symbol, factor = SYMBOLS[dimension]
+def _text(value: float, shown: tuple[str, float]) -> str:
+    """Return a number with its unit (symbol, factor)."""
+    symbol, factor = shown
     return f"{shortest(value, factor)} {symbol}"

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal check`: read a robot file, build the robot, and show what was understood."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from loopcal.cli import show
+from loopcal.cli.options import json_option, robot_argument
+
+if TYPE_CHECKING:
+    from loopcal.mechanism import Mechanism
+
+
+@click.command(short_help="Read a robot file and show what it says.")
+@robot_argument
+@json_option
+def check(robot: str, as_json: bool) -> None:
+    """Read ROBOT, a file or the name of a shipped robot, and show what was understood.
+
+    Whatever is wrong with the file, its units, its joints or its mobility is said in one sentence with the line.
+
+    \b
+    Examples:
+      loopcal check hexapod-42
+      loopcal check my-robot.yaml --json
+    """  # noqa: D301
+    from loopcal.io import load_robot
+
+    machine = load_robot(robot)
+    if as_json:
+        show.json_document(_document(machine))
+    else:
+        _print(machine)
+
+
+def _document(robot: Mechanism) -> dict[str, Any]:
+    """Return the robot as one document, in SI."""
+    table = robot.parameters
+    return {
+        "name": robot.name,
+        "freedoms": robot.freedoms,
+        "controlled": robot.controlled,
+        "size": robot.size,
+        "home": robot.home,
+        "tool": robot.tool,
+        "actuators": [{"name": a.name, "dimension": a.dimension, "stroke": a.stroke} for a in robot.actuators],
+        "parameters": [
+            {
+                "name": p.name,
+                "dimension": p.dimension,
+                "nominal": p.nominal,
+                "value": robot.values[i],
+                "tolerance": p.tolerance,
+                "free": p.free,
+            }
+            for i, p in enumerate(table.entries)
+        ],
+        "notes": robot.notes,
+    }
+
+
+def _print(robot: Mechanism) -> None:
+    """Print the robot's tables."""
+    units, table = show.units_of(robot), robot.parameters
+    words = {"freedoms": robot.freedoms, "commanded in": robot.controlled}
+    show.say(f"{robot.name}: {len(robot.actuators)} actuators, {len(table)} parameters, {int(table.free.sum())} free")
+    for what, names in words.items():
+        show.say(f"{what}: {' '.join(names)}")
+    for note in robot.notes:
+        show.say(f"note: {note}")
+    rows = []
+    for actuator in robot.actuators:
+        unit = units[actuator.dimension]
+        low, high = actuator.stroke or (float("nan"), float("nan"))
+        rows.append((actuator.name, *(show.number(v / unit.factor_to_si) for v in (low, high)), str(unit)))
+    show.table("Actuators", ("name", "lowest", "highest", "unit"), rows)
+    rows = []
+    for parameter, value in zip(table.entries, robot.values, strict=True):
+        unit = units[parameter.dimension]
+        numbers = [parameter.nominal, value, float("nan") if parameter.tolerance is None else parameter.tolerance]
+        nominal, present, tolerance = (v / unit.factor_to_si for v in numbers)
+        cells = (show.number(nominal, digits=9), show.number(present, digits=9), show.number(tolerance, digits=3))
+        rows.append((parameter.name, *cells, str(unit), "free" if parameter.free else "fixed"))
+    show.table("Parameters", ("name", "nominal", "value", "tolerance (1 sd)", "unit", ""), rows)

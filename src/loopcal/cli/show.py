@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What commands print: tables for people, one JSON document for programs."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from loopcal.units import DISPLAY_UNITS, Dimension, Unit, unit
+
+if TYPE_CHECKING:
+    from loopcal.mechanism import Mechanism
+
+
+def say(text: str = "") -> None:
+    """Print a line of the result."""
+    click.echo(text)
+
+
+def progress(text: str) -> None:
+    """Print a line of progress, on standard error."""
+    click.echo(text, err=True)
+
+
+def json_document(document: Mapping[str, Any]) -> None:
+    """Print one JSON document; see `loopcal.io.json_text`."""
+    from loopcal.io.json_text import to_json
+
+    click.echo(to_json(document), nl=False)
+
+
+def table(title: str, headers: Sequence[str], rows: Iterable[Sequence[str]], text_columns: int = 1) -> None:
+    """Print a table; the first `text_columns` columns are left-aligned, the others right-aligned."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    for i, header in enumerate(headers):
+        shown.add_column(header, justify="left" if i < text_columns else "right", no_wrap=True)
+    for row in rows:
+        shown.add_row(*row)
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 120
+    say()
+    Console(file=sys.stdout, width=width, highlight=False, markup=False).print(shown)
+
+
+def units_of(robot: Mechanism) -> dict[Dimension, Unit]:
+    """Return the units in which a robot's numbers are shown: those of its file."""
+    return {**DISPLAY_UNITS, **{dimension: unit(symbol) for dimension, symbol in robot.units.items()}}
+
+
+def number(value: float, plus_minus: float | None = None, digits: int = 6) -> str:
+    """Return a number to the digits that its uncertainty leaves, or to `digits` significant ones.
+
+    Two digits of the uncertainty are kept; what is not finite is a dash.
+    """
+    if not math.isfinite(value):
+        return "-"
+    if plus_minus is not None and math.isfinite(plus_minus) and plus_minus > 0:
+        decimals = 1 - math.floor(math.log10(plus_minus))
+        return f"{value:.{min(max(decimals, 0), 12)}f}"
+    return f"{value:.{digits}g}"
+
+
+def uncertainty(plus_minus: float) -> str:
+    """Return an uncertainty to two digits; `unknown` where the data do not determine the value, dash where fixed."""
+    if math.isnan(plus_minus):
+        return "-"
+    return "unknown" if math.isinf(plus_minus) else number(plus_minus, plus_minus)
