@@ -14,22 +14,10 @@ from loopcal.engine.program import Array
 
 
 def triangularise(matrix: Array, columns: int) -> tuple[Array, Array]:
-    """Reduce the first `columns` columns to upper triangular form by reflections applied to all columns.
-
-    Parameters
-    ----------
-    matrix : (r, c, batch), left unchanged.
-    columns : how many leading columns to reduce.
-
-    Returns
-    -------
-    reduced : (r, c, batch) Q' matrix.
-    sign : (batch,) determinant of Q', plus or minus one.
-    """
+    """Q' matrix (r, c, batch) with its first columns upper triangular, and the determinant +-1 of Q' (batch,)."""
     m = matrix.copy()
-    r = m.shape[0]
     sign = np.ones(m.shape[2:])
-    for j in range(min(columns, r - 1)):
+    for j in range(min(columns, len(m) - 1)):
         v = m[j:, j].copy()
         norm = np.sqrt(np.add.reduce(v * v, axis=0))
         alpha = -np.copysign(norm, v[0])
@@ -48,26 +36,15 @@ def triangularise(matrix: Array, columns: int) -> tuple[Array, Array]:
 def back_substitute(upper: Array, right: Array) -> Array:
     """Solve upper x = right for (u, u, batch) and (u, c, batch); a zero pivot yields infinities or NaN."""
     x = np.empty_like(right)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        for i in range(upper.shape[0] - 1, -1, -1):
-            rest = right[i]
-            if i + 1 < upper.shape[0]:
-                rest = rest - np.add.reduce(upper[i, i + 1 :, None] * x[i + 1 :], axis=0)
-            x[i] = rest / upper[i, i]
+    for i in range(len(upper) - 1, -1, -1):
+        x[i] = (right[i] - np.add.reduce(upper[i, i + 1 :, None] * x[i + 1 :], axis=0)) / upper[i, i]
     return x
 
 
 def accumulate(factor: Array, rows: Array) -> Array:
-    """Fold rows into an upper triangular factor: R' R = factor' factor + rows' rows without forming either side.
+    """Fold whitened rows (t | 1, m, p) into upper triangular factors (t, p, p): R'R = factor'factor + rows'rows.
 
-    Parameters
-    ----------
-    factor : (t, p, p) upper triangular.
-    rows : (t, m, p) whitened rows; a row of zeros is absent.
-
-    Returns
-    -------
-    (t, p, p) upper triangular, by the QR factorisation of the stack (signs of its rows are arbitrary).
+    By QR of the stack, neither product is formed; the signs of R's rows are arbitrary and a row of zeros is absent.
     """
     stacked = np.concatenate([factor, np.broadcast_to(rows, (factor.shape[0], *rows.shape[1:]))], axis=1)
-    return np.linalg.qr(stacked, mode="r")
+    return np.asarray(np.linalg.qr(stacked, mode="r"))

@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the engine is told of a mechanism: its structure, apart from every number that is estimated.
 
-A limb is a chain from the base to a tip: link 0, joint 0, link 1, ..., link J, and then one ending that ties the tip
-to an attachment frame on the platform. Every joint moves along or about the z axis of the frame it stands in:
-`R` turns by theta and advances by pitch * theta, `P` advances by theta. Limbs of one structure form a group and are
-evaluated together. The rod of a `distance` ending counts as joint J, whose value is the rod's length.
-
-    endings      rows of closure                                  joint J
-    rigid        6: rotation (times the size), position           none
-    ball         3: position                                      none
-    distance     1: |attachment - tip| - length                   the length
+A limb is a chain from the base to a tip (link 0, joint 0, link 1, ..., link J) and one ending that ties the tip to an
+attachment frame on the platform: `rigid` (6 rows: rotation times the size, position), `ball` (3: position) or `distance`
+(1: |attachment - tip| - length). A joint moves along or about the z axis of the frame it stands in: `R` turns by theta and
+advances by pitch * theta, `P` advances by theta. Limbs of one structure form a group and are evaluated together. The rod of
+a `distance` ending counts as joint J, whose value is added to the rod's length.
 """
 
 from __future__ import annotations
@@ -21,42 +17,31 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-FREEDOMS = ("rx", "ry", "rz", "x", "y", "z")
-"""The platform's freedoms in the order of a twist: rotation about the base axes, then translation along them."""
+PITCH, LENGTH = 6, 7
+CONVERGED, STALLED, EXHAUSTED, NOT_FINITE = 0, 1, 2, 3
 
 
 @dataclass(frozen=True)
 class Slot:
-    """One displacement that a parameter can move, the same in every limb of a group.
-
-    `element` counts the links 0..J and J + 1 for the platform's attachment; `axis` is an index into (rx, ry, rz, x, y, z)
-    of that link's own frame, 6 for a pitch of joint `element`, 7 for the length of the rod.
+    """A displacement that parameters can move, in every limb of a group: `element` counts the links 0..J and J + 1 for the
+    attachment; `axis` is 0..5 for (rx, ry, rz, x, y, z) in that link's frame, PITCH of joint `element`, LENGTH of the rod.
     """
 
     element: int
     axis: int
 
 
-PITCH, LENGTH = 6, 7
-
-
 @dataclass(frozen=True)
 class Group:
     """Limbs of one structure: k of them, with J joints each.
 
-    Attributes
-    ----------
-    limbs : (k,) positions of these limbs in the mechanism.
-    joints : one letter a joint, R or P.
-    actuator : (J + 1, k) column of the joint values q that drives the joint; -1 where the joint is passive. The last
-        row belongs to the rod.
-    held : (J + 1,) joints that keep their start value: those that only spin a limb about itself.
-    ending : rigid, ball or distance.
-    rows : which of the ending's rows count: positions in a twist (rigid, ball); (0,) for distance.
+    limbs : (k,) positions of these limbs in the mechanism. joints : one letter a joint, R or P.
+    actuator : (J + 1, k) column of q that drives the joint, -1 where it is passive; the last row belongs to the rod.
+    held : (J,) joints that keep their start value: those that only spin a limb about itself.
+    ending : rigid, ball or distance. rows : which of its rows count (positions in a twist); (0,) for distance.
     links : (k, J + 2, 4, 4) nominal link transforms, the attachment last [m].
-    pitch : (k, J) nominal advance per turn angle [m/rad].
-    length : (k,) nominal length of the rod at q = 0 [m].
-    slots : displacements present, and `columns`, their place in e: limb by limb, slot by slot.
+    pitch : (k, J) nominal advance per turn angle [m/rad]. length : (k,) nominal length of the rod [m].
+    slots : displacements present; columns : their place in e, limb by limb.
     """
 
     limbs: tuple[int, ...]
@@ -71,32 +56,21 @@ class Group:
     slots: tuple[Slot, ...]
     columns: slice
 
-    @property
-    def size(self) -> int:
-        """Number of limbs k."""
-        return len(self.limbs)
-
     def unknown(self, free: bool) -> list[int]:
         """Joints that closure determines: the passive ones and, if `free`, the actuated ones too."""
-        last = 1 if self.ending == "distance" else 0
-        return [
-            j
-            for j in range(len(self.joints) + last)
-            if not self.held[j] and ((self.actuator[j, 0] < 0 and j < len(self.joints)) or (free and self.actuator[j, 0] >= 0))
-        ]
+        driven = self.actuator[:, 0] >= 0
+        passive = [j for j in range(len(self.joints)) if not driven[j] and not self.held[j]]
+        return sorted(passive + [j for j in range(len(driven)) if free and driven[j]])
 
 
 @dataclass(frozen=True)
 class Program:
     """A mechanism as the engine sees it.
 
-    Attributes
-    ----------
-    groups : the limbs, grouped by structure.
-    freedoms : positions in a twist of the platform's m freedoms.
+    groups : the limbs. freedoms : positions in a twist of the platform's m freedoms.
     size : characteristic length [m]; angles times size compare with lengths.
-    n_displacements : length of e.
-    n_joints : number of actuated joint values, the length of q.
+    n_displacements, n_joints : lengths of e and of q.
+    sigma : (n_joints,) standard deviations of q that weigh redundant actuators, None where there is no redundancy.
     """
 
     groups: tuple[Group, ...]
@@ -104,19 +78,16 @@ class Program:
     size: float
     n_displacements: int
     n_joints: int
+    sigma: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True)
 class State:
     """Where the mechanism stands, for t trials and n poses.
 
-    Attributes
-    ----------
-    T : (t, n, 4, 4) platform in base [m].
-    joints : one (t, n, k, J + 1) array a group: all joint values [m, rad].
-    status : (t, n) 0 converged, 1 stalled (no closure near here), 2 out of iterations, 3 not finite.
-    residual : (t, n) norm of the closure residual [m].
-    iterations : (t, n) Newton steps taken.
+    T : (t, n, 4, 4) platform in base [m]. joints : one (t, n, k, J + 1) array a group: all joint values [m, rad].
+    status : (t, n) CONVERGED; STALLED: no closure near here; EXHAUSTED: out of iterations; NOT_FINITE or singular.
+    residual : (t, n) norm of the closure residual [m]. iterations : (t, n) Newton steps taken.
     orientation : (t, n) sign of the determinant of the closure Jacobian; it changes only through a singularity.
     """
 
@@ -129,36 +100,23 @@ class State:
 
 
 @dataclass(frozen=True)
-class Blocks:
-    """Closure linearised at a state, passive joints eliminated: A y + sum_k (E_k de_k) + Q dq = 0.
+class Block:
+    """Linearised closure of a group in its c' rows: U dtheta + A y + E de + Q dq, shapes (t, n, k, c', columns).
 
-    Attributes
-    ----------
-    A : (t, n, c, m) columns of the platform's freedoms; rotation and translation in base axes.
-    E : one (t, n, k, r, s) array a group: the r rows of limb k against its s displacements.
-    Q : one (t, n, k, r, J + 1) array a group: the same rows against its joint values (zero columns where passive).
-    rows : one (k, r) integer array a group: the place of those rows in A.
-    passive : one `Passive` a group: what the eliminated joints do.
+    theta are the eliminated joints (U is upper triangular), y the platform's m freedoms (rotation and translation in base
+    axes), e the s displacements of a limb, q all its J + 1 joint values.
     """
 
-    A: Array
-    E: tuple[Array, ...]
-    Q: tuple[Array, ...]
-    rows: tuple[NDArray[np.int64], ...]
-    passive: tuple[Passive, ...]
-
-
-@dataclass(frozen=True)
-class Passive:
-    """The eliminated joints of a group: U dtheta + A y + E de + Q dq = 0 with U upper triangular, u x u.
-
-    Attributes
-    ----------
-    joints : the u eliminated joints. U : (t, n, k, u, u). A : (t, n, k, u, m). E : (t, n, k, u, s). Q : (t, n, k, u, J + 1).
-    """
-
-    joints: tuple[int, ...]
     U: Array
     A: Array
     E: Array
     Q: Array
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Closure linearised, by group: the rows left (U is empty), the rows that give the eliminated joints, and these joints."""
+
+    closure: tuple[Block, ...]
+    passive: tuple[Block, ...]
+    joints: tuple[tuple[int, ...], ...]

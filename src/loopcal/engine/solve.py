@@ -1,60 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """Solve closure for the platform's pose and the free joints: Newton with step control, every row on its own.
 
-A step is one Householder reduction a limb (its own joints), one for the platform, and back-substitution. A row is
-converged once a step below 1e-7 of the robot's size has been applied (so the next would be below rounding) and its
+A step is a Householder reduction of each limb (its own joints) and one of the platform. A row is converged once a step
+below 1e-7 of the robot's size has been applied (the next would be below rounding) and what can still be reduced of its
 residual is at most 1e-13 of the size; from then on it is frozen. See docs/theory/engine.md.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.engine.closure import Geometry, at_rows, closure, geometry, matmul, rotation
+from loopcal.engine.closure import Chain, Geometry, geometry, matmul, rotation
 from loopcal.engine.householder import back_substitute, triangularise
-from loopcal.engine.program import Array, Blocks, Group, Passive, Program, State
+from loopcal.engine.program import CONVERGED, EXHAUSTED, NOT_FINITE, STALLED, Array, Block, Blocks, Group, Program, State
 
-CONVERGED, STALLED, EXHAUSTED, NOT_FINITE = 0, 1, 2, 3
 ROWS = 2048
-"""Rows worked on together: small enough for the cache, large enough that Python's share is small."""
-
-RESIDUAL = 1e-13
-"""A converged row's closure residual, of the robot's size (rounding of its coordinates is about 1e-15)."""
+"""Rows worked on together: few enough for the cache, many enough that Python's share is small."""
+RESIDUAL, STEP, SINGULAR = 1e-13, 1e-7, 1e-11
+"""Of the robot's size: residual and last step of a converged row. Of its largest: the smallest pivot of a limb's joints."""
 
 Task = Callable[[Array, np.ndarray], tuple[Array, Array]]
-"""Demands on the pose: (T (N, 4, 4), rows (N,)) -> residual (N, c) [m] and its columns (N, c, 6) per twist."""
-
-
-@dataclass
-class _Point:
-    """Where some rows stand and the Newton step from there; working memory of the iteration."""
-
-    T: Array
-    theta: list[Array]
-    norm: Array
-    reducible: Array
-    twist: Array
-    turn: list[Array]
-    length: Array
-    orientation: Array
-
-    def put(self, rows: np.ndarray, other: _Point) -> None:
-        """Overwrite these rows (the batch is the last axis, or the last but one for joints)."""
-        for mine, new in zip(vars(self).values(), vars(other).values(), strict=True):
-            if isinstance(mine, list):
-                for a, b in zip(mine, new, strict=True):
-                    a[:, rows] = b
-            else:
-                mine[..., rows] = new
-
-    def take(self, rows: np.ndarray) -> _Point:
-        """These rows only."""
-        return _Point(
-            *([a[:, rows] for a in v] if isinstance(v, list) else v[..., rows] for v in vars(self).values())
-        )
+"""Demands on the pose: (T (N, 3, 4), rows (N,)) -> residual (N, c) [m] and its columns (N, c, 6) per twist."""
 
 
 def solve(
@@ -62,211 +30,184 @@ def solve(
 ) -> State:
     """Find the pose and joints that close every loop.
 
-    Parameters
-    ----------
-    program : the mechanism. e : (t | 1, n_displacements) [m, rad].
-    q : (t | 1, n, n_joints) actuated joint values [m, rad]; with `free` they are unknowns and q only a first guess.
-    start : where to begin, (t | 1, n | 1) rows.
-    task : demands on the pose, as many as freed actuators leave open.
-    most : Newton steps before a row is given up.
+    e : (t | 1, n_displacements) [m, rad]. q : (t | 1, n, n_joints) actuated joint values [m, rad]; with `free` they are
+    unknowns and q only a first guess. start : where to begin, (t | 1, n | 1) rows. task : demands on the pose, as many as
+    freed actuators leave open. most : Newton steps before a row is given up.
 
-    Returns
-    -------
-    State for (t, n); rows that fail are marked in `status`, never raised.
+    Returns a State for (t, n); rows that fail are marked in `status`, never raised.
     """
-    t = max(e.shape[0], q.shape[0], start.T.shape[0])
+    t = max(len(e), len(q), len(start.T))
     n = max(q.shape[1], start.T.shape[1])
-    geometries = [geometry(g, e) for g in program.groups]
-    T = np.broadcast_to(start.T, (t, n, 4, 4)).reshape(-1, 4, 4)
-    theta = [_merge(g, np.broadcast_to(a, (t, n, *a.shape[2:])), q) for g, a in zip(program.groups, start.joints, strict=True)]
-    flat = [a.reshape(-1, *a.shape[2:]) for a in theta]
+    places = [geometry(g, e) for g in program.groups]
+    joints = [merged(g, np.broadcast_to(a, (t, n, *a.shape[2:])), q) for g, a in zip(program.groups, start.joints, strict=True)]
+    T = np.broadcast_to(start.T, (t, n, 4, 4))[:, :, :3]
+    begin = np.concatenate([a.reshape(t * n, -1) for a in (T, *(j.swapaxes(2, 3) for j in joints))], axis=1).T
     parts = []
     for first in range(0, t * n, ROWS):
         rows = np.arange(first, min(first + ROWS, t * n))
-        begin = _Rows(program, [at_rows(g, rows // n) for g in geometries], task, free, rows)
-        parts.append(_newton(begin, T[rows, :3].transpose(1, 2, 0), [a[rows].transpose(2, 0, 1) for a in flat], most))
-    return _state(program, parts, t, n)
+        work = _Rows(program, [g.rows(rows // n) for g in places], task, free, rows)
+        parts.append(_newton(work, begin[:, rows], most))
+    points, status, steps = (np.concatenate(p, axis=-1) for p in zip(*parts, strict=True))
+    return _Rows(program, places, task, free, np.arange(t * n)).state(points, status, steps, (t, n))
 
 
 def linearise(program: Program, e: Array, q: Array, state: State, free: bool = False) -> Blocks:
-    """Closure linearised at a state, passive joints (and, if `free`, the actuated ones) eliminated.
+    """Closure linearised at a state (t, n), its passive joints (and, if `free`, the actuated ones) eliminated.
 
-    Parameters
-    ----------
-    e : (t | 1, n_displacements); q : (t | 1, n, n_joints); state : (t, n).
-
-    Returns
-    -------
-    Blocks for (t, n); see there for the meaning of A, E, Q.
+    e : (t | 1, n_displacements) [m, rad]. q : (t | 1, n, n_joints) actuated joint values [m, rad].
     """
     t, n = state.T.shape[:2]
-    T = state.T.reshape(-1, 4, 4)[:, :3].transpose(1, 2, 0)
-    trial = np.arange(t * n) // n
-    A, E, Q, places, passive, count = [], [], [], [], [], 0
-    m = len(program.freedoms)
+    T, trial = state.T.reshape(-1, 4, 4)[:, :3].transpose(1, 2, 0), np.arange(t * n) // n
+    low, top, eliminated = [], [], []
     for group, joints in zip(program.groups, state.joints, strict=True):
-        theta = (joints if free else _merge(group, joints, q)).reshape(t * n, group.size, -1).transpose(2, 0, 1)
-        unknown = group.unknown(free)
-        u, s, last = len(unknown), len(group.slots), len(group.joints) + 1
-        block = closure(group, at_rows(geometry(group, e), trial), T, theta, program.freedoms, program.size, unknown, True)
-        reduced, _ = triangularise(block.reshape(*block.shape[:2], -1), u)
-        # (r, c, N k) -> (t, n, k, r, c)
-        reduced = reduced.reshape(block.shape).transpose(2, 3, 0, 1).reshape(t, n, group.size, *block.shape[:2])
-        ends = np.cumsum([u, m, s, last])
-        top, low = reduced[..., :u, :], reduced[..., u:, :]
-        r = low.shape[-2]
-        A.append(low[..., ends[0] : ends[1]].reshape(t, n, -1, m))
-        E.append(low[..., ends[1] : ends[2]])
-        Q.append(low[..., ends[2] : ends[3]])
-        places.append(count + np.arange(group.size * r).reshape(group.size, r))
-        count += group.size * r
-        parts = (top[..., a:b] for a, b in zip((0, *ends[:3]), ends, strict=True))
-        passive.append(Passive(tuple(unknown), *parts))
-    return Blocks(np.concatenate(A, axis=2), tuple(E), tuple(Q), tuple(places), tuple(passive))
+        values = joints if free else merged(group, joints, q)
+        theta = values.reshape(t * n, len(group.limbs), -1).transpose(2, 1, 0)
+        with np.errstate(all="ignore"):
+            chain = Chain(group, geometry(group, e).rows(trial), T, theta, program.size)
+            unknown = group.unknown(free)
+            columns = [chain.joint(j) for j in unknown] + [chain.freedom(f) for f in program.freedoms]
+            columns += [chain.slot(s) for s in group.slots] + [chain.joint(j) for j in range(chain.last)]
+            block, _ = triangularise(chain.matrix(columns), len(unknown))
+        block = block.transpose(3, 2, 0, 1).reshape(t, n, len(group.limbs), *block.shape[:2])
+        u, m, s = len(unknown), len(program.freedoms), len(group.slots)
+        top.append(Block(*np.split(block[..., :u, :], [u, u + m, u + m + s], axis=-1)))
+        low.append(Block(*np.split(block[..., u:, :], [u, u + m, u + m + s], axis=-1)))
+        eliminated.append(tuple(unknown))
+    return Blocks(tuple(low), tuple(top), tuple(eliminated))
 
 
 class _Rows:
-    """The rows of one chunk: evaluates closure and the Newton step at any point."""
+    """Some rows as points: one array (fields, N) of coordinates (pose, joint values), Newton step and its measures."""
 
-    def __init__(self, program: Program, geometries: list[Geometry], task: Task | None, free: bool, rows: np.ndarray) -> None:
-        self.program, self.geometries, self.task, self.free, self.rows = program, geometries, task, free, rows
+    def __init__(self, program: Program, places: list[Geometry], task: Task | None, free: bool, rows: np.ndarray) -> None:
+        self.program, self.places, self.task, self.free, self.rows = program, places, task, free, rows
         self.unknown = [g.unknown(free) for g in program.groups]
+        self.shapes = [(len(g.joints) + 1, len(g.limbs)) for g in program.groups]
+        self.ends = np.cumsum([12, *(a * k for a, k in self.shapes)])
 
-    def take(self, keep: np.ndarray) -> _Rows:
-        """These rows only."""
-        return _Rows(self.program, [at_rows(g, keep) for g in self.geometries], self.task, self.free, self.rows[keep])
+    def only(self, keep: np.ndarray) -> _Rows:
+        """These rows."""
+        return _Rows(self.program, [g.rows(keep) for g in self.places], self.task, self.free, self.rows[keep])
 
-    def at(self, T: Array, theta: list[Array]) -> _Point:
-        """Residual and Newton step at T (3, 4, N), theta (J + 1, N, k) a group."""
-        p, m, N = self.program, len(self.program.freedoms), T.shape[2]
-        tops, lows, sign = [], [], np.ones(N)
-        for group, g, joints, unknown in zip(p.groups, self.geometries, theta, self.unknown, strict=True):
-            block = closure(group, g, T, joints, p.freedoms, p.size, unknown, False)
-            u = len(unknown)
+    def joints(self, point: Array) -> list[Array]:
+        """Joint values (J + 1, k, N) a group, views into a point."""
+        return [
+            point[a:b].reshape(*s, point.shape[1]) for a, b, s in zip(self.ends[:-1], self.ends[1:], self.shapes, strict=True)
+        ]
+
+    def at(self, coordinates: Array) -> Array:
+        """The point at these coordinates: followed by step, norm, reducible norm, step length, orientation, pivot."""
+        p, m, N = self.program, len(self.program.freedoms), coordinates.shape[1]
+        redundant = p.sigma is not None and not self.free
+        T, sign, pivot, tops, lows = coordinates[:12].reshape(3, 4, N), np.ones(N), np.ones(N), [], []
+        for group, g, theta, unknown in zip(p.groups, self.places, self.joints(coordinates), self.unknown, strict=True):
+            chain, u = Chain(group, g, T, theta, p.size), len(unknown)
+            columns = [chain.joint(j) for j in unknown] + [chain.freedom(f) for f in p.freedoms]
+            if redundant:
+                j = int(np.flatnonzero(group.actuator[:, 0] >= 0)[0])
+                columns.append(chain.joint(j) * np.array(p.sigma)[group.actuator[j], None])
+            block, turn = triangularise(chain.matrix([*columns, chain.residual()]), u)
             if u:
-                block, turn = triangularise(block, u)
-                sign = sign * np.prod(turn * np.prod(np.sign(np.diagonal(block[:u, :u])), axis=-1), axis=-1)
+                diagonal = np.diagonal(block[:u, :u])
+                sign = sign * np.prod(turn * np.prod(np.sign(diagonal), axis=-1), axis=0)
+                large = np.maximum(np.abs(diagonal).max(axis=-1), 1e-300)
+                pivot = np.minimum(pivot, (np.abs(diagonal).min(axis=-1) / large).min(axis=0))
             tops.append(block[:u])
-            lows.append(block[u:].transpose(0, 3, 1, 2).reshape(-1, m + 1, N))
-        low = np.concatenate(lows)
+            low = block[u:, u:].transpose(2, 0, 1, 3).reshape(-1, block.shape[1] - u, N)
+            # redundant actuators: each row in the standard deviations of what drives it
+            lows.append(np.delete(low / np.abs(low[:, m, None]), m, axis=1) if redundant else low)
         if self.task is not None:
-            low = np.concatenate([low, self._demands(T, m)])
-        norm = np.sqrt(sum((np.add.reduce(top[:, -1] ** 2, axis=(0, 2)) for top in tops), np.add.reduce(low[:, -1] ** 2, axis=0)))
-        y = np.zeros((m, N))
-        inner = [np.add.reduce(top[:, -1] ** 2, axis=(0, 2)) for top in tops]
-        if low.shape[0]:
+            residual, columns = self.task(T.transpose(2, 0, 1), self.rows)
+            lows.append(np.concatenate([columns[..., list(p.freedoms)], residual[..., None]], axis=2).transpose(1, 2, 0))
+        low = np.concatenate(lows)
+        inner = sum((np.add.reduce(top[:, -1] ** 2, axis=(0, 1)) for top in tops), start=np.zeros(N))
+        norm, y = np.sqrt(inner + np.add.reduce(low[:, m] ** 2, axis=0)), np.zeros((m, N))
+        if len(low):
             low, turn = triangularise(low, m)
             sign = sign * turn * np.prod(np.sign(np.diagonal(low[:m, :m])), axis=-1)
             y = back_substitute(low[:m, :m], -low[:m, m:])[:, 0]
-            inner.append(np.add.reduce(low[:m, m] ** 2, axis=0))
-        turns = [self._joints(top, y) for top in tops]
-        return self._point(T, theta, norm, np.sqrt(sum(inner)), y, turns, sign)
-
-    def _demands(self, T: Array, m: int) -> Array:
-        """Rows of the task in the platform's freedoms, (c, m + 1, N)."""
-        assert self.task is not None
-        full = np.zeros((T.shape[2], 4, 4))
-        full[:, :3], full[:, 3, 3] = T.transpose(2, 0, 1), 1.0
-        residual, columns = self.task(full, self.rows)
-        return np.concatenate([columns[..., list(self.program.freedoms)], residual[..., None]], axis=2).transpose(1, 2, 0)
-
-    def _joints(self, top: Array, y: Array) -> Array:
-        """Steps of a group's own unknown joints, (u, N, k)."""
-        u = top.shape[0]
-        if not u:
-            return np.empty((0, *top.shape[2:]))
-        right = -(top[:, -1] + np.add.reduce(top[:, u:-1] * y[None, :, :, None], axis=1))
-        return back_substitute(top[:, :u], right[:, None])[:, 0]
-
-    def _point(self, T: Array, theta: list[Array], norm: Array, reducible: Array, y: Array, turns: list[Array], sign: Array) -> _Point:
-        """Put the step in one place and measure it, with a joint's turn as long as the robot's size."""
-        p, size = self.program, self.program.size
-        twist = np.zeros((6, T.shape[2]))
+            inner = inner + np.add.reduce(low[:m, m] ** 2, axis=0)
+        twist = np.zeros((6, N))
         twist[list(p.freedoms)] = y
+        rest = [top[:, -1] + np.add.reduce(top[:, len(top) : len(top) + m] * y[:, None], axis=1) for top in tops]
+        turns = [back_substitute(top[:, : len(top)], -r[:, None])[:, 0] for top, r in zip(tops, rest, strict=True)]
+        measures = [norm, np.sqrt(inner), self._length(twist, turns), sign, pivot]
+        return np.concatenate([coordinates, twist, *(turn.reshape(-1, N) for turn in turns), measures])
+
+    def _length(self, twist: Array, turns: list[Array]) -> Array:
+        """Length of a step [m], a turn counted with the robot's size."""
+        size = self.program.size
         length = np.maximum(np.abs(twist[:3]).max(axis=0) * size, np.abs(twist[3:]).max(axis=0))
-        for group, unknown, turn in zip(p.groups, self.unknown, turns, strict=True):
+        for group, unknown, turn in zip(self.program.groups, self.unknown, turns, strict=True):
             for j, step in zip(unknown, turn, strict=True):
-                arm = size if j < len(group.joints) and group.joints[j] == "R" else 1.0
-                length = np.maximum(length, arm * np.abs(step).max(axis=-1))
-        return _Point(T, theta, norm, reducible, twist, turns, length, sign)
+                length = np.maximum(length, np.abs(step).max(axis=0) * (size if group.joints[j : j + 1] == "R" else 1.0))
+        return length
 
-    def move(self, point: _Point, fraction: Array) -> tuple[Array, list[Array]]:
-        """The point a fraction (N,) of its step further."""
-        T = np.empty_like(point.T)
-        T[:, :3] = matmul(rotation(point.twist[:3] * fraction), point.T[:, :3])
-        T[:, 3] = point.T[:, 3] + fraction * point.twist[3:]
-        theta = []
-        for old, unknown, turn in zip(point.theta, self.unknown, point.turn, strict=True):
-            new = old.copy()
-            new[unknown] += fraction[:, None] * turn
-            theta.append(new)
-        return T, theta
+    def moved(self, point: Array, fraction: Array) -> Array:
+        """Coordinates a fraction (N,) of its step beyond a point."""
+        first, N = self.ends[-1], point.shape[1]
+        out, T, twist = point[:first].copy(), point[:12].reshape(3, 4, N), fraction * point[first : first + 6]
+        new = out[:12].reshape(3, 4, N)
+        new[:, :3] = matmul(rotation(twist[:3]), T[:, :3])
+        new[:, 3] += twist[3:]
+        first += 6
+        for theta, unknown in zip(self.joints(out), self.unknown, strict=True):
+            last = first + len(unknown) * theta.shape[1]
+            theta[unknown] += fraction * point[first:last].reshape(len(unknown), theta.shape[1], N)
+            first = last
+        return out
+
+    def state(self, points: Array, status: np.ndarray, steps: np.ndarray, shape: tuple[int, int]) -> State:
+        """Points of all rows with the axes (t, n) restored."""
+        T = np.zeros((points.shape[1], 4, 4))
+        T[:, :3], T[:, 3, 3] = points[:12].T.reshape(-1, 3, 4), 1.0
+        joints = tuple(
+            j.transpose(2, 1, 0).reshape(*shape, *s[::-1]) for j, s in zip(self.joints(points), self.shapes, strict=True)
+        )
+        norm, _, _, sign, _ = points[-5:].reshape(5, *shape)
+        sign = np.sign(np.nan_to_num(sign)).astype(np.int8)
+        return State(T.reshape(*shape, 4, 4), joints, status.reshape(shape), norm, steps.reshape(shape), sign)
 
 
-def _newton(work: _Rows, T: Array, theta: list[Array], most: int) -> tuple[_Point, np.ndarray, np.ndarray]:
+def _newton(work: _Rows, coordinates: Array, most: int) -> tuple[Array, np.ndarray, np.ndarray]:
     """Iterate one chunk; returns its points, status and iteration counts."""
-    size, count = work.program.size, T.shape[2]
+    size, N = work.program.size, coordinates.shape[1]
+    status, steps, alive = np.full(N, EXHAUSTED, np.int8), np.zeros(N, np.int64), np.arange(N)
+    shrink, applied, calm = np.ones(N), np.full(N, np.inf), np.zeros(N)
     with np.errstate(all="ignore"):
-        point = work.at(T.copy(), [a.copy() for a in theta])
-        done, status, steps = point, np.full(count, EXHAUSTED, np.int8), np.zeros(count, np.int64)
-        alive, shrink, applied, calm = np.arange(count), np.ones(count), np.full(count, np.inf), np.zeros(count, int)
-        done = point.take(alive)
+        point = work.at(coordinates)
+        done = point.copy()
         for _ in range(most):
-            settled = (point.reducible <= RESIDUAL * size) & ((applied <= 1e-7 * size) | (calm > 2))
-            broken = ~np.isfinite(point.norm + point.length)
-            stuck = shrink < 1e-5
-            end = settled | broken | stuck
+            reducible, length, pivot = point[-4], point[-3], point[-1]
+            settled = (reducible <= RESIDUAL * size) & ((applied <= STEP * size) | (calm > 2))
+            broken = ~(np.isfinite(reducible) & np.isfinite(length) & (pivot > SINGULAR))
+            end = settled | broken | (shrink < 1e-5)
             if end.any():
-                which = alive[end]
-                status[which] = np.where(settled, CONVERGED, np.where(broken, NOT_FINITE, STALLED))[end]
-                done.put(which, point.take(end))
+                status[alive[end]] = np.where(broken, NOT_FINITE, np.where(settled, CONVERGED, STALLED))[end]
+                done[:, alive[end]] = point[:, end]
                 keep = ~end
-                if not keep.any():
-                    break
-                work, point, alive = work.take(keep), point.take(keep), alive[keep]
+                work, point, alive = work.only(keep), point[:, keep], alive[keep]
                 shrink, applied, calm = shrink[keep], applied[keep], calm[keep]
-            fraction = shrink * np.minimum(1.0, 0.5 * size / np.maximum(point.length, 1e-300))
-            trial = work.at(*work.move(point, fraction))
-            low = trial.reducible <= RESIDUAL * size
-            better = (trial.norm <= (1 - 1e-4 * fraction) * point.norm) | (trial.reducible <= 0.5 * point.reducible) | low
-            applied = np.where(better, fraction * point.length, applied)
+                if not len(alive):
+                    break
+            fraction = shrink * np.minimum(1.0, 0.5 * size / np.maximum(point[-3], 1e-300))
+            trial = work.at(work.moved(point, fraction))
+            low = trial[-4] <= RESIDUAL * size
+            better = low | (trial[-5] <= (1 - 1e-4 * fraction) * point[-5]) | (trial[-4] <= 0.5 * point[-4])
+            applied = np.where(better, fraction * point[-3], applied)
             calm = np.where(better & low, calm + 1, 0)
             shrink = np.where(better, np.minimum(1.0, 4 * shrink), 0.25 * shrink)
             steps[alive] += 1
-            if better.all():
-                point = trial
-            elif better.any():
-                point.put(better, trial.take(better))
-        else:
-            done.put(alive, point)
+            point = trial if better.all() else np.where(better, trial, point)
+        done[:, alive] = point
     return done, status, steps
 
 
-def _merge(group: Group, joints: Array, q: Array) -> Array:
-    """Joint values of a group with the actuated ones set to q, (t, n, k, J + 1)."""
-    out = np.array(np.broadcast_to(joints, (max(joints.shape[0], q.shape[0]), max(joints.shape[1], q.shape[1]), *joints.shape[2:])))
+def merged(group: Group, joints: Array, q: Array) -> Array:
+    """Joint values (t, n, k, J + 1) of a group with the actuated ones set to q."""
+    shape = (max(len(joints), len(q)), max(joints.shape[1], q.shape[1]), *joints.shape[2:])
+    out = np.array(np.broadcast_to(joints, shape))
     for j, columns in enumerate(group.actuator):
         if columns[0] >= 0:
             out[..., j] = q[:, :, columns]
     return out
-
-
-def _state(program: Program, parts: list, t: int, n: int) -> State:
-    """Join the chunks and restore the (t, n) axes."""
-    points, status, steps = zip(*parts, strict=True)
-    T = np.zeros((t * n, 4, 4))
-    T[:, 3, 3] = 1.0
-    T[:, :3] = np.concatenate([p.T for p in points], axis=2).transpose(2, 0, 1)
-    joints = tuple(
-        np.concatenate([p.theta[g] for p in points], axis=1).transpose(1, 2, 0).reshape(t, n, group.size, -1)
-        for g, group in enumerate(program.groups)
-    )
-    scalars = [np.concatenate([getattr(p, name) for p in points]).reshape(t, n) for name in ("norm", "orientation")]
-    return State(
-        T.reshape(t, n, 4, 4),
-        joints,
-        np.concatenate(status).reshape(t, n),
-        scalars[0],
-        np.concatenate(steps).reshape(t, n),
-        np.sign(np.nan_to_num(scalars[1])).astype(np.int8),
-    )

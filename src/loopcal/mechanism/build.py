@@ -4,17 +4,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from loopcal import engine
-from loopcal.engine import Array, Group, Program, Slot, State
+from loopcal.engine import Group, Program, Slot, State
 from loopcal.errors import MechanismError
-from loopcal.mechanism import coordinates, mobility
-from loopcal.mechanism.assembly import AXES, Actuator, Address, Assembly, Joint, Limb
+from loopcal.mechanism import coordinates, mobility, states
+from loopcal.mechanism.assembly import AXES, Address, Assembly, Limb
 from loopcal.mechanism.model import Mechanism, SlotMap
-from loopcal.mechanism.transmission import TERMS, frequency, joint_values, nominal_terms
+from loopcal.mechanism.transmission import TERMS, frequency, nominal_terms
 from loopcal.mechanism.trials import inverse_trials
 from loopcal.parameters import ParameterTable
 from loopcal.units import Dimension
@@ -49,13 +50,14 @@ def build(assembly: Assembly, units: Mapping[Dimension, str] | None = None, reco
     groups, places, count = _groups(assembly, wanted)
     freedoms = tuple(AXES.index(f) for f in AXES if f in assembly.freedoms)
     size = characteristic_length(assembly)
-    program = Program(groups, freedoms, size, count, len(assembly.actuators))
+    program = Program(groups, freedoms, size, count, len(assembly.actuators), _weights(assembly, groups, freedoms))
+    guess = _guess(assembly, groups)
+    program, held = mobility.hold_spinning(program, guess)
+    notes = tuple(_spin_note(assembly, limb, joint) for limb, joint in held)
     slots = _slot_map(assembly, table, places, count)
     units = {**DEFAULT_UNITS, **(units or {})}
-    robot = Mechanism(assembly, table, table.nominal, program, slots, size, _guess(assembly, groups), units, record=record)
-    home = _home(robot)
-    robot = Mechanism(assembly, table, table.nominal, program, slots, size, home, units, record=record)
-    return mobility.checked(robot)
+    robot = Mechanism(assembly, table, table.nominal, program, slots, size, guess, units, notes, record)
+    return mobility.checked(replace(robot, home_state=_home(robot)))
 
 
 def characteristic_length(assembly: Assembly) -> float:
@@ -135,13 +137,16 @@ def _groups(assembly: Assembly, wanted: set[Address]) -> tuple[tuple[Group, ...]
         for found in own:
             places |= {a: count + slots.index(s) for a, s in found.items() if s}
             count += len(slots)
-        drives = [[*(column[j.actuator] if j.actuator else -1 for j in limb.joints), column.get(limb.actuator or "", -1)] for limb in limbs]
+        drives = [
+            [*(column[j.actuator] if j.actuator else -1 for j in limb.joints), column.get(limb.actuator or "", -1)]
+            for limb in limbs
+        ]
         groups.append(
             Group(
                 tuple(members),
                 "".join(kinds),
                 np.array(drives, dtype=np.int64).T.reshape(len(kinds) + 1, len(limbs)),
-                mobility.held_joints(assembly, limbs[0]),
+                (False,) * len(kinds),
                 ending,
                 _rows(ending, assembly.freedoms),
                 np.array([[link.transform for link in (*limb.links, limb.attachment)] for limb in limbs]),
@@ -160,6 +165,36 @@ def _rows(ending: str, freedoms: tuple[str, ...]) -> tuple[int, ...]:
         return (0,)
     axes = AXES if ending == "rigid" else AXES[3:]
     return tuple(i for i, axis in enumerate(axes) if axis in freedoms)
+
+
+def _weights(assembly: Assembly, groups: tuple[Group, ...], freedoms: tuple[int, ...]) -> tuple[float, ...] | None:
+    """Relative standard deviations of redundant actuators, the largest one 1; None where no actuator is redundant."""
+    if len(assembly.actuators) <= len(freedoms):
+        return None
+    for group in groups:
+        rows = len(group.rows) - len(group.unknown(False))
+        driven = int((group.actuator[:, 0] >= 0).sum())
+        if rows != driven or driven != 1:
+            limb = assembly.limbs[group.limbs[0]].name
+            raise MechanismError(
+                f"{assembly.name} has {len(assembly.actuators)} actuators for {len(freedoms)} freedoms, and limb {limb!r} has "
+                f"{driven} of them and {rows} closure equations; redundant actuation needs limbs with one of each"
+            )
+    sigma = [a.sigma if a.sigma is not None else 1.0 for a in assembly.actuators]
+    if len({a.sigma is None for a in assembly.actuators}) > 1 or min(sigma) <= 0:
+        raise MechanismError(
+            f"{assembly.name} has more actuators than freedoms; state a positive sigma for each of them, or for none"
+        )
+    return tuple(s / max(sigma) for s in sigma)
+
+
+def _spin_note(assembly: Assembly, limb: int, joint: int) -> str:
+    """What is said of a joint that only spins its limb."""
+    owner = assembly.limbs[limb]
+    return (
+        f"limb {owner.name} can spin about itself without moving the platform; "
+        f"its joint {owner.joints[joint].name} is held at {owner.joints[joint].start:g} rad, which changes no pose"
+    )
 
 
 def _slot_map(assembly: Assembly, table: ParameterTable, places: dict[Address, int], count: int) -> SlotMap:
@@ -188,7 +223,9 @@ def _guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
         limbs = [assembly.limbs[i] for i in group.limbs]
         joints.append(np.array([[*(j.start for j in limb.joints), 0.0] for limb in limbs])[None, None])
     zero = np.zeros((1, 1))
-    return State(assembly.home[None, None], tuple(joints), zero.astype(np.int8), zero, zero.astype(np.int64), zero.astype(np.int8))
+    return State(
+        assembly.home[None, None], tuple(joints), zero.astype(np.int8), zero, zero.astype(np.int64), zero.astype(np.int8)
+    )
 
 
 def _home(robot: Mechanism) -> State:
@@ -201,16 +238,5 @@ def _home(robot: Mechanism) -> State:
             f"{robot.name} cannot close at its home pose: the loops stay {state.residual[0, 0] * 1e3:.3g} mm open; "
             "check the joint centres, lengths and home"
         )
-    e, tau = robot.slots(values)
-    q = trial_readings(robot, state)
-    return engine.solve(robot.program, e, joint_values(q, tau, robot.slots.frequency), state)
-
-
-def trial_readings(robot: Mechanism, state: State) -> Array:
-    """Readings (t, n, a) of a state at the present values."""
-    from loopcal.mechanism.trials import readings_at
-
-    return readings_at(robot, robot.values[None], state)
-
-
-__all__ = ["Actuator", "Joint", "build", "characteristic_length"]
+    e, _ = robot.slots(values)
+    return engine.solve(robot.program, e, states.actuated(robot.program, state), state)

@@ -8,10 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopcal import se3
 from loopcal.engine import Array, State
 from loopcal.errors import DataError
-from loopcal.mechanism import coordinates
 from loopcal.mechanism.model import Mechanism, Status
 from loopcal.mechanism.projection import nearest_reachable
 from loopcal.mechanism.trials import forward_trials, inverse_trials, readings_at
@@ -129,6 +127,3 @@ def _solution(robot: Mechanism, state: State, q: Array) -> Solution:
         state.iterations[0],
         state,
     )
-
-
-__all__ = ["Solution", "coordinates", "forward", "inverse", "se3"]

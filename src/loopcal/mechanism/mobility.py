@@ -10,9 +10,10 @@ import numpy as np
 from loopcal import engine
 from loopcal.engine import Array
 from loopcal.errors import MechanismError
-from loopcal.mechanism import coordinates
-from loopcal.mechanism.assembly import AXES, Assembly, Limb
+from loopcal.mechanism import coordinates, states
+from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.trials import platform_rows, readings_at, sensitivity
 
 RANK = 1e-9
 """Relative size below which a singular value at home counts as zero; real margins are above 1e-4, rounding below 1e-13."""
@@ -31,19 +32,19 @@ def checked(robot: Mechanism) -> Mechanism:
     """The robot, or MechanismError naming the freedoms that are too many or too few at home."""
     program, home = robot.program, robot.home_state
     e = robot.slots(robot.values[None])[0]
-    q = _joint_values(robot)
+    q = states.actuated(program, home)
     blocks = engine.linearise(program, e, q, home)
     scale = np.array([1 / robot.size if f < 3 else 1.0 for f in program.freedoms])
-    A = blocks.A[0, 0] * scale
+    A = platform_rows(blocks)[0, 0] * scale
     _, s, V = np.linalg.svd(A, full_matrices=True)
     m = len(program.freedoms)
     rank = int((s > RANK * max(s[0], 1e-300)).sum()) if len(s) else 0
     if rank < m:
         raise MechanismError(
-            f"{robot.name}: with every actuator held the platform can still move at home ({_motion(program.freedoms, V[rank])}); "
+            f"{robot.name}: with every actuator held the platform can still move at home: {_motion(program.freedoms, V[rank])}; "
             f"its {len(A)} closure equations hold {rank} of {m} freedoms; add a limb or actuator, or state fewer freedoms"
         )
-    movable = _mobility(robot, blocks, scale)
+    movable = _mobility(robot, blocks, A)
     a = program.n_joints
     if movable < min(a, m):
         raise MechanismError(
@@ -58,24 +59,23 @@ def checked(robot: Mechanism) -> Mechanism:
     return _commandable(robot, movable)
 
 
-def _mobility(robot: Mechanism, blocks: engine.Blocks, scale: Array) -> int:
+def _mobility(robot: Mechanism, blocks: engine.Blocks, A: Array) -> int:
     """Freedoms of the platform that the actuators reach: rank of d pose / d joint values."""
-    m, a = len(robot.program.freedoms), robot.program.n_joints
-    Q = np.zeros((blocks.A.shape[2], a))
-    for group, part, rows in zip(robot.program.groups, blocks.Q, blocks.rows, strict=True):
-        for j, columns in enumerate(group.actuator):
-            if columns[0] >= 0:
-                for k, column in enumerate(columns):
-                    Q[rows[k], column] = part[0, 0, k, :, j]
-    D = np.linalg.lstsq(blocks.A[0, 0] * scale, Q, rcond=None)[0]
+    Q, first = np.zeros((len(A), robot.program.n_joints)), 0
+    for group, block in zip(robot.program.groups, blocks.closure, strict=True):
+        for k in range(len(group.limbs)):
+            rows = slice(first, first + block.Q.shape[3])
+            first = rows.stop
+            for j, columns in enumerate(group.actuator):
+                if columns[0] >= 0:
+                    Q[rows, columns[k]] = block.Q[0, 0, k, :, j]
+    D = np.linalg.lstsq(A, Q, rcond=None)[0]
     s = np.linalg.svd(D, compute_uv=False)
-    return int((s > RANK * max(s.max(initial=0.0), 1e-300)).sum()) if m else 0
+    return int((s > RANK * max(s.max(initial=0.0), 1e-300)).sum())
 
 
 def _commandable(robot: Mechanism, movable: int) -> Mechanism:
     """Refuse controlled coordinates that the machine has no way of choosing."""
-    from loopcal.mechanism.trials import readings_at, sensitivity
-
     values = robot.values[None]
     D = sensitivity(robot, values, readings_at(robot, values, robot.home_state), robot.home_state).readings[0, 0]
     target = coordinates.read(robot.home[None], robot.controlled)
@@ -89,24 +89,43 @@ def _commandable(robot: Mechanism, movable: int) -> Mechanism:
     return robot
 
 
-def held_joints(assembly: Assembly, limb: Limb) -> tuple[bool, ...]:
-    """Joints that only spin a limb about itself and keep their start value, (J + 1,): none where passive rank is full."""
-    return (False,) * (len(limb.joints) + 1)
+def hold_spinning(program: engine.Program, guess: engine.State) -> tuple[engine.Program, tuple[tuple[int, int], ...]]:
+    """Hold one joint for each way a limb can move while tip and platform stand still (the spin of an S-P-S leg).
+
+    The passive twists of a limb are ranked by the singular values of their triangular factor at joint values off any
+    special position; of the joints in a null combination the one that takes the largest part is held.
+
+    Returns
+    -------
+    The program, and the (limb, joint) pairs held.
+    """
+    rng = np.random.default_rng(0)
+    e, q = np.zeros((1, program.n_displacements)), np.zeros((1, 1, program.n_joints))
+    shaken = replace(guess, joints=tuple(j + rng.uniform(-0.3, 0.3, j.shape) for j in guess.joints))
+    blocks = engine.linearise(program, e, q, shaken)
+    groups, held = [], []
+    for group, block, joints in zip(program.groups, blocks.passive, blocks.joints, strict=True):
+        hold = list(group.held)
+        for chosen in _dependent(block.U[0, 0, 0]) if joints else ():
+            hold[joints[chosen]] = True
+            held += [(limb, joints[chosen]) for limb in group.limbs]
+        groups.append(replace(group, held=tuple(hold)))
+    return replace(program, groups=tuple(groups)), tuple(held)
+
+
+def _dependent(U: Array) -> list[int]:
+    """Columns to leave out so that the others are independent, one for each null direction."""
+    chosen: list[int] = []
+    while True:
+        rest = [c for c in range(U.shape[1]) if c not in chosen]
+        _, s, V = np.linalg.svd(U[:, rest])
+        rank = int((s > RANK * s.max(initial=1e-300)).sum())
+        if rank == len(rest):
+            return chosen
+        chosen.append(rest[int(np.argmax(np.abs(V[-1])))])
 
 
 def _motion(freedoms: tuple[int, ...], direction: Array) -> str:
     """A twist in words: its largest components first."""
     order = [i for i in np.argsort(-np.abs(direction)) if abs(direction[i]) > 0.3 * np.abs(direction).max()]
     return " with ".join(WORDS[AXES[freedoms[i]]] for i in order)
-
-
-def _joint_values(robot: Mechanism) -> Array:
-    out = np.zeros((1, 1, robot.program.n_joints))
-    for group, joints in zip(robot.program.groups, robot.home_state.joints, strict=True):
-        for j, columns in enumerate(group.actuator):
-            if columns[0] >= 0:
-                out[..., columns] = joints[..., j]
-    return out
-
-
-__all__ = ["checked", "held_joints", "replace"]

@@ -13,7 +13,7 @@ from loopcal import engine, se3
 from loopcal.engine import Array, State
 from loopcal.mechanism import coordinates
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.trials import inverse_trials
+from loopcal.mechanism.trials import inverse_trials, platform_rows
 
 STEPS = 12
 
@@ -42,7 +42,7 @@ def _pose_slopes(robot: Mechanism, values: Array, state: State) -> Array:
     e, _ = robot.slots(values)
     names, freedoms = robot.controlled, list(robot.program.freedoms)
     t, n = state.T.shape[:2]
-    rows = engine.linearise(robot.program, e, np.zeros((1, n, robot.program.n_joints)), state, free=True).A
+    rows = platform_rows(engine.linearise(robot.program, e, np.zeros((1, n, robot.program.n_joints)), state, free=True))
     flat = state.T.reshape(-1, 4, 4)
     _, columns = coordinates.demands(flat, coordinates.read(flat, names), names, robot.size)
     columns = columns.reshape(t, n, len(names), 6)[..., freedoms]
@@ -50,8 +50,10 @@ def _pose_slopes(robot: Mechanism, values: Array, state: State) -> Array:
     right = np.zeros((*both.shape[:3], len(names)))
     right[:, :, rows.shape[2] :] = np.eye(len(names))
     out = np.zeros((t, n, 6, len(names)))
-    good = np.isfinite(both).all(axis=(-1, -2))
-    out[good[..., None] & np.isin(np.arange(6), freedoms)] = np.matmul(np.linalg.pinv(both[good]), right[good]).reshape(-1, len(names))
+    good = np.asarray(np.isfinite(both).all(axis=(-1, -2)))
+    out[good[..., None] & np.isin(np.arange(6), freedoms)] = np.matmul(np.linalg.pinv(both[good]), right[good]).reshape(
+        -1, len(names)
+    )
     return out
 
 

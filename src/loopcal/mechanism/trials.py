@@ -9,7 +9,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.engine import Array, State
-from loopcal.mechanism import coordinates
+from loopcal.mechanism import coordinates, states
 from loopcal.mechanism.model import Mechanism, Status
 from loopcal.mechanism.transmission import joint_values, readings_of, slope, term_columns
 
@@ -49,7 +49,7 @@ def forward_trials(robot: Mechanism, values: Array, q: Array, start: State | Non
 
 def inverse_trials(robot: Mechanism, values: Array, target: Array, start: State | None = None) -> State:
     """States at controlled coordinates (t | 1, n, c), every actuator free; `readings_at` gives their readings."""
-    e, tau = robot.slots(values)
+    e, _ = robot.slots(values)
     names, size = robot.controlled, robot.size
     t, n = max(len(values), len(target)), target.shape[1]
     asked = np.broadcast_to(target, (t, n, target.shape[2])).reshape(t * n, -1)
@@ -58,7 +58,7 @@ def inverse_trials(robot: Mechanism, values: Array, target: Array, start: State 
         return coordinates.demands(T, asked[rows], names, size)
 
     begin = robot.home_state if start is None else start
-    guess = np.broadcast_to(_actuated(robot, begin), (t, n, len(robot.actuators)))
+    guess = np.broadcast_to(states.actuated(robot.program, begin), (t, n, len(robot.actuators)))
     T = coordinates.pose(np.broadcast_to(target, (t, n, target.shape[2])), names, robot.home)
     if start is not None:
         T = np.broadcast_to(start.T, T.shape)
@@ -68,7 +68,7 @@ def inverse_trials(robot: Mechanism, values: Array, target: Array, start: State 
 def readings_at(robot: Mechanism, values: Array, state: State) -> Array:
     """Readings (t, n, a) of a state."""
     _, tau = robot.slots(values)
-    return readings_of(_actuated(robot, state), tau, robot.slots.frequency)
+    return readings_of(states.actuated(robot.program, state), tau, robot.slots.frequency)
 
 
 def sensitivity(robot: Mechanism, values: Array, q: Array, state: State) -> Sensitivity:
@@ -99,22 +99,42 @@ def sensitivity(robot: Mechanism, values: Array, q: Array, state: State) -> Sens
 def _solved(robot: Mechanism, blocks: engine.Blocks) -> tuple[Array, Array]:
     """Twist per displacement (t, n, 6, s) and per joint value (t, n, 6, a)."""
     program = robot.program
-    t, n, c, m = blocks.A.shape
-    inverse = _pseudo_inverse(blocks.A)
+    t, n = blocks.closure[0].A.shape[:2]
+    m = len(program.freedoms)
+    inverse = _pseudo_inverse(platform_rows(blocks), _row_weights(program, blocks))
     by_slot = np.zeros((t, n, m, program.n_displacements))
     by_joint = np.zeros((t, n, m, program.n_joints))
-    for group, E, Q, rows in zip(program.groups, blocks.E, blocks.Q, blocks.rows, strict=True):
-        k, r = rows.shape
-        if not r:
-            continue
-        part = inverse[:, :, :, rows]
+    first = 0
+    for group, block in zip(program.groups, blocks.closure, strict=True):
+        k, r = block.A.shape[2:4]
+        part = inverse[..., first : first + k * r].reshape(t, n, m, k, r)
+        first += k * r
         # sum over the few rows of a limb, element by element
-        slots = -sum(part[..., i, None] * E[:, :, None, :, i] for i in range(r))
-        by_slot[..., group.columns] = slots.reshape(t, n, m, -1)
+        slots = (part[..., i, None] * block.E[:, :, None, :, i] for i in range(r))
+        by_slot[..., group.columns] = -sum(slots, start=np.zeros(1)).reshape(t, n, m, -1) if r else 0.0
         for j, columns in enumerate(group.actuator):
             if columns[0] >= 0:
-                by_joint[..., columns] = -sum(part[..., i] * Q[:, :, None, :, i, j] for i in range(r))
+                by_joint[..., columns] = -sum(
+                    (part[..., i] * block.Q[:, :, None, :, i, j] for i in range(r)), start=np.zeros(1)
+                )
     return _as_twist(program, by_slot), _as_twist(program, by_joint)
+
+
+def platform_rows(blocks: engine.Blocks) -> Array:
+    """All closure rows against the platform's freedoms, (t, n, c, m)."""
+    return np.concatenate([b.A.reshape(*b.A.shape[:2], -1, b.A.shape[-1]) for b in blocks.closure], axis=2)
+
+
+def _row_weights(program: engine.Program, blocks: engine.Blocks) -> Array | None:
+    """One over the standard deviation that a redundant actuator gives each row, (t, n, c); None without redundancy."""
+    if program.sigma is None:
+        return None
+    weights = []
+    for group, block in zip(program.groups, blocks.closure, strict=True):
+        j = int(np.flatnonzero(group.actuator[:, 0] >= 0)[0])
+        drive = np.abs(block.Q[..., j]) * np.array(program.sigma)[group.actuator[j], None]
+        weights.append(1.0 / drive.reshape(*drive.shape[:2], -1))
+    return np.concatenate(weights, axis=2)
 
 
 def _as_twist(program: engine.Program, rows: Array) -> Array:
@@ -126,9 +146,11 @@ def _as_twist(program: engine.Program, rows: Array) -> Array:
     return out
 
 
-def _pseudo_inverse(A: Array) -> Array:
-    """Inverse (square) or pseudo-inverse of A (t, n, c, m) -> (t, n, m, c), failed rows as NaN."""
-    good = np.isfinite(A).all(axis=(-1, -2))
+def _pseudo_inverse(A: Array, weights: Array | None) -> Array:
+    """Inverse, or weighted pseudo-inverse, of A (t, n, c, m) -> (t, n, m, c); rows that cannot be inverted are NaN."""
+    if weights is not None:
+        A = A * weights[..., None]
+    good = np.asarray(np.isfinite(A).all(axis=(-1, -2)))
     safe = np.where(good[..., None, None], A, np.eye(*A.shape[-2:]))
     if A.shape[-1] == A.shape[-2]:
         try:
@@ -137,91 +159,36 @@ def _pseudo_inverse(A: Array) -> Array:
             out = np.linalg.pinv(safe)
     else:
         out = np.linalg.pinv(safe)
-    return np.where(good[..., None, None], out, np.nan)
+    out = np.where(good[..., None, None], out, np.nan)
+    return out if weights is None else out * weights[..., None, :]
 
 
-def _actuated(robot: Mechanism, state: State) -> Array:
-    """Values of the actuated joints (t, n, a)."""
-    out = np.zeros((*state.T.shape[:2], robot.program.n_joints))
-    for group, joints in zip(robot.program.groups, state.joints, strict=True):
-        for j, columns in enumerate(group.actuator):
-            if columns[0] >= 0:
-                out[..., columns] = joints[..., j]
-    return out
-
-
-def _astray(state: State, begin: State) -> Array:
+def _astray(state: State, begin: State) -> np.ndarray:
     """Rows that failed or ended on the other side of a singularity."""
     return (state.status != Status.CONVERGED) & (state.status != Status.NOT_FINITE) | (
         (state.status == Status.CONVERGED) & (state.orientation != begin.orientation)
     )
 
 
-def _followed(robot: Mechanism, e: Array, joints: Array, begin: State, state: State, wrong: Array) -> State:
+def _followed(robot: Mechanism, e: Array, joints: Array, begin: State, state: State, wrong: np.ndarray) -> State:
     """Follow the wrong rows along the straight path of joint values from the start, in ever smaller steps."""
-    t, n = state.T.shape[:2]
-    rows = np.flatnonzero(wrong)
-    trial, place = np.divmod(rows, n)
-    e_rows = e if len(e) == 1 else e[trial]
-    full = np.broadcast_to(joints, (t, n, joints.shape[2]))[trial, place][:, None]
-    home = np.broadcast_to(_actuated(robot, begin), (t, n, joints.shape[2]))[trial, place][:, None]
-    first = _take(begin, trial, place, t, n)
-    result, alive = _take(state, trial, place, t, n), np.arange(len(rows))
-    for steps in STEPS:
-        at = _take_rows(first, alive)
-        own = e_rows if len(e_rows) == 1 else e_rows[alive]
-        for s in range(1, steps + 1):
-            part = home[alive] + (full[alive] - home[alive]) * (s / steps)
-            at = engine.solve(robot.program, own, part, at)
-        result = _put_rows(result, alive, at)
-        alive = alive[_astray(at, _take_rows(first, alive))[:, 0]]
+    shape = state.T.shape[0], state.T.shape[1]
+    trial, pose = np.nonzero(wrong)
+    own = np.broadcast_to(e, (shape[0], e.shape[1]))[trial]
+    target = np.broadcast_to(joints, (*shape, joints.shape[2]))[trial, pose][:, None]
+    first, result = states.pick(begin, shape, trial, pose), states.pick(state, shape, trial, pose)
+    origin = states.actuated(robot.program, first)
+    alive = np.arange(len(trial))
+    for count in STEPS:
+        zero = np.zeros(len(alive), int)
+        here = begun = states.pick(first, (len(trial), 1), alive, zero)
+        for step in range(1, count + 1):
+            part = origin[alive] + (target[alive] - origin[alive]) * (step / count)
+            here = engine.solve(robot.program, own[alive], part, here)
+        result = states.put(result, alive, zero, here)
+        alive = alive[_astray(here, begun)[:, 0]]
         if not len(alive):
             break
     lost = (result.status == Status.CONVERGED) & (result.orientation != first.orientation)
-    status = np.where(lost, np.int8(Status.OTHER_MODE), result.status)
-    return _scatter(state, replace(result, status=status), trial, place)
-
-
-def _take(state: State, trial: Array, place: Array, t: int, n: int) -> State:
-    """Chosen rows as (rows, 1)."""
-
-    def pick(a: Array) -> Array:
-        return np.broadcast_to(a, (t, n, *a.shape[2:]))[trial, place][:, None]
-
-    return State(
-        pick(state.T), tuple(pick(j) for j in state.joints), pick(state.status), pick(state.residual), pick(state.iterations), pick(state.orientation)
-    )
-
-
-def _take_rows(state: State, rows: Array) -> State:
-    return State(
-        state.T[rows],
-        tuple(j[rows] for j in state.joints),
-        state.status[rows],
-        state.residual[rows],
-        state.iterations[rows],
-        state.orientation[rows],
-    )
-
-
-def _put_rows(state: State, rows: Array, new: State) -> State:
-    """A copy of `state` (rows, 1) with some rows replaced."""
-    return _scatter(state, new, rows, np.zeros(len(rows), int))
-
-
-def _scatter(state: State, new: State, trial: Array, place: Array) -> State:
-    """A copy of `state` (t, n) with rows (trial, place) taken from `new` (rows, 1)."""
-
-    def put(a: Array, b: Array) -> Array:
-        out = np.array(a)
-        out[trial, place] = b[:, 0]
-        return out
-
-    return State(
-        put(state.T, new.T),
-        tuple(put(a, b) for a, b in zip(state.joints, new.joints, strict=True)),
-        put(state.status, new.status),
-        put(state.residual, new.residual),
-        put(state.iterations, new.iterations),
-        put(state.orientation, new.orientation),
-    )
+    marked = np.where(lost, np.int8(Status.OTHER_MODE), result.status)
+    return states.put(state, trial, pose, replace(result, status=marked))

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows of states: pick some, put them back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+
+import numpy as np
+
+from loopcal.engine import Array, Program, State
+
+
+def _each(make: Callable[..., np.ndarray], *states: State) -> State:
+    """A state whose every array is made from the arrays of the given states."""
+    found = {}
+    for f in fields(State):
+        parts = [getattr(s, f.name) for s in states]
+        found[f.name] = tuple(make(*g) for g in zip(*parts, strict=True)) if f.name == "joints" else make(*parts)
+    return State(**found)
+
+
+def pick(state: State, shape: tuple[int, int], trial: np.ndarray, pose: np.ndarray) -> State:
+    """Rows (trial, pose) of a state that broadcasts to `shape` = (t, n), as (rows, 1)."""
+    return _each(lambda a: np.broadcast_to(a, (*shape, *a.shape[2:]))[trial, pose][:, None], state)
+
+
+def put(state: State, trial: np.ndarray, pose: np.ndarray, new: State) -> State:
+    """A copy of a state (t, n) whose rows (trial, pose) are those of `new` (rows, 1)."""
+
+    def replaced(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        out = np.array(a)
+        out[trial, pose] = b[:, 0]
+        return out
+
+    return _each(replaced, state, new)
+
+
+def actuated(program: Program, state: State) -> Array:
+    """Values of the actuated joints (t, n, a) [m or rad]."""
+    out = np.zeros((*state.T.shape[:2], program.n_joints))
+    for group, joints in zip(program.groups, state.joints, strict=True):
+        for j, columns in enumerate(group.actuator):
+            if columns[0] >= 0:
+                out[..., columns] = joints[..., j]
+    return out
