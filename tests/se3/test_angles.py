@@ -38,6 +38,7 @@ def test_regular_angles_come_back_as_they_were(order, first, third, middle):
     assert_allclose(se3.wrap(back - angles), np.zeros(3), atol=1e-13)  # [rad], ulps over sin(0.05 pi)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", se3.EULER_ORDERS)
 def test_euler_rates_are_the_derivative_and_their_inverse_its_inverse(order):
     angles = np.array([0.4, 0.7, -2.1])
@@ -98,6 +99,7 @@ def test_tilt_torsion_matrix_has_the_printed_entries():
     assert_allclose(se3.tilt_torsion_to_matrix(phi, theta, psi), expected, atol=ROUNDING)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("theta", [0.02, 0.6, 2.8])
 def test_tilt_torsion_rates_are_the_derivative_and_their_inverse_its_inverse(theta):
     angles = np.array([2.4, theta, -0.8])

@@ -2,6 +2,7 @@
 """Poses form a group; updates, differences and the maps of twists agree with it."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
@@ -44,6 +45,7 @@ def test_adjoints_multiply_as_poses_do(a, b):
     assert_allclose(se3.adjoint(se3.compose(a, b)), se3.adjoint(a) @ se3.adjoint(b), atol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_transport_is_the_derivative_of_a_tool_pose_in_another_frame():
     rng = np.random.default_rng(1)
     T_base_platform, T_platform_tool, T_base_frame = se3.exp_update(np.eye(4), rng.normal(size=(3, 6)))

@@ -63,6 +63,7 @@ def test_the_inverse_of_the_left_jacobian_is_its_inverse(w):
     assert_allclose(product, np.eye(3), atol=2e-14)  # [1], at pi the inverse has entries of size 1.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-9, 1e-3, 0.7, 2.0, 3.1])
 def test_left_jacobian_is_the_derivative_of_the_exponential(size):
     w = size * np.array([0.6, -0.48, 0.64])
@@ -74,6 +75,7 @@ def test_left_jacobian_is_the_derivative_of_the_exponential(size):
     check_jacobian(turned, se3.left_jacobian_so3(w), np.zeros(3), scale=0.3, automatic=turned)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-9, 1e-3, 0.7, 2.0, 3.0])
 def test_inverse_left_jacobian_is_the_derivative_of_the_logarithm(size):
     w = size * np.array([0.6, -0.48, 0.64])
