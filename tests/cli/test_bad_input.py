@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bad input at the command line: exit code 1, one sentence on standard error, nothing written."""
+
+from pathlib import Path
+
+import pytest
+
+from loopcal.cli import main
+from loopcal.io.robot_file import robot_path
+
+ROBOT = robot_path("hexapod-42").read_text()
+EXAMPLE = Path("examples/hexapod-42")
+HEADER = "pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm],z [mm]"
+DATA = f"""# kind: component
+# components: [z]
+# noise: {{z: 1 um}}
+{HEADER}
+a,0,0,0,0,0,0,200
+b,1,1,1,1,1,1,201.1
+c,2,2,2,2,2,2,202.2
+"""
+BASE = "[120, -140, 0]"
+UNITS = "units: {length: mm, angle: deg}\n"
+
+
+@pytest.fixture
+def refused(tmp_path, monkeypatch, capsys):
+    """Run a command line in an empty folder with the given files; return the sentence with which it is refused."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(words: str, **files: str | bytes | None) -> str:
+        for name, content in files.items():
+            path = tmp_path / name.replace("_", ".")
+            if content is None:
+                path.mkdir()
+            else:
+                path.write_bytes(content.encode() if isinstance(content, str) else content)
+        before = sorted(p.name for p in tmp_path.rglob("*"))
+        code = main(words.split())
+        out, err = capsys.readouterr()
+        assert code == 1
+        assert out == ""
+        assert err.startswith("loopcal: ")
+        assert err.count("\n") == 1, err
+        assert err.endswith("\n")
+        assert "Traceback" not in err
+        assert sorted(p.name for p in tmp_path.rglob("*")) == before, "something was written"
+        return err
+
+    return run
+
+
+ROBOT_CASES = {
+    "missing unit": (UNITS, "", "states no units, and a number without a unit is refused; write for example"),
+    "unit of the wrong kind": ("length: mm", "length: deg", "'deg' is not a unit of length; allowed are m, mm"),
+    "unknown key": ("stroke:", "strok:", "unknown key 'strok' (did you mean 'stroke'?)"),
+    "duplicate key": (UNITS, UNITS * 2, "key 'units' stands here for the second time; keep one of the two"),
+    "number typed as text": (BASE, "[120, '-140', 0]", "is the text '-140' where a number is needed; write the number"),
+    "two numbers where three are needed": (BASE, "[120, -140]", "has 2 values where 3 are needed; add the missing ones"),
+    "NaN": (BASE, "[120, .nan, 0]", "is nan; every number must be finite"),
+    "not YAML": (BASE, "[120, -140, 0", "this is not valid YAML"),
+    "newer format": ("format: 1", "format: 2", "has format 2, but this loopcal reads formats up to 1"),
+    "unknown family": ("family: gough", "family: gouhg", "is not a family of robots (did you mean 'gough'?)"),
+}
+
+
+@pytest.mark.parametrize("case", ROBOT_CASES)
+def test_a_bad_robot_file_is_refused_with_its_line(refused, case) -> None:
+    old, new, sentence = ROBOT_CASES[case]
+    assert old in ROBOT
+    found = refused("check robot.yaml", robot_yaml=ROBOT.replace(old, new, 1))
+    assert sentence in found
+    assert found.startswith("loopcal: robot.yaml:")
+
+
+def test_wrong_mobility_names_the_freedoms(refused) -> None:
+    """All base centres in one point: the platform can turn about it, whatever the legs do."""
+    lines = ROBOT.split("\n")
+    start, end = lines.index("base:"), lines.index("platform:")
+    text = "\n".join([*lines[: start + 1], *["  - [0, 0, 0]"] * 6, *lines[end:]])
+    text = text.replace("lengths: 233.238076", "lengths: 234.07")
+    found = refused("check robot.yaml", robot_yaml=text)
+    assert "with every actuator held the platform can still move at home: turn about" in found
+
+
+FILE_CASES = {
+    "empty file": (b"", "is empty"),
+    "empty but for blanks": (b" \n\n", "is empty"),
+    "a folder for a file": (None, "is a folder where a"),
+    "not UTF-8": ("# Länge\n".encode("latin-1"), "is not UTF-8 text (byte 0xe4); save it as UTF-8"),
+    "a zero byte": (b"format: 1\0\n", "holds a zero byte"),
+}
+
+
+@pytest.mark.parametrize("case", FILE_CASES)
+def test_what_is_no_text_file_is_refused_as_robot_and_as_data(refused, case) -> None:
+    content, sentence = FILE_CASES[case]
+    assert sentence in refused("check robot.yaml", robot_yaml=content)
+    assert sentence in refused("calibrate hexapod-42 data.csv -o run", data_csv=content)
+
+
+def test_an_absent_file_is_refused(refused) -> None:
+    assert "there is no such robot file" in refused("check robot.yaml")
+    assert "there is no such measurement file" in refused("calibrate hexapod-42 data.csv -o run")
+    assert "is not a run folder" in refused("validate run data.csv", data_csv=DATA)
+
+
+DATA_CASES = {
+    "missing unit": ("z [mm]", "z", "data.csv:4: column 'z' has no unit; write it in brackets, for example 'z [mm]'"),
+    "unknown unit": ("z [mm]", "z [mmm]", "data.csv:4: column 'z': unknown unit 'mmm' (did you mean 'mm'?)"),
+    "unknown column": ("q1 [mm]", "qq1 [mm]", "data.csv:4: column 'qq1' is unknown (did you mean 'q1'?"),
+    "unknown setting": ("# noise", "# nois", "data.csv:3: unknown key 'nois' (did you mean 'noise'?)"),
+    "duplicate setting": ("# noise", "# kind: pose\n# noise", "data.csv:3: key 'kind' stands here for the second time"),
+    "duplicate column": ("q2 [mm]", "q1 [mm]", "data.csv:4: column 'q1' stands here for the second time"),
+    "text for a number": ("b,1,", "b,one,", "data.csv:6: column 'q1' is 'one' where a number is needed"),
+    "a cell too few": ("b,1,", "b,", "data.csv:6: this row has 7 cells, but the header names 8 columns"),
+    "NaN": ("201.1", "NaN", "data.csv:6: column 'z' is 'NaN', which is not a finite number"),
+    "a reading outside the stroke": ("b,1,", "b,80,", "q1 reads 80 mm, outside its stroke of -75 to 75 mm"),
+    "the same row twice": ("c,2,2,2,2,2,2,202.2", "c,1,1,1,1,1,1,201.1", "'b' and 'c' have the same readings"),
+    "fewer equations than parameters": ("", "", "42 parameters"),
+}
+
+
+@pytest.mark.parametrize("command", ["calibrate hexapod-42 data.csv -o run", "identifiability hexapod-42 data.csv"])
+@pytest.mark.parametrize("case", DATA_CASES)
+def test_a_bad_measurement_file_is_refused_with_its_line(refused, case, command) -> None:
+    old, new, sentence = DATA_CASES[case]
+    if case.startswith("fewer") and command.startswith("identifiability"):
+        pytest.skip("identifiability tells what few equations do determine")
+    assert sentence in refused(command, data_csv=DATA.replace(old, new, 1))
+
+
+def test_a_byte_order_mark_is_accepted(tmp_path, capsys) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_bytes(b"\xef\xbb\xbf" + ROBOT.encode())
+    assert main(["check", str(path)]) == 0
+    assert capsys.readouterr().err == ""
+
+
+USAGE_CASES = {
+    "unknown command": ("calibrat hexapod-42", "No such command 'calibrat'"),
+    "unknown option": ("check hexapod-42 --jsn", "No such option"),
+    "missing argument": ("check", "Missing argument 'ROBOT'"),
+    "limit without a unit": ("calibrate hexapod-42 d.csv -o r --limit-position 0.1", "'0.1' has no unit; add one of m"),
+    "limit of the wrong kind": ("calibrate hexapod-42 d.csv -o r --limit-angle 1mm", "'mm' is a unit of length"),
+    "hold out everything": ("calibrate hexapod-42 d.csv -o r --hold-out 1", "--hold-out"),
+    "unknown method": ("calibrate hexapod-42 d.csv -o r --method best", "--method"),
+    "negative seed": ("simulate hexapod-42 --poses p.csv -o m.csv --seed -1", "--seed"),
+}
+
+
+@pytest.mark.parametrize("case", USAGE_CASES)
+def test_a_bad_command_line_is_refused(refused, case) -> None:
+    words, sentence = USAGE_CASES[case]
+    assert sentence in refused(words)
+
+
+def test_a_used_folder_is_refused_without_force(refused) -> None:
+    assert "this folder is not empty" in refused("calibrate hexapod-42 data.csv -o .", data_csv=DATA)
+    assert "something other than a run" in refused("calibrate hexapod-42 data.csv -o . --force")

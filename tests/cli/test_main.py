@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line as a whole: help with examples, quick to start, one funnel for errors."""
+
+import subprocess
+import sys
+
+import click
+import pytest
+
+from loopcal.cli import commands, main
+from loopcal.errors import MechanismError
+
+NAMES = sorted(commands.commands)
+
+
+def test_help_lists_every_command(capsys) -> None:
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(name in text for name in NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_command_has_help_with_an_example_and_json(name, capsys) -> None:
+    assert main([name, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert f"    loopcal {name} " in text
+    assert "--json" in text
+
+
+def test_nothing_heavy_is_imported_before_a_command_runs() -> None:
+    code = "import sys, loopcal, loopcal.cli; print(*{'numpy', 'scipy', 'pydantic', 'ruamel', 'rich'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (MechanismError("two\n  lines"), "loopcal: two lines\n"),
+        (KeyboardInterrupt(), "loopcal: stopped before the end; no result was written.\n"),
+        (PermissionError(13, "Permission denied", "run"), "loopcal: run: the operating system refused (permission denied)"),
+        (OSError(28, "No space left on device"), "loopcal: the operating system refused (no space left on device)"),
+        (MemoryError(), "loopcal: there is not enough memory"),
+        (click.UsageError("bad"), "loopcal: bad\n"),
+    ],
+)
+def test_an_error_of_the_user_becomes_one_sentence_and_exit_code_1(monkeypatch, capsys, error, sentence) -> None:
+    def fail(*_args, **_kwargs):
+        raise error
+
+    monkeypatch.setattr(commands.commands["check"], "callback", fail)
+    assert main(["check", "hexapod-42"]) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.lstrip("\n").startswith(sentence)  # click ends the line of ^C first
+    assert err.strip().count("\n") == 0
+
+
+def test_a_mistake_of_our_own_is_not_hidden(monkeypatch) -> None:
+    monkeypatch.setattr(commands.commands["check"], "callback", lambda **_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        main(["check", "hexapod-42"])
+
+
+def test_a_reader_that_goes_away_causes_no_traceback() -> None:
+    code = "import sys; from loopcal.cli import main; sys.exit(main(['check', 'hexapod-42']))"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait() == 1
