@@ -41,6 +41,7 @@ class Joint:
     name : unique in its limb. kind : R or P. actuator : name of what drives it, None if passive.
     pitch : advance per turn angle of a screw [m/rad], R only.
     start : value to begin from when the home position is computed [m or rad]; it picks the working mode.
+    limits : allowed values (low, high) [m or rad].
     """
 
     name: str
@@ -48,6 +49,20 @@ class Joint:
     actuator: str | None = None
     pitch: float = 0.0
     start: float = 0.0
+    limits: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Cone:
+    """How far a rod may lean at one of its ends: within `angle` [rad] of `axis` (3,).
+
+    `end` is `tip` (axis in the frame of the chain's tip, rod pointing to the platform) or `attachment` (axis in the
+    attachment's frame, rod pointing to the tip).
+    """
+
+    end: str
+    axis: tuple[float, float, float]
+    angle: float
 
 
 @dataclass(frozen=True)
@@ -58,7 +73,7 @@ class Limb:
     ----------
     links : one more than joints. ending : rigid, ball or distance. attachment : on the platform, in its frame.
     length : nominal length of the rod of a `distance` ending at joint value zero [m].
-    actuator : what drives that length, None for a rod of fixed length.
+    actuator : what drives that length, None for a rod of fixed length. cones : how far the rod may lean.
     """
 
     name: str
@@ -68,6 +83,7 @@ class Limb:
     attachment: Link
     length: float = 0.0
     actuator: str | None = None
+    cones: tuple[Cone, ...] = ()
 
 
 @dataclass(frozen=True)

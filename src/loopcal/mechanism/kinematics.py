@@ -51,7 +51,7 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
 
     Parameters
     ----------
-    q : (n, a) readings [m or rad]. start : a solution of one row or n rows that chooses the assembly mode.
+    q : (n, a) readings [m or rad], or (n, 2 a) with their directions of approach (+1, -1, 0 unknown) behind them. start : a solution of one row or n rows that chooses the assembly mode.
 
     Returns
     -------
@@ -63,13 +63,13 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
         q has another number of columns than the robot has actuators.
     """
     readings = np.atleast_2d(np.asarray(q, dtype=float))
-    if readings.ndim != 2 or readings.shape[1] != len(robot.actuators):
+    if readings.ndim != 2 or readings.shape[1] not in (len(robot.actuators), 2 * len(robot.actuators)):
         raise DataError(
             f"{readings.shape[-1]} readings a row were given, but {robot.name} has {len(robot.actuators)} actuators "
             f"({', '.join(a.name for a in robot.actuators)})"
         )
     state = forward_trials(robot, robot.values[None], readings[None], None if start is None else start.state)
-    return _solution(robot, state, readings)
+    return _solution(robot, state, readings[:, : len(robot.actuators)])
 
 
 def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) -> Solution:

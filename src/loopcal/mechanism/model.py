@@ -47,12 +47,12 @@ class SlotMap:
     """From parameter values to displacements e and transmission terms tau.
 
     slots(v) = M (v - nominal) + sum over shared maps of [g(v) - g(nominal)]; the first `n_displacements` slots are e, the
-    others the terms of the actuators, (a, 6) row by row.
+    others the terms of the actuators, (a, 8) row by row.
 
     Attributes
     ----------
     matrix : (s, p). shared : with, for each, the positions of its inputs and outputs. n_displacements : length of e.
-    terms : (a, 6) nominal transmission terms. frequency : (a,) of their harmonics.
+    terms : (a, 8) nominal transmission terms. frequency : (a,) of their harmonics.
     """
 
     matrix: Array
@@ -63,7 +63,7 @@ class SlotMap:
     frequency: Array
 
     def __call__(self, values: Array) -> tuple[Array, Array]:
-        """Values (t, p) -> e (t, n_displacements), tau (t, a, 6)."""
+        """Values (t, p) -> e (t, n_displacements), tau (t, a, 8)."""
         slots = np.zeros((len(values), len(self.matrix)))
         # one column at a time, so that a trial's result does not depend on its neighbours
         for p in np.flatnonzero(self.matrix.any(axis=0)):

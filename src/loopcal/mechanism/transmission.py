@@ -1,60 +1,84 @@
 # SPDX-License-Identifier: Apache-2.0
 """From an actuator's reading to the value of the joint it drives.
 
-    joint = offset + gain r + sin1 sin(w r) + cos1 cos(w r) + sin2 sin(2 w r) + cos2 cos(2 w r),   w = 2 pi / period
+    joint = offset + gain r + curve r^2 + sin1 sin(w r) + cos1 cos(w r) + sin2 sin(2 w r) + cos2 cos(2 w r) + backlash d / 2
 
-Derivation and use: docs/theory/parameters.md.
+with w = 2 pi / period and d = +1 or -1 the direction in which the reading was approached (0 where it is not known). A gear
+ratio or spool radius is a gain, a spool whose radius grows with what is wound on it a curve: r = r0 - b phi / 2 pays out
+r0 phi - b phi^2 / 4. Derivation: docs/theory/parameters.md.
+
+Readings are (t, n, a), or (t, n, 2 a) with the directions of approach behind them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import Actuator, Array
 
-TERMS = ("offset", "gain", "sin1", "cos1", "sin2", "cos2")
-"""Terms in the order of the last axis of tau (t, a, 6); `gain` is a ratio, the others have the joint's unit."""
+TERMS = ("offset", "gain", "curve", "sin1", "cos1", "sin2", "cos2", "backlash")
+"""Terms in the order of the last axis of tau (t, a, 8), each in the joint's unit per power of the reading's unit."""
 
 
-def nominal_terms(actuators: tuple[Actuator, ...]) -> Array:
-    """Nominal transmission terms (a, 6) of these actuators."""
-    return np.array([[a.terms.get(term, 1.0 if term == "gain" else 0.0) for term in TERMS] for a in actuators]).reshape(-1, 6)
+def nominal_terms(actuators: Sequence[Actuator]) -> Array:
+    """Nominal transmission terms (a, 8); raises MechanismError for an unknown term or a gain of zero."""
+    for actuator in actuators:
+        wrong = sorted(set(actuator.terms) - set(TERMS))
+        if wrong:
+            raise MechanismError(f"actuator {actuator.name!r} has a term {wrong[0]!r}; allowed are {', '.join(TERMS)}")
+        if actuator.terms.get("gain", 1.0) == 0.0:
+            raise MechanismError(f"actuator {actuator.name!r} has a gain of zero, so its reading moves nothing; give its gain")
+    rows = [[a.terms.get(term, 1.0 if term == "gain" else 0.0) for term in TERMS] for a in actuators]
+    return np.array(rows, dtype=float).reshape(-1, len(TERMS))
 
 
-def frequency(actuators: tuple[Actuator, ...]) -> Array:
+def frequency(actuators: Sequence[Actuator]) -> Array:
     """Angular frequency of the harmonics (a,) [rad per unit of reading], 0 where there are none."""
     return np.array([2 * np.pi / a.period if a.period else 0.0 for a in actuators])
 
 
-def joint_values(readings: Array, tau: Array, w: Array) -> Array:
-    """Joint values (t, n, a) of readings (t | 1, n, a) under terms tau (t | 1, a, 6)."""
-    columns = term_columns(readings, w)
+def term_columns(q: Array, w: Array) -> list[Array]:
+    """Derivative of the joint values in each term, eight arrays (t | 1, n, a)."""
+    r, approach = split(q, len(w))
+    # with w = 0 the cosines would repeat the offset
+    on = (w != 0).astype(float)
+    turn = w * r
+    waves = [np.sin(turn), on * np.cos(turn), np.sin(2 * turn), on * np.cos(2 * turn)]
+    return [np.ones_like(r), r, r * r, *waves, 0.5 * approach]
+
+
+def joint_values(q: Array, tau: Array, w: Array) -> Array:
+    """Joint values (t, n, a) of readings q under terms tau (t | 1, a, 8)."""
+    columns = term_columns(q, w)
     return sum((columns[i] * tau[:, None, :, i] for i in range(1, len(TERMS))), start=columns[0] * tau[:, None, :, 0])
 
 
-def term_columns(readings: Array, w: Array) -> list[Array]:
-    """Derivative of the joint values in each term, six arrays (t | 1, n, a)."""
-    a = w * readings
-    # with w = 0 the cosines would repeat the offset
-    on = (w != 0).astype(float)
-    return [np.ones_like(readings), readings, np.sin(a), on * np.cos(a), np.sin(2 * a), on * np.cos(2 * a)]
-
-
-def slope(readings: Array, tau: Array, w: Array) -> Array:
+def slope(q: Array, tau: Array, w: Array) -> Array:
     """d joint / d reading (t, n, a)."""
-    a, tau = w * readings, tau[:, None]
-    return (
-        tau[..., 1]
-        + w * (tau[..., 2] * np.cos(a) - tau[..., 3] * np.sin(a))
-        + 2 * w * (tau[..., 4] * np.cos(2 * a) - tau[..., 5] * np.sin(2 * a))
-    )
+    r, _ = split(q, len(w))
+    turn = w * r
+    _, gain, curve, sin1, cos1, sin2, cos2, _ = np.moveaxis(tau[:, None], -1, 0)
+    first = w * (sin1 * np.cos(turn) - cos1 * np.sin(turn))
+    second = 2 * w * (sin2 * np.cos(2 * turn) - cos2 * np.sin(2 * turn))
+    return gain + 2 * curve * r + first + second
 
 
 def readings_of(joints: Array, tau: Array, w: Array) -> Array:
-    """Readings (t, n, a) that give these joint values: the linear part, then Newton on the harmonics."""
+    """Readings (t, n, a) that give these joint values, approach not counted: the linear part, then Newton on the rest."""
     readings = (joints - tau[:, None, :, 0]) / tau[:, None, :, 1]
-    if not w.any():
+    if not tau[..., 2:7].any():
         return readings
-    for _ in range(8):
-        readings = readings - (joint_values(readings, tau, w) - joints) / slope(readings, tau, w)
+    for _ in range(20):
+        step = (joint_values(readings, tau, w) - joints) / slope(readings, tau, w)
+        readings = readings - step
+        if np.abs(step).max(initial=0.0) <= 1e-15 * np.abs(readings).max(initial=1.0):
+            break
     return readings
+
+
+def split(q: Array, a: int) -> tuple[Array, Array]:
+    """Readings and directions of approach (zero where none were given)."""
+    return q[..., :a], q[..., a:] if q.shape[-1] == 2 * a else np.zeros_like(q[..., :a])
