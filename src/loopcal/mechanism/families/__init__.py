@@ -7,7 +7,16 @@ Adding a family touches its own file and one line here; nothing below this packa
 from collections.abc import Mapping
 
 from loopcal.mechanism.families.gough import Gough
+from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.families.linear_delta import LinearDelta
+from loopcal.mechanism.families.ru_pus_prs import RuPusPrs
+from loopcal.mechanism.families.three_prs import ThreePrs
 from loopcal.mechanism.records import Robot
 
-FAMILIES: Mapping[str, type[Robot]] = {"gough": Gough, "linear-delta": LinearDelta}
+FAMILIES: Mapping[str, type[Robot]] = {
+    "3-prs": ThreePrs,
+    "gough": Gough,
+    "limbs": Limbs,
+    "linear-delta": LinearDelta,
+    "ru-pus-prs": RuPusPrs,
+}

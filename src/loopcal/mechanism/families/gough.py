@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gough-Stewart platforms: six legs of variable length between ball centres on the base and on the platform.
+"""Gough-Stewart platforms: six legs of variable length between joint centres on the base and on the platform.
 
 With `legs: rod` a leg is the distance between its two centres, l_i = |t + R p_i - b_i| = length_i + reading_i: seven
-parameters a leg, 42 in all (docs/theory/hexapod.md).
+parameters a leg, 42 in all. With `legs: ups` it is the chain that is really there (see `ups.py`), which can carry the
+complete error model and a screw that turns with the joints. Derivation: docs/theory/hexapod.md.
 """
 
 from __future__ import annotations
@@ -11,19 +12,23 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from loopcal.errors import MechanismError
-from loopcal.mechanism.assembly import AXES, Actuator, Address, Assembly, Limb, Linear, Link
-from loopcal.mechanism.records import LengthTolerance, Point, Robot, per_leg, standard_deviation, translation
-from loopcal.parameters import Parameter
+from loopcal.mechanism.assembly import AXES, Actuator, Assembly
+from loopcal.mechanism.families.chain import Placed, at, placed
+from loopcal.mechanism.families.errors import Errors, Spread, complete, offset, point, rod_length
+from loopcal.mechanism.families.ups import Screw, ScrewLeg, screw_leg, ups_leg
+from loopcal.mechanism.records import AngleTolerance, LengthTolerance, Point, Robot, per_leg, standard_deviation
 from loopcal.units import Dimension, Length
 
 
 @dataclass(frozen=True)
 class GoughTolerances:
-    """Tolerances of joint centres on base and platform, and of the leg lengths."""
+    """Tolerances of joint centres on base and platform, of the leg lengths, and of link angles in the complete model."""
 
     base: LengthTolerance | None = None
     platform: LengthTolerance | None = None
     length: LengthTolerance | None = None
+    links: LengthTolerance | None = None
+    angles: AngleTolerance | None = None
 
 
 @dataclass(frozen=True)
@@ -34,51 +39,92 @@ class Gough(Robot):
     ----------
     base, platform : centres of the joints, leg by leg, in the base and the platform frame [m].
     lengths : length of a leg at reading zero [m], one for all or one each.
-    stroke : allowed readings (low, high) [m]. legs : form of the legs. tolerances : of the parameters.
+    stroke : allowed readings (low, high) [m].
+    legs : form of the legs, a `rod` or the chain `ups`.
+    spherical : with `ups`, the upper joint as a perfect `point`, or as three `axes` with errors of their own.
+    screw : with `ups`, a screw in every leg; its nut turns with the lower joint, its spindle with the upper one.
+    error_model : `ideal`, 42 parameters, or `complete`, which needs `ups`.
+    tolerances : of the parameters; `links` and `angles` are of the complete model.
     """
 
     base: tuple[Point, ...] = ()
     platform: tuple[Point, ...] = ()
     lengths: Length | tuple[Length, ...] = 0.0
     stroke: tuple[Length, Length] | None = None
-    legs: Literal["rod"] = "rod"
+    legs: Literal["rod", "ups"] = "rod"
+    spherical: Literal["point", "axes"] = "point"
+    screw: Screw | None = None
+    error_model: Literal["ideal", "complete"] = "ideal"
     tolerances: GoughTolerances = field(default_factory=GoughTolerances)
 
     def expand(self) -> Assembly:
-        """Six limbs without joints that end in an actuated distance; raises MechanismError for other than six legs."""
-        if len(self.base) != 6 or len(self.platform) != 6:
-            raise MechanismError(
-                f"{self.name} has {len(self.base)} base and {len(self.platform)} platform centres; a hexapod has six of each"
-            )
+        """Six legs in the form stated; raises MechanismError for other than six, or a model the form cannot carry."""
+        self._check()
         lengths = per_leg(self.lengths, 6, "lengths")
-        limbs, actuators, parameters, maps = [], [], [], []
-        for i, (b, p, length) in enumerate(zip(self.base, self.platform, lengths, strict=True)):
-            leg, motor = f"leg{i + 1}", f"q{i + 1}"
-            limbs.append(
-                Limb(leg, (Link("base", translation(b)),), (), "distance", Link("platform", translation(p)), length, motor)
-            )
-            actuators.append(Actuator(motor, Dimension.LENGTH, self.stroke))
-            for element, nominal, tolerance in (
-                ("base", b, self.tolerances.base),
-                ("platform", p, self.tolerances.platform),
-            ):
-                sd = standard_deviation(tolerance, f"the {element} centres")
-                for axis, value in zip(AXES[3:], nominal, strict=True):
-                    parameters.append(Parameter(f"{leg}.{element}.{axis}", Dimension.LENGTH, value, sd))
-                    maps.append(Linear(f"{leg}.{element}.{axis}", Address(leg, element, axis)))
-            sd = standard_deviation(self.tolerances.length, "the leg lengths")
-            parameters.append(Parameter(f"{leg}.length", Dimension.LENGTH, length, sd))
-            maps.append(Linear(f"{leg}.length", Address(leg, "rod", "length")))
+        screws = self.screw.legs() if self.screw else (None,) * 6
+        legs, actuators, errors = [], [], Errors()
+        for i, length in enumerate(lengths):
+            leg, motor = self._leg(i, length, screws[i]), f"q{i + 1}"
+            legs.append(leg)
+            # a rod has its length in the ending, a chain in the offset of its sliding joint
+            terms = {} if self.legs == "rod" else {"offset": length}
+            actuators.append(Actuator(motor, Dimension.LENGTH, self.stroke, terms))
+            errors += self._complete(leg, motor, length) if self.error_model == "complete" else self._ideal(leg, motor, length)
         return Assembly(
             name=self.name,
             source=self.source,
-            limbs=tuple(limbs),
+            limbs=tuple(leg.limb for leg in legs),
             actuators=tuple(actuators),
             freedoms=AXES,
             controlled=("x", "y", "z", "roll", "pitch", "yaw"),
             home=self.home.matrix,
             tool=self.tool.matrix,
             workspace=self.workspace.ranges,
-            parameters=tuple(parameters),
-            maps=tuple(maps),
+            parameters=errors.parameters,
+            maps=errors.maps,
         )
+
+    def _check(self) -> None:
+        if len(self.base) != 6 or len(self.platform) != 6:
+            raise MechanismError(
+                f"{self.name} has {len(self.base)} base and {len(self.platform)} platform centres; a hexapod has six of each"
+            )
+        asked = [
+            words
+            for words, found in (
+                ("error_model: complete", self.error_model == "complete"),
+                ("spherical: axes", self.spherical == "axes"),
+                ("a screw", self.screw is not None),
+            )
+            if found
+        ]
+        if self.legs == "rod" and asked:
+            raise MechanismError(
+                f"{self.name} states legs: rod with {asked[0]}, but a rod has no joints that could carry it; state legs: ups"
+            )
+
+    def _leg(self, i: int, length: float, screw: ScrewLeg | None) -> Placed:
+        """Leg i in its form."""
+        leg, motor = f"leg{i + 1}", f"q{i + 1}"
+        if self.legs == "rod":
+            return placed(leg, (), at(*self.base[i]), "distance", at(*self.platform[i]), length, motor)
+        if screw:
+            return screw_leg(leg, motor, self.base[i], self.platform[i], self.home.matrix, screw)
+        return ups_leg(leg, motor, self.base[i], self.platform[i], self.home.matrix, self.spherical == "axes")
+
+    def _ideal(self, leg: Placed, motor: str, length: float) -> Errors:
+        """Two centres and a length, the same in both forms."""
+        sd = self.tolerances
+        base = point(leg, leg.elements[0], "xyz", standard_deviation(sd.base, "the base centres"), "base")
+        top = point(leg, "platform", "xyz", standard_deviation(sd.platform, "the platform centres"))
+        own = standard_deviation(sd.length, "the leg lengths")
+        if self.legs == "rod":
+            return base + top + rod_length(leg, own)
+        return base + top + offset(f"{leg.name}.length", motor, Dimension.LENGTH, length, own)
+
+    def _complete(self, leg: Placed, motor: str, length: float) -> Errors:
+        """Every link, and the length."""
+        sd = self.tolerances
+        spread = Spread(standard_deviation(sd.links, "the links"), standard_deviation(sd.angles, "the link angles"))
+        own = standard_deviation(sd.length, "the leg lengths")
+        return complete(leg, spread, offsets=False) + offset(f"{leg.name}.length", motor, Dimension.LENGTH, length, own)

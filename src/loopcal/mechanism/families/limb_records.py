@@ -1,0 +1,295 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a file of the family `limbs` may say: joints, limbs, drives and named parameters, as plain records.
+
+Frames: a limb carries a frame from the base to its tip. `at:` places a joint in it, as [x, y, z] or as a whole pose, and
+`axis:` is a direction in the frame so placed. With all joints at zero and no placement turned, all axes are those of the
+base (of a copy: turned with it).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from loopcal.engine import Array
+from loopcal.errors import MechanismError
+from loopcal.mechanism.records import AngleTolerance, LengthTolerance, Point, Pose, RatioTolerance, translation
+from loopcal.units import Angle, Length, Ratio
+
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"] | tuple[Ratio, Ratio, Ratio]
+Place = Point | Pose
+ORIGIN: Point = (0.0, 0.0, 0.0)
+Moving = Literal["x", "y", "z", "length"]
+Turning = Literal["rx", "ry", "rz"]
+
+
+def direction(axis: Axis) -> Array:
+    """An axis as a vector (3,)."""
+    if isinstance(axis, str):
+        return (-1.0 if axis.startswith("-") else 1.0) * np.eye(3)["xyz".index(axis[-1])]
+    return np.array(axis, dtype=float)
+
+
+def place_matrix(place: Place) -> Array:
+    """A placement as (4, 4)."""
+    return place.matrix if isinstance(place, Pose) else translation(place)
+
+
+@dataclass(frozen=True)
+class Revolute:
+    """A turning joint; `lead` is its advance along the axis in one turn (a screw), `start` its angle near home."""
+
+    joint: Literal["R"]
+    name: str = ""
+    at: Place = ORIGIN
+    axis: Axis = "z"
+    actuated: str | None = None
+    lead: Length = 0.0
+    start: Angle = 0.0
+
+
+@dataclass(frozen=True)
+class Prismatic:
+    """A sliding joint."""
+
+    joint: Literal["P"]
+    name: str = ""
+    at: Place = ORIGIN
+    axis: Axis = "z"
+    actuated: str | None = None
+    start: Length = 0.0
+
+
+@dataclass(frozen=True)
+class Universal:
+    """Two turning joints whose axes meet."""
+
+    joint: Literal["U"]
+    name: str = ""
+    at: Place = ORIGIN
+    axes: tuple[Axis, Axis] = ("x", "y")
+    start: tuple[Angle, Angle] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Cylindrical:
+    """A turn about and a slide along the same axis."""
+
+    joint: Literal["C"]
+    name: str = ""
+    at: Place = ORIGIN
+    axis: Axis = "z"
+    start: Angle = 0.0
+    slide_start: Length = 0.0
+
+
+@dataclass(frozen=True)
+class Spherical:
+    """Three turning joints about z, then y, then x through one point (singular where the second is at 90 degrees)."""
+
+    joint: Literal["S"]
+    name: str = ""
+    at: Place = ORIGIN
+    start: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
+
+
+JointRecord = Revolute | Prismatic | Universal | Cylindrical | Spherical
+
+
+@dataclass(frozen=True)
+class Copies:
+    """The same limb several times, turned about an axis of base and platform; numbers 1, 2, .. are added to its names."""
+
+    count: int
+    about: Literal["x", "y", "z"] = "z"
+    step: Angle | None = None
+
+
+@dataclass(frozen=True)
+class Shifts:
+    """Unknown lengths of a limb: where an element is in the frame placed there, or the rod's length.
+
+    `of` is a joint, `tip` (`base` in a limb without joints), `platform` or `rod`; parameters are called
+    `limb.NAME.axis`, or `limb.NAME` for a rod's length, with NAME = `of` where no `name` is given.
+    """
+
+    of: str
+    shift: tuple[Moving, ...]
+    name: str = ""
+    tolerance: LengthTolerance | None = None
+
+
+@dataclass(frozen=True)
+class Tilts:
+    """Unknown angles of a limb: turns of a joint's axis, with what follows; or of a slide's axis alone (`alone: true`)."""
+
+    of: str
+    tilt: tuple[Turning, ...]
+    name: str = ""
+    alone: bool = False
+    tolerance: AngleTolerance | None = None
+
+
+@dataclass(frozen=True)
+class LinkTolerances:
+    """Tolerances of lengths and angles in the complete error model."""
+
+    lengths: LengthTolerance | None = None
+    angles: AngleTolerance | None = None
+
+
+@dataclass(frozen=True)
+class LimbRecord:
+    """A limb: joints from the base on, then how it is tied to the platform.
+
+    Attributes
+    ----------
+    on, to : what it starts from and ends on; only `base` and `platform` exist.
+    chain : its joints. tip : its end, in the frame carried last; of a limb without joints, its point on the base.
+    ending : `rigid`, `ball` (tip and attachment meet in a point), `distance` (a rod of `length` lies between them).
+    attach : the attachment in the platform frame. actuated : the drive of a `distance` of changing length.
+    copies : repeat it around an axis. errors : its unknowns in the ideal model.
+    """
+
+    name: str
+    ending: Literal["rigid", "ball", "distance"]
+    attach: Place = ORIGIN
+    chain: tuple[JointRecord, ...] = ()
+    tip: Place = ORIGIN
+    length: Length = 0.0
+    actuated: str | None = None
+    on: str = "base"
+    to: str = "platform"
+    copies: Copies | None = None
+    errors: tuple[Shifts | Tilts, ...] = ()
+
+
+@dataclass(frozen=True)
+class LengthDrive:
+    """A drive whose reading is a length. joint value = offset + gain * reading + harmonics of the period.
+
+    `unknown` names terms to identify (offset, gain, sin1, cos1, sin2, cos2), with tolerances `length` and `ratio`.
+    """
+
+    reads: Literal["length"]
+    stroke: tuple[Length, Length] | None = None
+    gain: Ratio = 1.0
+    offset: Length = 0.0
+    period: Length = 0.0
+    sigma: Length | None = None
+    unknown: tuple[str, ...] = ()
+    length: LengthTolerance | None = None
+    ratio: RatioTolerance | None = None
+
+
+@dataclass(frozen=True)
+class AngleDrive:
+    """A drive whose reading is an angle and turns a joint. joint value = offset + gain * reading + harmonics."""
+
+    reads: Literal["angle"]
+    stroke: tuple[Angle, Angle] | None = None
+    gain: Ratio = 1.0
+    offset: Angle = 0.0
+    period: Angle = 0.0
+    sigma: Angle | None = None
+    unknown: tuple[str, ...] = ()
+    angle: AngleTolerance | None = None
+    ratio: RatioTolerance | None = None
+
+
+@dataclass(frozen=True)
+class SpoolDrive:
+    """A drive whose reading is an angle and moves a length. joint value = offset + radius * reading + harmonics.
+
+    `radius` is the length wound per radian of the reading (spool radius with gears and tackle; a spindle's lead / 2 pi),
+    negative where a growing reading shortens.
+    """
+
+    reads: Literal["angle"]
+    radius: Length
+    stroke: tuple[Angle, Angle] | None = None
+    offset: Length = 0.0
+    period: Angle = 0.0
+    sigma: Angle | None = None
+    unknown: tuple[str, ...] = ()
+    length: LengthTolerance | None = None
+    radii: LengthTolerance | None = None
+
+
+Drive = LengthDrive | AngleDrive | SpoolDrive
+
+
+@dataclass(frozen=True)
+class Onto:
+    """Where a named parameter enters: axis `axis` of the frame placed at `element` of `limb` (of all its copies).
+
+    With `limb` the name of a drive, `element` is `transmission` and `axis` one of its terms. The displacement is
+    coefficient * change, or arm * change for an angle that moves a length [arm per radian].
+    """
+
+    limb: str
+    element: str
+    axis: Literal["rx", "ry", "rz", "x", "y", "z", "length", "pitch", "offset", "gain", "sin1", "cos1", "sin2", "cos2"]
+    coefficient: Ratio = 1.0
+    arm: Length | None = None
+
+
+@dataclass(frozen=True)
+class NamedLength:
+    """A named parameter that is a length, with its nominal value."""
+
+    name: str
+    length: Length
+    maps: tuple[Onto, ...]
+    tolerance: LengthTolerance | None = None
+
+
+@dataclass(frozen=True)
+class NamedAngle:
+    """A named parameter that is an angle, with its nominal value."""
+
+    name: str
+    angle: Angle
+    maps: tuple[Onto, ...]
+    tolerance: AngleTolerance | None = None
+
+
+@dataclass(frozen=True)
+class NamedRatio:
+    """A named parameter without dimension, with its nominal value."""
+
+    name: str
+    ratio: Ratio
+    maps: tuple[Onto, ...]
+    tolerance: RatioTolerance | None = None
+
+
+Named = NamedLength | NamedAngle | NamedRatio
+
+
+@dataclass(frozen=True)
+class LimbsFile:
+    """The fields of a `limbs` file beside those that every robot has; see `Limbs`."""
+
+    freedoms: tuple[Literal["rx", "ry", "rz", "x", "y", "z"], ...] = ("rx", "ry", "rz", "x", "y", "z")
+    controlled: tuple[str, ...] = ()
+    actuators: Mapping[str, Drive] = field(default_factory=dict)
+    limbs: tuple[LimbRecord, ...] = ()
+    error_model: Literal["ideal", "complete"] = "ideal"
+    parameters: tuple[Named, ...] = ()
+    tolerances: LinkTolerances = field(default_factory=LinkTolerances)
+
+
+def refuse_branch(limb: LimbRecord, names: tuple[str, ...]) -> None:
+    """Refuse a limb that does not join base and platform; raises MechanismError naming what it hangs on."""
+    for key, found, allowed in (("starts on", limb.on, "base"), ("ends on", limb.to, "platform")):
+        if found == allowed:
+            continue
+        what = f"limb {found!r}" if found in names else f"{found!r}"
+        raise MechanismError(
+            f"limb {limb.name!r} {key} {what}: loopcal has no limbs that branch from limbs; every limb must join the base "
+            f"to the platform, so let it {key.replace('s on', ' on')} the {allowed}, or model the branch as limbs of its own"
+        )

@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Any mechanism of limbs between base and platform, written out joint by joint: one short file is a robot.
+
+`error_model: ideal` takes the unknowns that the file names (`errors:` of a limb, `unknown:` of a drive, `parameters:`),
+`complete` six for every link transform less what its joint absorbs, and the named ones on top. How to write such a file:
+docs/robots.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from loopcal.errors import MechanismError
+from loopcal.mechanism.assembly import AXES, Actuator, Address, Assembly, Linear
+from loopcal.mechanism.families.chain import EX, EY, EZ, Placed, Step, moved, placed, tilted, turn_about
+from loopcal.mechanism.families.errors import Errors, Spread, complete, quantity
+from loopcal.mechanism.families.limb_records import (
+    AngleDrive,
+    Cylindrical,
+    Drive,
+    JointRecord,
+    LengthDrive,
+    LimbRecord,
+    LimbsFile,
+    Named,
+    NamedAngle,
+    NamedLength,
+    Onto,
+    Prismatic,
+    Revolute,
+    Shifts,
+    SpoolDrive,
+    Tilts,
+    Universal,
+    direction,
+    place_matrix,
+    refuse_branch,
+)
+from loopcal.mechanism.records import Robot, standard_deviation
+from loopcal.mechanism.transmission import TERMS
+from loopcal.units import Dimension
+
+
+@dataclass(frozen=True)
+class Limbs(LimbsFile, Robot):
+    """The file of a mechanism of any limbs.
+
+    Attributes
+    ----------
+    freedoms : of the platform, in base axes. controlled : coordinates it is commanded in.
+    actuators : drives by name; a drive that is not listed reads the joint's value. In a limb with copies, `q` means q1, q2, ..
+    limbs : from base to platform. error_model, parameters : see the module. tolerances : of the complete model.
+    """
+
+    def expand(self) -> Assembly:
+        """All copies of all limbs; raises MechanismError for a branch, a name not known, or a model without unknowns."""
+        names = tuple(limb.name for limb in self.limbs)
+        for limb in self.limbs:
+            refuse_branch(limb, names)
+        members = {limb.name: tuple(_copies(limb)) for limb in self.limbs}
+        everyone = [one for limb in self.limbs for one in members[limb.name]]
+        drives = tuple(drive for one in everyone for drive in self._drives(one))
+        errors = sum((self._limb_errors(one) for one in everyone), start=Errors())
+        errors += sum((_drive_errors(name, drive, turns) for name, drive, turns in drives), start=Errors())
+        errors += sum((_named(named, members, {name for name, *_ in drives}) for named in self.parameters), start=Errors())
+        self._check(errors, {name for name, *_ in drives})
+        return Assembly(
+            name=self.name,
+            source=self.source,
+            limbs=tuple(one.placed.limb for one in everyone),
+            actuators=tuple(_actuator(name, drive, turns) for name, drive, turns in drives),
+            freedoms=self.freedoms,
+            controlled=self.controlled,
+            home=self.home.matrix,
+            tool=self.tool.matrix,
+            workspace=self.workspace.ranges,
+            parameters=errors.parameters,
+            maps=errors.maps,
+        )
+
+    def _check(self, errors: Errors, drives: set[str]) -> None:
+        if not errors.parameters:
+            raise MechanismError(
+                f"{self.name} names no unknown; give a limb 'errors:', a drive 'unknown:', or state error_model: complete"
+            )
+        idle = [
+            name for name in self.actuators if name not in drives and not any(d.rstrip("0123456789") == name for d in drives)
+        ]
+        if idle:
+            raise MechanismError(f"actuator {idle[0]!r} drives no joint; write 'actuated: {idle[0]}' at one, or leave it out")
+
+    def _drives(self, one: _Member) -> Iterator[tuple[str, Drive, bool]]:
+        """Names of a limb's drives, what they are, and whether the joint turns."""
+        limb = one.placed.limb
+        driven = [(j.actuator, j.kind == "R") for j in limb.joints if j.actuator]
+        for name, turns in (*driven, *([(limb.actuator, False)] if limb.actuator else [])):
+            plain = AngleDrive("angle") if turns else LengthDrive("length")
+            drive = self.actuators.get(name) or self.actuators.get(name.removesuffix(one.suffix)) or plain
+            if turns != isinstance(drive, AngleDrive):
+                found = "turns" if turns else "slides"
+                raise MechanismError(
+                    f"actuator {name!r} drives a joint that {found}; state "
+                    + ("reads: angle without a radius" if turns else "reads: length, or reads: angle with a radius")
+                )
+            yield name, drive, turns
+
+    def _limb_errors(self, one: _Member) -> Errors:
+        """Unknowns of one limb."""
+        found = Errors()
+        if self.error_model == "complete":
+            length = standard_deviation(self.tolerances.lengths, "the lengths")
+            angle = standard_deviation(self.tolerances.angles, "the angles")
+            found += complete(one.placed, Spread(length, angle))
+        for entry in one.record.errors:
+            found += _shifts(one.placed, entry) if isinstance(entry, Shifts) else _tilts(one.placed, entry)
+        return found
+
+
+@dataclass(frozen=True)
+class _Member:
+    """A limb that is there: a copy of its record, with the number that its names end in."""
+
+    record: LimbRecord
+    placed: Placed
+    suffix: str
+
+
+def _copies(limb: LimbRecord) -> Iterator[_Member]:
+    """A limb as often as it stands there."""
+    if limb.copies is None:
+        yield _Member(limb, _placed(limb, limb.name, "", np.eye(4)), "")
+        return
+    if limb.copies.count < 1:
+        raise MechanismError(f"limb {limb.name!r} has {limb.copies.count} copies; give one or more")
+    step = limb.copies.step if limb.copies.step is not None else 2 * np.pi / limb.copies.count
+    for i in range(limb.copies.count):
+        turn = turn_about(limb.copies.about, i * step)
+        yield _Member(limb, _placed(limb, f"{limb.name}{i + 1}", str(i + 1), turn), str(i + 1))
+
+
+def _placed(limb: LimbRecord, name: str, suffix: str, turn: np.ndarray) -> Placed:
+    """One copy of a limb, turned."""
+    steps: list[Step] = []
+    for i, joint in enumerate(limb.chain):
+        number = 1 + sum(other.joint == joint.joint for other in limb.chain[:i])
+        steps += _steps(joint, joint.name or f"{joint.joint}{number}", suffix)
+    tip = place_matrix(limb.tip)
+    if steps:
+        steps[0] = replace(steps[0], place=turn @ steps[0].place)
+    else:
+        tip = turn @ tip
+    if limb.ending != "distance" and (limb.length or limb.actuated):
+        raise MechanismError(
+            f"limb {limb.name!r} ends {limb.ending} and states a rod's length or drive; state ending: distance, or leave it out"
+        )
+    drive = limb.actuated + suffix if limb.actuated else None
+    return placed(name, tuple(steps), tip, limb.ending, turn @ place_matrix(limb.attach), limb.length, drive)
+
+
+def _steps(joint: JointRecord, name: str, suffix: str) -> list[Step]:
+    """A joint as R and P joints."""
+    place, here = place_matrix(joint.at), np.eye(4)
+    if isinstance(joint, Revolute):
+        motor = joint.actuated + suffix if joint.actuated else None
+        return [Step(name, "R", place, direction(joint.axis), motor, joint.lead / (2 * np.pi), joint.start)]
+    if isinstance(joint, Prismatic):
+        motor = joint.actuated + suffix if joint.actuated else None
+        return [Step(name, "P", place, direction(joint.axis), motor, 0.0, joint.start)]
+    if isinstance(joint, Cylindrical):
+        axis = direction(joint.axis)
+        turn = Step(f"{name}.turn", "R", place, axis, start=joint.start)
+        return [turn, Step(f"{name}.slide", "P", here, axis, start=joint.slide_start)]
+    axes = [direction(axis) for axis in joint.axes] if isinstance(joint, Universal) else [EZ, EY, EX]
+    return [
+        Step(f"{name}.{i + 1}", "R", place if i == 0 else here, axis, start=start)
+        for i, (axis, start) in enumerate(zip(axes, joint.start, strict=True))
+    ]
+
+
+def _shifts(limb: Placed, entry: Shifts) -> Errors:
+    """Unknown lengths of a limb."""
+    sd, found = standard_deviation(entry.tolerance, f"{limb.name} {entry.of}"), Errors()
+    for axis in entry.shift:
+        label = f"{limb.name}.{entry.name or entry.of}"
+        if axis == "length":
+            _check_rod(limb, entry)
+            name = label if entry.name else f"{limb.name}.length"
+            address = Address(limb.name, "rod", "length")
+            found += quantity(name, Dimension.LENGTH, limb.limb.length, sd, Linear(name, address))
+            continue
+        element = _element(limb, entry.of)
+        place, name = limb.places[element], f"{label}.{axis}"
+        nominal = float((place[:3, :3].T @ place[:3, 3])["xyz".index(axis)])
+        found += quantity(name, Dimension.LENGTH, nominal, sd, *moved(name, limb, element, axis))
+    return found
+
+
+def _check_rod(limb: Placed, entry: Shifts) -> None:
+    if limb.limb.ending != "distance" or entry.of != "rod":
+        raise MechanismError(f"{limb.name!r}: 'length' belongs to a rod; write 'of: rod' in a limb that ends in a distance")
+
+
+def _tilts(limb: Placed, entry: Tilts) -> Errors:
+    """Unknown angles of a limb."""
+    sd, found = standard_deviation(entry.tolerance, f"{limb.name} {entry.of}"), Errors()
+    element = _element(limb, entry.of)
+    for axis in entry.tilt:
+        name = f"{limb.name}.{entry.name or entry.of}.{axis}"
+        maps = tilted(name, limb, element, axis) if entry.alone else moved(name, limb, element, axis)
+        found += quantity(name, Dimension.ANGLE, 0.0, sd, *maps)
+    return found
+
+
+def _element(limb: Placed, name: str) -> str:
+    """A link of a limb; a joint of several is meant by its first. Raises MechanismError listing what there is."""
+    for found in (name, f"{name}.1", f"{name}.turn"):
+        if found in limb.elements:
+            return found
+    raise MechanismError(f"limb {limb.name!r} has no {name!r}; it has {', '.join(limb.elements)}")
+
+
+def _named(named: Named, members: dict[str, tuple[_Member, ...]], drives: set[str]) -> Errors:
+    """A parameter with maps of its own."""
+    if isinstance(named, NamedLength):
+        dimension, nominal = Dimension.LENGTH, named.length
+    else:
+        dimension, nominal = (Dimension.ANGLE, named.angle) if isinstance(named, NamedAngle) else (Dimension.RATIO, named.ratio)
+    maps = [linear for entry in named.maps for linear in _onto(named.name, entry, members, drives)]
+    sd = standard_deviation(named.tolerance, named.name)
+    return quantity(named.name, dimension, nominal, sd, *maps)
+
+
+def _onto(name: str, entry: Onto, members: dict[str, tuple[_Member, ...]], drives: set[str]) -> Iterator[Linear]:
+    """One entry of a parameter's maps, for every copy that it means."""
+    coefficient = entry.coefficient * (1.0 if entry.arm is None else entry.arm)
+    if entry.limb in drives:
+        yield Linear(name, Address(entry.limb, entry.element, entry.axis), coefficient)
+        return
+    found = members.get(entry.limb) or tuple(m for ms in members.values() for m in ms if m.placed.name == entry.limb)
+    if not found:
+        known = ", ".join((*members, *sorted(drives)))
+        raise MechanismError(f"parameter {name!r} is mapped onto {entry.limb!r}, which is not there; known are {known}")
+    for one in found:
+        if entry.axis in AXES:
+            yield from moved(name, one.placed, _element(one.placed, entry.element), entry.axis, coefficient)
+        else:
+            yield Linear(name, Address(one.placed.name, entry.element, entry.axis), coefficient)
+
+
+def _actuator(name: str, drive: Drive, turns: bool) -> Actuator:
+    """A drive for the engine; terms are those that the file changes."""
+    gain = drive.radius if isinstance(drive, SpoolDrive) else drive.gain
+    dimension = Dimension.LENGTH if isinstance(drive, LengthDrive) else Dimension.ANGLE
+    return Actuator(name, dimension, drive.stroke, {"offset": drive.offset, "gain": gain}, drive.period, drive.sigma)
+
+
+def _drive_errors(name: str, drive: Drive, turns: bool) -> Errors:
+    """Unknown terms of a drive, `q1.offset` and so on; a spool's gain is called its radius."""
+    spool, found = isinstance(drive, SpoolDrive), Errors()
+    terms = tuple("radius" if spool and term == "gain" else term for term in TERMS)
+    own = Dimension.ANGLE if turns else Dimension.LENGTH
+    tolerance = drive.angle if isinstance(drive, AngleDrive) else drive.length
+    for term in drive.unknown:
+        if term not in terms:
+            raise MechanismError(f"actuator {name!r} has no term {term!r}; allowed are {', '.join(terms)}")
+        full = f"{name}.{term}"
+        if term == "radius":
+            assert isinstance(drive, SpoolDrive)
+            dimension, nominal, sd = Dimension.LENGTH, drive.radius, drive.radii
+        elif term == "gain":
+            assert not isinstance(drive, SpoolDrive)
+            dimension, nominal, sd = Dimension.RATIO, drive.gain, drive.ratio
+        else:
+            dimension, nominal, sd = own, drive.offset if term == "offset" else 0.0, tolerance
+        address = Address(name, "transmission", "gain" if term == "radius" else term)
+        found += quantity(full, dimension, nominal, standard_deviation(sd, full), Linear(full, address))
+    return found
