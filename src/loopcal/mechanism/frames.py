@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from loopcal import se3
-from loopcal.engine import PITCH, Array, Group, State
 from loopcal.engine import LENGTH as ROD
+from loopcal.engine import PITCH, Array, Group, State
 from loopcal.mechanism.model import Mechanism
 
 

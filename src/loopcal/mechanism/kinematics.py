@@ -51,7 +51,8 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
 
     Parameters
     ----------
-    q : (n, a) readings [m or rad], or (n, 2 a) with their directions of approach (+1, -1, 0 unknown) behind them. start : a solution of one row or n rows that chooses the assembly mode.
+    q : (n, a) readings [m or rad], or (n, 2 a) with their directions of approach (+1, -1, 0 unknown) behind them.
+    start : a solution of one row or n rows that chooses the assembly mode.
 
     Returns
     -------

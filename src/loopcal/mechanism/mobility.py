@@ -41,8 +41,8 @@ def checked(robot: Mechanism) -> Mechanism:
     rank = int((s > RANK * max(s[0], 1e-300)).sum()) if len(s) else 0
     if rank < m:
         raise MechanismError(
-            f"{robot.name}: with every actuator held the platform can still move at home: {_motion(program.freedoms, V[rank])}; "
-            f"its {len(A)} closure equations hold {rank} of {m} freedoms; add a limb or actuator, or state fewer freedoms"
+            f"{robot.name}: with every actuator held the platform can still move at home: "
+            f"{_motion(program.freedoms, V[rank])}; its {len(A)} closure equations hold {rank} of {m} freedoms; add a limb or actuator, or state fewer freedoms"
         )
     movable = _mobility(robot, blocks, A)
     a = program.n_joints
