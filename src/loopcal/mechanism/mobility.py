@@ -42,7 +42,8 @@ def checked(robot: Mechanism) -> Mechanism:
     if rank < m:
         raise MechanismError(
             f"{robot.name}: with every actuator held the platform can still move at home: "
-            f"{_motion(program.freedoms, V[rank])}; its {len(A)} closure equations hold {rank} of {m} freedoms; add a limb or actuator, or state fewer freedoms"
+            f"{_motion(program.freedoms, V[rank])}; its {len(A)} closure equations hold {rank} of {m} freedoms; "
+            "add a limb or actuator, or state fewer freedoms"
         )
     movable = _mobility(robot, blocks, A)
     a = program.n_joints
