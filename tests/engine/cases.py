@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mechanisms as the engine sees them, and their closure written down a second time, plainly, one limb at a time."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopcal import se3
+from loopcal.engine import LENGTH, PITCH, Block, Group, Program, State
+from loopcal.mechanism import Mechanism
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A program with displacements e (t, ..), joint values q (t, n, a) near home, and home as the start."""
+
+    name: str
+    program: Program
+    e: Array
+    q: Array
+    home: State
+
+    @property
+    def home_q(self) -> Array:
+        """Joint values (1, 1, a) at home."""
+        return driven(self.program, self.home)
+
+
+def case(robot: Mechanism, t: int = 1, n: int = 5, seed: int = 1) -> Case:
+    """Random displacements of about 1e-3 of the size, joint values within some hundredths of it from home."""
+    rng, p = np.random.default_rng(seed), robot.program
+    e = rng.normal(size=(t, p.n_displacements)) * 1e-3 * unit_of_displacements(p)
+    if p.freedoms == (2, 3, 4):
+        # closure of orientation is asked for about z alone; what tilts out of the plane bends its column by tilt^2 / 12
+        e *= np.concatenate([np.tile([s.axis not in (0, 1) for s in g.slots], len(g.limbs)) for g in p.groups])
+    step = np.array([0.03 * p.size if a.dimension.value == "length" else 0.05 for a in robot.actuators])
+    q = driven(p, robot.home_state) + rng.uniform(-1, 1, (t, n, p.n_joints)) * step
+    return Case(robot.name, p, e, q, robot.home_state)
+
+
+def driven(program: Program, state: State) -> Array:
+    """Values of the actuated joints (t, n, a)."""
+    q = np.zeros((*state.T.shape[:2], program.n_joints))
+    for group, joints in zip(program.groups, state.joints, strict=True):
+        for j, columns in enumerate(group.actuator):
+            if columns[0] >= 0:
+                q[..., columns] = joints[..., j]
+    return q
+
+
+def unit_of_displacements(program: Program) -> Array:
+    """What counts as one for each displacement: a radian, or the size of the robot [m]."""
+    unit = np.ones(program.n_displacements)
+    for group in program.groups:
+        own = [1.0 if s.axis < 3 else program.size for s in group.slots]
+        unit[group.columns] = np.tile(own, len(group.limbs))
+    return unit
+
+
+def unknowns(program: Program, state: State, free: bool = False) -> Array:
+    """Joints that closure determines (t, n, u): group by group, limb by limb."""
+    parts = [
+        joints[..., group.unknown(free)].reshape(*state.T.shape[:2], -1)
+        for group, joints in zip(program.groups, state.joints, strict=True)
+    ]
+    return np.concatenate(parts, axis=-1)
+
+
+def motion(program: Program, state: State, of: State, free: bool = False) -> Array:
+    """Change (t, n, m + u) of the platform (as a twist, its freedoms only) and of the unknown joints since `of`."""
+    twist = se3.difference(state.T, np.broadcast_to(of.T, state.T.shape))[..., list(program.freedoms)]
+    return np.concatenate([twist, unknowns(program, state, free) - unknowns(program, of, free)], axis=-1)
+
+
+def pose_demand(target: Array, size: float) -> Callable[[Array, Array], tuple[Array, Array]]:
+    """The task of reaching poses (N, 4, 4), all six freedoms."""
+
+    def task(T: Array, rows: Array) -> tuple[Array, Array]:
+        gap = se3.difference(T, target[rows])
+        columns = np.zeros((len(rows), 6, 6))
+        columns[:, :3, :3] = se3.left_jacobian_inverse_so3(gap[:, :3])
+        columns[:, 3:, 3:] = np.eye(3)
+        scale = np.array([size] * 3 + [1.0] * 3)
+        return gap * scale, columns * scale[:, None]
+
+    return task
+
+
+# --- closure once more, for numpy or jax, one row and one limb at a time ---------------------------------------------
+
+
+_HAT = np.zeros((3, 3, 3))
+_HAT[[0, 1, 2], [2, 0, 1], [1, 2, 0]], _HAT[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0, -1.0
+
+
+def rotation(xp: ModuleType, w: Any) -> Any:
+    """exp(hat(w)) for (..., 3), safe for differentiation at zero."""
+    t2 = (w * w).sum(-1)[..., None, None]
+    small = t2 < 1e-16
+    t = xp.sqrt(xp.where(small, 1.0, t2))
+    a = xp.where(small, 1.0 - t2 / 6, xp.sin(t) / t)
+    b = xp.where(small, 0.5, (1 - xp.cos(t)) / (t * t))
+    K = xp.einsum("ijl,...l->...ij", _HAT, w)
+    return xp.eye(3) + a * K + b * (K @ K)
+
+
+def homogeneous(xp: ModuleType, R: Any, t: Any) -> Any:
+    """(..., 4, 4) of rotations and positions."""
+    last = xp.broadcast_to(xp.array([0.0, 0.0, 0.0, 1.0]), (*t.shape[:-1], 1, 4))
+    return xp.concatenate([xp.concatenate([R, t[..., None]], axis=-1), last], axis=-2)
+
+
+def limb_rows(xp: ModuleType, group: Group, k: int, size: float, T: Any, theta: Any, own: Any) -> Any:
+    """Closure residual of limb k: T (4, 4), joint values theta (J + 1,), the limb's own displacements."""
+    count = len(group.joints)
+    place, pitch_of, length_of = np.zeros((count + 2, 6, len(own))), np.zeros((count, len(own))), np.zeros(len(own))
+    for s, slot in enumerate(group.slots):
+        if slot.axis == PITCH:
+            pitch_of[slot.element, s] = 1.0
+        elif slot.axis == LENGTH:
+            length_of[s] = 1.0
+        else:
+            place[slot.element, slot.axis, s] = 1.0
+    move = place @ own
+    shifted = homogeneous(xp, xp.broadcast_to(xp.eye(3), (count + 2, 3, 3)), move[:, 3:])
+    turned = homogeneous(xp, rotation(xp, move[:, :3]), xp.zeros((count + 2, 3)))
+    placed = group.links[k] @ shifted @ turned
+    tip, z = placed[0], np.array([0.0, 0.0, 1.0])
+    if count:
+        turns = np.array([letter == "R" for letter in group.joints])
+        advance = theta[:count] * xp.where(turns, group.pitch[k] + pitch_of @ own, 1.0)
+        moved = homogeneous(xp, rotation(xp, (theta[:count] * turns)[:, None] * z), advance[:, None] * z)
+        for j in range(count):
+            tip = tip @ moved[j] @ placed[j + 1]
+    end = T @ placed[-1]
+    gap = end[:3, 3] - tip[:3, 3]
+    if group.ending == "distance":
+        return (xp.sqrt(gap @ gap) - group.length[k] - theta[count] - length_of @ own)[None]
+    if group.ending == "ball":
+        return gap[np.array(group.rows)]
+    turn = end[:3, :3] @ tip[:3, :3].T
+    skew = 0.5 * xp.einsum("ijl,ij->l", _HAT, turn)
+    return xp.concatenate([size * skew, gap])[np.array(group.rows)]
+
+
+def open_by(program: Program, state: State, e: Array) -> Array:
+    """Norm of the plain closure residual (t, n) [m]."""
+    t, n = state.T.shape[:2]
+    out = np.zeros((t, n))
+    for group, joints in zip(program.groups, state.joints, strict=True):
+        for k in range(len(group.limbs)):
+            for i, r in np.ndindex(t, n):
+                own = e[min(i, len(e) - 1), group.columns].reshape(len(group.limbs), -1)[k]
+                rows = limb_rows(np, group, k, program.size, state.T[i, r], joints[i, r, k], own)
+                out[i, r] = np.hypot(out[i, r], np.linalg.norm(rows))
+    return out
+
+
+# --- what the blocks of `linearise` say, solved row by row -----------------------------------------------------------
+
+
+def spread(program: Program, parts: tuple[Block, ...]) -> tuple[Array, Array, Array]:
+    """Rows of all limbs, one after the other, against freedoms, displacements and joint values: (t, n, c, m | s | a)."""
+    A, E, Q = [], [], []
+    for group, block in zip(program.groups, parts, strict=True):
+        own = np.arange(program.n_displacements)[group.columns].reshape(len(group.limbs), -1)
+        for k in range(len(group.limbs)):
+            t, n, _, r = block.A.shape[:4]
+            slots, drives = np.zeros((t, n, r, program.n_displacements)), np.zeros((t, n, r, program.n_joints))
+            slots[..., own[k]] = block.E[:, :, k]
+            for j, columns in enumerate(group.actuator):
+                if columns[0] >= 0:
+                    drives[..., columns[k]] = block.Q[:, :, k, :, j]
+            A.append(block.A[:, :, k])
+            E.append(slots)
+            Q.append(drives)
+    return np.concatenate(A, axis=2), np.concatenate(E, axis=2), np.concatenate(Q, axis=2)
+
+
+def slopes(program: Program, blocks: Any, free: bool = False) -> Array:
+    """d (platform, unknown joints) / d (displacements, joint values): (t, n, m + u, s + a); `free`: / d (platform, displacements)."""
+    A, E, Q = spread(program, blocks.closure)
+    m = len(program.freedoms)
+    right = np.concatenate([E, Q], axis=-1)
+    if free:
+        platform = np.broadcast_to(np.eye(m, m + E.shape[-1]), (*A.shape[:2], m, m + E.shape[-1]))
+    else:
+        platform = -np.linalg.pinv(A) @ right
+    parts = [platform]
+    for group, block in zip(program.groups, blocks.passive, strict=True):
+        own = np.arange(program.n_displacements)[group.columns].reshape(len(group.limbs), -1)
+        for k in range(len(group.limbs)):
+            U, E_k = block.U[:, :, k], np.zeros((*block.U.shape[:2], block.U.shape[3], program.n_displacements))
+            E_k[..., own[k]] = block.E[:, :, k]
+            Q_k = np.zeros((*U.shape[:3], program.n_joints))
+            for j, columns in enumerate(group.actuator):
+                if columns[0] >= 0:
+                    Q_k[..., columns[k]] = block.Q[:, :, k, :, j]
+            own_rows = np.concatenate([np.zeros((*U.shape[:3], m)), E_k] if free else [E_k, Q_k], axis=-1)
+            rows = block.A[:, :, k] @ platform + own_rows
+            parts.append(-np.linalg.solve(U, rows))
+    return np.concatenate(parts, axis=2)

@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The engine under test: every test of this folder takes it as a fixture, so that another engine is accepted by adding it here."""
+
+import importlib
+from types import ModuleType
+
+import pytest
+
+from tests import zoo
+from tests.engine.cases import Case, case
+
+
+@pytest.fixture(scope="session", params=["loopcal.engine"])
+def engine(request) -> ModuleType:
+    return importlib.import_module(request.param)
+
+
+@pytest.fixture(scope="session", params=["menagerie", "three_prs", "hexapod", "delta", "five_bar", "planar_rrr"])
+def some(request) -> Case:
+    """One mechanism after another: six, three and two freedoms, all endings, with and without passive joints."""
+    return case(getattr(zoo, request.param)())

@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The engine in NumPy is specification and default: it has to stay small enough to be read in one sitting."""
+
+import ast
+from pathlib import Path
+
+
+def test_the_engine_has_at_most_five_files_and_600_lines(root: Path):
+    files = sorted((root / "src" / "loopcal" / "engine").glob("*.py"))
+    assert len(files) <= 5
+    assert sum(len(file.read_text("utf-8").splitlines()) for file in files) <= 600
+
+
+def test_the_engine_imports_numpy_and_nothing_of_loopcal(root: Path):
+    found = set()
+    for file in (root / "src" / "loopcal" / "engine").glob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            found |= {name for name in names if not name.startswith("loopcal.engine")}
+    assert found <= {"numpy", "numpy.typing", "__future__", "collections.abc", "dataclasses", "typing"}
