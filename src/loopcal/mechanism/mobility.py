@@ -101,8 +101,9 @@ def hold_spinning(program: engine.Program, guess: engine.State) -> tuple[engine.
     The program, and the (limb, joint) pairs held.
     """
     rng = np.random.default_rng(0)
-    e, q = np.zeros((1, program.n_displacements)), np.zeros((1, 1, program.n_joints))
     shaken = replace(guess, joints=tuple(j + rng.uniform(-0.3, 0.3, j.shape) for j in guess.joints))
+    # driven joints as shaken too: a slide at zero would take a leg's lower joint for one that only spins it
+    e, q = np.zeros((1, program.n_displacements)), states.actuated(program, shaken)
     blocks = engine.linearise(program, e, q, shaken)
     groups, held = [], []
     for group, block, joints in zip(program.groups, blocks.passive, blocks.joints, strict=True):
