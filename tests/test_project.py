@@ -66,6 +66,12 @@ def test_every_make_command_in_the_pages_exists(root: Path, page: str) -> None:
     assert named <= targets
 
 
+def test_the_list_of_decisions_is_complete(root: Path) -> None:
+    folder = root / "docs" / "decisions"
+    listed = re.findall(r"^\| \[\d\d\]\(([^)]+)\)", (folder / "README.md").read_text("utf-8"), re.MULTILINE)
+    assert listed == sorted(path.name for path in folder.glob("[0-9]*.md") if not path.name.startswith("00"))
+
+
 def test_links_between_the_pages_lead_somewhere(root: Path, tracked: list[Path]) -> None:
     pages = [path for path in tracked if path.suffix == ".md"]
     links = [(page, link) for page in pages for link in re.findall(r"\]\(([^)#:]+)\)", page.read_text("utf-8"))]
