@@ -2,8 +2,8 @@
 """One triangular factor of any number of rows, and the one decomposition from which everything else is read.
 
 Rows [A | b] of a linear least-squares problem are folded, block by block, into the triangular factor of their QR
-decomposition; the right-hand side rides along as the last column, so that the norm of what no solution explains is
-the last diagonal entry. Singular values, rank, solutions, filters and covariances come from the singular value
+decomposition (`loopcal.engine.accumulate`); the right-hand side rides along as the last column, so that the norm of
+what no solution explains is the last diagonal entry. Singular values, rank, solutions, filters and covariances come from the singular value
 decomposition of that factor. The product A'A is never formed: it would turn null directions of 1e-14 into 1e-7.
 Every array has a leading trial axis t. See docs/theory/estimation.md.
 """
@@ -31,29 +31,8 @@ NULL_COMPONENT = 1e-8
 
 
 def empty_factor(trials: int, parameters: int) -> FloatArray:
-    """Return the factor of no rows at all: zeros (t, p + 1, p + 1)."""
+    """Return the factor of no rows at all, zeros (t, p + 1, p + 1), into which the engine folds rows [A | b]."""
     return np.zeros((trials, parameters + 1, parameters + 1))
-
-
-def fold(factor: FloatArray | None, rows: FloatArray) -> FloatArray:
-    """Fold rows into a triangular factor: R'R of the result = R'R of `factor` + rows'rows, without forming either.
-
-    Parameters
-    ----------
-    factor : (t, p + 1, p + 1) upper triangular, or None for the first block.
-    rows : (t, m, p + 1) rows [A | b]; a row of zeros changes nothing.
-
-    Returns
-    -------
-    (t, p + 1, p + 1) upper triangular. Signs of its rows are those that the QR decomposition leaves.
-    """
-    columns = rows.shape[-1]
-    if factor is not None:
-        rows = np.concatenate([factor, rows], axis=-2)
-    if rows.shape[-2] < columns:
-        missing = np.zeros((*rows.shape[:-2], columns - rows.shape[-2], columns))
-        rows = np.concatenate([rows, missing], axis=-2)
-    return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
 
 
 PER_TRIAL = ("singular_values", "directions", "projections", "outside", "rows")
@@ -213,7 +192,7 @@ def decompose(
 
     Parameters
     ----------
-    factor : (t, p + 1, p + 1) from `fold`.
+    factor : (t, p + 1, p + 1) upper triangular, as `engine.accumulate` folds it.
     rows : (t,) number of equations that were folded.
     about : (t, p), optional. With it the last column is read as a residual r at the deviation z = `about`, and the
         problem becomes the one for the total deviation: |A z_new - b| with b = A z - r.

@@ -52,9 +52,7 @@ def read(path: Path) -> Certified:
 
 def _gauss(b, x):
     return (
-        b[0] * np.exp(-b[1] * x)
-        + b[2] * np.exp(-((x - b[3]) ** 2) / b[4] ** 2)
-        + b[5] * np.exp(-((x - b[6]) ** 2) / b[7] ** 2)
+        b[0] * np.exp(-b[1] * x) + b[2] * np.exp(-((x - b[3]) ** 2) / b[4] ** 2) + b[5] * np.exp(-((x - b[6]) ** 2) / b[7] ** 2)
     )
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from loopcal.calibrate.descent import DescentStatus, StepControl, descend
 from loopcal.calibrate.filters import MAP, LeastSquares, Ridge
-from loopcal.linalg import fold
+from tests.calibrate.problems import folded
 
 
 class Exponentials:
@@ -23,7 +23,7 @@ class Exponentials:
         decay = np.exp(-(1.0 + b) * self.x)
         residual = (1.0 + a) * decay + c - self.y[trials]
         columns = [decay, -(1.0 + a) * self.x * decay, np.ones_like(decay)]
-        return fold(None, np.stack([*columns, residual], axis=2)), (residual**2).sum(axis=1)
+        return folded(np.stack([*columns, residual], axis=2)), (residual**2).sum(axis=1)
 
 
 class Circle:
@@ -35,7 +35,7 @@ class Circle:
         x, y = 1.0 + deviation[:, 0], deviation[:, 1]
         length = np.hypot(x, y)
         row = np.stack([x / length, y / length, length - 2.0], axis=1)[:, None, :]
-        return fold(None, row), (length - 2.0) ** 2
+        return folded(row), (length - 2.0) ** 2
 
 
 class Unreachable:

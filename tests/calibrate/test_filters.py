@@ -7,7 +7,8 @@ import pytest
 from loopcal.calibrate.filters import MAP, LeastSquares, Ridge, TruncatedSVD
 from loopcal.calibrate.rules import GCV, MarginalLikelihood, TruncationGCV
 from loopcal.errors import EstimationError
-from loopcal.linalg import decompose, fold
+from loopcal.linalg import decompose
+from tests.calibrate.problems import folded
 
 P, M, T = 6, 50, 4
 
@@ -19,7 +20,7 @@ def rows() -> np.ndarray:
 
 def estimate(rows: np.ndarray, method) -> np.ndarray:
     """Deviation (t, p) that the method finds for linear rows [A | b]."""
-    d = decompose(fold(None, rows), np.full(len(rows), rows.shape[1]), scale=method.scale(P))
+    d = decompose(folded(rows), np.full(len(rows), rows.shape[1]), scale=method.scale(P))
     return d.deviation(d.solution(method.penalty(d)))
 
 
@@ -27,9 +28,7 @@ def stacked(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Solve the least-squares problem with the penalty written as extra rows."""
     return np.stack(
         [
-            np.linalg.lstsq(
-                np.vstack([r[:, :P], np.diag(np.sqrt(weights))]), np.append(r[:, P], np.zeros(P)), rcond=None
-            )[0]
+            np.linalg.lstsq(np.vstack([r[:, :P], np.diag(np.sqrt(weights))]), np.append(r[:, P], np.zeros(P)), rcond=None)[0]
             for r in rows
         ]
     )
@@ -55,24 +54,22 @@ def test_truncation_at_full_rank_and_ridge_at_zero_are_least_squares(rows):
 
 
 def test_truncation_projects_the_least_squares_solution_onto_the_strongest_directions(rows):
-    d = decompose(fold(None, rows), np.full(T, M))
+    d = decompose(folded(rows), np.full(T, M))
     strongest = d.directions[:, :, :3]
     expected = strongest @ (strongest.swapaxes(-1, -2) @ estimate(rows, LeastSquares())[:, :, None])
     np.testing.assert_allclose(estimate(rows, TruncatedSVD(3)), expected[:, :, 0], rtol=1e-12)
 
 
 def test_filter_factors_are_the_formulas(rows):
-    d = decompose(fold(None, rows), np.full(T, M))
+    d = decompose(folded(rows), np.full(T, M))
     s2 = d.singular_values**2
     np.testing.assert_allclose(d.filter_factors(Ridge(0.7).penalty(d)), s2 / (s2 + 0.7), rtol=1e-15)
-    np.testing.assert_array_equal(
-        d.filter_factors(TruncatedSVD(2).penalty(d)), np.arange(P) < np.array([2] * T)[:, None]
-    )
+    np.testing.assert_array_equal(d.filter_factors(TruncatedSVD(2).penalty(d)), np.arange(P) < np.array([2] * T)[:, None])
     np.testing.assert_array_equal(d.filter_factors(LeastSquares().penalty(d)), np.ones((T, P)))
 
 
 def test_posterior_covariance_of_map_is_the_inverse_information(rows):
-    d = decompose(fold(None, rows), np.full(T, M))
+    d = decompose(folded(rows), np.full(T, M))
     covariance = d.covariance(MAP().penalty(d))
     for r, c in zip(rows, covariance, strict=True):
         np.testing.assert_allclose(c @ (r[:, :P].T @ r[:, :P] + np.eye(P)), np.eye(P), atol=1e-12)
@@ -83,14 +80,14 @@ def test_eliminating_unknowns_by_projection_equals_solving_for_all_of_them_at_on
     local, rest = rows[:, :, 4:P], np.concatenate([rows[:, :, :4], rows[:, :, P:]], axis=2)
     q = np.linalg.qr(local).Q
     projected = rest - q @ (q.swapaxes(-1, -2) @ rest)
-    d = decompose(fold(None, projected), np.full(T, M - 2))
+    d = decompose(folded(projected), np.full(T, M - 2))
     np.testing.assert_allclose(d.deviation(d.solution(np.zeros((T, 4)))), joint, rtol=1e-12)
 
 
 def test_gcv_is_at_its_minimum(rows):
     rows = rows.copy()
     rows[:, :, P] += rows[:, :, :P] @ np.full(P, 0.3)  # something to find, so that the minimum is inside
-    d = decompose(fold(None, rows), np.full(T, M))
+    d = decompose(folded(rows), np.full(T, M))
 
     def criterion(lam):
         penalty = np.broadcast_to(lam[:, None], (T, P))
@@ -105,7 +102,7 @@ def test_marginal_likelihood_finds_the_prior_variance_that_made_the_data():
     rng = np.random.default_rng(8)
     a = rng.standard_normal((1, 4000, 400))
     b = a @ (0.05 * rng.standard_normal((400, 1))) + rng.standard_normal((1, 4000, 1))
-    d = decompose(fold(None, np.concatenate([a, b], axis=2)), np.array([4000]))
+    d = decompose(folded(np.concatenate([a, b], axis=2)), np.array([4000]))
     # lam = 1 / 0.05^2 = 400; its standard error from 400 unknowns is about 400 sqrt(2 / 400) = 28
     assert MarginalLikelihood()(d)[0] == pytest.approx(400.0, abs=4 * 28)
 

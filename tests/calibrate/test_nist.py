@@ -13,8 +13,8 @@ import pytest
 
 from loopcal.calibrate.descent import DescentStatus, StepControl, descend
 from loopcal.calibrate.filters import LeastSquares
-from loopcal.linalg import fold
 from tests.calibrate.nist import MODELS, Certified, matching_digits, read, residual_and_jacobian
+from tests.calibrate.problems import folded
 
 NO_CUT = 1e-15  # [1] the starts are so far off that genuine directions sink to the rank tolerance used for robots
 
@@ -38,13 +38,13 @@ class Regression:
             cost = np.array([residual @ residual])
         if not np.isfinite(rows).all():
             return np.zeros((1, self.parameters + 1, self.parameters + 1)), np.array([np.inf])
-        return fold(None, rows[None]), cost
+        return folded(rows[None]), cost
 
 
 def score(certified: Certified, start: np.ndarray) -> tuple[float, float, int, str]:
     """Fit and return matching digits of values and of standard errors, accepted steps, status."""
     problem = Regression(certified, start)
-    control = StepControl(iterations=2000)
+    control = StepControl(iterations=2000, relative=1e-8)
     fit = descend(problem, np.zeros((1, problem.parameters)), LeastSquares(), control, tolerance=NO_CUT)
     errors = fit.decomposition.standard_deviations(fit.penalty, fit.cost / certified.degrees)[0] * np.abs(start)
     return (

@@ -4,9 +4,14 @@
 import numpy as np
 import pytest
 
-from loopcal.linalg import decompose, empty_factor, fold
+from loopcal.engine import accumulate
+from loopcal.linalg import decompose, empty_factor
 
 P, M, T = 7, 40, 3
+
+
+def folded(rows: np.ndarray) -> np.ndarray:
+    return accumulate(empty_factor(len(rows), P), rows)
 
 
 @pytest.fixture
@@ -32,44 +37,44 @@ def none(d) -> np.ndarray:
 
 
 def test_folding_in_blocks_of_any_size_gives_the_same_triangle_up_to_signs(rows):
-    whole = np.abs(fold(None, rows))
+    whole = np.abs(folded(rows))
     for cuts in ([1, 3, 20], [10], list(range(1, M))):
         factor = empty_factor(T, P)
         for block in np.split(rows, cuts, axis=1):
-            factor = fold(factor, block)
+            factor = accumulate(factor, block)
         np.testing.assert_allclose(np.abs(factor), whole, rtol=0, atol=1e-12 * whole.max())
 
 
 def test_the_order_of_rows_changes_the_triangle_by_rounding_only(rows):
     shuffled = rows[:, np.random.default_rng(1).permutation(M)]
-    a, b = np.abs(fold(None, rows)), np.abs(fold(None, shuffled))
+    a, b = np.abs(folded(rows)), np.abs(folded(shuffled))
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-13 * a.max())
 
 
 def test_a_row_of_weight_zero_equals_no_row(rows):
     zeroed = rows.copy()
     zeroed[:, 5:9] = 0.0
-    d = decompose(fold(None, zeroed), counts() - 4)
-    e = decompose(fold(None, np.delete(rows, slice(5, 9), axis=1)), counts() - 4)
+    d = decompose(folded(zeroed), counts() - 4)
+    e = decompose(folded(np.delete(rows, slice(5, 9), axis=1)), counts() - 4)
     scale = d.solution(none(d))
     np.testing.assert_allclose(d.deviation(scale), e.deviation(e.solution(none(e))), rtol=1e-12)
 
 
 def test_the_solution_and_what_it_leaves_equal_those_of_lapack(rows):
-    d = decompose(fold(None, rows), counts())
+    d = decompose(folded(rows), counts())
     z = d.deviation(d.solution(none(d)))
     for i in range(T):
         expected, left, rank, s = np.linalg.lstsq(rows[i, :, :P], rows[i, :, P], rcond=None)
-        np.testing.assert_allclose(z[i], expected, rtol=1e-12)
+        np.testing.assert_allclose(z[i], expected, rtol=1e-11)  # rounding times a condition of 1e4
         np.testing.assert_allclose(d.remaining(none(d))[i], left[0], rtol=1e-12)
         np.testing.assert_allclose(d.singular_values[i], s, rtol=1e-12)
         assert d.rank[i] == rank == P
 
 
 def test_trials_stacked_equal_trials_alone_bit_for_bit(rows):
-    stacked = decompose(fold(None, rows), counts())
+    stacked = decompose(folded(rows), counts())
     for i in range(T):
-        alone = decompose(fold(None, rows[i : i + 1]), counts(1))
+        alone = decompose(folded(rows[i : i + 1]), counts(1))
         for name in ("singular_values", "directions", "projections", "outside"):
             assert np.array_equal(getattr(stacked, name)[i], getattr(alone, name)[0]), name
         assert np.array_equal(stacked.covariance(none(stacked))[i], alone.covariance(none(alone))[0])
@@ -78,7 +83,7 @@ def test_trials_stacked_equal_trials_alone_bit_for_bit(rows):
 def test_rows_read_about_a_deviation_solve_for_the_total_deviation(rows):
     z0 = np.random.default_rng(2).standard_normal((T, P))
     residual = rows.copy()  # predicted - measured at z0, so A (z - z0) = -residual
-    d = decompose(fold(None, residual), counts(), about=z0)
+    d = decompose(folded(residual), counts(), about=z0)
     total = d.deviation(d.solution(none(d)))
     for i in range(T):
         step = np.linalg.lstsq(rows[i, :, :P], -rows[i, :, P], rcond=None)[0]
@@ -88,7 +93,7 @@ def test_rows_read_about_a_deviation_solve_for_the_total_deviation(rows):
 @pytest.mark.parametrize("rank", [P - 1, P - 3])
 def test_null_directions_come_out_at_1e_13_and_not_at_1e_7(rank):
     rows, null = deficient(rank, np.random.default_rng(rank))
-    d = decompose(fold(None, rows), counts(1))
+    d = decompose(folded(rows), counts(1))
     assert d.rank[0] == rank
     assert d.singular_values[0, rank] < 1e-13 * d.singular_values[0, 0]
     assert d.gap[0] > 1e10
@@ -98,14 +103,12 @@ def test_null_directions_come_out_at_1e_13_and_not_at_1e_7(rank):
 def test_infinite_variance_falls_on_exactly_the_parameters_of_the_null_directions():
     rows = np.random.default_rng(5).standard_normal((1, M, P + 1))
     rows[..., 2] = 3.0 * rows[..., 4]  # parameters 2 and 4 act as one
-    d = decompose(fold(None, rows), counts(1))
+    d = decompose(folded(rows), counts(1))
     penalty = np.where(d.used, 0.0, np.inf)
     sd = d.standard_deviations(penalty)[0]
     assert np.flatnonzero(np.isinf(sd)).tolist() == [2, 4]
     covariance = d.covariance(penalty)[0]
-    np.testing.assert_array_equal(
-        np.sqrt(np.diag(covariance)), np.where(np.isinf(sd), np.inf, np.sqrt(np.diag(covariance)))
-    )
+    np.testing.assert_array_equal(np.sqrt(np.diag(covariance)), np.where(np.isinf(sd), np.inf, np.sqrt(np.diag(covariance))))
     assert np.isnan(covariance[2, [0, 1, 3, 4]]).all()
     known = [0, 1, 3, 5, 6]
     reduced = np.delete(rows[0, :, :P], 2, axis=1)
@@ -124,14 +127,14 @@ def test_a_matrix_of_zeros_has_rank_zero_and_infinite_condition():
 
 def test_the_scale_of_columns_leaves_the_least_squares_solution_alone(rows):
     scale = np.array([1.0, 5.0, 0.1, 2.0, 1e3, 1.0, 1e-2])
-    a, b = decompose(fold(None, rows), counts()), decompose(fold(None, rows), counts(), scale=scale)
+    a, b = decompose(folded(rows), counts()), decompose(folded(rows), counts(), scale=scale)
     # rounding times the condition numbers of 1e4 and 1e6
     np.testing.assert_allclose(a.deviation(a.solution(none(a))), b.deviation(b.solution(none(b))), rtol=1e-8)
     np.testing.assert_allclose(a.covariance(none(a)), b.covariance(none(b)), rtol=1e-8, atol=1e-12)
 
 
 def test_taking_and_putting_trials_keeps_each_trial(rows):
-    d = decompose(fold(None, rows), counts())
+    d = decompose(folded(rows), counts())
     some = d.take(np.array([2, 0]))
     back = d.put(np.array([2, 0]), some)
     assert np.array_equal(back.directions, d.directions)

@@ -96,13 +96,14 @@ class StepControl:
     ----------
     iterations : evaluations of the rows after the first, at most.
     relative : converged when the step changes the whitened residuals by at most this share of their norm (the relative
-        offset of Bates and Watts, Technometrics 23, 1981).
+        offset of Bates and Watts, Technometrics 23, 1981). That step is still taken, without evaluating the rows again:
+        the result is the solution of the last decomposition.
     absolute : converged when the step is at most this long, in tolerances, relative to 1 + |z|.
     damping : of the first step, in units of the largest squared singular value; zero tries the full step.
     """
 
     iterations: int = 50
-    relative: float = 1e-8
+    relative: float = 1e-6
     absolute: float = 1e-12
     damping: float = 0.0
 
@@ -114,11 +115,11 @@ class Descent:
     Attributes
     ----------
     deviation : (t, p) total deviation z from nominal, in tolerances.
-    decomposition : of the rows at `deviation`, for the total deviation.
+    decomposition : of the rows next to `deviation`, for the total deviation.
     penalty : (t, p) what the method penalised there.
     cost : (t,) sum of squares of the whitened residuals.
-    status : (t,) DescentStatus. iterations : (t,) accepted steps. step : (t,) length of the last step considered.
-    deviation_history, cost_history : (i + 1, t, p) and (i + 1, t) after each round; trials that ended repeat.
+    status : (t,) DescentStatus. iterations : (t,) steps taken. step : (t,) length of the last step considered.
+    deviation_history, cost_history : (i + 1, t, p) and (i + 1, t) after each round; what ended repeats.
     """
 
     deviation: FloatArray
@@ -133,11 +134,7 @@ class Descent:
 
 
 def descend(
-    problem: Problem,
-    start: FloatArray,
-    method: Method,
-    control: StepControl | None = None,
-    tolerance: float = RANK_TOLERANCE,
+    problem: Problem, start: FloatArray, method: Method, control: StepControl | None = None, tolerance: float = RANK_TOLERANCE
 ) -> Descent:
     """Minimise the whitened sum of squares, filtered by the method, from `start`.
 
@@ -165,6 +162,9 @@ def descend(
             costs.append(run.cost.copy())
     else:
         run.propose(control)  # the last accepted point may be good enough
+    if (run.z != deviations[-1]).any():
+        deviations.append(run.z)
+        costs.append(run.cost)
     run.status[run.status == DescentStatus.RUNNING] = DescentStatus.OUT_OF_ITERATIONS
     return Descent(
         deviation=run.z,
@@ -207,6 +207,8 @@ class _Run:
         done = step.offset <= control.relative**2 * self.cost[active]
         done |= step.full_length <= control.absolute * self._spread(active)
         self.status[active[done]] = DescentStatus.CONVERGED
+        self.iterations[active[done]] += 1
+        self.z[active[done]] = step.target[done]
         return (active[~done], step.take(~done)) if done.any() else (active, step)
 
     def attempt(self, active: IntArray, step: Step) -> bool:

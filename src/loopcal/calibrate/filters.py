@@ -118,9 +118,7 @@ class Ridge:
             return
         values = np.asarray(self.lam, dtype=np.float64)
         if values.ndim > 1 or not np.all(np.isfinite(values)) or np.any(values < 0.0):
-            raise EstimationError(
-                f"ridge with lam = {self.lam}: give a finite number >= 0, one per parameter, or a rule"
-            )
+            raise EstimationError(f"ridge with lam = {self.lam}: give a finite number >= 0, one per parameter, or a rule")
         if values.ndim == 1:
             if np.any(values == 0.0):
                 raise EstimationError("ridge with lam = 0 for a single parameter: give each parameter a positive lam")
@@ -131,9 +129,7 @@ class Ridge:
         if not isinstance(self.lam, tuple):
             return None
         if len(self.lam) != parameters:
-            raise EstimationError(
-                f"ridge with {len(self.lam)} values of lam for {parameters} free parameters: give one each"
-            )
+            raise EstimationError(f"ridge with {len(self.lam)} values of lam for {parameters} free parameters: give one each")
         return 1.0 / np.sqrt(np.asarray(self.lam))
 
     def penalty(self, decomposition: Decomposition) -> FloatArray:

@@ -21,13 +21,14 @@ class Step:
 
     Attributes
     ----------
-    deviation : (a, p) total deviation to which it leads.
+    deviation : (a, p) total deviation to which it leads. target : (a, p) that to which the undamped step leads.
     length, full_length : (a,) of this step and of the undamped one, in tolerances.
     predicted : (a,) decrease of sum of squares plus penalty that the linear model promises.
     offset : (a,) squared length of the undamped step measured in the whitened residuals and the penalty.
     """
 
     deviation: FloatArray
+    target: FloatArray
     length: FloatArray
     full_length: FloatArray
     predicted: FloatArray
@@ -42,7 +43,8 @@ def propose(deviation: FloatArray, decomposition: Decomposition, penalty: FloatA
     """Return the step from `deviation` (a, p) to the filtered solution, damped by mu = `damping` (a,)."""
     s, c = decomposition.singular_values, decomposition.projections
     now = decomposition.coordinates(deviation)
-    full = decomposition.solution(penalty) - now
+    solution = decomposition.solution(penalty)
+    full = solution - now
     curvature = _curvature(s, penalty)
     new = now + curvature / (curvature + damping[:, None]) * full
     # differences of squares as products, so that a small decrease is not lost in a large sum
@@ -51,6 +53,7 @@ def propose(deviation: FloatArray, decomposition: Decomposition, penalty: FloatA
     reached = decomposition.deviation(new)
     return Step(
         deviation=reached,
+        target=decomposition.deviation(solution),
         length=np.linalg.norm(reached - deviation, axis=1),
         full_length=np.linalg.norm(decomposition.deviation(full), axis=1),
         predicted=(data + prior).sum(axis=1),

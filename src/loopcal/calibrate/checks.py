@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What cannot be estimated is refused beforehand, with what was found and what to do."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from loopcal.calibrate.filters import Method
+from loopcal.calibrate.rows import Rows
+from loopcal.errors import EstimationError
+from loopcal.linalg import FloatArray
+from loopcal.measure import Measurements, check_actuators
+from loopcal.mechanism import Mechanism
+
+
+def check_rows(rows: Rows, data: Measurements, robot: Mechanism) -> None:
+    """Refuse readings of another robot, a robot without free parameters, and data without any row.
+
+    Raises
+    ------
+    DataError
+        Wrong number of actuators.
+    EstimationError
+        Nothing to identify, or nothing to identify it from.
+    """
+    check_actuators(data, robot)
+    if rows.parameters == 0:
+        raise EstimationError(f"{robot.name} has no free parameter: free at least one of {len(robot.parameters)}")
+    if rows.rows[0] == 0:
+        raise EstimationError("no measured value counts: every row is absent or has weight 0; give at least one")
+
+
+def check_count(rows: Rows, data: Measurements, method: Method, allow_fewer: bool) -> None:
+    """Refuse fewer equations than parameters where the method has no prior to fill the gap.
+
+    Raises
+    ------
+    EstimationError
+        Naming both numbers and the poses that would do.
+    """
+    m, p = int(rows.rows[0]), rows.parameters
+    if m >= p or method.has_prior or allow_fewer:
+        return
+    poses = int(np.ceil(p * data.n_poses / m))
+    raise EstimationError(
+        f"{m} equations from {data.n_poses} poses cannot determine {p} parameters: measure at least {poses} poses like"
+        f" these (better twice as many), fix parameters, or use a method with a prior (MAP)"
+    )
+
+
+def check_start(rows: Rows, data: Measurements, deviation: FloatArray, cost: FloatArray) -> None:
+    """Refuse a start from which some poses cannot be reached.
+
+    Raises
+    ------
+    EstimationError
+        Naming the first poses and how many there are.
+    """
+    if np.isfinite(cost[0]):
+        return
+    lost = rows.unreachable(deviation)
+    names = ", ".join(repr(data.labels[i]) for i in lost[:5]) + (", ..." if len(lost) > 5 else "")
+    raise EstimationError(
+        f"the robot cannot reach {len(lost)} of {data.n_poses} poses with the readings given there (poses {names});"
+        " correct the readings, their unit or the robot's dimensions, or give these rows weight 0"
+    )

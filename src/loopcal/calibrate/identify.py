@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identify a robot's free parameters from measurements: one machine with all its diagnostics, or many trials at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from loopcal.calibrate.checks import check_count, check_rows, check_start
+from loopcal.calibrate.combinations import combinations
+from loopcal.calibrate.descent import Descent, DescentStatus, StepControl, descend
+from loopcal.calibrate.filters import LeastSquares, Method
+from loopcal.calibrate.identification import Identification, KindResiduals
+from loopcal.calibrate.rows import Residuals, rows_of, rows_of_trials
+from loopcal.calibrate.scaling import Unknowns, unknowns
+from loopcal.calibrate.statistics import ResidualCheck, residual_check
+from loopcal.errors import EstimationError
+from loopcal.linalg import RANK_TOLERANCE, Decomposition, FloatArray, IntArray
+from loopcal.measure import Measurements, Trials
+from loopcal.mechanism import Mechanism
+
+
+def identify(
+    robot: Mechanism,
+    data: Measurements,
+    method: Method | None = None,
+    *,
+    noise: Literal["given", "estimated"] = "given",
+    start: ArrayLike | None = None,
+    control: StepControl | None = None,
+    rank_tolerance: float = RANK_TOLERANCE,
+    allow_fewer_equations: bool = False,
+) -> Identification:
+    """Identify the free parameters of a robot.
+
+    Minimises |W (predicted - measured)|^2 over e, filtered by `method` in the total deviation z = (e - e0) / tolerance
+    from nominal e0; see `loopcal.calibrate.filters`.
+
+    Parameters
+    ----------
+    robot : its values are the start, its table says what is nominal, free and tolerated.
+    data : the measurements. method : default least squares with rank detection.
+    noise : "given": the sigmas of the data are true; "estimated": true up to one common factor.
+    start : (parameters of the robot,) [SI] values to begin with instead of the robot's.
+    control : settings of the iteration. rank_tolerance : relative to the largest singular value.
+    allow_fewer_equations : let least squares return the smallest deviation that explains too few equations.
+
+    Returns
+    -------
+    Identification; look at `status`, an iteration that did not converge is not raised.
+
+    Raises
+    ------
+    EstimationError
+        Nothing to identify, fewer equations than parameters, or poses out of reach at the start.
+    """
+    if noise not in {"given", "estimated"}:
+        raise EstimationError(f"noise is {noise!r}; it must be 'given' or 'estimated'")
+    method = method or LeastSquares()
+    free = unknowns(robot)
+    rows = rows_of(free, data)
+    check_rows(rows, data, robot)
+    check_count(rows, data, method, allow_fewer_equations)
+    values = (robot if start is None else robot.with_values(start)).values
+    z = free.deviation(values[None])
+    fit = descend(rows, z, method, control, rank_tolerance)
+    if fit.status[0] == DescentStatus.BAD_START:
+        check_start(rows, data, z, fit.cost)
+    residuals = _labelled(rows.residuals(fit.deviation), data)
+    return _identification(robot, free, method, fit, residual_check(fit.decomposition, fit.penalty, noise), residuals)
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedTrials:
+    """t machines identified at once. Arrays are (t, ...), parameters all of the robot's, SI.
+
+    Attributes
+    ----------
+    values : (t, p). status : (t,) DescentStatus. iterations : (t,). cost : (t,) whitened sum of squares.
+    unknowns : the free parameters. decomposition, penalty : from which variances and leverages are read.
+    """
+
+    values: FloatArray
+    status: IntArray
+    iterations: IntArray
+    cost: FloatArray
+    unknowns: Unknowns
+    decomposition: Decomposition
+    penalty: FloatArray
+
+    @property
+    def converged(self) -> np.ndarray:
+        """(t,) which trials converged."""
+        return self.status == DescentStatus.CONVERGED
+
+    def standard_deviations(self, noise_variance: FloatArray | float = 1.0) -> FloatArray:
+        """Return standard deviations (t, p free) [SI], infinite where the data cannot tell."""
+        scaled = self.decomposition.standard_deviations(self.penalty, noise_variance)
+        return scaled * self.unknowns.tolerance
+
+
+def identify_trials(
+    robot: Mechanism,
+    trials: Trials,
+    method: Method | None = None,
+    *,
+    start: ArrayLike | None = None,
+    control: StepControl | None = None,
+    rank_tolerance: float = RANK_TOLERANCE,
+) -> IdentifiedTrials:
+    """Identify t simulated machines at once; each equals its own `identify` and no trial stops another.
+
+    Parameters
+    ----------
+    robot : as for `identify`. trials : their measurements.
+    start : (t | 1, parameters of the robot) [SI], default the robot's values.
+    """
+    free = unknowns(robot)
+    rows = rows_of_trials(free, trials)
+    values = np.atleast_2d(robot.values if start is None else np.asarray(start, dtype=np.float64))
+    z = np.broadcast_to(free.deviation(values), (len(trials), len(free)))
+    fit = descend(rows, z, method or LeastSquares(), control, rank_tolerance)
+    return IdentifiedTrials(
+        free.values(fit.deviation), fit.status, fit.iterations, fit.cost, free, fit.decomposition, fit.penalty
+    )
+
+
+def _identification(
+    robot: Mechanism, free: Unknowns, method: Method, fit: Descent, check: ResidualCheck, residuals: tuple[KindResiduals, ...]
+) -> Identification:
+    """Put the result together."""
+    d = fit.decomposition
+    variance = check.sigma_scale**2 if check.intervals else np.nan
+    covariance = d.covariance(fit.penalty, variance)[0] * free.tolerance[:, None] * free.tolerance
+    values = free.values(fit.deviation)[0]
+    status = DescentStatus(int(fit.status[0]))
+    open_ = combinations(free, d.null_space())
+    notes = [check.sentence]
+    if status is not DescentStatus.CONVERGED:
+        notes.insert(0, status.sentence)
+    notes += [f"not identifiable: {combination}" for combination in open_]
+    if assumed := free.note():
+        notes.append(assumed)
+    return Identification(
+        robot=robot.with_values(values),
+        initial=robot,
+        method=method,
+        unknowns=free,
+        estimate=values[free.places],
+        covariance=covariance,
+        rank=int(d.rank[0]),
+        condition=float(d.condition[0]),
+        singular_values=d.singular_values[0],
+        rank_tolerance=d.tolerance,
+        unidentifiable=open_,
+        check=check,
+        residuals=residuals,
+        status=status,
+        iterations=int(fit.iterations[0]),
+        cost_history=fit.cost_history[:, 0],
+        estimate_history=free.nominal + free.tolerance * fit.deviation_history[:, 0],
+        notes=tuple(notes),
+    )
+
+
+def _labelled(residuals: tuple[Residuals, ...], data: Measurements) -> tuple[KindResiduals, ...]:
+    """Put names to the residuals (t = 1) of every kind."""
+    observations = [o for o in data.observations if len(o)]
+    return tuple(
+        KindResiduals(
+            kind=o.kind.name,
+            components=tuple(column.name for column in o.kind.noise_columns),
+            poses=tuple(data.labels[i] for i in o.rows),
+            raw=np.where(o.present, r.raw[0], np.nan),
+            whitened=r.whitened[0],
+        )
+        for o, r in zip(observations, residuals, strict=True)
+    )
