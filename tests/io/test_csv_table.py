@@ -99,3 +99,9 @@ def test_what_is_not_utf8_is_refused_with_its_line(tmp_path) -> None:
 def test_a_folder_is_refused(tmp_path) -> None:
     with pytest.raises(FileError, match="this is a folder where a measurement file is needed"):
         read_table(tmp_path)
+
+
+def test_a_robot_file_of_the_same_name_is_no_sidecar(tmp_path) -> None:
+    path = write(tmp_path, GOOD)
+    (tmp_path / "data.yaml").write_text("format: 1\nfamily: gough\n")
+    assert read_table(path).settings.content["kind"] == "pose"

@@ -13,8 +13,11 @@ from collections.abc import Sequence
 
 import click
 
+from loopcal.cli.calibrate import calibrate
 from loopcal.cli.check import check
+from loopcal.cli.identifiability import identifiability
 from loopcal.cli.simulate import simulate
+from loopcal.cli.validate import validate
 from loopcal.errors import LoopcalError
 
 
@@ -31,7 +34,7 @@ def commands() -> None:
     """  # noqa: D301
 
 
-for _command in (check, simulate):
+for _command in (check, simulate, identifiability, calibrate, validate):
     commands.add_command(_command)
 
 

@@ -41,6 +41,7 @@ def _document(robot: Mechanism) -> dict[str, Any]:
     table = robot.parameters
     return {
         "name": robot.name,
+        "path": robot.record.path,
         "freedoms": robot.freedoms,
         "controlled": robot.controlled,
         "size": robot.size,

@@ -5,12 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from loopcal.errors import UnitError
+from loopcal.errors import DataError, UnitError, nearest
 from loopcal.units import Dimension, quantity
+
+if TYPE_CHECKING:
+    from loopcal.measure import Instrument
 
 FILE = click.Path(path_type=Path)
 
@@ -47,3 +50,57 @@ def gate_options(command: Callable[..., Any]) -> Callable[..., Any]:
         text = f"Quality gate, such as {example}: exit with 2 where the largest {what} error on unseen poses is above it."
         command = click.option(name, type=Quantity(dimension), metavar="QUANTITY", help=text)(command)
     return command
+
+
+def data_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the flags that let implausible measurements pass."""
+    for name, what in (
+        ("--allow-duplicates", "Accept rows that repeat another to the last digit."),
+        ("--allow-outside-stroke", "Accept readings outside the stroke of their actuator."),
+    ):
+        command = click.option(name, is_flag=True, help=what)(command)
+    return command
+
+
+def instrument_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add what describes an instrument; `instrument` makes one of them."""
+    length, angle = Quantity(Dimension.LENGTH), Quantity(Dimension.ANGLE)
+    forms = "rotation-vector, quaternion, tilt-torsion, euler-xyz, ..."
+    for option in (
+        click.option("--sigma-angle", type=angle, default="50urad", show_default=True, metavar="QUANTITY",
+                     help="Standard deviation of each measured angle."),
+        click.option("--sigma-position", type=length, default="0.01mm", show_default=True, metavar="QUANTITY",
+                     help="Standard deviation of each measured length."),
+        click.option("--orientation", help=f"How angles are written: {forms}"),
+        click.option("--components", help="For the kind component: which coordinates, such as z or x,y,z."),
+        click.option("--kind", default="pose", show_default=True, help="Kind of measurement: pose or component."),
+    ):  # fmt: skip
+        command = option(command)
+    return command
+
+
+def instrument(
+    kind: str, components: str | None, orientation: str | None, sigma_position: float, sigma_angle: float
+) -> Instrument:
+    """Return the instrument that `instrument_options` describe.
+
+    Raises
+    ------
+    DataError
+        Unknown kind, or an option that does not belong to it.
+    """
+    import numpy as np
+
+    from loopcal.io.sensor_settings import kind_settings
+    from loopcal.measure import KINDS, Gaussian, Instrument, Sensor
+
+    if kind not in KINDS:
+        raise DataError(f"{kind!r} is not a kind of measurement{nearest(kind, KINDS)}; known are {', '.join(KINDS)}")
+    stated = {"components": components and tuple(components.split(",")), "orientation": orientation}
+    settings = {name: value for name, value in stated.items() if value}
+    for name in settings:
+        if name not in kind_settings(KINDS[kind]):
+            raise DataError(f"--{name} does not belong to the kind {kind!r}; leave it out, or choose another kind")
+    made = KINDS[kind](**settings)
+    sigma = {Dimension.LENGTH: sigma_position, Dimension.ANGLE: sigma_angle}
+    return Instrument((Sensor(made, Gaussian(np.array([sigma[c.dimension] for c in made.noise_columns]))),))

@@ -14,7 +14,11 @@ import click
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit, unit
 
 if TYPE_CHECKING:
+    from loopcal.calibrate import Validation
     from loopcal.mechanism import Mechanism
+
+ROUNDING = 1e-12
+"""What is smaller than this, in whatever unit is shown, is rounding and shown as 0."""
 
 
 def say(text: str = "") -> None:
@@ -23,8 +27,9 @@ def say(text: str = "") -> None:
 
 
 def progress(text: str) -> None:
-    """Print a line of progress, on standard error."""
-    click.echo(text, err=True)
+    """Print a line of progress on standard error, for somebody who watches."""
+    if sys.stderr.isatty():
+        click.echo(text, err=True)
 
 
 def json_document(document: Mapping[str, Any]) -> None:
@@ -62,6 +67,8 @@ def number(value: float, plus_minus: float | None = None, digits: int = 6) -> st
     """
     if not math.isfinite(value):
         return "-"
+    if abs(value) < ROUNDING:
+        value = 0.0
     if plus_minus is not None and math.isfinite(plus_minus) and plus_minus > 0:
         decimals = 1 - math.floor(math.log10(plus_minus))
         return f"{value:.{min(max(decimals, 0), 12)}f}"
@@ -73,3 +80,42 @@ def uncertainty(plus_minus: float) -> str:
     if math.isnan(plus_minus):
         return "-"
     return "unknown" if math.isinf(plus_minus) else number(plus_minus, plus_minus)
+
+
+def parameters(title: str, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Print identified parameters: rows of `Identification.to_dict()["parameters"]`."""
+    table(
+        title,
+        ("name", "nominal", "estimate", "+/- (95 %)", "unit"),
+        [
+            (
+                row["name"],
+                number(row["nominal"], row["plus_minus"], 9),
+                number(row["estimate"], row["plus_minus"], 9),
+                uncertainty(row["plus_minus"]),
+                row["unit"],
+            )
+            for row in rows
+        ],
+    )
+
+
+def validation(found: Validation, poses: str) -> None:
+    """Print errors before and after calibration."""
+    rows = [(title, index.replace("_", " "), *(number(x, digits=4) for x in four), symbol)
+            for title, index, symbol, *four in found.rows()]  # fmt: skip
+    headers = ("error", "of", "max", "rms", "mean", "sd", "unit")
+    table(f"Errors on {len(found.poses)} {poses} rows", headers, rows, text_columns=2)
+    for index in ("position", "orientation"):
+        if found.after.statistics(index).count:
+            say(f"{index} error (rms): {found.improvement(index):.3g} times smaller after calibration")
+    if found.failed:
+        say(f"left out, out of reach: poses {', '.join(found.failed)}")
+
+
+def gates(reasons: Iterable[str]) -> int:
+    """Print why quality gates are not met, on standard error; return the exit code, 0 or 2."""
+    sentences = list(reasons)
+    for sentence in sentences:
+        click.echo(f"loopcal: quality gate not met: {sentence}", err=True)
+    return 2 if sentences else 0

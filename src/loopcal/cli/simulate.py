@@ -4,29 +4,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from loopcal.cli import show
-from loopcal.cli.options import FILE, Quantity, json_option, robot_argument
-from loopcal.units import Dimension
-
-if TYPE_CHECKING:
-    from loopcal.measure import Instrument
+from loopcal.cli.options import FILE, instrument, instrument_options, json_option, robot_argument
 
 
 @click.command(short_help="Make a measurement file by simulation.")
 @robot_argument
 @click.option("--poses", required=True, type=FILE, help="CSV file of commanded poses, one column per coordinate.")
 @click.option("-o", "--output", required=True, type=FILE, help="The measurement file to write.")
-@click.option("--kind", default="pose", show_default=True, help="Kind of measurement: pose or component.")
-@click.option("--components", help="For the kind component: which coordinates, such as z or x,y,z.")
-@click.option("--orientation", help="How angles are written: rotation-vector, quaternion, tilt-torsion, euler-xyz, ...")
-@click.option("--sigma-position", type=Quantity(Dimension.LENGTH), default="0.01mm", show_default=True, metavar="QUANTITY",
-              help="Standard deviation of each measured length.")  # fmt: skip
-@click.option("--sigma-angle", type=Quantity(Dimension.ANGLE), default="50urad", show_default=True, metavar="QUANTITY",
-              help="Standard deviation of each measured angle.")  # fmt: skip
+@instrument_options
 @click.option("--draw-errors", is_flag=True, help="Give the machine errors drawn from the tolerances of the robot file.")
 @click.option("--truth", type=FILE, help="Also write the true machine, as a robot file.")
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of noise and errors.")
@@ -61,8 +50,8 @@ def simulate(
     machine = load_robot(robot)
     if draw_errors:
         machine = machine.with_values(measure.sample_truth(machine, 1, seed)[0])
-    instrument = _instrument(kind, components, orientation, sigma_position, sigma_angle)
-    data = measure.simulate(machine, load_poses(poses, machine), instrument, seed)
+    seen_by = instrument(kind, components, orientation, sigma_position, sigma_angle)
+    data = measure.simulate(machine, load_poses(poses, machine), seen_by, seed)
     measure.check_strokes(data, machine)
     save_measurements(data, output, machine, f"simulated by loopcal: {poses.name}, seed {seed}")
     if truth is not None:
@@ -71,25 +60,3 @@ def simulate(
         show.json_document({"output": output, "truth": truth, "n_poses": data.n_poses, "n_rows": data.n_rows, "seed": seed})
     else:
         show.say(f"{output}: {data.n_poses} poses of {machine.name}, {data.n_rows} measured values, seed {seed}")
-
-
-def _instrument(
-    kind: str, components: str | None, orientation: str | None, sigma_position: float, sigma_angle: float
-) -> Instrument:
-    """Return the instrument that the options describe."""
-    import numpy as np
-
-    from loopcal.errors import DataError, nearest
-    from loopcal.io.sensor_settings import kind_settings
-    from loopcal.measure import KINDS, Gaussian, Instrument, Sensor
-
-    if kind not in KINDS:
-        raise DataError(f"{kind!r} is not a kind of measurement{nearest(kind, KINDS)}; known are {', '.join(KINDS)}")
-    stated = {"components": components and tuple(components.split(",")), "orientation": orientation}
-    settings = {name: value for name, value in stated.items() if value}
-    for name in settings:
-        if name not in kind_settings(KINDS[kind]):
-            raise DataError(f"--{name} does not belong to the kind {kind!r}; leave it out, or choose another kind")
-    made = KINDS[kind](**settings)
-    sigma = {Dimension.LENGTH: sigma_position, Dimension.ANGLE: sigma_angle}
-    return Instrument((Sensor(made, Gaussian(np.array([sigma[c.dimension] for c in made.noise_columns]))),))

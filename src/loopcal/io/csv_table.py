@@ -180,7 +180,9 @@ def _settings(path: Path, lines: Sequence[str]) -> tuple[YamlFile, int]:
     """Return the settings and the index of the first line behind the front matter."""
     beside = sidecar(path)
     if beside != path and beside.exists():
-        return read_yaml(beside, "settings file of the measurements"), 0
+        settings = read_yaml(beside, "settings file of the measurements")
+        if "family" not in settings.content:  # a robot file may have the same name as its measurements
+            return settings, 0
     count = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
     text = "\n".join(line[1:] for line in lines[:count])
     # `# key: value` leaves one blank before each key, the same for all

@@ -23,7 +23,7 @@ from loopcal.io.csv_table import Table, read_table, require_columns
 from loopcal.io.robot_file import check_format, load_robot
 from loopcal.io.sensor_settings import kind_settings, read_kind, read_noise
 from loopcal.io.yaml_file import Location, refuse_unknown_keys
-from loopcal.units import unit
+from loopcal.units import EXAMPLES, unit
 
 if TYPE_CHECKING:
     import numpy as np
@@ -262,7 +262,8 @@ def _sigma(table: Table, sensor: _Sensor, place: int) -> np.ndarray:
     if column.name not in sensor.noise:
         raise table.settings.error(
             f"no noise is stated for {column.name!r}, and without it rows cannot be weighed; add 'noise: "
-            f"{{{column.name}: ..}}' to the settings, or a column {name!r}",
+            f"{{{column.name}: {EXAMPLES[column.dimension]}}}' to the settings, or a column {name!r} (not known: a guess, "
+            "and calibrate with --noise estimated)",
             (*sensor.location, "noise"),
         )
     return np.full(len(sensor.rows), sensor.noise[column.name])

@@ -98,15 +98,16 @@ def read_noise(file: YamlFile, node: Mapping[str, Any], kind: Kind, location: Lo
 
 
 def write_sensor(kind: Kind, noise: Mapping[str, float], tool: np.ndarray) -> dict[str, str]:
-    """Return key -> text of a sensor's settings; a pose only where it differs from its default, or the robot's `tool`."""
+    """Return key -> text of a sensor's settings; those by keyword only where they differ from default or `tool`."""
     lines = {"kind": kind.name}
     default = type(kind)()
+    by_keyword = {f.name for f in dataclasses.fields(typing.cast(Any, kind)) if f.kw_only}
     for key, annotation in kind_settings(type(kind)).items():
         value, usual = getattr(kind, key), tool if key == "T_platform_tool" else getattr(default, key)
         if _is_pose(annotation):
             if value is not None and (value != usual).any():
                 lines[key] = _pose_text(value)
-        elif value is not None:
+        elif value != usual or (value and key not in by_keyword):
             lines[key] = f"[{', '.join(value)}]" if isinstance(value, tuple) else str(value)
     if noise:
         dimensions = {column.name: column.dimension for column in kind.noise_columns}

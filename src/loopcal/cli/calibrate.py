@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal calibrate`: identify a robot from measurements, prove it on held-out poses, keep it in a run folder."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from loopcal.cli import show
+from loopcal.cli.options import FILE, data_argument, data_options, gate_options, json_option, robot_argument
+from loopcal.errors import DataError
+
+if TYPE_CHECKING:
+    from loopcal.calibrate import Identification, Validation
+    from loopcal.calibrate.filters import Method
+
+METHODS = ("least-squares", "map", "ridge", "truncated-svd")
+
+
+@click.command(short_help="Identify a robot's parameters from measurements.")
+@robot_argument
+@data_argument
+@click.option("-o", "--output", required=True, type=FILE, help="The run folder to make.")
+@click.option("--hold-out", type=click.FloatRange(0, 1, max_open=True), default=0.0, metavar="SHARE",
+              help="Share of the poses to keep from the fit and to judge it by, such as 0.25.")  # fmt: skip
+@click.option("--method", type=click.Choice(METHODS), default=METHODS[0], show_default=True, help="How to estimate.")
+@click.option("--lam", type=click.FloatRange(min=0), help="For ridge; chosen by cross-validation where not given.")
+@click.option("--keep", type=click.IntRange(min=0), metavar="K",
+              help="For truncated-svd: how many directions; chosen by cross-validation where not given.")  # fmt: skip
+@click.option("--noise", type=click.Choice(("given", "estimated")), default="given", show_default=True,
+              help="Whether the stated noise is true, or only up to one common factor.")  # fmt: skip
+@gate_options
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the held-out choice.")
+@data_options
+@click.option("--force", is_flag=True, help="Replace a run that is there.")
+@json_option
+def calibrate(
+    robot: str,
+    data: Path,
+    output: Path,
+    hold_out: float,
+    method: str,
+    lam: float | None,
+    keep: int | None,
+    noise: Literal["given", "estimated"],
+    limit_position: float | None,
+    limit_angle: float | None,
+    seed: int,
+    allow_outside_stroke: bool,
+    allow_duplicates: bool,
+    force: bool,
+    as_json: bool,
+) -> int:
+    """Identify the free parameters of ROBOT from DATA and write a run folder with the corrected robot file.
+
+    The exit code is 2 where a quality gate is not met, or the iteration did not converge.
+
+    \b
+    Examples:
+      loopcal calibrate hexapod-42 measurements.csv -o run --hold-out 0.25
+      loopcal calibrate robot.yaml data.csv -o run --hold-out 0.25 --limit-position 0.02mm --limit-angle 0.01deg
+      loopcal calibrate printer.yaml heights.csv -o run --noise estimated
+    """  # noqa: D301
+    from loopcal.calibrate import identify, validate
+    from loopcal.io import load_measurements, load_robot
+    from loopcal.io.calibration_run import run_document, save_run
+    from loopcal.io.robot_file import robot_path
+    from loopcal.io.run_folder import made_by, refuse_used_folder
+
+    if not hold_out and (limit_position is not None or limit_angle is not None):
+        raise DataError("a quality gate is judged on unseen poses; say which share to keep for it, as --hold-out 0.25")
+    refuse_used_folder(output, force)
+    machine = load_robot(robot)
+    measured = load_measurements(data, machine, allow_outside_stroke=allow_outside_stroke, allow_duplicates=allow_duplicates)
+    fitted, unseen = measured.split(1 - hold_out, seed) if hold_out else (measured, None)
+    show.progress(f"identifying {int(machine.parameters.free.sum())} parameters from {fitted.n_rows} equations ...")
+    fit = identify(machine, fitted, _method(method, lam, keep), noise=noise)
+    validation = None if unseen is None else validate(fit, unseen, limit_position, limit_angle)
+    origin = made_by(sys.argv, {"robot": robot_path(robot), "data": data}, {"hold_out": seed})
+    split = None if unseen is None else {"hold_out": hold_out, "seed": seed, "held_out": unseen.labels}
+    document = run_document(fit, validation, origin, split)
+    save_run(output, fit, document, force)
+    if as_json:
+        show.json_document(document)
+    else:
+        _print(fit, validation, output)
+    return _exit_code(fit, validation)
+
+
+def _method(name: str, lam: float | None, keep: int | None) -> Method:
+    """Return the method that the options describe."""
+    from loopcal.calibrate import GCV, MAP, LeastSquares, Ridge, TruncatedSVD, TruncationGCV
+
+    for option, value, needs in (("--lam", lam, "ridge"), ("--keep", keep, "truncated-svd")):
+        if value is not None and name != needs:
+            raise DataError(f"{option} belongs to --method {needs}, not to {name}; leave it out, or change the method")
+    if name == "ridge":
+        return Ridge(GCV() if lam is None else lam)
+    if name == "truncated-svd":
+        return TruncatedSVD(TruncationGCV() if keep is None else keep)
+    return MAP() if name == "map" else LeastSquares()
+
+
+def _print(fit: Identification, validation: Validation | None, output: Path) -> None:
+    """Print what was found, and how well it does on unseen poses."""
+    show.parameters(f"{fit.robot.name}: {len(fit.names)} parameters", fit.to_dict()["parameters"])
+    show.say()
+    show.say(f"{fit.status.sentence} after {fit.iterations} steps; rank {fit.rank} of {len(fit.names)}")
+    show.say(f"chi-square {fit.chi_square:.5g} with {fit.check.degrees:.4g} degrees of freedom")
+    for note in fit.notes:
+        show.say(f"note: {note}")
+    if validation is not None:
+        show.validation(validation, "unseen")
+    show.say(f"\nwritten to {output}: result.json, arrays.npz, robot.yaml")
+
+
+def _exit_code(fit: Identification, validation: Validation | None) -> int:
+    """Return 0, or 2 with a sentence for each thing that is not good enough."""
+    reasons: list[Any] = [] if fit.converged else [f"not converged: {fit.status.sentence}"]
+    reasons += [] if validation is None else validation.reasons
+    return show.gates(reasons)

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal validate`: judge a calibration by measurements that it has not seen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from loopcal.cli import show
+from loopcal.cli.options import FILE, data_argument, data_options, gate_options, json_option
+
+
+@click.command(short_help="Judge a calibration by other measurements.")
+@click.argument("run", metavar="RUN", type=FILE)
+@data_argument
+@gate_options
+@data_options
+@click.option("--allow-fitted-data", is_flag=True, help="Accept the very measurements that the run was fitted to.")
+@json_option
+def validate(
+    run: Path,
+    data: Path,
+    limit_position: float | None,
+    limit_angle: float | None,
+    allow_outside_stroke: bool,
+    allow_duplicates: bool,
+    allow_fitted_data: bool,
+    as_json: bool,
+) -> int:
+    """Compare the robot of RUN, a folder made by `loopcal calibrate`, with DATA, before and after calibration.
+
+    The exit code is 2 where a quality gate is not met.
+
+    \b
+    Examples:
+      loopcal validate run more-measurements.csv
+      loopcal validate run more-measurements.csv --limit-position 0.02mm --limit-angle 0.01deg
+    """  # noqa: D301
+    from loopcal.calibrate import validate as compare
+    from loopcal.io import load_measurements
+    from loopcal.io.calibration_run import load_run, refuse_fitted_data
+
+    calibrated = load_run(run)
+    measured = load_measurements(
+        data, calibrated.robot, allow_outside_stroke=allow_outside_stroke, allow_duplicates=allow_duplicates
+    )
+    if not allow_fitted_data:
+        refuse_fitted_data(calibrated, data)
+    found = compare(calibrated.robot, measured, limit_position, limit_angle, before=calibrated.before)
+    if as_json:
+        show.json_document(found.to_dict())
+    else:
+        show.validation(found, "measured")
+    return show.gates(found.reasons)

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a calibration leaves behind: its result as one document, and the run folder that keeps it.
+
+result.json    made_by    how (see `loopcal.io.run_folder.MADE_BY`)
+               fit        `Identification.to_dict()`: parameters in the units of the robot's file, the rest in SI
+               split      share and labels of the poses that were held out; null where none were
+               validation `Validation.to_dict()` on those poses, SI; null where none were
+arrays.npz     `Identification.arrays()`, and `initial`: the values before calibration of all parameters [SI]
+robot.yaml     the corrected robot file
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from loopcal.errors import DataError
+from loopcal.io.robot_file import load_robot, robot_text
+from loopcal.io.run_folder import read_run_folder, write_run_folder
+from loopcal.io.text_file import sha256
+
+if TYPE_CHECKING:
+    from loopcal.calibrate import Identification, Validation
+    from loopcal.mechanism import Mechanism
+
+
+@dataclass(frozen=True)
+class CalibratedRun:
+    """A calibration read back: the corrected robot, and the one it started from."""
+
+    path: Path
+    result: dict[str, Any]
+    robot: Mechanism
+    before: Mechanism
+
+
+def run_document(
+    fit: Identification, validation: Validation | None, origin: Mapping[str, Any], split: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Return the content of result.json; see the module."""
+    shown = None if validation is None else validation.to_dict()
+    return {"made_by": dict(origin), "fit": fit.to_dict(), "split": split, "validation": shown}
+
+
+def save_run(path: str | Path, fit: Identification, document: Mapping[str, Any], force: bool = False) -> Path:
+    """Write the run folder of a calibration.
+
+    Parameters
+    ----------
+    path : str or Path
+        The folder to make.
+    fit : Identification
+        Of a robot that came from a file.
+    document : mapping
+        What `run_document` returned.
+    force : bool
+        Replace a run that is there.
+
+    Raises
+    ------
+    FileError
+        The folder is in use, or cannot be written.
+    MechanismError
+        The robot did not come from a file.
+    """
+    arrays = {**fit.arrays(), "initial": fit.initial.values}
+    return write_run_folder(path, document, arrays, robot_text(fit.robot, fit.plus_minus), force)
+
+
+def load_run(path: str | Path) -> CalibratedRun:
+    """Read the run folder of a calibration.
+
+    Raises
+    ------
+    FileError
+        Not a run folder, damaged, or made by a newer loopcal.
+    """
+    run = read_run_folder(path)
+    robot = load_robot(run.robot_path)
+    initial = run.arrays.get("initial", robot.parameters.nominal)
+    return CalibratedRun(run.path, run.result, robot, robot.with_values(initial))
+
+
+def refuse_fitted_data(run: CalibratedRun, data: str | Path) -> None:
+    """Refuse to validate a run with the file that it was made from.
+
+    Raises
+    ------
+    DataError
+        The file is the same to the last byte.
+    """
+    used = run.result.get("made_by", {}).get("inputs", {}).get("data", {}).get("sha256")
+    if used == sha256(data):
+        raise DataError(
+            f"{data}: this run was fitted to these very measurements, which prove nothing about unseen poses; "
+            "give others, or use --allow-fitted-data"
+        )

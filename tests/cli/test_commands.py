@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands on the shipped hexapod: simulate, calibrate, validate, identifiability, with their files and exit codes."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal.cli import main
+from loopcal.io import load_robot
+from loopcal.io.calibration_run import load_run
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
+SIMULATE = "simulate truth.yaml --poses poses.csv --sigma-position 0.001mm --sigma-angle 5urad --seed 42 -o again.csv"
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Run a command line in a copy of the example's folder; return exit code, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+    for path in EXAMPLE.iterdir():
+        shutil.copy(path, tmp_path)
+
+    def run(words: str) -> tuple[int, str, str]:
+        code = main(words.split())
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def test_the_recipe_makes_the_shipped_measurements(run, tmp_path) -> None:
+    assert run(SIMULATE)[0] == 0
+    made, shipped = (tmp_path / "again.csv").read_text(), (EXAMPLE / "measurements.csv").read_text()
+    assert [line for line in made.split("\n") if "," not in line] == [line for line in shipped.split("\n") if "," not in line]
+    numbers = [np.loadtxt(text.split("\n"), delimiter=",", skiprows=7) for text in (made, shipped)]
+    np.testing.assert_allclose(*numbers, rtol=0, atol=1e-10)  # [mm, deg]: rounding of another linear algebra library
+
+
+def test_calibrate_finds_the_true_machine_and_leaves_a_complete_run(run, tmp_path) -> None:
+    code, out, err = run("calibrate hexapod-42 measurements.csv -o out/run --hold-out 0.25")
+    assert code == 0, err
+    assert "leg6.length" in out
+    assert "Errors on 10 unseen rows" in out
+    assert sorted(p.name for p in (tmp_path / "out" / "run").iterdir()) == ["arrays.npz", "result.json", "robot.yaml"]
+    result = json.loads((tmp_path / "out" / "run" / "result.json").read_text(), parse_constant=pytest.fail)
+    assert len(result["split"]["held_out"]) == 10
+    assert set(result["made_by"]["inputs"]) == {"robot", "data"}
+    assert result["fit"]["rank"] == 42
+    truth, found = load_robot("truth.yaml").values, load_run("out/run").robot
+    errors = np.abs(found.values - truth) / np.load("out/run/arrays.npz")["sd"]
+    # 42 values, 180 equations: the mean square of errors over their sd is 1 within 1 / sqrt(21) per sd; 4.5 sd allowed
+    assert np.mean(errors**2) < 2.0
+    after, before = (result["validation"][when]["position"]["rms"] for when in ("after", "before"))
+    assert after < 3e-6  # [m]: three times the instrument's 1 um, one for each axis and some for the fit
+    assert after < before / 15
+
+
+def test_json_is_one_document_on_standard_output_and_equals_the_runs(run, tmp_path) -> None:
+    code, out, _ = run("calibrate hexapod-42 measurements.csv -o run --hold-out 0.25 --json")
+    assert code == 0
+    assert json.loads(out) == {
+        k: v for k, v in json.loads((tmp_path / "run" / "result.json").read_text()).items() if k != "format"
+    }
+
+
+@pytest.mark.parametrize("words", ["check hexapod-42", "identifiability hexapod-42 measurements.csv", SIMULATE])
+def test_every_command_prints_json_and_nothing_else(run, words) -> None:
+    code, out, err = run(f"{words} --json")
+    assert (code, err) == (0, "")
+    assert isinstance(json.loads(out, parse_constant=pytest.fail), dict)
+
+
+def test_quality_gates_that_are_not_met_give_exit_code_2_and_keep_the_run(run, tmp_path) -> None:
+    words = "calibrate hexapod-42 measurements.csv -o run --hold-out 0.25 --force --limit-position"
+    assert run(f"{words} 0.02mm --limit-angle 0.01deg")[0] == 0
+    code, _, err = run(f"{words} 0.1um")
+    assert code == 2
+    assert "quality gate not met: position error" in err
+    assert (tmp_path / "run" / "result.json").exists()
+
+
+def test_a_gate_without_held_out_poses_is_refused(run) -> None:
+    code, _, err = run("calibrate hexapod-42 measurements.csv -o run --limit-position 1mm")
+    assert code == 1
+    assert "as --hold-out 0.25" in err
+
+
+def test_validate_judges_a_run_by_other_measurements_only(run) -> None:
+    assert run("calibrate hexapod-42 measurements.csv -o run")[0] == 0
+    code, _, err = run("validate run measurements.csv")
+    assert code == 1
+    assert "--allow-fitted-data" in err
+    assert run(SIMULATE.replace("42", "43"))[0] == 0
+    code, out, _ = run("validate run again.csv")
+    assert code == 0
+    assert "Errors on 40 measured rows" in out
+    assert run("validate run again.csv --limit-angle 1urad")[0] == 2
+    assert json.loads(run("validate run again.csv --json")[1])["passed"] is True
+
+
+def test_a_calibration_can_start_from_a_corrected_robot_file(run) -> None:
+    assert run("calibrate hexapod-42 measurements.csv -o run")[0] == 0
+    assert run("calibrate run/robot.yaml measurements.csv -o run2")[0] == 0
+    first, second = load_run("run"), load_run("run2")
+    np.testing.assert_allclose(second.robot.values, first.robot.values, rtol=0, atol=1e-10)  # [m]
+    np.testing.assert_allclose(second.before.values, first.robot.values, rtol=0, atol=1e-15)  # [m]
+    assert first.robot.record.text == second.robot.record.text
+
+
+@pytest.mark.parametrize("method", ["map", "ridge", "ridge --lam 0.5", "truncated-svd --keep 30", "truncated-svd"])
+def test_other_methods_calibrate_too(run, method) -> None:
+    assert run(f"calibrate hexapod-42 measurements.csv -o run --hold-out 0.25 --method {method}")[0] == 0
+
+
+def test_noise_can_be_estimated_from_the_residual(run) -> None:
+    code, out, _ = run("calibrate hexapod-42 measurements.csv -o run --noise estimated")
+    assert code == 0
+    assert "noise estimated from the residual" in out
+
+
+def test_an_option_of_another_method_is_refused(run) -> None:
+    assert "--lam belongs to --method ridge" in run("calibrate hexapod-42 measurements.csv -o run --lam 1")[2]
+
+
+def test_identifiability_names_what_heights_alone_cannot_tell(run) -> None:
+    assert "42 of 42 parameter combinations" in run("identifiability hexapod-42 measurements.csv")[1]
+    code, out, _ = run("identifiability hexapod-42 --poses poses.csv --kind component --components z")
+    assert code == 0
+    assert "not identifiable: together" in out
+    assert run("identifiability hexapod-42")[0] == 1
+
+
+def test_drawn_errors_are_written_as_a_robot_file(run) -> None:
+    words = "simulate hexapod-42 --poses poses.csv --draw-errors --truth drawn.yaml -o drawn.csv"
+    assert run(words)[0] == 0
+    drawn = load_robot("drawn.yaml")
+    assert 1e-6 < np.std(drawn.values - drawn.parameters.nominal) < 1e-4  # [m], tolerance 0.029 mm
+    assert run("calibrate hexapod-42 drawn.csv -o run")[0] == 0
