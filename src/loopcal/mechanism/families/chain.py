@@ -16,7 +16,7 @@ import numpy as np
 from loopcal import se3
 from loopcal.engine import Array
 from loopcal.errors import MechanismError
-from loopcal.mechanism.assembly import AXES, Address, Joint, Limb, Linear, Link
+from loopcal.mechanism.assembly import AXES, Address, Cone, Joint, Limb, Linear, Link
 
 EX, EY, EZ = np.eye(3)
 
@@ -30,7 +30,7 @@ class Step:
     name : of the joint and of the link before it. kind : R or P.
     place : (4, 4) of the joint in the frame carried so far [m].
     axis : (3,) in the placed frame, of any length but zero.
-    actuator, pitch, start : as in `loopcal.mechanism.assembly.Joint`.
+    actuator, pitch, start, limits : as in `loopcal.mechanism.assembly.Joint`.
     """
 
     name: str
@@ -40,6 +40,7 @@ class Step:
     actuator: str | None = None
     pitch: float = 0.0
     start: float = 0.0
+    limits: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,7 @@ def placed(
     attachment: Array,
     length: float = 0.0,
     actuator: str | None = None,
+    cones: tuple[Cone, ...] = (),
 ) -> Placed:
     """A limb from its joints, its tip and its attachment.
 
@@ -83,21 +85,21 @@ def placed(
     steps : the joints from base to tip; the first placement is in the base frame.
     tip : (4, 4) of the tip in the frame carried last [m]; the link is called `tip`, or `base` in a limb without joints.
     attachment : (4, 4) in the platform frame [m]; the link is called `platform`.
-    length, actuator : of the rod of a `distance` ending [m].
+    length, actuator, cones : of the rod of a `distance` ending [m].
     """
     back, links, joints = np.eye(4), [], []
     turns, places = {}, {}
     for step in steps:
         turn = axis_frame(step.axis, step.name)
         links.append(Link(step.name, back @ step.place @ _turned(turn)))
-        joints.append(Joint(step.name, step.kind, step.actuator, step.pitch, step.start))
+        joints.append(Joint(step.name, step.kind, step.actuator, step.pitch, step.start, step.limits))
         turns[step.name], places[step.name] = turn, step.place
         back = _turned(turn.T)
     last = "tip" if steps else "base"
     links.append(Link(last, back @ tip))
     turns |= {last: np.eye(3), "platform": np.eye(3)}
     places |= {last: tip, "platform": attachment}
-    limb = Limb(name, tuple(links), tuple(joints), ending, Link("platform", attachment), length, actuator)
+    limb = Limb(name, tuple(links), tuple(joints), ending, Link("platform", attachment), length, actuator, cones)
     return Placed(limb, turns, places)
 
 
@@ -115,9 +117,9 @@ def axis_frame(axis: Array, name: str) -> Array:
     z = np.asarray(axis, dtype=float) / length
     # the cyclic successor of the largest component is never parallel to the axis
     across = np.eye(3)[(int(np.argmax(np.abs(z))) + 1) % 3]
-    x = across - (across @ z) * z
+    x = across - float(across @ z) * z
     x /= float(np.linalg.norm(x))
-    return np.stack([x, np.cross(z, x), z], axis=1)
+    return np.array([x, np.cross(z, x), z], dtype=float).T
 
 
 def moved(parameter: str, limb: Placed, element: str, axis: str, coefficient: float = 1.0) -> tuple[Linear, ...]:

@@ -11,13 +11,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from loopcal.engine import Array
 from loopcal.errors import MechanismError
-from loopcal.mechanism.assembly import AXES, Actuator, Assembly
+from loopcal.mechanism.assembly import AXES, Actuator, Assembly, Cone
 from loopcal.mechanism.families.chain import Placed, at, placed
 from loopcal.mechanism.families.errors import Errors, Spread, complete, offset, point, rod_length
+from loopcal.mechanism.families.prs import check_spherical
 from loopcal.mechanism.families.ups import Screw, ScrewLeg, screw_leg, ups_leg
 from loopcal.mechanism.records import AngleTolerance, LengthTolerance, Point, Robot, per_leg, standard_deviation
-from loopcal.units import Dimension, Length
+from loopcal.units import Angle, Dimension, Length
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,14 @@ class GoughTolerances:
 
 
 @dataclass(frozen=True)
+class GoughCones:
+    """How far a rod may lean at its base and platform joints from its direction at home."""
+
+    base: Angle | None = None
+    platform: Angle | None = None
+
+
+@dataclass(frozen=True)
 class Gough(Robot):
     """A hexapod's file.
 
@@ -39,7 +49,7 @@ class Gough(Robot):
     ----------
     base, platform : centres of the joints, leg by leg, in the base and the platform frame [m].
     lengths : length of a leg at reading zero [m], one for all or one each.
-    stroke : allowed readings (low, high) [m].
+    stroke : allowed readings (low, high) [m]. cones : of the joints of rods.
     legs : form of the legs, a `rod` or the chain `ups`.
     spherical : with `ups`, the upper joint as a perfect `point`, or as three `axes` with errors of their own.
     screw : with `ups`, a screw in every leg; its nut turns with the lower joint, its spindle with the upper one.
@@ -51,6 +61,7 @@ class Gough(Robot):
     platform: tuple[Point, ...] = ()
     lengths: Length | tuple[Length, ...] = 0.0
     stroke: tuple[Length, Length] | None = None
+    cones: GoughCones = field(default_factory=GoughCones)
     legs: Literal["rod", "ups"] = "rod"
     spherical: Literal["point", "axes"] = "point"
     screw: Screw | None = None
@@ -98,6 +109,11 @@ class Gough(Robot):
             )
             if found
         ]
+        check_spherical(self.name, self.spherical, "complete" if self.legs == "rod" else self.error_model)
+        if self.legs == "ups" and self.cones != GoughCones():
+            raise MechanismError(
+                f"{self.name} states cones with legs: ups, whose joints are not told as cones; state legs: rod"
+            )
         if self.legs == "rod" and asked:
             raise MechanismError(
                 f"{self.name} states legs: rod with {asked[0]}, but a rod has no joints that could carry it; state legs: ups"
@@ -107,10 +123,20 @@ class Gough(Robot):
         """Leg i in its form."""
         leg, motor = f"leg{i + 1}", f"q{i + 1}"
         if self.legs == "rod":
-            return placed(leg, (), at(*self.base[i]), "distance", at(*self.platform[i]), length, motor)
+            ends = at(*self.base[i]), at(*self.platform[i])
+            return placed(leg, (), ends[0], "distance", ends[1], length, motor, self._cones(*ends))
         if screw:
             return screw_leg(leg, motor, self.base[i], self.platform[i], self.home.matrix, screw)
         return ups_leg(leg, motor, self.base[i], self.platform[i], self.home.matrix, self.spherical == "axes")
+
+    def _cones(self, base: Array, top: Array) -> tuple[Cone, ...]:
+        """The cones of a rod between these centres (4, 4), about its direction at home."""
+        home = self.home.matrix
+        rod = (home @ top)[:3, 3] - base[:3, 3]
+        ends = (("tip", self.cones.base, rod), ("attachment", self.cones.platform, -home[:3, :3].T @ rod))
+        return tuple(
+            Cone(end, (float(axis[0]), float(axis[1]), float(axis[2])), angle) for end, angle, axis in ends if angle is not None
+        )
 
     def _ideal(self, leg: Placed, motor: str, length: float) -> Errors:
         """Two centres and a length, the same in both forms."""

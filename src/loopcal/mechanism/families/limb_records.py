@@ -40,7 +40,10 @@ def place_matrix(place: Place) -> Array:
 
 @dataclass(frozen=True)
 class Revolute:
-    """A turning joint; `lead` is its advance along the axis in one turn (a screw), `start` its angle near home."""
+    """A turning joint; `lead` is its advance along the axis in one turn (a screw), `start` its angle near home.
+
+    `limits` are its allowed values (low, high).
+    """
 
     joint: Literal["R"]
     name: str = ""
@@ -49,6 +52,7 @@ class Revolute:
     actuated: str | None = None
     lead: Length = 0.0
     start: Angle = 0.0
+    limits: tuple[Angle, Angle] | None = None
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,7 @@ class Prismatic:
     axis: Axis = "z"
     actuated: str | None = None
     start: Length = 0.0
+    limits: tuple[Length, Length] | None = None
 
 
 @dataclass(frozen=True)
@@ -142,6 +147,15 @@ class LinkTolerances:
 
 
 @dataclass(frozen=True)
+class RodCone:
+    """How far a rod may lean from an axis at its `tip` (rod towards the platform) or `attachment` (rod towards the tip)."""
+
+    end: Literal["tip", "attachment"]
+    axis: Axis
+    angle: Angle
+
+
+@dataclass(frozen=True)
 class LimbRecord:
     """A limb: joints from the base on, then how it is tied to the platform.
 
@@ -151,7 +165,7 @@ class LimbRecord:
     chain : its joints. tip : its end, in the frame carried last; of a limb without joints, its point on the base.
     ending : `rigid`, `ball` (tip and attachment meet in a point), `distance` (a rod of `length` lies between them).
     attach : the attachment in the platform frame. actuated : the drive of a `distance` of changing length.
-    copies : repeat it around an axis. errors : its unknowns in the ideal model.
+    cones : how far that rod may lean. copies : repeat it around an axis. errors : its unknowns in the ideal model.
     """
 
     name: str
@@ -163,6 +177,7 @@ class LimbRecord:
     actuated: str | None = None
     on: str = "base"
     to: str = "platform"
+    cones: tuple[RodCone, ...] = ()
     copies: Copies | None = None
     errors: tuple[Shifts | Tilts, ...] = ()
 
@@ -171,7 +186,8 @@ class LimbRecord:
 class LengthDrive:
     """A drive whose reading is a length. joint value = offset + gain * reading + harmonics of the period.
 
-    `unknown` names terms to identify (offset, gain, sin1, cos1, sin2, cos2), with tolerances `length` and `ratio`.
+    `unknown` names terms to identify (offset, gain, backlash, and with a period sin1, cos1, sin2, cos2), with the tolerances
+    `length` and, of the gain, `ratio`.
     """
 
     reads: Literal["length"]
@@ -202,14 +218,16 @@ class AngleDrive:
 
 @dataclass(frozen=True)
 class SpoolDrive:
-    """A drive whose reading is an angle and moves a length. joint value = offset + radius * reading + harmonics.
+    """A drive whose reading is an angle and moves a length.
 
-    `radius` is the length wound per radian of the reading (spool radius with gears and tackle; a spindle's lead / 2 pi),
-    negative where a growing reading shortens.
+    joint value = offset + radius * reading + buildup * reading^2 / (4 pi) + harmonics. `radius` is the length paid out per
+    radian of the reading (spool radius with gears and tackle; a spindle's lead / 2 pi), negative where a growing reading
+    shortens; `buildup` is how much it grows in one turn of the reading.
     """
 
     reads: Literal["angle"]
     radius: Length
+    buildup: Length = 0.0
     stroke: tuple[Angle, Angle] | None = None
     offset: Length = 0.0
     period: Angle = 0.0
@@ -217,6 +235,7 @@ class SpoolDrive:
     unknown: tuple[str, ...] = ()
     length: LengthTolerance | None = None
     radii: LengthTolerance | None = None
+    buildups: LengthTolerance | None = None
 
 
 Drive = LengthDrive | AngleDrive | SpoolDrive
@@ -232,7 +251,7 @@ class Onto:
 
     limb: str
     element: str
-    axis: Literal["rx", "ry", "rz", "x", "y", "z", "length", "pitch", "offset", "gain", "sin1", "cos1", "sin2", "cos2"]
+    axis: Literal["rx", "ry", "rz", "x", "y", "z", "length", "pitch", "offset", "gain", "curve", "backlash"]
     coefficient: Ratio = 1.0
     arm: Length | None = None
 

@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopcal.errors import MechanismError
-from loopcal.mechanism.assembly import AXES, Actuator, Address, Assembly, Linear
+from loopcal.mechanism.assembly import AXES, Address, Assembly, Cone, Linear
 from loopcal.mechanism.families.chain import EX, EY, EZ, Placed, Step, moved, placed, tilted, turn_about
+from loopcal.mechanism.families.drives import actuator, drive_errors
 from loopcal.mechanism.families.errors import Errors, Spread, complete, quantity
 from loopcal.mechanism.families.limb_records import (
     AngleDrive,
@@ -32,7 +33,6 @@ from loopcal.mechanism.families.limb_records import (
     Prismatic,
     Revolute,
     Shifts,
-    SpoolDrive,
     Tilts,
     Universal,
     direction,
@@ -40,7 +40,6 @@ from loopcal.mechanism.families.limb_records import (
     refuse_branch,
 )
 from loopcal.mechanism.records import Robot, standard_deviation
-from loopcal.mechanism.transmission import TERMS
 from loopcal.units import Dimension
 
 
@@ -64,14 +63,14 @@ class Limbs(LimbsFile, Robot):
         everyone = [one for limb in self.limbs for one in members[limb.name]]
         drives = tuple(drive for one in everyone for drive in self._drives(one))
         errors = sum((self._limb_errors(one) for one in everyone), start=Errors())
-        errors += sum((_drive_errors(name, drive, turns) for name, drive, turns in drives), start=Errors())
+        errors += sum((drive_errors(name, drive, turns) for name, drive, turns in drives), start=Errors())
         errors += sum((_named(named, members, {name for name, *_ in drives}) for named in self.parameters), start=Errors())
         self._check(errors, {name for name, *_ in drives})
         return Assembly(
             name=self.name,
             source=self.source,
             limbs=tuple(one.placed.limb for one in everyone),
-            actuators=tuple(_actuator(name, drive, turns) for name, drive, turns in drives),
+            actuators=tuple(actuator(name, drive) for name, drive, _ in drives),
             freedoms=self.freedoms,
             controlled=self.controlled,
             home=self.home.matrix,
@@ -152,12 +151,14 @@ def _placed(limb: LimbRecord, name: str, suffix: str, turn: np.ndarray) -> Place
         steps[0] = replace(steps[0], place=turn @ steps[0].place)
     else:
         tip = turn @ tip
-    if limb.ending != "distance" and (limb.length or limb.actuated):
+    if limb.ending != "distance" and (limb.length or limb.actuated or limb.cones):
         raise MechanismError(
-            f"limb {limb.name!r} ends {limb.ending} and states a rod's length or drive; state ending: distance, or leave it out"
+            f"limb {limb.name!r} ends {limb.ending} and states a length, drive or cone of a rod; "
+            "state ending: distance, or leave it out"
         )
     drive = limb.actuated + suffix if limb.actuated else None
-    return placed(name, tuple(steps), tip, limb.ending, turn @ place_matrix(limb.attach), limb.length, drive)
+    cones = tuple(Cone(cone.end, _plain(direction(cone.axis)), cone.angle) for cone in limb.cones)
+    return placed(name, tuple(steps), tip, limb.ending, turn @ place_matrix(limb.attach), limb.length, drive, cones)
 
 
 def _steps(joint: JointRecord, name: str, suffix: str) -> list[Step]:
@@ -165,10 +166,11 @@ def _steps(joint: JointRecord, name: str, suffix: str) -> list[Step]:
     place, here = place_matrix(joint.at), np.eye(4)
     if isinstance(joint, Revolute):
         motor = joint.actuated + suffix if joint.actuated else None
-        return [Step(name, "R", place, direction(joint.axis), motor, joint.lead / (2 * np.pi), joint.start)]
+        pitch = joint.lead / (2 * np.pi)
+        return [Step(name, "R", place, direction(joint.axis), motor, pitch, joint.start, joint.limits)]
     if isinstance(joint, Prismatic):
         motor = joint.actuated + suffix if joint.actuated else None
-        return [Step(name, "P", place, direction(joint.axis), motor, 0.0, joint.start)]
+        return [Step(name, "P", place, direction(joint.axis), motor, 0.0, joint.start, joint.limits)]
     if isinstance(joint, Cylindrical):
         axis = direction(joint.axis)
         turn = Step(f"{name}.turn", "R", place, axis, start=joint.start)
@@ -250,31 +252,6 @@ def _onto(name: str, entry: Onto, members: dict[str, tuple[_Member, ...]], drive
             yield Linear(name, Address(one.placed.name, entry.element, entry.axis), coefficient)
 
 
-def _actuator(name: str, drive: Drive, turns: bool) -> Actuator:
-    """A drive for the engine; terms are those that the file changes."""
-    gain = drive.radius if isinstance(drive, SpoolDrive) else drive.gain
-    dimension = Dimension.LENGTH if isinstance(drive, LengthDrive) else Dimension.ANGLE
-    return Actuator(name, dimension, drive.stroke, {"offset": drive.offset, "gain": gain}, drive.period, drive.sigma)
-
-
-def _drive_errors(name: str, drive: Drive, turns: bool) -> Errors:
-    """Unknown terms of a drive, `q1.offset` and so on; a spool's gain is called its radius."""
-    spool, found = isinstance(drive, SpoolDrive), Errors()
-    terms = tuple("radius" if spool and term == "gain" else term for term in TERMS)
-    own = Dimension.ANGLE if turns else Dimension.LENGTH
-    tolerance = drive.angle if isinstance(drive, AngleDrive) else drive.length
-    for term in drive.unknown:
-        if term not in terms:
-            raise MechanismError(f"actuator {name!r} has no term {term!r}; allowed are {', '.join(terms)}")
-        full = f"{name}.{term}"
-        if term == "radius":
-            assert isinstance(drive, SpoolDrive)
-            dimension, nominal, sd = Dimension.LENGTH, drive.radius, drive.radii
-        elif term == "gain":
-            assert not isinstance(drive, SpoolDrive)
-            dimension, nominal, sd = Dimension.RATIO, drive.gain, drive.ratio
-        else:
-            dimension, nominal, sd = own, drive.offset if term == "offset" else 0.0, tolerance
-        address = Address(name, "transmission", "gain" if term == "radius" else term)
-        found += quantity(full, dimension, nominal, standard_deviation(sd, full), Linear(full, address))
-    return found
+def _plain(vector: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in vector)
+    return x, y, z

@@ -119,10 +119,10 @@ def _along(name: str, base: Direction, top: Direction, home: Array) -> tuple[Arr
 
 def _across(s: Array, axis: Array) -> Array:
     """The unit vector across s nearest to `axis`, or any where they are parallel."""
-    part = axis - (axis @ s) * s
+    part = axis - float(axis @ s) * s
     if np.linalg.norm(part) < 1e-6 * np.linalg.norm(axis):
         part = np.cross(s, np.eye(3)[int(np.argmin(np.abs(s)))])
-    return part / float(np.linalg.norm(part))
+    return np.array(part / np.linalg.norm(part), dtype=float)
 
 
 def _direction(name: str, axis: Direction) -> Array:

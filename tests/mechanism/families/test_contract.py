@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every robot that comes with loopcal must do. A new file in src/loopcal/robots is picked up by itself."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from loopcal import se3
+from loopcal.io.robot_file import load_robot, shipped_robots
+from loopcal.mechanism import Mechanism, coordinates, forward, inverse
+from loopcal.mechanism.trials import forward_trials, readings_at, sensitivity
+from loopcal.units import Dimension
+from tests.jacobians import check_jacobian
+from tests.mechanism.families.ranks import coordinates as random_coordinates
+
+ROBOTS = tuple(shipped_robots())
+
+
+@cache
+def robot(name: str) -> Mechanism:
+    return load_robot(name)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_it_closes_at_home_where_its_file_says(name: str) -> None:
+    machine = robot(name)
+    assert machine.home_state.residual.max() <= 1e-12 * machine.size
+    home = machine.assembly.home
+    read = [coordinates.read(T, machine.controlled) for T in (machine.home, home)]
+    tilt = se3.log_so3(machine.home[:3, :3] @ home[:3, :3].T)
+    if "phi" in machine.controlled and abs(tilt).max() < 1e-12:  # phi is anything at zero tilt
+        read = [np.delete(r, machine.controlled.index("phi")) for r in read]
+    np.testing.assert_allclose(*read, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_its_file_says_what_people_need(name: str) -> None:
+    machine = robot(name)
+    assert machine.name == name
+    assert machine.assembly.source
+    assert set(machine.assembly.workspace) <= set(machine.controlled)
+    assert len(machine.assembly.workspace) == len(machine.controlled)
+    assert all(a.stroke is not None for a in machine.actuators)
+    assert np.isfinite(machine.parameters.tolerance).all()
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_forward_undoes_inverse_in_the_workspace(name: str) -> None:
+    machine = robot(name)
+    wanted = random_coordinates(machine, 1000, seed=11)
+    there = inverse(machine, wanted)
+    back = forward(machine, there.q)
+    good = there.converged & back.converged
+    assert good.mean() >= 0.999
+    # [m, rad] Newton stops below 1e-13 of the size; the rest is the condition of the mechanism
+    np.testing.assert_allclose(back.T[good], there.T[good], atol=1e-9)
+    residual = coordinates.demands(back.T[good], wanted[good], machine.controlled, machine.size)[0]
+    np.testing.assert_allclose(residual, 0.0, atol=1e-9 * machine.size)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ROBOTS)
+def test_ten_thousand_random_rows_converge_and_the_others_say_why(name: str) -> None:
+    machine = robot(name)
+    there = inverse(machine, random_coordinates(machine, 10_000, seed=12))
+    back = forward(machine, there.q)
+    assert (there.converged & back.converged).mean() >= 0.999
+    for row in np.flatnonzero(~back.converged)[:5]:
+        assert back.explain(int(row))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ROBOTS)
+def test_its_sensitivities_are_the_derivatives_of_its_forward_kinematics(name: str) -> None:
+    machine = robot(name)
+    there = inverse(machine, random_coordinates(machine, 3, seed=13))
+    assert there.converged.all()
+    q, values = readings_at(machine, machine.values[None], there.state), machine.values
+    state = forward_trials(machine, values[None], q)
+    known = sensitivity(machine, values[None], q, state)
+
+    def by_value(x: np.ndarray) -> np.ndarray:
+        return se3.difference(forward_trials(machine, x[None], q, state).T[0], state.T[0])
+
+    def by_reading(x: np.ndarray) -> np.ndarray:
+        return se3.difference(forward_trials(machine, values[None], q + x, state).T[0], state.T[0])
+
+    # the difference of two rotations is a logarithm, whose slope at zero is the angular velocity
+    length, angle = 0.02 * machine.size, 0.02
+    scale = np.array([length if d is Dimension.LENGTH else angle for d in machine.parameters.dimensions])
+    reason = "[m] Newton's own accuracy over the smallest step"
+    check_jacobian(by_value, known.parameters[0], values, scale=scale, atol=1e-9 * machine.size, atol_reason=reason)
+    scale = np.array([length if a.dimension is Dimension.LENGTH else angle for a in machine.actuators])
+    zero = np.zeros(len(scale))
+    check_jacobian(by_reading, known.readings[0], zero, scale=scale, atol=1e-9 * machine.size, atol_reason=reason)

@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hexapods: columns against the leg equation, legs as rods and as chains, the screw against another program, ranks."""
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from loopcal import se3
+from loopcal.errors import MechanismError
+from loopcal.mechanism import Mechanism, build, forward, inverse
+from loopcal.mechanism.families.gough import Gough, GoughCones
+from loopcal.mechanism.families.ups import Screw
+from loopcal.mechanism.limits import within
+from loopcal.mechanism.records import LengthTolerance, Pose, Workspace
+from loopcal.mechanism.trials import sensitivity
+from tests import zoo
+from tests.mechanism.families.ranks import frame_columns, measured, perturbed, rank, ranks, scaled_sensitivity, solved
+
+Array = NDArray[np.float64]
+KINDS = ("full", "5-dof", "positions", "orientation")
+
+
+def points(array: Array) -> tuple[tuple[float, float, float], ...]:
+    return tuple((float(x), float(y), float(z)) for x, y, z in array)
+
+
+ROD = Gough(
+    name="hexapod",
+    base=points(zoo.HEXAPOD_BASE * zoo.MM),
+    platform=points(zoo.HEXAPOD_PLATFORM * zoo.MM),
+    lengths=zoo.HEXAPOD_LENGTH * zoo.MM,
+    home=Pose(z=0.2),
+    workspace=Workspace(
+        x=(-0.04, 0.04), y=(-0.04, 0.04), z=(0.17, 0.23), roll=(-0.25, 0.25), pitch=(-0.25, 0.25), yaw=(-0.25, 0.25)
+    ),
+)
+CHAIN = replace(ROD, legs="ups")
+
+
+@cache
+def robot(record: Gough) -> Mechanism:
+    return build(record.expand())
+
+
+def moved(machine: Mechanism) -> Mechanism:
+    """With the published errors of all 42 parameters, a thousand times their size would be 50 mm: use ten times, 0.5 mm."""
+    return machine.with_values(machine.values + 10 * zoo.HEXAPOD_ERRORS.reshape(-1)[ORDER] * zoo.MM)
+
+
+# the table lists base, length, platform; the package base, platform, length
+ORDER = np.concatenate([7 * leg + np.array([0, 1, 2, 4, 5, 6, 3]) for leg in range(6)])
+
+
+# --- the 42 parameters -----------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("record", [ROD, CHAIN], ids=["rod", "ups"])
+def test_columns_are_those_of_the_leg_equation(record: Gough) -> None:
+    """u . dt + (R p x u) . omega = dl + u . db - u . R dp, six legs: D = J^-1 G."""
+    machine = moved(robot(record))
+    solution = solved(machine)
+    D = sensitivity(machine, machine.values[None], solution.q[None], solution.state).parameters[0]
+    value = machine.values.reshape(6, 7)
+    for T, found in zip(solution.T, D, strict=True):
+        N, R = T[:3, 3], T[:3, :3]
+        J, G = np.zeros((6, 6)), np.zeros((6, 42))
+        for leg, (b, p) in enumerate(zip(value[:, :3], value[:, 3:6], strict=True)):
+            u = N + R @ p - b
+            u /= np.linalg.norm(u)
+            J[leg] = np.concatenate([np.cross(R @ p, u), u])
+            G[leg, 7 * leg : 7 * leg + 7] = np.concatenate([u, -u @ R, [1.0]])
+        expected = np.linalg.solve(J, G)
+        # [m/m, rad/m] rounding times the condition of J, about 1e2
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_rods_and_chains_agree_in_names_pose_residual_and_sensitivities() -> None:
+    rod, chain = moved(robot(ROD)), moved(robot(CHAIN))
+    assert rod.parameters.names == chain.parameters.names
+    np.testing.assert_array_equal(rod.parameters.nominal, chain.parameters.nominal)
+    one = solved(rod)
+    two = inverse(chain, one.T)
+    assert two.converged.all()
+    np.testing.assert_allclose(two.q, one.q, rtol=0, atol=1e-12)  # [m]
+    there, back = forward(rod, one.q), forward(chain, one.q)
+    np.testing.assert_allclose(back.T, there.T, rtol=0, atol=1e-12)  # [m, 1]
+    assert max(there.residual.max(), back.residual.max()) < 1e-12  # [m]
+    D = [
+        sensitivity(machine, machine.values[None], one.q[None], found.state) for machine, found in ((rod, there), (chain, back))
+    ]
+    size = np.abs(D[0].parameters).max()  # [rad/m] about 10
+    np.testing.assert_allclose(D[1].parameters, D[0].parameters, rtol=0, atol=1e-12 * max(size, 1.0))
+    np.testing.assert_allclose(D[1].readings, D[0].readings, rtol=0, atol=1e-12 * max(size, 1.0))
+
+
+def test_ranks_of_the_42_parameters() -> None:
+    for record in (ROD, CHAIN):
+        assert ranks(robot(record), KINDS) == [42, 41, 39, 36]
+
+
+@pytest.mark.parametrize(
+    ("kind", "base", "tool", "expected"),
+    [
+        ("full", True, False, 36),
+        ("full", False, True, 36),
+        ("full", True, True, 30),
+        ("5-dof", True, False, 35),
+        ("positions", True, False, 33),
+    ],
+)
+def test_unknown_frames_cost_the_42_parameters_what_they_add(kind: str, base: bool, tool: bool, expected: int) -> None:
+    machine = robot(ROD)
+    solution = solved(machine)
+    F = frame_columns(solution.T, base, tool)
+    both = np.concatenate([scaled_sensitivity(machine, solution), F], axis=2)
+    seen = measured(both, solution.T, kind)
+    assert rank(seen) - rank(seen[..., 42:]) == expected
+
+
+# --- complete models -------------------------------------------------------------------------------------------------
+COMPLETE = replace(CHAIN, error_model="complete")
+REAL = replace(COMPLETE, spherical="axes")
+
+
+@pytest.mark.parametrize(
+    ("record", "size", "expected"),
+    [(COMPLETE, 0.0, [48, 47, 45]), (COMPLETE, 2e-3, [84, 83, 81]), (REAL, 0.0, [66, 65, 63]), (REAL, 4e-3, [138, 137, 135])],
+    ids=["perfect balls, nominal", "perfect balls, moved", "nominal", "moved"],
+)
+def test_ranks_of_the_complete_model(record: Gough, size: float, expected: list[int]) -> None:
+    # moved by 2 mm and 10 mrad (4 mm, 20 mrad): at smaller errors the last directions sink into rounding
+    assert ranks(perturbed(robot(record), size, seed=5), KINDS[:3], n=150) == expected
+
+
+def test_each_unknown_frame_costs_the_complete_model_six() -> None:
+    machine = perturbed(robot(REAL), 4e-3, seed=5)
+    solution = solved(machine, 150)
+    D = scaled_sensitivity(machine, solution)
+    found = []
+    for base, tool in ((True, False), (False, True), (True, True)):
+        F = frame_columns(solution.T, base, tool)
+        found.append(rank(np.concatenate([D, F], axis=2)) - F.shape[2])
+    assert found == [132, 132, 126]
+
+
+def test_the_complete_model_moves_the_42_parameters_along() -> None:
+    """What the 42 can do, the complete model can: its columns span theirs."""
+    solution = solved(robot(ROD))
+    small = scaled_sensitivity(robot(ROD), solution)
+    machine = robot(REAL)
+    large = scaled_sensitivity(machine, inverse(machine, solution.T))
+    assert rank(np.concatenate([large, small], axis=2)) == rank(large) == 66
+
+
+# --- refusals --------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("record", "sentence"),
+    [
+        (replace(ROD, error_model="complete"), "legs: rod with error_model: complete.*state legs: ups"),
+        (replace(ROD, spherical="axes"), "legs: rod with spherical: axes.*state legs: ups"),
+        (replace(ROD, screw=Screw()), "legs: rod with a screw.*state legs: ups"),
+        (replace(CHAIN, spherical="axes"), "spherical: axes.*state error_model: complete"),
+        (replace(CHAIN, screw=Screw(0.004, ((0, 0, 1),) * 5, ((1, 0, 0),) * 6)), "names 5 base_axes and 6 platform_axes"),
+        (replace(CHAIN, screw=Screw(0.004, ((0, 0, 0),) * 6, ((1, 0, 0),) * 6)), r"joint axis of leg1 is \[0, 0, 0\]"),
+        (replace(ROD, base=ROD.base[:5]), "5 base and 6 platform centres"),
+        (replace(ROD, tolerances=replace(ROD.tolerances, base=LengthTolerance())), "state either sd or limits"),
+    ],
+)
+def test_what_a_form_cannot_carry_is_refused_with_the_way_out(record: Gough, sentence: str) -> None:
+    with pytest.raises(MechanismError, match=sentence):
+        record.expand()
+
+
+# --- the screw, against LinuxCNC's genhexkins ------------------------------------------------------------------------
+LEAD = 4.0  # unit of the file, here taken as a metre
+
+
+@pytest.fixture(scope="module")
+def genhexkins(data_folder: Path) -> tuple[dict[str, Array], Array, Array]:
+    """Geometry, poses (200, 4, 4) and strut lengths (200, 6) that LinuxCNC's own code printed."""
+    folder = data_folder / "kinematics_oracles"
+    geometry = json.loads((folder / "genhexkins_geometry.json").read_text())
+    rows = np.genfromtxt(folder / "genhexkins_screwlead4_200poses.csv", delimiter=",", names=True)
+    angles = np.radians(np.stack([rows[c] for c in ("a_deg", "b_deg", "c_deg")], axis=1))
+    T = se3.pose(se3.euler_to_matrix(angles, "xyz"), np.stack([rows[c] for c in "xyz"], axis=1))
+    struts = np.stack([rows[f"L{leg}"] for leg in range(6)], axis=1)
+    return {key: np.array(geometry[key]) for key in geometry if not key.startswith("_") and key != "units"}, T, struts
+
+
+def folded(geometry: dict[str, Array], T: Array) -> NDArray[np.bool_]:
+    """Where the platform's joint axis has turned past a quarter turn from the base's, seen along the leg, (n, 6)."""
+    R = T[:, None, :3, :3]
+    v = T[:, None, :3, 3] + (R @ geometry["platform"][..., None])[..., 0] - geometry["base"]
+    s = v / np.linalg.norm(v, axis=2, keepdims=True)
+    low, high = geometry["base_joint_axis"] + 0 * v, (R @ geometry["platform_joint_axis"][..., None])[..., 0]
+    return (low * high).sum(2) - (low * s).sum(2) * (high * s).sum(2) < 0
+
+
+def screw_hexapod(geometry: dict[str, Array], fold: NDArray[np.bool_], home: Array) -> Mechanism:
+    """Hexapod whose screws do what genhexkins does with asin(sin a) for the angle a.
+
+    Past a quarter turn that is the screw of the other hand, counted from the other side of its axis.
+    """
+    sign = np.where(fold, -1.0, 1.0)
+    x, y, z = home[:3, 3]
+    roll, pitch, yaw = se3.matrix_to_euler(home[:3, :3], "xyz")
+    axes = points(geometry["base_joint_axis"]), points(geometry["platform_joint_axis"] * sign[:, None])
+    record = Gough(
+        name="genhexkins",
+        base=points(geometry["base"]),
+        platform=points(geometry["platform"]),
+        legs="ups",
+        screw=Screw(tuple(LEAD * sign), *axes),
+        home=Pose(x, y, z, roll, pitch, yaw),
+    )
+    return build(record.expand())
+
+
+def test_the_screw_gives_all_strut_lengths_and_poses_of_genhexkins(genhexkins: tuple[dict[str, Array], Array, Array]) -> None:
+    geometry, T, struts = genhexkins
+    patterns, place = np.unique(folded(geometry, T), axis=0, return_inverse=True)
+    checked = 0
+    for i, pattern in enumerate(patterns):
+        rows = np.flatnonzero(place.reshape(-1) == i)
+        machine = screw_hexapod(geometry, pattern, T[rows[0]])
+        # walk there in twenty steps: a screw that overtakes half a turn on the way stands a turn further
+        start = None
+        twist = se3.difference(T[rows], T[rows[:1]] + 0 * T[rows])
+        for part in np.linspace(0.05, 1.0, 20):
+            pose = se3.exp_update(T[rows[:1]] + 0 * T[rows], part * twist)
+            start = inverse(machine, pose, start)
+        assert start is not None
+        assert start.converged.all()
+        np.testing.assert_allclose(start.T, T[rows], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(start.q, struts[rows], rtol=0, atol=1e-9)  # printed to 1e-12
+        back = forward(machine, struts[rows])
+        assert back.converged.all()
+        np.testing.assert_allclose(back.T, T[rows], rtol=0, atol=1e-7)  # printed poses are exact to 1e-10
+        checked += len(rows)
+    assert checked == 200
+
+
+def test_a_screw_without_lead_is_a_plain_leg() -> None:
+    axes = ((0.0, 0.0, 1.0),) * 6, ((1.0, 0.0, 0.0),) * 6
+    machine, plain = robot(replace(CHAIN, screw=Screw(0.0, *axes))), robot(CHAIN)
+    one = solved(plain, 20)
+    np.testing.assert_allclose(inverse(machine, one.T).q, one.q, rtol=0, atol=1e-12)  # [m]
+
+
+def test_the_screw_adds_its_lead_for_each_turn_of_the_upper_joint_about_the_leg() -> None:
+    """length + reading = |t + R p - b| + lead a / (2 pi), a from the lower axis to the upper one about the leg."""
+    lead, low, high = 0.004, np.array([1.0, 0.0, 0.0]), np.array([0.6, 0.8, 0.0])
+    machine = robot(replace(CHAIN, screw=Screw(lead, points(np.tile(low, (6, 1))), points(np.tile(high, (6, 1))))))
+    solution = solved(machine, 30)
+    for T, q in zip(solution.T, solution.q, strict=True):
+        v = T[:3, 3] + machine_points(ROD.platform) @ T[:3, :3].T - machine_points(ROD.base)
+        length = np.linalg.norm(v, axis=1)
+        s, upper = v / length[:, None], T[:3, :3] @ high
+        across = np.cross(s, low)  # with low's part across s, a right-handed frame about s
+        a = np.arctan2(across @ upper, s * (s @ low)[:, None] @ -upper + low @ upper)
+        np.testing.assert_allclose(q, length + lead * a / (2 * np.pi) - ROD.lengths, rtol=0, atol=1e-12)  # [m]
+
+
+def machine_points(listed: tuple[tuple[float, float, float], ...]) -> Array:
+    return np.array(listed)
+
+
+def test_a_leg_that_leans_too_far_from_its_direction_at_home_is_told() -> None:
+    machine = robot(replace(ROD, cones=GoughCones(base=0.1, platform=0.3)))
+    q = inverse(machine, np.array([[0.0, 0, 0.2, 0, 0, 0], [0.1, 0, 0.2, 0, 0, 0]]))
+    allowed, why = within(machine, machine.values[None], q.q[None], q.state)
+    assert allowed.tolist() == [[True, False]]
+    assert why[0, 1].startswith("lean of leg1 at its tip is")
+    with pytest.raises(MechanismError, match="cones with legs: ups"):
+        replace(CHAIN, cones=GoughCones(base=0.1)).expand()

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""3-PRS and RU-PUS-PRS: columns against the error models written out by hand, ranks, null directions.
+
+The formulas here are those of docs/theory/tripods.md, from the loops |v_i| = l_i, v_i . r_i = 0 and so on, and share no
+code with the package.
+"""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from loopcal.engine.closure import geometry
+from loopcal.errors import MechanismError
+from loopcal.mechanism import Mechanism, build
+from loopcal.mechanism.families.ru_pus_prs import LEFT_OUT, RuPusPrs
+from loopcal.mechanism.families.three_prs import ThreePrs
+from loopcal.mechanism.records import Pose, Workspace
+from loopcal.mechanism.trials import sensitivity
+from tests.mechanism.families.ranks import (
+    frame_columns,
+    measured,
+    null_vector,
+    perturbed,
+    rank,
+    ranks,
+    scaled_sensitivity,
+    solved,
+)
+
+Array = NDArray[np.float64]
+TILTS = {"phi": (-np.pi, np.pi), "theta": (0.02, 0.6)}
+THREE_PRS = ThreePrs(
+    name="3-prs", platform_radius=0.2, base_radius=0.35, rod=0.5, home=Pose(z=0.7), workspace=Workspace(z=(0.65, 0.75), **TILTS)
+)
+RU_PUS_PRS = RuPusPrs(
+    name="ru-pus-prs", platform_radius=0.3, base_radius=0.4, rod=0.5, post=0.6, home=Pose(z=0.6), workspace=Workspace(**TILTS)
+)
+KINDS = ("full", "5-dof", "positions", "orientation")
+EX, EY, EZ = np.eye(3)
+
+
+@cache
+def robot(record: ThreePrs | RuPusPrs) -> Mechanism:
+    return build(record.expand())
+
+
+# --- the error models by hand ----------------------------------------------------------------------------------------
+def spin(angle: float) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def sphere_row(N: Array, R: Array, a: Array, b: Array, q: float, Z: Array, tags: dict[str, str]) -> tuple[Array, dict]:
+    """w . dN + (R a x w) . om = dl + w . [Z db + s dq + q Z (dthBy, -dthBx, 0)] - w . R Z da: twist row, parameter slopes."""
+    v = N + R @ a - b - q * EZ
+    w = v / np.linalg.norm(v)
+    slopes = {tags["l"]: 1.0} | guided(w, R, q, Z, tags)
+    return np.concatenate([np.cross(R @ a, w), w]), slopes
+
+
+def hinge_row(N: Array, R: Array, a: Array, b: Array, q: float, Z: Array, r: Array, tags: dict) -> tuple[Array, dict]:
+    """r . dN + (R a x r) . om = r . [Z db + s dq + q Z (dthBy, -dthBx, 0)] - r . R Z da - v . dr, dr = (Z dthC) x r."""
+    v = N + R @ a - b - q * EZ
+    slopes = guided(r, R, q, Z, tags)
+    for axis in "xyz":
+        if f"thC{axis}" in tags:
+            slopes[tags[f"thC{axis}"]] = -float(v @ np.cross(Z @ np.eye(3)["xyz".index(axis)], r))
+    return np.concatenate([np.cross(R @ a, r), r]), slopes
+
+
+def guided(w: Array, R: Array, q: float, Z: Array, tags: dict[str, str]) -> dict:
+    """What centres, offset and guide contribute along w."""
+    found = {tags["q"]: w @ EZ, tags["thBx"]: -q * (w @ Z @ EY), tags["thBy"]: q * (w @ Z @ EX)}
+    found |= {tags[f"b{axis}"]: w @ Z @ np.eye(3)["xyz".index(axis)] for axis in "xy"}
+    return found | {tags[f"a{axis}"]: -w @ R @ Z @ np.eye(3)["xyz".index(axis)] for axis in "xyz"}
+
+
+def tags(i: int, joint: str) -> dict[str, str]:
+    """The paper's names of the parameters of chain i."""
+    keys = ("ax", "ay", "az", "bx", "by", "q", "l", "thBx", "thBy", *(f"thC{axis}" for axis in joint))
+    return {key: f"{key[:-1]}{i}{key[-1]}" if key[-1] in "xyz" else f"{key}{i}" for key in keys}
+
+
+def three_prs_rows(N: Array, R: Array, q: Array) -> list[tuple[Array, dict]]:
+    """The six loops of the 3-PRS."""
+    found = []
+    for i in range(3):
+        Z = spin(2 * np.pi / 3 * i)
+        a, b, names = Z @ [0.2, 0, 0], Z @ [0.35, 0, 0], tags(i + 1, "xz")
+        found.append(sphere_row(N, R, a, b, q[i], Z, names))
+        found.append(hinge_row(N, R, a, b, q[i], Z, Z @ EY, names))
+    return found
+
+
+def ru_pus_prs_rows(N: Array, R: Array, q: Array) -> list[tuple[Array, dict]]:
+    """The six loops of the RU-PUS-PRS: two rods, the hinge of chain 2, |N| = r, n . N = 0, u1 . R u2 = 0."""
+    a1, b1, a2, b2 = -0.3 * EX, -0.4 * EX, 0.3 * EY, 0.4 * EY
+    eye, u1, u2 = np.eye(3), EX, R @ EY
+    zero = np.zeros(3)
+    post = {"thU1y": -u2 @ np.cross(EY, u1), "thU1z": -u2 @ np.cross(EZ, u1), "thOz": -u2 @ np.cross(EZ, u1)}
+    post |= {"thU2x": -u1 @ R @ np.cross(EX, EY), "thU2z": -u1 @ R @ np.cross(EZ, EY)}
+    return [
+        sphere_row(N, R, a1, b1, q[0], eye, tags(1, "")),
+        sphere_row(N, R, a2, b2, q[1], eye, tags(2, "")),
+        hinge_row(N, R, a2, b2, q[1], eye, EX, tags(2, "yz")),
+        (np.concatenate([zero, N / np.linalg.norm(N)]), {"r": 1.0}),
+        # the pivot along n = y: its turn about x tips the post sideways, that about z leaves N where it is
+        (np.concatenate([zero, EY]), {"thOx": -N @ np.cross(EX, EY), "thOz": -N @ np.cross(EZ, EY)}),
+        # u1 is carried by the post: it turns with the pivot about z, and about y with N, du1 = dN_x / r (y x x)
+        (np.concatenate([np.cross(u2, u1), -EX * (u2 @ EZ) / np.linalg.norm(N)]), post),
+    ]
+
+
+def by_hand(rows: list[tuple[Array, dict]], names: tuple[str, ...]) -> Array:
+    """D = J^-1 G (6, p), twist (rotation, translation) per parameter."""
+    J = np.stack([row for row, _ in rows])
+    G = np.array([[slopes.get(name, 0.0) for name in names] for _, slopes in rows])
+    return np.asarray(np.linalg.solve(J, G), dtype=float)
+
+
+CASES = {
+    "3-PRS": (THREE_PRS, three_prs_rows),
+    "RU-PUS-PRS, 25": (RU_PUS_PRS, ru_pus_prs_rows),
+    "RU-PUS-PRS, 27": (replace(RU_PUS_PRS, parameters="twenty-seven"), ru_pus_prs_rows),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_columns_are_those_of_the_error_model_written_out(case: str) -> None:
+    record, rows = CASES[case]
+    machine = robot(record)
+    solution = solved(machine)
+    D = sensitivity(machine, machine.values[None], solution.q[None], solution.state).parameters[0]
+    expected = np.stack(
+        [by_hand(rows(T[:3, 3], T[:3, :3], q), machine.parameters.names) for T, q in zip(solution.T, solution.q, strict=True)]
+    )
+    # [m/m, rad/m, ..] condition of the six loops 1e2 times rounding
+    np.testing.assert_allclose(D, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_the_declared_names_are_eleven_a_chain_and_twenty_five() -> None:
+    names = robot(THREE_PRS).parameters.names
+    assert len(names) == 33
+    assert names[:11] == ("a1x", "a1y", "a1z", "b1x", "b1y", "q1", "l1", "thB1x", "thB1y", "thC1x", "thC1z")
+    names = robot(RU_PUS_PRS).parameters.names
+    assert len(names) == 25
+    assert set(robot(CASES["RU-PUS-PRS, 27"][0]).parameters.names) - set(names) == set(LEFT_OUT)
+    assert names[-5:] == ("r", "thOx", "thU1y", "thU2x", "thU2z")
+
+
+# --- what can be told apart ------------------------------------------------------------------------------------------
+def test_ranks_of_the_3_prs_are_33_and_lose_one_without_torsion_and_three_without_angles() -> None:
+    assert ranks(robot(THREE_PRS), KINDS) == [33, 32, 30, 27]
+
+
+def test_an_unknown_frame_costs_the_3_prs_six_parameters_and_two_cost_twelve() -> None:
+    machine = robot(THREE_PRS)
+    solution = solved(machine)
+    D = scaled_sensitivity(machine, solution)
+    for base, tool, expected in ((True, False, 27), (False, True, 27), (True, True, 21)):
+        F = frame_columns(solution.T, base, tool)
+        assert rank(np.concatenate([D, F], axis=2)) - F.shape[2] == expected
+
+
+def test_without_torsion_the_3_prs_cannot_see_its_three_balls_turned_together() -> None:
+    machine = robot(THREE_PRS)
+    solution = solved(machine)
+    found = null_vector(measured(scaled_sensitivity(machine, solution), solution.T, "5-dof"))
+    expected = np.isin(machine.parameters.names, ("a1y", "a2y", "a3y")) / np.sqrt(3)
+    np.testing.assert_allclose(np.abs(found @ expected), 1.0, atol=1e-9)  # rounding over the next singular value, 4e-5
+
+
+def test_fourteen_natural_parameters_a_chain_reduce_to_the_eleven_by_dropping_three() -> None:
+    machine = robot(replace(THREE_PRS, parameters="fourteen"))
+    names = machine.parameters.names
+    assert len(names) == 42
+    solution = solved(machine)
+    D = scaled_sensitivity(machine, solution)
+    assert rank(D) == 33
+    dropped = [f"{letter}{chain}{axis}" for letter, axis in (("b", "z"), ("thB", "z"), ("thC", "y")) for chain in "123"]
+    # an angle about its own axis changes nothing, the foot's height what the offset changes
+    for name in dropped:
+        column = D[..., machine.parameters.index(name)]
+        twin = D[..., machine.parameters.index(f"q{name[1]}")] if name[0] == "b" else 0.0 * column
+        np.testing.assert_allclose(column, twin, rtol=0, atol=1e-14 * np.abs(D).max())
+    kept = np.array([name not in dropped for name in names])
+    assert rank(D[..., kept]) == 33
+    assert tuple(np.array(names)[kept]) == robot(THREE_PRS).parameters.names
+
+
+def test_a_tilted_guide_does_not_turn_the_joint_on_the_carriage() -> None:
+    machine = robot(THREE_PRS)
+    # 0.1 rad, far beyond first order: the hinge stays along y of its chain
+    values = machine.values.copy()
+    values[machine.parameters.index("thB1x")] = 0.1
+    values[machine.parameters.index("thB1y")] = -0.1
+    e, _ = machine.slots(values[None])
+    group = machine.program.groups[0]
+    g = geometry(group, e)
+    np.testing.assert_allclose(g.turn[0][..., 0, 0] @ g.turn[1][..., 0, 0] @ EZ, EY, atol=1e-15)
+
+
+def test_twenty_seven_parameters_of_the_tracker_have_rank_26_because_pivot_and_first_axis_turn_alike() -> None:
+    machine = robot(CASES["RU-PUS-PRS, 27"][0])
+    solution = solved(machine)
+    D = scaled_sensitivity(machine, solution)
+    assert rank(D) == 26
+    names = machine.parameters
+    pivot, first = D[..., names.index("thOz")], D[..., names.index("thU1z")]
+    np.testing.assert_allclose(pivot, first, rtol=0, atol=1e-14 * np.abs(D).max())
+    # leaving out thOz alone keeps 26; the declared twenty-five leave out thU1z as well
+    assert ranks(robot(RU_PUS_PRS), ("full", "5-dof")) == [25, 24]
+
+
+def test_without_torsion_the_tracker_cannot_see_its_two_balls_turned_together() -> None:
+    machine = robot(RU_PUS_PRS)
+    solution = solved(machine)
+    found = null_vector(measured(scaled_sensitivity(machine, solution), solution.T, "5-dof"))
+    found *= np.sign(found[machine.parameters.index("a1y")])
+    # mostly a1y = a2x, and a small angle of the second axis on the platform
+    assert found[machine.parameters.index("a1y")] == pytest.approx(found[machine.parameters.index("a2x")], rel=1e-6)
+    largest = np.array(machine.parameters.names)[np.argsort(-np.abs(found))[:3]]
+    assert set(largest) == {"a1y", "a2x", "thU2z"}
+
+
+# --- complete models -------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("record", "size", "expected"),
+    [
+        (replace(THREE_PRS, error_model="complete"), 0.0, [33, 32, 30]),
+        (replace(THREE_PRS, error_model="complete"), 2e-3, [33, 32, 30]),
+        (replace(THREE_PRS, error_model="complete", spherical="axes"), 0.0, [42, 41, 39]),
+        (replace(THREE_PRS, error_model="complete", spherical="axes"), 2e-3, [60, 59, 57]),
+        (replace(RU_PUS_PRS, error_model="complete", spherical="axes"), 6e-3, [58, 57, 55]),
+    ],
+    ids=["perfect balls", "perfect balls, moved", "nominal", "moved", "tracker"],
+)
+def test_ranks_of_the_complete_models(record: ThreePrs | RuPusPrs, size: float, expected: list[int]) -> None:
+    # moved by 2 mm and 10 mrad (tracker: 6 mm, 30 mrad): at smaller errors the last directions sink into rounding
+    assert ranks(perturbed(robot(record), size, seed=7), KINDS[:3], n=120) == expected
+
+
+def test_a_model_of_points_refuses_joints_of_axes() -> None:
+    with pytest.raises(MechanismError, match="state error_model: complete"):
+        replace(THREE_PRS, spherical="axes").expand()
+
+
+def test_a_rod_too_short_is_told_in_words() -> None:
+    with pytest.raises(MechanismError, match="rod of chain1 is 100 mm long, but its ball is 150 mm"):
+        replace(THREE_PRS, rod=0.1).expand()
+
+
+def test_the_origin_of_the_trackers_platform_stays_where_it_is() -> None:
+    solution = solved(robot(RU_PUS_PRS))
+    np.testing.assert_allclose(solution.T[:, :3, 3], [[0, 0, 0.6]] * len(solution.T), atol=1e-12)  # [m] rounding
