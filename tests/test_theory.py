@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pages of docs/theory: those that the code cites exist, links lead somewhere, and their examples hold."""
+
+import doctest
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+THEORY = ROOT / "docs" / "theory"
+PAGES = sorted(THEORY.glob("*.md"))
+TEXTS = {page: page.read_text("utf-8") for page in [*PAGES, ROOT / "docs" / "README.md"]}
+FENCED = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
+EXAMPLE = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+def anchors(text: str) -> set[str]:
+    """Return the names under which the headings of a page can be linked to."""
+    headings = re.findall(r"^#+ (.*)$", FENCED.sub("", text), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_every_page_that_the_code_cites_exists() -> None:
+    files = (ROOT / "src").rglob("*.py")
+    cited = {name for f in files for name in re.findall(r"docs/theory/([\w-]+\.md)", f.read_text("utf-8"))}
+    assert cited, "the code cites no page of theory"
+    assert sorted(cited - {page.name for page in PAGES}) == []
+
+
+def test_every_page_is_in_the_index() -> None:
+    index = TEXTS[ROOT / "docs" / "README.md"]
+    assert [page.name for page in PAGES if f"(theory/{page.name})" not in index] == []
+
+
+@pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.name)
+def test_every_link_leads_to_a_page_and_a_heading_of_it(page: Path) -> None:
+    wrong = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", FENCED.sub("", TEXTS[page])):
+        if link.startswith("http"):
+            continue
+        name, _, anchor = link.partition("#")
+        target = (page.parent / name) if name else page
+        if not target.exists() or (anchor and anchor not in anchors(target.read_text("utf-8"))):
+            wrong.append(link)
+    assert wrong == []
+
+
+def test_every_cited_key_is_in_the_list_of_references() -> None:
+    known = set(re.findall(r"^- \*\*\[(\w+)\]\*\*", TEXTS[THEORY / "references.md"], re.MULTILINE))
+    cited = {key for text in TEXTS.values() for key in re.findall(r"\[([A-Z]\w+\d{2,4})\]\(references\.md\)", text)}
+    assert sorted(cited - known) == []
+    assert sorted(known - cited) == []
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if EXAMPLE.search(TEXTS[page])], ids=lambda page: page.name)
+def test_the_examples_of_a_page_give_what_it_says(page: Path) -> None:
+    source = "\n".join(EXAMPLE.findall(TEXTS[page]))
+    example = doctest.DocTestParser().get_doctest(source, {}, page.name, str(page), 0)
+    report: list[str] = []
+    failed, tried = doctest.DocTestRunner().run(example, out=report.append)
+    assert tried > 0
+    assert failed == 0, "".join(report)
