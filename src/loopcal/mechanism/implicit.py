@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the platform moves with parameters and readings, by the implicit function theorem on the closure of all limbs.
+
+Closure linearised, passive joints eliminated: A y + E de + Q dq = 0, so y = -A^-1 (E de/dp + Q dq/dp). A limb's rows are
+touched by its own displacements and actuators only, so its part of the right-hand side has few columns. Rows are worked
+on in blocks that fit the cache. Derivation: docs/theory/engine.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopcal import engine
+from loopcal.engine import Array, Block, Group, State
+from loopcal.mechanism.model import Mechanism, SlotMap, Status
+from loopcal.mechanism.transmission import TERMS, joint_values, slope, term_columns
+
+ROWS = 512
+"""Rows linearised together."""
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """How the platform moves with parameters and readings.
+
+    Attributes
+    ----------
+    parameters : (t, n, 6, p) twist (omega in base axes, velocity of the platform's origin) per unit of each parameter.
+    readings : (t, n, 6, a) the same per unit of each reading.
+    """
+
+    parameters: Array
+    readings: Array
+
+
+def sensitivity(robot: Mechanism, values: Array, q: Array, state: State) -> Sensitivity:
+    """Derivative of the platform's pose by the implicit function theorem, D = -A^-1 [E de/dp + Q dq/dp].
+
+    Parameters
+    ----------
+    values : (t | 1, p). q : (t | 1, n, a) readings. state : (t, n), converged rows.
+
+    Returns
+    -------
+    Sensitivity; failed rows hold NaN, rows of singular states infinities or NaN.
+    """
+    t, n = state.T.shape[:2]
+    freedoms = list(robot.program.freedoms)
+    out = Sensitivity(np.zeros((t, n, 6, len(robot.parameters))), np.zeros((t, n, 6, len(robot.actuators))))
+    for rows in row_blocks(t, n):
+        work = Linearised(robot, some(values, rows[:1]), some(q, rows), some_rows(state, rows))
+        by_parameter, by_reading = work.platform()
+        if len(freedoms) == 6:
+            out.parameters[rows], out.readings[rows] = by_parameter, by_reading
+        else:
+            out.parameters[rows][:, :, freedoms], out.readings[rows][:, :, freedoms] = by_parameter, by_reading
+    lost = (state.status != Status.CONVERGED) & (state.status != Status.OTHER_MODE)
+    out.parameters[lost], out.readings[lost] = np.nan, np.nan
+    return out
+
+
+def row_blocks(t: int, n: int) -> Iterator[tuple[slice, slice]]:
+    """Slices of trials and poses that cover (t, n) by at most ROWS rows each."""
+    poses = min(n, ROWS)
+    trials = max(1, ROWS // max(poses, 1))
+    for i in range(0, t, trials):
+        for j in range(0, n, max(poses, 1)):
+            yield slice(i, min(i + trials, t)), slice(j, min(j + poses, n))
+
+
+def some(array: Array, rows: tuple[slice, ...]) -> Array:
+    """A block of rows of an array whose leading axes may be 1 and then broadcast."""
+    return array[tuple(s if length > 1 else slice(None) for s, length in zip(rows, array.shape, strict=False))]
+
+
+def some_rows(state: State, rows: tuple[slice, slice]) -> State:
+    """A block of rows of a state (t, n)."""
+    cut = {f.name: getattr(state, f.name)[rows] for f in fields(State) if f.name != "joints"}
+    return replace(state, **cut, joints=tuple(j[rows] for j in state.joints))
+
+
+class Linearised:
+    """Closure of some rows, with the parameters and readings that each limb's equations hold."""
+
+    def __init__(self, robot: Mechanism, values: Array, q: Array, state: State) -> None:
+        slots, self.robot, self.shape = robot.slots, robot, state.T.shape[:2]
+        e, tau = slots(values)
+        self.blocks = engine.linearise(robot.program, e, joint_values(q, tau, slots.frequency), state)
+        J = slots.jacobian(values)
+        self.of_slots = J[:, : slots.n_displacements]
+        self.of_terms = J[:, slots.n_displacements :].reshape(len(J), *slots.terms.shape, -1)
+        self.touches = _touches(slots)
+        self.terms = term_columns(q, slots.frequency)
+        self.slope = slope(q, tau, slots.frequency)
+
+    def limbs(self, parts: tuple[Block, ...]) -> Iterator[tuple[Array, Columns, Array, Columns, Array]]:
+        """For each limb: its rows (t, n, r, m) against the platform, its parameters with their columns (t, n, r, ..), its
+        actuators with theirs.
+        """
+        for group, block in zip(self.robot.program.groups, parts, strict=True):
+            for k in range(len(group.limbs)):
+                yield block.A[:, :, k], *self._parameters(group, block, k), *self._readings(group, block, k)
+
+    def platform(self) -> tuple[Array, Array]:
+        """d platform freedoms / d parameters (t, n, m, p), and / d readings (t, n, m, a)."""
+        program = self.robot.program
+        inverse = _pseudo_inverse(platform_rows(self.blocks), _row_weights(program, self.blocks))
+        m = len(program.freedoms)
+        by_parameter = np.zeros((*self.shape, m, len(self.robot.parameters)))
+        by_reading = np.zeros((*self.shape, m, program.n_joints))
+        first = 0
+        for A, parameters, of_parameters, drives, of_drives in self.limbs(self.blocks.closure):
+            for i in range(A.shape[2]):
+                column = inverse[..., first + i, None]
+                by_parameter[..., parameters] -= column * of_parameters[:, :, i, None]
+                by_reading[..., drives] -= column * of_drives[:, :, i, None]
+            first += A.shape[2]
+        return by_parameter, by_reading
+
+    def _parameters(self, group: Group, block: Block, k: int) -> tuple[Columns, Array]:
+        """Parameters that limb k's rows hold, and d rows / d them (t, n, r, ..)."""
+        width = len(group.slots)
+        own = slice(group.columns.start + k * width, group.columns.start + (k + 1) * width)
+        driven = [(j, int(columns[k])) for j, columns in enumerate(group.actuator) if columns[k] >= 0]
+        first = self.robot.slots.n_displacements
+        touched = self.touches[own].any(axis=0)
+        for _, a in driven:
+            touched = touched | self.touches[first + len(TERMS) * a : first + len(TERMS) * (a + 1)].any(axis=0)
+        columns = _columns(np.flatnonzero(touched))
+        E = block.E[:, :, k]
+        right = np.matmul(E.reshape(len(E), -1, width), self.of_slots[:, own, columns])
+        right = right.reshape(*right.shape[:1], *E.shape[1:3], -1)
+        for j, a in driven:
+            for i, term in enumerate(self.terms):
+                slopes = self.of_terms[:, None, None, a, i, columns]
+                if slopes.any():
+                    right = right + (block.Q[:, :, k, :, j] * term[:, :, a, None])[..., None] * slopes
+        return columns, right
+
+    def _readings(self, group: Group, block: Block, k: int) -> tuple[Columns, Array]:
+        """Readings that limb k's rows hold, and d rows / d them (t, n, r, ..)."""
+        driven = [(j, int(columns[k])) for j, columns in enumerate(group.actuator) if columns[k] >= 0]
+        places = np.array([a for _, a in driven], dtype=np.int64)
+        right = block.Q[:, :, k][..., [j for j, _ in driven]] * self.slope[:, :, None, places]
+        return _columns(places), right
+
+
+Columns = slice | NDArray[np.int64]
+
+
+def _columns(places: NDArray[np.int64]) -> Columns:
+    """Places as a slice where they are consecutive: a view in the place of a copy."""
+    if len(places) and places[-1] - places[0] == len(places) - 1 and (np.diff(places) == 1).all():
+        return slice(int(places[0]), int(places[-1]) + 1)
+    return places
+
+
+def _touches(slots: SlotMap) -> NDArray[np.bool_]:
+    """Which parameters (p) may move which slots (s), (s, p)."""
+    touches = slots.matrix != 0
+    for _, inputs, outputs in slots.shared:
+        touches[np.ix_(outputs, inputs)] = True
+    return touches
+
+
+def platform_rows(blocks: engine.Blocks) -> Array:
+    """All closure rows against the platform's freedoms, (t, n, c, m)."""
+    return np.concatenate([b.A.reshape(*b.A.shape[:2], -1, b.A.shape[-1]) for b in blocks.closure], axis=2)
+
+
+def _row_weights(program: engine.Program, blocks: engine.Blocks) -> Array | None:
+    """One over the standard deviation that a redundant actuator gives each row, (t, n, c); None without redundancy."""
+    if program.sigma is None:
+        return None
+    weights = []
+    for group, block in zip(program.groups, blocks.closure, strict=True):
+        j = int(np.flatnonzero(group.actuator[:, 0] >= 0)[0])
+        drive = np.abs(block.Q[..., j]) * np.array(program.sigma)[group.actuator[j], None]
+        weights.append(1.0 / drive.reshape(*drive.shape[:2], -1))
+    return np.concatenate(weights, axis=2)
+
+
+def _pseudo_inverse(A: Array, weights: Array | None) -> Array:
+    """Inverse, or weighted pseudo-inverse, of A (t, n, c, m) -> (t, n, m, c); rows that cannot be inverted are NaN."""
+    if weights is not None:
+        A = A * weights[..., None]
+    good = np.asarray(np.isfinite(A).all(axis=(-1, -2)))
+    safe = np.where(good[..., None, None], A, np.eye(*A.shape[-2:]))
+    if A.shape[-1] == A.shape[-2]:
+        try:
+            out = np.linalg.inv(safe)
+        except np.linalg.LinAlgError:
+            out = np.linalg.pinv(safe)
+    else:
+        out = np.linalg.pinv(safe)
+    out = np.where(good[..., None, None], out, np.nan)
+    return out if weights is None else out * weights[..., None, :]
