@@ -25,8 +25,8 @@ def triangularise(matrix: Array, columns: int) -> tuple[Array, Array]:
         # v'v = 2 norm (norm + |v0|); a zero column keeps beta = 0 and is left alone
         vv = -alpha * v[0]
         beta = np.divide(1.0, vv, out=np.zeros_like(vv), where=vv > 0)
-        w = beta * np.add.reduce(v[:, None] * m[j:, j + 1 :], axis=0)
-        m[j:, j + 1 :] -= v[:, None] * w
+        right = m[j:, j + 1 :]
+        right -= v[:, None] * (beta * np.einsum("i...,ij...->j...", v, right))
         m[j, j] = alpha
         m[j + 1 :, j] = 0.0
         sign = np.where(beta > 0, -sign, sign)
