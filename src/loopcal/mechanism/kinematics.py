@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loopcal.engine import Array, State
 from loopcal.errors import DataError
+from loopcal.mechanism import states
 from loopcal.mechanism.model import Mechanism, Status
 from loopcal.mechanism.projection import nearest_reachable
 from loopcal.mechanism.trials import forward_trials, inverse_trials, readings_at
@@ -39,6 +41,11 @@ class Solution:
     def converged(self) -> NDArray[np.bool_]:
         """(n,) True where the loops are closed in the mode of the start."""
         return self.status == Status.CONVERGED
+
+    def take(self, rows: NDArray[Any]) -> Solution:
+        """These rows, by position or by a mask (n,)."""
+        cut = {name: getattr(self, name)[rows] for name in ("T", "q", "passive", "status", "residual", "iterations")}
+        return replace(self, **cut, state=states.take(self.state, rows))
 
     def explain(self, row: int) -> str:
         """What became of a row, in a sentence."""
@@ -70,7 +77,7 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
             f"({', '.join(a.name for a in robot.actuators)})"
         )
     state = forward_trials(robot, robot.values[None], readings[None], None if start is None else start.state)
-    return _solution(robot, state, readings[:, : len(robot.actuators)])
+    return solution_of(robot, state, readings[:, : len(robot.actuators)])
 
 
 def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) -> Solution:
@@ -105,10 +112,11 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
             f"a target of shape {wanted.shape} was given; allowed are (n, 4, 4) poses or (n, {c}) coordinates "
             f"({', '.join(robot.controlled)})"
         )
-    return _solution(robot, state, readings_at(robot, values, state)[0])
+    return solution_of(robot, state, readings_at(robot, values, state)[0])
 
 
-def _solution(robot: Mechanism, state: State, q: Array) -> Solution:
+def solution_of(robot: Mechanism, state: State, q: Array) -> Solution:
+    """The solution of a state (1, n) and its readings (n, a)."""
     names, columns = [], []
     for group, joints in zip(robot.program.groups, state.joints, strict=True):
         for k, limb in enumerate(group.limbs):

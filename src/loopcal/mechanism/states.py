@@ -25,6 +25,11 @@ def pick(state: State, shape: tuple[int, int], trial: np.ndarray, pose: np.ndarr
     return _each(lambda a: np.broadcast_to(a, (*shape, *a.shape[2:]))[trial, pose][:, None], state)
 
 
+def take(state: State, rows: np.ndarray) -> State:
+    """Poses `rows` (positions or a mask) of a state (t, n), every trial."""
+    return _each(lambda a: a[:, rows], state)
+
+
 def put(state: State, trial: np.ndarray, pose: np.ndarray, new: State) -> State:
     """A copy of a state (t, n) whose rows (trial, pose) are those of `new` (rows, 1)."""
 
