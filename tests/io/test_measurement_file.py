@@ -6,12 +6,10 @@ import pytest
 
 from loopcal.errors import DataError, LoopcalError
 from loopcal.io import load_measurements, load_robot, save_measurements
-from loopcal.io.csv_table import read_table
 from loopcal.io.measurement_file import load_poses
 from loopcal.io.measurement_writer import template_text
-from loopcal.io.numbers import shortest
-from loopcal.io.sensor_settings import SYMBOLS
-from loopcal.measure import KINDS, Component, Gaussian, Instrument, Observations, Pose, Sensor, Uniform, simulate
+from loopcal.io.sensor_settings import kind_settings
+from loopcal.measure import KINDS, Component, Gaussian, Instrument, Measurements, Observations, Pose, Sensor, simulate
 from loopcal.mechanism import inverse
 
 EXAMPLES = [kind for cls in KINDS.values() for kind in cls.examples()]
@@ -46,11 +44,31 @@ def assert_same(data, again) -> None:
         np.testing.assert_allclose(new.covariance / scale, old.covariance / scale, atol=1e-9)  # the writer's EQUAL
 
 
+def measured_by(robot, poses, kind) -> Measurements:
+    """Rows of any kind: numbers that no kind doubts, each pose (or each pair of neighbours) seen once."""
+    generator = np.random.default_rng(11)
+    links = np.arange(len(poses) - kind.links + 1)[:, None] + np.arange(kind.links)
+    values = generator.uniform(0.1, 0.2, (len(links), len(kind.columns)))
+    for names in (("qw", "qx", "qy", "qz"), ("i", "j", "k")):
+        places = [i for i, column in enumerate(kind.columns) if column.name in names]
+        if places:
+            values[:, places] /= np.linalg.norm(values[:, places], axis=1, keepdims=True)
+    seen = links if kind.links > 1 else links[:, 0]
+    sigma = np.linspace(1e-6, 2e-6, len(kind.noise_columns))
+    rows = Observations.from_sigma(kind.mounted(robot.tool), seen, values, sigma)
+    return Measurements(robot.name, inverse(robot, poses).q, (rows,))
+
+
 @pytest.mark.parametrize("kind", EXAMPLES, ids=IDS)
 def test_measurements_of_every_kind_come_back_as_they_were_written(tmp_path, robot, poses, kind) -> None:
-    data = simulate(robot, poses, Instrument((sensor(kind),)), seed=1)
+    data = measured_by(robot, poses, kind)
     save_measurements(data, tmp_path / "data.csv", robot, "a test")
-    assert_same(data, load_measurements(tmp_path / "data.csv", robot))
+    loaded = load_measurements(tmp_path / "data.csv", robot)
+    assert_same(data, loaded)
+    for field in kind_settings(type(kind)):
+        old, new = (getattr(d.observations[0].kind, field) for d in (data, loaded))
+        same = old == new if isinstance(old, (str, tuple, type(None))) else np.allclose(old, new, rtol=1e-15, atol=1e-15)
+        assert same, field
 
 
 def test_several_kinds_share_a_file(tmp_path, robot, poses) -> None:
@@ -87,18 +105,14 @@ def test_frame_tool_repeats_absence_and_correlated_noise_come_back(tmp_path, rob
 @pytest.mark.parametrize("kind", EXAMPLES, ids=IDS)
 def test_a_template_lacks_only_the_rows(tmp_path, robot, poses, kind) -> None:
     path = tmp_path / "data.csv"
-    instrument = Instrument((Sensor(kind, Uniform(np.full(len(kind.noise_columns), 1e-6))),))
+    instrument = Instrument((Sensor(kind.mounted(robot.tool), Gaussian(np.linspace(1e-6, 2e-6, len(kind.noise_columns)))),))
     path.write_text(template_text(robot, instrument))
     with pytest.raises(LoopcalError, match="a header but no rows"):
         load_measurements(path, robot)
-    names = [a.name for a in robot.actuators] + [c.name for c in kind.columns]
-    seen = kind.mounted(robot.tool).measure(inverse(robot, poses).T[None], np.zeros((1, len(poses), len(kind.noise_columns))))[
-        0, 0
-    ]
-    cells = [shortest(v, SYMBOLS[c.dimension][1]) for v, c in zip(seen, kind.columns, strict=True)]
-    path.write_text(template_text(robot, instrument) + ",".join(["p", *["0"] * 6, *cells]))
-    assert read_table(path).names == ("pose", *names)
-    np.testing.assert_allclose(load_measurements(path, robot).observations[0].measured[0], seen, rtol=1e-15, atol=0)
+    save_measurements(measured_by(robot, poses, kind), tmp_path / "full.csv", robot)
+    full = (tmp_path / "full.csv").read_text()
+    assert full.startswith(path.read_text())
+    assert full.count("\n") == path.read_text().count("\n") + 6 + (5 if kind.links > 1 else 0)
 
 
 HEADER = "pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm],z [mm]"

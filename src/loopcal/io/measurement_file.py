@@ -5,7 +5,7 @@
     # noise: {rx: 5 urad, ry: 5 urad, rz: 5 urad, x: 1 um, y: 1 um, z: 1 um}
     pose,q1 [mm],..,q6 [mm],rx [mrad],..,z [mm]
 
-Columns: `pose` (a name; rows of one name saw one pose), `block` (poses never to be split), one for each actuator or
+Columns: `pose` (see `loopcal.io.pose_rows`), `block` (poses never to be split), one for each actuator or
 `commanded.<coordinate>`, those of the kind, `sigma.<noise column>` where noise differs from row to row,
 `cov.<a>.<b>` (unit `[mm*mrad]`) where errors are correlated, `note..` for remarks. Several kinds in one file stand
 under `kinds: {label: {kind: ..}}`, and a column `kind` holds the label. Settings: see SETTINGS.
@@ -14,13 +14,14 @@ under `kinds: {label: {kind: ..}}`, and a column `kind` holds the label. Setting
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import DataError, UnitError, nearest
 from loopcal.io.csv_table import Table, read_table, require_columns
-from loopcal.io.robot_file import check_format, load_robot
+from loopcal.io.pose_rows import COMMANDED, PoseRows, dimension_of, measured_name, read_pose_rows
+from loopcal.io.robot_file import check_format
 from loopcal.io.sensor_settings import kind_settings, read_kind, read_noise
 from loopcal.io.yaml_file import Location, refuse_unknown_keys
 from loopcal.units import EXAMPLES, unit
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from loopcal.mechanism import Mechanism
 
 FORMAT = 1
-COMMANDED, SIGMA, COVARIANCE = "commanded.", "sigma.", "cov."
+SIGMA, COVARIANCE = "sigma.", "cov."
 SETTINGS: Mapping[str, str] = {
     "format": "1",
     "robot": "name of the robot; information",
@@ -89,16 +90,16 @@ def load_measurements(
         check_format(table.settings, FORMAT)
     sensors = _sensors(table, robot)
     _refuse_unknown_columns(table, robot, sensors)
-    labels, pose = _groups(table, "pose")
-    first = np.array([int(np.flatnonzero(pose == i)[0]) for i in range(len(labels))])
     try:
-        readings = _readings(table, robot, labels, pose, first)
+        poses = read_pose_rows(table, robot)
         observations = []
         for sensor in sensors:
-            measured, covariance = _values(table, sensor)
-            observations.append(Observations(sensor.kind, pose[sensor.rows], measured, covariance))
-        block = _groups(table, "block")[1][first] if "block" in table.units else np.arange(len(labels))
-        data = Measurements(robot.name, readings, tuple(observations), block, labels)
+            chosen = _seen(table, sensor, poses)
+            measured, covariance = _values(table, robot, chosen)
+            seen = np.array([poses.members[row] for row in chosen.rows], dtype=np.intp).reshape(-1, chosen.kind.links)
+            seen = seen[:, 0] if chosen.kind.links == 1 else seen
+            observations.append(Observations(chosen.kind, seen, measured, covariance))
+        data = Measurements(robot.name, poses.readings, tuple(observations), poses.block, poses.labels)
         check_strokes(data, robot, allow=allow_outside_stroke, override="--allow-outside-stroke")
         check_duplicates(data, allow=allow_duplicates, override="--allow-duplicates")
     except DataError as error:
@@ -126,13 +127,6 @@ def load_poses(path: str | Path, robot: Mechanism) -> np.ndarray:
     return np.column_stack([table.numbers(name, dimension_of(name), empty=False) for name in robot.controlled])
 
 
-def dimension_of(coordinate: str) -> Any:
-    """Return what a controlled coordinate measures: x, y, z lengths, the others angles."""
-    from loopcal.units import Dimension
-
-    return Dimension.LENGTH if coordinate in ("x", "y", "z") else Dimension.ANGLE
-
-
 def _sensors(table: Table, robot: Mechanism) -> tuple[_Sensor, ...]:
     """Return the kinds of the file, mounted on the robot's tool, with the indices of their rows."""
     import numpy as np
@@ -149,7 +143,7 @@ def _sensors(table: Table, robot: Mechanism) -> tuple[_Sensor, ...]:
     require_columns(table, ["kind"], "says which of the kinds each row is")
     cells, sensors = np.array(table.text("kind")), []
     for row, cell in enumerate(cells):
-        if cell not in several:
+        if cell and cell not in several:  # without a kind a row only says where a pose is
             raise table.row_error(row, f"{cell!r} is not one of the kinds of this file: {', '.join(several)}; correct it")
     for label, node in several.items():
         location = ("kinds", label)
@@ -165,7 +159,7 @@ def _refuse_unknown_columns(table: Table, robot: Mechanism, sensors: tuple[_Sens
     known |= {COMMANDED + name for name in robot.controlled}
     for sensor in sensors:
         noise = [column.name for column in sensor.kind.noise_columns]
-        known |= {column.name for column in sensor.kind.columns} | {SIGMA + name for name in noise}
+        known |= {measured_name(column.name, robot) for column in sensor.kind.columns} | {SIGMA + name for name in noise}
         known |= {f"{COVARIANCE}{a}.{b}" for a in noise for b in noise if a != b}
     for name in table.names:
         if name not in known and not name.startswith("note"):
@@ -173,66 +167,27 @@ def _refuse_unknown_columns(table: Table, robot: Mechanism, sensors: tuple[_Sens
             raise table.header_error(f"column {name!r} is unknown{hint}; correct it, or call it 'note {name}' to ignore it")
 
 
-def _groups(table: Table, column: str) -> tuple[tuple[str, ...], np.ndarray]:
-    """Return the distinct texts of a column in order, and (rows,) which of them each row has; without it, row by row."""
-    import numpy as np
-
-    if column not in table.units:
-        return tuple(str(i + 1) for i in range(len(table.rows))), np.arange(len(table.rows))
-    places: dict[str, int] = {}
-    for row, cell in enumerate(table.text(column)):
-        if not cell:
-            raise table.row_error(row, f"column {column!r} is empty, but every row needs it; write a name or a number")
-        places.setdefault(cell, len(places))
-    return tuple(places), np.array([places[cell] for cell in table.text(column)])
-
-
-def _readings(table: Table, robot: Mechanism, labels: tuple[str, ...], pose: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Return (n, a) readings of the poses, from their columns or from commanded coordinates."""
-    import numpy as np
-
-    from loopcal.measure import readings_from_commanded
-
-    commanded = [name for name in table.names if name.startswith(COMMANDED)]
-    read = [a.name for a in robot.actuators if a.name in table.units]
-    if commanded and read:
-        raise table.header_error(
-            f"there are readings ({read[0]!r}) and commanded coordinates ({commanded[0]!r}); keep one kind"
-        )
-    controller = _controller(table, robot) if commanded else None
-    if controller is not None:
-        dimensions = {COMMANDED + name: dimension_of(name) for name in controller.controlled}
-        require_columns(table, list(dimensions), f"is a coordinate that {controller.name} is commanded in")
-    else:
-        dimensions = {actuator.name: actuator.dimension for actuator in robot.actuators}
-        require_columns(table, list(dimensions), f"is the reading of an actuator of {robot.name}")
-    rows = np.column_stack([table.numbers(name, dimension, empty=False) for name, dimension in dimensions.items()])
-    differs = np.flatnonzero((rows != rows[first[pose]]).any(axis=1))
-    if len(differs):
-        row = int(differs[0])
-        line = table.lines[first[pose[row]]]
-        raise table.row_error(row, f"pose {labels[pose[row]]!r} has other readings here than in line {line}; name it anew")
-    if controller is not None:
-        return readings_from_commanded(controller, rows[first], labels)
-    return rows[first]
+def _seen(table: Table, sensor: _Sensor, poses: PoseRows) -> _Sensor:
+    """Return the sensor with those of its rows that measure: for a kind that compares poses, not those that name one."""
+    links = sensor.kind.links
+    if links > 1 and "kind" not in table.units:
+        sensor = replace(sensor, rows=sensor.rows[[len(poses.members[row]) > 1 for row in sensor.rows]])
+    for row in sensor.rows:
+        found = len(poses.members[row])
+        if found != links:
+            sentence = f"this row names {found} poses, but the kind {sensor.kind.name!r} sees {links}; correct the names"
+            raise table.row_error(int(row), sentence)
+    return sensor
 
 
-def _controller(table: Table, robot: Mechanism) -> Mechanism:
-    """Return the robot whose geometry turned commanded coordinates into readings."""
-    name = table.settings.content.get("controller")
-    if name is None:
-        return robot.nominal
-    beside = table.path.parent / str(name)
-    return load_robot(beside if beside.exists() else str(name))
-
-
-def _values(table: Table, sensor: _Sensor) -> tuple[np.ndarray, np.ndarray]:
+def _values(table: Table, robot: Mechanism, sensor: _Sensor) -> tuple[np.ndarray, np.ndarray]:
     """Return measured values (r, c) and the covariance (r, m, m) of their residuals [SI]."""
     import numpy as np
 
     kind, rows = sensor.kind, sensor.rows
-    require_columns(table, [column.name for column in kind.columns], f"belongs to the kind {kind.name!r}")
-    measured = np.column_stack([table.numbers(column.name, column.dimension) for column in kind.columns])[rows]
+    columns = {measured_name(column.name, robot): column.dimension for column in kind.columns}
+    require_columns(table, list(columns), f"belongs to the kind {kind.name!r}")
+    measured = np.column_stack([table.numbers(name, dimension) for name, dimension in columns.items()])[rows]
     for i, doubt in kind.doubts(measured):
         raise table.row_error(int(rows[i]), f"this row {doubt}")
     sigma = np.column_stack([_sigma(table, sensor, i) for i in range(len(kind.noise_columns))])

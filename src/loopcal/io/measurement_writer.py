@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from loopcal.io.measurement_file import COVARIANCE, FORMAT, SIGMA
 from loopcal.io.numbers import shortest
+from loopcal.io.pose_rows import LINK, measured_name
 from loopcal.io.sensor_settings import SYMBOLS, write_sensor
 from loopcal.io.text_file import write_text
 from loopcal.units import Dimension, unit
@@ -42,7 +43,9 @@ def save_measurements(data: Measurements, path: str | Path, robot: Mechanism, re
     FileError
         The file cannot be written.
     """
-    parts = [_Part(str(i + 1), rows) for i, rows in enumerate(data.observations)]
+    parts = [_Part(str(i + 1), rows, robot) for i, rows in enumerate(data.observations)]
+    told = {int(pose[0]) for part in parts if part.rows.kind.links == 1 for pose, _ in part.cells()}
+    untold = [pose for pose in range(data.n_poses) if pose not in told]
     several = len(parts) > 1
     lines = _settings(robot, [(part.label, part.rows.kind, part.common) for part in parts], remark)
     columns = {"pose": "pose"} | ({"block": "block"} if len(set(data.block.tolist())) < data.n_poses else {})
@@ -51,12 +54,15 @@ def save_measurements(data: Measurements, path: str | Path, robot: Mechanism, re
     for part in parts:
         columns |= part.headers
     lines.append(",".join(columns.values()))
-    for part in parts:
-        for pose, values in part.cells():
-            cells = {"pose": _quoted(data.labels[pose]), "block": str(int(data.block[pose])), "kind": part.label, **values}
-            for (name, (_, factor)), reading in zip(readings.items(), data.readings[pose], strict=True):
+    rows = [((pose,), {}) for pose in untold]  # poses that no row of their own measures
+    rows += [(seen, {"kind": part.label, **values}) for part in parts for seen, values in part.cells()]
+    for seen, values in rows:
+        cells = {"pose": _quoted(LINK.join(data.labels[pose] for pose in seen)), **values}
+        if len(seen) == 1:
+            cells["block"] = str(int(data.block[seen[0]]))
+            for (name, (_, factor)), reading in zip(readings.items(), data.readings[seen[0]], strict=True):
                 cells[name] = shortest(float(reading), factor)
-            lines.append(",".join(cells.get(name, "") for name in columns))
+        lines.append(",".join(cells.get(name, "") for name in columns))
     write_text(path, "\n".join(lines) + "\n")
 
 
@@ -77,17 +83,19 @@ def template_text(robot: Mechanism, instrument: Instrument) -> str:
     columns = ["pose", *(["kind"] if len(sensors) > 1 else [])]
     columns += [f"{a.name} [{_unit(robot, a.dimension)[0]}]" for a in robot.actuators]
     for _, kind, _ in sensors:
-        columns += [header for header in _headers(kind.columns).values() if header not in columns]
+        names = [measured_name(column.name, robot) for column in kind.columns]
+        columns += [header for header in _headers(names, kind.columns).values() if header not in columns]
     return "\n".join([*_settings(robot, sensors, ""), ",".join(columns)]) + "\n"
 
 
 class _Part:
     """Rows of one kind with their noise: `common` in the settings, the rest in columns of their own."""
 
-    def __init__(self, label: str, rows: Observations) -> None:
+    def __init__(self, label: str, rows: Observations, robot: Mechanism) -> None:
         import numpy as np
 
         self.label, self.rows = label, rows
+        self.names = [measured_name(column.name, robot) for column in rows.kind.columns]
         N = rows.kind.noise_map(rows.measured)
         half = np.linalg.solve(N, rows.covariance)
         self.covariance = np.linalg.solve(N, np.swapaxes(half, -1, -2))
@@ -104,7 +112,7 @@ class _Part:
     def headers(self) -> Mapping[str, str]:
         """Column -> header of the measured values and of noise that differs from row to row."""
         noise = self.rows.kind.noise_columns
-        found = dict(_headers(self.rows.kind.columns))
+        found = dict(_headers(self.names, self.rows.kind.columns))
         for i in self.own:
             found[SIGMA + noise[i].name] = f"{SIGMA}{noise[i].name} [{SYMBOLS[noise[i].dimension][0]}]"
         for a, b in self.pairs:
@@ -113,20 +121,23 @@ class _Part:
             found[name] = f"{name} [{units}]"
         return found
 
-    def cells(self) -> Iterator[tuple[int, dict[str, str]]]:
-        """Yield the pose and the cells of each row that counts; a row of weight 0 is not written."""
+    def cells(self) -> Iterator[tuple[tuple[int, ...], dict[str, str]]]:
+        """Yield the poses and the cells of each row that counts; a row of weight 0 is not written."""
+        import numpy as np
+
         kind, noise = self.rows.kind, self.rows.kind.noise_columns
-        for i, pose in enumerate(self.rows.rows):
+        for i, poses in enumerate(self.rows.rows):
             if self.rows.weight[i] == 0.0:
                 continue
-            cells = {c.name: _cell(v, c.dimension) for c, v in zip(kind.columns, self.rows.measured[i], strict=True)}
+            values = zip(self.names, kind.columns, self.rows.measured[i], strict=True)
+            cells = {name: _cell(value, column.dimension) for name, column, value in values}
             for k in self.own:
                 cells[SIGMA + noise[k].name] = _cell(self.sigma[i, k], noise[k].dimension)
             for a, b in self.pairs:
                 factor = SYMBOLS[noise[a].dimension][1] * SYMBOLS[noise[b].dimension][1]
                 name = f"{COVARIANCE}{noise[a].name}.{noise[b].name}"
                 cells[name] = shortest(float(self.covariance[i, a, b]), factor)
-            yield int(pose), cells
+            yield tuple(np.atleast_1d(poses).tolist()), cells
 
 
 def _settings(robot: Mechanism, sensors: Sequence[tuple[str, Kind, Mapping[str, float]]], remark: str) -> list[str]:
@@ -143,9 +154,9 @@ def _settings(robot: Mechanism, sensors: Sequence[tuple[str, Kind, Mapping[str, 
     return lines
 
 
-def _headers(columns: Sequence[Column]) -> Mapping[str, str]:
-    """Return column -> header with its unit."""
-    return {c.name: f"{c.name} [{SYMBOLS[c.dimension][0]}]" for c in columns}
+def _headers(names: Sequence[str], columns: Sequence[Column]) -> Mapping[str, str]:
+    """Return name -> header with its unit."""
+    return {name: f"{name} [{SYMBOLS[c.dimension][0]}]" for name, c in zip(names, columns, strict=True)}
 
 
 def _unit(robot: Mechanism, dimension: Dimension) -> tuple[str, float]:

@@ -4,9 +4,11 @@
     kind: pose                                the name of a kind, of `loopcal.measure.KINDS`
     orientation: euler-xyz                    then the kind's own settings: the fields of its dataclass
     T_base_frame: {x: 12 mm, yaw: 90 deg}     poses: x y z and R = Rz(yaw) Ry(pitch) Rx(roll), each with its unit
+    places: [[100 mm, 0 mm, 20 mm]]           points and other lengths with their units; directions as plain numbers
     noise: {x: 1 um, y: 1 um, z: 1 um, a: 5 urad, b: 5 urad, c: 5 urad}     standard deviations of the noise columns
 
-A new kind needs nothing here: its fields are its settings.
+A new kind needs nothing here, its fields are its settings: arrays called T_.. are poses, those in DIRECTIONS unit
+vectors, other arrays and floats lengths, the rest text.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 
     from loopcal.measure import Kind
 
+DIRECTIONS = ("along", "axis", "normal", "up")
 POSE_KEYS = {**dict.fromkeys(("x", "y", "z"), Dimension.LENGTH), **dict.fromkeys(("roll", "pitch", "yaw"), Dimension.ANGLE)}
 NOISE_SYMBOLS = {Dimension.LENGTH: ("um", 1e-6), Dimension.ANGLE: ("urad", 1e-6), Dimension.RATIO: ("1", 1.0)}
 SYMBOLS = {Dimension.LENGTH: ("mm", 1e-3), Dimension.ANGLE: ("deg", math.pi / 180.0), Dimension.RATIO: ("1", 1.0)}
@@ -100,26 +103,39 @@ def read_noise(file: YamlFile, node: Mapping[str, Any], kind: Kind, location: Lo
 def write_sensor(kind: Kind, noise: Mapping[str, float], tool: np.ndarray) -> dict[str, str]:
     """Return key -> text of a sensor's settings; those by keyword only where they differ from default or `tool`."""
     lines = {"kind": kind.name}
-    default = type(kind)()
-    by_keyword = {f.name for f in dataclasses.fields(typing.cast(Any, kind)) if f.kw_only}
-    for key, annotation in kind_settings(type(kind)).items():
-        value, usual = getattr(kind, key), tool if key == "T_platform_tool" else getattr(default, key)
-        if _is_pose(annotation):
-            if value is not None and (value != usual).any():
-                lines[key] = _pose_text(value)
-        elif value != usual or (value and key not in by_keyword):
-            lines[key] = f"[{', '.join(value)}]" if isinstance(value, tuple) else str(value)
+    for field in dataclasses.fields(typing.cast(Any, kind)):
+        if field.init:
+            value, usual = getattr(kind, field.name), tool if field.name == "T_platform_tool" else _default(field)
+            if value is not None and (not _same(value, usual) or (not field.kw_only and isinstance(value, (str, tuple)))):
+                lines[field.name] = _setting_text(field.name, value)
     if noise:
         dimensions = {column.name: column.dimension for column in kind.noise_columns}
-        texts = [f"{name}: {_text(sigma, NOISE_SYMBOLS[dimensions[name]])}" for name, sigma in noise.items()]
+        texts = [f"{name}: {_noise_text(sigma, dimensions[name])}" for name, sigma in noise.items()]
         lines["noise"] = f"{{{', '.join(texts)}}}"
     return lines
 
 
+def _default(field: dataclasses.Field[Any]) -> Any:
+    """Return a field's default, None where it has none."""
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return None if field.default is dataclasses.MISSING else field.default
+
+
+def _same(value: Any, usual: Any) -> bool:
+    """Tell whether two values of a setting are equal, arrays included."""
+    import numpy as np
+
+    return usual is not None and bool(np.array_equal(value, usual))
+
+
 def _setting(file: YamlFile, value: Any, annotation: Any, location: Location) -> Any:
-    """Return one setting of a kind as its field wants it: a pose, a tuple of text, or text."""
-    if _is_pose(annotation):
+    """Return one setting of a kind as its field wants it: a pose, numbers, a tuple of text, or text."""
+    key = str(location[-1])
+    if "ndarray" in str(annotation) and key.startswith("T_"):
         return _pose(file, value, location)
+    if "ndarray" in str(annotation) or annotation is float:
+        return _numbers(file, value, None if key in DIRECTIONS else Dimension.LENGTH, location)
     if isinstance(value, list) and all(isinstance(item, str) for item in value):
         return tuple(value)
     if isinstance(value, str):
@@ -127,9 +143,28 @@ def _setting(file: YamlFile, value: Any, annotation: Any, location: Location) ->
     raise file.error(f"{words(location)!r} is {value!r} where text is needed; see the kinds in the file reference", location)
 
 
-def _is_pose(annotation: Any) -> bool:
-    """Tell whether a field holds a pose (an array) and not text."""
-    return "ndarray" in str(annotation)
+def _numbers(file: YamlFile, value: Any, dimension: Dimension | None, location: Location) -> Any:
+    """Return a number, or lists of them, in SI: each with its unit, or plain where they have no dimension."""
+    if isinstance(value, list):
+        return [_numbers(file, item, dimension, (*location, i)) for i, item in enumerate(value)]
+    if dimension is not None:
+        return _quantity(file, value, dimension, location)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise file.error(f"{words(location)!r} is {value!r} where a plain number is needed; write a number", location)
+    return float(value)
+
+
+def _setting_text(key: str, value: Any) -> str:
+    """Return a setting as text that `_setting` reads."""
+    if key.startswith("T_"):
+        return _pose_text(value)
+    if isinstance(value, str):
+        return value
+    if isinstance(value, list):
+        return f"[{', '.join(_setting_text(key, item) for item in value)}]"
+    if isinstance(value, float):
+        return repr(value) if key in DIRECTIONS else _text(value, SYMBOLS[Dimension.LENGTH])
+    return _setting_text(key, list(value) if isinstance(value, tuple) else value.tolist())
 
 
 def _pose(file: YamlFile, node: Any, location: Location) -> np.ndarray:
@@ -167,3 +202,9 @@ def _text(value: float, shown: tuple[str, float]) -> str:
     """Return a number with its unit (symbol, factor)."""
     symbol, factor = shown
     return f"{shortest(value, factor)} {symbol}"
+
+
+def _noise_text(sigma: float, dimension: Dimension) -> str:
+    """Return a standard deviation with its unit, to nine digits: more would be rounding."""
+    symbol, factor = NOISE_SYMBOLS[dimension]
+    return f"{sigma / factor:.9g} {symbol}"
