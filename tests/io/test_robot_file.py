@@ -123,6 +123,14 @@ def test_a_mistake_in_the_identified_table_names_its_line(tmp_path, row: str, me
     assert caught.value.line == len(text.split("\n")) - 1
 
 
+def test_parameters_are_fixed_by_name_or_pattern(tmp_path) -> None:
+    table = load_robot(write(tmp_path, HEXAPOD + "fixed: [leg1.base.x, leg*.length]\n")).parameters
+    held = [name for name, free in zip(table.names, table.free, strict=True) if not free]
+    assert held == ["leg1.base.x", *(f"leg{i}.length" for i in range(1, 7))]
+    with pytest.raises(FileError, match=r"'leg1.base.q' fixes no parameter of this robot .did you mean 'leg1.base"):
+        load_robot(write(tmp_path, HEXAPOD + "fixed: [leg1.base.q]\n"))
+
+
 def test_a_robot_that_cannot_be_built_names_its_file(tmp_path) -> None:
     path = write(tmp_path, HEXAPOD.replace("  - [120, 140, 0]\n", ""))
     with pytest.raises(LoopcalError, match=r"robot.yaml: hexapod-42 has 5 base and 6 platform centres"):

@@ -76,9 +76,9 @@ def number(value: float, plus_minus: float | None = None, digits: int = 6) -> st
 
 
 def uncertainty(plus_minus: float) -> str:
-    """Return an uncertainty to two digits; `unknown` where the data do not determine the value, dash where fixed."""
+    """Return an uncertainty to two digits, or in a word why there is none: not determined, or no interval possible."""
     if math.isnan(plus_minus):
-        return "-"
+        return "not given"
     return "unknown" if math.isinf(plus_minus) else number(plus_minus, plus_minus)
 
 

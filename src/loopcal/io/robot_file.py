@@ -13,9 +13,10 @@ A robot that was read keeps the text of its file, so that writing it back change
 
 from __future__ import annotations
 
+import fnmatch
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +30,7 @@ from loopcal.io.yaml_file import YamlFile, read_yaml
 if TYPE_CHECKING:
     import numpy as np
 
-    from loopcal.mechanism import Mechanism
+    from loopcal.mechanism import Assembly, Mechanism, Robot
 
 FORMAT = 1
 HEADER = ("format", "units", "family", TABLE)
@@ -80,7 +81,7 @@ def load_robot(source: str | Path) -> Mechanism:
     with _naming(file):
         record = read_record(file, content, FAMILIES[family], units)
         symbols = {dimension: found.symbol for dimension, found in units.items()}
-        robot = build(record.expand(), symbols, RobotSource(file.path, nominal_text(file), record))
+        robot = build(_fixed(record, file), symbols, RobotSource(file.path, nominal_text(file), record))
     return robot.with_values(table_values(file, robot)) if TABLE in file.content else robot
 
 
@@ -173,6 +174,21 @@ def _family(file: YamlFile, known: Sequence[str]) -> str:
         hint = nearest(str(found), known)
         raise file.error(f"{found!r} is not a family of robots{hint}; known are {', '.join(known)}", ("family",))
     return str(found)
+
+
+def _fixed(record: Robot, file: YamlFile) -> Assembly:
+    """Return what a record expands to, with the parameters that it calls `fixed` (names, or patterns such as arm*)."""
+    assembly = record.expand()
+    names = [parameter.name for parameter in assembly.parameters]
+    held: set[str] = set()
+    for i, pattern in enumerate(record.fixed):
+        matching = fnmatch.filter(names, pattern)
+        if not matching:
+            hint = nearest(pattern, names) or f"; its parameters are {', '.join(names)}"
+            raise file.error(f"{pattern!r} fixes no parameter of this robot{hint}; correct it", ("fixed", i))
+        held.update(matching)
+    parameters = tuple(replace(p, free=False) if p.name in held else p for p in assembly.parameters)
+    return replace(assembly, parameters=parameters)
 
 
 @contextmanager
