@@ -3,24 +3,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.calibrate.checks import check_count, check_rows, check_start
+from loopcal.calibrate.closure import descend_from_closure
 from loopcal.calibrate.combinations import combinations
 from loopcal.calibrate.descent import Descent, DescentStatus, StepControl, descend
 from loopcal.calibrate.filters import LeastSquares, Method
 from loopcal.calibrate.identification import Identification, KindResiduals
-from loopcal.calibrate.rows import Residuals, rows_of, rows_of_trials
+from loopcal.calibrate.rows import Residuals, Rows, rows_of, rows_of_trials
 from loopcal.calibrate.scaling import Unknowns, unknowns
 from loopcal.calibrate.statistics import ResidualCheck, residual_check
 from loopcal.errors import EstimationError
 from loopcal.linalg import RANK_TOLERANCE, Decomposition, FloatArray, IntArray
 from loopcal.measure import Measurements, Trials
 from loopcal.mechanism import Mechanism
+
+Begin = Literal["kinematics", "closure"]
+BEGINS = get_args(Begin)
 
 
 def identify(
@@ -30,6 +34,7 @@ def identify(
     *,
     noise: Literal["given", "estimated"] = "given",
     start: ArrayLike | None = None,
+    begin: Begin = "kinematics",
     control: StepControl | None = None,
     rank_tolerance: float = RANK_TOLERANCE,
     allow_fewer_equations: bool = False,
@@ -45,6 +50,8 @@ def identify(
     data : the measurements. method : default least squares with rank detection.
     noise : "given": the sigmas of the data are true; "estimated": true up to one common factor.
     start : (parameters of the robot,) [SI] values to begin with instead of the robot's.
+    begin : "kinematics": every step solves the predicted poses; "closure": where all poses are measured in full, first
+        linearise closure at the measured ones, which needs fewer steps from a start that is far off.
     control : settings of the iteration. rank_tolerance : relative to the largest singular value.
     allow_fewer_equations : let least squares return the smallest deviation that explains too few equations.
 
@@ -66,7 +73,7 @@ def identify(
     check_count(rows, data, method, allow_fewer_equations)
     values = (robot if start is None else robot.with_values(start)).values
     z = free.deviation(values[None])
-    fit = descend(rows, z, method, control, rank_tolerance)
+    fit = _descended(rows, z, method, control, rank_tolerance, begin)
     if fit.status[0] == DescentStatus.BAD_START:
         check_start(rows, data, z, fit.cost)
     residuals = _labelled(rows.residuals(fit.deviation), data)
@@ -108,6 +115,7 @@ def identify_trials(
     method: Method | None = None,
     *,
     start: ArrayLike | None = None,
+    begin: Begin = "kinematics",
     control: StepControl | None = None,
     rank_tolerance: float = RANK_TOLERANCE,
 ) -> IdentifiedTrials:
@@ -116,15 +124,36 @@ def identify_trials(
     Parameters
     ----------
     robot : as for `identify`. trials : their measurements.
-    start : (t | 1, parameters of the robot) [SI], default the robot's values.
+    start : (t | 1, parameters of the robot) [SI], default the robot's values. The others: as for `identify`.
     """
     free = unknowns(robot)
     rows = rows_of_trials(free, trials)
     values = np.atleast_2d(robot.values if start is None else np.asarray(start, dtype=np.float64))
     z = np.broadcast_to(free.deviation(values), (len(trials), len(free)))
-    fit = descend(rows, z, method or LeastSquares(), control, rank_tolerance)
+    fit = _descended(rows, z, method or LeastSquares(), control, rank_tolerance, begin)
     return IdentifiedTrials(
         free.values(fit.deviation), fit.status, fit.iterations, fit.cost, free, fit.decomposition, fit.penalty
+    )
+
+
+def _descended(
+    rows: Rows, z: FloatArray, method: Method, control: StepControl | None, tolerance: float, begin: Begin
+) -> Descent:
+    """Descend from deviations z (t, p); steps of the beginning count and stand first in the history."""
+    control = control or StepControl()
+    if begin not in BEGINS:
+        raise EstimationError(f"begin is {begin!r}; it must be one of {', '.join(BEGINS)}")
+    if begin == "kinematics":
+        return descend(rows, z, method, control, tolerance)
+    z, first = descend_from_closure(rows, z, method, control, tolerance)
+    fit = descend(rows, z, method, control, tolerance)
+    if first is None:
+        return fit
+    return replace(
+        fit,
+        iterations=first.iterations + fit.iterations,
+        deviation_history=np.concatenate([first.deviation_history, fit.deviation_history[1:]]),
+        cost_history=np.concatenate([first.cost_history, fit.cost_history[1:]]),
     )
 
 

@@ -16,13 +16,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal import engine
+from loopcal import engine, se3
 from loopcal.calibrate.scaling import Unknowns
 from loopcal.linalg import FloatArray, IntArray, empty_factor
 from loopcal.measure import Kind, Measurements, Trials
 from loopcal.measure.whitening import whitener
 from loopcal.mechanism import Status
-from loopcal.mechanism.trials import forward_trials, sensitivity
+from loopcal.mechanism.implicit import sensitivity
+from loopcal.mechanism.transmission import joint_values
+from loopcal.mechanism.trials import forward_trials
 
 BLOCK = 512
 """Poses (of all trials together) whose rows are made at once: large enough for NumPy, small enough for the cache."""
@@ -65,8 +67,9 @@ class Residuals(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Some consecutive poses: their readings, their rows, and which of them any row needs."""
+    """Some consecutive poses: their places, readings and rows, and which of them any row needs."""
 
+    poses: slice
     readings: FloatArray
     sensed: tuple[Sensed, ...]
     needed: np.ndarray
@@ -84,11 +87,22 @@ class Rows:
     readings : (n, a) [SI].
     sensed : what each kind measured.
     trials : number of machines t.
+    located : (t | 1, n, 4, 4) poses [m], optional. With it closure is not solved but linearised at these poses: with its
+        Newton step dx from there a row is [W G D diag(tolerance) | W (r + G dx)]. See `loopcal.calibrate.closure`.
     """
 
-    def __init__(self, unknowns: Unknowns, readings: FloatArray, sensed: tuple[Sensed, ...], trials: int) -> None:
+    def __init__(
+        self,
+        unknowns: Unknowns,
+        readings: FloatArray,
+        sensed: tuple[Sensed, ...],
+        trials: int,
+        located: FloatArray | None = None,
+    ) -> None:
         self.unknowns = unknowns
+        self.readings = readings
         self.sensed = sensed
+        self.located = located
         self.parameters = len(unknowns)
         present = [np.einsum("trii->tri", s.whitener) != 0.0 for s in sensed]
         counted = sum((p.sum(axis=(1, 2)) for p in present), start=np.zeros(1, dtype=np.int64))
@@ -101,14 +115,14 @@ class Rows:
         for first in range(0, n, BLOCK):
             last = min(first + BLOCK, n)
             inside = tuple(s.within(first, last) for s in sensed)
-            self.blocks.append(_Block(readings[None, first:last], inside, needed[first:last]))
+            self.blocks.append(_Block(slice(first, last), readings[None, first:last], inside, needed[first:last]))
         self.last = _Last(unknowns.robot.home_state, trials, n) if n <= BLOCK else None
 
     def fold(self, deviation: FloatArray, trials: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return triangular factor (a, p + 1, p + 1) and sum of squares (a,); infinite where a pose is out of reach."""
         factor = empty_factor(len(trials), self.parameters)
         lost = np.zeros(len(trials), dtype=bool)
-        shared = len(trials) > 1 and bool((deviation == deviation[0]).all())
+        shared = len(trials) > 1 and self.located is None and bool((deviation == deviation[0]).all())
         together = max(1, BLOCK // len(self.blocks[0].needed))
         moves = self._moves(self.blocks[0], deviation[:1], trials) if shared and len(self.blocks) == 1 else None
         for first in range(0, len(trials), together):
@@ -148,6 +162,8 @@ class Rows:
     def _moves(self, block: _Block, deviation: FloatArray, trials: IntArray) -> _Moves:
         """Solve a block's poses and linearise them; one deviation (1, p) stands for all of the trials."""
         robot, values = self.unknowns.robot, self.unknowns.values(deviation)
+        if self.located is not None:
+            return self._closure(block, values, trials)
         begin = self.last and self.last.take(trials[: len(values)])
         state = forward_trials(robot, values, block.readings, begin)
         D, T = sensitivity(robot, values, block.readings, state).parameters, state.T
@@ -158,9 +174,28 @@ class Rows:
             T, D = np.where(ok[..., None, None], T, np.eye(4)), np.where(ok[..., None, None], D, 0.0)
         if self.last is not None:
             self.last.put(trials, state, ok)
-        if len(self.unknowns.places) < D.shape[-1]:
-            D = D[..., self.unknowns.places]
-        return _Moves(T, D * self.unknowns.tolerance, failed)
+        return _Moves(T, self._scaled(D), None, failed)
+
+    def _closure(self, block: _Block, values: FloatArray, trials: IntArray) -> _Moves:
+        """Linearise closure at the located poses of a block."""
+        robot = self.unknowns.robot
+        assert self.located is not None
+        every = np.broadcast_to(self.located, (self.rows.size, *self.located.shape[1:]))
+        T = every[trials, block.poses]
+        e, tau = robot.slots(values)
+        joints = joint_values(block.readings, tau, robot.slots.frequency)
+        state = engine.solve(robot.program, e, joints, dataclasses.replace(robot.home_state, T=T), most=1)
+        step = se3.difference(state.T, T)
+        here = dataclasses.replace(state, T=T, status=np.zeros_like(state.status))
+        D = sensitivity(robot, values, block.readings, here).parameters
+        ok = np.asarray(np.isfinite(step).all(axis=2) & np.isfinite(D).all(axis=(2, 3)))
+        step, D = np.where(ok[..., None], step, 0.0), np.where(ok[..., None, None], D, 0.0)
+        return _Moves(T, self._scaled(D), step, np.any(~ok & block.needed, axis=1))
+
+    def _scaled(self, D: FloatArray) -> FloatArray:
+        """Columns of the free parameters in units of their tolerance."""
+        free = D[..., self.unknowns.places] if len(self.unknowns.places) < D.shape[-1] else D
+        return free * self.unknowns.tolerance
 
     def _kind_rows(self, sensed: Sensed, moves: _Moves, trials: IntArray) -> FloatArray:
         """Rows (a, r * m, p + 1) of one kind."""
@@ -169,18 +204,25 @@ class Rows:
         if not np.array_equal(sensed.poses, np.arange(T.shape[1])):
             T, D = T[:, sensed.poses], D[:, sensed.poses]
         found = sensed.kind.evaluate(np.broadcast_to(T, (len(trials), *T.shape[1:])), measured)
-        a, r, m = found.residual.shape
+        residual = found.residual
+        if moves.step is not None:
+            residual = residual + np.matmul(found.jacobian, moves.step[:, sensed.poses, :, None])[..., 0]
+        a, r, m = residual.shape
         rows = np.empty((a, r, m, self.parameters + 1))
         np.matmul(np.matmul(white, found.jacobian), D, out=rows[..., :-1])
-        rows[..., -1] = np.matmul(white, found.residual[..., None])[..., 0]
+        rows[..., -1] = np.matmul(white, residual[..., None])[..., 0]
         return rows.reshape(a, r * m, -1)
 
 
 class _Moves(NamedTuple):
-    """Poses T (a, n, 4, 4), how they move with the scaled unknowns D (a, n, 6, p), and trials that failed (a,)."""
+    """Poses of a block and how they move.
+
+    T (a, n, 4, 4); D (a, n, 6, p) by the scaled unknowns; closure's step (a, n, 6) where it is not solved; failed (a,).
+    """
 
     T: FloatArray
     D: FloatArray
+    step: FloatArray | None
     failed: np.ndarray
 
 

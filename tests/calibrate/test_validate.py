@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Validation: the indices, the two errors told apart, and quality gates."""
+
+import json
+
+import numpy as np
+import pytest
+
+from loopcal.calibrate import identify, pose_errors, validate
+from loopcal.errors import DataError
+from loopcal.io.json_text import to_json
+from loopcal.measure import simulate
+from tests import zoo
+from tests.calibrate.problems import bed, hexapod, hexapod_data, probed_heights, tracker, with_tolerance
+
+MM = 1e-3
+
+
+@pytest.fixture(scope="module")
+def parts():
+    return hexapod_data(40).split(0.75, seed=1)
+
+
+@pytest.fixture(scope="module")
+def validation(parts):
+    return validate(identify(hexapod(), parts[0]), parts[1])
+
+
+def test_indices_are_the_formulas():
+    errors = pose_errors(np.array([[3.0, 0.0, -4.0]]) * MM, np.array([[2e-3, 0.0, 0.0]]))
+    assert errors.position[0] == pytest.approx(5 * MM)
+    assert errors.orientation[0] == pytest.approx(2e-3)
+    assert errors.integrated[0] == pytest.approx(5.002)  # mm + rad
+    assert errors.position_balance[0] == pytest.approx(7 * MM)
+    assert errors.orientation_balance[0] == pytest.approx(2e-3)
+
+
+def test_what_was_not_measured_has_no_index():
+    heights = pose_errors(np.array([[np.nan, np.nan, 1.0], [np.nan, np.nan, np.nan]]) * MM, np.zeros((2, 0)))
+    assert heights.position[0] == pytest.approx(MM)
+    assert np.isnan(heights.position[1])
+    assert np.isnan(heights.orientation).all()
+    assert np.isnan(heights.position_balance).all()
+    assert heights.statistics("position").count == 1
+    assert heights.statistics("orientation").count == 0
+
+
+def test_calibration_brings_held_out_poses_to_the_noise(validation):
+    assert len(validation.poses) == 10
+    assert validation.before.statistics("position").rms > 0.02 * MM
+    assert validation.after.statistics("position").rms < 4e-6  # [m] sqrt(3) um of noise and as much of the fit
+    assert validation.improvement() > 10.0
+
+
+def test_with_an_actuator_for_every_freedom_commanding_is_as_good_as_predicting(validation):
+    assert validation.not_compensable.position.max() < 1e-12
+    np.testing.assert_allclose(validation.commanded_after.position, validation.after.position, rtol=1e-9)
+    np.testing.assert_allclose(validation.commanded_before.position, validation.before.position, rtol=1e-12)
+
+
+def test_what_has_no_actuator_stays_as_not_compensable():
+    robot = with_tolerance(zoo.three_prs(), 0.1 * MM)
+    rng = np.random.default_rng(0)
+    truth = robot.with_values(robot.values + rng.uniform(-0.05, 0.05, len(robot.values)) * MM)
+    poses = np.column_stack([rng.uniform(0.65, 0.75, 30), rng.uniform(-3, 3, 30), rng.uniform(0.1, 0.3, 30)])
+    data = simulate(truth, poses, tracker(), 0)
+    # perfect knowledge predicts the measured poses, and still cannot command x, y and torsion
+    perfect = validate(truth, data, before=robot)
+    assert perfect.after.statistics("position").rms < 2.5e-6  # [m] noise
+    left = perfect.not_compensable.statistics("position").rms
+    assert left > 5e-6
+    assert perfect.commanded_after.statistics("position").rms == pytest.approx(left, rel=0.3)
+    assert perfect.commanded_after.statistics("position").rms < perfect.commanded_before.statistics("position").rms
+
+
+def test_gates_pass_and_fail_with_a_sentence(parts):
+    fit = identify(hexapod(), parts[0])
+    assert validate(fit, parts[1], limit_position=0.01 * MM, limit_angle=1e-4).passed
+    failed = validate(fit, parts[1], limit_position=1e-7, limit_angle=1e-4)
+    assert not failed.passed
+    assert "position error" in failed.reasons[0]
+    assert "exceeds the limit of 0.0001 mm" in failed.reasons[0]
+
+
+def test_a_gate_on_what_was_not_measured_is_not_met():
+    robot = zoo.delta()
+    found = validate(robot, probed_heights(robot, bed(8)), limit_angle=1e-3)
+    assert found.reasons == ("the orientation limit cannot be checked: no row measures orientation",)
+
+
+def test_rows_without_weight_are_left_out_and_no_row_is_refused(parts):
+    weight = np.ones(parts[1].n_poses)
+    weight[0] = 0.0
+    fewer = validate(hexapod(), parts[1].reweighted(weight))
+    assert len(fewer.poses) == parts[1].n_poses - 1
+    with pytest.raises(DataError, match="no row to validate"):
+        validate(hexapod(), parts[1].reweighted(0.0 * weight))
+
+
+def test_the_table_names_every_error_and_the_json_every_pose(validation):
+    text = str(validation)
+    assert all(word in text for word in ("predicted before", "commanded after", "not compensable", "mm+rad"))
+    document = json.loads(to_json(validation.to_dict()))
+    assert document["passed"] is True
+    assert len(document["after"]["position"]["rows"]) == len(document["poses"])
