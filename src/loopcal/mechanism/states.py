@@ -30,6 +30,11 @@ def take(state: State, rows: np.ndarray) -> State:
     return _each(lambda a: a[:, rows], state)
 
 
+def joined(*parts: State) -> State:
+    """States (t, n_i) one after the other, (t, sum n_i)."""
+    return _each(lambda *arrays: np.concatenate(arrays, axis=1), *parts)
+
+
 def put(state: State, trial: np.ndarray, pose: np.ndarray, new: State) -> State:
     """A copy of a state (t, n) whose rows (trial, pose) are those of `new` (rows, 1)."""
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loopcal import engine
 from loopcal.engine import Array, State
@@ -14,7 +15,9 @@ from loopcal.mechanism.implicit import Sensitivity, platform_rows, sensitivity
 from loopcal.mechanism.model import Mechanism, Status
 from loopcal.mechanism.transmission import joint_values, readings_of
 
-__all__ = ["Sensitivity", "forward_trials", "inverse_trials", "platform_rows", "readings_at", "sensitivity"]
+# fmt: off
+__all__ = ["Sensitivity", "forward_trials", "inverse_trials", "orientation_at", "platform_rows", "readings_at", "sensitivity"]
+# fmt: on
 
 STEPS = (8, 64)
 """Steps of the path from the start's readings along which a row is followed when the direct solution fails."""
@@ -27,7 +30,8 @@ def forward_trials(robot: Mechanism, values: Array, q: Array, start: State | Non
     straight path from the start's readings. Rows that still fail are marked, see `Status`.
     """
     e, tau = robot.slots(values)
-    joints = joint_values(q, tau, robot.slots.frequency)
+    with np.errstate(invalid="ignore"):  # an infinite reading turns into NaN, and the engine marks its row
+        joints = joint_values(q, tau, robot.slots.frequency)
     begin = robot.home_state if start is None else start
     state = engine.solve(robot.program, e, joints, begin)
     wrong = _astray(state, begin)
@@ -52,6 +56,18 @@ def inverse_trials(robot: Mechanism, values: Array, target: Array, start: State 
     if start is not None:
         T = np.broadcast_to(start.T, T.shape)
     return engine.solve(robot.program, e, guess, replace(begin, T=T), task, free=True)
+
+
+def orientation_at(robot: Mechanism, values: Array, state: State) -> NDArray[np.int8]:
+    """Sign of the determinant of closure with the actuators held (t, n): it changes only through a singularity.
+
+    The orientation of a state with free actuators is another one. With more equations than freedoms it is zero.
+    """
+    equations = sum(len(g.limbs) * (len(g.rows) - len(g.unknown(False))) for g in robot.program.groups)
+    if equations != len(robot.program.freedoms):
+        return np.zeros(state.status.shape, np.int8)
+    e, _ = robot.slots(values)
+    return engine.solve(robot.program, e, states.actuated(robot.program, state), state, most=0).orientation
 
 
 def readings_at(robot: Mechanism, values: Array, state: State) -> Array:
