@@ -3,8 +3,9 @@
 
 Rows [A | b] of a linear least-squares problem are folded, block by block, into the triangular factor of their QR
 decomposition (`loopcal.engine.accumulate`); the right-hand side rides along as the last column, so that the norm of
-what no solution explains is the last diagonal entry. Singular values, rank, solutions, filters and covariances come from the singular value
-decomposition of that factor. The product A'A is never formed: it would turn null directions of 1e-14 into 1e-7.
+what no solution explains is the last diagonal entry. Singular values, rank, solutions, filters and covariances come
+from the singular value decomposition of that factor. The product A'A is never formed: it would turn null directions
+of 1e-14 into 1e-7.
 Every array has a leading trial axis t. See docs/theory/estimation.md.
 """
 
