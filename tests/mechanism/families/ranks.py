@@ -28,7 +28,11 @@ def coordinates(robot: Mechanism, n: int, seed: int) -> Array:
 
 def scaled_sensitivity(robot: Mechanism, solution: Solution) -> Array:
     """(n, 6, p) platform twist per parameter, all lengths [m / m]."""
-    D = sensitivity(robot, robot.values[None], solution.q[None], solution.state).parameters[0]
+    return scaled(robot, sensitivity(robot, robot.values[None], solution.q[None], solution.state).parameters[0])
+
+
+def scaled(robot: Mechanism, D: Array) -> Array:
+    """A sensitivity (.., 6, p) with all angles as lengths."""
     columns = np.array([1.0 if d is Dimension.LENGTH else 1 / ARM for d in robot.parameters.dimensions])
     return D * np.array([ARM] * 3 + [1.0] * 3)[:, None] * columns
 
