@@ -106,11 +106,15 @@ JointRecord = Revolute | Prismatic | Universal | Cylindrical | Spherical
 
 @dataclass(frozen=True)
 class Copies:
-    """The same limb several times, turned about an axis of base and platform; numbers 1, 2, .. are added to its names."""
+    """The same limb several times, turned about an axis of base and platform; numbers 1, 2, .. are added to its names.
+
+    Copy i is turned by start + (i - 1) step; a step that is not given divides the full turn.
+    """
 
     count: int
     about: Literal["x", "y", "z"] = "z"
     step: Angle | None = None
+    start: Angle = 0.0
 
 
 @dataclass(frozen=True)

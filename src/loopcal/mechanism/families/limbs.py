@@ -136,7 +136,7 @@ def _copies(limb: LimbRecord) -> Iterator[_Member]:
         raise MechanismError(f"limb {limb.name!r} has {limb.copies.count} copies; give one or more")
     step = limb.copies.step if limb.copies.step is not None else 2 * np.pi / limb.copies.count
     for i in range(limb.copies.count):
-        turn = turn_about(limb.copies.about, i * step)
+        turn = turn_about(limb.copies.about, limb.copies.start + i * step)
         yield _Member(limb, _placed(limb, f"{limb.name}{i + 1}", str(i + 1), turn), str(i + 1))
 
 
