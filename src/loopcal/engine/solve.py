@@ -123,7 +123,7 @@ class _Rows:
         inner = sum((np.add.reduce(top[:, -1] ** 2, axis=(0, 1)) for top in tops), start=np.zeros(N))
         norm, y = np.sqrt(inner + np.add.reduce(low[:, m] ** 2, axis=0)), np.zeros((m, N))
         if len(low):
-            low, turn = triangularise(low, m)
+            low, turn = triangularise(np.concatenate([low, np.zeros((max(0, m - len(low)), m + 1, N))]), m)
             sign = sign * turn * np.prod(np.sign(np.diagonal(low[:m, :m])), axis=-1)
             y = back_substitute(low[:m, :m], -low[:m, m:])[:, 0]
             inner = inner + np.add.reduce(low[:m, m] ** 2, axis=0)

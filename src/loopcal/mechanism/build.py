@@ -232,6 +232,13 @@ def _home(robot: Mechanism) -> State:
     """The closed state at the home pose's controlled coordinates; raises MechanismError where the loops cannot close."""
     values = robot.values[None]
     target = coordinates.read(robot.assembly.home[None, None], robot.controlled)
+    program = robot.program
+    movable = len(program.freedoms) - sum(len(g.limbs) * (len(g.rows) - len(g.unknown(True))) for g in program.groups)
+    if len(robot.controlled) < movable:
+        raise MechanismError(
+            f"{robot.name} can be moved in {movable} freedoms or more, but {len(robot.controlled)} controlled coordinates are "
+            f"named ({', '.join(robot.controlled)}); name one for every freedom"
+        )
     state = inverse_trials(robot, values, target)
     if state.status[0, 0] != engine.CONVERGED:
         raise MechanismError(

@@ -132,7 +132,7 @@ class Linearised:
             touched = touched | self.touches[first + len(TERMS) * a : first + len(TERMS) * (a + 1)].any(axis=0)
         columns = _columns(np.flatnonzero(touched))
         E = block.E[:, :, k]
-        right = np.matmul(E.reshape(len(E), -1, width), self.of_slots[:, own, columns])
+        right = np.matmul(E.reshape(len(E), E.shape[1] * E.shape[2], width), self.of_slots[:, own, columns])
         right = right.reshape(*right.shape[:1], *E.shape[1:3], -1)
         for j, a in driven:
             for i, term in enumerate(self.terms):

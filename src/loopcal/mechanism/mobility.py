@@ -61,7 +61,7 @@ def checked(robot: Mechanism) -> Mechanism:
 
 
 def _mobility(robot: Mechanism, blocks: engine.Blocks, A: Array) -> int:
-    """Freedoms of the platform that the actuators reach: rank of d pose / d joint values."""
+    """Freedoms of the platform with every actuator free: solutions (y, dq) of A y + Q dq = 0, A of full column rank."""
     Q, first = np.zeros((len(A), robot.program.n_joints)), 0
     for group, block in zip(robot.program.groups, blocks.closure, strict=True):
         for k in range(len(group.limbs)):
@@ -70,9 +70,9 @@ def _mobility(robot: Mechanism, blocks: engine.Blocks, A: Array) -> int:
             for j, columns in enumerate(group.actuator):
                 if columns[0] >= 0:
                     Q[rows, columns[k]] = block.Q[0, 0, k, :, j]
-    D = np.linalg.lstsq(A, Q, rcond=None)[0]
-    s = np.linalg.svd(D, compute_uv=False)
-    return int((s > RANK * max(s.max(initial=0.0), 1e-300)).sum())
+    both = np.concatenate([A, Q], axis=1)
+    s = np.linalg.svd(both, compute_uv=False)
+    return both.shape[1] - int((s > RANK * s[0]).sum())
 
 
 def _commandable(robot: Mechanism, movable: int) -> Mechanism:

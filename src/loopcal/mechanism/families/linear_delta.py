@@ -52,11 +52,7 @@ class TowerMap:
         radius, angle, arm, _ = inputs.T
         c, s, zero = np.cos(angle), np.sin(angle), np.zeros_like(radius)
         height = np.sqrt(arm**2 - radius**2)
-        rows = [
-            [c, -radius * s, zero, zero],
-            [s, radius * c, zero, zero],
-            [-radius / height, zero, arm / height, zero + 1.0],
-        ]
+        rows = [[c, -radius * s, zero, zero], [s, radius * c, zero, zero], [-radius / height, zero, arm / height, zero + 1.0]]
         return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
 
 
@@ -91,14 +87,17 @@ class LinearDelta(Robot):
                 "the radius must be positive and every arm longer than it"
             )
         sd = {
-            name: standard_deviation(getattr(self.tolerances, name), f"the {name}") for name in ("radius", "angles", "arms", "stops")
+            name: standard_deviation(getattr(self.tolerances, name), f"the {name}")
+            for name in ("radius", "angles", "arms", "stops")
         }
         parameters = [Parameter("radius", Dimension.LENGTH, self.radius, sd["radius"])]
         limbs, actuators, maps, shared = [], [], [], []
         for k, (angle, arm, stop) in enumerate(zip(self.angles, arms, stops, strict=True), start=1):
             limb, motor = f"arm{k}", f"q{k}"
             foot = (self.radius * np.cos(angle), self.radius * np.sin(angle), 0.0)
-            joints = (Joint("carriage", "P", motor),)
+            # above the nozzle: the other side is the mirrored working mode
+            height = self.home.z + float(np.sqrt(arm**2 - self.radius**2))
+            joints = (Joint("carriage", "P", motor, start=height),)
             links = (Link("tower", translation(foot)), Link("hinge", np.eye(4)))
             limbs.append(Limb(limb, links, joints, "distance", Link("nozzle", np.eye(4)), arm))
             sign = -1.0 if self.readings == "drop" else 1.0
