@@ -286,14 +286,17 @@ def random_limb(
     attachment = se3.pose(se3.exp_so3(rng.normal(size=3)), corner)
     end = home @ attachment
     rod = ending == "distance"
-    frames = []
+    leg, frames = end[:3, 3] - foot, []
     for j, kind in enumerate(kinds):
-        along = (j + 0.3 * rng.uniform()) / (len(kinds) + rod)
-        point = foot + along * (end[:3, 3] - foot) + rng.normal(size=3) * 0.01
-        frames.append(se3.pose(_frame(rng, end[:3, 3] - foot, kind), point))
-    tip = end @ place(-0.3 * (end[:3, :3].T @ (end[:3, 3] - foot))) if rod and kinds else end
-    if rod and not kinds:
-        tip = se3.pose(se3.exp_so3(rng.normal(size=3)), foot)
+        along = float(j + 0.3 * rng.uniform()) / (len(kinds) + int(rod))
+        point = foot + along * leg + 0.01 * rng.normal(size=3)
+        frames.append(se3.pose(_frame(rng, leg, kind), point))
+    tip = end
+    if rod and kinds == "H":  # a crank whose arm lies across the leg, far from its dead points
+        arm = se3.hat(frames[0][:3, 2]) @ leg
+        tip = se3.pose(se3.exp_so3(rng.normal(size=3)), foot + leg * 0.2 + arm * 0.4)
+    elif rod:
+        tip = se3.pose(se3.exp_so3(rng.normal(size=3)), foot + leg * (0.7 if kinds else 0.0))
     start = rng.uniform(0.02, 0.06, len(kinds)) * np.where([k == "P" for k in kinds], 1.0, 8.0)
     joints = tuple(
         Joint(f"joint{j + 1}", "P" if k == "P" else "R", motor if j == driven else None, 0.015 if k == "H" else 0.0, s)

@@ -78,10 +78,10 @@ def motion(program: Program, state: State, of: State, free: bool = False) -> Arr
     return np.concatenate([twist, unknowns(program, state, free) - unknowns(program, of, free)], axis=-1)
 
 
-def pose_demand(target: Array, size: float) -> Callable[[Array, Array], tuple[Array, Array]]:
+def pose_demand(target: Array, size: float) -> Callable[[Array, NDArray[np.int64]], tuple[Array, Array]]:
     """The task of reaching poses (N, 4, 4), all six freedoms."""
 
-    def task(T: Array, rows: Array) -> tuple[Array, Array]:
+    def task(T: Array, rows: NDArray[np.int64]) -> tuple[Array, Array]:
         gap = se3.difference(T, target[rows])
         columns = np.zeros((len(rows), 6, 6))
         columns[:, :3, :3] = se3.left_jacobian_inverse_so3(gap[:, :3])
@@ -184,7 +184,10 @@ def spread(program: Program, parts: tuple[Block, ...]) -> tuple[Array, Array, Ar
 
 
 def slopes(program: Program, blocks: Any, free: bool = False) -> Array:
-    """d (platform, unknown joints) / d (displacements, joint values): (t, n, m + u, s + a); `free`: / d (platform, displacements)."""
+    """d (platform, unknown joints) / d (displacements, joint values): (t, n, m + u, s + a).
+
+    With `free`, / d (platform, displacements): (t, n, m + u, m + s).
+    """
     A, E, Q = spread(program, blocks.closure)
     m = len(program.freedoms)
     right = np.concatenate([E, Q], axis=-1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The engine under test: every test of this folder takes it as a fixture, so that another engine is accepted by adding it here."""
+"""The engine under test, a fixture of every test in this folder: another engine is accepted by adding it here."""
 
 import importlib
 from types import ModuleType

@@ -73,7 +73,7 @@ def compiled(letters, ending, chosen, slots, size):
     count = len(letters) + 1
 
     def rows(v, T, links, pitch, length):
-        limb = Group((0,), letters, None, (), ending, chosen, links, pitch, length, slots, None)
+        limb = Group((0,), letters, np.empty((0, 1), np.int64), (), ending, chosen, links, pitch, length, slots, slice(0))
         twist, joints, own = v[:6], v[6 : 6 + count], v[6 + count :]
         moved = homogeneous(jnp, rotation(jnp, twist[:3]) @ T[:3, :3], T[:3, 3] + twist[3:])
         return limb_rows(jnp, limb, 0, size, moved, joints, own)

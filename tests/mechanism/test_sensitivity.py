@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How poses follow parameters and readings: derivatives, their batch, and what can be known of 42 and 33 parameters."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from loopcal import se3
+from loopcal.mechanism import Address, Linear, build
+from loopcal.mechanism.trials import forward_trials, sensitivity
+from loopcal.parameters import Parameter
+from loopcal.units import Dimension
+from tests import zoo
+from tests.jacobians import check_jacobian
+from tests.mechanism.test_kinematics import sampled
+
+RANK = 1e-10  # relative; the smallest true singular values are above 1e-6, null ones below 1e-13
+
+
+def hexapod_legs(jnp, values, q, T, twist):
+    """Plain closure of a hexapod (6,): |t + R p - b| - length - reading."""
+    legs = values.reshape(6, 7)
+    w = twist[:3]
+    K = jnp.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+    R = (jnp.eye(3) + K) @ T[:3, :3]  # the first order is all that a derivative at zero needs
+    gap = legs[:, 3:6] @ R.T + T[:3, 3] + twist[3:] - legs[:, :3]
+    return jnp.sqrt((gap**2).sum(axis=1)) - legs[:, 6] - q
+
+
+def delta_arms(jnp, values, q, T, twist):
+    """Plain closure of a linear delta (3,): distance of the nozzle from each carriage, less the arm."""
+    radius, towers = values[0], values[1:].reshape(3, 3)
+    angle, arm, stop = towers.T
+    carriage = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), stop + jnp.sqrt(arm**2 - radius**2) - q], axis=1)
+    return jnp.sqrt(((T[:3, 3] + twist[3:] - carriage) ** 2).sum(axis=1)) - arm
+
+
+def noisy(robot, size=2e-4, seed=1, t=1):
+    return robot.values + np.random.default_rng(seed).normal(size=(t, len(robot.parameters))) * size
+
+
+@pytest.mark.parametrize(("name", "legs"), [("hexapod", hexapod_legs), ("delta", delta_arms)])
+def test_sensitivity_of_the_families_agrees_with_differences_and_jax(name, legs, jax):
+    robot, sol, _ = sampled(name, 4)
+    values, q = noisy(robot), sol.q[None]
+    state = forward_trials(robot, values, q)
+    found = sensitivity(robot, values, q, state)
+    free = list(robot.program.freedoms)
+
+    both = np.concatenate([found.parameters[0], found.readings[0]], axis=-1)
+    scale = np.concatenate(
+        [[1.0 if d is Dimension.ANGLE else robot.size for d in robot.parameters.dimensions], np.full(q.shape[2], robot.size)]
+    )
+    moved = np.diag(scale)
+
+    def solved(x):  # one trial a parameter or reading
+        v, r = values + x[0] * moved[:, : values.size], q + x[0] * moved[:, None, values.size :]
+        return se3.difference(forward_trials(robot, v, r, start=state).T, state.T)
+
+    check_jacobian(
+        solved, (both * scale).transpose(2, 0, 1)[..., None], np.zeros(1), scale=0.1,
+        atol=1e-8, atol_reason="closure to 1e-13, condition 30, step 1e-4",
+    )  # fmt: skip
+    x = np.concatenate([values[0], np.zeros(q.shape[2])])
+    jnp = jax.numpy
+    for row in range(4):
+        at = q[0, row], state.T[0, row]
+        F = jax.jacfwd(lambda y, at=at: legs(jnp, values[0], *at, y))(np.zeros(6))[:, free]
+        G = jax.jacfwd(lambda v, at=at: legs(jnp, v[: values.size], at[0] + v[values.size :], at[1], np.zeros(6)))(x)
+        assert_allclose(both[row][free], -np.linalg.solve(F, G), atol=1e-11)
+
+
+@pytest.mark.parametrize("name", ["menagerie", "three_prs", "five_bar", "planar_rrr"])
+def test_sensitivity_of_any_mechanism_agrees_with_differences(name):
+    robot, sol, _ = sampled(name, 1)
+    values, q = robot.values[None], sol.q[None]
+    state = forward_trials(robot, values, q, start=sol.state)
+    found = sensitivity(robot, values, q, state)
+    unit = np.array([robot.size if d is Dimension.LENGTH else 1.0 for d in robot.parameters.dimensions])
+
+    def solved(x):  # one trial a parameter
+        moved = forward_trials(robot, values + x[0] * np.diag(unit), q, start=state)
+        return se3.difference(moved.T, np.broadcast_to(state.T, moved.T.shape))
+
+    check_jacobian(
+        solved, (found.parameters[0] * unit).transpose(2, 0, 1)[..., None], np.zeros(1), scale=0.1,
+        atol=1e-7, atol_reason="closure to 1e-13, condition 30, step 1e-4",
+    )  # fmt: skip
+
+
+def test_transmission_terms_enter_the_pose_with_their_slopes():
+    robot = with_harmonics(zoo.hexapod())
+    _, sol, _ = sampled("hexapod", 3)
+    values, q = noisy(robot, 1e-4), sol.q[None]
+    state = forward_trials(robot, values, q)
+    found = sensitivity(robot, values, q, state)
+    both = np.concatenate([found.parameters[0][..., 42:], found.readings[0]], axis=-1)
+
+    def solved(x):
+        v = np.concatenate([values[0, :42], x[:-6]])[None]
+        return se3.difference(forward_trials(robot, v, q + x[-6:], start=state).T[0], state.T[0])
+
+    x = np.concatenate([values[0, 42:], np.zeros(6)])
+    check_jacobian(solved, both, x, scale=0.002, atol=1e-10, atol_reason="closure to 1e-13, condition 30, step 1e-4")
+
+
+def with_harmonics(robot):
+    """The same robot whose first two actuators have every transmission term as a parameter, on a 5 mm screw."""
+    terms = ("offset", "gain", "sin1", "cos1", "sin2", "cos2")
+    assembly, extra, maps = robot.assembly, [], []
+    for name in ("q1", "q2"):
+        for term in terms:
+            dimension = Dimension.RATIO if term == "gain" else Dimension.LENGTH
+            extra.append(Parameter(f"{name}.{term}", dimension, float(term == "gain")))
+            maps.append(Linear(f"{name}.{term}", Address(name, "transmission", term)))
+    actuators = tuple(replace(a, period=0.005) if a.name in ("q1", "q2") else a for a in assembly.actuators)
+    return build(
+        replace(assembly, parameters=(*assembly.parameters, *extra), maps=(*assembly.maps, *maps), actuators=actuators)
+    )
+
+
+def test_trials_agree_with_single_calls_up_to_the_rounding_of_numpy_matmul():
+    robot, sol, _ = sampled("three_prs", 6)
+    values, q = noisy(robot, 1e-4, t=7), sol.q[None]
+    state = forward_trials(robot, values, q)
+    together = sensitivity(robot, values, q, state)
+    for i in range(7):
+        one = forward_trials(robot, values[i : i + 1], q)
+        alone = sensitivity(robot, values[i : i + 1], q, one)
+        # the product with de/dp is one matmul a trial, whose order of summation BLAS chooses
+        assert_allclose(together.parameters[i], alone.parameters[0], rtol=1e-12, atol=1e-13)
+        assert_array_equal(together.readings[i], alone.readings[0])
+
+
+def test_failed_rows_hold_no_numbers_and_do_not_stop_the_others():
+    robot, q = zoo.hexapod(), np.zeros((1, 3, 6))
+    q[0, 1, 2] = np.nan
+    values = robot.values[None]
+    found = sensitivity(robot, values, q, forward_trials(robot, values, q))
+    assert np.isnan(found.parameters[0, 1]).all()
+    assert np.isfinite(found.parameters[0, [0, 2]]).all()
+
+
+# --- what can be known: frames that are not known are six extra columns each -----------------------------------------
+
+
+def scaled_matrix(name, n=40):
+    """Sensitivities of n poses, angles in sizes of the robot; columns for the unknown base and tool frame beside them."""
+    robot, sol, _ = sampled(name, n)
+    state = forward_trials(robot, noisy(robot, 1e-4), sol.q[None], start=sol.state)
+    D = sensitivity(robot, noisy(robot, 1e-4), sol.q[None], state).parameters[0]
+    T, eye, zero = state.T[0], np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3, 3))
+    base = np.concatenate([np.concatenate([eye, zero], axis=2), np.concatenate([-se3.hat(T[:, :3, 3]), eye], axis=2)], axis=1)
+    R = T[:, :3, :3]
+    tool = np.concatenate([np.concatenate([R, zero], axis=2), np.concatenate([zero, R], axis=2)], axis=1)
+    rows = np.array([robot.size] * 3 + [1.0] * 3)[:, None]
+    columns = np.array([1.0 if d is Dimension.ANGLE else robot.size for d in robot.parameters.dimensions])
+    return D * rows * columns / robot.size, base * rows / robot.size, tool * rows / robot.size, T
+
+
+def rank_beside(matrix, *unknown):
+    """Rank of the parameters once the unknown columns are projected out, and all singular values."""
+    flat = matrix.reshape(-1, matrix.shape[-1])
+    if unknown:
+        basis, _ = np.linalg.qr(np.concatenate([u.reshape(len(flat), -1) for u in unknown], axis=1))
+        flat = flat - basis @ (basis.T @ flat)
+    s = np.linalg.svd(flat, compute_uv=False)
+    return int((s > RANK * s[0]).sum()), s / s[0]
+
+
+@pytest.mark.parametrize(("name", "count"), [("hexapod", 42), ("nategh", 42), ("three_prs", 33)])
+def test_each_unknown_frame_costs_six_parameters(name, count):
+    D, base, tool, _ = scaled_matrix(name)
+    assert D.shape[-1] == count
+    for unknown, rank in (((), count), ((base,), count - 6), ((tool,), count - 6), ((base, tool), count - 12)):
+        found, s = rank_beside(D, *unknown)
+        assert found == rank
+        assert (s[rank:] < 1e-13).all()  # null to rounding; from J'J it would be 1e-7
+        assert s[rank - 1] > 1e-7
+
+
+@pytest.mark.parametrize(("name", "count"), [("hexapod", 42), ("three_prs", 33)])
+def test_torsion_costs_one_parameter_and_orientation_three(name, count):
+    D, _, _, T = scaled_matrix(name)
+    normal = T[:, :3, 2]
+    across = np.linalg.svd(normal[:, None, :])[2][:, 1:]
+    tilt = np.einsum("nij,njp->nip", across, D[:, :3])
+    assert rank_beside(np.concatenate([tilt, D[:, 3:]], axis=1))[0] == count - 1
+    assert rank_beside(D[:, 3:])[0] == count - 3
