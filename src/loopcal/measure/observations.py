@@ -15,6 +15,7 @@ from loopcal.measure.whitening import whitener
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 Bools = NDArray[np.bool_]
+Texts = NDArray[np.str_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,9 @@ class Observations:
         Of the residuals, see `from_sigma` and `Kind.noise_map`; entries of absent components are not looked at.
     weight : (r,), optional
         Factor of the squared whitened residual; 0 makes a row absent. Default 1.
+    session, group : text or (r,) text, optional
+        Rows of one session share the kind's frames and targets, rows of one group its surface. Default: one of each,
+        without a name.
 
     Attributes
     ----------
@@ -45,7 +49,7 @@ class Observations:
     ------
     DataError
         If shapes do not fit the kind, a number is infinite, a covariance is not positive definite, a weight is
-        negative, or the kind doubts a row.
+        negative, a row links a pose with itself, or the kind doubts a row.
     """
 
     kind: Kind
@@ -53,6 +57,8 @@ class Observations:
     measured: Array
     covariance: Array
     weight: Array = field(default_factory=lambda: np.array(1.0))
+    session: Texts = field(default_factory=lambda: np.array(""))
+    group: Texts = field(default_factory=lambda: np.array(""))
     present: Bools = field(init=False, repr=False)
     whitener: Array = field(init=False, repr=False)
 
@@ -75,11 +81,20 @@ class Observations:
         for array in (rows, covariance, present, W):
             array.setflags(write=False)
         values = {"rows": rows, "measured": measured, "covariance": covariance, "weight": weight}
+        values |= {name: labels(getattr(self, name), r, name) for name in ("session", "group")}
         for name, array in {**values, "present": present, "whitener": W}.items():
             object.__setattr__(self, name, array)
 
     @classmethod
-    def from_sigma(cls, kind: Kind, rows: ArrayLike, measured: ArrayLike, sigma: ArrayLike) -> Self:
+    def from_sigma(
+        cls,
+        kind: Kind,
+        rows: ArrayLike,
+        measured: ArrayLike,
+        sigma: ArrayLike,
+        session: str | Texts = "",
+        group: str | Texts = "",
+    ) -> Self:
         """Rows with independent noise of the kind's noise columns, mapped to the residuals by `N diag(sigma^2) N'`.
 
         Parameters
@@ -89,6 +104,7 @@ class Observations:
         measured : (r, c) [SI]
         sigma : number, (m,) or (r, m) [SI]
             Standard deviations.
+        session, group : text or (r,) text
 
         Returns
         -------
@@ -107,7 +123,7 @@ class Observations:
             raise _wrong_columns(kind, values.shape)
         N = kind.noise_map(values)
         covariance = (N * (sd * sd)[:, None, :]) @ np.swapaxes(N, -1, -2)
-        return cls(kind, np.asarray(rows), values, covariance)
+        return cls(kind, np.asarray(rows), values, covariance, session=np.asarray(session), group=np.asarray(group))
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -117,20 +133,21 @@ class Observations:
         """How many residuals count: present, in rows of weight above 0."""
         return int(np.count_nonzero(self.present & (self.weight > 0.0)[:, None]))
 
-    def evaluate(self, T: Array, unknowns: Array | None = None) -> Evaluation:
+    def evaluate(self, T: Array, unknowns: Array | None = None, joints: Array | None = None) -> Evaluation:
         """Residuals and derivatives of all rows at the poses of all n readings.
 
         Parameters
         ----------
         T : (t, n, 4, 4)
             T_base_platform of each pose.
-        unknowns : (t or 1, r, u), optional
+        unknowns : (t or 1, r or 1, u), optional
+        joints : (t, r, j), optional
 
         Returns
         -------
         Evaluation
         """
-        return self.kind.evaluate(T[:, self.rows], self.measured[None], unknowns)
+        return self.kind.evaluate(T[:, self.rows], self.measured[None], unknowns, joints)
 
     def take(self, keep: ArrayLike) -> Self:
         """The rows at these positions (or of this mask)."""
@@ -141,6 +158,8 @@ class Observations:
             measured=self.measured[chosen],
             covariance=self.covariance[chosen],
             weight=self.weight[chosen],
+            session=self.session[chosen],
+            group=self.group[chosen],
         )
 
     def reweighted(self, weight: ArrayLike) -> Self:
@@ -159,7 +178,25 @@ def _indices(rows: ArrayLike, kind: Kind) -> Ints:
             f"rows of kind {kind.name!r} have shape {given.shape} and type {given.dtype}; give whole numbers of shape"
             f" {shape}: the index of the pose each row saw"
         )
+    if wanted == 2:
+        same = np.flatnonzero(given[:, 0] == given[:, 1])
+        if len(same):
+            raise DataError(
+                f"row {int(same[0]) + 1} of kind {kind.name!r} links pose {int(given[same[0], 0])} with itself; name two poses"
+            )
     return given.astype(np.intp)
+
+
+def labels(value: ArrayLike, r: int, what: str) -> Texts:
+    """Read-only labels (r,) from one text or one for each row."""
+    given = np.asarray(value)
+    if given.dtype.kind != "U" or given.shape not in ((), (r,)):
+        raise DataError(
+            f"the {what} has shape {given.shape} and type {given.dtype}; give one text, or one for each of {r} rows"
+        )
+    spread = np.array(np.broadcast_to(given, (r,)))
+    spread.setflags(write=False)
+    return spread
 
 
 def _spread(value: ArrayLike, shape: tuple[int, ...], what: str, wanted: str) -> Array:

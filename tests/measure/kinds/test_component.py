@@ -22,7 +22,7 @@ def test_a_probed_height_is_z_of_the_tool_alone():
     T_platform_tool = se3.pose(np.eye(3), np.array([0.0, 0.1, -0.2]))
     height = Component(T_platform_tool=T_platform_tool)
     T = se3.pose(se3.axis_rotation(0.5, 0), np.array([1.0, 2.0, 3.0]))[None, None]
-    residual, jacobian, own = height.evaluate(T, np.array([[[3.0]]]))
+    residual, jacobian, own, _ = height.evaluate(T, np.array([[[3.0]]]))
     assert own is None
     assert_allclose(residual, 0.1 * np.sin(0.5) - 0.2 * np.cos(0.5), atol=1e-15)
     assert_allclose(jacobian[0, 0, 0, 3:], [0.0, 0.0, 1.0], atol=0.0)

@@ -27,21 +27,34 @@ def platform_poses(kind, t, r, seed=0, spread=0.4):
 
 def placed(kind):
     """The kind on a robot with a tool, seen from a frame of its own where the kind has one."""
-    fields = {f.name for f in dataclasses.fields(kind)}
-    if "T_base_frame" in fields:
+    if np.array_equal(getattr(kind, "T_base_frame", None), np.eye(4)):
         kind = dataclasses.replace(kind, T_base_frame=T_BASE_FRAME)
     return kind.mounted(T_PLATFORM_TOOL)
 
 
-def own_unknowns(kind):
-    """Nominal values of the kind's unknowns (1, 1, u), None where it has none."""
-    return np.array([p.nominal for p in kind.unknowns])[None, None] if kind.unknowns else None
+def own_unknowns(kind, seed=2):
+    """Values of the kind's unknowns (1, 1, u) off their nominal ones, None where it has none."""
+    if not kind.unknowns:
+        return None
+    return kind.nominal[None, None] + np.random.default_rng(seed).uniform(-0.2, 0.2, (1, 1, len(kind.unknowns)))
+
+
+def joints_of(kind, T, seed=3):
+    """Values of the joints that the kind looks at (t, r, j), None where it looks at none."""
+    if not kind.looks_at:
+        return None
+    return np.random.default_rng(seed).uniform(-0.5, 0.5, (*T.shape[:2], len(kind.looks_at)))
 
 
 def measured_near(kind, T, size, seed=1):
     """Readings of the true poses with errors of this size in the noise columns."""
     noise = size * np.random.default_rng(seed).uniform(-1.0, 1.0, (*T.shape[:2], len(kind.noise_columns)))
-    return kind.measure(T, noise, own_unknowns(kind)), noise
+    return kind.measure(T, noise, own_unknowns(kind), joints_of(kind, T)), noise
+
+
+def evaluated(kind, T, measured):
+    """The kind at its unknowns and joints."""
+    return kind.evaluate(T, measured, own_unknowns(kind), joints_of(kind, T))
 
 
 @every_kind
@@ -62,7 +75,7 @@ def test_shapes_follow_trials_and_rows(kind):
     assert kind.present(measured).shape == (3, 5, m)
     assert kind.noise_map(measured).shape == (3, 5, m, m)
     for rows in (measured, measured[:1]):
-        result = kind.evaluate(T, rows, own_unknowns(kind))
+        result = evaluated(kind, T, rows)
         assert result.residual.shape == (3, 5, m)
         assert result.jacobian.shape == (3, 5, *links, m, 6)
         assert (result.own is None) == (not kind.unknowns)
@@ -73,7 +86,7 @@ def test_the_residual_of_a_noise_free_reading_is_zero(kind):
     kind = placed(kind)
     T = platform_poses(kind, 2, 50)
     measured, _ = measured_near(kind, T, 0.0)
-    residual = kind.evaluate(T, measured, own_unknowns(kind)).residual
+    residual = evaluated(kind, T, measured).residual
     assert_allclose(residual, 0.0, atol=1e-13)  # [m, rad], ulps over the sine of the smallest tilt, about 0.01
 
 
@@ -82,7 +95,7 @@ def test_the_residual_of_a_noisy_reading_is_the_mapped_noise_with_the_sign_turne
     kind = placed(kind)
     T = platform_poses(kind, 2, 50)
     measured, noise = measured_near(kind, T, 1e-6)
-    residual = kind.evaluate(T, measured, own_unknowns(kind)).residual
+    residual = evaluated(kind, T, measured).residual
     expected = -(kind.noise_map(measured) @ noise[..., None])[..., 0]
     assert_allclose(residual, expected, atol=1e-11)  # [m, rad], the square of the noise times the bend of the angles
 
@@ -91,7 +104,10 @@ def check_twist_jacobian(kind, error, *, with_jax):
     kind = placed(kind)
     T = platform_poses(kind, 2, 4, seed=5)
     measured, _ = measured_near(kind, T, error)
-    jacobian = kind.evaluate(T, measured, own_unknowns(kind)).jacobian
+    jacobian = evaluated(kind, T, measured).jacobian
+    if kind.looks_at:
+        assert not jacobian.any()
+        return
     for link in range(kind.links):
         unit = np.zeros((6, kind.links, 6))
         unit[:, link] = np.eye(6)
@@ -99,7 +115,7 @@ def check_twist_jacobian(kind, error, *, with_jax):
 
         def residual(x, unit=unit, shape=shape):
             twist = (x @ unit.reshape(6, -1)).reshape(shape)  # the same small motion in every row and trial
-            return kind.evaluate(se3.exp_update(T, twist), measured, own_unknowns(kind)).residual
+            return evaluated(kind, se3.exp_update(T, twist), measured).residual
 
         part = jacobian if kind.links == 1 else jacobian[:, :, link]
         reason = "[rad] per 0.05 rad, rounding of angles near small tilt"
@@ -119,20 +135,64 @@ def test_the_jacobian_by_the_platform_twist_agrees_with_an_automatic_derivative(
     check_twist_jacobian(kind, 0.1, with_jax=True)
 
 
-@every_kind
-def test_the_jacobian_by_the_own_unknowns(kind):
-    if not kind.unknowns:
-        return
+def check_own_jacobian(kind, *, with_jax):
     kind = placed(kind)
     T = platform_poses(kind, 2, 4, seed=5)
     measured, _ = measured_near(kind, T, 1e-3)
-    nominal = own_unknowns(kind)
+    values, joints = own_unknowns(kind), joints_of(kind, T)
 
     def residual(x):
-        return kind.evaluate(T, measured, nominal + x).residual
+        return kind.evaluate(T, measured, values + x, joints).residual
 
-    own = kind.evaluate(T, measured, nominal).own
-    check_jacobian(residual, own, np.zeros(len(kind.unknowns)), scale=0.05, automatic=residual)
+    own = kind.evaluate(T, measured, values, joints).own
+    automatic = residual if with_jax else None
+    check_jacobian(residual, own, np.zeros(len(kind.unknowns)), scale=0.05, automatic=automatic, atol=1e-13)
+
+
+WITH_UNKNOWNS = [example for example in EXAMPLES if example.values[0].unknowns]
+
+
+@pytest.mark.parametrize("kind", WITH_UNKNOWNS)
+def test_the_jacobian_by_the_own_unknowns_agrees_with_differences(kind):
+    check_own_jacobian(kind, with_jax=False)
+
+
+@pytest.mark.parametrize("kind", WITH_UNKNOWNS)
+@pytest.mark.slow
+def test_the_jacobian_by_the_own_unknowns_agrees_with_an_automatic_derivative(kind):
+    check_own_jacobian(kind, with_jax=True)
+
+
+@pytest.mark.parametrize("kind", [example for example in EXAMPLES if example.values[0].looks_at])
+def test_the_jacobian_by_the_joints_agrees_with_differences(kind):
+    T = platform_poses(kind, 2, 4)
+    measured, _ = measured_near(kind, T, 1e-3)
+    joints = joints_of(kind, T)
+    found = kind.evaluate(T, measured, own_unknowns(kind), joints).joints
+
+    def residual(x):
+        return kind.evaluate(T, measured, own_unknowns(kind), joints + x).residual
+
+    check_jacobian(residual, found, np.zeros(len(kind.looks_at)), scale=0.05, atol=1e-13)
+    with pytest.raises(DataError, match="needs the values of"):
+        kind.evaluate(T, measured, own_unknowns(kind))
+
+
+@pytest.mark.parametrize("kind", WITH_UNKNOWNS)
+def test_unknowns_may_differ_from_row_to_row_and_from_trial_to_trial(kind):
+    kind = placed(kind)
+    T = platform_poses(kind, 2, 3)
+    joints = joints_of(kind, T)
+    values = own_unknowns(kind) + np.random.default_rng(8).uniform(-0.1, 0.1, (2, 3, len(kind.unknowns)))
+    measured = kind.measure(T, np.zeros((2, 3, len(kind.noise_columns))), values, joints)
+    together = kind.evaluate(T, measured, own_unknowns(kind), joints)
+    assert_allclose(kind.evaluate(T, measured, values, joints).residual, 0.0, atol=1e-13)
+    one = (slice(1, 2), slice(2, 3))
+    alone = kind.measure(
+        T[one], np.zeros((1, 1, len(kind.noise_columns))), values[one], None if joints is None else joints[one]
+    )
+    assert_allclose(alone[0, 0], measured[1, 2], atol=1e-14)
+    assert np.abs(together.residual).max() > 1e-3
 
 
 @every_kind
@@ -140,16 +200,17 @@ def test_components_not_measured_are_zero_and_leave_the_others_as_they_were(kind
     kind = placed(kind)
     T = platform_poses(kind, 2, 20)
     measured, _ = measured_near(kind, T, 1e-3)
-    whole = kind.evaluate(T, measured, own_unknowns(kind))
+    whole = evaluated(kind, T, measured)
     for column in range(len(kind.columns)):
         holed = measured.copy()
         holed[:, ::2, column] = np.nan
         present = kind.present(holed)
-        part = kind.evaluate(T, holed, own_unknowns(kind))
+        part = evaluated(kind, T, holed)
         assert not present[:, ::2].all()
         assert present[:, 1::2].all()
         assert_allclose(part.residual[~present], 0.0, atol=0.0)
-        assert_allclose(part.jacobian[np.broadcast_to(~present[..., None], part.jacobian.shape)], 0.0, atol=0.0)
+        absent = ~present[..., None] if kind.links == 1 else ~present[..., None, :, None]
+        assert_allclose(part.jacobian[np.broadcast_to(absent, part.jacobian.shape)], 0.0, atol=0.0)
         assert_allclose(part.residual[:, 1::2], whole.residual[:, 1::2], atol=0.0)
         assert np.isfinite(part.residual).all()
         assert np.isfinite(part.jacobian).all()
@@ -160,9 +221,11 @@ def test_rows_do_not_depend_on_their_batch(kind):
     kind = placed(kind)
     T = platform_poses(kind, 3, 6)
     measured, _ = measured_near(kind, T, 1e-3)
-    together = kind.evaluate(T, measured, own_unknowns(kind))
+    together = evaluated(kind, T, measured)
     for i, j in ((0, 0), (2, 5)):
-        alone = kind.evaluate(T[i : i + 1, j : j + 1], measured[i : i + 1, j : j + 1], own_unknowns(kind))
+        one = (slice(i, i + 1), slice(j, j + 1))
+        joints = joints_of(kind, T)
+        alone = kind.evaluate(T[one], measured[one], own_unknowns(kind), None if joints is None else joints[one])
         # numpy takes another path through vectorised sines and small products for other lengths: a rounding each
         assert_allclose(alone.residual[0, 0], together.residual[i, j], atol=1e-14)
         assert_allclose(alone.jacobian[0, 0], together.jacobian[i, j], atol=1e-12)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kind `component`: some of the tool's coordinates and declared angles in a known frame; z alone is a probed height.
+"""Kind `component`: some of the tool's coordinates and declared angles in a frame; z alone is a probed height.
 
 Angles are the ones the data declare, their differences wrapped. Near zero tilt the azimuth phi loses its meaning; there
 the x and y components of the unit normal stand in for theta and phi.
@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from loopcal import se3
 from loopcal.errors import DataError
+from loopcal.measure.closed_form import kabsch
+from loopcal.measure.kinds import parts
 from loopcal.measure.kinds.kind import Bools, Column, Evaluation
 from loopcal.measure.kinds.tool import POSITION, ToolKind
 from loopcal.measure.orientation import Orientation, orientation
@@ -43,9 +45,9 @@ class Component(ToolKind):
     orientation : str, optional
         Form of the angles, "tilt-torsion" (phi theta psi) or "euler-" with an order (a b c); needed as soon as an angle
         is measured.
-    form, _places
+    form, _places_among
         The orientation's form, and the place of each component among all: three angles (if declared), then x y z.
-    T_base_frame, T_platform_tool
+    T_base_frame, T_platform_tool, unknown, frame
         See `ToolKind`.
 
     Raises
@@ -58,7 +60,7 @@ class Component(ToolKind):
     orientation: str | None = None
 
     form: Orientation | None = field(init=False, repr=False)
-    _places: NDArray[np.intp] = field(init=False, repr=False)
+    _places_among: NDArray[np.intp] = field(init=False, repr=False)
 
     name: ClassVar[str] = "component"
 
@@ -76,7 +78,7 @@ class Component(ToolKind):
         object.__setattr__(self, "form", form)
         places = np.array([allowed.index(name) for name in self.components])
         places.setflags(write=False)
-        object.__setattr__(self, "_places", places)
+        object.__setattr__(self, "_places_among", places)
 
     def _check(self, allowed: tuple[str, ...]) -> None:
         for name in self.components:
@@ -91,7 +93,7 @@ class Component(ToolKind):
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
-        """A probed height, a point, five of six coordinates, and angles alone."""
+        """A probed height, a point, five of six coordinates, angles alone, and unknown places."""
         return (
             cls(("z",)),
             cls(("x", "y", "z")),
@@ -99,6 +101,8 @@ class Component(ToolKind):
             cls(("psi", "theta"), "tilt-torsion"),
             cls(("z", "a", "b"), "euler-xyz"),
             cls(("c", "a", "b"), "euler-ZXZ"),
+            cls(("x", "y", "z", "phi", "theta"), "tilt-torsion", unknown=("frame",)),
+            cls(("z", "x"), unknown=("tool", "frame")),
         )
 
     @property
@@ -124,21 +128,27 @@ class Component(ToolKind):
             for i in np.flatnonzero(determinant < _GIMBAL)
         )
 
-    def _evaluate(self, T: Array, measured: Array, unknowns: Array | None) -> Evaluation:
-        seen = self.seen(T)
+    @property
+    def neutral(self) -> Array:
+        """NaN, which each component sorts out for itself."""
+        return np.full(len(self.components), np.nan)
+
+    def _evaluate(self, T: Array, measured: Array, values: Array, joints: Array) -> Evaluation:
+        seen = self.seen(T, values)
         predicted, slopes = self._predict(seen)
         difference = predicted - np.where(np.isnan(measured), predicted, measured)
         residual = difference
         if self.form is not None:
-            residual = np.where(self._places < 3, se3.wrap(difference), difference)
-        rows = slopes @ self.transport(T)
+            residual = np.where(self._places_among < 3, se3.wrap(difference), difference)
+        moved = self.transport(T, values)
+        rows = slopes @ moved
         if not self._has_normal:
-            return Evaluation(residual, rows)
-        return self._flattened(residual, rows, seen, measured, T)
+            return self.split(residual, rows)
+        return self._flattened(residual, rows, seen, measured, moved)
 
-    def measure(self, T: Array, noise: Array, unknowns: Array | None = None) -> Array:
+    def measure(self, T: Array, noise: Array, unknowns: Array | None = None, joints: Array | None = None) -> Array:
         """Columns (t, r, m) of the tool with noise added; near zero tilt the noise of phi and theta is the normal's."""
-        seen = self.seen(T)
+        seen = self.seen(T, unknowns)
         exact, _ = self._predict(seen)
         noisy = exact + noise
         if not self._has_normal:
@@ -150,6 +160,15 @@ class Component(ToolKind):
         places = np.arange(len(self.components))
         noisy = np.where(flat[..., None] & (places == theta), tilt[..., None], noisy)
         return np.where(flat[..., None] & (places == phi), azimuth[..., None], noisy)
+
+    def starts(self, T: Array, measured: Array) -> Array:
+        """The frame from positions, where all three are measured; else in 24 orientations."""
+        whole = ~np.any(np.isnan(measured), axis=-1)
+        if self.unknown != ("frame",) or not set(POSITION) <= set(self.components) or np.count_nonzero(whole) < 3:
+            return super().starts(T, measured)
+        point = (T @ self._tool())[whole, :3, 3]
+        seen = measured[whole][:, [self.components.index(name) for name in POSITION]]
+        return parts.frame_values(self.T_base_frame, kabsch(seen, point))[None]
 
     def covariance_of_rotation(self, measured: Array, covariance: Array) -> Array:
         """Covariance of the residuals from that of the tool's rotation error and position.
@@ -198,9 +217,9 @@ class Component(ToolKind):
         """Components (..., m) of tool poses (..., 4, 4), and their derivative (..., m, 6) by the tool's twist."""
         position = seen[..., :3, 3]
         if self.form is None:
-            return position[..., self._places], self._slopes(np.zeros((1, 1, 3)))
+            return position[..., self._places_among], self._slopes(np.zeros((1, 1, 3)))
         angles = self.form.from_matrix(seen[..., :3, :3])
-        return np.concatenate([angles, position], axis=-1)[..., self._places], self._slopes(angles)
+        return np.concatenate([angles, position], axis=-1)[..., self._places_among], self._slopes(angles)
 
     def _slopes(self, angles: Array) -> Array:
         """Derivative (..., m, 6) of the components by the tool's twist, in axes of the frame."""
@@ -211,7 +230,7 @@ class Component(ToolKind):
             inverse = self.form.rates_inverse(angles)
             turning = np.concatenate([inverse, np.zeros_like(inverse)], axis=-1)
             rows = np.concatenate([turning, rows], axis=-2)
-        return rows[..., self._places, :]
+        return rows[..., self._places_among, :]
 
     def _flat(self, measured: Array) -> Bools:
         """Rows (..., 1, 1) whose normal stands in for phi and theta: both measured, and little tilt."""
@@ -227,7 +246,7 @@ class Component(ToolKind):
         places = np.arange(len(self.components))[:, None]
         return np.where(places == theta, x[..., None, :], np.where(places == phi, y[..., None, :], rows))
 
-    def _flattened(self, residual: Array, rows: Array, seen: Array, measured: Array, T: Array) -> Evaluation:
+    def _flattened(self, residual: Array, rows: Array, seen: Array, measured: Array, moved: Array) -> Evaluation:
         """The evaluation with the normal in place of phi and theta where the measured tilt is small."""
         flat = self._flat(measured)
         theta, phi = self._normal_places
@@ -237,6 +256,6 @@ class Component(ToolKind):
         x = seen[..., 0, 2] - np.cos(azimuth) * tilt
         y = seen[..., 1, 2] - np.sin(azimuth) * tilt
         normal = np.where(places == theta, x[..., None], np.where(places == phi, y[..., None], residual))
-        slopes = self._normal_rows(seen, np.zeros((1, 1, len(self.components), 6))) @ self.transport(T)
+        slopes = self._normal_rows(seen, np.zeros((1, 1, len(self.components), 6))) @ moved
         chosen = flat & ((places == theta) | (places == phi))[:, None]
-        return Evaluation(np.where(chosen[..., 0], normal, residual), np.where(chosen, slopes, rows))
+        return self.split(np.where(chosen[..., 0], normal, residual), np.where(chosen, slopes, rows))

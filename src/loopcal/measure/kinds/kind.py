@@ -4,17 +4,21 @@
 Adding a kind takes one file with one frozen dataclass, and its line in `KINDS`; files, templates, documentation and the
 contract tests follow from what this class asks for. A kind knows nothing of robots: it is given platform poses.
 
-Shapes: t trials, r rows, c columns as written in files, m residuals (often c), u unknowns of the kind. A kind with
-`links` > 1 compares several poses in one row and has an axis l for them: T (t, r, l, 4, 4), jacobian (t, r, l, m, 6).
+Shapes: t trials, r rows, c columns as written in files, m residuals (often c), u unknowns of the kind, j joints it looks
+at. A kind with `links` > 1 compares several poses in one row and has an axis l for them: T (t, r, l, 4, 4), jacobian
+(t, r, l, m, 6). Values of unknowns are plain numbers that add up; how a frame or a direction is written in them, see
+`loopcal.measure.kinds.parts`.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from loopcal.errors import DataError
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 
@@ -40,11 +44,14 @@ class Evaluation(NamedTuple):
         By the platform twist (omega, v) in base axes; with an axis of links before m where there are several.
     own : (t, r, m, u) or None
         By the kind's own unknowns, None where it has none.
+    joints : (t, r, m, j) or None
+        By the values of the joints it looks at, None where it looks at poses only.
     """
 
     residual: Array
     jacobian: Array
     own: Array | None = None
+    joints: Array | None = None
 
 
 class Kind(ABC):
@@ -72,8 +79,23 @@ class Kind(ABC):
         return self.columns
 
     @property
+    def parts(self) -> Mapping[str, tuple[Parameter, ...]]:
+        """The unknowns by what they describe (a frame, a target, a surface), in order."""
+        return {}
+
+    @property
     def unknowns(self) -> tuple[Parameter, ...]:
         """The u unknowns the kind brings with it, each with the scope that shares one value of it."""
+        return tuple(parameter for part in self.parts.values() for parameter in part)
+
+    @property
+    def references(self) -> Mapping[str, Array]:
+        """What unknowns of a name are counted from (a frame's stated orientation); kinds that share the name must agree."""
+        return {}
+
+    @property
+    def looks_at(self) -> tuple[str, ...]:
+        """Names of the j joints, driven or passive, whose values the residual depends on."""
         return ()
 
     @classmethod
@@ -100,7 +122,7 @@ class Kind(ABC):
         del measured
         return ()
 
-    def evaluate(self, T: Array, measured: Array, unknowns: Array | None = None) -> Evaluation:
+    def evaluate(self, T: Array, measured: Array, unknowns: Array | None = None, joints: Array | None = None) -> Evaluation:
         """Residuals and derivatives at platform poses.
 
         Parameters
@@ -109,27 +131,51 @@ class Kind(ABC):
             T_base_platform of each row (with an axis of links where there are several).
         measured : (t or 1, r, c) [SI]
             NaN where not measured.
-        unknowns : (t or 1, r, u), optional
-            Values of the kind's unknowns that hold for each row.
+        unknowns : (t or 1, r or 1, u), optional
+            Values of the kind's unknowns that hold for each row; default: nominal.
+        joints : (t, r, j), optional
+            Values of the joints in `looks_at`.
 
         Returns
         -------
         Evaluation
+
+        Raises
+        ------
+        DataError
+            If the kind looks at joints and none are given.
         """
-        result = self._evaluate(T, measured, unknowns)
+        if self.looks_at and joints is None:
+            raise DataError(f"the kind {self.name!r} needs the values of {', '.join(self.looks_at)}; hand them over as joints")
+        filled = np.where(np.isnan(measured), self.neutral, measured)
+        result = self._evaluate(T, filled, self.values(unknowns), np.empty((1, 1, 0)) if joints is None else joints)
         present = self.present(measured)
         if np.all(present):
             return result
-        links = present[..., None, :, None] if self.links > 1 else present[..., None]
-        own = None if result.own is None else np.where(present[..., None], result.own, 0.0)
-        return Evaluation(np.where(present, result.residual, 0.0), np.where(links, result.jacobian, 0.0), own)
+        here = present[..., None]
+        links = present[..., None, :, None] if self.links > 1 else here
+        own, moved = (None if part is None else np.where(here, part, 0.0) for part in (result.own, result.joints))
+        return Evaluation(np.where(present, result.residual, 0.0), np.where(links, result.jacobian, 0.0), own, moved)
+
+    @property
+    def neutral(self) -> Array:
+        """Columns (c,) that stand where nothing was measured, so that nothing becomes NaN."""
+        return np.zeros(len(self.columns))
 
     @abstractmethod
-    def _evaluate(self, T: Array, measured: Array, unknowns: Array | None) -> Evaluation:
-        """`evaluate`, free to put anything finite where a component is not measured."""
+    def _evaluate(self, T: Array, measured: Array, values: Array, joints: Array) -> Evaluation:
+        """`evaluate` with unknowns and measured values filled in; anything finite may come where nothing was measured."""
+
+    def starts(self, T: Array, measured: Array) -> Array:
+        """Candidates (k, u) for the unknowns of rows that share them, from poses T (r, 4, 4) and columns (r, c) alone.
+
+        Found in closed form where there is one; `loopcal.measure.starts` improves and compares them.
+        """
+        del T, measured
+        return self.nominal[None]
 
     @abstractmethod
-    def measure(self, T: Array, noise: Array, unknowns: Array | None = None) -> Array:
+    def measure(self, T: Array, noise: Array, unknowns: Array | None = None, joints: Array | None = None) -> Array:
         """Columns that an instrument with this noise would write.
 
         Parameters
@@ -138,7 +184,9 @@ class Kind(ABC):
             True T_base_platform.
         noise : (t, r, m)
             In the noise columns.
-        unknowns : (t or 1, r, u), optional
+        unknowns : (t or 1, r or 1, u), optional
+        joints : (t, r, j), optional
+            Default: zero.
 
         Returns
         -------
@@ -150,3 +198,54 @@ class Kind(ABC):
         """Matrix (..., m, m) by which errors of the noise columns enter the residuals (up to sign)."""
         m = len(self.noise_columns)
         return np.broadcast_to(np.eye(m), (*measured.shape[:-1], m, m))
+
+    # --- for the kinds themselves ------------------------------------------------------------------------------------
+
+    @property
+    def nominal(self) -> Array:
+        """Nominal values (u,) of the unknowns."""
+        return np.array([parameter.nominal for parameter in self.unknowns])
+
+    def values(self, unknowns: Array | None) -> Array:
+        """The values given, or the nominal ones (1, 1, u)."""
+        return self.nominal[None, None] if unknowns is None else unknowns
+
+    def part(self, values: Array, name: str) -> Array | None:
+        """Values (.., w) of one part, None where it is known."""
+        first = 0
+        for part, parameters in self.parts.items():
+            if part == name:
+                return values[..., first : first + len(parameters)]
+            first += len(parameters)
+        return None
+
+    def columns_of(self, blocks: Mapping[str, Array], shape: tuple[int, ...]) -> Array:
+        """Put derivatives side by side: the twist, then every part of the unknowns, zeros where a block is missing.
+
+        Parameters
+        ----------
+        blocks : part or "twist" -> (.., w)
+        shape : tuple of int
+            Leading axes of the result.
+
+        Returns
+        -------
+        rows : (*shape, 6 + u)
+        """
+        widths = {"twist": 6} | {name: len(part) for name, part in self.parts.items()}
+        return np.concatenate(
+            [np.broadcast_to(blocks.get(name, np.zeros(w)), (*shape, w)) for name, w in widths.items()], axis=-1
+        )
+
+    def split(self, residual: Array, rows: Array) -> Evaluation:
+        """The evaluation of residuals (t, r, m) whose derivatives (t, r, m, 6 + u) stand side by side."""
+        return Evaluation(residual, rows[..., :6], rows[..., 6:] if self.parts else None)
+
+
+def chosen(unknown: tuple[str, ...], possible: tuple[str, ...], kind: str) -> tuple[str, ...]:
+    """What a kind is told is unknown, as a tuple; DataError names what can be."""
+    named = (unknown,) if isinstance(unknown, str) else tuple(unknown)
+    for name in named:
+        if name not in possible:
+            raise DataError(f"{name!r} cannot be unknown in the kind {kind!r}; what can be is {', '.join(possible)}")
+    return named

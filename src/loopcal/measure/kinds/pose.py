@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kind `pose`: position and full orientation of the tool in a known frame."""
+"""Kind `pose`: position and full orientation of the tool in a frame."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar, Self
@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import se3
+from loopcal.measure.closed_form import hand_eye
+from loopcal.measure.kinds import parts
 from loopcal.measure.kinds.kind import Bools, Column, Evaluation
-from loopcal.measure.kinds.tool import ToolKind, position_columns
+from loopcal.measure.kinds.tool import ToolKind, position_columns, stacked
 from loopcal.measure.orientation import Orientation, orientation
 from loopcal.units import Dimension
 
@@ -30,7 +32,7 @@ class Pose(ToolKind):
         is a rotation error rx ry rz about the axes of the frame; noise of angles is theirs, and is mapped.
     form
         The same as an object.
-    T_base_frame, T_platform_tool
+    T_base_frame, T_platform_tool, unknown, frame
         See `ToolKind`.
 
     Raises
@@ -50,9 +52,9 @@ class Pose(ToolKind):
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
-        """One of each form of orientation."""
+        """One of each form of orientation, and one with unknown frame and tool."""
         names = ("rotation-vector", "quaternion", "tilt-torsion", "euler-xyz", "euler-ZYX", "euler-ZXZ")
-        return tuple(cls(name) for name in names)
+        return (*(cls(name) for name in names), cls(unknown=("frame", "tool"), frame="tracker"))
 
     @property
     def columns(self) -> tuple[Column, ...]:
@@ -86,24 +88,44 @@ class Pose(ToolKind):
             ]
         return tuple(found)
 
-    def _evaluate(self, T: Array, measured: Array, unknowns: Array | None) -> Evaluation:
-        seen = self.seen(T)
+    @property
+    def neutral(self) -> Array:
+        """The identity for an orientation that was not measured."""
+        return np.array([1.0, *[0.0] * 6] if self.orientation == "quaternion" else [0.0] * 6)
+
+    def _evaluate(self, T: Array, measured: Array, values: Array, joints: Array) -> Evaluation:
+        seen = self.seen(T, values)
         turned = self.form.to_matrix(self._filled(measured))
         rotation = se3.log_so3(seen[..., :3, :3] @ np.swapaxes(turned, -1, -2))
         residual = np.concatenate([rotation, seen[..., :3, 3] - measured[..., -3:]], axis=-1)
-        moved = self.transport(T)
+        moved = self.transport(T, values)
         turning = se3.left_jacobian_inverse_so3(rotation) @ moved[..., :3, :]
-        return Evaluation(residual, np.concatenate([turning, moved[..., 3:, :]], axis=-2))
+        return self.split(residual, np.concatenate([turning, moved[..., 3:, :]], axis=-2))
 
-    def measure(self, T: Array, noise: Array, unknowns: Array | None = None) -> Array:
+    def measure(self, T: Array, noise: Array, unknowns: Array | None = None, joints: Array | None = None) -> Array:
         """Columns (t, r, c) of the tool pose with noise (t, r, 6): a rotation error, or added to the angles."""
-        seen = self.seen(T)
+        seen = self.seen(T, unknowns)
         if self.form.angles:
             turned = self.form.from_matrix(seen[..., :3, :3])
             turned = turned + noise[..., :3]
         else:
             turned = self.form.from_matrix(se3.exp_so3(noise[..., :3]) @ seen[..., :3, :3])
         return np.concatenate([turned, seen[..., :3, 3] + noise[..., 3:]], axis=-1)
+
+    def starts(self, T: Array, measured: Array) -> Array:
+        """Frame and tool in closed form, from rows that are complete."""
+        whole = ~np.any(np.isnan(measured), axis=-1)
+        if not self.unknown or np.count_nonzero(whole) < 3:
+            return super().starts(T, measured)
+        seen = se3.pose(self.form.to_matrix(measured[whole, :-3]), measured[whole, -3:])
+        frame, tool = hand_eye(
+            T[whole],
+            seen,
+            None if "frame" in self.unknown else self.T_base_frame,
+            None if "tool" in self.unknown else self._tool(),
+        )
+        found = {"frame": parts.frame_values(self.T_base_frame, frame), "tool": parts.frame_values(self._tool(), tool)}
+        return stacked(self, found, 1)
 
     def noise_map(self, measured: Array) -> Array:
         """Matrix (..., 6, 6): E of the angles for the rotation, the identity for x y z."""
@@ -114,7 +136,6 @@ class Pose(ToolKind):
         return np.concatenate([top, np.concatenate([zero, identity], axis=-1)], axis=-2)
 
     def _filled(self, measured: Array) -> Array:
-        """Orientation columns, with the identity where they were not measured."""
-        neutral = np.array([1.0, 0.0, 0.0, 0.0] if self.orientation == "quaternion" else [0.0, 0.0, 0.0])
+        """Orientation columns, with the identity where any of them was not measured."""
         turned = measured[..., :-3]
-        return np.where(np.any(np.isnan(turned), axis=-1, keepdims=True), neutral, turned)
+        return np.where(np.any(np.isnan(turned), axis=-1, keepdims=True), self.neutral[:-3], turned)

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames, points and surfaces from measurements in closed form, as starts that need no guess. Arrays only; SI.
+
+A rotation that enters squares linearly is found on the whole rotation group: `rotations` minimises a quadratic form of
+its nine entries from 24 orientations spread evenly over all of them.
+"""
+
+from itertools import permutations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopcal import se3
+
+Array = NDArray[np.float64]
+
+_SIGNED = [np.eye(3)[list(order)] * sign for order in permutations(range(3)) for sign in product((1.0, -1.0), repeat=3)]
+OCTAHEDRAL: Array = np.array([R for R in _SIGNED if np.linalg.det(R) > 0.0])
+"""The 24 rotations (24, 3, 3) of a cube: none is further than 63 degrees from the nearest."""
+OCTAHEDRAL.setflags(write=False)
+
+
+def nearest_rotation(M: Array) -> Array:
+    """Rotations (.., 3, 3) nearest to matrices (.., 3, 3)."""
+    U, _, V = np.linalg.svd(M)
+    sign = np.ones(M.shape[:-1])
+    sign[..., 2] = np.sign(np.linalg.det(U @ V))
+    return (U * sign[..., None, :]) @ V
+
+
+def kabsch(points: Array, seen: Array) -> Array:
+    """Pose T (4, 4) that takes points (r, 3) nearest to others (r, 3), in the mean square.
+
+    Source: Umeyama, IEEE Transactions on Pattern Analysis 13(4) 376, 1991, doi 10.1109/34.88573, without the scale.
+    """
+    middle, centre = points.mean(axis=0), seen.mean(axis=0)
+    R = nearest_rotation((seen - centre).T @ (points - middle))
+    return se3.pose(R, centre - R @ middle)
+
+
+def rotations(H: Array, g: Array, best: int = 3) -> Array:
+    """Rotations (k, 3, 3) at the lowest local minima of `v' H v - 2 g' v`, v the nine entries of R row by row.
+
+    Gauss-Newton on the group from the rotation nearest to the unconstrained minimum and from the 24 of a cube.
+
+    Parameters
+    ----------
+    H : (9, 9), positive semidefinite. g : (9,)
+    best : how many different ones at most.
+    """
+    free = nearest_rotation(np.linalg.lstsq(H, g, rcond=1e-12)[0].reshape(3, 3))
+    R = np.concatenate([free[None], OCTAHEDRAL])
+    root = _square_root(H)
+    target = np.linalg.lstsq(root.T, g, rcond=1e-10)[0]
+    damping = np.full((len(R), 1, 1), 1e-3 * max(float(np.trace(H)), 1e-300))
+    cost = _cost(root, target, R)
+    for _ in range(40):
+        residual = R.reshape(-1, 9) @ root.T - target
+        # dR = hat(w) R for w along each axis
+        J = root @ np.stack([(se3.hat(axis) @ R).reshape(-1, 9) for axis in np.eye(3)], axis=-1)
+        A = np.swapaxes(J, -1, -2) @ J + damping * np.eye(3)
+        step = -np.linalg.solve(A, np.swapaxes(J, -1, -2) @ residual[..., None])[..., 0]
+        moved = se3.exp_so3(step) @ R
+        new = _cost(root, target, moved)
+        better = new <= cost
+        R, cost = np.where(better[:, None, None], moved, R), np.where(better, new, cost)
+        damping = np.where(better[:, None, None], 0.1 * damping, 10.0 * damping)
+    return distinct(R[np.argsort(cost)])[:best]
+
+
+def distinct(R: Array) -> Array:
+    """Those of rotations (k, 3, 3) that are further than 0.02 from all before them."""
+    kept: list[Array] = []
+    for one in R:
+        if all(np.abs(one - other).max() > 0.02 for other in kept):
+            kept.append(one)
+    return np.array(kept)
+
+
+def hand_eye(T: Array, seen: Array, frame: Array | None, tool: Array | None) -> tuple[Array, Array]:
+    """Frame F and tool X with `F seen = T X`; one of them may be known.
+
+    Rotations: the trace of `sum R_F' R_T R_X R_seen'` is largest at the leading singular vectors of `sum R_T kron R_seen`
+    (Shah, Journal of Mechanisms and Robotics 5(3) 031007, 2013, doi 10.1115/1.4024473). Translations: linear.
+
+    Parameters
+    ----------
+    T : (r, 4, 4) T_base_platform. seen : (r, 4, 4) T_frame_tool. frame, tool : (4, 4), None where unknown.
+    """
+    A, B = T[:, :3, :3], seen[:, :3, :3]
+    if tool is not None:
+        R_F = nearest_rotation(np.einsum("rij,jk,rlk->il", A, tool[:3, :3], B)) if frame is None else frame[:3, :3]
+        R_X = tool[:3, :3]
+    elif frame is not None:
+        R_F = frame[:3, :3]
+        R_X = nearest_rotation(np.einsum("rji,jk,rkl->il", A, R_F, B))
+    else:
+        K = np.einsum("rij,rkl->ikjl", A, B).reshape(9, 9)
+        U, _, V = np.linalg.svd(K)
+        left, right = U[:, 0].reshape(3, 3), V[0].reshape(3, 3)
+        sign = 1.0 if np.linalg.det(left) > 0.0 else -1.0
+        R_F, R_X = nearest_rotation(sign * left), nearest_rotation(sign * right)
+    # R_F m + t_F = A t_X + t
+    one = np.broadcast_to(np.eye(3), A.shape)
+    known = T[:, :3, 3] - seen[:, :3, 3] @ R_F.T
+    columns = []
+    if frame is None:
+        columns.append(one)
+    else:
+        known = known - frame[:3, 3]
+    if tool is None:
+        columns.append(-A)
+    else:
+        known = known + A @ tool[:3, 3]
+    found = np.linalg.lstsq(np.concatenate(columns, axis=-1).reshape(known.size, -1), known.ravel(), rcond=1e-9)[0]
+    t_F = found[:3] if frame is None else frame[:3, 3]
+    t_X = found[-3:] if tool is None else tool[:3, 3]
+    return se3.pose(R_F, t_F), se3.pose(R_X, t_X)
+
+
+def frame_and_points(seen: Array, moving: Array, known: Array) -> tuple[Array, Array]:
+    """Frames and points from what a frame saw of points on a moving body: `R seen + t = moving p + known`.
+
+    Given R, the rest is linear; eliminating it leaves a quadratic form of R.
+
+    Parameters
+    ----------
+    seen : (q, 3) in the frame. moving : (q, 3, w). known : (q, 3).
+
+    Returns
+    -------
+    frames : (k, 4, 4) candidates. points : (k, w) with each.
+    """
+    q, w = len(seen), moving.shape[-1]
+    C = np.concatenate([moving, -np.broadcast_to(np.eye(3), (q, 3, 3))], axis=-1).reshape(3 * q, w + 3)
+    M = (np.eye(3)[None, :, :, None] * seen[:, None, None, :]).reshape(3 * q, 9)
+    Q = _range(C)
+    b = known.ravel()
+    M_out, b_out = M - Q @ (Q.T @ M), b - Q @ (Q.T @ b)
+    R = rotations(M_out.T @ M_out, M_out.T @ b_out)
+    rest = np.linalg.lstsq(C, (M @ R.reshape(-1, 9).T) - b[:, None], rcond=1e-9)[0].T
+    return se3.pose(R, rest[:, w:]), rest[:, :w]
+
+
+def resection(rays: Array, points: Array) -> Array:
+    """Frames (k, 4, 4) of a station from unit rays (r, 3) in it towards points (r, 3) in the base.
+
+    `(1 - b b') (A p - s) = 0` with A = R' and s = R' t: linear in both; eliminating s leaves a quadratic form of A.
+    """
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    middle = points.mean(axis=0)
+    M = np.einsum("rij,rk->rijk", across, points - middle).reshape(-1, 9)
+    C = across.reshape(-1, 3)
+    Q = _range(C)
+    out = M - Q @ (Q.T @ M)
+    A = rotations(out.T @ out, np.zeros(9), best=8)
+    s = np.linalg.lstsq(C, M @ A.reshape(-1, 9).T, rcond=1e-9)[0].T
+    ahead = np.einsum("ri,kij,rj->kr", rays, A, points - middle) - np.einsum("ri,ki->kr", rays, s)
+    order = np.argsort(-np.mean(ahead > 0.0, axis=1), kind="stable")
+    R = np.swapaxes(A, -1, -2)
+    return se3.pose(R, (R @ s[..., None])[..., 0] + middle)[order]
+
+
+def trilateration(points: Array, distances: Array, *, with_offset: bool) -> tuple[Array, Array]:
+    """Points c and offsets o with `|p - c| + o = d`: both sides of a plane where all points lie in one.
+
+    `|p|^2 - d^2 = 2 p'c - 2 d o - (|c|^2 - o^2)` is linear in c, o and the bracket.
+
+    Returns
+    -------
+    centres : (k, 3), offsets : (k,); k = 1 or 2.
+    """
+    middle = points.mean(axis=0)
+    p = points - middle
+    normal = np.linalg.svd(p, full_matrices=False)[2][2]
+    flat = np.linalg.norm(p @ normal) < 1e-6 * np.linalg.norm(p)
+    columns = [2.0 * p, -np.ones((len(p), 1))] + ([-2.0 * distances[:, None]] if with_offset else [])
+    found = np.linalg.lstsq(np.concatenate(columns, axis=1), np.sum(p * p, axis=1) - distances**2, rcond=1e-9)[0]
+    offset = found[4] if with_offset else 0.0
+    centre = found[:3]
+    if not flat:
+        return (centre + middle)[None], np.array([offset])
+    foot = centre - (centre @ normal) * normal
+    height = np.sqrt(max(float(np.mean((distances - offset) ** 2 - np.sum((p - foot) ** 2, axis=1))), 0.0))
+    return middle + foot + height * np.array([[1.0], [-1.0]]) * normal, np.array([offset, offset])
+
+
+def directions(seen: Array, turns: Array, axis: Array | None) -> tuple[Array, Array]:
+    """Orientations R and directions a with `R seen = turns a`, both unknown (or the direction known), best first.
+
+    Each is found in closed form from the other, in turn, from 24 orientations.
+
+    Parameters
+    ----------
+    seen : (r, 3) unit, in the frame. turns : (r, 3, 3). axis : (3,) or None.
+
+    Returns
+    -------
+    R : (k, 3, 3). a : (k, 3).
+    """
+    if axis is not None:
+        R = nearest_rotation(np.einsum("rij,j,rk->ik", turns, axis, seen))
+        return R[None], axis[None]
+    R = np.array(OCTAHEDRAL)
+    a = np.zeros((len(R), 3))
+    for _ in range(200):
+        a = np.einsum("rji,kjl,rl->ki", turns, R, seen)
+        a /= np.maximum(np.linalg.norm(a, axis=-1, keepdims=True), 1e-300)
+        R = nearest_rotation(np.einsum("rij,kj,rl->kil", turns, a, seen))
+    missed = np.linalg.norm(np.einsum("kij,rj->kri", R, seen) - np.einsum("rij,kj->kri", turns, a), axis=(1, 2))
+    order = np.argsort(missed)
+    return R[order][:6], a[order][:6]
+
+
+def _cost(root: Array, target: Array, R: Array) -> Array:
+    return np.sum((R.reshape(-1, 9) @ root.T - target) ** 2, axis=-1)
+
+
+def _square_root(H: Array) -> Array:
+    """A matrix S with S'S = H."""
+    values, vectors = np.linalg.eigh(H)
+    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+
+
+def _range(C: Array) -> Array:
+    """Orthonormal basis of the columns of C."""
+    U, s, _ = np.linalg.svd(C, full_matrices=False)
+    return U[:, s > 1e-9 * s[0]]

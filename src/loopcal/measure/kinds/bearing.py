@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kind `bearing`: two angles of a point from a station, by a theodolite or a camera."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopcal import se3
+from loopcal.errors import DataError
+from loopcal.measure.closed_form import resection
+from loopcal.measure.kinds import parts
+from loopcal.measure.kinds.kind import Column
+from loopcal.measure.kinds.target import TargetKind, points_of
+from loopcal.measure.kinds.tool import stacked
+from loopcal.units import Dimension
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Bearing(TargetKind):
+    """Two angles of each target. Residual: differences of angles, wrapped.
+
+    theodolite: `azimuth = atan2(y, x)`, `elevation = atan2(z, hypot(x, y))`. camera, which looks along its z axis:
+    `azimuth = atan2(x, z)`, `elevation = atan2(y, z)`.
+
+    Parameters
+    ----------
+    form : str
+        "theodolite" or "camera".
+    Others: see `TargetKind`; "frame" (the station) and "targets" may be unknown.
+
+    Raises
+    ------
+    DataError
+        As `TargetKind`, or for another form.
+    """
+
+    form: str = "theodolite"
+
+    name: ClassVar[str] = "bearing"
+    per_target: ClassVar[tuple[Column, ...]] = (Column("azimuth", Dimension.ANGLE), Column("elevation", Dimension.ANGLE))
+    wraps: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.form not in ("theodolite", "camera"):
+            raise DataError(f"the form of a bearing is {self.form!r}; use theodolite or camera")
+
+    @classmethod
+    def examples(cls) -> tuple[Self, ...]:
+        """A theodolite, a camera at an unknown station, and two targets."""
+        station = se3.pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
+        behind = se3.pose(np.eye(3), np.array([0.1, -0.1, -2.5]))
+        pair = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02]])
+        return (
+            cls(T_base_frame=station),
+            cls(T_base_frame=behind, form="camera", unknown=("frame",), frame="camera"),
+            cls(targets=("a", "b"), places=pair, T_base_frame=station, unknown=("frame", "targets"), frame="station"),
+        )
+
+    def predict(self, x: Array, values: Array) -> tuple[Array, Array, Mapping[str, Array]]:
+        """Both angles of points x (.., k, 3) and their slopes."""
+        a, b, c = x[..., 0], x[..., 1], x[..., 2]
+        zero = np.zeros_like(a)
+        if self.form == "camera":
+            across, up = a * a + c * c, b * b + c * c
+            angles = [np.arctan2(a, c), np.arctan2(b, c)]
+            first, second = [c / across, zero, -a / across], [zero, c / up, -b / up]
+        else:
+            flat = a * a + b * b
+            reach, level = flat + c * c, np.sqrt(flat)
+            angles = [np.arctan2(b, a), np.arctan2(c, level)]
+            first = [-b / flat, a / flat, zero]
+            second = [-a * c / (level * reach), -b * c / (level * reach), level / reach]
+        slopes = np.stack([np.stack(first, axis=-1), np.stack(second, axis=-1)], axis=-2)
+        return np.stack(angles, axis=-1), slopes, {}
+
+    def rays(self, measured: Array) -> Array:
+        """Unit vectors (.., 3) of measured angles (.., 2)."""
+        azimuth, elevation = measured[..., 0], measured[..., 1]
+        if self.form == "camera":
+            ray = np.stack([np.tan(azimuth), np.tan(elevation), np.ones_like(azimuth)], axis=-1)
+            # behind the camera the tangents point ahead
+            ray = np.where((np.cos(azimuth) < 0.0)[..., None], -ray, ray)
+            return ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+        level = np.cos(elevation)
+        return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
+
+    def starts(self, T: Array, measured: Array) -> Array:
+        """The station by resection, targets where they are stated."""
+        _, _, points, seen = points_of(self, T, measured)
+        if "frame" not in self.unknown or len(seen) < 4:
+            return self.nominal[None]
+        frames = resection(self.rays(seen), points)
+        return stacked(self, {"frame": parts.frame_values(self.T_base_frame, frames)}, len(frames))

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kind `inclination`: two tilts of the platform against gravity, by inclinometers mounted on it."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopcal.measure.arrays import stored_pose
+from loopcal.measure.kinds.aim import AimKind
+from loopcal.measure.kinds.kind import Column, chosen
+from loopcal.measure.kinds.surface import stored_direction
+from loopcal.units import Dimension
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Inclination(AimKind):
+    """Elevations of a sensor's x and y axis above the horizontal. Residual: differences of angles.
+
+    With the upward vertical d in axes of the sensor: `tilt_x = atan2(d_x, hypot(d_y, d_z))`, `tilt_y` likewise.
+
+    Parameters
+    ----------
+    up : (3,)
+        The upward vertical in the base, of any length. Where unknown, the value it is counted from.
+    T_platform_sensor : (4, 4)
+        Mounting of the sensor, of which only the orientation matters.
+    sensor : str
+        Name of the sensor, after which the unknowns of its mounting are called.
+    unknown : tuple of str
+        Which of "mounting" and "gravity" are unknown.
+
+    Raises
+    ------
+    DataError
+        If the vertical has no length, the mounting is no pose, or something else is said to be unknown.
+    """
+
+    up: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    T_platform_sensor: Array = field(default_factory=lambda: np.eye(4))
+    sensor: str = "inclinometer"
+
+    name: ClassVar[str] = "inclination"
+    possible: ClassVar[tuple[str, str]] = ("mounting", "gravity")
+    inward: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "up", stored_direction(self.up, "the vertical"))
+        object.__setattr__(self, "T_platform_sensor", stored_pose(self.T_platform_sensor, "T_platform_sensor"))
+        object.__setattr__(self, "unknown", chosen(self.unknown, self.possible, self.name))
+
+    @classmethod
+    def examples(cls) -> tuple[Self, ...]:
+        """A base that stands level, an unknown vertical, and an unknown mounting too."""
+        return (cls(), cls(unknown=("gravity",)), cls(unknown=("mounting", "gravity"), sensor="level"))
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Two angles."""
+        return (Column("tilt_x", Dimension.ANGLE), Column("tilt_y", Dimension.ANGLE))
+
+    @property
+    def stated(self) -> tuple[str, Array, str, Array]:
+        """Mounting and vertical."""
+        return self.sensor, self.T_platform_sensor[:3, :3], "gravity", self.up
+
+    def predict(self, d: Array) -> tuple[Array, Array]:
+        """Both elevations (.., 2) and their slopes (.., 2, 3)."""
+        x, y, z = d[..., 0], d[..., 1], d[..., 2]
+        level_x, level_y = np.sqrt(y * y + z * z), np.sqrt(x * x + z * z)
+        angles = np.stack([np.arctan2(x, level_x), np.arctan2(y, level_y)], axis=-1)
+        # d has length one
+        first = np.stack([level_x, -x * y / level_x, -x * z / level_x], axis=-1)
+        second = np.stack([-x * y / level_y, level_y, -y * z / level_y], axis=-1)
+        return angles, np.stack([first, second], axis=-2)
+
+    def directions(self, measured: Array) -> Array:
+        """The upward vertical in the sensor, which stands nearer upright than upside down."""
+        side = np.sin(measured)
+        rest = np.sqrt(np.maximum(1.0 - np.sum(side * side, axis=-1, keepdims=True), 0.0))
+        d = np.concatenate([side, rest], axis=-1)
+        return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+    def doubts(self, measured: Array) -> tuple[tuple[int, str], ...]:
+        """Rows whose two tilts no direction can have."""
+        with np.errstate(invalid="ignore"):
+            wrong = np.flatnonzero(
+                (np.sum(np.sin(measured) ** 2, axis=-1) > 1.0) | np.any(np.abs(measured) > np.pi / 2, axis=-1)
+            )
+        return tuple(
+            (
+                int(i),
+                f"has tilts of {np.rad2deg(measured[i, 0]):.6g} and {np.rad2deg(measured[i, 1]):.6g} deg, which no"
+                " direction has: elevations of two axes at right angles add up to at most 90 deg; check the unit",
+            )
+            for i in wrong
+        )

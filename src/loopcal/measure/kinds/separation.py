@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kind `separation`: the distance between where a point was at two poses, by a ballbar or callipers on a printed part."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopcal.measure.kinds.distance import not_above_zero
+from loopcal.measure.kinds.kind import Column, Evaluation
+from loopcal.measure.kinds.target import TargetKind, length_of, offset_of
+from loopcal.parameters import Parameter
+from loopcal.units import Dimension
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Separation(TargetKind):
+    """Distance between two poses of each target. Residual: `|x_2 - x_1| + offset - measured`.
+
+    A row names two poses; no frame matters.
+
+    Parameters
+    ----------
+    See `TargetKind`; "targets" and "offset" (the callipers' zero, the width of a printed line) may be unknown.
+    """
+
+    name: ClassVar[str] = "separation"
+    links: ClassVar[int] = 2
+    per_target: ClassVar[tuple[Column, ...]] = (Column("separation", Dimension.LENGTH),)
+    possible: ClassVar[tuple[str, ...]] = ("targets", "offset")
+
+    @classmethod
+    def examples(cls) -> tuple[Self, ...]:
+        """The tool's point, and an unknown point with unknown zero."""
+        return (cls(), cls(targets=("nozzle",), unknown=("targets", "offset")))
+
+    def own_part(self, name: str) -> tuple[Parameter, ...]:
+        """One unknown: the offset."""
+        return self.offset_part()
+
+    def doubts(self, measured: Array) -> tuple[tuple[int, str], ...]:
+        """Rows with a distance that is none."""
+        return not_above_zero(measured)
+
+    def predict(self, x: Array, values: Array) -> tuple[Array, Array, Mapping[str, Array]]:
+        """Length (.., k, 1) of differences x (.., k, 3), and unit vectors."""
+        offset, blocks = offset_of(self, values)
+        length, unit = length_of(x)
+        return length + offset, unit[..., None, :], blocks
+
+    def _linked(self, T: Array, values: Array) -> tuple[Array, Array, Array | None]:
+        """Columns (t, r, m), derivatives (t, r, 2, m, 6) and (t, r, m, u)."""
+        x, rows = self.sight(T, values[..., None, :])
+        predicted, unit, blocks = self.predict(x[..., 1, :, :] - x[..., 0, :, :], values)
+        each = unit[..., None, :, :, :] @ rows * np.array([-1.0, 1.0])[:, None, None, None]
+        own = np.sum(each, axis=-4) + self.columns_of(blocks, predicted.shape)
+        jacobian = each[..., 0, :6]
+        if not self.parts:
+            return predicted[..., 0], jacobian, None
+        return predicted[..., 0], jacobian, own[..., 0, 6:]
+
+    def _evaluate(self, T: Array, measured: Array, values: Array, joints: Array) -> Evaluation:
+        predicted, jacobian, own = self._linked(T, values)
+        return Evaluation(predicted - measured, jacobian, own)
+
+    def measure(self, T: Array, noise: Array, unknowns: Array | None = None, joints: Array | None = None) -> Array:
+        """Columns (t, r, c) with noise added."""
+        return self._linked(T, self.values(unknowns))[0] + noise
