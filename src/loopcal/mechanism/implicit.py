@@ -133,7 +133,7 @@ class Linearised:
         columns = _columns(np.flatnonzero(touched))
         E = block.E[:, :, k]
         right = np.matmul(E.reshape(len(E), E.shape[1] * E.shape[2], width), self.of_slots[:, own, columns])
-        right = right.reshape(*right.shape[:1], *E.shape[1:3], -1)
+        right = right.reshape(len(right), *E.shape[1:3], right.shape[-1])
         for j, a in driven:
             for i, term in enumerate(self.terms):
                 slopes = self.of_terms[:, None, None, a, i, columns]

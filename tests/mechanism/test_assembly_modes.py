@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All modes: 40 of Dietmaier's hexapod, those of known machines, and the choice of one by `start`."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from loopcal.errors import DataError, MechanismError
+from loopcal.io import load_robot
+from loopcal.mechanism import build, coordinates, forward, inverse
+from loopcal.mechanism.assembly_modes import assembly_modes, working_modes
+from loopcal.mechanism.families.gough import Gough
+from loopcal.mechanism.records import Pose
+from tests import zoo
+
+# P. Dietmaier, "The Stewart-Gough platform of general geometry can have 40 real postures" (1998,
+# doi:10.1007/978-94-015-9064-8_1); numbers as in the tests of Drake's global inverse kinematics. Dimensionless.
+DIETMAIER_BASE = (
+    (0.0, 0.0, 0.0),
+    (1.107915, 0.0, 0.0),
+    (0.549094, 0.756063, 0.0),
+    (0.735077, -0.223935, 0.525991),
+    (0.514188, -0.526063, -0.368418),
+    (0.590473, 0.094733, -0.205018),
+)
+DIETMAIER_PLATFORM = (
+    (0.0, 0.0, 0.0),
+    (0.542805, 0.0, 0.0),
+    (0.956919, -0.528915, 0.0),
+    (0.665885, -0.353482, 1.402538),
+    (0.478359, 1.158742, 0.107672),
+    (-0.137087, -0.235121, 0.353913),
+)
+DIETMAIER_LENGTHS = (1.0, 0.645275, 1.086284, 1.503439, 1.281933, 0.771071)
+
+
+def dietmaier():
+    home = Pose(z=0.8, roll=0.3, pitch=0.2, yaw=0.5)
+    record = Gough("dietmaier", base=DIETMAIER_BASE, platform=DIETMAIER_PLATFORM, lengths=DIETMAIER_LENGTHS, home=home)
+    return build(record.expand())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_dietmaiers_hexapod_has_forty_modes(seed):
+    found = assembly_modes(dietmaier(), np.zeros(6), seed=seed)
+    assert len(found) == 40
+    assert found.solution.residual.max() < 1e-12  # of legs of length 1
+    for T in found.solution.T:  # closure once more, plainly
+        legs = np.array(DIETMAIER_PLATFORM) @ T[:3, :3].T + T[:3, 3] - DIETMAIER_BASE
+        assert_allclose(np.linalg.norm(legs, axis=1), DIETMAIER_LENGTHS, atol=1e-13)
+    assert found.quiet >= 8192
+    assert str(found).startswith("40 modes found from ")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("robot", "coordinates", "modes", "above"),
+    [(zoo.hexapod, (0.013, -0.007, 0.205, 0.05, -0.08, 0.11), 8, 4), (zoo.nategh, (0.03, -0.02, 0.8, 0.1, -0.05, 0.15), 16, 8)],
+)
+def test_hexapods_with_plane_base_and_platform_have_as_many_modes_above_as_below(robot, coordinates, modes, above):
+    machine = robot()
+    at = inverse(machine, np.array(coordinates))
+    found = assembly_modes(machine, at.q[0])
+    assert (len(found), int((found.solution.T[:, 2, 3] > 0).sum())) == (modes, above)
+    assert np.abs(found.solution.T - at.T).max(axis=(1, 2)).min() < 1e-9  # the pose it came from is among them
+
+
+@pytest.mark.parametrize(("name", "modes"), [("five-bar", 2), ("linear-delta", 2), ("rotary-delta", 2), ("cable-4", 1)])
+def test_known_machines_have_as_many_assembly_modes_as_spheres_or_circles_meet(name, modes):
+    robot = load_robot(name)
+    at = inverse(robot, robot.home[None])
+    assert len(assembly_modes(robot, at.q[0], quiet=4096)) == modes
+
+
+@pytest.mark.parametrize(("name", "modes"), [("five-bar", 4), ("3-rrr", 8), ("rotary-delta", 8), ("3-prs", 8)])
+def test_each_limb_with_one_drive_doubles_the_working_modes(name, modes):
+    robot = load_robot(name)
+    target = inverse(robot, robot.home[None])
+    home = working_modes(robot, np.array([target_of(robot)]))
+    assert len(home) == modes
+    assert np.abs(home.solution.q - target.q).max(axis=1).min() < 1e-9  # [rad, m]
+
+
+def target_of(robot):
+    return coordinates.read(robot.home, robot.controlled)
+
+
+def test_start_chooses_the_mode():
+    robot = load_robot("five-bar")
+    modes = working_modes(robot, target_of(robot))
+    for row in range(len(modes)):
+        one = modes.solution.take(np.array([row]))
+        near = inverse(robot, target_of(robot) + np.array([0.005, -0.005]), start=one)
+        assert np.abs(near.q - one.q).max() < 0.1
+    q = modes.solution.q[0]
+    both = assembly_modes(robot, q)
+    for row in range(len(both)):
+        one = both.solution.take(np.array([row]))
+        assert_allclose(forward(robot, q[None], start=one).T, one.T, atol=1e-12)
+
+
+def test_readings_that_allow_no_pose_have_no_modes():
+    found = assembly_modes(load_robot("linear-delta"), [5.0, -5.0, 0.0], quiet=2048)
+    assert len(found) == 0
+    assert "0 modes" in str(found)
+
+
+def test_a_platform_that_is_free_to_move_is_said():
+    with pytest.raises(MechanismError, match="new ones keep coming"):
+        assembly_modes(dietmaier(), np.zeros(6), quiet=4096, most=2048)
+
+
+def test_a_wrong_number_of_readings_is_refused():
+    with pytest.raises(DataError, match="3 readings were given"):
+        assembly_modes(zoo.hexapod(), np.zeros(3))

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How passive joints follow parameters and readings, against differences."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from loopcal.mechanism import build, forward
+from loopcal.mechanism.families.gough import Gough
+from loopcal.mechanism.kinematics import solution_of
+from loopcal.mechanism.passive import passive_sensitivity
+from loopcal.mechanism.records import Pose
+from loopcal.mechanism.trials import forward_trials
+from loopcal.units import Dimension
+from tests import zoo
+from tests.jacobians import check_jacobian
+from tests.mechanism.test_kinematics import sampled
+
+
+def ups():
+    record = Gough(
+        name="ups",
+        base=tuple(map(tuple, (zoo.HEXAPOD_BASE * zoo.MM).tolist())),
+        platform=tuple(map(tuple, (zoo.HEXAPOD_PLATFORM * zoo.MM).tolist())),
+        lengths=zoo.HEXAPOD_LENGTH * zoo.MM,
+        home=Pose(z=0.2),
+        legs="ups",
+        error_model="complete",
+    )
+    return build(record.expand(), record=record)
+
+
+@pytest.mark.parametrize("name", ["menagerie", "three_prs", "planar_rrr"])
+def test_passive_joints_follow_parameters_and_readings_as_differences_say(name):
+    robot, sol, _ = sampled(name, 1)
+    values, q = robot.values[None], sol.q[None]
+    state = forward_trials(robot, values, q, start=sol.state)
+    found = passive_sensitivity(robot, values, q, state)
+    assert found.names == sol.passive_names
+    dimensions = [*robot.parameters.dimensions, *(a.dimension for a in robot.actuators)]
+    unit = np.array([robot.size if d is Dimension.LENGTH else 1.0 for d in dimensions])
+    moved, p = np.diag(unit), values.shape[1]
+
+    def joints(x):  # one trial a parameter or reading
+        at = forward_trials(robot, values + x[0] * moved[:, :p], q + x[0] * moved[:, None, p:], start=state)
+        by_limb = sorted((limb, g, k) for g, group in enumerate(robot.program.groups) for k, limb in enumerate(group.limbs))
+        return np.concatenate(
+            [at.joints[g][:, 0, k, : len(robot.program.groups[g].joints)][:, passive(robot, limb)] for limb, g, k in by_limb],
+            axis=1,
+        )
+
+    both = np.concatenate([found.parameters, found.readings], axis=-1)[0, 0] * unit
+    check_jacobian(
+        joints, both.T[..., None], np.zeros(1), scale=0.1,
+        atol=1e-6, atol_reason="closure to 1e-13, condition of platform and limb 30 each, step 1e-4",
+    )  # fmt: skip
+
+
+def passive(robot, limb):
+    return [j for j, joint in enumerate(robot.assembly.limbs[limb].joints) if joint.actuator is None]
+
+
+def test_blocks_of_rows_change_nothing():
+    robot = ups()
+    q = np.random.default_rng(0).uniform(-0.01, 0.01, (1, 700, 6))
+    values = robot.values[None]
+    state = forward_trials(robot, values, q)
+    whole = passive_sensitivity(robot, values, q, state)
+    single = forward(robot, q[0, 600:601])
+    alone = passive_sensitivity(robot, values, q[:, 600:601], single.state)
+    # numpy's matmul rounds a batch by its size; a turn per metre is about 10
+    np.testing.assert_allclose(whole.parameters[:, 600:601], alone.parameters, rtol=0, atol=1e-11)
+    assert solution_of(robot, state, q[0]).passive_names == whole.names
+
+
+def test_failed_rows_hold_no_numbers():
+    robot, q = ups(), np.zeros((1, 2, 6))
+    q[0, 1, 2] = np.nan
+    found = passive_sensitivity(robot, robot.values[None], q, forward_trials(robot, robot.values[None], q))
+    assert np.isfinite(found.parameters[0, 0]).all()
+    assert np.isnan(found.parameters[0, 1]).all()
+
+
+def test_a_driven_slide_does_not_make_the_joint_below_it_a_spinning_one():
+    # once the slide was taken at zero, where a universal joint turns nothing, and both its axes were held
+    robot = ups()
+    assert robot.notes == ()
+    assert_array_equal([g.held for g in robot.program.groups], [(False, False, False)])

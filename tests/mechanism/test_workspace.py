@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Positions drawn from a workspace: even, inside every stroke, the same for a seed; an empty workspace is said."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from loopcal.errors import MechanismError
+from loopcal.io import load_robot
+from loopcal.mechanism import build, forward
+from loopcal.mechanism.workspace import sample
+from tests import zoo
+
+
+def test_positions_are_inside_ranges_and_strokes_and_forward_leads_back():
+    robot = load_robot("hexapod-42")
+    found = sample(robot, 300, seed=1)
+    low, high = np.array([robot.assembly.workspace[name] for name in robot.controlled]).T
+    assert ((found.coordinates >= low) & (found.coordinates <= high)).all()
+    assert np.abs(found.solution.q).max() <= 0.075
+    assert_allclose(forward(robot, found.solution.q).T, found.solution.T, atol=1e-12)  # [1, m]: rounding over Newton
+    assert 0.95 < found.share < 1.0
+    assert all(name.startswith("stroke of q") for name in found.lost)
+
+
+def test_a_seed_gives_the_same_positions_and_another_one_others():
+    robot = zoo.delta()
+    assert_array_equal(sample(robot, 50, seed=3).coordinates, sample(robot, 50, seed=3).coordinates)
+    assert (sample(robot, 50, seed=3).coordinates != sample(robot, 50, seed=4).coordinates).all()
+
+
+def test_tilt_is_even_over_the_cap():
+    robot = load_robot("3-prs")
+    found = sample(robot, 4000, seed=0)
+    theta = found.coordinates[:, robot.controlled.index("theta")]
+    low, high = robot.assembly.workspace["theta"]
+    share = (np.cos(low) - np.cos(theta)) / (np.cos(low) - np.cos(high))
+    # uniform on (0, 1): the mean of 4000 is within 4 standard deviations of a half in all but 6 of 1e5 seeds
+    assert abs(share.mean() - 0.5) < 4 / np.sqrt(12 * 4000)
+    assert abs(np.quantile(share, 0.1) - 0.1) < 4 * np.sqrt(0.09 / 4000)
+
+
+def test_an_empty_workspace_is_said_with_its_reason():
+    robot = with_workspace({"x": (5.0, 6.0), "y": (-0.08, 0.08), "z": (0.0, 0.2)})
+    with pytest.raises(MechanismError, match=r"workspace is empty: 0 of .* because the loops cannot be closed"):
+        sample(robot, 10)
+    robot = with_workspace({"x": (-0.08, 0.08), "y": (-0.08, 0.08), "z": (0.0, 0.2)}, stroke=(0.9, 1.0))
+    with pytest.raises(MechanismError, match="because stroke of q1 is exceeded"):
+        sample(robot, 10)
+
+
+def test_a_range_that_is_missing_is_named():
+    with pytest.raises(MechanismError, match="states no workspace for y"):
+        sample(with_workspace({"x": (-0.1, 0.1), "z": (0.0, 0.1)}), 10)
+
+
+def with_workspace(ranges, stroke=None):
+    assembly = replace(zoo.delta().assembly, workspace=ranges)
+    if stroke:
+        assembly = replace(assembly, actuators=tuple(replace(a, stroke=stroke) for a in assembly.actuators))
+    return build(assembly)
