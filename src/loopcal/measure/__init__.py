@@ -1,18 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements: kinds, instruments, observations, and their simulation."""
+"""Measurements: kinds, instruments, observations, their unknowns, and their simulation."""
 
+from loopcal.measure.alignment import Alignment as Alignment
+from loopcal.measure.alignment import align as align
+from loopcal.measure.alignment import align_points as align_points
 from loopcal.measure.checks import check_actuators as check_actuators
 from loopcal.measure.checks import check_duplicates as check_duplicates
 from loopcal.measure.checks import check_strokes as check_strokes
 from loopcal.measure.commanded import readings_from_commanded as readings_from_commanded
+from loopcal.measure.evaluate import KindRows as KindRows
+from loopcal.measure.evaluate import evaluate_all as evaluate_all
+from loopcal.measure.evaluate import whitened_rows as whitened_rows
 from loopcal.measure.instrument import Instrument as Instrument
 from loopcal.measure.instrument import Sensor as Sensor
+from loopcal.measure.joints import joint_values as joint_values
+from loopcal.measure.joints import joints_looked_at as joints_looked_at
 from loopcal.measure.kinds import KINDS as KINDS
+from loopcal.measure.kinds import Autocollimation as Autocollimation
+from loopcal.measure.kinds import Bearing as Bearing
 from loopcal.measure.kinds import Column as Column
 from loopcal.measure.kinds import Component as Component
+from loopcal.measure.kinds import Direction as Direction
+from loopcal.measure.kinds import Distance as Distance
 from loopcal.measure.kinds import Evaluation as Evaluation
+from loopcal.measure.kinds import Inclination as Inclination
+from loopcal.measure.kinds import JointSensor as JointSensor
 from loopcal.measure.kinds import Kind as Kind
+from loopcal.measure.kinds import Line as Line
+from loopcal.measure.kinds import Locked as Locked
+from loopcal.measure.kinds import Plane as Plane
 from loopcal.measure.kinds import Pose as Pose
+from loopcal.measure.kinds import Position as Position
+from loopcal.measure.kinds import Separation as Separation
+from loopcal.measure.kinds import Sphere as Sphere
 from loopcal.measure.measurements import Measurements as Measurements
 from loopcal.measure.noise import Gaussian as Gaussian
 from loopcal.measure.noise import Noise as Noise
@@ -25,3 +45,6 @@ from loopcal.measure.simulate import Trials as Trials
 from loopcal.measure.simulate import sample_truth as sample_truth
 from loopcal.measure.simulate import simulate as simulate
 from loopcal.measure.simulate import simulate_trials as simulate_trials
+from loopcal.measure.starts import start_values as start_values
+from loopcal.measure.unknowns import LocalUnknowns as LocalUnknowns
+from loopcal.measure.unknowns import local_unknowns as local_unknowns

@@ -20,6 +20,11 @@ OCTAHEDRAL: Array = np.array([R for R in _SIGNED if np.linalg.det(R) > 0.0])
 OCTAHEDRAL.setflags(write=False)
 
 
+def linear(A: Array, b: Array) -> Array:
+    """Least-squares solution of A x = b, the shortest one where it is not unique (relative rank tolerance 1e-9)."""
+    return np.asarray(np.linalg.lstsq(A, b, rcond=1e-9)[0], dtype=float)
+
+
 def nearest_rotation(M: Array) -> Array:
     """Rotations (.., 3, 3) nearest to matrices (.., 3, 3)."""
     U, _, V = np.linalg.svd(M)
@@ -48,10 +53,10 @@ def rotations(H: Array, g: Array, best: int = 3) -> Array:
     H : (9, 9), positive semidefinite. g : (9,)
     best : how many different ones at most.
     """
-    free = nearest_rotation(np.linalg.lstsq(H, g, rcond=1e-12)[0].reshape(3, 3))
+    free = nearest_rotation(linear(H, g).reshape(3, 3))
     R = np.concatenate([free[None], OCTAHEDRAL])
     root = _square_root(H)
-    target = np.linalg.lstsq(root.T, g, rcond=1e-10)[0]
+    target = linear(root.T, g)
     damping = np.full((len(R), 1, 1), 1e-3 * max(float(np.trace(H)), 1e-300))
     cost = _cost(root, target, R)
     for _ in range(40):
@@ -59,7 +64,7 @@ def rotations(H: Array, g: Array, best: int = 3) -> Array:
         # dR = hat(w) R for w along each axis
         J = root @ np.stack([(se3.hat(axis) @ R).reshape(-1, 9) for axis in np.eye(3)], axis=-1)
         A = np.swapaxes(J, -1, -2) @ J + damping * np.eye(3)
-        step = -np.linalg.solve(A, np.swapaxes(J, -1, -2) @ residual[..., None])[..., 0]
+        step = np.asarray(-np.linalg.solve(A, np.swapaxes(J, -1, -2) @ residual[..., None])[..., 0], dtype=float)
         moved = se3.exp_so3(step) @ R
         new = _cost(root, target, moved)
         better = new <= cost
@@ -112,7 +117,7 @@ def hand_eye(T: Array, seen: Array, frame: Array | None, tool: Array | None) -> 
         columns.append(-A)
     else:
         known = known + A @ tool[:3, 3]
-    found = np.linalg.lstsq(np.concatenate(columns, axis=-1).reshape(known.size, -1), known.ravel(), rcond=1e-9)[0]
+    found = linear(np.concatenate(columns, axis=-1).reshape(known.size, -1), known.ravel())
     t_F = found[:3] if frame is None else frame[:3, 3]
     t_X = found[-3:] if tool is None else tool[:3, 3]
     return se3.pose(R_F, t_F), se3.pose(R_X, t_X)
@@ -138,7 +143,7 @@ def frame_and_points(seen: Array, moving: Array, known: Array) -> tuple[Array, A
     b = known.ravel()
     M_out, b_out = M - Q @ (Q.T @ M), b - Q @ (Q.T @ b)
     R = rotations(M_out.T @ M_out, M_out.T @ b_out)
-    rest = np.linalg.lstsq(C, (M @ R.reshape(-1, 9).T) - b[:, None], rcond=1e-9)[0].T
+    rest = linear(C, (M @ R.reshape(-1, 9).T) - b[:, None]).T
     return se3.pose(R, rest[:, w:]), rest[:, :w]
 
 
@@ -154,7 +159,7 @@ def resection(rays: Array, points: Array) -> Array:
     Q = _range(C)
     out = M - Q @ (Q.T @ M)
     A = rotations(out.T @ out, np.zeros(9), best=8)
-    s = np.linalg.lstsq(C, M @ A.reshape(-1, 9).T, rcond=1e-9)[0].T
+    s = linear(C, M @ A.reshape(-1, 9).T).T
     ahead = np.einsum("ri,kij,rj->kr", rays, A, points - middle) - np.einsum("ri,ki->kr", rays, s)
     order = np.argsort(-np.mean(ahead > 0.0, axis=1), kind="stable")
     R = np.swapaxes(A, -1, -2)
@@ -175,7 +180,7 @@ def trilateration(points: Array, distances: Array, *, with_offset: bool) -> tupl
     normal = np.linalg.svd(p, full_matrices=False)[2][2]
     flat = np.linalg.norm(p @ normal) < 1e-6 * np.linalg.norm(p)
     columns = [2.0 * p, -np.ones((len(p), 1))] + ([-2.0 * distances[:, None]] if with_offset else [])
-    found = np.linalg.lstsq(np.concatenate(columns, axis=1), np.sum(p * p, axis=1) - distances**2, rcond=1e-9)[0]
+    found = linear(np.concatenate(columns, axis=1), np.sum(p * p, axis=1) - distances**2)
     offset = found[4] if with_offset else 0.0
     centre = found[:3]
     if not flat:

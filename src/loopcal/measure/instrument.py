@@ -1,18 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
 """An instrument: the kinds it measures, each with its noise and its frame."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
 
 from loopcal.errors import DataError
 from loopcal.measure.kinds import Kind
 from loopcal.measure.noise import Noise
+from loopcal.measure.observations import indices, labels
 from loopcal.mechanism import Mechanism
+
+Ints = NDArray[np.intp]
+Texts = NDArray[np.str_]
 
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """One kind (with its frame) and the noise of its noise columns.
+    """One kind (with its frame), the noise of its noise columns, and what it looks at.
+
+    Parameters
+    ----------
+    kind : Kind
+    noise : Noise
+    rows : (r,) or (r, links) int, optional
+        Poses of each row. Default: every pose once; where rows link poses, each with the next and the last with the first.
+    session, group : text or (r,) text, optional
+        See `Observations`.
 
     Raises
     ------
@@ -22,6 +38,9 @@ class Sensor:
 
     kind: Kind
     noise: Noise
+    rows: Ints | None = None
+    session: Texts = field(default_factory=lambda: np.array(""))
+    group: Texts = field(default_factory=lambda: np.array(""))
 
     def __post_init__(self) -> None:
         names = ", ".join(column.name for column in self.kind.noise_columns)
@@ -29,6 +48,26 @@ class Sensor:
             raise DataError(
                 f"the noise of kind {self.kind.name!r} has {len(self.noise.sigma)} numbers; give one for each of {names}"
             )
+
+    def looking(self, n_poses: int) -> Self:
+        """The sensor with its rows, sessions and groups spelt out for n poses; DataError where a pose is not there."""
+        rows = self._rows(n_poses)
+        if rows.size and (rows.min() < 0 or rows.max() >= n_poses):
+            raise DataError(
+                f"the kind {self.kind.name!r} is to see poses up to {int(rows.max())} of 0 to {n_poses - 1}; correct it"
+            )
+        spread = {name: labels(getattr(self, name), len(rows), name) for name in ("session", "group")}
+        return replace(self, rows=rows, **spread)
+
+    def _rows(self, n: int) -> Ints:
+        if self.rows is not None:
+            return indices(self.rows, self.kind)
+        if self.kind.links == 1:
+            return np.arange(n)
+        if n < 2:
+            raise DataError(f"the kind {self.kind.name!r} compares poses, but there is {n}; give at least 2")
+        first = np.arange(n if n > 2 else 1)
+        return np.stack([first, (first + 1) % n], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,4 +93,4 @@ class Instrument:
 
     def mounted(self, robot: Mechanism) -> Self:
         """The instrument with the robot's tool, wherever a kind states none of its own."""
-        return type(self)(tuple(Sensor(s.kind.mounted(robot.tool), s.noise) for s in self.sensors))
+        return type(self)(tuple(replace(s, kind=s.kind.mounted(robot.tool)) for s in self.sensors))

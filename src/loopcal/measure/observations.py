@@ -66,7 +66,7 @@ class Observations:
         kind = self.kind
         if not kind.is_mounted:
             raise DataError(f"the kind {kind.name!r} has no tool yet; use kind.mounted(robot.tool)")
-        rows = _indices(self.rows, kind)
+        rows = indices(self.rows, kind)
         c, m, r = len(kind.columns), len(kind.noise_columns), len(rows)
         measured = stored(self.measured, f"measured values of kind {kind.name!r}", (r, c), allow_nan=True)
         weight = stored(_spread(self.weight, (r,), "the weight", f"one number for each of {r} rows"), "the weight", (r,))
@@ -167,8 +167,8 @@ class Observations:
         return replace(self, weight=np.asarray(weight, dtype=float))
 
 
-def _indices(rows: ArrayLike, kind: Kind) -> Ints:
-    """Checked copy of the pose indices."""
+def indices(rows: ArrayLike, kind: Kind) -> Ints:
+    """Checked copy of the pose indices (r,) or (r, links)."""
     given = np.array(rows)
     wanted = 1 if kind.links == 1 else 2
     whole = np.issubdtype(given.dtype, np.integer) or given.size == 0

@@ -5,21 +5,29 @@ Commanded poses become readings by the controller's inverse kinematics, readings
 forward kinematics, and the instrument writes down what it sees of them, noise included.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loopcal.errors import DataError
 from loopcal.measure.commanded import solve_commanded
-from loopcal.measure.instrument import Instrument
+from loopcal.measure.instrument import Instrument, Sensor
+from loopcal.measure.joints import joint_values, joints_looked_at
+from loopcal.measure.kinds import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.noise import stream
 from loopcal.measure.observations import Observations
+from loopcal.measure.unknowns import LocalUnknowns, local_unknowns
 from loopcal.mechanism import Mechanism, Status
 from loopcal.mechanism.trials import forward_trials
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.intp]
+Texts = NDArray[np.str_]
+Bools = NDArray[np.bool_]
 
 NOISE, TRUTH = 0, 1  # purposes of a trial's random streams
 
@@ -31,16 +39,20 @@ class Trials:
     Attributes
     ----------
     instrument : Instrument
-        Mounted on the robot's tool.
+        Mounted on the robot's tool, with the rows of every sensor spelt out.
     robot_name : str
     readings : (n, a) [SI]
         The controller's, equal in all trials.
-    measured : tuple of (t, n, c) [SI]
+    measured : tuple of (t, r, c) [SI]
         Columns of each sensor; NaN in rows whose true machine cannot follow the readings.
     truth : (t, p) [SI]
         True parameter values of each trial.
     T : (t, n, 4, 4)
         True T_base_platform.
+    reached : (t, n) bool
+        Poses to which the true machine could follow.
+    local : LocalUnknowns
+        Of the kinds, their true values as nominal ones.
     """
 
     instrument: Instrument
@@ -49,16 +61,17 @@ class Trials:
     measured: tuple[Array, ...]
     truth: Array
     T: Array
+    reached: Bools
+    local: LocalUnknowns
 
     def __len__(self) -> int:
         return len(self.truth)
 
     def trial(self, i: int) -> Measurements:
         """Measurements of one trial."""
-        rows = np.arange(len(self.readings))
         observations = tuple(
-            Observations.from_sigma(sensor.kind, rows, measured[i], sensor.noise.sigma)
-            for sensor, measured in zip(self.instrument.sensors, self.measured, strict=True)
+            Observations.from_sigma(s.kind, rows_of(s), measured[i], s.noise.sigma, s.session, s.group)
+            for s, measured in zip(self.instrument.sensors, self.measured, strict=True)
         )
         return Measurements(self.robot_name, self.readings, observations)
 
@@ -85,7 +98,13 @@ def sample_truth(robot: Mechanism, n_trials: int, seed: int) -> Array:
 
 
 def simulate_trials(
-    robot: Mechanism, truth: ArrayLike, poses: ArrayLike, instrument: Instrument, seed: int, controller: Mechanism | None = None
+    robot: Mechanism,
+    truth: ArrayLike,
+    poses: ArrayLike,
+    instrument: Instrument,
+    seed: int,
+    controller: Mechanism | None = None,
+    unknowns: Mapping[str, float] | None = None,
 ) -> Trials:
     """Measure the same commanded poses on t machines.
 
@@ -102,6 +121,8 @@ def simulate_trials(
         Trial i draws the same noise however many trials there are.
     controller : Mechanism, optional
         The geometry that turns poses into readings; default: the robot at its nominal values.
+    unknowns : name -> value [SI], optional
+        True values of unknowns of the kinds, such as `tracker.x`; default: nominal.
 
     Returns
     -------
@@ -110,26 +131,39 @@ def simulate_trials(
     Raises
     ------
     DataError
-        If the controller cannot reach a pose.
+        If the controller cannot reach a pose, or an unknown is not there.
     """
     values = np.atleast_2d(np.asarray(truth, dtype=float))
-    mounted = instrument.mounted(robot)
     commanded = solve_commanded(robot.nominal if controller is None else controller, poses)
-    readings = commanded.q
+    readings, n = commanded.q, len(commanded.q)
+    mounted = Instrument(tuple(sensor.looking(n) for sensor in instrument.mounted(robot).sensors))
+    seeing = [_Seeing(s.kind, rows_of(s), s.session, s.group) for s in mounted.sensors]
+    local = local_unknowns(seeing, tuple(str(i + 1) for i in range(n)))
+    local = local.starting_at(local.values(unknowns))
     # Starting at the commanded pose keeps the true machine in the assembly mode of its controller.
     state = forward_trials(robot, values, readings[None], commanded.state)
     T = np.broadcast_to(state.T, (len(values), *state.T.shape[1:]))
-    reached = np.broadcast_to(state.status == Status.CONVERGED, T.shape[:2])
-    noise = [_drawn(mounted, len(readings), stream(seed, trial, NOISE)) for trial in range(len(values))]
+    reached: Bools = np.broadcast_to(np.asarray(state.status == Status.CONVERGED), T.shape[:2])
+    joints = joint_values(robot, joints_looked_at(s.kind for s in mounted.sensors), readings[None], state)
+    noise = [_drawn(mounted, stream(seed, trial, NOISE)) for trial in range(len(values))]
+    safe = np.where(reached[..., None, None], T, np.eye(4))
     measured = []
-    for k, sensor in enumerate(mounted.sensors):
-        seen = sensor.kind.measure(np.where(reached[..., None, None], T, np.eye(4)), np.stack([d[k] for d in noise]))
-        measured.append(np.where(reached[..., None], seen, np.nan))
-    return Trials(mounted, robot.name, readings, tuple(measured), values, T)
+    for k, (kind, rows, _, _) in enumerate(seeing):
+        at = np.stack([joints[name][:, rows] for name in kind.looks_at], axis=-1) if kind.looks_at else None
+        own = local.of(k, local.table.nominal[None]) if kind.unknowns else None
+        seen = kind.measure(safe[:, rows], np.stack([drawn[k] for drawn in noise]), own, at)
+        there = reached[:, rows].reshape(len(values), len(rows), -1).all(axis=-1)
+        measured.append(np.where(there[..., None], seen, np.nan))
+    return Trials(mounted, robot.name, readings, tuple(measured), values, T, reached, local)
 
 
 def simulate(
-    robot: Mechanism, poses: ArrayLike, instrument: Instrument, seed: int, controller: Mechanism | None = None
+    robot: Mechanism,
+    poses: ArrayLike,
+    instrument: Instrument,
+    seed: int,
+    controller: Mechanism | None = None,
+    unknowns: Mapping[str, float] | None = None,
 ) -> Measurements:
     """Measure commanded poses on one machine.
 
@@ -144,6 +178,8 @@ def simulate(
         The result is that of trial 0 of `simulate_trials`.
     controller : Mechanism, optional
         The geometry that turns poses into readings; default: the robot at its nominal values.
+    unknowns : name -> value [SI], optional
+        True values of unknowns of the kinds; default: nominal.
 
     Returns
     -------
@@ -154,8 +190,8 @@ def simulate(
     DataError
         If the controller cannot reach a pose, or the true machine cannot follow the readings.
     """
-    trials = simulate_trials(robot, robot.values[None], poses, instrument, seed, controller)
-    lost = np.flatnonzero(np.isnan(trials.measured[0][0]).all(axis=-1))
+    trials = simulate_trials(robot, robot.values[None], poses, instrument, seed, controller, unknowns)
+    lost = np.flatnonzero(~trials.reached[0])
     if len(lost):
         raise DataError(
             f"the true machine cannot follow the readings of pose {int(lost[0]) + 1} ({len(lost)} of"
@@ -164,6 +200,22 @@ def simulate(
     return trials.trial(0)
 
 
-def _drawn(instrument: Instrument, n: int, generator: np.random.Generator) -> list[Array]:
-    """Noise (n, m) of each sensor, one after the other from one stream."""
-    return [sensor.noise.draw(generator, n) for sensor in instrument.sensors]
+class _Seeing(NamedTuple):
+    """A kind and its rows, before anything is measured."""
+
+    kind: Kind
+    rows: Ints
+    session: Texts
+    group: Texts
+
+
+def rows_of(sensor: Sensor) -> Ints:
+    """Rows of a sensor whose rows are spelt out, see `Sensor.looking`."""
+    if sensor.rows is None:
+        raise DataError("the rows of the sensor are not spelt out; use sensor.looking(n_poses)")
+    return sensor.rows
+
+
+def _drawn(instrument: Instrument, generator: np.random.Generator) -> list[Array]:
+    """Noise (r, m) of each sensor, one after the other from one stream."""
+    return [sensor.noise.draw(generator, len(rows_of(sensor))) for sensor in instrument.sensors]

@@ -134,9 +134,13 @@ def local_unknowns(observations: Iterable[Labelled], labels: tuple[str, ...]) ->
         kind = rows.kind
         _agree(references, kind)
         owners = {scope: _owners(rows, scope, labels) for scope in {p.scope for p in kind.unknowns}}
-        columns = []
-        for parameter in kind.unknowns:
-            columns.append([_entered(entries, parameter, owner, kind) for owner in owners[parameter.scope]])
+        twice = [p.name for p in kind.unknowns]
+        if len(set(twice)) < len(twice):
+            again = next(name for name in twice if twice.count(name) > 1)
+            raise DataError(
+                f"the kind {kind.name!r} calls two unknowns {again!r}; give frames, targets and surfaces different names"
+            )
+        columns = [[_entered(entries, p, owner, kind) for owner in owners[p.scope]] for p in kind.unknowns]
         order = {name: i for i, name in enumerate(entries)}
         found = np.array([[order[name] for name in column] for column in columns], dtype=np.intp)
         places.append(found.reshape(len(columns), len(rows.rows)).T)

@@ -90,11 +90,8 @@ class Inclination(AimKind):
             wrong = np.flatnonzero(
                 (np.sum(np.sin(measured) ** 2, axis=-1) > 1.0) | np.any(np.abs(measured) > np.pi / 2, axis=-1)
             )
-        return tuple(
-            (
-                int(i),
-                f"has tilts of {np.rad2deg(measured[i, 0]):.6g} and {np.rad2deg(measured[i, 1]):.6g} deg, which no"
-                " direction has: elevations of two axes at right angles add up to at most 90 deg; check the unit",
-            )
-            for i in wrong
+        sentence = (
+            "has tilts of {:.6g} and {:.6g} deg, which no direction has: elevations of two axes at right angles add up to"
+            " at most 90 deg; check the unit"
         )
+        return tuple((int(i), sentence.format(*np.rad2deg(measured[i]))) for i in wrong)

@@ -8,6 +8,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from loopcal.measure.closed_form import linear
 from loopcal.measure.kinds import parts
 from loopcal.measure.kinds.kind import Column
 from loopcal.measure.kinds.surface import SurfaceKind
@@ -62,7 +63,7 @@ class Plane(SurfaceKind):
             return self.nominal[None]
         middle = x.mean(axis=0)
         normals = [np.linalg.svd(x - middle, full_matrices=False)[2][2]]
-        sloped = np.linalg.lstsq(x - middle, gaps[:, 0] - gaps.mean(), rcond=1e-9)[0]
+        sloped = linear(x - middle, gaps[:, 0] - gaps.mean())
         if np.linalg.norm(sloped) > 0.1:
             normals.append(sloped / np.linalg.norm(sloped))
         n = np.array([normal if normal @ self.along >= 0.0 else -normal for normal in normals])

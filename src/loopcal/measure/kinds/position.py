@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.measure.closed_form import frame_and_points, kabsch
+from loopcal.measure.closed_form import frame_and_points, kabsch, linear
 from loopcal.measure.kinds import parts
 from loopcal.measure.kinds.kind import Column
 from loopcal.measure.kinds.target import TargetKind, points_of
@@ -56,4 +56,4 @@ class Position(TargetKind):
             found = {"frame": parts.frame_values(self.T_base_frame, frames), "targets": places}
             return stacked(self, found, len(frames))
         base = seen @ self.T_base_frame[:3, :3].T + self.T_base_frame[:3, 3]
-        return np.linalg.lstsq(moving.reshape(base.size, -1), (base - origin).ravel(), rcond=1e-9)[0][None]
+        return linear(moving.reshape(base.size, -1), (base - origin).ravel())[None]
