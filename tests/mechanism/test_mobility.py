@@ -87,7 +87,7 @@ WRONG = {
     "an actuator twice": (lambda: replace(HEXAPOD, actuators=HEXAPOD.actuators[:1] * 2), r"two actuators are called 'q1'"),
     "an actuator without a joint": (
         lambda: replace(HEXAPOD, actuators=(*HEXAPOD.actuators, Actuator("spare", Dimension.LENGTH))),
-        r"actuator 'spare' drives 0 joints; it must drive exactly one",
+        r"actuator 'spare' drives 0 joints; it must drive one",
     ),
     "a joint driven by nobody": (
         lambda: with_limb(HEXAPOD, 2, actuator="q9"),

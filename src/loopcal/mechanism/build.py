@@ -14,6 +14,7 @@ from loopcal.engine import Group, Program, Slot, State
 from loopcal.errors import MechanismError
 from loopcal.mechanism import coordinates, mobility, states
 from loopcal.mechanism.assembly import AXES, Address, Assembly, Limb
+from loopcal.mechanism.coupled import shared_drives
 from loopcal.mechanism.model import Mechanism, SlotMap
 from loopcal.mechanism.transmission import TERMS, frequency, nominal_terms
 from loopcal.mechanism.trials import inverse_trials
@@ -78,14 +79,17 @@ def _check_names(assembly: Assembly) -> None:
                 raise MechanismError(f"two {kind}s are called {name!r}; every {kind} needs its own name")
     driven = [name for limb in assembly.limbs for name in (*(j.actuator for j in limb.joints), limb.actuator) if name]
     for actuator in assembly.actuators:
-        if driven.count(actuator.name) != 1:
+        if actuator.name not in driven:
             raise MechanismError(
-                f"actuator {actuator.name!r} drives {driven.count(actuator.name)} joints; it must drive exactly one"
+                f"actuator {actuator.name!r} drives 0 joints; it must drive one, or one in each of several limbs"
             )
     unknown = sorted(set(driven) - {a.name for a in assembly.actuators})
     if unknown:
         raise MechanismError(f"a joint is driven by {unknown[0]!r}, which is not among the actuators; add it or mend the name")
     for limb in assembly.limbs:
+        own = [name for name in (*(j.actuator for j in limb.joints), limb.actuator) if name]
+        if len(set(own)) < len(own):
+            raise MechanismError(f"limb {limb.name!r} is driven twice by {own[0]!r}; a drive may move one joint of a limb")
         if limb.ending not in ROWS:
             raise MechanismError(f"limb {limb.name!r} ends in {limb.ending!r}; allowed endings are {', '.join(ROWS)}")
         if len(limb.links) != len(limb.joints) + 1:
@@ -234,6 +238,7 @@ def _home(robot: Mechanism) -> State:
     target = coordinates.read(robot.assembly.home[None, None], robot.controlled)
     program = robot.program
     movable = len(program.freedoms) - sum(len(g.limbs) * (len(g.rows) - len(g.unknown(True))) for g in program.groups)
+    movable -= shared_drives(program)
     if len(robot.controlled) < movable:
         raise MechanismError(
             f"{robot.name} can be moved in {movable} freedoms or more, but {len(robot.controlled)} controlled coordinates are "

@@ -12,6 +12,7 @@ import numpy as np
 from loopcal import engine, se3
 from loopcal.engine import Array, State
 from loopcal.mechanism import coordinates
+from loopcal.mechanism.coupled import reading_slopes, shared_drives
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.trials import inverse_trials, platform_rows
 
@@ -39,6 +40,8 @@ def nearest_reachable(robot: Mechanism, values: Array, T: Array, start: State | 
 
 def _pose_slopes(robot: Mechanism, values: Array, state: State) -> Array:
     """d twist / d demand (t, n, 6, c) with the actuators free, demands as `coordinates.demands` counts them [1/m, 1]."""
+    if shared_drives(robot.program):
+        return reading_slopes(robot, values, state)
     e, _ = robot.slots(values)
     names, freedoms = robot.controlled, list(robot.program.freedoms)
     t, n = state.T.shape[:2]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from loopcal import engine
 from loopcal.engine import Array, State
 from loopcal.mechanism import coordinates, states
+from loopcal.mechanism.coupled import inverse_coupled, shared_drives
 from loopcal.mechanism.implicit import Sensitivity, platform_rows, sensitivity
 from loopcal.mechanism.model import Mechanism, Status
 from loopcal.mechanism.transmission import joint_values, readings_of
@@ -42,6 +43,8 @@ def forward_trials(robot: Mechanism, values: Array, q: Array, start: State | Non
 
 def inverse_trials(robot: Mechanism, values: Array, target: Array, start: State | None = None) -> State:
     """States at controlled coordinates (t | 1, n, c), every actuator free; `readings_at` gives their readings."""
+    if shared_drives(robot.program):
+        return inverse_coupled(robot, values, target, robot.home_state if start is None else start)
     e, _ = robot.slots(values)
     names, size = robot.controlled, robot.size
     t, n = max(len(values), len(target)), target.shape[1]

@@ -61,7 +61,8 @@ class Limbs(LimbsFile, Robot):
             refuse_branch(limb, names)
         members = {limb.name: tuple(_copies(limb)) for limb in self.limbs}
         everyone = [one for limb in self.limbs for one in members[limb.name]]
-        drives = tuple(drive for one in everyone for drive in self._drives(one))
+        # a drive that several limbs name is one drive
+        drives = tuple({drive[0]: drive for one in everyone for drive in self._drives(one)}.values())
         errors = sum((self._limb_errors(one) for one in everyone), start=Errors())
         errors += sum((drive_errors(name, drive, turns) for name, drive, turns in drives), start=Errors())
         errors += sum((_named(named, members, {name for name, *_ in drives}) for named in self.parameters), start=Errors())
