@@ -20,5 +20,8 @@ from loopcal.calibrate.pose_errors import pose_errors as pose_errors
 from loopcal.calibrate.rules import GCV as GCV
 from loopcal.calibrate.rules import MarginalLikelihood as MarginalLikelihood
 from loopcal.calibrate.rules import TruncationGCV as TruncationGCV
+from loopcal.calibrate.start_check import Start as Start
+from loopcal.calibrate.start_check import StartCheck as StartCheck
+from loopcal.calibrate.start_check import start_check as start_check
 from loopcal.calibrate.validate import Validation as Validation
 from loopcal.calibrate.validate import validate as validate

@@ -16,6 +16,7 @@ from loopcal.errors import DataError
 if TYPE_CHECKING:
     from loopcal.calibrate import Identification, Validation
     from loopcal.calibrate.filters import Method
+    from loopcal.measure import Measurements
 
 METHODS = ("least-squares", "map", "ridge", "truncated-svd")
 
@@ -86,7 +87,7 @@ def calibrate(
     if as_json:
         show.json_document(document)
     else:
-        _print(fit, validation, output)
+        _print(fit, validation, fitted, output)
     return _exit_code(fit, validation)
 
 
@@ -104,16 +105,23 @@ def _method(name: str, lam: float | None, keep: int | None) -> Method:
     return MAP() if name == "map" else LeastSquares()
 
 
-def _print(fit: Identification, validation: Validation | None, output: Path) -> None:
-    """Print what was found, and how well it does on unseen poses."""
+def _print(fit: Identification, validation: Validation | None, fitted: Measurements, output: Path) -> None:
+    """Print what was found, and how well it does on unseen poses, or without any on the fitted ones."""
+    from loopcal.calibrate import start_check, validate
+
     show.parameters(f"{fit.robot.name}: {len(fit.names)} parameters", fit.to_dict()["parameters"])
     show.say()
     show.say(f"{fit.status.sentence} after {fit.iterations} steps; rank {fit.rank} of {len(fit.names)}")
-    show.say(f"chi-square {fit.chi_square:.5g} with {fit.check.degrees:.4g} degrees of freedom")
+    degrees = f"{fit.check.degrees:.4g} degree{'' if round(fit.check.degrees) == 1 else 's'} of freedom"
+    show.say(f"chi-square {fit.chi_square:.5g} with {degrees}")
+    show.say(f"note: {start_check(fit).sentence}")
     for note in fit.notes:
         show.say(f"note: {note}")
     if validation is not None:
         show.validation(validation, "unseen")
+    elif not any(observations.kind.unknowns for observations in fitted.observations):
+        show.validation(validate(fit, fitted), "fitted")
+        show.say("these rows were fitted, so this proves nothing about other poses; keep some for that with --hold-out 0.25")
     show.say(f"\nwritten to {output}: result.json, arrays.npz, robot.yaml")
 
 

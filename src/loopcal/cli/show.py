@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 ROUNDING = 1e-12
 """What is smaller than this, in whatever unit is shown, is rounding and shown as 0."""
 
+ALIKE = 5e-3
+"""Share by which two errors may differ and still be called the same."""
+
 
 def say(text: str = "") -> None:
     """Print a line of the result."""
@@ -100,17 +103,39 @@ def parameters(title: str, rows: Iterable[Mapping[str, Any]]) -> None:
     )
 
 
-def validation(found: Validation, poses: str) -> None:
-    """Print errors before and after calibration."""
-    rows = [(title, index.replace("_", " "), *(number(x, digits=4) for x in four), symbol)
-            for title, index, symbol, *four in found.rows()]  # fmt: skip
-    headers = ("error", "of", "max", "rms", "mean", "sd", "unit")
-    table(f"Errors on {len(found.poses)} {poses} rows", headers, rows, text_columns=2)
+def validation(found: Validation, poses: str, before: bool = True) -> None:
+    """Print errors before and after calibration, or of one geometry alone.
+
+    Errors after commanding are left out where they are those of the prediction because nothing is out of the actuators'
+    reach.
+    """
+    rows = found.rows()
+    same = all(max(four) < ROUNDING for title, _, _, *four in rows if title == "not compensable")
+    if same:
+        rows = [row for row in rows if row[0].startswith("predicted")]
+    if not before:
+        rows = [("predicted", *row[1:]) for row in rows if row[0] == "predicted after"]
+    cells = [(title, index.replace("_", " "), *(number(x, digits=4) for x in four), symbol)
+             for title, index, symbol, *four in rows]  # fmt: skip
+    table(
+        f"Errors on {len(found.poses)} {poses} rows", ("error", "of", "max", "rms", "mean", "sd", "unit"), cells, text_columns=2
+    )
+    if same and before:
+        say("poses after commanding have these same errors: what was measured can be corrected by the actuators in full")
     for index in ("position", "orientation"):
-        if found.after.statistics(index).count:
-            say(f"{index} error (rms): {found.improvement(index):.3g} times smaller after calibration")
+        if before and found.after.statistics(index).count:
+            say(f"{index} error (rms): {_compared(found.improvement(index))}")
     if found.failed:
         say(f"left out, out of reach: poses {', '.join(found.failed)}")
+
+
+def _compared(improvement: float) -> str:
+    """Return in words how many times smaller an error became."""
+    if abs(improvement - 1.0) < ALIKE:
+        return "the same before and after calibration"
+    if improvement > 1.0:
+        return f"{improvement:.3g} times smaller after calibration"
+    return f"{1.0 / improvement:.3g} times LARGER after calibration" if improvement > 0.0 else "LARGER after calibration"
 
 
 def gates(reasons: Iterable[str]) -> int:

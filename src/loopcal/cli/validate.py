@@ -11,7 +11,7 @@ from loopcal.cli import show
 from loopcal.cli.options import FILE, data_argument, data_options, gate_options, json_option
 
 
-@click.command(short_help="Judge a calibration by other measurements.")
+@click.command(short_help="Judge a calibration, or a robot file, by measurements.")
 @click.argument("run", metavar="RUN", type=FILE)
 @data_argument
 @gate_options
@@ -28,7 +28,9 @@ def validate(
     allow_fitted_data: bool,
     as_json: bool,
 ) -> int:
-    """Compare the robot of RUN, a folder made by `loopcal calibrate`, with DATA, before and after calibration.
+    """Compare the robot of RUN, a folder made by `loopcal calibrate` or a robot file, with DATA.
+
+    Errors are those before and after calibration; of a robot file without identified values, its own alone.
 
     The exit code is 2 where a quality gate is not met.
 
@@ -36,12 +38,13 @@ def validate(
     Examples:
       loopcal validate run more-measurements.csv
       loopcal validate run more-measurements.csv --limit-position 0.02mm --limit-angle 0.01deg
+      loopcal validate robot.yaml measurements.csv --limit-position 0.1mm
     """  # noqa: D301
     from loopcal.calibrate import validate as compare
     from loopcal.io import load_measurements
-    from loopcal.io.calibration_run import load_run, refuse_fitted_data
+    from loopcal.io.calibration_run import load_calibrated, refuse_fitted_data
 
-    calibrated = load_run(run)
+    calibrated = load_calibrated(run)
     measured = load_measurements(
         data, calibrated.robot, allow_outside_stroke=allow_outside_stroke, allow_duplicates=allow_duplicates
     )
@@ -51,5 +54,6 @@ def validate(
     if as_json:
         show.json_document(found.to_dict())
     else:
-        show.validation(found, "measured")
+        changed = bool((calibrated.robot.values != calibrated.before.values).any())
+        show.validation(found, "measured", before=changed)
     return show.gates(found.reasons)

@@ -3,6 +3,7 @@
 
 result.json    made_by    how (see `loopcal.io.run_folder.MADE_BY`)
                fit        `Identification.to_dict()`: parameters in the units of the robot's file, the rest in SI
+               start      `StartCheck.to_dict()`: the geometry of the robot file against the fit, on the fitted rows
                split      share and labels of the poses that were held out; null where none were
                validation `Validation.to_dict()` on those poses, SI; null where none were
 arrays.npz     `Identification.arrays()`, and `initial`: the values before calibration of all parameters [SI]
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import DataError
-from loopcal.io.robot_file import load_robot, robot_text
+from loopcal.io.robot_file import load_robot, robot_text, shipped_robots
 from loopcal.io.run_folder import read_run_folder, write_run_folder
 from loopcal.io.text_file import sha256
 
@@ -40,8 +41,11 @@ def run_document(
     fit: Identification, validation: Validation | None, origin: Mapping[str, Any], split: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """Return the content of result.json; see the module."""
+    from loopcal.calibrate import start_check
+
     shown = None if validation is None else validation.to_dict()
-    return {"made_by": dict(origin), "fit": fit.to_dict(), "split": split, "validation": shown}
+    start = start_check(fit).to_dict()
+    return {"made_by": dict(origin), "fit": fit.to_dict(), "start": start, "split": split, "validation": shown}
 
 
 def save_run(path: str | Path, fit: Identification, document: Mapping[str, Any], force: bool = False) -> Path:
@@ -81,6 +85,21 @@ def load_run(path: str | Path) -> CalibratedRun:
     robot = load_robot(run.robot_path)
     initial = run.arrays.get("initial", robot.parameters.nominal)
     return CalibratedRun(run.path, run.result, robot, robot.with_values(initial))
+
+
+def load_calibrated(path: str | Path) -> CalibratedRun:
+    """Read a run folder, or a robot file (or the name of a shipped robot) as if a run had made it.
+
+    Raises
+    ------
+    FileError
+        Neither.
+    """
+    path = Path(path)
+    if path.is_dir() or (not path.exists() and str(path) not in shipped_robots()):
+        return load_run(path)
+    robot = load_robot(path)
+    return CalibratedRun(path, {}, robot, robot.nominal)
 
 
 def refuse_fitted_data(run: CalibratedRun, data: str | Path) -> None:

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a fit gained over its start, told apart from noise."""
+
+import numpy as np
+import pytest
+
+from loopcal.calibrate import Start, identify, start_check
+from tests import zoo
+from tests.calibrate.problems import hexapod, hexapod_data
+
+
+def test_a_start_at_the_truth_is_as_good_as_the_fit_within_the_noise() -> None:
+    truth = hexapod().with_values(zoo.hexapod_truth())
+    found = start_check(identify(truth, hexapod_data()))
+    assert found.verdict is Start.WITHIN_NOISE
+    assert found.p_value > 1e-3
+    # 180 equations, 42 parameters: the truth leaves 1 sigma, the fit sqrt(138 / 180) of it
+    assert found.before == pytest.approx(1.0, abs=0.2)
+    assert found.after == pytest.approx(np.sqrt(138 / 180), abs=0.2)
+
+
+@pytest.mark.parametrize("noise", ["given", "estimated"])
+def test_a_nominal_start_is_not_calibrated(noise) -> None:
+    found = start_check(identify(hexapod(), hexapod_data(), noise=noise))
+    assert found.verdict is Start.NOT_CALIBRATED
+    assert found.p_value < 1e-6
+    assert found.before > 10 * found.after
+
+
+def test_the_fit_itself_is_the_best_start() -> None:
+    first = identify(hexapod(), hexapod_data())
+    assert start_check(identify(first.robot, hexapod_data())).verdict is Start.BEST

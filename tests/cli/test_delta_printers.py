@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Real delta printers as their owners would calibrate them: a robot file, a file of probed heights, one command.
+
+What is compared with is the answer that the printers' own firmware stored, made from the same heights of equal weight.
+"""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from loopcal.cli import main
+from tests.cli.delta_printers import every_record, heights_only, stored, write_files
+
+# The heights-only records of the folder; a test below holds this list against it.
+CALIBRATED = (
+    "cupsster/FLSUN-SR---Klipper-Config Configuration/printer.cfg",
+    "danorder/Flsun-super-racer-Full-klipper-config- printer.cfg",
+    "fzechert/FLSun-V400 printer-config/printer.cfg",
+)
+FACTORY_DEFAULT = "danorder/Flsun-super-racer-Full-klipper-config- V400 FIXES.txt"
+WITH_DISTANCES = "RazorCopter/Klipper_FLSUN_Q5 printer [Post-Calibration].cfg"
+CALIBRATE = "calibrate robot.yaml heights.csv -o run"
+
+
+@pytest.fixture
+def calibrate(tmp_path, monkeypatch, capsys, data_folder):
+    """Write the files of a record, run the documented command, and return its output and result."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(name: str, options: str = "", **files: float | str) -> tuple[str, dict]:
+        write_files(every_record(data_folder)[name], tmp_path, **files)  # type: ignore[arg-type]
+        assert main(f"{CALIBRATE} {options}".split()) == 0
+        return capsys.readouterr().out, json.loads((tmp_path / "run" / "result.json").read_text())
+
+    return run
+
+
+def test_every_record_of_heights_alone_is_tried_here(data_folder) -> None:
+    assert sorted(heights_only(data_folder)) == sorted([*CALIBRATED, FACTORY_DEFAULT])
+
+
+@pytest.mark.parametrize("stop_off", [0.0, 40.0, -40.0])
+@pytest.mark.parametrize("name", CALIBRATED)
+def test_the_answer_of_the_firmware_comes_back_from_stops_far_off(calibrate, data_folder, name, stop_off) -> None:
+    out, result = calibrate(name, "--noise estimated", stop_off=stop_off)
+    answer = stored(every_record(data_folder)[name])
+    found = {row["name"]: row["estimate"] for row in result["fit"]["parameters"]}
+    assert sorted(found) == sorted(answer.keys() - {"tower3.angle"})
+    for parameter, value in found.items():
+        assert abs(value - answer[parameter]) < 2e-3, f"{parameter} [mm, deg]"
+    assert (result["start"]["verdict"] == "best") == (stop_off == 0.0)
+    assert ("is already the best fit" in out) == (stop_off == 0.0)
+
+
+def test_the_command_works_as_typed_into_a_shell(tmp_path, data_folder) -> None:
+    write_files(heights_only(data_folder)[CALIBRATED[0]], tmp_path)
+    command = [str(Path(sys.executable).parent / "loopcal"), *CALIBRATE.split()]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60)
+    assert done.stderr == ""
+    assert "printer: 6 parameters" in done.stdout
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == ["arrays.npz", "result.json", "robot.yaml"]
+
+
+def test_a_factory_default_is_flagged_as_not_calibrated(calibrate, capsys) -> None:
+    out, result = calibrate(FACTORY_DEFAULT)
+    assert result["start"]["verdict"] == "not calibrated"
+    assert result["start"]["before"] / result["start"]["after"] > 5.0
+    assert "NOT calibrated to these rows" in out
+    # a robot file can be judged without a fit, and the corrected one passes where the factory default does not
+    assert main(["validate", "robot.yaml", "heights.csv", "--limit-position", "0.1mm"]) == 2
+    assert "position error 0.2617 mm at pose point5 exceeds" in capsys.readouterr().err
+    assert main(["validate", "run/robot.yaml", "heights.csv", "--limit-position", "0.1mm"]) == 0
+
+
+def test_a_probe_of_unknown_sigma_leaves_that_open_and_says_so(calibrate) -> None:
+    out, result = calibrate(FACTORY_DEFAULT, "--noise estimated")
+    assert result["start"]["verdict"] == "open"
+    assert "can only be said with its true sigma" in out
+
+
+def test_one_degree_of_freedom_gives_intervals_only_with_the_sigma_of_the_probe(calibrate) -> None:
+    out, result = calibrate(CALIBRATED[2], "--noise estimated")
+    assert result["fit"]["dof"] == pytest.approx(1.0)
+    assert "one degree of freedom is too few for intervals unless the instrument's sigma is given" in out
+    assert {row["plus_minus"] for row in result["fit"]["parameters"]} == {None}
+    out, result = calibrate(CALIBRATED[2], "--force", sigma="0.02 mm")
+    assert "too few" not in out
+    assert all(0.01 < row["plus_minus"] < 1.0 for row in result["fit"]["parameters"])  # [mm, deg]
+    wider = calibrate(CALIBRATED[2], "--force", sigma="0.04 mm")[1]["fit"]["parameters"]
+    for narrow, wide in zip(result["fit"]["parameters"], wider, strict=True):
+        assert wide["plus_minus"] == pytest.approx(2 * narrow["plus_minus"], rel=1e-6)
+
+
+def test_a_geometry_from_heights_and_distances_is_not_the_best_for_heights_alone(calibrate) -> None:
+    """RazorCopter's firmware weighed 12 distances as well; its heights alone ask for something else."""
+    out, result = calibrate(WITH_DISTANCES, "--noise estimated")
+    assert result["fit"]["rank"] == 6
+    assert result["start"]["verdict"] == "open"
+    assert "the robot file's geometry: its residuals are 1.64 times those of the fit" in out
