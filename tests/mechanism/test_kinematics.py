@@ -59,7 +59,6 @@ def test_forward_leads_back_to_within_rounding_times_the_condition(name):
     assert (gap_of(robot, back.T, sol.T) <= 1e-14 * condition(robot, sol.state)).all()
 
 
-@pytest.mark.xfail(strict=True, reason="the orientation of an inverse solution is that of closure with every actuator free")
 @pytest.mark.parametrize("name", ["delta"])
 def test_forward_started_from_an_inverse_solution_stays_in_its_mode(name):
     robot, sol, _ = sampled(name, 20)

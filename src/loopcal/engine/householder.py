@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small dense matrices by the thousand: Householder triangularisation with the batch as the contiguous axis.
 
-Shapes are (rows, columns, batch). Only element-wise operations are used, so the result of one matrix never depends on
-its neighbours, bit for bit, and a singular matrix yields infinities instead of stopping the others. See
-docs/theory/engine.md.
+Shapes are (rows, columns, batch). Only element-wise operations are used, so the result of one matrix never depends on its
+neighbours, bit for bit, and a singular one yields infinities without stopping the others. See docs/theory/engine.md.
 """
 
 from __future__ import annotations

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
 PITCH, LENGTH = 6, 7
 CONVERGED, STALLED, EXHAUSTED, NOT_FINITE = 0, 1, 2, 3
 
@@ -103,8 +102,7 @@ class State:
 class Block:
     """Linearised closure of a group in its c' rows: U dtheta + A y + E de + Q dq, shapes (t, n, k, c', columns).
 
-    theta are the eliminated joints (U is upper triangular), y the platform's m freedoms (rotation and translation in base
-    axes), e the s displacements of a limb, q all its J + 1 joint values.
+    theta: the eliminated joints (U is triangular); y: the platform's freedoms in base axes; e, q: all of a limb's own.
     """
 
     U: Array

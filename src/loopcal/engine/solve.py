@@ -32,9 +32,7 @@ def solve(
 
     e : (t | 1, n_displacements) [m, rad]. q : (t | 1, n, n_joints) actuated joint values [m, rad]; with `free` they are
     unknowns and q only a first guess. start : where to begin, (t | 1, n | 1) rows. task : demands on the pose, as many as
-    freed actuators leave open. most : Newton steps before a row is given up.
-
-    Returns a State for (t, n); rows that fail are marked in `status`, never raised.
+    freed actuators leave open. most : Newton steps allowed. Rows that fail are marked in `status`, never raised.
     """
     t = max(len(e), len(q), len(start.T))
     n = max(q.shape[1], start.T.shape[1])
@@ -91,12 +89,14 @@ class _Rows:
 
     def joints(self, point: Array) -> list[Array]:
         """Joint values (J + 1, k, N) a group, views into a point."""
-        return [
-            point[a:b].reshape(*s, point.shape[1]) for a, b, s in zip(self.ends[:-1], self.ends[1:], self.shapes, strict=True)
-        ]
+        cuts = zip(self.ends[:-1], self.ends[1:], self.shapes, strict=True)
+        return [point[a:b].reshape(*shape, point.shape[1]) for a, b, shape in cuts]
 
-    def at(self, coordinates: Array) -> Array:
-        """The point at these coordinates: followed by step, norm, reducible norm, step length, orientation, pivot."""
+    def at(self, coordinates: Array, last: Array | None = None) -> Array:
+        """The point at these coordinates: followed by step, norm, reducible norm, step length, orientation, pivot.
+
+        Given `last`, a rounding away, no further step is worked out where all rows close.
+        """
         p, m, N = self.program, len(self.program.freedoms), coordinates.shape[1]
         redundant = p.sigma is not None and not self.free
         T, sign, pivot, tops, lows = coordinates[:12].reshape(3, 4, N), np.ones(N), np.ones(N), [], []
@@ -119,14 +119,15 @@ class _Rows:
         if self.task is not None:
             residual, columns = self.task(T.transpose(2, 0, 1), self.rows)
             lows.append(np.concatenate([columns[..., list(p.freedoms)], residual[..., None]], axis=2).transpose(1, 2, 0))
-        low = np.concatenate(lows)
+        low = np.concatenate([*lows, np.zeros((max(0, m - sum(map(len, lows))), m + 1, N))])
         inner = sum((np.add.reduce(top[:, -1] ** 2, axis=(0, 1)) for top in tops), start=np.zeros(N))
-        norm, y = np.sqrt(inner + np.add.reduce(low[:, m] ** 2, axis=0)), np.zeros((m, N))
-        if len(low):
-            low, turn = triangularise(np.concatenate([low, np.zeros((max(0, m - len(low)), m + 1, N))]), m)
-            sign = sign * turn * np.prod(np.sign(np.diagonal(low[:m, :m])), axis=-1)
-            y = back_substitute(low[:m, :m], -low[:m, m:])[:, 0]
-            inner = inner + np.add.reduce(low[:m, m] ** 2, axis=0)
+        norm = np.sqrt(inner + np.add.reduce(low[:, m] ** 2, axis=0))
+        if last is not None and (norm <= RESIDUAL * p.size).all():
+            return np.concatenate([coordinates, 0 * last[self.ends[-1] : -5], [norm, norm, 0 * norm], last[-2:]])
+        low, turn = triangularise(low, m)
+        sign = sign * turn * np.prod(np.sign(np.diagonal(low[:m, :m])), axis=-1)
+        y = back_substitute(low[:m, :m], -low[:m, m:])[:, 0]
+        inner = inner + np.add.reduce(low[:m, m] ** 2, axis=0)
         twist = np.zeros((6, N))
         twist[list(p.freedoms)] = y
         rest = [top[:, -1] + np.add.reduce(top[:, len(top) : len(top) + m] * y[:, None], axis=1) for top in tops]
@@ -183,7 +184,8 @@ def _newton(work: _Rows, coordinates: Array, most: int) -> tuple[Array, np.ndarr
             broken = ~(np.isfinite(reducible) & np.isfinite(length) & (pivot > SINGULAR))
             end = settled | broken | (shrink < 1e-5)
             if end.any():
-                status[alive[end]] = np.where(broken, NOT_FINITE, np.where(settled, CONVERGED, STALLED))[end]
+                closed = settled & ((point[-5] <= 1e4 * RESIDUAL * size) | (work.program.sigma is not None))
+                status[alive[end]] = np.where(broken, NOT_FINITE, np.where(closed, CONVERGED, STALLED))[end]
                 done[:, alive[end]] = point[:, end]
                 keep = ~end
                 work, point, alive = work.only(keep), point[:, keep], alive[keep]
@@ -191,7 +193,8 @@ def _newton(work: _Rows, coordinates: Array, most: int) -> tuple[Array, np.ndarr
                 if not len(alive):
                     break
             fraction = shrink * np.minimum(1.0, 0.5 * size / np.maximum(point[-3], 1e-300))
-            trial = work.at(work.moved(point, fraction))
+            short = (fraction * point[-3] <= STEP * size).all()
+            trial = work.at(work.moved(point, fraction), point if short else None)
             low = trial[-4] <= RESIDUAL * size
             better = low | (trial[-5] <= (1 - 1e-4 * fraction) * point[-5]) | (trial[-4] <= 0.5 * point[-4])
             applied = np.where(better, fraction * point[-3], applied)

@@ -36,7 +36,7 @@ def forward_trials(robot: Mechanism, values: Array, q: Array, start: State | Non
     begin = robot.home_state if start is None else start
     state = engine.solve(robot.program, e, joints, begin)
     wrong = _astray(state, begin)
-    if not wrong.any() or len(robot.actuators) != len(robot.program.freedoms):
+    if not wrong.any() or robot.program.sigma is not None:
         return state
     return _followed(robot, e, joints, begin, state, wrong)
 
@@ -58,7 +58,8 @@ def inverse_trials(robot: Mechanism, values: Array, target: Array, start: State 
     T = coordinates.pose(np.broadcast_to(target, (t, n, target.shape[2])), names, robot.home)
     if start is not None:
         T = np.broadcast_to(start.T, T.shape)
-    return engine.solve(robot.program, e, guess, replace(begin, T=T), task, free=True)
+    state = engine.solve(robot.program, e, guess, replace(begin, T=T), task, free=True)
+    return replace(state, orientation=orientation_at(robot, values, state))
 
 
 def orientation_at(robot: Mechanism, values: Array, state: State) -> NDArray[np.int8]:
