@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of robots: every shipped one can be drawn, what is drawn lies where it is, and units stand on the axes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import loopcal
+from loopcal.cli import main
+from loopcal.errors import FileError
+from loopcal.io import load_robot
+from loopcal.mechanism import inverse
+from loopcal.report import draw, save_picture
+from tests import zoo
+
+SHIPPED = sorted(path.stem for path in (Path(loopcal.__file__).parent / "robots").glob("*.yaml"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_shipped_robot_has_a_picture_with_units_on_its_axes(name):
+    robot = load_robot(name)
+    figure = draw(robot)
+    space, above = figure.axes
+    for axes in (space, above):
+        assert "[mm]" in axes.get_xlabel()
+        assert "[mm]" in axes.get_ylabel()
+    assert robot.name in figure.get_suptitle()
+    assert f"{len(robot.assembly.limbs)} limbs" in figure.get_suptitle()
+    assert {text.get_text() for text in above.texts} == {limb.name for limb in robot.assembly.limbs}
+
+
+def test_rods_run_from_base_to_platform_in_millimetres():
+    robot = zoo.hexapod()
+    above = draw(robot).axes[1]
+    lines = [np.array(line.get_data()).T for line in above.lines]
+    for base, top in zip(zoo.HEXAPOD_BASE, zoo.HEXAPOD_PLATFORM, strict=True):
+        assert any(line.shape == (2, 2) and np.allclose(line, [base[:2], top[:2]], atol=1e-6) for line in lines)
+
+
+def test_a_pose_of_a_solution_moves_the_platform():
+    robot = zoo.hexapod()
+    found = inverse(robot, np.array([[0.0, 0.0, 0.2, 0, 0, 0], [0.03, -0.02, 0.21, 0, 0, 0]]))
+    figure = draw(robot, found, row=1)
+    star = [line for line in figure.axes[1].lines if line.get_marker() == "*"]
+    assert_allclose(np.array(star[0].get_data()).ravel(), [30.0, -20.0], atol=1e-9)  # [mm]
+    assert "at row 1" in figure.get_suptitle()
+
+
+def test_check_writes_the_picture(tmp_path, capsys):
+    assert main(["check", "five-bar", "--plot", str(tmp_path / "five-bar.png")]) == 0
+    assert (tmp_path / "five-bar.png").read_bytes().startswith(b"\x89PNG")
+    assert "picture: " in capsys.readouterr().out
+
+
+def test_a_format_that_cannot_be_written_is_refused(tmp_path):
+    with pytest.raises(FileError, match=r"written as '.docx'; end its name in .png, .svg, .pdf"):
+        save_picture(tmp_path / "robot.docx", zoo.hexapod())
