@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from loopcal.cli import show
-from loopcal.cli.options import json_option, robot_argument
+from loopcal.cli.options import FILE, json_option, robot_argument
 
 if TYPE_CHECKING:
     from loopcal.mechanism import Mechanism
@@ -16,8 +17,9 @@ if TYPE_CHECKING:
 
 @click.command(short_help="Read a robot file and show what it says.")
 @robot_argument
+@click.option("--plot", type=FILE, metavar="FILE", help="Draw the robot at home into FILE (.png, .svg or .pdf).")
 @json_option
-def check(robot: str, as_json: bool) -> None:
+def check(robot: str, plot: Path | None, as_json: bool) -> None:
     """Read ROBOT, a file or the name of a shipped robot, and show what was understood.
 
     Whatever is wrong with the file, its units, its joints or its mobility is said in one sentence with the line.
@@ -26,14 +28,21 @@ def check(robot: str, as_json: bool) -> None:
     Examples:
       loopcal check hexapod-42
       loopcal check my-robot.yaml --json
+      loopcal check 3-prs --plot 3-prs.png
     """  # noqa: D301
     from loopcal.io import load_robot
 
     machine = load_robot(robot)
+    if plot is not None:
+        from loopcal.report import save_picture
+
+        save_picture(plot, machine)
     if as_json:
         show.json_document(_document(machine))
     else:
         _print(machine)
+        if plot is not None:
+            show.say(f"\npicture: {plot}")
 
 
 def _document(robot: Mechanism) -> dict[str, Any]:
