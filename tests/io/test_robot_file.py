@@ -28,6 +28,7 @@ def test_every_shipped_robot_loads_and_states_its_source() -> None:
     for name in robots:
         loaded = load_robot(name)
         assert loaded.name == name
+        assert build(loaded.record.record.assembly()).parameters == loaded.parameters
         assert loaded.record.record.source
         assert np.array_equal(loaded.values, loaded.parameters.nominal)
 
@@ -127,6 +128,8 @@ def test_parameters_are_fixed_by_name_or_pattern(tmp_path) -> None:
     table = load_robot(write(tmp_path, HEXAPOD + "fixed: [leg1.base.x, leg*.length]\n")).parameters
     held = [name for name, free in zip(table.names, table.free, strict=True) if not free]
     assert held == ["leg1.base.x", *(f"leg{i}.length" for i in range(1, 7))]
+    record = load_robot(tmp_path / "robot.yaml").record.record
+    assert build(record.assembly()).parameters == table  # the same robot without its file
     with pytest.raises(FileError, match=r"'leg1.base.q' fixes no parameter of this robot .did you mean 'leg1.base"):
         load_robot(write(tmp_path, HEXAPOD + "fixed: [leg1.base.q]\n"))
 

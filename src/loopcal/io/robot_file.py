@@ -13,10 +13,9 @@ A robot that was read keeps the text of its file, so that writing it back change
 
 from __future__ import annotations
 
-import fnmatch
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -81,7 +80,7 @@ def load_robot(source: str | Path) -> Mechanism:
     with _naming(file):
         record = read_record(file, content, FAMILIES[family], units)
         symbols = {dimension: found.symbol for dimension, found in units.items()}
-        robot = build(_fixed(record, file), symbols, RobotSource(file.path, nominal_text(file), record))
+        robot = build(_assembly(record, file), symbols, RobotSource(file.path, nominal_text(file), record))
     return robot.with_values(table_values(file, robot)) if TABLE in file.content else robot
 
 
@@ -176,19 +175,17 @@ def _family(file: YamlFile, known: Sequence[str]) -> str:
     return str(found)
 
 
-def _fixed(record: Robot, file: YamlFile) -> Assembly:
-    """Return what a record expands to, with the parameters that it calls `fixed` (names, or patterns such as arm*)."""
-    assembly = record.expand()
-    names = [parameter.name for parameter in assembly.parameters]
-    held: set[str] = set()
+def _assembly(record: Robot, file: YamlFile) -> Assembly:
+    """Return what a record expands to; a name under `fixed` that calls no parameter is refused at its line."""
+    from loopcal.mechanism.records import called
+
+    names = [parameter.name for parameter in record.expand().parameters] if record.fixed else []
     for i, pattern in enumerate(record.fixed):
-        matching = fnmatch.filter(names, pattern)
-        if not matching:
-            hint = nearest(pattern, names) or f"; its parameters are {', '.join(names)}"
-            raise file.error(f"{pattern!r} fixes no parameter of this robot{hint}; correct it", ("fixed", i))
-        held.update(matching)
-    parameters = tuple(replace(p, free=False) if p.name in held else p for p in assembly.parameters)
-    return replace(assembly, parameters=parameters)
+        try:
+            called(pattern, names)
+        except MechanismError as error:
+            raise file.error(str(error), ("fixed", i)) from None
+    return record.assembly()
 
 
 @contextmanager

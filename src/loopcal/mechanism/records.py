@@ -6,14 +6,15 @@ Numbers are in SI; `loopcal.io` converts them from the units that the file state
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+import fnmatch
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
 from loopcal import se3
 from loopcal.engine import Array
-from loopcal.errors import MechanismError
+from loopcal.errors import MechanismError, nearest
 from loopcal.mechanism.assembly import Assembly
 from loopcal.units import Angle, Length, Ratio
 
@@ -112,6 +113,29 @@ class Robot:
     def expand(self) -> Assembly:
         """The generic description of this robot."""
         raise TypeError("a record of no family cannot be expanded")
+
+    def assembly(self) -> Assembly:
+        """`expand`, with the parameters that `fixed` calls by name or pattern (arm*) kept at their nominal values.
+
+        Raises
+        ------
+        MechanismError
+            A name that calls no parameter.
+        """
+        expanded = self.expand()
+        names = [parameter.name for parameter in expanded.parameters]
+        held = {name for pattern in self.fixed for name in called(pattern, names)}
+        parameters = tuple(replace(p, free=False) if p.name in held else p for p in expanded.parameters)
+        return replace(expanded, parameters=parameters)
+
+
+def called(pattern: str, names: Sequence[str]) -> list[str]:
+    """The parameters that a name or pattern calls; raises MechanismError where there is none."""
+    found = fnmatch.filter(names, pattern)
+    if not found:
+        hint = nearest(pattern, names) or f"; its parameters are {', '.join(names)}"
+        raise MechanismError(f"{pattern!r} fixes no parameter of this robot{hint}; correct it")
+    return found
 
 
 def translation(point: tuple[float, float, float]) -> Array:
