@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sensitivities of a hexapod whose legs are chains, all displacements, against np.linalg.solve of as many 6 x 6 systems;
+and the first answer of a mechanism that has never been seen.
+"""
+
+import numpy as np
+
+from benchmarks.harness import Metric, measure_ratio, time_in_turns
+from loopcal.io import load_robot
+from loopcal.mechanism import build, forward
+from loopcal.mechanism.families.gough import Gough
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.trials import forward_trials, sensitivity
+
+POSES = 10_000
+
+
+def _record() -> Gough:
+    """The shipped hexapod with `legs: ups` and `error_model: complete`."""
+    rod = load_robot("hexapod-42").assembly
+    return Gough(
+        name="hexapod-ups",
+        base=tuple(tuple(limb.links[0].transform[:3, 3].tolist()) for limb in rod.limbs),
+        platform=tuple(tuple(limb.attachment.transform[:3, 3].tolist()) for limb in rod.limbs),
+        lengths=tuple(limb.length for limb in rod.limbs),
+        home=load_robot("hexapod-42").record.record.home,
+        legs="ups",
+        error_model="complete",
+    )
+
+
+def _first_answer(record: Gough) -> Mechanism:
+    """Build a mechanism and ask it for one pose."""
+    robot = build(record.expand())
+    forward(robot, np.full((1, 6), 1e-3))
+    return robot
+
+
+def bench_sensitivity() -> Metric:
+    """Time the sensitivities to 102 parameters (all displacements of six chains) at ten thousand poses."""
+    robot, rng = _first_answer(_record()), np.random.default_rng(0)
+    values, q = robot.values[None], rng.uniform(-0.02, 0.02, (1, POSES, 6))
+    state = forward_trials(robot, values, q)
+    A, b = rng.normal(size=(POSES, 6, 6)), rng.normal(size=(POSES, 6, 1))
+    return measure_ratio(
+        "sensitivity.ups_hexapod", lambda: sensitivity(robot, values, q, state), lambda: np.linalg.solve(A, b), limit=80.0
+    )
+
+
+def bench_first_answer() -> Metric:
+    """Time the first call of a new mechanism: expand, build, home, checks and one forward solution."""
+    record = _record()
+    (times,) = time_in_turns(lambda: _first_answer(record), repeats=15)
+    return Metric("sensitivity.first_answer", 1e3 * min(times), "ms", "lower", 0.5, 10.0, "best of 15")
