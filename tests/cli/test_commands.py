@@ -11,6 +11,7 @@ import pytest
 from loopcal.cli import main
 from loopcal.io import load_robot
 from loopcal.io.calibration_run import load_run
+from loopcal.io.robot_file import shipped_robots
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 SIMULATE = "simulate truth.yaml --poses poses.csv --sigma-position 0.001mm --sigma-angle 5urad --seed 42 -o again.csv"
@@ -129,7 +130,36 @@ def test_identifiability_names_what_heights_alone_cannot_tell(run) -> None:
     code, out, _ = run("identifiability hexapod-42 --poses poses.csv --kind component --components z")
     assert code == 0
     assert "not identifiable: together" in out
-    assert run("identifiability hexapod-42")[0] == 1
+    code, _, err = run("identifiability hexapod-42 measurements.csv --poses poses.csv")
+    assert code == 1
+    assert "there are both DATA and --poses" in err
+
+
+@pytest.mark.parametrize("robot", ["hexapod-42", "3-prs", "five-bar"])
+def test_identifiability_without_data_draws_poses_from_the_workspace(run, robot) -> None:
+    code, out, _ = run(f"identifiability {robot} --draw 30 --seed 3")
+    assert code == 0
+    assert out.startswith(f"30 poses drawn from the workspace of {robot}, seed 3\n")
+    assert "parameter combinations can be identified from" in out
+
+
+def test_check_shows_what_a_file_expands_into_in_its_units(run) -> None:
+    out = run("check linear-delta --expand")[1]
+    assert "arm3       tower      link                                       0     105     0" in out
+    assert "q1         arm1/carriage   offset   493.326149     mm" in out
+    assert "radius tower1.angle arm1.length tower1.stop   arm1/tower/x, arm1/tower/y, q1/transmission/offset" in out
+    out = run("check cable-4 --expand")[1]
+    assert "gain   0.10262536   mm/deg" in out  # 5.88 mm a radian
+    assert "a/transmission/gain   0.0174533   (mm/deg)/mm" in out
+
+
+@pytest.mark.parametrize("robot", sorted(shipped_robots()))
+def test_every_shipped_robot_expands_and_no_number_is_cut_short(run, robot) -> None:
+    code, out, err = run(f"check {robot} --expand")
+    assert (code, err) == (0, "")
+    assert "…" not in out
+    document = json.loads(run(f"check {robot} --expand --json")[1], parse_constant=pytest.fail)
+    assert {limb["name"] for limb in document["assembly"]["limbs"]}
 
 
 def test_drawn_errors_are_written_as_a_robot_file(run) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from loopcal.cli import expand as expanded
 from loopcal.cli import show
 from loopcal.cli.options import FILE, json_option, robot_argument
 
@@ -18,8 +19,9 @@ if TYPE_CHECKING:
 @click.command(short_help="Read a robot file and show what it says.")
 @robot_argument
 @click.option("--plot", type=FILE, metavar="FILE", help="Draw the robot at home into FILE (.png, .svg or .pdf).")
+@click.option("--expand", is_flag=True, help="Also show limbs, links, joints, transmissions and how parameters enter.")
 @json_option
-def check(robot: str, plot: Path | None, as_json: bool) -> None:
+def check(robot: str, plot: Path | None, expand: bool, as_json: bool) -> None:
     """Read ROBOT, a file or the name of a shipped robot, and show what was understood.
 
     Whatever is wrong with the file, its units, its joints or its mobility is said in one sentence with the line.
@@ -28,6 +30,7 @@ def check(robot: str, plot: Path | None, as_json: bool) -> None:
     Examples:
       loopcal check hexapod-42
       loopcal check my-robot.yaml --json
+      loopcal check linear-delta --expand
       loopcal check 3-prs --plot 3-prs.png
     """  # noqa: D301
     from loopcal.io import load_robot
@@ -38,9 +41,11 @@ def check(robot: str, plot: Path | None, as_json: bool) -> None:
 
         save_picture(plot, machine)
     if as_json:
-        show.json_document(_document(machine))
+        show.json_document(_document(machine) | ({"assembly": machine.assembly} if expand else {}))
     else:
         _print(machine)
+        if expand:
+            expanded.assembly(machine)
         if plot is not None:
             show.say(f"\npicture: {plot}")
 
@@ -77,6 +82,7 @@ def _print(robot: Mechanism) -> None:
     units, table = show.units_of(robot), robot.parameters
     words = {"freedoms": robot.freedoms, "commanded in": robot.controlled}
     show.say(f"{robot.name}: {len(robot.actuators)} actuators, {len(table)} parameters, {int(table.free.sum())} free")
+    show.say(f"file: {robot.record.path}")
     for what, names in words.items():
         show.say(f"{what}: {' '.join(names)}")
     for note in robot.notes:

@@ -16,6 +16,9 @@ from loopcal.errors import DataError
 @robot_argument
 @click.argument("data", metavar="[DATA]", type=FILE, required=False)
 @click.option("--poses", type=FILE, help="In place of DATA: CSV file of poses that could be measured.")
+@click.option("--draw", type=click.IntRange(min=1), default=40, show_default=True, metavar="N",
+              help="Without DATA and --poses: how many poses to draw from the robot's workspace.")  # fmt: skip
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of these poses.")
 @instrument_options
 @data_options
 @json_option
@@ -23,6 +26,8 @@ def identifiability(
     robot: str,
     data: Path | None,
     poses: Path | None,
+    draw: int,
+    seed: int,
     kind: str,
     components: str | None,
     orientation: str | None,
@@ -32,13 +37,15 @@ def identifiability(
     allow_duplicates: bool,
     as_json: bool,
 ) -> None:
-    """Tell what DATA, or an instrument at --poses, can determine of the parameters of ROBOT, and what stays open.
+    """Tell what DATA can determine of the parameters of ROBOT, and what stays open.
 
-    The options of the instrument belong to --poses; DATA states its own.
+    Without DATA an instrument is assumed, at --poses or at poses drawn evenly from the workspace that ROBOT states; its
+    options are --kind, --components, --orientation and the sigmas. DATA states its own.
 
     \b
     Examples:
       loopcal identifiability hexapod-42 measurements.csv
+      loopcal identifiability linear-delta --kind component --components z --sigma-position 20um
       loopcal identifiability hexapod-42 --poses poses.csv --kind component --components x,y,z --sigma-position 5um
     """  # noqa: D301
     from loopcal.calibrate import identifiability as identifiable
@@ -46,18 +53,28 @@ def identifiability(
     from loopcal.io.measurement_file import load_poses
     from loopcal.measure import simulate
 
-    if (data is None) == (poses is None):
-        raise DataError("give either DATA, a measurement file, or --poses, a file of poses that could be measured")
+    if data is not None and poses is not None:
+        raise DataError("there are both DATA and --poses; give measurements, or poses that could be measured, but not both")
     machine = load_robot(robot)
+    drawn = ""
     if data is not None:
         measured = load_measurements(
             data, machine, allow_outside_stroke=allow_outside_stroke, allow_duplicates=allow_duplicates
         )
     else:
         seen_by = instrument(kind, components, orientation, sigma_position, sigma_angle)
-        measured = simulate(machine, load_poses(poses or Path(), machine), seen_by, seed=0)
+        if poses is not None:
+            targets = load_poses(poses, machine)
+        else:
+            from loopcal.mechanism.workspace import sample
+
+            targets = sample(machine, draw, seed).coordinates
+            drawn = f"{draw} poses drawn from the workspace of {machine.name}, seed {seed}"
+        measured = simulate(machine, targets, seen_by, seed=0)
     found = identifiable(machine, measured)
     if as_json:
         show.json_document(found.to_dict())
     else:
+        if drawn:
+            show.say(drawn)
         show.say(str(found))

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -19,6 +18,9 @@ if TYPE_CHECKING:
 
 ROUNDING = 1e-12
 """What is smaller than this, in whatever unit is shown, is rounding and shown as 0."""
+
+WIDEST = 1000
+"""Characters in a line of a table; more than any has."""
 
 ALIKE = 5e-3
 """Share by which two errors may differ and still be called the same."""
@@ -53,9 +55,13 @@ def table(title: str, headers: Sequence[str], rows: Iterable[Sequence[str]], tex
         shown.add_column(header, justify="left" if i < text_columns else "right", no_wrap=True)
     for row in rows:
         shown.add_row(*row)
-    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 120
     say()
-    Console(file=sys.stdout, width=width, highlight=False, markup=False).print(shown)
+    # wide enough for everything: a number that is cut short is a wrong number
+    console = Console(width=WIDEST, highlight=False, markup=False, color_system=None)
+    with console.capture() as captured:
+        console.print(shown)
+    for line in captured.get().splitlines():
+        say(line.rstrip())
 
 
 def units_of(robot: Mechanism) -> dict[Dimension, Unit]:
