@@ -6,6 +6,7 @@ from loopcal.measure.alignment import align as align
 from loopcal.measure.alignment import align_points as align_points
 from loopcal.measure.checks import check_actuators as check_actuators
 from loopcal.measure.checks import check_duplicates as check_duplicates
+from loopcal.measure.checks import check_moved as check_moved
 from loopcal.measure.checks import check_strokes as check_strokes
 from loopcal.measure.commanded import readings_from_commanded as readings_from_commanded
 from loopcal.measure.evaluate import KindRows as KindRows

@@ -2,11 +2,14 @@
 """What measurements must satisfy beside their robot: refused with the evidence, unless the caller overrides it."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loopcal.errors import DataError
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.units import unit
+
+Array = NDArray[np.float64]
 
 
 def check_actuators(measurements: Measurements, robot: Mechanism) -> None:
@@ -82,7 +85,8 @@ def check_duplicates(measurements: Measurements, *, allow: bool = False, overrid
         return
     for rows in measurements.observations:
         poses = rows.rows.reshape(len(rows), -1)
-        content = np.concatenate([measurements.readings[poses].reshape(len(rows), -1), rows.measured], axis=1)
+        owners = [np.unique(texts, return_inverse=True)[1].reshape(-1, 1) for texts in (rows.session, rows.group)]
+        content = np.concatenate([measurements.readings[poses].reshape(len(rows), -1), rows.measured, *owners], axis=1)
         _, first, kinds = np.unique(np.nan_to_num(content, nan=1e300), axis=0, return_index=True, return_inverse=True)
         again = np.flatnonzero(first[kinds.ravel()] != np.arange(len(rows)))
         if len(again):
@@ -92,6 +96,51 @@ def check_duplicates(measurements: Measurements, *, allow: bool = False, overrid
                 f"poses {names[0]!r} and {names[1]!r} have the same readings and the same {rows.kind.name} values to"
                 " the last digit; remove one of them" + _or_use(override)
             )
+
+
+def check_moved(measurements: Measurements, T: Array, *, allow: bool = False, override: str = "") -> None:
+    """Refuse a target that no pose moves: its readings stay within the noise, though the robot carried it about.
+
+    A reflector that stands on the floor, a frozen display, a column of another target give such readings, and whatever is
+    fitted to them is wrong.
+
+    Parameters
+    ----------
+    measurements : Measurements
+    T : (n, 4, 4)
+        T_base_platform of each pose, by the nominal robot.
+    allow : bool
+        True accepts them.
+    override : str
+        How a user of the caller says so; closes the message.
+
+    Raises
+    ------
+    DataError
+        Naming the target, how far it moved and how far it should have.
+    """
+    if allow:
+        return
+    for rows in measurements.observations:
+        kind = rows.kind
+        if not kind.follows or kind.links > 1 or len(rows) < 3:
+            continue
+        m = len(kind.noise_columns)
+        expected = kind.measure(T[None, rows.rows], np.zeros((1, len(rows), m)))[0]
+        noise = float(np.sqrt(np.einsum("rii->ri", rows.covariance).max()))
+        for session in np.unique(rows.session):
+            for target, places in kind.sights.items():
+                seen = rows.measured[:, places]
+                here = (rows.session == session) & ~np.any(np.isnan(seen), axis=1)
+                if np.count_nonzero(here) < 3:
+                    continue
+                moved, planned = (float(np.ptp(a[here], axis=0).max()) for a in (seen, expected[:, places]))
+                if planned > 100.0 * noise and moved < 10.0 * noise:
+                    raise DataError(
+                        f"{target!r} of kind {kind.name!r} never moves: its readings stay within {moved:.3g}, but the robot"
+                        f" moves it by {planned:.3g} (m or rad); check that it sits on the platform and that the column is"
+                        " its own" + _or_use(override)
+                    )
 
 
 def _or_use(override: str) -> str:

@@ -19,6 +19,9 @@ OCTAHEDRAL: Array = np.array([R for R in _SIGNED if np.linalg.det(R) > 0.0])
 """The 24 rotations (24, 3, 3) of a cube: none is further than 63 degrees from the nearest."""
 OCTAHEDRAL.setflags(write=False)
 
+FLAT = 1e-6
+"""Extent across over extent along [1] below which points lie in a plane or on a line."""
+
 
 def linear(A: Array, b: Array) -> Array:
     """Least-squares solution of A x = b, the shortest one where it is not unique (relative rank tolerance 1e-9)."""
@@ -70,6 +73,8 @@ def rotations(H: Array, g: Array, best: int = 3) -> Array:
         better = new <= cost
         R, cost = np.where(better[:, None, None], moved, R), np.where(better, new, cost)
         damping = np.where(better[:, None, None], 0.1 * damping, 10.0 * damping)
+        if np.abs(step).max() < 1e-9:
+            break
     return distinct(R[np.argsort(cost)])[:best]
 
 
@@ -167,27 +172,26 @@ def resection(rays: Array, points: Array) -> Array:
 
 
 def trilateration(points: Array, distances: Array, *, with_offset: bool) -> tuple[Array, Array]:
-    """Points c and offsets o with `|p - c| + o = d`: both sides of a plane where all points lie in one.
+    """Points c and offsets o with `|p - c| + o = d`; both sides of a plane in or near which all points lie.
 
     `|p|^2 - d^2 = 2 p'c - 2 d o - (|c|^2 - o^2)` is linear in c, o and the bracket.
 
     Returns
     -------
-    centres : (k, 3), offsets : (k,); k = 1 or 2.
+    centres : (k, 3), offsets : (k,); k = 3, or 2 (one on each side) where the points lie in a plane.
     """
     middle = points.mean(axis=0)
     p = points - middle
-    normal = np.linalg.svd(p, full_matrices=False)[2][2]
-    flat = np.linalg.norm(p @ normal) < 1e-6 * np.linalg.norm(p)
+    _, s, axes = np.linalg.svd(p, full_matrices=False)
     columns = [2.0 * p, -np.ones((len(p), 1))] + ([-2.0 * distances[:, None]] if with_offset else [])
     found = linear(np.concatenate(columns, axis=1), np.sum(p * p, axis=1) - distances**2)
-    offset = found[4] if with_offset else 0.0
-    centre = found[:3]
-    if not flat:
-        return (centre + middle)[None], np.array([offset])
+    offset, centre, normal = found[4] if with_offset else 0.0, found[:3], axes[2]
     foot = centre - (centre @ normal) * normal
     height = np.sqrt(max(float(np.mean((distances - offset) ** 2 - np.sum((p - foot) ** 2, axis=1))), 0.0))
-    return middle + foot + height * np.array([[1.0], [-1.0]]) * normal, np.array([offset, offset])
+    centres = foot + height * np.array([[1.0], [-1.0]]) * normal
+    if s[2] > FLAT * s[0]:
+        centres = np.concatenate([centre[None], centres])
+    return middle + centres, np.full(len(centres), offset)
 
 
 def directions(seen: Array, turns: Array, axis: Array | None) -> tuple[Array, Array]:

@@ -143,7 +143,7 @@ def simulate_trials(
     # Starting at the commanded pose keeps the true machine in the assembly mode of its controller.
     state = forward_trials(robot, values, readings[None], commanded.state)
     T = np.broadcast_to(state.T, (len(values), *state.T.shape[1:]))
-    reached: Bools = np.broadcast_to(np.asarray(state.status == Status.CONVERGED), T.shape[:2])
+    reached = np.array(np.broadcast_to(state.status == Status.CONVERGED, T.shape[:2]), dtype=np.bool_)
     joints = joint_values(robot, joints_looked_at(s.kind for s in mounted.sensors), readings[None], state)
     noise = [_drawn(mounted, stream(seed, trial, NOISE)) for trial in range(len(values))]
     safe = np.where(reached[..., None, None], T, np.eye(4))

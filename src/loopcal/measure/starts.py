@@ -133,10 +133,11 @@ def descended(white: Callable[[Array], tuple[Array, Array]], x: Array) -> tuple[
         e_new, J_new = white(tried)
         new = _squares(e_new)
         better = new < cost
-        done = ~better | (cost - new <= 1e-12 * cost)
+        # a step that moves no residual by a millionth of its sigma is as good as none
+        done = np.linalg.norm(step * scale, axis=1) <= 1e-6
         x, e = np.where(better[:, None], tried, x), np.where(better[:, None], e_new, e)
         J, cost = np.where(better[:, None, None], J_new, J), np.where(better, new, cost)
-        if np.all(done & ((damping > 1e3) | better)):
+        if np.all(done | (damping > 1e4)):
             break
         damping = np.where(better, 0.1 * damping, 10.0 * damping)
     return x, cost

@@ -140,10 +140,11 @@ def local_unknowns(observations: Iterable[Labelled], labels: tuple[str, ...]) ->
             raise DataError(
                 f"the kind {kind.name!r} calls two unknowns {again!r}; give frames, targets and surfaces different names"
             )
-        columns = [[_entered(entries, p, owner, kind) for owner in owners[p.scope]] for p in kind.unknowns]
+        keys = list(zip(*owners.values(), strict=True)) if owners else [()] * len(rows.rows)
+        own = {key: _entered_all(entries, kind, dict(zip(owners, key, strict=True))) for key in dict.fromkeys(keys)}
         order = {name: i for i, name in enumerate(entries)}
-        found = np.array([[order[name] for name in column] for column in columns], dtype=np.intp)
-        places.append(found.reshape(len(columns), len(rows.rows)).T)
+        used = {key: [order[name] for name in names] for key, names in own.items()}
+        places.append(np.array([used[key] for key in keys], dtype=np.intp).reshape(len(rows.rows), len(kind.unknowns)))
     return LocalUnknowns(ParameterTable(tuple(entries.values())), tuple(places))
 
 
@@ -158,6 +159,11 @@ def _owners(rows: Labelled, scope: str, labels: tuple[str, ...]) -> list[str]:
     if scope == "pose":
         return [labels[int(i)] for i in rows.rows.reshape(len(rows.rows), -1)[:, 0]]
     return [""] * len(rows.rows)
+
+
+def _entered_all(entries: dict[str, Parameter], kind: Kind, owner: Mapping[str, str]) -> list[str]:
+    """Enter all unknowns of a kind for the owners of each scope; their full names."""
+    return [_entered(entries, parameter, owner[parameter.scope], kind) for parameter in kind.unknowns]
 
 
 def _entered(entries: dict[str, Parameter], parameter: Parameter, owner: str, kind: Kind) -> str:

@@ -8,8 +8,9 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from loopcal.errors import DataError
 from loopcal.measure.arrays import stored
-from loopcal.measure.closed_form import trilateration
+from loopcal.measure.closed_form import FLAT, trilateration
 from loopcal.measure.kinds import parts
 from loopcal.measure.kinds.kind import Column
 from loopcal.measure.kinds.target import TargetKind, length_of, offset_of, points_of
@@ -80,7 +81,13 @@ class Distance(TargetKind):
         return not_above_zero(measured)
 
     def starts(self, T: Array, measured: Array) -> Array:
-        """The fixed point by trilateration, targets where they are stated."""
+        """The fixed point by trilateration, targets where they are stated.
+
+        Raises
+        ------
+        DataError
+            If all points lie in a plane and nothing is said of the side on which the fixed point is.
+        """
         _, _, points, seen = points_of(self, T, measured)
         if "anchor" not in self.unknown or len(seen) < 4:
             return self.nominal[None]
@@ -88,7 +95,22 @@ class Distance(TargetKind):
         with_offset = "offset" in self.unknown
         found = [trilateration(inside, seen[:, 0], with_offset=flag) for flag in {False, with_offset}]
         centres, offsets = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-        return stacked(self, {"anchor": centres, "offset": offsets[:, None]}, len(centres))
+        side = self._sides(inside, centres)
+        return stacked(self, {"anchor": centres[side], "offset": offsets[side, None]}, int(np.count_nonzero(side)))
+
+    def _sides(self, points: Array, centres: Array) -> NDArray[np.bool_]:
+        """Which centres (k,) are on the stated side of a plane that all points (q, 3) lie in; all, if there is none."""
+        middle = points.mean(axis=0)
+        _, s, axes = np.linalg.svd(points - middle, full_matrices=False)
+        if s[2] > FLAT * s[0] or "targets" in self.unknown:
+            return np.ones(len(centres), dtype=bool)
+        stated = (self.anchor - middle) @ axes[2]
+        if not self.anchor.any() or abs(stated) <= FLAT * s[0]:
+            raise DataError(
+                f"the distances to {self.anchor_name!r} were all measured in one plane, so it can be on either side of it;"
+                " state 'anchor' roughly where it is, or measure poses off the plane"
+            )
+        return (centres - middle) @ axes[2] * stated >= 0.0
 
 
 def not_above_zero(measured: Array) -> tuple[tuple[int, str], ...]:

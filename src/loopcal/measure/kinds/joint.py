@@ -46,6 +46,7 @@ class JointSensor(Kind):
 
     name: ClassVar[str] = "joint"
     scope: ClassVar[str] = "session"
+    follows: ClassVar[bool] = False
     sign: ClassVar[float] = 1.0
 
     def __post_init__(self) -> None:

@@ -63,10 +63,13 @@ class Kind(ABC):
         As files and `KINDS` call it.
     links : int
         How many poses one row compares.
+    follows : bool
+        Whether columns that stay the same while the robot moves are a mistake; touched surfaces and locks stay at 0.
     """
 
     name: ClassVar[str]
     links: ClassVar[int] = 1
+    follows: ClassVar[bool] = True
 
     @property
     @abstractmethod
@@ -87,6 +90,11 @@ class Kind(ABC):
     def unknowns(self) -> tuple[Parameter, ...]:
         """The u unknowns the kind brings with it, each with the scope that shares one value of it."""
         return tuple(parameter for part in self.parts.values() for parameter in part)
+
+    @property
+    def sights(self) -> Mapping[str, tuple[int, ...]]:
+        """What is looked at, by name, with the places of its columns."""
+        return {self.name: tuple(range(len(self.columns)))}
 
     @property
     def references(self) -> Mapping[str, Array]:
@@ -127,7 +135,7 @@ class Kind(ABC):
 
         Parameters
         ----------
-        T : (t, r, 4, 4)
+        T : (t or 1, r, 4, 4)
             T_base_platform of each row (with an axis of links where there are several).
         measured : (t or 1, r, c) [SI]
             NaN where not measured.
@@ -148,7 +156,10 @@ class Kind(ABC):
         if self.looks_at and joints is None:
             raise DataError(f"the kind {self.name!r} needs the values of {', '.join(self.looks_at)}; hand them over as joints")
         filled = np.where(np.isnan(measured), self.neutral, measured)
-        result = self._evaluate(T, filled, self.values(unknowns), np.empty((1, 1, 0)) if joints is None else joints)
+        values = self.values(unknowns)
+        if len(values) > len(T):
+            T = np.broadcast_to(T, (len(values), *T.shape[1:]))
+        result = self._evaluate(T, filled, values, np.empty((1, 1, 0)) if joints is None else joints)
         present = self.present(measured)
         if np.all(present):
             return result

@@ -8,7 +8,8 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.measure.closed_form import frame_and_points, kabsch, linear
+from loopcal.errors import DataError
+from loopcal.measure.closed_form import FLAT, frame_and_points, kabsch, linear
 from loopcal.measure.kinds import parts
 from loopcal.measure.kinds.kind import Column
 from loopcal.measure.kinds.target import TargetKind, points_of
@@ -45,10 +46,22 @@ class Position(TargetKind):
         return x, np.eye(3), {}
 
     def starts(self, T: Array, measured: Array) -> Array:
-        """Frame and targets in closed form."""
+        """Frame and targets in closed form.
+
+        Raises
+        ------
+        DataError
+            If all points lie on a line, about which an unknown frame could turn.
+        """
         moving, origin, points, seen = points_of(self, T, measured)
         if not self.unknown or len(seen) < 3:
             return self.nominal[None]
+        extent = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
+        if "frame" in self.unknown and extent[1] <= FLAT * extent[0]:
+            raise DataError(
+                f"the {len(seen)} positions lie on a line, about which the frame {self.frame!r} could turn; measure poses off"
+                " the line, or state T_base_frame as known"
+            )
         if "targets" not in self.unknown:
             return parts.frame_values(self.T_base_frame, kabsch(seen, points))[None]
         if "frame" in self.unknown:

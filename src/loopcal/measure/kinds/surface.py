@@ -44,6 +44,7 @@ class SurfaceKind(TargetKind):
     surface: str = "surface"
 
     possible: ClassVar[tuple[str, ...]] = ("surface", "targets")
+    follows: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

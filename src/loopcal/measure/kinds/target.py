@@ -101,6 +101,12 @@ class TargetKind(Kind):
                 found[name] = self.own_part(name)
         return found
 
+    @property
+    def sights(self) -> Mapping[str, tuple[int, ...]]:
+        """The targets."""
+        g = len(self.per_target)
+        return {target: tuple(range(i * g, (i + 1) * g)) for i, target in enumerate(self.targets)}
+
     def own_part(self, name: str) -> tuple[Parameter, ...]:
         """Parameters of a part that only this kind has."""
         raise NotImplementedError(name)
