@@ -12,6 +12,7 @@ import numpy as np
 from loopcal.calibrate.combinations import Combination
 from loopcal.calibrate.descent import DescentStatus
 from loopcal.calibrate.filters import Method
+from loopcal.calibrate.posterior import Posterior
 from loopcal.calibrate.scaling import Unknowns
 from loopcal.calibrate.statistics import LEVEL, ResidualCheck, coverage_factor
 from loopcal.linalg import FloatArray
@@ -44,6 +45,7 @@ class Identification:
     robot : Mechanism at the estimated values. initial : the same robot as it was given, to compare with.
     method, unknowns : how it was estimated, and the free parameters with their units.
     estimate : (p,). covariance : (p, p), infinite and NaN where the data cannot tell.
+    posterior : the same knowledge by directions, from which the accuracy of poses and a later prior are made.
     rank, condition, singular_values, rank_tolerance : of the whitened, tolerance-scaled matrix.
     unidentifiable : combinations that change nothing that was measured.
     check : the residual against its degrees of freedom.
@@ -58,6 +60,7 @@ class Identification:
     unknowns: Unknowns
     estimate: FloatArray
     covariance: FloatArray
+    posterior: Posterior
     rank: int
     condition: float
     singular_values: FloatArray
@@ -188,6 +191,7 @@ class Identification:
             "singular_values": self.singular_values,
             "estimate_history": self.estimate_history,
             "cost_history": self.cost_history,
+            **self.posterior.arrays(),
         }
         for i, r in enumerate(self.residuals):
             result[f"residual_{i}_{r.kind}"] = r.raw

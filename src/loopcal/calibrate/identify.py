@@ -15,6 +15,8 @@ from loopcal.calibrate.combinations import combinations
 from loopcal.calibrate.descent import Descent, DescentStatus, StepControl, descend
 from loopcal.calibrate.filters import LeastSquares, Method
 from loopcal.calibrate.identification import Identification, KindResiduals
+from loopcal.calibrate.posterior import posterior
+from loopcal.calibrate.prior import Prior
 from loopcal.calibrate.rows import Residuals, Rows, rows_of, rows_of_trials
 from loopcal.calibrate.scaling import Unknowns, unknowns
 from loopcal.calibrate.statistics import ResidualCheck, residual_check
@@ -33,6 +35,7 @@ def identify(
     method: Method | None = None,
     *,
     noise: Literal["given", "estimated"] = "given",
+    prior: Prior | None = None,
     start: ArrayLike | None = None,
     begin: Begin = "kinematics",
     control: StepControl | None = None,
@@ -49,6 +52,7 @@ def identify(
     robot : its values are the start, its table says what is nominal, free and tolerated.
     data : the measurements. method : default least squares with rank detection.
     noise : "given": the sigmas of the data are true; "estimated": true up to one common factor.
+    prior : what an earlier calibration knows, as further rows; see `loopcal.calibrate.prior`.
     start : (parameters of the robot,) [SI] values to begin with instead of the robot's.
     begin : "kinematics": every step solves the predicted poses; "closure": where all poses are measured in full, first
         linearise closure at the measured ones, which needs fewer steps from a start that is far off.
@@ -70,10 +74,10 @@ def identify(
     free = unknowns(robot)
     rows = rows_of(free, data)
     check_rows(rows, data, robot)
-    check_count(rows, data, method, allow_fewer_equations)
+    check_count(rows, data, method, allow_fewer_equations or prior is not None)
     values = (robot if start is None else robot.with_values(start)).values
     z = free.deviation(values[None])
-    fit = _descended(rows, z, method, control, rank_tolerance, begin)
+    fit = _descended(rows, z, method, control, rank_tolerance, begin, prior)
     if fit.status[0] == DescentStatus.BAD_START:
         check_start(rows, data, z, fit.cost)
     residuals = _labelled(rows.residuals(fit.deviation), data)
@@ -137,16 +141,23 @@ def identify_trials(
 
 
 def _descended(
-    rows: Rows, z: FloatArray, method: Method, control: StepControl | None, tolerance: float, begin: Begin
+    rows: Rows,
+    z: FloatArray,
+    method: Method,
+    control: StepControl | None,
+    tolerance: float,
+    begin: Begin,
+    prior: Prior | None = None,
 ) -> Descent:
     """Descend from deviations z (t, p); steps of the beginning count and stand first in the history."""
     control = control or StepControl()
     if begin not in BEGINS:
         raise EstimationError(f"begin is {begin!r}; it must be one of {', '.join(BEGINS)}")
+    problem = rows if prior is None else prior.added(rows)
     if begin == "kinematics":
-        return descend(rows, z, method, control, tolerance)
+        return descend(problem, z, method, control, tolerance)
     z, first = descend_from_closure(rows, z, method, control, tolerance)
-    fit = descend(rows, z, method, control, tolerance)
+    fit = descend(problem, z, method, control, tolerance)
     if first is None:
         return fit
     return replace(
@@ -180,6 +191,7 @@ def _identification(
         unknowns=free,
         estimate=values[free.places],
         covariance=covariance,
+        posterior=posterior(robot.with_values(values), free.places, free.tolerance, d, fit.penalty, variance),
         rank=int(d.rank[0]),
         condition=float(d.condition[0]),
         singular_values=d.singular_values[0],
