@@ -251,4 +251,5 @@ def _home(robot: Mechanism) -> State:
             "check the joint centres, lengths and home"
         )
     e, _ = robot.slots(values)
-    return engine.solve(robot.program, e, states.actuated(robot.program, state), state)
+    held = engine.solve(program, e, states.actuated(program, state), state, most=0)
+    return replace(state, orientation=held.orientation)

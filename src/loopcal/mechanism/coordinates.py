@@ -85,10 +85,15 @@ def demands(T: Array, target: Array, names: tuple[str, ...], size: float) -> tup
         places = [names.index("phi"), names.index("theta")]
         residual[:, places], columns[:, places, :3] = _normal(rotation, wanted["phi"], wanted["theta"], size)
     if "psi" in wanted:
-        _angle(residual, columns, names.index("psi"), rotation, wanted["psi"], size, "psi")
-    for name in EULER:
-        if name in wanted:
-            _angle(residual, columns, names.index(name), rotation, wanted[name], size, name)
+        place, angle, row = names.index("psi"), *_torsion(rotation)
+        residual[:, place], columns[:, place, :3] = size * se3.wrap(angle - wanted["psi"]), size * row
+    if set(EULER) & set(names):
+        angles = se3.matrix_to_euler(rotation, "xyz")
+        rates = se3.euler_rates_inverse(angles, "xyz")
+        for i, name in enumerate(EULER):
+            if name in wanted:
+                place = names.index(name)
+                residual[:, place], columns[:, place, :3] = size * se3.wrap(angles[:, i] - wanted[name]), size * rates[:, i]
     return residual, columns
 
 
@@ -108,15 +113,8 @@ def _normal(rotation: Array, phi: Array, theta: Array, size: float) -> tuple[Arr
     return size * residual, size * np.cross(normal[:, None], across)
 
 
-def _angle(residual: Array, columns: Array, place: int, rotation: Array, target: Array, size: float, name: str) -> None:
-    """One wrapped angle and its slope in the angular velocity, written in place."""
-    if name == "psi":
-        angle = se3.matrix_to_tilt_torsion(rotation)[2]
-        # d psi = (ez + n) . omega / (1 + cos theta): across everything that phi and theta turn about
-        normal = rotation[:, :, 2]
-        row = (normal + np.array([0.0, 0.0, 1.0])) / (1.0 + normal[:, 2:])
-    else:
-        angles, index = se3.matrix_to_euler(rotation, "xyz"), EULER.index(name)
-        angle, row = angles[:, index], se3.euler_rates_inverse(angles, "xyz")[:, index]
-    residual[:, place] = size * se3.wrap(angle - target)
-    columns[:, place, :3] = size * row
+def _torsion(rotation: Array) -> tuple[Array, Array]:
+    """psi (N,) and its slope in the angular velocity (N, 3)."""
+    # d psi = (ez + n) . omega / (1 + cos theta): across everything that phi and theta turn about
+    normal = rotation[:, :, 2]
+    return se3.matrix_to_tilt_torsion(rotation)[2], (normal + np.array([0.0, 0.0, 1.0])) / (1.0 + normal[:, 2:])

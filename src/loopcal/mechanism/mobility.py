@@ -12,8 +12,8 @@ from loopcal.engine import Array
 from loopcal.errors import MechanismError
 from loopcal.mechanism import coordinates, states
 from loopcal.mechanism.assembly import AXES
+from loopcal.mechanism.implicit import platform_rows
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.trials import platform_rows, readings_at, sensitivity
 
 RANK = 1e-9
 """Relative size below which a singular value at home counts as zero; real margins are above 1e-4, rounding below 1e-13."""
@@ -45,7 +45,10 @@ def checked(robot: Mechanism) -> Mechanism:
             f"{_motion(program.freedoms, V[rank])}; its {len(A)} closure equations hold {rank} of {m} freedoms; "
             "add a limb or actuator, or state fewer freedoms"
         )
-    movable = _mobility(robot, blocks, A)
+    Q = _drives(robot, blocks)
+    both = np.linalg.svd(np.concatenate([A, Q], axis=1), compute_uv=False)
+    # freedoms with every actuator free: solutions (y, dq) of A y + Q dq = 0, A of full column rank
+    movable = A.shape[1] + Q.shape[1] - int((both > RANK * both[0]).sum())
     a = program.n_joints
     if movable < min(a, m):
         raise MechanismError(
@@ -57,31 +60,27 @@ def checked(robot: Mechanism) -> Mechanism:
             f"{robot.name} can be moved in {movable} freedoms, but {len(robot.controlled)} controlled coordinates are named "
             f"({', '.join(robot.controlled)}); name {movable}"
         )
-    return _commandable(robot, movable)
+    return _commandable(robot, movable, scale[:, None] * np.linalg.lstsq(A, -Q, rcond=None)[0])
 
 
-def _mobility(robot: Mechanism, blocks: engine.Blocks, A: Array) -> int:
-    """Freedoms of the platform with every actuator free: solutions (y, dq) of A y + Q dq = 0, A of full column rank."""
-    Q, first = np.zeros((len(A), robot.program.n_joints)), 0
+def _drives(robot: Mechanism, blocks: engine.Blocks) -> Array:
+    """Closure rows of the home position against the actuated joints (c, a)."""
+    parts = []
     for group, block in zip(robot.program.groups, blocks.closure, strict=True):
         for k in range(len(group.limbs)):
-            rows = slice(first, first + block.Q.shape[3])
-            first = rows.stop
+            Q = np.zeros((block.Q.shape[3], robot.program.n_joints))
             for j, columns in enumerate(group.actuator):
                 if columns[0] >= 0:
-                    Q[rows, columns[k]] = block.Q[0, 0, k, :, j]
-    both = np.concatenate([A, Q], axis=1)
-    s = np.linalg.svd(both, compute_uv=False)
-    return both.shape[1] - int((s > RANK * s[0]).sum())
+                    Q[:, columns[k]] = block.Q[0, 0, k, :, j]
+            parts.append(Q)
+    return np.concatenate(parts)
 
 
-def _commandable(robot: Mechanism, movable: int) -> Mechanism:
-    """Refuse controlled coordinates that the machine has no way of choosing."""
-    values = robot.values[None]
-    D = sensitivity(robot, values, readings_at(robot, values, robot.home_state), robot.home_state).readings[0, 0]
+def _commandable(robot: Mechanism, movable: int, D: Array) -> Mechanism:
+    """Refuse controlled coordinates that the machine has no way of choosing; D (m, a): freedoms per actuated joint."""
     target = coordinates.read(robot.home[None], robot.controlled)
     _, columns = coordinates.demands(robot.home[None], target, robot.controlled, robot.size)
-    s = np.linalg.svd(columns[0] @ D, compute_uv=False)
+    s = np.linalg.svd(columns[0][:, list(robot.program.freedoms)] @ D, compute_uv=False)
     if (s > RANK * s.max(initial=1e-300)).sum() < movable:
         raise MechanismError(
             f"{robot.name}: the coordinates {', '.join(robot.controlled)} cannot all be chosen freely at home; "
