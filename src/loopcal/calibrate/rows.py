@@ -143,7 +143,7 @@ class Rows:
         trials = np.arange(len(deviation))
         parts: list[list[Residuals]] = [[] for _ in self.sensed]
         for block in self.blocks:
-            state = forward_trials(robot, values, block.readings, self.last and self.last.take(trials))
+            state = forward_trials(robot, values, block.readings, self.last and self.last.take(trials, deviation))
             ok = _solved(state)
             T = np.where(ok[..., None, None], state.T, np.eye(4))
             for part, sensed in zip(parts, block.sensed, strict=True):
@@ -164,7 +164,7 @@ class Rows:
         robot, values = self.unknowns.robot, self.unknowns.values(deviation)
         if self.located is not None:
             return self._closure(block, values, trials)
-        begin = self.last and self.last.take(trials[: len(values)])
+        begin = self.last and self.last.take(trials[: len(values)], deviation)
         state = forward_trials(robot, values, block.readings, begin)
         D, T = sensitivity(robot, values, block.readings, state).parameters, state.T
         ok = _solved(state) & np.isfinite(D).all(axis=(2, 3))
@@ -172,9 +172,10 @@ class Rows:
         if not ok.all():
             failed = np.any(~ok & block.needed, axis=1)
             T, D = np.where(ok[..., None, None], T, np.eye(4)), np.where(ok[..., None, None], D, 0.0)
+        D = self._scaled(D)
         if self.last is not None:
-            self.last.put(trials, state, ok)
-        return _Moves(T, self._scaled(D), None, failed)
+            self.last.put(trials, state, ok, deviation, D)
+        return _Moves(T, D, None, failed)
 
     def _closure(self, block: _Block, values: FloatArray, trials: IntArray) -> _Moves:
         """Linearise closure at the located poses of a block."""
@@ -227,22 +228,36 @@ class _Moves(NamedTuple):
 
 
 class _Last:
-    """The last solved state of every trial and pose, where its next solution begins; home at first."""
+    """The last solved state of every trial and pose, moved on by its sensitivities: where the next solution begins.
+
+    The sensitivities only choose a start, so they are kept in single precision.
+    """
 
     def __init__(self, home: engine.State, trials: int, poses: int) -> None:
         self.shape = (trials, poses)
         self.state = _mapped(self._spread, home)
+        self.deviation: FloatArray | None = None
+        self.moves = np.zeros(0, np.float32)
 
-    def take(self, trials: IntArray) -> engine.State:
-        """Return the states of some trials."""
-        return self.state if len(trials) == self.shape[0] else _mapped(lambda a: a[trials], self.state)
+    def take(self, trials: IntArray, deviation: FloatArray) -> engine.State:
+        """Return the states of some trials, as far as first order takes them to deviations (a, p)."""
+        state = self.state if len(trials) == self.shape[0] else _mapped(lambda a: a[trials], self.state)
+        if self.deviation is None:
+            return state
+        change = (deviation - self.deviation[trials]).astype(np.float32)
+        twist = np.matmul(self.moves[trials], change[:, None, :, None])[..., 0]
+        return dataclasses.replace(state, T=se3.exp_update(state.T, twist.astype(np.float64)))
 
-    def put(self, trials: IntArray, state: engine.State, ok: np.ndarray) -> None:
+    def put(self, trials: IntArray, state: engine.State, ok: np.ndarray, deviation: FloatArray, D: FloatArray) -> None:
         """Keep the states of poses that are solved; one state stands for all trials where there is one only."""
         if ok.all() and len(trials) == self.shape[0]:
             self.state = _mapped(self._spread, state)
         else:
             _mapped(lambda old, new: _overwrite(old, new, trials, ok), self.state, state)
+        if self.deviation is None:
+            self.deviation = np.zeros((self.shape[0], deviation.shape[1]))
+            self.moves = np.zeros((*self.shape, 6, deviation.shape[1]), np.float32)
+        self.deviation[trials], self.moves[trials] = deviation, D
 
     def _spread(self, array: np.ndarray) -> np.ndarray:
         return np.array(np.broadcast_to(array, (*self.shape, *array.shape[2:])))

@@ -149,8 +149,10 @@ class Chain:
 
     def matrix(self, columns: list[Array]) -> Array:
         """Columns side by side, (r, c, k, N)."""
-        shape = (len(self.group.rows), *self.gap.shape[1:])
-        return np.stack([np.broadcast_to(column, shape) for column in columns], axis=1)
+        out = np.empty((len(self.group.rows), len(columns), *self.gap.shape[1:]))
+        for c, column in enumerate(columns):
+            out[:, c] = column
+        return out
 
 
 def matmul(a: Array, b: Array) -> Array:

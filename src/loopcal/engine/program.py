@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-PITCH, LENGTH = 6, 7
-CONVERGED, STALLED, EXHAUSTED, NOT_FINITE = 0, 1, 2, 3
+PITCH, LENGTH, CONVERGED, STALLED, EXHAUSTED, NOT_FINITE = 6, 7, 0, 1, 2, 3
 
 
 @dataclass(frozen=True)

@@ -93,9 +93,8 @@ class _Rows:
         return [point[a:b].reshape(*shape, point.shape[1]) for a, b, shape in cuts]
 
     def at(self, coordinates: Array, last: Array | None = None) -> Array:
-        """The point at these coordinates: followed by step, norm, reducible norm, step length, orientation, pivot.
-
-        Given `last`, a rounding away, no further step is worked out where all rows close.
+        """These coordinates, then step, norm, reducible norm, step length, orientation, pivot; no new step where all rows close
+        and `last`, a rounding away, is given.
         """
         p, m, N = self.program, len(self.program.freedoms), coordinates.shape[1]
         redundant = p.sigma is not None and not self.free

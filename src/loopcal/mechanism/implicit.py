@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from loopcal import engine
 from loopcal.engine import Array, Block, Group, State
-from loopcal.mechanism.model import Mechanism, SlotMap, Status
+from loopcal.mechanism.model import Mechanism, Status
 from loopcal.mechanism.transmission import TERMS, joint_values, slope, term_columns
 
 ROWS = 512
@@ -93,7 +93,7 @@ class Linearised:
         J = slots.jacobian(values)
         self.of_slots = J[:, : slots.n_displacements]
         self.of_terms = J[:, slots.n_displacements :].reshape(len(J), *slots.terms.shape, -1)
-        self.touches = _touches(slots)
+        self.touches = slots.touches
         self.terms = term_columns(q, slots.frequency)
         self.slope = slope(q, tau, slots.frequency)
 
@@ -159,14 +159,6 @@ def _columns(places: NDArray[np.int64]) -> Columns:
     return places
 
 
-def _touches(slots: SlotMap) -> NDArray[np.bool_]:
-    """Which parameters (p) may move which slots (s), (s, p)."""
-    touches = slots.matrix != 0
-    for _, inputs, outputs in slots.shared:
-        touches[np.ix_(outputs, inputs)] = True
-    return touches
-
-
 def platform_rows(blocks: engine.Blocks) -> Array:
     """All closure rows against the platform's freedoms, (t, n, c, m)."""
     return np.concatenate([b.A.reshape(*b.A.shape[:2], -1, b.A.shape[-1]) for b in blocks.closure], axis=2)
@@ -192,7 +184,7 @@ def _pseudo_inverse(A: Array, weights: Array | None) -> Array:
     safe = np.where(good[..., None, None], A, np.eye(*A.shape[-2:]))
     if A.shape[-1] == A.shape[-2]:
         try:
-            out = np.linalg.inv(safe)
+            out = np.linalg.solve(safe, np.eye(A.shape[-1]))
         except np.linalg.LinAlgError:
             out = np.linalg.pinv(safe)
     else:

@@ -6,10 +6,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from loopcal.engine import Array, Program, State
 from loopcal.errors import MechanismError
@@ -65,15 +66,32 @@ class SlotMap:
     def __call__(self, values: Array) -> tuple[Array, Array]:
         """Values (t, p) -> e (t, n_displacements), tau (t, a, 8)."""
         slots = np.zeros((len(values), len(self.matrix)))
-        # one column at a time, so that a trial's result does not depend on its neighbours
-        for p in np.flatnonzero(self.matrix.any(axis=0)):
-            slots += (values[:, p, None] - self.nominal[p]) * self.matrix[:, p]
+        change = values - self.nominal
+        # element by element, so that a trial's result does not depend on its neighbours
+        for places, columns, coefficients in self._layers:
+            slots[:, places] += change[:, columns] * coefficients
         for shared, inputs, outputs in self.shared:
             change = shared.value(values[:, inputs]) - shared.value(self.nominal[None, inputs])
             for place, column in zip(outputs, change.T, strict=True):
                 slots[:, place] += column
         e, tau = slots[:, : self.n_displacements], slots[:, self.n_displacements :]
         return e, self.terms + tau.reshape(-1, *self.terms.shape)
+
+    @cached_property
+    def _layers(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64], Array]]:
+        """The matrix as (slots, parameters, coefficients), each slot once in a layer."""
+        rows, columns = np.nonzero(self.matrix)
+        nth = np.arange(len(rows)) - np.searchsorted(rows, rows)
+        layers = (nth == i for i in range(nth.max(initial=-1) + 1))
+        return [(rows[layer], columns[layer], self.matrix[rows[layer], columns[layer]]) for layer in layers]
+
+    @cached_property
+    def touches(self) -> NDArray[np.bool_]:
+        """Which parameters may move which slots, (s, p)."""
+        touches = self.matrix != 0
+        for _, inputs, outputs in self.shared:
+            touches[np.ix_(outputs, inputs)] = True
+        return touches
 
     def jacobian(self, values: Array) -> Array:
         """d slots / d values, (t, s, p)."""
