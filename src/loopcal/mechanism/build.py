@@ -246,6 +246,8 @@ def _home(robot: Mechanism) -> State:
         )
     state = inverse_trials(robot, values, target)
     if state.status[0, 0] != engine.CONVERGED:
+        if not shared_drives(program):
+            mobility.refuse_uncommandable(robot, robot.home_state)
         raise MechanismError(
             f"{robot.name} cannot close at its home pose: the loops stay {state.residual[0, 0] * 1e3:.3g} mm open; "
             "check the joint centres, lengths and home"

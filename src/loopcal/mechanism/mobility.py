@@ -89,6 +89,22 @@ def _commandable(robot: Mechanism, movable: int, D: Array) -> Mechanism:
     return robot
 
 
+def refuse_uncommandable(robot: Mechanism, state: engine.State) -> None:
+    """Refuse coordinates that do not determine the platform where its limbs let it move, judged at a state (1, 1)."""
+    program = robot.program
+    e, q = robot.slots(robot.values[None])[0], states.actuated(program, state)
+    rows = platform_rows(engine.linearise(program, e, q, state, free=True))[0, 0]
+    T = state.T[0]
+    _, columns = coordinates.demands(T, coordinates.read(T, robot.controlled), robot.controlled, robot.size)
+    scale = np.array([1 / robot.size if f < 3 else 1.0 for f in program.freedoms])
+    s = np.linalg.svd(np.concatenate([rows, columns[0][:, list(program.freedoms)]]) * scale, compute_uv=False)
+    if len(s) < len(scale) or (s <= RANK * s[0]).any():
+        raise MechanismError(
+            f"{robot.name}: the coordinates {', '.join(robot.controlled)} cannot all be chosen freely at home; "
+            f"name {len(robot.controlled)} that the actuators move independently, of {', '.join(coordinates.NAMES)}"
+        )
+
+
 def hold_spinning(program: engine.Program, guess: engine.State) -> tuple[engine.Program, tuple[tuple[int, int], ...]]:
     """Hold one joint for each way a limb can move while tip and platform stand still (the spin of an S-P-S leg).
 
