@@ -31,8 +31,12 @@ if TYPE_CHECKING:
     from loopcal.mechanism import Mechanism as Mechanism
     from loopcal.mechanism import Solution as Solution
     from loopcal.mechanism import Status as Status
+    from loopcal.mechanism import along_path as along_path
+    from loopcal.mechanism import assembly_modes as assembly_modes
     from loopcal.mechanism import forward as forward
     from loopcal.mechanism import inverse as inverse
+    from loopcal.mechanism import sample as sample
+    from loopcal.mechanism import working_modes as working_modes
 
 __version__ = "0.1.0.dev0"
 
@@ -53,7 +57,17 @@ _WHERE = {
         "loopcal.errors": ("LoopcalError",),
         "loopcal.io": ("load_measurements", "load_robot", "save_measurements", "save_robot"),
         "loopcal.measure": ("Instrument", "Measurements", "simulate"),
-        "loopcal.mechanism": ("Mechanism", "Solution", "Status", "forward", "inverse"),
+        "loopcal.mechanism": (
+            "Mechanism",
+            "Solution",
+            "Status",
+            "along_path",
+            "assembly_modes",
+            "forward",
+            "inverse",
+            "sample",
+            "working_modes",
+        ),
     }.items()
     for name in names
 }

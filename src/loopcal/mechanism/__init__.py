@@ -9,6 +9,8 @@ from loopcal.mechanism.assembly import Joint as Joint
 from loopcal.mechanism.assembly import Limb as Limb
 from loopcal.mechanism.assembly import Linear as Linear
 from loopcal.mechanism.assembly import Link as Link
+from loopcal.mechanism.assembly_modes import assembly_modes as assembly_modes
+from loopcal.mechanism.assembly_modes import working_modes as working_modes
 from loopcal.mechanism.build import build as build
 from loopcal.mechanism.families import FAMILIES as FAMILIES
 from loopcal.mechanism.kinematics import Solution as Solution
@@ -17,3 +19,7 @@ from loopcal.mechanism.kinematics import inverse as inverse
 from loopcal.mechanism.model import Mechanism as Mechanism
 from loopcal.mechanism.model import Status as Status
 from loopcal.mechanism.records import Robot as Robot
+from loopcal.mechanism.singularity import Singularity as Singularity
+from loopcal.mechanism.singularity import along_path as along_path
+from loopcal.mechanism.singularity import singularity as singularity
+from loopcal.mechanism.workspace import sample as sample
