@@ -25,8 +25,9 @@ evidence: .venv/dev.stamp  ## statistics at full size: docs/evidence/*.json, the
 	$(BIN)/python -m tools.evidence
 	$(BIN)/pytest -m evidence
 
-docs: .venv/dev.stamp  ## rewrite the tables in the documentation from docs/evidence/*.json
+docs: .venv/dev.stamp  ## rewrite the tables in the documentation from docs/evidence/*.json and from the code
 	$(BIN)/python -m tools.evidence --tables
+	$(BIN)/python -m tools.file_reference
 
 bench: .venv/dev.stamp  ## benchmarks against the committed baseline; fails when one got worse
 	$(BIN)/python -m benchmarks.run --gate

@@ -101,7 +101,15 @@ class Workspace:
 
 @dataclass(frozen=True)
 class Robot:
-    """What every robot file may say, whatever its family. A family adds its own fields and `expand`."""
+    """What every robot file may say, whatever its family. A family adds its own fields and `expand`.
+
+    Attributes
+    ----------
+    name : what the robot is called. source : where its numbers come from.
+    home : the platform's pose, in the base, at which loops are closed first; what is not said is zero.
+    tool : the tool's pose on the platform. workspace : where the machine works; poses are drawn from it.
+    fixed : parameters that are not to be identified, by name or pattern, such as `arm*.length`.
+    """
 
     name: str
     source: str = ""

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal new` writes files that work as they are."""
+
+import pytest
+
+from loopcal.cli import main
+from loopcal.io import load_robot
+from loopcal.io.robot_file import shipped_robots
+from loopcal.mechanism import FAMILIES
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("name", sorted({*FAMILIES, *shipped_robots()}))
+def test_a_new_robot_of_every_family_closes_and_lists_its_keys(name) -> None:
+    assert main(["new", name, "-o", "mine.yaml"]) == 0
+    robot = load_robot("mine.yaml")
+    assert robot.name == "mine"
+    text = robot.record.text
+    for key in ("workspace", "tolerances", "fixed"):
+        assert f"#   {key}: " in text
+    assert max(len(line) for line in text.split("\n") if line.startswith("#   ")) <= 120
+
+
+def test_a_name_that_yaml_would_read_as_a_number_is_quoted() -> None:
+    assert main(["new", "gough", "-o", "2.yaml"]) == 0
+    assert load_robot("2.yaml").name == "2"
+
+
+def test_the_template_lacks_nothing_but_rows(tmp_path, capsys) -> None:
+    words = "new linear-delta -o printer.yaml --measurements heights.csv --kind component --components z --sigma-position 20um"
+    assert main(words.split()) == 0
+    template = tmp_path / "heights.csv"
+    assert template.read_text().endswith("# noise: {z: 20 um}\npose,q1 [mm],q2 [mm],q3 [mm],z [mm]\n")
+    assert main(["calibrate", "printer.yaml", "heights.csv", "-o", "run"]) == 1
+    assert "has a header but no rows; add one row for each measured pose" in capsys.readouterr().err
+    rows = [f"p{i},{150 + 7 * i},{150 + i * i},{160 - 3 * i},100.0" for i in range(12)]
+    template.write_text(template.read_text() + "\n".join(rows) + "\n")
+    assert main(["identifiability", "printer.yaml", "heights.csv"]) == 0
+
+
+def test_files_that_are_there_stay_without_force(tmp_path, capsys) -> None:
+    assert main(["new", "gough", "-o", "mine.yaml"]) == 0
+    (tmp_path / "mine.yaml").write_text("mine")
+    capsys.readouterr()
+    assert main(["new", "3-prs", "-o", "mine.yaml"]) == 1
+    assert "this file exists" in capsys.readouterr().err
+    assert (tmp_path / "mine.yaml").read_text() == "mine"
+    assert main(["new", "3-prs", "-o", "mine.yaml", "--force"]) == 0
+
+
+def test_an_unknown_family_is_refused_with_those_that_are_known(capsys) -> None:
+    assert main(["new", "hexpod", "-o", "mine.yaml"]) == 1
+    assert "neither a family nor a shipped robot" in capsys.readouterr().err

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""docs/files.md says what the code reads and writes."""
+
+import json
+import re
+
+import pytest
+
+from loopcal.cli import main
+from loopcal.io import reference
+from loopcal.measure import KINDS
+from loopcal.mechanism import FAMILIES
+from loopcal.mechanism.families.linear_delta import LinearDelta
+from tools import file_reference
+
+PAGE = file_reference.PAGE.read_text("utf-8")
+
+
+def test_the_page_is_up_to_date() -> None:
+    assert file_reference.written(PAGE) == PAGE, "run `make docs`"
+    assert {m["name"] for m in file_reference.BLOCK.finditer(PAGE)} == set(file_reference.BLOCKS)
+
+
+def test_every_family_and_kind_is_there() -> None:
+    for name in FAMILIES:
+        assert f"### `family: {name}`\n" in PAGE
+    for name in KINDS:
+        assert f"### `kind: {name}`\n" in PAGE
+
+
+def test_keys_come_with_what_they_hold_and_what_it_means() -> None:
+    found = {key.name: key for key in reference.keys(LinearDelta)}
+    assert found["radius"] == reference.Key(
+        "radius", "length", "0", "horizontal distance from a rod's upper to its lower end with the nozzle in the centre"
+    )
+    assert found["readings"].holds == "`drop` or `height`"
+    assert found["arms"].holds == "length or list of length"
+    assert found["name"].default == "needed"
+
+
+def test_every_key_of_a_run_is_described(tmp_path, monkeypatch, root) -> None:
+    monkeypatch.chdir(root / "examples" / "hexapod-42")
+    assert main(["calibrate", "hexapod-42", "measurements.csv", "-o", str(tmp_path / "run"), "--hold-out", "0.25"]) == 0
+    result = json.loads((tmp_path / "run" / "result.json").read_text(), parse_constant=pytest.fail)
+    described = set(re.findall(r"`(\w+)`", PAGE[PAGE.index("## Run folders") :]))
+    keys = set(result) - {"nulls"}
+    for part in ("made_by", "fit", "start", "split", "validation"):
+        keys |= set(result[part])
+    keys |= set(result["fit"]["parameters"][0]) | set(result["validation"]["before"])
+    assert sorted(keys - described) == []

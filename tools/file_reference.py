@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write the tables of docs/files.md from the records and kinds that read the files: `python -m tools.file_reference`.
+
+A table stands between `<!-- made by tools.file_reference: NAME -->` and `<!-- end -->`; what is around it is written by hand.
+"""
+
+import dataclasses
+import re
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from loopcal.io import reference
+from loopcal.io.measurement_file import SETTINGS
+from loopcal.io.run_folder import MADE_BY
+from loopcal.io.sensor_settings import SYMBOLS, kind_settings
+from loopcal.measure import KINDS, Column, Kind
+from loopcal.mechanism import FAMILIES
+from loopcal.mechanism.records import Robot
+from loopcal.units import Dimension
+
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "files.md"
+BLOCK = re.compile(r"(<!-- made by tools.file_reference: (?P<name>[\w-]+) -->\n)(?P<body>.*?)(<!-- end -->)", re.DOTALL)
+
+
+def table(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [headers, ["---"] * len(headers), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
+
+
+def record_table(record: type, without: Iterable[str] = ()) -> str:
+    """Return the keys of a record, those left out that `without` names."""
+    left = set(without)
+    found = [key for key in reference.keys(record) if key.name not in left]
+    if not any(key.meaning for key in found):
+        return "; ".join(f"`{k.name}`: {k.holds}" + (f" ({k.default})" if k.default else "") for k in found) + "\n"
+    rows = [(f"`{k.name}`", k.holds, k.default, k.meaning) for k in found]
+    return table(("key", "holds", "default", "meaning"), rows)
+
+
+def common() -> str:
+    """Return what every robot file may say."""
+    parts = [record_table(Robot)]
+    parts += [_nested(record) for record in common_records()]
+    return "\n".join(parts)
+
+
+def common_records() -> tuple[type, ...]:
+    """Return the records that several families use."""
+    seen: dict[type, int] = {}
+    for family in FAMILIES.values():
+        for record in reference.nested(family):
+            seen[record] = seen.get(record, 0) + 1
+    return tuple(record for record, count in seen.items() if count > 1)
+
+
+def families() -> str:
+    """Return the keys of every family, beside the common ones."""
+    shared = [key.name for key in reference.keys(Robot)]
+    parts = []
+    for name, family in FAMILIES.items():
+        own = [record for record in reference.nested(family) if record not in common_records()]
+        parts.append(f"### `family: {name}`\n\n{reference.summary(family)}\n\n{record_table(family, shared)}")
+        parts += [_nested(record) for record in own]
+    return "\n".join(parts)
+
+
+def _nested(record: type) -> str:
+    return f"**{record.__name__}**: {reference.summary(record)}\n\n{record_table(record)}"
+
+
+def kinds() -> str:
+    """Return columns and settings of every kind of measurement."""
+    parts = []
+    for name, kind in KINDS.items():
+        rows = dict.fromkeys(_example(one) for one in kind.examples())
+        columns = table(("settings", "columns", "noise is stated for"), rows)
+        meanings = reference.meanings_of(kind)
+        if possible := getattr(kind, "possible", ()):
+            meanings["unknown"] = f"Which of {', '.join(f'`{p}`' for p in possible)} are unknown, and identified with the robot"
+        settings = table(("setting", "meaning"), [(f"`{key}`", meanings.get(key, "")) for key in kind_settings(kind)])
+        parts.append(f"### `kind: {name}`\n\n{reference.summary(kind)}\n\n{columns}\n{settings}")
+    return "\n".join(parts)
+
+
+def _example(kind: Kind) -> tuple[str, str, str]:
+    """Return settings, columns and noise columns of an example."""
+    stated = []
+    for field in dataclasses.fields(kind):  # type: ignore[arg-type]  # every kind is a dataclass
+        value = getattr(kind, field.name)
+        if field.init and field.name in ("orientation", "components", "targets", "joints", "form") and value:
+            stated.append(f"`{field.name}: {value if isinstance(value, str) else '[' + ', '.join(value) + ']'}`")
+    return ", ".join(stated), _columns(kind.columns), _columns(kind.noise_columns)
+
+
+def _columns(columns: Iterable[Column]) -> str:
+    """Return columns with an example of their unit."""
+    return " ".join(
+        f"`{c.name}`" + ("" if c.dimension is Dimension.RATIO else f" [{SYMBOLS[c.dimension][0]}]") for c in columns
+    )
+
+
+def settings() -> str:
+    """Return the settings of a measurement file."""
+    return table(("setting", "meaning"), [(f"`{key}`", words) for key, words in SETTINGS.items()])
+
+
+def made_by() -> str:
+    """Return the keys of `made_by`."""
+    return table(("key", "meaning"), [(f"`{key}`", words) for key, words in MADE_BY.items()])
+
+
+BLOCKS = {"common": common, "families": families, "kinds": kinds, "settings": settings, "made-by": made_by}
+
+
+def written(text: str) -> str:
+    """Return the page with every table made anew."""
+    return BLOCK.sub(lambda m: f"{m[1]}{BLOCKS[m['name']]()}{m[4]}", text)
+
+
+def main() -> int:
+    """Rewrite the page."""
+    PAGE.write_text(written(PAGE.read_text("utf-8")), "utf-8")
+    print(f"written: {PAGE.relative_to(PAGE.parent.parent)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
