@@ -17,7 +17,7 @@ from loopcal.mechanism.projection import nearest_reachable
 from loopcal.mechanism.trials import forward_trials, inverse_trials, readings_at
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Solution:
     """Poses and joints of n rows.
 
@@ -36,6 +36,12 @@ class Solution:
     residual: Array
     iterations: NDArray[np.int64]
     state: State
+
+    def __repr__(self) -> str:
+        lost = int((~self.converged).sum())
+        first = f"; {self.explain(int(np.flatnonzero(~self.converged)[0]))}" if lost else ""
+        gap = self.residual[self.converged].max(initial=0.0)
+        return f"Solution of {len(self.q)} rows, {lost} not closed, the others to {gap * 1e3:.2g} mm{first}"
 
     @property
     def converged(self) -> NDArray[np.bool_]:
