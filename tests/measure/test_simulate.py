@@ -16,7 +16,9 @@ from loopcal.measure import (
     Measurements,
     Observations,
     Pose,
+    Position,
     Sensor,
+    Separation,
     Uniform,
     check_actuators,
     check_duplicates,
@@ -174,3 +176,34 @@ def test_a_row_given_twice_is_refused():
     with pytest.raises(DataError, match="poses '1' and '3' have the same readings and the same component values"):
         check_duplicates(twice)
     check_duplicates(twice, allow=True)
+
+
+def test_true_values_of_unknowns_are_seen_and_unknown_names_are_refused(robot):
+    tracker = Position(targets=("ball",), unknown=("frame", "targets"), frame="tracker")
+    instrument = Instrument((Sensor(tracker, Gaussian(np.full(3, 1e-9))),))
+    at = {"tracker.x": 1.0, "tracker.rz": np.pi / 2, "ball.z": 0.1}
+    data = simulate(robot, COMMANDED, instrument, seed=1, unknowns=at)
+    point = (COMMANDED @ [0.0, 0.0, 0.1, 1.0])[:, :3]
+    seen = np.stack([point[:, 1], 1.0 - point[:, 0], point[:, 2]], axis=1)  # turned by a quarter about z, one metre off
+    assert_allclose(data.observations[0].measured, seen, atol=1e-8)
+    trials = simulate_trials(robot, robot.values, COMMANDED, instrument, seed=1, unknowns=at)
+    assert trials.local.values()[trials.local.table.index("tracker.x")] == 1.0
+    with pytest.raises(DataError, match=r"no unknown of these measurements is called 'traker\.x'.*did you mean 'tracker\.x'"):
+        simulate(robot, COMMANDED, instrument, seed=1, unknowns={"traker.x": 1.0})
+
+
+def test_rows_may_see_some_poses_compare_two_and_stand_in_sessions(robot):
+    pairs = np.array([[0, 5], [3, 1]])
+    bar = Sensor(Separation(), Gaussian(np.array([1e-9])), rows=pairs)
+    some = Sensor(Position(), Gaussian(np.full(3, 1e-9)), rows=np.array([2, 2, 7]), session=np.array(["a", "a", "b"]))
+    every = Sensor(Separation(), Gaussian(np.array([1e-9])))
+    data = simulate(robot, COMMANDED, Instrument((bar, some, every)), seed=1)
+    place = COMMANDED[:, :3, 3]
+    length = np.linalg.norm(place[pairs[:, 0]] - place[pairs[:, 1]], axis=1)
+    assert_allclose(data.observations[0].measured[:, 0], length, atol=1e-8)
+    assert_allclose(data.observations[1].measured, place[[2, 2, 7]], atol=1e-8)
+    assert data.observations[1].session.tolist() == ["a", "a", "b"]
+    assert data.observations[2].rows.tolist() == [[i, (i + 1) % 12] for i in range(12)]
+    part = data.take([1, 3, 2])
+    assert part.observations[0].rows.tolist() == [[1, 0]]
+    assert part.observations[1].session.tolist() == ["a", "a"]

@@ -124,17 +124,20 @@ def descended(white: Callable[[Array], tuple[Array, Array]], x: Array) -> tuple[
     cost = _squares(e)
     damping = np.full(len(x), 1e-4)
     for _ in range(STEPS):
-        scale = np.linalg.norm(J, axis=1)
-        scale = np.where(scale > 0.0, scale, 1.0)
-        U, s, V = np.linalg.svd(np.nan_to_num(J / scale[:, None, :]), full_matrices=False)
-        rhs = np.einsum("cmk,cm->ck", U, np.nan_to_num(e))
-        step = -np.einsum("cku,ck->cu", V, s / (s * s + damping[:, None] ** 2 + 1e-24) * rhs) / scale
+        norm = np.linalg.norm(J, axis=1)
+        scale = np.where(norm > 0.0, norm, 1.0)
+        # one triangular factor, so that the decomposition does not grow with the rows
+        R = np.linalg.qr(np.nan_to_num(np.concatenate([J / scale[:, None, :], e[..., None]], axis=-1)), mode="r")
+        U, s, V = np.linalg.svd(R[..., :-1], full_matrices=False)
+        rhs = np.einsum("cmk,cm->ck", U, R[..., -1])
+        gain = np.where(s > 1e-12, s / (s * s + damping[:, None] ** 2 + 1e-24), 0.0)
+        step = np.where(norm > 0.0, -np.einsum("cku,ck->cu", V, gain * rhs) / scale, 0.0)
         tried = x + step
         e_new, J_new = white(tried)
         new = _squares(e_new)
         better = new < cost
-        # a step that moves no residual by a millionth of its sigma is as good as none
-        done = np.linalg.norm(step * scale, axis=1) <= 1e-6
+        # a step that moves the residuals by a millionth of their sigma, or of themselves, is as good as none
+        done = np.linalg.norm(step * scale, axis=1) <= 1e-6 * (1.0 + np.sqrt(new))
         x, e = np.where(better[:, None], tried, x), np.where(better[:, None], e_new, e)
         J, cost = np.where(better[:, None, None], J_new, J), np.where(better, new, cost)
         if np.all(done | (damping > 1e4)):

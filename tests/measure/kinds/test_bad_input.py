@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What cannot be meant is refused by every kind, in one sentence that says what to do."""
+
+import numpy as np
+import pytest
+
+from loopcal import se3
+from loopcal.errors import DataError
+from loopcal.measure import (
+    KINDS,
+    Autocollimation,
+    Bearing,
+    Direction,
+    Distance,
+    Gaussian,
+    Inclination,
+    JointSensor,
+    Line,
+    Measurements,
+    Observations,
+    Plane,
+    Position,
+    Sensor,
+    Separation,
+    Sphere,
+    check_duplicates,
+    check_moved,
+)
+from tests import zoo
+
+POINT = np.zeros((1, 3))
+EXAMPLES = [pytest.param(kind, id=f"{name}-{i}") for name, cls in KINDS.items() for i, kind in enumerate(cls.examples())]
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: Position(targets=()), "the targets are none: name at least one"),
+        (lambda: Position(targets=("a", "a")), "the targets are a, a: name at least one, and each once"),
+        (lambda: Position(targets=("a", "b"), places=POINT), r"the places of the targets has shape \(1, 3\); .*\(2, 3\)"),
+        (
+            lambda: Position(unknown=("tracker",)),
+            "'tracker' cannot be unknown in the kind 'position'; what can be is frame, targets",
+        ),
+        (lambda: Position(T_base_frame=2.0 * np.eye(4)), "T_base_frame is not a pose"),
+        (lambda: Bearing(form="telescope"), "the form of a bearing is 'telescope'; use theodolite or camera"),
+        (lambda: Distance(anchor=np.array([0.0, np.nan, 0.0])), "the anchor: row 2 is nan; give a finite number"),
+        (lambda: Plane(along=np.zeros(3)), "the direction of the surface is 0, 0, 0, which points nowhere"),
+        (lambda: Sphere(radius=0.0), "the radius of a sphere is 0.0 m; give a length above 0"),
+        (lambda: Direction(axis=np.zeros(3)), "the axis is 0, 0, 0, which points nowhere"),
+        (lambda: Inclination(unknown=("frame",)), "what can be is mounting, gravity"),
+        (lambda: JointSensor(joints=()), "the joints are none: name at least one"),
+        (lambda: JointSensor(measures="force"), "the joints measure 'force'; use length or angle"),
+    ],
+)
+def test_settings_that_make_no_kind(make, sentence):
+    with pytest.raises(DataError, match=sentence):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("kind", "row", "sentence"),
+    [
+        (Distance(places=POINT), [0.0], "row 2 of kind 'distance' has a distance of 0 m; a distance is above 0"),
+        (Separation(places=POINT), [-0.1], "has a distance of -0.1 m"),
+        (Direction(), [0.0, 0.6, 0.7], "has a direction of length 0.921954; it must be 1 to 1e-3"),
+        (Direction(), [0.0, np.nan, 1.0], "has only a part of its direction"),
+        (Inclination(), [0.9, 0.9], "has tilts of 51.5662 and 51.5662 deg, which no direction has"),
+        (Inclination(), [2.0, 0.0], "has tilts of 114.592 and 0 deg"),
+        (Autocollimation(), [0.0, 1.6], "has an angle of 91.6732 deg, at which a mirror faces away"),
+    ],
+)
+def test_rows_that_no_instrument_shows(kind, row, sentence):
+    good = {"distance": [1.0], "separation": [1.0], "direction": [0.0, 0.0, 1.0]}.get(kind.name, [0.0, 0.0])
+    poses = np.arange(2) if kind.links == 1 else np.array([[0, 1], [1, 0]])
+    with pytest.raises(DataError, match=sentence):
+        Observations.from_sigma(kind, poses, [good, row], 1e-4)
+
+
+def test_a_row_that_compares_a_pose_with_itself():
+    with pytest.raises(DataError, match="row 2 of kind 'separation' links pose 3 with itself; name two poses"):
+        Observations.from_sigma(Separation(places=POINT), [[0, 1], [3, 3]], np.ones((2, 1)), 1e-4)
+
+
+@pytest.mark.parametrize("kind", EXAMPLES)
+def test_a_covariance_that_is_not_positive_definite_and_rows_that_repeat(kind):
+    kind = kind.mounted(np.eye(4))
+    T = se3.exp_update(np.eye(4), np.random.default_rng(0).uniform(-0.4, 0.4, (1, 3, 6)))
+    rows = np.array([0, 1, 1]) if kind.links == 1 else np.array([[0, 1], [1, 2], [1, 2]])
+    m = len(kind.noise_columns)
+    measured = kind.measure(T[:, rows], np.zeros((1, 3, m)))[0]
+    with pytest.raises(DataError, match="the covariance of row 1"):
+        Observations(kind, rows, measured, np.zeros((m, m)))
+    twice = Observations.from_sigma(kind, rows, measured, 1e-4)
+    data = Measurements("toy", np.arange(3.0)[:, None], (twice,))
+    with pytest.raises(DataError, match=f"poses '2' and '2' have the same readings and the same {kind.name} values"):
+        check_duplicates(data)
+    apart = Observations.from_sigma(kind, rows, measured, 1e-4, group=np.array(["a", "b", "c"]))
+    check_duplicates(Measurements("toy", np.arange(3.0)[:, None], (apart,)))
+
+
+@pytest.mark.parametrize("name", ["a,b", 'say "hello"', "Kügelchen №1", "日本"])
+def test_names_may_hold_anything(name):
+    kind = Position(targets=(name, "b"), places=np.zeros((2, 3)), unknown=("targets",))
+    assert kind.columns[0].name == f"{name}.x"
+    assert kind.unknowns[0].name == f"{name}.x"
+
+
+def test_a_target_that_no_pose_moves_is_named():
+    T = zoo.poses_of(np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)))
+    kind = Position(targets=("a", "b"), places=0.1 * np.eye(3)[:2])
+    noise = 1e-5 * np.random.default_rng(1).normal(size=(1, 8, 6))
+    measured = kind.measure(T[None], noise)[0]
+    readings = np.arange(8.0)[:, None]
+    check_moved(Measurements("toy", readings, (Observations.from_sigma(kind, np.arange(8), measured, 1e-5),)), T)
+    measured[:, 3:] = measured[0, 3:] + noise[0, :, 3:]
+    data = Measurements("toy", readings, (Observations.from_sigma(kind, np.arange(8), measured, 1e-5),))
+    with pytest.raises(DataError, match=r"'b' of kind 'position' never moves: its readings stay within .*use --allow-still"):
+        check_moved(data, T, override="--allow-still")
+    check_moved(data, T, allow=True)
+
+
+@pytest.mark.parametrize("kind", [Plane(places=POINT), Line(places=POINT), JointSensor()])
+def test_touched_surfaces_and_joints_may_stay_where_they_are(kind):
+    T = zoo.poses_of(np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)))
+    rows = Observations.from_sigma(kind, np.arange(8), np.zeros((8, len(kind.columns))), 1e-5)
+    check_moved(Measurements("toy", np.arange(8.0)[:, None], (rows,)), T)
+
+
+def test_a_sensor_that_is_to_look_at_poses_that_are_not_there():
+    kind = Separation(places=POINT)
+    with pytest.raises(DataError, match="is to see poses up to 7 of 0 to 3"):
+        Sensor(kind, Gaussian(np.ones(1)), rows=np.array([[0, 7]])).looking(4)
+    with pytest.raises(DataError, match="compares poses, but there is 1; give at least 2"):
+        Sensor(kind, Gaussian(np.ones(1))).looking(1)

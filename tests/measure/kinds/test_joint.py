@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sensors on joints: passive ones by name, driven ones as encoders, locks."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from loopcal.errors import DataError
+from loopcal.measure import (
+    Gaussian,
+    Instrument,
+    JointSensor,
+    Locked,
+    Sensor,
+    evaluate_all,
+    joint_values,
+    simulate,
+    whitened_rows,
+)
+from loopcal.mechanism import inverse
+from loopcal.mechanism.trials import forward_trials
+from tests import zoo
+
+COMMANDED = np.random.default_rng(2).uniform([0.65, -np.pi, 0.05], [0.75, np.pi, 0.2], (8, 3))
+TINY = 1e-9
+
+
+def sensor(kind, **labels):
+    return Sensor(kind, Gaussian(np.full(len(kind.noise_columns), TINY)), **labels)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return zoo.three_prs()
+
+
+def test_a_sensor_on_a_passive_joint_shows_its_value_and_the_offset(robot):
+    kind = JointSensor(joints=("limb2.pin", "limb1.pin"), measures="angle", unknown=("offset",))
+    data = simulate(robot, COMMANDED, Instrument((sensor(kind),)), 1, unknowns={"limb1.pin.joint": 0.1})
+    solution = inverse(robot, COMMANDED)
+    expected = [solution.passive[:, solution.passive_names.index(name)] for name in kind.joints]
+    shown = np.stack(expected, axis=1) + np.array([0.0, 0.1])
+    assert_allclose(data.observations[0].measured, shown, atol=1e-8)
+
+
+def test_an_encoder_is_a_sensor_on_a_driven_joint(robot):
+    kind = JointSensor(joints=("q1", "q2", "q3"))
+    data = simulate(robot, COMMANDED, Instrument((sensor(kind),)), 1)
+    assert_allclose(data.observations[0].measured, data.readings, atol=1e-8)
+
+
+def test_a_lock_holds_at_a_constant_of_its_group(robot):
+    kind = Locked(joints=("q1",))
+    groups = np.repeat(["a", "b"], 4)
+    data = simulate(robot, COMMANDED, Instrument((sensor(kind, group=groups),)), 1, unknowns={"a.q1.locked": 0.2})
+    slip = data.readings[:, 0] - np.repeat([0.2, 0.0], 4)
+    assert_allclose(data.observations[0].measured[:, 0], slip, atol=1e-8)
+
+
+def test_rows_of_joints_follow_the_joints(robot):
+    kind = JointSensor(joints=("limb1.pin", "q2"), measures="angle")
+    data = simulate(robot, COMMANDED, Instrument((sensor(kind),)), 1)
+    state = forward_trials(robot, robot.values[None], data.readings[None])
+    values = joint_values(robot, kind.looks_at, data.readings[None], state)
+    slopes = {name: np.random.default_rng(5).normal(size=(1, 8, 4)) for name in kind.looks_at}
+    parts = evaluate_all(data, state.T, np.zeros((1, 0)), joints=values)
+    rows = whitened_rows(parts, np.ones((1, 8, 6, 4)), slopes)
+    assert rows.shape == (1, 16, 5)
+    assert_allclose(rows[0, :, :4] * TINY, np.stack([slopes[n][0] for n in kind.looks_at], axis=1).reshape(16, 4), rtol=1e-12)
+    with pytest.raises(DataError, match=r"needs the values of joint 'limb1\.pin'"):
+        evaluate_all(data, state.T, np.zeros((1, 0)))
+
+
+def test_a_joint_that_is_not_there_is_named_with_those_that_are(robot):
+    with pytest.raises(DataError, match=r"has no joint 'limb1.pim'.*limb1\.pin"):
+        simulate(robot, COMMANDED, Instrument((sensor(JointSensor(joints=("limb1.pim",))),)), 1)

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Starts for unknown frames, targets and surfaces are found from any orientation, without a guess."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from loopcal import se3
+from loopcal.errors import DataError
+from loopcal.measure import (
+    Autocollimation,
+    Bearing,
+    Component,
+    Direction,
+    Distance,
+    Gaussian,
+    Inclination,
+    Line,
+    Measurements,
+    Observations,
+    Plane,
+    Pose,
+    Position,
+    Sensor,
+    Separation,
+    Sphere,
+    evaluate_all,
+    local_unknowns,
+    start_values,
+    whitened_rows,
+)
+from loopcal.measure.closed_form import OCTAHEDRAL, trilateration
+from tests import zoo
+
+N = 30
+POINT = np.array([[0.03, -0.02, 0.05]])
+NOWHERE, NOWHERE_3 = np.zeros((1, 3)), np.zeros((3, 3))
+ONE = np.eye(4)
+FIVE = ("x", "y", "z", "phi", "theta")
+KINDS = {
+    "targets in a frame": Position(targets=("a", "b", "c"), places=NOWHERE_3, unknown=("frame", "targets")),
+    "a frame": Position(places=POINT, unknown=("frame",)),
+    "targets": Position(targets=("a", "b", "c"), places=NOWHERE_3, unknown=("targets",)),
+    "frame and tool of poses": Pose(unknown=("frame", "tool"), T_platform_tool=ONE),
+    "frame of poses": Pose(unknown=("frame",), T_platform_tool=ONE),
+    "frame of five coordinates": Component(FIVE, "tilt-torsion", unknown=("frame",), T_platform_tool=ONE),
+    "frame of a height and two tilts": Component(("z", "a", "b"), "euler-xyz", unknown=("frame",), T_platform_tool=ONE),
+    "point of distances": Distance(places=POINT, unknown=("anchor",)),
+    "point and zero of a wire": Distance(places=POINT, unknown=("anchor", "offset")),
+    "both ends of a wire": Distance(places=NOWHERE, unknown=("anchor", "targets")),
+    "theodolite": Bearing(places=POINT, unknown=("frame",)),
+    "theodolite and its target": Bearing(places=NOWHERE, unknown=("frame", "targets")),
+    "camera": Bearing(places=POINT, unknown=("frame",), form="camera"),
+    "frame and axis": Direction(unknown=("frame", "axis")),
+    "gravity and mounting": Inclination(unknown=("gravity", "mounting")),
+    "mirror": Autocollimation(unknown=("mirror",)),
+    "plane": Plane(places=POINT, unknown=("surface",)),
+    "line": Line(places=POINT, unknown=("surface",)),
+    "sphere": Sphere(places=POINT, unknown=("surface",)),
+    "point and zero of a ball-bar": Separation(places=NOWHERE, unknown=("targets", "offset")),
+}
+FAR = ("frame", "anchor", "sphere")
+
+
+def poses(rng, n=N):
+    return zoo.poses_of(rng.uniform(-1, 1, (n, 6)) * [0.1, 0.1, 0.1, 0.25, 0.25, 0.25] + [0, 0, 0.8, 0, 0, 0])
+
+
+def truth_of(local, rng):
+    """Values anywhere: rotations over the whole group, frames up to metres off, targets and surfaces by centimetres."""
+    values = local.values()
+    for i, name in enumerate(local.table.names):
+        owner, axis = name.rsplit(".", 1)
+        if axis in ("u", "v"):
+            values[i] = rng.uniform(-0.6, 0.6)
+        elif axis == "radius":
+            values[i] += rng.uniform(0.0, 0.02)
+        elif axis not in ("rx", "ry", "rz"):
+            reach = 2.0 if owner in FAR else 0.1
+            values[i] += rng.uniform(-reach, reach)
+    for owner in {name[:-3] for name in local.table.names if name.endswith(".rx")}:
+        quaternion = rng.normal(size=4)
+        turn = se3.log_so3(se3.quaternion_to_matrix(quaternion / np.linalg.norm(quaternion)))
+        for axis, value in zip(("rx", "ry", "rz"), turn, strict=True):
+            values[local.table.index(f"{owner}.{axis}")] = value
+    return values
+
+
+def measured_at(kind, T, rng):
+    """Noise-free rows at random true values, and these values."""
+    sensor = Sensor(kind, Gaussian(np.ones(len(kind.noise_columns)))).looking(len(T))
+    labels = tuple(str(i) for i in range(len(T)))
+    local = local_unknowns([sensor], labels)
+    truth = truth_of(local, rng)
+    seen = kind.measure(T[None, sensor.rows], np.zeros((1, len(T), len(kind.noise_columns))), local.of(0, truth[None]))
+    rows = Observations.from_sigma(kind, sensor.rows, seen[0], 1e-5)
+    return Measurements("toy", np.zeros((len(T), 1)), (rows,), labels=labels), local, truth
+
+
+def residuals(data, T, local, values):
+    return whitened_rows(evaluate_all(data, T[None], values[None], local), np.zeros((1, len(T), 6, 0)))[0, :, -1]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_unknown_is_found_without_a_guess(name):
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        T = poses(rng)
+        try:
+            data, local, _ = measured_at(KINDS[name], T, rng)
+        except DataError:  # a truth that cannot be measured, such as a sensor upside down
+            continue
+        found = start_values(data, T, local)
+        # [sigma] noise-free rows with sigma 1e-5 m or rad: 1e-8 m
+        assert_allclose(residuals(data, T, local, found), 0.0, atol=1e-3, err_msg=f"seed {seed}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["targets in a frame", "frame and tool of poses"])
+def test_starts_are_found_in_1000_of_1000_random_frames_with_a_machine_that_is_a_millimetre_off(name):
+    for seed in range(1000):
+        rng = np.random.default_rng(seed)
+        T = poses(rng, 12)
+        data, local, truth = measured_at(KINDS[name], T, rng)
+        believed = se3.exp_update(T, rng.normal(size=(12, 6)) * 1e-3)
+        found = start_values(data, believed, local)
+        turn, right = se3.exp_so3(found[:3]), se3.exp_so3(truth[:3])
+        # [rad] a millimetre over a tenth of a metre is 0.01
+        assert np.linalg.norm(se3.log_so3(turn @ right.T)) < 0.05, seed
+        assert np.sqrt(np.mean(residuals(data, believed, local, found) ** 2)) < 3e-3 / 1e-5, seed
+
+
+def test_kinds_that_share_a_frame_start_it_together():
+    rng = np.random.default_rng(0)
+    T = poses(rng)
+    balls = Position(targets=("ball",), places=NOWHERE, unknown=("frame", "targets"))
+    data, _, truth = measured_at(balls, T, rng)
+    axis = Direction(unknown=("frame",))
+    seen = axis.measure(T[None], np.zeros((1, N, 2)), truth[None, None, :3])[0]
+    both = replace(data, observations=(Observations.from_sigma(axis, np.arange(N), seen, 1e-5), *data.observations))
+    local = local_unknowns(both.observations, both.labels)
+    assert len(local) == 9
+    assert_allclose(residuals(both, T, local, start_values(both, T, local)), 0.0, atol=1e-3)
+
+
+def test_sessions_are_started_one_by_one():
+    rng = np.random.default_rng(1)
+    T = poses(rng)
+    parts = [measured_at(KINDS["targets in a frame"], T[half], rng)[0].observations[0] for half in (slice(0, 15), slice(15, N))]
+    kind = parts[0].kind
+    measured = np.concatenate([part.measured for part in parts])
+    rows = Observations.from_sigma(kind, np.arange(N), measured, 1e-5, session=np.repeat(["mon", "tue"], 15))
+    data = Measurements("toy", np.zeros((N, 1)), (rows,))
+    local = local_unknowns(data.observations, data.labels)
+    assert len(local) == 2 * 15
+    assert_allclose(residuals(data, T, local, start_values(data, T, local)), 0.0, atol=1e-3)
+
+
+def test_fixed_values_stay_and_priors_pull():
+    rng = np.random.default_rng(2)
+    T = poses(rng)
+    data, local, truth = measured_at(KINDS["a frame"], T, rng)
+    held = local.starting_at(truth + np.array([0.0, 0.0, 0.0, 1e-3, 0.0, 0.0]))
+    found = start_values(data, T, held.fixed("frame.x"))
+    assert found[3] == truth[3] + 1e-3
+    loose = start_values(data, T, held.with_prior("*", 1.0))
+    assert_allclose(loose, truth, atol=1e-8)
+    tight = start_values(data, T, held.with_prior("*", 1e-9))
+    assert_allclose(tight[3], truth[3] + 1e-3, atol=1e-5)
+
+
+def test_points_in_one_plane_need_a_word_on_the_side():
+    rng = np.random.default_rng(3)
+    T = poses(rng)
+    T[:, 2, 3] = 0.8
+    data, local, truth = measured_at(Distance(places=NOWHERE, unknown=("anchor",)), T, rng)
+    with pytest.raises(DataError, match=r"'anchor' were all measured in one plane, so it can be on either side"):
+        start_values(data, T, local)
+    side = np.array([0.0, 0.0, 0.8 + np.sign(truth[2] - 0.8)])
+    rows = replace(data.observations[0], kind=Distance(places=NOWHERE, unknown=("anchor",), anchor=side))
+    found = start_values(replace(data, observations=(rows,)), T)
+    assert_allclose(found, truth, atol=1e-7)
+
+
+def test_points_on_a_line_leave_a_turn_open_and_are_refused():
+    rng = np.random.default_rng(3)
+    T = poses(rng)
+    T[:, :3, 3] = np.array([0.1, 0.2, 0.3]) * np.linspace(0, 1, N)[:, None]
+    data, local, _ = measured_at(Position(places=NOWHERE, unknown=("frame",)), T, rng)
+    with pytest.raises(DataError, match=r"the 30 positions lie on a line, about which the frame 'frame' could turn"):
+        start_values(data, T, local)
+
+
+def test_the_24_rotations_of_a_cube_leave_none_out():
+    assert OCTAHEDRAL.shape == (24, 3, 3)
+    assert_allclose(OCTAHEDRAL @ np.swapaxes(OCTAHEDRAL, 1, 2), np.broadcast_to(np.eye(3), (24, 3, 3)), atol=0.0)
+    quaternion = np.random.default_rng(0).normal(size=(2000, 4))
+    R = se3.quaternion_to_matrix(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))
+    trace = np.einsum("nij,kij->nk", R, OCTAHEDRAL).max(axis=1)
+    assert np.rad2deg(np.arccos((trace.min() - 1.0) / 2.0)) < 63.0
+
+
+def test_trilateration_gives_both_sides_of_a_plane():
+    flat = np.random.default_rng(0).uniform(-1, 1, (10, 3)) * [1, 1, 0]
+    centre = np.array([0.3, -0.2, 0.7])
+    found, offsets = trilateration(flat, np.linalg.norm(flat - centre, axis=1) + 0.1, with_offset=True)
+    assert_allclose(np.sort(found[:, 2]), [-0.7, 0.7], atol=1e-9)
+    assert_allclose(found[:, :2], np.tile(centre[:2], (2, 1)), atol=1e-9)
+    assert_allclose(offsets, 0.1, atol=1e-9)
