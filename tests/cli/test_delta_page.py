@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""docs/delta-printers.md: its files are those of the example, and its command prints what it says."""
+
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from loopcal.cli import main
+from loopcal.io import load_robot
+
+
+@pytest.fixture
+def page(root, tmp_path, monkeypatch) -> str:
+    """Work in a copy of the example's folder."""
+    for path in (root / "examples" / "delta-printer").iterdir():
+        shutil.copy(path, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return (root / "docs" / "delta-printers.md").read_text("utf-8")
+
+
+def test_the_command_prints_what_the_page_says(page, capsys) -> None:
+    command = re.search(r"^loopcal (calibrate .*)$", page, re.MULTILINE)
+    printed = re.search(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    assert command
+    assert printed
+    assert main(command[1].split()) == 0
+    assert capsys.readouterr().out.strip() == printed[1].strip()
+
+
+def test_the_robot_file_of_the_page_is_the_same_printer(page, tmp_path) -> None:
+    text = re.search(r"^```yaml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    assert text
+    (tmp_path / "page.yaml").write_text(text[1])
+    ours, shipped = load_robot("page.yaml"), load_robot("printer.yaml")
+    assert ours.parameters.names == shipped.parameters.names
+    np.testing.assert_array_equal(ours.values, shipped.values)
+    np.testing.assert_array_equal(ours.parameters.free, shipped.parameters.free)
+
+
+def test_the_truth_lies_in_the_intervals(page) -> None:
+    assert main(["calibrate", "printer.yaml", "heights.csv", "-o", "run"]) == 0
+    sd = np.load("run/arrays.npz")["sd"]
+    free = load_robot("printer.yaml").parameters.free
+    errors = (load_robot("run/robot.yaml").values - load_robot("truth.yaml").values)[free] / sd
+    assert np.abs(errors).max() < 3.5  # six values, in standard deviations
+
+
+def test_both_ways_to_judge_a_printer_work(page, capsys) -> None:
+    assert main(["validate", "printer.yaml", "heights.csv", "--limit-position", "0.1mm"]) == 2
+    assert "quality gate not met" in capsys.readouterr().err
