@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Published studies, repeated: the same steps by this library's functions, published numbers beside computed ones.
+
+One folder a paper: `published.yaml` (the printed numbers and statements, with their place), `steps.py` (what the paper
+does), `compare.py` (what agrees and what does not). A further paper is one more folder and its line in PAPERS. Nothing is
+imported before a paper is run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from loopcal.errors import DataError, nearest
+
+if TYPE_CHECKING:
+    from loopcal.papers.reproduction import Reproduction
+
+TRIALS = 50
+"""Drawings of noise behind each statistical number, unless more are asked for."""
+
+
+@dataclass(frozen=True)
+class Paper:
+    """A published study that can be repeated.
+
+    Attributes
+    ----------
+    name : on the command line. title, source : what it is and where it stands.
+    module : has `reproduce(seed, trials, progress) -> Reproduction`; imported when it is run.
+    """
+
+    name: str
+    title: str
+    source: str
+    module: str
+
+    def run(self, seed: int = 0, trials: int = TRIALS, progress: Callable[[str], None] | None = None) -> Reproduction:
+        """Repeat the study.
+
+        Parameters
+        ----------
+        seed : of all that is drawn. trials : drawings behind each statistical number, at least 2.
+        progress : is told in a few words what is being done.
+
+        Raises
+        ------
+        DataError
+            A seed below zero, or fewer than 2 trials.
+        """
+        if seed < 0 or trials < 2:
+            raise DataError(f"seed {seed} with {trials} trials: give a seed of 0 or more, and 2 trials or more")
+        return import_module(self.module).reproduce(seed, trials, progress or (lambda _: None))
+
+
+PAPERS: Mapping[str, Paper] = {
+    paper.name: paper
+    for paper in (
+        Paper(
+            "hexapod-42",
+            "Numerical simulation of the calibration of a hexapod: 42 parameters, 10 poses, least squares leg by leg",
+            "study of a 6-DOF parallel mechanism with 42 kinematic parameters, read as text; no DOI known to us",
+            "loopcal.papers.hexapod_42.compare",
+        ),
+    )
+}
+
+
+def paper(name: str) -> Paper:
+    """Return a paper by its name.
+
+    Raises
+    ------
+    DataError
+        No paper is called so.
+    """
+    if name not in PAPERS:
+        raise DataError(f"{name!r} is not a paper that can be repeated{nearest(name, PAPERS)}; known are {', '.join(PAPERS)}")
+    return PAPERS[name]

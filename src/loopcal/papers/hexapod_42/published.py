@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the paper prints, and the machine of its Tables 2 and 3."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from loopcal.mechanism import Mechanism
+from loopcal.papers.printed import Array, Printed
+
+MM = 1e-3
+LEGS = tuple(f"leg{i}" for i in range(1, 7))
+PARAMETERS = ("base.x", "base.y", "base.z", "length", "platform.x", "platform.y", "platform.z")
+"""Ours for the columns of Tables 2, 3 and 5."""
+
+PARAMETER_COLUMNS = ("XB", "YB", "ZB", "l", "XP", "YP", "ZP")
+POSE_COLUMNS = ("X [mm]", "Y [mm]", "Z [mm]", "alpha [rad]", "beta [rad]", "gamma [rad]")
+ODD_POSE = "A2"
+"""The row of Table 4 that is of another machine; that it is so is found, not assumed: see `outliers` in studies.py."""
+
+
+@dataclass(frozen=True)
+class Published:
+    """The printed tables, the statements, and where they stand; see published.yaml."""
+
+    source: str
+    statements: Mapping[str, Mapping[str, str]]
+    nominal: Printed
+    errors: Printed
+    nominal_poses: Printed
+    measured_poses: Printed
+    pose_errors: Printed
+    parameter_errors_before: Printed
+    parameter_errors_after: Printed
+    pose_errors_before: Printed
+    pose_errors_after: Printed
+
+    @property
+    def threshold(self) -> float:
+        """Of max dQint [mm + rad], at which the iteration ends."""
+        return float(self.statements["threshold"]["value"])
+
+    @property
+    def iterations(self) -> int:
+        """After how many it is met."""
+        return int(self.statements["iterations"]["value"])
+
+    @property
+    def noise(self) -> float:
+        """Limit of the stated noise [m]."""
+        return float(self.statements["noise"]["value"]) * MM
+
+    @property
+    def order(self) -> str:
+        """Euler order, in our names, of the printed rotation matrix."""
+        return self.statements["rotation"]["order"]
+
+
+@cache
+def published() -> Published:
+    """Read published.yaml."""
+    from loopcal.io.yaml_file import read_yaml
+
+    content: dict[str, Any] = read_yaml(Path(__file__).with_name("published.yaml"), "file of published numbers").content
+    poses, fifth, sixth = content["table_4"], content["table_5"], content["table_6"]
+    return Published(
+        source=content["source"],
+        statements={name: content[name] for name in ("rotation", "threshold", "iterations", "noise", "poses")},
+        nominal=Printed.parse(content["table_2"]),
+        errors=Printed.parse(content["table_3"]),
+        nominal_poses=Printed.parse(poses["PT"]),
+        measured_poses=Printed.parse(poses["PP"]),
+        pose_errors=Printed.parse(poses["E1"]),
+        parameter_errors_before=Printed.parse(fifth["before"]),
+        parameter_errors_after=Printed.parse(fifth["after"]),
+        pose_errors_before=Printed.parse(sixth["before"]),
+        pose_errors_after=Printed.parse(sixth["after"]),
+    )
+
+
+def nominal_machine() -> Mechanism:
+    """The hexapod of Table 2 (shipped as the robot hexapod-42)."""
+    from loopcal.io import load_robot
+
+    return load_robot("hexapod-42")
+
+
+def true_machine(robot: Mechanism, errors: Array, leg_lengths: bool = True) -> Mechanism:
+    """The hexapod with errors.
+
+    Parameters
+    ----------
+    robot : nominal. errors : (6, 7) [m] in the layout of Table 3. leg_lengths : False leaves out the errors of the leg
+        lengths.
+    """
+    assumed = errors.copy()
+    if not leg_lengths:
+        assumed[:, PARAMETERS.index("length")] = 0.0
+    return robot.with_values(robot.parameters.nominal + to_values(robot, assumed))
+
+
+def to_values(robot: Mechanism, table: Array) -> Array:
+    """(p,) in the robot's order of a table (6, 7) in the paper's layout."""
+    values = np.zeros(len(robot.parameters))
+    values[_places(robot)] = table
+    return values
+
+
+def to_table(robot: Mechanism, values: Array) -> Array:
+    """(6, 7) in the paper's layout of values (p,) in the robot's order."""
+    return values[_places(robot)]
+
+
+def _places(robot: Mechanism) -> np.ndarray:
+    return np.array([[robot.parameters.index(f"{leg}.{name}") for name in PARAMETERS] for leg in LEGS])

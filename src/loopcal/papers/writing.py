@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A reproduction as a folder: a page to read, every table as CSV and JSON, every figure as PNG.
+
+    page.md        what agrees, what does not and why, with all tables and figures
+    result.json    the same for programs, and under `made_by` where it comes from
+    tables/        NAME.csv and NAME.json, one row for each number
+    figures/       NAME.png
+
+The folder is written under a temporary name and renamed, so it is either whole or absent.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+from collections.abc import Mapping
+from io import StringIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from loopcal.io.json_text import to_json
+from loopcal.io.run_folder import RESULT, refuse_used_folder
+from loopcal.io.text_file import writing
+
+if TYPE_CHECKING:
+    from loopcal.papers.printed import Table
+    from loopcal.papers.reproduction import Reproduction
+
+TEMPLATE = "page.md.j2"
+
+
+def page(found: Reproduction, made_by: Mapping[str, Any]) -> str:
+    """Return the page as Markdown.
+
+    Parameters
+    ----------
+    found : what to tell. made_by : see `loopcal.io.run_folder.made_by`.
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.get_template(TEMPLATE).render(found=found, made_by=made_by)
+
+
+def write_folder(path: str | Path, found: Reproduction, made_by: Mapping[str, Any], force: bool = False) -> Path:
+    """Write a reproduction whole or not at all; return the folder.
+
+    Parameters
+    ----------
+    path : folder to make. found : what to write. made_by : where it comes from. force : replace an earlier one.
+
+    Raises
+    ------
+    FileError
+        The folder is in use, or cannot be written.
+    """
+    from loopcal.papers.drawing import png, styles
+
+    path = Path(path)
+    refuse_used_folder(path, force)
+    files: dict[str, bytes] = {
+        "page.md": page(found, made_by).encode(),
+        RESULT: to_json({"made_by": made_by, **found.to_dict()}).encode(),
+    }
+    for table in (found.summary(), *(c.table() for c in found.comparisons), *found.tables):
+        files[f"tables/{table.name}.csv"] = csv_text(table).encode()
+        files[f"tables/{table.name}.json"] = to_json(table.to_dict()).encode()
+    style = styles(found.figures)
+    for figure in found.figures:
+        files[f"figures/{figure.name}.png"] = png(figure, style)
+    _write(path, files)
+    return path
+
+
+def csv_text(table: Table) -> str:
+    """Return a table as CSV with a header; numbers in full."""
+    stream = StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(table.columns)
+    writer.writerows(["" if cell is None else cell for cell in row] for row in table.rows)
+    return stream.getvalue()
+
+
+def _write(path: Path, files: Mapping[str, bytes]) -> None:
+    """Write files by relative name into a new folder, which then takes the place of `path`."""
+    temporary, old = (path.with_name(f".{path.name}.{os.getpid()}.{end}") for end in ("tmp", "old"))
+    with writing(path):
+        try:
+            for name, content in files.items():
+                target = temporary / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(content)
+            if path.is_dir():
+                path.rename(old)
+            temporary.rename(path)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+            if path.exists():
+                shutil.rmtree(old, ignore_errors=True)
+            elif old.exists():
+                old.rename(path)

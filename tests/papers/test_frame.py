@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The frame that every repeated paper shares: printed numbers, comparisons, pages, the command."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from loopcal.cli import main
+from loopcal.errors import DataError, FileError
+from loopcal.papers import PAPERS, Paper, paper
+from loopcal.papers.printed import Comparison, Printed, Table
+from loopcal.papers.reproduction import ASKED_HERE, Figure, Reproduction, Series, Verdict
+from loopcal.papers.writing import page, write_folder
+
+MADE_BY = {"command": ["loopcal", "reproduce", "small"], "versions": {"loopcal": "1", "numpy": "2"}}
+
+
+def small() -> Reproduction:
+    printed = Printed.parse({"A": "0.12 -3E-05", "B": "7 1.50"})
+    comparison = Comparison("one", "Table 1", ("x [mm]", "y [mm]"), printed, np.array([[0.125, -2e-5], [9.0, 1.5]]))
+    figure = Figure(
+        "curve", "Curve", "step [1]", "error [mm]", "Of 1 pose.", (Series("a", (0.0, 1.0), (1.0, 0.1)),), {"rule": 0.5}
+    )
+    extra = Table("extra", "Extra", ("case", "value"), (("p", 1.0), ("q", None), ("r", 3.0)), ("", ".1f"), shown=2)
+    verdict = Verdict("It holds.", False, "It does not.", ASKED_HERE)
+    return Reproduction(
+        "small", "A title", "a source", ("About.",), {"seed": 0}, (comparison,), (extra,), (verdict,), (figure,)
+    )
+
+
+def test_a_number_agrees_within_one_unit_of_its_last_printed_digit() -> None:
+    comparison = small().comparisons[0]
+    np.testing.assert_array_equal(comparison.step, [[0.01, 1e-5], [1.0, 0.01]])
+    np.testing.assert_array_equal(comparison.within, [[True, True], [False, True]])
+    assert (comparison.agreeing, comparison.count, comparison.largest) == (3, 4, 2.0)
+
+
+def test_published_numbers_stay_text_as_printed() -> None:
+    rows = small().comparisons[0].table().rows
+    assert [row[2] for row in rows] == ["0.12", "-3E-05", "7", "1.50"]
+
+
+def test_the_page_shows_published_beside_computed_and_marks_what_differs() -> None:
+    text = page(small(), MADE_BY)
+    assert "| B | published | 7 | 1.50 |\n|  | computed | 9.0 | 1.500 |\n|  | difference | **2.0e+00** | 0 |" in text
+    assert "**Does not agree:** It holds. (not a statement of the paper, asked here)\n   It does not." in text
+    assert "| q | - |" in text
+    assert "The first 2 of 3 rows" in text
+    assert "(figures/curve.png)" in text
+
+
+def test_a_folder_holds_page_tables_and_figures_and_is_not_overwritten_unasked(tmp_path) -> None:
+    folder = write_folder(tmp_path / "a" / "out", small(), MADE_BY)
+    names = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+    assert names == {"page.md", "result.json", "figures/curve.png"} | {
+        f"tables/{name}.{end}" for name in ("one", "extra", "summary") for end in ("csv", "json")
+    }
+    assert (folder / "figures" / "curve.png").read_bytes().startswith(b"\x89PNG")
+    with (folder / "tables" / "extra.csv").open() as stream:
+        assert list(csv.reader(stream)) == [["case", "value"], ["p", "1.0"], ["q", ""], ["r", "3.0"]]
+    with pytest.raises(FileError, match="--force"):
+        write_folder(folder, small(), MADE_BY)
+    (folder / "old").touch()
+    write_folder(folder, small(), MADE_BY, force=True)
+    assert not (folder / "old").exists()
+    assert [p.name for p in folder.parent.iterdir()] == ["out"]
+
+
+def test_an_unknown_paper_and_impossible_sizes_are_refused() -> None:
+    with pytest.raises(DataError, match="hexapod-42"):
+        paper("hexapod")
+    for seed, trials in ((-1, 5), (0, 1)):
+        with pytest.raises(DataError, match="give a seed of 0 or more"):
+            PAPERS["hexapod-42"].run(seed, trials)
+
+
+def test_every_paper_is_named_as_it_is_registered() -> None:
+    assert all(isinstance(one, Paper) and name == one.name and one.title and one.source for name, one in PAPERS.items())
+
+
+def test_the_command_lists_papers(capsys) -> None:
+    assert main(["reproduce"]) == 0
+    assert "hexapod-42" in capsys.readouterr().out
+    assert main(["reproduce", "--json"]) == 0
+    assert [p["name"] for p in json.loads(capsys.readouterr().out)["papers"]] == list(PAPERS)
+
+
+def test_the_command_refuses_an_unknown_paper_and_a_used_folder_in_one_sentence(capsys, tmp_path) -> None:
+    assert main(["reproduce", "hexapod42"]) == 1
+    assert capsys.readouterr().err.startswith("loopcal: 'hexapod42' is not a paper")
+    (tmp_path / "mine.txt").touch()
+    for words in ([], ["--force"]):
+        assert main(["reproduce", "hexapod-42", "-o", str(tmp_path), *words]) == 1
+        assert capsys.readouterr().err.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.slow
+def test_the_command_repeats_a_paper_and_writes_the_same_document_that_it_prints(capsys, tmp_path) -> None:
+    folder = tmp_path / "out"
+    assert main(["reproduce", "hexapod-42", "--trials", "2", "-o", str(folder), "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    document = json.loads(out, parse_constant=pytest.fail)
+    written = json.loads((folder / "result.json").read_text("utf-8"))
+    assert written.pop("made_by")["seeds"] == {"seed": 0}
+    assert written == document
+    assert (folder / "figures" / "figure_4.png").is_file()
+    assert main(["reproduce", "hexapod-42", "--trials", "2"]) == 0
+    assert "DOES NOT AGREE" in capsys.readouterr().out
