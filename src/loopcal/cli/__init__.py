@@ -16,6 +16,7 @@ import click
 from loopcal.cli.calibrate import calibrate
 from loopcal.cli.check import check
 from loopcal.cli.identifiability import identifiability
+from loopcal.cli.reproduce import reproduce
 from loopcal.cli.simulate import simulate
 from loopcal.cli.validate import validate
 from loopcal.errors import LoopcalError
@@ -34,7 +35,7 @@ def commands() -> None:
     """  # noqa: D301
 
 
-for _command in (check, simulate, identifiability, calibrate, validate):
+for _command in (check, simulate, identifiability, calibrate, validate, reproduce):
     commands.add_command(_command)
 
 
