@@ -16,6 +16,7 @@ import click
 from loopcal.cli.calibrate import calibrate
 from loopcal.cli.check import check
 from loopcal.cli.identifiability import identifiability
+from loopcal.cli.new import new
 from loopcal.cli.reproduce import reproduce
 from loopcal.cli.simulate import simulate
 from loopcal.cli.validate import validate
@@ -35,7 +36,7 @@ def commands() -> None:
     """  # noqa: D301
 
 
-for _command in (check, simulate, identifiability, calibrate, validate, reproduce):
+for _command in (new, check, simulate, identifiability, calibrate, validate, reproduce):
     commands.add_command(_command)
 
 
