@@ -8,7 +8,16 @@ from pathlib import Path
 import click
 
 from loopcal.cli import show
-from loopcal.cli.options import FILE, data_options, instrument, instrument_options, json_option, robot_argument
+from loopcal.cli.options import (
+    FILE,
+    data_options,
+    draw_option,
+    drawn_poses,
+    instrument,
+    instrument_options,
+    json_option,
+    robot_argument,
+)
 from loopcal.errors import DataError
 
 
@@ -16,9 +25,8 @@ from loopcal.errors import DataError
 @robot_argument
 @click.argument("data", metavar="[DATA]", type=FILE, required=False)
 @click.option("--poses", type=FILE, help="In place of DATA: CSV file of poses that could be measured.")
-@click.option("--draw", type=click.IntRange(min=1), default=40, show_default=True, metavar="N",
-              help="Without DATA and --poses: how many poses to draw from the robot's workspace.")  # fmt: skip
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of these poses.")
+@draw_option
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of drawn poses.")
 @instrument_options
 @data_options
 @json_option
@@ -66,10 +74,7 @@ def identifiability(
         if poses is not None:
             targets = load_poses(poses, machine)
         else:
-            from loopcal.mechanism.workspace import sample
-
-            targets = sample(machine, draw, seed).coordinates
-            drawn = f"{draw} poses drawn from the workspace of {machine.name}, seed {seed}"
+            targets, drawn = drawn_poses(machine, draw, seed)
         measured = simulate(machine, targets, seen_by, seed=0)
     found = identifiable(machine, measured)
     if as_json:

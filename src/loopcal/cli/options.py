@@ -13,7 +13,10 @@ from loopcal.errors import DataError, UnitError, nearest
 from loopcal.units import Dimension, quantity
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from loopcal.measure import Instrument
+    from loopcal.mechanism import Mechanism
 
 FILE = click.Path(path_type=Path)
 
@@ -60,6 +63,26 @@ def data_options(command: Callable[..., Any]) -> Callable[..., Any]:
     ):
         command = click.option(name, is_flag=True, help=what)(command)
     return command
+
+
+def draw_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add how many poses are drawn where none are given; `drawn_poses` draws them."""
+    text = "Where no poses are given: how many to draw evenly from the workspace that the robot file states."
+    return click.option("--draw", type=click.IntRange(min=1), default=40, show_default=True, metavar="N", help=text)(command)
+
+
+def drawn_poses(robot: Mechanism, count: int, seed: int) -> tuple[np.ndarray, str]:
+    """Return controlled coordinates (n, c) drawn from a robot's workspace, and what to say of them.
+
+    Raises
+    ------
+    MechanismError
+        The robot states no workspace, or cannot reach it.
+    """
+    from loopcal.mechanism.workspace import sample
+
+    words = f"{count} poses drawn from the workspace of {robot.name}, seed {seed}"
+    return sample(robot, count, seed).coordinates, words
 
 
 def instrument_options(command: Callable[..., Any]) -> Callable[..., Any]:
