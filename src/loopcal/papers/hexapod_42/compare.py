@@ -245,13 +245,13 @@ def _figure_noise(found: Results) -> Figure:
     published = study_noise.published_sizes(found.printed)
     labels = {"parameter error rms [mm]": 2, "pose residual rms [mm]": 0}
     series = [Series(label, x, tuple(float(level.median[i]) for level in line)) for label, i in labels.items()]
-    levels = {f"published {label}": float(published[i]) for label, i in labels.items()}
+    levels = {f"published, Table {table}": float(published[i]) for table, i in zip((5, 6), labels.values(), strict=True)}
     before = float(np.sqrt(np.mean(found.exact.parameter_errors(found.study.truth)[0] ** 2)) / MM)
     return Figure(
         "noise", "What is left after calibration, over the noise", "noise +- [mm], with 1e-3 rad / mm", "rms [mm]",
         f"Medians of {len(line[0].needed)} drawings, leg by leg, after {found.printed.iterations} iterations. Published"
         f" levels are met near +-1e-6 mm; the stated noise is +-{found.printed.noise / MM:g} mm.",
-        tuple(series), {**levels, "parameter error before calibration": before}, "xy",
+        tuple(series), {**levels, "before calibration": before}, "xy",
     )  # fmt: skip
 
 
