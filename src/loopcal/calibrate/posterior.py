@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a fit knows of the parameters, direction by direction: nothing is lost where a covariance would be infinite.
 
-The deviation from the estimate is e - estimate = diag(unit) V y, the columns of V orthonormal, with independent
-coordinates y_i of variance `variance_i`: infinite where nothing is known. See docs/theory/uncertainty.md.
+The deviation from the estimate is e - estimate = diag(unit) V y, with independent coordinates y_i of variance
+`variance_i`: infinite where nothing is known. See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from loopcal.linalg import Decomposition, FloatArray
 from loopcal.mechanism import Mechanism
 
 PREFIX = "posterior_"
-STORED = ("unit", "directions", "variance", "seen", "holds_tolerances")
+STORED = ("unit", "directions", "variance", "seen")
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,6 @@ class Posterior:
     robot : Mechanism at the estimate. places : (p,) positions of the free parameters in its table.
     unit : (p,) [SI]. directions : (p, p) V. variance : (p,) of each direction, infinite or NaN (no interval can be given).
     seen : (p,) directions that the rows determine; of the others only a prior or nothing at all is known.
-    holds_tolerances : whether the tolerances were used as a prior, so that they must not be used a second time.
     """
 
     robot: Mechanism
@@ -39,7 +38,6 @@ class Posterior:
     directions: FloatArray
     variance: FloatArray
     seen: NDArray[np.bool_]
-    holds_tolerances: bool
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -71,14 +69,9 @@ def posterior(
     robot : at the estimate. places, tolerance : (p,) of the free parameters.
     decomposition, penalty : of the fit; columns scaled by tolerance. noise : variance of the whitened rows.
     """
+    directions, variance, seen = decomposition.knowledge(penalty, noise)
     return Posterior(
-        robot=robot,
-        places=places,
-        unit=tolerance * decomposition.scale,
-        directions=decomposition.directions[0],
-        variance=decomposition.variances(penalty, noise)[0],
-        seen=decomposition.used[0],
-        holds_tolerances=bool((np.isfinite(penalty[0]) & (penalty[0] > 0.0)).any()),
+        robot=robot, places=places, unit=tolerance * decomposition.scale, directions=directions, variance=variance, seen=seen
     )
 
 
@@ -99,11 +92,11 @@ def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) ->
         raise EstimationError(
             f"this run holds no posterior (there is no {PREFIX}{missing[0]}); make it again with this version of loopcal"
         )
-    unit, directions, variance, seen, holds = (arrays[PREFIX + name] for name in STORED)
+    unit, directions, variance, seen = (arrays[PREFIX + name] for name in STORED)
     places = np.flatnonzero(robot.parameters.free)
     if len(places) != len(unit):
         raise EstimationError(
             f"this run identified {len(unit)} parameters, but its robot file has {len(places)} free ones; restore the file, "
             "or make the run again"
         )
-    return Posterior(robot, places, unit, directions, variance, seen.astype(bool), bool(holds))
+    return Posterior(robot, places, unit, directions, variance, seen.astype(bool))

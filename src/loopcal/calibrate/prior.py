@@ -2,9 +2,10 @@
 """An earlier calibration as the prior of the next one: its whitened rows, appended to the factor of the new rows.
 
 A posterior e ~ N(mean, C), C = diag(unit) V diag(var) V' diag(unit), is the rows B (e - mean) of unit variance with
-B = diag(var)^(-1/2) V' diag(1 / unit); a direction of infinite variance has no row. Least squares over these and the new
+B = diag(var)^(-1/2) V^-1 diag(1 / unit); a direction of infinite variance has no row. Least squares over these and the new
 rows is the estimate from both calibrations together. A limb that was repaired is freed by eliminating its columns from B
-(an orthogonal reduction, which is the marginal distribution of the others). J'J and C are never inverted.
+(an orthogonal reduction, which is the marginal distribution of the others). V is well conditioned (orthonormal, if no
+parameter is exempt from a prior); J'J and C are never inverted.
 See docs/theory/uncertainty.md.
 """
 
@@ -100,11 +101,11 @@ def prior_from(earlier: Posterior) -> Prior:
     """
     if np.isnan(earlier.variance).any():
         raise EstimationError(
-            "the earlier calibration gives no uncertainty (too few degrees of freedom to estimate its noise), so it cannot be a "
-            "prior; make it again with the instrument's sigma"
+            "the earlier calibration gives no uncertainty (too few degrees of freedom to estimate its noise), so it cannot be"
+            " a prior; make it again with the instrument's sigma"
         )
     known = np.isfinite(earlier.variance)
-    rows = (earlier.directions[:, known] / np.sqrt(earlier.variance[known])).T / earlier.unit
+    rows = np.linalg.inv(earlier.directions)[known] / np.sqrt(earlier.variance[known])[:, None] / earlier.unit
     return Prior(earlier.names, np.array(earlier.estimate), earlier.unit, rows)
 
 

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from loopcal.calibrate.filters import LeastSquares, Method
+from loopcal.calibrate.filters import LeastSquares
 from loopcal.calibrate.identification import Identification
 from loopcal.calibrate.identify import identify
 from loopcal.calibrate.posterior import Posterior
@@ -58,7 +58,6 @@ def recalibrate(
     data: Measurements,
     earlier: Posterior,
     free_limb: str | None = None,
-    method: Method | None = None,
     noise: Literal["given", "estimated"] = "given",
 ) -> tuple[Identification, Change]:
     """Identify a robot from new measurements and an earlier calibration.
@@ -69,8 +68,7 @@ def recalibrate(
     earlier : `Identification.posterior`, or that of a run folder.
     free_limb : a limb that was repaired: its parameters get the tolerance of the robot's file about nominal again, the
         others keep what the earlier calibration knew of them.
-    method : least squares or nothing: the prior stands in the place of the tolerances.
-    noise : see `identify`.
+    noise : see `identify`. The method is least squares: the prior stands in the place of the tolerances.
 
     Returns
     -------
@@ -79,17 +77,13 @@ def recalibrate(
     Raises
     ------
     EstimationError
-        Another method, an unknown limb, other parameters, or an earlier calibration without uncertainty.
+        An unknown limb, other parameters, or an earlier calibration without uncertainty.
     """
-    if method is not None and method != LeastSquares():
-        raise EstimationError(
-            f"{method!r} uses the tolerances as a prior, and an earlier run is one already; use least squares with it"
-        )
     prior = prior_from(earlier)
     _check_names(robot, prior)
     names = prior.names if free_limb is None else limb_parameters(robot, free_limb)
     change = change_since(robot, data, prior, names, "the machine" if free_limb is None else free_limb)
-    fit = identify(robot, data, noise=noise, prior=_used(robot, prior, free_limb, names))
+    fit = identify(robot, data, LeastSquares(), noise=noise, prior=_used(robot, prior, free_limb, names))
     return replace(fit, notes=(*fit.notes, change.sentence)), change
 
 
@@ -101,8 +95,8 @@ def change_since(robot: Mechanism, data: Measurements, prior: Prior, names: tupl
     robot, data : as for `identify`, noise as stated. prior : the earlier calibration.
     names : the parameters in question. what : their common name in the sentence.
     """
-    kept = identify(robot, data, prior=prior)
-    opened = identify(robot, data, prior=prior.without(names))
+    kept = identify(robot, data, LeastSquares(), prior=prior)
+    opened = identify(robot, data, LeastSquares(), prior=prior.without(names))
     of_prior, of_fit = ([table.index(n) for n in names] for table in (prior.names, opened.names))
     change = opened.estimate[of_fit] - prior.mean[of_prior]
     degrees = kept.check.degrees - opened.check.degrees
@@ -157,5 +151,6 @@ def _check_names(robot: Mechanism, prior: Prior) -> None:
         if name not in prior.names or name not in free:
             where = "the earlier run" if name in prior.names else "the robot file"
             raise EstimationError(
-                f"{name!r} is free in {where} alone, so the two do not describe the same robot; free the same parameters in both"
+                f"{name!r} is free in {where} alone, so the two do not describe the same robot; free the same parameters in"
+                " both"
             )

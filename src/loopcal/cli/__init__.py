@@ -15,6 +15,7 @@ import click
 
 from loopcal.cli.calibrate import calibrate
 from loopcal.cli.check import check
+from loopcal.cli.compensate import compensate
 from loopcal.cli.identifiability import identifiability
 from loopcal.cli.new import new
 from loopcal.cli.reproduce import reproduce
@@ -36,7 +37,7 @@ def commands() -> None:
     """  # noqa: D301
 
 
-for _command in (new, check, simulate, identifiability, calibrate, validate, reproduce):
+for _command in (new, check, simulate, identifiability, calibrate, validate, compensate, reproduce):
     commands.add_command(_command)
 
 

@@ -33,6 +33,8 @@ METHODS = ("least-squares", "map", "ridge", "truncated-svd")
               help="For truncated-svd: how many directions; chosen by cross-validation where not given.")  # fmt: skip
 @click.option("--noise", type=click.Choice(("given", "estimated")), default="given", show_default=True,
               help="Whether the stated noise is true, or only up to one common factor.")  # fmt: skip
+@click.option("--prior", type=FILE, metavar="RUN", help="An earlier run on this machine; what it knew is kept.")
+@click.option("--free-limb", metavar="LIMB", help="With --prior: a limb that was repaired, such as leg3, starts anew.")
 @gate_options
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the held-out choice.")
 @data_options
@@ -47,6 +49,8 @@ def calibrate(
     lam: float | None,
     keep: int | None,
     noise: Literal["given", "estimated"],
+    prior: Path | None,
+    free_limb: str | None,
     limit_position: float | None,
     limit_angle: float | None,
     seed: int,
@@ -64,31 +68,51 @@ def calibrate(
       loopcal calibrate hexapod-42 measurements.csv -o run --hold-out 0.25
       loopcal calibrate robot.yaml data.csv -o run --hold-out 0.25 --limit-position 0.02mm --limit-angle 0.01deg
       loopcal calibrate printer.yaml heights.csv -o run --noise estimated
+      loopcal calibrate hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
     """  # noqa: D301
     from loopcal.calibrate import identify, validate
+    from loopcal.calibrate.recalibrate import recalibrate
     from loopcal.io import load_measurements, load_robot
     from loopcal.io.calibration_run import run_document, save_run
+    from loopcal.io.compensation_file import load_prior
     from loopcal.io.robot_file import robot_path
-    from loopcal.io.run_folder import made_by, refuse_used_folder
+    from loopcal.io.run_folder import RESULT, made_by, refuse_used_folder
 
     if not hold_out and (limit_position is not None or limit_angle is not None):
         raise DataError("a quality gate is judged on unseen poses; say which share to keep for it, as --hold-out 0.25")
+    _refuse_contradictions(prior, free_limb)
     refuse_used_folder(output, force)
     machine = load_robot(robot)
     measured = load_measurements(data, machine, allow_outside_stroke=allow_outside_stroke, allow_duplicates=allow_duplicates)
     fitted, unseen = measured.split(1 - hold_out, seed) if hold_out else (measured, None)
     show.progress(f"identifying {int(machine.parameters.free.sum())} parameters from {fitted.n_rows} equations ...")
-    fit = identify(machine, fitted, _method(method, lam, keep), noise=noise)
+    if prior is None:
+        fit, change = identify(machine, fitted, _method(method, lam, keep), noise=noise), None
+    else:
+        fit, change = recalibrate(machine, fitted, load_prior(prior, data), free_limb, noise)
     validation = None if unseen is None else validate(fit, unseen, limit_position, limit_angle)
-    origin = made_by(sys.argv, {"robot": robot_path(robot), "data": data}, {"hold_out": seed})
+    inputs = {"robot": robot_path(robot), "data": data, **({} if prior is None else {"prior": prior / RESULT})}
+    origin = made_by(sys.argv, inputs, {"hold_out": seed})
     split = None if unseen is None else {"hold_out": hold_out, "seed": seed, "held_out": unseen.labels}
     document = run_document(fit, validation, origin, split)
+    if change is not None:
+        document["change"] = change.to_dict()
     save_run(output, fit, document, force)
     if as_json:
         show.json_document(document)
     else:
         _print(fit, validation, fitted, output)
     return _exit_code(fit, validation)
+
+
+def _refuse_contradictions(prior: Path | None, free_limb: str | None) -> None:
+    """Refuse options that do not go with, or without, --prior."""
+    if prior is None and free_limb is not None:
+        raise DataError("--free-limb needs the run in which the other limbs were known; name it with --prior RUN")
+    given = click.get_current_context().get_parameter_source
+    for option in ("method", "lam", "keep"):
+        if prior is not None and given(option) is click.core.ParameterSource.COMMANDLINE:
+            raise DataError(f"--{option} does not go with --prior, which stands in the place of the tolerances; leave it out")
 
 
 def _method(name: str, lam: float | None, keep: int | None) -> Method:
