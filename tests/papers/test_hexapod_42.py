@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.calibrate import identify_trials
+from loopcal.calibrate import LeastSquares, identify_trials
 from loopcal.mechanism import forward
 from loopcal.papers import PAPERS
 from loopcal.papers.hexapod_42.compare import Results, compute
@@ -93,7 +93,7 @@ def test_leg_by_leg_has_2_4_times_the_standard_deviation_of_all_legs_weighted_to
     legs, actual = LegForm.at(study.robot, study.commanded), actual_poses(study)
     unit = np.eye(60).reshape(60, 10, 6) * sd  # exact to first order: each of 60 noises on its own
     alone = np.sqrt(np.sum([legs.change(twists(noise, actual, study.order)) ** 2 for noise in unit], axis=0))
-    together = identify_trials(study.robot, simulated(study, 0, 2)).standard_deviations()[0]
+    together = identify_trials(study.robot, simulated(study, 0, 2), LeastSquares()).standard_deviations()[0]
     rms = [float(np.sqrt(np.mean(values**2)) / MM) for values in (alone, together)]
     np.testing.assert_allclose(rms, [0.199, 0.084], rtol=0.03)  # [mm]
     assert rms[0] / rms[1] == pytest.approx(2.4, abs=0.1)

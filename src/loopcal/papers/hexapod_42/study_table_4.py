@@ -104,10 +104,10 @@ def outliers(study: Study, printed: Published, measured: Array) -> Outliers:
     data = measurements(study, measured, sigma)
     keep, named, rounds = np.arange(len(measured)), [], []
     while True:
-        whole = identify(study.robot, data.take(keep)).chi_square
+        whole = identify(study.robot, data.take(keep), LeastSquares()).chi_square
         left = []
         for pose in keep:
-            check = identify(study.robot, data.take(keep[keep != pose])).check
+            check = identify(study.robot, data.take(keep[keep != pose]), LeastSquares()).check
             left.append(LeftOut(data.labels[pose], check.chi_square, check.degrees, check.p_value, whole - check.chi_square))
         rounds.append(tuple(left))
         worst = int(np.argmax([one.drop for one in left]))
