@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""README.md: its Python runs, its first half hour runs, and it names every command."""
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal.cli import commands, main
+from loopcal.io import load_robot
+
+README = (Path(__file__).resolve().parent.parent / "README.md").read_text("utf-8")
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path, monkeypatch, root) -> None:
+    """Work where nothing is but the examples."""
+    shutil.copytree(root / "examples", tmp_path / "examples")
+    monkeypatch.chdir(tmp_path)
+
+
+def test_the_python_example_runs_and_improves_the_robot(tmp_path, capsys) -> None:
+    block = re.search(r"^```python\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+    assert block
+    assert len([line for line in block[1].splitlines() if line and not line.startswith("import")]) <= 10
+    names: dict = {}
+    exec(block[1], names)  # noqa: S102  (our own page)
+    assert names["readings"].shape == (40, 6)
+    truth = load_robot("examples/hexapod-42/truth.yaml").values
+    found = load_robot("calibrated.yaml").values
+    assert np.linalg.norm(found - truth) < 0.5 * np.linalg.norm(names["robot"].values - truth)
+    assert "42 of 42 parameter combinations" in capsys.readouterr().out
+
+
+def test_every_line_of_the_first_half_hour_works_as_it_stands(capsys) -> None:
+    part = README[README.index("## The first half hour") : README.index("## Status")]
+    lines = [line for block in re.findall(r"^```sh\n(.*?)^```", part, re.MULTILINE | re.DOTALL) for line in block.splitlines()]
+    assert len(lines) == 5
+    for line in lines:
+        assert line.startswith("loopcal ")
+        assert main(line.split()[1:]) == 0, capsys.readouterr().err
+        assert capsys.readouterr().err == ""
+
+
+def test_the_table_of_commands_is_complete() -> None:
+    listed = set(re.findall(r"^\| `loopcal ([a-z]+)", README, re.MULTILINE))
+    assert listed == set(commands.commands)
