@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Are the error bars true? Coverage of 95 % intervals, chi-square, and predicted against simulated spread of poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopcal import se3
+from loopcal.calibrate import MAP, LeastSquares, identify_trials
+from loopcal.calibrate.filters import Method
+from loopcal.calibrate.identify import IdentifiedTrials
+from loopcal.calibrate.steps import penalised
+from loopcal.io import load_robot
+from loopcal.measure import KINDS, Gaussian, Instrument, Sensor, sample_truth, simulate_trials
+from loopcal.mechanism import Mechanism, sample
+from loopcal.mechanism.trials import forward_trials, sensitivity
+
+Array = NDArray[np.float64]
+
+FITS, TOGETHER, SEED = 4000, 250, 11
+NORMAL_95 = 1.959963984540054
+"""97.5 % point of the normal distribution: half-width of a 95 % interval in standard deviations."""
+
+SIGMA_LENGTH, SIGMA_ANGLE = 5e-6, 25e-6
+"""Noise of the simulated instrument, one standard deviation: 5 micrometres and 25 microradians."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A robot, how it is measured, and by what it is identified.
+
+    `noise` multiplies the true noise over the stated one: 1 where the error bars must be true, 2 where they must not be.
+    """
+
+    name: str
+    robot: str
+    kind: str
+    poses: int
+    method: Method
+    noise: float = 1.0
+
+
+CASES = (
+    Case("hexapod, least squares", "hexapod-42", "pose", 20, LeastSquares()),
+    Case("hexapod, MAP", "hexapod-42", "pose", 20, MAP()),
+    Case("3-PRS, least squares", "3-prs", "pose", 20, LeastSquares()),
+    Case("3-PRS, MAP", "3-prs", "pose", 20, MAP()),
+    Case("delta, least squares", "linear-delta", "component", 20, LeastSquares()),
+    Case("delta, MAP", "linear-delta", "component", 20, MAP()),
+    Case("hexapod, noise twice as large as stated", "hexapod-42", "pose", 20, LeastSquares(), noise=2.0),
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What some fits of a case came to.
+
+    inside : (t, p) estimates whose 95 % interval holds the truth. chi_square : (t,) and its degrees of freedom.
+    spread : (t, n, 6) errors of the poses predicted at other readings, over their predicted standard deviations.
+    """
+
+    inside: NDArray[np.bool_]
+    chi_square: Array
+    dof: float
+    spread: Array
+
+
+def instrument(case: Case, noise: float) -> Instrument:
+    """The instrument of a case with its noise multiplied."""
+    if case.kind == "component":
+        return Instrument((Sensor(KINDS["component"](("x", "y", "z")), Gaussian(np.full(3, noise * SIGMA_LENGTH))),))
+    sigma = np.array([SIGMA_ANGLE] * 3 + [SIGMA_LENGTH] * 3)
+    return Instrument((Sensor(KINDS["pose"](), Gaussian(noise * sigma)),))
+
+
+def fits(case: Case, count: int) -> Iterator[Outcome]:
+    """Simulate and identify `count` machines drawn from the tolerances, some at a time."""
+    robot = load_robot(case.robot)
+    coordinates, elsewhere = sample(robot, case.poses, SEED).coordinates, sample(robot, 10, SEED + 1).solution.q
+    for first in range(0, count, TOGETHER):
+        seed = SEED + first
+        truth = sample_truth(robot, min(TOGETHER, count - first), seed)
+        # the stated noise whitens the rows, whatever the true one is
+        trials = simulate_trials(robot, truth, coordinates, instrument(case, 1.0), seed)
+        if case.noise != 1.0:
+            louder = simulate_trials(robot, truth, coordinates, instrument(case, case.noise), seed)
+            trials = replace(trials, measured=louder.measured)
+        found = identify_trials(robot, trials, case.method)
+        good = found.converged
+        sd = found.standard_deviations()[good]
+        places = np.flatnonzero(robot.parameters.free)
+        error = (found.values - truth)[good][:, places]
+        decided = np.isfinite(sd)
+        inside = np.abs(error) <= NORMAL_95 * np.where(decided, sd, np.inf)
+        z = found.unknowns.deviation(found.values)
+        chi_square = found.cost + penalised(found.decomposition, found.penalty, z)
+        # a prior counts as one equation for each direction it holds
+        dof = case.poses * (3 if case.kind == "component" else 6) - found.decomposition.rank[0] + (found.penalty[0] > 0).sum()
+        yield Outcome(inside[:, decided.all(axis=0)], chi_square[good], dof, _spread(robot, found, truth, good, elsewhere))
+
+
+def _spread(robot: Mechanism, found: IdentifiedTrials, truth: Array, good: NDArray[np.bool_], q: Array) -> Array:
+    """Errors of predicted poses at readings q (n, a) in their predicted standard deviations, (t, n, 6)."""
+    values = found.values[good]
+    predicted, true = forward_trials(robot, values, q[None]), forward_trials(robot, truth[good], q[None])
+    error = se3.difference(predicted.T, true.T)
+    D = sensitivity(robot, values, q[None], predicted).parameters[..., robot.parameters.free]
+    C = found.decomposition.take(np.flatnonzero(good)).covariance(found.penalty[good], 1.0)
+    tolerance = found.unknowns.tolerance
+    C = C * tolerance[:, None] * tolerance
+    variance = np.einsum("tnip,tpq,tniq->tni", D, C, D)
+    return error / np.sqrt(np.where(variance > 0, variance, np.nan))
+
+
+def judge(case: Case, count: int = FITS) -> dict[str, float]:
+    """Coverage, chi-square level and ratio of simulated to predicted pose spread of one case."""
+    from scipy.stats import chi2
+
+    outcomes = list(fits(case, count))
+    inside = np.concatenate([o.inside for o in outcomes])
+    chi_square, dof = np.concatenate([o.chi_square for o in outcomes]), outcomes[0].dof
+    spread = np.concatenate([o.spread for o in outcomes])
+    return {
+        "fits": len(inside),
+        "coverage": float(inside.mean()),
+        "lowest": float(inside.mean(axis=0).min()),
+        "rejected": float((chi_square > chi2.ppf(0.95, dof)).mean()),
+        "pose_spread": float(np.sqrt(np.nanmean(spread**2))),
+    }
+
+
+def collect() -> dict:
+    """Every case at full size."""
+    found = {case.name: judge(case) for case in CASES}
+    rows = [
+        [name, int(r["fits"]), 100 * r["coverage"], 100 * r["lowest"], 100 * r["rejected"], r["pose_spread"]]
+        for name, r in found.items()
+    ]
+    return {
+        "seed": SEED,
+        "noise": {"length [um]": 1e6 * SIGMA_LENGTH, "angle [urad]": 1e6 * SIGMA_ANGLE},
+        "tables": {
+            "coverage": {
+                "columns": [
+                    "case",
+                    "fits",
+                    "95 % intervals that hold the truth [%]",
+                    "the worst parameter [%]",
+                    "rejected by chi-square at 5 % [%]",
+                    "simulated / predicted pose spread",
+                ],
+                "formats": ["", "d", ".2f", ".2f", ".2f", ".3f"],
+                "rows": rows,
+            }
+        },
+    }
