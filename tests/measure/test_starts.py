@@ -15,7 +15,6 @@ from loopcal.measure import (
     Component,
     Direction,
     Distance,
-    Gaussian,
     Inclination,
     Line,
     Measurements,
@@ -23,7 +22,6 @@ from loopcal.measure import (
     Plane,
     Pose,
     Position,
-    Sensor,
     Separation,
     Sphere,
     evaluate_all,
@@ -90,13 +88,14 @@ def truth_of(local, rng):
 
 def measured_at(kind, T, rng):
     """Noise-free rows at random true values, and these values."""
-    sensor = Sensor(kind, Gaussian(np.ones(len(kind.noise_columns)))).looking(len(T))
-    labels = tuple(str(i) for i in range(len(T)))
-    local = local_unknowns([sensor], labels)
+    n, m = len(T), len(kind.noise_columns)
+    poses_seen = np.arange(n) if kind.links == 1 else np.stack([np.arange(n), (np.arange(n) + 1) % n], axis=1)
+    empty = Observations.from_sigma(kind, poses_seen, np.full((n, len(kind.columns)), np.nan), 1e-5)
+    data = Measurements("toy", np.zeros((n, 1)), (empty,))
+    local = local_unknowns(data.observations, data.labels)
     truth = truth_of(local, rng)
-    seen = kind.measure(T[None, sensor.rows], np.zeros((1, len(T), len(kind.noise_columns))), local.of(0, truth[None]))
-    rows = Observations.from_sigma(kind, sensor.rows, seen[0], 1e-5)
-    return Measurements("toy", np.zeros((len(T), 1)), (rows,), labels=labels), local, truth
+    seen = kind.measure(T[None, poses_seen], np.zeros((1, n, m)), local.of(0, truth[None]))
+    return replace(data, observations=(replace(empty, measured=seen[0]),)), local, truth
 
 
 def residuals(data, T, local, values):

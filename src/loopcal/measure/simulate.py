@@ -143,7 +143,8 @@ def simulate_trials(
     # Starting at the commanded pose keeps the true machine in the assembly mode of its controller.
     state = forward_trials(robot, values, readings[None], commanded.state)
     T = np.broadcast_to(state.T, (len(values), *state.T.shape[1:]))
-    reached = np.array(np.broadcast_to(state.status == Status.CONVERGED, T.shape[:2]), dtype=np.bool_)
+    reached = np.zeros(T.shape[:2], dtype=np.bool_)
+    reached[:] = state.status == Status.CONVERGED
     joints = joint_values(robot, joints_looked_at(s.kind for s in mounted.sensors), readings[None], state)
     noise = [_drawn(mounted, stream(seed, trial, NOISE)) for trial in range(len(values))]
     safe = np.where(reached[..., None, None], T, np.eye(4))
@@ -152,7 +153,7 @@ def simulate_trials(
         at = np.stack([joints[name][:, rows] for name in kind.looks_at], axis=-1) if kind.looks_at else None
         own = local.of(k, local.table.nominal[None]) if kind.unknowns else None
         seen = kind.measure(safe[:, rows], np.stack([drawn[k] for drawn in noise]), own, at)
-        there = reached[:, rows].reshape(len(values), len(rows), -1).all(axis=-1)
+        there = np.asarray(np.all(reached[:, rows].reshape(len(values), len(rows), -1), axis=-1))
         measured.append(np.where(there[..., None], seen, np.nan))
     return Trials(mounted, robot.name, readings, tuple(measured), values, T, reached, local)
 

@@ -127,7 +127,8 @@ def descended(white: Callable[[Array], tuple[Array, Array]], x: Array) -> tuple[
         norm = np.linalg.norm(J, axis=1)
         scale = np.where(norm > 0.0, norm, 1.0)
         # one triangular factor, so that the decomposition does not grow with the rows
-        R = np.linalg.qr(np.nan_to_num(np.concatenate([J / scale[:, None, :], e[..., None]], axis=-1)), mode="r")
+        stack = np.nan_to_num(np.concatenate([J / scale[:, None, :], e[..., None]], axis=-1))
+        R = np.asarray(np.linalg.qr(stack, mode="r"), dtype=float)
         U, s, V = np.linalg.svd(R[..., :-1], full_matrices=False)
         rhs = np.einsum("cmk,cm->ck", U, R[..., -1])
         gain = np.where(s > 1e-12, s / (s * s + damping[:, None] ** 2 + 1e-24), 0.0)

@@ -104,64 +104,44 @@ def test_the_residual_of_a_noisy_reading_is_the_mapped_noise_with_the_sign_turne
     assert_allclose(residual, expected, atol=1e-11)  # [m, rad], the square of the noise times the bend of the angles
 
 
-def check_twist_jacobian(kind, error, *, with_jax):
+def check_derivatives(kind, error, *, with_jax):
+    """By the platform's twist (of every pose of a row) and by the unknowns, all at once."""
     kind = placed(kind)
     T = platform_poses(kind, 2, 4, seed=5)
     measured, _ = measured_near(kind, T, error)
-    jacobian = evaluated(kind, T, measured).jacobian
-    if kind.looks_at:
-        assert not jacobian.any()
-        return
-    for link in range(kind.links):
-        unit = np.zeros((6, kind.links, 6))
-        unit[:, link] = np.eye(6)
-        shape = (6,) if kind.links == 1 else (kind.links, 6)
+    values, joints = own_unknowns(kind), joints_of(kind, T)
+    found = kind.evaluate(T, measured, values, joints)
+    parts = [found.jacobian] if kind.links == 1 else [found.jacobian[:, :, link] for link in range(kind.links)]
+    if kind.looks_at:  # differences of nothing prove nothing
+        assert not found.jacobian.any()
+        parts = []
+    n = 6 * len(parts)
+    shape = (6,) if kind.links == 1 else (kind.links, 6)
 
-        def residual(x, unit=unit, shape=shape):
-            twist = (x @ unit.reshape(6, -1)).reshape(shape)  # the same small motion in every row and trial
-            return evaluated(kind, se3.exp_update(T, twist), measured).residual
+    def residual(x):
+        moved = se3.exp_update(T, x[:n].reshape(shape)) if n else T  # the same small motion in every row and trial
+        return kind.evaluate(moved, measured, None if values is None else values + x[n:], joints).residual
 
-        part = jacobian if kind.links == 1 else jacobian[:, :, link]
+    if found.own is not None:
+        parts.append(found.own)
+    if parts:
+        jacobian = np.concatenate(parts, axis=-1)
         reason = "[rad] per 0.05 rad, rounding of angles near small tilt"
         automatic = residual if with_jax else None
-        check_jacobian(residual, part, np.zeros(6), scale=0.05, automatic=automatic, atol=1e-13, atol_reason=reason)
+        zero = np.zeros(jacobian.shape[-1])
+        check_jacobian(residual, jacobian, zero, scale=0.05, automatic=automatic, atol=1e-13, atol_reason=reason)
 
 
 @every_kind
 @pytest.mark.parametrize("error", [1e-4, 0.3])
-def test_the_jacobian_by_the_platform_twist_agrees_with_differences(kind, error):
-    check_twist_jacobian(kind, error, with_jax=False)
+def test_the_derivatives_by_twist_and_unknowns_agree_with_differences(kind, error):
+    check_derivatives(kind, error, with_jax=False)
 
 
 @every_kind
 @pytest.mark.slow
-def test_the_jacobian_by_the_platform_twist_agrees_with_an_automatic_derivative(kind):
-    check_twist_jacobian(kind, 0.1, with_jax=True)
-
-
-def check_own_jacobian(kind, *, with_jax):
-    kind = placed(kind)
-    T = platform_poses(kind, 2, 4, seed=5)
-    measured, _ = measured_near(kind, T, 1e-3)
-    values, joints = own_unknowns(kind), joints_of(kind, T)
-
-    def residual(x):
-        return kind.evaluate(T, measured, values + x, joints).residual
-
-    own = kind.evaluate(T, measured, values, joints).own
-    automatic = residual if with_jax else None
-    check_jacobian(residual, own, np.zeros(len(kind.unknowns)), scale=0.05, automatic=automatic, atol=1e-13)
-
-
-@pytest.mark.parametrize("kind", WITH_UNKNOWNS)
-def test_the_jacobian_by_the_own_unknowns_agrees_with_differences(kind):
-    check_own_jacobian(kind, with_jax=False)
-
-
-@pytest.mark.parametrize("kind", WITH_UNKNOWNS)
-@pytest.mark.slow
-def test_the_jacobian_by_the_own_unknowns_agrees_with_an_automatic_derivative(kind):
-    check_own_jacobian(kind, with_jax=True)
+def test_the_derivatives_by_twist_and_unknowns_agree_with_an_automatic_derivative(kind):
+    check_derivatives(kind, 0.1, with_jax=True)
 
 
 @pytest.mark.parametrize("kind", WITH_JOINTS)
