@@ -85,6 +85,9 @@ def symbols(dimension: Dimension | None = None) -> tuple[str, ...]:
     return tuple(s for s, u in UNITS.items() if dimension is None or u.dimension is dimension)
 
 
+ARTICLES = {Dimension.LENGTH: "a length", Dimension.ANGLE: "an angle", Dimension.RATIO: "a ratio"}
+
+
 def unit(symbol: str, dimension: Dimension | None = None) -> Unit:
     """Return the unit with this symbol.
 
@@ -106,7 +109,7 @@ def unit(symbol: str, dimension: Dimension | None = None) -> Unit:
         raise UnitError(f"unknown unit {symbol!r}{nearest(symbol, allowed)}; allowed are {', '.join(allowed)}")
     if dimension is not None and found.dimension is not dimension:
         raise UnitError(
-            f"{symbol!r} is a unit of {found.dimension.value}, but a {dimension.value} is needed; "
+            f"{symbol!r} is a unit of {found.dimension.value}, but {ARTICLES[dimension]} is needed; "
             f"allowed are {', '.join(allowed)}"
         )
     return found

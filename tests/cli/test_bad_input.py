@@ -58,6 +58,8 @@ ROBOT_CASES = {
     "number typed as text": (BASE, "[120, '-140', 0]", "is the text '-140' where a number is needed; write the number"),
     "two numbers where three are needed": (BASE, "[120, -140]", "has 2 values where 3 are needed; add the missing ones"),
     "NaN": (BASE, "[120, .nan, 0]", "is nan; every number must be finite"),
+    "a comma in a number": ("lengths: 233.238076", "lengths: 233,238", "write a point in the number, not a comma"),
+    "a list too long": ("[-75, 75]", "[-75, 75, 3]", "'stroke' has 3 values where 2 are needed; remove the others"),
     "not YAML": (BASE, "[120, -140, 0", "this is not valid YAML"),
     "newer format": ("format: 1", "format: 2", "has format 2, but this loopcal reads formats up to 1"),
     "unknown family": ("family: gough", "family: gouhg", "is not a family of robots (did you mean 'gough'?)"),
@@ -81,6 +83,25 @@ def test_wrong_mobility_names_the_freedoms(refused) -> None:
     text = text.replace("lengths: 233.238076", "lengths: 234.07")
     found = refused("check robot.yaml", robot_yaml=text)
     assert "with every actuator held the platform can still move at home: turn about" in found
+
+
+def test_too_few_freedoms_are_named_as_well(refused) -> None:
+    """A second limb that only slides along x takes y away from two motors."""
+    limbs = [
+        "  - name: a\n    ending: rigid\n    errors: [{of: s, shift: [y]}]",
+        "    chain: [{joint: P, name: s, axis: x, actuated: q1}, {joint: P, name: t, axis: y, actuated: q2}]",
+        "  - {name: b, ending: rigid, chain: [{joint: P, name: s, axis: x}]}",
+    ]
+    head = ["format: 1", "family: limbs", "name: locked", UNITS.strip(), "freedoms: [x, y]", "controlled: [x, y]", "limbs:"]
+    found = refused("check robot.yaml", robot_yaml="\n".join([*head, *limbs]))
+    assert "2 actuators, but the limbs leave the platform only 1 of 2 freedoms at home; it cannot shift along y" in found
+
+
+def test_a_home_outside_the_strokes_is_noted(tmp_path, capsys) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text(ROBOT.replace("lengths: 233.238076", "lengths: 500"))
+    assert main(["check", str(path)]) == 0
+    assert "note: at home stroke of q1, stroke of q2" in capsys.readouterr().out
 
 
 FILE_CASES = {
@@ -116,6 +137,9 @@ DATA_CASES = {
     "a cell too few": ("b,1,", "b,", "data.csv:6: this row has 7 cells, but the header names 8 columns"),
     "NaN": ("201.1", "NaN", "data.csv:6: column 'z' is 'NaN', which is not a finite number"),
     "a reading outside the stroke": ("b,1,", "b,80,", "q1 reads 80 mm, outside its stroke of -75 to 75 mm"),
+    "no noise": ("# noise: {z: 1 um}\n", "", "no noise is stated for 'z'"),
+    "noise without a unit": ("1 um", "1", "'1' has no unit; add one of m, mm"),
+    "a comma in a number": ("201.1", "201,1", "data.csv:6: this row has 9 cells"),
     "the same row twice": ("c,2,2,2,2,2,2,202.2", "c,1,1,1,1,1,1,201.1", "'b' and 'c' have the same readings"),
 }
 
@@ -137,6 +161,9 @@ def test_a_byte_order_mark_is_accepted(tmp_path, capsys) -> None:
     path.write_bytes(b"\xef\xbb\xbf" + ROBOT.encode())
     assert main(["check", str(path)]) == 0
     assert capsys.readouterr().err == ""
+    data = tmp_path / "data.csv"
+    data.write_bytes(b"\xef\xbb\xbf" + DATA.encode())
+    assert main(["identifiability", str(path), str(data)]) == 0
 
 
 USAGE_CASES = {

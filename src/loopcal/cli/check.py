@@ -15,6 +15,9 @@ from loopcal.cli.options import FILE, json_option, robot_argument
 if TYPE_CHECKING:
     from loopcal.mechanism import Mechanism
 
+SLACK = 1e-9
+"""How far beyond a limit home may be by rounding [m or rad]."""
+
 
 @click.command(short_help="Read a robot file and show what it says.")
 @robot_argument
@@ -85,14 +88,18 @@ def _print(robot: Mechanism) -> None:
     show.say(f"file: {robot.record.path}")
     for what, names in words.items():
         show.say(f"{what}: {' '.join(names)}")
-    for note in robot.notes:
+    readings, exceeded = _home(robot)
+    notes = [*robot.notes]
+    if exceeded:
+        notes.append(f"at home {', '.join(exceeded)} is exceeded; correct home, lengths, strokes or limits")
+    for note in notes:
         show.say(f"note: {note}")
     rows = []
-    for actuator in robot.actuators:
+    for actuator, reading in zip(robot.actuators, readings, strict=True):
         unit = units[actuator.dimension]
         low, high = actuator.stroke or (float("nan"), float("nan"))
-        rows.append((actuator.name, *(show.number(v / unit.factor_to_si) for v in (low, high)), str(unit)))
-    show.table("Actuators", ("name", "lowest", "highest", "unit"), rows)
+        rows.append((actuator.name, *(show.number(v / unit.factor_to_si) for v in (low, high, reading)), str(unit)))
+    show.table("Actuators", ("name", "lowest", "highest", "at home", "unit"), rows)
     rows = []
     for parameter, value in zip(table.entries, robot.values, strict=True):
         unit = units[parameter.dimension]
@@ -101,3 +108,15 @@ def _print(robot: Mechanism) -> None:
         cells = (show.number(nominal, digits=9), show.number(present, digits=9), show.number(tolerance, digits=3))
         rows.append((parameter.name, *cells, str(unit), "free" if parameter.free else "fixed"))
     show.table("Parameters", ("name", "nominal", "value", "tolerance (1 sd)", "unit", ""), rows)
+
+
+def _home(robot: Mechanism) -> tuple[list[float], list[str]]:
+    """Return the readings (a,) [SI] of the home pose, and which strokes and limits they exceed."""
+    from loopcal.mechanism import inverse
+    from loopcal.mechanism.limits import limits
+
+    found = inverse(robot, robot.home[None])
+    exceeded = [
+        limit.name for limit in limits(robot, robot.values[None], found.q[None], found.state) if limit.margin[0, 0] < -SLACK
+    ]
+    return found.q[0].tolist(), exceeded

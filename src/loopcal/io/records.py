@@ -216,6 +216,7 @@ def _sentence(finding: Any, location: Location, node: Any, needed: int) -> str:
         number = "a whole number" if kind.startswith("int") else "a number"
         if isinstance(node, str):
             act = "write the number without quotes and without a unit" if _numeric(node) else "write a number"
+            act = "write a point in the number, not a comma" if _numeric(node) and "," in node else act
             return f"{name} is the text {node!r} where {number} is needed; {act}"
         return f"{name} is {_shape(node)} where {number} is needed; write a number"
     if kind in ("tuple_type", "list_type"):

@@ -242,7 +242,7 @@ def _home(robot: Mechanism) -> State:
     if len(robot.controlled) < movable:
         raise MechanismError(
             f"{robot.name} can be moved in {movable} freedoms or more, but {len(robot.controlled)} controlled coordinates are "
-            f"named ({', '.join(robot.controlled)}); name one for every freedom"
+            f"named ({', '.join(robot.controlled)}); name one for every freedom, or state fewer `freedoms:`"
         )
     state = inverse_trials(robot, values, target)
     if state.status[0, 0] != engine.CONVERGED:

@@ -46,14 +46,16 @@ def checked(robot: Mechanism) -> Mechanism:
             "add a limb or actuator, or state fewer freedoms"
         )
     Q = _drives(robot, blocks)
-    both = np.linalg.svd(np.concatenate([A, Q], axis=1), compute_uv=False)
+    _, both, W = np.linalg.svd(np.concatenate([A, Q], axis=1), full_matrices=True)
     # freedoms with every actuator free: solutions (y, dq) of A y + Q dq = 0, A of full column rank
-    movable = A.shape[1] + Q.shape[1] - int((both > RANK * both[0]).sum())
-    a = program.n_joints
+    moves = W[int((both > RANK * both[0]).sum()) :, :m]
+    movable, a = len(moves), program.n_joints
     if movable < min(a, m):
+        held = np.linalg.svd(moves, full_matrices=True)[2][movable:] if movable else np.eye(m)
         raise MechanismError(
-            f"{robot.name}: {a} actuators, but the limbs leave the platform only {movable} freedoms at home; "
-            "the machine is over-constrained: remove a constraint or make a joint passive"
+            f"{robot.name}: {a} actuators, but the limbs leave the platform only {movable} of {m} freedoms at home; it cannot "
+            f"{', nor '.join(_motion(program.freedoms, y) for y in held)}; the machine is over-constrained: remove a "
+            "constraint or make a joint passive"
         )
     if len(robot.controlled) != movable:
         raise MechanismError(
