@@ -36,7 +36,7 @@ def empty_factor(trials: int, parameters: int) -> FloatArray:
     return np.zeros((trials, parameters + 1, parameters + 1))
 
 
-PER_TRIAL = ("singular_values", "directions", "projections", "outside", "rows")
+PER_TRIAL = ("singular_values", "directions", "projections", "outside", "rows", "dual", "flat")
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,11 @@ class Decomposition:
     what lies outside the range. A `penalty` (t, p) adds penalty_i y_i^2: zero for plain least squares, infinite where
     a direction is not used at all. Its filter factors are f_i = s_i^2 / (s_i^2 + penalty_i).
 
+    Where some columns are `flat`, never penalised, V holds two groups of columns: those of flat parameters alone, and
+    those of the others, each with the change of the flat ones that goes best with it. U stays orthonormal and V'z of
+    the second group depends on the penalised parameters alone, so that all formulas stay as they are; V itself is
+    oblique and its inverse is kept as `dual`.
+
     Attributes
     ----------
     singular_values : (t, p) s, descending.
@@ -56,6 +61,8 @@ class Decomposition:
     rows : (t,) number of equations folded (rows of weight zero not counted).
     scale : (p,) by which the columns were multiplied.
     tolerance : singular values below tolerance * s_1 count as zero.
+    dual : (t, p, p) inverse of V where V is oblique; None where it is V'.
+    flat : (t, p) directions of parameters that are never penalised; None where there are none.
     """
 
     singular_values: FloatArray
@@ -65,6 +72,8 @@ class Decomposition:
     rows: IntArray
     scale: FloatArray
     tolerance: float = RANK_TOLERANCE
+    dual: FloatArray | None = None
+    flat: NDArray[np.bool_] | None = None
 
     @cached_property
     def used(self) -> NDArray[np.bool_]:
@@ -95,7 +104,10 @@ class Decomposition:
 
     def coordinates(self, deviation: FloatArray) -> FloatArray:
         """Return y = V' (z / scale), (t, p), of a deviation z (t, p)."""
-        return np.matmul((deviation / self.scale)[:, None, :], self.directions)[:, 0]
+        scaled = deviation / self.scale
+        if self.dual is not None:
+            return np.matmul(self.dual, scaled[:, :, None])[:, :, 0]
+        return np.matmul(scaled[:, None, :], self.directions)[:, 0]
 
     def deviation(self, coordinates: FloatArray) -> FloatArray:
         """Return z = scale * V y, (t, p), of coordinates y (t, p)."""
@@ -161,20 +173,56 @@ class Decomposition:
         """Return the decomposition of some trials only (the same object where these are all)."""
         if len(trials) == len(self.outside):
             return self
-        return replace(self, **{name: getattr(self, name)[trials] for name in PER_TRIAL})
+        return replace(self, **{name: array[trials] for name, array in self._per_trial().items()})
 
     def put(self, trials: IntArray, other: Decomposition) -> Decomposition:
         """Return this decomposition with some trials taken from another one."""
         if len(trials) == len(self.outside):
             return other
-        merged = {name: getattr(self, name).copy() for name in PER_TRIAL}
+        merged = {name: array.copy() for name, array in self._per_trial().items()}
         for name, array in merged.items():
             array[trials] = getattr(other, name)
         return replace(self, **merged)
 
     def null_space(self, trial: int = 0) -> FloatArray:
-        """Return an orthonormal basis (p, d) of the scaled deviations that change no row, for one trial."""
+        """Return a basis (p, d) of the scaled deviations that change no row, for one trial; orthonormal without `flat`."""
         return self.directions[trial][:, ~self.used[trial]]
+
+    def plain(self) -> Decomposition:
+        """Return the decomposition without flat columns, which alone has the singular values of A (itself where it has)."""
+        if self.dual is None:
+            return replace(self, flat=None)
+        u, s, vt = np.linalg.svd(self.singular_values[:, :, None] * self.dual)
+        projections = np.matmul(self.projections[:, None, :], u)[:, 0]
+        directions = np.ascontiguousarray(vt.swapaxes(-1, -2))
+        return replace(self, singular_values=s, directions=directions, projections=projections, dual=None, flat=None)
+
+    def knowledge(
+        self, penalty: FloatArray, noise: float = 1.0, trial: int = 0
+    ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Return orthonormal directions (p, p) of z / scale, the variance (p,) of each, and which the rows see, of one trial.
+
+        Where V is oblique these come from the singular values of diag(var)^(-1/2) V^-1.
+        """
+        variances = self.variances(penalty, noise)[trial]
+        if self.dual is None or np.isnan(variances).any():
+            return self.plain().directions[trial], variances, self.plain().used[trial]
+        dual = self.dual[trial]
+        root = np.where(np.isfinite(variances), 1.0 / np.sqrt(variances), 0.0)
+        _, s, vt = np.linalg.svd(root[:, None] * dual)
+        known = s > self.tolerance * s[0]
+        variance = np.where(known, 1.0 / np.where(known, s, 1.0) ** 2, np.inf)
+        effect = np.linalg.norm(self.singular_values[trial][:, None] * (dual @ vt.T), axis=0)
+        return vt.T, variance, effect > self.tolerance * self.singular_values[trial].max()
+
+    def divided(self, sigma: FloatArray) -> Decomposition:
+        """Return the decomposition of the rows divided by sigma (t,)."""
+        s, c, outside = self.singular_values / sigma[:, None], self.projections / sigma[:, None], self.outside / sigma**2
+        return replace(self, singular_values=s, projections=c, outside=outside)
+
+    def _per_trial(self) -> dict[str, NDArray]:
+        """Arrays with the trial axis, by name."""
+        return {name: getattr(self, name) for name in PER_TRIAL if getattr(self, name) is not None}
 
     def _touched(self, infinite: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """(t, p) which parameters have a part in the directions marked (t, p)."""
@@ -188,6 +236,7 @@ def decompose(
     about: FloatArray | None = None,
     scale: FloatArray | None = None,
     tolerance: float = RANK_TOLERANCE,
+    flat: NDArray[np.bool_] | None = None,
 ) -> Decomposition:
     """Decompose a triangular factor of rows [A | b].
 
@@ -199,6 +248,7 @@ def decompose(
         problem becomes the one for the total deviation: |A z_new - b| with b = A z - r.
     scale : (p,), optional. Factors for the columns before the decomposition; the penalty then acts on z / scale.
     tolerance : relative rank tolerance.
+    flat : (p,), optional. Columns that no penalty may touch.
     """
     p = factor.shape[-1] - 1
     triangle, last = factor[:, :p, :p], factor[:, :p, p]
@@ -206,9 +256,53 @@ def decompose(
         last = np.matmul(triangle, about[:, :, None])[:, :, 0] - last
     if scale is not None:
         triangle = triangle * scale
+    factors = np.ones(p) if scale is None else scale
+    outside = factor[:, p, p] ** 2
+    if flat is not None and flat.any() and not flat.all():
+        return _split(triangle, last, outside, rows, factors, tolerance, flat)
     u, s, vt = np.linalg.svd(triangle)
     projections = np.matmul(last[:, None, :], u)[:, 0]
-    factors = np.ones(p) if scale is None else scale
     # One memory layout, whichever trials are taken later: products round by the layout of their factors.
     directions = np.ascontiguousarray(vt.swapaxes(-1, -2))
-    return Decomposition(s, directions, projections, factor[:, p, p] ** 2, rows, factors, tolerance)
+    marked = np.ones(s.shape, dtype=bool) if flat is not None and flat.all() else None
+    return Decomposition(s, directions, projections, outside, rows, factors, tolerance, flat=marked)
+
+
+def _split(
+    triangle: FloatArray,
+    last: FloatArray,
+    outside: FloatArray,
+    rows: IntArray,
+    scale: FloatArray,
+    tolerance: float,
+    flat: NDArray[np.bool_],
+) -> Decomposition:
+    """Decompose [F G] with flat columns F first: F = U1 S1 W', then what F cannot explain of G, (I - U1 U1') G = U2 S2 V2'.
+
+    With T = S1^+ U1'G the columns of V are (W, 0) and (-W T V2, V2), and its inverse is [[W', T], [0, V2']].
+    """
+    p, k = len(flat), int(flat.sum())
+    order = np.concatenate([np.flatnonzero(flat), np.flatnonzero(~flat)])
+    reduced: FloatArray = np.array(np.linalg.qr(np.concatenate([triangle[:, :, order], last[:, :, None]], axis=2), mode="r"))
+    u1, s1, w1t = np.linalg.svd(reduced[:, :k, :k])
+    top = np.linalg.norm(reduced[:, :, :p], axis=(1, 2))
+    used = s1 > tolerance * top[:, None]
+    first = np.matmul(u1.swapaxes(-1, -2), reduced[:, :k, k:])  # U1'G and U1'b
+    rest = np.concatenate([np.where(used[:, :, None], 0.0, first), reduced[:, k:, k:]], axis=1)
+    u2, s2, v2t = np.linalg.svd(rest[:, :, :-1], full_matrices=False)
+    second = np.matmul(rest[:, None, :, -1], u2)[:, 0]
+    outside = outside + np.maximum((rest[:, :, -1] ** 2).sum(axis=1) - (second**2).sum(axis=1), 0.0)
+    inverse = np.divide(1.0, s1, out=np.zeros_like(s1), where=used)
+    shift = inverse[:, :, None] * first[:, :, :-1]
+    dual, directions = np.zeros_like(triangle), np.zeros_like(triangle)
+    dual[:, :k, :k], dual[:, :k, k:], dual[:, k:, k:] = w1t, shift, v2t
+    w1, v2 = w1t.swapaxes(-1, -2), v2t.swapaxes(-1, -2)
+    directions[:, :k, :k], directions[:, :k, k:], directions[:, k:, k:] = w1, -w1 @ (shift @ v2), v2
+    s = np.concatenate([np.where(used, s1, 0.0), s2], axis=1)
+    c = np.concatenate([np.where(used, first[:, :, -1], 0.0), second], axis=1)
+    by_size, back = np.argsort(-s, axis=1, kind="stable"), np.argsort(order)
+    marked = by_size < k
+    dual = np.take_along_axis(dual[:, :, back], by_size[:, :, None], axis=1)
+    directions = np.take_along_axis(directions[:, back], by_size[:, None, :], axis=2)
+    s, c = np.take_along_axis(s, by_size, axis=1), np.take_along_axis(c, by_size, axis=1)
+    return Decomposition(s, directions, c, outside, rows, scale, tolerance, dual, marked)

@@ -118,7 +118,8 @@ def test_rules_choose_for_each_trial_on_its_own(rows):
     ("make", "words"),
     [
         (lambda: Ridge(-1.0), "finite number >= 0"),
-        (lambda: Ridge((1.0, 0.0)), "positive lam"),
+        (lambda: Ridge((1.0, -1.0)), "finite number >= 0"),
+        (lambda: MAP(0.0), "finite factor above 0"),
         (lambda: Ridge(float("nan")), "finite number >= 0"),
         (lambda: TruncatedSVD(-1), "0 or more"),
         (lambda: Ridge((1.0, 2.0)).scale(3), "2 values of lam for 3"),

@@ -36,7 +36,7 @@ def data():
 
 @pytest.fixture(scope="module")
 def fit(data):
-    return identify(hexapod(), data)
+    return identify(hexapod(), data, LeastSquares())
 
 
 def test_the_true_parameters_lie_within_their_uncertainty(fit):
@@ -62,7 +62,7 @@ def test_exact_poses_of_the_nategh_hexapod_are_recovered_quadratically():
     for seed in range(100):
         T = zoo.nategh_poses(np.random.default_rng(seed))
         exact = simulate(robot.with_values(truth), T, tracker(1e-16, 5e-16), seed)
-        fit = identify(robot, exact, begin="closure")
+        fit = identify(robot, exact, LeastSquares(), begin="closure")
         assert fit.converged
         errors = np.abs(fit.estimate_history - truth).max(axis=1) / MM
         steps.append(errors[1:4])
@@ -87,21 +87,22 @@ def test_beginning_from_closure_changes_nothing_where_poses_are_not_measured_in_
 def test_leaving_poses_out_by_weight_equals_removing_them(data):
     weight = np.ones(data.n_poses)
     weight[[3, 17, 29]] = 0.0
-    by_weight = identify(hexapod(), data.reweighted(weight))
-    removed = identify(hexapod(), data.take(weight > 0.0))
+    by_weight = identify(hexapod(), data.reweighted(weight), LeastSquares())
+    removed = identify(hexapod(), data.take(weight > 0.0), LeastSquares())
     np.testing.assert_allclose(by_weight.estimate, removed.estimate, rtol=0, atol=1e-12)  # [m]
     np.testing.assert_allclose(by_weight.sd, removed.sd, rtol=1e-9)
     assert by_weight.dof == removed.dof
 
 
 def test_the_order_of_poses_changes_rounding_only(data, fit):
-    shuffled = identify(hexapod(), data.take(np.random.default_rng(0).permutation(data.n_poses)))
+    order = np.random.default_rng(0).permutation(data.n_poses)
+    shuffled = identify(hexapod(), data.take(order), LeastSquares())
     np.testing.assert_allclose(shuffled.estimate, fit.estimate, rtol=0, atol=1e-12)  # [m]
 
 
 def test_blocks_of_poses_change_rounding_only(data, fit, monkeypatch):
     monkeypatch.setattr(rows_module, "BLOCK", 7)
-    blocked = identify(hexapod(), data)
+    blocked = identify(hexapod(), data, LeastSquares())
     np.testing.assert_allclose(blocked.estimate, fit.estimate, rtol=0, atol=1e-12)  # [m]
     np.testing.assert_allclose(blocked.residuals[0].raw, fit.residuals[0].raw, rtol=0, atol=1e-12)
     assert blocked.residuals[0].poses == fit.residuals[0].poses
@@ -149,7 +150,7 @@ def test_fixed_parameters_stay_and_have_no_uncertainty(data):
     robot = hexapod()
     names = [n for n in robot.parameters.names if not n.startswith("leg4")]
     some = replace(robot, parameters=robot.parameters.only(names))
-    fit = identify(some, data)
+    fit = identify(some, data, LeastSquares())
     held = [i for i, n in enumerate(robot.parameters.names) if n.startswith("leg4")]
     assert len(fit.names) == 35
     assert np.array_equal(fit.robot.values[held], robot.values[held])
@@ -160,7 +161,7 @@ def test_fixed_parameters_stay_and_have_no_uncertainty(data):
 
 def test_what_the_data_cannot_tell_is_named_has_infinite_uncertainty_and_stays_nearest_to_nominal():
     robot, data = hexapod(), hexapod_data(30, instrument=five_dof())
-    fit = identify(robot, data)
+    fit = identify(robot, data, LeastSquares())
     assert fit.rank == 41
     (turn,) = fit.unidentifiable
     assert {n for n, sd in zip(fit.names, fit.sd, strict=True) if np.isinf(sd)} == set(turn.names)
@@ -181,16 +182,16 @@ def test_what_the_data_cannot_tell_is_named_has_infinite_uncertainty_and_stays_n
 
 
 def test_missing_tolerances_are_assumed_aloud(data):
-    fit = identify(zoo.hexapod(), data)
+    fit = identify(zoo.hexapod(), data, LeastSquares())
     assert any("42 of 42 parameters have no tolerance" in note for note in fit.notes)
-    assert not any("no tolerance" in note for note in identify(hexapod(), data).notes)
+    assert not any("no tolerance" in note for note in identify(hexapod(), data, LeastSquares()).notes)
 
 
 def test_fewer_equations_than_parameters_are_refused_unless_asked_for_or_a_prior_fills_the_gap(data):
     few = data.take(np.arange(5))
     with pytest.raises(EstimationError, match=r"30 equations from 5 poses cannot determine 42 .* at least 7 poses"):
-        identify(hexapod(), few)
-    forced = identify(hexapod(), few, allow_fewer_equations=True)
+        identify(hexapod(), few, LeastSquares())
+    forced = identify(hexapod(), few, LeastSquares(), allow_fewer_equations=True)
     assert forced.rank == 30
     assert len(forced.unidentifiable) == 12
     assert "no degree of freedom" in forced.check.sentence
@@ -202,7 +203,7 @@ def test_few_degrees_of_freedom_give_no_intervals_unless_sigma_is_given():
     six = [n for n in robot.parameters.names if "arm" not in n and "angle" not in n][:6]
     some = replace(robot, parameters=robot.parameters.only(six))
     data = probed_heights(robot, bed(len(six) + 1))
-    estimated, given = identify(some, data, noise="estimated"), identify(some, data)
+    estimated, given = identify(some, data, LeastSquares(), noise="estimated"), identify(some, data, LeastSquares())
     assert estimated.dof == 1
     assert "one degree of freedom is too few for intervals unless the instrument's sigma is given" in estimated.notes
     assert np.isnan(estimated.sd).all()
@@ -213,11 +214,11 @@ def test_estimated_noise_scales_the_uncertainty(data):
     quarter = hexapod_data(instrument=tracker(4e-6, 20e-6))
     claimed = quarter.observations[0]
     sharp = replace(quarter, observations=(replace(claimed, covariance=claimed.covariance / 16.0),))
-    fit = identify(hexapod(), sharp, noise="estimated")
+    fit = identify(hexapod(), sharp, LeastSquares(), noise="estimated")
     assert fit.check.sigma_scale == pytest.approx(4.0, rel=0.25)  # 138 degrees of freedom: sd 6 %
-    np.testing.assert_allclose(fit.sd, identify(hexapod(), quarter).sd * fit.check.sigma_scale / 4.0, rtol=1e-3)
+    np.testing.assert_allclose(fit.sd, identify(hexapod(), quarter, LeastSquares()).sd * fit.check.sigma_scale / 4.0, rtol=1e-3)
     assert np.isnan(fit.p_value)
-    assert "sigma too small" in identify(hexapod(), sharp).check.sentence
+    assert "sigma too small" in identify(hexapod(), sharp, LeastSquares()).check.sentence
 
 
 def test_poses_out_of_reach_are_refused_by_name_and_ignored_without_weight(data):
@@ -225,16 +226,16 @@ def test_poses_out_of_reach_are_refused_by_name_and_ignored_without_weight(data)
     readings[4] = -0.2  # [m]
     broken = replace(data, readings=readings)
     with pytest.raises(EstimationError, match=r"cannot reach 1 of 30 poses .*'5'"):
-        identify(hexapod(), broken)
+        identify(hexapod(), broken, LeastSquares())
     weight = np.ones(30)
     weight[4] = 0.0
-    found = identify(hexapod(), broken.reweighted(weight))
-    expected = identify(hexapod(), data.take(weight > 0))
+    found = identify(hexapod(), broken.reweighted(weight), LeastSquares())
+    expected = identify(hexapod(), data.take(weight > 0), LeastSquares())
     np.testing.assert_allclose(found.estimate, expected.estimate, rtol=0, atol=1e-12)
 
 
 def test_an_iteration_cut_short_says_so(data):
-    fit = identify(hexapod(), data, control=StepControl(iterations=0))
+    fit = identify(hexapod(), data, LeastSquares(), control=StepControl(iterations=0))
     assert fit.status is DescentStatus.OUT_OF_ITERATIONS
     assert "did not converge" in fit.notes[0]
     assert "did not converge" in str(fit)
@@ -242,19 +243,19 @@ def test_an_iteration_cut_short_says_so(data):
 
 def test_a_start_far_off_converges_to_the_same_answer(data, fit):
     start = zoo.hexapod().values + np.random.default_rng(1).uniform(-5 * MM, 5 * MM, 42)
-    far = identify(hexapod(), data, start=start)
+    far = identify(hexapod(), data, LeastSquares(), start=start)
     assert far.converged
     np.testing.assert_allclose(far.estimate, fit.estimate, rtol=0, atol=1e-9)  # [m] 1e-3 of the smallest sd
 
 
 def test_rows_of_weight_zero_alone_and_no_free_parameter_are_refused(data):
     with pytest.raises(EstimationError, match="every row is absent or has weight 0"):
-        identify(hexapod(), data.reweighted(np.zeros(30)))
+        identify(hexapod(), data.reweighted(np.zeros(30)), LeastSquares())
     fixed = replace(hexapod(), parameters=hexapod().parameters.only([]))
     with pytest.raises(EstimationError, match="no free parameter"):
-        identify(fixed, data)
+        identify(fixed, data, LeastSquares())
     with pytest.raises(EstimationError, match="'given' or 'estimated'"):
-        identify(hexapod(), data, noise="guessed")  # pyright: ignore[reportArgumentType]
+        identify(hexapod(), data, LeastSquares(), noise="guessed")  # pyright: ignore[reportArgumentType]
 
 
 def test_the_printed_table_and_the_json_name_every_parameter(fit):

@@ -2,6 +2,8 @@
 """From measurements to parameters: identify, what can be identified, validate."""
 
 from loopcal.calibrate.combinations import Combination as Combination
+from loopcal.calibrate.conflict import PriorConflict as PriorConflict
+from loopcal.calibrate.conflict import Widened as Widened
 from loopcal.calibrate.descent import DescentStatus as DescentStatus
 from loopcal.calibrate.descent import StepControl as StepControl
 from loopcal.calibrate.filters import MAP as MAP
@@ -14,6 +16,10 @@ from loopcal.calibrate.identification import Identification as Identification
 from loopcal.calibrate.identify import IdentifiedTrials as IdentifiedTrials
 from loopcal.calibrate.identify import identify as identify
 from loopcal.calibrate.identify import identify_trials as identify_trials
+from loopcal.calibrate.losses import Huber as Huber
+from loopcal.calibrate.losses import Tukey as Tukey
+from loopcal.calibrate.outliers import OutlierCheck as OutlierCheck
+from loopcal.calibrate.outliers import find_outliers as find_outliers
 from loopcal.calibrate.per_leg import identify_per_leg as identify_per_leg
 from loopcal.calibrate.pose_errors import PoseErrors as PoseErrors
 from loopcal.calibrate.pose_errors import pose_errors as pose_errors

@@ -38,13 +38,14 @@ def check_count(rows: Rows, data: Measurements, method: Method, allow_fewer: boo
     EstimationError
         Naming both numbers and the poses that would do.
     """
-    m, p = int(rows.rows[0]), rows.parameters
-    if m >= p or method.has_prior or allow_fewer:
+    m, p = int(rows.rows[0]), method.needs(rows.parameters)
+    if m >= p or allow_fewer:
         return
     poses = int(np.ceil(p * data.n_poses / m))
+    without = "" if p == rows.parameters else " without a tolerance"
     raise EstimationError(
-        f"{m} equations from {data.n_poses} poses cannot determine {p} parameters: measure at least {poses} poses like"
-        f" these (better twice as many), fix parameters, or use a method with a prior (MAP)"
+        f"{m} equations from {data.n_poses} poses cannot determine {p} parameters{without}: measure at least {poses} poses like"
+        f" these (better twice as many), fix parameters, or state their tolerances and use a method with a prior (MAP)"
     )
 
 

@@ -184,13 +184,13 @@ class _Run:
 
     def __init__(self, problem: Problem, method: Method, tolerance: float, start: FloatArray, damping: float) -> None:
         self.problem, self.method, self.tolerance = problem, method, tolerance
-        self.scale = method.scale(problem.parameters)
+        self.scale, self.flat = method.scale(problem.parameters), method.flat(problem.parameters)
         t = len(start)
         factor, self.cost = problem.fold(start, np.arange(t))
         good = np.isfinite(self.cost) & np.isfinite(factor).all(axis=(1, 2))
         self.z = start
         self.decomposition = decompose(
-            np.where(good[:, None, None], factor, 0.0), problem.rows.copy(), start, self.scale, tolerance
+            np.where(good[:, None, None], factor, 0.0), problem.rows.copy(), start, self.scale, tolerance, self.flat
         )
         self.penalty: FloatArray = np.array(method.penalty(self.decomposition), dtype=np.float64)
         self.status = np.where(good, DescentStatus.RUNNING, DescentStatus.BAD_START).astype(np.int64)
@@ -245,7 +245,7 @@ class _Run:
 
     def _move(self, trials: IntArray, z: FloatArray, factor: FloatArray, cost: FloatArray) -> None:
         """Put some trials at a new point."""
-        new = decompose(factor, self.problem.rows[trials], z, self.scale, self.tolerance)
+        new = decompose(factor, self.problem.rows[trials], z, self.scale, self.tolerance, self.flat)
         penalty = self.method.penalty(new)
         self.iterations[trials] += 1
         self.z[trials], self.cost[trials], self.penalty[trials] = z, cost, penalty

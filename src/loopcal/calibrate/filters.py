@@ -6,8 +6,9 @@ deviation, every method here is z = sum_i f_i (c_i / s_i) v_i with f_i = s_i^2 /
 
     LeastSquares     penalty 0 up to the numerical rank, infinite beyond it: the smallest total deviation there
     TruncatedSVD(k)  penalty 0 up to k, infinite beyond it
-    Ridge(lam)       penalty lam everywhere (or one lam per parameter)
-    MAP()            penalty 1: the tolerances are the standard deviations of a Gaussian prior
+    Ridge(lam)       penalty lam everywhere, or one lam per parameter, zero for those that are not held back
+    MAP()            penalty 1: the tolerances are the standard deviations of a Gaussian prior; none where none is stated
+    MAP(Widened())   the default: the same, with all tolerances widened where the data contradict them
 
 What is penalised is the total deviation from nominal in units of tolerance, never the step, so the answer does not
 depend on the number of iterations. A new method is one more class here. See docs/theory/estimation.md.
@@ -16,11 +17,14 @@ depend on the number of iterations. A new method is one more class here. See doc
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
+from loopcal.calibrate.conflict import Widened
+from loopcal.calibrate.statistics import FEWEST_DEGREES
 from loopcal.errors import EstimationError
 from loopcal.linalg import Decomposition, FloatArray, IntArray
 
@@ -31,9 +35,12 @@ Rule = Callable[[Decomposition], FloatArray | IntArray]
 class Method(Protocol):
     """What the descent asks of a method."""
 
-    @property
-    def has_prior(self) -> bool:
-        """Whether the method can estimate more parameters than there are equations."""
+    def needs(self, parameters: int) -> int:
+        """Return how many equations the method needs: the number of parameters without anything else to hold them."""
+        ...
+
+    def flat(self, parameters: int) -> NDArray[np.bool_] | None:
+        """Return which parameters (p,) are never penalised, or None where the method does not tell them apart."""
         ...
 
     def scale(self, parameters: int) -> FloatArray | None:
@@ -55,7 +62,12 @@ class LeastSquares:
     LeastSquares()
     """
 
-    has_prior = False
+    def needs(self, parameters: int) -> int:
+        """Return as many as there are parameters."""
+        return parameters
+
+    def flat(self, parameters: int) -> None:
+        """All parameters are alike."""
 
     def scale(self, parameters: int) -> None:
         """No factors: the columns stay scaled by tolerance."""
@@ -80,11 +92,17 @@ class TruncatedSVD:
     """
 
     k: int | Rule
-    has_prior = True
 
     def __post_init__(self) -> None:
         if not callable(self.k) and self.k < 0:
             raise EstimationError(f"truncation at k = {self.k}: k counts directions; give 0 or more, or a rule")
+
+    def needs(self, parameters: int) -> int:
+        """Return 0: directions without data keep their nominal value."""
+        return 0
+
+    def flat(self, parameters: int) -> None:
+        """All parameters are alike."""
 
     def scale(self, parameters: int) -> None:
         """No factors: the columns stay scaled by tolerance."""
@@ -102,16 +120,16 @@ class Ridge:
 
     Parameters
     ----------
-    lam : a number, one number per free parameter (in the order of the parameter table), or a rule that chooses one.
+    lam : a number, one number per free parameter (in the order of the parameter table; 0 for one that is not held
+        back), or a rule that chooses one.
 
     Raises
     ------
     EstimationError
-        lam is negative, not finite, or zero for some parameters only.
+        lam is negative or not finite.
     """
 
     lam: float | tuple[float, ...] | Rule
-    has_prior = True
 
     def __post_init__(self) -> None:
         if callable(self.lam):
@@ -120,9 +138,17 @@ class Ridge:
         if values.ndim > 1 or not np.all(np.isfinite(values)) or np.any(values < 0.0):
             raise EstimationError(f"ridge with lam = {self.lam}: give a finite number >= 0, one per parameter, or a rule")
         if values.ndim == 1:
-            if np.any(values == 0.0):
-                raise EstimationError("ridge with lam = 0 for a single parameter: give each parameter a positive lam")
             object.__setattr__(self, "lam", tuple(float(v) for v in values))
+
+    def needs(self, parameters: int) -> int:
+        """Return the number of parameters that are not held back."""
+        if isinstance(self.lam, tuple):
+            return sum(value == 0.0 for value in self.lam)
+        return parameters if self.lam == 0.0 else 0
+
+    def flat(self, parameters: int) -> NDArray[np.bool_] | None:
+        """Return where lam is 0, for one lam per parameter."""
+        return np.array(self.lam) == 0.0 if isinstance(self.lam, tuple) and 0.0 in self.lam else None
 
     def scale(self, parameters: int) -> FloatArray | None:
         """1 / sqrt(lam) for one lam per parameter: penalty 1 on the rescaled deviation is lam on the original."""
@@ -130,27 +156,85 @@ class Ridge:
             return None
         if len(self.lam) != parameters:
             raise EstimationError(f"ridge with {len(self.lam)} values of lam for {parameters} free parameters: give one each")
-        return 1.0 / np.sqrt(np.asarray(self.lam))
+        lam = np.asarray(self.lam)
+        return 1.0 / np.sqrt(np.where(lam > 0.0, lam, 1.0))
 
     def penalty(self, decomposition: Decomposition) -> FloatArray:
         """Return lam for every direction; where lam is 0, a direction that does not count is not used."""
         lam = 1.0 if isinstance(self.lam, tuple) else self.lam
         lam = np.atleast_1d(np.asarray(lam(decomposition) if callable(lam) else lam, dtype=np.float64))
-        return np.where((lam[:, None] > 0.0) | decomposition.used, lam[:, None], np.inf)
+        return _held(decomposition, lam)
 
 
 @dataclass(frozen=True)
 class MAP:
     """Most probable parameters when each tolerance is the standard deviation of a Gaussian prior: ridge with lam = 1.
 
-    The rows must be divided by their true sigma. What the data cannot tell keeps its prior.
+    What the data cannot tell keeps its prior. A parameter without a stated tolerance is not held back.
+
+    Parameters
+    ----------
+    spread : factor on all tolerances, or a rule that chooses it, such as `Widened()`.
+    free : (p,) parameters that are not held back; `identify` puts in those without a stated tolerance.
+    noise : "given": the rows are divided by their true sigma; "estimated": true up to one factor, which is estimated
+        from what no parameters could explain, so that data and prior are weighed against each other rightly.
+
+    Raises
+    ------
+    EstimationError
+        spread is not positive and finite.
     """
 
-    has_prior = True
+    spread: float | Rule = 1.0
+    free: tuple[bool, ...] = ()
+    noise: Literal["given", "estimated"] = "given"
+
+    def __post_init__(self) -> None:
+        if not callable(self.spread) and not 0.0 < self.spread < np.inf:
+            raise EstimationError(f"tolerances times {self.spread}: give a finite factor above 0, or a rule")
+
+    def needs(self, parameters: int) -> int:
+        """Return the number of parameters that are not held back."""
+        return sum(self.free)
+
+    def flat(self, parameters: int) -> NDArray[np.bool_] | None:
+        """Return the parameters that are not held back."""
+        return np.array(self.free) if any(self.free) else None
 
     def scale(self, parameters: int) -> None:
         """No factors: the columns stay scaled by tolerance."""
 
     def penalty(self, decomposition: Decomposition) -> FloatArray:
-        """One for every direction."""
-        return np.ones_like(decomposition.singular_values)
+        """Return sigma^2 / spread^2, sigma = 1 where the noise is given."""
+        sigma = self.sigma(decomposition)
+        spread = self.spread(decomposition.divided(sigma)) if callable(self.spread) else self.spread
+        return _held(decomposition, (sigma / spread) ** 2)
+
+    def sigma(self, decomposition: Decomposition) -> FloatArray:
+        """Return the factor (t,) on the stated sigmas that is used; 1 where too little is left over to estimate it."""
+        if self.noise == "given":
+            return np.ones_like(decomposition.outside)
+        left = decomposition.rows - decomposition.rank
+        enough = (left >= FEWEST_DEGREES) & (decomposition.outside > 0.0)
+        return np.sqrt(np.where(enough, decomposition.outside / np.maximum(left, 1), 1.0))
+
+
+def _held(decomposition: Decomposition, lam: FloatArray) -> FloatArray:
+    """Return lam (t,) or (1,) for all directions but flat ones: those are free where the data see them, else not used."""
+    free = np.where(decomposition.used, 0.0, np.inf)
+    held = np.where(lam[:, None] > 0.0, lam[:, None], free)
+    return held if decomposition.flat is None else np.where(decomposition.flat, free, held)
+
+
+def adapted(method: Method | None, assumed: NDArray[np.bool_], noise: Literal["given", "estimated"]) -> Method:
+    """Return the method for a robot and its data: the default where there is none, and what MAP must know.
+
+    Parameters
+    ----------
+    assumed : (p,) free parameters whose tolerance is not stated. noise : see `identify`.
+    """
+    method = MAP(Widened()) if method is None else method
+    if not isinstance(method, MAP):
+        return method
+    free = method.free or (tuple(assumed.tolist()) if assumed.any() else ())
+    return replace(method, free=free, noise=noise)

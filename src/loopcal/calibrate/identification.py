@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.calibrate.combinations import Combination
+from loopcal.calibrate.conflict import PriorConflict
 from loopcal.calibrate.descent import DescentStatus
 from loopcal.calibrate.filters import Method
 from loopcal.calibrate.posterior import Posterior
@@ -49,9 +50,11 @@ class Identification:
     rank, condition, singular_values, rank_tolerance : of the whitened, tolerance-scaled matrix.
     unidentifiable : combinations that change nothing that was measured.
     check : the residual against its degrees of freedom.
+    conflict : the stated tolerances against the data, where the method uses them; else None.
     residuals : of every kind. status : how the iteration ended. iterations : steps taken.
     cost_history : (i + 1,) whitened sum of squares. estimate_history : (i + 1, p).
     notes : sentences that belong to the result.
+    weight : (n,) of each pose by the loss, 1 without one. dropped : labels of the poses that were left out as asked.
     """
 
     robot: Mechanism
@@ -67,12 +70,15 @@ class Identification:
     rank_tolerance: float
     unidentifiable: tuple[Combination, ...]
     check: ResidualCheck
+    conflict: PriorConflict | None
     residuals: tuple[KindResiduals, ...]
     status: DescentStatus
     iterations: int
     cost_history: FloatArray
     estimate_history: FloatArray
     notes: tuple[str, ...]
+    weight: FloatArray
+    dropped: tuple[str, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -175,6 +181,8 @@ class Identification:
             "p_value": self.p_value,
             "noise": self.noise,
             "sigma_scale": self.check.sigma_scale,
+            "prior_conflict": None if self.conflict is None else self.conflict.to_dict(),
+            "dropped": list(self.dropped),
             "status": self.status.name.lower(),
             "iterations": self.iterations,
             "cost_history": self.cost_history,
@@ -191,6 +199,7 @@ class Identification:
             "singular_values": self.singular_values,
             "estimate_history": self.estimate_history,
             "cost_history": self.cost_history,
+            "weight": self.weight,
             **self.posterior.arrays(),
         }
         for i, r in enumerate(self.residuals):

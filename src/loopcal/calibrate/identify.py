@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -12,11 +13,15 @@ from numpy.typing import ArrayLike
 from loopcal.calibrate.checks import check_count, check_rows, check_start
 from loopcal.calibrate.closure import descend_from_closure
 from loopcal.calibrate.combinations import combinations
+from loopcal.calibrate.conflict import prior_conflict
 from loopcal.calibrate.descent import Descent, DescentStatus, StepControl, descend
-from loopcal.calibrate.filters import LeastSquares, Method
+from loopcal.calibrate.filters import MAP, LeastSquares, Method, adapted
 from loopcal.calibrate.identification import Identification, KindResiduals
+from loopcal.calibrate.left_out import without_poses
+from loopcal.calibrate.losses import Loss
 from loopcal.calibrate.posterior import posterior
 from loopcal.calibrate.prior import Prior
+from loopcal.calibrate.robust import descend_robustly
 from loopcal.calibrate.rows import Residuals, Rows, rows_of, rows_of_trials
 from loopcal.calibrate.scaling import Unknowns, unknowns
 from loopcal.calibrate.statistics import ResidualCheck, residual_check
@@ -41,6 +46,8 @@ def identify(
     control: StepControl | None = None,
     rank_tolerance: float = RANK_TOLERANCE,
     allow_fewer_equations: bool = False,
+    loss: Loss | None = None,
+    drop: Sequence[str] = (),
 ) -> Identification:
     """Identify the free parameters of a robot.
 
@@ -50,7 +57,9 @@ def identify(
     Parameters
     ----------
     robot : its values are the start, its table says what is nominal, free and tolerated.
-    data : the measurements. method : default least squares with rank detection.
+    data : the measurements.
+    method : default `MAP(Widened())`: each stated tolerance is a prior, widened where the data contradict the tolerances;
+        parameters without one are not held back. With `prior`: least squares.
     noise : "given": the sigmas of the data are true; "estimated": true up to one common factor.
     prior : what an earlier calibration knows, as further rows; see `loopcal.calibrate.prior`.
     start : (parameters of the robot,) [SI] values to begin with instead of the robot's.
@@ -58,6 +67,8 @@ def identify(
         linearise closure at the measured ones, which needs fewer steps from a start that is far off.
     control : settings of the iteration. rank_tolerance : relative to the largest singular value.
     allow_fewer_equations : let least squares return the smallest deviation that explains too few equations.
+    loss : `Huber()` or `Tukey()`: blocks of rows far from the fit count less.
+    drop : labels of poses to leave out. Nothing is ever left out that is not named here.
 
     Returns
     -------
@@ -70,18 +81,46 @@ def identify(
     """
     if noise not in {"given", "estimated"}:
         raise EstimationError(f"noise is {noise!r}; it must be 'given' or 'estimated'")
-    method = method or LeastSquares()
     free = unknowns(robot)
+    method = adapted(LeastSquares() if method is None and prior is not None else method, free.assumed, noise)
+    data = without_poses(data, drop)
     rows = rows_of(free, data)
     check_rows(rows, data, robot)
     check_count(rows, data, method, allow_fewer_equations or prior is not None)
     values = (robot if start is None else robot.with_values(start)).values
     z = free.deviation(values[None])
-    fit = _descended(rows, z, method, control, rank_tolerance, begin, prior)
+
+    def run(some: Rows, at: FloatArray) -> Descent:
+        return _descended(some, at, method, control, rank_tolerance, begin, prior)
+
+    if loss is None:
+        fit, weight = run(rows, z), np.ones(data.n_poses)
+    else:
+        robust = descend_robustly(rows, data.block, loss, z, noise == "estimated", run)
+        fit, weight = robust.fit, robust.weight
     if fit.status[0] == DescentStatus.BAD_START:
         check_start(rows, data, z, fit.cost)
     residuals = _labelled(rows.residuals(fit.deviation), data)
-    return _identification(robot, free, method, fit, residual_check(fit.decomposition, fit.penalty, noise), residuals)
+    check = residual_check(fit.decomposition, fit.penalty, noise, robust=loss is not None)
+    result = _identification(robot, free, method, fit, check, residuals)
+    notes = (*_weight_notes(data, weight, loss), *_drop_notes(drop))
+    return replace(result, weight=weight, dropped=tuple(drop), notes=(*result.notes, *notes))
+
+
+def _weight_notes(data: Measurements, weight: FloatArray, loss: Loss | None) -> list[str]:
+    """Say which poses a loss made count less than half."""
+    if loss is None:
+        return []
+    little = [data.labels[i] for i in np.flatnonzero(weight < 0.5)]
+    if not little:
+        return [f"{loss!r}: every pose counts at least half"]
+    shown = ", ".join(little[:10]) + (f" and {len(little) - 10} more" if len(little) > 10 else "")
+    return [f"{loss!r}: {len(little)} of {data.n_poses} poses count less than half ({shown})"]
+
+
+def _drop_notes(drop: Sequence[str]) -> list[str]:
+    """Say which poses were left out."""
+    return [f"left out as asked: poses {', '.join(drop)}"] if drop else []
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +173,7 @@ def identify_trials(
     rows = rows_of_trials(free, trials)
     values = np.atleast_2d(robot.values if start is None else np.asarray(start, dtype=np.float64))
     z = np.broadcast_to(free.deviation(values), (len(trials), len(free)))
-    fit = _descended(rows, z, method or LeastSquares(), control, rank_tolerance, begin)
+    fit = _descended(rows, z, adapted(method, free.assumed, "given"), control, rank_tolerance, begin)
     return IdentifiedTrials(
         free.values(fit.deviation), fit.status, fit.iterations, fit.cost, free, fit.decomposition, fit.penalty
     )
@@ -172,15 +211,23 @@ def _identification(
     robot: Mechanism, free: Unknowns, method: Method, fit: Descent, check: ResidualCheck, residuals: tuple[KindResiduals, ...]
 ) -> Identification:
     """Put the result together."""
-    d = fit.decomposition
-    variance = check.sigma_scale**2 if check.intervals else np.nan
-    covariance = d.covariance(fit.penalty, variance)[0] * free.tolerance[:, None] * free.tolerance
+    d, penalty, variance = fit.decomposition, fit.penalty, check.sigma_scale**2 if check.intervals else np.nan
+    plain = d.plain()
+    conflict = None
+    if isinstance(method, MAP):
+        sigma = float(method.sigma(d)[0])
+        conflict = prior_conflict(free, d, penalty, sigma, fit.deviation[0])
+        if check.intervals:  # the penalty holds the noise's variance: divided by it, noise and prior are as stated
+            d, penalty, variance = d.divided(np.full(1, check.sigma_scale)), penalty / variance, 1.0
+    covariance = d.covariance(penalty, variance)[0] * free.tolerance[:, None] * free.tolerance
     values = free.values(fit.deviation)[0]
     status = DescentStatus(int(fit.status[0]))
-    open_ = combinations(free, d.null_space())
+    open_ = combinations(free, plain.null_space())
     notes = [check.sentence]
     if status is not DescentStatus.CONVERGED:
         notes.insert(0, status.sentence)
+    if conflict is not None and conflict.conflict:
+        notes.append(conflict.sentence)
     notes += [f"not identifiable: {combination}" for combination in open_]
     if assumed := free.note():
         notes.append(assumed)
@@ -191,19 +238,22 @@ def _identification(
         unknowns=free,
         estimate=values[free.places],
         covariance=covariance,
-        posterior=posterior(robot.with_values(values), free.places, free.tolerance, d, fit.penalty, variance),
-        rank=int(d.rank[0]),
-        condition=float(d.condition[0]),
-        singular_values=d.singular_values[0],
+        posterior=posterior(robot.with_values(values), free.places, free.tolerance, d, penalty, variance),
+        rank=int(plain.rank[0]),
+        condition=float(plain.condition[0]),
+        singular_values=plain.singular_values[0],
         rank_tolerance=d.tolerance,
         unidentifiable=open_,
         check=check,
+        conflict=conflict,
         residuals=residuals,
         status=status,
         iterations=int(fit.iterations[0]),
         cost_history=fit.cost_history[:, 0],
         estimate_history=free.nominal + free.tolerance * fit.deviation_history[:, 0],
         notes=tuple(notes),
+        weight=np.ones(0),
+        dropped=(),
     )
 
 

@@ -10,7 +10,7 @@ triangular factor by the engine, so the memory of a fit is its parameters square
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -152,6 +152,23 @@ class Rows:
                 raw = np.where(ok[:, sensed.poses, None], raw, np.nan)
                 part.append(Residuals(raw, np.matmul(white, raw[..., None])[..., 0]))
         return tuple(_in_order(part, sensed.poses) for part, sensed in zip(parts, self.sensed, strict=True))
+
+    def linearised(self, deviation: FloatArray) -> Iterator[list[tuple[IntArray, FloatArray]]]:
+        """Give, block of poses by block, the poses (r,) and rows (r, m, p + 1) of every kind at deviation (1, p) of trial 0."""
+        trial = np.arange(1)
+        for block in self.blocks:
+            found = self._moves(block, deviation, trial)
+            seen = [s for s in block.sensed if len(s.poses)]
+            rows = [self._kind_rows(s, found, trial).reshape(len(s.poses), -1, self.parameters + 1) for s in seen]
+            yield [(s.poses + block.poses.start, part) for s, part in zip(seen, rows, strict=True)]
+
+    def weighted(self, weight: FloatArray) -> Rows:
+        """Return these rows with a factor (n,) on each pose's squares; 0 makes its rows absent. Kinematics goes on."""
+        root = np.sqrt(weight)
+        scaled = [dataclasses.replace(s, whitener=s.whitener * root[s.poses, None, None]) for s in self.sensed]
+        other = Rows(self.unknowns, self.readings, tuple(scaled), self.rows.size, self.located)
+        other.last = self.last
+        return other
 
     def unreachable(self, deviation: FloatArray) -> IntArray:
         """Return the poses that some row needs and that cannot be reached at deviation (1, p)."""

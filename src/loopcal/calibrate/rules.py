@@ -47,7 +47,8 @@ class MarginalLikelihood:
 
     def __call__(self, decomposition: Decomposition) -> FloatArray:
         """Return lam (t,)."""
-        square, projected = decomposition.singular_values**2, decomposition.projections**2
+        held = np.ones(1) if decomposition.flat is None else ~decomposition.flat  # flat directions tell nothing
+        square, projected = decomposition.singular_values**2 * held, decomposition.projections**2 * held
 
         def criterion(lam: FloatArray) -> FloatArray:
             variance = 1.0 + square / lam[:, None]

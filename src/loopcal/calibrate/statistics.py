@@ -44,7 +44,7 @@ class ResidualCheck:
     sentence: str
 
 
-def residual_check(decomposition: Decomposition, penalty: FloatArray, noise: str) -> ResidualCheck:
+def residual_check(decomposition: Decomposition, penalty: FloatArray, noise: str, robust: bool = False) -> ResidualCheck:
     """Check the residual of a fit (t = 1).
 
     chi_square = |W r|^2 + sum penalty_i y_i^2 over the directions used, with one degree of freedom for each equation
@@ -53,6 +53,7 @@ def residual_check(decomposition: Decomposition, penalty: FloatArray, noise: str
     Parameters
     ----------
     decomposition, penalty : of the fit. noise : "given" or "estimated".
+    robust : whether a loss gave the rows weights by their residuals, so that chi_square has no known distribution.
     """
     finite = np.where(np.isfinite(penalty), penalty, 0.0)
     left = float(decomposition.remaining(penalty)[0])
@@ -68,6 +69,8 @@ def residual_check(decomposition: Decomposition, penalty: FloatArray, noise: str
         return ResidualCheck(chi_square, degrees, np.nan, dof, noise, scale, enough, _estimated(dof, scale, enough))
     from scipy.special import chdtrc
 
+    if robust:
+        return ResidualCheck(chi_square, degrees, np.nan, dof, noise, 1.0, True, "weights by residuals: no test of the noise")
     p_value = float(chdtrc(degrees, chi_square)) if degrees > 0 else np.nan
     return ResidualCheck(chi_square, degrees, p_value, dof, noise, 1.0, True, _given(chi_square, degrees, p_value))
 

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Robust fits by reweighting: descend, weigh each block by its distance from the fit, descend again, until weights stand.
+
+The weights are found outside the descent and enter it as weights of the same rows, so that every method, decomposition
+and covariance is used as it is. Blocks are what `Measurements.block` says belongs together: never a single component.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopcal.calibrate.descent import Descent, DescentStatus
+from loopcal.calibrate.losses import Huber, Loss, Tukey
+from loopcal.calibrate.rows import Rows
+from loopcal.linalg import FloatArray, IntArray
+
+ROUNDS = 50
+"""Reweightings at most."""
+
+SETTLED = 1e-4
+"""Largest change of a weight at which they stand; a hundred times that where they are only the start of another loss."""
+
+
+@dataclass(frozen=True, eq=False)
+class RobustFit:
+    """A robust descent.
+
+    Attributes
+    ----------
+    fit : Descent over the weighted rows. rows : these rows. weight : (n,) of each pose, equal within a block.
+    """
+
+    fit: Descent
+    rows: Rows
+    weight: FloatArray
+
+
+def descend_robustly(
+    rows: Rows, block: IntArray, loss: Loss, start: FloatArray, estimate_scale: bool, run: Callable[[Rows, FloatArray], Descent]
+) -> RobustFit:
+    """Fit with a loss (one trial).
+
+    Parameters
+    ----------
+    rows : unweighted. block : (n,) block of each pose. start : (1, p) deviation.
+    estimate_scale : whether the sigmas are only true up to a factor; it is then the median of the blocks' distances.
+    run : descends rows from a deviation.
+    """
+    member = np.unique(block, return_inverse=True)[1]
+    found = RobustFit(run(rows, start), rows, np.ones(len(block)))
+    if isinstance(loss, Tukey):
+        found = _settle(rows, member, Huber(), found, estimate_scale, run, 100.0 * SETTLED)
+    return _settle(rows, member, loss, found, estimate_scale, run, SETTLED)
+
+
+def _settle(
+    rows: Rows,
+    member: IntArray,
+    loss: Loss,
+    found: RobustFit,
+    estimate_scale: bool,
+    run: Callable[[Rows, FloatArray], Descent],
+    settled: float,
+) -> RobustFit:
+    """Reweight until the weights stand."""
+    for _ in range(ROUNDS):
+        if found.fit.status[0] != DescentStatus.CONVERGED:
+            break
+        distance, degrees = block_distances(rows, found.fit.deviation, member)
+        if estimate_scale:
+            distance = distance / scale_of(distance, degrees)
+        weight = loss.weight(distance, degrees)[member]
+        change = float(np.abs(weight - found.weight).max())
+        if change <= settled:
+            break
+        weighted = rows.weighted(weight)
+        found = RobustFit(run(weighted, found.fit.deviation), weighted, weight)
+    return found
+
+
+def block_distances(rows: Rows, deviation: FloatArray, member: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return d = |W r| (u,) and the number of residuals (u,) of every block; member (n,) is the block of each pose."""
+    count = int(member.max()) + 1
+    square, degrees = np.zeros(count), np.zeros(count)
+    for sensed, found in zip(rows.sensed, rows.residuals(deviation), strict=True):
+        of = member[sensed.poses]
+        present = np.einsum("rii->ri", sensed.whitener[0]) != 0.0
+        square += np.bincount(of, np.where(present, found.whitened[0] ** 2, 0.0).sum(axis=1), count)
+        degrees += np.bincount(of, present.sum(axis=1), count)
+    return np.sqrt(square), degrees
+
+
+def scale_of(distance: FloatArray, degrees: FloatArray) -> float:
+    """Return the factor on sigma that the median block shows: its d against the median of chi with its degrees."""
+    from scipy.special import chdtri
+
+    there = degrees > 0.0
+    ratio = distance[there] / np.sqrt(chdtri(degrees[there], 0.5))
+    middle = float(np.median(ratio)) if len(ratio) else 1.0
+    return middle if middle > 0.0 else 1.0
