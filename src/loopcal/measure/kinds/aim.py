@@ -101,9 +101,17 @@ class AimKind(Kind):
         if not self.unknown or np.count_nonzero(whole) < 3:
             return self.nominal[None]
         _, S, _, a = self.stated
-        Q, seen = T[whole, :3, :3], self.directions(measured[whole])
+        Q = T[whole, :3, :3]
         if self.inward:
             Q = np.swapaxes(Q, -1, -2)
+        return np.concatenate([self._found(Q, S, a, seen) for seen in self.readings(measured[whole])])
+
+    def readings(self, measured: Array) -> tuple[Array, ...]:
+        """All the directions (r, 3) that columns (r, c) may stand for."""
+        return (self.directions(measured),)
+
+    def _found(self, Q: Array, S: Array, a: Array, seen: Array) -> Array:
+        """Candidates (k, u) from directions seen (r, 3)."""
         turned, pointed = (name in self.unknown for name in self.possible)
         if turned:
             turns, points = directions(seen, Q, None if pointed else a)

@@ -84,6 +84,11 @@ class Inclination(AimKind):
         d = np.concatenate([side, rest], axis=-1)
         return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
+    def readings(self, measured: Array) -> tuple[Array, ...]:
+        """The vertical in an upright sensor, and in one that hangs upside down and shows the same."""
+        upright = self.directions(measured)
+        return (upright, upright * np.array([1.0, 1.0, -1.0])) if "mounting" in self.unknown else (upright,)
+
     def doubts(self, measured: Array) -> tuple[tuple[int, str], ...]:
         """Rows whose two tilts no direction can have."""
         with np.errstate(invalid="ignore"):
