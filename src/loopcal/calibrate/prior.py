@@ -20,8 +20,11 @@ from loopcal import engine
 from loopcal.calibrate.posterior import Posterior
 from loopcal.calibrate.rows import Rows
 from loopcal.errors import EstimationError, nearest
-from loopcal.linalg import FloatArray, IntArray
+from loopcal.linalg import RANK_TOLERANCE, FloatArray, IntArray
 from loopcal.mechanism import Mechanism
+
+PARALLEL = 1e-2
+"""Sine of the angle up to which two null directions are one and the same, seen from two estimates."""
 
 ELIMINATED = 1e-11
 """Share of the largest singular value below which an eliminated column counts as dependent on the others."""
@@ -64,7 +67,12 @@ class Prior:
 
 
 class WithPrior:
-    """Rows of measurements followed by those of a prior; a `Problem` of the descent."""
+    """Rows of measurements followed by those of a prior; a `Problem` of the descent.
+
+    What neither calibration can tell must stay unknown. Both see the same null direction, but each as it is at its own
+    linearisation; the small angle between the two would pass for knowledge. Null directions of the measured rows that
+    are parallel to one of the prior's are therefore taken out of the prior's rows.
+    """
 
     def __init__(self, rows: Rows, prior: Prior) -> None:
         unknowns = rows.unknowns
@@ -72,12 +80,15 @@ class WithPrior:
         places = np.array([table.index(name) for name in prior.names], dtype=np.int64)
         B = np.zeros((len(prior.rows), len(table)))
         B[:, places] = prior.rows
-        # parameters that are not free any more contribute what they differ from the mean
-        base = unknowns.values(np.zeros((1, len(unknowns))))[0]
+        mean = unknowns.robot.values.copy()
+        mean[places] = prior.mean
         self.measured = rows
         self.parameters = rows.parameters
         self.slope = B[:, unknowns.places] * unknowns.tolerance
-        self.constant = prior.rows @ (base[places] - prior.mean)
+        self.centre = unknowns.deviation(mean[None])
+        # parameters that are not free any more contribute what they differ from the mean
+        self.constant = B @ (unknowns.values(self.centre)[0] - mean)
+        self.open = np.linalg.svd(self.slope, full_matrices=True)[2][len(B) :].T
         self.rows: IntArray = rows.rows + len(B)
 
     def fold(self, deviation: FloatArray, trials: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -85,10 +96,24 @@ class WithPrior:
         factor, cost = self.measured.fold(deviation, trials)
         if not len(self.slope):
             return factor, cost
-        residual = deviation @ self.slope.T + self.constant
         slope = np.broadcast_to(self.slope, (len(trials), *self.slope.shape))
+        if self.open.shape[1]:
+            slope = np.stack([self._consistent(triangle) for triangle in factor[:, :-1, :-1]])
+        residual = np.matmul(slope, (deviation - self.centre)[..., None])[..., 0] + self.constant
         rows = np.concatenate([slope, residual[..., None]], axis=2)
         return engine.accumulate(factor, rows), cost + (residual**2).sum(axis=1)
+
+    def _consistent(self, triangle: FloatArray) -> FloatArray:
+        """The prior's rows without the null directions (p, d) of measured rows that it does not know either."""
+        if not np.isfinite(triangle).all():
+            return self.slope
+        _, s, vt = np.linalg.svd(triangle)
+        null = vt[s <= RANK_TOLERANCE * s[0]].T
+        outside = null - self.open @ (self.open.T @ null)
+        _, sine, combine = np.linalg.svd(outside, full_matrices=True)
+        sine = np.r_[sine, np.zeros(len(combine) - len(sine))]
+        common = null @ combine[sine < PARALLEL].T
+        return self.slope - (self.slope @ common) @ common.T
 
 
 def prior_from(earlier: Posterior) -> Prior:

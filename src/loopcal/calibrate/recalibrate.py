@@ -26,6 +26,12 @@ from loopcal.linalg import FloatArray
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 
+MOST = 60
+"""Parameters up to which each is tried alone as the explanation of a change."""
+
+EXPLAINED = 0.5
+"""Share of the chi-square without a change below which a single parameter explains most of it."""
+
 
 @dataclass(frozen=True, eq=False)
 class Change:
@@ -109,30 +115,27 @@ def change_since(robot: Mechanism, data: Measurements, prior: Prior, names: tupl
 
     p_value = float(chdtrc(degrees, gain))
     moved = p_value < DOUBT
-    return Change(
-        what, names, change, gain, degrees, p_value, moved, _sentence(opened, names, what, change, gain, degrees, p_value)
-    )
+    sentence = f"the change has chi-square {gain:.4g} where {degrees:.0f} is expected of noise"
+    if moved:
+        alone = _alone(robot, data, prior, names, kept.chi_square) if len(names) <= MOST else ""
+        sentence = f"{what} HAS moved since the earlier calibration: {sentence}{alone}"
+    else:
+        sentence = f"{what} has not moved beyond the noise since the earlier calibration: {sentence}"
+    return Change(what, names, change, gain, degrees, p_value, moved, sentence)
 
 
-def _sentence(
-    opened: Identification, names: tuple[str, ...], what: str, change: FloatArray, gain: float, degrees: float, p_value: float
-) -> str:
-    """Say whether it moved, and where most in terms of the new estimate's own uncertainty."""
-    evidence = f"the change has chi-square {gain:.4g} where {degrees:.0f} is expected of noise"
-    if p_value >= DOUBT:
-        return f"{what} has not moved beyond the noise since the earlier calibration: {evidence}"
-    places = [opened.names.index(n) for n in names]
-    factor, symbols = opened.unknowns.display()
-    pull = np.abs(change) / opened.sd[places]
-    finite = np.isfinite(pull)
-    if not finite.any():
-        return f"{what} HAS moved since the earlier calibration: {evidence}"
-    worst = int(np.argmax(np.where(finite, pull, -1.0)))
-    value = change[worst] / factor[places[worst]]
-    return (
-        f"{what} HAS moved since the earlier calibration: {evidence}; clearest in {names[worst]}, by {value:+.3g}"
-        f" {symbols[places[worst]]}"
-    )
+def _alone(robot: Mechanism, data: Measurements, prior: Prior, names: tuple[str, ...], kept: float) -> str:
+    """Say which single parameter explains most of the change, if it explains most of it."""
+    fits = [identify(robot, data, LeastSquares(), prior=prior.without((name,))) for name in names]
+    values = [fit.chi_square if fit.converged else np.inf for fit in fits]
+    best = int(np.argmin(values))
+    fit, name = fits[best], names[best]
+    if not values[best] < EXPLAINED * kept:
+        return ", and no single parameter explains it"
+    i = fit.names.index(name)
+    factor, symbols = fit.unknowns.display()
+    by = (fit.estimate[i] - prior.mean[prior.names.index(name)]) / factor[i]
+    return f"; a change of {name} alone, by {by:+.3g} {symbols[i]}, explains most of it"
 
 
 def _used(robot: Mechanism, prior: Prior, limb: str | None, names: tuple[str, ...]) -> Prior:

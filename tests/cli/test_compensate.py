@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal compensate`, and `loopcal calibrate --prior`: files with units, exit codes, refusals in a sentence."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal.cli import main
+from loopcal.io import load_robot
+from loopcal.io.csv_table import read_table
+from loopcal.mechanism import forward, inverse
+from loopcal.units import Dimension
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
+TARGETS = """pose,x [mm],y [mm],z [mm],roll [deg],pitch [deg],yaw [deg]
+home,0,0,200,0,0,0
+left,-20,10,0.21e3,5,-3,8
+"""
+UNREACHABLE = "high,0,0,300,0,0,0\n"
+WANTED = np.array([[0, 0, 0.2, 0, 0, 0], [-0.02, 0.01, 0.21, *np.deg2rad([5, -3, 8])]])
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with the example's files and a run on its measurements."""
+    folder = tmp_path_factory.mktemp("compensate")
+    for path in EXAMPLE.iterdir():
+        shutil.copy(path, folder)
+    words = ["calibrate", "hexapod-42", str(folder / "measurements.csv"), "-o", str(folder / "run")]
+    assert main([*words, "--method", "least-squares"]) == 0
+    return folder
+
+
+@pytest.fixture
+def run(made, monkeypatch, capsys):
+    """Run a command line in that folder; return exit code, standard output and standard error."""
+    monkeypatch.chdir(made)
+    (made / "targets.csv").write_text(TARGETS)
+
+    def run(words: str) -> tuple[int, str, str]:
+        code = main(words.split())
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def test_readings_from_the_file_take_the_calibrated_robot_to_the_targets(run, made) -> None:
+    code, out, err = run("compensate run targets.csv -o readings.csv")
+    assert code == 0, err
+    assert "home" in out
+    assert "U = 2 x rms uncertainty: tool point, base axes, in the base frame of the robot file" in out
+    table = read_table(made / "readings.csv")
+    q = np.column_stack([table.numbers(f"q{i}", Dimension.LENGTH) for i in range(1, 7)])
+    np.testing.assert_allclose(q, inverse(load_robot("run/robot.yaml"), WANTED).q, rtol=0, atol=1e-15)
+    assert table.text("note status") == ("reached in full",) * 2
+    assert (table.numbers("note U x", Dimension.LENGTH) < 3e-6).all()  # [m], instrument 1 um
+
+
+def test_commands_lead_the_nominal_controller_to_the_same_readings(run, made) -> None:
+    code, out, err = run("compensate run targets.csv --mode commands --steps 4 -o commands.csv")
+    assert code == 0, err
+    assert "after step 4: within" in out
+    table = read_table(made / "commands.csv")
+    commanded = [table.numbers(f"commanded.{n}", Dimension.LENGTH) for n in "xyz"]
+    commanded += [table.numbers(f"commanded.{n}", Dimension.ANGLE) for n in ("roll", "pitch", "yaw")]
+    readings = inverse(load_robot("hexapod-42"), np.column_stack(commanded)).q
+    calibrated = load_robot("run/robot.yaml")
+    wanted = inverse(calibrated, WANTED).T
+    np.testing.assert_allclose(forward(calibrated, readings).T, wanted, rtol=0, atol=1e-12)
+
+
+def test_without_an_output_file_the_csv_text_is_printed_and_json_is_one_document(run) -> None:
+    code, out, _ = run("compensate run targets.csv")
+    assert code == 0
+    assert out.startswith("pose,q1 [mm],q2 [mm]")
+    code, out, err = run("compensate run targets.csv --json")
+    assert (code, err) == (0, "")
+    document = json.loads(out, parse_constant=pytest.fail)
+    assert document["labels"] == ["home", "left"]
+    assert np.shape(document["uncertainty"]["expanded"]) == (2, 6)
+
+
+def test_a_robot_file_has_no_uncertainties(run) -> None:
+    code, out, _ = run("compensate truth.yaml targets.csv --json")
+    assert code == 0
+    assert json.loads(out)["uncertainty"] is None
+
+
+def test_a_target_out_of_the_machines_limits_gives_exit_code_2_and_no_reading(run, made) -> None:
+    (made / "targets.csv").write_text(TARGETS + UNREACHABLE)
+    code, out, err = run("compensate run targets.csv")
+    assert code == 2
+    assert "target 'high' outside the machine's limits: stroke of q1" in err
+    assert out.split("\n")[3].startswith("high,,,,,,,")
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (TARGETS.replace("roll [deg]", "roll"), "targets.csv:1: column 'roll' has no unit"),
+        (TARGETS.replace("z [mm]", "z [deg]"), "targets.csv:1: column 'z': 'deg' is a unit of angle, but a length is needed"),
+        (TARGETS.replace("yaw", "jaw"), "targets.csv:1: there is no column 'yaw' (did you mean 'jaw'?)"),
+        (TARGETS.replace("x [mm]", "X [mm],x [mm]"), "names 8 columns"),
+        (TARGETS.replace("0.21e3", ""), "targets.csv:3: column 'z' is empty, but every row needs it"),
+        (TARGETS.replace("left", "home"), "targets.csv:3: the name of this target stands here for the second time"),
+        ("pose\n", "has a header but no rows"),
+    ],
+)
+def test_bad_targets_are_refused_in_a_sentence(run, made, text, sentence) -> None:
+    (made / "targets.csv").write_text(text)
+    code, out, err = run("compensate run targets.csv")
+    assert (code, out) == (1, "")
+    assert sentence in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("compensate nothing targets.csv", "this is not a run folder"),
+        ("compensate run nothing.csv", "nothing.csv: there is no such"),
+        ("compensate run targets.csv --controller nobody", "nobody"),
+        ("calibrate hexapod-42 measurements.csv -o new --prior run", "the earlier run was fitted to these very measurements"),
+        ("calibrate hexapod-42 measurements.csv -o new --free-limb leg3", "name it with --prior RUN"),
+        ("calibrate hexapod-42 later.csv -o new --prior run --method map", "--method does not go with --prior"),
+        (
+            "calibrate hexapod-42 later.csv -o new --prior run --free-limb leg9",
+            "no free parameter of hexapod-42 belongs to 'leg9'",
+        ),
+    ],
+)
+def test_requests_that_make_no_sense_are_refused_in_a_sentence(run, made, later, words, sentence) -> None:
+    code, _, err = run(words)
+    assert code == 1
+    assert sentence in err
+    assert err.count("\n") == 1
+    assert not (made / "new").exists()
+
+
+@pytest.fixture(scope="module")
+def later(made):
+    """Measurements of the same machine on another day."""
+    words = "--sigma-position 0.001mm --sigma-angle 5urad --seed 7"
+    main(
+        [
+            "simulate",
+            str(made / "truth.yaml"),
+            "--poses",
+            str(made / "poses.csv"),
+            *words.split(),
+            "-o",
+            str(made / "later.csv"),
+        ]
+    )
+    return made / "later.csv"
+
+
+def test_calibrate_with_a_prior_says_whether_the_machine_moved(run, later, made) -> None:
+    code, out, err = run("calibrate hexapod-42 later.csv -o second --prior run --free-limb leg3 --force")
+    assert code == 0, err
+    assert "leg3 has not moved beyond the noise since the earlier calibration" in " ".join(out.split())
+    result = json.loads((made / "second" / "result.json").read_text())
+    assert result["change"]["what"] == "leg3"
+    assert result["change"]["moved"] is False
+    assert set(result["made_by"]["inputs"]) == {"robot", "data", "prior"}
+    first, second = (np.load(made / name / "arrays.npz")["sd"] for name in ("run", "second"))
+    others = np.delete(np.arange(42), slice(14, 21))
+    assert (second[others] < first[others]).all()
