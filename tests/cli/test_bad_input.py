@@ -156,6 +156,16 @@ def test_fewer_equations_than_parameters_are_refused_with_both_numbers(refused) 
     assert "3 equations from 3 poses cannot determine 42 parameters: measure at least 42 poses" in found
 
 
+@pytest.mark.parametrize("kind", ["separation", "joint", "locked"])
+def test_a_kind_that_cannot_be_fitted_yet_is_refused_in_a_sentence(tmp_path, monkeypatch, capsys, kind) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["simulate", "hexapod-42", "--kind", kind, "-o", "data.csv"]) == 0
+    capsys.readouterr()
+    for words in (["identifiability", "hexapod-42", "data.csv"], ["calibrate", "hexapod-42", "data.csv", "-o", "run"]):
+        assert main(words) == 1
+        assert "cannot be fitted yet; leave them out" in capsys.readouterr().err
+
+
 def test_a_byte_order_mark_is_accepted(tmp_path, capsys) -> None:
     path = tmp_path / "robot.yaml"
     path.write_bytes(b"\xef\xbb\xbf" + ROBOT.encode())

@@ -18,6 +18,7 @@ import numpy as np
 
 from loopcal import engine, se3
 from loopcal.calibrate.scaling import Unknowns
+from loopcal.errors import EstimationError
 from loopcal.linalg import FloatArray, IntArray, empty_factor
 from loopcal.measure import Kind, Measurements, Trials
 from loopcal.measure.whitening import whitener
@@ -288,7 +289,11 @@ def _overwrite(old: np.ndarray, new: np.ndarray, trials: IntArray, ok: np.ndarra
 
 
 def rows_of(unknowns: Unknowns, data: Measurements) -> Rows:
-    """Return the rows of one machine's measurements."""
+    """Return the rows of one machine's measurements; raises EstimationError for kinds that cannot be fitted yet."""
+    for kind in (observations.kind for observations in data.observations if len(observations)):
+        if kind.links > 1 or kind.looks_at:
+            what = "compare poses" if kind.links > 1 else "look at joints"
+            raise EstimationError(f"rows of the kind {kind.name!r} {what}, which cannot be fitted yet; leave them out")
     sensed = tuple(Sensed(o.kind, o.rows, o.measured[None], o.whitener[None]) for o in data.observations if len(o))
     return Rows(unknowns, data.readings, sensed, 1)
 
