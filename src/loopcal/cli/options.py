@@ -96,7 +96,8 @@ def instrument_options(command: Callable[..., Any]) -> Callable[..., Any]:
                      help="Standard deviation of each measured length."),
         click.option("--orientation", help=f"How angles are written: {forms}"),
         click.option("--components", help="For the kind component: which coordinates, such as z or x,y,z."),
-        click.option("--kind", default="pose", show_default=True, help="Kind of measurement: pose, component, position, bearing, ..."),
+        click.option("--kind", default="pose", show_default=True,
+                     help="Kind of measurement: pose, component, position, bearing, ..."),
     ):  # fmt: skip
         command = option(command)
     return command
