@@ -7,7 +7,7 @@ with pivoting; coefficients are displacements in the units of the robot's file.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,51 +17,93 @@ from loopcal.linalg import FloatArray
 NEGLIGIBLE = 1e-6
 """Part of a combination, in tolerances and relative to its largest, that is rounding and not shown."""
 
-SHOWN = 8
-"""Parameters written out in the words of a combination; the others are counted."""
+MINOR = 0.1
+"""The same for a direction that is weak but not null, which has a small part of nearly every parameter."""
+
+SHOWN, SHOWN_WEAK = 8, 4
+"""Parameters written out in the words of a combination, and of one that is only weak; the others are counted."""
+
+EQUAL = 1e-6
+"""Relative difference of changes that are called equal parts."""
 
 
 @dataclass(frozen=True, eq=False)
 class Combination:
-    """Parameters that, changed together like this, change nothing that was measured.
+    """Parameters that, changed together like this, change nothing that was measured, or hardly anything.
 
     Attributes
     ----------
     names : (k,) strongest first. changes : (k,) displacements that belong together, in `units` (symbols).
+    weights : (k,) the same in tolerances, of length one over all parameters.
+    singular_value : what one tolerance along the direction changes, in standard deviations of the noise; 0 for a null one.
+    meaning : what the robot does with such a change, in words; empty where there is nothing to say.
     """
 
     names: tuple[str, ...]
     changes: FloatArray
     units: tuple[str, ...]
+    weights: FloatArray = field(default_factory=lambda: np.zeros(0))
+    singular_value: float = 0.0
+    meaning: str = ""
 
     def __str__(self) -> str:
+        rest = f": {self.meaning}" if self.meaning else ""
+        several = len(self.names) > 1
+        if self.singular_value > 0.0:
+            shows = f"one tolerance shows as {self.singular_value:.2g} standard deviations of the noise"
+            return f"together {self.parts}: {shows}" if several else f"{self.names[0]} alone: {shows}"
+        if several:
+            return f"together {self.parts} change nothing that was measured{rest}"
+        return f"{self.names[0]} alone changes nothing that was measured{rest}"
+
+    @property
+    def parts(self) -> str:
+        """The parameters and how much of each: in equal parts, or each with its change."""
+        signs = np.sign(self.changes)
+        if len(set(self.units)) == 1 and (np.abs(np.abs(self.changes) - 1.0) < EQUAL).all():
+            names = [n if s > 0 else f"minus {n}" for n, s in zip(self.names, signs, strict=True)]
+            return f"{listed(names)}, in equal parts,"
         parts = [f"{n} {c:+.4g} {u}" for n, c, u in zip(self.names, self.changes, self.units, strict=True)]
-        if len(parts) > SHOWN:
-            parts = [*parts[:SHOWN], f"and {len(parts) - SHOWN} more"]
-        if len(parts) == 1:
-            return f"{self.names[0]} alone changes nothing that was measured"
-        return f"together {', '.join(parts)} change nothing that was measured"
+        return listed(parts, SHOWN if self.singular_value == 0.0 else SHOWN_WEAK)
 
     def to_dict(self) -> dict[str, object]:
-        """Names, changes and units."""
-        return {"names": list(self.names), "changes": self.changes.tolist(), "units": list(self.units)}
+        """All attributes by name, and the sentence."""
+        numbers = {"changes": self.changes.tolist(), "units": list(self.units), "weights": self.weights.tolist()}
+        words = {"singular_value": self.singular_value, "meaning": self.meaning, "sentence": str(self)}
+        return {"names": list(self.names), **numbers, **words}
+
+
+def listed(words: list[str] | tuple[str, ...], most: int = SHOWN) -> str:
+    """Words in a sentence, `a, b and c`; those beyond `most` are counted."""
+    if len(words) > most:
+        return f"{', '.join(words[:most])} and {len(words) - most} more"
+    return f"{', '.join(words[:-1])} and {words[-1]}" if len(words) > 1 else "".join(words)
 
 
 def combinations(unknowns: Unknowns, null_space: FloatArray) -> tuple[Combination, ...]:
     """Return the combinations that span a null space (p, d) of deviations in tolerances."""
+    return tuple(combination(unknowns, direction) for direction in sparse(null_space))
+
+
+def combination(unknowns: Unknowns, direction: FloatArray, singular_value: float = 0.0) -> Combination:
+    """Return one direction (p,) of deviations in tolerances by names; small parts are left out."""
     factor, symbols = unknowns.display()
-    found = []
-    for direction in _sparse(null_space):
-        largest = np.abs(direction).max()
-        chosen = np.flatnonzero(np.abs(direction) > NEGLIGIBLE * largest)
-        order = chosen[np.argsort(-np.abs(direction[chosen]), kind="stable")]
-        changes = direction[order] * unknowns.tolerance[order] / factor[order]
-        names = tuple(unknowns.names[i] for i in order)
-        found.append(Combination(names, changes / changes[0], tuple(symbols[i] for i in order)))
-    return tuple(found)
+    size = np.abs(direction)
+    chosen = np.flatnonzero(size > (MINOR if singular_value > 0.0 else NEGLIGIBLE) * size.max())
+    # parts that differ by rounding stand in the order of the robot's parameters
+    order = chosen[np.argsort(-np.round(size[chosen] / size.max(), 9), kind="stable")]
+    changes = direction[order] * unknowns.tolerance[order] / factor[order]
+    sign = np.sign(changes[0])
+    return Combination(
+        names=tuple(unknowns.names[i] for i in order),
+        changes=changes / changes[0],
+        units=tuple(symbols[i] for i in order),
+        weights=sign * direction[order] / np.linalg.norm(direction),
+        singular_value=singular_value,
+    )
 
 
-def _sparse(null_space: FloatArray) -> FloatArray:
+def sparse(null_space: FloatArray) -> FloatArray:
     """Return a basis (d, p) of the same space in which each vector has a parameter of its own."""
     d = null_space.shape[1]
     if d == 0:
@@ -69,5 +111,5 @@ def _sparse(null_space: FloatArray) -> FloatArray:
     from scipy.linalg import lu_factor, lu_solve, qr
 
     *_, order = qr(null_space.T, mode="r", pivoting=True)
-    pivots = np.asarray(order)[:d]  # a well-conditioned choice of leaders
+    pivots = np.sort(np.asarray(order)[:d])  # a well-conditioned choice of leaders, in the order of the parameters
     return lu_solve(lu_factor(null_space[pivots].T), null_space.T)

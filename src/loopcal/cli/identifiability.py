@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -20,6 +23,15 @@ from loopcal.cli.options import (
 )
 from loopcal.errors import DataError
 
+if TYPE_CHECKING:
+    from loopcal.calibrate import Identifiability
+    from loopcal.calibrate.reduce import Reduction
+    from loopcal.calibrate.remedies import Remedy
+    from loopcal.measure import Instrument
+
+FRAMES = {"base": ("frame",), "tool": ("tool", "targets")}
+"""What --frames calls unknown, and how kinds call it."""
+
 
 @click.command(short_help="Tell which parameters measurements can determine.")
 @robot_argument
@@ -27,6 +39,11 @@ from loopcal.errors import DataError
 @click.option("--poses", type=FILE, help="In place of DATA: CSV file of poses that could be measured.")
 @draw_option
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of drawn poses.")
+@click.option("--measure", metavar="NAMES", help="Short for --kind component: some of x,y,z,phi,theta,psi.")
+@click.option("--frames", metavar="NAMES", help="What else is unknown: base (the instrument's frame in it), tool, or both.")
+@click.option("--reduce", "reduced", is_flag=True, help="Choose a smallest set of parameters; say what is merged into what.")
+@click.option("-o", "--output", type=FILE, help="With --reduce: the robot file to write, the others fixed.")
+@click.option("--force", is_flag=True, help="Replace a file that is there.")
 @instrument_options
 @data_options
 @json_option
@@ -36,50 +53,136 @@ def identifiability(
     poses: Path | None,
     draw: int,
     seed: int,
+    reduced: bool,
+    output: Path | None,
+    force: bool,
+    allow_outside_stroke: bool,
+    allow_duplicates: bool,
+    as_json: bool,
+    **seen_by: Any,
+) -> None:
+    """Tell what DATA can determine of the parameters of ROBOT, what stays open, and what would determine it.
+
+    Without DATA an instrument is assumed, at --poses or at poses drawn evenly from the workspace that ROBOT states; its
+    options are --measure (or --kind, --components, --orientation), --frames and the sigmas. DATA states its own.
+
+    \b
+    Examples:
+      loopcal identifiability hexapod-42 measurements.csv
+      loopcal identifiability 3-prs --measure x,y,z,phi,theta
+      loopcal identifiability hexapod-42 --frames base,tool --reduce -o reduced.yaml
+      loopcal identifiability hexapod-42 --poses poses.csv --kind component --components x,y,z --sigma-position 5um
+    """  # noqa: D301
+    from loopcal.calibrate import identifiability as identifiable
+    from loopcal.calibrate.reduce import reduce
+    from loopcal.calibrate.remedies import remedies
+    from loopcal.io import load_measurements, load_robot
+    from loopcal.io.measurement_file import load_poses
+    from loopcal.measure import simulate
+
+    _refuse(data, poses, seen_by, reduced, output, force)
+    machine, drawn = load_robot(robot), ""
+    if data is not None:
+        allowed = {"allow_outside_stroke": allow_outside_stroke, "allow_duplicates": allow_duplicates}
+        measured = load_measurements(data, machine, **allowed)
+    else:
+        looking = _instrument(**seen_by)
+        targets, drawn = (load_poses(poses, machine), "") if poses is not None else drawn_poses(machine, draw, seed)
+        measured = simulate(machine, targets, looking, seed=0, controller=machine)
+    found = identifiable(machine, measured)
+    cures, smaller = remedies(found), reduce(found) if reduced else None
+    if smaller is not None and output is not None:
+        _write(output, smaller)
+    if as_json:
+        document = found.to_dict() | {"remedies": [cure.to_dict() for cure in cures]}
+        show.json_document(document if smaller is None else document | {"reduction": smaller.to_dict()})
+        return
+    if drawn:
+        show.say(drawn)
+    _print(found, cures)
+    if smaller is not None:
+        show.say(f"\n{smaller}")
+    if output is not None:
+        show.say(f"\n{output}: the robot with these parameters fixed")
+
+
+def _refuse(
+    data: Path | None, poses: Path | None, seen_by: Mapping[str, Any], reduced: bool, output: Path | None, force: bool
+) -> None:
+    """Refuse options that contradict each other, and an output file that is there."""
+    from loopcal.io.new_robot import refuse_existing
+
+    if data is not None and poses is not None:
+        raise DataError("there are both DATA and --poses; give measurements, or poses that could be measured, but not both")
+    if data is not None and (seen_by["measure"] or seen_by["frames"]):
+        raise DataError("DATA states what is measured and what is unknown; leave out --measure and --frames, or DATA")
+    if output is not None and not reduced:
+        raise DataError("-o writes what --reduce finds; add --reduce, or leave out -o")
+    if output is not None:
+        refuse_existing(output, force)
+
+
+def _instrument(
+    measure: str | None,
+    frames: str | None,
     kind: str,
     components: str | None,
     orientation: str | None,
     sigma_position: float,
     sigma_angle: float,
-    allow_outside_stroke: bool,
-    allow_duplicates: bool,
-    as_json: bool,
-) -> None:
-    """Tell what DATA can determine of the parameters of ROBOT, and what stays open.
+) -> Instrument:
+    """Return the instrument of `instrument_options`, with what --measure and --frames say."""
+    from loopcal.measure import Instrument
 
-    Without DATA an instrument is assumed, at --poses or at poses drawn evenly from the workspace that ROBOT states; its
-    options are --kind, --components, --orientation and the sigmas. DATA states its own.
+    if measure is not None:
+        if components is not None or kind != "pose":
+            raise DataError("--measure is short for --kind component --components; give one or the other")
+        kind, components = "component", measure
+        if orientation is None and {"phi", "theta", "psi"} & set(measure.split(",")):
+            orientation = "tilt-torsion"
+    made = instrument(kind, components, orientation, sigma_position, sigma_angle)
+    if frames is None:
+        return made
+    (sensor,) = made.sensors
+    kinds: Any = sensor.kind
+    return Instrument((replace(sensor, kind=replace(kinds, unknown=_unknown(frames, kinds))),))
 
-    \b
-    Examples:
-      loopcal identifiability hexapod-42 measurements.csv
-      loopcal identifiability linear-delta --kind component --components z --sigma-position 20um
-      loopcal identifiability hexapod-42 --poses poses.csv --kind component --components x,y,z --sigma-position 5um
-    """  # noqa: D301
-    from loopcal.calibrate import identifiability as identifiable
-    from loopcal.io import load_measurements, load_robot
-    from loopcal.io.measurement_file import load_poses
-    from loopcal.measure import simulate
 
-    if data is not None and poses is not None:
-        raise DataError("there are both DATA and --poses; give measurements, or poses that could be measured, but not both")
-    machine = load_robot(robot)
-    drawn = ""
-    if data is not None:
-        measured = load_measurements(
-            data, machine, allow_outside_stroke=allow_outside_stroke, allow_duplicates=allow_duplicates
-        )
-    else:
-        seen_by = instrument(kind, components, orientation, sigma_position, sigma_angle)
-        if poses is not None:
-            targets = load_poses(poses, machine)
-        else:
-            targets, drawn = drawn_poses(machine, draw, seed)
-        measured = simulate(machine, targets, seen_by, seed=0)
-    found = identifiable(machine, measured)
-    if as_json:
-        show.json_document(found.to_dict())
-    else:
-        if drawn:
-            show.say(drawn)
-        show.say(str(found))
+def _unknown(frames: str, kind: object) -> tuple[str, ...]:
+    """Return what a kind calls the frames that are unknown."""
+    possible: tuple[str, ...] = getattr(kind, "possible", ())
+    found = []
+    for name in frames.split(","):
+        if name not in FRAMES:
+            raise DataError(f"--frames says {name!r}; what can be unknown is base, tool, or base,tool")
+        known = [own for own in FRAMES[name] if own in possible]
+        if not known:
+            raise DataError(f"--frames {name} means nothing to this kind of measurement; leave it out")
+        found.append(known[0])
+    return tuple(found)
+
+
+def _print(found: Identifiability, cures: Sequence[Remedy]) -> None:
+    """Print sentences, then what is said of each parameter, then the indices."""
+    from loopcal.calibrate.remedies import ASSUMED
+
+    for sentence in found.sentences():
+        show.say(sentence)
+    for cure in cures:
+        show.say(f"to determine {cure}")
+    if cures:
+        show.say(f"note: {ASSUMED}")
+    verdicts = [(v.name, "yes" if v.state == "determined" else str(v), f"{v.left:.2f}") for v in found.parameters]
+    show.table("Parameters", ("name", "determined", "sd / tolerance"), verdicts, text_columns=2)
+    show.say("sd / tolerance: with the tolerances as a prior; 1 where nothing is learned")
+    indices = [(name, meaning, f"{value:.3g}") for name, value, meaning in found.indices.rows()]
+    show.table("Observability", ("index", "what", "value"), indices, text_columns=2)
+
+
+def _write(output: Path, smaller: Reduction) -> None:
+    """Write the robot file with the parameters fixed that are left out."""
+    from loopcal.io.reduced_robot import reduced_robot_text
+    from loopcal.io.text_file import write_text
+
+    words = {merged.name: merged.words(most=3) for merged in smaller.dropped}
+    write_text(output, reduced_robot_text(smaller.robot, words))
