@@ -10,7 +10,7 @@ import numpy as np
 from evidence.known_truth import errors, instrument
 from loopcal.calibrate import MAP, LeastSquares, Widened, identify, identify_trials
 from loopcal.io import load_robot
-from loopcal.measure import sample_truth, simulate_trials
+from loopcal.measure import Measurements, sample_truth, simulate_trials
 from loopcal.mechanism import Mechanism, sample
 from loopcal.parameters import ParameterTable
 
@@ -40,7 +40,7 @@ def judge(name: str, factor: float, machines: int = MACHINES) -> dict[str, float
     return {**found, "conflict named": float(np.mean(named))}
 
 
-def _names_conflict(robot: Mechanism, data) -> bool:
+def _names_conflict(robot: Mechanism, data: Measurements) -> bool:
     """Whether the default fit says that data and tolerances contradict each other."""
     fit = identify(robot, data)
     return fit.conflict is not None and fit.conflict.conflict
