@@ -12,7 +12,7 @@ from loopcal.mechanism import Mechanism, forward, inverse
 from loopcal.parameters import ParameterTable
 from tests import zoo
 
-UM, URAD = 1e-6, 1e-6
+MM, UM, URAD = 1e-3, 1e-6, 1e-6
 
 
 def folded(rows: np.ndarray) -> np.ndarray:

@@ -1,9 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """From measurements to parameters: identify, what can be identified, validate."""
 
+from loopcal.calibrate.accuracy import AccuracyMap as AccuracyMap
+from loopcal.calibrate.accuracy import PoseUncertainty as PoseUncertainty
+from loopcal.calibrate.accuracy import accuracy_map as accuracy_map
+from loopcal.calibrate.accuracy import pose_uncertainty as pose_uncertainty
+from loopcal.calibrate.choose_model import choose_model as choose_model
+from loopcal.calibrate.choose_model import nested_sets as nested_sets
 from loopcal.calibrate.combinations import Combination as Combination
+from loopcal.calibrate.compensate import Compensation as Compensation
+from loopcal.calibrate.compensate import compensate as compensate
 from loopcal.calibrate.conflict import PriorConflict as PriorConflict
 from loopcal.calibrate.conflict import Widened as Widened
+from loopcal.calibrate.correlated import correlated_groups as correlated_groups
+from loopcal.calibrate.cross_validation import cross_validate as cross_validate
 from loopcal.calibrate.descent import DescentStatus as DescentStatus
 from loopcal.calibrate.descent import StepControl as StepControl
 from loopcal.calibrate.filters import MAP as MAP
@@ -18,11 +28,19 @@ from loopcal.calibrate.identify import identify as identify
 from loopcal.calibrate.identify import identify_trials as identify_trials
 from loopcal.calibrate.losses import Huber as Huber
 from loopcal.calibrate.losses import Tukey as Tukey
+from loopcal.calibrate.monte_carlo import MonteCarlo as MonteCarlo
+from loopcal.calibrate.monte_carlo import monte_carlo as monte_carlo
 from loopcal.calibrate.outliers import OutlierCheck as OutlierCheck
 from loopcal.calibrate.outliers import find_outliers as find_outliers
 from loopcal.calibrate.per_leg import identify_per_leg as identify_per_leg
 from loopcal.calibrate.pose_errors import PoseErrors as PoseErrors
 from loopcal.calibrate.pose_errors import pose_errors as pose_errors
+from loopcal.calibrate.posterior import Posterior as Posterior
+from loopcal.calibrate.prior import Prior as Prior
+from loopcal.calibrate.prior import prior_from as prior_from
+from loopcal.calibrate.recalibrate import Change as Change
+from loopcal.calibrate.recalibrate import recalibrate as recalibrate
+from loopcal.calibrate.repeats import lack_of_fit as lack_of_fit
 from loopcal.calibrate.rules import GCV as GCV
 from loopcal.calibrate.rules import MarginalLikelihood as MarginalLikelihood
 from loopcal.calibrate.rules import TruncationGCV as TruncationGCV
@@ -31,3 +49,4 @@ from loopcal.calibrate.start_check import StartCheck as StartCheck
 from loopcal.calibrate.start_check import start_check as start_check
 from loopcal.calibrate.validate import Validation as Validation
 from loopcal.calibrate.validate import validate as validate
+from loopcal.calibrate.worth import worth as worth
