@@ -128,7 +128,7 @@ def compensate(
         cannot be controlled, for the pose that the controller's geometry has there.
     mode : "readings" to set the actuators, "commands" for a controller whose geometry cannot be changed.
     controller : that geometry; default: the nominal robot. steps : fixed-point steps of "commands".
-    labels : names of the targets; default "1", "2", ...
+    labels : of the targets; default "1", "2", ...
 
     Returns
     -------
@@ -139,29 +139,23 @@ def compensate(
     DataError
         Unknown mode, no step, targets of another shape.
     """
-    if mode not in get_args(Mode):
-        raise DataError(f"mode is {mode!r}; it must be 'readings' or 'commands'")
-    if steps < 1:
-        raise DataError(f"{steps} steps of compensation were asked for; give 1 or more, 3 are usually enough")
+    _check(mode, steps)
     known = fit.posterior if isinstance(fit, Identification) else fit
     robot = known if isinstance(known, Mechanism) else known.robot
-    old = robot.nominal if controller is None else controller
+    old = controller or robot.nominal
     believed = inverse(old, targets)
-    wanted = np.asarray(targets, dtype=np.float64)
-    wanted = wanted.reshape(-1, 4, 4) if wanted.shape[-2:] == (4, 4) else believed.T
-    names = tuple(labels) or tuple(str(i + 1) for i in range(len(wanted)))
+    wanted = np.reshape(targets, (-1, 4, 4)) if np.shape(targets)[-2:] == (4, 4) else believed.T
     best = inverse(robot, targets)
-    settled = _Settled(best, None, np.zeros((1, len(wanted), 6)))
     before = se3.difference(forward(robot, believed.q, _begin(robot, best)).T, wanted)
-    if mode == "commands":
-        settled = _shifted(robot, old, believed, best, steps)
+    exact = _Settled(best, None, np.zeros((1, len(wanted), 6)))
+    settled = exact if mode == "readings" else _shifted(robot, old, believed, best, steps)
     final = settled.final
     fixed = se3.difference(best.T, wanted)
+    position, angle = (np.linalg.norm(settled.gaps[..., part], axis=2) for part in (slice(3, 6), slice(3)))
     reach, sentences = _judged(robot, believed, best, settled, fixed)
-    size = np.linalg.norm(settled.gaps[..., 3:], axis=2), np.linalg.norm(settled.gaps[..., :3], axis=2)
     return Compensation(
         mode=mode,
-        labels=names,
+        labels=tuple(labels) or tuple(str(i + 1) for i in range(len(wanted))),
         robot=robot,
         controller=old,
         readings=final.q,
@@ -171,12 +165,20 @@ def compensate(
         before=before,
         remaining=se3.difference(final.T, wanted),
         not_compensable=fixed,
-        residual_position=size[0],
-        residual_orientation=size[1],
+        residual_position=position,
+        residual_orientation=angle,
         uncertainty=None if isinstance(known, Mechanism) else pose_uncertainty(known, final),
         reach=reach,
         sentences=sentences,
     )
+
+
+def _check(mode: str, steps: int) -> None:
+    """Refuse what `compensate` cannot do; raises DataError."""
+    if mode not in get_args(Mode):
+        raise DataError(f"mode is {mode!r}; it must be 'readings' or 'commands'")
+    if steps < 1:
+        raise DataError(f"{steps} steps of compensation were asked for; give 1 or more, 3 are usually enough")
 
 
 @dataclass(frozen=True, eq=False)

@@ -78,9 +78,7 @@ def calibrate(
     from loopcal.io.robot_file import robot_path
     from loopcal.io.run_folder import RESULT, made_by, refuse_used_folder
 
-    if not hold_out and (limit_position is not None or limit_angle is not None):
-        raise DataError("a quality gate is judged on unseen poses; say which share to keep for it, as --hold-out 0.25")
-    _refuse_contradictions(prior, free_limb)
+    _refuse_contradictions(hold_out, limit_position is not None or limit_angle is not None, prior, free_limb)
     refuse_used_folder(output, force)
     machine = load_robot(robot)
     measured = load_measurements(data, machine, allow_outside_stroke=allow_outside_stroke, allow_duplicates=allow_duplicates)
@@ -94,9 +92,7 @@ def calibrate(
     inputs = {"robot": robot_path(robot), "data": data, **({} if prior is None else {"prior": prior / RESULT})}
     origin = made_by(sys.argv, inputs, {"hold_out": seed})
     split = None if unseen is None else {"hold_out": hold_out, "seed": seed, "held_out": unseen.labels}
-    document = run_document(fit, validation, origin, split)
-    if change is not None:
-        document["change"] = change.to_dict()
+    document = run_document(fit, validation, origin, split) | ({} if change is None else {"change": change.to_dict()})
     save_run(output, fit, document, force)
     if as_json:
         show.json_document(document)
@@ -105,8 +101,10 @@ def calibrate(
     return _exit_code(fit, validation)
 
 
-def _refuse_contradictions(prior: Path | None, free_limb: str | None) -> None:
-    """Refuse options that do not go with, or without, --prior."""
+def _refuse_contradictions(hold_out: float, gates: bool, prior: Path | None, free_limb: str | None) -> None:
+    """Refuse quality gates without unseen poses, and options that do not go with, or without, --prior."""
+    if gates and not hold_out:
+        raise DataError("a quality gate is judged on unseen poses; say which share to keep for it, as --hold-out 0.25")
     if prior is None and free_limb is not None:
         raise DataError("--free-limb needs the run in which the other limbs were known; name it with --prior RUN")
     given = click.get_current_context().get_parameter_source
