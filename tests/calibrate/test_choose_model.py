@@ -80,5 +80,5 @@ def test_sets_of_the_shipped_names():
 
 
 def test_sets_that_are_not_nested_are_refused():
-    with pytest.raises(EstimationError, match="'b' is not within 'a'|'a' is not within 'b'"):
+    with pytest.raises(EstimationError, match="'a' is not within 'b'"):
         choose_model(hexapod(), hexapod_data(30), {"a": ["leg1.length"], "b": ["leg2.length", "leg3.length"]})

@@ -51,7 +51,7 @@ def test_something_else_than_geometry_is_told_from_noise():
     bent = replace(data, observations=(replace(rows, measured=warm),))
     found = lack_of_fit(identify(hexapod(), bent, LeastSquares()), bent)
     assert found.explained is False
-    assert "something else than geometry" in found.sentence
+    assert "something else than the geometry" in found.sentence
     assert found.sigma_scale == pytest.approx(1.0, abs=0.2)
 
 

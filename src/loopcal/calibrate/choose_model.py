@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Literal
 
 from loopcal.calibrate.cross_validation import CrossValidation, cross_validate
@@ -128,15 +129,14 @@ def choose_model(
     """
     sets = {NOTHING: (), **{name: tuple(names) for name, names in (nested_sets(robot) if nested is None else nested).items()}}
     named = list(sets.items())
-    for (small, inner), (large, outer) in zip(named, named[1:], strict=False):
+    for (small, inner), (large, outer) in pairwise(named):
         if not set(inner) < set(outer):
             raise EstimationError(f"the set {small!r} is not within {large!r}, or equal to it; give each set within the next")
-    candidates = tuple(
-        Candidate(
-            name, names, cross_validate(_only(robot, names), data, method, count=count, seed=seed, noise=noise, loss=loss)
-        )
-        for name, names in named
-    )
+
+    def validated(names: Sequence[str]) -> CrossValidation:
+        return cross_validate(_only(robot, names), data, method, count=count, seed=seed, noise=noise, loss=loss)
+
+    candidates = tuple(Candidate(name, names, validated(names)) for name, names in named)
     best = min(candidates, key=lambda c: c.validation.score)
     enough = best.validation.score + best.validation.standard_error
     chosen = next(c for c in candidates if c.validation.score <= enough)

@@ -122,7 +122,9 @@ def _sentence(ratio: float, p_value: float, scale: float, degrees: int) -> str:
     """Say what explains the residuals."""
     times = np.sqrt(ratio)
     if p_value < LEVEL:
-        sentence = f"something else than geometry of this model is at work: residuals are {times:.3g} times what repeated poses differ by"
+        sentence = (
+            f"something else than the geometry of this model is at work: residuals are {times:.3g} times the repeatability"
+        )
     else:
         sentence = "the geometry explains the data to within their repeatability"
     from scipy.special import chdtrc

@@ -61,7 +61,7 @@ def worth(fit: Identification, data: Measurements) -> Worth:
     free = fit.unknowns
     if free.assumed.any():
         missing = f"{int(free.assumed.sum())} parameters have no tolerance"
-        return Worth(*[np.nan] * 4, None, f"what calibration gains cannot be predicted: {missing}; state them")
+        return _open(f"{missing}; state them")
     chosen = np.unique(np.linspace(0, data.n_poses - 1, min(POSES, data.n_poses)).astype(int))
     readings, values = data.readings[None, chosen], fit.robot.values[None]
     state = forward_trials(fit.robot, values, readings)
@@ -69,11 +69,17 @@ def worth(fit: Identification, data: Measurements) -> Worth:
     D = sensitivity(fit.robot, values, readings, state).parameters[0, ok][..., free.places]
     spread = _spread(fit)
     if not ok.any() or np.isnan(spread).any():
-        return Worth(*[np.nan] * 4, None, "what calibration gains cannot be predicted: no interval can be given")
+        return _open("no interval can be given")
     before, after = _errors(D * free.tolerance), _errors(D @ spread)
     better = [b > GAIN * a for b, a in zip(before, after, strict=True) if b > 0.0]
     calibrate = any(better)
     return Worth(before[1], after[1], before[0], after[0], calibrate, _sentence(fit, before, after, calibrate))
+
+
+def _open(why: str) -> Worth:
+    """Return that nothing can be said."""
+    nan = float("nan")
+    return Worth(nan, nan, nan, nan, None, f"what calibration gains cannot be predicted: {why}")
 
 
 def _spread(fit: Identification) -> FloatArray:
