@@ -1,0 +1,15 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The comparison of tsvd-2016 on many 3-PRS machines: raw LS, RE and TSVD at their best, and the library's methods."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from loopcal.papers.tsvd_2016.draws import document, draw
+
+DRAWS, SEED = 120, 0
+
+
+def collect() -> dict[str, Any]:
+    """Medians with bootstrap intervals, ratios, and curves over lambda and k."""
+    return document(draw("3-PRS", SEED, DRAWS), SEED)

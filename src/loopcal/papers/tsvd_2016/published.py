@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the paper prints and states, as far as our text of it goes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+from loopcal.linalg import FloatArray
+from loopcal.papers.printed import Printed
+
+MM = 1e-3
+NOISE_COLUMNS = ("X [mm]", "Y [mm]", "Z [mm]", "phi [rad]", "theta [rad]", "psi [rad]")
+
+
+@dataclass(frozen=True)
+class Published:
+    """See published.yaml.
+
+    Attributes
+    ----------
+    source : what we have of the paper. noise : Appendix 1. counts : numbers that the text states.
+    parameters : names as printed, by manipulator. statements : claims with their place.
+    """
+
+    source: str
+    noise: Printed
+    counts: Printed
+    parameters: Mapping[str, str]
+    statements: Mapping[str, Mapping[str, str]]
+
+    @cached_property
+    def noise_si(self) -> FloatArray:
+        """(36, 6) Appendix 1 [m, rad]."""
+        values = self.noise.values.copy()
+        values[:, :3] *= MM
+        values.setflags(write=False)
+        return values
+
+
+@cache
+def published() -> Published:
+    """Read published.yaml."""
+    from loopcal.io.yaml_file import read_yaml
+
+    content: dict[str, Any] = read_yaml(Path(__file__).with_name("published.yaml"), "file of published numbers").content
+    return Published(
+        source=content["source"],
+        noise=Printed.parse(content["appendix_1"]),
+        counts=Printed.parse(content["counts"]),
+        parameters=content["parameters"],
+        statements=content["statements"],
+    )

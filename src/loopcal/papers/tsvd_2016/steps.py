@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nine steps of the paper, for t machines or t settings of lambda and k at once.
+
+ 1 nominal parameters, e = 0                          `machine`                      \
+ 2 forward kinematic model                            `forward_trials`                |
+ 3 measured poses                                     `measured_poses`                | study.py
+ 4 measured data: true machine, with noise            `simulate_trials`               /
+ 5 error transfer matrix T_j of pose j                `sensitivity`, in rows of x, y, z, phi, theta (, psi)
+ 6 identification matrix H, all T_j in one column     `accumulate`: one triangular factor
+ 7 de from H de = D, by LS, RE or TSVD                `decompose`, with the filter factors below
+ 8 e + de; again from step 5 unless |de| is small     `iterate`
+ 9 save e
+
+Raw numbers as in the paper: millimetres and radians, every equation and every parameter of weight one, and the filter acts
+on the step. With H = U S V' and s_i = S_ii the step is de = sum f_i (u_i'D / s_i) v_i, where f_i = 1 for LS,
+s_i^2 / (s_i^2 + lambda) for RE, and 1 for i <= k, else 0, for TSVD.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopcal import engine
+from loopcal.linalg import Decomposition, FloatArray, IntArray, decompose, empty_factor
+from loopcal.mechanism import Mechanism, Status
+from loopcal.mechanism.trials import forward_trials, sensitivity
+from loopcal.papers.tsvd_2016.published import MM
+from loopcal.papers.tsvd_2016.study import Study
+from loopcal.units import Dimension
+
+ENOUGH = 1e-6
+"""Largest component of a step [mm, rad] at which the iteration ends; the paper's is not in our text."""
+
+LIMIT = 20
+"""Iterations at most; ridge steps shorten slowly."""
+
+LOST = 1e4
+"""A step of more than this [mm, rad] has diverged: ten metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Iterations:
+    """What the steps yield for t settings; index k of a history is the state after k iterations.
+
+    Attributes
+    ----------
+    values : (t, p) identified parameters [SI], NaN where diverged. history : (k + 1, t, p) [SI].
+    steps : (k, t) largest component of each step [mm, rad], NaN after the end. count : (t,) iterations done.
+    converged, diverged : (t,); neither: `LIMIT` was met. machine : (t,) as given.
+    """
+
+    values: FloatArray
+    history: FloatArray
+    steps: FloatArray
+    count: IntArray
+    converged: np.ndarray
+    diverged: np.ndarray
+    machine: IntArray
+
+
+def least_squares(parameters: int) -> FloatArray:
+    """(1, p) penalties of LS: none, whatever the singular values."""
+    return np.zeros((1, parameters))
+
+
+def ridge(lam: FloatArray, parameters: int) -> FloatArray:
+    """(l, p) penalties of RE for each lambda."""
+    return np.repeat(np.asarray(lam, dtype=np.float64)[:, None], parameters, axis=1)
+
+
+def truncated(k: IntArray, parameters: int) -> FloatArray:
+    """(l, p) penalties of TSVD for each k: infinite beyond it."""
+    return np.where(np.arange(parameters) < np.asarray(k)[:, None], 0.0, np.inf)
+
+
+def iterate(study: Study, penalty: FloatArray, machine: IntArray | None = None, limit: int = LIMIT) -> Iterations:
+    """Steps 5 to 9.
+
+    Parameters
+    ----------
+    study : the machines. penalty : (t | 1, p) of each setting, see above.
+    machine : (t,) which machine was measured; default: the first. limit : iterations at most.
+    """
+    machine = np.zeros(len(penalty), dtype=np.int64) if machine is None else machine
+    t = len(machine)
+    penalty = np.broadcast_to(penalty, (t, penalty.shape[1]))
+    values = np.repeat(study.robot.parameters.nominal[None], t, axis=0)
+    running, diverged = np.ones(t, dtype=bool), np.zeros(t, dtype=bool)
+    history, steps, count = [values.copy()], [], np.zeros(t, dtype=np.int64)
+    for _ in range(limit):
+        active = np.flatnonzero(running)
+        if not active.size:
+            break
+        found, reached = linearised(study, values[active], machine[active])
+        step = found.deviation(found.solution(penalty[active]))
+        size = np.abs(step).max(axis=1)
+        good = reached & (size < LOST)
+        values[active] += np.where(good[:, None], step, 0.0) * units(study.robot)
+        count[active] += 1
+        running[active], diverged[active] = good & (size > ENOUGH), ~good
+        history.append(values.copy())
+        steps.append(np.full(t, np.nan))
+        steps[-1][active] = size
+    final = np.where(diverged[:, None], np.nan, values)
+    return Iterations(final, np.stack(history), np.stack(steps), count, ~running & ~diverged, diverged, machine)
+
+
+def linearised(study: Study, values: FloatArray, machine: IntArray) -> tuple[Decomposition, np.ndarray]:
+    """Steps 5 and 6 and the decomposition of H, and which of the settings (a,) reach all poses.
+
+    Parameters
+    ----------
+    values : (a, p) corrected parameters [SI]. machine : (a,) which of the machines was measured.
+    """
+    robot, readings = study.robot, study.trials.readings[None]
+    kind, measured = study.kind, study.trials.measured[0]
+    shared = len(values) > 1 and bool((values == values[0]).all())
+    at = values[:1] if shared else values
+    state = forward_trials(robot, at, readings, study.commanded)
+    reached = (state.status == Status.CONVERGED).all(axis=1)
+    T = np.where(reached[:, None, None, None], state.T, np.eye(4))
+    D = np.where(reached[:, None, None, None], sensitivity(robot, at, readings, state).parameters, 0.0) * units(robot)
+    if shared:
+        T, reached = np.broadcast_to(T, (len(values), *T.shape[1:])), np.broadcast_to(reached, len(values))
+    seen = kind.evaluate(T, measured[machine])
+    raw = np.where([c.dimension is Dimension.LENGTH for c in kind.columns], 1.0 / MM, 1.0)
+    H = np.matmul(seen.jacobian * raw[:, None], D)
+    rows = np.concatenate([H, -(seen.residual * raw)[..., None]], axis=-1)
+    rows = rows.reshape(len(values), -1, rows.shape[-1])
+    factor = engine.accumulate(empty_factor(len(rows), rows.shape[-1] - 1), rows)
+    return decompose(factor, np.full(len(values), rows.shape[1]), tolerance=0.0), reached
+
+
+def units(robot: Mechanism) -> FloatArray:
+    """(p,) the paper's units in SI: millimetres and radians."""
+    return np.where([d is Dimension.LENGTH for d in robot.parameters.dimensions], MM, 1.0)
