@@ -12,12 +12,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loopcal import engine
-from loopcal.engine import Array, Block, Group, State
+from loopcal.engine import Array, Block, State
+from loopcal.mechanism.limb_maps import Columns, LimbMap
 from loopcal.mechanism.model import Mechanism, Status
-from loopcal.mechanism.transmission import TERMS, joint_values, slope, term_columns
+from loopcal.mechanism.transmission import joint_values, slope, term_columns
 
 ROWS = 512
 """Rows linearised together."""
@@ -93,7 +93,6 @@ class Linearised:
         J = slots.jacobian(values)
         self.of_slots = J[:, : slots.n_displacements]
         self.of_terms = J[:, slots.n_displacements :].reshape(len(J), *slots.terms.shape, -1)
-        self.touches = slots.touches
         self.terms = term_columns(q, slots.frequency)
         self.slope = slope(q, tau, slots.frequency)
 
@@ -101,9 +100,10 @@ class Linearised:
         """For each limb: its rows (t, n, r, m) against the platform, its parameters with their columns (t, n, r, ..), its
         actuators with theirs.
         """
-        for group, block in zip(self.robot.program.groups, parts, strict=True):
-            for k in range(len(group.limbs)):
-                yield block.A[:, :, k], *self._parameters(group, block, k), *self._readings(group, block, k)
+        for maps, block in zip(self.robot.limb_maps, parts, strict=True):
+            for k, limb in enumerate(maps):
+                right = self._right(limb, block, k)
+                yield block.A[:, :, k], limb.parameters, right, limb.readings, self._driven(limb, block, k)
 
     def platform(self) -> tuple[Array, Array]:
         """d platform freedoms / d parameters (t, n, m, p), and / d readings (t, n, m, a)."""
@@ -121,42 +121,22 @@ class Linearised:
             first += A.shape[2]
         return by_parameter, by_reading
 
-    def _parameters(self, group: Group, block: Block, k: int) -> tuple[Columns, Array]:
-        """Parameters that limb k's rows hold, and d rows / d them (t, n, r, ..)."""
-        width = len(group.slots)
-        own = slice(group.columns.start + k * width, group.columns.start + (k + 1) * width)
-        driven = [(j, int(columns[k])) for j, columns in enumerate(group.actuator) if columns[k] >= 0]
-        first = self.robot.slots.n_displacements
-        touched = self.touches[own].any(axis=0)
-        for _, a in driven:
-            touched = touched | self.touches[first + len(TERMS) * a : first + len(TERMS) * (a + 1)].any(axis=0)
-        columns = _columns(np.flatnonzero(touched))
-        E = block.E[:, :, k]
-        right = np.matmul(E.reshape(len(E), E.shape[1] * E.shape[2], width), self.of_slots[:, own, columns])
-        right = right.reshape(len(right), *E.shape[1:3], right.shape[-1])
-        for j, a in driven:
-            for i, term in enumerate(self.terms):
-                slopes = self.of_terms[:, None, None, a, i, columns]
-                if slopes.any():
-                    right = right + (block.Q[:, :, k, :, j] * term[:, :, a, None])[..., None] * slopes
-        return columns, right
+    def _right(self, limb: LimbMap, block: Block, k: int) -> Array:
+        """d rows / d parameters of limb k (t, n, r, ..)."""
+        right = block.E[:, :, k]
+        if not limb.plain:
+            t, n, r, width = right.shape
+            of_slots = self.of_slots[:, limb.own, limb.parameters]
+            right = np.matmul(right.reshape(t, n * r, width), of_slots).reshape(t, n, r, of_slots.shape[-1])
+        for j, a, terms in limb.drives:
+            for i in terms:
+                slopes = self.of_terms[:, None, None, a, i, limb.parameters]
+                right = right + (block.Q[:, :, k, :, j] * self.terms[i][:, :, a, None])[..., None] * slopes
+        return right
 
-    def _readings(self, group: Group, block: Block, k: int) -> tuple[Columns, Array]:
-        """Readings that limb k's rows hold, and d rows / d them (t, n, r, ..)."""
-        driven = [(j, int(columns[k])) for j, columns in enumerate(group.actuator) if columns[k] >= 0]
-        places = np.array([a for _, a in driven], dtype=np.int64)
-        right = block.Q[:, :, k][..., [j for j, _ in driven]] * self.slope[:, :, None, places]
-        return _columns(places), right
-
-
-Columns = slice | NDArray[np.int64]
-
-
-def _columns(places: NDArray[np.int64]) -> Columns:
-    """Places as a slice where they are consecutive: a view in the place of a copy."""
-    if len(places) and places[-1] - places[0] == len(places) - 1 and (np.diff(places) == 1).all():
-        return slice(int(places[0]), int(places[-1]) + 1)
-    return places
+    def _driven(self, limb: LimbMap, block: Block, k: int) -> Array:
+        """d rows / d readings of limb k (t, n, r, ..)."""
+        return block.Q[:, :, k][..., [j for j, *_ in limb.drives]] * self.slope[:, :, None, limb.readings]
 
 
 def platform_rows(blocks: engine.Blocks) -> Array:

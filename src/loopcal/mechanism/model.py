@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from loopcal.engine import Array, Program, State
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import Actuator, Assembly, Shared
+from loopcal.mechanism.limb_maps import LimbMap, limb_maps
 from loopcal.parameters import ParameterTable
 from loopcal.units import Dimension
 
@@ -158,6 +159,11 @@ class Mechanism:
     def home(self) -> Array:
         """T_base_platform (4, 4) of the home pose."""
         return self.home_state.T[0, 0]
+
+    @cached_property
+    def limb_maps(self) -> tuple[tuple[LimbMap, ...], ...]:
+        """What stands in the equations of each limb, group by group."""
+        return limb_maps(self.program, self.slots.matrix, self.slots.touches)
 
     @property
     def nominal(self) -> Mechanism:
