@@ -3,14 +3,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from loopcal.calibrate.filters import Method
 from loopcal.calibrate.rows import Rows
 from loopcal.errors import EstimationError
 from loopcal.linalg import FloatArray
-from loopcal.measure import Measurements, check_actuators
+from loopcal.measure import Kind, Measurements, check_actuators
 from loopcal.mechanism import Mechanism
+
+
+def check_known(kinds: Iterable[Kind]) -> None:
+    """Refuse kinds whose rows need more than the pose they saw.
+
+    Raises
+    ------
+    EstimationError
+        Naming the kind and what is unknown.
+    """
+    for kind in kinds:
+        if kind.unknowns:
+            names = ", ".join(kind.parts)
+            raise EstimationError(f"the {names} of kind {kind.name!r} cannot be estimated here yet; state their values")
+        if kind.links > 1 or kind.looks_at:
+            what = "compare poses" if kind.links > 1 else "look at joints"
+            raise EstimationError(f"rows of the kind {kind.name!r} {what}, which cannot be used here yet; leave them out")
 
 
 def check_rows(rows: Rows, data: Measurements, robot: Mechanism) -> None:

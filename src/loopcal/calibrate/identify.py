@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.calibrate.checks import check_count, check_rows, check_start
+from loopcal.calibrate.checks import check_count, check_known, check_rows, check_start
 from loopcal.calibrate.closure import descend_from_closure
 from loopcal.calibrate.combinations import combinations
 from loopcal.calibrate.conflict import prior_conflict
@@ -49,10 +49,9 @@ def identify(
     loss: Loss | None = None,
     drop: Sequence[str] = (),
 ) -> Identification:
-    """Identify the free parameters of a robot.
+    """Identify the free parameters of a robot: |W (predicted - measured)|^2 made small over e, filtered by `method`.
 
-    Minimises |W (predicted - measured)|^2 over e, filtered by `method` in the total deviation z = (e - e0) / tolerance
-    from nominal e0; see `loopcal.calibrate.filters`.
+    What is filtered is the total deviation z = (e - e0) / tolerance from nominal e0; see `loopcal.calibrate.filters`.
 
     Parameters
     ----------
@@ -84,6 +83,7 @@ def identify(
     free = unknowns(robot)
     method = adapted(LeastSquares() if method is None and prior is not None else method, free.assumed, noise)
     data = without_poses(data, drop)
+    check_known(o.kind for o in data.observations if len(o))
     rows = rows_of(free, data)
     check_rows(rows, data, robot)
     check_count(rows, data, method, allow_fewer_equations or prior is not None)
@@ -93,18 +93,24 @@ def identify(
     def run(some: Rows, at: FloatArray) -> Descent:
         return _descended(some, at, method, control, rank_tolerance, begin, prior)
 
-    if loss is None:
-        fit, weight = run(rows, z), np.ones(data.n_poses)
-    else:
-        robust = descend_robustly(rows, data.block, loss, z, noise == "estimated", run)
-        fit, weight = robust.fit, robust.weight
+    fit, weight = _weighed(rows, data, z, loss, noise, run)
     if fit.status[0] == DescentStatus.BAD_START:
         check_start(rows, data, z, fit.cost)
     residuals = _labelled(rows.residuals(fit.deviation), data)
     check = residual_check(fit.decomposition, fit.penalty, noise, robust=loss is not None)
     result = _identification(robot, free, method, fit, check, residuals)
-    notes = (*_weight_notes(data, weight, loss), *_drop_notes(drop))
-    return replace(result, weight=weight, dropped=tuple(drop), notes=(*result.notes, *notes))
+    notes = (*result.notes, *_weight_notes(data, weight, loss), *_drop_notes(drop))
+    return replace(result, weight=weight, dropped=tuple(drop), notes=notes)
+
+
+def _weighed(
+    rows: Rows, data: Measurements, z: FloatArray, loss: Loss | None, noise: str, run: Callable[[Rows, FloatArray], Descent]
+) -> tuple[Descent, FloatArray]:
+    """Descend, with a loss or without, and return the weight (n,) of each pose."""
+    if loss is None:
+        return run(rows, z), np.ones(data.n_poses)
+    robust = descend_robustly(rows, data.block, loss, z, noise == "estimated", run)
+    return robust.fit, robust.weight
 
 
 def _weight_notes(data: Measurements, weight: FloatArray, loss: Loss | None) -> list[str]:
@@ -170,6 +176,7 @@ def identify_trials(
     start : (t | 1, parameters of the robot) [SI], default the robot's values. The others: as for `identify`.
     """
     free = unknowns(robot)
+    check_known(sensor.kind for sensor in trials.instrument.sensors)
     rows = rows_of_trials(free, trials)
     values = np.atleast_2d(robot.values if start is None else np.asarray(start, dtype=np.float64))
     z = np.broadcast_to(free.deviation(values), (len(trials), len(free)))

@@ -21,6 +21,7 @@ from loopcal.calibrate.scaling import Unknowns
 from loopcal.errors import EstimationError
 from loopcal.linalg import FloatArray, IntArray, empty_factor
 from loopcal.measure import Kind, Measurements, Trials
+from loopcal.measure.simulate import rows_of as sensor_rows
 from loopcal.measure.whitening import whitener
 from loopcal.mechanism import Status
 from loopcal.mechanism.implicit import sensitivity
@@ -301,7 +302,6 @@ def rows_of(unknowns: Unknowns, data: Measurements) -> Rows:
 def rows_of_trials(unknowns: Unknowns, trials: Trials) -> Rows:
     """Return the rows of t simulated machines."""
     sensed = []
-    poses = np.arange(len(trials.readings))
     for sensor, measured in zip(trials.instrument.sensors, trials.measured, strict=True):
         kind = sensor.kind
         present = kind.present(measured)
@@ -309,7 +309,7 @@ def rows_of_trials(unknowns: Unknowns, trials: Trials) -> Rows:
         covariance = (N * np.asarray(sensor.noise.sigma) ** 2) @ np.swapaxes(N, -1, -2)
         t, r, m = present.shape
         flat = whitener(np.broadcast_to(covariance, (t, r, m, m)).reshape(-1, m, m), present.reshape(-1, m), np.ones(t * r))
-        sensed.append(Sensed(kind, poses, measured, flat.reshape(t, r, m, m)))
+        sensed.append(Sensed(kind, sensor_rows(sensor), measured, flat.reshape(t, r, m, m)))
     return Rows(unknowns, trials.readings, tuple(sensed), len(trials))
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from loopcal.calibrate.checks import check_known
 from loopcal.calibrate.identification import Identification
 from loopcal.calibrate.pose_errors import INDICES, PoseErrors, pose_errors
 from loopcal.errors import DataError
@@ -140,6 +141,7 @@ def validate(
     robot = fit.robot if isinstance(fit, Identification) else fit
     old = before or (fit.initial if isinstance(fit, Identification) else fit.nominal)
     check_actuators(data, robot)
+    check_known(o.kind for o in data.observations if len(o))
     rows = [o.take(o.weight > 0.0) for o in data.observations]
     rows = [o for o in rows if len(o)]
     if not rows:
