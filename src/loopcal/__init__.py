@@ -17,8 +17,12 @@ if TYPE_CHECKING:
     from loopcal.calibrate import Ridge as Ridge
     from loopcal.calibrate import TruncatedSVD as TruncatedSVD
     from loopcal.calibrate import Validation as Validation
+    from loopcal.calibrate import accuracy_map as accuracy_map
+    from loopcal.calibrate import compensate as compensate
     from loopcal.calibrate import identifiability as identifiability
     from loopcal.calibrate import identify as identify
+    from loopcal.calibrate import pose_uncertainty as pose_uncertainty
+    from loopcal.calibrate import recalibrate as recalibrate
     from loopcal.calibrate import validate as validate
     from loopcal.errors import LoopcalError as LoopcalError
     from loopcal.io import load_measurements as load_measurements
@@ -50,8 +54,12 @@ _WHERE = {
             "Ridge",
             "TruncatedSVD",
             "Validation",
+            "accuracy_map",
+            "compensate",
             "identifiability",
             "identify",
+            "pose_uncertainty",
+            "recalibrate",
             "validate",
         ),
         "loopcal.errors": ("LoopcalError",),
