@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from loopcal.calibrate.checks import check_rows, check_start
 from loopcal.calibrate.combinations import Combination, combination, combinations, listed, sparse
 from loopcal.calibrate.meaning import with_meaning
 from loopcal.calibrate.observability import SCALING, Observability, observability
 from loopcal.calibrate.outlook import information
-from loopcal.calibrate.rows import rows_of
 from loopcal.calibrate.scaling import Unknowns, unknowns
+from loopcal.errors import EstimationError
 from loopcal.linalg import NULL_COMPONENT, RANK_TOLERANCE, Decomposition, FloatArray, decompose
-from loopcal.measure import Instrument, Measurements, simulate
+from loopcal.measure import Instrument, Measurements, check_actuators, simulate
 from loopcal.mechanism import Mechanism
 from loopcal.mechanism.workspace import sample
 
@@ -172,14 +172,15 @@ def identifiability(
     """
     if isinstance(data, Instrument):
         data = simulate(robot, sample(robot, poses, seed).coordinates, data, seed=0, controller=robot)
+    check_actuators(data, robot)
     free = unknowns(robot)
-    rows = rows_of(free, data)
-    check_rows(rows, data, robot)
+    if not len(free) or not data.n_rows:
+        what = f"{robot.name} has no free parameter; free one" if data.n_rows else "no measured value counts; give at least one"
+        raise EstimationError(f"there is nothing to tell: {what}")
     factor, reached = information(free, data)
-    z = free.deviation(robot.values[None])
     if not reached.all():
-        check_start(rows, data, z, np.full(1, np.inf))
-    return summary(free, decompose(factor, rows.rows, z, tolerance=rank_tolerance), factor[0, :-1, :-1])
+        raise EstimationError(_unreached(data, reached))
+    return summary(free, decompose(factor, np.full(1, data.n_rows), tolerance=rank_tolerance), factor[0, :-1, :-1])
 
 
 def summary(free: Unknowns, decomposition: Decomposition, factor: FloatArray) -> Identifiability:
@@ -206,6 +207,16 @@ def summary(free: Unknowns, decomposition: Decomposition, factor: FloatArray) ->
         notes=() if note is None else (note,),
         unknowns=free,
         factor=factor,
+    )
+
+
+def _unreached(data: Measurements, reached: NDArray[np.bool_]) -> str:
+    """The sentence for poses that the robot does not reach."""
+    lost = np.flatnonzero(~reached)
+    names = ", ".join(repr(data.labels[i]) for i in lost[:WEAKEST]) + (", ..." if len(lost) > WEAKEST else "")
+    return (
+        f"the robot cannot reach {len(lost)} of {data.n_poses} poses with the readings given there (poses {names}); correct "
+        "the readings, their unit or the robot's dimensions, or give these rows weight 0"
     )
 
 

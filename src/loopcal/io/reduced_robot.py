@@ -15,7 +15,7 @@ from loopcal.io.robot_file import RobotSource
 if TYPE_CHECKING:
     from loopcal.mechanism import Mechanism
 
-FIXED = re.compile(r"^fixed:.*\n(?:(?:[ \t]+.*|-.*|[ \t]*#.*)\n)*", re.MULTILINE)
+FIXED = re.compile(r"^fixed:.*\n(?:(?:[ \t]+.*|-.*)\n)*", re.MULTILINE)
 """The list as it stands in a file, in one line or in several."""
 
 PLAIN = re.compile(r"[A-Za-z][\w.-]*$")

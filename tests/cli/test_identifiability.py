@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal identifiability`: sentences, tables, the smaller robot file, JSON, and options that contradict each other."""
+
+import json
+
+import pytest
+
+from loopcal.cli import main
+from loopcal.io import load_robot
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Run the command in an empty folder; return exit code, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(words: str) -> tuple[int, str, str]:
+        code = main(["identifiability", *words.split()])
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def test_five_of_six_coordinates_of_the_3_prs(run):
+    code, out, err = run("3-prs --measure x,y,z,phi,theta")
+    assert (code, err) == (0, "")
+    assert "32 of 33 parameter combinations can be identified" in out
+    assert "together a1y, a2y and a3y, in equal parts, change nothing that was measured" in out
+    assert "to determine a1y, a2y and a3y: measuring psi as well would determine them" in out
+    assert "a2y     only together with a1y and a3y" in out
+    assert "O5      1 / sum(1/s)" in out
+
+
+def test_five_of_six_coordinates_of_the_tracker(run):
+    assert "24 of 25 parameter combinations can be identified" in run("ru-pus-prs --measure x,y,z,phi,theta")[1]
+
+
+@pytest.mark.parametrize(("frames", "rank"), [("base", 36), ("tool", 36), ("base,tool", 30)])
+def test_unknown_frames_of_the_hexapod(run, frames, rank):
+    assert f"{rank} of 42 parameter combinations" in run(f"hexapod-42 --frames {frames}")[1]
+
+
+def test_the_reduced_file_is_written_and_whole(run, tmp_path):
+    code, out, _ = run("hexapod-42 --frames base --reduce -o smaller.yaml")
+    assert code == 0
+    assert "36 of 42 parameters say all that the measurements tell" in out
+    assert out.count("left out: leg") == 6
+    assert load_robot(tmp_path / "smaller.yaml").parameters.free.sum() == 36
+    assert "36 of 36 parameter combinations" in run("smaller.yaml --frames base")[1]
+    assert "this file exists" in run("hexapod-42 --frames base --reduce -o smaller.yaml")[2]
+    assert run("hexapod-42 --frames base --reduce -o smaller.yaml --force")[0] == 0
+
+
+def test_the_json_holds_all_of_it(run):
+    document = json.loads(run("3-prs --measure x,y,z,phi,theta --reduce --json")[1])
+    assert document["unidentifiable"][0]["names"] == ["a1y", "a2y", "a3y"]
+    assert document["remedies"][0]["cures"][0]["words"] == "psi"
+    assert document["reduction"]["dropped"][0]["name"] == "a2y"
+    assert set(document["indices"]) >= {"o1", "o2", "o3", "o4", "o5", "scaling"}
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("3-prs --measure x,y --components z", "--measure is short for --kind component --components"),
+        ("3-prs --measure x,y,w", "the component 'w' is unknown"),
+        ("3-prs --frames floor", "--frames says 'floor'; what can be unknown is base, tool, or base,tool"),
+        ("3-prs --kind inclination --frames base", "--frames base means nothing to this kind of measurement"),
+        ("3-prs data.csv --measure x", "DATA states what is measured"),
+        ("3-prs -o smaller.yaml", "-o writes what --reduce finds"),
+    ],
+)
+def test_options_that_contradict_each_other_are_one_sentence(run, words, sentence):
+    code, out, err = run(words)
+    assert (code, out) == (1, "")
+    assert sentence in err
+    assert err.count("\n") == 1
