@@ -110,9 +110,35 @@ def test_a_calibration_can_start_from_a_corrected_robot_file(run) -> None:
     assert first.robot.record.text == second.robot.record.text
 
 
-@pytest.mark.parametrize("method", ["map", "ridge", "ridge --lam 0.5", "truncated-svd --keep 30", "truncated-svd"])
+@pytest.mark.parametrize("method", ["map", "ls", "ridge", "ridge --lam 0.5", "tsvd --keep 30", "tsvd"])
 def test_other_methods_calibrate_too(run, method) -> None:
     assert run(f"calibrate hexapod-42 measurements.csv -o run --hold-out 0.25 --method {method}")[0] == 0
+
+
+def test_poses_are_dropped_and_weighed_only_when_asked(run) -> None:
+    code, out, _ = run("calibrate hexapod-42 measurements.csv -o run --drop 3 --drop 7 --loss tukey")
+    assert code == 0
+    assert "left out as asked: poses 3, 7" in out
+    assert "Tukey(c=4.685)" in out
+    assert "there is no pose '99'" in run("calibrate hexapod-42 measurements.csv -o run2 --drop 99")[2]
+
+
+def test_the_result_says_how_far_the_fit_can_be_trusted(run) -> None:
+    code, out, _ = run("calibrate hexapod-42 measurements.csv -o run")
+    assert code == 0
+    assert "expected errors at these poses" in out
+    found = load_run("run").result
+    assert found["examination"]["outliers"]["blocks"] == 40
+    assert len(found["examination"]["outliers"]["outliers"]) <= 1  # right data: one in 5 % of cases
+    assert found["examination"]["worth"]["calibrate"] is True
+    assert found["fit"]["prior_conflict"]["conflict"] is False
+
+
+def test_a_model_can_be_chosen(run) -> None:
+    code, out, _ = run("calibrate hexapod-42 measurements.csv -o run --choose-model")
+    assert code == 0
+    assert "no simpler model is enough" in out
+    assert load_run("run").result["model_choice"]["chosen"] == "ideal"
 
 
 def test_noise_can_be_estimated_from_the_residual(run) -> None:

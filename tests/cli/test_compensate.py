@@ -30,7 +30,7 @@ def made(tmp_path_factory):
     for path in EXAMPLE.iterdir():
         shutil.copy(path, folder)
     words = ["calibrate", "hexapod-42", str(folder / "measurements.csv"), "-o", str(folder / "run")]
-    assert main([*words, "--method", "least-squares"]) == 0
+    assert main([*words, "--method", "ls"]) == 0
     return folder
 
 

@@ -16,6 +16,8 @@ from loopcal.calibrate.correlated import correlated_groups as correlated_groups
 from loopcal.calibrate.cross_validation import cross_validate as cross_validate
 from loopcal.calibrate.descent import DescentStatus as DescentStatus
 from loopcal.calibrate.descent import StepControl as StepControl
+from loopcal.calibrate.examine import Examination as Examination
+from loopcal.calibrate.examine import examine as examine
 from loopcal.calibrate.filters import MAP as MAP
 from loopcal.calibrate.filters import LeastSquares as LeastSquares
 from loopcal.calibrate.filters import Ridge as Ridge

@@ -32,6 +32,18 @@ def check_known(kinds: Iterable[Kind]) -> None:
             raise EstimationError(f"rows of the kind {kind.name!r} {what}, which cannot be used here yet; leave them out")
 
 
+def check_noise(noise: str) -> None:
+    """Refuse anything but the two words.
+
+    Raises
+    ------
+    EstimationError
+        Naming them.
+    """
+    if noise not in {"given", "estimated"}:
+        raise EstimationError(f"noise is {noise!r}; it must be 'given' or 'estimated'")
+
+
 def check_rows(rows: Rows, data: Measurements, robot: Mechanism) -> None:
     """Refuse readings of another robot, a robot without free parameters, and data without any row.
 

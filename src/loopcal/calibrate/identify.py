@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.calibrate.checks import check_count, check_known, check_rows, check_start
+from loopcal.calibrate.checks import check_count, check_known, check_noise, check_rows, check_start
 from loopcal.calibrate.closure import descend_from_closure
 from loopcal.calibrate.combinations import combinations
 from loopcal.calibrate.conflict import prior_conflict
@@ -49,37 +49,31 @@ def identify(
     loss: Loss | None = None,
     drop: Sequence[str] = (),
 ) -> Identification:
-    """Identify the free parameters of a robot: |W (predicted - measured)|^2 made small over e, filtered by `method`.
-
-    What is filtered is the total deviation z = (e - e0) / tolerance from nominal e0; see `loopcal.calibrate.filters`.
+    """Identify the free parameters of a robot; the theory is in `loopcal.calibrate.filters`.
 
     Parameters
     ----------
-    robot : its values are the start, its table says what is nominal, free and tolerated.
-    data : the measurements.
-    method : default `MAP(Widened())`: each stated tolerance is a prior, widened where the data contradict the tolerances;
-        parameters without one are not held back. With `prior`: least squares.
+    robot : its values are the start, its table says what is nominal, free and tolerated. data : the measurements.
+    method : default `MAP(Widened())`: stated tolerances are a prior, widened where the data contradict them; with `prior`
+        least squares.
     noise : "given": the sigmas of the data are true; "estimated": true up to one common factor.
     prior : what an earlier calibration knows, as further rows; see `loopcal.calibrate.prior`.
     start : (parameters of the robot,) [SI] values to begin with instead of the robot's.
-    begin : "kinematics": every step solves the predicted poses; "closure": where all poses are measured in full, first
-        linearise closure at the measured ones, which needs fewer steps from a start that is far off.
+    begin : "closure": where all poses are measured in full, first linearise closure there (for starts far off).
     control : settings of the iteration. rank_tolerance : relative to the largest singular value.
     allow_fewer_equations : let least squares return the smallest deviation that explains too few equations.
-    loss : `Huber()` or `Tukey()`: blocks of rows far from the fit count less.
-    drop : labels of poses to leave out. Nothing is ever left out that is not named here.
+    loss : `Huber()` or `Tukey()`: blocks of rows far from the fit count less. drop : labels of poses to leave out.
 
     Returns
     -------
-    Identification; look at `status`, an iteration that did not converge is not raised.
+    Identification; an iteration that did not converge is not raised, look at `status`.
 
     Raises
     ------
     EstimationError
         Nothing to identify, fewer equations than parameters, or poses out of reach at the start.
     """
-    if noise not in {"given", "estimated"}:
-        raise EstimationError(f"noise is {noise!r}; it must be 'given' or 'estimated'")
+    check_noise(noise)
     free = unknowns(robot)
     method = adapted(LeastSquares() if method is None and prior is not None else method, free.assumed, noise)
     data = without_poses(data, drop)
@@ -87,8 +81,7 @@ def identify(
     rows = rows_of(free, data)
     check_rows(rows, data, robot)
     check_count(rows, data, method, allow_fewer_equations or prior is not None)
-    values = (robot if start is None else robot.with_values(start)).values
-    z = free.deviation(values[None])
+    z = free.deviation((robot if start is None else robot.with_values(start)).values[None])
 
     def run(some: Rows, at: FloatArray) -> Descent:
         return _descended(some, at, method, control, rank_tolerance, begin, prior)
@@ -96,8 +89,8 @@ def identify(
     fit, weight = _weighed(rows, data, z, loss, noise, run)
     if fit.status[0] == DescentStatus.BAD_START:
         check_start(rows, data, z, fit.cost)
-    residuals = _labelled(rows.residuals(fit.deviation), data)
     check = residual_check(fit.decomposition, fit.penalty, noise, robust=loss is not None)
+    residuals = _labelled(rows.residuals(fit.deviation), data)
     result = _identification(robot, free, method, fit, check, residuals)
     notes = (*result.notes, *_weight_notes(data, weight, loss), *_drop_notes(drop))
     return replace(result, weight=weight, dropped=tuple(drop), notes=notes)

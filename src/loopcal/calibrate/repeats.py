@@ -122,9 +122,7 @@ def _sentence(ratio: float, p_value: float, scale: float, degrees: int) -> str:
     """Say what explains the residuals."""
     times = np.sqrt(ratio)
     if p_value < LEVEL:
-        sentence = (
-            f"something else than the geometry of this model is at work: residuals are {times:.3g} times the repeatability"
-        )
+        sentence = f"something else than the geometry of this model is at work: residuals are {times:.3g} times repeatability"
     else:
         sentence = "the geometry explains the data to within their repeatability"
     from scipy.special import chdtrc

@@ -4,21 +4,21 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from loopcal.cli import show
+from loopcal.cli.fitting import Fitting, fit_options
 from loopcal.cli.options import FILE, data_argument, data_options, gate_options, json_option, robot_argument
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
     from loopcal.calibrate import Identification, Validation
-    from loopcal.calibrate.filters import Method
+    from loopcal.calibrate.examine import Examination
     from loopcal.measure import Measurements
-
-METHODS = ("least-squares", "map", "ridge", "truncated-svd")
 
 
 @click.command(short_help="Identify a robot's parameters from measurements.")
@@ -27,12 +27,7 @@ METHODS = ("least-squares", "map", "ridge", "truncated-svd")
 @click.option("-o", "--output", required=True, type=FILE, help="The run folder to make.")
 @click.option("--hold-out", type=click.FloatRange(0, 1, max_open=True), default=0.0, metavar="SHARE",
               help="Share of the poses to keep from the fit and to judge it by, such as 0.25.")  # fmt: skip
-@click.option("--method", type=click.Choice(METHODS), default=METHODS[0], show_default=True, help="How to estimate.")
-@click.option("--lam", type=click.FloatRange(min=0), help="For ridge; chosen by cross-validation where not given.")
-@click.option("--keep", type=click.IntRange(min=0), metavar="K",
-              help="For truncated-svd: how many directions; chosen by cross-validation where not given.")  # fmt: skip
-@click.option("--noise", type=click.Choice(("given", "estimated")), default="given", show_default=True,
-              help="Whether the stated noise is true, or only up to one common factor.")  # fmt: skip
+@fit_options
 @click.option("--prior", type=FILE, metavar="RUN", help="An earlier run on this machine; what it knew is kept.")
 @click.option("--free-limb", metavar="LIMB", help="With --prior: a limb that was repaired, such as leg3, starts anew.")
 @gate_options
@@ -45,10 +40,7 @@ def calibrate(
     data: Path,
     output: Path,
     hold_out: float,
-    method: str,
-    lam: float | None,
-    keep: int | None,
-    noise: Literal["given", "estimated"],
+    fitting: Fitting,
     prior: Path | None,
     free_limb: str | None,
     limit_position: float | None,
@@ -68,9 +60,10 @@ def calibrate(
       loopcal calibrate hexapod-42 measurements.csv -o run --hold-out 0.25
       loopcal calibrate robot.yaml data.csv -o run --hold-out 0.25 --limit-position 0.02mm --limit-angle 0.01deg
       loopcal calibrate printer.yaml heights.csv -o run --noise estimated
+      loopcal calibrate robot.yaml data.csv -o run --loss huber --drop 17
       loopcal calibrate hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
     """  # noqa: D301
-    from loopcal.calibrate import identify, validate
+    from loopcal.calibrate import validate
     from loopcal.calibrate.recalibrate import recalibrate
     from loopcal.io import load_measurements, load_robot
     from loopcal.io.calibration_run import run_document, save_run
@@ -82,22 +75,25 @@ def calibrate(
     refuse_used_folder(output, force)
     machine = load_robot(robot)
     measured = load_measurements(data, machine, allow_outside_stroke=allow_outside_stroke, allow_duplicates=allow_duplicates)
-    fitted, unseen = measured.split(1 - hold_out, seed) if hold_out else (measured, None)
+    fitted, unseen = fitting.split(measured, hold_out, seed)
     show.progress(f"identifying {int(machine.parameters.free.sum())} parameters from {fitted.n_rows} equations ...")
+    choice = change = None
     if prior is None:
-        fit, change = identify(machine, fitted, _method(method, lam, keep), noise=noise), None
+        fit, choice = fitting.fit(machine, fitted)
     else:
-        fit, change = recalibrate(machine, fitted, load_prior(prior, data), free_limb, noise)
+        fit, change = recalibrate(machine, fitted, load_prior(prior, data), free_limb, fitting.noise)
     validation = None if unseen is None else validate(fit, unseen, limit_position, limit_angle)
     inputs = {"robot": robot_path(robot), "data": data, **({} if prior is None else {"prior": prior / RESULT})}
     origin = made_by(sys.argv, inputs, {"hold_out": seed})
     split = None if unseen is None else {"hold_out": hold_out, "seed": seed, "held_out": unseen.labels}
-    document = run_document(fit, validation, origin, split) | ({} if change is None else {"change": change.to_dict()})
+    findings = {"examination": _examined(fit, fitted), "change": change, "model_choice": choice}
+    document = run_document(fit, validation, origin, split)
+    document |= {name: found.to_dict() for name, found in findings.items() if found is not None}
     save_run(output, fit, document, force)
     if as_json:
         show.json_document(document)
     else:
-        _print(fit, validation, fitted, output)
+        _print(fit, validation, fitted, findings, output)
     return _exit_code(fit, validation)
 
 
@@ -108,26 +104,23 @@ def _refuse_contradictions(hold_out: float, gates: bool, prior: Path | None, fre
     if prior is None and free_limb is not None:
         raise DataError("--free-limb needs the run in which the other limbs were known; name it with --prior RUN")
     given = click.get_current_context().get_parameter_source
-    for option in ("method", "lam", "keep"):
+    for option in ("method", "lam", "keep", "loss", "choose_model"):
         if prior is not None and given(option) is click.core.ParameterSource.COMMANDLINE:
-            raise DataError(f"--{option} does not go with --prior, which stands in the place of the tolerances; leave it out")
+            name = option.replace("_", "-")
+            raise DataError(f"--{name} does not go with --prior, which is fitted by least squares; leave it out")
 
 
-def _method(name: str, lam: float | None, keep: int | None) -> Method:
-    """Return the method that the options describe."""
-    from loopcal.calibrate import GCV, MAP, LeastSquares, Ridge, TruncatedSVD, TruncationGCV
+def _examined(fit: Identification, fitted: Measurements) -> Examination | None:
+    """Examine a fit, where no kind has unknowns of its own."""
+    from loopcal.calibrate.examine import examine
 
-    for option, value, needs in (("--lam", lam, "ridge"), ("--keep", keep, "truncated-svd")):
-        if value is not None and name != needs:
-            raise DataError(f"{option} belongs to --method {needs}, not to {name}; leave it out, or change the method")
-    if name == "ridge":
-        return Ridge(GCV() if lam is None else lam)
-    if name == "truncated-svd":
-        return TruncatedSVD(TruncationGCV() if keep is None else keep)
-    return MAP() if name == "map" else LeastSquares()
+    own = any(observations.kind.unknowns for observations in fitted.observations)
+    return None if own or not fit.converged else examine(fit, fitted)
 
 
-def _print(fit: Identification, validation: Validation | None, fitted: Measurements, output: Path) -> None:
+def _print(
+    fit: Identification, validation: Validation | None, fitted: Measurements, findings: Mapping[str, Any], output: Path
+) -> None:
     """Print what was found, and how well it does on unseen poses, or without any on the fitted ones."""
     from loopcal.calibrate import start_check, validate
 
@@ -137,8 +130,11 @@ def _print(fit: Identification, validation: Validation | None, fitted: Measureme
     degrees = f"{fit.check.degrees:.4g} degree{'' if round(fit.check.degrees) == 1 else 's'} of freedom"
     show.say(f"chi-square {fit.chi_square:.5g} with {degrees}")
     show.say(f"note: {start_check(fit).sentence}")
-    for note in fit.notes:
+    examined: Examination | None = findings["examination"]
+    for note in (*fit.notes, *(() if examined is None else examined.sentences)):
         show.say(f"note: {note}")
+    if findings["model_choice"] is not None:
+        show.say(f"\n{findings['model_choice']}")
     if validation is not None:
         show.validation(validation, "unseen")
     elif not any(observations.kind.unknowns for observations in fitted.observations):
