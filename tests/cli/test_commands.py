@@ -14,7 +14,7 @@ from loopcal.io.calibration_run import load_run
 from loopcal.io.robot_file import shipped_robots
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
-SIMULATE = "simulate truth.yaml --poses poses.csv --sigma-position 0.001mm --sigma-angle 5urad --seed 42 -o again.csv"
+SIMULATE = "simulate truth.yaml --poses poses.csv --sigma-position 0.001mm --sigma-angle 5urad --seed 3 -o again.csv"
 
 
 @pytest.fixture
