@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""More actuators than freedoms: the pose is the least-squares one, each reading weighed by its own standard deviation."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.optimize import least_squares
+
+from loopcal.io import load_robot
+from loopcal.mechanism import Status, build, forward, inverse
+from loopcal.mechanism.trials import forward_trials, sensitivity
+from tests.jacobians import check_jacobian
+
+
+def cable_robot(sigmas=None):
+    """The shipped four-line robot, its encoders with these standard deviations."""
+    assembly = load_robot("cable-4").assembly
+    if sigmas is None:
+        return build(assembly)
+    return build(
+        replace(assembly, actuators=tuple(replace(a, sigma=s) for a, s in zip(assembly.actuators, sigmas, strict=True)))
+    )
+
+
+def line_lengths(robot, q):
+    """Length of each line at readings q (a,), from the assembly's own numbers."""
+    terms = [a.terms for a in robot.actuators]
+    driven = np.array(
+        [t.get("offset", 0.0) + t.get("gain", 1.0) * r + t.get("curve", 0.0) * r**2 for t, r in zip(terms, q, strict=True)]
+    )
+    return driven + np.array([limb.length for limb in robot.assembly.limbs])
+
+
+def points(robot):
+    """Anchors and where the lines meet the platform (k, 3), from the assembly's own numbers."""
+    anchors = np.array([limb.links[-1].transform[:3, 3] for limb in robot.assembly.limbs])
+    return anchors, np.array([limb.attachment.transform[:3, 3] for limb in robot.assembly.limbs])
+
+
+def best_position(robot, q, sigmas):
+    """Position that minimises the weighted sum of squared length errors, by scipy."""
+    anchors, attached = points(robot)
+    lengths = line_lengths(robot, q)
+
+    def misfit(x):
+        return (np.linalg.norm(x + attached - anchors, axis=1) - lengths) / sigmas
+
+    return least_squares(misfit, robot.home[:3, 3], xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+
+
+@pytest.mark.parametrize("sigmas", [(1.0, 1.0, 1.0, 1.0), (1.0, 5.0, 0.2, 2.0)])
+def test_contradicting_readings_give_the_pose_of_least_squares(sigmas):
+    robot = cable_robot(tuple(1e-3 * s for s in sigmas))
+    rng = np.random.default_rng(2)
+    asked = np.array([robot.home[:3, 3]]) + rng.uniform(-0.1, 0.1, (5, 3))
+    q = inverse(robot, asked).q
+    q = q + rng.normal(size=q.shape) * 1e-3 * np.abs(q).max()
+    sol = forward(robot, q)
+    assert (sol.status == Status.CONVERGED).all()
+    gains = np.array([abs(a.terms.get("gain", 1.0)) for a in robot.actuators])
+    for i, row in enumerate(q):
+        # scipy stops at about the square root of rounding in x, the gap being millimetres
+        assert_allclose(sol.T[i, :3, 3], best_position(robot, row, np.array(sigmas) * gains), atol=1e-7 * robot.size)
+    assert (sol.residual > 1e-6).all()
+
+
+def test_consistent_readings_leave_nothing_open():
+    robot = cable_robot((1e-3, 5e-3, 2e-4, 2e-3))
+    asked = np.array([robot.home[:3, 3]]) + np.random.default_rng(3).uniform(-0.1, 0.1, (20, 3))
+    sol = forward(robot, inverse(robot, asked).q)
+    assert_allclose(sol.T[:, :3, 3], asked, atol=1e-12)
+    assert sol.residual.max() <= 1e-12
+
+
+def test_poses_follow_readings_as_linearised():
+    robot = cable_robot((1e-3, 5e-3, 2e-4, 2e-3))
+    q = inverse(robot, np.array([robot.home[:3, 3]]) + 0.05).q
+    values = robot.values[None]
+
+    def position(readings):
+        return forward(robot, readings[None]).T[0, :3, 3]
+
+    def slopes(readings):
+        state = forward_trials(robot, values, readings[None, None])
+        return sensitivity(robot, values, readings[None, None], state).readings[0, 0, 3:]
+
+    check_jacobian(position, slopes(q[0]), q[0], scale=1e-2, atol=1e-9, atol_reason="poses solved to 1e-13 of metres, steps of 1e-2")
