@@ -104,9 +104,7 @@ def check_jacobian(
         raise AssertionError(f"Jacobian of shape {analytic.shape}, differences of shape {difference.shape}")
     scaled_bound = bound * scales
     if np.max(scaled_bound) > max(_USEFUL * largest, atol):
-        raise AssertionError(
-            f"differences too coarse to prove anything: bound {scaled_bound}, entries to {largest:.3g}"
-        )
+        raise AssertionError(f"differences too coarse to prove anything: bound {scaled_bound}, entries to {largest:.3g}")
     _compare("central differences", analytic, difference * scales, scaled_bound + atol, atol_reason)
     if automatic is not None:
         reference = automatic_derivative(automatic, point, package) * scales

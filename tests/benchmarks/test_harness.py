@@ -15,14 +15,7 @@ BASELINE = {"fit": {"value": 4.0}}
 
 @pytest.mark.parametrize(
     ("value", "direction", "faults"),
-    [
-        (4.9, "lower", 0),
-        (5.1, "lower", 1),
-        (0.1, "lower", 0),
-        (3.1, "higher", 0),
-        (2.9, "higher", 1),
-        (9.0, "higher", 0),
-    ],
+    [(4.9, "lower", 0), (5.1, "lower", 1), (0.1, "lower", 0), (3.1, "higher", 0), (2.9, "higher", 1), (9.0, "higher", 0)],
 )
 def test_only_a_worsening_beyond_the_tolerance_fails(value: float, direction: str, faults: int) -> None:
     metric = Metric("fit", value, direction=direction, tolerance=0.25)  # pyright: ignore[reportArgumentType]

@@ -86,4 +86,4 @@ def test_poses_follow_readings_as_linearised():
         state = forward_trials(robot, values, readings[None, None])
         return sensitivity(robot, values, readings[None, None], state).readings[0, 0, 3:]
 
-    check_jacobian(position, slopes(q[0]), q[0], scale=1e-2, atol=1e-9, atol_reason="poses solved to 1e-13 of metres, steps of 1e-2")
+    check_jacobian(position, slopes(q[0]), q[0], scale=1e-2, atol=1e-9, atol_reason="poses solved to 1e-13, steps of 1e-2")
