@@ -20,7 +20,7 @@ def rows() -> np.ndarray:
 
 def estimate(rows: np.ndarray, method) -> np.ndarray:
     """Deviation (t, p) that the method finds for linear rows [A | b]."""
-    d = decompose(folded(rows), np.full(len(rows), rows.shape[1]), scale=method.scale(P))
+    d = decompose(folded(rows), np.full(len(rows), rows.shape[1]), scale=method.scale(P), flat=method.flat(P))
     return d.deviation(d.solution(method.penalty(d)))
 
 
@@ -41,6 +41,63 @@ def test_ridge_equals_the_penalty_written_as_extra_rows(rows):
 def test_one_lambda_per_parameter_equals_extra_rows_of_different_weight(rows):
     lam = np.array([1.0, 0.1, 20.0, 3.0, 1e-3, 5.0])
     np.testing.assert_allclose(estimate(rows, Ridge(tuple(lam))), stacked(rows, lam), rtol=1e-12)
+
+
+def test_a_parameter_with_lambda_zero_is_not_held_back(rows):
+    lam = np.array([1.0, 0.0, 20.0, 3.0, 0.0, 5.0])
+    method = Ridge(tuple(lam))
+    d = decompose(folded(rows), np.full(T, M), scale=method.scale(P), flat=method.flat(P))
+    penalty = method.penalty(d)
+    np.testing.assert_allclose(d.deviation(d.solution(penalty)), stacked(rows, lam), rtol=1e-12)
+    for r, c in zip(rows, d.covariance(penalty), strict=True):
+        np.testing.assert_allclose(c @ (r[:, :P].T @ r[:, :P] + np.diag(lam)), np.eye(P), atol=1e-12)
+    assert method.needs(P) == 2
+    # all alike: the plain method
+    assert np.array_equal(estimate(rows, Ridge((0.0,) * P)), estimate(rows, LeastSquares()))
+    plain = decompose(folded(rows), np.full(T, M))
+    np.testing.assert_allclose(
+        decompose(folded(rows), np.full(T, M), flat=method.flat(P)).plain().singular_values, plain.singular_values, rtol=1e-12
+    )
+
+
+def test_an_unseen_parameter_with_lambda_zero_stays_unknown_and_leaves_the_others_alone(rows):
+    rows = rows.copy()
+    rows[:, :, 4] = rows[:, :, 1]
+    flat = np.array([False, True, False, False, True, False])
+    d = decompose(folded(rows), np.full(T, M), flat=flat)
+    assert d.flat is not None
+    penalty = np.where(d.flat, np.where(d.used, 0.0, np.inf), 1.0)
+    sd = d.standard_deviations(penalty)
+    assert np.isinf(sd[:, flat]).all()
+    assert np.isfinite(sd[:, ~flat]).all()
+    np.testing.assert_allclose(d.deviation(d.solution(penalty)), stacked(rows, 1.0 - flat), rtol=1e-10)
+    V, variance, seen = d.knowledge(penalty)
+    np.testing.assert_allclose(V.T @ V, np.eye(P), atol=1e-12)
+    assert np.isinf(variance).sum() == 1
+    assert seen.sum() == 5
+    known = np.isfinite(variance)
+    finite = (V[:, known] * variance[known]) @ V[:, known].T
+    np.testing.assert_allclose(np.diag(finite)[~flat], sd[0, ~flat] ** 2, rtol=1e-10)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7])
+def test_ridge_in_every_step_is_another_filter_that_tends_to_least_squares(rows, steps):
+    lam = 3.0
+    A, b = rows[0, :, :P], rows[0, :, P]
+    z = np.zeros(P)
+    for _ in range(steps):
+        z = z + np.linalg.solve(A.T @ A + lam * np.eye(P), A.T @ (b - A @ z))
+    d = decompose(folded(rows[:1]), np.array([M]))
+    f = 1.0 - (lam / (d.singular_values**2 + lam)) ** steps
+    np.testing.assert_allclose(z, d.deviation(f * d.projections / d.singular_values)[0], rtol=1e-12, atol=1e-14)
+
+
+def test_map_is_ridge_one_on_columns_scaled_by_their_spread(rows):
+    spread = np.array([0.5, 2.0, 1.0, 3.0, 0.1, 1.0])
+    scaled = rows.copy()
+    scaled[:, :, :P] *= spread
+    lam = tuple(1.0 / spread**2)
+    np.testing.assert_allclose(spread * estimate(scaled, MAP()), estimate(rows, Ridge(lam)), rtol=1e-12)
 
 
 def test_map_is_ridge_with_lambda_one(rows):

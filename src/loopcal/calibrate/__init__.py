@@ -28,6 +28,8 @@ from loopcal.calibrate.identification import Identification as Identification
 from loopcal.calibrate.identify import IdentifiedTrials as IdentifiedTrials
 from loopcal.calibrate.identify import identify as identify
 from loopcal.calibrate.identify import identify_trials as identify_trials
+from loopcal.calibrate.leave_one_out import LeaveOneOut as LeaveOneOut
+from loopcal.calibrate.leave_one_out import leave_one_out as leave_one_out
 from loopcal.calibrate.losses import Huber as Huber
 from loopcal.calibrate.losses import Tukey as Tukey
 from loopcal.calibrate.monte_carlo import MonteCarlo as MonteCarlo

@@ -157,6 +157,6 @@ def _sentence(outliers: tuple[Outlier, ...], tested: int, level: float, found: I
     if not outliers:
         return f"all {tested} blocks of rows fit each other (false alarm in {level:.0%} of data sets)"
     return (
-        f"{len(outliers)} of {tested} blocks of rows do not fit the others (chance names one in {level:.0%} of right data sets):"
+        f"{len(outliers)} of {tested} blocks of rows do not fit the others (chance names one in {level:.0%} of right data):"
         " look at them; leave them out with drop, or fit with a loss"
     )

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an identification costs: against numpy's own decompositions, with a prior, for many filters, trials and poses."""
+
+import statistics
+import tracemalloc
+
+import numpy as np
+
+from benchmarks.harness import Metric, measure_ratio, time_in_turns
+from loopcal.calibrate import MAP, LeastSquares, identify, identify_trials, leave_one_out
+from loopcal.calibrate.leave_one_out import path_of_methods
+from loopcal.calibrate.rows import rows_of
+from loopcal.calibrate.scaling import unknowns
+from loopcal.io import load_robot
+from loopcal.measure import Gaussian, Instrument, Measurements, Pose, Sensor, sample_truth, simulate, simulate_trials
+from loopcal.mechanism import Mechanism
+
+UM, URAD = 1e-6, 1e-6
+TRIALS = 1000
+SIZES = (1_000, 10_000, 100_000)
+
+
+def _tracker() -> Instrument:
+    return Instrument((Sensor(Pose(), Gaussian(np.array([5 * URAD] * 3 + [UM] * 3))),))
+
+
+def _poses(robot: Mechanism, n: int) -> np.ndarray:
+    """Random controlled coordinates in the workspace."""
+    ranges = np.array([robot.assembly.workspace[name] for name in robot.controlled])
+    return np.random.default_rng(0).uniform(ranges[:, 0], ranges[:, 1], (n, len(ranges)))
+
+
+def _measured(robot: Mechanism, n: int) -> Measurements:
+    """A machine drawn from the tolerances, measured in n poses."""
+    truth = robot.with_values(sample_truth(robot, 1, 0)[0])
+    return simulate(truth, _poses(robot, n), _tracker(), 0)
+
+
+def bench_fit() -> Metric:
+    """Fit 42 parameters to 50 poses, against the singular value decompositions of its steps' matrices alone."""
+    robot = load_robot("hexapod-42")
+    data = _measured(robot, 50)
+    steps = identify(robot, data, LeastSquares()).iterations
+    A = np.random.default_rng(0).normal(size=(300, 42))
+
+    def decompositions() -> None:
+        for _ in range(steps):
+            np.linalg.svd(A, full_matrices=False)
+
+    return measure_ratio(
+        "identify.fit_of_its_svds", lambda: identify(robot, data, LeastSquares()), decompositions, repeats=31, limit=6.0
+    )
+
+
+def bench_map() -> Metric:
+    """MAP with its covariance, conflict test and widening by rule, against the least-squares fit."""
+    robot = load_robot("hexapod-42")
+    data = _measured(robot, 50)
+    return measure_ratio(
+        "identify.map_of_least_squares",
+        lambda: (identify(robot, data, MAP()).covariance, identify(robot, data).covariance),
+        lambda: (identify(robot, data, LeastSquares()), identify(robot, data, LeastSquares())),
+        repeats=31,
+        limit=1.5,
+    )
+
+
+def bench_filters() -> Metric:
+    """Forty ridge parameters and all truncations with leave-one-out from one linearisation, against one fit."""
+    robot = load_robot("hexapod-42")
+    data = _measured(robot, 50)
+    fit = identify(robot, data, LeastSquares())
+    methods = path_of_methods(1.0, 40, 42)
+    return measure_ratio(
+        "identify.paths_of_one_fit",
+        lambda: leave_one_out(fit.robot, data, methods),
+        lambda: identify(robot, data, LeastSquares()),
+        repeats=15,
+        limit=5.0,
+    )
+
+
+def bench_trials() -> Metric:
+    """A thousand simulated machines at once, against one after the other (a twentieth of them), time for each fit."""
+    robot = load_robot("hexapod-42")
+    trials = simulate_trials(robot, sample_truth(robot, TRIALS, 0), _poses(robot, 50), _tracker(), 0)
+    single = [trials.trial(i) for i in range(0, TRIALS, 20)]
+    alone, together = time_in_turns(
+        lambda: [identify(robot, data, LeastSquares()) for data in single],
+        lambda: identify_trials(robot, trials, LeastSquares()),
+        repeats=3,
+    )
+    value = statistics.median(20 * a / b for a, b in zip(alone, together, strict=True))
+    note = f"{statistics.median(together) / TRIALS * 1e3:.3g} ms a fit"
+    return Metric("identify.stacked_speed_up", value, "1", "higher", 0.25, 1.5, note)
+
+
+def bench_poses() -> list[Metric]:
+    """Exponent of the cost over the number of poses, and growth of the memory of folding, up to 1e5 poses."""
+    robot = load_robot("hexapod-42")
+    largest = _measured(robot, SIZES[-1])
+    parts = [largest.take(np.arange(n)) for n in SIZES[:-1]] + [largest]
+    times = time_in_turns(*(lambda d=d: identify(robot, d, LeastSquares()) for d in parts), repeats=2)
+    seconds = [min(t) for t in times]
+    exponent = float(np.polyfit(np.log(SIZES), np.log(seconds), 1)[0])
+    memory = [_memory_of_folding(robot, d) for d in parts]
+    return [
+        Metric("identify.exponent_of_poses", exponent, "1", "lower", 0.05, 1.05, f"{seconds[-1]:.3g} s for 1e5 poses"),
+        Metric("identify.memory_of_poses", memory[2] / memory[1], "1", "lower", 0.1, 1.1, f"{memory[2] / 1e6:.3g} MB"),
+    ]
+
+
+def _memory_of_folding(robot: Mechanism, data: Measurements) -> float:
+    """Peak of what one folding of the rows allocates [bytes], its input not counted."""
+    free = unknowns(robot)
+    rows = rows_of(free, data)
+    z = free.deviation(robot.values[None])
+    rows.fold(z, np.arange(1))
+    tracemalloc.start()
+    rows.fold(z, np.arange(1))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return float(peak)
