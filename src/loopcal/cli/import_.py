@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal import`: a robot file, and measurements, from a file of another program."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from loopcal.cli import show
+from loopcal.cli.options import FILE, Quantity, json_option
+from loopcal.errors import DataError
+from loopcal.units import Dimension, symbols
+
+if TYPE_CHECKING:
+    from loopcal.calibrate import Identification
+    from loopcal.io.formats.exchange import Format, Reading
+    from loopcal.mechanism import Mechanism
+
+FORMATS = ("klipper", "marlin", "reprap", "linuxcnc")
+LENGTH = Quantity(Dimension.LENGTH)
+ASKED = {
+    "sigma_height": "--sigma-height",
+    "sigma_distance": "--sigma-distance",
+    "length_unit": "--unit",
+    "home_height": "--home-z",
+    "closures": "--closures",
+}
+
+
+@click.command("import", short_help="Read a controller's file as a robot file.")
+@click.argument("file", metavar="FILE", type=FILE)
+@click.option("--format", "format_name", type=click.Choice(FORMATS), help="What FILE is; by the ending of its name.")
+@click.option("-o", "--output", required=True, type=FILE, help="The robot file to write; the robot is called after it.")
+@click.option("--data", type=FILE, help="Also write the measurements that FILE holds.")
+@click.option("--corrected", type=FILE, help="Also calibrate with them, and write FILE with the corrected numbers.")
+@click.option("--sigma-height", type=LENGTH, metavar="QUANTITY", help="Noise of the probe (klipper); 0.02mm if left out.")
+@click.option("--sigma-distance", type=LENGTH, metavar="QUANTITY", help="Noise of distances (klipper); 0.1mm if left out.")
+@click.option("--unit", "length_unit", type=click.Choice(symbols(Dimension.LENGTH)), help="Of lengths (linuxcnc).")
+@click.option("--home-z", "home_height", type=LENGTH, metavar="QUANTITY", help="Height of the home pose (linuxcnc).")
+@click.option("--force", is_flag=True, help="Replace files that are there.")
+@json_option
+def import_(
+    file: Path, format_name: str | None, output: Path, data: Path | None, corrected: Path | None, force: bool, as_json: bool,
+    **asked: Any,
+) -> int:  # fmt: skip
+    """Read FILE, which another program wrote, as a robot file and, where it holds any, measurements.
+
+    With --corrected the exit code is 2 where the calibration did not converge.
+
+    \b
+    Examples:
+      loopcal import printer.cfg -o printer.yaml --data heights.csv
+      loopcal import printer.cfg -o printer.yaml --data heights.csv --corrected corrected.cfg
+      loopcal import config-override.g --format reprap -o printer.yaml
+      loopcal import hexapod.hal --unit mm --home-z 200mm -o hexapod.yaml
+    """  # noqa: D301
+    from loopcal.io.formats.transfer import format_of, save_imported
+    from loopcal.io.new_robot import refuse_existing
+
+    source = format_of(file, format_name)
+    if source.read is None:
+        raise DataError(f"loopcal writes the format {source.name}, but does not read it; known are {', '.join(FORMATS)}")
+    if corrected is not None and data is None:
+        raise DataError("--corrected calibrates with the measurements in the file; say where to write them, as --data data.csv")
+    for path in (output, data, corrected):
+        if path is not None:
+            refuse_existing(path, force)
+    found = source.read(file, _reading(source, output.stem, asked))
+    robot = save_imported(file, found, output, data)
+    fit = None if corrected is None or data is None else _corrected(source, robot, file, data, corrected)
+    document: dict[str, Any] = {"robot": output, "data": data, "corrected": corrected, "notes": found.notes}
+    if as_json:
+        show.json_document(document | {"fit": None if fit is None else fit[0].to_dict(), "changes": fit and fit[1]})
+    else:
+        _print(robot, document, fit)
+    return show.gates([] if fit is None or fit[0].converged else [f"not converged: {fit[0].status.sentence}"])
+
+
+def _reading(source: Format, name: str, asked: dict[str, Any]) -> Reading:
+    """What the options say; one that does not belong to the format is refused."""
+    from loopcal.io.formats.exchange import Reading
+
+    given = {key: value for key, value in asked.items() if value is not None}
+    for key in given:
+        if key not in source.reads:
+            raise DataError(f"{ASKED[key]} does not belong to the format {source.name}; leave it out")
+    return Reading(name, **given)
+
+
+def _corrected(
+    source: Format, robot: Mechanism, file: Path, data: Path, output: Path
+) -> tuple[Identification, tuple[str, ...]]:
+    """Calibrate with what was read, and write the corrected file."""
+    from loopcal.calibrate import identify
+    from loopcal.io import load_measurements
+    from loopcal.io.formats.exchange import Source
+    from loopcal.io.formats.transfer import exported
+    from loopcal.io.text_file import write_text
+
+    fit = identify(robot, load_measurements(data, robot))
+    written = exported(Source(fit.robot), source, file)
+    write_text(output, written.text)
+    return fit, written.notes
+
+
+def _print(robot: Mechanism, document: dict[str, Any], fit: tuple[Identification, tuple[str, ...]] | None) -> None:
+    """Print what was read, what was found, and which lines were changed."""
+    free = int(robot.parameters.free.sum())
+    show.say(f"{document['robot']}: {len(robot.actuators)} actuators, {len(robot.parameters)} parameters, {free} free")
+    if document["data"] is not None:
+        show.say(f"{document['data']}: the measurements of the file")
+    for note in document["notes"]:
+        show.say(f"note: {note}")
+    if fit is None:
+        data = document["data"] or "DATA"
+        show.say(f"next: loopcal calibrate {document['robot']} {data} -o run")
+        return
+    found, changes = fit
+    show.parameters(f"{robot.name}: {len(found.names)} parameters", found.to_dict()["parameters"])
+    show.say(f"\n{found.status.sentence}; rank {found.rank} of {len(found.names)}; chi-square {found.chi_square:.5g}")
+    for note in (*found.notes, *changes):
+        show.say(f"note: {note}" if note in found.notes else note)
+    show.say(f"written to {document['corrected']}; nothing else in it was changed")

@@ -1,0 +1,15 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files of other programs, one format in each module: read as a robot file and measurements, written corrected.
+
+A format is a `Format` with `read`, `write` or both; its line in `FORMATS` is all that the command line needs.
+"""
+
+from collections.abc import Mapping
+
+from loopcal.io.formats import klipper, linuxcnc, marlin, parameters, reprap
+from loopcal.io.formats.exchange import Format
+
+FORMATS: Mapping[str, Format] = {
+    found.name: found
+    for found in (klipper.FORMAT, marlin.FORMAT, reprap.FORMAT, linuxcnc.FORMAT, parameters.JSON, parameters.CSV)
+}

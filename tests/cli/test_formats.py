@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal import` and `loopcal export`: files of controllers in, corrected files out, nothing else in them changed."""
+
+import difflib
+import json
+
+import numpy as np
+import pytest
+
+from loopcal.cli import main
+from loopcal.io import load_measurements, load_robot
+from tests.cli.delta_printers import every_record, stored
+from tests.io.formats.printers import printer_cfg
+
+FIRMWARE_CALIBRATED = (
+    "cupsster/FLSUN-SR---Klipper-Config Configuration/printer.cfg",
+    "danorder/Flsun-super-racer-Full-klipper-config- printer.cfg",
+    "fzechert/FLSun-V400 printer-config/printer.cfg",
+)
+WITH_DISTANCES = "RazorCopter/Klipper_FLSUN_Q5 printer [Post-Calibration].cfg"
+ONE_COMMAND = "import printer.cfg -o printer.yaml --data heights.csv --corrected corrected.cfg"
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(command: str) -> int:
+    """Exit code of a command line."""
+    return main(command.split())
+
+
+def changed(before: str, after: str) -> list[str]:
+    """Lines that differ, as they are afterwards."""
+    return [line[2:] for line in difflib.ndiff(before.splitlines(), after.splitlines()) if line.startswith("+ ")]
+
+
+@pytest.mark.parametrize("name", sorted((*FIRMWARE_CALIBRATED, WITH_DISTANCES)))
+def test_a_printer_cfg_gives_its_geometry_and_every_probe(folder, data_folder, name) -> None:
+    record = every_record(data_folder)[name]
+    (folder / "printer.cfg").write_text(printer_cfg(record))
+    assert run("import printer.cfg -o printer.yaml --data data.csv") == 0
+    robot = load_robot("printer.yaml")
+    for parameter, value in stored(record).items():
+        factor = np.pi / 180 if parameter.endswith("angle") else 1e-3
+        assert robot.values[robot.parameters.index(parameter)] == pytest.approx(value * factor, abs=1e-12)  # [m, rad]
+    data = load_measurements("data.csv", robot)
+    assert data.n_rows == len(record["heights"]) + len(record["distances"])
+    steps = np.array(record["heights"][0]["stable_steps"]) * record["geometry_stored_in_config"]["stepdist"]
+    np.testing.assert_allclose(data.readings[data.labels.index("height0")], steps * 1e-3, rtol=0, atol=1e-12)  # [m]
+    # the arms are to be identified only where distances can tell them
+    assert int(robot.parameters.free.sum()) == (9 if record["distances"] else 6)
+
+
+@pytest.mark.parametrize("name", FIRMWARE_CALIBRATED)
+def test_one_command_corrects_a_printer_whose_stops_are_far_off(folder, capsys, data_folder, name) -> None:
+    record = every_record(data_folder)[name]
+    text = printer_cfg(record, stop_off=20.0)
+    (folder / "printer.cfg").write_text(text)
+    assert run(ONE_COMMAND) == 0
+    out = capsys.readouterr().out
+    corrected = (folder / "corrected.cfg").read_text()
+    assert run("import corrected.cfg -o again.yaml") == 0
+    again = load_robot("again.yaml")
+    for parameter, value in stored(record).items():
+        factor = np.pi / 180 if parameter.endswith("angle") else 1e-3
+        assert abs(again.values[again.parameters.index(parameter)] / factor - value) < 2e-3, f"{parameter} [mm, deg]"
+    # six numbers were identified, so at most six lines are others, all of them options of the geometry
+    lines = changed(text, corrected)
+    assert 3 <= len(lines) <= 6
+    assert all(line.removeprefix("#*# ").startswith(("delta_radius", "angle", "position_endstop")) for line in lines)
+    assert len(text.splitlines()) == len(corrected.splitlines())
+    assert f"delta_radius {record['geometry_stored_in_config']['radius']:.6f} ->" in out or "delta_radius" not in str(lines)
+
+
+def test_the_chain_of_three_commands_reads_back_equal(folder, data_folder) -> None:
+    record = every_record(data_folder)[FIRMWARE_CALIBRATED[0]]
+    (folder / "printer.cfg").write_bytes(b"\xef\xbb\xbf" + printer_cfg(record, stop_off=5.0).replace("\n", "\r\n").encode())
+    assert run("import printer.cfg -o printer.yaml --data data.csv --sigma-height 50um") == 0
+    assert run("calibrate printer.yaml data.csv -o run --noise estimated") == 0
+    assert run("export run --format klipper --into printer.cfg -o corrected.cfg") == 0
+    before, after = (folder / "printer.cfg").read_bytes(), (folder / "corrected.cfg").read_bytes()
+    assert before != after
+    assert after.startswith(b"\xef\xbb\xbf")
+    assert before.count(b"\r\n") == after.count(b"\r\n") == after.count(b"\n")
+    assert run("import corrected.cfg -o again.yaml") == 0
+    found, again = load_robot("run/robot.yaml"), load_robot("again.yaml")
+    # six decimals are written [mm, deg]
+    np.testing.assert_allclose(again.values, found.values, rtol=0, atol=1e-8)
+    assert run("export again.yaml --format klipper --into corrected.cfg -o twice.cfg") == 0
+    assert (folder / "twice.cfg").read_bytes() == after
+
+
+def test_json_and_csv_hold_every_parameter_with_its_interval(folder, capsys, data_folder) -> None:
+    (folder / "printer.cfg").write_text(printer_cfg(every_record(data_folder)[FIRMWARE_CALIBRATED[0]]))
+    assert run("import printer.cfg -o printer.yaml --data data.csv") == 0
+    assert run("calibrate printer.yaml data.csv -o run") == 0
+    assert run("export run -o found.json") == 0
+    assert run("export run -o found.csv --json") == 0
+    document = json.loads((folder / "found.json").read_text())
+    result = json.loads((folder / "run" / "result.json").read_text())
+    half = {row["name"]: row["plus_minus"] for row in result["fit"]["parameters"]}
+    robot = load_robot("run/robot.yaml")
+    assert [row["name"] for row in document["parameters"]] == list(robot.parameters.names)
+    csv_rows = (folder / "found.csv").read_text().splitlines()
+    assert csv_rows[0] == "name,nominal,value,plus_minus,unit,free"
+    for row, line, value in zip(document["parameters"], csv_rows[1:], robot.values, strict=True):
+        factor = np.pi / 180 if row["unit"] == "deg" else 1e-3
+        assert row["value"] * factor == value
+        assert float(line.split(",")[2]) * factor == value
+        assert row["plus_minus"] == half.get(row["name"])
+        assert row["free"] == (row["name"] in half)
+
+
+def test_files_that_are_there_stay_without_force(folder, capsys, data_folder) -> None:
+    (folder / "printer.cfg").write_text(printer_cfg(every_record(data_folder)[WITH_DISTANCES]))
+    (folder / "printer.yaml").write_text("mine")
+    assert run("import printer.cfg -o printer.yaml") == 1
+    assert "this file exists" in capsys.readouterr().err
+    assert (folder / "printer.yaml").read_text() == "mine"
+    assert run("import printer.cfg -o printer.yaml --force") == 0
+    assert run("export printer.yaml --format klipper --into printer.cfg -o printer.cfg") == 1
+    assert run("export printer.yaml --format klipper --into printer.cfg -o printer.cfg --force") == 0
+
+
+@pytest.mark.parametrize(
+    ("command", "sentence"),
+    [
+        ("import no.cfg -o x.yaml", "no.cfg: there is no such printer.cfg"),
+        ("import a.txt -o x.yaml", "the name of this file tells no format"),
+        ("import a.csv -o x.yaml", "loopcal writes the format csv, but does not read it"),
+        ("import a.cfg -o x.yaml --corrected y.cfg", "say where to write them, as --data data.csv"),
+        ("import a.cfg -o x.yaml --unit mm", "--unit does not belong to the format klipper"),
+        ("import a.hal -o x.yaml --sigma-height 1mm", "--sigma-height does not belong to the format linuxcnc"),
+        ("export hexapod-42 --format klipper -o x.cfg", "is not a robot of the family linear-delta"),
+        ("export linear-delta --format linuxcnc -o x.hal", "is not a hexapod of the family gough"),
+        ("export linear-delta -o x.csv --into y.csv", "the format csv is written whole; leave out --into"),
+        ("export linear-delta --format klipper --into no.cfg -o x.cfg", "no.cfg: there is no such printer.cfg"),
+    ],
+)
+def test_bad_use_is_one_sentence(folder, capsys, command, sentence) -> None:
+    assert run(command) == 1
+    error = capsys.readouterr().err
+    assert sentence in error
+    assert error.count("\n") == 1
+    assert list(folder.iterdir()) == []

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""M665 and M666 of Marlin and RepRapFirmware: read, written, written into a file, and what they do not share."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal.errors import FileError
+from loopcal.io import load_robot, save_robot
+from loopcal.io.formats import FORMATS
+from loopcal.io.formats.exchange import Reading, Source
+from loopcal.io.formats.transfer import checked
+from loopcal.mechanism import Mechanism
+
+REPRAP = """\
+; config-override.g, ours ; keep
+M665 L269.100:269.200:269.300 R130.250 H301.500 B140.0 X-0.100 Y0.200 Z0.000
+G28 ; home
+M666 X0.500 Y-0.200 Z-0.300 A0.00 B0.00
+M307 H0 A139.0 X9
+"""
+MARLIN = """\
+echo:; Delta settings:
+echo:  M665 L269.10 R130.25 H300.00 S100.00 X-0.10 Y0.20 Z0.00 A0.00 B0.10 C-0.10
+echo:  M666 X-0.50 Y0.00 Z-0.25
+echo:  M851 X0.00 Y0.00 Z-1.50 ; (mm)
+"""
+
+
+def imported(folder: Path, name: str, text: str) -> Mechanism:
+    path = folder / f"{name}.g"
+    path.write_text(text)
+    read = FORMATS[name].read
+    assert read is not None
+    return checked(path, read(path, Reading("printer")))
+
+
+def exported(robot: Mechanism, name: str, into: Path | None = None) -> str:
+    write = FORMATS[name].write
+    assert write is not None
+    return write(Source(robot), into).text
+
+
+def value(robot: Mechanism, name: str) -> float:
+    """In mm or degrees."""
+    found = float(robot.values[robot.parameters.index(name)])
+    return math.degrees(found) if name.endswith("angle") else found * 1e3
+
+
+def test_reprap_stops_are_the_homed_height_plus_the_adjustments(tmp_path) -> None:
+    robot = imported(tmp_path, "reprap", REPRAP)
+    assert [value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx([302.0, 301.3, 301.2])
+    assert [value(robot, f"tower{k}.angle") for k in (1, 2, 3)] == pytest.approx([209.9, 330.2, 90.0])
+    assert [value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx([269.1, 269.2, 269.3])
+    assert value(robot, "radius") == pytest.approx(130.25)
+
+
+def test_marlin_stops_are_the_height_less_the_adjustments_and_the_probe(tmp_path) -> None:
+    robot = imported(tmp_path, "marlin", MARLIN)
+    assert [value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx([302.0, 301.5, 301.75])
+    assert [value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx([269.1, 269.2, 269.0])
+
+
+@pytest.mark.parametrize(("name", "text"), [("reprap", REPRAP), ("marlin", MARLIN)])
+def test_a_file_whose_numbers_are_already_these_stays_byte_for_byte(tmp_path, name, text) -> None:
+    robot = imported(tmp_path, name, text)
+    assert exported(robot, name, tmp_path / f"{name}.g") == text
+
+
+@pytest.mark.parametrize(("name", "text"), [("reprap", REPRAP), ("marlin", MARLIN)])
+def test_corrected_words_read_back_equal_and_nothing_else_changes(tmp_path, name, text) -> None:
+    robot = imported(tmp_path, name, text)
+    shift = 1e-3 * np.random.default_rng(3).uniform(-1, 1, len(robot.values))
+    shift[robot.parameters.index("tower3.angle")] = 0.0
+    robot = robot.with_values(robot.values + shift)
+    for into in (tmp_path / f"{name}.g", None):
+        written = exported(robot, name, into)
+        again = imported(tmp_path, name, written)
+        # six decimals are written; two such numbers make a stop [mm, deg]
+        np.testing.assert_allclose(again.values, robot.values, rtol=0, atol=9e-9)
+        if into is not None:
+            changed = [(a, b) for a, b in zip(text.splitlines(), written.splitlines(), strict=True) if a != b]
+            assert [a for a, _ in changed] == [line for line in text.splitlines() if "M665" in line or "M666" in line]
+            assert ("B140.0" in written) == ("B140.0" in text)
+        if into is not None:
+            into.write_text(text)
+
+
+def test_the_two_firmwares_say_the_same_printer_with_opposite_signs(tmp_path) -> None:
+    robot = imported(tmp_path, "reprap", REPRAP)
+    marlin = exported(robot, "marlin")
+    assert "M666 X0.000000 " not in marlin
+    assert "M666 X-0.800000 Y-0.100000 Z-0.000000" in marlin or "M666 X-0.800000 Y-0.100000 Z0.000000" in marlin
+    again = imported(tmp_path, "marlin", marlin)
+    np.testing.assert_allclose(again.values, robot.values, rtol=0, atol=2e-9)
+
+
+def test_a_word_that_is_not_there_is_added_before_the_comment(tmp_path) -> None:
+    text = "M665 L250 R130 H300 ; ours\r\n"
+    robot = imported(tmp_path, "reprap", text)
+    shift = 1e-3 * np.eye(10)[1]
+    save_robot(robot.with_values(robot.values + shift), tmp_path / "other.yaml")
+    moved = load_robot(tmp_path / "other.yaml")
+    (tmp_path / "reprap.g").write_bytes(text.encode())
+    assert exported(moved, "reprap", tmp_path / "reprap.g") == "M665 L250 R130 H300 X0.057296 ; ours\r\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "sentence"),
+    [
+        ("reprap", "G28\n", "there is no M665 in this file"),
+        ("reprap", "M665 R1 H2\n", "M665 states no L"),
+        ("reprap", "G20\nM665 L2 R1 H2\n", r":1: G20 asks for inches"),
+        ("reprap", "G28\nM665 L2:2:2:2 R1 H2\n", r":2: L of M665 has 4 lengths"),
+        ("reprap", "M665 L250 R130 H2-3\n", r":1: H of M665 is '2-3' where a finite number is needed"),
+        ("reprap", "M665 L250 R130 H200\nM666 A0.3\n", r":2: M666 A tilts the bed"),
+        ("reprap", "M665 L100 R130 H200\n", "the delta radius is 130 mm and the shortest arm 100 mm"),
+        ("marlin", "M665 L250 R130 H200 B80\n", r":1: M665 B without A and C"),
+        ("marlin", "M665 L250 R130 H200\nM666 X0.1\n", r":2: M666 X is 0.1, but Marlin takes none above zero"),
+    ],
+)
+def test_bad_files_are_refused_with_their_line(tmp_path, name, text, sentence) -> None:
+    with pytest.raises(FileError, match=sentence):
+        imported(tmp_path, name, text)

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Klipper's printer.cfg: which option counts, Klipper's defaults, options that are not there yet, and bad files."""
+
+import numpy as np
+import pytest
+
+from loopcal.errors import FileError
+from loopcal.io.formats import klipper, printer_cfg
+from loopcal.io.formats.exchange import Reading, Source
+from loopcal.io.formats.transfer import checked
+
+SHORT = """\
+[printer]
+kinematics: delta
+delta_radius: 130
+[stepper_a]
+arm_length = 250 ; mm
+position_endstop: 300
+rotation_distance: 40
+microsteps: 16
+[stepper_b]
+[stepper_c]
+"""
+SAVED = """
+#*# <---------------------- SAVE_CONFIG ---------------------->
+#*# DO NOT EDIT THIS BLOCK OR BELOW. The contents are auto-generated.
+#*#
+#*# [stepper_b]
+#*# angle = 330.500000
+#*#
+#*# [printer]
+#*# delta_radius = 131.000000
+"""
+
+
+def read(folder, text: str):
+    path = folder / "printer.cfg"
+    path.write_text(text)
+    return checked(path, klipper.read(path, Reading("printer")))
+
+
+def test_defaults_are_those_of_klipper_and_the_main_part_hides_the_saved_one(tmp_path) -> None:
+    (tmp_path / "printer.cfg").write_text(SHORT + SAVED)
+    found = klipper.geometry(printer_cfg.read(tmp_path / "printer.cfg"))
+    assert found.radius == 130.0
+    assert found.angles == (210.0, 330.5, 90.0)
+    assert found.arms == (250.0, 250.0, 250.0)
+    assert found.stops == (300.0, 300.0, 300.0)
+
+
+@pytest.mark.parametrize("text", [SHORT, SHORT + SAVED, SHORT.rstrip("\n"), SHORT + "\n\n"])
+def test_numbers_that_were_left_out_are_added_to_the_saved_block(tmp_path, text) -> None:
+    robot = read(tmp_path, text)
+    moved = robot.with_values(robot.values + 1e-3 * np.arange(1, 11) * (np.array(robot.parameters.names) != "tower3.angle"))
+    written = klipper.write(Source(moved), tmp_path / "printer.cfg").text
+    again = read(tmp_path, written)
+    np.testing.assert_allclose(again.values, moved.values, rtol=0, atol=1e-8)  # six decimals [mm, deg]
+    # without the new lines the old ones are left, but for the numbers that were changed
+    assert written.startswith("[printer]\nkinematics: delta\ndelta_radius: 131.000000\n[stepper_a]\narm_length = ")
+    assert "rotation_distance: 40\nmicrosteps: 16\n[stepper_b]\n[stepper_c]\n" in written
+    assert written.count("SAVE_CONFIG") == 1
+    assert written.count("[stepper_b]") == 2
+
+
+def test_an_arm_that_kept_its_length_is_written_where_its_default_moved(tmp_path) -> None:
+    robot = read(tmp_path, SHORT)
+    values = robot.values.copy()
+    values[robot.parameters.index("arm1.length")] += 1e-3
+    written = klipper.write(Source(robot.with_values(values)), tmp_path / "printer.cfg").text
+    np.testing.assert_allclose(read(tmp_path, written).values, values, rtol=0, atol=1e-9)
+
+
+def test_without_a_file_a_block_to_paste_is_written(tmp_path) -> None:
+    robot = read(tmp_path, SHORT)
+    block = klipper.write(Source(robot), None).text
+    assert block.startswith("#*# <------")
+    assert all(line.startswith("#*#") for line in block.splitlines())
+    pasted = SHORT.replace("delta_radius: 130\n", "").replace("position_endstop: 300\n", "") + "\n" + block
+    np.testing.assert_array_equal(read(tmp_path, pasted).values, robot.values)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (("kinematics: delta", "kinematics: corexy"), ":2: kinematics is 'corexy'"),
+        (("delta_radius: 130", ""), r"option 'delta_radius' of \[printer\] is missing, and has no default|is missing"),
+        (("delta_radius: 130", "[include geometry.cfg]"), "it may stand in geometry.cfg"),
+        (("position_endstop: 300", "position_endstop: high"), ":6: 'position_endstop' of .* is 'high' where a finite number"),
+        (("position_endstop: 300", "position_endstop: inf"), ":6: "),
+        (("arm_length = 250", "arm_length = 120"), "the delta radius is 130 mm and the shortest arm 120 mm"),
+        (("[stepper_c]\n", "[delta_calibrate]\nheight0: 0\nheight0_pos: 1,2\n"), ":12: 'height0_pos' .* has 2 numbers"),
+        (("[stepper_c]\n", "[delta_calibrate]\nheight0: 0\n"), "'height0_pos' of .* is missing"),
+        (
+            ("[stepper_c]\n", "[delta_calibrate]\nheight0: 0\nheight0_pos: 1,2,3\n"),
+            r"'rotation_distance' of \[stepper_b\] is missing",
+        ),
+        (("[stepper_c]\n", SAVED + "[tmc]\n"), ":19: this line stands below SAVE_CONFIG"),
+    ],
+)
+def test_bad_files_are_refused_in_one_sentence(tmp_path, change, sentence) -> None:
+    with pytest.raises(FileError, match=sentence):
+        read(tmp_path, SHORT.replace(*change))
+
+
+@pytest.mark.parametrize("ratio", ["80", "80:0", "a:b", "1:2:3"])
+def test_gear_ratios_that_are_none_are_refused(tmp_path, ratio) -> None:
+    (tmp_path / "printer.cfg").write_text(SHORT.replace("microsteps: 16", f"microsteps: 16\ngear_ratio: {ratio}"))
+    with pytest.raises(FileError, match=":9: gear_ratio is"):
+        klipper.step_distance(printer_cfg.read(tmp_path / "printer.cfg"), "stepper_a")
+
+
+def test_steps_of_geared_motors(tmp_path) -> None:
+    (tmp_path / "printer.cfg").write_text(SHORT.replace("microsteps: 16", "microsteps: 16\ngear_ratio: 57:11, 2:1"))
+    found = klipper.step_distance(printer_cfg.read(tmp_path / "printer.cfg"), "stepper_a")
+    assert found == pytest.approx(40 / (200 * 16 * 57 / 11 * 2), rel=1e-15)
