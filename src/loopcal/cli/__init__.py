@@ -16,7 +16,9 @@ import click
 from loopcal.cli.calibrate import calibrate
 from loopcal.cli.check import check
 from loopcal.cli.compensate import compensate
+from loopcal.cli.export import export
 from loopcal.cli.identifiability import identifiability
+from loopcal.cli.import_ import import_
 from loopcal.cli.new import new
 from loopcal.cli.reproduce import reproduce
 from loopcal.cli.simulate import simulate
@@ -37,7 +39,7 @@ def commands() -> None:
     """  # noqa: D301
 
 
-for _command in (new, check, simulate, identifiability, calibrate, validate, compensate, reproduce):
+for _command in (new, check, simulate, identifiability, calibrate, validate, compensate, reproduce, import_, export):
     commands.add_command(_command)
 
 
