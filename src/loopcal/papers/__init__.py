@@ -64,6 +64,12 @@ PAPERS: Mapping[str, Paper] = {
             "study of a 6-DOF parallel mechanism with 42 kinematic parameters, read as text; no DOI known to us",
             "loopcal.papers.hexapod_42.compare",
         ),
+        Paper(
+            "tsvd-2016",
+            "Least squares, ridge estimation and truncated SVD compared on a 3-PRS and an RU-PUS-PRS manipulator",
+            "Advances in Mechanical Engineering 2016, doi:10.1177/1687814016667908",
+            "loopcal.papers.tsvd_2016.compare",
+        ),
     )
 }
 

@@ -20,6 +20,7 @@ from loopcal.papers.tsvd_2016.study import AppendixNoise, Study, machine, study,
 
 LS, RANKED, RE, TSVD = "LS", "LS with rank detection", "RE", "TSVD"
 WHITENED, CROSS, PRIOR = "whitened LS", "whitened ridge, GCV", "MAP"
+CHOSEN = ", chosen"
 EQUAL_INTERVALS, EQUAL_RATIOS = 11, 13
 TRIED = np.array([1e-20, 1e-18, 1e-16, 1e-14, 1e-12, 1e3, 1e6])
 """Lambdas among which the ends of convergence are looked for."""
@@ -157,7 +158,7 @@ def library(measured: Study) -> dict[str, Answer]:
         found = identify_trials(measured.robot, measured.trials, method)
         setting = "-"
         if name == CROSS:
-            setting = f"lambda = {float(found.penalty[0, 0]):.2g}, chosen"
+            setting = f"lambda = {float(found.penalty[0, 0]):.2g}{CHOSEN}"
         elif name == PRIOR:
             setting = "lambda = 1, by definition"
         errors = measured.output_errors(found.values)[0]

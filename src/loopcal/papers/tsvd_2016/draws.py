@@ -175,7 +175,8 @@ def document(found: Draws, seed: int) -> dict[str, Any]:
     """Return the draws as evidence/README.md asks for them: tables by name, and which curves have a minimum inside."""
     tables = {"medians": medians_table(found), "ratios": ratios_table(found), "curves": curves_table(found)}
     inside = {
-        algorithm: {m: interior(found.curve(algorithm)[:, i]) for i, m in enumerate(MEASURES[:3])} for algorithm in ("RE", "TSVD")
+        algorithm: {m: interior(found.curve(algorithm)[:, i]) for i, m in enumerate(MEASURES[:3])}
+        for algorithm in ("RE", "TSVD")
     }
     return {
         "robot": found.name,

@@ -115,16 +115,16 @@ class Study:
         -------
         errors : (a, 4) root mean squares, see MEASURES. psi counts in none of them: the paper holds it unnecessary.
         """
-        lost = ~np.isfinite(values).all(axis=1)
+        found = np.isfinite(values).all(axis=1, keepdims=True)
         machine = np.arange(len(values)) if machine is None else machine
-        T, true = self._outputs(np.where(lost[:, None], self.robot.values, values)), self.true_outputs[machine]
+        T, true = self._outputs(np.where(found, values, self.robot.values)), self.true_outputs[machine]
         position = np.sum((T[..., :3, 3] - true[..., :3, 3]) ** 2, axis=-1) / MM**2
         first, second = (se3.matrix_to_tilt_torsion(x[..., :3, :3]) for x in (T, true))
         angles = sum(np.rad2deg(se3.wrap(a - b)) ** 2 for a, b in zip(first[:2], second[:2], strict=True))
         normal = np.rad2deg(1.0) ** 2 * np.sum((T[..., :3, 2] - true[..., :3, 2]) ** 2, axis=-1)
         parameters = ((values - self.trials.truth[machine]) / self.robot.parameters.tolerance) ** 2
         squares = [np.asarray(square).mean(axis=1) for square in (position, angles, normal, parameters)]
-        return np.where(lost[:, None], np.nan, np.sqrt(np.stack(squares, axis=1)))
+        return np.where(found, np.sqrt(np.stack(squares, axis=1)), np.nan)
 
 
 def study(name: str, truth: FloatArray, noise: Noise | None = None, seed: int = 0) -> Study:

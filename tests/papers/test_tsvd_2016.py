@@ -1,0 +1,326 @@
+# SPDX-License-Identifier: Apache-2.0
+"""LS, RE and TSVD on two parallel manipulators repeated: the paper's steps, its claims, and the same on many machines.
+
+The small version below draws 10 machines; its bounds are wide, because a median of ten is sure to some 20 %. The tests
+marked `evidence` hold the bounds at full size.
+"""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal.measure import Noise, Uniform
+from loopcal.mechanism.trials import forward_trials
+from loopcal.papers import PAPERS
+from loopcal.papers.tsvd_2016.cases import LS, PRIOR, RANKED, RE, TSVD, WHITENED, spacing
+from loopcal.papers.tsvd_2016.compare import compute
+from loopcal.papers.tsvd_2016.draws import (
+    CROSS,
+    HINDSIGHT,
+    METHODS,
+    PRIOR_FIVE,
+    RAW_FIVE,
+    RAW_LS,
+    RAW_RE,
+    RAW_TSVD,
+    WHITENED_FIVE,
+    interior,
+)
+from loopcal.papers.tsvd_2016.figures import figures
+from loopcal.papers.tsvd_2016.published import published
+from loopcal.papers.tsvd_2016.steps import iterate, least_squares, linearised, ridge, truncated, units
+from loopcal.papers.tsvd_2016.study import (
+    ANGLE_ERRORS,
+    LENGTH_ERRORS,
+    LIMITS,
+    AppendixNoise,
+    Study,
+    machine,
+    measured_poses,
+    output_range,
+    study,
+    true_values,
+)
+from loopcal.papers.tsvd_2016.tables import Results, tables
+from loopcal.papers.tsvd_2016.verdicts import verdicts
+
+ROOT = Path(__file__).parents[2]
+DOC = ROOT / "docs" / "papers" / "tsvd-2016.md"
+DRAWS = 10
+RAW = np.array([1e3, 1e3, 1e3, 1.0, 1.0, 1.0])  # from m and rad to mm and rad
+FIRST = np.zeros(1, dtype=np.int64)
+
+
+class NoNoise(Noise):
+    """Exact measurements."""
+
+    @property
+    def sigma(self) -> np.ndarray:
+        return LIMITS / np.sqrt(3.0)
+
+    def draw(self, generator: np.random.Generator, n: int) -> np.ndarray:
+        del generator
+        return np.zeros((n, 6))
+
+
+@pytest.fixture(scope="module")
+def tripod() -> Study:
+    return study("3-PRS", true_values(machine("3-PRS"), 1, 0), AppendixNoise())
+
+
+@pytest.fixture(scope="module")
+def found() -> Results:
+    return compute(0, DRAWS, lambda _: None)
+
+
+def identification_matrix(measured: Study) -> np.ndarray:
+    """H (216, p) in mm and rad by central differences of the forward kinematics."""
+    robot, step = measured.robot, 1e-4
+    nominal, scale = robot.parameters.nominal, units(robot)
+    shifts = step * np.diag(scale)
+
+    def seen(values: np.ndarray) -> np.ndarray:
+        T = forward_trials(robot, values, measured.trials.readings[None], measured.commanded).T
+        around = measured.kind.measure(measured.commanded.T, np.zeros((1, T.shape[1], 6)))  # nominal: phi does not wrap
+        return (measured.kind.evaluate(T, around).residual * RAW).reshape(len(values), -1)
+
+    return (seen(nominal + shifts) - seen(nominal - shifts)).T / (2 * step)
+
+
+def test_appendix_1_is_read_as_printed() -> None:
+    noise = published().noise
+    assert noise.values.shape == (36, 6)
+    assert noise.rows["1"] == ("0.006294", "-0.003925", "-0.007118", "0.000092", "0.000087", "0.000162")
+    assert noise.rows["36"] == ("0.008664", "-0.006628", "-0.004280", "-0.000036", "-0.000082", "0.000151")
+    assert np.abs(noise.values[:, :3]).max() == 0.009989
+    assert np.abs(noise.values[:, 3:]).max() == 0.000174
+    assert (np.abs(published().noise_si) <= LIMITS).all()
+
+
+def test_poses_errors_and_range_are_as_stated() -> None:
+    robot = machine("3-PRS")
+    z, phi, theta = measured_poses(robot).T
+    assert len(z) == 36
+    assert set(np.round(z, 9)) == {0.65, 0.7, 0.75}
+    assert {int(x) for x in np.round(np.rad2deg(theta))} == {10, 20, 30}
+    assert len(set(np.round(np.rad2deg(phi)))) == 12
+    for name in ("3-PRS", "RU-PUS-PRS"):
+        assert len(output_range(machine(name))) == 96
+    errors = np.abs(true_values(robot, 5, 0) - robot.parameters.nominal)
+    lengths = units(robot) != 1.0
+    for chosen, (low, high) in ((lengths, LENGTH_ERRORS), (~lengths, ANGLE_ERRORS)):
+        assert low < errors[:, chosen].min()
+        assert errors[:, chosen].max() < high
+    np.testing.assert_array_equal(true_values(robot, 5, 0)[:2], true_values(robot, 2, 0))
+
+
+@pytest.mark.parametrize("name", ["3-PRS", "RU-PUS-PRS"])
+def test_a_step_is_that_of_the_printed_formulas(name) -> None:
+    measured = study(name, true_values(machine(name), 1, 0), AppendixNoise())
+    H, p, lam, k = identification_matrix(measured), len(measured.robot.parameters), 0.01, 15
+    kind, T = measured.kind, forward_trials(measured.robot, measured.robot.values[None], measured.trials.readings[None]).T
+    D = -(kind.evaluate(T, measured.trials.measured[0]).residual * RAW).ravel()
+    U, s, Vt = np.linalg.svd(H, full_matrices=False)
+    by_hand = (np.linalg.solve(H.T @ H + lam * np.eye(p), H.T @ D), Vt[:k].T @ (U[:, :k].T @ D / s[:k]))
+    for penalty, expected in zip((ridge(np.array([lam]), p), truncated(np.array([k]), p)), by_hand, strict=True):
+        step = (iterate(measured, penalty, limit=1).values - measured.robot.values)[0] / units(measured.robot)
+        np.testing.assert_allclose(step, expected, rtol=0, atol=1e-5)  # [mm, rad], central differences
+    found, _ = linearised(measured, measured.robot.values[None], FIRST)
+    np.testing.assert_allclose(found.singular_values[0], s, rtol=1e-5, atol=1e-8)
+
+
+def test_ridge_in_every_step_is_a_filter_that_forgets_lambda() -> None:
+    robot = machine("3-PRS")
+    small = robot.values + 1e-2 * (true_values(robot, 1, 0) - robot.values)  # so small that the problem is linear
+    measured = study("3-PRS", small, NoNoise())
+    d, _ = linearised(measured, robot.values[None], FIRST)
+    lam = 0.01
+    for m in (1, 3, 10):
+        values = iterate(measured, ridge(np.array([lam]), 33), limit=m).values
+        f = 1.0 - (lam / (d.singular_values**2 + lam)) ** m
+        expected = d.deviation(f * d.projections / d.singular_values) * units(robot)
+        np.testing.assert_allclose(values - robot.values, expected, rtol=0, atol=5e-10)  # [m, rad] of 4e-6, second order
+
+
+def test_exact_measurements_give_the_true_parameters() -> None:
+    robot = machine("3-PRS")
+    truth = true_values(robot, 2, 0)
+    run = iterate(study("3-PRS", truth, NoNoise()), least_squares(33), np.arange(2))
+    assert run.converged.all()
+    np.testing.assert_allclose(run.values, truth, rtol=0, atol=1e-9)  # [m, rad], rounding times 1 / 4e-4
+
+
+def test_tsvd_with_all_singular_values_is_ls_and_settings_do_not_disturb_each_other(tripod) -> None:
+    both = iterate(tripod, np.concatenate([least_squares(33), truncated(np.array([33, 22]), 33)]))
+    np.testing.assert_array_equal(both.values[0], both.values[1])
+    np.testing.assert_allclose(both.values[2], iterate(tripod, truncated(np.array([22]), 33)).values[0], rtol=0, atol=1e-13)
+
+
+def test_lambda_runs_from_the_smallest_singular_value_to_1_in_equal_intervals_and_ratios() -> None:
+    lambdas, equal = spacing(1e-4)
+    assert (lambdas[0], lambdas[-1]) == (1e-4, 1.0)
+    assert np.ptp(np.diff(lambdas[equal])) < 1e-12
+    assert np.ptp(np.diff(np.log(np.r_[lambdas[0], lambdas[~equal], 1.0]))) < 1e-12
+
+
+def test_without_psi_the_numbers_are_the_same_otherwise(tripod) -> None:
+    np.testing.assert_array_equal(tripod.five.trials.measured[0], tripod.trials.measured[0][..., :5])
+    np.testing.assert_allclose(tripod.five.trials.instrument.sensors[0].noise.sigma, Uniform(LIMITS[:5]).sigma)
+
+
+@pytest.mark.slow
+def test_5_dof_measurement_leaves_one_combination_open_and_nothing_else(found) -> None:
+    for name, p, parameters in (("3-PRS", 33, {"a1y", "a2y", "a3y"}), ("RU-PUS-PRS", 25, {"a1y", "a2x", "thU2z"})):
+        six, five = found.case(name, 6), found.case(name, 5)
+        assert (six.rank, five.rank, five.known.rank) == (p, p - 1, p - 1)
+        assert five.singular_values[-1] < 1e-11
+        assert five.singular_values[-2] > 1e-6
+        (null,) = five.known.unidentifiable
+        assert set(null.names) == parameters
+        assert five.answers[LS].diverged
+        assert five.normal_equations > 1e3  # [mm], from an inverse that is rounding
+        assert six.normal_equations < 1e2
+        # rank detection alone: as good as with 6-DOF
+        np.testing.assert_allclose(five.answers[RANKED].errors[:2], six.answers[LS].errors[:2], rtol=0.02)
+        assert (five.answers[PRIOR].errors[:2] < 1.2 * six.answers[PRIOR].errors[:2]).all()
+
+
+@pytest.mark.slow
+def test_tsvd_needs_fewest_iterations_and_ridge_most(found) -> None:
+    for case in found.cases:
+        ls = case.answers[LS if case.study.freedoms == 6 else RANKED]
+        assert case.answers[TSVD].converged
+        assert case.answers[TSVD].iterations < ls.iterations
+        assert not case.answers[RE].converged
+
+
+@pytest.mark.slow
+def test_the_bottom_of_ridge_wanders_with_the_iterations(found) -> None:
+    lambdas = [lam for _, lam, _ in found.steps]
+    assert lambdas == sorted(lambdas)
+    assert lambdas[-1] > 5.0 * lambdas[0]
+
+
+@pytest.mark.slow
+def test_on_drawn_machines_map_is_better_than_raw_methods_at_their_best(found) -> None:
+    for drawn in found.draws:
+        for method in (RAW_LS, RAW_RE, RAW_TSVD):
+            assert (drawn.ratio(PRIOR, method)[:2] < 1.1).all()
+            assert drawn.ratio(PRIOR, method)[1] < 0.7  # in angle by far
+    tripod = found.drawn("3-PRS")
+    assert (tripod.ratio(PRIOR, CROSS)[:2] < 1.15).all()
+    assert (tripod.ratio(PRIOR, HINDSIGHT)[:2] < 1.3).all()
+    np.testing.assert_allclose(tripod.ratio(RAW_FIVE, RAW_LS)[:2], 1.0, rtol=0.02)
+
+
+@pytest.mark.slow
+def test_identified_parameters_deviate_though_poses_do_not(found) -> None:
+    ls, prior = (found.case("3-PRS", 6).answers[m].errors for m in (WHITENED, PRIOR))
+    assert ls[0] < 0.01  # [mm]
+    assert ls[3] > 10.0  # [tolerances]
+    assert prior[3] < 1.0
+
+
+@pytest.mark.slow
+def test_the_verdicts_are_these(found) -> None:
+    judged = {v.claim: v.agrees for v in verdicts(found)}
+    assert len(judged) == 19
+    for words, agrees in (
+        ("Here: 3-PRS, position", True),
+        ("Here: 3-PRS, angle", True),
+        ("Here: RU-PUS-PRS, position", False),
+        ("RE and TSVD are better", True),
+        ("TSVD has the best solution", False),
+        ("LS totally fails", True),
+        ("LS cannot be used with 5-DOF", False),
+        ("real solution does not exist", False),
+        ("converges faster", True),
+        ("Not all identified parameters", True),
+        ("No formula gives lambda", False),
+        ("may be mixed", False),
+        ("MAP with the tolerances", True),
+    ):
+        assert [a for claim, a in judged.items() if words in claim] == [agrees], words
+
+
+@pytest.mark.slow
+def test_numbers_of_tables_and_figures_are_finite_or_said_to_be_missing(found) -> None:
+    for table in tables(found):
+        cells = [cell for row in table.rows for cell in row if isinstance(cell, float)]
+        assert table.name in {"table_5", "table_6"} or np.isfinite(cells).all(), table.name
+        assert table.text()
+    made = figures(found)
+    assert {f"figure_{n}{part}" for n in (6, 8, 10, 11) for part in "ab"} <= {f.name for f in made}
+    assert all(np.isfinite(s.y).all() and len(s.x) == len(s.y) for f in made for s in f.series)
+    assert found.counts.within.all()
+
+
+def test_a_minimum_inside_is_lower_than_both_ends() -> None:
+    assert interior(np.array([2.0, 1.0, 2.0]))
+    assert not interior(np.array([1.0, 1.0, 2.0]))
+    assert not interior(np.array([1.04, 1.0, 2.0]))
+    assert interior(np.array([np.inf, 1.0, 2.0]))
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_numbers() -> None:
+    from loopcal.papers.tsvd_2016.draws import draw
+
+    first, again, more = draw("3-PRS", 3, 2), draw("3-PRS", 3, 2), draw("3-PRS", 3, 3)
+    for method in METHODS:
+        np.testing.assert_array_equal(first.errors[method], again.errors[method])
+        np.testing.assert_allclose(more.errors[method][:2], first.errors[method], rtol=1e-6)
+
+
+def test_the_page_of_the_documentation_names_every_module_and_no_missing_one() -> None:
+    folder = ROOT / "src" / "loopcal" / "papers" / "tsvd_2016"
+    named = set(re.findall(r"`(\w+\.(?:py|yaml))`", DOC.read_text("utf-8")))
+    assert {n for n in named if not n.endswith("_draws.py")} == {
+        path.name for path in folder.iterdir() if path.suffix in {".py", ".yaml"}
+    } - {"__init__.py"}
+    assert "tsvd-2016" in PAPERS
+
+
+def evidence(name: str) -> dict:
+    return json.loads((ROOT / "docs" / "evidence" / f"{name}.json").read_text("utf-8"))
+
+
+def column(document: dict, table: str, number: int) -> dict[str, float]:
+    return {row[0]: row[number] for row in document["tables"][table]["rows"]}
+
+
+@pytest.mark.evidence
+def test_evidence_map_is_better_than_raw_methods_and_near_gcv_and_hindsight() -> None:
+    document = evidence("three_prs_draws")
+    assert document["draws"] >= 100
+    for ratio, low, high in ((1, 2, 3), (4, 5, 6)):  # position, angle
+        for method in (RAW_LS, RAW_RE, RAW_TSVD):
+            assert column(document, "ratios", high)[f"MAP over {method}"] < 1.0
+        assert column(document, "ratios", ratio)[f"MAP over {CROSS}"] < 1.05
+        assert column(document, "ratios", ratio)[f"MAP over {HINDSIGHT}"] < 1.15
+        assert column(document, "ratios", low)[f"MAP over {HINDSIGHT}"] >= 1.0  # nothing beats hindsight
+
+
+@pytest.mark.evidence
+def test_evidence_curves_of_the_3_prs_are_u_shaped_and_5_dof_costs_nothing() -> None:
+    document = evidence("three_prs_draws")
+    assert all(inside for algorithm in document["minimum_inside"].values() for inside in algorithm.values())
+    for number in (1, 3):  # position, angle
+        medians = column(document, "medians", number)
+        assert medians[RAW_FIVE] == pytest.approx(medians[RAW_LS], rel=0.02)
+        assert medians[WHITENED_FIVE] == pytest.approx(medians["whitened LS"], rel=0.05)
+        assert medians[PRIOR_FIVE] == pytest.approx(medians[PRIOR], rel=0.1)
+
+
+@pytest.mark.evidence
+def test_evidence_curves_of_the_ru_pus_prs_are_u_shaped_in_angle_only() -> None:
+    document = evidence("ru_pus_prs_draws")
+    for algorithm in ("RE", "TSVD"):
+        inside = document["minimum_inside"][algorithm]
+        assert inside["phi and theta [deg]"]
+        assert not inside["position [mm]"]
+    for method in (RAW_LS, RAW_RE, RAW_TSVD):
+        assert column(document, "ratios", 4)[f"MAP over {method}"] < 1.0
