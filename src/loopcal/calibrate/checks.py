@@ -3,33 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 
 from loopcal.calibrate.filters import Method
 from loopcal.calibrate.rows import Rows
 from loopcal.errors import EstimationError
 from loopcal.linalg import FloatArray
-from loopcal.measure import Kind, Measurements, check_actuators
+from loopcal.measure import Measurements, check_actuators
 from loopcal.mechanism import Mechanism
-
-
-def check_known(kinds: Iterable[Kind]) -> None:
-    """Refuse kinds whose rows need more than the pose they saw.
-
-    Raises
-    ------
-    EstimationError
-        Naming the kind and what is unknown.
-    """
-    for kind in kinds:
-        if kind.unknowns:
-            names = ", ".join(kind.parts)
-            raise EstimationError(f"the {names} of kind {kind.name!r} cannot be estimated here yet; state their values")
-        if kind.links > 1 or kind.looks_at:
-            what = "compare poses" if kind.links > 1 else "look at joints"
-            raise EstimationError(f"rows of the kind {kind.name!r} {what}, which cannot be used here yet; leave them out")
 
 
 def check_noise(noise: str) -> None:
@@ -57,7 +38,7 @@ def check_rows(rows: Rows, data: Measurements, robot: Mechanism) -> None:
     check_actuators(data, robot)
     if rows.parameters == 0:
         raise EstimationError(f"{robot.name} has no free parameter: free at least one of {len(robot.parameters)}")
-    if rows.rows[0] == 0:
+    if rows.counted[0] == 0:
         raise EstimationError("no measured value counts: every row is absent or has weight 0; give at least one")
 
 
@@ -69,11 +50,13 @@ def check_count(rows: Rows, data: Measurements, method: Method, allow_fewer: boo
     EstimationError
         Naming both numbers and the poses that would do.
     """
-    m, p = int(rows.rows[0]), method.needs(rows.parameters)
+    own = 0 if rows.own is None else rows.own.unheld
+    m, p = int(rows.counted[0]), method.needs(rows.parameters) + own
     if m >= p or allow_fewer:
         return
     poses = int(np.ceil(p * data.n_poses / m))
-    without = "" if p == rows.parameters else " without a tolerance"
+    without = "" if p - own == rows.parameters else " without a tolerance"
+    without += f" ({own} of them in frames, targets and the like)" if own else ""
     raise EstimationError(
         f"{m} equations from {data.n_poses} poses cannot determine {p} parameters{without}: measure at least {poses} poses like"
         f" these (better twice as many), fix parameters, or state their tolerances and use a method with a prior (MAP)"

@@ -45,11 +45,11 @@ def locate(rows: Rows) -> FloatArray | None:
     """Return the measured poses T_base_platform (t | 1, n, 4, 4); None where they are not all measured in full."""
     robot = rows.unknowns.robot
     passive = any(group.unknown(False) for group in robot.program.groups)
-    if passive or len(robot.program.freedoms) < 6 or len(rows.sensed) != 1:
+    if passive or len(robot.program.freedoms) < 6 or len(rows.sensed) != 1 or rows.own is not None:
         return None
     (sensed,) = rows.sensed
     t, r, m = sensed.whitener.shape[:3]
-    full = m == 6 and (np.einsum("trii->tri", sensed.whitener) != 0.0).all()
+    full = m == 6 and not rows.joints and sensed.kind.links == 1 and (np.einsum("trii->tri", sensed.whitener) != 0.0).all()
     if not full or not np.array_equal(sensed.poses, np.arange(len(rows.readings))):
         return None
     T = np.broadcast_to(robot.home, (t, r, 4, 4))

@@ -13,6 +13,7 @@ from loopcal.calibrate.combinations import Combination
 from loopcal.calibrate.conflict import PriorConflict
 from loopcal.calibrate.descent import DescentStatus
 from loopcal.calibrate.filters import Method
+from loopcal.calibrate.local_estimate import LocalEstimate
 from loopcal.calibrate.posterior import Posterior
 from loopcal.calibrate.scaling import Unknowns
 from loopcal.calibrate.statistics import LEVEL, ResidualCheck, coverage_factor
@@ -55,6 +56,7 @@ class Identification:
     cost_history : (i + 1,) whitened sum of squares. estimate_history : (i + 1, p).
     notes : sentences that belong to the result.
     weight : (n,) of each pose by the loss, 1 without one. dropped : labels of the poses that were left out as asked.
+    local : what was found of the unknowns that the measurements bring with them: frames, targets, surfaces.
     """
 
     robot: Mechanism
@@ -79,6 +81,7 @@ class Identification:
     notes: tuple[str, ...]
     weight: FloatArray
     dropped: tuple[str, ...]
+    local: LocalEstimate
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -139,12 +142,16 @@ class Identification:
     def __str__(self) -> str:
         factor, symbols = self.unknowns.display()
         half = self.interval()
-        width = max(len(name) for name in self.names)
+        width = max(len(name) for name in (*self.names, *self.local.names))
         lines = [f"{'parameter':<{width}} {'nominal':>14} {'estimate':>14} {'+/- (95 %)':>12} unit"]
         for i, name in enumerate(self.names):
             decimals, shown = _uncertainty(half[i] / factor[i])
             nominal, estimate = self.nominal[i] / factor[i], self.estimate[i] / factor[i]
             lines.append(f"{name:<{width}} {nominal:>14.{decimals}f} {estimate:>14.{decimals}f} {shown:>12} {symbols[i]}")
+        for entry in self.local.rows(coverage_factor(self.check)):
+            decimals, shown = _uncertainty(entry["plus_minus"]) if entry["free"] else (6, "fixed")
+            nominal, estimate = (f"{entry[name]:>14.{decimals}f}" for name in ("nominal", "estimate"))
+            lines.append(f"{entry['name']:<{width}} {nominal} {estimate} {shown:>12} {entry['unit']}")
         lines += ["", f"{self.status.sentence} after {self.iterations} steps; rank {self.rank} of {len(self.names)}"]
         lines += [f"chi-square {self.chi_square:.5g} with {self.check.degrees:.4g} degrees of freedom"]
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
@@ -170,6 +177,7 @@ class Identification:
             "robot": self.robot.name,
             "method": repr(self.method),
             "parameters": parameters,
+            "local": self.local.rows(coverage_factor(self.check)),
             "rank": self.rank,
             "condition": self.condition,
             "singular_values": self.singular_values,
@@ -200,6 +208,8 @@ class Identification:
             "estimate_history": self.estimate_history,
             "cost_history": self.cost_history,
             "weight": self.weight,
+            "local_estimate": self.local.estimate,
+            "local_sd": self.local.sd,
             **self.posterior.arrays(),
         }
         for i, r in enumerate(self.residuals):

@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.calibrate.checks import check_count, check_known, check_noise, check_rows, check_start
+from loopcal.calibrate.checks import check_count, check_noise, check_rows, check_start
 from loopcal.calibrate.closure import descend_from_closure
 from loopcal.calibrate.combinations import combinations
 from loopcal.calibrate.conflict import prior_conflict
@@ -18,16 +18,18 @@ from loopcal.calibrate.descent import Descent, DescentStatus, StepControl, desce
 from loopcal.calibrate.filters import MAP, LeastSquares, Method, adapted
 from loopcal.calibrate.identification import Identification, KindResiduals
 from loopcal.calibrate.left_out import without_poses
+from loopcal.calibrate.local_estimate import LocalEstimate, local_estimate, nothing_local, with_followers
 from loopcal.calibrate.losses import Loss
 from loopcal.calibrate.posterior import posterior
 from loopcal.calibrate.prior import Prior
 from loopcal.calibrate.robust import descend_robustly
-from loopcal.calibrate.rows import Residuals, Rows, rows_of, rows_of_trials
+from loopcal.calibrate.rows import Rows, rows_of, rows_of_trials
 from loopcal.calibrate.scaling import Unknowns, unknowns
+from loopcal.calibrate.sensed import Residuals, linked
 from loopcal.calibrate.statistics import ResidualCheck, residual_check
 from loopcal.errors import EstimationError
 from loopcal.linalg import RANK_TOLERANCE, Decomposition, FloatArray, IntArray
-from loopcal.measure import Measurements, Trials
+from loopcal.measure import LocalUnknowns, Measurements, Trials
 from loopcal.mechanism import Mechanism
 
 Begin = Literal["kinematics", "closure"]
@@ -48,6 +50,7 @@ def identify(
     allow_fewer_equations: bool = False,
     loss: Loss | None = None,
     drop: Sequence[str] = (),
+    local: LocalUnknowns | None = None,
 ) -> Identification:
     """Identify the free parameters of a robot; the theory is in `loopcal.calibrate.filters`.
 
@@ -77,8 +80,7 @@ def identify(
     free = unknowns(robot)
     method = adapted(LeastSquares() if method is None and prior is not None else method, free.assumed, noise)
     data = without_poses(data, drop)
-    check_known(o.kind for o in data.observations if len(o))
-    rows = rows_of(free, data)
+    rows = rows_of(free, data, local)
     check_rows(rows, data, robot)
     check_count(rows, data, method, allow_fewer_equations or prior is not None)
     z = free.deviation((robot if start is None else robot.with_values(start)).values[None])
@@ -86,24 +88,24 @@ def identify(
     def run(some: Rows, at: FloatArray) -> Descent:
         return _descended(some, at, method, control, rank_tolerance, begin, prior)
 
-    fit, weight = _weighed(rows, data, z, loss, noise, run)
+    fit, weight, weighed = _weighed(rows, data, z, loss, noise, run)
     if fit.status[0] == DescentStatus.BAD_START:
         check_start(rows, data, z, fit.cost)
     check = residual_check(fit.decomposition, fit.penalty, noise, robust=loss is not None)
-    residuals = _labelled(rows.residuals(fit.deviation), data)
-    result = _identification(robot, free, method, fit, check, residuals)
+    residuals = _labelled(rows.residuals(fit.deviation, weighed), data)
+    result = _identification(robot, free, method, fit, check, residuals, weighed)
     notes = (*result.notes, *_weight_notes(data, weight, loss), *_drop_notes(drop))
     return replace(result, weight=weight, dropped=tuple(drop), notes=notes)
 
 
 def _weighed(
     rows: Rows, data: Measurements, z: FloatArray, loss: Loss | None, noise: str, run: Callable[[Rows, FloatArray], Descent]
-) -> tuple[Descent, FloatArray]:
-    """Descend, with a loss or without, and return the weight (n,) of each pose."""
+) -> tuple[Descent, FloatArray, Rows]:
+    """Descend, with a loss or without; return the weight (n,) of each pose, too, and the rows with these weights."""
     if loss is None:
-        return run(rows, z), np.ones(data.n_poses)
-    robust = descend_robustly(rows, data.block, loss, z, noise == "estimated", run)
-    return robust.fit, robust.weight
+        return run(rows, z), np.ones(data.n_poses), rows
+    robust = descend_robustly(rows, linked(data), loss, z, noise == "estimated", run)
+    return robust.fit, robust.weight, robust.rows
 
 
 def _weight_notes(data: Measurements, weight: FloatArray, loss: Loss | None) -> list[str]:
@@ -169,7 +171,6 @@ def identify_trials(
     start : (t | 1, parameters of the robot) [SI], default the robot's values. The others: as for `identify`.
     """
     free = unknowns(robot)
-    check_known(sensor.kind for sensor in trials.instrument.sensors)
     rows = rows_of_trials(free, trials)
     values = np.atleast_2d(robot.values if start is None else np.asarray(start, dtype=np.float64))
     z = np.broadcast_to(free.deviation(values), (len(trials), len(free)))
@@ -208,9 +209,15 @@ def _descended(
 
 
 def _identification(
-    robot: Mechanism, free: Unknowns, method: Method, fit: Descent, check: ResidualCheck, residuals: tuple[KindResiduals, ...]
+    robot: Mechanism,
+    free: Unknowns,
+    method: Method,
+    fit: Descent,
+    check: ResidualCheck,
+    residuals: tuple[KindResiduals, ...],
+    rows: Rows,
 ) -> Identification:
-    """Put the result together."""
+    """Put the result together; `rows` are folded once more where they have unknowns of their own."""
     d, penalty, variance = fit.decomposition, fit.penalty, check.sigma_scale**2 if check.intervals else np.nan
     plain = d.plain()
     conflict = None
@@ -222,13 +229,15 @@ def _identification(
     covariance = d.covariance(penalty, variance)[0] * free.tolerance[:, None] * free.tolerance
     values = free.values(fit.deviation)[0]
     status = DescentStatus(int(fit.status[0]))
-    open_ = combinations(free, plain.null_space())
+    local = _local(rows, robot, fit.deviation, d, penalty, variance)
+    open_ = with_followers(combinations(free, plain.null_space()), plain.null_space(), local)
     notes = [check.sentence]
     if status is not DescentStatus.CONVERGED:
         notes.insert(0, status.sentence)
     if conflict is not None and conflict.conflict:
         notes.append(conflict.sentence)
     notes += [f"not identifiable: {combination}" for combination in open_]
+    notes += local.notes()
     if assumed := free.note():
         notes.append(assumed)
     return Identification(
@@ -254,7 +263,20 @@ def _identification(
         notes=tuple(notes),
         weight=np.ones(0),
         dropped=(),
+        local=local,
     )
+
+
+def _local(
+    rows: Rows, robot: Mechanism, z: FloatArray, d: Decomposition, penalty: FloatArray, variance: float
+) -> LocalEstimate:
+    """The unknowns of the measurements at the estimate z (1, p)."""
+    if rows.own is None:
+        return nothing_local(rows.parameters)
+    rows.own.cost[:] = np.inf
+    if not np.isfinite(rows.fold(z, np.arange(1))[1][0]):
+        rows.own.solved = ()
+    return local_estimate(rows.own, robot, rows.own.start, d, penalty, variance)
 
 
 def _labelled(residuals: tuple[Residuals, ...], data: Measurements) -> tuple[KindResiduals, ...]:
@@ -264,7 +286,7 @@ def _labelled(residuals: tuple[Residuals, ...], data: Measurements) -> tuple[Kin
         KindResiduals(
             kind=o.kind.name,
             components=tuple(column.name for column in o.kind.noise_columns),
-            poses=tuple(data.labels[i] for i in o.rows),
+            poses=tuple("/".join(data.labels[i] for i in seen) for seen in o.rows.reshape(len(o), -1)),
             raw=np.where(o.present, r.raw[0], np.nan),
             whitened=r.whitened[0],
         )

@@ -70,10 +70,11 @@ def influence(
     change = np.zeros(d.scale.shape) if at is None else (at - deviation)[0]
     u = len(weight)
     found = Influence(np.zeros(u), np.zeros(u, np.int64), np.zeros(u), np.zeros(u, np.int64), np.zeros(u))
-    for blocks, A, r in _by_block(rows, member, deviation, u):
+    for blocks, columns, r in _by_block(rows, member, deviation, u):
+        A, own = columns[..., -len(root) :], columns[..., : -len(root)]  # own unknowns are in units of their sd
         residual = r + A @ change
-        present = np.any(A != 0.0, axis=2) | (r != 0.0)
-        half = A @ spread
+        present = np.any(A != 0.0, axis=2) | np.any(own != 0.0, axis=2) | (r != 0.0)
+        half = np.concatenate([own, A @ spread], axis=2)
         g, vectors = np.linalg.eigh(half @ half.swapaxes(-1, -2))
         w = weight[blocks][:, None]
         inside = 1.0 - w * g
@@ -98,7 +99,7 @@ def _by_block(
     """
     total = np.zeros(count, dtype=np.int64)
     for sensed in rows.sensed:
-        total += np.bincount(member[sensed.poses], minlength=count) * sensed.whitener.shape[-1]
+        total += np.bincount(member[sensed.first], minlength=count) * sensed.whitener.shape[-1]
     waiting: list[tuple[IntArray, FloatArray]] = []
     for kinds in rows.linearised(deviation):
         waiting += [(np.repeat(member[poses], part.shape[1]), part.reshape(-1, part.shape[2])) for poses, part in kinds]

@@ -19,6 +19,7 @@ from loopcal.calibrate.influence import Influence, influence
 from loopcal.calibrate.left_out import without_poses
 from loopcal.calibrate.robust import scale_of
 from loopcal.calibrate.rows import Rows, rows_of
+from loopcal.calibrate.sensed import linked
 from loopcal.linalg import Decomposition, FloatArray, decompose
 from loopcal.measure import Measurements
 
@@ -97,7 +98,7 @@ def find_outliers(fit: Identification, data: Measurements, level: float = 0.05) 
     """
     data = without_poses(data, fit.dropped)
     rows = rows_of(fit.unknowns, data)
-    numbers, member = np.unique(data.block, return_inverse=True)
+    numbers, member = np.unique(linked(data), return_inverse=True)
     labels = tuple(tuple(np.array(data.labels)[member == i].tolist()) for i in range(len(numbers)))
     z = fit.unknowns.deviation(fit.robot.values[None])
     aside = np.zeros(len(numbers), dtype=bool)

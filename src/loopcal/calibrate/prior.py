@@ -89,7 +89,12 @@ class WithPrior:
         # parameters that are not free any more contribute what they differ from the mean
         self.constant = B @ (unknowns.values(self.centre)[0] - mean)
         self.open = np.linalg.svd(self.slope, full_matrices=True)[2][len(B) :].T
-        self.rows: IntArray = rows.rows + len(B)
+        self.added = len(B)
+
+    @property
+    def rows(self) -> IntArray:
+        """(t,) equations of the measurements, as the last fold counted them, and of the prior."""
+        return self.measured.rows + self.added
 
     def fold(self, deviation: FloatArray, trials: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return factor and sum of squares of all rows, see `Problem.fold`."""

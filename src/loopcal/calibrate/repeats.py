@@ -100,7 +100,8 @@ def _pure_error(fit: Identification, data: Measurements, member: IntArray) -> tu
     z = fit.unknowns.deviation(fit.robot.values[None])
     total, degrees = 0.0, 0
     for sensed, found in zip(rows.sensed, rows.residuals(z), strict=True):
-        of = member[sensed.poses]
+        same = np.column_stack([member[sensed.per_pose], sensed.places])
+        of = np.unique(same, axis=0, return_inverse=True)[1].ravel()
         for group in np.flatnonzero(np.bincount(of) > 1):
             own = of == group
             W = sensed.whitener[0, own]

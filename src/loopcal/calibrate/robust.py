@@ -69,7 +69,7 @@ def _settle(
     for _ in range(ROUNDS):
         if found.fit.status[0] != DescentStatus.CONVERGED:
             break
-        distance, degrees = block_distances(rows, found.fit.deviation, member)
+        distance, degrees = block_distances(rows, found.fit.deviation, member, found.rows)
         if estimate_scale:
             distance = distance / scale_of(distance, degrees)
         weight = loss.weight(distance, degrees)[member]
@@ -81,12 +81,17 @@ def _settle(
     return found
 
 
-def block_distances(rows: Rows, deviation: FloatArray, member: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return d = |W r| (u,) and the number of residuals (u,) of every block; member (n,) is the block of each pose."""
+def block_distances(
+    rows: Rows, deviation: FloatArray, member: IntArray, like: Rows | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Return d = |W r| (u,) and the number of residuals (u,) of every block; member (n,) is the block of each pose.
+
+    Frames and targets that are unknown are those that fit best with the weights of `like`, default these rows.
+    """
     count = int(member.max()) + 1
     square, degrees = np.zeros(count), np.zeros(count)
-    for sensed, found in zip(rows.sensed, rows.residuals(deviation), strict=True):
-        of = member[sensed.poses]
+    for sensed, found in zip(rows.sensed, rows.residuals(deviation, like), strict=True):
+        of = member[sensed.first]
         present = np.einsum("rii->ri", sensed.whitener[0]) != 0.0
         square += np.bincount(of, np.where(present, found.whitened[0] ** 2, 0.0).sum(axis=1), count)
         degrees += np.bincount(of, present.sum(axis=1), count)

@@ -2,79 +2,44 @@
 """The rows of an identification: residuals of a robot against its measurements, whitened and scaled, block by block.
 
 For a row with residual r = predicted - measured, whitener W and kind's derivative G by the platform's twist, and the
-error model D = d twist / d parameter, the row is [W G D diag(tolerance) | W r]. Blocks of poses are folded into one
-triangular factor by the engine, so the memory of a fit is its parameters squared plus one block. The rows are a
-`Problem` of the descent: t machines that share readings and kinds, each with its own measured values.
+error model D = d twist / d parameter, the row is [W G D diag(tolerance) | W r]; a row that compares poses has the sum
+over its poses, one that looks at joints their derivatives in addition. Blocks of poses are folded into one triangular
+factor by the engine, so the memory of a fit is its parameters squared plus one block. Unknowns that measurements bring
+with them are eliminated, see `loopcal.calibrate.local`. The rows are a `Problem` of the descent: t machines that share
+readings and kinds, each with its own measured values.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping
+from functools import partial
 
 import numpy as np
 
 from loopcal import engine, se3
+from loopcal.calibrate.local import Find, Folding, Own, spread_columns
+from loopcal.calibrate.moves import Last, Moves, machine_columns
 from loopcal.calibrate.scaling import Unknowns
-from loopcal.errors import EstimationError
+from loopcal.calibrate.sensed import BLOCK, Block, Residuals, Sensed, blocks_of
 from loopcal.linalg import FloatArray, IntArray, empty_factor
-from loopcal.measure import Kind, Measurements, Trials
+from loopcal.measure import (
+    Evaluation,
+    LocalUnknowns,
+    Measurements,
+    Trials,
+    joint_values,
+    joints_looked_at,
+    local_unknowns,
+    start_values,
+)
 from loopcal.measure.simulate import rows_of as sensor_rows
 from loopcal.measure.whitening import whitener
 from loopcal.mechanism import Status
 from loopcal.mechanism.implicit import sensitivity
-from loopcal.mechanism.transmission import joint_values
+from loopcal.mechanism.passive import passive_sensitivity
+from loopcal.mechanism.transmission import joint_values as driven_values
 from loopcal.mechanism.trials import forward_trials
-
-BLOCK = 512
-"""Poses (of all trials together) whose rows are made at once: large enough for NumPy, small enough for the cache."""
-
-
-@dataclass(frozen=True, eq=False)
-class Sensed:
-    """Rows of one kind for t trials.
-
-    Attributes
-    ----------
-    kind : what was measured. poses : (r,) the pose that each row saw.
-    measured : (t | 1, r, c) [SI]. whitener : (t | 1, r, m, m), zero rows for what is absent.
-    """
-
-    kind: Kind
-    poses: IntArray
-    measured: FloatArray
-    whitener: FloatArray
-
-    def within(self, first: int, last: int) -> Sensed:
-        """The rows that saw the poses first..last - 1, poses counted from `first`."""
-        chosen = np.flatnonzero((self.poses >= first) & (self.poses < last))
-        if len(chosen) == len(self.poses):
-            return Sensed(self.kind, self.poses - first, self.measured, self.whitener)
-        return Sensed(self.kind, self.poses[chosen] - first, self.measured[:, chosen], self.whitener[:, chosen])
-
-    def trials(self, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Measured values and whiteners of some trials."""
-        measured = self.measured if len(self.measured) == 1 else self.measured[chosen]
-        return measured, self.whitener if len(self.whitener) == 1 else self.whitener[chosen]
-
-
-class Residuals(NamedTuple):
-    """Residuals (predicted - measured) of one kind's rows: raw (t, r, m) [SI] and whitened (t, r, m)."""
-
-    raw: FloatArray
-    whitened: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class _Block:
-    """Some consecutive poses: their places, readings and rows, and which of them any row needs."""
-
-    poses: slice
-    readings: FloatArray
-    sensed: tuple[Sensed, ...]
-    needed: np.ndarray
 
 
 class Rows:
@@ -91,6 +56,7 @@ class Rows:
     trials : number of machines t.
     located : (t | 1, n, 4, 4) poses [m], optional. With it closure is not solved but linearised at these poses: with its
         Newton step dx from there a row is [W G D diag(tolerance) | W (r + G dx)]. See `loopcal.calibrate.closure`.
+    own : the unknowns that the measurements bring with them, where there are any.
     """
 
     def __init__(
@@ -100,25 +66,28 @@ class Rows:
         sensed: tuple[Sensed, ...],
         trials: int,
         located: FloatArray | None = None,
+        own: Own | None = None,
     ) -> None:
         self.unknowns = unknowns
         self.readings = readings
         self.sensed = sensed
         self.located = located
+        self.own = own
         self.parameters = len(unknowns)
+        self.joints = joints_looked_at(s.kind for s in sensed)
         present = [np.einsum("trii->tri", s.whitener) != 0.0 for s in sensed]
         counted = sum((p.sum(axis=(1, 2)) for p in present), start=np.zeros(1, dtype=np.int64))
-        self.rows: IntArray = np.broadcast_to(counted, (trials,)).astype(np.int64)
-        n = len(readings)
-        needed = np.zeros(n, dtype=bool)
+        self.counted: IntArray = np.broadcast_to(counted, (trials,)).astype(np.int64)
+        needed = np.zeros(len(readings), dtype=bool)
         for s, p in zip(sensed, present, strict=True):
             needed[s.poses[p.any(axis=(0, 2))]] = True
-        self.blocks = []
-        for first in range(0, n, BLOCK):
-            last = min(first + BLOCK, n)
-            inside = tuple(s.within(first, last) for s in sensed)
-            self.blocks.append(_Block(slice(first, last), readings[None, first:last], inside, needed[first:last]))
-        self.last = _Last(unknowns.robot.home_state, trials, n) if n <= BLOCK else None
+        self.blocks = blocks_of(readings, sensed, needed, BLOCK)
+        self.last = Last(unknowns.robot.home_state, trials, len(readings)) if len(self.blocks) == 1 else None
+
+    @property
+    def rows(self) -> IntArray:
+        """(t,) equations, less the directions of own unknowns that the last fold solved for."""
+        return self.counted if self.own is None else self.counted + self.own.priors - self.own.rank
 
     def fold(self, deviation: FloatArray, trials: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return triangular factor (a, p + 1, p + 1) and sum of squares (a,); infinite where a pose is out of reach."""
@@ -129,56 +98,99 @@ class Rows:
         moves = self._moves(self.blocks[0], deviation[:1], trials) if shared and len(self.blocks) == 1 else None
         for first in range(0, len(trials), together):
             some = slice(first, first + together)
-            part = factor[some]
-            for block in self.blocks:
-                found = moves or self._moves(block, deviation[some], trials[some])
-                rows = [self._kind_rows(s, found, trials[some]) for s in block.sensed if len(s.poses)]
-                part = engine.accumulate(part, rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1))
-                lost[some] |= found.failed
-            factor[some] = part
-        cost = (factor[:, :, -1] ** 2).sum(axis=1)
-        return factor, np.where(lost, np.inf, cost)
+            factor[some], lost[some] = self._folded(deviation[some], trials[some], moves)
+        return factor, np.where(lost, np.inf, (factor[:, :, -1] ** 2).sum(axis=1))
 
-    def residuals(self, deviation: FloatArray) -> tuple[Residuals, ...]:
-        """Return the residuals of every kind at deviations (t, p); NaN where a pose is out of reach."""
-        robot, values = self.unknowns.robot, self.unknowns.values(deviation)
-        trials = np.arange(len(deviation))
-        parts: list[list[Residuals]] = [[] for _ in self.sensed]
+    def _folded(self, z: FloatArray, trials: IntArray, moves: Moves | None) -> tuple[FloatArray, np.ndarray]:
+        """Factor (a, p + 1, p + 1) of some trials, own unknowns settled and eliminated, and which are out of reach."""
+        p, lost = self.parameters, np.zeros(len(trials), dtype=bool)
+        factor = empty_factor(len(trials), p)
+        if moves is None and len(self.blocks) == 1:
+            moves = self._moves(self.blocks[0], z, trials)
+        values = None
+        if self.own is not None:
+            looks = [moves or self._look(block, z, trials) for block in self.blocks]
+            values = self._settled(looks, z, trials)
+        folding = Folding(self.own, len(trials), p)
         for block in self.blocks:
-            state = forward_trials(robot, values, block.readings, self.last and self.last.take(trials, deviation))
-            ok = _solved(state)
-            T = np.where(ok[..., None, None], state.T, np.eye(4))
-            for part, sensed in zip(parts, block.sensed, strict=True):
-                measured, white = sensed.trials(trials)
-                raw = sensed.kind.evaluate(T[:, sensed.poses], measured).residual
-                raw = np.where(ok[:, sensed.poses, None], raw, np.nan)
-                part.append(Residuals(raw, np.matmul(white, raw[..., None])[..., 0]))
-        return tuple(_in_order(part, sensed.poses) for part, sensed in zip(parts, self.sensed, strict=True))
+            found = moves or self._moves(block, z, trials)
+            parts = [(c, rows) for s in block.sensed for c, rows in self._kind_rows(s, found, trials, values)]
+            plain = [rows for c, rows in parts if c < 0]
+            if plain:
+                factor = engine.accumulate(factor, plain[0] if len(plain) == 1 else np.concatenate(plain, axis=1))
+            folding.add(parts)
+            lost |= found.failed
+        if self.own is not None and values is not None:
+            factor = folding.finish(factor, values)
+            self.own.solved = tuple(folding.solved)
+            self.own.keep(trials, z, values, np.where(lost, np.inf, (factor[:, :, -1] ** 2).sum(axis=1)))
+        return factor, lost
+
+    def residuals(self, deviation: FloatArray, like: Rows | None = None) -> tuple[Residuals, ...]:
+        """Return the residuals of every kind at deviations (t, p); NaN where a pose is out of reach.
+
+        Own unknowns are those that fit best with the weights of `like`, default these rows.
+        """
+        trials = np.arange(len(deviation))
+        looks = [self._look(block, deviation, trials) for block in self.blocks]
+        values = None if self.own is None else (like or self)._settled(looks, deviation, trials)
+        shapes = [(len(trials), *s.whitener.shape[1:3]) for s in self.sensed]
+        found = [Residuals(np.full(shape, np.nan), np.full(shape, np.nan)) for shape in shapes]
+        for block, look in zip(self.blocks, looks, strict=True):
+            for kind, rows, sensed in zip(found, block.rows, block.sensed, strict=True):
+                if not len(rows):
+                    continue
+                evaluated, white = self._evaluated(sensed, look, trials, values)
+                raw = np.where(np.all(look.ok[:, sensed.per_pose], axis=2, keepdims=True), evaluated.residual, np.nan)
+                kind.raw[:, rows], kind.whitened[:, rows] = raw, np.matmul(white, raw[..., None])[..., 0]
+        return tuple(found)
 
     def linearised(self, deviation: FloatArray) -> Iterator[list[tuple[IntArray, FloatArray]]]:
-        """Give, block of poses by block, the poses (r,) and rows (r, m, p + 1) of every kind at deviation (1, p) of trial 0."""
-        trial = np.arange(1)
+        """Give, block by block, the poses (r,) and rows (r, m, U + p + 1) of every kind at deviation (1, p) of trial 0.
+
+        The first U columns, none without own unknowns, are in units of these unknowns' own standard deviation, and the
+        next p those of the machine as the own unknowns follow it: all as the last fold found them.
+        """
+        trial, p = np.arange(1), self.parameters
         for block in self.blocks:
             found = self._moves(block, deviation, trial)
-            seen = [s for s in block.sensed if len(s.poses)]
-            rows = [self._kind_rows(s, found, trial).reshape(len(s.poses), -1, self.parameters + 1) for s in seen]
-            yield [(s.poses + block.poses.start, part) for s, part in zip(seen, rows, strict=True)]
+            given = []
+            for s in (s for s in block.sensed if len(s.poses)):
+                m = s.whitener.shape[-1]
+                values = None if self.own is None else self.own.predicted(trial, deviation)
+                rows = np.zeros((len(s.poses), m, (0 if self.own is None else len(self.own.local)) + p + 1))
+                members = [(-1, np.arange(len(s.poses)), None)] if self.own is None else self.own.members(s)
+                for (c, part), (_, which, _) in zip(self._kind_rows(s, found, trial, values), members, strict=True):
+                    one = part.reshape(len(which), m, -1)
+                    u = one.shape[-1] - p - 1
+                    rows[which, :, -p - 1 :] = one[..., u:]
+                    if self.own is not None and c >= 0:
+                        done = self.own.solved[c]
+                        rows[which, :, -p - 1 : -1] += one[..., :u] @ done.slope[0]
+                        rows[np.ix_(which, np.arange(m), done.columns)] = one[..., :u] @ done.inverse[0]
+                given.append((block.poses[s.first], rows))
+            yield given
 
     def weighted(self, weight: FloatArray) -> Rows:
         """Return these rows with a factor (n,) on each pose's squares; 0 makes its rows absent. Kinematics goes on."""
         root = np.sqrt(weight)
-        scaled = [dataclasses.replace(s, whitener=s.whitener * root[s.poses, None, None]) for s in self.sensed]
-        other = Rows(self.unknowns, self.readings, tuple(scaled), self.rows.size, self.located)
+        scaled = []
+        for s in self.sensed:
+            each = root[s.per_pose].prod(axis=1) ** (1.0 / s.per_pose.shape[1])
+            scaled.append(dataclasses.replace(s, whitener=s.whitener * each[:, None, None]))
+        if self.own is not None:
+            self.own.cost[:] = np.inf
+        other = Rows(self.unknowns, self.readings, tuple(scaled), self.counted.size, self.located, self.own)
         other.last = self.last
         return other
 
     def unreachable(self, deviation: FloatArray) -> IntArray:
         """Return the poses that some row needs and that cannot be reached at deviation (1, p)."""
         robot, values = self.unknowns.robot, self.unknowns.values(deviation)
-        lost = [_solved(forward_trials(robot, values, b.readings))[0] | ~b.needed for b in self.blocks]
-        return np.flatnonzero(~np.concatenate(lost))
+        lost = [b.poses[~_solved(forward_trials(robot, values, b.readings))[0] & b.needed] for b in self.blocks]
+        return np.unique(np.concatenate(lost))
 
-    def _moves(self, block: _Block, deviation: FloatArray, trials: IntArray) -> _Moves:
+    def _moves(self, block: Block, deviation: FloatArray, trials: IntArray) -> Moves:
         """Solve a block's poses and linearise them; one deviation (1, p) stands for all of the trials."""
         robot, values = self.unknowns.robot, self.unknowns.values(deviation)
         if self.located is not None:
@@ -194,141 +206,163 @@ class Rows:
         D = self._scaled(D)
         if self.last is not None:
             self.last.put(trials, state, ok, deviation, D)
-        return _Moves(T, D, None, failed)
+        if not self.joints:
+            return Moves(T, ok, failed, D)
+        passive = [name for name in self.joints if name not in {actuator.name for actuator in robot.actuators}]
+        slopes = {}
+        if passive:
+            moved = passive_sensitivity(robot, values, block.readings, state)
+            every = self._scaled(np.where(ok[..., None, None], moved.parameters, 0.0))
+            slopes = {name: every[:, :, moved.names.index(name)] for name in passive}
+        return Moves(T, ok, failed, D, joints=self._joints(block, state, ok), slopes=slopes)
 
-    def _closure(self, block: _Block, values: FloatArray, trials: IntArray) -> _Moves:
+    def _look(self, block: Block, deviation: FloatArray, trials: IntArray) -> Moves:
+        """Solve a block's poses alone."""
+        robot, values = self.unknowns.robot, self.unknowns.values(deviation)
+        state = forward_trials(robot, values, block.readings, self.last and self.last.take(trials, deviation))
+        ok = _solved(state)
+        T = np.where(ok[..., None, None], state.T, np.eye(4))
+        return Moves(T, ok, np.any(~ok & block.needed, axis=1), joints=self._joints(block, state, ok))
+
+    def _joints(self, block: Block, state: engine.State, ok: np.ndarray) -> dict[str, FloatArray]:
+        """Values (a, n) of the joints that kinds look at; zero where a pose failed."""
+        found = joint_values(self.unknowns.robot, self.joints, block.readings, state)
+        return {name: np.where(ok, value, 0.0) for name, value in found.items()}
+
+    def _settled(self, looks: list[Moves], z: FloatArray, trials: IntArray) -> FloatArray:
+        """Values (a, U) of the own unknowns that fit best at the poses of all blocks."""
+        own = self.own
+        assert own is not None
+        for i in np.flatnonzero(~own.started[trials]):
+            self._start(looks, int(i), trials)
+
+        def factors(values: FloatArray) -> list[FloatArray]:
+            folding = Folding(own, len(trials), 0)
+            for block, look in zip(self.blocks, looks, strict=True):
+                for s in (s for s in block.sensed if s.places.shape[1]):
+                    folding.add(list(self._kind_rows(s, look, trials, values, machine=False)))
+            return folding.whole(values)
+
+        return own.settled(own.predicted(trials, z), factors)
+
+    def _start(self, looks: list[Moves], i: int, trials: IntArray) -> None:
+        """Find values to begin with from the poses of trial trials[i]; where it cannot reach some they stay nominal."""
+        assert self.own is not None
+        each = [(look, i if len(look.T) > 1 else 0) for look in looks]
+        if any(look.failed[k] for look, k in each):
+            return
+        n = len(self.readings)
+        T = np.concatenate([look.T[k] for look, k in each])[:n]
+        joints = {name: np.concatenate([np.broadcast_to(look.joints[name], look.ok.shape)[k] for look, k in each])[None, :n]
+                  for name in self.joints}  # fmt: skip
+        trial = int(trials[i])
+        self.own.begin(trial, self.own.find(trial, T, joints))
+
+    def _closure(self, block: Block, values: FloatArray, trials: IntArray) -> Moves:
         """Linearise closure at the located poses of a block."""
         robot = self.unknowns.robot
         assert self.located is not None
-        every = np.broadcast_to(self.located, (self.rows.size, *self.located.shape[1:]))
-        T = every[trials, block.poses]
+        every = np.broadcast_to(self.located, (self.counted.size, *self.located.shape[1:]))
+        T = every[trials[:, None], block.poses]
         e, tau = robot.slots(values)
-        joints = joint_values(block.readings, tau, robot.slots.frequency)
+        joints = driven_values(block.readings, tau, robot.slots.frequency)
         state = engine.solve(robot.program, e, joints, dataclasses.replace(robot.home_state, T=T), most=1)
         step = se3.difference(state.T, T)
         here = dataclasses.replace(state, T=T, status=np.zeros_like(state.status))
         D = sensitivity(robot, values, block.readings, here).parameters
         ok = np.asarray(np.isfinite(step).all(axis=2) & np.isfinite(D).all(axis=(2, 3)))
         step, D = np.where(ok[..., None], step, 0.0), np.where(ok[..., None, None], D, 0.0)
-        return _Moves(T, self._scaled(D), step, np.any(~ok & block.needed, axis=1))
+        return Moves(T, ok, np.any(~ok & block.needed, axis=1), self._scaled(D), step)
 
     def _scaled(self, D: FloatArray) -> FloatArray:
         """Columns of the free parameters in units of their tolerance."""
         free = D[..., self.unknowns.places] if len(self.unknowns.places) < D.shape[-1] else D
         return free * self.unknowns.tolerance
 
-    def _kind_rows(self, sensed: Sensed, moves: _Moves, trials: IntArray) -> FloatArray:
-        """Rows (a, r * m, p + 1) of one kind."""
+    def _evaluated(
+        self, sensed: Sensed, moves: Moves, trials: IntArray, values: FloatArray | None
+    ) -> tuple[Evaluation, FloatArray]:
+        """A kind's residuals and derivatives at the poses of a block, and its whiteners."""
         measured, white = sensed.trials(trials)
-        T, D = moves.T, moves.D
+        T = moves.T
         if not np.array_equal(sensed.poses, np.arange(T.shape[1])):
-            T, D = T[:, sensed.poses], D[:, sensed.poses]
-        found = sensed.kind.evaluate(np.broadcast_to(T, (len(trials), *T.shape[1:])), measured)
+            T = T[:, sensed.poses]
+        T = np.broadcast_to(T, (len(trials), *T.shape[1:]))
+        own = values[:, sensed.places] if values is not None and sensed.places.shape[1] else None
+        names = sensed.kind.looks_at
+        joints = None
+        if names:
+            seen = np.stack([moves.joints[name][:, sensed.poses] for name in names], axis=-1)
+            joints = np.broadcast_to(seen, (len(trials), *seen.shape[1:]))
+        return sensed.kind.evaluate(T, measured, own, joints), white
+
+    def _kind_rows(
+        self, sensed: Sensed, moves: Moves, trials: IntArray, values: FloatArray | None, machine: bool = True
+    ) -> Iterator[tuple[int, FloatArray]]:
+        """Rows (a, k * m, u + p + 1) of one kind, cluster by cluster; without the p columns where `machine` is false."""
+        if not len(sensed.poses):
+            return
+        found, white = self._evaluated(sensed, moves, trials, values)
         residual = found.residual
         if moves.step is not None:
             residual = residual + np.matmul(found.jacobian, moves.step[:, sensed.poses, :, None])[..., 0]
         a, r, m = residual.shape
-        rows = np.empty((a, r, m, self.parameters + 1))
-        np.matmul(np.matmul(white, found.jacobian), D, out=rows[..., :-1])
+        p = self.parameters if machine else 0
+        rows = np.empty((a, r, m, p + 1))
+        if machine:
+            rows[..., :-1] = machine_columns(sensed, found, white, moves)
         rows[..., -1] = np.matmul(white, residual[..., None])[..., 0]
-        return rows.reshape(a, r * m, -1)
+        if self.own is None:
+            yield -1, rows.reshape(a, r * m, -1)
+            return
+        own = None if found.own is None else np.matmul(white, np.broadcast_to(found.own, (a, r, m, found.own.shape[-1])))
+        for c, which, columns in self.own.members(sensed):
+            part = rows[:, which]
+            if c >= 0 and own is not None:
+                wide = spread_columns(own[:, which], columns, len(self.own.clusters[c]))
+                part = np.concatenate([wide, part], axis=-1)
+            yield c, part.reshape(a, len(which) * m, -1)
 
 
-class _Moves(NamedTuple):
-    """Poses of a block and how they move.
-
-    T (a, n, 4, 4); D (a, n, 6, p) by the scaled unknowns; closure's step (a, n, 6) where it is not solved; failed (a,).
-    """
-
-    T: FloatArray
-    D: FloatArray
-    step: FloatArray | None
-    failed: np.ndarray
-
-
-class _Last:
-    """The last solved state of every trial and pose, moved on by its sensitivities: where the next solution begins.
-
-    The sensitivities only choose a start, so they are kept in single precision.
-    """
-
-    def __init__(self, home: engine.State, trials: int, poses: int) -> None:
-        self.shape = (trials, poses)
-        self.state = _mapped(self._spread, home)
-        self.deviation: FloatArray | None = None
-        self.moves = np.zeros(0, np.float32)
-
-    def take(self, trials: IntArray, deviation: FloatArray) -> engine.State:
-        """Return the states of some trials, as far as first order takes them to deviations (a, p)."""
-        state = self.state if len(trials) == self.shape[0] else _mapped(lambda a: a[trials], self.state)
-        if self.deviation is None:
-            return state
-        change = (deviation - self.deviation[trials]).astype(np.float32)
-        twist = np.matmul(self.moves[trials], change[:, None, :, None])[..., 0]
-        return dataclasses.replace(state, T=se3.exp_update(state.T, twist.astype(np.float64)))
-
-    def put(self, trials: IntArray, state: engine.State, ok: np.ndarray, deviation: FloatArray, D: FloatArray) -> None:
-        """Keep the states of poses that are solved; one state stands for all trials where there is one only."""
-        if ok.all() and len(trials) == self.shape[0]:
-            self.state = _mapped(self._spread, state)
-        else:
-            _mapped(lambda old, new: _overwrite(old, new, trials, ok), self.state, state)
-        if self.deviation is None:
-            self.deviation = np.zeros((self.shape[0], deviation.shape[1]))
-            self.moves = np.zeros((*self.shape, 6, deviation.shape[1]), np.float32)
-        self.deviation[trials], self.moves[trials] = deviation, D
-
-    def _spread(self, array: np.ndarray) -> np.ndarray:
-        return np.array(np.broadcast_to(array, (*self.shape, *array.shape[2:])))
-
-
-def _overwrite(old: np.ndarray, new: np.ndarray, trials: IntArray, ok: np.ndarray) -> np.ndarray:
-    """Write the solved poses (ok) of some trials into working memory."""
-    solved = ok.reshape(*ok.shape, *[1] * (new.ndim - 2))
-    old[trials] = np.where(solved, new, old[trials])
-    return old
-
-
-def rows_of(unknowns: Unknowns, data: Measurements) -> Rows:
-    """Return the rows of one machine's measurements; raises EstimationError for kinds that cannot be fitted yet."""
-    for kind in (observations.kind for observations in data.observations if len(observations)):
-        if kind.links > 1 or kind.looks_at:
-            what = "compare poses" if kind.links > 1 else "look at joints"
-            raise EstimationError(f"rows of the kind {kind.name!r} {what}, which cannot be fitted yet; leave them out")
-    sensed = tuple(Sensed(o.kind, o.rows, o.measured[None], o.whitener[None]) for o in data.observations if len(o))
-    return Rows(unknowns, data.readings, sensed, 1)
+def rows_of(unknowns: Unknowns, data: Measurements, local: LocalUnknowns | None = None) -> Rows:
+    """Return the rows of one machine's measurements; `local` are the unknowns that these bring, default as stated."""
+    own = local_unknowns(data.observations, data.labels) if local is None else local
+    pairs = [(o, places) for o, places in zip(data.observations, own.places, strict=True) if len(o)]
+    sensed = tuple(Sensed(o.kind, o.rows, o.measured[None], o.whitener[None], places) for o, places in pairs)
+    return Rows(unknowns, data.readings, sensed, 1, own=_own(unknowns, own, sensed, 1, partial(_start_of, data, own)))
 
 
 def rows_of_trials(unknowns: Unknowns, trials: Trials) -> Rows:
     """Return the rows of t simulated machines."""
+    sensors = trials.instrument.sensors
+    first = trials.trial(0)
+    local = local_unknowns(first.observations, first.labels)
     sensed = []
-    for sensor, measured in zip(trials.instrument.sensors, trials.measured, strict=True):
+    for sensor, measured, places in zip(sensors, trials.measured, local.places, strict=True):
         kind = sensor.kind
         present = kind.present(measured)
         N = kind.noise_map(measured)
         covariance = (N * np.asarray(sensor.noise.sigma) ** 2) @ np.swapaxes(N, -1, -2)
         t, r, m = present.shape
         flat = whitener(np.broadcast_to(covariance, (t, r, m, m)).reshape(-1, m, m), present.reshape(-1, m), np.ones(t * r))
-        sensed.append(Sensed(kind, sensor_rows(sensor), measured, flat.reshape(t, r, m, m)))
-    return Rows(unknowns, trials.readings, tuple(sensed), len(trials))
+        sensed.append(Sensed(kind, sensor_rows(sensor), measured, flat.reshape(t, r, m, m), places))
+
+    def find(i: int, T: FloatArray, joints: Mapping[str, FloatArray]) -> FloatArray:
+        return start_values(trials.trial(i), T, local, joints)
+
+    every = tuple(sensed)
+    return Rows(unknowns, trials.readings, every, len(trials), own=_own(unknowns, local, every, len(trials), find))
+
+
+def _own(unknowns: Unknowns, local: LocalUnknowns, sensed: tuple[Sensed, ...], trials: int, find: Find) -> Own | None:
+    """The own unknowns of rows, None where there are none."""
+    return Own(local, sensed, trials, len(unknowns), find) if len(local) else None
+
+
+def _start_of(data: Measurements, local: LocalUnknowns, _: int, T: FloatArray, joints: Mapping[str, FloatArray]) -> FloatArray:
+    return start_values(data, T, local, joints)
 
 
 def _solved(state: engine.State) -> np.ndarray:
     """(t, n) which poses closed."""
     return state.status == Status.CONVERGED
-
-
-def _mapped(function: Callable[..., np.ndarray], *states: engine.State) -> engine.State:
-    """Return the state whose arrays are the function of those of the given states."""
-    first, columns = states[0], range(len(states[0].joints))
-    joints = tuple(function(*(s.joints[g] for s in states)) for g in columns)
-    fields = {f.name: f.name for f in dataclasses.fields(first) if f.name != "joints"}
-    return engine.State(joints=joints, **{name: function(*(getattr(s, name) for s in states)) for name in fields})
-
-
-def _in_order(parts: list[Residuals], poses: IntArray) -> Residuals:
-    """Residuals of all blocks in the order of the kind's rows."""
-    if len(parts) == 1:
-        return parts[0]
-    place = np.argsort(np.argsort(poses // BLOCK, kind="stable"), kind="stable")
-    return Residuals(*(np.concatenate(arrays, axis=1)[:, place] for arrays in zip(*parts, strict=True)))

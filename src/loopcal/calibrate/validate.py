@@ -10,18 +10,29 @@ the identified model as it did at the measured readings. What no actuator can re
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from loopcal.calibrate.checks import check_known
+from loopcal.calibrate.combinations import listed
 from loopcal.calibrate.identification import Identification
 from loopcal.calibrate.pose_errors import INDICES, PoseErrors, pose_errors
 from loopcal.errors import DataError
 from loopcal.linalg import FloatArray
-from loopcal.measure import Measurements, Observations, check_actuators
-from loopcal.mechanism import Mechanism, forward, inverse
+from loopcal.measure import (
+    LocalUnknowns,
+    Measurements,
+    Observations,
+    check_actuators,
+    joint_values,
+    joints_looked_at,
+    local_unknowns,
+    start_values,
+)
+from loopcal.mechanism import Mechanism, Solution, forward, inverse
+from loopcal.parameters import ParameterTable
 from loopcal.units import DISPLAY_UNITS, Dimension, unit
 
 
@@ -39,6 +50,7 @@ class Validation:
     limit_position, limit_angle : quality gates [m], [rad] on the largest prediction error after; None for no gate.
     reasons : a sentence for each gate that is not met.
     units : display symbols of length and angle.
+    notes : where unknown frames, targets and surfaces come from: from the fit, or found anew from these rows.
     """
 
     poses: tuple[str, ...]
@@ -52,6 +64,7 @@ class Validation:
     limit_angle: float | None
     reasons: tuple[str, ...]
     units: tuple[str, str]
+    notes: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -100,7 +113,7 @@ class Validation:
             lines.append(f"{title:<17} {index:<20} " + " ".join(f"{x:>11.4g}" for x in four) + f" {symbol}")
         if self.failed:
             lines.append(f"left out, out of reach: poses {', '.join(self.failed)}")
-        return "\n".join([*lines, *self.reasons])
+        return "\n".join([*lines, *(f"note: {note}" for note in self.notes), *self.reasons])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result by attribute name for JSON, SI (integrated: mm + rad)."""
@@ -113,6 +126,7 @@ class Validation:
             "limit_angle": self.limit_angle,
             "passed": self.passed,
             "reasons": list(self.reasons),
+            "notes": list(self.notes),
         }
 
 
@@ -141,7 +155,6 @@ def validate(
     robot = fit.robot if isinstance(fit, Identification) else fit
     old = before or (fit.initial if isinstance(fit, Identification) else fit.nominal)
     check_actuators(data, robot)
-    check_known(o.kind for o in data.observations if len(o))
     rows = [o.take(o.weight > 0.0) for o in data.observations]
     rows = [o for o in rows if len(o)]
     if not rows:
@@ -151,10 +164,12 @@ def validate(
     ok = believed.converged & predicted.converged & reached.converged
     if not ok.any():
         raise DataError(f"{robot.name} reaches none of the {data.n_poses} poses; check the readings and their units")
-    rows = [o.take(ok[o.rows]) for o in rows]
-    was = [o.evaluate(_safe(believed.T, ok)[None]).residual[0] for o in rows]
-    now = [o.evaluate(_safe(predicted.T, ok)[None]).residual[0] for o in rows]
-    missed = [_difference(o, _safe(reached.T, ok), _safe(believed.T, ok)) for o in rows]
+    rows = [o.take(ok[o.rows].reshape(len(o), -1).all(axis=1)) for o in rows]
+    seen = replace(data, observations=tuple(rows))
+    known = (fit.local.starts if before is None else {}, fit.local.values) if isinstance(fit, Identification) else ({}, {})
+    first, last = _view(old, seen, believed, ok, known[0]), _view(robot, seen, predicted, ok, known[1])
+    was, now = first.residuals(rows), last.residuals(rows)
+    missed = first.differences(rows, _view(old, seen, reached, ok, None))
     after = _errors(rows, now)
     reasons = _gates(after, _labels(rows, data), limit_position, limit_angle, _units(robot))
     return Validation(
@@ -169,19 +184,72 @@ def validate(
         limit_angle=limit_angle,
         reasons=reasons,
         units=_units(robot),
+        notes=_notes(last),
     )
 
 
-def _safe(T: FloatArray, ok: np.ndarray) -> FloatArray:
-    """Poses with the identity where they failed; rows that see those are gone."""
-    return np.where(ok[:, None, None], T, np.eye(4))
+@dataclass(frozen=True, eq=False)
+class _View:
+    """Poses (1, n, 4, 4) of a robot, its joints, and the values (1, U) of what the measurements bring with them."""
+
+    T: FloatArray
+    joints: Mapping[str, FloatArray]
+    local: LocalUnknowns
+    values: FloatArray
+    carried: tuple[str, ...]
+
+    def residuals(self, rows: list[Observations]) -> list[FloatArray]:
+        """Prediction errors (r, m) of every kind."""
+        return [o.evaluate(self.T, self.own(i, o), self.seen(o)).residual[0] for i, o in enumerate(rows)]
+
+    def differences(self, rows: list[Observations], other: _View) -> list[FloatArray]:
+        """What every kind would see (r, m) of another view's poses, less what it would see of these."""
+        found = []
+        for i, o in enumerate(rows):
+            own = self.own(i, o)
+            wanted = o.kind.measure(self.T[:, o.rows], np.zeros((1, *o.present.shape)), own, self.seen(o))
+            found.append(o.kind.evaluate(other.T[:, o.rows], wanted, own, other.seen(o)).residual[0])
+        return found
+
+    def own(self, i: int, o: Observations) -> FloatArray | None:
+        """Unknowns (1, r, u) of a kind's rows."""
+        return self.local.of(i, self.values) if o.kind.unknowns else None
+
+    def seen(self, o: Observations) -> FloatArray | None:
+        """Joints (1, r, j) that a kind looks at."""
+        names = o.kind.looks_at
+        return np.stack([self.joints[name][:, o.rows] for name in names], axis=-1) if names else None
 
 
-def _difference(o: Observations, T: FloatArray, target: FloatArray) -> FloatArray:
-    """What the kind would see between poses T and target (n, 4, 4), (r, m)."""
-    r, m = o.present.shape
-    wanted = o.kind.measure(target[None, o.rows], np.zeros((1, r, m)))
-    return o.kind.evaluate(T[None, o.rows], wanted).residual[0]
+def _view(robot: Mechanism, data: Measurements, found: Solution, ok: np.ndarray, known: Mapping[str, float] | None) -> _View:
+    """Look at solved poses; unknowns of the measurements are as known or fit these poses best (None: nominal)."""
+    T = np.where(ok[:, None, None], found.T, np.eye(4))
+    names = joints_looked_at(o.kind for o in data.observations)
+    joints = joint_values(robot, names, found.q[None], found.state)
+    local = local_unknowns(data.observations, data.labels)
+    values, carried = local.values(), ()
+    if known is not None and len(local):
+        carried = tuple(name for name in local.table.names if name in known)
+        entries = tuple(
+            p if p.name not in carried else replace(p, nominal=known[p.name], free=False) for p in local.table.entries
+        )
+        values = start_values(data, T, replace(local, table=ParameterTable(entries)), joints)
+    return _View(T[None], joints, local, values[None], carried)
+
+
+def _notes(view: _View) -> tuple[str, ...]:
+    """Say where the unknowns of the measurements come from."""
+    parts = [name.rsplit(".", 1)[0] for name in view.local.table.names]
+    there = [name in view.carried for name in view.local.table.names]
+    notes = []
+    for carried, words in (
+        (True, "as the fit found it"),
+        (False, "found anew from these rows, which flatters"),
+    ):
+        names = list(dict.fromkeys(p for p, c in zip(parts, there, strict=True) if c is carried))
+        if names:
+            notes.append(f"{listed(names)}: {words}")
+    return tuple(notes)
 
 
 def _errors(rows: list[Observations], residuals: list[FloatArray]) -> PoseErrors:
@@ -196,7 +264,7 @@ def _errors(rows: list[Observations], residuals: list[FloatArray]) -> PoseErrors
 
 
 def _labels(rows: list[Observations], data: Measurements) -> tuple[str, ...]:
-    return tuple(data.labels[i] for o in rows for i in o.rows)
+    return tuple("/".join(data.labels[i] for i in seen) for o in rows for seen in o.rows.reshape(len(o), -1))
 
 
 def _units(robot: Mechanism) -> tuple[str, str]:
