@@ -15,6 +15,7 @@ import numpy as np
 from loopcal.calibrate.filters import Method, Ridge, TruncatedSVD, adapted
 from loopcal.calibrate.rows import rows_of
 from loopcal.calibrate.scaling import unknowns
+from loopcal.errors import EstimationError
 from loopcal.linalg import Decomposition, FloatArray, decompose
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
@@ -48,9 +49,16 @@ def leave_one_out(robot: Mechanism, data: Measurements, methods: tuple[Method, .
     Parameters
     ----------
     robot : where the rows are linearised; best the robot of a fit. data : the measurements. methods : at least one.
+
+    Raises
+    ------
+    EstimationError
+        The kinds have unknowns of their own.
     """
     free = unknowns(robot)
     rows = rows_of(free, data)
+    if rows.own is not None:
+        raise EstimationError("leave-one-out of many methods needs known frames and targets; state them, or use cross_validate")
     z = free.deviation(robot.values[None])
     factor, _ = rows.fold(z, np.arange(1))
     d = decompose(factor, rows.rows, z)

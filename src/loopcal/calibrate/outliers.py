@@ -155,6 +155,8 @@ def _sentence(outliers: tuple[Outlier, ...], tested: int, level: float, found: I
     """Say how many blocks do not belong."""
     if tested == 0:
         return "no block of rows can be checked: each determines parameters that no other sees; measure more"
+    if tested == 1:
+        return "all rows belong to one block, which has no others to be compared with"
     if not outliers:
         return f"all {tested} blocks of rows fit each other (false alarm in {level:.0%} of data sets)"
     return (
