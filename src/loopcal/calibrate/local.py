@@ -27,8 +27,9 @@ OWN_RANK = 1e-10
 STEPS, HALVINGS = 30, 20
 """Gauss-Newton steps to the best own unknowns at fixed poses, and halvings of each; two or three steps are usual."""
 
-CLOSE = 1e-7
-"""Share of the whitened residuals that a step still changes when it ends; what is left the elimination removes."""
+CLOSE, NOTHING = 1e-7, 1e-5
+"""Change of the whitened residuals, as a share of them and in standard deviations, below which a step is the last: what
+is left to first order the elimination removes."""
 
 Find = Callable[[int, FloatArray, Mapping[str, FloatArray]], FloatArray]
 """Values (U,) of trial i to begin with, from its poses (n, 4, 4) and joints name -> (1, n)."""
@@ -134,7 +135,7 @@ class Own:
         cost = _squares(found)
         for _ in range(STEPS):
             step, offset = self._step(found, len(values))
-            far = offset > CLOSE**2 * (cost + np.finfo(float).tiny)
+            far = offset > CLOSE**2 * cost + NOTHING**2
             if not far.any():
                 break
             share = far.astype(np.float64)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loopcal.calibrate.combinations import Combination, listed, sparse
 from loopcal.calibrate.local import Own
@@ -34,6 +35,7 @@ class LocalEstimate:
     table : nominal values, priors, and which were kept fixed. start : values with which the fit began.
     estimate : (U,). sd : standard deviations, infinite where the data cannot tell, 0 where fixed, NaN without an interval.
     slope : (U, p) change of the best values by the machine's deviations in tolerances.
+    open : (U,) which have a part in a direction that no row sees, whatever the machine.
     display : factor to SI and symbol of the unit in which each is shown.
     """
 
@@ -42,6 +44,7 @@ class LocalEstimate:
     estimate: FloatArray
     sd: FloatArray
     slope: FloatArray
+    open: NDArray[np.bool_]
     display: tuple[tuple[float, str], ...]
 
     def __len__(self) -> int:
@@ -79,16 +82,17 @@ class LocalEstimate:
         return shown
 
     def notes(self) -> list[str]:
-        """Say which unknowns no row sees well enough, whatever the machine."""
-        alone = np.isinf(self.sd) & (np.abs(self.slope).max(axis=1, initial=0.0) == 0.0)
-        names = [name for name, unseen in zip(self.names, alone, strict=True) if unseen]
-        return [f"not identifiable: {listed(names)}, whatever the robot"] if names else []
+        """Say which unknowns the rows do not tell, whatever the machine: alone, or one only together with another."""
+        names = list(dict.fromkeys(n.rsplit(".", 1)[0] for n, unseen in zip(self.names, self.open, strict=True) if unseen))
+        if not names:
+            return []
+        return [f"not identifiable, whatever the robot: {listed(names)}{', or only together' if len(names) > 1 else ''}"]
 
 
 def nothing_local(parameters: int) -> LocalEstimate:
     """Return the estimate of no unknowns at all."""
     nothing = np.zeros(0)
-    return LocalEstimate(ParameterTable(()), nothing, nothing, nothing, np.zeros((0, parameters)), ())
+    return LocalEstimate(ParameterTable(()), nothing, nothing, nothing, np.zeros((0, parameters)), np.zeros(0, dtype=bool), ())
 
 
 def local_estimate(
@@ -103,19 +107,20 @@ def local_estimate(
     """
     table = own.local.table
     estimate, variance = own.values[0].copy(), np.zeros(len(table))
-    slope = np.zeros((len(table), own.slope.shape[2]))
+    slope, unseen = np.zeros((len(table), own.slope.shape[2])), np.zeros(len(table), dtype=bool)
     known = decomposition.variances(penalty, noise)[0]
     V = decomposition.scale[:, None] * decomposition.directions[0]
     for one in own.solved:
         S = one.slope[0]
         estimate[one.columns] += one.shift[0]
-        slope[one.columns] = S
+        slope[one.columns], unseen[one.columns] = S, one.open[0]
         moved = S @ V
         infinite = np.linalg.norm(moved[:, np.isinf(known)], axis=1) > MOVES * np.linalg.norm(moved, axis=1)
         by_machine = (moved**2) @ np.where(np.isinf(known), 0.0, known)
         alone = (one.inverse[0] ** 2).sum(axis=1) * noise
         variance[one.columns] = np.where(infinite | one.open[0], np.inf, alone + by_machine)
-    return LocalEstimate(table, start, estimate, np.sqrt(variance), slope, tuple(_shown(robot, p) for p in table.entries))
+    shown = tuple(_shown(robot, p) for p in table.entries)
+    return LocalEstimate(table, start, estimate, np.sqrt(variance), slope, unseen, shown)
 
 
 def with_followers(found: tuple[Combination, ...], null: FloatArray, local: LocalEstimate) -> tuple[Combination, ...]:

@@ -111,11 +111,10 @@ def _refuse_contradictions(hold_out: float, gates: bool, prior: Path | None, fre
 
 
 def _examined(fit: Identification, fitted: Measurements) -> Examination | None:
-    """Examine a fit, where no kind has unknowns of its own."""
+    """Examine a fit that converged."""
     from loopcal.calibrate.examine import examine
 
-    own = any(observations.kind.unknowns for observations in fitted.observations)
-    return None if own or not fit.converged else examine(fit, fitted)
+    return examine(fit, fitted) if fit.converged else None
 
 
 def _print(
@@ -124,7 +123,11 @@ def _print(
     """Print what was found, and how well it does on unseen poses, or without any on the fitted ones."""
     from loopcal.calibrate import start_check, validate
 
-    show.parameters(f"{fit.robot.name}: {len(fit.names)} parameters", fit.to_dict()["parameters"])
+    found = fit.to_dict()
+    show.parameters(f"{fit.robot.name}: {len(fit.names)} parameters", found["parameters"])
+    if found["local"]:
+        show.say()
+        show.parameters(f"Measurements: {len(fit.local)} unknowns", found["local"])
     show.say()
     show.say(f"{fit.status.sentence} after {fit.iterations} steps; rank {fit.rank} of {len(fit.names)}")
     degrees = f"{fit.check.degrees:.4g} degree{'' if round(fit.check.degrees) == 1 else 's'} of freedom"
@@ -137,7 +140,7 @@ def _print(
         show.say(f"\n{findings['model_choice']}")
     if validation is not None:
         show.validation(validation, "unseen")
-    elif not any(observations.kind.unknowns for observations in fitted.observations):
+    else:
         show.validation(validate(fit, fitted), "fitted")
         show.say("these rows were fitted, so this proves nothing about other poses; keep some for that with --hold-out 0.25")
     show.say(f"\nwritten to {output}: result.json, arrays.npz, robot.yaml")

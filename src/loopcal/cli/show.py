@@ -133,6 +133,8 @@ def validation(found: Validation, poses: str, before: bool = True) -> None:
             say(f"{index} error (rms): {_compared(found.improvement(index))}")
     if found.failed:
         say(f"left out, out of reach: poses {', '.join(found.failed)}")
+    for note in found.notes:
+        say(f"note: {note}")
 
 
 def _compared(improvement: float) -> str:
