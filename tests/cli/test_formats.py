@@ -2,6 +2,7 @@
 """`loopcal import` and `loopcal export`: files of controllers in, corrected files out, nothing else in them changed."""
 
 import difflib
+import importlib
 import json
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from loopcal.cli import main
 from loopcal.io import load_measurements, load_robot
+from loopcal.io.formats import FORMATS
 from tests.cli.delta_printers import every_record, stored
 from tests.io.formats.printers import printer_cfg
 
@@ -146,3 +148,43 @@ def test_bad_use_is_one_sentence(folder, capsys, command, sentence) -> None:
     assert sentence in error
     assert error.count("\n") == 1
     assert list(folder.iterdir()) == []
+
+
+def test_commands_and_page_name_every_format(root) -> None:
+    import_, export = (importlib.import_module(f"loopcal.cli.{name}") for name in ("import_", "export"))
+    page = (root / "docs" / "formats.md").read_text()
+    assert all(f"`{name}`" in page for name in FORMATS)
+    assert {*import_.FORMATS} == {name for name, found in FORMATS.items() if found.read}
+    assert {*export.FORMATS} == {name for name, found in FORMATS.items() if found.write}
+
+
+def test_a_five_bar_goes_from_urdf_to_corrected_origins(folder, capsys, data_folder) -> None:
+    source = data_folder / "urdf_closures" / "5bar_linkage" / "robot.urdf"
+    assert run(f"import {source} -o five-bar.yaml") == 0
+    assert (
+        "5 rigid bodies with the base (of 8 links), 5 joints (1 close loops), 2 motors, mobility 2" in capsys.readouterr().out
+    )
+    assert run(f"export five-bar.yaml --format urdf --into {source} -o same.urdf") == 0
+    assert (folder / "same.urdf").read_bytes() == source.read_bytes()
+
+
+def test_heights_and_distances_give_the_optimum_of_the_firmwares_own_cost(folder, capsys, data_folder) -> None:
+    """With its weighting; two of the arms that this printer's firmware stored are not the optimum (cost 0.6477)."""
+    record = every_record(data_folder)[WITH_DISTANCES]
+    (folder / "printer.cfg").write_text(printer_cfg(record))
+    sigma = 0.1 / np.sqrt(2 * len(record["distances"]) / len(record["heights"]))
+    assert run(f"{ONE_COMMAND} --sigma-height {sigma}mm --sigma-distance 0.1mm --json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["fit"]["rank"] == 9
+    assert document["fit"]["chi_square"] * 0.1**2 == pytest.approx(0.6160, abs=1e-4)  # [mm^2]
+    found = {row["name"]: row["estimate"] for row in document["fit"]["parameters"]}
+    best = {"arm1.length": 217.4260, "arm2.length": record["geometry_stored_in_config"]["arms"][1], "arm3.length": 215.6702}
+    for name, value in {**stored(record), **best}.items():
+        if name in found:
+            assert abs(found[name] - value) < 1e-3, f"{name} [mm, deg]"
+    assert len(changed((folder / "printer.cfg").read_text(), (folder / "corrected.cfg").read_text())) <= 9
+    assert run("import corrected.cfg -o again.yaml") == 0
+    again = load_robot("again.yaml")
+    for name, value in found.items():
+        factor = np.pi / 180 if name.endswith("angle") else 1e-3
+        assert again.values[again.parameters.index(name)] / factor == pytest.approx(value, abs=1e-6)  # six decimals

@@ -10,7 +10,7 @@ import click
 from loopcal.cli import show
 from loopcal.cli.options import FILE, json_option
 
-FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "json", "csv")
+FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "json", "csv")
 
 
 @click.command(short_help="Write identified numbers into a controller's file.")

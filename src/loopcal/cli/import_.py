@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from loopcal.io.formats.exchange import Format, Reading
     from loopcal.mechanism import Mechanism
 
-FORMATS = ("klipper", "marlin", "reprap", "linuxcnc")
+FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf")
 LENGTH = Quantity(Dimension.LENGTH)
 ASKED = {
     "sigma_height": "--sigma-height",
@@ -26,6 +26,7 @@ ASKED = {
     "length_unit": "--unit",
     "home_height": "--home-z",
     "closures": "--closures",
+    "platform": "--platform",
 }
 
 
@@ -39,6 +40,8 @@ ASKED = {
 @click.option("--sigma-distance", type=LENGTH, metavar="QUANTITY", help="Noise of distances (klipper); 0.1mm if left out.")
 @click.option("--unit", "length_unit", type=click.Choice(symbols(Dimension.LENGTH)), help="Of lengths (linuxcnc).")
 @click.option("--home-z", "home_height", type=LENGTH, metavar="QUANTITY", help="Height of the home pose (linuxcnc).")
+@click.option("--closures", type=FILE, help="Which loops a URDF closes (urdf); FILE with the ending .yaml if left out.")
+@click.option("--platform", metavar="LINK", help="Which link is the platform (urdf); the one on a fixed joint if left out.")
 @click.option("--force", is_flag=True, help="Replace files that are there.")
 @json_option
 def import_(
@@ -55,6 +58,7 @@ def import_(
       loopcal import printer.cfg -o printer.yaml --data heights.csv --corrected corrected.cfg
       loopcal import config-override.g --format reprap -o printer.yaml
       loopcal import hexapod.hal --unit mm --home-z 200mm -o hexapod.yaml
+      loopcal import five-bar.urdf --closures five-bar-loops.yaml -o five-bar.yaml
     """  # noqa: D301
     from loopcal.io.formats.transfer import format_of, save_imported
     from loopcal.io.new_robot import refuse_existing

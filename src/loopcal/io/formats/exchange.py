@@ -31,7 +31,7 @@ class Reading:
     ----------
     name : of the robot. sigma_height, sigma_distance : noise of measurements in the file [m], which no format states.
     length_unit : symbol of the unit of lengths, for formats that state none. home_height : z of the home pose [m].
-    closures : the file of loop closures, for formats that keep them apart.
+    closures : the file of loop closures, for formats that keep them apart. platform : the link that is the platform.
     """
 
     name: str
@@ -40,6 +40,7 @@ class Reading:
     length_unit: str | None = None
     home_height: float | None = None
     closures: Path | None = None
+    platform: str | None = None
 
 
 @dataclass(frozen=True)

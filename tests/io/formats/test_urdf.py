@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""URDF with loop closures: what is in the two public files, agreement with the tree's own kinematics, origins out."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal.errors import DataError, FileError, LoopcalError
+from loopcal.io.formats import urdf, urdf_limbs, urdf_loops, urdf_tree
+from loopcal.io.formats.exchange import Imported, Reading, Source
+from loopcal.io.formats.transfer import checked
+from loopcal.mechanism import Mechanism, forward, inverse
+
+FIVE_BAR, DELTA = "5bar_linkage", "robot_delta"
+FRAME = {FIVE_BAR: "effector", DELTA: "eff"}
+# bodies with the base, joints, loops, mobility: by hand from the drawings; 3 (bodies - 1) - 2 joints = mobility in a plane
+COUNTS = {FIVE_BAR: (5, 5, 1, 2), DELTA: (9, 11, 3, 2)}
+
+
+@pytest.fixture(scope="module")
+def files(data_folder) -> dict[str, Path]:
+    return {name: data_folder / "urdf_closures" / name / "robot.urdf" for name in COUNTS}
+
+
+@pytest.fixture(scope="module")
+def read(files) -> dict[str, tuple[Imported, Mechanism]]:
+    found = {name: urdf.read(path, Reading(name)) for name, path in files.items()}
+    return {name: (one, checked(files[name], one)) for name, one in found.items()}
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_bodies_joints_loops_and_mobility_are_right_and_printed(files, read, name) -> None:
+    bodies, joints, loops, mobility = COUNTS[name]
+    assert 3 * (bodies - 1) - 2 * joints == mobility
+    assert joints - (bodies - 1) == loops
+    first, second = read[name][0].notes[:2]
+    assert f"{bodies} rigid bodies with the base" in first
+    assert f"{joints} joints ({loops} close loops), 2 motors, mobility {mobility}" in first
+    assert float(re.findall(r"residual at home (\S+) m", second)[0]) < 1e-12  # [m]
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_the_loops_are_closed_at_home(read, name) -> None:
+    robot = read[name][1]
+    found = inverse(robot, robot.home[None])
+    assert found.residual[0] < 1e-12  # [m]
+    np.testing.assert_allclose(found.T[0], robot.home, rtol=0, atol=1e-12)
+    assert len(robot.controlled) == COUNTS[name][3]
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_poses_are_those_of_the_tree_with_its_loops_closed(files, read, name) -> None:
+    """The tree's joints closed by Newton on all of its loops, the branches too, against the limbs of the robot file."""
+    robot, tree = read[name][1], urdf_tree.read(files[name])
+    body, frame = tree.body(FRAME[name]), tree.in_body(FRAME[name])
+    loops = urdf_loops.read(tree, files[name].with_name("robot.yaml"))
+    near = list(urdf_limbs.cut(loops, body).loops.nearby())
+    assert len(near) > 2
+    q = np.array([[one.values[motor] for motor in loops.motors] for one in near])
+    found = forward(robot, q)
+    assert found.converged.all()
+    np.testing.assert_allclose(found.T, [one.places[body] @ frame for one in near], rtol=0, atol=1e-11)  # [m, 1]
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_an_unchanged_robot_leaves_the_file_byte_for_byte(files, read, name) -> None:
+    assert urdf.write(Source(read[name][1]), files[name]).text.encode() == files[name].read_bytes()
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_only_attributes_of_origins_change(files, read, name) -> None:
+    robot = moved(read[name][1])
+    before, after = files[name].read_text(), urdf.write(Source(robot), files[name]).text
+    changed = [(a, b) for a, b in zip(before.splitlines(), after.splitlines(), strict=True) if a != b]
+    assert len(changed) == {FIVE_BAR: 6, DELTA: 7}[name]
+    for a, b in changed:
+        assert re.sub(r'(xyz|rpy)="[^"]*"', "", a) == re.sub(r'(xyz|rpy)="[^"]*"', "", b)
+        assert a.strip().startswith("<origin")
+
+
+def test_corrected_origins_read_back_as_the_same_machine(tmp_path, files, read) -> None:
+    robot = moved(read[FIVE_BAR][1])
+    (tmp_path / "robot.urdf").write_text(urdf.write(Source(robot), files[FIVE_BAR]).text)
+    (tmp_path / "robot.yaml").write_text(files[FIVE_BAR].with_name("robot.yaml").read_text())
+    again = checked(tmp_path / "robot.urdf", urdf.read(tmp_path / "robot.urdf", Reading("again")))
+    T = inverse(again, again.home[None]).T
+    q = inverse(again, T).q + 0.05 * np.random.default_rng(2).uniform(-1, 1, (20, 2))
+    one, other = forward(again, q), forward(robot, q)
+    assert one.converged.all()
+    assert other.converged.all()
+    np.testing.assert_allclose(other.T, one.T, rtol=0, atol=1e-10)  # [m, 1]
+
+
+def moved(robot: Mechanism) -> Mechanism:
+    """With every parameter off by up to a millimetre or a milliradian."""
+    shift = 1e-3 * np.random.default_rng(1).uniform(-1, 1, len(robot.values))
+    return robot.with_values(robot.values + shift)
+
+
+def test_a_limb_that_branches_is_refused_with_its_joints(files) -> None:
+    with pytest.raises(FileError, match=r"joints .* meet in '.*', so a limb branches from a limb"):
+        urdf.read(files[DELTA], Reading("delta", platform="transmission_connecting_rod"))
+
+
+def test_a_urdf_needs_a_file_to_be_corrected(read) -> None:
+    with pytest.raises(DataError, match=r"name the one to correct, as --into robot.urdf"):
+        urdf.write(Source(read[FIVE_BAR][1]), None)
+
+
+def test_another_machine_is_not_corrected(tmp_path, files, read) -> None:
+    (tmp_path / "other.urdf").write_text(files[FIVE_BAR].read_text().replace('xyz="0.1000', 'xyz="0.2000'))
+    with pytest.raises(FileError, match="export into the URDF that it came from"):
+        urdf.write(Source(read[FIVE_BAR][1]), tmp_path / "other.urdf")
+
+
+JOINT = (
+    '<joint name="a" type="revolute"><origin xyz="0 0 1"/><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/></joint>'
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("<robot><link name='a'>", ":1: this is no XML"),
+        ("<!DOCTYPE robot><robot/>", ":1: a document type is no part of a URDF"),
+        (
+            "<robot><link name='base'/><link name='arm'/>\n" + JOINT.replace("0 0 1", "0 1", 1) + "</robot>",
+            ":2: xyz of joint 'a' is",
+        ),
+        (
+            "<robot><link name='base'/><link name='arm'/>\n" + JOINT.replace("revolute", "planar") + "</robot>",
+            ":2: joint 'a' is of type",
+        ),
+        ("<robot><link name='base'/>\n" + JOINT + "</robot>", ":2: joint 'a' names the link 'arm', which is not there"),
+        ("<robot><link name='base'/><link name='arm'/></robot>", "a URDF has one root link, this has 2"),
+        (
+            "<robot><link name='base'/><link name='arm'/>\n" + JOINT + JOINT + "</robot>",
+            ":2: joint 'a' stands here for the second time",
+        ),
+        ("<robot><link name='base'/><link name='arm'/>\n" + JOINT + "</robot>", "name the file of closures, as --closures"),
+    ],
+)
+def test_bad_files_are_refused_in_one_sentence(tmp_path, text, sentence) -> None:
+    (tmp_path / "a.urdf").write_text(text)
+    with pytest.raises(FileError, match=sentence):
+        urdf.read(tmp_path / "a.urdf", Reading("a"))
+
+
+@pytest.mark.parametrize(
+    ("closures", "sentence"),
+    [
+        ("closed_loop: [[a, b]]\ntype: ['6d']\nname_mot: [a]\n", ":1: the closure 'b' is no joint of a.urdf"),
+        ("closed_loop: []\ntype: []\nname_mot: []\n", "no motor is named"),
+        ("closed_loop: [[a, a]]\ntype: ['3d']\nname_mot: []\n", ":2: closure 'a' is of type '3d'"),
+        ("closed_loop: 1\n", "write 'closed_loop:' as a list of pairs"),
+        ("closed_loop: []\ntype: []\nname_mot: [z]\n", ":3: the motor 'z' is no movable joint"),
+    ],
+)
+def test_bad_closures_are_refused_in_one_sentence(tmp_path, closures, sentence) -> None:
+    (tmp_path / "a.urdf").write_text("<robot><link name='base'/><link name='arm'/>\n" + JOINT + "</robot>")
+    (tmp_path / "a.yaml").write_text(closures)
+    with pytest.raises(LoopcalError, match=sentence):
+        urdf.read(tmp_path / "a.urdf", Reading("a"))
