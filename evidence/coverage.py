@@ -15,7 +15,7 @@ from loopcal.calibrate.filters import Method
 from loopcal.calibrate.identify import IdentifiedTrials
 from loopcal.calibrate.steps import penalised
 from loopcal.io import load_robot
-from loopcal.measure import KINDS, Gaussian, Instrument, Sensor, sample_truth, simulate_trials
+from loopcal.measure import Component, Gaussian, Instrument, Pose, Sensor, sample_truth, simulate_trials
 from loopcal.mechanism import Mechanism, sample
 from loopcal.mechanism.trials import forward_trials, sensitivity
 
@@ -72,9 +72,9 @@ class Outcome:
 def instrument(case: Case, noise: float) -> Instrument:
     """The instrument of a case with its noise multiplied."""
     if case.kind == "component":
-        return Instrument((Sensor(KINDS["component"](("x", "y", "z")), Gaussian(np.full(3, noise * SIGMA_LENGTH))),))
+        return Instrument((Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, noise * SIGMA_LENGTH))),))
     sigma = np.array([SIGMA_ANGLE] * 3 + [SIGMA_LENGTH] * 3)
-    return Instrument((Sensor(KINDS["pose"](), Gaussian(noise * sigma)),))
+    return Instrument((Sensor(Pose(), Gaussian(noise * sigma)),))
 
 
 def fits(case: Case, count: int) -> Iterator[Outcome]:

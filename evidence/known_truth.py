@@ -7,16 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import se3
-from loopcal.calibrate import GCV, MAP, LeastSquares, Ridge, TruncatedSVD, TruncationGCV, Widened, identify_trials
+from loopcal.calibrate import GCV, MAP, LeastSquares, Ridge, TruncatedSVD, TruncationGCV, Widened, identify, identify_trials
+from loopcal.calibrate.choose_model import choose_model
 from loopcal.calibrate.filters import Method
 from loopcal.io import load_robot
-from loopcal.measure import KINDS, Gaussian, Instrument, Sensor, sample_truth, simulate_trials
+from loopcal.measure import Component, Gaussian, Instrument, Measurements, Pose, Sensor, sample_truth, simulate_trials
 from loopcal.mechanism import Mechanism, sample
 from loopcal.mechanism.trials import forward_trials
 
 Array = NDArray[np.float64]
 
-SEED, MACHINES, POSES, UNSEEN = 5, 40, 25, 60
+SEED, MACHINES, POSES, UNSEEN, CHOSEN = 5, 40, 25, 60, 20
 ROBOTS = ("hexapod-42", "3-prs", "ru-pus-prs", "linear-delta")
 NOISE = {"1 um, 5 urad": (1e-6, 5e-6), "10 um, 50 urad": (1e-5, 5e-5), "100 um, 500 urad": (1e-4, 5e-4)}
 METHODS: dict[str, Method] = {
@@ -31,8 +32,8 @@ METHODS: dict[str, Method] = {
 def instrument(robot: Mechanism, length: float, angle: float) -> Instrument:
     """Full poses, or positions where the platform does not turn."""
     if len(robot.freedoms) == 3:
-        return Instrument((Sensor(KINDS["component"](("x", "y", "z")), Gaussian(np.full(3, length))),))
-    return Instrument((Sensor(KINDS["pose"](), Gaussian(np.array([angle] * 3 + [length] * 3))),))
+        return Instrument((Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, length))),))
+    return Instrument((Sensor(Pose(), Gaussian(np.array([angle] * 3 + [length] * 3))),))
 
 
 def errors(robot: Mechanism, values: Array, truth: Array, q: Array) -> Array:
@@ -51,7 +52,16 @@ def cell(name: str, noise: tuple[float, float], machines: int = MACHINES) -> dic
     found = {"before": errors(robot, np.broadcast_to(robot.values, truth.shape), truth, q)}
     for title, method in METHODS.items():
         found[title] = errors(robot, identify_trials(robot, trials, method).values, truth, q)
+    few = min(machines, CHOSEN)
+    chosen = np.array([simplest(robot, trials.trial(i)) for i in range(few)])
+    found["chosen model"] = errors(robot, chosen, truth[:few], q)
     return found
+
+
+def simplest(robot: Mechanism, data: Measurements) -> Array:
+    """Values (p,) [SI] of the simplest set of parameters that cross-validation finds enough."""
+    choice = choose_model(robot, data)
+    return identify(choice.robot, data).robot.values if choice.chosen.parameters else robot.values
 
 
 def collect() -> dict:
@@ -62,8 +72,9 @@ def collect() -> dict:
             found = cell(name, noise)
             worse = int((found["default"] > found["before"]).sum())
             rows.append([name, title, *(1e6 * float(np.median(e)) for e in found.values()), worse])
-    columns = ["robot", "noise", "before", *METHODS, f"default worse than before, of {MACHINES}"]
-    formats = ["", "", *[".3g"] * (1 + len(METHODS)), "d"]
+    columns = ["robot", "noise", "before", *METHODS, f"chosen model ({CHOSEN} machines)"]
+    columns.append(f"default worse than before, of {MACHINES}")
+    formats = ["", "", *[".3g"] * (2 + len(METHODS)), "d"]
     return {
         "seed": SEED,
         "machines": MACHINES,

@@ -51,9 +51,7 @@ def _polynomial(vector: Array, first: Array, second: Array) -> Array:
     xy, xz, yz = second * x * y, second * x * z, second * y * z
     xx, yy, zz = second * x * x, second * y * y, second * z * z
     ax, ay, az = first * x, first * y, first * z
-    return matrix(
-        ((1.0 - yy - zz, xy - az, xz + ay), (xy + az, 1.0 - xx - zz, yz - ax), (xz - ay, yz + ax, 1.0 - xx - yy))
-    )
+    return matrix(((1.0 - yy - zz, xy - az, xz + ay), (xy + az, 1.0 - xx - zz, yz - ax), (xz - ay, yz + ax, 1.0 - xx - yy)))
 
 
 def _angle(vector: Array) -> tuple[Array, Array]:
@@ -183,18 +181,12 @@ def matrix_to_quaternion(rotation: Array) -> Array:
     diagonal = (1.0 + trace, 1.0 + 2.0 * xx - trace, 1.0 + 2.0 * yy - trace, 1.0 + 2.0 * zz - trace)
     wx, wy, wz = zy - yz, xz - zx, yx - xy
     sxy, sxz, syz = xy + yx, xz + zx, yz + zy
-    rows = (
-        (diagonal[0], wx, wy, wz),
-        (wx, diagonal[1], sxy, sxz),
-        (wy, sxy, diagonal[2], syz),
-        (wz, sxz, syz, diagonal[3]),
-    )
+    rows = ((diagonal[0], wx, wy, wz), (wx, diagonal[1], sxy, sxz), (wy, sxy, diagonal[2], syz), (wz, sxz, syz, diagonal[3]))
     first = diagonal[0] >= diagonal[1]
     second = diagonal[2] >= diagonal[3]
     lower = np.maximum(diagonal[0], diagonal[1]) >= np.maximum(diagonal[2], diagonal[3])
     chosen = [
-        np.where(lower, np.where(first, rows[0][j], rows[1][j]), np.where(second, rows[2][j], rows[3][j]))
-        for j in range(4)
+        np.where(lower, np.where(first, rows[0][j], rows[1][j]), np.where(second, rows[2][j], rows[3][j])) for j in range(4)
     ]
     scale = np.where(chosen[0] < 0.0, -1.0, 1.0) / np.sqrt(sum(entry * entry for entry in chosen))
     return np.stack([scale * entry for entry in chosen], axis=-1)
