@@ -86,9 +86,7 @@ __all__ = ["__version__", *sorted(_WHERE)]  # noqa: PLE0604  # pyright: ignore[r
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used."""
     if name not in _WHERE:
-        raise AttributeError(
-            f"module 'loopcal' has no attribute {name!r}; public names are {', '.join(sorted(_WHERE))}"
-        )
+        raise AttributeError(f"module 'loopcal' has no attribute {name!r}; public names are {', '.join(sorted(_WHERE))}")
     value = getattr(import_module(_WHERE[name]), name)
     globals()[name] = value
     return value
