@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Unknown frames, targets, surfaces, linked poses and joint sensors in the fit."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -172,7 +174,7 @@ def test_intervals_of_machine_and_frame_hold_the_truth():
         fit = identify(robot, data, MAP())
         fits.append(fit)
         true = [TRUE.get(name, nominal) for name, nominal in zip(fit.local.names, fit.local.table.nominal, strict=True)]
-        off = np.concatenate([fit.estimate - truth[unknowns(robot).places], fit.local.estimate - true])
+        off = np.concatenate([fit.estimate - truth[unknowns(robot).places], fit.local.estimate - np.array(true)])
         sd = np.concatenate([fit.sd, fit.local.sd])
         inside.append((np.abs(off) < 1.96 * sd)[np.isfinite(sd)])
         # the delta does not turn: where the target sits and where the frame begins are one and the same
@@ -247,6 +249,24 @@ def test_sessions_have_frames_of_their_own_and_are_eliminated_one_by_one():
     assert fit.p_value > 1e-4
     assert fit.local.values["day3.frame.rz"] == pytest.approx(0.3, abs=1e-3)
     assert fit.rank == 36
+
+
+@pytest.mark.slow
+def test_memory_stays_flat_in_the_number_of_sessions():
+    def peak(sessions):
+        day = np.repeat([f"day{i}" for i in range(sessions)], 8)
+        sensor = Sensor(Pose(unknown=("frame",)), Gaussian(np.full(6, UM)), session=day)
+        truth = hexapod().with_values(zoo.hexapod_truth())
+        data = simulate(truth, hexapod_poses(8 * sessions), Instrument((sensor,)), 1)
+        tracemalloc.start()
+        try:
+            assert identify(hexapod(), data, LeastSquares()).rank == 36
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    # one block of 512 poses either way; per session there is a factor of 49 columns and little else
+    assert peak(128) < 1.5 * peak(64) + 128 * 49**2 * 8
 
 
 def test_priors_and_fixed_unknowns_are_kept_to():

@@ -12,14 +12,15 @@ sessions and groups there are. A tolerance is one more row. See docs/theory/iden
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loopcal import engine
 from loopcal.calibrate.sensed import Sensed
 from loopcal.linalg import NULL_COMPONENT, FloatArray, IntArray, empty_factor
-from loopcal.measure import LocalUnknowns
+from loopcal.measure import LocalUnknowns, Measurements, Observations, start_values
+from loopcal.parameters import ParameterTable
 
 OWN_RANK = 1e-10
 """Share of the largest singular value (columns of length one) below which a direction of the own unknowns is none."""
@@ -30,9 +31,6 @@ STEPS, HALVINGS = 30, 20
 CLOSE, NOTHING = 1e-7, 1e-5
 """Change of the whitened residuals, as a share of them and in standard deviations, below which a step is the last: what
 is left to first order the elimination removes."""
-
-Find = Callable[[int, FloatArray, Mapping[str, FloatArray]], FloatArray]
-"""Values (U,) of trial i to begin with, from its poses (n, 4, 4) and joints name -> (1, n)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +60,18 @@ class Own:
     Parameters
     ----------
     local : the U unknowns. sensed : the rows of every kind. trials : number of machines. parameters : p.
-    find : values to begin with.
+    data : from a trial's number to its measurements, from which values to begin with are found.
     """
 
-    def __init__(self, local: LocalUnknowns, sensed: tuple[Sensed, ...], trials: int, parameters: int, find: Find) -> None:
-        self.local, self.find = local, find
+    def __init__(
+        self,
+        local: LocalUnknowns,
+        sensed: tuple[Sensed, ...],
+        trials: int,
+        parameters: int,
+        data: Callable[[int], Measurements],
+    ) -> None:
+        self.local, self.data = local, data
         table = local.table
         self.free = np.asarray(table.free, dtype=bool)
         self.held = self.free & ~np.isnan(table.tolerance)
@@ -113,11 +118,25 @@ class Own:
         rows[:, :, -1] = (values[:, columns[held]] - table.nominal[columns[held]]) / tolerance
         return rows
 
-    def begin(self, trial: int, values: FloatArray) -> None:
-        """Put a trial at the values (U,) with which it starts."""
+    def begin(self, trial: int, T: FloatArray, joints: Mapping[str, FloatArray]) -> None:
+        """Put a trial at the values that fit its poses (n, 4, 4) and joints name -> (1, n), cluster by cluster."""
+        values, data = self.local.values(), self.data(trial)
+        clusters = [self.cluster[places].max(axis=1, initial=-1) for places in self.local.places]
+        for c in range(len(self.clusters)):
+            some = [(o.take(of == c), p[of == c]) for o, p, of in self._rows(data, clusters) if (of == c).any()]
+            used = np.unique(np.concatenate([places.ravel() for _, places in some]))
+            entries = tuple(self.local.table.entries[i] for i in used)
+            local = LocalUnknowns(ParameterTable(entries), tuple(np.searchsorted(used, places) for _, places in some))
+            part = replace(data, observations=tuple(rows for rows, _ in some))
+            values[used] = start_values(part, T, local, joints)
         self.values[trial], self.started[trial] = values, True
         if trial == 0:
             self.start = values.copy()
+
+    def _rows(self, data: Measurements, clusters: list[IntArray]) -> list[tuple[Observations, IntArray, IntArray]]:
+        """Kinds with rows, which unknowns each uses, and the cluster of each row."""
+        every = zip(data.observations, self.local.places, clusters, strict=True)
+        return [(o, places, of) for o, places, of in every if len(o) and places.shape[1]]
 
     def predicted(self, trials: IntArray, deviation: FloatArray) -> FloatArray:
         """Values (a, U) of some trials at deviations (a, p), to first order from where they were found last."""

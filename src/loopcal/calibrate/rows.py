@@ -12,27 +12,17 @@ readings and kinds, each with its own measured values.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
-from functools import partial
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from loopcal import engine, se3
-from loopcal.calibrate.local import Find, Folding, Own, spread_columns
+from loopcal.calibrate.local import Folding, Own, spread_columns
 from loopcal.calibrate.moves import Last, Moves, machine_columns
 from loopcal.calibrate.scaling import Unknowns
 from loopcal.calibrate.sensed import BLOCK, Block, Residuals, Sensed, blocks_of
 from loopcal.linalg import FloatArray, IntArray, empty_factor
-from loopcal.measure import (
-    Evaluation,
-    LocalUnknowns,
-    Measurements,
-    Trials,
-    joint_values,
-    joints_looked_at,
-    local_unknowns,
-    start_values,
-)
+from loopcal.measure import Evaluation, LocalUnknowns, Measurements, Trials, joint_values, joints_looked_at, local_unknowns
 from loopcal.measure.simulate import rows_of as sensor_rows
 from loopcal.measure.whitening import whitener
 from loopcal.mechanism import Status
@@ -256,7 +246,7 @@ class Rows:
         joints = {name: np.concatenate([np.broadcast_to(look.joints[name], look.ok.shape)[k] for look, k in each])[None, :n]
                   for name in self.joints}  # fmt: skip
         trial = int(trials[i])
-        self.own.begin(trial, self.own.find(trial, T, joints))
+        self.own.begin(trial, T, joints)
 
     def _closure(self, block: Block, values: FloatArray, trials: IntArray) -> Moves:
         """Linearise closure at the located poses of a block."""
@@ -329,7 +319,7 @@ def rows_of(unknowns: Unknowns, data: Measurements, local: LocalUnknowns | None 
     own = local_unknowns(data.observations, data.labels) if local is None else local
     pairs = [(o, places) for o, places in zip(data.observations, own.places, strict=True) if len(o)]
     sensed = tuple(Sensed(o.kind, o.rows, o.measured[None], o.whitener[None], places) for o, places in pairs)
-    return Rows(unknowns, data.readings, sensed, 1, own=_own(unknowns, own, sensed, 1, partial(_start_of, data, own)))
+    return Rows(unknowns, data.readings, sensed, 1, own=_own(unknowns, own, sensed, 1, lambda _: data))
 
 
 def rows_of_trials(unknowns: Unknowns, trials: Trials) -> Rows:
@@ -347,20 +337,15 @@ def rows_of_trials(unknowns: Unknowns, trials: Trials) -> Rows:
         flat = whitener(np.broadcast_to(covariance, (t, r, m, m)).reshape(-1, m, m), present.reshape(-1, m), np.ones(t * r))
         sensed.append(Sensed(kind, sensor_rows(sensor), measured, flat.reshape(t, r, m, m), places))
 
-    def find(i: int, T: FloatArray, joints: Mapping[str, FloatArray]) -> FloatArray:
-        return start_values(trials.trial(i), T, local, joints)
-
     every = tuple(sensed)
-    return Rows(unknowns, trials.readings, every, len(trials), own=_own(unknowns, local, every, len(trials), find))
+    return Rows(unknowns, trials.readings, every, len(trials), own=_own(unknowns, local, every, len(trials), trials.trial))
 
 
-def _own(unknowns: Unknowns, local: LocalUnknowns, sensed: tuple[Sensed, ...], trials: int, find: Find) -> Own | None:
+def _own(
+    unknowns: Unknowns, local: LocalUnknowns, sensed: tuple[Sensed, ...], trials: int, data: Callable[[int], Measurements]
+) -> Own | None:
     """The own unknowns of rows, None where there are none."""
-    return Own(local, sensed, trials, len(unknowns), find) if len(local) else None
-
-
-def _start_of(data: Measurements, local: LocalUnknowns, _: int, T: FloatArray, joints: Mapping[str, FloatArray]) -> FloatArray:
-    return start_values(data, T, local, joints)
+    return Own(local, sensed, trials, len(unknowns), data) if len(local) else None
 
 
 def _solved(state: engine.State) -> np.ndarray:
