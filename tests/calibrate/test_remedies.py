@@ -59,3 +59,39 @@ def test_a_robot_without_a_workspace_is_looked_at_about_home():
     found = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
     assert not hexapod().assembly.workspace
     assert "psi" in {cure.words for cure in remedies(found)[0].cures}
+
+
+TRANSLATIONAL = """\
+format: 1
+family: limbs
+name: tsai-3upu
+source: of the kind of Tsai 1996, dimensions ours
+units: {length: mm, angle: deg}
+controlled: [x, y, z]
+actuators:
+  q: {reads: length, stroke: [-150, 150], offset: 500, unknown: [offset], length: {sd: 0.1}}
+limbs:
+  - name: leg
+    chain:
+      - {joint: U, name: lower, at: [300, 0, 0], axes: [y, x], start: [-18, 0]}
+      - {joint: P, name: slide, axis: z, actuated: q, start: 500}
+      - {joint: U, name: upper, axes: [x, y], start: [0, 18]}
+    ending: rigid
+    attach: [145, 0, 0]
+    copies: {count: 3}
+    errors:
+      - {of: lower, shift: [x, y], tolerance: {sd: 0.1}}
+      - {of: platform, shift: [x, y, z], tolerance: {sd: 0.1}}
+home: {z: 475}
+workspace: {x: [-60, 60], y: [-60, 60], z: [420, 530]}
+"""
+
+
+def test_what_is_measured_in_full_already_is_no_remedy(tmp_path):
+    """Rounding in what a further instrument sees is no information: this platform never turns, and full poses were measured."""
+    path = tmp_path / "upu.yaml"
+    path.write_text(TRANSLATIONAL)
+    found = identifiability(load_robot(path), tracker(), poses=60)
+    assert found.rank < found.n_parameters
+    for remedy in remedies(found):
+        assert not {"psi", "theta", "phi and theta", "the pose"} & {cure.words for cure in remedy.cures}, str(remedy)

@@ -29,7 +29,10 @@ POSES = 24
 """Poses at which a further instrument is supposed to look."""
 
 SEEN = 1e-8
-"""Singular value, relative to the largest of the instrument's rows, above which it shows a direction."""
+"""Singular value, relative to the largest of the instrument's rows and of those there are, above which it shows a direction."""
+
+HELP = 0.9
+"""A cure must bring the leading parameter below this share of what is left of its tolerance now."""
 
 NAMED = 4
 """Further measurements written out in a sentence; the others are counted."""
@@ -103,6 +106,8 @@ def remedies(found: Identifiability, sigma: dict[Dimension, float] | None = None
     B = B / np.linalg.norm(B, axis=1, keepdims=True)
     leading = [free.names.index(c.names[0]) for c in found.unidentifiable]
     cures: list[list[Cure]] = [[] for _ in leading]
+    # what a kind sees must stand out from the rounding of what is measured already, not only from its own
+    floor, present = float(np.linalg.norm(found.factor, ord=2)), _left(found.factor)
     passive = _passive(free.robot)
     at = _scene(free, [name for name, _ in passive])
     for words, kind in _candidates(free.robot, passive):
@@ -110,10 +115,10 @@ def remedies(found: Identifiability, sigma: dict[Dimension, float] | None = None
             X = alone(at, _seen(at, kind, SIGMA | (sigma or {})))[0, :-1, :-1]
         except DataError:
             continue  # this kind has nothing to look at on this robot
-        determined = _determined(X, B)
+        determined = _determined(X, B, floor)
         if determined.any():
             left = _left(np.concatenate([found.factor, X]))
-            for i in np.flatnonzero(determined):
+            for i in np.flatnonzero(determined & (left[leading] < HELP * present[leading])):
                 cures[i].append(Cure(words, kind.name, float(left[leading[i]])))
     pairs = zip(found.unidentifiable, cures, strict=True)
     return tuple(Remedy(combination, tuple(some)) for combination, some in pairs)
@@ -178,10 +183,10 @@ def _seen(at: Scene, kind: Kind, sigma: dict[Dimension, float]) -> Measurements:
     return Measurements(robot.name, at.readings, (seen,))
 
 
-def _determined(X: FloatArray, B: FloatArray) -> np.ndarray:
-    """Which combinations (d,) the rows X (p, p) tell from all others."""
+def _determined(X: FloatArray, B: FloatArray, floor: float) -> np.ndarray:
+    """Which combinations (d,) the rows X (p, p) tell from all others; `floor` is the size of the rows there are already."""
     _, s, vt = np.linalg.svd(X @ B.T)
-    largest = np.linalg.norm(X, ord=2)
+    largest = max(float(np.linalg.norm(X, ord=2)), floor)
     still_open = vt[s <= SEEN * largest] if largest > 0.0 else vt
     return np.asarray(np.linalg.norm(still_open, axis=0) <= np.sqrt(SEEN))
 
