@@ -12,7 +12,9 @@ docs/theory/parameters.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from loopcal.mechanism.assembly import AXES, Address, Linear
 from loopcal.mechanism.families.chain import Placed, moved
@@ -32,6 +34,29 @@ class Errors:
 
     def __add__(self, other: Errors) -> Errors:
         return Errors(self.parameters + other.parameters, self.maps + other.maps)
+
+    def beside(self, named: Errors) -> Errors:
+        """These, less those whose effect `named` and the ones before have already; a name that is taken gets `.own`."""
+        place = {address: i for i, address in enumerate(dict.fromkeys(m.address for m in (*named.maps, *self.maps)))}
+        taken, left, basis = {p.name for p in named.parameters}, Errors(), np.zeros((0, len(place)))
+        for errors in (named, self):
+            rows = dict.fromkeys((p.name for p in errors.parameters), np.zeros(len(place)))
+            for entry in errors.maps:
+                rows[entry.parameter] = rows[entry.parameter] + entry.coefficient * np.eye(len(place))[place[entry.address]]
+            for parameter in errors.parameters:
+                row = rows[parameter.name]
+                rest = row - (basis @ row) @ basis
+                if np.linalg.norm(rest) <= 1e-9 * np.linalg.norm(row):
+                    continue
+                basis = np.vstack([basis, rest / np.linalg.norm(rest)])
+                if errors is self:
+                    left += self._called(parameter, f"{parameter.name}.own" if parameter.name in taken else parameter.name)
+        return left
+
+    def _called(self, parameter: Parameter, name: str) -> Errors:
+        """One of the parameters with its maps, under a name."""
+        maps = tuple(replace(entry, parameter=name) for entry in self.maps if entry.parameter == parameter.name)
+        return Errors((replace(parameter, name=name),), maps)
 
 
 @dataclass(frozen=True)

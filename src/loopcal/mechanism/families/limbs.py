@@ -2,7 +2,7 @@
 """Any mechanism of limbs between base and platform, written out joint by joint: one short file is a robot.
 
 `error_model: ideal` takes the unknowns that the file names (`errors:` of a limb, `unknown:` of a drive, `parameters:`),
-`complete` six for every link transform less what its joint absorbs, and the named ones on top. How to write such a file:
+`complete` six for every link transform less what its joint absorbs, beside the named ones. How to write such a file:
 docs/robots.md.
 """
 
@@ -17,7 +17,7 @@ from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES, Address, Assembly, Cone, Linear
 from loopcal.mechanism.families.chain import EX, EY, EZ, Placed, Step, moved, placed, tilted, turn_about
 from loopcal.mechanism.families.drives import actuator, drive_errors
-from loopcal.mechanism.families.errors import Errors, Spread, complete, quantity
+from loopcal.mechanism.families.errors import Errors, Spread, complete, offset, quantity
 from loopcal.mechanism.families.limb_records import (
     AngleDrive,
     Cylindrical,
@@ -63,9 +63,11 @@ class Limbs(LimbsFile, Robot):
         everyone = [one for limb in self.limbs for one in members[limb.name]]
         # a drive that several limbs name is one drive
         drives = tuple({drive[0]: drive for one in everyone for drive in self._drives(one)}.values())
-        errors = sum((self._limb_errors(one) for one in everyone), start=Errors())
+        errors = sum((_limb_errors(one) for one in everyone), start=Errors())
         errors += sum((drive_errors(name, drive, turns) for name, drive, turns in drives), start=Errors())
         errors += sum((_named(named, members, {name for name, *_ in drives}) for named in self.parameters), start=Errors())
+        if self.error_model == "complete":
+            errors = self._complete(everyone, drives).beside(errors) + errors
         self._check(errors, {name for name, *_ in drives})
         return Assembly(
             name=self.name,
@@ -107,15 +109,14 @@ class Limbs(LimbsFile, Robot):
                 )
             yield name, drive, turns
 
-    def _limb_errors(self, one: _Member) -> Errors:
-        """Unknowns of one limb."""
-        found = Errors()
-        if self.error_model == "complete":
-            length = standard_deviation(self.tolerances.lengths, "the lengths")
-            angle = standard_deviation(self.tolerances.angles, "the angles")
-            found += complete(one.placed, Spread(length, angle))
-        for entry in one.record.errors:
-            found += _shifts(one.placed, entry) if isinstance(entry, Shifts) else _tilts(one.placed, entry)
+    def _complete(self, everyone: list[_Member], drives: tuple[tuple[str, Drive, bool], ...]) -> Errors:
+        """All errors of all limbs, and the offset of every drive once, however many limbs it moves."""
+        length = standard_deviation(self.tolerances.lengths, "the lengths")
+        angle = standard_deviation(self.tolerances.angles, "the angles")
+        found = sum((complete(one.placed, Spread(length, angle), offsets=False) for one in everyone), start=Errors())
+        for name, drive, turns in drives:
+            dimension, sd = (Dimension.ANGLE, angle) if turns else (Dimension.LENGTH, length)
+            found += offset(f"{name}.offset", name, dimension, drive.offset, sd)
         return found
 
 
@@ -181,6 +182,12 @@ def _steps(joint: JointRecord, name: str, suffix: str) -> list[Step]:
         Step(f"{name}.{i + 1}", "R", place if i == 0 else here, axis, start=start)
         for i, (axis, start) in enumerate(zip(axes, joint.start, strict=True))
     ]
+
+
+def _limb_errors(one: _Member) -> Errors:
+    """Unknowns that a limb's record names."""
+    parts = (_shifts(one.placed, e) if isinstance(e, Shifts) else _tilts(one.placed, e) for e in one.record.errors)
+    return sum(parts, start=Errors())
 
 
 def _shifts(limb: Placed, entry: Shifts) -> Errors:
