@@ -44,17 +44,19 @@ def build(assembly: Assembly, units: Mapping[Dimension, str] | None = None, reco
         that are too many or too few), a coordinate nobody controls.
     """
     _check_names(assembly)
-    coordinates.check_names(assembly.controlled)
+    _check_freedoms(assembly)
     table = ParameterTable(assembly.parameters)
     wanted = {m.address for m in assembly.maps} | {a for s in assembly.shared for a in s.outputs}
     _check_addresses(assembly, wanted)
-    groups, places, count = _groups(assembly, wanted)
     freedoms = tuple(AXES.index(f) for f in AXES if f in assembly.freedoms)
     size = characteristic_length(assembly)
+    loose, _, count = _groups(assembly, wanted, {})
+    held = mobility.spinning(Program(loose, freedoms, size, count, len(assembly.actuators)), _guess(assembly, loose))
+    _check_drives(assembly, held)
+    groups, places, count = _groups(assembly, wanted, held)
     program = Program(groups, freedoms, size, count, len(assembly.actuators), _weights(assembly, groups, freedoms))
     guess = _guess(assembly, groups)
-    program, held = mobility.hold_spinning(program, guess)
-    notes = tuple(_spin_note(assembly, limb, joint) for limb, joint in held)
+    notes = tuple(_spin_note(assembly, limb, joint) for limb in sorted(held) for joint in held[limb])
     slots = _slot_map(assembly, table, places, count)
     units = {**DEFAULT_UNITS, **(units or {})}
     robot = Mechanism(assembly, table, table.nominal, program, slots, size, guess, units, notes, record)
@@ -96,9 +98,25 @@ def _check_names(assembly: Assembly) -> None:
             raise MechanismError(
                 f"limb {limb.name!r} has {len(limb.joints)} joints and {len(limb.links)} links; links are one more than joints"
             )
-    wrong = [f for f in assembly.freedoms if f not in AXES]
+
+
+def _check_freedoms(assembly: Assembly) -> None:
+    """Freedoms and controlled coordinates: there are some, all known, each named once."""
+    found = assembly.freedoms
+    wrong = [f for f in found if f not in AXES]
     if wrong:
         raise MechanismError(f"{wrong[0]!r} is not a freedom of a platform; allowed are {', '.join(AXES)}")
+    if not found:
+        raise MechanismError(f"{assembly.name} has no freedoms; state those its platform has, of {', '.join(AXES)}")
+    twice = [f for f in found if found.count(f) > 1]
+    if twice:
+        raise MechanismError(f"the freedom {twice[0]!r} is named twice in {', '.join(found)}; name each once")
+    if not assembly.controlled:
+        raise MechanismError(
+            f"{assembly.name} names no controlled coordinate; state controlled: with one of {', '.join(coordinates.NAMES)}, "
+            "or with as many as it has freedoms"
+        )
+    coordinates.check_names(assembly.controlled)
 
 
 def _check_addresses(assembly: Assembly, wanted: set[Address]) -> None:
@@ -126,15 +144,33 @@ def _slot(limb: Limb, address: Address) -> Slot | None:
     return Slot(links.index(address.element), AXES.index(address.axis))
 
 
-def _groups(assembly: Assembly, wanted: set[Address]) -> tuple[tuple[Group, ...], dict[Address, int], int]:
-    """Group limbs of one structure; give every displacement its place in e."""
+def _check_drives(assembly: Assembly, held: Mapping[int, tuple[int, ...]]) -> None:
+    """Refuse a limb whose drive moves nothing but the limb itself."""
+    for i, limb in enumerate(assembly.limbs):
+        driven = sum(bool(j.actuator) for j in limb.joints) + bool(limb.actuator)
+        free, rows = len(limb.joints) + bool(limb.actuator) - len(held.get(i, ())), len(_rows(limb.ending, assembly.freedoms))
+        if driven and free > rows:
+            raise MechanismError(
+                f"limb {limb.name!r} has {free} joints, but {rows} closure equations: its drive moves the limb and not the "
+                f"platform; leave out {_joints(free - rows)}, or make their axes such that they only spin the limb"
+            )
+
+
+def _joints(count: int) -> str:
+    return f"{count} joint{'s' if count > 1 else ''}"
+
+
+def _groups(
+    assembly: Assembly, wanted: set[Address], held: Mapping[int, tuple[int, ...]]
+) -> tuple[tuple[Group, ...], dict[Address, int], int]:
+    """Group limbs of one structure, by what is held in them too; give every displacement its place in e."""
     column = {a.name: i for i, a in enumerate(assembly.actuators)}
     alike: dict[tuple, list[int]] = {}
     for i, limb in enumerate(assembly.limbs):
         drive = tuple(bool(j.actuator) for j in limb.joints), bool(limb.actuator)
-        alike.setdefault((limb.ending, tuple(j.kind for j in limb.joints), drive), []).append(i)
+        alike.setdefault((limb.ending, tuple(j.kind for j in limb.joints), drive, held.get(i, ())), []).append(i)
     groups, places, count = [], {}, 0
-    for (ending, kinds, _), members in alike.items():
+    for (ending, kinds, _, still), members in alike.items():
         limbs = [assembly.limbs[i] for i in members]
         own = [{a: _slot(limb, a) for a in wanted if a.owner == limb.name} for limb in limbs]
         slots = tuple(sorted({s for found in own for s in found.values() if s}, key=lambda s: (s.element, s.axis)))
@@ -150,7 +186,7 @@ def _groups(assembly: Assembly, wanted: set[Address]) -> tuple[tuple[Group, ...]
                 tuple(members),
                 "".join(kinds),
                 np.array(drives, dtype=np.int64).T.reshape(len(kinds) + 1, len(limbs)),
-                (False,) * len(kinds),
+                tuple(j in still for j in range(len(kinds))),
                 ending,
                 _rows(ending, assembly.freedoms),
                 np.array([[link.transform for link in (*limb.links, limb.attachment)] for limb in limbs]),
@@ -193,11 +229,13 @@ def _weights(assembly: Assembly, groups: tuple[Group, ...], freedoms: tuple[int,
 
 
 def _spin_note(assembly: Assembly, limb: int, joint: int) -> str:
-    """What is said of a joint that only spins its limb."""
+    """What is said of a joint that moves only its limb."""
     owner = assembly.limbs[limb]
+    held = owner.joints[joint]
+    what, unit = ("spin about itself", "rad") if held.kind == "R" else ("slide along itself", "m")
     return (
-        f"limb {owner.name} can spin about itself without moving the platform; "
-        f"its joint {owner.joints[joint].name} is held at {owner.joints[joint].start:g} rad, which changes no pose"
+        f"limb {owner.name} can {what} without moving the platform; "
+        f"its joint {held.name} is held at {held.start:g} {unit}, which changes no pose"
     )
 
 

@@ -107,29 +107,30 @@ def refuse_uncommandable(robot: Mechanism, state: engine.State) -> None:
         )
 
 
-def hold_spinning(program: engine.Program, guess: engine.State) -> tuple[engine.Program, tuple[tuple[int, int], ...]]:
-    """Hold one joint for each way a limb can move while tip and platform stand still (the spin of an S-P-S leg).
+def spinning(program: engine.Program, guess: engine.State) -> dict[int, tuple[int, ...]]:
+    """One joint of a limb for each way it can move while tip and platform stand still (the spin of an S-P-S leg).
 
     The passive twists of a limb are ranked by the singular values of their triangular factor at joint values off any
-    special position; of the joints in a null combination the one that takes the largest part is held.
+    special position; of the joints in a null combination the one that takes the largest part is chosen. Every limb is
+    judged by its own geometry, whatever other limbs have the same joints and wherever it stands among them.
 
     Returns
     -------
-    The program, and the (limb, joint) pairs held.
+    The joints to hold of each limb that has any.
     """
-    rng = np.random.default_rng(0)
-    shaken = replace(guess, joints=tuple(j + rng.uniform(-0.3, 0.3, j.shape) for j in guess.joints))
+    # the same shake in every limb: what is held must not depend on the order of the limbs
+    shakes = [np.random.default_rng(0).uniform(-0.3, 0.3, j.shape[-1]) for j in guess.joints]
+    shaken = replace(guess, joints=tuple(j + shake for j, shake in zip(guess.joints, shakes, strict=True)))
     # driven joints as shaken too: a slide at zero would take a leg's lower joint for one that only spins it
     e, q = np.zeros((1, program.n_displacements)), states.actuated(program, shaken)
     blocks = engine.linearise(program, e, q, shaken)
-    groups, held = [], []
+    held = {}
     for group, block, joints in zip(program.groups, blocks.passive, blocks.joints, strict=True):
-        hold = list(group.held)
-        for chosen in _dependent(block.U[0, 0, 0]) if joints else ():
-            hold[joints[chosen]] = True
-            held += [(limb, joints[chosen]) for limb in group.limbs]
-        groups.append(replace(group, held=tuple(hold)))
-    return replace(program, groups=tuple(groups)), tuple(held)
+        for k, limb in enumerate(group.limbs):
+            chosen = _dependent(block.U[0, 0, k]) if joints else []
+            if chosen:
+                held[limb] = tuple(joints[c] for c in chosen)
+    return held
 
 
 def _dependent(U: Array) -> list[int]:
@@ -141,7 +142,8 @@ def _dependent(U: Array) -> list[int]:
         rank = int((s > RANK * s.max(initial=1e-300)).sum())
         if rank == len(rest):
             return chosen
-        chosen.append(rest[int(np.argmax(np.abs(V[-1])))])
+        part = np.abs(V[-1])
+        chosen.append(rest[int(np.argmax(part > (1 - 1e-6) * part.max()))])  # of equal parts the first, whatever rounding says
 
 
 def _motion(freedoms: tuple[int, ...], direction: Array) -> str:

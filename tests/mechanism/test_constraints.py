@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Limbs judged one by one, closure equations that repeat others, and mechanisms without a length."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from loopcal.errors import MechanismError
+from loopcal.mechanism import Joint, Limb, Link, build, forward, inverse
+from loopcal.se3 import inverse as back
+from tests import zoo
+
+HOME = zoo.place((0.01, -0.02, 0.25), (0.05, -0.08, 0.1))
+
+
+def through(name, frames, joints, corner):
+    """A rigid limb whose joints stand in these frames [base] at home, joint values zero."""
+    attachment = zoo.place(corner)
+    ends = [np.eye(4), *frames, HOME @ attachment]
+    links = tuple(Link(f"link{i}", back(a) @ b) for i, (a, b) in enumerate(pairwise(ends)))
+    return Limb(name, links, joints, "rigid", Link("attachment", attachment))
+
+
+def leg_frame(i):
+    """Frame at a leg's foot with z along the leg, and the leg's length."""
+    foot, end = zoo.HEXAPOD_BASE[i] * zoo.MM, HOME @ zoo.place(zoo.HEXAPOD_PLATFORM[i] * zoo.MM)
+    z = (end[:3, 3] - foot) / np.linalg.norm(end[:3, 3] - foot)
+    x = np.cross((0.3, 1.0, 0.2), z)
+    frame = np.eye(4)
+    frame[:3, 0] = x / np.linalg.norm(x)
+    frame[:3, 1], frame[:3, 2], frame[:3, 3] = np.cross(z, frame[:3, 0]), z, foot
+    return frame, float(np.linalg.norm(end[:3, 3] - foot))
+
+
+ABOUT_X, ABOUT_Y = zoo.place((0, 0, 0), (0, np.pi / 2, 0)), zoo.place((0, 0, 0), (-np.pi / 2, 0, 0))
+
+
+def sps(i, apart=0.0):
+    """Leg RRR-P-RRR; its base axes meet in a point unless `apart` [m]."""
+    F, length = leg_frame(i)
+    top = F @ zoo.place((0, 0, length))
+    askew = zoo.place((0, 0, 0), (0.3, 0.2, 0))
+    frames = [F @ ABOUT_X @ zoo.place((0, apart, 0)), F @ ABOUT_Y, F @ askew @ zoo.place((apart, 0, 0)), F]
+    frames += [top @ ABOUT_X, top @ ABOUT_Y, top @ askew]
+    joints = tuple(Joint(f"j{n}", k, f"q{i + 1}" if k == "P" else None) for n, k in enumerate("RRRPRRR", start=1))
+    return through(f"leg{i + 1}", frames, joints, zoo.HEXAPOD_PLATFORM[i] * zoo.MM)
+
+
+def universal(i, loose):
+    """Leg RRRPRR with its third axis along the slide; `loose`: the axis behind the slide is along it too, else askew."""
+    F, length = leg_frame(i)
+    middle = F @ zoo.place((0, 0, length / 2))
+    if not loose:
+        middle = middle @ zoo.place((0.02, 0.01, 0), (0.4, -0.5, 0))
+    askew = F @ zoo.place((0.01, -0.02, length), (0.9, 0.3, 0.2))
+    frames = [F @ ABOUT_X, F @ ABOUT_Y, F, F, middle, askew]
+    joints = tuple(Joint(f"j{n}", k, f"q{i + 1}" if k == "P" else None) for n, k in enumerate("RRRPRR", start=1))
+    return through(f"leg{i + 1}", frames, joints, zoo.HEXAPOD_PLATFORM[i] * zoo.MM)
+
+
+def machine(limbs, controlled=("x", "y", "z", "roll", "pitch", "yaw")):
+    return zoo.assembled("machine", tuple(limbs), zoo.AXES, controlled, HOME)
+
+
+@pytest.mark.parametrize("odd", [0, 3])
+def test_a_limb_with_its_own_geometry_is_judged_on_its_own_in_any_order(odd):
+    limbs = [sps(i, 0.02 if i == odd else 0.0) for i in range(6)]
+    said = set()
+    for shift in range(6):
+        with pytest.raises(MechanismError, match=f"limb 'leg{odd + 1}' has 7 joints, but 6 closure equations") as error:
+            build(machine(np.roll(np.array(limbs, dtype=object), shift)))
+        said.add(str(error.value))
+    assert len(said) == 1
+
+
+def test_the_order_of_limbs_that_differ_in_rank_changes_nothing():
+    limbs = [universal(i, loose=i == 2) for i in range(5)]
+    orders = [(0, 1, 2, 3, 4), (2, 0, 1, 3, 4), (4, 3, 1, 0, 2)]
+    robots = [build(machine([limbs[i] for i in order], ("x", "y", "z", "roll", "pitch"))) for order in orders]
+    target = np.array([[0.012, -0.018, 0.252, 0.06, -0.07]])
+    poses = [inverse(robot, target) for robot in robots]
+    for robot, found in zip(robots, poses, strict=True):
+        assert found.converged.all()
+        assert_allclose(found.T, poses[0].T, atol=1e-12)
+        assert_allclose(forward(robot, found.q).T, found.T, atol=1e-11)
+        held = [(limb, j) for g in robot.program.groups for limb in g.limbs for j, h in enumerate(g.held) if h]
+        (limb, joint), (note,) = held[0], robot.notes
+        assert len(held) == 1
+        assert note == (
+            "limb leg3 can spin about itself without moving the platform; "
+            f"its joint {robot.assembly.limbs[limb].joints[joint].name} is held at 0 rad, which changes no pose"
+        )
+
+
+def test_what_the_note_says_of_a_held_joint_is_true():
+    limbs = [universal(i, loose=i == 2) for i in range(5)]
+    robot = build(machine(limbs, ("x", "y", "z", "roll", "pitch")))
+    joint = robot.notes[0].split("its joint ")[1].split()[0]
+    turned = replace(limbs[2], joints=tuple(replace(j, start=0.4) if j.name == joint else j for j in limbs[2].joints))
+    other = build(machine([*limbs[:2], turned, *limbs[3:]], ("x", "y", "z", "roll", "pitch")))
+    assert f"joint {joint} is held at 0.4 rad" in other.notes[0]
+    q = inverse(robot, np.array([[0.012, -0.018, 0.252, 0.06, -0.07]])).q
+    assert_allclose(forward(other, q).T, forward(robot, q).T, atol=1e-11)
