@@ -113,8 +113,7 @@ def _check_freedoms(assembly: Assembly) -> None:
         raise MechanismError(f"the freedom {twice[0]!r} is named twice in {', '.join(found)}; name each once")
     if not assembly.controlled:
         raise MechanismError(
-            f"{assembly.name} names no controlled coordinate; state controlled: with one of {', '.join(coordinates.NAMES)}, "
-            "or with as many as it has freedoms"
+            f"{assembly.name} names no controlled coordinate; state one for each freedom, of {', '.join(coordinates.NAMES)}"
         )
     coordinates.check_names(assembly.controlled)
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from loopcal.errors import LoopcalError
 from loopcal.io.robot_file import load_robot, robot_path, shipped_robots
 from loopcal.mechanism import Mechanism
 
@@ -43,3 +44,32 @@ def test_a_named_error_about_another_axis_than_the_one_of_its_name_takes_none_aw
     assert moved == {
         "arm1.motor.x": "y", "arm1.motor.x.own": "x", "arm1.motor.rx": "rx", "arm1.motor.ry": "ry"
     }  # fmt: skip
+
+
+# --- left out or mistyped --------------------------------------------------------------------------------------------
+def refused(tmp_path: Path, name: str, *changes: tuple[str, str], more: str = "") -> str:
+    """The one sentence that a changed file is refused with."""
+    with pytest.raises(LoopcalError) as found:
+        changed(tmp_path, name, *changes, more=more)
+    assert "\n" not in str(found.value)
+    return str(found.value)
+
+
+FREEDOMS = {
+    "controlled left out": (
+        ("controlled: [x, y]\n", ""),
+        "five-bar names no controlled coordinate; state one for each freedom, of x, y, z, roll, pitch, yaw, phi, theta, psi",
+    ),
+    "controlled empty": (("controlled: [x, y]", "controlled: []"), "five-bar names no controlled coordinate"),
+    "freedoms empty": (("freedoms: [x, y]", "freedoms: []"), "five-bar has no freedoms; state those its platform has, of rx,"),
+    "freedoms twice": (
+        ("freedoms: [x, y]", "freedoms: [x, x, y]"),
+        "the freedom 'x' is named twice in x, x, y; name each once",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FREEDOMS)
+def test_freedoms_and_coordinates_are_named_once_and_not_left_out(tmp_path: Path, case: str) -> None:
+    change, sentence = FREEDOMS[case]
+    assert sentence in refused(tmp_path, "five-bar", change)
