@@ -87,6 +87,11 @@ class Decomposition:
         return self.used.sum(axis=1)
 
     @property
+    def unexplained(self) -> FloatArray:
+        """(t,) squared length of b outside what counts: where the rank is less than p, null directions have a share of it."""
+        return self.outside + np.where(self.used, 0.0, self.projections**2).sum(axis=1)
+
+    @property
     def condition(self) -> FloatArray:
         """(t,) largest singular value over the smallest one that counts; infinite for a matrix of zeros."""
         s = self.singular_values

@@ -283,6 +283,15 @@ def test_priors_and_fixed_unknowns_are_kept_to():
     assert wide.check.degrees == identify(hexapod(), data).check.degrees + len(local)
 
 
+def test_noise_is_estimated_where_null_directions_hold_a_part_of_the_residual():
+    truth = hexapod().with_values(zoo.hexapod_truth())
+    data = simulate(truth, hexapod_poses(40), Instrument((seen_by(TRACKER, Gaussian),)), 1, unknowns=true_of(TRACKER))
+    fit = identify(hexapod(), data, noise="estimated")
+    assert fit.converged
+    # 315 degrees of freedom: sd of the ratio is 4 %
+    assert fit.check.sigma_scale == pytest.approx(1.0, abs=0.16)
+
+
 def test_trials_with_unknown_frames_are_identified_as_each_alone():
     robot = hexapod()
     instrument = Instrument((seen_by(TRACKER, Gaussian),))

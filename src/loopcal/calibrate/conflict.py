@@ -115,8 +115,8 @@ def prior_statistic(decomposition: Decomposition) -> tuple[FloatArray, FloatArra
 def shown_noise(decomposition: Decomposition) -> FloatArray:
     """Return the factor (t,) on sigma that the part outside the range shows, 1 unless that is beyond doubt above 1."""
     left = (decomposition.rows - decomposition.rank).astype(np.float64)
-    larger = _tail(left, decomposition.outside) < DOUBT
-    return np.sqrt(np.where(larger, decomposition.outside / np.maximum(left, 1.0), 1.0))
+    larger = _tail(left, decomposition.unexplained) < DOUBT
+    return np.sqrt(np.where(larger, decomposition.unexplained / np.maximum(left, 1.0), 1.0))
 
 
 def _tail(degrees: FloatArray, statistic: FloatArray) -> FloatArray:

@@ -215,8 +215,8 @@ class MAP:
         if self.noise == "given":
             return np.ones_like(decomposition.outside)
         left = decomposition.rows - decomposition.rank
-        enough = (left >= FEWEST_DEGREES) & (decomposition.outside > 0.0)
-        return np.sqrt(np.where(enough, decomposition.outside / np.maximum(left, 1), 1.0))
+        enough = (left >= FEWEST_DEGREES) & (decomposition.unexplained > 0.0)
+        return np.sqrt(np.where(enough, decomposition.unexplained / np.maximum(left, 1), 1.0))
 
 
 def _held(decomposition: Decomposition, lam: FloatArray) -> FloatArray:

@@ -242,10 +242,7 @@ def _notes(view: _View) -> tuple[str, ...]:
     parts = [name.rsplit(".", 1)[0] for name in view.local.table.names]
     there = [name in view.carried for name in view.local.table.names]
     notes = []
-    for carried, words in (
-        (True, "as the fit found it"),
-        (False, "found anew from these rows, which flatters"),
-    ):
+    for carried, words in ((True, "as the fit found it"), (False, "found anew from these rows, which flatters")):
         names = list(dict.fromkeys(p for p, c in zip(parts, there, strict=True) if c is carried))
         if names:
             notes.append(f"{listed(names)}: {words}")
