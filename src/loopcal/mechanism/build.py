@@ -12,15 +12,19 @@ import numpy as np
 from loopcal import engine
 from loopcal.engine import Group, Program, Slot, State
 from loopcal.errors import MechanismError
-from loopcal.mechanism import coordinates, mobility, states
+from loopcal.mechanism import coordinates, mobility
 from loopcal.mechanism.assembly import AXES, Address, Assembly, Limb
 from loopcal.mechanism.coupled import shared_drives
 from loopcal.mechanism.model import Mechanism, SlotMap
 from loopcal.mechanism.transmission import TERMS, frequency, nominal_terms
-from loopcal.mechanism.trials import inverse_trials
+from loopcal.mechanism.trials import inverse_trials, orientation_at
 from loopcal.parameters import ParameterTable
 from loopcal.units import Dimension
 
+DEFAULT_SIZE = 1.0
+"""Characteristic length [m] of a mechanism all of whose lengths are zero (a spherical one with every frame in its centre)."""
+POINT = 1e-9
+"""Size over the longest link below which limbs leave and end in one point."""
 DEFAULT_UNITS = {Dimension.LENGTH: "mm", Dimension.ANGLE: "deg", Dimension.RATIO: "1"}
 ROWS = {"rigid": 6, "ball": 3, "distance": 1}
 
@@ -45,6 +49,7 @@ def build(assembly: Assembly, units: Mapping[Dimension, str] | None = None, reco
     """
     _check_names(assembly)
     _check_freedoms(assembly)
+    _check_ranges(assembly)
     table = ParameterTable(assembly.parameters)
     wanted = {m.address for m in assembly.maps} | {a for s in assembly.shared for a in s.outputs}
     _check_addresses(assembly, wanted)
@@ -64,13 +69,21 @@ def build(assembly: Assembly, units: Mapping[Dimension, str] | None = None, reco
 
 
 def characteristic_length(assembly: Assembly) -> float:
-    """Root mean square distance [m] between the points where limbs leave the base and those where they meet the platform."""
+    """Root mean square distance [m] between the points where limbs leave the base and those where they meet the platform.
+
+    Where these all lie in one point, the root mean square of links and rods; DEFAULT_SIZE where every length is zero.
+    """
     home = assembly.home
     gaps = [(home @ limb.attachment.transform)[:3, 3] - limb.links[0].transform[:3, 3] for limb in assembly.limbs]
     reach = [limb.attachment.transform[:3, 3] for limb in assembly.limbs]
     feet = [limb.links[0].transform[:3, 3] for limb in assembly.limbs]
     spread = np.concatenate([gaps, reach, np.subtract(feet, np.mean(feet, axis=0))])
-    return float(np.sqrt((spread**2).sum() / len(gaps)))
+    size = float(np.sqrt((spread**2).sum() / len(gaps)))
+    links = [np.linalg.norm(link.transform[:3, 3]) for limb in assembly.limbs for link in (*limb.links, limb.attachment)]
+    links += [limb.length for limb in assembly.limbs]
+    if size > POINT * max(links):  # else the points coincide but for rounding
+        return size
+    return float(np.sqrt(np.mean(np.square(links)))) or DEFAULT_SIZE
 
 
 def _check_names(assembly: Assembly) -> None:
@@ -116,6 +129,17 @@ def _check_freedoms(assembly: Assembly) -> None:
             f"{assembly.name} names no controlled coordinate; state one for each freedom, of {', '.join(coordinates.NAMES)}"
         )
     coordinates.check_names(assembly.controlled)
+
+
+def _check_ranges(assembly: Assembly) -> None:
+    """Strokes and limits run upwards."""
+    units = {Dimension.LENGTH: "m", Dimension.ANGLE: "rad"}
+    ranges = [(f"stroke of {a.name} runs", a.stroke, units.get(a.dimension, "")) for a in assembly.actuators]
+    for limb in assembly.limbs:
+        ranges += [(f"limits of {limb.name}.{j.name} run", j.limits, "rad" if j.kind == "R" else "m") for j in limb.joints]
+    for what, found, symbol in ranges:
+        if found and not found[0] < found[1]:
+            raise MechanismError(f"the {what} from {found[0]:g} to {found[1]:g} {symbol}; the first must be smaller")
 
 
 def _check_addresses(assembly: Assembly, wanted: set[Address]) -> None:
@@ -289,6 +313,4 @@ def _home(robot: Mechanism) -> State:
             f"{robot.name} cannot close at its home pose: the loops stay {state.residual[0, 0] * 1e3:.3g} mm open; "
             "check the joint centres, lengths and home"
         )
-    e, _ = robot.slots(values)
-    held = engine.solve(program, e, states.actuated(program, state), state, most=0)
-    return replace(state, orientation=held.orientation)
+    return replace(state, orientation=orientation_at(robot, values, state))

@@ -73,3 +73,48 @@ FREEDOMS = {
 def test_freedoms_and_coordinates_are_named_once_and_not_left_out(tmp_path: Path, case: str) -> None:
     change, sentence = FREEDOMS[case]
     assert sentence in refused(tmp_path, "five-bar", change)
+
+
+TYPED = {
+    "rod without length": (
+        ("    length: 480\n", ""),
+        "limb 'arm' ends in a rod that no drive moves, of length 0 m; it needs a positive `length:`",
+    ),
+    "rod of no length": (("length: 480", "length: 0"), "it needs a positive `length:`"),
+    "rod of negative length": (("length: 480", "length: -480"), "of length -0.48 m; it needs a positive `length:`"),
+    "stroke reversed": (
+        ("stroke: [-45, 95]", "stroke: [90, 10]"),
+        "the stroke of q1 runs from 1.5708 to 0.174533 rad; the first must be smaller",
+    ),
+    "limits reversed": (
+        ("start: 30}", "start: 30, limits: [95, -45]}"),
+        "the limits of arm1.motor run from 1.65806 to -0.785398 rad; the first must be smaller",
+    ),
+    "drive mistyped": (
+        ("actuated: q", "actuated: w"),
+        "actuator 'q' drives no joint; write 'actuated: q' at one, or leave it out; joints are driven by w1, w2, w3",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", TYPED)
+def test_lengths_ranges_and_drives_that_cannot_be_are_told_in_a_sentence(tmp_path: Path, case: str) -> None:
+    change, sentence = TYPED[case]
+    assert sentence in refused(tmp_path, "rotary-delta", change)
+
+
+def test_a_mistyped_drive_is_told_before_that_nothing_is_unknown(tmp_path: Path) -> None:
+    text = robot_path("rotary-delta").read_text().replace("actuated: q", "actuated: w")
+    start, end = text.index("    errors:"), text.index("home:")
+    path = tmp_path / "silent.yaml"
+    path.write_text(text[:start] + text[end:])
+    with pytest.raises(LoopcalError, match="joints are driven by w1, w2, w3"):
+        load_robot(path)
+
+
+def test_a_file_without_limbs_is_told_so(tmp_path: Path) -> None:
+    text = robot_path("rotary-delta").read_text()
+    path = tmp_path / "none.yaml"
+    path.write_text(text[: text.index("limbs:\n")] + "limbs: []\n" + text[text.index("home:") :])
+    with pytest.raises(LoopcalError, match="rotary-delta has no limbs; write those that join the base to the platform"):
+        load_robot(path)

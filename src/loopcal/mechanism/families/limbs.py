@@ -55,7 +55,9 @@ class Limbs(LimbsFile, Robot):
     """
 
     def expand(self) -> Assembly:
-        """All copies of all limbs; raises MechanismError for a branch, a name not known, or a model without unknowns."""
+        """All copies of all limbs; raises MechanismError for what cannot be."""
+        if not self.limbs:
+            raise MechanismError(f"{self.name} has no limbs; write those that join the base to the platform")
         names = tuple(limb.name for limb in self.limbs)
         for limb in self.limbs:
             refuse_branch(limb, names)
@@ -68,7 +70,7 @@ class Limbs(LimbsFile, Robot):
         errors += sum((_named(named, members, {name for name, *_ in drives}) for named in self.parameters), start=Errors())
         if self.error_model == "complete":
             errors = self._complete(everyone, drives).beside(errors) + errors
-        self._check(errors, {name for name, *_ in drives})
+        self._check(errors, tuple(name for name, *_ in drives))
         return Assembly(
             name=self.name,
             source=self.source,
@@ -83,16 +85,19 @@ class Limbs(LimbsFile, Robot):
             maps=errors.maps,
         )
 
-    def _check(self, errors: Errors, drives: set[str]) -> None:
-        if not errors.parameters:
-            raise MechanismError(
-                f"{self.name} names no unknown; give a limb 'errors:', a drive 'unknown:', or state error_model: complete"
-            )
+    def _check(self, errors: Errors, drives: tuple[str, ...]) -> None:
         idle = [
             name for name in self.actuators if name not in drives and not any(d.rstrip("0123456789") == name for d in drives)
         ]
         if idle:
-            raise MechanismError(f"actuator {idle[0]!r} drives no joint; write 'actuated: {idle[0]}' at one, or leave it out")
+            raise MechanismError(
+                f"actuator {idle[0]!r} drives no joint; write 'actuated: {idle[0]}' at one, or leave it out"
+                + (f"; joints are driven by {', '.join(drives)}" if drives else "")
+            )
+        if not errors.parameters:
+            raise MechanismError(
+                f"{self.name} names no unknown; give a limb 'errors:', a drive 'unknown:', or state error_model: complete"
+            )
 
     def _drives(self, one: _Member) -> Iterator[tuple[str, Drive, bool]]:
         """Names of a limb's drives, what they are, and whether the joint turns."""
@@ -157,6 +162,10 @@ def _placed(limb: LimbRecord, name: str, suffix: str, turn: np.ndarray) -> Place
         raise MechanismError(
             f"limb {limb.name!r} ends {limb.ending} and states a length, drive or cone of a rod; "
             "state ending: distance, or leave it out"
+        )
+    if limb.ending == "distance" and not limb.actuated and not limb.length > 0:
+        raise MechanismError(
+            f"limb {limb.name!r} ends in a rod that no drive moves, of length {limb.length:g} m; it needs a positive `length:`"
         )
     drive = limb.actuated + suffix if limb.actuated else None
     cones = tuple(Cone(cone.end, _plain(direction(cone.axis)), cone.angle) for cone in limb.cones)
