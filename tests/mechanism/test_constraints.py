@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 
 from loopcal.errors import MechanismError
 from loopcal.mechanism import Joint, Limb, Link, build, forward, inverse
+from loopcal.mechanism.assembly_modes import assembly_modes
 from loopcal.se3 import inverse as back
 from tests import zoo
 
@@ -104,3 +105,69 @@ def test_what_the_note_says_of_a_held_joint_is_true():
     assert f"joint {joint} is held at 0.4 rad" in other.notes[0]
     q = inverse(robot, np.array([[0.012, -0.018, 0.252, 0.06, -0.07]])).q
     assert_allclose(forward(other, q).T, forward(robot, q).T, atol=1e-11)
+
+
+def planar(freedoms):
+    """A planar 3-RRR, every limb pinned rigidly to the platform."""
+    limbs = []
+    for i, angle in enumerate(np.deg2rad((90.0, 210.0, 330.0)), start=1):
+        out = np.array((np.cos(angle), np.sin(angle), 0.0))
+        base, hand = Link("base", zoo.place(0.3 * out, (0, 0, angle))), Link("hand", np.eye(4))
+        links = (base, Link("crank", zoo.place((0.15, 0, 0))), Link("rod", zoo.place((0.17, 0, 0))), hand)
+        joints = (Joint("motor", "R", f"q{i}", start=2.2), Joint("elbow", "R", start=1.7), Joint("wrist", "R", start=-0.5))
+        limbs.append(Limb(f"arm{i}", links, joints, "rigid", Link("corner", zoo.place(0.06 * out))))
+    return build(zoo.assembled("3-RRR", tuple(limbs), freedoms, ("x", "y", "yaw"), np.eye(4)))
+
+
+def test_a_planar_machine_with_all_six_freedoms_is_solved_like_one_with_three_and_told():
+    whole, flat = planar(zoo.AXES), planar(("rz", "x", "y"))
+    assert flat.notes == ()
+    assert whole.notes == (
+        "6 closure equations repeat others: it closes only for exact geometry; state freedoms: [rz, x, y] to leave them out",
+    )
+    asked = np.random.default_rng(0).uniform((-0.06, -0.06, -0.45), (0.06, 0.06, 0.45), (300, 3))
+    found = inverse(flat, asked)
+    found = found.take(found.converged)
+    assert len(found.q) > 200
+    again = forward(whole, found.q)
+    # the determinant of closure that is not square has no sign: it once told rows apart at random
+    assert again.converged.all()
+    assert_allclose(again.T, found.T, atol=1e-11)
+    assert (again.state.orientation == 0).all()
+    assert (whole.home_state.orientation == 0).all()
+    modes = [assembly_modes(robot, found.q[0], quiet=2048) for robot in (whole, flat)]
+    assert_allclose(modes[0].solution.T, modes[1].solution.T, atol=1e-9)
+    assert (modes[0].solution.state.orientation == 0).all()
+
+
+def test_equations_that_repeat_others_are_told_where_no_choice_of_freedoms_leaves_them_out():
+    turned = zoo.place((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
+    whole = planar(zoo.AXES)
+    assembly = zoo.relocated(whole.assembly, turned)
+    robot = build(replace(assembly, parameters=(), maps=(), controlled=("x", "y", "yaw")))
+    assert robot.notes == ("6 closure equations repeat others: it closes only for exact geometry",)
+
+
+def spherical():
+    """Spherical 3-RRR, every frame at the origin: axes 60 degrees apart along each arm."""
+    limbs = []
+    for i in range(3):
+        turn = zoo.place((0, 0, 0), (0, 0, 2 * np.pi * i / 3))
+        bend = zoo.place((0, 0, 0), (np.pi / 3, 0, 0))
+        links = (Link("base", turn @ zoo.place((0, 0, 0), (np.pi / 4, 0, 0))), Link("crank", bend), Link("rod", bend))
+        joints = (Joint("motor", "R", f"q{i + 1}", start=0.6), Joint("elbow", "R", start=1.4), Joint("wrist", "R", start=0.5))
+        tip = turn @ zoo.place((0, 0, 0), (np.pi / 4, 0, 0))
+        for joint, link in zip(joints, (bend, bend, np.eye(4)), strict=True):
+            tip = tip @ zoo.place((0, 0, 0), (0, 0, joint.start)) @ link
+        limbs.append(Limb(f"arm{i + 1}", (*links, Link("hand", np.eye(4))), joints, "rigid", Link("on", tip)))
+    freedoms, wanted = ("rx", "ry", "rz"), ("roll", "pitch", "yaw")
+    return build(zoo.assembled("wrist", tuple(limbs), freedoms, wanted, np.eye(4)))
+
+
+def test_a_spherical_machine_without_any_length_has_the_size_of_a_metre():
+    robot = spherical()
+    assert robot.size == 1.0
+    asked = np.random.default_rng(1).uniform(-0.2, 0.2, (50, 3))
+    found = inverse(robot, asked)
+    assert found.converged.all()
+    assert_allclose(forward(robot, found.q).T, found.T, atol=1e-10)

@@ -21,7 +21,7 @@ from loopcal.mechanism import states
 from loopcal.mechanism.kinematics import Solution, solution_of
 from loopcal.mechanism.model import Mechanism, Status
 from loopcal.mechanism.transmission import joint_values
-from loopcal.mechanism.trials import inverse_trials, readings_at
+from loopcal.mechanism.trials import inverse_trials, orientation_at, readings_at
 
 BATCH = 2048
 """Starts solved together."""
@@ -80,11 +80,13 @@ def assembly_modes(robot: Mechanism, q: ArrayLike, quiet: int = 4 * BATCH, most:
     readings = np.asarray(q, dtype=float).reshape(-1)
     if len(readings) != len(robot.actuators):
         raise DataError(f"{len(readings)} readings were given, but {robot.name} has {len(robot.actuators)} actuators")
-    e, tau = robot.slots(robot.values[None])
+    values = robot.values[None]
+    e, tau = robot.slots(values)
     driven = joint_values(readings[None, None], tau, robot.slots.frequency)
 
     def solved(start: State) -> State:
-        return engine.solve(robot.program, e, driven, start)
+        state = engine.solve(robot.program, e, driven, start)
+        return replace(state, orientation=orientation_at(robot, values, state))
 
     def key(state: State) -> Array:
         return np.concatenate([state.T[0, :, :3, 3] / robot.size, state.T[0, :, :3, :3].reshape(-1, 9)], axis=1)

@@ -79,7 +79,7 @@ def characteristic_length(assembly: Assembly) -> float:
     feet = [limb.links[0].transform[:3, 3] for limb in assembly.limbs]
     spread = np.concatenate([gaps, reach, np.subtract(feet, np.mean(feet, axis=0))])
     size = float(np.sqrt((spread**2).sum() / len(gaps)))
-    links = [np.linalg.norm(link.transform[:3, 3]) for limb in assembly.limbs for link in (*limb.links, limb.attachment)]
+    links = [float(np.linalg.norm(link.transform[:3, 3])) for limb in assembly.limbs for link in (*limb.links, limb.attachment)]
     links += [limb.length for limb in assembly.limbs]
     if size > POINT * max(links):  # else the points coincide but for rounding
         return size

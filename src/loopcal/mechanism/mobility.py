@@ -48,7 +48,8 @@ def checked(robot: Mechanism) -> Mechanism:
     Q = _drives(robot, blocks)
     _, both, W = np.linalg.svd(np.concatenate([A, Q], axis=1), full_matrices=True)
     # freedoms with every actuator free: solutions (y, dq) of A y + Q dq = 0, A of full column rank
-    moves = W[int((both > RANK * both[0]).sum()) :, :m]
+    independent = int((both > RANK * both[0]).sum())
+    moves = W[independent:, :m]
     movable, a = len(moves), program.n_joints
     if movable < min(a, m):
         held = np.linalg.svd(moves, full_matrices=True)[2][movable:] if movable else np.eye(m)
@@ -62,7 +63,17 @@ def checked(robot: Mechanism) -> Mechanism:
             f"{robot.name} can be moved in {movable} freedoms, but {len(robot.controlled)} controlled coordinates are named "
             f"({', '.join(robot.controlled)}); name {movable}"
         )
+    if len(A) > independent:
+        robot = replace(robot, notes=(*robot.notes, _repeated(program.freedoms, len(A) - independent, moves)))
     return _commandable(robot, movable, scale[:, None] * np.linalg.lstsq(A, -Q, rcond=None)[0])
+
+
+def _repeated(freedoms: tuple[int, ...], count: int, moves: Array) -> str:
+    """What is said of closure equations that repeat others; moves (f, m): what the platform can do with free actuators."""
+    used = [AXES[f] for f, part in zip(freedoms, np.abs(moves).max(axis=0), strict=True) if part > RANK * np.abs(moves).max()]
+    what = "equations repeat" if count > 1 else "equation repeats"
+    told = f"{count} closure {what} others: it closes only for exact geometry"
+    return f"{told}; state freedoms: [{', '.join(used)}] to leave them out" if len(used) == len(moves) else told
 
 
 def _drives(robot: Mechanism, blocks: engine.Blocks) -> Array:

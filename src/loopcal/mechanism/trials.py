@@ -33,8 +33,8 @@ def forward_trials(robot: Mechanism, values: Array, q: Array, start: State | Non
     e, tau = robot.slots(values)
     with np.errstate(invalid="ignore"):  # an infinite reading turns into NaN, and the engine marks its row
         joints = joint_values(q, tau, robot.slots.frequency)
-    begin = robot.home_state if start is None else start
-    state = engine.solve(robot.program, e, joints, begin)
+    begin = _signed(robot, robot.home_state if start is None else start)
+    state = _signed(robot, engine.solve(robot.program, e, joints, begin))
     wrong = _astray(state, begin)
     if not wrong.any() or robot.program.sigma is not None:
         return state
@@ -67,11 +67,20 @@ def orientation_at(robot: Mechanism, values: Array, state: State) -> NDArray[np.
 
     The orientation of a state with free actuators is another one. With more equations than freedoms it is zero.
     """
-    equations = sum(len(g.limbs) * (len(g.rows) - len(g.unknown(False))) for g in robot.program.groups)
-    if equations != len(robot.program.freedoms):
+    if not _square(robot):
         return np.zeros(state.status.shape, np.int8)
     e, _ = robot.slots(values)
     return engine.solve(robot.program, e, states.actuated(robot.program, state), state, most=0).orientation
+
+
+def _square(robot: Mechanism) -> bool:
+    """Has closure with the actuators held as many equations as the platform has freedoms?"""
+    return sum(len(g.limbs) * (len(g.rows) - len(g.unknown(False))) for g in robot.program.groups) == len(robot.freedoms)
+
+
+def _signed(robot: Mechanism, state: State) -> State:
+    """The state, its orientation zero where closure is not square: the sign of a reduced matrix then means nothing."""
+    return state if _square(robot) else replace(state, orientation=np.zeros_like(state.orientation))
 
 
 def readings_at(robot: Mechanism, values: Array, state: State) -> Array:
@@ -101,7 +110,7 @@ def _followed(robot: Mechanism, e: Array, joints: Array, begin: State, state: St
         here = begun = states.pick(first, (len(trial), 1), alive, zero)
         for step in range(1, count + 1):
             part = origin[alive] + (target[alive] - origin[alive]) * (step / count)
-            here = engine.solve(robot.program, own[alive], part, here)
+            here = _signed(robot, engine.solve(robot.program, own[alive], part, here))
         result = states.put(result, alive, zero, here)
         alive = alive[_astray(here, begun)[:, 0]]
         if not len(alive):
