@@ -8,7 +8,7 @@ import pytest
 
 from loopcal.errors import LoopcalError
 from loopcal.io.robot_file import load_robot, robot_path, shipped_robots
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism import Mechanism, inverse
 
 LIMBS = tuple(name for name in shipped_robots() if "family: limbs" in robot_path(name).read_text())
 
@@ -118,3 +118,74 @@ def test_a_file_without_limbs_is_told_so(tmp_path: Path) -> None:
     path.write_text(text[: text.index("limbs:\n")] + "limbs: []\n" + text[text.index("home:") :])
     with pytest.raises(LoopcalError, match="rotary-delta has no limbs; write those that join the base to the platform"):
         load_robot(path)
+
+
+# --- named parameters and their maps ---------------------------------------------------------------------------------
+def named(kind: str, onto: str) -> str:
+    """A parameter `p` of a kind, mapped once."""
+    return f"parameters: [{{name: p, {kind}: 1, tolerance: {{sd: 1}}, maps: [{{{onto}}}]}}]"
+
+
+ON_ARM = "limb: arm, element: motor, axis: "
+MAPS = {
+    "angle onto x": (
+        ("angle", ON_ARM + "x"),
+        "parameter 'p' is an angle and x of 'arm' a length; state an `arm:` [length per radian]",
+    ),
+    "angle onto rod": (
+        ("angle", "limb: arm, element: rod, axis: length"),
+        "is an angle and length of 'arm' a length; state an",
+    ),
+    "ratio onto x": (("ratio", ON_ARM + "x"), "parameter 'p' is a ratio and x of 'arm' a length; state an `arm:`"),
+    "length onto rx": (("length", ON_ARM + "rx"), "parameter 'p' is a length and rx of 'arm' an angle; state it as an angle"),
+    "arm of a length": (("length", ON_ARM + "x, arm: 2"), "parameter 'p' is a length with an arm; leave the arm out"),
+    "arm onto rx": (("angle", ON_ARM + "rx, arm: 2"), "is an angle with an arm and rx of 'arm' an angle; leave the arm out"),
+    "length onto offset": (
+        ("length", "limb: q1, element: transmission, axis: offset"),
+        "is a length and offset of 'q1' an angle; state it as an angle",
+    ),
+    "angle onto gain": (
+        ("angle", "limb: q1, element: transmission, axis: gain"),
+        "is an angle and gain of 'q1' a ratio; state it as a ratio",
+    ),
+    "pitch": (("length", ON_ARM + "pitch"), "parameter 'p' is mapped onto 'pitch'; use lead, the advance in one turn"),
+}
+
+
+@pytest.mark.parametrize("case", MAPS)
+def test_a_map_between_unlike_units_is_refused(tmp_path: Path, case: str) -> None:
+    (kind, onto), sentence = MAPS[case]
+    assert sentence in refused(tmp_path, "rotary-delta", more=named(kind, onto))
+
+
+@pytest.mark.parametrize(
+    ("kind", "onto"),
+    [
+        ("length", ON_ARM + "x"),
+        ("angle", ON_ARM + "x, arm: 2"),
+        ("angle", ON_ARM + "rx"),
+        ("ratio", ON_ARM + "rx"),  # a slope
+        ("angle", "limb: q1, element: transmission, axis: offset"),
+        ("ratio", "limb: q1, element: transmission, axis: gain"),
+    ],
+)
+def test_a_map_between_like_units_is_taken(tmp_path: Path, kind: str, onto: str) -> None:
+    assert "p" in changed(tmp_path, "rotary-delta", more=named(kind, onto)).parameters.names
+
+
+def test_a_spools_radius_may_be_named(tmp_path: Path) -> None:
+    """The gain of an angle that moves a length is a length, per radian."""
+    more = named("length", "limb: a, element: transmission, axis: gain")
+    assert "p" in changed(tmp_path, "cable-4", more=more).parameters.names
+
+
+def test_a_lead_is_the_advance_in_one_turn_also_in_a_map(tmp_path: Path) -> None:
+    """A lead that grows by a parameter is the lead that the joint states."""
+    machine = changed(tmp_path, "rotary-delta", more=named("length", ON_ARM + "lead"))
+    values = machine.values.copy()
+    values[machine.parameters.index("p")] += 0.003  # [m], in one turn
+    stated = changed(tmp_path, "rotary-delta", ("axis: y,", "axis: y, lead: 3,"))
+    xyz = np.array([[0.05, -0.08, -0.45], [-0.1, 0.02, -0.5]])
+    there, twin = inverse(machine.with_values(values), xyz), inverse(stated, xyz)
+    np.testing.assert_allclose(there.q, twin.q, rtol=0, atol=1e-12)  # [rad]
+    assert abs(there.q - inverse(machine, xyz).q).max() > 1e-5

@@ -250,12 +250,13 @@ class Onto:
     """Where a named parameter enters: axis `axis` of the frame placed at `element` of `limb` (of all its copies).
 
     With `limb` the name of a drive, `element` is `transmission` and `axis` one of its terms. The displacement is
-    coefficient * change, or arm * change for an angle that moves a length [arm per radian].
+    coefficient * change, or arm * change for an angle or ratio that moves a length [arm per radian]. `lead` is a screw's
+    advance in one turn (`pitch`, the engine's advance in a radian, is refused); a `curve` counts per radian or metre.
     """
 
     limb: str
     element: str
-    axis: Literal["rx", "ry", "rz", "x", "y", "z", "length", "pitch", "offset", "gain", "curve", "backlash"]
+    axis: Literal["rx", "ry", "rz", "x", "y", "z", "length", "lead", "pitch", "offset", "gain", "curve", "backlash"]
     coefficient: Ratio = 1.0
     arm: Length | None = None
 

@@ -8,7 +8,7 @@ docs/robots.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,6 +39,7 @@ from loopcal.mechanism.families.limb_records import (
     place_matrix,
     refuse_branch,
 )
+from loopcal.mechanism.families.map_units import check_units, dimension_of, engine_axis
 from loopcal.mechanism.records import Robot, standard_deviation
 from loopcal.units import Dimension
 
@@ -67,10 +68,11 @@ class Limbs(LimbsFile, Robot):
         drives = tuple({drive[0]: drive for one in everyone for drive in self._drives(one)}.values())
         errors = sum((_limb_errors(one) for one in everyone), start=Errors())
         errors += sum((drive_errors(name, drive, turns) for name, drive, turns in drives), start=Errors())
-        errors += sum((_named(named, members, {name for name, *_ in drives}) for named in self.parameters), start=Errors())
+        by_name = {name: (drive, turns) for name, drive, turns in drives}
+        errors += sum((_named(named, members, by_name) for named in self.parameters), start=Errors())
         if self.error_model == "complete":
             errors = self._complete(everyone, drives).beside(errors) + errors
-        self._check(errors, tuple(name for name, *_ in drives))
+        self._check(errors, tuple(by_name))
         return Assembly(
             name=self.name,
             source=self.source,
@@ -241,32 +243,36 @@ def _element(limb: Placed, name: str) -> str:
     raise MechanismError(f"limb {limb.name!r} has no {name!r}; it has {', '.join(limb.elements)}")
 
 
-def _named(named: Named, members: dict[str, tuple[_Member, ...]], drives: set[str]) -> Errors:
+def _named(named: Named, members: dict[str, tuple[_Member, ...]], drives: Mapping[str, tuple[Drive, bool]]) -> Errors:
     """A parameter with maps of its own."""
     if isinstance(named, NamedLength):
-        dimension, nominal = Dimension.LENGTH, named.length
+        nominal = named.length
     else:
-        dimension, nominal = (Dimension.ANGLE, named.angle) if isinstance(named, NamedAngle) else (Dimension.RATIO, named.ratio)
-    maps = [linear for entry in named.maps for linear in _onto(named.name, entry, members, drives)]
+        nominal = named.angle if isinstance(named, NamedAngle) else named.ratio
+    maps = [linear for entry in named.maps for linear in _onto(named, entry, members, drives)]
     sd = standard_deviation(named.tolerance, named.name)
-    return quantity(named.name, dimension, nominal, sd, *maps)
+    return quantity(named.name, dimension_of(named), nominal, sd, *maps)
 
 
-def _onto(name: str, entry: Onto, members: dict[str, tuple[_Member, ...]], drives: set[str]) -> Iterator[Linear]:
+def _onto(
+    named: Named, entry: Onto, members: dict[str, tuple[_Member, ...]], drives: Mapping[str, tuple[Drive, bool]]
+) -> Iterator[Linear]:
     """One entry of a parameter's maps, for every copy that it means."""
-    coefficient = entry.coefficient * (1.0 if entry.arm is None else entry.arm)
+    name, (axis, coefficient) = named.name, engine_axis(named.name, entry)
     if entry.limb in drives:
-        yield Linear(name, Address(entry.limb, entry.element, entry.axis), coefficient)
+        check_units(named, entry, drives[entry.limb])
+        yield Linear(name, Address(entry.limb, entry.element, axis), coefficient)
         return
     found = members.get(entry.limb) or tuple(m for ms in members.values() for m in ms if m.placed.name == entry.limb)
     if not found:
         known = ", ".join((*members, *sorted(drives)))
         raise MechanismError(f"parameter {name!r} is mapped onto {entry.limb!r}, which is not there; known are {known}")
+    check_units(named, entry, None)
     for one in found:
-        if entry.axis in AXES:
-            yield from moved(name, one.placed, _element(one.placed, entry.element), entry.axis, coefficient)
+        if axis in AXES:
+            yield from moved(name, one.placed, _element(one.placed, entry.element), axis, coefficient)
         else:
-            yield Linear(name, Address(one.placed.name, entry.element, entry.axis), coefficient)
+            yield Linear(name, Address(one.placed.name, entry.element, axis), coefficient)
 
 
 def _plain(vector: np.ndarray) -> tuple[float, float, float]:
