@@ -179,6 +179,20 @@ def test_check_shows_what_a_file_expands_into_in_its_units(run) -> None:
     assert "a/transmission/gain   0.0174533   (mm/deg)/mm" in out
 
 
+@pytest.mark.parametrize("name", ["five-bar", "3-rrr", "rotary-delta"])
+def test_joints_are_shown_where_they_stand_with_the_platform_at_home(run, name) -> None:
+    """Not where the search for home starts (`start:`), which differs by some degrees."""
+    robot, out = load_robot(name), run(f"check {name} --expand")[1]
+    shown = {tuple(row.split()[:2]): row.split()[-2] for row in out.splitlines() if " turns about z" in row}
+    for group, joints in zip(robot.program.groups, robot.home_state.joints, strict=True):
+        for k, i in enumerate(group.limbs):
+            for j, joint in enumerate(robot.assembly.limbs[i].joints):
+                if joint.kind == "R":
+                    found = float(shown[robot.assembly.limbs[i].name, joint.name])
+                    assert found == pytest.approx(np.degrees(joints[0, 0, k, j]), abs=1e-5)
+                    assert found != pytest.approx(np.degrees(joint.start), abs=1e-5)
+
+
 @pytest.mark.parametrize("robot", sorted(shipped_robots()))
 def test_every_shipped_robot_expands_and_no_number_is_cut_short(run, robot) -> None:
     code, out, err = run(f"check {robot} --expand")

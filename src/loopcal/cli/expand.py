@@ -27,7 +27,8 @@ def assembly(robot: Mechanism) -> None:
     units = show.units_of(robot)
     words = f"lengths in {units[Dimension.LENGTH]}, angles in {units[Dimension.ANGLE]}"
     place = ("x", "y", "z", "roll", "pitch", "yaw")
-    rows = [row for limb in robot.assembly.limbs for row in _limb(limb, units)]
+    values = _at_home(robot)
+    rows = [row for i, limb in enumerate(robot.assembly.limbs) for row in _limb(limb, values[i], units)]
     rows += [("platform", "home", "T_base_platform", *_place(robot.assembly.home, units), "")]
     rows += [("platform", "tool", "T_platform_tool", *_place(robot.assembly.tool, units), "")]
     show.table(f"Limbs, from base to platform ({words})", ("limb", "element", "is", *place, "at home"), rows, text_columns=3)
@@ -36,8 +37,14 @@ def assembly(robot: Mechanism) -> None:
     show.table("Maps: how parameters enter", ("parameter", "moves", "by", "unit"), _maps(robot, units), text_columns=2)
 
 
-def _limb(limb: Limb, units: Units) -> list[tuple[str, ...]]:
-    """Return the rows of a limb."""
+def _at_home(robot: Mechanism) -> dict[int, np.ndarray]:
+    """Return number of a limb -> values of its joints [m, rad] with the platform at home."""
+    groups = zip(robot.program.groups, robot.home_state.joints, strict=True)
+    return {i: joints[0, 0, k] for group, joints in groups for k, i in enumerate(group.limbs)}
+
+
+def _limb(limb: Limb, values: np.ndarray, units: Units) -> list[tuple[str, ...]]:
+    """Return the rows of a limb whose joints stand at `values`."""
     rows = []
     for i, link in enumerate(limb.links):
         rows.append((limb.name, link.name, "link", *_place(link.transform, units), ""))
@@ -48,8 +55,8 @@ def _limb(limb: Limb, units: Units) -> list[tuple[str, ...]]:
             pitch = (
                 f", {_shown(joint.pitch, units[Dimension.LENGTH])} {units[Dimension.LENGTH]} in a radian" if joint.pitch else ""
             )
-            start = f"{_shown(joint.start, units[dimension])} {units[dimension]}"
-            rows.append((limb.name, joint.name, f"{joint.kind} {words}{pitch}{driven}", *[""] * 6, start))
+            home = f"{_shown(float(values[i]), units[dimension])} {units[dimension]}"
+            rows.append((limb.name, joint.name, f"{joint.kind} {words}{pitch}{driven}", *[""] * 6, home))
     length = units[Dimension.LENGTH]
     rod = f", {_shown(limb.length, length)} {length}" if limb.ending == "distance" else ""
     driven = f", driven by {limb.actuator}" if limb.actuator else ""
