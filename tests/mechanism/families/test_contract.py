@@ -2,6 +2,7 @@
 """What every robot that comes with loopcal must do. A new file in src/loopcal/robots is picked up by itself."""
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -94,3 +95,13 @@ def test_its_sensitivities_are_the_derivatives_of_its_forward_kinematics(name: s
     scale = np.array([length if a.dimension is Dimension.LENGTH else angle for a in machine.actuators])
     zero = np.zeros(len(scale))
     check_jacobian(by_reading, known.readings[0], zero, scale=scale, atol=1e-9 * machine.size, atol_reason=reason)
+
+
+def test_every_robot_has_its_row_in_the_documentation() -> None:
+    """| name | family | .. | parameters | ..; the table has no others."""
+    page = (Path(__file__).parents[3] / "docs" / "robots.md").read_text("utf-8")
+    table = page[page.index("| name | family |") :].split("\n\n")[0]
+    rows = [[cell.strip().strip("`") for cell in line.split("|")[1:-1]] for line in table.splitlines()[2:]]
+    assert sorted(row[0] for row in rows) == sorted(ROBOTS)
+    for name, _, _, _, parameters, _ in rows:
+        assert int(parameters) == len(robot(name).parameters), name
