@@ -9,8 +9,10 @@ from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
 from loopcal.io import load_robot
-from loopcal.mechanism import Status, build, forward, inverse
+from loopcal.mechanism import Actuator, Link, Status, build, forward, inverse
 from loopcal.mechanism.trials import forward_trials, sensitivity
+from loopcal.units import Dimension
+from tests import zoo
 from tests.jacobians import check_jacobian
 
 
@@ -87,3 +89,42 @@ def test_poses_follow_readings_as_linearised():
         return sensitivity(robot, values, readings[None, None], state).readings[0, 0, 3:]
 
     check_jacobian(position, slopes(q[0]), q[0], scale=1e-2, atol=1e-9, atol_reason="poses solved to 1e-13, steps of 1e-2")
+
+
+def hexapod_with_seven_legs():
+    """The small hexapod with a seventh driven leg from the middle of the base."""
+    assembly = zoo.hexapod().assembly
+    foot, corner = zoo.place((0.0, 0.0, 0.0)), zoo.place((0.02, 0.03, 0.0))
+    length = float(np.linalg.norm((assembly.home @ corner)[:3, 3]))
+    links = {"links": (Link("base", foot),), "attachment": Link("platform", corner)}
+    leg = replace(assembly.limbs[0], name="leg7", actuator="q7", length=length, **links)
+    actuators = (*assembly.actuators, Actuator("q7", Dimension.LENGTH))
+    return build(replace(assembly, limbs=(*assembly.limbs, leg), actuators=actuators, parameters=(), maps=()))
+
+
+def test_a_wrong_local_minimum_far_from_home_is_left_or_marked():
+    robot = hexapod_with_seven_legs()
+    reach = np.array([0.12, 0.12, 0.12, 1.2, 1.2, 1.2])
+    asked = np.array([0, 0, 0.2, 0, 0, 0]) + np.random.default_rng(0).uniform(-1, 1, (600, 6)) * reach
+    found = inverse(robot, asked)
+    found = found.take(found.converged)
+    again = forward(robot, found.q)
+    # readings agree with each other here: what stays open is a minimum beside the pose they came from
+    assert again.residual[again.converged].max() < 1e-2 * robot.size
+    right = np.abs(again.T - found.T).max(axis=(1, 2)) < 1e-9
+    assert 0.85 < right.mean() < 1
+    assert again.converged[right].all()
+    for row in np.flatnonzero(~right).tolist():
+        assert ": closed" not in again.explain(row)
+
+
+def test_a_gap_of_contradicting_readings_is_not_called_closed():
+    robot = cable_robot((1e-3, 1e-3, 1e-3, 1e-3))
+    q = inverse(robot, robot.home[None, :3, 3]).q
+    fits, apart = forward(robot, q), forward(robot, q * [1.002, 1, 1, 1])
+    assert "row 0: closed (" in fits.explain(0)
+    assert apart.converged.all()
+    assert "row 0: as near as contradicting readings allow (" in apart.explain(0)
+    wild = forward(robot, q + np.array([40.0, 0, 0, 40.0]))
+    assert wild.status[0] == Status.UNREACHABLE
+    assert "leaves a gap" in wild.explain(0)

@@ -16,6 +16,9 @@ from loopcal.mechanism.model import Mechanism, Status
 from loopcal.mechanism.projection import nearest_reachable
 from loopcal.mechanism.trials import forward_trials, inverse_trials, readings_at
 
+APART = 1e-9
+"""Gap [m] above which a converged row, which then has redundant readings, is not called closed."""
+
 
 @dataclass(frozen=True, repr=False)
 class Solution:
@@ -56,7 +59,9 @@ class Solution:
     def explain(self, row: int) -> str:
         """What became of a row, in a sentence."""
         status = Status(int(self.status[row]))
-        return f"row {row}: {status.sentence} ({self.residual[row] * 1e3:.3g} mm open after {self.iterations[row]} steps)"
+        apart = status == Status.CONVERGED and self.residual[row] > APART
+        sentence = "as near as contradicting readings allow" if apart else status.sentence
+        return f"row {row}: {sentence} ({self.residual[row] * 1e3:.3g} mm open after {self.iterations[row]} steps)"
 
 
 def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> Solution:

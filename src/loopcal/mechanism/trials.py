@@ -22,21 +22,24 @@ __all__ = ["Sensitivity", "forward_trials", "inverse_trials", "orientation_at", 
 
 STEPS = (8, 64)
 """Steps of the path from the start's readings along which a row is followed when the direct solution fails."""
+WIDE = 1e-2
+"""Share of the size: a pose that redundant readings leave open by more is not what their errors mean, but a wrong minimum."""
 
 
 def forward_trials(robot: Mechanism, values: Array, q: Array, start: State | None = None) -> State:
     """Poses of readings q (t | 1, n, a) under parameter values (t | 1, p).
 
     Newton from `start` (default: home); a row that fails, or ends on the far side of a singularity, is followed along the
-    straight path from the start's readings. Rows that still fail are marked, see `Status`.
+    straight path from the start's readings. Rows that still fail are marked, see `Status`. Redundant readings contradict
+    each other by their errors; a row that they leave wide open is followed too, and marked where it stays open.
     """
     e, tau = robot.slots(values)
     with np.errstate(invalid="ignore"):  # an infinite reading turns into NaN, and the engine marks its row
         joints = joint_values(q, tau, robot.slots.frequency)
     begin = _signed(robot, robot.home_state if start is None else start)
     state = _signed(robot, engine.solve(robot.program, e, joints, begin))
-    wrong = _astray(state, begin)
-    if not wrong.any() or robot.program.sigma is not None:
+    wrong = _astray(robot, state, begin)
+    if not wrong.any():
         return state
     return _followed(robot, e, joints, begin, state, wrong)
 
@@ -89,11 +92,11 @@ def readings_at(robot: Mechanism, values: Array, state: State) -> Array:
     return readings_of(states.actuated(robot.program, state), tau, robot.slots.frequency)
 
 
-def _astray(state: State, begin: State) -> np.ndarray:
-    """Rows that failed or ended on the other side of a singularity."""
-    return (state.status != Status.CONVERGED) & (state.status != Status.NOT_FINITE) | (
-        (state.status == Status.CONVERGED) & (state.orientation != begin.orientation)
-    )
+def _astray(robot: Mechanism, state: State, begin: State) -> np.ndarray:
+    """Rows that failed, ended on the other side of a singularity or left a wide gap."""
+    closed = state.status == Status.CONVERGED
+    beside = (state.orientation != begin.orientation) | (state.residual > WIDE * robot.size)
+    return ~closed & (state.status != Status.NOT_FINITE) | closed & beside
 
 
 def _followed(robot: Mechanism, e: Array, joints: Array, begin: State, state: State, wrong: np.ndarray) -> State:
@@ -112,9 +115,10 @@ def _followed(robot: Mechanism, e: Array, joints: Array, begin: State, state: St
             part = origin[alive] + (target[alive] - origin[alive]) * (step / count)
             here = _signed(robot, engine.solve(robot.program, own[alive], part, here))
         result = states.put(result, alive, zero, here)
-        alive = alive[_astray(here, begun)[:, 0]]
+        alive = alive[_astray(robot, here, begun)[:, 0]]
         if not len(alive):
             break
     lost = (result.status == Status.CONVERGED) & (result.orientation != first.orientation)
-    marked = np.where(lost, np.int8(Status.OTHER_MODE), result.status)
+    wide = (result.status == Status.CONVERGED) & (result.residual > WIDE * robot.size)
+    marked = np.where(lost, np.int8(Status.OTHER_MODE), np.where(wide, np.int8(Status.UNREACHABLE), result.status))
     return states.put(state, trial, pose, replace(result, status=marked))
