@@ -12,16 +12,21 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from loopcal.calibrate import MAP as MAP
+    from loopcal.calibrate import Huber as Huber
     from loopcal.calibrate import Identification as Identification
     from loopcal.calibrate import LeastSquares as LeastSquares
     from loopcal.calibrate import Ridge as Ridge
+    from loopcal.calibrate import StepControl as StepControl
     from loopcal.calibrate import TruncatedSVD as TruncatedSVD
+    from loopcal.calibrate import Tukey as Tukey
     from loopcal.calibrate import Validation as Validation
     from loopcal.calibrate import accuracy_map as accuracy_map
     from loopcal.calibrate import compensate as compensate
     from loopcal.calibrate import identifiability as identifiability
     from loopcal.calibrate import identify as identify
+    from loopcal.calibrate import identify_trials as identify_trials
     from loopcal.calibrate import pose_uncertainty as pose_uncertainty
+    from loopcal.calibrate import prior_from as prior_from
     from loopcal.calibrate import recalibrate as recalibrate
     from loopcal.calibrate import validate as validate
     from loopcal.errors import LoopcalError as LoopcalError
@@ -29,9 +34,17 @@ if TYPE_CHECKING:
     from loopcal.io import load_robot as load_robot
     from loopcal.io import save_measurements as save_measurements
     from loopcal.io import save_robot as save_robot
+    from loopcal.measure import KINDS as KINDS
+    from loopcal.measure import Component as Component
+    from loopcal.measure import Gaussian as Gaussian
     from loopcal.measure import Instrument as Instrument
     from loopcal.measure import Measurements as Measurements
+    from loopcal.measure import Observations as Observations
+    from loopcal.measure import Pose as Pose
+    from loopcal.measure import Sensor as Sensor
+    from loopcal.measure import Uniform as Uniform
     from loopcal.measure import simulate as simulate
+    from loopcal.measure import simulate_trials as simulate_trials
     from loopcal.mechanism import Mechanism as Mechanism
     from loopcal.mechanism import Solution as Solution
     from loopcal.mechanism import Status as Status
@@ -49,22 +62,39 @@ _WHERE = {
     for module, names in {
         "loopcal.calibrate": (
             "MAP",
+            "Huber",
             "Identification",
             "LeastSquares",
             "Ridge",
+            "StepControl",
             "TruncatedSVD",
+            "Tukey",
             "Validation",
             "accuracy_map",
             "compensate",
             "identifiability",
             "identify",
+            "identify_trials",
             "pose_uncertainty",
+            "prior_from",
             "recalibrate",
             "validate",
         ),
         "loopcal.errors": ("LoopcalError",),
         "loopcal.io": ("load_measurements", "load_robot", "save_measurements", "save_robot"),
-        "loopcal.measure": ("Instrument", "Measurements", "simulate"),
+        "loopcal.measure": (
+            "KINDS",
+            "Component",
+            "Gaussian",
+            "Instrument",
+            "Measurements",
+            "Observations",
+            "Pose",
+            "Sensor",
+            "Uniform",
+            "simulate",
+            "simulate_trials",
+        ),
         "loopcal.mechanism": (
             "Mechanism",
             "Solution",
