@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """All modes: 40 of Dietmaier's hexapod, those of known machines, and the choice of one by `start`."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.errors import DataError, MechanismError
 from loopcal.io import load_robot
-from loopcal.mechanism import build, coordinates, forward, inverse
+from loopcal.mechanism import build, coordinates, forward, inverse, states
 from loopcal.mechanism.assembly_modes import assembly_modes, working_modes
 from loopcal.mechanism.families.gough import Gough
 from loopcal.mechanism.records import Pose
@@ -114,3 +116,24 @@ def test_a_platform_that_is_free_to_move_is_said():
 def test_a_wrong_number_of_readings_is_refused():
     with pytest.raises(DataError, match="3 readings were given"):
         assembly_modes(zoo.hexapod(), np.zeros(3))
+
+
+@pytest.mark.parametrize("stroke", [None, (5.0, 11.0)])
+def test_working_modes_have_readings_within_a_turn_and_start_with_the_one_at_home(stroke):
+    assembly = zoo.five_bar().assembly
+    robot = build(replace(assembly, actuators=tuple(replace(a, stroke=stroke) for a in assembly.actuators)))
+    found = working_modes(robot, target_of(robot))
+    low, high = stroke or (-np.pi, np.pi)
+    home = inverse(robot, robot.home[None]).q[0]
+    middle = (low + high) / 2
+    q = found.solution.q
+    assert len(found) == 4
+    assert (np.abs(q - middle) <= np.pi + 1e-12).all()
+    distance = np.linalg.norm(q - home, axis=1)
+    assert (np.diff(distance) >= -1e-12).all()
+    if stroke is None:
+        assert_allclose(q[0], home, atol=1e-9)
+    for row in range(4):  # readings, joints and pose belong together
+        one = found.solution.take(np.array([row]))
+        assert_allclose(states.actuated(robot.program, one.state)[0], one.q, atol=1e-12)
+        assert_allclose(forward(robot, one.q, start=one).T, one.T, atol=1e-12)

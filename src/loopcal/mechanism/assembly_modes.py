@@ -37,7 +37,8 @@ class Modes:
 
     Attributes
     ----------
-    solution : one row a mode, the nearest to home first; with `start=` it chooses the mode elsewhere.
+    solution : one row a mode, the nearest to home first (its pose, or for working modes its readings);
+        with `start=` it chooses the mode elsewhere.
     hits : (modes,) starts that led to each. starts : how many were tried. quiet : how many since the last new mode.
     """
 
@@ -91,13 +92,18 @@ def assembly_modes(robot: Mechanism, q: ArrayLike, quiet: int = 4 * BATCH, most:
     def key(state: State) -> Array:
         return np.concatenate([state.T[0, :, :3, 3] / robot.size, state.T[0, :, :3, :3].reshape(-1, 9)], axis=1)
 
-    return _search(robot, solved, key, lambda state: np.tile(readings, (state.T.shape[1], 1)), quiet, most, seed)
+    def far(state: State) -> Array:
+        distance = se3.difference(state.T[0], np.broadcast_to(robot.home, state.T[0].shape))
+        return distance * np.repeat([robot.size, 1.0], 3)
+
+    return _search(robot, solved, key, far, lambda state: np.tile(readings, (state.T.shape[1], 1)), quiet, most, seed)
 
 
 def working_modes(robot: Mechanism, target: ArrayLike, quiet: int = 4 * BATCH, most: int = 200_000, seed: int = 0) -> Modes:
     """All readings that lead to controlled coordinates (c,) [m, rad], whatever strokes and limits say.
 
-    Starts have random joints and the platform near the target. Readings are told apart, and poses where the machine has
+    Starts have random joints and the platform near the target. Whole turns are taken off readings: they lie within half a
+    turn of the middle of the stroke, or of zero where none is stated. Readings are told apart, and poses where the machine has
     fewer controlled coordinates than freedoms. Parameters, result and errors as for `assembly_modes`.
     """
     wanted = np.asarray(target, dtype=float).reshape(-1)
@@ -108,22 +114,49 @@ def working_modes(robot: Mechanism, target: ArrayLike, quiet: int = 4 * BATCH, m
 
     def solved(start: State) -> State:
         T = np.broadcast_to(begun.T, start.T.shape) if begun.status[0, 0] == Status.CONVERGED else start.T
-        return inverse_trials(robot, values, np.broadcast_to(wanted, (1, T.shape[1], len(wanted))), replace(start, T=T))
+        target = np.broadcast_to(wanted, (1, T.shape[1], len(wanted)))
+        return _unwound(robot, inverse_trials(robot, values, target, replace(start, T=T)))
+
+    turning = [a.dimension.value == "angle" for a in robot.actuators]
+    home = readings_at(robot, values, robot.home_state)[0]
+
+    def far(state: State) -> Array:
+        return (readings_at(robot, values, state)[0] - home) * np.where(turning, robot.size, 1.0)
 
     def key(state: State) -> Array:
-        turning = [a.dimension.value == "angle" for a in robot.actuators]
         q = readings_at(robot, values, state)[0]
         turns = np.concatenate([np.cos(q[:, turning]), np.sin(q[:, turning])], axis=1)
         pose = np.concatenate([state.T[0, :, :3, 3] / robot.size, state.T[0, :, :3, :3].reshape(-1, 9)], axis=1)
         return np.concatenate([q[:, np.logical_not(turning)] / robot.size, turns, pose], axis=1)
 
-    return _search(robot, solved, key, lambda state: readings_at(robot, values, state)[0], quiet, most, seed)
+    return _search(robot, solved, key, far, lambda state: readings_at(robot, values, state)[0], quiet, most, seed)
+
+
+def _unwound(robot: Mechanism, state: State) -> State:
+    """The state with whole turns taken off its driven joints, as near as possible to the middle of their strokes."""
+    middle = np.array([np.mean(a.stroke) if a.stroke and np.isfinite(a.stroke).all() else 0.0 for a in robot.actuators])
+    _, tau = robot.slots(robot.values[None])
+    centre = joint_values(middle[None, None], tau, robot.slots.frequency)[0, 0]
+    turns = np.round((states.actuated(robot.program, state) - centre) / (2 * np.pi))
+    for group in robot.program.groups:  # a slide or a screw is elsewhere after a turn
+        for j, columns in enumerate(group.actuator):
+            if columns[0] >= 0 and (group.joints[j : j + 1] != "R" or group.pitch[:, j].any()):
+                turns[..., columns] = 0.0
+    joints = []
+    for group, old in zip(robot.program.groups, state.joints, strict=True):
+        new = np.array(old)
+        for j, columns in enumerate(group.actuator):
+            if columns[0] >= 0:
+                new[..., j] -= 2 * np.pi * turns[..., columns]
+        joints.append(new)
+    return replace(state, joints=tuple(joints))
 
 
 def _search(
     robot: Mechanism,
     solved: Callable[[State], State],
     key: Callable[[State], Array],
+    far: Callable[[State], Array],
     readings: Callable[[State], Array],
     quiet: int,
     most: int,
@@ -144,8 +177,7 @@ def _search(
         found, hits = _merged(found, hits, new, key)
         tried += BATCH
         last = tried if len(hits) > before else last
-    distance = se3.difference(found.T[0], np.broadcast_to(robot.home, found.T[0].shape))
-    order = np.argsort(np.linalg.norm(distance * np.repeat([robot.size, 1.0], 3), axis=1))
+    order = np.argsort(np.linalg.norm(far(found), axis=1))
     found = states.take(found, order)
     return Modes(solution_of(robot, found, readings(found)), hits[order], tried, tried - last)
 
