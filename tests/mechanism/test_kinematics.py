@@ -201,3 +201,17 @@ def test_readings_do_not_depend_on_where_the_base_stands(twist):
     _, sol, _ = sampled("hexapod", 5)
     assert_allclose(inverse(there, G @ sol.T).q, sol.q, atol=1e-14)
     assert_allclose(forward(there, sol.q).T, G @ forward(here, sol.q).T, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "words"),
+    [
+        (np.diag([2.0, 2.0, 2.0, 1.0]), "not a rotation"),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "not a rotation"),
+        (2 * np.eye(4), "last row"),
+        (np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0.2, 1]]), "last row"),
+    ],
+)
+def test_a_matrix_that_is_no_pose_is_refused(matrix, words):
+    with pytest.raises(DataError, match=words):
+        inverse(zoo.hexapod(), matrix[None])

@@ -20,6 +20,10 @@ APART = 1e-9
 """Gap [m] above which a converged row, which then has redundant readings, is not called closed."""
 
 
+ROTATION = 1e-6
+"""How far R'R may be from the identity: what a file with seven digits leaves."""
+
+
 @dataclass(frozen=True, repr=False)
 class Solution:
     """Poses and joints of n rows.
@@ -115,6 +119,7 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
     values, begin = robot.values[None], None if start is None else start.state
     if wanted.ndim >= 2 and wanted.shape[-2:] == (4, 4):
         T = wanted.reshape(-1, 4, 4)
+        _check_poses(T)
         state = nearest_reachable(robot, values, T[None], begin)
     elif wanted.ndim in (1, 2) and wanted.shape[-1] == c:
         state = inverse_trials(robot, values, np.atleast_2d(wanted)[None], begin)
@@ -124,6 +129,23 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
             f"({', '.join(robot.controlled)})"
         )
     return solution_of(robot, state, readings_at(robot, values, state)[0])
+
+
+def _check_poses(T: Array) -> None:
+    """Refuse matrices that are no pose: the first bad row and why."""
+    R = T[:, :3, :3]
+    finite = np.isfinite(T).all(axis=(1, 2))
+    turned = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2)) <= ROTATION
+    proper = turned & (np.linalg.det(np.where(finite[:, None, None], R, np.eye(3))) > 0)
+    bottom = np.abs(T[:, 3] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=1) <= ROTATION
+    # a row of NaN is marked in the solution, like readings that are NaN
+    wrong = np.flatnonzero(finite & ~(proper & bottom))
+    if len(wrong):
+        row = int(wrong[0])
+        reason = (
+            "its last row is not 0 0 0 1" if not bottom[row] else "its upper left 3 x 3 is not a rotation (R'R = I, det +1)"
+        )
+        raise DataError(f"target {row} is no pose: {reason}; give T_base_platform as (n, 4, 4) homogeneous matrices")
 
 
 def solution_of(robot: Mechanism, state: State, q: Array) -> Solution:
