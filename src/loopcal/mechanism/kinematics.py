@@ -134,7 +134,7 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
 def _check_poses(T: Array) -> None:
     """Refuse matrices that are no pose: the first bad row and why."""
     R = T[:, :3, :3]
-    finite = np.isfinite(T).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(T).all(axis=(1, 2)))
     turned = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2)) <= ROTATION
     proper = turned & (np.linalg.det(np.where(finite[:, None, None], R, np.eye(3))) > 0)
     bottom = np.abs(T[:, 3] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=1) <= ROTATION
