@@ -68,11 +68,12 @@ def calibrate(
     from loopcal.io import load_measurements, load_robot
     from loopcal.io.calibration_run import run_document, save_run
     from loopcal.io.compensation_file import load_prior
-    from loopcal.io.robot_file import robot_path
-    from loopcal.io.run_folder import RESULT, made_by, refuse_used_folder
+    from loopcal.io.outputs import refuse_run_folder
+    from loopcal.io.run_folder import made_by
 
     _refuse_contradictions(hold_out, limit_position is not None or limit_angle is not None, prior, free_limb)
-    refuse_used_folder(output, force)
+    inputs = _inputs(robot, data, prior)
+    refuse_run_folder(output, list(inputs.values()), force)
     machine = load_robot(robot)
     measured = load_measurements(data, machine, allow_outside_stroke=allow_outside_stroke, allow_duplicates=allow_duplicates)
     fitted, unseen = fitting.split(measured, hold_out, seed)
@@ -83,7 +84,6 @@ def calibrate(
     else:
         fit, change = recalibrate(machine, fitted, load_prior(prior, data), free_limb, fitting.noise)
     validation = None if unseen is None else validate(fit, unseen, limit_position, limit_angle)
-    inputs = {"robot": robot_path(robot), "data": data, **({} if prior is None else {"prior": prior / RESULT})}
     origin = made_by(sys.argv, inputs, {"hold_out": seed})
     split = None if unseen is None else {"hold_out": hold_out, "seed": seed, "held_out": unseen.labels}
     findings = {"examination": _examined(fit, fitted), "change": change, "model_choice": choice}
@@ -95,6 +95,14 @@ def calibrate(
     else:
         _print(fit, validation, fitted, findings, output)
     return _exit_code(fit, validation)
+
+
+def _inputs(robot: str, data: Path, prior: Path | None) -> dict[str, Path]:
+    """Return the files that are read."""
+    from loopcal.io.robot_file import robot_path
+    from loopcal.io.run_folder import RESULT
+
+    return {"robot": robot_path(robot), "data": data, **({} if prior is None else {"prior": prior / RESULT})}
 
 
 def _refuse_contradictions(hold_out: float, gates: bool, prior: Path | None, free_limb: str | None) -> None:

@@ -22,9 +22,10 @@ SLACK = 1e-9
 @click.command(short_help="Read a robot file and show what it says.")
 @robot_argument
 @click.option("--plot", type=FILE, metavar="FILE", help="Draw the robot at home into FILE (.png, .svg or .pdf).")
+@click.option("--force", is_flag=True, help="Replace a file that is there.")
 @click.option("--expand", is_flag=True, help="Also show limbs, links, joints, transmissions and how parameters enter.")
 @json_option
-def check(robot: str, plot: Path | None, expand: bool, as_json: bool) -> None:
+def check(robot: str, plot: Path | None, force: bool, expand: bool, as_json: bool) -> None:
     """Read ROBOT, a file or the name of a shipped robot, and show what was understood.
 
     Whatever is wrong with the file, its units, its joints or its mobility is said in one sentence with the line.
@@ -37,7 +38,10 @@ def check(robot: str, plot: Path | None, expand: bool, as_json: bool) -> None:
       loopcal check 3-prs --plot 3-prs.png
     """  # noqa: D301
     from loopcal.io import load_robot
+    from loopcal.io.outputs import refuse_outputs
+    from loopcal.io.robot_file import robot_path
 
+    refuse_outputs((plot,), (robot_path(robot),), force)
     machine = load_robot(robot)
     if plot is not None:
         from loopcal.report import save_picture

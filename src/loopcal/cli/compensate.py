@@ -24,6 +24,7 @@ if TYPE_CHECKING:
               help="Set the actuators, or shift what a closed controller is commanded.")  # fmt: skip
 @click.option("--controller", metavar="ROBOT", help="Robot file of the controller's geometry; default: the nominal robot.")
 @click.option("--steps", type=click.IntRange(min=1), default=3, show_default=True, help="Steps of the shift.")
+@click.option("--force", is_flag=True, help="Replace a file that is there.")
 @json_option
 def compensate(
     run: Path,
@@ -32,6 +33,7 @@ def compensate(
     mode: Literal["readings", "commands"],
     controller: str | None,
     steps: int,
+    force: bool,
     as_json: bool,
 ) -> int:
     """Compute what to tell the machine of RUN so that it goes to TARGETS, a CSV file of controlled coordinates.
@@ -50,8 +52,10 @@ def compensate(
     from loopcal.calibrate.posterior import Posterior
     from loopcal.io import load_robot
     from loopcal.io.compensation_file import compensation_text, load_calibrated_or_posterior, load_targets
+    from loopcal.io.outputs import refuse_outputs
     from loopcal.io.text_file import write_text
 
+    refuse_outputs((output,), (run, targets, None if controller is None else Path(controller)), force)
     known = load_calibrated_or_posterior(run)
     robot = known.robot if isinstance(known, Posterior) else known
     wanted, labels = load_targets(targets, robot)

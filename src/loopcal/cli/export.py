@@ -32,11 +32,11 @@ def export(source: str, format_name: str | None, into: Path | None, output: Path
       loopcal export run -o parameters.csv
     """  # noqa: D301
     from loopcal.io.formats.transfer import exported, format_of, load_source
-    from loopcal.io.new_robot import refuse_existing
+    from loopcal.io.outputs import refuse_outputs
     from loopcal.io.text_file import write_text
 
     target = format_of(output, format_name)
-    refuse_existing(output, force)
+    refuse_outputs((output,), (Path(source),), force)  # --into may be corrected in place
     found = exported(load_source(source), target, into)
     write_text(output, found.text)
     if as_json:

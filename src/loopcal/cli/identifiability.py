@@ -78,9 +78,12 @@ def identifiability(
     from loopcal.calibrate.remedies import remedies
     from loopcal.io import load_measurements, load_robot
     from loopcal.io.measurement_file import load_poses
+    from loopcal.io.outputs import refuse_outputs
+    from loopcal.io.robot_file import robot_path
     from loopcal.measure import simulate
 
-    _refuse(data, poses, seen_by, reduced, output, force)
+    _refuse(data, poses, seen_by, reduced, output)
+    refuse_outputs((output,), (robot_path(robot), data, poses), force)
     machine, drawn = load_robot(robot), ""
     if data is not None:
         allowed = {"allow_outside_stroke": allow_outside_stroke, "allow_duplicates": allow_duplicates}
@@ -106,20 +109,14 @@ def identifiability(
         show.say(f"\n{output}: the robot with these parameters fixed")
 
 
-def _refuse(
-    data: Path | None, poses: Path | None, seen_by: Mapping[str, Any], reduced: bool, output: Path | None, force: bool
-) -> None:
-    """Refuse options that contradict each other, and an output file that is there."""
-    from loopcal.io.new_robot import refuse_existing
-
+def _refuse(data: Path | None, poses: Path | None, seen_by: Mapping[str, Any], reduced: bool, output: Path | None) -> None:
+    """Refuse options that contradict each other."""
     if data is not None and poses is not None:
         raise DataError("there are both DATA and --poses; give measurements, or poses that could be measured, but not both")
     if data is not None and (seen_by["measure"] or seen_by["frames"]):
         raise DataError("DATA states what is measured and what is unknown; leave out --measure and --frames, or DATA")
     if output is not None and not reduced:
         raise DataError("-o writes what --reduce finds; add --reduce, or leave out -o")
-    if output is not None:
-        refuse_existing(output, force)
 
 
 def _instrument(

@@ -61,16 +61,16 @@ def import_(
       loopcal import five-bar.urdf --closures five-bar-loops.yaml -o five-bar.yaml
     """  # noqa: D301
     from loopcal.io.formats.transfer import format_of, save_imported
-    from loopcal.io.new_robot import refuse_existing
+    from loopcal.io.outputs import refuse_outputs
 
     source = format_of(file, format_name)
     if source.read is None:
         raise DataError(f"loopcal writes the format {source.name}, but does not read it; known are {', '.join(FORMATS)}")
     if corrected is not None and data is None:
         raise DataError("--corrected calibrates with the measurements in the file; say where to write them, as --data data.csv")
-    for path in (output, data, corrected):
-        if path is not None:
-            refuse_existing(path, force)
+    beside = file.with_suffix(".yaml") if source.name == "urdf" else None
+    refuse_outputs((output, data), (file, asked["closures"] or beside), force)
+    refuse_outputs((output, data, corrected), (), force)  # FILE may be corrected in place
     found = source.read(file, _reading(source, output.stem, asked))
     robot = save_imported(file, found, output, data)
     fit = None if corrected is None or data is None else _corrected(source, robot, file, data, corrected)

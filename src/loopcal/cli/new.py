@@ -3,12 +3,17 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from loopcal.cli import show
 from loopcal.cli.options import FILE, instrument, instrument_options, json_option
+
+if TYPE_CHECKING:
+    from loopcal.measure import Instrument
 
 
 @click.command(short_help="Write a robot file, and a measurement file, to fill in.")
@@ -39,21 +44,31 @@ def new(
       loopcal new gough -o my-hexapod.yaml --measurements tracker.csv
       loopcal new linear-delta -o printer.yaml --measurements heights.csv --kind component --components z
     """  # noqa: D301
-    from loopcal.io import load_robot
-    from loopcal.io.measurement_writer import template_text
-    from loopcal.io.new_robot import new_robot_text, refuse_existing
+    from loopcal.io.new_robot import new_robot_text
+    from loopcal.io.outputs import refuse_outputs
     from loopcal.io.text_file import write_text
 
     seen_by = instrument(kind, components, orientation, sigma_position, sigma_angle)
-    for path in (output, measurements):
-        if path is not None:
-            refuse_existing(path, force)
-    write_text(output, new_robot_text(family, output.stem))
-    if measurements is not None:
-        write_text(measurements, template_text(load_robot(output), seen_by))
+    refuse_outputs((output, measurements), (), force)
+    robot_text = new_robot_text(family, output.stem)
+    template = None if measurements is None else _template(robot_text, seen_by)
+    write_text(output, robot_text)
+    if measurements is not None and template is not None:
+        write_text(measurements, template)
     if as_json:
         show.json_document({"robot": output, "measurements": measurements})
         return
     show.say(f"{output}: a working robot to put your own numbers into; then: loopcal check {output}")
     if measurements is not None:
         show.say(f"{measurements}: columns without rows; fill in and: loopcal calibrate {output} {measurements} -o run")
+
+
+def _template(robot_text: str, seen_by: Instrument) -> str:
+    """Return a measurement file without rows for a robot that is not written yet."""
+    from loopcal.io import load_robot
+    from loopcal.io.measurement_writer import template_text
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.yaml"
+        path.write_text(robot_text, encoding="utf-8")
+        return template_text(load_robot(path), seen_by)

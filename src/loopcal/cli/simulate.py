@@ -20,6 +20,7 @@ from loopcal.cli.options import FILE, draw_option, drawn_poses, instrument, inst
 @click.option("--draw-errors", is_flag=True, help="Give the machine errors drawn from the tolerances of the robot file.")
 @click.option("--truth", type=FILE, help="Also write the true machine, as a robot file.")
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of poses, errors and noise.")
+@click.option("--force", is_flag=True, help="Replace files that are there.")
 @json_option
 def simulate(
     robot: str,
@@ -34,6 +35,7 @@ def simulate(
     draw_errors: bool,
     truth: Path | None,
     seed: int,
+    force: bool,
     as_json: bool,
 ) -> None:
     """Command ROBOT to poses by its nominal geometry, and write down what an instrument would see of the true machine.
@@ -51,7 +53,10 @@ def simulate(
     from loopcal import measure
     from loopcal.io import load_robot, save_measurements, save_robot
     from loopcal.io.measurement_file import load_poses
+    from loopcal.io.outputs import refuse_outputs
+    from loopcal.io.robot_file import robot_path
 
+    refuse_outputs((output, truth), (robot_path(robot), poses), force)
     machine = load_robot(robot)
     if draw_errors:
         machine = machine.with_values(measure.sample_truth(machine, 1, seed)[0])

@@ -6,9 +6,8 @@ from __future__ import annotations
 import json
 import re
 import textwrap
-from pathlib import Path
 
-from loopcal.errors import FileError, MechanismError, nearest
+from loopcal.errors import MechanismError, nearest
 from loopcal.io import reference
 from loopcal.io.robot_file import shipped_robots
 from loopcal.io.yaml_file import read_yaml
@@ -60,15 +59,3 @@ def new_robot_text(family: str, name: str) -> str:
     body = text.split("\n")
     first = next(i for i, line in enumerate(body) if not line.startswith("#"))
     return "\n".join([*lines, "", *body[first:]])
-
-
-def refuse_existing(path: str | Path, force: bool) -> None:
-    """Refuse to write over a file.
-
-    Raises
-    ------
-    FileError
-        There is one, and `force` is not given.
-    """
-    if Path(path).is_file() and not force:
-        raise FileError("this file exists; choose another name, or replace it with --force", Path(path))

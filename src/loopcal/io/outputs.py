@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which files a command may write: all of them are looked at before the first is written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from loopcal.errors import FileError
+from loopcal.io.run_folder import refuse_used_folder
+
+
+def refuse_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], force: bool) -> None:
+    """Refuse outputs that cannot or should not be written; None among outputs and inputs is passed over.
+
+    Parameters
+    ----------
+    outputs : sequence of Path or None
+        The files to write.
+    inputs : sequence of Path or None
+        What is read: files, or folders whose files are read.
+    force : bool
+        Files that are there may be replaced; those that are read may not.
+
+    Raises
+    ------
+    FileError
+        An output is an input or another output, is there without `force`, is a folder, or has no folder to stand in.
+    """
+    read = [file for path in inputs if path is not None for file in (path.iterdir() if path.is_dir() else (path,))]
+    wanted = [path for path in outputs if path is not None]
+    for i, path in enumerate(wanted):
+        if any(_same(path, other) for other in read):
+            raise FileError("this file is read by the same command, which would replace it; choose another name", path)
+        if any(_same(path, other) for other in wanted[:i]):
+            raise FileError("two outputs have this name; choose another for one of them", path)
+        if path.is_dir():
+            raise FileError("this is a folder where a file name is needed; add the name of the file to write", path)
+        if not path.parent.is_dir():
+            raise FileError(f"this cannot be written because there is no folder {path.parent}; make it first", path)
+        if not os.access(path.parent, os.W_OK):
+            raise FileError("this cannot be written (permission denied); choose another place", path)
+        if path.is_file() and not force:
+            raise FileError("this file exists; choose another name, or replace it with --force", path)
+
+
+def refuse_run_folder(folder: Path, inputs: Sequence[Path], force: bool) -> None:
+    """Refuse a run folder that would replace something it may not, or a file that is read.
+
+    Raises
+    ------
+    FileError
+        See `loopcal.io.run_folder.refuse_used_folder`; or an input is in the folder.
+    """
+    refuse_used_folder(folder, force)
+    for path in inputs:
+        if path.exists() and path.resolve().is_relative_to(folder.resolve()):
+            raise FileError(f"this folder would be replaced, but {path} in it is read; choose another name", folder)
+
+
+def _same(one: Path, other: Path) -> bool:
+    """Tell whether two names are of one file, whether it is there or not."""
+    if one.exists() and other.exists():
+        return one.samefile(other)
+    return one.resolve() == other.resolve()
