@@ -50,7 +50,7 @@ def test_a_byte_order_mark_and_windows_line_ends_are_accepted(tmp_path) -> None:
 
 
 def test_a_sidecar_holds_the_settings_and_makes_comments_of_what_begins_with_a_hash(tmp_path) -> None:
-    path = write(tmp_path, GOOD.replace("# kind: pose", "# measured on a cold day"))
+    path = write(tmp_path, GOOD.replace("# kind: pose", "# measured on a cold day").replace("# noise: {x: 0.001 mm}\n", ""))
     (tmp_path / "data.yaml").write_text("kind: component\n")
     assert read_table(path).settings.content == {"kind": "component"}
 
@@ -104,4 +104,19 @@ def test_a_folder_is_refused(tmp_path) -> None:
 def test_a_robot_file_of_the_same_name_is_no_sidecar(tmp_path) -> None:
     path = write(tmp_path, GOOD)
     (tmp_path / "data.yaml").write_text("format: 1\nfamily: gough\n")
+    assert read_table(path).settings.content["kind"] == "pose"
+
+
+@pytest.mark.parametrize("beside", ["kind: component\n", "noise: {x: 1 mm}\n"])
+def test_settings_in_front_and_beside_are_refused(tmp_path, beside) -> None:
+    path = write(tmp_path, GOOD)
+    (tmp_path / "data.yaml").write_text(beside)
+    with pytest.raises(FileError, match=r"at the top of this file and in data.yaml; keep one of the two"):
+        read_table(path)
+
+
+@pytest.mark.parametrize("beside", ["title: a plot\n", "- a\n- list\n", "not: [yaml\n", ""])
+def test_some_other_yaml_file_of_the_same_name_does_not_matter_to_settings_in_front(tmp_path, beside) -> None:
+    path = write(tmp_path, GOOD)
+    (tmp_path / "data.yaml").write_text(beside)
     assert read_table(path).settings.content["kind"] == "pose"

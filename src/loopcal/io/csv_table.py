@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     import numpy as np
 
 WHAT = "measurement file"
+SIDECAR_KEYS = ("kind", "kinds", "noise", "controller", "instrument")
+"""What tells a settings file from another YAML file of the same name."""
+
+_SETTING = re.compile(r"^#\s*[A-Za-z]\w*:(\s|$)")
 _HEADER = re.compile(r"^(?P<name>[^\[\]]*[^\[\]\s])\s*(\[(?P<unit>[^\[\]]*)\])?$")
 
 
@@ -176,14 +180,19 @@ def sidecar(path: Path) -> Path:
     return path.with_suffix(".yaml")
 
 
+def stated_robot(path: str | Path) -> str | None:
+    """Return the robot that a measurement file says it belongs to, None where it says none; raises FileError."""
+    lines = [line.rstrip("\r") for line in read_text(path, WHAT).split("\n")]
+    found = _settings(Path(path), lines)[0].content.get("robot")
+    return None if found is None else str(found).strip()
+
+
 def _settings(path: Path, lines: Sequence[str]) -> tuple[YamlFile, int]:
     """Return the settings and the index of the first line behind the front matter."""
-    beside = sidecar(path)
-    if beside != path and beside.exists():
-        settings = read_yaml(beside, "settings file of the measurements")
-        if "family" not in settings.content:  # a robot file may have the same name as its measurements
-            return settings, 0
     count = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    beside = _beside(path, front=any(_SETTING.match(line) for line in lines[:count]))
+    if beside is not None:
+        return beside, 0
     text = "\n".join(line[1:] for line in lines[:count])
     # `# key: value` leaves one blank before each key, the same for all
     if not any(line.strip() and not line.strip().startswith("#") for line in text.splitlines()):
@@ -193,6 +202,29 @@ def _settings(path: Path, lines: Sequence[str]) -> tuple[YamlFile, int]:
     except FileError as error:
         advice = "lines that begin with # at the top are settings, '# key: value'; begin a remark with ##"
         raise FileError(f"{error.sentence} ({advice})", path, error.line) from None
+
+
+def _beside(path: Path, front: bool) -> YamlFile | None:
+    """Return the settings file beside a measurement file, if there is one; refuse it where there are settings in front."""
+    beside = sidecar(path)
+    if beside == path or not beside.exists():
+        return None
+    try:
+        settings = read_yaml(beside, "settings file of the measurements")
+    except FileError:
+        if front:
+            return None  # some other file of this name
+        raise
+    if "family" in settings.content:  # a robot file may have the same name as its measurements
+        return None
+    if not front:
+        return settings
+    if any(key in settings.content for key in SIDECAR_KEYS):
+        raise FileError(
+            f"there are settings at the top of this file and in {beside.name}; keep one of the two (a remark begins with ##)",
+            path,
+        )
+    return None
 
 
 def _header(path: Path, line: int, text: str) -> dict[str, str | None]:
