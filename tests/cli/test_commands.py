@@ -112,7 +112,9 @@ def test_a_calibration_can_start_from_a_corrected_robot_file(run) -> None:
 
 @pytest.mark.parametrize("method", ["map", "ls", "ridge", "ridge --lam 0.5", "tsvd --keep 30", "tsvd"])
 def test_other_methods_calibrate_too(run, method) -> None:
-    assert run(f"calibrate hexapod-42 measurements.csv -o run --hold-out 0.25 --method {method}")[0] == 0
+    # 30 of 42 directions leave more than the stated noise explains, and the exit code says so
+    code = 2 if method == "tsvd --keep 30" else 0
+    assert run(f"calibrate hexapod-42 measurements.csv -o run --hold-out 0.25 --method {method}")[0] == code
 
 
 def test_poses_are_dropped_and_weighed_only_when_asked(run) -> None:

@@ -98,7 +98,8 @@ def test_the_chain_of_three_commands_reads_back_equal(folder, data_folder) -> No
 def test_json_and_csv_hold_every_parameter_with_its_interval(folder, capsys, data_folder) -> None:
     (folder / "printer.cfg").write_text(printer_cfg(every_record(data_folder)[FIRMWARE_CALIBRATED[0]]))
     assert run("import printer.cfg -o printer.yaml --data data.csv") == 0
-    assert run("calibrate printer.yaml data.csv -o run") == 0
+    # the real printer's rows do not fit the sigma that the import states: exit code 2, and the run is written all the same
+    assert run("calibrate printer.yaml data.csv -o run") == 2
     assert run("export run -o found.json") == 0
     assert run("export run -o found.csv --json") == 0
     document = json.loads((folder / "found.json").read_text())

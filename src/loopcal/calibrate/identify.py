@@ -224,7 +224,7 @@ def _identification(
     if isinstance(method, MAP):
         sigma = float(method.sigma(d)[0])
         conflict = prior_conflict(free, d, penalty, sigma, fit.deviation[0])
-        if check.intervals:  # the penalty holds the noise's variance: divided by it, noise and prior are as stated
+        if check.intervals and check.noise == "estimated":  # the penalty holds its variance: divided by it, all is as stated
             d, penalty, variance = d.divided(np.full(1, check.sigma_scale)), penalty / variance, 1.0
     covariance = d.covariance(penalty, variance)[0] * free.tolerance[:, None] * free.tolerance
     values = free.values(fit.deviation)[0]

@@ -79,13 +79,16 @@ def start_check(fit: Identification) -> StartCheck:
     if fit.dof < FEWEST_DEGREES and not _trusted(fit):
         sentence = f"the robot file's geometry: {ratio}; whether noise explains that can only be said with its true sigma"
         return StartCheck(Start.OPEN, before, after, p_value, sentence)
+    if fit.check.failed:
+        sentence = f"the robot file's geometry: {ratio}; neither fits the stated noise, so which is better cannot be said"
+        return StartCheck(Start.OPEN, before, after, p_value, sentence)
     sentence = f"the robot file's geometry is as good as the fit within the noise ({ratio})"
     return StartCheck(Start.WITHIN_NOISE, before, after, p_value, sentence)
 
 
 def _trusted(fit: Identification) -> bool:
     """Whether the noise is stated, and explains what the fit leaves (or nothing is left to tell)."""
-    return fit.noise == "given" and not fit.p_value < DOUBT
+    return fit.noise == "given" and not fit.check.failed
 
 
 def _p_value(fit: Identification, gain: float, last: float) -> float:

@@ -29,7 +29,8 @@ class ResidualCheck:
     degrees : of freedom that chi_square has when model, noise and prior are right.
     p_value : probability of a larger chi_square; NaN where the noise is estimated or nothing is left over.
     dof : equations minus the number of parameters that the method effectively uses.
-    noise : "given" or "estimated". sigma_scale : factor on the stated sigmas; 1 where the noise is given.
+    noise : "given" or "estimated". sigma_scale : factor on the stated sigmas; 1 where the noise is given, unless the
+        residual is too large for it: then the intervals are wider by this factor, as the stated noise is not believed.
     intervals : whether intervals are given at all.
     sentence : what this means.
     """
@@ -42,6 +43,11 @@ class ResidualCheck:
     sigma_scale: float
     intervals: bool
     sentence: str
+
+    @property
+    def failed(self) -> bool:
+        """Whether the residual is, beyond doubt, larger than the stated noise explains."""
+        return self.noise == "given" and self.p_value < DOUBT
 
 
 def residual_check(decomposition: Decomposition, penalty: FloatArray, noise: str, robust: bool = False) -> ResidualCheck:
@@ -72,7 +78,8 @@ def residual_check(decomposition: Decomposition, penalty: FloatArray, noise: str
     if robust:
         return ResidualCheck(chi_square, degrees, np.nan, dof, noise, 1.0, True, "weights by residuals: no test of the noise")
     p_value = float(chdtrc(degrees, chi_square)) if degrees > 0 else np.nan
-    return ResidualCheck(chi_square, degrees, p_value, dof, noise, 1.0, True, _given(chi_square, degrees, p_value))
+    scale = max(1.0, float(np.sqrt(chi_square / degrees))) if p_value < DOUBT else 1.0
+    return ResidualCheck(chi_square, degrees, p_value, dof, noise, scale, True, _given(chi_square, degrees, p_value))
 
 
 def coverage_factor(check: ResidualCheck, level: float = LEVEL) -> float:
@@ -101,7 +108,8 @@ def _given(chi_square: float, degrees: float, p_value: float) -> str:
     if p_value < DOUBT:
         return (
             f"the residual is {ratio:.3g} times what the stated noise explains: sigma too small, wrong rows,"
-            " or a model that misses something"
+            f" or a model that misses something; intervals are {ratio:.3g} times wider than by the stated noise,"
+            " and hold only if no row is wrong"
         )
     if p_value > 1.0 - DOUBT:
         return f"the residual is only {ratio:.3g} of what the stated noise explains: sigma is too large"

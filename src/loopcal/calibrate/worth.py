@@ -62,6 +62,8 @@ def worth(fit: Identification, data: Measurements) -> Worth:
     if free.assumed.any():
         missing = f"{int(free.assumed.sum())} parameters have no tolerance"
         return _open(f"{missing}; state them")
+    if fit.check.failed:
+        return _open("the residual does not fit the stated noise")
     chosen = np.unique(np.linspace(0, data.n_poses - 1, min(POSES, data.n_poses)).astype(int))
     readings, values = data.readings[None, chosen], fit.robot.values[None]
     state = forward_trials(fit.robot, values, readings)

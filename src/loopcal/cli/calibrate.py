@@ -12,13 +12,16 @@ import click
 
 from loopcal.cli import show
 from loopcal.cli.fitting import Fitting, fit_options
-from loopcal.cli.options import FILE, data_argument, data_options, gate_options, json_option, robot_argument
+from loopcal.cli.options import FILE, data_argument, data_options, gate_options, json_option, measurements, robot_argument
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
     from loopcal.calibrate import Identification, Validation
     from loopcal.calibrate.examine import Examination
     from loopcal.measure import Measurements
+
+GREW = 1.1
+"""Times by which errors on unseen poses are said to have grown: less is the noise of those poses."""
 
 
 @click.command(short_help="Identify a robot's parameters from measurements.")
@@ -53,7 +56,8 @@ def calibrate(
 ) -> int:
     """Identify the free parameters of ROBOT from DATA and write a run folder with the corrected robot file.
 
-    The exit code is 2 where a quality gate is not met, or the iteration did not converge.
+    The exit code is 2 where a quality gate is not met, the iteration did not converge, the residual does not fit the
+    stated noise, or errors on unseen poses grew; the run folder is written all the same.
 
     \b
     Examples:
@@ -65,7 +69,7 @@ def calibrate(
     """  # noqa: D301
     from loopcal.calibrate import validate
     from loopcal.calibrate.recalibrate import recalibrate
-    from loopcal.io import load_measurements, load_robot
+    from loopcal.io import load_robot
     from loopcal.io.calibration_run import run_document, save_run
     from loopcal.io.compensation_file import load_prior
     from loopcal.io.outputs import refuse_run_folder
@@ -75,7 +79,7 @@ def calibrate(
     inputs = _inputs(robot, data, prior)
     refuse_run_folder(output, list(inputs.values()), force)
     machine = load_robot(robot)
-    measured = load_measurements(data, machine, allow_outside_stroke=allow_outside_stroke, allow_duplicates=allow_duplicates)
+    measured = measurements(data, machine, allow_outside_stroke=allow_outside_stroke, allow_duplicates=allow_duplicates)
     fitted, unseen = fitting.split(measured, hold_out, seed)
     show.progress(f"identifying {int(machine.parameters.free.sum())} parameters from {fitted.n_rows} equations ...")
     choice = change = None
@@ -89,12 +93,14 @@ def calibrate(
     findings = {"examination": _examined(fit, fitted), "change": change, "model_choice": choice}
     document = run_document(fit, validation, origin, split)
     document |= {name: found.to_dict() for name, found in findings.items() if found is not None}
+    reasons = _reasons(fit, validation)
+    document |= {"passed": not reasons, "reasons": reasons}
     save_run(output, fit, document, force)
     if as_json:
         show.json_document(document)
     else:
         _print(fit, validation, fitted, findings, output)
-    return _exit_code(fit, validation)
+    return show.gates(reasons)
 
 
 def _inputs(robot: str, data: Path, prior: Path | None) -> dict[str, Path]:
@@ -154,8 +160,13 @@ def _print(
     show.say(f"\nwritten to {output}: result.json, arrays.npz, robot.yaml")
 
 
-def _exit_code(fit: Identification, validation: Validation | None) -> int:
-    """Return 0, or 2 with a sentence for each thing that is not good enough."""
-    reasons: list[Any] = [] if fit.converged else [f"not converged: {fit.status.sentence}"]
-    reasons += [] if validation is None else validation.reasons
-    return show.gates(reasons)
+def _reasons(fit: Identification, validation: Validation | None) -> list[str]:
+    """Return a sentence for each thing that is not good enough."""
+    reasons = [] if fit.converged else [f"not converged: {fit.status.sentence}"]
+    reasons += [fit.check.sentence] if fit.check.failed else []
+    if validation is None:
+        return reasons
+    for index in ("position", "orientation"):
+        if validation.after.statistics(index).count and (times := 1.0 / validation.improvement(index)) > GREW:
+            reasons.append(f"{index} errors on unseen poses are {times:.3g} times LARGER after calibration (rms)")
+    return [*reasons, *validation.reasons]

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A fit to a blundered cell: told in the exit code, and by no note contradicted."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal.cli import main
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
+
+
+@pytest.fixture
+def blundered(tmp_path, monkeypatch) -> Path:
+    """Measurements of the example with rz of one fitted pose set to 12 degrees, in a folder of their own."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(EXAMPLE / "measurements.csv", tmp_path)
+    lines = (tmp_path / "measurements.csv").read_text().split("\n")
+    head = next(i for i, line in enumerate(lines) if line.startswith("pose,"))
+    column = next(i for i, name in enumerate(lines[head].split(",")) if name.startswith("rz"))
+    cells = lines[head + 5].split(",")
+    cells[column] = "12"
+    lines[head + 5] = ",".join(cells)
+    (tmp_path / "bad.csv").write_text("\n".join(lines))
+    return tmp_path
+
+
+def test_a_blundered_cell_is_told_and_widens_the_intervals(blundered, capsys) -> None:
+    assert main(["calibrate", "hexapod-42", "measurements.csv", "-o", "good"]) == 0
+    assert main(["calibrate", "hexapod-42", "bad.csv", "-o", "bad"]) == 2
+    out, err = capsys.readouterr()
+    assert "times what the stated noise explains" in err
+    assert "times wider than by the stated noise" in err
+    bad = out[out.index("written to good") :]
+    assert "within the noise" not in bad
+    assert "expected errors" not in bad
+    good, bad = (json.loads((blundered / name / "result.json").read_text()) for name in ("good", "bad"))
+    assert (good["passed"], good["reasons"]) == (True, [])
+    assert not bad["passed"]
+    scale = bad["fit"]["sigma_scale"]
+    assert scale > 100  # 12 degrees against 5 urad in one of 240 equations
+    assert scale == pytest.approx(np.sqrt(bad["fit"]["chi_square"] / bad["fit"]["degrees"]), rel=1e-12)
+    wide, narrow = (np.array([p["sd"] for p in r["fit"]["parameters"]]) for r in (bad, good))
+    assert (wide > 5 * narrow).all()
+
+
+def test_errors_that_grew_on_unseen_poses_are_a_reason(blundered, capsys) -> None:
+    code = main(["calibrate", "hexapod-42", "bad.csv", "-o", "run", "--hold-out", "0.25", "--json"])
+    document = json.loads(capsys.readouterr().out)
+    grown = [
+        index
+        for index in ("position", "orientation")
+        if document["validation"]["after"][index]["rms"] > 1.1 * document["validation"]["before"][index]["rms"]
+    ]
+    assert grown
+    assert code == 2
+    assert [r.split()[0] for r in document["reasons"] if "LARGER" in r] == grown
