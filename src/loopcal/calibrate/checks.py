@@ -12,6 +12,9 @@ from loopcal.linalg import FloatArray
 from loopcal.measure import Measurements, check_actuators
 from loopcal.mechanism import Mechanism
 
+HUGE = 1e150
+"""Residuals, in units of sigma, whose squares cannot be summed."""
+
 
 def check_noise(noise: str) -> None:
     """Refuse anything but the two words.
@@ -23,6 +26,23 @@ def check_noise(noise: str) -> None:
     """
     if noise not in {"given", "estimated"}:
         raise EstimationError(f"noise is {noise!r}; it must be 'given' or 'estimated'")
+
+
+def check_settings(method: object, rank_tolerance: float) -> None:
+    """Refuse a method that is a word or a class, and a rank tolerance outside (0, 1).
+
+    Raises
+    ------
+    EstimationError
+        Naming what is allowed.
+    """
+    parts = ("needs", "flat", "scale", "penalty")
+    if method is not None and (isinstance(method, type) or not all(hasattr(method, name) for name in parts)):
+        raise EstimationError(
+            f"method is {method!r}; it must be an instance such as MAP(), LeastSquares(), Ridge(1.0) or TruncatedSVD(10)"
+        )
+    if not 0.0 < rank_tolerance < 1.0:
+        raise EstimationError(f"rank_tolerance is {rank_tolerance}; it must be above 0 and below 1")
 
 
 def check_rows(rows: Rows, data: Measurements, robot: Mechanism) -> None:
@@ -74,6 +94,17 @@ def check_start(rows: Rows, data: Measurements, deviation: FloatArray, cost: Flo
     if np.isfinite(cost[0]):
         return
     lost = rows.unreachable(deviation)
+    if len(lost) == 0:
+        with np.errstate(all="ignore"):
+            parts = rows.residuals(deviation)
+        seen = [o for o in data.observations if len(o)]
+        bad = {
+            int(i)
+            for o, r in zip(seen, parts, strict=True)
+            for i in o.rows.reshape(len(o), -1)[~(np.abs(r.whitened[0]) < HUGE).all(axis=1)].ravel()
+        }
+        poses = ", ".join(repr(data.labels[i]) for i in sorted(bad)[:5]) + (", ..." if len(bad) > 5 else "")
+        raise EstimationError(f"residuals are not finite, or too large to square, at poses {poses}; correct these rows")
     names = ", ".join(repr(data.labels[i]) for i in lost[:5]) + (", ..." if len(lost) > 5 else "")
     raise EstimationError(
         f"the robot cannot reach {len(lost)} of {data.n_poses} poses with the readings given there (poses {names});"

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from loopcal.calibrate.filters import Method
 from loopcal.calibrate.steps import Step, penalised, propose
+from loopcal.errors import EstimationError
 from loopcal.linalg import RANK_TOLERANCE, Decomposition, FloatArray, IntArray, decompose
 
 ACCEPT = 1e-4
@@ -107,6 +108,15 @@ class StepControl:
     absolute: float = 1e-12
     damping: float = 0.0
 
+    def __post_init__(self) -> None:
+        for name in ("relative", "absolute"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise EstimationError(f"{name} is {getattr(self, name)}; it must be finite and above 0")
+        if self.iterations < 0:
+            raise EstimationError(f"iterations is {self.iterations}; it must not be negative")
+        if not 0.0 <= self.damping < np.inf:
+            raise EstimationError(f"damping is {self.damping}; it must be finite and not negative")
+
 
 @dataclass(frozen=True)
 class Descent:
@@ -186,7 +196,8 @@ class _Run:
         self.problem, self.method, self.tolerance = problem, method, tolerance
         self.scale, self.flat = method.scale(problem.parameters), method.flat(problem.parameters)
         t = len(start)
-        factor, self.cost = problem.fold(start, np.arange(t))
+        with np.errstate(over="ignore", invalid="ignore"):  # told as a bad start
+            factor, self.cost = problem.fold(start, np.arange(t))
         good = np.isfinite(self.cost) & np.isfinite(factor).all(axis=(1, 2))
         self.z = start
         self.decomposition = decompose(

@@ -88,14 +88,14 @@ class TruncatedSVD:
     Raises
     ------
     EstimationError
-        k is negative.
+        k is negative, or no integer.
     """
 
     k: int | Rule
 
     def __post_init__(self) -> None:
-        if not callable(self.k) and self.k < 0:
-            raise EstimationError(f"truncation at k = {self.k}: k counts directions; give 0 or more, or a rule")
+        if not callable(self.k) and (not isinstance(self.k, int | np.integer) or self.k < 0):
+            raise EstimationError(f"truncation at k = {self.k}: k counts directions; give an integer, 0 or more, or a rule")
 
     def needs(self, parameters: int) -> int:
         """Return 0: directions without data keep their nominal value."""

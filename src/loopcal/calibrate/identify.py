@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.calibrate.checks import check_count, check_noise, check_rows, check_start
+from loopcal.calibrate.checks import check_count, check_noise, check_rows, check_settings, check_start
 from loopcal.calibrate.closure import descend_from_closure
 from loopcal.calibrate.combinations import combinations
 from loopcal.calibrate.conflict import prior_conflict
@@ -77,6 +77,7 @@ def identify(
         Nothing to identify, fewer equations than parameters, or poses out of reach at the start.
     """
     check_noise(noise)
+    check_settings(method, rank_tolerance)
     free = unknowns(robot)
     method = adapted(LeastSquares() if method is None and prior is not None else method, free.assumed, noise)
     data = without_poses(data, drop)
@@ -94,7 +95,7 @@ def identify(
     check = residual_check(fit.decomposition, fit.penalty, noise, robust=loss is not None)
     residuals = _labelled(rows.residuals(fit.deviation, weighed), data)
     result = _identification(robot, free, method, fit, check, residuals, weighed)
-    notes = (*result.notes, *_weight_notes(data, weight, loss), *_drop_notes(drop))
+    notes = (*result.notes, *_count_notes(rows, method), *_weight_notes(data, weight, loss), *_drop_notes(drop))
     return replace(result, weight=weight, dropped=tuple(drop), notes=notes)
 
 
@@ -106,6 +107,14 @@ def _weighed(
         return run(rows, z), np.ones(data.n_poses), rows
     robust = descend_robustly(rows, linked(data), loss, z, noise == "estimated", run)
     return robust.fit, robust.weight, robust.rows
+
+
+def _count_notes(rows: Rows, method: Method) -> list[str]:
+    """Say that tolerances alone hold some directions, where equations are fewer than parameters."""
+    m, p = int(rows.counted[0]), rows.parameters
+    if m >= p or not isinstance(method, MAP):
+        return []
+    return [f"{m} equations for {p} parameters: at least {p - m} directions rest on tolerances alone"]
 
 
 def _weight_notes(data: Measurements, weight: FloatArray, loss: Loss | None) -> list[str]:
