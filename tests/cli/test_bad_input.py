@@ -6,8 +6,10 @@ from pathlib import Path
 import pytest
 
 from loopcal.cli import main
+from loopcal.errors import MechanismError
 from loopcal.io.robot_file import robot_path
 from loopcal.measure import KINDS
+from loopcal.mechanism.records import AngleTolerance, LengthTolerance, Workspace, standard_deviation
 
 ROBOT = robot_path("hexapod-42").read_text()
 EXAMPLE = Path("examples/hexapod-42")
@@ -141,6 +143,7 @@ DATA_CASES = {
     "no noise": ("# noise: {z: 1 um}\n", "", "no noise is stated for 'z'"),
     "noise without a unit": ("1 um", "1", "'1' has no unit; add one of m, mm"),
     "a comma in a number": ("201.1", "201,1", "data.csv:6: this row has 9 cells"),
+    "a controller of readings": ("# noise", "# controller: no.yaml\n# noise", "data.csv:3: a controller is named, but"),
     "the same row twice": ("c,2,2,2,2,2,2,202.2", "c,1,1,1,1,1,1,201.1", "'b' and 'c' have the same readings"),
 }
 
@@ -200,3 +203,33 @@ def test_a_bad_command_line_is_refused(refused, case) -> None:
 def test_a_used_folder_is_refused_without_force(refused) -> None:
     assert "this folder is not empty" in refused("calibrate hexapod-42 data.csv -o .", data_csv=DATA)
     assert "something other than a run" in refused("calibrate hexapod-42 data.csv -o . --force")
+
+
+def test_a_controller_that_is_not_there_is_refused(refused) -> None:
+    commanded = ",".join(
+        f"commanded.{name}" for name in ("x [mm]", "y [mm]", "z [mm]", "roll [deg]", "pitch [deg]", "yaw [deg]")
+    )
+    text = DATA.replace(HEADER, f"pose,{commanded},z [mm]").replace("# noise", "# controller: no.yaml\n# noise")
+    assert "there is no such robot file" in refused("calibrate hexapod-42 data.csv -o run", data_csv=text)
+
+
+@pytest.mark.parametrize("number", [LengthTolerance(sd=-2.9e-5), LengthTolerance(limits=-2.9e-5)])
+def test_tolerances_and_workspaces_are_told_with_their_units(number) -> None:
+    with pytest.raises(MechanismError, match=r"the tolerance of base is -2.9e-05 m; it must"):
+        standard_deviation(number, "base")
+    with pytest.raises(MechanismError, match=r"the tolerance of tilt is 0 rad; it must"):
+        standard_deviation(AngleTolerance(sd=0.0), "tilt")
+    with pytest.raises(MechanismError, match=r"the workspace of z runs from 0.3 m to 0.2 m; the first must"):
+        _ = Workspace(z=(0.3, 0.2)).ranges
+    with pytest.raises(MechanismError, match=r"the workspace of yaw runs from 1 rad to -1 rad; the first must"):
+        _ = Workspace(yaw=(1.0, -1.0)).ranges
+
+
+@pytest.mark.parametrize(("stated", "noted"), [("other-robot", True), ("hexapod-42", False)])
+def test_another_robot_in_the_data_is_noted(tmp_path, capsys, stated, noted) -> None:
+    data = tmp_path / "data.csv"
+    data.write_text(f"# robot: {stated}\n{DATA}")
+    for words in (["identifiability", "hexapod-42", str(data)], ["validate", "hexapod-42", str(data)]):
+        main(words)
+        said = f"loopcal: note: {data} is said to be of robot 'other-robot', but 'hexapod-42' is used"
+        assert (said in capsys.readouterr().err) == noted

@@ -19,6 +19,7 @@ from loopcal.cli.options import (
     instrument,
     instrument_options,
     json_option,
+    measurements,
     robot_argument,
 )
 from loopcal.errors import DataError
@@ -76,7 +77,7 @@ def identifiability(
     from loopcal.calibrate import identifiability as identifiable
     from loopcal.calibrate.reduce import reduce
     from loopcal.calibrate.remedies import remedies
-    from loopcal.io import load_measurements, load_robot
+    from loopcal.io import load_robot
     from loopcal.io.measurement_file import load_poses
     from loopcal.io.outputs import refuse_outputs
     from loopcal.io.robot_file import robot_path
@@ -87,7 +88,7 @@ def identifiability(
     machine, drawn = load_robot(robot), ""
     if data is not None:
         allowed = {"allow_outside_stroke": allow_outside_stroke, "allow_duplicates": allow_duplicates}
-        measured = load_measurements(data, machine, **allowed)
+        measured = measurements(data, machine, **allowed)
     else:
         looking = _instrument(**seen_by)
         targets, drawn = (load_poses(poses, machine), "") if poses is not None else drawn_poses(machine, draw, seed)

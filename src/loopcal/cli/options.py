@@ -15,7 +15,7 @@ from loopcal.units import Dimension, quantity
 if TYPE_CHECKING:
     import numpy as np
 
-    from loopcal.measure import Instrument
+    from loopcal.measure import Instrument, Measurements
     from loopcal.mechanism import Mechanism
 
 FILE = click.Path(path_type=Path)
@@ -63,6 +63,24 @@ def data_options(command: Callable[..., Any]) -> Callable[..., Any]:
     ):
         command = click.option(name, is_flag=True, help=what)(command)
     return command
+
+
+def measurements(path: Path, robot: Mechanism, **allowed: bool) -> Measurements:
+    """Read a measurement file, with a note on standard error where it says that it is of another robot.
+
+    Raises
+    ------
+    LoopcalError
+        See `loopcal.io.load_measurements`.
+    """
+    from loopcal.io import load_measurements
+    from loopcal.io.csv_table import stated_robot
+
+    found = load_measurements(path, robot, **allowed)
+    stated = stated_robot(path)
+    if stated is not None and stated != robot.name:
+        click.echo(f"loopcal: note: {path} is said to be of robot {stated!r}, but {robot.name!r} is used", err=True)
+    return found
 
 
 def draw_option(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from loopcal.cli import show
-from loopcal.cli.options import FILE, data_argument, data_options, gate_options, json_option
+from loopcal.cli.options import FILE, data_argument, data_options, gate_options, json_option, measurements
 
 
 @click.command(short_help="Judge a calibration, or a robot file, by measurements.")
@@ -41,11 +41,10 @@ def validate(
       loopcal validate robot.yaml measurements.csv --limit-position 0.1mm
     """  # noqa: D301
     from loopcal.calibrate import validate as compare
-    from loopcal.io import load_measurements
     from loopcal.io.calibration_run import load_calibrated, refuse_fitted_data
 
     calibrated = load_calibrated(run)
-    measured = load_measurements(
+    measured = measurements(
         data, calibrated.robot, allow_outside_stroke=allow_outside_stroke, allow_duplicates=allow_duplicates
     )
     if not allow_fitted_data:

@@ -36,7 +36,7 @@ FORMAT = 1
 SIGMA, COVARIANCE = "sigma.", "cov."
 SETTINGS: Mapping[str, str] = {
     "format": "1",
-    "robot": "name of the robot; information",
+    "robot": "name of the robot; another than the one used is noted",
     "instrument": "what measured; information",
     "controller": "robot file of the geometry that turned commanded coordinates into readings; default: nominal",
     "kind": "the kind of all rows, followed by its own settings and noise",

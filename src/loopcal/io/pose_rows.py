@@ -139,9 +139,12 @@ def _rows(table: Table, robot: Mechanism, controller: Mechanism | None) -> np.nd
 
 def _controller(table: Table, robot: Mechanism) -> Mechanism | None:
     """Return the robot whose geometry turned commanded coordinates into readings; None where readings are given."""
-    if not any(name.startswith(COMMANDED) for name in table.names):
-        return None
     name = table.settings.content.get("controller")
+    if not any(column.startswith(COMMANDED) for column in table.names):
+        if name is not None:
+            sentence = "a controller is named, but there are readings, not commanded coordinates; remove 'controller'"
+            raise table.settings.error(sentence, ("controller",))
+        return None
     if name is None:
         return robot.nominal
     beside = table.path.parent / str(name)

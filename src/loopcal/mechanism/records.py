@@ -69,10 +69,11 @@ def standard_deviation(tolerance: LengthTolerance | AngleTolerance | RatioTolera
         return None
     if (tolerance.sd is None) == (tolerance.limits is None):
         raise MechanismError(f"the tolerance of {name} must state either sd or limits, and not both")
-    value = tolerance.sd if tolerance.sd is not None else (tolerance.limits or 0.0) / np.sqrt(3.0)
-    if not value > 0:
-        raise MechanismError(f"the tolerance of {name} is {value:g}; it must be greater than zero, or left out")
-    return float(value)
+    stated = tolerance.sd if tolerance.sd is not None else tolerance.limits or 0.0
+    if not stated > 0:
+        unit = " m" if isinstance(tolerance, LengthTolerance) else " rad" if isinstance(tolerance, AngleTolerance) else ""
+        raise MechanismError(f"the tolerance of {name} is {stated:g}{unit}; it must be greater than zero, or left out")
+    return float(stated if tolerance.sd is not None else stated / np.sqrt(3.0))
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,10 @@ class Workspace:
         found = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
         for name, (low, high) in found.items():
             if not low < high:
-                raise MechanismError(f"the workspace of {name} runs from {low:g} to {high:g}; the first must be smaller")
+                unit = "m" if name in ("x", "y", "z") else "rad"
+                raise MechanismError(
+                    f"the workspace of {name} runs from {low:g} {unit} to {high:g} {unit}; the first must be smaller"
+                )
         return found
 
 
