@@ -66,6 +66,7 @@ def identify(
     control : settings of the iteration. rank_tolerance : relative to the largest singular value.
     allow_fewer_equations : let least squares return the smallest deviation that explains too few equations.
     loss : `Huber()` or `Tukey()`: blocks of rows far from the fit count less. drop : labels of poses to leave out.
+    local : unknowns of the instruments with priors or fixed, see `loopcal.measure.local_unknowns`; default all free.
 
     Returns
     -------
@@ -73,15 +74,13 @@ def identify(
 
     Raises
     ------
-    EstimationError
-        Nothing to identify, fewer equations than parameters, or poses out of reach at the start.
+    EstimationError : nothing to identify, fewer equations than parameters, or poses out of reach at the start.
     """
     check_noise(noise)
     check_settings(method, rank_tolerance)
     free = unknowns(robot)
     method = adapted(LeastSquares() if method is None and prior is not None else method, free.assumed, noise)
-    data = without_poses(data, drop)
-    rows = rows_of(free, data, local)
+    rows = rows_of(free, data := without_poses(data, drop), local)
     check_rows(rows, data, robot)
     check_count(rows, data, method, allow_fewer_equations or prior is not None)
     z = free.deviation((robot if start is None else robot.with_values(start)).values[None])

@@ -76,9 +76,8 @@ def calibrate(
     from loopcal.io.run_folder import made_by
 
     _refuse_contradictions(hold_out, limit_position is not None or limit_angle is not None, prior, free_limb)
-    inputs = _inputs(robot, data, prior)
+    inputs, machine = _inputs(robot, data, prior), load_robot(robot)
     refuse_run_folder(output, list(inputs.values()), force)
-    machine = load_robot(robot)
     measured = measurements(data, machine, allow_outside_stroke=allow_outside_stroke, allow_duplicates=allow_duplicates)
     fitted, unseen = fitting.split(measured, hold_out, seed)
     show.progress(f"identifying {int(machine.parameters.free.sum())} parameters from {fitted.n_rows} equations ...")
@@ -91,15 +90,11 @@ def calibrate(
     origin = made_by(sys.argv, inputs, {"hold_out": seed})
     split = None if unseen is None else {"hold_out": hold_out, "seed": seed, "held_out": unseen.labels}
     findings = {"examination": _examined(fit, fitted), "change": change, "model_choice": choice}
-    document = run_document(fit, validation, origin, split)
-    document |= {name: found.to_dict() for name, found in findings.items() if found is not None}
+    found = {name: finding.to_dict() for name, finding in findings.items() if finding is not None}
     reasons = _reasons(fit, validation)
-    document |= {"passed": not reasons, "reasons": reasons}
+    document = run_document(fit, validation, origin, split) | found | {"passed": not reasons, "reasons": reasons}
     save_run(output, fit, document, force)
-    if as_json:
-        show.json_document(document)
-    else:
-        _print(fit, validation, fitted, findings, output)
+    show.json_document(document) if as_json else _print(fit, validation, fitted, findings, output)
     return show.gates(reasons)
 
 
