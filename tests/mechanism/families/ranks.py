@@ -96,6 +96,20 @@ def ranks(robot: Mechanism, kinds: Sequence[str], seed: int = 3, n: int = 80, **
     return [rank(measured(D, solution.T, kind), **limits) for kind in kinds]
 
 
+FRAMES = ((True, False), (False, True), (True, True))
+"""Unknown: base, tool, both."""
+
+
+def told_apart(robot: Mechanism, kind: str, frames: Sequence[tuple[bool, bool]] = FRAMES, n: int = 80) -> list[int]:
+    """Parameters determined beside unknown frames: rank of all columns less the rank of the frames' own."""
+    solution = solved(robot, n)
+    D, found = scaled_sensitivity(robot, solution), []
+    for base, tool in frames:
+        F = measured(frame_columns(solution.T, base, tool), solution.T, kind)
+        found.append(rank(np.concatenate([measured(D, solution.T, kind), F], axis=2)) - rank(F))
+    return found
+
+
 def null_vector(rows: Array) -> Array:
     """The last right singular vector (p,)."""
     return np.linalg.svd(rows.reshape(-1, rows.shape[-1]))[2][-1]

@@ -19,18 +19,10 @@ from loopcal.mechanism.families.ru_pus_prs import LEFT_OUT, RuPusPrs
 from loopcal.mechanism.families.three_prs import ThreePrs
 from loopcal.mechanism.records import Pose, Workspace
 from loopcal.mechanism.trials import sensitivity
-from tests.mechanism.families.ranks import (
-    frame_columns,
-    measured,
-    null_vector,
-    perturbed,
-    rank,
-    ranks,
-    scaled_sensitivity,
-    solved,
-)
+from tests.mechanism.families.ranks import measured, null_vector, perturbed, rank, ranks, scaled_sensitivity, solved, told_apart
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 TILTS = {"phi": (-np.pi, np.pi), "theta": (0.02, 0.6)}
 THREE_PRS = ThreePrs(
     name="3-prs", platform_radius=0.2, base_radius=0.35, rod=0.5, home=Pose(z=0.7), workspace=Workspace(z=(0.65, 0.75), **TILTS)
@@ -141,6 +133,107 @@ def test_columns_are_those_of_the_error_model_written_out(case: str) -> None:
     np.testing.assert_allclose(D, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
+# --- the closure by hand, at any parameters --------------------------------------------------------------------------
+def cross_matrix(w: Array | Complex) -> Complex:
+    return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]], dtype=complex)
+
+
+def turned(w: Array | Complex) -> Complex:
+    """exp of small angles as its series, which takes complex numbers; 0.1^12 / 12! is far below rounding."""
+    W, term, total = cross_matrix(w), np.eye(3, dtype=complex), np.eye(3, dtype=complex)
+    for k in range(1, 12):
+        term = term @ W / k
+        total = total + term
+    return total
+
+
+class Loops:
+    """The loops as equations of (platform, pivot's angle, parameters), without first-order steps.
+
+    The paper's derivatives hold at zero angles. Beyond, two angles of one axis act as one turn exp((x, y, z)), and the joint
+    on a tilted guide takes that turn back and its own in one: r = exp(thB) exp(thC - thB) r0.
+    """
+
+    def __init__(self, names: tuple[str, ...], values: Array | Complex) -> None:
+        self.of = dict(zip(names, values, strict=True))
+
+    def vector(self, name: str) -> Complex:
+        return np.array([self.of.get(f"{name}{axis}", 0.0) for axis in "xyz"], dtype=complex)
+
+    def limb(self, i: int, N: Complex, R: Complex, q: float, Z: Array, hinge: Array | None) -> list[complex]:
+        guide = turned(self.vector(f"thB{i}"))
+        s = Z @ guide @ EZ
+        v = N + R @ Z @ self.vector(f"a{i}") - Z @ self.vector(f"b{i}") - (self.of[f"q{i}"] + q) * s
+        found = [np.sqrt(v @ v) - self.of[f"l{i}"]]
+        if hinge is not None:
+            r = Z @ guide @ turned(self.vector(f"thC{i}") - self.vector(f"thB{i}")) @ hinge
+            found.append(v @ r)
+        return found
+
+    def three_prs(self, N: Complex, R: Complex, pivot: complex, q: Array) -> Complex:
+        """Six, and one that holds the pivot the machine does not have."""
+        limbs = [self.limb(i + 1, N, R, q[i], spin(2 * np.pi / 3 * i), EY) for i in range(3)]
+        return np.array([*limbs[0], *limbs[1], *limbs[2], pivot])
+
+    def ru_pus_prs(self, N: Complex, R: Complex, pivot: complex, q: Array) -> Complex:
+        """Seven: three of the limbs, the post's end, the cross of its universal joint."""
+        eye, c, s = np.eye(3), np.cos(pivot), np.sin(pivot)
+        post = turned(self.vector("thO")) @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        u1, u2 = post @ turned(self.vector("thU1")) @ EX, R @ turned(self.vector("thU2")) @ EY
+        limbs = [*self.limb(1, N, R, q[0], eye, None), *self.limb(2, N, R, q[1], eye, EX)]
+        return np.array([*limbs, *(N - self.of["r"] * post @ EZ), u1 @ u2])
+
+    def pivot(self, N: Array) -> float:
+        x, _, z = (turned(self.vector("thO")).T @ N).real
+        return float(np.arctan2(x, z))
+
+
+def by_closure(kind: str, names: tuple[str, ...], values: Array, T: Array, q: Array) -> tuple[Array, Array]:
+    """Residuals (7,) and D (6, p) of the loops by complex steps, which have no truncation and no cancellation."""
+    N, R, h = T[:3, 3], T[:3, :3], 1e-30
+    start = Loops(names, values).pivot(N) if kind == "ru_pus_prs" else 0.0
+
+    def loops(x: Array | Complex, p: Array | Complex) -> Complex:
+        moved = Loops(names, values + p)
+        return np.asarray(getattr(moved, kind)(N + x[3:6], (np.eye(3) + cross_matrix(x[:3])) @ R, start + x[6], q))
+
+    def steps(n: int) -> Complex:
+        return np.asarray(1j * h * np.eye(n), dtype=complex)
+
+    still, none = np.zeros(7), np.zeros(len(names))
+    J = np.stack([loops(e, none).imag / h for e in steps(7)], axis=1)
+    G = np.stack([loops(still, e).imag / h for e in steps(len(names))], axis=1)
+    return loops(still, none).real, np.asarray(-np.linalg.solve(J, G)[:6], dtype=float)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1e-2])
+@pytest.mark.parametrize("case", CASES)
+def test_columns_at_moved_parameters_are_those_of_the_closure_written_out(case: str, size: float) -> None:
+    # [m] and angles of 5 (50) mrad: centres, guides, joints and post all displaced, also against each other
+    record, rows = CASES[case]
+    machine = perturbed(robot(record), size, seed=11)
+    solution = solved(machine, 40)
+    D = sensitivity(machine, machine.values[None], solution.q[None], solution.state).parameters[0]
+    kind, names = rows.__name__.removesuffix("_rows"), machine.parameters.names
+    found = [by_closure(kind, names, machine.values, T, q) for T, q in zip(solution.T, solution.q, strict=True)]
+    expected = np.stack([slopes for _, slopes in found])
+    assert max(np.abs(residual).max() for residual, _ in found) < 1e-12  # [m, 1] the machine stands on these loops
+    # [m/m, rad/m, ..] condition of the loops 1e2 times rounding
+    np.testing.assert_allclose(D, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_both_derivations_by_hand_agree_at_nominal_parameters(case: str) -> None:
+    record, rows = CASES[case]
+    machine = robot(record)
+    solution = solved(machine, 20)
+    names = machine.parameters.names
+    for T, q in zip(solution.T, solution.q, strict=True):
+        _, slopes = by_closure(rows.__name__.removesuffix("_rows"), names, machine.values, T, q)
+        expected = by_hand(rows(T[:3, 3], T[:3, :3], q), names)
+        np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
 def test_the_declared_names_are_eleven_a_chain_and_twenty_five() -> None:
     names = robot(THREE_PRS).parameters.names
     assert len(names) == 33
@@ -157,12 +250,23 @@ def test_ranks_of_the_3_prs_are_33_and_lose_one_without_torsion_and_three_withou
 
 
 def test_an_unknown_frame_costs_the_3_prs_six_parameters_and_two_cost_twelve() -> None:
-    machine = robot(THREE_PRS)
-    solution = solved(machine)
-    D = scaled_sensitivity(machine, solution)
-    for base, tool, expected in ((True, False, 27), (False, True, 27), (True, True, 21)):
-        F = frame_columns(solution.T, base, tool)
-        assert rank(np.concatenate([D, F], axis=2)) - F.shape[2] == expected
+    assert told_apart(robot(THREE_PRS), "full") == [27, 27, 21]
+    # the frame's own turn about the normal hides nothing new: 32 - 6
+    assert told_apart(robot(THREE_PRS), "5-dof", [(True, False)]) == [26]
+
+
+def test_an_unknown_frame_costs_the_tracker_the_motions_that_its_parameters_can_follow() -> None:
+    """A frame costs as many as it has motions that a change of the parameters repeats; by counting.
+
+    Base, 5 (20): all moves and turns but the one about z, for the twenty-five leave out the post's thOz and thU1z; its
+    other motions the post's angles and length follow, for its end N stands still in all poses. The 27 lose all 6 (20 of 26).
+    Tool, 3 (22): the turns, by a1 a2 thU2; a move would shift the universal joint on the platform, which has no parameter.
+    Both, 8 (17): the sum. Without torsion one less where the tool is known, none where its turn about the normal is lost.
+    """
+    machine = robot(RU_PUS_PRS)
+    assert told_apart(machine, "full") == [20, 22, 17]
+    assert told_apart(machine, "5-dof") == [19, 22, 17]
+    assert told_apart(robot(CASES["RU-PUS-PRS, 27"][0]), "full") == [20, 23, 17]
 
 
 def test_without_torsion_the_3_prs_cannot_see_its_three_balls_turned_together() -> None:
@@ -241,6 +345,61 @@ def test_without_torsion_the_tracker_cannot_see_its_two_balls_turned_together() 
 def test_ranks_of_the_complete_models(record: ThreePrs | RuPusPrs, size: float, expected: list[int]) -> None:
     # moved by 2 mm and 10 mrad (tracker: 6 mm, 30 mrad): at smaller errors the last directions sink into rounding
     assert ranks(perturbed(robot(record), size, seed=7), KINDS[:3], n=120) == expected
+
+
+COMPLETE_THREE = replace(THREE_PRS, error_model="complete", spherical="axes")
+COMPLETE_TRACKER = replace(RU_PUS_PRS, error_model="complete", spherical="axes")
+
+
+@pytest.mark.parametrize(
+    ("record", "size", "expected"),
+    # a complete model has all moves and turns of both frames: each unknown frame costs six
+    [
+        (COMPLETE_THREE, 2e-3, [54, 54, 48]),
+        (replace(COMPLETE_THREE, spherical="point"), 2e-3, [27, 27, 21]),
+        (COMPLETE_TRACKER, 6e-3, [52, 52, 46]),
+    ],
+    ids=["3-PRS", "3-PRS, perfect balls", "tracker"],
+)
+def test_each_unknown_frame_costs_the_complete_models_six(
+    record: ThreePrs | RuPusPrs, size: float, expected: list[int]
+) -> None:
+    machine = perturbed(robot(record), size, seed=7)
+    assert told_apart(machine, "full", n=120) == expected
+    # without torsion one less with the tool known; with it unknown, its turn about the normal was lost already
+    assert told_apart(machine, "5-dof", n=120) == [expected[0] - 1, *expected[1:]]
+
+
+@pytest.mark.parametrize(
+    ("record", "size", "expected"),
+    # orientation alone loses the moves of base and tool, three each: 60 - 6, 42 - 6, 33 - 6, 58 - 6
+    [
+        (COMPLETE_THREE, 2e-3, 54),
+        (COMPLETE_THREE, 0.0, 36),
+        (replace(COMPLETE_THREE, spherical="point"), 2e-3, 27),
+        (COMPLETE_TRACKER, 6e-3, 52),
+    ],
+    ids=["3-PRS", "3-PRS, nominal", "3-PRS, perfect balls", "tracker"],
+)
+def test_orientation_alone_costs_the_complete_models_six(record: ThreePrs | RuPusPrs, size: float, expected: int) -> None:
+    assert ranks(perturbed(robot(record), size, seed=7), ["orientation"], n=120) == [expected]
+
+
+def test_the_tracker_with_perfect_balls_has_35_and_with_a_perfect_cross_33() -> None:
+    """PUS 9, PRS 11 and the post's three revolute joints 3 * 3 + 6 = 15: 35 (C = 3R + 6 for a chain of passive R).
+
+    The published 33 takes the universal joint as ideal too: its axes meet and are square, two less.
+    """
+    machine = perturbed(robot(replace(COMPLETE_TRACKER, spherical="point")), 2e-3, seed=7)
+    assert ranks(machine, KINDS, n=120) == [35, 34, 32, 29]
+    assert told_apart(machine, "full", n=120) == [29, 29, 23]
+    # in the second axis' own frame: x from the first axis to the second, rx their angle
+    ideal = np.isin(machine.parameters.names, ("chain3.universal2.x", "chain3.universal2.rx"))
+    assert ideal.sum() == 2
+    crossed = machine.with_values(np.where(ideal, 0.0, machine.values))
+    solution = solved(crossed, 120)
+    D = scaled_sensitivity(crossed, solution)[..., ~ideal]
+    assert [rank(measured(D, solution.T, kind)) for kind in KINDS[:3]] == [33, 32, 30]
 
 
 def test_a_model_of_points_refuses_joints_of_axes() -> None:
