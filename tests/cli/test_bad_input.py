@@ -160,6 +160,12 @@ def test_fewer_equations_than_parameters_are_refused_with_both_numbers(refused) 
     assert "3 equations from 3 poses cannot determine 42 parameters: measure at least 42 poses" in found
 
 
+def test_fewer_equations_are_refused_by_default_too_unless_tolerances_are_asked_to_decide(refused) -> None:
+    found = refused("calibrate hexapod-42 data.csv -o run", data_csv=DATA)
+    assert "3 equations cannot determine 42 parameters; measure more poses" in found
+    assert "--method map" in found
+
+
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_every_kind_is_fitted_or_refused_in_a_sentence(tmp_path, monkeypatch, capsys, kind) -> None:
     monkeypatch.chdir(tmp_path)

@@ -73,6 +73,12 @@ class Fitting:
         chosen = robot if choice is None else choice.robot
         if choice is not None and not choice.chosen.parameters:
             raise DataError(f"{choice.sentence}; without --choose-model it is calibrated all the same")
+        free = int(chosen.parameters.free.sum())
+        if method is None and data.n_rows < free:
+            raise DataError(
+                f"{data.n_rows} equations cannot determine {free} parameters; measure more poses, fix parameters, or let the "
+                "stated tolerances decide what is open with --method map"
+            )
         drop = tuple(label for label in self.drop if label in data.labels)
         return identify(chosen, data, method, noise=self.noise, loss=loss, drop=drop), choice
 
