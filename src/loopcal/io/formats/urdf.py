@@ -76,7 +76,7 @@ def read(path: Path, reading: Reading) -> Imported:
     platform, frame = _platform(urdf, loops, reading.platform)
     found = urdf_limbs.cut(loops, platform)
     loops = found.loops
-    T_body_frame = np.linalg.inv(urdf.in_body(platform)) @ urdf.in_body(frame)
+    T_body_frame = se3.inverse(urdf.in_body(platform)) @ urdf.in_body(frame)
     motion = loops.motions()
     turns = any(name.startswith("r") for name in found.freedoms)
     home = loops.places[platform] @ T_body_frame
@@ -188,10 +188,10 @@ def _limb(loops: Loops, limb: tuple[Edge, ...], T_body_frame: Array, turns: bool
         if forward:
             name = f"tip, name: {json.dumps(edge.name)}" if ends else json.dumps(edge.name)
             errors.append(f"      - {{of: {name}, shift: [{', '.join(_across(axis))}]}}")
-        pending = np.linalg.inv(edge.T_other if forward else edge.T_one).astype(np.float64)
+        pending = se3.inverse(edge.T_other if forward else edge.T_one)
         body = other_end(edge, body)
     last = path[-1]
-    attach: Array = np.linalg.inv(pending @ T_body_frame).astype(np.float64)
+    attach: Array = se3.inverse(pending @ T_body_frame)
     if last.pin:
         # the far end of the pin, a joint of its own in the URDF
         errors.append(f"      - {{of: platform, name: {json.dumps(last.far)}, shift: [{', '.join(_across(last.axis))}]}}")

@@ -173,7 +173,7 @@ class Loops:
     def pin_value(self, pin: Edge) -> float:
         """The angle of a pin at home [rad]."""
         T = self.places
-        between = np.linalg.inv(T[pin.one] @ pin.T_one) @ T[pin.other] @ pin.T_other
+        between = se3.inverse(T[pin.one] @ pin.T_one) @ T[pin.other] @ pin.T_other
         return float(se3.log_so3(between[:3, :3]) @ pin.axis)
 
 
