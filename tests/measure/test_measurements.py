@@ -111,3 +111,33 @@ def test_a_mistake_is_one_sentence(change, sentence):
     right = {"robot_name": "toy", "readings": np.zeros((2, 2)), "observations": (rows,)}
     with pytest.raises(DataError, match=sentence):
         Measurements(**(right | change))
+
+
+def test_the_sigma_of_readings_follows_their_poses():
+    data = _data_with_sigma([[1e-6, np.inf], [0.0, 2e-6], [3e-6, 3e-6]], [[1.0, np.nan], [2.0, 2.0], [3.0, 3.0]])
+    assert data.take([2, 0]).reading_sigma.tolist() == [[3e-6, 3e-6], [1e-6, np.inf]]
+    fit, held = data.split(0.6, seed=1)
+    assert len(fit.reading_sigma) + len(held.reading_sigma) == 3
+    weighted = data.reweighted([4.0, 1.0, 0.0])
+    assert weighted.reading_sigma.tolist() == [[5e-7, np.inf], [0.0, 2e-6], [np.inf, np.inf]]
+    assert _data_with_sigma(1e-6, np.ones((3, 2))).reading_sigma.shape == (3, 2)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "readings", "words"),
+    [
+        (-1e-6, np.ones((3, 2)), "no standard deviation"),
+        (np.nan, np.ones((3, 2)), "no standard deviation"),
+        (1e-6, [[1.0, np.nan], [1.0, 1.0], [1.0, 1.0]], "not there"),
+        (np.ones(3), np.ones((3, 2)), "one for each of the 2 actuators"),
+        (None, [[1.0, np.nan], [1.0, 1.0], [1.0, 1.0]], "finite"),
+        (np.inf, [[1.0, np.inf], [1.0, 1.0], [1.0, 1.0]], "finite"),
+    ],
+)
+def test_a_sigma_of_readings_without_sense_is_refused(sigma, readings, words):
+    with pytest.raises(DataError, match=words):
+        _data_with_sigma(sigma, readings)
+
+
+def _data_with_sigma(sigma, readings):
+    return Measurements("r", np.asarray(readings, dtype=float), (), reading_sigma=sigma)

@@ -30,11 +30,15 @@ class Measurements:
         Poses of equal number belong together (a repeat, a shared covariance) and are never split. Default: each alone.
     labels : tuple of str, optional
         Names of the poses, for messages and tables. Default "1", "2", ...
+    reading_sigma : (n, a) or what spreads to it [SI], optional
+        Standard deviation of each reading: 0 is exact, infinite was not taken or is not believed. A reading may be NaN
+        exactly where this is infinite. Default None: exact, but where the robot states the sigma of its actuators.
 
     Raises
     ------
     DataError
-        If shapes differ, a reading is not finite, or a row refers to a pose that is not there.
+        If shapes differ, a reading is not finite though it has a sigma, a sigma is negative, or a row refers to a pose that
+        is not there.
     """
 
     robot_name: str
@@ -42,9 +46,10 @@ class Measurements:
     observations: tuple[Observations, ...]
     block: Ints = field(default_factory=lambda: np.empty(0, dtype=np.intp))
     labels: tuple[str, ...] = ()
+    reading_sigma: Array | None = None
 
     def __post_init__(self) -> None:
-        readings = stored(self.readings, "readings", (None, None))
+        readings = stored(self.readings, "readings", (None, None), allow_nan=self.reading_sigma is not None)
         n = len(readings)
         if n == 0:
             raise DataError("there is no pose in these measurements; give at least one row of readings")
@@ -58,6 +63,8 @@ class Measurements:
         for rows in self.observations:
             _check_rows(rows, n)
         values = {"readings": readings, "block": block, "labels": labels, "observations": tuple(self.observations)}
+        if self.reading_sigma is not None:
+            values["reading_sigma"] = _reading_sigma(self.reading_sigma, readings, labels)
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
@@ -100,6 +107,7 @@ class Measurements:
             observations=tuple(_moved(rows, place) for rows in self.observations),
             block=self.block[chosen],
             labels=tuple(self.labels[i] for i in chosen),
+            reading_sigma=None if self.reading_sigma is None else self.reading_sigma[chosen],
         )
 
     def split(self, fraction: float, seed: int) -> tuple[Self, Self]:
@@ -135,7 +143,8 @@ class Measurements:
     def reweighted(self, weight: ArrayLike) -> Self:
         """The same measurements with one weight (n,) for each pose; a row that links poses takes their product.
 
-        For a weight of each row use `Observations.reweighted`.
+        Readings that have a sigma are weighted like the rows of their pose: sigma / sqrt(weight). For a weight of each row
+        use `Observations.reweighted`.
 
         Raises
         ------
@@ -144,7 +153,37 @@ class Measurements:
         """
         given = stored(weight, "the weight of the poses", (self.n_poses,))
         parts = tuple(rows.reweighted(given[rows.rows].reshape(len(rows), -1).prod(axis=1)) for rows in self.observations)
-        return replace(self, observations=parts)
+        return replace(self, observations=parts, reading_sigma=weighted_sigma(self.reading_sigma, given))
+
+
+def weighted_sigma(sigma: Array | None, weight: Array) -> Array | None:
+    """Standard deviations (n, a) of readings whose squares count by a weight (n,): infinite for 0; exact ones stay exact."""
+    if sigma is None:
+        return None
+    root = np.sqrt(weight)[:, None]
+    apart = np.divide(sigma, root, out=np.full(sigma.shape, np.inf), where=root > 0.0)
+    return np.where(sigma == 0.0, 0.0, apart)
+
+
+def _reading_sigma(sigma: ArrayLike, readings: Array, labels: tuple[str, ...]) -> Array:
+    """Checked, read-only standard deviations (n, a) of the readings."""
+    given = np.asarray(sigma, dtype=float)
+    try:
+        spread = np.array(np.broadcast_to(given, readings.shape))
+    except ValueError:
+        raise DataError(
+            f"reading_sigma has shape {given.shape}; give one number, or one for each of the {readings.shape[1]} actuators,"
+            f" or one for each of the {readings.shape[0]} x {readings.shape[1]} readings"
+        ) from None
+    for wrong, what in (
+        (~(spread >= 0.0), "is no standard deviation; give 0 (exact), a positive number, or infinity (not taken)"),
+        (np.isnan(readings) & np.isfinite(spread), "belongs to a reading that is not there; give the reading, or infinity"),
+    ):
+        if np.any(wrong):
+            pose, column = (int(i) for i in np.argwhere(wrong)[0])
+            raise DataError(f"pose {labels[pose]!r}: the sigma {spread[pose, column]} of reading {column + 1} {what}")
+    spread.setflags(write=False)
+    return spread
 
 
 def _check_rows(rows: Observations, n: int) -> None:
