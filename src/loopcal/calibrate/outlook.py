@@ -24,7 +24,6 @@ from loopcal.measure import (
     evaluate_all,
     joint_values,
     joints_looked_at,
-    local_unknowns,
     start_values,
     whitened_rows,
 )
@@ -112,7 +111,7 @@ def information(free: Unknowns, data: Measurements) -> tuple[FloatArray, NDArray
     factor : (1, p + 1, p + 1) of rows [A | r] with own unknowns eliminated. reached : (n,) poses that close or are not
         needed; where one is False its rows are missing.
     """
-    local = local_unknowns(data.observations, data.labels)
+    local = data.unknowns
     own = len(local)
     factor = empty_factor(1, own + len(free))
     values = _own_values(free, data, local) if own else np.zeros(0)
@@ -136,7 +135,7 @@ def information(free: Unknowns, data: Measurements) -> tuple[FloatArray, NDArray
 
 def alone(at: Scene, measured: Measurements) -> FloatArray:
     """Factor (1, p + 1, p + 1) of one instrument's rows at a scene, its own unknowns eliminated at their stated values."""
-    local = local_unknowns(measured.observations, measured.labels)
+    local = measured.unknowns
     rows = look(at, measured, local, local.values())
     factor = engine.accumulate(empty_factor(1, len(local) + len(at.free)), rows)
     return without_own(engine.accumulate(factor, _prior_rows(local, len(at.free))), len(local))

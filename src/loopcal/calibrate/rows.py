@@ -316,7 +316,7 @@ class Rows:
 
 def rows_of(unknowns: Unknowns, data: Measurements, local: LocalUnknowns | None = None) -> Rows:
     """Return the rows of one machine's measurements; `local` are the unknowns that these bring, default as stated."""
-    own = local_unknowns(data.observations, data.labels) if local is None else local
+    own = data.unknowns if local is None else local
     pairs = [(o, places) for o, places in zip(data.observations, own.places, strict=True) if len(o)]
     sensed = tuple(Sensed(o.kind, o.rows, o.measured[None], o.whitener[None], places) for o, places in pairs)
     return Rows(unknowns, data.readings, sensed, 1, own=_own(unknowns, own, sensed, 1, lambda _: data))

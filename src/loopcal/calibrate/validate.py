@@ -28,7 +28,6 @@ from loopcal.measure import (
     check_actuators,
     joint_values,
     joints_looked_at,
-    local_unknowns,
     start_values,
 )
 from loopcal.mechanism import Mechanism, Solution, forward, inverse
@@ -226,7 +225,7 @@ def _view(robot: Mechanism, data: Measurements, found: Solution, ok: np.ndarray,
     T = np.where(ok[:, None, None], found.T, np.eye(4))
     names = joints_looked_at(o.kind for o in data.observations)
     joints = joint_values(robot, names, found.q[None], found.state)
-    local = local_unknowns(data.observations, data.labels)
+    local = data.unknowns
     values, carried = local.values(), ()
     if known is not None and len(local):
         carried = tuple(name for name in local.table.names if name in known)

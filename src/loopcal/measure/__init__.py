@@ -47,5 +47,6 @@ from loopcal.measure.simulate import sample_truth as sample_truth
 from loopcal.measure.simulate import simulate as simulate
 from loopcal.measure.simulate import simulate_trials as simulate_trials
 from loopcal.measure.starts import start_values as start_values
+from loopcal.measure.unknowns import Known as Known
 from loopcal.measure.unknowns import LocalUnknowns as LocalUnknowns
 from loopcal.measure.unknowns import local_unknowns as local_unknowns

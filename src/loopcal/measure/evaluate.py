@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """All rows of measurements at given poses and unknowns: what an estimator needs of them, and nothing of robots.
 
-    local = local_unknowns(measurements.observations, measurements.labels)    # U unknowns: frames, targets, surfaces
+    local = measurements.unknowns                                             # U unknowns: frames, targets, surfaces
     values = local.values()                                                   # (U,), or start_values(measurements, T, local)
     parts = evaluate_all(measurements, T, values[None], local)                # one `KindRows` for each kind
     rows = whitened_rows(parts, D)                                            # (t, M, p + U + 1): [machine | local | residual]
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from loopcal.errors import DataError
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
-from loopcal.measure.unknowns import LocalUnknowns, local_unknowns
+from loopcal.measure.unknowns import LocalUnknowns
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -80,7 +80,7 @@ def evaluate_all(
     DataError
         If a joint's values are missing.
     """
-    gathered = local_unknowns(measurements.observations, measurements.labels) if local is None else local
+    gathered = measurements.unknowns if local is None else local
     return tuple(
         _kind_rows(rows, T, gathered.of(i, values), gathered.places[i], gathered, joints or {})
         for i, rows in enumerate(measurements.observations)

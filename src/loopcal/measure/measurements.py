@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measurements: the readings of the actuators at n poses, and what the instruments saw there."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from loopcal.errors import DataError
 from loopcal.measure.arrays import stored
 from loopcal.measure.observations import Observations
+from loopcal.measure.unknowns import Known, LocalUnknowns, local_unknowns
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -33,6 +35,8 @@ class Measurements:
     reading_sigma : (n, a) or what spreads to it [SI], optional
         Standard deviation of each reading: 0 is exact, infinite was not taken or is not believed. A reading may be NaN
         exactly where this is infinite. Default None: exact, but where the robot states the sigma of its actuators.
+    known : tuple of Known, optional
+        Priors and fixed values of unknowns that the observations bring with them. Default: all are left to the data.
 
     Raises
     ------
@@ -47,6 +51,7 @@ class Measurements:
     block: Ints = field(default_factory=lambda: np.empty(0, dtype=np.intp))
     labels: tuple[str, ...] = ()
     reading_sigma: Array | None = None
+    known: tuple[Known, ...] = ()
 
     def __post_init__(self) -> None:
         readings = stored(self.readings, "readings", (None, None), allow_nan=self.reading_sigma is not None)
@@ -77,6 +82,25 @@ class Measurements:
     def n_rows(self) -> int:
         """Number of scalar residuals that count (present, weight above 0), over all kinds."""
         return sum(rows.n_residuals for rows in self.observations)
+
+    @property
+    def unknowns(self) -> LocalUnknowns:
+        """The unknowns that the observations bring with them, with what is known of them."""
+        return local_unknowns(self.observations, self.labels, self.known)
+
+    @property
+    def context(self) -> Mapping[str, Array]:
+        """Time [s] and temperatures [degC] by name, (n,): the mean over the rows that saw a pose, NaN where none says."""
+        found: dict[str, Array] = {}
+        for name in dict.fromkeys(name for rows in self.observations for name in rows.context):
+            total, count = np.zeros(self.n_poses), np.zeros(self.n_poses)
+            for rows in (rows for rows in self.observations if name in rows.context):
+                values = np.broadcast_to(rows.context[name][:, None], (len(rows), rows.kind.links))
+                there = ~np.isnan(values)
+                np.add.at(total, rows.rows.reshape(values.shape)[there], values[there])
+                np.add.at(count, rows.rows.reshape(values.shape)[there], 1.0)
+            found[name] = np.divide(total, count, out=np.full(self.n_poses, np.nan), where=count > 0.0)
+        return found
 
     def take(self, poses: ArrayLike) -> Self:
         """Measurements of these poses alone, in this order; rows that need any other pose are left out.

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows of one kind: which pose each saw, what it read, and how far to believe it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -37,6 +38,9 @@ class Observations:
     session, group : text or (r,) text, optional
         Rows of one session share the kind's frames and targets, rows of one group its surface. Default: one of each,
         without a name.
+    context : name -> (r,), optional
+        What stood beside each row and enters no equation: `time` [s], `temperature` and `temperature.PLACE` [degC], NaN
+        where it was not noted.
 
     Attributes
     ----------
@@ -59,6 +63,7 @@ class Observations:
     weight: Array = field(default_factory=lambda: np.array(1.0))
     session: Texts = field(default_factory=lambda: np.array(""))
     group: Texts = field(default_factory=lambda: np.array(""))
+    context: Mapping[str, Array] = field(default_factory=dict)
     present: Bools = field(init=False, repr=False)
     whitener: Array = field(init=False, repr=False)
 
@@ -82,7 +87,8 @@ class Observations:
             array.setflags(write=False)
         values = {"rows": rows, "measured": measured, "covariance": covariance, "weight": weight}
         values |= {name: labels(getattr(self, name), r, name) for name in ("session", "group")}
-        for name, array in {**values, "present": present, "whitener": W}.items():
+        context = {name: stored(v, f"the context {name!r}", (r,), allow_nan=True) for name, v in self.context.items()}
+        for name, array in {**values, "context": context, "present": present, "whitener": W}.items():
             object.__setattr__(self, name, array)
 
     @classmethod
@@ -160,6 +166,7 @@ class Observations:
             weight=self.weight[chosen],
             session=self.session[chosen],
             group=self.group[chosen],
+            context={name: values[chosen] for name, values in self.context.items()},
         )
 
     def reweighted(self, weight: ArrayLike) -> Self:

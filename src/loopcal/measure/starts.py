@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from loopcal.measure.evaluate import evaluate_all, whitened_rows
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
-from loopcal.measure.unknowns import LocalUnknowns, local_unknowns
+from loopcal.measure.unknowns import LocalUnknowns
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -47,7 +47,7 @@ def start_values(
     DataError
         If poses are too few or too much alike to tell where something is.
     """
-    gathered = local_unknowns(measurements.observations, measurements.labels) if local is None else local
+    gathered = measurements.unknowns if local is None else local
     values, free = gathered.values(), gathered.table.free
     sought = free & np.isnan(gathered.table.tolerance)
     if not free.any():

@@ -46,6 +46,41 @@ class Labelled(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Known:
+    """What is known beforehand of one unknown that measurements bring with them.
+
+    Parameters
+    ----------
+    name : str
+        Its full name, such as `monday.tracker.x`.
+    sd : float
+        Standard deviation of a prior [SI]; 0 keeps the unknown fixed.
+    nominal : float, optional
+        The value that it is kept at, or that the prior is about [SI]; default that of its kind.
+
+    Raises
+    ------
+    DataError
+        If the standard deviation is negative or not finite.
+    """
+
+    name: str
+    sd: float = 0.0
+    nominal: float | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.sd < float("inf"):
+            raise DataError(
+                f"the standard deviation of {self.name!r} is {self.sd}; give a number above 0, or 0 to fix the unknown"
+            )
+
+    def applied(self, entry: Parameter) -> Parameter:
+        """The unknown with what is known of it."""
+        nominal = entry.nominal if self.nominal is None else self.nominal
+        return replace(entry, nominal=nominal, tolerance=self.sd or entry.tolerance, free=entry.free and self.sd > 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class LocalUnknowns:
     """All unknowns that measurements bring with them.
@@ -110,13 +145,16 @@ class LocalUnknowns:
         return self.table.index(name)
 
 
-def local_unknowns(observations: Iterable[Labelled], labels: tuple[str, ...]) -> LocalUnknowns:
+def local_unknowns(
+    observations: Iterable[Labelled], labels: tuple[str, ...], known: Iterable[Known] = ()
+) -> LocalUnknowns:
     """Gather the unknowns of measurements.
 
     Parameters
     ----------
     observations : of `Measurements`, or anything with kind, rows, session and group.
     labels : names of the poses.
+    known : what is known of some of them, usually `Measurements.known`; of names that do not occur nothing is said.
 
     Returns
     -------
@@ -145,6 +183,9 @@ def local_unknowns(observations: Iterable[Labelled], labels: tuple[str, ...]) ->
         order = {name: i for i, name in enumerate(entries)}
         used = {key: [order[name] for name in names] for key, names in own.items()}
         places.append(np.array([used[key] for key in keys], dtype=np.intp).reshape(len(rows.rows), len(kind.unknowns)))
+    for said in known:
+        if said.name in entries:
+            entries[said.name] = said.applied(entries[said.name])
     return LocalUnknowns(ParameterTable(tuple(entries.values())), tuple(places))
 
 
