@@ -8,13 +8,13 @@ has a part left in that combination.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from loopcal.calibrate.combinations import Combination, listed, sparse
-from loopcal.calibrate.identifiability import Identifiability
+from loopcal.calibrate.identifiability import Identifiability, identifiability
 from loopcal.calibrate.meaning import probed
 from loopcal.calibrate.outlook import Scene, alone, scene
 from loopcal.calibrate.scaling import Unknowns
@@ -36,6 +36,9 @@ HELP = 0.9
 
 NAMED = 4
 """Further measurements written out in a sentence; the others are counted."""
+
+FEW = 3
+"""Open combinations at most that are written out in a refusal."""
 
 TILT = "tilt-torsion"
 SINGLE = (("x",), ("y",), ("z",), ("psi",), ("theta",), ("phi", "theta"))
@@ -124,6 +127,23 @@ def remedies(found: Identifiability, sigma: dict[Dimension, float] | None = None
     return tuple(Remedy(combination, tuple(some)) for combination, some in pairs)
 
 
+def open_words(robot: Mechanism, data: Measurements) -> str:
+    """What too few equations leave open and what would determine it, for a refusal; empty where that is too much to say.
+
+    Parameters
+    ----------
+    robot, data : as for `identifiability`.
+    """
+    if int(robot.parameters.free.sum()) - data.n_rows > FEW:
+        return ""
+    found = remedies(identifiability(robot, data))
+    if not 0 < len(found) <= FEW:
+        return ""
+    common = [cure.words for cure in found[0].cures if all(cure.words in {c.words for c in other.cures} for other in found)]
+    advice = f"add {common[0]}" if common else "no one kind of measurement would tell all of it"
+    return f" ({'; '.join(str(remedy.combination) for remedy in found)}; {advice})"
+
+
 def _scene(free: Unknowns, joints: list[str]) -> Scene:
     """Poses drawn from the workspace, or about home where none is stated."""
     try:
@@ -144,28 +164,33 @@ def _passive(robot: Mechanism) -> list[tuple[str, str]]:
 
 
 def _candidates(robot: Mechanism, passive: list[tuple[str, str]]) -> Iterator[tuple[str, Kind]]:
-    """What could be measured, in words, the simplest first: single coordinates, every kind's examples, joint sensors."""
-    said: set[str] = set()
+    """What could be measured, in words, the simplest first: what needs no frame, single coordinates, other kinds, joints."""
+    # examples of Component and JointSensor are of one robot; both are made for this one
+    known = [kind for kind in KINDS.values() if not issubclass(kind, (Component, JointSensor))]
+    yield from _examples([kind for kind in known if kind.links > 1])
     for names in SINGLE:
         yield " and ".join(names), Component(names, None if names[0] in "xyz" else TILT)
-    for kind_class in KINDS.values():
-        if issubclass(kind_class, (Component, JointSensor)):
-            continue  # their examples are of one robot; see above and below
-        for kind in kind_class.examples():
-            words = _words(kind)
-            if words not in said:
-                said.add(words)
-                yield words, kind
+    yield from _examples([kind for kind in known if kind.links == 1])
     for name, measures in passive:
         yield f"the joint {name}", JointSensor(joints=(name,), measures=measures)
 
 
+def _examples(kinds: Iterable[type[Kind]]) -> Iterator[tuple[str, Kind]]:
+    """Examples of kinds that differ in words."""
+    said: set[str] = set()
+    for kind in (example for one in kinds for example in one.examples()):
+        words = _words(kind)
+        if words not in said:
+            said.add(words)
+            yield words, kind
+
+
 def _words(kind: Kind) -> str:
     """A kind with what is unknown of it."""
-    article = "the" if kind.links == 1 else "the point-to-point"
-    targets = getattr(kind, "targets", ())
-    words = f"{article} {kind.name}" + (f" of {len(targets)} targets" if len(targets) > 1 else "")
-    unknown = list(kind.parts)
+    targets, unknown = getattr(kind, "targets", ()), list(kind.parts)
+    if kind.said and not unknown:
+        return kind.said
+    words = f"the {kind.name}" + (f" of {len(targets)} targets" if len(targets) > 1 else "")
     return f"{words} ({listed(unknown)} unknown)" if unknown else words
 
 

@@ -18,6 +18,7 @@ from loopcal.errors import DataError
 if TYPE_CHECKING:
     from loopcal.calibrate import Identification, Validation
     from loopcal.calibrate.examine import Examination
+    from loopcal.calibrate.remedies import Remedy
     from loopcal.measure import Measurements
 
 GREW = 1.1
@@ -91,10 +92,12 @@ def calibrate(
     split = None if unseen is None else {"hold_out": hold_out, "seed": seed, "held_out": unseen.labels}
     findings = {"examination": _examined(fit, fitted), "change": change, "model_choice": choice}
     found = {name: finding.to_dict() for name, finding in findings.items() if finding is not None}
+    cures = _cures(fit, fitted)
+    found |= {"remedies": [cure.to_dict() for cure in cures]} if cures else {}
     reasons = _reasons(fit, validation)
     document = run_document(fit, validation, origin, split) | found | {"passed": not reasons, "reasons": reasons}
     save_run(output, fit, document, force)
-    show.json_document(document) if as_json else _print(fit, validation, fitted, findings, output)
+    show.json_document(document) if as_json else _print(fit, validation, fitted, findings, cures, output)
     return show.gates(reasons)
 
 
@@ -126,8 +129,23 @@ def _examined(fit: Identification, fitted: Measurements) -> Examination | None:
     return examine(fit, fitted) if fit.converged else None
 
 
+def _cures(fit: Identification, fitted: Measurements) -> tuple[Remedy, ...]:
+    """What would determine what these measurements leave open."""
+    from loopcal.calibrate import identifiability
+    from loopcal.calibrate.remedies import remedies
+
+    if not (fit.converged and fit.unidentifiable):
+        return ()
+    return remedies(identifiability(fit.robot, fitted))
+
+
 def _print(
-    fit: Identification, validation: Validation | None, fitted: Measurements, findings: Mapping[str, Any], output: Path
+    fit: Identification,
+    validation: Validation | None,
+    fitted: Measurements,
+    findings: Mapping[str, Any],
+    cures: tuple[Remedy, ...],
+    output: Path,
 ) -> None:
     """Print what was found, and how well it does on unseen poses, or without any on the fitted ones."""
     from loopcal.calibrate import start_check, validate
@@ -143,7 +161,8 @@ def _print(
     show.say(f"chi-square {fit.chi_square:.5g} with {degrees}")
     show.say(f"note: {start_check(fit).sentence}")
     examined: Examination | None = findings["examination"]
-    for note in (*fit.notes, *(() if examined is None else examined.sentences)):
+    advised = [f"to determine {cure}" for cure in cures]
+    for note in (*fit.notes, *advised, *(() if examined is None else examined.sentences)):
         show.say(f"note: {note}")
     if findings["model_choice"] is not None:
         show.say(f"\n{findings['model_choice']}")

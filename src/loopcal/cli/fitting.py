@@ -67,6 +67,7 @@ class Fitting:
     def fit(self, robot: Mechanism, data: Measurements) -> tuple[Identification, ModelChoice | None]:
         """Identify, after choosing the set of parameters where asked."""
         from loopcal.calibrate import choose_model, identify
+        from loopcal.calibrate.remedies import open_words
 
         method, loss = self.estimator(), self.robust()
         choice = choose_model(robot, data, method=method, noise=self.noise, loss=loss) if self.choose_model else None
@@ -77,7 +78,7 @@ class Fitting:
         if method is None and data.n_rows < free:
             raise DataError(
                 f"{data.n_rows} equations cannot determine {free} parameters; measure more poses, fix parameters, or let the "
-                "stated tolerances decide what is open with --method map"
+                f"stated tolerances decide what is open with --method map{open_words(chosen, data)}"
             )
         drop = tuple(label for label in self.drop if label in data.labels)
         return identify(chosen, data, method, noise=self.noise, loss=loss, drop=drop), choice

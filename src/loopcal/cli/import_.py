@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -73,6 +74,8 @@ def import_(
     refuse_outputs((output, data, corrected), (), force)  # FILE may be corrected in place
     found = source.read(file, _reading(source, output.stem, asked))
     robot = save_imported(file, found, output, data)
+    if source.judged is not None and found.measurements is not None:
+        found = replace(found, notes=(*found.notes, *source.judged(robot, found.measurements)))
     fit = None if corrected is None or data is None else _corrected(source, robot, file, data, corrected)
     document: dict[str, Any] = {"robot": output, "data": data, "corrected": corrected, "notes": found.notes}
     if as_json:

@@ -48,6 +48,7 @@ arms: {arms}
 stops: {stops}       # height of the nozzle, in the centre, with the carriage at its end stop
 readings: drop       # carriage positions count down from the end stops
 home: {{z: 0}}
+workspace: {{x: {side}, y: {side}, z: [0, {top:g}]}}     # taken; say how far the nozzle really goes
 {fixed}"""
 FIXED = "fixed: [arm*.length]     # heights alone cannot tell the arms from the rest; distances can\n"
 
@@ -69,6 +70,8 @@ def robot_text(found: DeltaNumbers, name: str, path: Path, program: str, arms_kn
         angles=list(found.angles),
         arms=list(found.arms),
         stops=list(found.stops),
+        side=[-round(0.5 * found.radius), round(0.5 * found.radius)],
+        top=round(0.5 * found.radius),
         fixed="" if arms_known else FIXED,
     )
 

@@ -88,6 +88,7 @@ class Format:
     name, what : its name on the command line, and one line on it. endings : of file names that are taken for it.
     read : from a file. write : of a source, into the file given (all else in it stays as it is) or as a text of its own.
     takes_file : whether `write` can correct a file. reads : options of `Reading` that `read` looks at.
+    judged : sentences on what the other program stored, from the robot and the measurements that were read.
     """
 
     name: str
@@ -97,6 +98,7 @@ class Format:
     write: Callable[[Source, Path | None], Exported] | None = None
     takes_file: bool = True
     reads: tuple[str, ...] = ()
+    judged: Callable[[Mechanism, Measurements], tuple[str, ...]] | None = None
 
 
 def record_of(source: Source, family: type, format_name: str, words: str) -> Any:

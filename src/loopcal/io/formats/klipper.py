@@ -23,6 +23,7 @@ from loopcal.io.formats.printer_cfg import PrinterConfig
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements
+    from loopcal.mechanism import Mechanism
 
 STEPPERS = ("stepper_a", "stepper_b", "stepper_c")
 PROBED = "delta_calibrate"
@@ -185,6 +186,20 @@ def _positive(cfg: PrinterConfig, section: str, option: str, value: float) -> fl
     return value
 
 
+def judged(robot: Mechanism, measured: Measurements) -> tuple[str, ...]:
+    """Whether the stored geometry is the optimum of Klipper's own cost; nothing where the probes do not determine one."""
+    from loopcal.io.formats.stored_answer import stored_answer
+
+    found = stored_answer(robot, measured)
+    return () if found is None else (str(found),)
+
+
 FORMAT = Format(
-    "klipper", "printer.cfg of a Klipper delta printer", (".cfg",), read, write, reads=("sigma_height", "sigma_distance")
+    "klipper",
+    "printer.cfg of a Klipper delta printer",
+    (".cfg",),
+    read,
+    write,
+    reads=("sigma_height", "sigma_distance"),
+    judged=judged,
 )

@@ -65,11 +65,14 @@ class Kind(ABC):
         How many poses one row compares.
     follows : bool
         Whether columns that stay the same while the robot moves are a mistake; touched surfaces and locks stay at 0.
+    said : str
+        What is measured, for sentences that advise it with nothing unknown; "the" and the name where empty.
     """
 
     name: ClassVar[str]
     links: ClassVar[int] = 1
     follows: ClassVar[bool] = True
+    said: ClassVar[str] = ""
 
     @property
     @abstractmethod

@@ -30,6 +30,7 @@ class Separation(TargetKind):
 
     name: ClassVar[str] = "separation"
     links: ClassVar[int] = 2
+    said: ClassVar[str] = "distances between two poses (ball bar; callipers on a printed part)"
     per_target: ClassVar[tuple[Column, ...]] = (Column("separation", Dimension.LENGTH),)
     possible: ClassVar[tuple[str, ...]] = ("targets", "offset")
 
