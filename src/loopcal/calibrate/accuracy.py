@@ -123,7 +123,7 @@ def pose_uncertainty(
     parts = []
     for first in range(0, len(found.q), BLOCK):
         rows = np.arange(first, min(first + BLOCK, len(found.q)))
-        parts.append(_covariance(known, found.take(rows), roots, _transport(robot, found.T[rows], frame, point)))
+        parts.append(_covariance(known, found.take(rows), roots, transport(robot, found.T[rows], frame, point)))
     T = np.where(found.converged[:, None, None], found.T, np.nan)
     return PoseUncertainty(T, np.concatenate(parts), _frame_words(motions, frame, gauge, point))
 
@@ -160,7 +160,7 @@ def _covariance(known: Posterior, found: Solution, roots: tuple[FloatArray, Floa
     return covariance
 
 
-def _transport(robot: Mechanism, T: FloatArray, frame: Axes, point: Point) -> FloatArray:
+def transport(robot: Mechanism, T: FloatArray, frame: Axes, point: Point) -> FloatArray:
     """(n, 6, 6) from twists of the platform's origin in base axes to those of the point in the axes."""
     R = T[:, :3, :3]
     arm = R @ robot.tool[:3, 3] if point == "tool" else np.zeros((len(T), 3))

@@ -57,23 +57,29 @@ def sample(robot: Mechanism, n: int, seed: int | np.random.Generator = 0) -> Sam
         The robot states no range for a controlled coordinate, or almost nothing of its workspace can be reached.
     """
     rng = np.random.default_rng(seed)
-    ranges = _ranges(robot)
+    wanted = ranges(robot)
     lost: Counter[str] = Counter()
     parts: list[Array] = []
-    kept = drawn = 0
-    while kept < n or not drawn:
-        coordinates = _drawn(rng, robot.controlled, ranges, max(n, DRAWS // 8))
+    kept = tried = 0
+    while kept < n or not tried:
+        coordinates = drawn(rng, robot.controlled, wanted, max(n, DRAWS // 8))
         good = _reached(robot, coordinates, lost)
         parts.append(coordinates[good])
-        kept, drawn = kept + int(good.sum()), drawn + len(coordinates)
-        if drawn >= DRAWS and kept < FEWEST * drawn:
-            raise MechanismError(_empty(robot, kept, drawn, lost))
+        kept, tried = kept + int(good.sum()), tried + len(coordinates)
+        if tried >= DRAWS and kept < FEWEST * tried:
+            raise MechanismError(_empty(robot, kept, tried, lost))
     coordinates = np.concatenate(parts)[:n]
-    return Sample(coordinates, inverse(robot, coordinates), kept / drawn, dict((+lost).most_common()))
+    return Sample(coordinates, inverse(robot, coordinates), kept / tried, dict((+lost).most_common()))
 
 
-def _ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
-    """Range of every controlled coordinate; phi runs all the way round where it is not stated."""
+def ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
+    """Range of every controlled coordinate [m, rad]; phi runs all the way round where it is not stated.
+
+    Raises
+    ------
+    MechanismError
+        The robot states no range for a coordinate.
+    """
     stated = dict(robot.assembly.workspace)
     if "theta" in stated:
         stated.setdefault("phi", (-np.pi, np.pi))
@@ -86,11 +92,11 @@ def _ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
     return {name: stated[name] for name in robot.controlled}
 
 
-def _drawn(rng: np.random.Generator, names: tuple[str, ...], ranges: Mapping[str, tuple[float, float]], n: int) -> Array:
-    """Coordinates (n, c) spread evenly over their ranges."""
+def drawn(rng: np.random.Generator, names: tuple[str, ...], within: Mapping[str, tuple[float, float]], n: int) -> Array:
+    """Coordinates (n, c) spread evenly over their ranges [m, rad], whether the machine reaches them or not."""
     columns = []
     for name in names:
-        low, high = ranges[name]
+        low, high = within[name]
         if name == "theta":
             # the area of a cap grows with 1 - cos(theta)
             columns.append(np.arccos(rng.uniform(np.cos(high), np.cos(max(low, 0.0)), n)))

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A planning problem made ready: candidates, the rows an instrument would give there, what is known, what is wanted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from loopcal.calibrate.outlook import information
+from loopcal.calibrate.plan.candidates import Candidates, candidates, listed_candidates
+from loopcal.calibrate.plan.constraints import Constraints
+from loopcal.calibrate.plan.criteria import Criterion, D, I
+from loopcal.calibrate.plan.design import Directions, Start, design_factor, directions
+from loopcal.calibrate.plan.information import Predicted, UnitRows, knowable, predicted, start_of, unit_rows, units_of
+from loopcal.calibrate.scaling import Unknowns, unknowns
+from loopcal.errors import DataError, EstimationError
+from loopcal.linalg import Decomposition, FloatArray
+from loopcal.measure import Instrument, Measurements, check_actuators
+from loopcal.mechanism import Mechanism
+
+PREDICTED = 200
+"""Poses of the workspace at most whose errors are predicted."""
+
+Target = Literal["pose", "position", "orientation"]
+
+
+@dataclass(frozen=True, eq=False)
+class Accuracy:
+    """Predicted errors of the tool, root mean square over the workspace.
+
+    Attributes
+    ----------
+    position [m], orientation [rad].
+    """
+
+    position: float
+    orientation: float
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Everything that a choice of poses is made from.
+
+    Attributes
+    ----------
+    free : the robot's unknowns. instrument : mounted on its tool. candidates : poses that may be measured.
+    units : their rows. start : what is known before. seen : what all candidates together could tell, without tolerances.
+    wanted : what is to be predicted. equations : rows that were measured already.
+    """
+
+    free: Unknowns
+    instrument: Instrument
+    candidates: Candidates
+    units: UnitRows
+    start: Start
+    seen: Decomposition
+    wanted: Predicted
+    equations: int
+
+    @cached_property
+    def space(self) -> Directions:
+        """The directions in which designs are compared."""
+        return directions(self.units.rows, self.start)
+
+    @property
+    def poses_in_unit(self) -> int:
+        """Number of poses that are measured together."""
+        return self.units.members.shape[1]
+
+    def criterion(self, name: str, target: Target = "pose") -> Criterion:
+        """Return D, or I for what is to be predicted; raises EstimationError for another name."""
+        if name == "D":
+            return D()
+        if name != "I":
+            raise EstimationError(
+                f"the criterion is {name!r}; allowed are I (mean predicted variance of poses) and D (volume of uncertainty)"
+            )
+        return I(getattr(self.wanted, target), len(self.wanted.shifts))
+
+    def accuracy(self, chosen: np.ndarray) -> Accuracy | None:
+        """Return the predicted errors after measuring units (n,), none at all allowed; None where nothing bounds them."""
+        factor = design_factor(self.units.rows[chosen], self.start, self.space)
+        s = np.linalg.svd(factor, compute_uv=False)
+        if not s[-1] > np.finfo(float).eps * len(s) * s[0]:
+            return None
+        k = len(self.wanted.shifts)
+        found = [
+            float(np.sqrt((np.linalg.solve(factor.T, (L @ self.space.machine).T) ** 2).sum() / k))
+            for L in (self.wanted.position, self.wanted.orientation)
+        ]
+        return Accuracy(*found)
+
+    def require_equations(self, n: int) -> None:
+        """Refuse n units that give fewer equations than there are unknowns.
+
+        Raises
+        ------
+        EstimationError
+            With the number of poses that it takes.
+        """
+        r, k, p = self.units.rows.shape[1], self.poses_in_unit, len(self.free)
+        own = self.space.own.shape[1] - int(np.any(self.units.prior != 0.0, axis=1).sum())
+        needed = max(p, int(self.seen.rank[0]) + max(own, 0))
+        if n * r + self.equations < needed:
+            least = -(-(needed - self.equations) // r) * k
+            also = f" and {self.equations} were measured already" if self.equations else ""
+            raise EstimationError(
+                f"{n * k} poses give {n * r} equations{also}, but there are {needed} unknowns ({p} parameters of "
+                f"{self.free.robot.name}, the others of the instrument); plan at least {least} poses, or fix parameters in the "
+                "robot file"
+            )
+
+
+def problem(
+    robot: Mechanism,
+    instrument: Instrument,
+    constraints: Constraints | None = None,
+    poses: FloatArray | None = None,
+    measured: Measurements | None = None,
+    count: int = 1000,
+    seed: int = 1,
+) -> Problem:
+    """Make a planning problem ready.
+
+    Parameters
+    ----------
+    robot : at the values that are believed now; its free parameters and tolerances.
+    instrument : what will measure, with its noise. constraints : what poses must keep to.
+    poses : (n, c) controlled coordinates that are allowed [m, rad]; default: about `count` drawn from the workspace.
+    measured : measurements that were made already; the instrument is taken to be set up anew after them.
+
+    Raises
+    ------
+    EstimationError
+        The robot has no free parameter. MechanismError, DataError: see `candidates`, `units_of`.
+    """
+    free = unknowns(robot)
+    if not len(free):
+        raise EstimationError(f"there is nothing to plan for: {robot.name} has no free parameter; free one in its file")
+    if any(sensor.rows is not None for sensor in instrument.sensors):
+        raise DataError("an instrument for planning looks at every pose; leave out the rows of its sensors")
+    if any(set(np.unique(label)) != {""} for s in instrument.sensors for label in (s.session, s.group)):
+        raise DataError("an instrument for planning is set up once; leave out sessions and groups of its sensors")
+    rng = np.random.default_rng(seed)
+    found = candidates(robot, constraints, count, rng) if poses is None else listed_candidates(robot, poses, constraints)
+    mounted = instrument.mounted(robot)
+    units = unit_rows(free, mounted, found.solution.q, units_of(len(found), mounted, rng))
+    known, equations = None, 0
+    if measured is not None:
+        check_actuators(measured, robot)
+        factor, reached = information(free, measured)
+        if not reached.all():
+            lost = measured.labels[int(np.flatnonzero(~reached)[0])]
+            raise DataError(
+                f"{robot.name} does not reach the measured pose {lost!r} with the readings given there; correct the readings, "
+                "or plan with the calibrated robot file"
+            )
+        known, equations = factor[0, :-1, :-1], measured.n_rows
+    seen = knowable(free, units, known)
+    some = np.flatnonzero(found.even)[:PREDICTED]
+    wanted = predicted(free, found.solution.take(some), seen)
+    return Problem(free, mounted, found, units, start_of(free, units, known), seen, wanted, equations)
