@@ -13,6 +13,7 @@ import pytest
 
 from loopcal.cli import main
 from tests.cli.delta_printers import every_record, heights_only, stored, write_files
+from tests.io.formats.printers import printer_cfg
 
 # The heights-only records of the folder; a test below holds this list against it.
 CALIBRATED = (
@@ -22,6 +23,7 @@ CALIBRATED = (
 )
 FACTORY_DEFAULT = "danorder/Flsun-super-racer-Full-klipper-config- V400 FIXES.txt"
 WITH_DISTANCES = "RazorCopter/Klipper_FLSUN_Q5 printer [Post-Calibration].cfg"
+TOLERANCES = "tolerances: {radius: {sd: 0.5}, angles: {sd: 0.3}, arms: {sd: 0.3}, stops: {sd: 0.5}}\n"
 CALIBRATE = "calibrate robot.yaml heights.csv -o run"
 
 
@@ -102,3 +104,60 @@ def test_a_geometry_from_heights_and_distances_is_not_the_best_for_heights_alone
     assert result["fit"]["rank"] == 6
     assert result["start"]["verdict"] == "open"
     assert "the robot file's geometry: its residuals are 1.64 times those of the fit" in out
+
+
+@pytest.fixture
+def imported(tmp_path, monkeypatch, capsys, data_folder):
+    """Write a record as printer.cfg, import it, and return what was printed."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(name: str) -> str:
+        (tmp_path / "printer.cfg").write_text(printer_cfg(every_record(data_folder)[name]), "utf-8")
+        assert main("import printer.cfg -o printer.yaml --data probes.csv --force".split()) == 0
+        return capsys.readouterr().out
+
+    return run
+
+
+def test_import_says_where_a_stored_geometry_is_not_the_optimum_of_the_firmwares_own_cost(imported) -> None:
+    """Two arms of this record were stored otherwise than its heights and distances ask for."""
+    assert (
+        "note: the stored geometry is NOT the optimum of the firmware's own cost: 0.6477 mm^2, where 0.6160 mm^2 can be had "
+        "(arm1.length 217.6266 -> 217.4260, arm3.length 215.7964 -> 215.6702); it was changed since, or never fitted"
+    ) in imported(WITH_DISTANCES)
+
+
+def test_import_says_the_same_of_a_factory_default_and_not_of_printers_that_were_calibrated(imported) -> None:
+    out = imported(FACTORY_DEFAULT)
+    assert "NOT the optimum of the firmware's own cost: 0.1179 mm^2, where 0.0019 mm^2 can be had (radius 161.7500 ->" in out
+    for name in CALIBRATED:
+        assert "the stored geometry is the optimum of the firmware's own cost" in imported(name), name
+
+
+@pytest.mark.parametrize("name", [*CALIBRATED, FACTORY_DEFAULT, WITH_DISTANCES])
+def test_nine_parameters_from_heights_alone_are_flagged_with_the_combination_and_the_remedy(
+    imported, capsys, tmp_path, data_folder, name
+) -> None:
+    imported(name)
+    text = (tmp_path / "printer.yaml").read_text()
+    (tmp_path / "nine.yaml").write_text("".join(s for s in text.splitlines(keepends=True) if not s.startswith("fixed")))
+    write_files(every_record(data_folder)[name], tmp_path)
+    assert main(["identifiability", "nine.yaml", "heights.csv"]) == 0
+    out = capsys.readouterr().out
+    assert "7 of 9 parameter combinations can be identified from 7 equations" in out
+    remedy = "distances between two poses (ball bar; callipers on a printed part)"
+    assert out.count("change nothing that was measured") == 2
+    assert out.count(f"measuring {remedy} as well would determine them") == 2
+    # calibrate refuses by default, and says the same
+    assert main(["calibrate", "nine.yaml", "heights.csv", "-o", "run"]) == 1
+    error = capsys.readouterr().err
+    assert "7 equations cannot determine 9 parameters" in error
+    assert error.count("change nothing that was measured") == 2
+    assert f"add {remedy}" in error
+    # where stated tolerances fill the gap, the note is printed and kept in the run
+    (tmp_path / "nine.yaml").write_text((tmp_path / "nine.yaml").read_text() + TOLERANCES)
+    assert main(["calibrate", "nine.yaml", "heights.csv", "-o", "run", "--method", "map"]) in (0, 2)
+    assert f"measuring {remedy} as well would determine them" in capsys.readouterr().out
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["fit"]["rank"] == 7
+    assert [cure["cures"][0]["words"] for cure in result["remedies"]] == [remedy, remedy]
