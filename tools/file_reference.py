@@ -11,8 +11,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from loopcal.io import reference
-from loopcal.io.measurement_file import SETTINGS
 from loopcal.io.run_folder import MADE_BY
+from loopcal.io.sensor_rows import SETTINGS
 from loopcal.io.sensor_settings import SYMBOLS, kind_settings
 from loopcal.measure import KINDS, Column, Kind
 from loopcal.mechanism import FAMILIES

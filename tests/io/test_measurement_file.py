@@ -110,9 +110,13 @@ def test_a_template_lacks_only_the_rows(tmp_path, robot, poses, kind) -> None:
     with pytest.raises(LoopcalError, match="a header but no rows"):
         load_measurements(path, robot)
     save_measurements(measured_by(robot, poses, kind), tmp_path / "full.csv", robot)
-    full = (tmp_path / "full.csv").read_text()
-    assert full.startswith(path.read_text())
-    assert full.count("\n") == path.read_text().count("\n") + 6 + (5 if kind.links > 1 else 0)
+    full, template = (tmp_path / "full.csv").read_text(), path.read_text()
+    head = template[: template.index("\n# Below come the rows") + 1]
+    assert full.startswith(head)
+    assert "session, group" in template[len(head) :]
+    assert full.count("\n") == head.count("\n") + 6 + (5 if kind.links > 1 else 0)
+    (tmp_path / "filled.csv").write_text(template + full[len(head) :])
+    assert_same(load_measurements(tmp_path / "full.csv", robot), load_measurements(tmp_path / "filled.csv", robot))
 
 
 HEADER = "pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm],z [mm]"

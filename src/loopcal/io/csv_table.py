@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from loopcal.errors import FileError, UnitError, nearest
+from loopcal.io.numbers import exact
 from loopcal.io.text_file import read_text
 from loopcal.io.yaml_file import YamlFile, parse_yaml, read_yaml
 from loopcal.units import Dimension, unit
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 WHAT = "measurement file"
-SIDECAR_KEYS = ("kind", "kinds", "noise", "controller", "instrument")
+SIDECAR_KEYS = ("kind", "kinds", "noise", "controller", "instrument", "reading_noise", "poses")
 """What tells a settings file from another YAML file of the same name."""
 
 _SETTING = re.compile(r"^#\s*[A-Za-z]\w*:(\s|$)")
@@ -93,10 +94,15 @@ class Table:
         FileError
             Unit missing or of another dimension, a cell that is not a finite number, an empty cell.
         """
+        return self.scaled(name, dimension, self.text(name), empty)
+
+    def scaled(self, name: str, dimension: Dimension, cells: Sequence[str], empty: bool = True) -> np.ndarray:
+        """Return cells (n,) of a column, or what stands for them, in SI; see `numbers`."""
         import numpy as np
 
         factor = self.factor(name, dimension)
-        return np.array([self.number(name, i, cell, empty) for i, cell in enumerate(self.text(name))]) * factor
+        known = [self.number(name, i, cell, empty) for i, cell in enumerate(cells)]
+        return np.array([exact(c, factor) if v == v else v for v, c in zip(known, cells, strict=True)])  # noqa: PLR0124
 
     def factor(self, name: str, dimension: Dimension) -> float:
         """Return SI per unit of a column; see `numbers`."""
@@ -116,6 +122,10 @@ class Table:
     def row_error(self, row: int, sentence: str) -> FileError:
         """Return an error at the line of a row."""
         return FileError(sentence, self.path, self.lines[row])
+
+    def place(self, row: int) -> str:
+        """Return where a row is, for the message about another one: `data.csv:12`."""
+        return f"{self.path}:{self.lines[row]}"
 
     def number(self, name: str, row: int, cell: str, empty: bool) -> float:
         """Return one cell as a number, NaN for an empty one."""

@@ -33,6 +33,8 @@ DIRECTIONS = ("along", "axis", "normal", "up")
 POSE_KEYS = {**dict.fromkeys(("x", "y", "z"), Dimension.LENGTH), **dict.fromkeys(("roll", "pitch", "yaw"), Dimension.ANGLE)}
 NOISE_SYMBOLS = {Dimension.LENGTH: ("um", 1e-6), Dimension.ANGLE: ("urad", 1e-6), Dimension.RATIO: ("1", 1.0)}
 SYMBOLS = {Dimension.LENGTH: ("mm", 1e-3), Dimension.ANGLE: ("deg", math.pi / 180.0), Dimension.RATIO: ("1", 1.0)}
+SI = {"mm": "m", "um": "m", "deg": "rad", "urad": "rad", "1": "1"}
+"""What the units of a length, an angle and a ratio are multiples of."""
 
 
 def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Kind:
@@ -163,7 +165,7 @@ def _setting_text(key: str, value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(_setting_text(key, item) for item in value)}]"
     if isinstance(value, float):
-        return repr(value) if key in DIRECTIONS else _text(value, SYMBOLS[Dimension.LENGTH])
+        return repr(value) if key in DIRECTIONS else quantity_text(value, SYMBOLS[Dimension.LENGTH])
     return _setting_text(key, list(value) if isinstance(value, tuple) else value.tolist())
 
 
@@ -186,7 +188,9 @@ def _pose_text(T: np.ndarray) -> str:
     from loopcal import se3
 
     numbers = (*T[:3, 3], *se3.matrix_to_euler(T[:3, :3], "xyz"))
-    texts = [f"{key}: {_text(float(v) + 0.0, SYMBOLS[POSE_KEYS[key]])}" for key, v in zip(POSE_KEYS, numbers, strict=True)]
+    texts = [
+        f"{key}: {quantity_text(float(v) + 0.0, SYMBOLS[POSE_KEYS[key]])}" for key, v in zip(POSE_KEYS, numbers, strict=True)
+    ]
     return f"{{{', '.join(texts)}}}"
 
 
@@ -198,10 +202,11 @@ def _quantity(file: YamlFile, node: Any, dimension: Dimension, location: Locatio
         raise file.error(f"{words(location)!r}: {error}", location) from None
 
 
-def _text(value: float, shown: tuple[str, float]) -> str:
-    """Return a number with its unit (symbol, factor)."""
+def quantity_text(value: float, shown: tuple[str, float]) -> str:
+    """Return a number with its unit (symbol, factor), or in SI where only that reads back as the same double."""
     symbol, factor = shown
-    return f"{shortest(value, factor)} {symbol}"
+    text = shortest(value, factor)
+    return f"{text} {symbol}" if float(text) * factor == value else f"{value!r} {SI[symbol]}"
 
 
 def _noise_text(sigma: float, dimension: Dimension) -> str:
