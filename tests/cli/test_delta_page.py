@@ -50,3 +50,29 @@ def test_the_truth_lies_in_the_intervals(page) -> None:
 def test_both_ways_to_judge_a_printer_work(page, capsys) -> None:
     assert main(["validate", "printer.yaml", "heights.csv", "--limit-position", "0.1mm"]) == 2
     assert "quality gate not met" in capsys.readouterr().err
+
+
+def test_what_a_list_of_points_would_tell_is_what_the_page_says(page, capsys) -> None:
+    command = re.search(r"^loopcal (identifiability .*)$", page, re.MULTILINE)
+    assert command
+    assert main(command[1].split()) == 0
+    left = _left(capsys.readouterr().out)
+    assert {name: value for name, value in left.items() if "tower" in name} == {
+        "tower1.angle": 0.26, "tower2.angle": 0.26, "tower1.stop": 0.05, "tower2.stop": 0.05, "tower3.stop": 0.05,
+    }  # fmt: skip
+
+
+def test_thirteen_heights_leave_the_arms_where_they_were(page, tmp_path, capsys) -> None:
+    lines = (tmp_path / "printer.yaml").read_text().splitlines(keepends=True)
+    (tmp_path / "nine.yaml").write_text("".join(line for line in lines if not line.startswith("fixed")))
+    assert main(["identifiability", "nine.yaml", "heights.csv"]) == 0
+    out = capsys.readouterr().out
+    assert "9 of 9 parameter combinations" in out
+    assert "all three arms stay at 0.92 to 0.94 of their tolerance" in " ".join(page.split())
+    assert {value for name, value in _left(out).items() if "arm" in name} == {0.92, 0.94}
+
+
+def _left(out: str) -> dict[str, float]:
+    """The last column of the table of parameters."""
+    rows = re.findall(r"^(\S+)\s+yes\s+(\d\.\d\d)$", out, re.MULTILINE)
+    return {name: float(value) for name, value in rows}

@@ -24,6 +24,7 @@ CALIBRATED = (
 FACTORY_DEFAULT = "danorder/Flsun-super-racer-Full-klipper-config- V400 FIXES.txt"
 WITH_DISTANCES = "RazorCopter/Klipper_FLSUN_Q5 printer [Post-Calibration].cfg"
 TOLERANCES = "tolerances: {radius: {sd: 0.5}, angles: {sd: 0.3}, arms: {sd: 0.3}, stops: {sd: 0.5}}\n"
+IMPORT = "import printer.cfg -o printer.yaml --data probes.csv --force"
 CALIBRATE = "calibrate robot.yaml heights.csv -o run"
 
 
@@ -111,9 +112,9 @@ def imported(tmp_path, monkeypatch, capsys, data_folder):
     """Write a record as printer.cfg, import it, and return what was printed."""
     monkeypatch.chdir(tmp_path)
 
-    def run(name: str) -> str:
+    def run(name: str, options: str = "") -> str:
         (tmp_path / "printer.cfg").write_text(printer_cfg(every_record(data_folder)[name]), "utf-8")
-        assert main("import printer.cfg -o printer.yaml --data probes.csv --force".split()) == 0
+        assert main(f"{IMPORT}{options}".split()) == 0
         return capsys.readouterr().out
 
     return run
@@ -125,6 +126,20 @@ def test_import_says_where_a_stored_geometry_is_not_the_optimum_of_the_firmwares
         "note: the stored geometry is NOT the optimum of the firmware's own cost: 0.6477 mm^2, where 0.6160 mm^2 can be had "
         "(arm1.length 217.6266 -> 217.4260, arm3.length 215.7964 -> 215.6702); it was changed since, or never fitted"
     ) in imported(WITH_DISTANCES)
+
+
+def test_the_page_quotes_what_is_printed_of_the_real_printer(imported, capsys, root) -> None:
+    page = (root / "docs" / "delta-printers.md").read_text("utf-8")
+    quoted = page.split("holds these lines against the program -->\n```text\n")[1].split("```")[0]
+    assert quoted in imported(WITH_DISTANCES, " --sigma-height 0.05mm --sigma-distance 0.3mm")
+    assert main("calibrate printer.yaml probes.csv -o run --method ls".split()) == 0
+    out = capsys.readouterr().out
+    assert "chi-square 12.909 with 10 degrees of freedom" in out
+    assert "as good as the fit within the noise" in out
+    result = json.loads(Path("run/result.json").read_text())
+    half = {row["name"]: row["plus_minus"] for row in result["fit"]["parameters"]}  # [mm, deg]
+    assert all(2.05 < half[f"arm{k}.length"] < 2.45 for k in (1, 2, 3))
+    assert half["radius"] == pytest.approx(0.53, abs=0.005)
 
 
 def test_import_says_the_same_of_a_factory_default_and_not_of_printers_that_were_calibrated(imported) -> None:
