@@ -132,7 +132,7 @@ def test_the_page_quotes_what_is_printed_of_the_real_printer(imported, capsys, r
     page = (root / "docs" / "delta-printers.md").read_text("utf-8")
     quoted = page.split("holds these lines against the program -->\n```text\n")[1].split("```")[0]
     assert quoted in imported(WITH_DISTANCES, " --sigma-height 0.05mm --sigma-distance 0.3mm")
-    assert main("calibrate printer.yaml probes.csv -o run --method ls".split()) == 0
+    assert main(["calibrate", "printer.yaml", "probes.csv", "-o", "run", "--method", "ls"]) == 0
     out = capsys.readouterr().out
     assert "chi-square 12.909 with 10 degrees of freedom" in out
     assert "as good as the fit within the noise" in out
