@@ -1,15 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """What measurements must satisfy beside their robot: refused with the evidence, unless the caller overrides it."""
 
+from collections.abc import Iterator
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from loopcal.errors import DataError
 from loopcal.measure.measurements import Measurements
+from loopcal.measure.observations import Observations
 from loopcal.mechanism import Mechanism
 from loopcal.units import unit
 
 Array = NDArray[np.float64]
+
+STILL, PLANNED = 10.0, 100.0
+"""Standard deviations of the noise within which readings stay that never move, and beyond which a target is moved."""
 
 
 def check_actuators(measurements: Measurements, robot: Mechanism) -> None:
@@ -121,26 +128,51 @@ def check_moved(measurements: Measurements, T: Array, *, allow: bool = False, ov
     """
     if allow:
         return
+    for still in _stays(measurements):
+        rows, kind = still.rows, still.rows.kind
+        expected = kind.measure(T[None, rows.rows], np.zeros((1, len(rows), len(kind.noise_columns))))[0]
+        planned = np.ptp(expected[still.here][:, still.places], axis=0)
+        if np.any(planned > PLANNED * still.noise):
+            worst = int(np.argmax(planned / still.noise))
+            raise DataError(
+                f"{still.target!r} of kind {kind.name!r} never moves: its readings stay within {still.moved[worst]:.3g}, but"
+                f" the robot moves it by {planned[worst]:.3g} (m or rad); check that it sits on the platform and that the"
+                " column is its own" + _or_use(override)
+            )
+
+
+def stays(measurements: Measurements) -> bool:
+    """Whether any target's readings stay within the noise, so that `check_moved` has something to look at."""
+    return any(True for _ in _stays(measurements))
+
+
+class _Still(NamedTuple):
+    """A target whose readings stay within the noise: its rows (here), columns, range of each (k,) and noise (k,) [SI]."""
+
+    rows: Observations
+    target: str
+    here: NDArray[np.bool_]
+    places: list[int]
+    moved: Array
+    noise: Array
+
+
+def _stays(measurements: Measurements) -> Iterator[_Still]:
     for rows in measurements.observations:
         kind = rows.kind
-        if not kind.follows or kind.links > 1 or len(rows) < 3:
+        if not kind.follows or kind.links > 1 or kind.looks_at or len(rows) < 3:
             continue
-        m = len(kind.noise_columns)
-        expected = kind.measure(T[None, rows.rows], np.zeros((1, len(rows), m)))[0]
-        noise = float(np.sqrt(np.einsum("rii->ri", rows.covariance).max()))
+        sigma = np.sqrt(np.einsum("rii->ri", rows.covariance)).max(axis=0)
+        each = sigma if len(sigma) == len(kind.columns) else np.full(len(kind.columns), sigma.max())
         for session in np.unique(rows.session):
-            for target, places in kind.sights.items():
-                seen = rows.measured[:, places]
-                here = (rows.session == session) & ~np.any(np.isnan(seen), axis=1)
+            for target, columns in kind.sights.items():
+                places = list(columns)
+                here = (rows.session == session) & ~np.any(np.isnan(rows.measured[:, places]), axis=1)
                 if np.count_nonzero(here) < 3:
                     continue
-                moved, planned = (float(np.ptp(a[here], axis=0).max()) for a in (seen, expected[:, places]))
-                if planned > 100.0 * noise and moved < 10.0 * noise:
-                    raise DataError(
-                        f"{target!r} of kind {kind.name!r} never moves: its readings stay within {moved:.3g}, but the robot"
-                        f" moves it by {planned:.3g} (m or rad); check that it sits on the platform and that the column is"
-                        " its own" + _or_use(override)
-                    )
+                moved = np.ptp(rows.measured[here][:, places], axis=0)
+                if np.all(moved < STILL * each[places]):
+                    yield _Still(rows, target, here, places, moved, each[places])
 
 
 def _or_use(override: str) -> str:

@@ -44,6 +44,19 @@ def forward_trials(robot: Mechanism, values: Array, q: Array, start: State | Non
     return _followed(robot, e, joints, begin, state, wrong)
 
 
+def plainly_reached(robot: Mechanism, values: Array, q: Array) -> NDArray[np.bool_]:
+    """Which readings q (t | 1, n, a) Newton solves from home at once, on home's side of every singularity, (t, n).
+
+    What `forward_trials` would have to follow is not reached plainly; to find that out takes a fraction of following it.
+    """
+    e, tau = robot.slots(values)
+    with np.errstate(invalid="ignore"):
+        joints = joint_values(q, tau, robot.slots.frequency)
+    begin = _signed(robot, robot.home_state)
+    state = _signed(robot, engine.solve(robot.program, e, joints, begin))
+    return (state.status == Status.CONVERGED) & ~_astray(robot, state, begin)
+
+
 def inverse_trials(robot: Mechanism, values: Array, target: Array, start: State | None = None) -> State:
     """States at controlled coordinates (t | 1, n, c), every actuator free; `readings_at` gives their readings."""
     if shared_drives(robot.program):
