@@ -20,9 +20,6 @@ from loopcal.linalg import RANK_TOLERANCE, FloatArray, IntArray
 OWN_TOLERANCE = 1e-10
 """Share of the largest singular value (columns of length one) below which a direction of the own unknowns is none."""
 
-SINGULAR = 1e-7
-"""A design does not determine a direction of which it knows less than this share (in sd) of what the mean design knows."""
-
 
 @dataclass(frozen=True, eq=False)
 class Start:
@@ -148,29 +145,32 @@ def design_factor(rows: FloatArray, start: Start, space: Directions) -> FloatArr
     return R[o:, o:]
 
 
-def require_enough(n: int, rows: FloatArray, start: Start, space: Directions) -> None:
+def require_enough(n: int, rows: FloatArray, start: Start, space: Directions, repeats: bool = True) -> None:
     """Refuse a number of units that cannot determine all directions.
 
     Raises
     ------
     EstimationError
-        Nothing is allowed, nothing can be known, or n units have fewer rows than there are unknowns left open.
+        Nothing is allowed, nothing can be known, n units have fewer rows than there are unknowns left open, or fewer
+        units are allowed than asked for, none being repeated.
     """
     count = int(allowed(rows).sum())
-    if count == 0 or len(space) == 0:
+    if count == 0:
+        raise EstimationError(f"none of the {len(rows)} candidates is allowed; relax a constraint or widen the workspace")
+    if len(space) == 0:
+        raise EstimationError("the candidates' rows depend on no parameter that is free; choose another kind of measurement")
+    if n > count and not repeats:
         raise EstimationError(
-            f"none of the {len(rows)} candidates can be used; relax a constraint or widen the workspace"
-            if count == 0
-            else "the candidates' rows depend on no parameter of the robot; choose another kind of measurement"
+            f"{n} poses were asked for and {count} candidates are allowed; make more candidates or ask for fewer"
         )
     known = 0
-    if len(start.rows):
+    if start.rows.any():
         s = np.linalg.svd(space.reduce(start.rows), compute_uv=False)
-        known = int((s > RANK_TOLERANCE * s[0]).sum()) if s[0] > 0.0 else 0
+        known = int((s > RANK_TOLERANCE * s[0]).sum())
     r = rows.shape[1]
-    needed = -(-(space.unknowns - known) // r)
-    if n < max(needed, 1):
+    needed = max(-(-(space.unknowns - known) // r), 1)
+    if n < needed:
         raise EstimationError(
             f"{n} poses were asked for, which give {n * r} equations for {space.unknowns - known} unknowns;"
-            f" ask for at least {max(needed, 1)} or state tolerances as prior knowledge"
+            f" ask for at least {needed} or state tolerances as prior knowledge"
         )

@@ -1,17 +1,49 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fedorov exchange: from a set of candidates, swap one chosen against one not chosen while the criterion improves."""
+"""Fedorov exchange: from a set of candidates, swap one chosen against one not chosen while the criterion improves.
+
+Unit after unit of the design, in random order, is exchanged for the candidate that gains most (the order of exchanges of
+Cook and Nachtsheim), all candidates being tried at once by the formulas of `swaps`. The factor is made anew after every
+exchange, and an exchange counts only if the score so made has grown. The end is a design that no single swap improves.
+Sources and derivation: docs/theory/planning.md.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
-from loopcal.calibrate.plan.criteria import Criterion, D, evaluate
-from loopcal.calibrate.plan.design import Design, Start, allowed, design_factor, directions, require_enough
-from loopcal.linalg import FloatArray
+from loopcal.calibrate.plan.criteria import Criterion
+from loopcal.calibrate.plan.design import Design, Start, allowed, directions, require_enough
+from loopcal.calibrate.plan.relaxation import Relaxed
+from loopcal.calibrate.plan.scoring import Scoring, determines, make_scoring
+from loopcal.calibrate.plan.swaps import see, swaps
+from loopcal.errors import EstimationError
+from loopcal.linalg import FloatArray, IntArray
+
+GAIN = 1e-7
+"""An exchange must multiply the efficiency by more than 1 + this."""
+
+RIDGE = 1e-3
+"""Standard-deviation share of the mean design that is lent to a start that leaves directions open."""
+
+
+TOO_FEW = (
+    "no {n} of the {allowed} allowed candidates were found that determine all {unknowns} unknowns;"
+    " ask for more poses or state tolerances as prior knowledge"
+)
 
 
 def fedorov_exchange(
-    rows: FloatArray, n: int, criterion: Criterion, start: Start, seed: int = 0, starts: int = 20, repeats: bool = False
+    rows: FloatArray,
+    n: int,
+    criterion: Criterion,
+    start: Start,
+    seed: int = 0,
+    starts: int = 20,
+    repeats: bool = False,
+    relaxed: Relaxed | None = None,
+    first: Iterable[IntArray] = (),
 ) -> Design:
     """Choose n of N units.
 
@@ -19,39 +51,95 @@ def fedorov_exchange(
     ----------
     rows : (N, r, o + p) whitened and tolerance-scaled; NaN where a unit is not allowed.
     n : units to choose. criterion : D, I or A. start : what is known before.
-    seed : of the random starts. starts : their number. repeats : whether a unit may be chosen more than once.
+    seed : of the random starts; start i has always the same stream. starts : their number.
+    repeats : whether a unit may be chosen more than once.
+    relaxed : the relaxed design of the same scoring: its rounding is one more start, and random starts are drawn with its
+        weights instead of evenly.
+    first : more designs (n,) to start from.
 
     Returns
     -------
-    Design
+    Design; the best of all starts.
 
     Raises
     ------
     EstimationError
         n units cannot determine the unknowns, or fewer are allowed than asked for.
     """
-    space = directions(rows, start)
-    require_enough(n, rows, start, space)
-    sign = 1.0 if isinstance(criterion, D) else -1.0
+    space = directions(rows, start) if relaxed is None else relaxed.directions
+    require_enough(n, rows, start, space, repeats)
+    usable = np.flatnonzero(allowed(rows))
+    scoring = make_scoring(rows[usable], n / len(usable), criterion, start, space)
+    ready = scoring.ready(rows[usable])
+    weights = None if relaxed is None else relaxed.weights[usable]
+    begins = [] if weights is None else [rounded(weights, n, repeats)]
+    begins += [np.searchsorted(usable, np.asarray(chosen)) for chosen in first]
+    streams = np.random.default_rng(seed).spawn(len(begins) + starts)
+    found = []
+    for i, stream in enumerate(streams):
+        chosen = begins[i] if i < len(begins) else drawn(stream, len(usable), n, repeats, weights)
+        found.append(settle(scoring, ready, chosen, stream, repeats))
+    scores = [history[-1] for _, history in found]
+    chosen, history = found[int(np.argmax(scores))]
+    if not np.isfinite(history[-1]):
+        raise EstimationError(TOO_FEW.format(n=n, allowed=len(usable), unknowns=space.unknowns))
+    values = tuple(scoring.value(score) for score in history)
+    ends = tuple(scoring.value(score) for score in scores)
+    return Design(np.sort(usable[chosen]), values[-1], values, ends, space)
 
-    def gain(chosen: list[int]) -> float:
-        return sign * evaluate(criterion, design_factor(rows[chosen], start, space), space.machine)
 
-    usable, best, values = np.flatnonzero(allowed(rows)), None, []
-    for stream in np.random.default_rng(seed).spawn(starts):
-        chosen = stream.choice(usable, n, replace=repeats).tolist()
-        history, better = [gain(chosen)], True
-        while better:
-            better = False
-            for i in range(n):
-                tried = [k for k in usable.tolist() if repeats or k not in chosen]
-                found = [gain([*chosen[:i], k, *chosen[i + 1 :]]) for k in tried]
-                if found and max(found) > history[-1] + 1e-9:
-                    chosen[i], better = tried[int(np.argmax(found))], True
-                    history.append(max(found))
-        values.append(sign * history[-1])
-        if best is None or history[-1] > best[1][-1]:
-            best = (chosen, history)
-    assert best is not None
-    history = tuple(sign * value for value in best[1])
-    return Design(np.sort(np.array(best[0], dtype=np.int64)), history[-1], history, tuple(values), space)
+def settle(
+    scoring: Scoring, ready: FloatArray, chosen: IntArray, stream: np.random.Generator, repeats: bool
+) -> tuple[IntArray, list[float]]:
+    """Exchange from one start, with a ridge first where the start leaves directions open."""
+    if not determines(scoring.factor(ready[chosen])):
+        chosen, _ = exchange(scoring.lent(RIDGE), ready, chosen, stream, repeats)
+        if not determines(scoring.factor(ready[chosen])):
+            return chosen, [-np.inf]
+    return exchange(scoring, ready, chosen, stream, repeats)
+
+
+def exchange(
+    scoring: Scoring, ready: FloatArray, chosen: IntArray, stream: np.random.Generator, repeats: bool
+) -> tuple[IntArray, list[float]]:
+    """Exchange units chosen (n,) of ready ones (N, r, Q), nonsingular, until none has a better one.
+
+    Returns
+    -------
+    chosen : (n,). history : scores at the beginning and after each exchange.
+    """
+    chosen, n = chosen.copy(), len(chosen)
+    R = scoring.factor(ready[chosen])
+    history, seen, idle = [scoring.score(R)], see(scoring, R, ready), 0
+    while idle < n:
+        for j in stream.permutation(n):
+            out = chosen[j]
+            gain = swaps(seen, seen.Y[out], None if seen.V is None else seen.V[out])
+            if not repeats:
+                gain[chosen] = -np.inf
+            idle += 1
+            if gain.max() > GAIN * scoring.height:
+                tried = chosen.copy()
+                tried[j] = int(np.argmax(gain))
+                R = scoring.factor(ready[tried])
+                score = scoring.score(R)
+                if score > history[-1]:
+                    chosen, seen, idle = tried, see(scoring, R, ready), 0
+                    history.append(score)
+            if idle >= n:
+                break
+    return chosen, history
+
+
+def drawn(stream: np.random.Generator, N: int, n: int, repeats: bool, weights: FloatArray | None) -> IntArray:
+    """Draw n of N units, evenly or by weights (with a little for every unit, so that n can be drawn)."""
+    share = None if weights is None else (weights + 1e-3 * n / N) / (weights + 1e-3 * n / N).sum()
+    return stream.choice(N, n, replace=repeats, p=share)
+
+
+def rounded(weights: FloatArray, n: int, repeats: bool) -> IntArray:
+    """Round weights (N,) of sum n to n units: whole parts first, then the largest remainders."""
+    whole = np.floor(weights).astype(np.int64) if repeats else np.zeros(len(weights), dtype=np.int64)
+    order = np.argsort(whole - weights, kind="stable")
+    whole[order[: n - int(whole.sum())]] += 1
+    return np.repeat(np.arange(len(weights)), whole)
