@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +41,7 @@ GREW = 1.1
 @json_option
 def calibrate(
     robot: str,
-    data: Path,
+    data: tuple[Path, ...],
     output: Path,
     hold_out: float,
     fitting: Fitting,
@@ -57,6 +57,8 @@ def calibrate(
 ) -> int:
     """Identify the free parameters of ROBOT from DATA and write a run folder with the corrected robot file.
 
+    DATA may be several files, joined by the names of poses: of several instruments, or readings and measured values apart.
+
     The exit code is 2 where a quality gate is not met, the iteration did not converge, the residual does not fit the
     stated noise, or errors on unseen poses grew; the run folder is written all the same.
 
@@ -65,6 +67,7 @@ def calibrate(
       loopcal calibrate hexapod-42 measurements.csv -o run --hold-out 0.25
       loopcal calibrate robot.yaml data.csv -o run --hold-out 0.25 --limit-position 0.02mm --limit-angle 0.01deg
       loopcal calibrate printer.yaml heights.csv -o run --noise estimated
+      loopcal calibrate robot.yaml poses.csv tracker.csv inclinometer.csv -o run
       loopcal calibrate robot.yaml data.csv -o run --loss huber --drop 17
       loopcal calibrate hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
     """  # noqa: D301
@@ -101,12 +104,13 @@ def calibrate(
     return show.gates(reasons)
 
 
-def _inputs(robot: str, data: Path, prior: Path | None) -> dict[str, Path]:
+def _inputs(robot: str, data: Sequence[Path], prior: Path | None) -> dict[str, Path]:
     """Return the files that are read."""
+    from loopcal.io.measurement_file import measurement_paths
     from loopcal.io.robot_file import robot_path
     from loopcal.io.run_folder import RESULT
 
-    return {"robot": robot_path(robot), "data": data, **({} if prior is None else {"prior": prior / RESULT})}
+    return {"robot": robot_path(robot), **measurement_paths(data), **({} if prior is None else {"prior": prior / RESULT})}
 
 
 def _refuse_contradictions(hold_out: float, gates: bool, prior: Path | None, free_limb: str | None) -> None:

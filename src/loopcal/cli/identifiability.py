@@ -36,7 +36,7 @@ FRAMES = {"base": ("frame",), "tool": ("tool", "targets")}
 
 @click.command(short_help="Tell which parameters measurements can determine.")
 @robot_argument
-@click.argument("data", metavar="[DATA]", type=FILE, required=False)
+@click.argument("data", metavar="[DATA]...", type=FILE, nargs=-1)
 @click.option("--poses", type=FILE, help="In place of DATA: CSV file of poses that could be measured.")
 @draw_option
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of drawn poses.")
@@ -50,7 +50,7 @@ FRAMES = {"base": ("frame",), "tool": ("tool", "targets")}
 @json_option
 def identifiability(
     robot: str,
-    data: Path | None,
+    data: tuple[Path, ...],
     poses: Path | None,
     draw: int,
     seed: int,
@@ -70,6 +70,7 @@ def identifiability(
     \b
     Examples:
       loopcal identifiability hexapod-42 measurements.csv
+      loopcal identifiability hexapod-42 poses.csv tracker.csv inclinometer.csv
       loopcal identifiability 3-prs --measure x,y,z,phi,theta
       loopcal identifiability hexapod-42 --frames base,tool --reduce -o reduced.yaml
       loopcal identifiability hexapod-42 --poses poses.csv --kind component --components x,y,z --sigma-position 5um
@@ -84,9 +85,9 @@ def identifiability(
     from loopcal.measure import simulate
 
     _refuse(data, poses, seen_by, reduced, output)
-    refuse_outputs((output,), (robot_path(robot), data, poses), force)
+    refuse_outputs((output,), (robot_path(robot), *data, poses), force)
     machine, drawn = load_robot(robot), ""
-    if data is not None:
+    if data:
         allowed = {"allow_outside_stroke": allow_outside_stroke, "allow_duplicates": allow_duplicates}
         measured = measurements(data, machine, **allowed)
     else:
@@ -110,11 +111,11 @@ def identifiability(
         show.say(f"\n{output}: the robot with these parameters fixed")
 
 
-def _refuse(data: Path | None, poses: Path | None, seen_by: Mapping[str, Any], reduced: bool, output: Path | None) -> None:
+def _refuse(data: Sequence[Path], poses: Path | None, seen_by: Mapping[str, Any], reduced: bool, output: Path | None) -> None:
     """Refuse options that contradict each other."""
-    if data is not None and poses is not None:
+    if data and poses is not None:
         raise DataError("there are both DATA and --poses; give measurements, or poses that could be measured, but not both")
-    if data is not None and (seen_by["measure"] or seen_by["frames"]):
+    if data and (seen_by["measure"] or seen_by["frames"]):
         raise DataError("DATA states what is measured and what is unknown; leave out --measure and --frames, or DATA")
     if output is not None and not reduced:
         raise DataError("-o writes what --reduce finds; add --reduce, or leave out -o")
@@ -141,9 +142,9 @@ def _instrument(
     made = instrument(kind, components, orientation, sigma_position, sigma_angle)
     if frames is None:
         return made
-    (sensor,) = made.sensors
-    kinds: Any = sensor.kind
-    return Instrument((replace(sensor, kind=replace(kinds, unknown=_unknown(frames, kinds))),))
+    kinds: list[Any] = [sensor.kind for sensor in made.sensors]
+    unknown = [replace(one, unknown=_unknown(frames, one)) for one in kinds]
+    return Instrument(tuple(replace(sensor, kind=one) for sensor, one in zip(made.sensors, unknown, strict=True)))
 
 
 def _unknown(frames: str, kind: object) -> tuple[str, ...]:

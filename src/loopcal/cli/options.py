@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 FILE = click.Path(path_type=Path)
 
 robot_argument = click.argument("robot", metavar="ROBOT")
-data_argument = click.argument("data", metavar="DATA", type=FILE)
+data_argument = click.argument("data", metavar="DATA...", type=FILE, nargs=-1, required=True)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 
 
@@ -65,8 +65,8 @@ def data_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
-def measurements(path: Path, robot: Mechanism, **allowed: bool) -> Measurements:
-    """Read a measurement file, with a note on standard error where it says that it is of another robot.
+def measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) -> Measurements:
+    """Read measurement files as one set, with a note on standard error where one says that it is of another robot.
 
     Raises
     ------
@@ -76,10 +76,11 @@ def measurements(path: Path, robot: Mechanism, **allowed: bool) -> Measurements:
     from loopcal.io import load_measurements
     from loopcal.io.csv_table import stated_robot
 
-    found = load_measurements(path, robot, **allowed)
-    stated = stated_robot(path)
-    if stated is not None and stated != robot.name:
-        click.echo(f"loopcal: note: {path} is said to be of robot {stated!r}, but {robot.name!r} is used", err=True)
+    found = load_measurements(paths, robot, **allowed)
+    for path in paths:
+        stated = stated_robot(path)
+        if stated is not None and stated != robot.name:
+            click.echo(f"loopcal: note: {path} is said to be of robot {stated!r}, but {robot.name!r} is used", err=True)
     return found
 
 
@@ -115,7 +116,7 @@ def instrument_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--orientation", help=f"How angles are written: {forms}"),
         click.option("--components", help="For the kind component: which coordinates, such as z or x,y,z."),
         click.option("--kind", default="pose", show_default=True,
-                     help="Kind of measurement: pose, component, position, bearing, ..."),
+                     help="Kind of measurement: pose, component, position, bearing, ...; or several, as position,inclination."),
     ):  # fmt: skip
         command = option(command)
     return command
@@ -136,13 +137,19 @@ def instrument(
     from loopcal.io.sensor_settings import kind_settings
     from loopcal.measure import KINDS, Gaussian, Instrument, Sensor
 
-    if kind not in KINDS:
-        raise DataError(f"{kind!r} is not a kind of measurement{nearest(kind, KINDS)}; known are {', '.join(KINDS)}")
+    kinds, made = kind.split(","), []
     stated = {"components": components and tuple(components.split(",")), "orientation": orientation}
     settings = {name: value for name, value in stated.items() if value}
-    for name in settings:
-        if name not in kind_settings(KINDS[kind]):
-            raise DataError(f"--{name} does not belong to the kind {kind!r}; leave it out, or choose another kind")
-    made = KINDS[kind](**settings)
     sigma = {Dimension.LENGTH: sigma_position, Dimension.ANGLE: sigma_angle}
-    return Instrument((Sensor(made, Gaussian(np.array([sigma[c.dimension] for c in made.noise_columns]))),))
+    for i, one in enumerate(kinds):
+        if one not in KINDS:
+            raise DataError(f"{one!r} is not a kind of measurement{nearest(one, KINDS)}; known are {', '.join(KINDS)}")
+        if one in kinds[:i]:
+            raise DataError(f"the kind {one!r} is named twice; name it once, and write the other into the file by hand")
+        known = kind_settings(KINDS[one])
+        looking = KINDS[one](**{name: value for name, value in settings.items() if name in known})
+        made.append(Sensor(looking, Gaussian(np.array([sigma[c.dimension] for c in looking.noise_columns]))))
+    for name in settings:
+        if not any(name in kind_settings(KINDS[one]) for one in kinds):
+            raise DataError(f"--{name} does not belong to the kind {kind!r}; leave it out, or choose another kind")
+    return Instrument(tuple(made))

@@ -20,7 +20,7 @@ from loopcal.cli.options import FILE, data_argument, data_options, gate_options,
 @json_option
 def validate(
     run: Path,
-    data: Path,
+    data: tuple[Path, ...],
     limit_position: float | None,
     limit_angle: float | None,
     allow_outside_stroke: bool,
@@ -28,7 +28,7 @@ def validate(
     allow_fitted_data: bool,
     as_json: bool,
 ) -> int:
-    """Compare the robot of RUN, a folder made by `loopcal calibrate` or a robot file, with DATA.
+    """Compare the robot of RUN, a folder made by `loopcal calibrate` or a robot file, with DATA, one file or several.
 
     Errors are those before and after calibration; of a robot file without identified values, its own alone.
 

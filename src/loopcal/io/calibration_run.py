@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import DataError
+from loopcal.io.measurement_file import Paths, measurement_paths
 from loopcal.io.robot_file import load_robot, robot_text, shipped_robots
-from loopcal.io.run_folder import read_run_folder, write_run_folder
-from loopcal.io.text_file import sha256
+from loopcal.io.run_folder import fitted_before, read_run_folder, write_run_folder
 
 if TYPE_CHECKING:
     from loopcal.calibrate import Identification, Validation
@@ -102,17 +102,17 @@ def load_calibrated(path: str | Path) -> CalibratedRun:
     return CalibratedRun(path, {}, robot, robot.nominal)
 
 
-def refuse_fitted_data(run: CalibratedRun, data: str | Path) -> None:
-    """Refuse to validate a run with the file that it was made from.
+def refuse_fitted_data(run: CalibratedRun, data: Paths) -> None:
+    """Refuse to validate a run with a file of measured values that it was made from.
 
     Raises
     ------
     DataError
         The file is the same to the last byte.
     """
-    used = run.result.get("made_by", {}).get("inputs", {}).get("data", {}).get("sha256")
-    if used == sha256(data):
+    again = fitted_before(run.result, measurement_paths(data))
+    if again is not None:
         raise DataError(
-            f"{data}: this run was fitted to these very measurements, which prove nothing about unseen poses; "
+            f"{again}: this run was fitted to these very measurements, which prove nothing about unseen poses; "
             "give others, or use --allow-fitted-data"
         )

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING
 from loopcal.errors import DataError, nearest
 from loopcal.io.calibration_run import load_calibrated
 from loopcal.io.csv_table import read_table, require_columns
+from loopcal.io.measurement_file import Paths, measurement_paths
 from loopcal.io.numbers import shortest
 from loopcal.io.pose_rows import COMMANDED, dimension_of
 from loopcal.io.robot_file import load_robot
-from loopcal.io.run_folder import read_run_folder
-from loopcal.io.text_file import sha256
+from loopcal.io.run_folder import fitted_before, read_run_folder
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit, unit
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def load_posterior(path: str | Path) -> Posterior:
     return posterior_from_arrays(load_robot(run.robot_path), run.arrays)
 
 
-def load_prior(path: str | Path, data: str | Path) -> Posterior:
+def load_prior(path: str | Path, data: Paths) -> Posterior:
     """Read what an earlier run knows, as a prior for new measurements.
 
     Raises
@@ -60,10 +60,10 @@ def load_prior(path: str | Path, data: str | Path) -> Posterior:
     DataError
         The run was fitted to these very measurements, which would count twice.
     """
-    used = read_run_folder(path).result.get("made_by", {}).get("inputs", {}).get("data", {}).get("sha256")
-    if used == sha256(data):
+    again = fitted_before(read_run_folder(path).result, measurement_paths(data))
+    if again is not None:
         raise DataError(
-            f"{data}: the earlier run was fitted to these very measurements, which would count twice; give new ones"
+            f"{again}: the earlier run was fitted to these very measurements, which would count twice; give new ones"
         )
     return load_posterior(path)
 

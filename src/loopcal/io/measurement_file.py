@@ -91,15 +91,23 @@ def load_measurements(
     return data
 
 
-def measurement_paths(path: Paths) -> tuple[Path, ...]:
-    """Return all the files that `load_measurements` reads: those given, and the files of poses that they name.
+def measurement_paths(path: Paths) -> dict[str, Path]:
+    """Return role -> file of all that `load_measurements` reads, those included that files name as `poses`.
+
+    Files with measured values are called `data`, `data-2` and so on, files that only say where poses are `poses`.
 
     Raises
     ------
     FileError
         One of them cannot be read, or is given twice.
     """
-    return tuple(table.path for table in _tables(path))
+    tables = _tables(path)
+    found: dict[str, Path] = {}
+    for table in tables:
+        role = "data" if len(tables) == 1 or measures(table) else "poses"
+        count = sum(name.partition("-")[0] == role for name in found)
+        found[role if count == 0 else f"{role}-{count + 1}"] = table.path
+    return found
 
 
 def load_poses(path: str | Path, robot: Mechanism) -> np.ndarray:

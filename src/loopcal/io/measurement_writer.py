@@ -61,7 +61,8 @@ def save_measurements(data: Measurements, path: str | Path, robot: Mechanism, re
 
 def measurements_text(data: Measurements, robot: Mechanism, remark: str = "") -> str:
     """Return the text of a measurement file; see `save_measurements`."""
-    parts = [_Part(str(i + 1), rows, robot) for i, rows in enumerate(data.observations)]
+    names = _kind_labels([rows.kind for rows in data.observations])
+    parts = [_Part(name, rows, robot) for name, rows in zip(names, data.observations, strict=True)]
     _refuse_names(data)
     readings = _Readings(data, robot)
     told = {int(pose[0]) for part in parts if part.rows.kind.links == 1 for pose, _ in part.cells()}
@@ -137,10 +138,17 @@ def to_fill_in_text(robot: Mechanism, instrument: Instrument, readings: ArrayLik
 
 def _stated(instrument: Instrument) -> list[tuple[str, Kind, dict[str, float]]]:
     """Return label, kind and noise of each sensor."""
+    names = _kind_labels([sensor.kind for sensor in instrument.sensors])
     return [
-        (str(i + 1), s.kind, dict(zip((c.name for c in s.kind.noise_columns), s.noise.sigma.tolist(), strict=True)))
-        for i, s in enumerate(instrument.sensors)
+        (name, s.kind, dict(zip((c.name for c in s.kind.noise_columns), s.noise.sigma.tolist(), strict=True)))
+        for name, s in zip(names, instrument.sensors, strict=True)
     ]
+
+
+def _kind_labels(kinds: Sequence[Kind]) -> list[str]:
+    """Return what a file calls its kinds: by name, with a number where there are several of that name."""
+    names = [kind.name for kind in kinds]
+    return [name if names.count(name) == 1 else f"{name}-{names[: i + 1].count(name)}" for i, name in enumerate(names)]
 
 
 def _template_columns(

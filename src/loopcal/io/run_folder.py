@@ -87,6 +87,20 @@ def made_by(command: Sequence[str], inputs: Mapping[str, Path], seeds: Mapping[s
     return {"command": list(command), "versions": versions, "seeds": dict(seeds), "inputs": files}
 
 
+def fitted_before(result: Mapping[str, Any], inputs: Mapping[str, Path]) -> Path | None:
+    """Return the first file of measured values, by its role in `inputs`, that a run was made from; None where none is.
+
+    Raises
+    ------
+    FileError
+        A file cannot be read.
+    """
+    made = result.get("made_by", {}).get("inputs", {})
+    used = {file.get("sha256") for role, file in made.items() if role.partition("-")[0] == "data"}
+    given = (path for role, path in inputs.items() if role.partition("-")[0] == "data")
+    return next((path for path in given if sha256(path) in used), None)
+
+
 def refuse_used_folder(path: str | Path, force: bool) -> None:
     """Raise where a run folder would replace something; called before the work as well as after it.
 
