@@ -8,7 +8,8 @@
       tracker.z: {start: 1.2 m, fixed: true}  kept at this value
 
 Names are those of results (`loopcal identifiability` and `loopcal calibrate` show them) or patterns of them, and mean
-unknowns of this file; of several lines that mean one unknown the last one counts.
+unknowns of this file; without the session before it a name means the unknown of every session. Of several lines that mean
+one unknown the last one counts.
 """
 
 from __future__ import annotations
@@ -87,6 +88,7 @@ def _meant(file: YamlFile, entries: Sequence[Parameter], pattern: str) -> list[P
     if pattern in names:
         return [entries[names.index(pattern)]]
     meant = [entry for entry in entries if fnmatchcase(entry.name, pattern)]
+    meant = meant or [entry for entry in entries if fnmatchcase(entry.name, f"*.{pattern}")]
     if not meant:
         shown = ", ".join(names[:12]) or "none; say which are, as 'unknown: [frame]' of the kind"
         hint = nearest(pattern, names)

@@ -2,12 +2,14 @@
 """What measurements must satisfy beside their robot: refused with the evidence, unless the caller overrides it."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from dataclasses import fields
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from loopcal.errors import DataError
+from loopcal.measure.kinds import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism import Mechanism
@@ -90,12 +92,15 @@ def check_duplicates(measurements: Measurements, *, allow: bool = False, overrid
     """
     if allow:
         return
-    for rows in measurements.observations:
-        poses = rows.rows.reshape(len(rows), -1)
-        owners = [np.unique(texts, return_inverse=True)[1].reshape(-1, 1) for texts in (rows.session, rows.group)]
-        content = np.concatenate([measurements.readings[poses].reshape(len(rows), -1), rows.measured, *owners], axis=1)
+    for alike in _alike(measurements.observations):
+        rows = alike[0]
+        poses = np.concatenate([part.rows.reshape(len(part), -1) for part in alike])
+        texts = [np.concatenate([getattr(part, name) for part in alike]) for name in ("session", "group")]
+        owners = [np.unique(text, return_inverse=True)[1].reshape(-1, 1) for text in texts]
+        measured = np.concatenate([part.measured for part in alike])
+        content = np.concatenate([measurements.readings[poses].reshape(len(poses), -1), measured, *owners], axis=1)
         _, first, kinds = np.unique(np.nan_to_num(content, nan=1e300), axis=0, return_index=True, return_inverse=True)
-        again = np.flatnonzero(first[kinds.ravel()] != np.arange(len(rows)))
+        again = np.flatnonzero(first[kinds.ravel()] != np.arange(len(poses)))
         if len(again):
             second = int(again[0])
             names = [measurements.labels[poses[i, 0]] for i in (int(first[kinds.ravel()[second]]), second)]
@@ -103,6 +108,24 @@ def check_duplicates(measurements: Measurements, *, allow: bool = False, overrid
                 f"poses {names[0]!r} and {names[1]!r} have the same readings and the same {rows.kind.name} values to"
                 " the last digit; remove one of them" + _or_use(override)
             )
+
+
+def _alike(observations: tuple[Observations, ...]) -> list[list[Observations]]:
+    """Observations in groups of equal kinds and settings, as two files of one instrument give them."""
+    found: list[list[Observations]] = []
+    for rows in observations:
+        there = next((group for group in found if _same(group[0].kind, rows.kind)), None)
+        if there is None:
+            found.append([rows])
+        else:
+            there.append(rows)
+    return found
+
+
+def _same(one: Kind, other: Kind) -> bool:
+    """Whether two kinds are of one class and all their settings are equal."""
+    settings = [field.name for field in fields(cast(Any, one)) if field.init]
+    return type(one) is type(other) and all(np.array_equal(getattr(one, s), getattr(other, s)) for s in settings)
 
 
 def check_moved(measurements: Measurements, T: Array, *, allow: bool = False, override: str = "") -> None:
