@@ -16,7 +16,7 @@ import numpy as np
 
 from loopcal.calibrate.plan.criteria import Criterion
 from loopcal.calibrate.plan.design import Design, Start, allowed
-from loopcal.calibrate.plan.fedorov import TOO_FEW, drawn, exchange, rounded, settle
+from loopcal.calibrate.plan.fedorov import TOO_FEW, drawn, exchange, grown, rounded, settle
 from loopcal.calibrate.plan.relaxation import Relaxed, relaxed_design
 from loopcal.calibrate.plan.scoring import Scoring, determines, make_scoring
 from loopcal.errors import EstimationError
@@ -74,7 +74,7 @@ def certified_design(
     scoring = make_scoring(rows[usable], n / len(usable), criterion, start, space)
     ready, random = scoring.ready(rows[usable]), np.random.default_rng(seed)
     weights, slopes = relaxed.weights[usable], relaxed.slopes[usable]
-    begins = [rounded(weights, n, repeats), *(np.searchsorted(usable, chosen) for chosen in first)]
+    begins = [rounded(weights, n, repeats), *(grown(scoring, ready, np.searchsorted(usable, c), n, repeats) for c in first)]
     chosen, history = max((settle(scoring, ready, begin, random, repeats) for begin in begins), key=lambda found: found[1][-1])
     if not np.isfinite(history[-1]):
         raise EstimationError(TOO_FEW.format(n=n, allowed=len(usable), unknowns=space.unknowns))

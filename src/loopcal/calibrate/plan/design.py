@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A design problem in its own coordinates: what is known before, which directions can be known, rows made ready.
+"""What every design is made of: what is known before, and which directions can be known at all.
 
 Rows [F | A] have the unknowns of the instruments (F, to be eliminated) before those of the machine (A). Directions of
 the machine that no candidate can tell from the instruments' unknowns are left out once, by a stated tolerance, for all
-designs alike. What is left is divided by the triangular factor of the mean design, so that every criterion is counted
-against it and no digits are lost by scaling. See docs/theory/planning.md.
+designs alike. See docs/theory/planning.md.
 """
 
 from __future__ import annotations
@@ -78,6 +77,15 @@ class Directions:
     def unknowns(self) -> int:
         """Own and machine directions together."""
         return self.own.shape[1] + self.machine.shape[1]
+
+    def outside(self, weights: FloatArray) -> float:
+        """Return the share, 0 to 1, of rows (k, p) in the machine's unknowns that lies in directions nothing can tell.
+
+        It is what I leaves out of its prediction: root of the sum of squares of that part over that of all.
+        """
+        whole = float((weights**2).sum())
+        inside = float(((weights @ self.machine) ** 2).sum())
+        return float(np.sqrt(max(whole - inside, 0.0) / whole)) if whole > 0.0 else 0.0
 
     def reduce(self, rows: FloatArray) -> FloatArray:
         """Return rows (..., o + p) in these directions, (..., o' + q), own ones first."""
@@ -163,14 +171,23 @@ def require_enough(n: int, rows: FloatArray, start: Start, space: Directions, re
         raise EstimationError(
             f"{n} poses were asked for and {count} candidates are allowed; make more candidates or ask for fewer"
         )
-    known = 0
-    if start.rows.any():
-        s = np.linalg.svd(space.reduce(start.rows), compute_uv=False)
-        known = int((s > RANK_TOLERANCE * s[0]).sum())
-    r = rows.shape[1]
-    needed = max(-(-(space.unknowns - known) // r), 1)
+    needed = fewest(rows.shape[1], start, space)
     if n < needed:
+        open_ = space.unknowns - _known(start, space)
         raise EstimationError(
-            f"{n} poses were asked for, which give {n * r} equations for {space.unknowns - known} unknowns;"
+            f"{n} poses were asked for, which give {n * rows.shape[1]} equations for {open_} unknowns;"
             f" ask for at least {needed} or state tolerances as prior knowledge"
         )
+
+
+def fewest(equations: int, start: Start, space: Directions) -> int:
+    """Return the least number of units, of so many equations each, that can determine what the start leaves open."""
+    return max(-(-(space.unknowns - _known(start, space)) // equations), 1)
+
+
+def _known(start: Start, space: Directions) -> int:
+    """Number of directions, own and machine together, that the start knows."""
+    if not start.rows.any():
+        return 0
+    s = np.linalg.svd(space.reduce(start.rows), compute_uv=False)
+    return int((s > RANK_TOLERANCE * s[0]).sum())

@@ -17,7 +17,7 @@ from loopcal.calibrate.plan.criteria import Criterion
 from loopcal.calibrate.plan.design import Design, Start, allowed, directions, require_enough
 from loopcal.calibrate.plan.relaxation import Relaxed
 from loopcal.calibrate.plan.scoring import Scoring, determines, make_scoring
-from loopcal.calibrate.plan.swaps import see, swaps
+from loopcal.calibrate.plan.swaps import additions, see, swaps
 from loopcal.errors import EstimationError
 from loopcal.linalg import FloatArray, IntArray
 
@@ -55,7 +55,7 @@ def fedorov_exchange(
     repeats : whether a unit may be chosen more than once.
     relaxed : the relaxed design of the same scoring: its rounding is one more start, and random starts are drawn with its
         weights instead of evenly.
-    first : more designs (n,) to start from.
+    first : more designs to start from; where one has fewer than n units, those are added that gain most.
 
     Returns
     -------
@@ -73,7 +73,7 @@ def fedorov_exchange(
     ready = scoring.ready(rows[usable])
     weights = None if relaxed is None else relaxed.weights[usable]
     begins = [] if weights is None else [rounded(weights, n, repeats)]
-    begins += [np.searchsorted(usable, np.asarray(chosen)) for chosen in first]
+    begins += [grown(scoring, ready, np.searchsorted(usable, chosen), n, repeats) for chosen in first]
     streams = np.random.default_rng(seed).spawn(len(begins) + starts)
     found = []
     for i, stream in enumerate(streams):
@@ -129,6 +129,17 @@ def exchange(
             if idle >= n:
                 break
     return chosen, history
+
+
+def grown(scoring: Scoring, ready: FloatArray, chosen: IntArray, n: int, repeats: bool) -> IntArray:
+    """Return a design (n,) made of chosen units, at most n, and those whose additions gain most, one after another."""
+    lent = scoring if determines(scoring.factor(ready[chosen])) else scoring.lent(RIDGE)
+    while len(chosen) < n:
+        gain = additions(see(lent, lent.factor(ready[chosen]), ready))
+        if not repeats:
+            gain[chosen] = -np.inf
+        chosen = np.append(chosen, np.argmax(gain))
+    return chosen
 
 
 def drawn(stream: np.random.Generator, N: int, n: int, repeats: bool, weights: FloatArray | None) -> IntArray:
