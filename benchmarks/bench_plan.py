@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Planning: coordinate exchange of 100 poses against evaluating their rows once, and a certified choice of 20 of 1000.
+
+The reference of coordinate exchange is the rows of all 100 poses, once at each of the five levels of each of the six
+coordinates: what one sweep asks of the mechanism.
+"""
+
+from functools import cache
+
+import numpy as np
+
+from benchmarks.harness import Metric, measure_ratio, time_in_turns
+from loopcal.calibrate.outlook import scene
+from loopcal.calibrate.plan.certified import certified_design
+from loopcal.calibrate.plan.coordinate import coordinate_exchange
+from loopcal.calibrate.plan.criteria import D
+from loopcal.calibrate.plan.design import Start
+from loopcal.calibrate.scaling import unknowns
+from loopcal.io import load_robot
+from loopcal.mechanism import inverse
+from loopcal.mechanism.workspace import sample
+
+SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)
+"""Of a full pose: rotation [rad] and position [m]."""
+
+POSES, SHARES = 100, (-1.0, -0.5, 0.0, 0.5, 1.0)
+
+
+@cache
+def _hexapod():
+    """The shipped hexapod's unknowns, and the half ranges of its drawn positions about their means."""
+    free = unknowns(load_robot("hexapod-42"))
+    drawn = sample(free.robot, 1000, 0)
+    return free, drawn, drawn.coordinates.mean(axis=0), 0.5 * np.ptp(drawn.coordinates, axis=0)
+
+
+def _rows(coordinates: np.ndarray) -> np.ndarray:
+    """Whitened rows (b, 6, p) at controlled coordinates (b, 6); NaN where out of reach."""
+    free = _hexapod()[0]
+    found = inverse(free.robot, coordinates)
+    rows = scene(free, np.where(found.converged[:, None], found.q, 0.0)).twists[0] / SIGMA[:, None]
+    return np.where(found.converged[:, None, None], rows, np.nan)
+
+
+def bench_coordinate_exchange() -> Metric:
+    """Time the improvement of 100 random poses of the hexapod, D-criterion, against one evaluation of all their rows."""
+    free, drawn, middle, half = _hexapod()
+    levels = [m + h * np.array(SHARES) for m, h in zip(middle, half, strict=True)]
+    begin = drawn.coordinates[:POSES]
+    start = Start.nothing(len(free))
+
+    def once() -> None:
+        for c, values in enumerate(levels):
+            moved = np.repeat(begin[:, None], len(values), axis=1)
+            moved[:, :, c] = values
+            _rows(moved.reshape(-1, moved.shape[2]))
+
+    return measure_ratio(
+        "plan.coordinate_exchange",
+        lambda: coordinate_exchange(lambda _, x: _rows(x), begin, levels, D(), start),
+        once,
+        repeats=3,
+        tolerance=0.5,
+        limit=40.0,
+    )
+
+
+def bench_certified_design() -> Metric:
+    """Time the choice of 20 of 1000 full poses of the hexapod, with its certificate."""
+    free, drawn, _, _ = _hexapod()
+    rows = scene(free, drawn.solution.q).twists[0] / SIGMA[:, None]
+    (times,) = time_in_turns(lambda: certified_design(rows, 20, D(), Start.nothing(len(free))), repeats=3)
+    return Metric("plan.certified_design", min(times), "s", "lower", 1.0, 10.0, "best of 3")
