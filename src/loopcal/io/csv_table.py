@@ -185,6 +185,11 @@ def require_columns(table: Table, needed: Sequence[str], why: str) -> None:
             raise table.header_error(f"there is no column {name!r}{hint}, which {why}; add it with its unit")
 
 
+def quoted(text: str) -> str:
+    """Return text as a cell, in quotes where it holds a comma, a quote or the mark of a remark."""
+    return '"' + text.replace('"', '""') + '"' if any(c in text for c in ',"#') else text
+
+
 def sidecar(path: Path) -> Path:
     """Return the name of the settings file beside a measurement file."""
     return path.with_suffix(".yaml")

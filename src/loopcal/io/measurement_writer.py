@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from loopcal.errors import DataError
 from loopcal.io.context_columns import context_header
+from loopcal.io.csv_table import quoted
 from loopcal.io.known_unknowns import known_text
 from loopcal.io.measurement_file import FORMAT
 from loopcal.io.numbers import exactly, shortest
@@ -80,7 +81,7 @@ def measurements_text(data: Measurements, robot: Mechanism, remark: str = "") ->
     rows = [((pose,), {}) for pose in untold]  # poses that no row of their own measures
     rows += [(seen, {"kind": part.label, **values}) for part in parts for seen, values in part.cells()]
     for seen, values in rows:
-        cells = {"pose": _quoted(LINK.join(data.labels[pose] for pose in seen)), **values}
+        cells = {"pose": quoted(LINK.join(data.labels[pose] for pose in seen)), **values}
         if len(seen) == 1:
             cells |= {"block": str(int(data.block[seen[0]])), **readings.cells(seen[0])}
         lines.append(",".join(cells.get(name, "") for name in columns))
@@ -262,7 +263,7 @@ class _Part:
                 continue
             values = zip(self.names, kind.columns, self.rows.measured[i], strict=True)
             cells = {name: _cell(value, column.dimension) for name, column, value in values}
-            cells |= {"session": _quoted(str(self.rows.session[i])), "group": _quoted(str(self.rows.group[i]))}
+            cells |= {"session": quoted(str(self.rows.session[i])), "group": quoted(str(self.rows.group[i]))}
             cells |= {name: _plain(v[i]) for name, v in self.rows.context.items()}
             for k in self.own:
                 cells[SIGMA + self.noise[k]] = _cell(self.sigma[i, k], noise[k].dimension)
@@ -306,8 +307,3 @@ def _cell(value: np.floating, dimension: Dimension) -> str:
 def _plain(value: np.floating) -> str:
     """Return a number as it is; nothing for what was not noted."""
     return "" if math.isnan(float(value)) else exactly(float(value), 1.0)
-
-
-def _quoted(text: str) -> str:
-    """Return text as a CSV cell."""
-    return '"' + text.replace('"', '""') + '"' if any(c in text for c in ',"#') else text

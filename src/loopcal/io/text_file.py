@@ -29,15 +29,7 @@ def read_text(path: str | Path, what: str) -> str:
     FileError
         No such file, a folder, no permission, not UTF-8, or nothing in it.
     """
-    path = Path(path)
-    if path.is_dir():
-        raise FileError(f"this is a folder where a {what} is needed; name the file inside it", path)
-    try:
-        raw = path.read_bytes()
-    except FileNotFoundError:
-        raise FileError(f"there is no such {what}; check the name and the folder", path) from None
-    except OSError as error:
-        raise FileError(f"this {what} cannot be read ({_reason(error)}); check its permissions", path) from error
+    path, raw = Path(path), read_raw(path, what)
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -50,6 +42,25 @@ def read_text(path: str | Path, what: str) -> str:
     if not text.strip():
         raise FileError(f"this {what} is empty; see the examples that come with loopcal for what it should hold", path)
     return text
+
+
+def read_raw(path: str | Path, what: str) -> bytes:
+    """Return the bytes of a file; `what` it should be is for messages.
+
+    Raises
+    ------
+    FileError
+        No such file, a folder, no permission.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise FileError(f"this is a folder where a {what} is needed; name the file inside it", path)
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise FileError(f"there is no such {what}; check the name and the folder", path) from None
+    except OSError as error:
+        raise FileError(f"this {what} cannot be read ({_reason(error)}); check its permissions", path) from error
 
 
 def sha256(path: str | Path) -> str:

@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""A profile: how the text that an instrument's software exports is to be read.
+
+delimiter: semicolon                    comma, semicolon, tab or spaces
+columns:
+  pose: {from: Name, match: 'P(?P<pose>\d+)_(?P<target>\w+)'}
+  x: {from: X, unit: mm}                by the name in the export's header, or its place counted from 1
+settings: {kind: position, ...}         what the measurement file will state
+"""
+
+from __future__ import annotations
+
+import codecs
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from loopcal.errors import UnitError, nearest
+from loopcal.io.context_columns import TEMPERATURE_UNITS, TIME, TIME_UNITS, is_context
+from loopcal.io.sensor_rows import COVARIANCE, SETTINGS, SIGMA
+from loopcal.io.sensor_settings import kind_settings, read_kind
+from loopcal.io.yaml_file import Location, YamlFile, read_yaml, refuse_unknown_keys
+from loopcal.units import symbols, unit
+
+if TYPE_CHECKING:
+    from loopcal.measure import Kind
+
+DELIMITERS: Mapping[str, str | None] = {"comma": ",", "semicolon": ";", "tab": "\t", "spaces": None}
+DECIMALS: Mapping[str, str] = {"point": ".", "comma": ","}
+KEYS: Mapping[str, str] = {
+    "format": "1",
+    "delimiter": "what stands between columns: comma, semicolon, tab, or spaces (any number of blanks and tabs)",
+    "decimal": "the decimal mark: point (if left out) or comma",
+    "comment": "what a line begins with that holds nothing",
+    "skip": "number of lines in front to pass over",
+    "ignore": "pattern of lines that are none of the measurement, such as totals",
+    "encoding": "of the text; utf-8 if left out, with or without byte order mark",
+    "missing": "cells that mean not measured, beside empty ones",
+    "columns": "our column -> where it comes from",
+    "readings": "actuator -> where its reading comes from, where the export holds it",
+    "matrix": "nine columns of a rotation matrix, row by row, in place of the columns of an orientation",
+    "settings": "settings of the measurement file, see docs/files.md; `poses` names the file in which the poses stand",
+}
+FROM: Mapping[str, str] = {
+    "from": "name in the export's header, or place counted from 1; a list of them is joined by blanks",
+    "unit": "unit of a number",
+    "match": "of pose: pattern that finds (?P<pose>..), and (?P<target>..) where each target has a line of its own",
+    "format": "of time: as Python's strptime has it, such as '%d.%m.%Y %H:%M:%S'",
+}
+TEXTS = ("pose", "block", "session", "group")
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where one of our columns comes from.
+
+    Parameters
+    ----------
+    places : tuple of str or int
+        Names in the export's header, or places counted from 1.
+    unit : str or None
+        Of a number; None for text.
+    match : Pattern or None
+        What finds the pose, and the target, in a name.
+    time : str or None
+        How a date and time is written.
+    """
+
+    places: tuple[str | int, ...]
+    unit: str | None = None
+    match: re.Pattern[str] | None = None
+    time: str | None = None
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A profile; its fields are the keys of KEYS.
+
+    `columns` has the readings, too; `matrix` is empty where the export has none. `kind` is what `settings` describe.
+    """
+
+    file: YamlFile
+    delimiter: str | None
+    decimal: str
+    comment: str | None
+    skip: int
+    ignore: re.Pattern[str] | None
+    encoding: str
+    missing: tuple[str, ...]
+    columns: Mapping[str, Source]
+    matrix: tuple[str | int, ...]
+    kind: Kind
+    settings: Mapping[str, Any]
+
+
+def read_profile(path: str | Path) -> Profile:
+    """Read a profile.
+
+    Raises
+    ------
+    FileError
+        A key that is missing, unknown or without sense, a column that is none of ours, a pattern that is none; at its line.
+    """
+    file = read_yaml(path, "profile of an export")
+    content = file.content
+    refuse_unknown_keys(file, list(content), list(KEYS))
+    for key in ("delimiter", "columns", "settings"):
+        if key not in content:
+            raise file.error(f"this profile does not say {key!r} ({KEYS[key]}); add it")
+    kind = _kind(file)
+    matrix = _matrix(file, kind)
+    decimal = DECIMALS[_choice(file, "decimal", list(DECIMALS), "point")]
+    delimiter = DELIMITERS[_choice(file, "delimiter", list(DELIMITERS), "comma")]
+    if delimiter == decimal:
+        raise file.error("a comma cannot be the decimal mark and stand between columns, too; correct one", ("decimal",))
+    return Profile(
+        file,
+        delimiter,
+        decimal,
+        _text(file, "comment"),
+        _count(file, "skip"),
+        _pattern(file, content["ignore"], ("ignore",)) if "ignore" in content else None,
+        _encoding(file),
+        _missing(file),
+        _columns(file, kind, bool(matrix)),
+        matrix,
+        kind,
+        content["settings"],
+    )
+
+
+def _kind(file: YamlFile) -> Kind:
+    """Return the kind that the settings describe."""
+    settings, place = file.content["settings"], ("settings",)
+    if not isinstance(settings, dict):
+        raise file.error("'settings' holds what the measurement file states: kind, noise, ..; correct it", place)
+    kind = read_kind(file, settings, place)
+    known = [key for key in SETTINGS if key != "kinds"]
+    refuse_unknown_keys(file, list(settings), [*known, *kind_settings(type(kind))], place)
+    return kind
+
+
+def _columns(file: YamlFile, kind: Kind, matrix: bool) -> dict[str, Source]:
+    """Return our columns, readings among them, with where they come from."""
+    targets = getattr(kind, "targets", ())
+    several = len(targets) > 1
+    own = list(dict.fromkeys(c.name.partition(".")[2] if several else c.name for c in kind.columns))
+    if matrix:
+        own = own[-3:]
+    allowed = [*TEXTS, "time", "temperature", *own]
+    columns: dict[str, Source] = {}
+    for part in ("columns", "readings"):
+        node = file.content.get(part, {})
+        if not isinstance(node, dict):
+            raise file.error(f"{part!r} must name columns, as {part}: {{x: {{from: X, unit: mm}}}}; correct it", (part,))
+        for name, said in node.items():
+            free = part == "readings" or is_context(name) or name.startswith((SIGMA, COVARIANCE, "note"))
+            if not free and name not in allowed:
+                hint = nearest(name, allowed) or f"; there are {', '.join(allowed)}"
+                raise file.error(f"{name!r} is no column of a measurement file of the kind {kind.name!r}{hint}", (part, name))
+            columns[name] = _source(file, name, said, (part, name))
+    for name in own:
+        if name not in columns:
+            raise file.error(
+                f"'columns' does not say where {name!r} comes from, which the kind {kind.name!r} needs", ("columns",)
+            )
+    match = columns["pose"].match if "pose" in columns else None
+    if several and (match is None or "target" not in match.groupindex):
+        raise file.error(
+            "the kind has several targets, each with a line of its own; say how 'match' of 'pose' finds (?P<target>..)",
+            ("columns", "pose"),
+        )
+    return columns
+
+
+def _source(file: YamlFile, name: str, node: Any, place: Location) -> Source:
+    """Return where a column comes from."""
+    if not isinstance(node, dict) or "from" not in node:
+        raise file.error(f"{name!r} needs 'from', a name or a place in the export, as {{from: X, unit: mm}}; correct it", place)
+    refuse_unknown_keys(file, list(node), list(FROM), place)
+    places = _places(file, node["from"], (*place, "from"))
+    text = name in TEXTS or name.startswith("note") or (name == TIME and "unit" not in node)
+    if text != ("unit" not in node):
+        raise file.error(
+            f"{name!r} {'is text and has no unit; remove it' if text else 'needs the unit of its numbers; add it'}", place
+        )
+    if len(places) > 1 and not text:
+        raise file.error(f"{name!r} is a number and comes from one column; name one", place)
+    if "unit" in node:
+        _check_unit(file, name, str(node["unit"]), (*place, "unit"))
+    for key, owner in (("match", "pose"), ("format", TIME)):
+        if key in node and (name != owner or not text):
+            raise file.error(f"{key!r} belongs to {owner!r}, not to {name!r}; remove it", (*place, key))
+    match = _pattern(file, node["match"], (*place, "match")) if "match" in node else None
+    if match is not None and "pose" not in match.groupindex:
+        raise file.error("this pattern finds no pose; put its part of the name in (?P<pose>..)", (*place, "match"))
+    return Source(
+        places, str(node["unit"]) if "unit" in node else None, match, str(node["format"]) if "format" in node else None
+    )
+
+
+def _check_unit(file: YamlFile, name: str, symbol: str, place: Location) -> None:
+    """Refuse a unit that no column can have."""
+    if is_context(name):
+        known = TIME_UNITS if name == TIME else TEMPERATURE_UNITS
+        if symbol not in known:
+            raise file.error(f"{symbol!r} is no unit of {name!r}; write one of {', '.join(known)}", place)
+        return
+    try:
+        for part in symbol.split("*"):
+            unit(part.strip())
+    except UnitError:
+        raise file.error(
+            f"{symbol!r} is no unit{nearest(symbol, symbols())}; write one of {', '.join(symbols())}", place
+        ) from None
+
+
+def _matrix(file: YamlFile, kind: Kind) -> tuple[str | int, ...]:
+    """Return the nine places of a rotation matrix, row by row."""
+    if "matrix" not in file.content:
+        return ()
+    places = _places(file, file.content["matrix"], ("matrix",))
+    if len(places) != 9 or getattr(kind, "orientation", None) != "quaternion" or kind.name != "pose":
+        sentence = "a matrix has nine columns, row by row, and becomes the quaternion of 'kind: pose, orientation: quaternion'"
+        raise file.error(f"{sentence}; correct it", ("matrix",))
+    return places
+
+
+def _places(file: YamlFile, node: Any, place: Location) -> tuple[str | int, ...]:
+    """Return names, or places counted from 1."""
+    given = node if isinstance(node, list) else [node]
+    for one in given:
+        if isinstance(one, bool) or not isinstance(one, (str, int)) or (isinstance(one, int) and one < 1) or one == "":
+            raise file.error(f"{one!r} is neither a name in the export's header nor a place counted from 1; correct it", place)
+    if not given:
+        raise file.error("this names no column; write a name in the export's header or a place counted from 1", place)
+    return tuple(given)
+
+
+def _choice(file: YamlFile, key: str, allowed: list[str], usual: str) -> str:
+    """Return one of a few words."""
+    value = file.content.get(key, usual)
+    if value not in allowed:
+        raise file.error(f"{key!r} is {value!r}; write one of {', '.join(allowed)}", (key,))
+    return value
+
+
+def _pattern(file: YamlFile, text: Any, place: Location) -> re.Pattern[str]:
+    """Return a regular expression."""
+    try:
+        return re.compile(str(text))
+    except re.error as error:
+        raise file.error(f"{text!r} is no regular expression ({error}); correct it", place) from None
+
+
+def _encoding(file: YamlFile) -> str:
+    """Return the name of an encoding; UTF-8 passes over a byte order mark."""
+    name = str(file.content.get("encoding", "utf-8"))
+    try:
+        found = codecs.lookup(name).name
+    except LookupError:
+        sentence = f"{name!r} is no encoding that is known; write utf-8, utf-16, latin-1 or cp1252"
+        raise file.error(sentence, ("encoding",)) from None
+    return "utf-8-sig" if found == "utf-8" else found
+
+
+def _text(file: YamlFile, key: str) -> str | None:
+    """Return text that is not empty, None where the key is not there."""
+    value = file.content.get(key)
+    if value is not None and (not isinstance(value, str) or not value):
+        raise file.error(f"{key!r} is {value!r} where text is needed; put it in quotes", (key,))
+    return value
+
+
+def _count(file: YamlFile, key: str) -> int:
+    """Return a number of lines."""
+    value = file.content.get(key, 0)
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise file.error(f"{key!r} is {value!r} where a number of lines is needed; write 0, 1, ..", (key,))
+    return value
+
+
+def _missing(file: YamlFile) -> tuple[str, ...]:
+    """Return the cells that mean not measured."""
+    value = file.content.get("missing", [])
+    return tuple(str(one) for one in (value if isinstance(value, list) else [value]))
