@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf")
 LENGTH = Quantity(Dimension.LENGTH)
+SHOWN = 20
+"""Lines that do not fit a profile that are shown."""
+
 ASKED = {
     "sigma_height": "--sigma-height",
     "sigma_distance": "--sigma-distance",
@@ -34,7 +37,14 @@ ASKED = {
 @click.command("import", short_help="Read a controller's file as a robot file.")
 @click.argument("file", metavar="FILE", type=FILE)
 @click.option("--format", "format_name", type=click.Choice(FORMATS), help="What FILE is; by the ending of its name.")
-@click.option("-o", "--output", required=True, type=FILE, help="The robot file to write; the robot is called after it.")
+@click.option("--profile", type=FILE, help="In place of --format: how FILE, an instrument's export, is to be read.")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=FILE,
+    help="The robot file to write, called after the robot; with --profile the measurement file.",
+)
 @click.option("--data", type=FILE, help="Also write the measurements that FILE holds.")
 @click.option("--corrected", type=FILE, help="Also calibrate with them, and write FILE with the corrected numbers.")
 @click.option("--sigma-height", type=LENGTH, metavar="QUANTITY", help="Noise of the probe (klipper); 0.02mm if left out.")
@@ -46,24 +56,30 @@ ASKED = {
 @click.option("--force", is_flag=True, help="Replace files that are there.")
 @json_option
 def import_(
-    file: Path, format_name: str | None, output: Path, data: Path | None, corrected: Path | None, force: bool, as_json: bool,
+    file: Path, format_name: str | None, profile: Path | None, output: Path, data: Path | None, corrected: Path | None,
+    force: bool, as_json: bool,
     **asked: Any,
 ) -> int:  # fmt: skip
     """Read FILE, which another program wrote, as a robot file and, where it holds any, measurements.
 
     With --corrected the exit code is 2 where the calibration did not converge.
 
+    With --profile FILE is text that an instrument exported, and becomes a measurement file; see docs/exports.md.
+
     \b
     Examples:
       loopcal import printer.cfg -o printer.yaml --data heights.csv
       loopcal import printer.cfg -o printer.yaml --data heights.csv --corrected corrected.cfg
       loopcal import config-override.g --format reprap -o printer.yaml
+      loopcal import export.txt --profile tracker.yaml -o measurements.csv
       loopcal import hexapod.hal --unit mm --home-z 200mm -o hexapod.yaml
       loopcal import five-bar.urdf --closures five-bar-loops.yaml -o five-bar.yaml
     """  # noqa: D301
     from loopcal.io.formats.transfer import format_of, save_imported
     from loopcal.io.outputs import refuse_outputs
 
+    if profile is not None:
+        return _export(file, profile, output, force, as_json)
     source = format_of(file, format_name)
     if source.read is None:
         raise DataError(f"loopcal writes the format {source.name}, but does not read it; known are {', '.join(FORMATS)}")
@@ -83,6 +99,32 @@ def import_(
     else:
         _print(robot, document, fit)
     return show.gates([] if fit is None or fit[0].converged else [f"not converged: {fit[0].status.sentence}"])
+
+
+def _export(file: Path, profile: Path, output: Path, force: bool, as_json: bool) -> int:
+    """Write the measurements of an export; say how many lines were read, passed over, and which do not fit."""
+    from loopcal.io.exports import convert, read_profile
+    from loopcal.io.outputs import refuse_outputs
+    from loopcal.io.text_file import write_text
+
+    given = click.get_current_context().get_parameter_source
+    for parameter in click.get_current_context().command.params:
+        own = parameter.name in {"file", "profile", "output", "force", "as_json"}
+        if not own and parameter.name and given(parameter.name) is click.core.ParameterSource.COMMANDLINE:
+            raise DataError(f"{parameter.opts[0]} does not go with --profile, which says how the file is read; leave it out")
+    refuse_outputs((output,), (file, profile), force)
+    found = convert(file, read_profile(profile))
+    write_text(output, found.text)
+    if as_json:
+        misfits = [{"line": line, "reason": reason} for line, reason in found.misfits]
+        show.json_document({"measurements": output, "rows": found.rows, "passed": found.passed, "misfits": misfits})
+        return 0
+    show.say(f"{output}: {found.rows} rows; {found.passed} lines passed over as the profile says")
+    for line, reason in found.misfits[:SHOWN]:
+        show.say(f"note: {file}:{line} does not fit: {reason}")
+    if len(found.misfits) > SHOWN:
+        show.say(f"note: {len(found.misfits) - SHOWN} more lines do not fit; {output} lists them")
+    return 0
 
 
 def _reading(source: Format, name: str, asked: dict[str, Any]) -> Reading:
