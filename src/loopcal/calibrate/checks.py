@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from loopcal.calibrate.filters import Method
-from loopcal.calibrate.rows import Rows
+from loopcal.calibrate.rows import AnyRows
 from loopcal.errors import EstimationError
 from loopcal.linalg import FloatArray
 from loopcal.measure import Measurements, check_actuators
@@ -28,14 +28,15 @@ def check_noise(noise: str) -> None:
         raise EstimationError(f"noise is {noise!r}; it must be 'given' or 'estimated'")
 
 
-def check_settings(method: object, rank_tolerance: float) -> None:
-    """Refuse a method that is a word or a class, and a rank tolerance outside (0, 1).
+def check_settings(method: object, rank_tolerance: float, noise: str) -> None:
+    """Refuse a method that is a word or a class, a rank tolerance outside (0, 1), and a noise that is neither word.
 
     Raises
     ------
     EstimationError
         Naming what is allowed.
     """
+    check_noise(noise)
     parts = ("needs", "flat", "scale", "penalty")
     if method is not None and (isinstance(method, type) or not all(hasattr(method, name) for name in parts)):
         raise EstimationError(
@@ -45,7 +46,7 @@ def check_settings(method: object, rank_tolerance: float) -> None:
         raise EstimationError(f"rank_tolerance is {rank_tolerance}; it must be above 0 and below 1")
 
 
-def check_rows(rows: Rows, data: Measurements, robot: Mechanism) -> None:
+def check_rows(rows: AnyRows, data: Measurements, robot: Mechanism) -> None:
     """Refuse readings of another robot, a robot without free parameters, and data without any row.
 
     Raises
@@ -62,7 +63,7 @@ def check_rows(rows: Rows, data: Measurements, robot: Mechanism) -> None:
         raise EstimationError("no measured value counts: every row is absent or has weight 0; give at least one")
 
 
-def check_count(rows: Rows, data: Measurements, method: Method, allow_fewer: bool) -> None:
+def check_count(rows: AnyRows, data: Measurements, method: Method, allow_fewer: bool) -> None:
     """Refuse fewer equations than parameters where the method has no prior to fill the gap.
 
     Raises
@@ -71,10 +72,10 @@ def check_count(rows: Rows, data: Measurements, method: Method, allow_fewer: boo
         Naming both numbers and the poses that would do.
     """
     own = 0 if rows.own is None else rows.own.unheld
-    m, p = int(rows.counted[0]), method.needs(rows.parameters) + own
+    m, p = int(rows.equations[0]), method.needs(rows.parameters) + own
     if m >= p or allow_fewer:
         return
-    poses = int(np.ceil(p * data.n_poses / m))
+    poses = int(np.ceil(p * data.n_poses / max(m, 1)))
     without = "" if p - own == rows.parameters else " without a tolerance"
     without += f" ({own} of them in frames, targets and the like)" if own else ""
     raise EstimationError(
@@ -83,7 +84,7 @@ def check_count(rows: Rows, data: Measurements, method: Method, allow_fewer: boo
     )
 
 
-def check_start(rows: Rows, data: Measurements, deviation: FloatArray, cost: FloatArray) -> None:
+def check_start(rows: AnyRows, data: Measurements, deviation: FloatArray, cost: FloatArray) -> None:
     """Refuse a start from which some poses cannot be reached.
 
     Raises

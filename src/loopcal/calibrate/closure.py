@@ -17,7 +17,8 @@ import numpy as np
 from loopcal import se3
 from loopcal.calibrate.descent import Descent, DescentStatus, StepControl, descend
 from loopcal.calibrate.filters import Method
-from loopcal.calibrate.rows import Rows
+from loopcal.calibrate.latent import LatentRows
+from loopcal.calibrate.rows import AnyRows, Rows
 from loopcal.linalg import FloatArray
 
 RELATIVE = 1e-3
@@ -28,11 +29,11 @@ STEPS = 20
 
 
 def descend_from_closure(
-    rows: Rows, start: FloatArray, method: Method, control: StepControl, tolerance: float
+    rows: AnyRows, start: FloatArray, method: Method, control: StepControl, tolerance: float
 ) -> tuple[FloatArray, Descent | None]:
     """Return the deviation (t, p) to which the linearised closure leads, and how; `start` itself where it cannot."""
-    located = locate(rows)
-    if located is None:
+    located = None if isinstance(rows, LatentRows) else locate(rows)
+    if located is None or isinstance(rows, LatentRows):
         return start, None
     problem = Rows(rows.unknowns, rows.readings, rows.sensed, rows.rows.size, located)
     coarse = dataclasses.replace(control, relative=max(control.relative, RELATIVE))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from loopcal.calibrate.combinations import Combination, combination, combinations, listed, sparse
 from loopcal.calibrate.meaning import with_meaning
 from loopcal.calibrate.observability import SCALING, Observability, observability
-from loopcal.calibrate.outlook import information
+from loopcal.calibrate.outlook import equations, information
 from loopcal.calibrate.scaling import Unknowns, unknowns
 from loopcal.errors import EstimationError
 from loopcal.linalg import NULL_COMPONENT, RANK_TOLERANCE, Decomposition, FloatArray, decompose
@@ -174,13 +174,14 @@ def identifiability(
         data = simulate(robot, sample(robot, poses, seed).coordinates, data, seed=0, controller=robot)
     check_actuators(data, robot)
     free = unknowns(robot)
-    if not len(free) or not data.n_rows:
-        what = f"{robot.name} has no free parameter; free one" if data.n_rows else "no measured value counts; give at least one"
+    count = equations(robot, data)
+    if not len(free) or not count:
+        what = f"{robot.name} has no free parameter; free one" if count else "no measured value counts; give at least one"
         raise EstimationError(f"there is nothing to tell: {what}")
     factor, reached = information(free, data)
     if not reached.all():
         raise EstimationError(_unreached(data, reached))
-    return summary(free, decompose(factor, np.full(1, data.n_rows), tolerance=rank_tolerance), factor[0, :-1, :-1])
+    return summary(free, decompose(factor, np.full(1, count), tolerance=rank_tolerance), factor[0, :-1, :-1])
 
 
 def summary(free: Unknowns, decomposition: Decomposition, factor: FloatArray) -> Identifiability:

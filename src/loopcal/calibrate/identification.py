@@ -13,6 +13,7 @@ from loopcal.calibrate.combinations import Combination
 from loopcal.calibrate.conflict import PriorConflict
 from loopcal.calibrate.descent import DescentStatus
 from loopcal.calibrate.filters import Method
+from loopcal.calibrate.latent_estimate import LatentEstimate
 from loopcal.calibrate.local_estimate import LocalEstimate
 from loopcal.calibrate.posterior import Posterior
 from loopcal.calibrate.scaling import Unknowns
@@ -57,6 +58,7 @@ class Identification:
     notes : sentences that belong to the result.
     weight : (n,) of each pose by the loss, 1 without one. dropped : labels of the poses that were left out as asked.
     local : what was found of the unknowns that the measurements bring with them: frames, targets, surfaces.
+    latent : where the machine stood and what its readings were, where these are not exact; else None.
     """
 
     robot: Mechanism
@@ -82,6 +84,7 @@ class Identification:
     weight: FloatArray
     dropped: tuple[str, ...]
     local: LocalEstimate
+    latent: LatentEstimate | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -191,6 +194,7 @@ class Identification:
             "sigma_scale": self.check.sigma_scale,
             "prior_conflict": None if self.conflict is None else self.conflict.to_dict(),
             "dropped": list(self.dropped),
+            "readings": None if self.latent is None else self.latent.to_dict(),
             "status": self.status.name.lower(),
             "iterations": self.iterations,
             "cost_history": self.cost_history,
@@ -211,6 +215,7 @@ class Identification:
             "local_estimate": self.local.estimate,
             "local_sd": self.local.sd,
             **self.posterior.arrays(),
+            **({} if self.latent is None else self.latent.arrays()),
         }
         for i, r in enumerate(self.residuals):
             result[f"residual_{i}_{r.kind}"] = r.raw

@@ -5,35 +5,40 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.calibrate.checks import check_count, check_noise, check_rows, check_settings, check_start
+from loopcal.calibrate.checks import check_count, check_rows, check_settings, check_start
 from loopcal.calibrate.closure import descend_from_closure
 from loopcal.calibrate.combinations import combinations
 from loopcal.calibrate.conflict import prior_conflict
 from loopcal.calibrate.descent import Descent, DescentStatus, StepControl, descend
 from loopcal.calibrate.filters import MAP, LeastSquares, Method, adapted
 from loopcal.calibrate.identification import Identification, KindResiduals
+from loopcal.calibrate.latent import LatentRows
+from loopcal.calibrate.latent_estimate import latent_estimate
 from loopcal.calibrate.left_out import without_poses
 from loopcal.calibrate.local_estimate import LocalEstimate, local_estimate, nothing_local, with_followers
 from loopcal.calibrate.losses import Loss
 from loopcal.calibrate.posterior import posterior
 from loopcal.calibrate.prior import Prior
 from loopcal.calibrate.robust import descend_robustly
-from loopcal.calibrate.rows import Rows, rows_of, rows_of_trials
+from loopcal.calibrate.rows import AnyRows, rows_of, rows_of_trials
 from loopcal.calibrate.scaling import Unknowns, unknowns
 from loopcal.calibrate.sensed import Residuals, linked
 from loopcal.calibrate.statistics import ResidualCheck, residual_check
 from loopcal.errors import EstimationError
 from loopcal.linalg import RANK_TOLERANCE, Decomposition, FloatArray, IntArray
-from loopcal.measure import LocalUnknowns, Measurements, Trials
+from loopcal.measure import LocalUnknowns, Measurements, Trials, with_stated_sigma
 from loopcal.mechanism import Mechanism
 
 Begin = Literal["kinematics", "closure"]
 BEGINS = get_args(Begin)
+Run = Callable[[AnyRows, FloatArray], Descent]
+"""Descends rows from a deviation."""
 
 
 def identify(
@@ -76,31 +81,30 @@ def identify(
     ------
     EstimationError : nothing to identify, fewer equations than parameters, or poses out of reach at the start.
     """
-    check_noise(noise)
-    check_settings(method, rank_tolerance)
+    check_settings(method, rank_tolerance, noise)
     free = unknowns(robot)
     method = adapted(LeastSquares() if method is None and prior is not None else method, free.assumed, noise)
-    rows = rows_of(free, data := without_poses(data, drop), local)
+    rows = rows_of(free, data := without_poses(with_stated_sigma(robot, data), drop), local)
     check_rows(rows, data, robot)
     check_count(rows, data, method, allow_fewer_equations or prior is not None)
     z = free.deviation((robot if start is None else robot.with_values(start)).values[None])
-
-    def run(some: Rows, at: FloatArray) -> Descent:
-        return _descended(some, at, method, control, rank_tolerance, begin, prior)
-
+    run: Run = partial(_descended, method=method, control=control, tolerance=rank_tolerance, begin=begin, prior=prior)
     fit, weight, weighed = _weighed(rows, data, z, loss, noise, run)
     if fit.status[0] == DescentStatus.BAD_START:
         check_start(rows, data, z, fit.cost)
     check = residual_check(fit.decomposition, fit.penalty, noise, robust=loss is not None)
-    residuals = _labelled(rows.residuals(fit.deviation, weighed), data)
+    residuals = _labelled(_residuals(rows, weighed, fit.deviation), data, rows)
     result = _identification(robot, free, method, fit, check, residuals, weighed)
+    latent = latent_estimate(rows, data, fit.deviation) if isinstance(rows, LatentRows) else None
     notes = (*result.notes, *_count_notes(rows, method), *_weight_notes(data, weight, loss), *_drop_notes(drop))
-    return replace(result, weight=weight, dropped=tuple(drop), notes=notes)
+    return replace(
+        result, weight=weight, dropped=tuple(drop), notes=(*notes, *(latent.notes() if latent else ())), latent=latent
+    )
 
 
 def _weighed(
-    rows: Rows, data: Measurements, z: FloatArray, loss: Loss | None, noise: str, run: Callable[[Rows, FloatArray], Descent]
-) -> tuple[Descent, FloatArray, Rows]:
+    rows: AnyRows, data: Measurements, z: FloatArray, loss: Loss | None, noise: str, run: Run
+) -> tuple[Descent, FloatArray, AnyRows]:
     """Descend, with a loss or without; return the weight (n,) of each pose, too, and the rows with these weights."""
     if loss is None:
         return run(rows, z), np.ones(data.n_poses), rows
@@ -108,9 +112,14 @@ def _weighed(
     return robust.fit, robust.weight, robust.rows
 
 
-def _count_notes(rows: Rows, method: Method) -> list[str]:
+def _residuals(rows: AnyRows, weighed: AnyRows, z: FloatArray) -> tuple[Residuals, ...]:
+    """Residuals of rows, own unknowns being those that fit best with the weights of the fit."""
+    return rows.residuals(z, None if weighed is rows else weighed.own_values(z))
+
+
+def _count_notes(rows: AnyRows, method: Method) -> list[str]:
     """Say that tolerances alone hold some directions, where equations are fewer than parameters."""
-    m, p = int(rows.counted[0]), rows.parameters
+    m, p = int(rows.equations[0]), rows.parameters
     if m >= p or not isinstance(method, MAP):
         return []
     return [f"{m} equations for {p} parameters: at least {p - m} directions rest on tolerances alone"]
@@ -189,7 +198,7 @@ def identify_trials(
 
 
 def _descended(
-    rows: Rows,
+    rows: AnyRows,
     z: FloatArray,
     method: Method,
     control: StepControl | None,
@@ -223,7 +232,7 @@ def _identification(
     fit: Descent,
     check: ResidualCheck,
     residuals: tuple[KindResiduals, ...],
-    rows: Rows,
+    rows: AnyRows,
 ) -> Identification:
     """Put the result together; `rows` are folded once more where they have unknowns of their own."""
     d, penalty, variance = fit.decomposition, fit.penalty, check.sigma_scale**2 if check.intervals else np.nan
@@ -276,7 +285,7 @@ def _identification(
 
 
 def _local(
-    rows: Rows, robot: Mechanism, z: FloatArray, d: Decomposition, penalty: FloatArray, variance: float
+    rows: AnyRows, robot: Mechanism, z: FloatArray, d: Decomposition, penalty: FloatArray, variance: float
 ) -> LocalEstimate:
     """The unknowns of the measurements at the estimate z (1, p)."""
     if rows.own is None:
@@ -287,16 +296,19 @@ def _local(
     return local_estimate(rows.own, robot, rows.own.start, d, penalty, variance)
 
 
-def _labelled(residuals: tuple[Residuals, ...], data: Measurements) -> tuple[KindResiduals, ...]:
-    """Put names to the residuals (t = 1) of every kind."""
+def _labelled(residuals: tuple[Residuals, ...], data: Measurements, rows: AnyRows) -> tuple[KindResiduals, ...]:
+    """Put names to the residuals (t = 1) of every kind, uncertain readings the last."""
     observations = [o for o in data.observations if len(o)]
+    present = [o.present for o in observations]
+    if isinstance(rows, LatentRows):
+        present.append(np.isfinite(data.readings))
     return tuple(
         KindResiduals(
-            kind=o.kind.name,
-            components=tuple(column.name for column in o.kind.noise_columns),
-            poses=tuple("/".join(data.labels[i] for i in seen) for seen in o.rows.reshape(len(o), -1)),
-            raw=np.where(o.present, r.raw[0], np.nan),
+            kind=s.kind.name,
+            components=tuple(column.name for column in s.kind.noise_columns),
+            poses=tuple("/".join(data.labels[i] for i in seen) for seen in s.per_pose),
+            raw=np.where(there, r.raw[0], np.nan),
             whitened=r.whitened[0],
         )
-        for o, r in zip(observations, residuals, strict=True)
+        for s, there, r in zip(rows.sensed, present, residuals, strict=True)
     )

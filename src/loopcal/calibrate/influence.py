@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.calibrate.rows import Rows
+from loopcal.calibrate.rows import AnyRows
 from loopcal.linalg import Decomposition, FloatArray, IntArray
 
 TESTABLE = 1e-6
@@ -47,7 +47,7 @@ class Influence:
 
 
 def influence(
-    rows: Rows,
+    rows: AnyRows,
     member: IntArray,
     decomposition: Decomposition,
     penalty: FloatArray,
@@ -91,15 +91,13 @@ def influence(
 
 
 def _by_block(
-    rows: Rows, member: IntArray, deviation: FloatArray, count: int
+    rows: AnyRows, member: IntArray, deviation: FloatArray, count: int
 ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
     """Give blocks of equal size together: their numbers (b,), matrices (b, m, p) and residuals (b, m).
 
     A block whose rows come with several blocks of poses waits until the last of them.
     """
-    total = np.zeros(count, dtype=np.int64)
-    for sensed in rows.sensed:
-        total += np.bincount(member[sensed.first], minlength=count) * sensed.whitener.shape[-1]
+    total = rows.sizes(member, count)
     waiting: list[tuple[IntArray, FloatArray]] = []
     for kinds in rows.linearised(deviation):
         waiting += [(np.repeat(member[poses], part.shape[1]), part.reshape(-1, part.shape[2])) for poses, part in kinds]

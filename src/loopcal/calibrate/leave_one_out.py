@@ -15,6 +15,7 @@ import numpy as np
 from loopcal.calibrate.filters import Method, Ridge, TruncatedSVD, adapted
 from loopcal.calibrate.rows import rows_of
 from loopcal.calibrate.scaling import unknowns
+from loopcal.calibrate.sensed import linked
 from loopcal.errors import EstimationError
 from loopcal.linalg import Decomposition, FloatArray, decompose
 from loopcal.measure import Measurements
@@ -65,7 +66,7 @@ def leave_one_out(robot: Mechanism, data: Measurements, methods: tuple[Method, .
     used = tuple(adapted(method, np.zeros(len(free), dtype=bool), "given") for method in methods)
     penalty = np.concatenate([method.penalty(d) for method in used])
     weight, y = _solutions(d, penalty)
-    member = np.unique(data.block, return_inverse=True)[1]
+    member = np.unique(linked(data), return_inverse=True)[1]
     parts = [part for kinds in rows.linearised(z) for part in kinds]
     of = np.concatenate([np.repeat(member[poses], part.shape[1]) for poses, part in parts])
     A = np.concatenate([part.reshape(-1, part.shape[2]) for _, part in parts])

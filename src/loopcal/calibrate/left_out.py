@@ -10,10 +10,11 @@ import numpy as np
 
 from loopcal.errors import DataError, nearest
 from loopcal.measure import Measurements
+from loopcal.measure.measurements import weighted_sigma
 
 
 def without_poses(data: Measurements, drop: Sequence[str]) -> Measurements:
-    """Return the measurements with weight 0 for every row that sees one of these poses.
+    """Return the measurements with weight 0 for every row that sees one of these poses, and their readings not believed.
 
     Parameters
     ----------
@@ -33,4 +34,4 @@ def without_poses(data: Measurements, drop: Sequence[str]) -> Measurements:
             raise DataError(f"there is no pose {label!r} to leave out{nearest(label, data.labels)}; give labels of the data")
     kept = np.array([label not in drop for label in data.labels])
     observations = tuple(o.reweighted(o.weight * kept[o.rows].reshape(len(o), -1).all(axis=1)) for o in data.observations)
-    return replace(data, observations=observations)
+    return replace(data, observations=observations, reading_sigma=weighted_sigma(data.reading_sigma, kept.astype(np.float64)))

@@ -61,6 +61,7 @@ class Own:
     ----------
     local : the U unknowns. sensed : the rows of every kind. trials : number of machines. parameters : p.
     data : from a trial's number to its measurements, from which values to begin with are found.
+    together : (n,) poses of equal number have unknowns of their own in common, so that their rows are one cluster's.
     """
 
     def __init__(
@@ -70,12 +71,13 @@ class Own:
         trials: int,
         parameters: int,
         data: Callable[[int], Measurements],
+        together: IntArray | None = None,
     ) -> None:
         self.local, self.data = local, data
         table = local.table
         self.free = np.asarray(table.free, dtype=bool)
         self.held = self.free & ~np.isnan(table.tolerance)
-        self.cluster, self.column, self.clusters = _clusters(self.free, sensed)
+        self.cluster, self.column, self.clusters = _clusters(self.free, sensed, together)
         self.priors = int(self.held.sum())
         self.values = np.tile(local.values(), (trials, 1))
         self.start = local.values()
@@ -130,8 +132,11 @@ class Own:
             part = replace(data, observations=tuple(rows for rows, _ in some))
             values[used] = start_values(part, T, local, joints)
         self.values[trial], self.started[trial] = values, True
-        if trial == 0:
-            self.start = values.copy()
+        self.start = values.copy()
+
+    def follow(self, trial: int) -> None:
+        """Put a trial at the values with which the first one began."""
+        self.values[trial], self.started[trial] = self.start, True
 
     def _rows(self, data: Measurements, clusters: list[IntArray]) -> list[tuple[Observations, IntArray, IntArray]]:
         """Kinds with rows, which unknowns each uses, and the cluster of each row."""
@@ -153,7 +158,7 @@ class Own:
         found = factors(values)
         cost = _squares(found)
         for _ in range(STEPS):
-            step, offset = self._step(found, len(values))
+            step, offset = self.step(found, len(values))
             far = offset > CLOSE**2 * cost + NOTHING**2
             if not far.any():
                 break
@@ -172,7 +177,7 @@ class Own:
                 break
         return values
 
-    def _step(self, factors: list[FloatArray], trials: int) -> tuple[FloatArray, FloatArray]:
+    def step(self, factors: list[FloatArray], trials: int) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton step (a, U), and by how much (squared) it changes the whitened residuals (a,)."""
         step, offset = np.zeros((trials, len(self.local))), np.zeros(trials)
         for columns, factor in zip(self.clusters, factors, strict=True):
@@ -263,7 +268,9 @@ def spread_columns(own: FloatArray, columns: IntArray, width: int) -> FloatArray
     return wide[..., :width]
 
 
-def _clusters(free: np.ndarray, sensed: tuple[Sensed, ...]) -> tuple[IntArray, IntArray, tuple[IntArray, ...]]:
+def _clusters(
+    free: np.ndarray, sensed: tuple[Sensed, ...], together: IntArray | None
+) -> tuple[IntArray, IntArray, tuple[IntArray, ...]]:
     """Cluster (U,) of each unknown (-1 where fixed), its column there (U,), and the unknowns of each cluster."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -273,9 +280,14 @@ def _clusters(free: np.ndarray, sensed: tuple[Sensed, ...]) -> tuple[IntArray, I
         for places in np.unique(s.places, axis=0):
             chosen = places[free[places]]
             pairs.append(np.column_stack([np.full(len(chosen), chosen[:1].sum()), chosen]))
+    if together is not None:  # nodes behind those of the unknowns stand for what poses have in common
+        for s in (s for s in sensed if s.places.shape[1]):
+            row, column = np.nonzero(free[s.places])
+            pairs.append(np.column_stack([len(free) + together[s.first[row]], s.places[row, column]]))
     links = np.concatenate(pairs)
-    graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(len(free), len(free)))
-    _, name = connected_components(graph, directed=False)
+    nodes = len(free) if together is None else len(free) + int(together.max()) + 1
+    graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(nodes, nodes))
+    name = connected_components(graph, directed=False)[1][: len(free)]
     clusters = tuple(np.flatnonzero(free & (name == c)) for c in np.unique(name[free]))
     cluster, column = np.full(len(free), -1), np.zeros(len(free), dtype=np.int64)
     for c, columns in enumerate(clusters):

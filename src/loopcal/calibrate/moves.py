@@ -48,6 +48,22 @@ def machine_columns(sensed: Sensed, found: Evaluation, white: FloatArray, moves:
     return columns
 
 
+def evaluated(sensed: Sensed, moves: Moves, trials: IntArray, values: FloatArray | None) -> tuple[Evaluation, FloatArray]:
+    """A kind's residuals and derivatives at the poses of a block, and its whiteners; values (a, U) of own unknowns."""
+    measured, white = sensed.trials(trials)
+    T = moves.T
+    if not np.array_equal(sensed.poses, np.arange(T.shape[1])):
+        T = T[:, sensed.poses]
+    T = np.broadcast_to(T, (len(trials), *T.shape[1:]))
+    own = values[:, sensed.places] if values is not None and sensed.places.shape[1] else None
+    names = sensed.kind.looks_at
+    joints = None
+    if names:
+        seen = np.stack([moves.joints[name][:, sensed.poses] for name in names], axis=-1)
+        joints = np.broadcast_to(seen, (len(trials), *seen.shape[1:]))
+    return sensed.kind.evaluate(T, measured, own, joints), white
+
+
 class Last:
     """The last solved state of every trial and pose, moved on by its sensitivities: where the next solution begins.
 
@@ -56,13 +72,13 @@ class Last:
 
     def __init__(self, home: engine.State, trials: int, poses: int) -> None:
         self.shape = (trials, poses)
-        self.state = _mapped(self._spread, home)
+        self.state = mapped(self._spread, home)
         self.deviation: FloatArray | None = None
         self.moves = np.zeros(0, np.float32)
 
     def take(self, trials: IntArray, deviation: FloatArray) -> engine.State:
         """Return the states of some trials, as far as first order takes them to deviations (a, p)."""
-        state = self.state if len(trials) == self.shape[0] else _mapped(lambda a: a[trials], self.state)
+        state = self.state if len(trials) == self.shape[0] else mapped(lambda a: a[trials], self.state)
         if self.deviation is None:
             return state
         change = (deviation - self.deviation[trials]).astype(np.float32)
@@ -72,9 +88,9 @@ class Last:
     def put(self, trials: IntArray, state: engine.State, ok: np.ndarray, deviation: FloatArray, D: FloatArray) -> None:
         """Keep the states of poses that are solved; one state stands for all trials where there is one only."""
         if ok.all() and len(trials) == self.shape[0]:
-            self.state = _mapped(self._spread, state)
+            self.state = mapped(self._spread, state)
         else:
-            _mapped(lambda old, new: _overwrite(old, new, trials, ok), self.state, state)
+            mapped(lambda old, new: _overwrite(old, new, trials, ok), self.state, state)
         if self.deviation is None:
             self.deviation = np.zeros((self.shape[0], deviation.shape[1]))
             self.moves = np.zeros((*self.shape, 6, deviation.shape[1]), np.float32)
@@ -91,7 +107,7 @@ def _overwrite(old: np.ndarray, new: np.ndarray, trials: IntArray, ok: np.ndarra
     return old
 
 
-def _mapped(function: Callable[..., np.ndarray], *states: engine.State) -> engine.State:
+def mapped(function: Callable[..., np.ndarray], *states: engine.State) -> engine.State:
     """Return the state whose arrays are the function of those of the given states."""
     first, columns = states[0], range(len(states[0].joints))
     joints = tuple(function(*(s.joints[g] for s in states)) for g in columns)

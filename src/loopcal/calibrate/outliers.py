@@ -18,10 +18,10 @@ from loopcal.calibrate.identification import Identification
 from loopcal.calibrate.influence import Influence, influence
 from loopcal.calibrate.left_out import without_poses
 from loopcal.calibrate.robust import scale_of
-from loopcal.calibrate.rows import Rows, rows_of
+from loopcal.calibrate.rows import AnyRows, rows_of
 from loopcal.calibrate.sensed import linked
 from loopcal.linalg import Decomposition, FloatArray, decompose
-from loopcal.measure import Measurements
+from loopcal.measure import Measurements, with_stated_sigma
 
 ROUNDS = 20
 """Times that blocks are set aside at most."""
@@ -96,7 +96,7 @@ def find_outliers(fit: Identification, data: Measurements, level: float = 0.05) 
     fit : the identification, with or without a loss. data : the measurements it was made from.
     level : probability of naming any block where none is wrong.
     """
-    data = without_poses(data, fit.dropped)
+    data = without_poses(with_stated_sigma(fit.robot, data), fit.dropped)
     rows = rows_of(fit.unknowns, data)
     numbers, member = np.unique(linked(data), return_inverse=True)
     labels = tuple(tuple(np.array(data.labels)[member == i].tolist()) for i in range(len(numbers)))
@@ -119,7 +119,7 @@ def find_outliers(fit: Identification, data: Measurements, level: float = 0.05) 
     return OutlierCheck(outliers, level, tested, labels, found, scale, _sentence(outliers, tested, level, found))
 
 
-def _ask(fit: Identification, rows: Rows, member: np.ndarray, weight: FloatArray, z: FloatArray) -> tuple[Influence, float]:
+def _ask(fit: Identification, rows: AnyRows, member: np.ndarray, weight: FloatArray, z: FloatArray) -> tuple[Influence, float]:
     """Fit linearly with these weights (u,) of 1 and 0 and return every block's influence, and the factor on sigma."""
     kept = rows.weighted(weight[member])
     factor, _ = kept.fold(z, np.arange(1))

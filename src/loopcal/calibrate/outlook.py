@@ -16,18 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import engine
-from loopcal.calibrate.scaling import Unknowns
+from loopcal.calibrate.rows import rows_of
+from loopcal.calibrate.scaling import Unknowns, unknowns
 from loopcal.linalg import FloatArray, empty_factor
 from loopcal.measure import (
     LocalUnknowns,
     Measurements,
+    believed_sigma,
     evaluate_all,
     joint_values,
     joints_looked_at,
     start_values,
     whitened_rows,
 )
-from loopcal.mechanism import Status
+from loopcal.mechanism import Mechanism, Status
 from loopcal.mechanism.passive import passive_sensitivity
 from loopcal.mechanism.trials import forward_trials, sensitivity
 
@@ -111,6 +113,8 @@ def information(free: Unknowns, data: Measurements) -> tuple[FloatArray, NDArray
     factor : (1, p + 1, p + 1) of rows [A | r] with own unknowns eliminated. reached : (n,) poses that close or are not
         needed; where one is False its rows are missing.
     """
+    if believed_sigma(free.robot, data.reading_sigma, data.n_poses) is not None:
+        return _uncertain(free, data)
     local = data.unknowns
     own = len(local)
     factor = empty_factor(1, own + len(free))
@@ -131,6 +135,22 @@ def information(free: Unknowns, data: Measurements) -> tuple[FloatArray, NDArray
             used = replace(local, places=(local.places[i][chosen],))
             factor = engine.accumulate(factor, look(at, some, used, values))
     return without_own(engine.accumulate(factor, _prior_rows(local, len(free))), own), reached
+
+
+def _uncertain(free: Unknowns, data: Measurements) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """The same where poses are unknowns, too: at those that fit the robot's present values best."""
+    rows, z = rows_of(free, data), free.deviation(free.robot.values[None])
+    factor, _ = rows.fold(z, np.arange(1))
+    reached = np.ones(data.n_poses, dtype=bool)
+    reached[rows.unreachable(z)] = False
+    return factor, reached
+
+
+def equations(robot: Mechanism, data: Measurements) -> int:
+    """How many equations measurements give: their rows; where readings are uncertain, less what the poses take of them."""
+    if believed_sigma(robot, data.reading_sigma, data.n_poses) is None:
+        return data.n_rows
+    return int(rows_of(unknowns(robot), data).equations[0])
 
 
 def alone(at: Scene, measured: Measurements) -> FloatArray:

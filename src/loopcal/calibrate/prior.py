@@ -18,7 +18,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.calibrate.posterior import Posterior
-from loopcal.calibrate.rows import Rows
+from loopcal.calibrate.rows import AnyRows
 from loopcal.errors import EstimationError, nearest
 from loopcal.linalg import RANK_TOLERANCE, FloatArray, IntArray
 from loopcal.mechanism import Mechanism
@@ -44,7 +44,7 @@ class Prior:
     unit: FloatArray
     rows: FloatArray
 
-    def added(self, rows: Rows) -> WithPrior:
+    def added(self, rows: AnyRows) -> WithPrior:
         """Return the problem of these rows and the prior's, as the descent sees it."""
         return WithPrior(rows, self)
 
@@ -74,7 +74,7 @@ class WithPrior:
     are parallel to one of the prior's are therefore taken out of the prior's rows.
     """
 
-    def __init__(self, rows: Rows, prior: Prior) -> None:
+    def __init__(self, rows: AnyRows, prior: Prior) -> None:
         unknowns = rows.unknowns
         table = unknowns.robot.parameters
         places = np.array([table.index(name) for name in prior.names], dtype=np.int64)

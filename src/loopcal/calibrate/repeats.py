@@ -21,7 +21,7 @@ from loopcal.calibrate.left_out import without_poses
 from loopcal.calibrate.rows import rows_of
 from loopcal.calibrate.statistics import DOUBT
 from loopcal.linalg import FloatArray, IntArray
-from loopcal.measure import Measurements
+from loopcal.measure import Measurements, with_stated_sigma
 
 SAME = 1e-9
 """Readings [m] or [rad] that differ by less are a repeat of one pose."""
@@ -66,6 +66,8 @@ def lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
     ----------
     fit : an identification without a loss. data : the measurements it was made from.
     """
+    if with_stated_sigma(fit.robot, data).reading_sigma is not None:
+        return _open("readings are uncertain, so poses of equal readings differ, and repeats are no pure error")
     data = without_poses(data, fit.dropped)
     member, times = repeated(data.readings)
     pure, degrees = _pure_error(fit, data, member)

@@ -14,7 +14,7 @@ import numpy as np
 
 from loopcal.calibrate.descent import Descent, DescentStatus
 from loopcal.calibrate.losses import Huber, Loss, Tukey
-from loopcal.calibrate.rows import Rows
+from loopcal.calibrate.rows import AnyRows
 from loopcal.linalg import FloatArray, IntArray
 
 ROUNDS = 50
@@ -34,12 +34,17 @@ class RobustFit:
     """
 
     fit: Descent
-    rows: Rows
+    rows: AnyRows
     weight: FloatArray
 
 
 def descend_robustly(
-    rows: Rows, block: IntArray, loss: Loss, start: FloatArray, estimate_scale: bool, run: Callable[[Rows, FloatArray], Descent]
+    rows: AnyRows,
+    block: IntArray,
+    loss: Loss,
+    start: FloatArray,
+    estimate_scale: bool,
+    run: Callable[[AnyRows, FloatArray], Descent],
 ) -> RobustFit:
     """Fit with a loss (one trial).
 
@@ -57,12 +62,12 @@ def descend_robustly(
 
 
 def _settle(
-    rows: Rows,
+    rows: AnyRows,
     member: IntArray,
     loss: Loss,
     found: RobustFit,
     estimate_scale: bool,
-    run: Callable[[Rows, FloatArray], Descent],
+    run: Callable[[AnyRows, FloatArray], Descent],
     settled: float,
 ) -> RobustFit:
     """Reweight until the weights stand."""
@@ -82,20 +87,21 @@ def _settle(
 
 
 def block_distances(
-    rows: Rows, deviation: FloatArray, member: IntArray, like: Rows | None = None
+    rows: AnyRows, deviation: FloatArray, member: IntArray, like: AnyRows | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Return d = |W r| (u,) and the number of residuals (u,) of every block; member (n,) is the block of each pose.
 
     Frames and targets that are unknown are those that fit best with the weights of `like`, default these rows.
     """
     count = int(member.max()) + 1
+    own = None if like is None else like.own_values(deviation)
     square, degrees = np.zeros(count), np.zeros(count)
-    for sensed, found in zip(rows.sensed, rows.residuals(deviation, like), strict=True):
+    for sensed, found in zip(rows.sensed, rows.residuals(deviation, own), strict=True):
         of = member[sensed.first]
         present = np.einsum("rii->ri", sensed.whitener[0]) != 0.0
         square += np.bincount(of, np.where(present, found.whitened[0] ** 2, 0.0).sum(axis=1), count)
         degrees += np.bincount(of, present.sum(axis=1), count)
-    return np.sqrt(square), degrees
+    return np.sqrt(square), degrees - rows.spent(member, count)
 
 
 def scale_of(distance: FloatArray, degrees: FloatArray) -> float:

@@ -17,12 +17,13 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from loopcal import engine, se3
+from loopcal.calibrate.latent import LatentRows, latent_rows
 from loopcal.calibrate.local import Folding, Own, spread_columns
-from loopcal.calibrate.moves import Last, Moves, machine_columns
+from loopcal.calibrate.moves import Last, Moves, evaluated, machine_columns
 from loopcal.calibrate.scaling import Unknowns
 from loopcal.calibrate.sensed import BLOCK, Block, Residuals, Sensed, blocks_of
 from loopcal.linalg import FloatArray, IntArray, empty_factor
-from loopcal.measure import Evaluation, LocalUnknowns, Measurements, Trials, joint_values, joints_looked_at, local_unknowns
+from loopcal.measure import LocalUnknowns, Measurements, Trials, believed_sigma, joint_values, joints_looked_at, local_unknowns
 from loopcal.measure.simulate import rows_of as sensor_rows
 from loopcal.measure.whitening import whitener
 from loopcal.mechanism import Status
@@ -116,22 +117,29 @@ class Rows:
             self.own.keep(trials, z, values, np.where(lost, np.inf, (factor[:, :, -1] ** 2).sum(axis=1)))
         return factor, lost
 
-    def residuals(self, deviation: FloatArray, like: Rows | None = None) -> tuple[Residuals, ...]:
+    def own_values(self, deviation: FloatArray) -> FloatArray | None:
+        """Return the own unknowns (t, U) that fit best at deviations (t, p); None where there are none."""
+        if self.own is None:
+            return None
+        trials = np.arange(len(deviation))
+        return self._settled([self._look(block, deviation, trials) for block in self.blocks], deviation, trials)
+
+    def residuals(self, deviation: FloatArray, own: FloatArray | None = None) -> tuple[Residuals, ...]:
         """Return the residuals of every kind at deviations (t, p); NaN where a pose is out of reach.
 
-        Own unknowns are those that fit best with the weights of `like`, default these rows.
+        Own unknowns are as given (t, U); by default those that fit best.
         """
         trials = np.arange(len(deviation))
         looks = [self._look(block, deviation, trials) for block in self.blocks]
-        values = None if self.own is None else (like or self)._settled(looks, deviation, trials)
+        values = self._settled(looks, deviation, trials) if own is None and self.own is not None else own
         shapes = [(len(trials), *s.whitener.shape[1:3]) for s in self.sensed]
         found = [Residuals(np.full(shape, np.nan), np.full(shape, np.nan)) for shape in shapes]
         for block, look in zip(self.blocks, looks, strict=True):
             for kind, rows, sensed in zip(found, block.rows, block.sensed, strict=True):
                 if not len(rows):
                     continue
-                evaluated, white = self._evaluated(sensed, look, trials, values)
-                raw = np.where(np.all(look.ok[:, sensed.per_pose], axis=2, keepdims=True), evaluated.residual, np.nan)
+                seen, white = evaluated(sensed, look, trials, values)
+                raw = np.where(np.all(look.ok[:, sensed.per_pose], axis=2, keepdims=True), seen.residual, np.nan)
                 kind.raw[:, rows], kind.whitened[:, rows] = raw, np.matmul(white, raw[..., None])[..., 0]
         return tuple(found)
 
@@ -173,6 +181,22 @@ class Rows:
         other = Rows(self.unknowns, self.readings, tuple(scaled), self.counted.size, self.located, self.own)
         other.last = self.last
         return other
+
+    @property
+    def equations(self) -> IntArray:
+        """(t,) equations, own unknowns not counted."""
+        return self.counted
+
+    def sizes(self, member: IntArray, count: int) -> IntArray:
+        """How many rows `linearised` gives of each of `count` blocks; member (n,) is the block of each pose."""
+        total = np.zeros(count, dtype=np.int64)
+        for s in self.sensed:
+            total += np.bincount(member[s.first], minlength=count) * s.whitener.shape[-1]
+        return total
+
+    def spent(self, member: IntArray, count: int) -> IntArray:
+        """How many of the residuals of each of `count` blocks its poses have used up: none, readings being exact."""
+        return np.zeros(count, dtype=np.int64)
 
     def unreachable(self, deviation: FloatArray) -> IntArray:
         """Return the poses that some row needs and that cannot be reached at deviation (1, p)."""
@@ -224,7 +248,10 @@ class Rows:
         own = self.own
         assert own is not None
         for i in np.flatnonzero(~own.started[trials]):
-            self._start(looks, int(i), trials)
+            if own.started.any():  # trials look with the same instrument: what was found for one is near for all
+                own.follow(int(trials[i]))
+            else:
+                self._start(looks, int(i), trials)
 
         def factors(values: FloatArray) -> list[FloatArray]:
             folding = Folding(own, len(trials), 0)
@@ -269,30 +296,13 @@ class Rows:
         free = D[..., self.unknowns.places] if len(self.unknowns.places) < D.shape[-1] else D
         return free * self.unknowns.tolerance
 
-    def _evaluated(
-        self, sensed: Sensed, moves: Moves, trials: IntArray, values: FloatArray | None
-    ) -> tuple[Evaluation, FloatArray]:
-        """A kind's residuals and derivatives at the poses of a block, and its whiteners."""
-        measured, white = sensed.trials(trials)
-        T = moves.T
-        if not np.array_equal(sensed.poses, np.arange(T.shape[1])):
-            T = T[:, sensed.poses]
-        T = np.broadcast_to(T, (len(trials), *T.shape[1:]))
-        own = values[:, sensed.places] if values is not None and sensed.places.shape[1] else None
-        names = sensed.kind.looks_at
-        joints = None
-        if names:
-            seen = np.stack([moves.joints[name][:, sensed.poses] for name in names], axis=-1)
-            joints = np.broadcast_to(seen, (len(trials), *seen.shape[1:]))
-        return sensed.kind.evaluate(T, measured, own, joints), white
-
     def _kind_rows(
         self, sensed: Sensed, moves: Moves, trials: IntArray, values: FloatArray | None, machine: bool = True
     ) -> Iterator[tuple[int, FloatArray]]:
         """Rows (a, k * m, u + p + 1) of one kind, cluster by cluster; without the p columns where `machine` is false."""
         if not len(sensed.poses):
             return
-        found, white = self._evaluated(sensed, moves, trials, values)
+        found, white = evaluated(sensed, moves, trials, values)
         residual = found.residual
         if moves.step is not None:
             residual = residual + np.matmul(found.jacobian, moves.step[:, sensed.poses, :, None])[..., 0]
@@ -314,15 +324,18 @@ class Rows:
             yield c, part.reshape(a, len(which) * m, -1)
 
 
-def rows_of(unknowns: Unknowns, data: Measurements, local: LocalUnknowns | None = None) -> Rows:
-    """Return the rows of one machine's measurements; `local` are the unknowns that these bring, default as stated."""
-    own = data.unknowns if local is None else local
+def rows_of(unknowns: Unknowns, data: Measurements, local: LocalUnknowns | None = None) -> AnyRows:
+    """Return the rows of one machine's measurements; `local` are the unknowns that these bring, default as stated.
+
+    Where readings have a sigma above 0, the poses are unknowns, too.
+    """
+    own = local_unknowns(data.observations, data.labels) if local is None else local
     pairs = [(o, places) for o, places in zip(data.observations, own.places, strict=True) if len(o)]
     sensed = tuple(Sensed(o.kind, o.rows, o.measured[None], o.whitener[None], places) for o, places in pairs)
-    return Rows(unknowns, data.readings, sensed, 1, own=_own(unknowns, own, sensed, 1, lambda _: data))
+    return _rows(unknowns, data.readings[None], data.reading_sigma, sensed, 1, own, lambda _: data)
 
 
-def rows_of_trials(unknowns: Unknowns, trials: Trials) -> Rows:
+def rows_of_trials(unknowns: Unknowns, trials: Trials) -> AnyRows:
     """Return the rows of t simulated machines."""
     sensors = trials.instrument.sensors
     first = trials.trial(0)
@@ -336,16 +349,32 @@ def rows_of_trials(unknowns: Unknowns, trials: Trials) -> Rows:
         t, r, m = present.shape
         flat = whitener(np.broadcast_to(covariance, (t, r, m, m)).reshape(-1, m, m), present.reshape(-1, m), np.ones(t * r))
         sensed.append(Sensed(kind, sensor_rows(sensor), measured, flat.reshape(t, r, m, m), places))
+    recorded = trials.readings[None] if trials.recorded is None else trials.recorded
+    return _rows(unknowns, recorded, trials.reading_sigma, tuple(sensed), len(trials), local, trials.trial)
 
-    every = tuple(sensed)
-    return Rows(unknowns, trials.readings, every, len(trials), own=_own(unknowns, local, every, len(trials), trials.trial))
+
+def _rows(
+    unknowns: Unknowns,
+    recorded: FloatArray,
+    sigma: FloatArray | None,
+    sensed: tuple[Sensed, ...],
+    trials: int,
+    local: LocalUnknowns,
+    data: Callable[[int], Measurements],
+) -> AnyRows:
+    """Rows at readings (t | 1, n, a), the poses unknown where a reading is not exact."""
+
+    def own(together: IntArray | None) -> Own | None:
+        return Own(local, sensed, trials, len(unknowns), data, together) if len(local) else None
+
+    believed = believed_sigma(unknowns.robot, sigma, recorded.shape[1])
+    if believed is None:
+        return Rows(unknowns, recorded[0], sensed, trials, own=own(None))
+    return latent_rows(unknowns, recorded, believed, sensed, trials, own)
 
 
-def _own(
-    unknowns: Unknowns, local: LocalUnknowns, sensed: tuple[Sensed, ...], trials: int, data: Callable[[int], Measurements]
-) -> Own | None:
-    """The own unknowns of rows, None where there are none."""
-    return Own(local, sensed, trials, len(unknowns), data) if len(local) else None
+AnyRows = Rows | LatentRows
+"""Rows of exact readings, or of uncertain ones: every estimator takes both."""
 
 
 def _solved(state: engine.State) -> np.ndarray:

@@ -111,19 +111,20 @@ def blocks_of(readings: FloatArray, sensed: tuple[Sensed, ...], needed: np.ndarr
     for k in range(0, n, size):
         poses = np.arange(k, min(k + size, n))
         rows = tuple(np.flatnonzero(run == k // size) for run in inside)
-        made.append(_block(poses, readings, sensed, rows, needed))
+        made.append(block_of(poses, readings, sensed, rows, needed))
     nothing = np.zeros(0, dtype=np.int64)
     for i, run in enumerate(inside):
         for rows in _chunks(np.flatnonzero(run < 0), size // 2):
             poses = np.unique(sensed[i].poses[rows])
             one = tuple(rows if j == i else nothing for j in range(len(sensed)))
-            made.append(_block(poses, readings, sensed, one, needed))
+            made.append(block_of(poses, readings, sensed, one, needed))
     return made
 
 
-def _block(
+def block_of(
     poses: IntArray, readings: FloatArray, sensed: tuple[Sensed, ...], rows: tuple[IntArray, ...], needed: np.ndarray
 ) -> Block:
+    """The block of these poses (b,) with these rows of every kind, whose poses all lie in it."""
     place = np.zeros(len(readings), dtype=np.int64)
     place[poses] = np.arange(len(poses))
     inside = tuple(s.take(r, place) for s, r in zip(sensed, rows, strict=True))

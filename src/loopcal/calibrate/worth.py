@@ -65,7 +65,8 @@ def worth(fit: Identification, data: Measurements) -> Worth:
     if fit.check.failed:
         return _open("the residual does not fit the stated noise")
     chosen = np.unique(np.linspace(0, data.n_poses - 1, min(POSES, data.n_poses)).astype(int))
-    readings, values = data.readings[None, chosen], fit.robot.values[None]
+    known = data.readings if fit.latent is None else fit.latent.readings
+    readings, values = known[None, chosen], fit.robot.values[None]
     state = forward_trials(fit.robot, values, readings)
     ok = np.asarray(state.status == Status.CONVERGED)[0]
     D = sensitivity(fit.robot, values, readings, state).parameters[0, ok][..., free.places]

@@ -42,6 +42,10 @@ from loopcal.measure.noise import stream as stream
 from loopcal.measure.observations import Observations as Observations
 from loopcal.measure.orientation import Orientation as Orientation
 from loopcal.measure.orientation import orientation as orientation
+from loopcal.measure.readings import Readings as Readings
+from loopcal.measure.readings import believed_sigma as believed_sigma
+from loopcal.measure.readings import readings_kind as readings_kind
+from loopcal.measure.readings import with_stated_sigma as with_stated_sigma
 from loopcal.measure.simulate import Trials as Trials
 from loopcal.measure.simulate import sample_truth as sample_truth
 from loopcal.measure.simulate import simulate as simulate

@@ -189,16 +189,21 @@ def weighted_sigma(sigma: Array | None, weight: Array) -> Array | None:
     return np.where(sigma == 0.0, 0.0, apart)
 
 
-def _reading_sigma(sigma: ArrayLike, readings: Array, labels: tuple[str, ...]) -> Array:
-    """Checked, read-only standard deviations (n, a) of the readings."""
+def spread_sigma(sigma: ArrayLike, readings: Array) -> Array:
+    """Standard deviations (n, a) of readings (n, a) from what spreads to them; DataError where that does not fit."""
     given = np.asarray(sigma, dtype=float)
     try:
-        spread = np.array(np.broadcast_to(given, readings.shape))
+        return np.array(np.broadcast_to(given, readings.shape))
     except ValueError:
         raise DataError(
             f"reading_sigma has shape {given.shape}; give one number, or one for each of the {readings.shape[1]} actuators,"
             f" or one for each of the {readings.shape[0]} x {readings.shape[1]} readings"
         ) from None
+
+
+def _reading_sigma(sigma: ArrayLike, readings: Array, labels: tuple[str, ...]) -> Array:
+    """Checked, read-only standard deviations (n, a) of the readings."""
+    spread = spread_sigma(sigma, readings)
     for wrong, what in (
         (~(spread >= 0.0), "is no standard deviation; give 0 (exact), a positive number, or infinity (not taken)"),
         (np.isnan(readings) & np.isfinite(spread), "belongs to a reading that is not there; give the reading, or infinity"),

@@ -12,16 +12,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loopcal.engine import State
 from loopcal.errors import DataError
 from loopcal.measure.commanded import solve_commanded
 from loopcal.measure.instrument import Instrument, Sensor
 from loopcal.measure.joints import joint_values, joints_looked_at
 from loopcal.measure.kinds import Kind
-from loopcal.measure.measurements import Measurements
+from loopcal.measure.measurements import Measurements, spread_sigma
 from loopcal.measure.noise import stream
 from loopcal.measure.observations import Observations
+from loopcal.measure.readings import believed_sigma
 from loopcal.measure.unknowns import LocalUnknowns, local_unknowns
 from loopcal.mechanism import Mechanism, Status
+from loopcal.mechanism.at_pose import solve_at_pose
 from loopcal.mechanism.trials import forward_trials
 
 Array = NDArray[np.float64]
@@ -29,7 +32,7 @@ Ints = NDArray[np.intp]
 Texts = NDArray[np.str_]
 Bools = NDArray[np.bool_]
 
-NOISE, TRUTH = 0, 1  # purposes of a trial's random streams
+NOISE, TRUTH, READING = 0, 1, 2  # purposes of a trial's random streams
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +56,10 @@ class Trials:
         Poses to which the true machine could follow.
     local : LocalUnknowns
         Of the kinds, their true values as nominal ones.
+    recorded : (t, n, a) [SI], optional
+        What the readings were recorded as, with their noise; None where they are the controller's.
+    reading_sigma : (n, a) [SI], optional
+        As in `Measurements`.
     """
 
     instrument: Instrument
@@ -63,6 +70,8 @@ class Trials:
     T: Array
     reached: Bools
     local: LocalUnknowns
+    recorded: Array | None = None
+    reading_sigma: Array | None = None
 
     def __len__(self) -> int:
         return len(self.truth)
@@ -73,7 +82,8 @@ class Trials:
             Observations.from_sigma(s.kind, rows_of(s), measured[i], s.noise.sigma, s.session, s.group)
             for s, measured in zip(self.instrument.sensors, self.measured, strict=True)
         )
-        return Measurements(self.robot_name, self.readings, observations)
+        readings = self.readings if self.recorded is None else self.recorded[i]
+        return Measurements(self.robot_name, readings, observations, reading_sigma=self.reading_sigma)
 
 
 def sample_truth(robot: Mechanism, n_trials: int, seed: int) -> Array:
@@ -105,6 +115,7 @@ def simulate_trials(
     seed: int,
     controller: Mechanism | None = None,
     unknowns: Mapping[str, float] | None = None,
+    reading_sigma: ArrayLike | None = None,
 ) -> Trials:
     """Measure the same commanded poses on t machines.
 
@@ -123,6 +134,9 @@ def simulate_trials(
         The geometry that turns poses into readings; default: the robot at its nominal values.
     unknowns : name -> value [SI], optional
         True values of unknowns of the kinds, such as `tracker.x`; default: nominal.
+    reading_sigma : number, (a,) or (n, a) [SI], optional
+        Standard deviation of the recorded readings: normal noise on the true ones, at which the true machine stands; 0 is
+        exact, infinite not taken. Default: what the robot states of its actuators.
 
     Returns
     -------
@@ -145,17 +159,13 @@ def simulate_trials(
     T = np.broadcast_to(state.T, (len(values), *state.T.shape[1:]))
     reached = np.zeros(T.shape[:2], dtype=np.bool_)
     reached[:] = state.status == Status.CONVERGED
-    joints = joint_values(robot, joints_looked_at(s.kind for s in mounted.sensors), readings[None], state)
+    # Redundant actuators cannot all read what a wrong geometry told them: their true readings are those of the pose.
+    true = readings[None] if robot.program.sigma is None else _closing(robot, values, readings, state)
+    joints = joint_values(robot, joints_looked_at(s.kind for s in mounted.sensors), true, state)
     noise = [_drawn(mounted, stream(seed, trial, NOISE)) for trial in range(len(values))]
-    safe = np.where(reached[..., None, None], T, np.eye(4))
-    measured = []
-    for k, (kind, rows, _, _) in enumerate(seeing):
-        at = np.stack([joints[name][:, rows] for name in kind.looks_at], axis=-1) if kind.looks_at else None
-        own = local.of(k, local.table.nominal[None]) if kind.unknowns else None
-        seen = kind.measure(safe[:, rows], np.stack([drawn[k] for drawn in noise]), own, at)
-        there = np.asarray(np.all(reached[:, rows].reshape(len(values), len(rows), -1), axis=-1))
-        measured.append(np.where(there[..., None], seen, np.nan))
-    return Trials(mounted, robot.name, readings, tuple(measured), values, T, reached, local)
+    measured = tuple(_seen(k, one, T, reached, joints, noise, local) for k, one in enumerate(seeing))
+    recorded, sigma = _recorded(robot, true, reading_sigma, len(values), seed)
+    return Trials(mounted, robot.name, readings, measured, values, T, reached, local, recorded, sigma)
 
 
 def simulate(
@@ -165,6 +175,7 @@ def simulate(
     seed: int,
     controller: Mechanism | None = None,
     unknowns: Mapping[str, float] | None = None,
+    reading_sigma: ArrayLike | None = None,
 ) -> Measurements:
     """Measure commanded poses on one machine.
 
@@ -181,6 +192,8 @@ def simulate(
         The geometry that turns poses into readings; default: the robot at its nominal values.
     unknowns : name -> value [SI], optional
         True values of unknowns of the kinds; default: nominal.
+    reading_sigma : optional
+        As for `simulate_trials`.
 
     Returns
     -------
@@ -191,7 +204,7 @@ def simulate(
     DataError
         If the controller cannot reach a pose, or the true machine cannot follow the readings.
     """
-    trials = simulate_trials(robot, robot.values[None], poses, instrument, seed, controller, unknowns)
+    trials = simulate_trials(robot, robot.values[None], poses, instrument, seed, controller, unknowns, reading_sigma)
     lost = np.flatnonzero(~trials.reached[0])
     if len(lost):
         raise DataError(
@@ -208,6 +221,38 @@ class _Seeing(NamedTuple):
     rows: Ints
     session: Texts
     group: Texts
+
+
+def _seen(
+    k: int, one: _Seeing, T: Array, reached: Bools, joints: Mapping[str, Array], noise: list[list[Array]], local: LocalUnknowns
+) -> Array:
+    """Columns (t, r, c) of sensor k at true poses; NaN where these could not be reached."""
+    kind, rows = one.kind, one.rows
+    safe = np.where(reached[..., None, None], T, np.eye(4))
+    at = np.stack([joints[name][:, rows] for name in kind.looks_at], axis=-1) if kind.looks_at else None
+    own = local.of(k, local.table.nominal[None]) if kind.unknowns else None
+    seen = kind.measure(safe[:, rows], np.stack([drawn[k] for drawn in noise]), own, at)
+    there = np.asarray(np.all(reached[:, rows].reshape(len(reached), len(rows), -1), axis=-1))
+    return np.where(there[..., None], seen, np.nan)
+
+
+def _closing(robot: Mechanism, values: Array, readings: Array, state: State) -> Array:
+    """Readings (t, n, a) that close every limb at the poses of a state; as commanded where there is no such pose."""
+    found = solve_at_pose(robot, values, state.T, state)[1]
+    return np.where(np.isfinite(found), found, readings)
+
+
+def _recorded(
+    robot: Mechanism, true: Array, sigma: ArrayLike | None, trials: int, seed: int
+) -> tuple[Array | None, Array | None]:
+    """Recorded readings (t, n, a) of true ones (t | 1, n, a), and their sigma (n, a); None, None where all are exact."""
+    given = None if sigma is None else spread_sigma(sigma, true[0])
+    stated = believed_sigma(robot, given, true.shape[1])
+    if stated is None:
+        return None, given
+    draws = np.stack([stream(seed, trial, READING).standard_normal(stated.shape) for trial in range(trials)])
+    taken = np.isfinite(stated)
+    return np.where(taken, true + np.where(taken, stated, 0.0) * draws, np.nan), stated
 
 
 def rows_of(sensor: Sensor) -> Ints:

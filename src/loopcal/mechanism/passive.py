@@ -60,15 +60,22 @@ def passive_sensitivity(robot: Mechanism, values: Array, q: Array, state: State)
                 moved, driven = np.matmul(A, by_parameter), np.matmul(A, by_reading)
                 moved[..., columns] += of_parameters
                 driven[..., drives] += of_drives
-                both = _solved(block.U[:, :, k], np.concatenate([moved, driven], axis=-1))
+                both = back_substituted(block.U[:, :, k], np.concatenate([moved, driven], axis=-1))
                 at = [place[limb, j] for j in joints]
                 parameters[rows][:, :, at], readings[rows][:, :, at] = np.split(both, [moved.shape[-1]], axis=-1)
     lost = (state.status != Status.CONVERGED) & (state.status != Status.OTHER_MODE)
     parameters[lost], readings[lost] = np.nan, np.nan
-    return PassiveSensitivity(tuple(f"{limbs[i].name}.{limbs[i].joints[j].name}" for i, j in passive), parameters, readings)
+    return PassiveSensitivity(passive_names(robot), parameters, readings)
 
 
-def _solved(U: Array, right: Array) -> Array:
+def passive_names(robot: Mechanism) -> tuple[str, ...]:
+    """Names `limb.joint` of all passive joints, limb by limb."""
+    return tuple(
+        f"{limb.name}.{joint.name}" for limb in robot.assembly.limbs for joint in limb.joints if joint.actuator is None
+    )
+
+
+def back_substituted(U: Array, right: Array) -> Array:
     """-U^-1 right for upper triangular U (t, n, u, u) and right (t, n, u, c); a zero pivot gives infinities or NaN."""
     out = np.empty_like(right)
     with np.errstate(all="ignore"):

@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses at given parameters of the machine: where they, and the measurements' own unknowns, fit all rows best.
+
+Gauss-Newton on both together, many trials at once: every pose is closed by the kinematics, its rows are put side by side
+with those of the poses it is linked to, its free numbers are eliminated by projection, and what is left gives the own
+unknowns; the best free numbers follow. A step that does not lower the sum of squares is halved. See docs/theory/latent.md.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopcal import engine
+from loopcal.calibrate.components import Group, KindRows, Projected, component_blocks, groups_of, project, side_by_side
+from loopcal.calibrate.local import CLOSE, HALVINGS, NOTHING, Folding, Own, spread_columns
+from loopcal.calibrate.moves import evaluated, machine_columns
+from loopcal.calibrate.scaling import Unknowns
+from loopcal.calibrate.sensed import BLOCK, Block, Sensed
+from loopcal.calibrate.standing import Chart, FreeMoves, Standing
+from loopcal.linalg import FloatArray, IntArray
+from loopcal.measure import Evaluation, joints_looked_at
+
+STEPS = 30
+"""Gauss-Newton steps to the best poses at given parameters; two are usual."""
+
+ROUNDING = 1e-12
+"""Change of the sum of squares, relative, that is rounding and says nothing about a step."""
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """Poses of a trials where their rows fit best.
+
+    Attributes
+    ----------
+    standing : closed. values : (a, U) of the own unknowns, None without any. moves : of every block, where there is one.
+    failed : (a,) where a needed pose is out of reach. cost : (a,). calm : (a,) which came to rest.
+    """
+
+    standing: Standing
+    values: FloatArray | None
+    moves: FreeMoves | None
+    failed: np.ndarray
+    cost: FloatArray
+    calm: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """All rows at a point: closed poses, sums of squares of the components, and the parts of the next step."""
+
+    standing: Standing
+    values: FloatArray | None
+    moves: list[FreeMoves]
+    ok: np.ndarray
+    joints: dict[str, FloatArray]
+    failed: np.ndarray
+    cost: FloatArray
+    squares: FloatArray
+    gain: FloatArray
+    parts: list[tuple[IntArray, int, FloatArray]]
+    factors: list[FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """Step of the poses and own unknowns, and by how much (squared) it changes the rows."""
+
+    u: FloatArray
+    b: FloatArray | None
+    gain: FloatArray
+
+
+class Poses:
+    """Poses that are unknowns, and the rows that see them.
+
+    Parameters
+    ----------
+    unknowns : the free parameters and their units. sensed : the rows of every kind. chart : how poses move.
+    member : (n,) component of each pose. own : the unknowns that the measurements bring with them.
+    needed : (n,) poses that must be in reach.
+    """
+
+    def __init__(
+        self,
+        unknowns: Unknowns,
+        sensed: tuple[Sensed, ...],
+        chart: Chart,
+        member: IntArray,
+        own: Own | None,
+        needed: np.ndarray,
+    ) -> None:
+        self.unknowns, self.sensed, self.chart, self.member, self.own = unknowns, sensed, chart, member, own
+        self.components = int(member.max()) + 1
+        self.joints = joints_looked_at(s.kind for s in sensed)
+        self.blocks = component_blocks(sensed[-1].measured[0], sensed, member, needed, BLOCK)
+        self.groups = [groups_of(block, member, self._clusters()) for block in self.blocks]
+
+    def _clusters(self) -> IntArray:
+        """Cluster of own unknowns that each component's rows use, -1 without any."""
+        found = np.full(self.components, -1)
+        for s in (s for s in self.sensed if self.own is not None and s.places.shape[1]):
+            np.maximum.at(found, self.member[s.first], self.own.cluster[s.places].max(axis=1))  # type: ignore[union-attr]
+        return found
+
+    def settle(self, z: FloatArray, trials: IntArray, begin: Standing, fixed: FloatArray | None = None) -> Settled:
+        """Move poses and own unknowns to where all rows fit best at deviations z (a, p); `fixed` (a, U) holds the latter."""
+        own = self.own is not None and fixed is None
+        values = fixed
+        if own:
+            values = self._own_values(z, trials, begin)
+        here = self.look(z, trials, begin, values, own)
+        calm = np.zeros(len(trials), dtype=bool)
+        for _ in range(STEPS):
+            step = self._step(here, len(trials), own)
+            calm = step.gain <= CLOSE**2 * here.cost + NOTHING**2
+            if (calm | ~np.isfinite(here.cost)).all():
+                break
+            here, moved = self._moved(z, trials, here, step, ~calm & np.isfinite(here.cost), own)
+            if not moved:
+                break
+        alone = here.moves[0] if len(self.blocks) == 1 else None
+        return Settled(here.standing, here.values, alone, here.failed, here.cost, calm)
+
+    def projected(self, here: Settled, z: FloatArray, trials: IntArray) -> Iterator[tuple[Block, Group, Projected]]:
+        """Every group of components with its rows, poses eliminated, at settled poses."""
+        k = self.chart.freedoms
+        for block, groups in zip(self.blocks, self.groups, strict=True):
+            moves = here.moves
+            if moves is None:
+                values = self.unknowns.values(z)
+                moves = self.chart.linearised(values, here.standing.at(block.poses), block.poses, block.needed)
+            kinds = self._kinds(block, moves, trials, here.values)
+            for group in groups:
+                width = self.width(group)
+                rows = side_by_side(group, self._own_columns(kinds, block, group), k, width, len(self.unknowns))
+                done = project(rows, group.poses.shape[1] * k)
+                yield block, group, done
+
+    def _own_values(self, z: FloatArray, trials: IntArray, begin: Standing) -> FloatArray:
+        """Values (a, U) with which the own unknowns begin: those followed from the last fold, or found from the poses."""
+        own = self.own
+        assert own is not None
+        fresh = np.flatnonzero(~own.started[trials])
+        if len(fresh):
+            here = self.look(z, trials, begin, own.predicted(trials, z), own=False)
+            for i in fresh[~here.failed[fresh]]:
+                joints = {name: value[i : i + 1] for name, value in here.joints.items()}
+                own.begin(int(trials[i]), here.standing.state.T[i], joints)
+        return own.predicted(trials, z)
+
+    def look(self, z: FloatArray, trials: IntArray, at: Standing, values: FloatArray | None, own: bool) -> Look:
+        """Close all poses and compare their rows; `own` tells whether the own unknowns move, too."""
+        free, k, a = self.unknowns.values(z), self.chart.freedoms, len(trials)
+        folding = Folding(self.own if own else None, a, 0)
+        squares, gain = np.zeros((a, self.components)), np.zeros(a)
+        every, parts, closed = [], [], []
+        for block, groups in zip(self.blocks, self.groups, strict=True):
+            closed.append(self.chart.closed(free, at.at(block.poses)))
+            moves = self.chart.linearised(free, closed[-1], block.poses, block.needed)
+            every.append(moves)
+            kinds = self._kinds(block, moves, trials, values, machine=False)
+            for group in groups:
+                width = self.width(group) if own else 0
+                rows = side_by_side(group, self._own_columns(kinds, block, group) if width else kinds, k, width, 0)
+                squares[:, group.components] = (rows[..., -1] ** 2).sum(axis=2)
+                done = project(rows, group.poses.shape[1] * k)
+                gain += done.gain.sum(axis=1)
+                parts.append((block.poses[group.poses], group.cluster, done.best))
+                if width:
+                    folding.add([(group.cluster, done.rest.reshape(a, -1, width + 1))])
+        cost = squares.sum(axis=1) + (0.0 if not own else self._held(values))
+        failed = np.any([moves.failed for moves in every], axis=0)
+        where = np.argsort(np.concatenate([block.poses for block in self.blocks]))
+        whole = Standing(
+            engine.State(**_joined([c.state for c in closed], where)), np.concatenate([c.q for c in closed], axis=1)[:, where]
+        )
+        ok = np.concatenate([moves.ok for moves in every], axis=1)[:, where]
+        joints = {
+            n: np.concatenate([np.broadcast_to(m.joints[n], m.ok.shape) for m in every], axis=1)[:, where] for n in self.joints
+        }
+        kept = every if len(self.blocks) == 1 else []
+        factors = folding.whole(values) if own and values is not None else []
+        cost = np.where(failed, np.inf, cost)
+        return Look(whole, values, kept, ok, joints, failed, cost, squares, gain, parts, factors)
+
+    def _held(self, values: FloatArray | None) -> FloatArray | float:
+        """Sum of squares (a,) of the priors of own unknowns."""
+        if self.own is None or values is None or not self.own.held.any():
+            return 0.0
+        table, held = self.own.local.table, self.own.held
+        return (((values[:, held] - table.nominal[held]) / table.tolerance[held]) ** 2).sum(axis=1)
+
+    def _step(self, here: Look, a: int, own: bool) -> _Step:
+        """Gauss-Newton step of all poses (a, n, k) and own unknowns (a, U), and by how much it lowers the squares."""
+        u = np.zeros((a, len(self.member), self.chart.freedoms))
+        b, gain = None, here.gain
+        if own and self.own is not None:
+            b, offset = self.own.step(here.factors, a)
+            gain = gain + offset
+        for poses, cluster, best in here.parts:
+            right = np.ones((a, 1))
+            if b is not None and cluster >= 0 and self.own is not None:
+                right = np.concatenate([b[:, self.own.clusters[cluster]], right], axis=1)
+            u[:, poses] = -np.matmul(best, right[:, None, :, None])[..., 0].reshape(a, *poses.shape, -1)
+        return _Step(u, b, gain)
+
+    def _moved(
+        self, z: FloatArray, trials: IntArray, here: Look, step: _Step, going: np.ndarray, own: bool
+    ) -> tuple[Look, bool]:
+        """Take the step of the trials that are going, halved where it does not lower the sum of squares; tell if any moved.
+
+        Without own unknowns components are independent, and only those that got worse are halved.
+        """
+        every = np.arange(len(self.member))
+        share = np.repeat(going[:, None], len(every), axis=1).astype(np.float64)
+        found = here
+        for i in range(HALVINGS + 1):
+            at = self.chart.moved(here.standing, share[..., None] * step.u, every)
+            values = here.values
+            if own and step.b is not None and values is not None:
+                values = values + share[:, :1] * step.b
+            found = self.look(z, trials, at, values, own)
+            worse = going & ~(found.cost <= (1.0 + ROUNDING) * here.cost + NOTHING**2)
+            if not worse.any():
+                break
+            bad = np.repeat(worse[:, None], len(every), axis=1)
+            if not own:
+                bad &= ~(found.squares <= here.squares)[:, self.member] | ~found.ok
+            share[bad] *= 0.5 if i < HALVINGS - 1 else 0.0
+        return found, bool(share.any())
+
+    def _kinds(
+        self, block: Block, moves: FreeMoves, trials: IntArray, values: FloatArray | None, machine: bool = True
+    ) -> list[KindRows | None]:
+        """Whitened rows of every kind at a block's poses."""
+        found: list[KindRows | None] = []
+        for s in block.sensed:
+            if not len(s.poses):
+                found.append(None)
+                continue
+            seen, white = evaluated(s, moves, trials, values)
+            a, r, m = seen.residual.shape
+            by_own = None if seen.own is None else np.matmul(white, np.broadcast_to(seen.own, (a, r, m, seen.own.shape[-1])))
+            by_machine = machine_columns(s, seen, white, moves) if machine else np.zeros((a, r, m, 0))
+            residual = np.matmul(white, seen.residual[..., None])[..., 0]
+            found.append(KindRows(_free_columns(s, seen, white, moves), by_own, by_machine, residual))
+        return found
+
+    def _own_columns(self, kinds: Sequence[KindRows | None], block: Block, group: Group) -> list[KindRows | None]:
+        """The rows with their own unknowns at the columns of the group's cluster."""
+        if self.own is None or group.cluster < 0:
+            return list(kinds)
+        width, found = len(self.own.clusters[group.cluster]), []
+        for kind, s in zip(kinds, block.sensed, strict=True):
+            if kind is None or kind.own is None:
+                found.append(kind)
+                continue
+            inside = self.own.free[s.places] & (self.own.cluster[s.places] == group.cluster)
+            columns = np.where(inside, self.own.column[s.places], width)
+            found.append(kind._replace(own=spread_columns(kind.own, columns, width)))
+        return found
+
+    def width(self, group: Group) -> int:
+        """Own unknowns of a group's rows."""
+        return 0 if self.own is None or group.cluster < 0 else len(self.own.clusters[group.cluster])
+
+
+def _free_columns(sensed: Sensed, seen: Evaluation, white: FloatArray, moves: FreeMoves) -> FloatArray:
+    """Whitened derivatives (a, r, links, m, k) of a kind's rows by the free numbers of the poses they saw."""
+    if sensed.kind.links > 1:
+        parts = [np.matmul(white, seen.jacobian[:, :, i] @ moves.Y[:, sensed.poses[:, i]]) for i in range(sensed.kind.links)]
+        return np.stack(parts, axis=2)
+    columns = np.matmul(seen.jacobian, moves.Y[:, sensed.poses])
+    if seen.joints is not None and sensed.kind.looks_at:
+        turns = np.stack([moves.turns[name][:, sensed.poses] for name in sensed.kind.looks_at], axis=2)
+        columns = columns + np.matmul(seen.joints, turns)
+    return np.matmul(white, columns)[:, :, None]
+
+
+def _joined(parts: list[engine.State], where: IntArray) -> dict:
+    """Fields of states of all blocks, poses in their own order."""
+    found = {}
+    for f in dataclasses.fields(engine.State):
+        if f.name == "joints":
+            found["joints"] = tuple(np.concatenate(j, axis=1)[:, where] for j in zip(*(p.joints for p in parts), strict=True))
+        else:
+            found[f.name] = np.concatenate([getattr(p, f.name) for p in parts], axis=1)[:, where]
+    return found
