@@ -212,10 +212,12 @@ def directions(seen: Array, turns: Array, axis: Array | None) -> tuple[Array, Ar
         return R[None], axis[None]
     R = np.array(OCTAHEDRAL)
     a = np.zeros((len(R), 3))
+    # both steps see the rows through these 27 sums alone
+    sums = np.einsum("rji,rl->ijl", turns, seen)
     for _ in range(200):
-        a = np.einsum("rji,kjl,rl->ki", turns, R, seen)
+        a = np.einsum("ijl,kjl->ki", sums, R)
         a /= np.maximum(np.linalg.norm(a, axis=-1, keepdims=True), 1e-300)
-        R = nearest_rotation(np.einsum("rij,kj,rl->kil", turns, a, seen))
+        R = nearest_rotation(np.einsum("jil,kj->kil", sums, a))
     missed = np.linalg.norm(np.einsum("kij,rj->kri", R, seen) - np.einsum("rij,kj->kri", turns, a), axis=(1, 2))
     order = np.argsort(missed)
     return R[order][:6], a[order][:6]

@@ -68,3 +68,17 @@ def test_a_frame_that_is_no_pose_is_refused():
         Pose(T_base_frame=mirrored)
     with pytest.raises(DataError, match=r"T_platform_tool has shape \(3, 3\)"):
         Pose(T_platform_tool=np.eye(3))
+
+
+@pytest.mark.parametrize("form", ["tilt-torsion", "euler-ZXZ"])
+@pytest.mark.parametrize("tilt", [0.0, 1e-9, 1e-3])
+def test_noise_of_angles_that_are_nearly_the_same_turn_is_a_rotation_error(form, tilt):
+    # before, a tilt of 1e-9 made one rotation a thousand million times as certain as stated, and a tilt of zero was refused
+    kind = Pose(form, T_platform_tool=np.eye(4))
+    T = se3.exp_update(np.eye(4), np.array([0.6 * tilt, -0.8 * tilt, 0.0, 0.0, 0.0, 0.1]))[None, None]
+    T = np.broadcast_to(T, (1, 200, 4, 4))
+    noise = np.random.default_rng(3).normal(size=(1, 200, 6)) * 1e-4
+    measured = kind.measure(T, noise)
+    assert_allclose(kind.evaluate(T, measured).residual, -noise, atol=1e-10)  # [rad, m], rounding over the tilt
+    rows = Observations.from_sigma(kind, np.arange(200), measured[0], 1e-4)
+    assert_allclose(rows.whitener, np.broadcast_to(1e4 * np.eye(6), (200, 6, 6)), rtol=1e-9)

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 FLAT = 0.05
 """Measured tilt [rad] below which the normal stands in for phi and theta; phi is there twenty times as noisy."""
 
-_GIMBAL = 1e-3
+GIMBAL = 1e-3
 """Smallest |det E| of measured angles [1]; below it a and c are the same turn to a thousandth."""
 
 
@@ -125,7 +125,7 @@ class Component(ToolKind):
                     " declare another order, or use the kind 'pose'"
                 ),
             )
-            for i in np.flatnonzero(determinant < _GIMBAL)
+            for i in np.flatnonzero(determinant < GIMBAL)
         )
 
     @property

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from loopcal import se3
 from loopcal.measure.closed_form import hand_eye
 from loopcal.measure.kinds import parts
+from loopcal.measure.kinds.component import FLAT
 from loopcal.measure.kinds.kind import Bools, Column, Evaluation
 from loopcal.measure.kinds.tool import ToolKind, position_columns, stacked
 from loopcal.measure.orientation import Orientation, orientation
@@ -29,7 +30,8 @@ class Pose(ToolKind):
     ----------
     orientation : str
         Form of the orientation columns, see `loopcal.measure.orientation`. Noise of a rotation vector or a quaternion
-        is a rotation error rx ry rz about the axes of the frame; noise of angles is theirs, and is mapped.
+        is a rotation error rx ry rz about the axes of the frame; noise of angles is theirs, and is mapped. Where two
+        angles are nearly the same turn (`|det E| < FLAT`, E their rates), it counts as a rotation error, too.
     form
         The same as an object.
     T_base_frame, T_platform_tool, unknown, frame
@@ -105,11 +107,10 @@ class Pose(ToolKind):
     def measure(self, T: Array, noise: Array, unknowns: Array | None = None, joints: Array | None = None) -> Array:
         """Columns (t, r, c) of the tool pose with noise (t, r, 6): a rotation error, or added to the angles."""
         seen = self.seen(T, unknowns)
+        turned = self.form.from_matrix(se3.exp_so3(noise[..., :3]) @ seen[..., :3, :3])
         if self.form.angles:
-            turned = self.form.from_matrix(seen[..., :3, :3])
-            turned = turned + noise[..., :3]
-        else:
-            turned = self.form.from_matrix(se3.exp_so3(noise[..., :3]) @ seen[..., :3, :3])
+            exact = self.form.from_matrix(seen[..., :3, :3])
+            turned = np.where(_degenerate(self.form.rates(exact))[..., 0], turned, exact + noise[..., :3])
         return np.concatenate([turned, seen[..., :3, 3] + noise[..., 3:]], axis=-1)
 
     def starts(self, T: Array, measured: Array) -> Array:
@@ -128,8 +129,9 @@ class Pose(ToolKind):
         return stacked(self, found, 1)
 
     def noise_map(self, measured: Array) -> Array:
-        """Matrix (..., 6, 6): E of the angles for the rotation, the identity for x y z."""
+        """Matrix (..., 6, 6): E of the angles (or the identity, see the class) for the rotation, the identity for x y z."""
         rates = self.form.rates(self._filled(measured))
+        rates = np.where(_degenerate(rates), np.eye(3), rates)
         zero = np.zeros_like(rates)
         identity = np.broadcast_to(np.eye(3), rates.shape)
         top = np.concatenate([rates, zero], axis=-1)
@@ -139,3 +141,8 @@ class Pose(ToolKind):
         """Orientation columns, with the identity where any of them was not measured."""
         turned = measured[..., :-3]
         return np.where(np.any(np.isnan(turned), axis=-1, keepdims=True), self.neutral[:-3], turned)
+
+
+def _degenerate(rates: Array) -> Bools:
+    """Whether angles with these rates (..., 3, 3) are nearly the same turn, (..., 1, 1)."""
+    return (np.abs(np.linalg.det(rates)) < FLAT)[..., None, None]
