@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write the tables of docs/files.md from the records and kinds that read the files: `python -m tools.file_reference`.
+"""Write the tables of docs/files.md and docs/exports.md from what reads the files: `python -m tools.file_reference`.
 
 A table stands between `<!-- made by tools.file_reference: NAME -->` and `<!-- end -->`; what is around it is written by hand.
 """
@@ -7,10 +7,11 @@ A table stands between `<!-- made by tools.file_reference: NAME -->` and `<!-- e
 import dataclasses
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from loopcal.io import reference
+from loopcal.io.exports.profile import FROM, KEYS
 from loopcal.io.run_folder import MADE_BY
 from loopcal.io.sensor_rows import SETTINGS
 from loopcal.io.sensor_settings import SYMBOLS, kind_settings
@@ -19,7 +20,9 @@ from loopcal.mechanism import FAMILIES
 from loopcal.mechanism.records import Robot
 from loopcal.units import Dimension
 
-PAGE = Path(__file__).resolve().parent.parent / "docs" / "files.md"
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+PAGE, EXPORTS = DOCS / "files.md", DOCS / "exports.md"
+EXAMPLES = DOCS.parent / "examples" / "exports"
 BLOCK = re.compile(r"(<!-- made by tools.file_reference: (?P<name>[\w-]+) -->\n)(?P<body>.*?)(<!-- end -->)", re.DOTALL)
 
 
@@ -111,18 +114,38 @@ def made_by() -> str:
     return table(("key", "meaning"), [(f"`{key}`", words) for key, words in MADE_BY.items()])
 
 
+def profile() -> str:
+    """Return the keys of a profile of exports."""
+    return table(("key", "meaning"), [(f"`{key}`", words) for key, words in KEYS.items()])
+
+
+def profile_columns() -> str:
+    """Return the keys of a column in a profile."""
+    return table(("key", "meaning"), [(f"`{key}`", words) for key, words in FROM.items()])
+
+
+def profile_example(name: str) -> Callable[[], str]:
+    """Return what gives a profile of the examples."""
+    return lambda: f"```yaml\n{(EXAMPLES / name).read_text('utf-8')}```\n"
+
+
 BLOCKS = {"common": common, "families": families, "kinds": kinds, "settings": settings, "made-by": made_by}
+OF_EXPORTS = {"profile": profile, "profile-columns": profile_columns} | {
+    name: profile_example(f"{name}.yaml") for name in ("tracker-points", "six-dof", "cmm-spheres")
+}
 
 
 def written(text: str) -> str:
     """Return the page with every table made anew."""
-    return BLOCK.sub(lambda m: f"{m[1]}{BLOCKS[m['name']]()}{m[4]}", text)
+    every = BLOCKS | OF_EXPORTS
+    return BLOCK.sub(lambda m: f"{m[1]}{every[m['name']]()}{m[4]}", text)
 
 
 def main() -> int:
-    """Rewrite the page."""
-    PAGE.write_text(written(PAGE.read_text("utf-8")), "utf-8")
-    print(f"written: {PAGE.relative_to(PAGE.parent.parent)}")
+    """Rewrite the pages."""
+    for page in (PAGE, EXPORTS):
+        page.write_text(written(page.read_text("utf-8")), "utf-8")
+        print(f"written: {page.relative_to(DOCS.parent)}")
     return 0
 
 

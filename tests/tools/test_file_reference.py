@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/files.md says what the code reads and writes."""
+"""docs/files.md and docs/exports.md say what the code reads and writes."""
 
 import json
 import re
@@ -19,6 +19,9 @@ PAGE = file_reference.PAGE.read_text("utf-8")
 def test_the_page_is_up_to_date() -> None:
     assert file_reference.written(PAGE) == PAGE, "run `make docs`"
     assert {m["name"] for m in file_reference.BLOCK.finditer(PAGE)} == set(file_reference.BLOCKS)
+    exports = file_reference.EXPORTS.read_text("utf-8")
+    assert file_reference.written(exports) == exports, "run `make docs`"
+    assert {m["name"] for m in file_reference.BLOCK.finditer(exports)} == set(file_reference.OF_EXPORTS)
 
 
 def test_every_family_and_kind_is_there() -> None:
