@@ -45,7 +45,7 @@ def maximise(scoring: Scoring, ready: FloatArray, w: FloatArray, cap: float | No
 def _centre(scoring: Scoring, ready: FloatArray, w: FloatArray, cap: float | None, t: float) -> FloatArray:
     """Newton's method for one t."""
     for _ in range(STEPS):
-        slope, curve = _derivatives(scoring, ready, w)
+        slope, curve = derivatives(scoring, ready, w)
         gradient, bend = t * slope + 1.0 / w, 1.0 / w**2
         if cap is not None:
             gradient, bend = gradient - 1.0 / (cap - w), bend + 1.0 / (cap - w) ** 2
@@ -89,7 +89,7 @@ def _barrier(scoring: Scoring, ready: FloatArray, w: FloatArray, cap: float | No
     return t * scoring.score(scoring.factor(np.sqrt(w)[:, None, None] * ready)) + float(walls)
 
 
-def _derivatives(scoring: Scoring, ready: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
+def derivatives(scoring: Scoring, ready: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
     """First (s,) and second (s, s) derivatives of the score by the weights."""
     R, o = scoring.factor(np.sqrt(w)[:, None, None] * ready), scoring.own
     Y = ready @ np.linalg.inv(R)

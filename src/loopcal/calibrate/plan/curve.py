@@ -122,13 +122,13 @@ def enough(
         return made[n].design.value
 
     least, q = fewest(rows.shape[1], start, space), len(space)
-    at_least = _smallest(bound_of, least, most, min(2 * least, most), criterion, target, q)
+    at_least = smallest(bound_of, least, most, min(2 * least, most), criterion, target, q)
     if at_least > most:
         raise EstimationError(
             f"no {most} of the {count} allowed candidates bring criterion {criterion.name} to {target:.6g}: the best possible"
             f" is {bounds[most]:.6g}; allow more poses, a less demanding target or a better instrument"
         )
-    n = _smallest(value_of, at_least, most, at_least, criterion, target, q)
+    n = smallest(value_of, at_least, most, at_least, criterion, target, q)
     if n > most:
         raise EstimationError(
             f"no {most} of the {count} allowed candidates were found that bring criterion {criterion.name} to {target:.6g}:"
@@ -137,7 +137,7 @@ def enough(
     return Enough(n, at_least, made[n], _curve([made[k] for k in sorted(made)]))
 
 
-def _smallest(
+def smallest(
     value_of: Callable[[int], float], low: int, high: int, n: int, criterion: Criterion, target: float, q: int
 ) -> int:
     """Return the smallest size from low to high whose value meets the target, high + 1 where none does.
