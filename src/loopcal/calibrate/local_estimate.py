@@ -96,17 +96,24 @@ def nothing_local(parameters: int) -> LocalEstimate:
 
 
 def local_estimate(
-    own: Own, robot: Mechanism, start: FloatArray, decomposition: Decomposition, penalty: FloatArray, noise: float
+    own: Own,
+    robot: Mechanism,
+    start: FloatArray,
+    decomposition: Decomposition,
+    penalty: FloatArray,
+    noise: float,
+    trial: int = 0,
 ) -> LocalEstimate:
-    """Return what the last fold of a fit (t = 1) says of the own unknowns.
+    """Return what the last fold, of one trial alone, says of the own unknowns.
 
     Parameters
     ----------
     own : after a fold at the estimate. robot : for its units. start : (U,) values with which the fit began.
-    decomposition, penalty : of the fit. noise : variance of the whitened rows; NaN where no interval is given.
+    decomposition, penalty : of the fit (t = 1). noise : variance of the whitened rows; NaN where no interval is given.
+    trial : which one was folded.
     """
     table = own.local.table
-    estimate, variance = own.values[0].copy(), np.zeros(len(table))
+    estimate, variance = own.values[trial].copy(), np.zeros(len(table))
     slope, unseen = np.zeros((len(table), own.slope.shape[2])), np.zeros(len(table), dtype=bool)
     known = decomposition.variances(penalty, noise)[0]
     V = decomposition.scale[:, None] * decomposition.directions[0]
