@@ -70,6 +70,12 @@ PAPERS: Mapping[str, Paper] = {
             "Advances in Mechanical Engineering 2016, doi:10.1177/1687814016667908",
             "loopcal.papers.tsvd_2016.compare",
         ),
+        Paper(
+            "cmm-constraint-2011",
+            "A hexapod calibrated from points on planes and perpendicular lines, held by a coordinate measuring machine",
+            "International Journal of Advanced Robotic Systems 2011, doi:10.5772/45684",
+            "loopcal.papers.cmm_constraint_2011.compare",
+        ),
     )
 }
 

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is given and what is asked: robot, points, true machines, and the errors by which a calibration is judged.
+
+Robot and workspace are ours, those of the robot file hexapod-nategh-agheli: the paper's Tables 1 and 2 are not in our text.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from loopcal import se3
+from loopcal.calibrate.plan.coordinate import MovedDesign, coordinate_exchange
+from loopcal.calibrate.plan.criteria import D
+from loopcal.calibrate.plan.design import Start
+from loopcal.calibrate.plan.groups import PlaneAndLine
+from loopcal.linalg import FloatArray
+from loopcal.measure import stream
+from loopcal.mechanism import Mechanism, Solution, sample
+from loopcal.mechanism.trials import forward_trials
+from loopcal.papers.cmm_constraint_2011.gauge import without_gauge
+from loopcal.papers.cmm_constraint_2011.published import MM
+from loopcal.papers.cmm_constraint_2011.steps import Layout
+
+ROBOT = "hexapod-nategh-agheli"
+GROUPS, POINTS = 10, 10
+"""Planes with a line each, and points of each: the paper's 100 positions."""
+AXES = ("z",)
+"""Along which lines run, as the paper describes it: planes of equal z."""
+SWEEPS = 3
+UNSEEN = 100
+"""Random poses over which errors are taken, as in the paper."""
+TRUTH = 1  # purpose of a random stream
+MEASURES = (
+    "position [mm]",
+    "orientation [deg]",
+    "position, aligned [mm]",
+    "orientation, aligned [deg]",
+    "parameters [mm]",
+    "parameters without gauge [mm]",
+)
+"""Root mean squares over the unseen poses, and the 2-norm of what is wrong with the 42 parameters."""
+
+
+@dataclass(frozen=True, eq=False)
+class Unseen:
+    """Poses that were not measured, at which identified machines are compared with true ones.
+
+    Attributes
+    ----------
+    robot : as designed. solution : 100 random poses of its workspace, as it is commanded to them.
+    """
+
+    robot: Mechanism
+    solution: Solution
+
+    def poses(self, values: FloatArray) -> FloatArray:
+        """(t, n, 4, 4) of machines (t, p) at the readings."""
+        return forward_trials(self.robot, values, self.solution.q[None], self.solution.state).T
+
+    def twists(self, values: FloatArray, true: FloatArray, aligned: bool) -> FloatArray:
+        """Differences (t, n, 6) [rad, m], rotation first, of the poses of machines (t | 1, p) from true ones (t, n, 4, 4)."""
+        T = np.broadcast_to(self.poses(values), true.shape)
+        return se3.difference(best_fit(T, true) if aligned else T, true)
+
+    def errors(self, values: FloatArray, truth: FloatArray, true: FloatArray) -> FloatArray:
+        """(t, 6) see MEASURES; values (t | 1, p) and truth (t, p) [m], true (t, n, 4, 4) the `poses` of the truth."""
+        T = np.broadcast_to(self.poses(values), true.shape)
+        found = []
+        for predicted in (T, best_fit(T, true)):
+            squares = np.mean(se3.difference(predicted, true) ** 2, axis=1)
+            found.append(np.sqrt(squares[:, 3:].sum(axis=1)) / MM)
+            found.append(np.rad2deg(np.sqrt(squares[:, :3].sum(axis=1))))
+        wrong = values - truth
+        lengths = (np.linalg.norm(e, axis=1) / MM for e in (wrong, without_gauge(self.robot, wrong)))
+        return np.stack([*found, *lengths], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """The robot, the points it is sent to, and the poses at which it is judged.
+
+    Attributes
+    ----------
+    planned : how groups are written as designs. first, optimised : before and after coordinate exchange. seed : of both.
+    """
+
+    robot: Mechanism
+    planned: PlaneAndLine
+    first: FloatArray
+    optimised: MovedDesign
+    seed: int
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The points that are measured."""
+        return Layout(self.robot, self.planned.coordinates(self.optimised.design))
+
+    @cached_property
+    def unseen(self) -> Unseen:
+        """Drawn by another seed than the points."""
+        return Unseen(self.robot, sample(self.robot, UNSEEN, self.seed + 1).solution)
+
+
+def machine() -> Mechanism:
+    """The hexapod as designed."""
+    from loopcal.io import load_robot
+
+    return load_robot(ROBOT)
+
+
+def plan(robot: Mechanism, groups: int, points: int, axes: tuple[str, ...], seed: int, sweeps: int) -> Study:
+    """Draw groups at random and improve them by coordinate exchange for log det of what they tell; 0 sweeps: as drawn."""
+    planned = PlaneAndLine(robot, points, MM, axes)
+    first = planned.random(groups, seed)
+    found = coordinate_exchange(
+        planned.evaluate, first, planned.levels(), D(), Start.nothing(len(planned.unknowns)), sweeps=sweeps
+    )
+    return Study(robot, planned, first, found, seed)
+
+
+def spread(rows: FloatArray) -> float:
+    """Root mean square sd of the identifiable directions [mm per mm of noise], of rows for a noise of 1 mm."""
+    s = np.linalg.svd(rows.reshape(-1, rows.shape[-1]), compute_uv=False)
+    s = s[s > 1e-10 * s[0]]
+    return float(np.sqrt(np.mean(1.0 / s**2)))
+
+
+def true_machines(robot: Mechanism, sd: float, trials: int, seed: int, gauge_free: bool = False) -> FloatArray:
+    """(t, p) [m] nominal values with Gaussian errors; machine i has the same errors, scaled, whatever sd and trials."""
+    drawn = np.stack([stream(seed, trial, TRUTH).standard_normal(len(robot.parameters)) for trial in range(trials)])
+    return robot.parameters.nominal + sd * (without_gauge(robot, drawn) if gauge_free else drawn)
+
+
+def best_fit(T: FloatArray, true: FloatArray) -> FloatArray:
+    """Poses (t, n, 4, 4) after the motion of the base and the turn of the platform that bring them nearest to true ones.
+
+    Positions fix the base's motion (their least squares), then orientations the platform's turn (nearest rotations): what
+    plane and line leave open, and nothing else.
+    """
+    x, y = T[..., :3, 3], true[..., :3, 3]
+    middle, centre = x.mean(axis=1, keepdims=True), y.mean(axis=1, keepdims=True)
+    Q = nearest_rotations(np.swapaxes(y - centre, 1, 2) @ (x - middle))
+    R = Q[:, None] @ T[..., :3, :3]
+    turn = nearest_rotations(np.sum(np.swapaxes(R, 2, 3) @ true[..., :3, :3], axis=1))
+    return se3.pose(R @ turn[:, None], (x - middle) @ np.swapaxes(Q, 1, 2) + centre)
+
+
+def nearest_rotations(M: FloatArray) -> FloatArray:
+    """Rotations (t, 3, 3) nearest to matrices (t, 3, 3), in the mean square of their entries."""
+    U, _, Vt = np.linalg.svd(M)
+    U[..., 2] *= np.linalg.det(U @ Vt)[..., None]
+    return U @ Vt
