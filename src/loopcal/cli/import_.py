@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from loopcal.io.formats.exchange import Format, Reading
     from loopcal.mechanism import Mechanism
 
-FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf")
+FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "hangprinter")
 LENGTH = Quantity(Dimension.LENGTH)
 SHOWN = 20
 """Lines that do not fit a profile that are shown."""
@@ -27,6 +27,8 @@ SHOWN = 20
 ASKED = {
     "sigma_height": "--sigma-height",
     "sigma_distance": "--sigma-distance",
+    "sigma_line": "--sigma-line",
+    "sigma_position": "--sigma-position",
     "length_unit": "--unit",
     "home_height": "--home-z",
     "closures": "--closures",
@@ -49,6 +51,9 @@ ASKED = {
 @click.option("--corrected", type=FILE, help="Also calibrate with them, and write FILE with the corrected numbers.")
 @click.option("--sigma-height", type=LENGTH, metavar="QUANTITY", help="Noise of the probe (klipper); 0.02mm if left out.")
 @click.option("--sigma-distance", type=LENGTH, metavar="QUANTITY", help="Noise of distances (klipper); 0.1mm if left out.")
+@click.option("--sigma-line", type=LENGTH, metavar="QUANTITY", help="Noise of lines (hangprinter); 1mm if left out.")
+@click.option("--sigma-position", type=LENGTH, metavar="QUANTITY",
+              help="Noise of known positions (hangprinter); 1mm if left out.")  # fmt: skip
 @click.option("--unit", "length_unit", type=click.Choice(symbols(Dimension.LENGTH)), help="Of lengths (linuxcnc).")
 @click.option("--home-z", "home_height", type=LENGTH, metavar="QUANTITY", help="Height of the home pose (linuxcnc).")
 @click.option("--closures", type=FILE, help="Which loops a URDF closes (urdf); FILE with the ending .yaml if left out.")
@@ -73,6 +78,7 @@ def import_(
       loopcal import config-override.g --format reprap -o printer.yaml
       loopcal import export.txt --profile tracker.yaml -o measurements.csv
       loopcal import hexapod.hal --unit mm --home-z 200mm -o hexapod.yaml
+      loopcal import samples.json --format hangprinter -o robot.yaml --data samples.csv --sigma-line 0.7mm
       loopcal import five-bar.urdf --closures five-bar-loops.yaml -o five-bar.yaml
     """  # noqa: D301
     from loopcal.io.formats.transfer import format_of, save_imported

@@ -6,10 +6,19 @@ A format is a `Format` with `read`, `write` or both; its line in `FORMATS` is al
 
 from collections.abc import Mapping
 
-from loopcal.io.formats import klipper, linuxcnc, marlin, parameters, reprap, urdf
+from loopcal.io.formats import hangprinter, klipper, linuxcnc, marlin, parameters, reprap, urdf
 from loopcal.io.formats.exchange import Format
 
 FORMATS: Mapping[str, Format] = {
     found.name: found
-    for found in (klipper.FORMAT, marlin.FORMAT, reprap.FORMAT, linuxcnc.FORMAT, urdf.FORMAT, parameters.JSON, parameters.CSV)
+    for found in (
+        klipper.FORMAT,
+        marlin.FORMAT,
+        reprap.FORMAT,
+        linuxcnc.FORMAT,
+        urdf.FORMAT,
+        hangprinter.FORMAT,
+        parameters.JSON,
+        parameters.CSV,
+    )
 }

@@ -19,6 +19,9 @@ HEIGHT_SIGMA = 20e-6
 
 UNCHANGED = "every number was already this one; nothing was changed"
 
+LINE_SIGMA = POSITION_SIGMA = 1e-3
+"""Standard deviations of a line's length and of a known position of a cable robot, where nothing is known [m]."""
+
 DISTANCE_SIGMA = 0.1e-3
 """Standard deviation of a distance by callipers on a printed part where nothing is known of them [m]."""
 
@@ -32,6 +35,7 @@ class Reading:
     name : of the robot. sigma_height, sigma_distance : noise of measurements in the file [m], which no format states.
     length_unit : symbol of the unit of lengths, for formats that state none. home_height : z of the home pose [m].
     closures : the file of loop closures, for formats that keep them apart. platform : the link that is the platform.
+    sigma_line, sigma_position : noise of lines and of known positions of a cable robot [m], which no format states.
     """
 
     name: str
@@ -41,6 +45,8 @@ class Reading:
     home_height: float | None = None
     closures: Path | None = None
     platform: str | None = None
+    sigma_line: float = LINE_SIGMA
+    sigma_position: float = POSITION_SIGMA
 
 
 @dataclass(frozen=True)

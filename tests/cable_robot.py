@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cable robots with poses nobody measured: the shipped example made anew, and an estimator that shares nothing with loopcal's.
+
+The reference has every pose as three explicit unknowns and is solved densely by scipy. With anchors a_k, lengths at zero c_k,
+spool radius r, gear g, line moved for line unwound s_k and build-up b_k, and positions x_i,
+
+    |x_i - a_k| = c_k + s_k (r g q_ik - b_k (g q_ik)^2 / 4),
+
+whose residuals are motor angles q (over their sigma) and known positions x (over theirs).
+
+Lengths in mm, angles in degrees as in the files of samples.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from loopcal.io.formats.hangprinter import Samples
+
+Array = NDArray[np.float64]
+NAMES = (
+    *(f"{line}.{what}" for line in "ABCD" for what in ("anchor.x", "anchor.y", "anchor.z", "length")),
+    "spool.radius",
+    *(f"{line}.buildup" for line in "ABCD"),
+)
+"""Parameters in the order of the robot file that the import writes."""
+
+TRUTH = np.array(
+    [
+        *(12.0, -1480.0, -95.0, 1484.5),
+        *(1250.0, 690.0, -130.0, 1433.5),
+        *(-1310.0, 720.0, -110.0, 1498.0),
+        *(15.0, -20.0, 2150.0, 2150.6),
+        60.8,
+        *(0.07, 0.05, 0.06, 0.055),
+    ]
+)
+"""The example's machine in that order [mm]."""
+
+LINE, POSITION = 0.5, 0.5
+"""Noise of the example [mm]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """What the reference finds. values, sd : (21,) in the order of `NAMES` [mm] (22 with a stretch). poses : (N, 3).
+
+    lines : (N, 4) residuals of the lines [mm]. positions : (K, 3). chi_square, dof, covariance : of the fit.
+    """
+
+    values: Array
+    covariance: Array
+    poses: Array
+    lines: Array
+    positions: Array
+    chi_square: float
+    dof: int
+
+    @property
+    def sd(self) -> Array:
+        """Standard deviations by the stated sigmas (21,) [mm]."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def real(data_folder: Path) -> dict[str, Any]:
+    """The samples of a real machine."""
+    return json.loads((data_folder / "cable_robot" / "hp_mark_adjusted.json").read_text("utf-8"))
+
+
+def share(found: dict[str, Any]) -> tuple[float, Array]:
+    """Gear g, and line moved for line unwound (4,)."""
+    gear = found["motor_gear_teeth"] / found["spool_gear_teeth"]
+    return gear, np.array(found["lines_per_spool"]) / np.array(found["mechanical_advantage"])
+
+
+def paid_out(found: dict[str, Any], radius: float, buildup: Array) -> Array:
+    """Line paid out at the motor angles (N, 4) [mm]."""
+    gear, s = share(found)
+    turn = gear * np.radians(found["motor_pos_samp"])
+    return s * (radius * turn - buildup * turn**2 / 4)
+
+
+def motor_angles(found: dict[str, Any], radius: float, buildup: Array, paid: Array) -> tuple[Array, Array]:
+    """Motor angles (N, 4) [rad] that pay out this much, and the line's change per radian there."""
+    gear, s = share(found)
+    # r t - b t^2 / 4 = u has the root t = 2 u / (r + sqrt(r^2 - b u)), and dt/du = 1 / sqrt(r^2 - b u)
+    root = np.sqrt(radius**2 - buildup * paid / s)
+    return 2 * (paid / s) / (radius + root) / gear, root * gear * s
+
+
+def reference(found: dict[str, Any], line: float, position: float, start: Array, stretch: Array | None = None) -> Reference:
+    """Solve densely for 21 parameters and all poses.
+
+    Parameters
+    ----------
+    found : samples. line : what the sigma of motor angles is in line on the spools as guessed, position : sigma [mm].
+    start : (21,) parameters to begin with [mm]. stretch : (N, 4) that lengthens the lines by an unknown factor, the last
+        parameter; none by default.
+    """
+    known, measured = np.array(found["xyz_of_samp"]), np.radians(found["motor_pos_samp"])
+    n, k, p21 = len(measured), len(known), 21 + (stretch is not None)
+    gear, s = share(found)
+    sigma = line / (np.array(found["spool_r_in_origin_first_guess"]) * gear * s)  # [rad]
+    first = np.concatenate([start, np.zeros(p21 - 21), _first_poses(found, start).ravel()])
+    more = np.zeros((n, 4)) if stretch is None else stretch
+
+    def modelled(p: Array) -> tuple[Array, Array, Array]:
+        a, c, r, b = _split(p)
+        apart = p[p21:].reshape(-1, 1, 3) - a
+        length = np.linalg.norm(apart, axis=2)
+        factor = p[21] if stretch is not None else 0.0
+        angles, slope = motor_angles(found, r, b, length - c - factor * more)
+        return angles, slope, apart / length[..., None]
+
+    def residual(p: Array) -> Array:
+        seen = (p[p21 : p21 + 3 * k] - known.ravel()) / position
+        return np.concatenate([((modelled(p)[0] - measured) / sigma).ravel(), seen])
+
+    def jacobian(p: Array) -> Array:
+        angles, slope, u = modelled(p)
+        turn = gear * angles
+        J = np.zeros((n, 4, len(p)))
+        for j in range(4):
+            J[:, j, 4 * j : 4 * j + 3], J[:, j, 4 * j + 3] = -u[:, j], -1.0
+            J[:, j, 16], J[:, j, 17 + j] = -s[j] * turn[:, j], s[j] * turn[:, j] ** 2 / 4
+        J[..., 21:p21] = -more[..., None]
+        for i in range(n):
+            J[i, :, p21 + 3 * i : p21 + 3 * i + 3] = u[i]
+        J /= (sigma * slope)[..., None]
+        seen = np.zeros((3 * k, len(p)))
+        seen[:, p21 : p21 + 3 * k] = np.eye(3 * k) / position
+        return np.concatenate([J.reshape(4 * n, -1), seen])
+
+    options: Any = {"method": "lm", "x_scale": "jac", "xtol": 1e-14, "ftol": 1e-14, "gtol": 1e-14}
+    done = least_squares(residual, first, jac=cast(Any, jacobian), **options)
+    inverse = np.linalg.inv(np.linalg.qr(done.jac, mode="r"))
+    angles, positions = np.split(done.fun, [4 * n])
+    return Reference(
+        done.x[:p21],
+        (inverse @ inverse.T)[:p21, :p21],
+        done.x[p21:].reshape(-1, 3),
+        angles.reshape(n, 4) * sigma * modelled(done.x)[1],
+        positions.reshape(k, 3) * position,
+        float(done.fun @ done.fun),
+        len(done.fun) - len(done.x),
+    )
+
+
+def _split(p: Array) -> tuple[Array, Array, float, Array]:
+    """Anchors (4, 3), lengths (4,), radius and build-ups (4,)."""
+    limbs = p[:16].reshape(4, 4)
+    return limbs[:, :3], limbs[:, 3], float(p[16]), p[17:21]
+
+
+def first_guess(samples: Samples, anchors: Array) -> Array:
+    """Parameters (21,) [mm] as the import has them: no build-up, lengths as zero readings say."""
+    limbs = np.column_stack([anchors, np.linalg.norm(anchors, axis=1)])
+    return np.concatenate([limbs.ravel(), samples.radius[:1], np.zeros(4)])
+
+
+def _first_poses(found: dict[str, Any], start: Array) -> Array:
+    """Poses by least squares on the lines of each, from the known position or from above the origin."""
+    known = np.array(found["xyz_of_samp"])
+    a, c, r, b = _split(start)
+    lengths = c + paid_out(found, r, b)
+    free = [
+        least_squares(lambda x, want=want: np.linalg.norm(x - a, axis=1) - want, [0.0, 0.0, 400.0]).x
+        for want in lengths[len(known) :]
+    ]
+    return np.concatenate([known, free])
+
+
+def example(seed: int = 11) -> dict[str, Any]:
+    """Samples of the example's machine: 9 known poses, 8 of them on the bed, and 36 unknown ones; with noise."""
+    rng = np.random.default_rng(seed)
+    ring = 0.25 * np.pi * np.arange(8)
+    bed = np.column_stack([320 * np.cos(ring), 320 * np.sin(ring), np.zeros(8)])
+    unknown = np.column_stack([rng.uniform(-450, 450, 36), rng.uniform(-450, 450, 36), rng.uniform(50, 1300, 36)])
+    poses = np.concatenate([bed, [[40.0, -30.0, 1200.0]], unknown])
+    found: dict[str, Any] = {
+        "_source": f"simulated for loopcal's example, seed {seed}; the machine is truth.yaml",
+        "spool_r_in_origin_first_guess": [60.0] * 4,
+        "spool_gear_teeth": 240,
+        "motor_gear_teeth": 18,
+        "mechanical_advantage": [2.0, 2.0, 2.0, 4.0],
+        "lines_per_spool": [1.0] * 4,
+        "xyz_of_samp": np.round(poses[:9] + POSITION * rng.standard_normal((9, 3)), 3).tolist(),
+    }
+    a, c, r, b = _split(TRUTH)
+    paid = np.linalg.norm(poses[:, None] - a, axis=2) - c + LINE * rng.standard_normal((45, 4))
+    angles, _ = motor_angles(found, r, b, paid)
+    return found | {"motor_pos_samp": np.round(np.degrees(angles), 2).tolist()}
+
+
+def samples_text(found: dict[str, Any]) -> str:
+    """The file, one row of numbers on a line."""
+    rows = [f'  "{key}": {_rows(value)}' for key, value in found.items()]
+    return "{\n" + ",\n".join(rows) + "\n}\n"
+
+
+def _rows(value: Any) -> str:
+    """JSON of a value; lists of lists with one inner list on a line."""
+    if isinstance(value, list) and isinstance(value[0], list):
+        return "[\n    " + ",\n    ".join(json.dumps(row) for row in value) + "\n  ]"
+    return json.dumps(value)

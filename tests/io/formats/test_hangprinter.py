@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Samples of a hanging printer: anchors from known poses, spools in the robot file, poses nobody measured, and bad files."""
+
+import json
+
+import numpy as np
+import pytest
+
+from loopcal import forward, inverse
+from loopcal.errors import FileError
+from loopcal.io.formats import hangprinter
+from loopcal.io.formats.exchange import Reading
+from loopcal.io.formats.transfer import checked
+from tests.cable_robot import NAMES, TRUTH, example, paid_out, samples_text
+
+
+def read(folder, found: dict, **reading: float):
+    path = folder / "samples.json"
+    path.write_text(samples_text(found), "utf-8")
+    imported = hangprinter.read(path, Reading("printer", **reading))
+    return checked(path, imported), imported
+
+
+def test_the_robot_has_four_anchors_lengths_one_spool_radius_and_four_buildups(tmp_path) -> None:
+    robot, _ = read(tmp_path, example())
+    assert robot.parameters.names == NAMES
+    assert robot.parameters.free.all()
+    assert not np.isnan(robot.parameters.tolerance).any()
+
+
+def test_spools_of_other_radii_have_parameters_of_their_own(tmp_path) -> None:
+    robot, _ = read(tmp_path, example() | {"spool_r_in_origin_first_guess": [60, 60, 60, 50]})
+    assert {"spoolA-B-C.radius", "spoolD.radius"} <= set(robot.parameters.names)
+
+
+def test_known_poses_are_measured_and_the_others_keep_their_readings(tmp_path) -> None:
+    found = example()
+    _, imported = read(tmp_path, found, sigma_position=0.6e-3)
+    data = imported.measurements
+    assert data is not None
+    np.testing.assert_allclose(np.degrees(data.readings), found["motor_pos_samp"], rtol=1e-14)
+    (seen,) = data.observations
+    np.testing.assert_array_equal(seen.rows, np.arange(9))
+    np.testing.assert_allclose(seen.measured * 1e3, found["xyz_of_samp"], rtol=1e-14)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(seen.covariance, axis1=1, axis2=2)), 0.6e-3, rtol=1e-14)
+    assert data.labels[8:10] == ("known9", "sample10")
+
+
+def test_sigma_of_a_line_becomes_that_of_its_motor(tmp_path) -> None:
+    robot, _ = read(tmp_path, example(), sigma_line=0.6e-3)
+    gear = 18 / 240
+    expected = 0.6e-3 / (60e-3 * gear * np.array([0.5, 0.5, 0.5, 0.25]))  # [rad]
+    found = [actuator.sigma or np.nan for actuator in robot.assembly.actuators]
+    np.testing.assert_allclose(found, expected, rtol=1e-3)  # four digits are written
+
+
+def test_line_that_builds_up_is_paid_out_as_the_spools_say(tmp_path) -> None:
+    """At the poses that the readings of the true machine reach, lines are as long as the closed form of the spools says."""
+    found = example()
+    robot, _ = read(tmp_path, found)
+    true = robot.with_values(TRUTH * 1e-3)
+    targets = np.zeros((12, 3))
+    targets[:, 2] = np.linspace(0.05, 1.2, 12)
+    targets[:, 0] = np.linspace(-0.4, 0.4, 12)
+    at = inverse(true, targets)
+    limbs = TRUTH[:16].reshape(4, 4)
+    length = np.linalg.norm(targets[:, None] * 1e3 - limbs[:, :3], axis=2)
+    paid = paid_out(found | {"motor_pos_samp": np.degrees(at.q)}, TRUTH[16], TRUTH[17:])
+    np.testing.assert_allclose(limbs[:, 3] + paid, length, rtol=0, atol=1e-7)  # [mm]
+    np.testing.assert_allclose(forward(true, at.q).T[:, :3, 3], targets, rtol=0, atol=1e-9)  # [m]
+
+
+def test_anchors_start_exactly_from_known_poses_without_noise_and_buildup(tmp_path) -> None:
+    found = example()
+    anchors = np.array([[10.0, -1500, -90], [1200, 700, -120], [-1250, 650, -100], [5, 5, 2200]])
+    known = np.array(found["xyz_of_samp"])
+    moved = np.linalg.norm(known[:, None] - anchors, axis=2) - np.linalg.norm(anchors, axis=1)
+    gain = 60 * 18 / 240 * np.array([0.5, 0.5, 0.5, 0.25])
+    path = tmp_path / "samples.json"
+    path.write_text(json.dumps(found | {"motor_pos_samp": np.degrees(moved / gain).tolist()}))
+    made = hangprinter.anchors_from_known(hangprinter.parse(path), path)
+    np.testing.assert_allclose(made, anchors, rtol=0, atol=1e-6)  # [mm], condition 1e3 of lengths of 1e3 mm
+
+
+def test_stated_anchors_are_taken(tmp_path) -> None:
+    anchors = [[0, -1500, -90], [1200, 700, -120], [-1250, 650, -100], [0, 0, 2200]]
+    robot, _ = read(tmp_path, example() | {"anchors": anchors, "xyz_of_samp": [[0, 0, 0]]})
+    np.testing.assert_allclose(robot.values[:16].reshape(4, 4)[:, :3] * 1e3, anchors, rtol=0, atol=1e-9)
+
+
+def test_what_a_robot_file_cannot_say_is_told(tmp_path) -> None:
+    more = {"springKPerUnitLength": 2e4, "mover_weight": 2.0, "force_samp": [[1, 2, 3, 4]] * 41, "colour": "red"}
+    _, imported = read(tmp_path, example() | more | {"line_lengths_when_at_origin": [1, 2, 3, 4]})
+    notes = " | ".join(imported.notes)
+    assert "41 rows of line forces are not read" in notes
+    assert "45 rows of motor angles go with them" in notes
+    for words in ("stiffness", "weight", "taped at the origin", "the key 'colour' is not known"):
+        assert words in notes
+    assert "line is taken to be known to 1 mm" in notes
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"motor_pos_samp": None}, "'motor_pos_samp' is not a list of rows of numbers"),
+        ({"motor_pos_samp": [[1, 2, 3, 4], [1, 2, 3]]}, "'motor_pos_samp' is not a list of rows of numbers"),
+        ({"motor_pos_samp": [[1, 2]]}, "has 2 motors in a row; a point in space needs 3 lines or more"),
+        ({"motor_pos_samp": [[1, 2, 3, 4]]}, "'xyz_of_samp' has 9 poses and 'motor_pos_samp' only 1"),
+        ({"xyz_of_samp": [[1, 2]]}, "'xyz_of_samp' is not a list of rows of numbers, 3 in each"),
+        ({"xyz_of_samp": [[1, 2, float("inf")]]}, "'xyz_of_samp' is not a list of rows of numbers"),
+        ({"mechanical_advantage": [2, 2, 2]}, "'mechanical_advantage' is not a list of numbers, 4 in all"),
+        ({"mechanical_advantage": [2, 2, 2, 0]}, "all of it must be above zero"),
+        ({"spool_gear_teeth": "many"}, "'spool_gear_teeth' is not a number"),
+        ({"anchors": [[1, 2, 3]]}, "'anchors' has 1 rows for 4 lines"),
+        ({"xyz_of_samp": [[0, 0, 0]]}, "the 1 known poses do not tell where line A is anchored"),
+    ],
+)
+def test_bad_samples_are_refused_in_one_sentence(tmp_path, change, sentence) -> None:
+    with pytest.raises(FileError) as refused:
+        read(tmp_path, example() | change)
+    assert sentence in str(refused.value)
+
+
+def test_known_poses_in_the_plane_of_the_origin_are_refused_with_the_remedy(tmp_path) -> None:
+    found = example()
+    flat = [[x, y, 0.0] for x, y, _ in found["xyz_of_samp"][:8]]
+    with pytest.raises(FileError, match=r"know poses at several heights, or add the key 'anchors'"):
+        read(tmp_path, found | {"xyz_of_samp": flat})
+
+
+@pytest.mark.parametrize(("text", "sentence"), [("{\n  [", r"samples.json:2: this is no JSON"), ("[1]", "'motor_pos_samp'")])
+def test_what_is_no_file_of_samples_is_refused(tmp_path, text, sentence) -> None:
+    path = tmp_path / "samples.json"
+    path.write_text(text)
+    with pytest.raises(FileError, match=sentence):
+        hangprinter.read(path, Reading("printer"))
