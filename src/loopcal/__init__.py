@@ -21,10 +21,12 @@ if TYPE_CHECKING:
     from loopcal.calibrate import Tukey as Tukey
     from loopcal.calibrate import Validation as Validation
     from loopcal.calibrate import accuracy_map as accuracy_map
+    from loopcal.calibrate import check_arrival as check_arrival
     from loopcal.calibrate import compensate as compensate
     from loopcal.calibrate import identifiability as identifiability
     from loopcal.calibrate import identify as identify
     from loopcal.calibrate import identify_trials as identify_trials
+    from loopcal.calibrate import parameter_error as parameter_error
     from loopcal.calibrate import pose_uncertainty as pose_uncertainty
     from loopcal.calibrate import prior_from as prior_from
     from loopcal.calibrate import recalibrate as recalibrate
@@ -71,10 +73,12 @@ _WHERE = {
             "Tukey",
             "Validation",
             "accuracy_map",
+            "check_arrival",
             "compensate",
             "identifiability",
             "identify",
             "identify_trials",
+            "parameter_error",
             "pose_uncertainty",
             "prior_from",
             "recalibrate",

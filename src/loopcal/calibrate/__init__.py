@@ -5,6 +5,9 @@ from loopcal.calibrate.accuracy import AccuracyMap as AccuracyMap
 from loopcal.calibrate.accuracy import PoseUncertainty as PoseUncertainty
 from loopcal.calibrate.accuracy import accuracy_map as accuracy_map
 from loopcal.calibrate.accuracy import pose_uncertainty as pose_uncertainty
+from loopcal.calibrate.arrival import Arrival as Arrival
+from loopcal.calibrate.arrival import arrival as arrival
+from loopcal.calibrate.arrival import check_arrival as check_arrival
 from loopcal.calibrate.choose_model import choose_model as choose_model
 from loopcal.calibrate.choose_model import nested_sets as nested_sets
 from loopcal.calibrate.combinations import Combination as Combination
@@ -22,6 +25,8 @@ from loopcal.calibrate.filters import MAP as MAP
 from loopcal.calibrate.filters import LeastSquares as LeastSquares
 from loopcal.calibrate.filters import Ridge as Ridge
 from loopcal.calibrate.filters import TruncatedSVD as TruncatedSVD
+from loopcal.calibrate.gauge import ParameterError as ParameterError
+from loopcal.calibrate.gauge import parameter_error as parameter_error
 from loopcal.calibrate.identifiability import Identifiability as Identifiability
 from loopcal.calibrate.identifiability import identifiability as identifiability
 from loopcal.calibrate.identification import Identification as Identification

@@ -99,6 +99,7 @@ def arrival(robot: Mechanism, data: Measurements) -> Arrival:
     free, believed = unknowns(robot), _believed(data)
     if believed is None:
         return Arrival(float("nan"))
+    uncertain = data.reading_sigma is not None and bool(np.any(np.isfinite(data.reading_sigma) & (data.reading_sigma > 0.0)))
     data = believed
     misfit = quick_misfit(free, data)
     if misfit <= IMPLAUSIBLE:
@@ -113,7 +114,7 @@ def arrival(robot: Mechanism, data: Measurements) -> Arrival:
         return Arrival(misfit)
     best, alike = _best(free, stated, misfit)
     if best is None:
-        return Arrival(misfit, sentence=_unexplained(stated, misfit))
+        return Arrival(misfit, sentence="" if uncertain else _unexplained(stated, misfit))
     words = tuple(h.words for h in alike)
     sentence = _evidence(stated, misfit, best, words)
     assert best.hypothesis is not None
@@ -165,7 +166,7 @@ def _believed(data: Measurements) -> Measurements | None:
     if data.reading_sigma is None:
         return data
     there = np.isfinite(data.reading_sigma).all(axis=1) & np.isfinite(data.readings).all(axis=1)
-    return data.take(there) if there.any() else None
+    return replace(data.take(there), reading_sigma=None) if there.any() else None
 
 
 def _best(free: Unknowns, stated: ReadAs, misfit: float) -> tuple[ReadAs | None, list[Hypothesis]]:
@@ -184,11 +185,16 @@ def _best(free: Unknowns, stated: ReadAs, misfit: float) -> tuple[ReadAs | None,
 
 
 def _tried(free: Unknowns, stated: ReadAs) -> list[tuple[Hypothesis, float]]:
-    """Every hypothesis with its misfit, to first order, blunders left out; those that cannot be evaluated are not there."""
+    """Hypotheses with their misfits, to first order, blunders left out; those that cannot be evaluated are not there.
+
+    The readings are read otherwise only where no other way to read the measured values is allowed: each needs its own poses.
+    """
     robot, found = free.robot, []
     ways = tuple(hypotheses(stated.data)) if stated.enough else ()
     if ways:
         found += _misfits(free, stated.data, ways)
+    if any(value <= ALLOWED for _, value in found):
+        return found
     names = tuple(a.name for a in robot.actuators)
     for way in readings_hypotheses(stated.whole, names, tuple(a.dimension for a in robot.actuators)):
         one = ReadAs(free, way.applied(stated.whole), hypothesis=way)

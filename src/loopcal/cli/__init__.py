@@ -7,6 +7,7 @@ met. Nothing heavier than click is imported before a command runs, so that `loop
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -20,6 +21,7 @@ from loopcal.cli.export import export
 from loopcal.cli.identifiability import identifiability
 from loopcal.cli.import_ import import_
 from loopcal.cli.new import new
+from loopcal.cli.plan import plan
 from loopcal.cli.reproduce import reproduce
 from loopcal.cli.simulate import simulate
 from loopcal.cli.validate import validate
@@ -39,7 +41,7 @@ def commands() -> None:
     """  # noqa: D301
 
 
-for _command in (new, check, simulate, identifiability, calibrate, validate, compensate, reproduce, import_, export):
+for _command in (new, check, plan, simulate, identifiability, calibrate, validate, compensate, reproduce, import_, export):
     commands.add_command(_command)
 
 
@@ -55,6 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # cores: 0.3 s with one, 5 s and more with two); whoever sets these variables decides
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
+    notes, logger = _Notes(), logging.getLogger("loopcal")
+    logger.addHandler(notes)
     try:
         code = commands.main(arguments, prog_name="loopcal", standalone_mode=False)
         sys.stdout.flush()
@@ -77,6 +81,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _refuse(f"{place}the operating system refused ({(error.strerror or str(error)).lower()}); check the place.")
     except MemoryError:
         return _refuse("there is not enough memory for this; use fewer poses at a time.")
+    finally:
+        logger.removeHandler(notes)
+
+
+class _Notes(logging.Handler):
+    """What the library has to say beside its results, as a line on standard error."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        click.echo(f"loopcal: note: {record.getMessage()}", err=True)
 
 
 def _refuse(sentence: str) -> int:

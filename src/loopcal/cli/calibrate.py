@@ -50,17 +50,14 @@ def calibrate(
     limit_position: float | None,
     limit_angle: float | None,
     seed: int,
-    allow_outside_stroke: bool,
-    allow_duplicates: bool,
+    allowed: Mapping[str, bool],
     force: bool,
     as_json: bool,
 ) -> int:
     """Identify the free parameters of ROBOT from DATA and write a run folder with the corrected robot file.
 
-    DATA may be several files, joined by the names of poses: of several instruments, or readings and measured values apart.
-
-    The exit code is 2 where a quality gate is not met, the iteration did not converge, the residual does not fit the
-    stated noise, or errors on unseen poses grew; the run folder is written all the same.
+    DATA may be several files, joined by the names of poses. The exit code is 2 where a quality gate is not met, the iteration
+    did not converge, the residual does not fit the stated noise, or errors on unseen poses grew; the run folder is written.
 
     \b
     Examples:
@@ -79,11 +76,14 @@ def calibrate(
     from loopcal.io.outputs import refuse_run_folder
     from loopcal.io.run_folder import made_by
 
-    _refuse_contradictions(hold_out, limit_position is not None or limit_angle is not None, prior, free_limb)
+    planned = _held_out(data, hold_out)
+    _refuse_contradictions(
+        hold_out > 0 or bool(planned), limit_position is not None or limit_angle is not None, prior, free_limb
+    )
     inputs, machine = _inputs(robot, data, prior), load_robot(robot)
     refuse_run_folder(output, list(inputs.values()), force)
-    measured = measurements(data, machine, allow_outside_stroke=allow_outside_stroke, allow_duplicates=allow_duplicates)
-    fitted, unseen = fitting.split(measured, hold_out, seed)
+    measured = measurements(data, machine, **allowed)
+    fitted, unseen = fitting.split(measured, hold_out, seed, planned)
     show.progress(f"identifying {int(machine.parameters.free.sum())} parameters from {fitted.n_rows} equations ...")
     choice = change = None
     if prior is None:
@@ -93,14 +93,12 @@ def calibrate(
     validation = None if unseen is None else validate(fit, unseen, limit_position, limit_angle)
     origin = made_by(sys.argv, inputs, {"hold_out": seed})
     split = None if unseen is None else {"hold_out": hold_out, "seed": seed, "held_out": unseen.labels}
-    findings = {"examination": _examined(fit, fitted), "change": change, "model_choice": choice}
-    found = {name: finding.to_dict() for name, finding in findings.items() if finding is not None}
-    cures = _cures(fit, fitted)
-    found |= {"remedies": [cure.to_dict() for cure in cures]} if cures else {}
+    findings = {"examination": _examined(fit, fitted), "change": change, "model_choice": choice, "remedies": _cure(fit, fitted)}
+    found = {name: _document(finding) for name, finding in findings.items() if finding is not None}
     reasons = _reasons(fit, validation)
     document = run_document(fit, validation, origin, split) | found | {"passed": not reasons, "reasons": reasons}
     save_run(output, fit, document, force)
-    show.json_document(document) if as_json else _print(fit, validation, fitted, findings, cures, output)
+    show.json_document(document) if as_json else _print(fit, validation, fitted, findings, output)
     return show.gates(reasons)
 
 
@@ -113,7 +111,20 @@ def _inputs(robot: str, data: Sequence[Path], prior: Path | None) -> dict[str, P
     return {"robot": robot_path(robot), **measurement_paths(data), **({} if prior is None else {"prior": prior / RESULT})}
 
 
-def _refuse_contradictions(hold_out: float, gates: bool, prior: Path | None, free_limb: str | None) -> None:
+def _held_out(data: Sequence[Path], hold_out: float) -> tuple[str, ...]:
+    """Return the poses that the data hold out themselves; refuse to draw others beside them."""
+    from loopcal.io.use_column import USE, held_out_poses
+
+    planned = held_out_poses(data)
+    if planned and hold_out:
+        raise DataError(
+            f"the column {USE!r} of the data says which poses are held out ({len(planned)} of them); leave out --hold-out, or "
+            "the column"
+        )
+    return planned
+
+
+def _refuse_contradictions(hold_out: bool, gates: bool, prior: Path | None, free_limb: str | None) -> None:
     """Refuse quality gates without unseen poses, and options that do not go with, or without, --prior."""
     if gates and not hold_out:
         raise DataError("a quality gate is judged on unseen poses; say which share to keep for it, as --hold-out 0.25")
@@ -133,23 +144,23 @@ def _examined(fit: Identification, fitted: Measurements) -> Examination | None:
     return examine(fit, fitted) if fit.converged else None
 
 
-def _cures(fit: Identification, fitted: Measurements) -> tuple[Remedy, ...]:
-    """What would determine what these measurements leave open."""
+def _document(finding: Any) -> Any:
+    """A finding, or several, for JSON."""
+    return [one.to_dict() for one in finding] if isinstance(finding, tuple) else finding.to_dict()
+
+
+def _cure(fit: Identification, fitted: Measurements) -> tuple[Remedy, ...] | None:
+    """What would determine what these measurements leave open; None where nothing stays open."""
     from loopcal.calibrate import identifiability
     from loopcal.calibrate.remedies import remedies
 
     if not (fit.converged and fit.unidentifiable):
-        return ()
+        return None
     return remedies(identifiability(fit.robot, fitted))
 
 
 def _print(
-    fit: Identification,
-    validation: Validation | None,
-    fitted: Measurements,
-    findings: Mapping[str, Any],
-    cures: tuple[Remedy, ...],
-    output: Path,
+    fit: Identification, validation: Validation | None, fitted: Measurements, findings: Mapping[str, Any], output: Path
 ) -> None:
     """Print what was found, and how well it does on unseen poses, or without any on the fitted ones."""
     from loopcal.calibrate import start_check, validate
@@ -165,7 +176,7 @@ def _print(
     show.say(f"chi-square {fit.chi_square:.5g} with {degrees}")
     show.say(f"note: {start_check(fit).sentence}")
     examined: Examination | None = findings["examination"]
-    advised = [f"to determine {cure}" for cure in cures]
+    advised = [f"to determine {cure}" for cure in findings["remedies"] or ()]
     for note in (*fit.notes, *advised, *(() if examined is None else examined.sentences)):
         show.say(f"note: {note}")
     if findings["model_choice"] is not None:

@@ -57,8 +57,7 @@ def identifiability(
     reduced: bool,
     output: Path | None,
     force: bool,
-    allow_outside_stroke: bool,
-    allow_duplicates: bool,
+    allowed: Mapping[str, bool],
     as_json: bool,
     **seen_by: Any,
 ) -> None:
@@ -88,10 +87,9 @@ def identifiability(
     refuse_outputs((output,), (robot_path(robot), *data, poses), force)
     machine, drawn = load_robot(robot), ""
     if data:
-        allowed = {"allow_outside_stroke": allow_outside_stroke, "allow_duplicates": allow_duplicates}
         measured = measurements(data, machine, **allowed)
     else:
-        looking = _instrument(**seen_by)
+        looking = assumed_instrument(**seen_by)
         targets, drawn = (load_poses(poses, machine), "") if poses is not None else drawn_poses(machine, draw, seed)
         measured = simulate(machine, targets, looking, seed=0, controller=machine)
     found = identifiable(machine, measured)
@@ -121,7 +119,7 @@ def _refuse(data: Sequence[Path], poses: Path | None, seen_by: Mapping[str, Any]
         raise DataError("-o writes what --reduce finds; add --reduce, or leave out -o")
 
 
-def _instrument(
+def assumed_instrument(
     measure: str | None,
     frames: str | None,
     kind: str,

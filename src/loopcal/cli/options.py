@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,13 +57,22 @@ def gate_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def data_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the flags that let implausible measurements pass."""
-    for name, what in (
-        ("--allow-duplicates", "Accept rows that repeat another to the last digit."),
-        ("--allow-outside-stroke", "Accept readings outside the stroke of their actuator."),
-    ):
-        command = click.option(name, is_flag=True, help=what)(command)
-    return command
+    """Add the flags that let implausible measurements pass; the command gets them as `allowed`, for `measurements`."""
+    flags = {
+        "allow_duplicates": "Accept rows that repeat another to the last digit.",
+        "allow_implausible": "Accept values that fit far better in another unit, order, sign or column.",
+        "allow_outside_stroke": "Accept readings outside the stroke of their actuator.",
+        "allow_still": "Accept a target that no pose moves.",
+    }
+
+    @functools.wraps(command)
+    def packed(**given: Any) -> Any:
+        allowed = {name: given.pop(name) for name in flags}
+        return command(**given, allowed=allowed)
+
+    for name, what in flags.items():
+        packed = click.option("--" + name.replace("_", "-"), is_flag=True, help=what)(packed)
+    return packed
 
 
 def measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) -> Measurements:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import click
@@ -23,8 +24,7 @@ def validate(
     data: tuple[Path, ...],
     limit_position: float | None,
     limit_angle: float | None,
-    allow_outside_stroke: bool,
-    allow_duplicates: bool,
+    allowed: Mapping[str, bool],
     allow_fitted_data: bool,
     as_json: bool,
 ) -> int:
@@ -44,9 +44,7 @@ def validate(
     from loopcal.io.calibration_run import load_calibrated, refuse_fitted_data
 
     calibrated = load_calibrated(run)
-    measured = measurements(
-        data, calibrated.robot, allow_outside_stroke=allow_outside_stroke, allow_duplicates=allow_duplicates
-    )
+    measured = measurements(data, calibrated.robot, **allowed)
     if not allow_fitted_data:
         refuse_fitted_data(calibrated, data)
     found = compare(calibrated.robot, measured, limit_position, limit_angle, before=calibrated.before)

@@ -17,6 +17,7 @@ without readings refers to poses of the others, and a pose in two files has the 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -40,7 +41,13 @@ Paths = str | Path | Sequence[str | Path]
 
 
 def load_measurements(
-    path: Paths, robot: Mechanism, *, allow_outside_stroke: bool = False, allow_duplicates: bool = False
+    path: Paths,
+    robot: Mechanism,
+    *,
+    allow_outside_stroke: bool = False,
+    allow_duplicates: bool = False,
+    allow_still: bool = False,
+    allow_implausible: bool = False,
 ) -> Measurements:
     """Read a measurement file, or several as one set of measurements.
 
@@ -52,6 +59,9 @@ def load_measurements(
         The robot that was measured; its actuators name the columns of the readings.
     allow_outside_stroke, allow_duplicates : bool
         Accept readings outside the stroke, and rows that repeat another to the last digit.
+    allow_still, allow_implausible : bool
+        Accept targets that no pose moves, and values that fit far better in another unit, order, sign or column; see
+        `loopcal.calibrate.check_arrival`.
 
     Returns
     -------
@@ -63,29 +73,21 @@ def load_measurements(
     FileError
         What does not fit, at its line.
     DataError
-        Readings outside the stroke, duplicates, noise that is no covariance; with the file.
+        Readings outside the stroke, duplicates, noise that is no covariance, conventions that cannot be; with the file.
     """
-    from loopcal.measure import Measurements, check_duplicates, check_strokes
+    from loopcal.calibrate.arrival import check_arrival
+    from loopcal.measure import check_duplicates, check_strokes
 
     tables = _tables(path)
-    sensors = [_sensors_of(table, robot, len(tables) > 1) for table in tables]
-    if not any(sensors):
-        raise FileError("neither this file nor the others state a kind of measurement; write '# kind: ..'", tables[0].path)
-    poses = read_pose_rows(tables, robot)
-    beside = [read_context(table) for table in tables]
-    of_poses = _context_of_poses(tables, sensors, poses.members, beside, len(poses.labels))
-    observations = [
-        [read_observations(table, robot, sensor, members, context, of_poses) for sensor in own]
-        for table, own, members, context in zip(tables, sensors, poses.members, beside, strict=True)
-    ]
-    every = tuple(rows for own in observations for rows in own)
-    files = " and ".join(str(table.path) for table in tables)
+    data, files = _gathered(tables, robot), _named(tables)
     try:
-        settings = [(table.settings, own) for table, own in zip(tables, observations, strict=True)]
-        known = read_known(settings, poses.labels)
-        data = Measurements(robot.name, poses.readings, every, poses.block, poses.labels, poses.sigma, known)
         check_strokes(data, robot, allow=allow_outside_stroke, override="--allow-outside-stroke")
         check_duplicates(data, allow=allow_duplicates, override="--allow-duplicates")
+        overrides = ("--allow-still", "--allow-implausible")
+        check = {"allow_still": allow_still, "allow_implausible": allow_implausible, "overrides": overrides}
+        told = check_arrival(robot, data, **check)
+        if told.sentence:
+            logging.getLogger(__name__).warning("%s: %s", files, told.sentence)
     except DataError as error:
         raise DataError(f"{files}: {error}") from None
     return data
@@ -153,6 +155,34 @@ def _tables(path: Paths) -> tuple[Table, ...]:
         if not any(beside.samefile(other.path) for other in tables):
             tables.append(read_table(beside))
     return tuple(tables)
+
+
+def _gathered(tables: Sequence[Table], robot: Mechanism) -> Measurements:
+    """Return what the files hold together."""
+    from loopcal.measure import Measurements
+
+    sensors = [_sensors_of(table, robot, len(tables) > 1) for table in tables]
+    if not any(sensors):
+        raise FileError("neither this file nor the others state a kind of measurement; write '# kind: ..'", tables[0].path)
+    poses = read_pose_rows(tables, robot)
+    beside = [read_context(table) for table in tables]
+    of_poses = _context_of_poses(tables, sensors, poses.members, beside, len(poses.labels))
+    observations = [
+        [read_observations(table, robot, sensor, members, context, of_poses) for sensor in own]
+        for table, own, members, context in zip(tables, sensors, poses.members, beside, strict=True)
+    ]
+    every = tuple(rows for own in observations for rows in own)
+    settings = [(table.settings, own) for table, own in zip(tables, observations, strict=True)]
+    try:
+        known = read_known(settings, poses.labels)
+        return Measurements(robot.name, poses.readings, every, poses.block, poses.labels, poses.sigma, known)
+    except DataError as error:
+        raise DataError(f"{_named(tables)}: {error}") from None
+
+
+def _named(tables: Sequence[Table]) -> str:
+    """Return the names of files, for messages about all of them together."""
+    return " and ".join(str(table.path) for table in tables)
 
 
 def _sensors_of(table: Table, robot: Mechanism, several: bool) -> tuple[Sensor, ...]:

@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Conventions on arrival: slips are named by what fits instead, and true data pass, however far the robot is off."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from loopcal import se3
+from loopcal.calibrate.arrival import ALLOWED, BETTER, IMPLAUSIBLE, arrival, check_arrival
+from loopcal.calibrate.scaling import unknowns
+from loopcal.errors import DataError, LoopcalError
+from loopcal.io import load_robot
+from loopcal.io.robot_file import shipped_robots
+from loopcal.measure import (
+    KINDS,
+    Bearing,
+    Component,
+    Distance,
+    Gaussian,
+    Inclination,
+    Instrument,
+    JointSensor,
+    Kind,
+    Measurements,
+    Pose,
+    Position,
+    Sensor,
+    simulate,
+)
+from loopcal.measure.hypotheses import hypotheses, readings_hypotheses
+from loopcal.mechanism.workspace import sample
+from loopcal.units import Dimension
+
+SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5}  # [m], [rad]
+PAIR = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02]])
+
+
+@cache
+def robot_of(name: str):
+    return load_robot(name)
+
+
+def measured(name: str, kind: Kind, n: int = 10, times: float = 1.0, seed: int = 0) -> Measurements:
+    """What a machine `times` its tolerances off shows, commanded by its nominal geometry."""
+    robot, noise = robot_of(name), Gaussian(np.array([SIGMA[c.dimension] for c in kind.noise_columns]))
+    free = unknowns(robot)
+    truth = robot.values.copy()
+    truth[free.places] += times * free.tolerance * np.random.default_rng(seed).standard_normal(len(free))
+    targets = sample(robot, n, 1).coordinates
+    return simulate(robot.with_values(truth), targets, Instrument((Sensor(kind, noise),)), seed, controller=robot)
+
+
+def changed(data: Measurements, change) -> Measurements:
+    """The data with other values of their first kind."""
+    rows = data.observations[0]
+    values = np.array(rows.measured)
+    change(values)
+    return replace(data, observations=(replace(rows, measured=values), *data.observations[1:]))
+
+
+def scaled(columns, factor):
+    def change(values):
+        values[:, columns] *= factor
+
+    return change
+
+
+def swapped(a, b):
+    def change(values):
+        values[:, [a, b]] = values[:, [b, a]]
+
+    return change
+
+
+def turned(convert):
+    def change(values):
+        values[:, :3] = convert(values[:, :3])
+
+    return change
+
+
+def zenith(values):
+    values[:, 1::2] = 0.5 * np.pi - values[:, 1::2]
+
+
+def left_handed(values):
+    values[:, [1, 2]] *= -1.0  # a rotation vector is an axial vector
+    values[:, 3] *= -1.0
+
+
+def scalar_last(values):
+    values[:, :4] = values[:, [1, 2, 3, 0]]
+
+
+STATION = se3.pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
+XYZ = Pose("euler-xyz")
+SLIPS = {
+    "mm written as m": ("hexapod-42", Pose(), scaled([3, 4, 5], 1e3), "lengths 1000 times smaller"),
+    "inches written as mm": ("3-prs", Position(unknown=("frame",)), scaled([0, 1, 2], 1 / 25.4), "lengths 25.4 times larger"),
+    "degrees written as radians": ("hexapod-42", Pose(), scaled([0, 1, 2], 180 / np.pi), "angles 57.3 times"),
+    "milliradians written as radians": ("3-prs", Pose(), scaled([0, 1, 2], 1e3), "angles 1000 times smaller"),
+    "another Euler order": (
+        "hexapod-42",
+        XYZ,
+        turned(lambda a: se3.matrix_to_euler(se3.euler_to_matrix(a, "xyz"), "zyx")),
+        "rotations read as euler-zyx",
+    ),
+    "moving for fixed axes": (
+        "hexapod-42",
+        XYZ,
+        turned(lambda a: se3.matrix_to_euler(se3.euler_to_matrix(a, "xyz"), "XYZ")),
+        "rotations read as euler-XYZ",
+    ),
+    "a rotation vector for Euler angles": (
+        "hexapod-42",
+        XYZ,
+        turned(lambda a: se3.log_so3(se3.euler_to_matrix(a, "xyz"))),
+        "rotations read as rotation-vector",
+    ),
+    "rotations the other way": ("ru-pus-prs", Pose(), scaled([0, 1, 2], -1.0), "rotations inverted"),
+    "scalar last": ("hexapod-42", Pose("quaternion"), scalar_last, "quaternions read scalar last"),
+    "a left-handed frame": ("hexapod-42", Pose(), left_handed, "left-handed"),
+    "x and y swapped": ("linear-delta", Position(), swapped(0, 1), "columns x and y swapped"),
+    "heights as drops": ("hexapod-42", Component(("z",)), scaled([0], -1.0), "z of the other sign"),
+    "targets swapped": ("3-prs", Distance(targets=("a", "b"), places=PAIR, anchor=PAIR[0] * 9), swapped(0, 1), "'a' and 'b'"),
+    "zenith angles": ("hexapod-42", Bearing(T_base_frame=STATION), zenith, "elevations read as zenith angles"),
+    "tilts swapped": ("3-prs", Inclination(unknown=("gravity",)), swapped(0, 1), "columns tilt_x and tilt_y swapped"),
+    "sensors swapped": ("hexapod-42", JointSensor(joints=("q1", "q2", "q3")), swapped(0, 2), "columns q1 and q3 swapped"),
+}
+
+
+@pytest.mark.parametrize("slip", SLIPS)
+def test_a_slip_is_refused_with_what_fits_instead(slip) -> None:
+    name, kind, change, words = SLIPS[slip]
+    data = changed(measured(name, kind), change)
+    found = arrival(robot_of(name), data)
+    assert found.refused, found
+    named = (found.other or "", *found.alike)
+    assert any(words in one for one in named), named
+    assert found.misfit > IMPLAUSIBLE
+    assert found.other_misfit < min(found.misfit / BETTER, ALLOWED)
+    assert "which is what tolerances and noise allow" in found.sentence
+
+
+READINGS = {
+    "actuators swapped": (lambda q: q[:, [1, 0, 2, 3, 4, 5]], "readings of q1 and q2 swapped"),
+    "one of the other sign": (lambda q: q * np.array([1, 1, 1, -1, 1, 1]), "readings of q4 of the other sign"),
+    "drop for rise": (lambda q: -q, "all readings of the other sign"),
+    "rows moved by one": (lambda q: np.roll(q, 1, axis=0), "every row belonging to the readings of the row below"),
+    "inches written as mm": (lambda q: q / 25.4, "readings 25.4 times larger"),
+}
+
+
+@pytest.mark.parametrize("slip", READINGS)
+def test_a_slip_of_the_readings_is_refused_with_what_fits_instead(slip) -> None:
+    change, words = READINGS[slip]
+    data = measured("hexapod-42", Pose())
+    found = arrival(robot_of("hexapod-42"), replace(data, readings=change(data.readings)))
+    assert words in (found.other or ""), found
+
+
+def test_a_slip_is_seen_through_blunders() -> None:
+    """Two of twenty rows are 0.1 m off, and all lengths are in the wrong unit."""
+    data = changed(measured("hexapod-42", Position(unknown=("frame",)), n=20), scaled(slice(None), 0.1))
+    bad = changed(data, lambda values: values.__setitem__((slice(3, 5), 0), values[3:5, 0] + 0.01))
+    found = arrival(robot_of("hexapod-42"), bad)
+    assert "lengths 10 times larger" in (found.other or ""), found
+
+
+def test_blunders_alone_are_left_to_their_own_check() -> None:
+    data = measured("hexapod-42", Position(unknown=("frame",)), n=20)
+    bad = changed(data, lambda values: values.__setitem__((slice(3, 5), 0), values[3:5, 0] + 0.1))
+    found = arrival(robot_of("hexapod-42"), bad)
+    assert not found.refused
+    assert found.misfit < IMPLAUSIBLE  # without the two rows all is well
+
+
+WITH_EVERY_KIND = ("hexapod-42", "3-prs")
+
+
+def every_case(kinds):
+    """Every shipped robot with the first kind, two of them with all."""
+    for name in shipped_robots():
+        if robot_of(name).assembly.workspace:
+            for kind in kinds if name in WITH_EVERY_KIND else kinds[:1]:
+                yield name, kind
+
+
+def test_true_data_of_robots_three_times_beyond_their_tolerances_pass() -> None:
+    """No draw may be refused; the misfit stays below the threshold but for angles that mean nothing near zero tilt."""
+    known = [cls.examples()[0] for cls in KINDS.values()]
+    count = 0
+    for name, kind in every_case(known):
+        try:
+            data = measured(name, kind, times=3.0)
+        except LoopcalError:
+            continue  # this kind has nothing to look at on this robot, or the robot cannot follow
+        count += 1
+        assert not arrival(robot_of(name), data).doubtful, (name, kind.name)
+    assert count >= 2 * len(KINDS) + 6
+
+
+@pytest.mark.parametrize("name", ["hexapod-42", "linear-delta"])
+def test_true_data_of_a_robot_far_off_its_tolerances_are_not_refused(name) -> None:
+    """Forty tolerances off: implausible, all others are tried, and none fits far better."""
+    data = measured(name, Position(unknown=("frame",)), times=40.0)
+    found = arrival(robot_of(name), data)
+    assert found.doubtful
+    assert not found.refused
+    assert "no other unit, order, sign or column explains it; check the noise" in found.sentence
+
+
+def test_heights_that_should_be_zero_are_no_evidence_of_a_unit() -> None:
+    """Every unit that makes them smaller fits better: a constant does so as well, and nothing is refused."""
+    robot = robot_of("linear-delta")
+    flat = np.column_stack([np.random.default_rng(0).uniform(-0.05, 0.05, (20, 2)), np.zeros(20)])
+    noise = Gaussian(np.array([1e-6]))
+    free = unknowns(robot)
+    truth = robot.values.copy()
+    truth[free.places] += 40.0 * free.tolerance * np.random.default_rng(1).standard_normal(len(free))
+    data = simulate(robot.with_values(truth), flat, Instrument((Sensor(Component(("z",)), noise),)), 0, controller=robot)
+    found = arrival(robot, data)
+    assert found.doubtful
+    assert not found.refused, found
+
+
+def test_too_few_rows_say_nothing() -> None:
+    data = changed(measured("hexapod-42", Position(unknown=("frame",)), n=4), scaled([0, 1, 2], 1e3))
+    found = arrival(robot_of("hexapod-42"), data)
+    assert np.isnan(found.misfit)
+    assert not found.refused
+
+
+def test_the_published_table_names_its_own_euler_order() -> None:
+    """The hexapod study prints Rz(a) Ry(b) Rx(c), but its Table 4 was made with the angles in the opposite order."""
+    from loopcal.measure import Observations
+    from loopcal.papers.hexapod_42.compare import TO_PRINTED, whole_degrees
+    from loopcal.papers.hexapod_42.published import MM, nominal_machine, published
+    from loopcal.papers.hexapod_42.steps import ORDER, Study, form_name, measurements
+
+    printed, robot = published(), nominal_machine()
+    study = Study(robot, robot, whole_degrees(printed.nominal_poses), ORDER)
+    values = printed.measured_poses.values / TO_PRINTED
+    sigma = printed.measured_poses.unit * np.array([MM] * 3 + [1.0] * 3) / np.sqrt(12.0)
+    right = measurements(study, values, sigma)
+    assert not arrival(robot, right).refused
+    kind = Pose(form_name(printed.order)).mounted(robot.tool)
+    rows = Observations.from_sigma(kind, np.arange(len(values)), np.roll(values, 3, axis=1), np.roll(sigma, 3, axis=1))
+    found = arrival(robot, replace(right, observations=(rows,)))
+    assert found.other == f"rotations read as {form_name(ORDER)}"
+    assert found.misfit > 100.0 * found.other_misfit
+
+
+def test_the_message_names_the_override_and_the_override_works() -> None:
+    robot = robot_of("hexapod-42")
+    data = changed(measured("hexapod-42", Pose()), scaled([3, 4, 5], 1e3))
+    with pytest.raises(DataError, match=r"correct the unit in the header, or use --allow-implausible$"):
+        check_arrival(robot, data, overrides=("--allow-still", "--allow-implausible"))
+    assert np.isnan(check_arrival(robot, data, allow_implausible=True).misfit)
+    still = changed(measured("hexapod-42", Position()), lambda values: values.__setitem__(slice(1, None), values[0]))
+    with pytest.raises(
+        DataError, match=r"never moves: its readings stay within 0, but the robot moves it by .*allow_still=True"
+    ):
+        check_arrival(robot, still)
+
+
+def test_every_hypothesis_is_another_reading_in_the_same_shape() -> None:
+    seen: set[str] = set()
+    for cls in KINDS.values():
+        for kind in cls.examples():
+            try:
+                data = measured("hexapod-42", kind, n=5)
+            except LoopcalError:
+                continue
+            for way in hypotheses(data):
+                rows = way.applied(data).observations[0]
+                assert rows.measured.shape == data.observations[0].measured.shape
+                assert not np.allclose(rows.measured, data.observations[0].measured, rtol=1e-12, atol=0.0)
+                assert way.shrinks == ("smaller" in way.words)
+            seen.add(kind.name)
+    assert seen == set(KINDS)
+    names, lengths = ("q1", "q2", "q3"), (Dimension.LENGTH,) * 3
+    data = measured("linear-delta", Position(), n=5)
+    ways = [way.words for way in readings_hypotheses(data, names, lengths)]
+    assert len(set(ways)) == len(ways) == 6 + 1 + 3 + 3 + 1 + 2  # units, signs, pairs, order, rows
