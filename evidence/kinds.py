@@ -186,9 +186,9 @@ def recover(case: Case, seed: int = SEED) -> Recovery:
     truth = robot.with_values(sample_truth(robot, 1, seed)[0])
     looking = instrument(case.kind, POSES + HELD_OUT, Silent)
     own = own_truth(robot, looking, POSES + HELD_OUT, rng)
-    data = simulate(truth, _commanded(case.robot, seed), looking, seed, unknowns=own)
-    some, others = data.take(np.arange(POSES)), data.take(np.arange(POSES, POSES + HELD_OUT))
     try:
+        data = simulate(truth, _commanded(case.robot, seed), looking, seed, unknowns=own)
+        some, others = data.take(np.arange(POSES)), data.take(np.arange(POSES, POSES + HELD_OUT))
         fit = identify(robot, some, LeastSquares(), allow_fewer_equations=True)
     except LoopcalError as error:
         return Recovery(0, len(robot.parameters), np.nan, np.nan, np.nan, np.nan, (), 0, str(error))
