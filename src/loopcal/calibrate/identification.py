@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -30,6 +31,7 @@ class KindResiduals:
     ----------
     kind : its name. components : names of the m residuals. poses : (r,) labels.
     raw : (r, m) [SI]. whitened : (r, m), divided by sigma (zero where absent).
+    context : name -> (r,), time [s] and temperatures [degC] of the rows, to plot the residuals against.
     """
 
     kind: str
@@ -37,6 +39,7 @@ class KindResiduals:
     poses: tuple[str, ...]
     raw: FloatArray
     whitened: FloatArray
+    context: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,6 +223,7 @@ class Identification:
         for i, r in enumerate(self.residuals):
             result[f"residual_{i}_{r.kind}"] = r.raw
             result[f"whitened_{i}_{r.kind}"] = r.whitened
+            result |= {f"{name}_{i}_{r.kind}": values for name, values in r.context.items()}
         return result
 
 

@@ -299,9 +299,10 @@ def _local(
 def _labelled(residuals: tuple[Residuals, ...], data: Measurements, rows: AnyRows) -> tuple[KindResiduals, ...]:
     """Put names to the residuals (t = 1) of every kind, uncertain readings the last."""
     observations = [o for o in data.observations if len(o)]
-    present = [o.present for o in observations]
+    present, context = [o.present for o in observations], [o.context for o in observations]
     if isinstance(rows, LatentRows):
         present.append(np.isfinite(data.readings))
+        context.append(data.context)
     return tuple(
         KindResiduals(
             kind=s.kind.name,
@@ -309,6 +310,7 @@ def _labelled(residuals: tuple[Residuals, ...], data: Measurements, rows: AnyRow
             poses=tuple("/".join(data.labels[i] for i in seen) for seen in s.per_pose),
             raw=np.where(there, r.raw[0], np.nan),
             whitened=r.whitened[0],
+            context=beside,
         )
-        for s, there, r in zip(rows.sensed, present, residuals, strict=True)
+        for s, there, beside, r in zip(rows.sensed, present, context, residuals, strict=True)
     )
