@@ -20,8 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from loopcal.io.formats.hangprinter import Samples
-
 Array = NDArray[np.float64]
 NAMES = (
     *(f"{line}.{what}" for line in "ABCD" for what in ("anchor.x", "anchor.y", "anchor.z", "length")),
@@ -155,12 +153,6 @@ def _split(p: Array) -> tuple[Array, Array, float, Array]:
     """Anchors (4, 3), lengths (4,), radius and build-ups (4,)."""
     limbs = p[:16].reshape(4, 4)
     return limbs[:, :3], limbs[:, 3], float(p[16]), p[17:21]
-
-
-def first_guess(samples: Samples, anchors: Array) -> Array:
-    """Parameters (21,) [mm] as the import has them: no build-up, lengths as zero readings say."""
-    limbs = np.column_stack([anchors, np.linalg.norm(anchors, axis=1)])
-    return np.concatenate([limbs.ravel(), samples.radius[:1], np.zeros(4)])
 
 
 def _first_poses(found: dict[str, Any], start: Array) -> Array:

@@ -2,6 +2,7 @@
 """Samples of a hanging printer: anchors from known poses, spools in the robot file, poses nobody measured, and bad files."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from loopcal.io.formats.transfer import checked
 from tests.cable_robot import NAMES, TRUTH, example, paid_out, samples_text
 
 
-def read(folder, found: dict, **reading: float):
+def read(folder, found: dict, **reading: Any):
     path = folder / "samples.json"
     path.write_text(samples_text(found), "utf-8")
     imported = hangprinter.read(path, Reading("printer", **reading))
@@ -51,7 +52,7 @@ def test_sigma_of_a_line_becomes_that_of_its_motor(tmp_path) -> None:
     gear = 18 / 240
     expected = 0.6e-3 / (60e-3 * gear * np.array([0.5, 0.5, 0.5, 0.25]))  # [rad]
     found = [actuator.sigma or np.nan for actuator in robot.assembly.actuators]
-    np.testing.assert_allclose(found, expected, rtol=1e-3)  # four digits are written
+    np.testing.assert_allclose(found, expected, rtol=1e-6)  # seven digits are written
 
 
 def test_line_that_builds_up_is_paid_out_as_the_spools_say(tmp_path) -> None:

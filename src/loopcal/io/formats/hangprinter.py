@@ -58,17 +58,17 @@ freedoms: [x, y, z]
 controlled: [x, y, z]
 actuators:                # radius: line paid out per radian of the motor; sigma: what {sigma:g} mm of line are
 {drives}
-limbs:                    # lengths at readings of zero; anchors start from the known poses
+limbs:                    # lengths at readings of zero; anchors start from the known poses, tolerances are of that start
 {limbs}
-parameters:               # of the spools, not of the motors
+parameters:               # of the spools; buildup: growth of radius^2 for each length that is wound
 {parameters}
 home: {{z: 0}}
 workspace: {{x: {side}, y: {side}, z: [0, {top:g}]}}     # taken; say where the printer really goes
 """
 LIMB = (
     "  - {{name: {name}, tip: {tip}, ending: distance, length: {length}, actuated: {drive}, "
-    "errors: [{{of: base, shift: [x, y, z], name: anchor, tolerance: {{sd: 50}}}}, "
-    "{{of: rod, shift: [length], tolerance: {{sd: 10}}}}]}}"
+    "errors: [{{of: base, shift: [x, y, z], name: anchor, tolerance: {{sd: 200}}}}, "
+    "{{of: rod, shift: [length], tolerance: {{sd: 200}}}}]}}"
 )
 PARAMETER = "  - {{name: {name}, length: {nominal}, tolerance: {{sd: {sd}}}, maps: [{maps}]}}"
 ONTO = "{{limb: {drive}, element: transmission, axis: {axis}, coefficient: {coefficient}}}"
@@ -186,7 +186,7 @@ def robot_text(samples: Samples, anchors: FloatArray, path: Path, reading: Readi
     sigma = reading.sigma_line / MM
     lengths = np.linalg.norm(anchors, axis=1)
     drives = [
-        f"  {name.lower()}: {{reads: angle, radius: {_written(gain)}, sigma: {_written(sigma / gain / DEG, 4)}}}"
+        f"  {name.lower()}: {{reads: angle, radius: {_written(gain)}, sigma: {_written(sigma / gain / DEG, 7)}}}"
         for name, gain in zip(samples.names, samples.gain, strict=True)
     ]
     limbs = [
@@ -217,11 +217,11 @@ def _parameters(samples: Samples) -> Iterator[str]:
         maps = ", ".join(
             ONTO.format(drive=samples.names[i].lower(), axis="gain", coefficient=_written(slope[i])) for i in members
         )
-        yield PARAMETER.format(name=name, nominal=_written(radius), sd=2, maps=maps)
+        yield PARAMETER.format(name=name, nominal=_written(radius), sd=3, maps=maps)
     for i, name in enumerate(samples.names):
         # dL = .. - k (g q)^2 / 4 of the line unwound
         onto = ONTO.format(drive=name.lower(), axis="curve", coefficient=_written(-samples.gear * slope[i] / 4))
-        yield PARAMETER.format(name=f"{name}.buildup", nominal=0, sd=0.2, maps=onto)
+        yield PARAMETER.format(name=f"{name}.buildup", nominal=0, sd=0.3, maps=onto)
 
 
 def _measurements(samples: Samples, reading: Reading) -> Measurements:
