@@ -10,8 +10,9 @@ the identified model as it did at the measured readings. What no actuator can re
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from loopcal.calibrate.combinations import listed
 from loopcal.calibrate.identification import Identification
 from loopcal.calibrate.pose_errors import INDICES, PoseErrors, pose_errors
-from loopcal.errors import DataError
+from loopcal.errors import DataError, nearest
 from loopcal.linalg import FloatArray
 from loopcal.measure import (
     LocalUnknowns,
@@ -50,6 +51,7 @@ class Validation:
     reasons : a sentence for each gate that is not met.
     units : display symbols of length and angle.
     notes : where unknown frames, targets and surfaces come from: from the fit, or found anew from these rows.
+    alignment : the same by name: `kept` as the fit found them, `fitted` to these very rows, after which errors are compared.
     """
 
     poses: tuple[str, ...]
@@ -64,6 +66,7 @@ class Validation:
     reasons: tuple[str, ...]
     units: tuple[str, str]
     notes: tuple[str, ...] = ()
+    alignment: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: {"kept": (), "fitted": ()})
 
     @property
     def passed(self) -> bool:
@@ -126,6 +129,7 @@ class Validation:
             "passed": self.passed,
             "reasons": list(self.reasons),
             "notes": list(self.notes),
+            "alignment": {name: list(parts) for name, parts in self.alignment.items()},
         }
 
 
@@ -135,6 +139,8 @@ def validate(
     limit_position: float | None = None,
     limit_angle: float | None = None,
     before: Mechanism | None = None,
+    known: Mapping[str, float] | None = None,
+    refit: Sequence[str] = (),
 ) -> Validation:
     """Compare a calibrated robot with measurements, best with ones it was not fitted to.
 
@@ -145,6 +151,10 @@ def validate(
     limit_position, limit_angle : quality gates [m], [rad].
     before : the geometry to compare with, and that of the controller; default: what `fit` started from (for a robot:
         its nominal values).
+    known : values [SI] by name of unknowns of the measurements (frames, targets, surfaces) that an earlier fit found; they
+        are kept as they are, so that what is proved is not fitted. Default: those of `fit`.
+    refit : names of frames, targets and surfaces, such as `tracker` or `tracker*`, to be found anew all the same, because
+        they were set up anew.
 
     Raises
     ------
@@ -160,13 +170,15 @@ def validate(
         raise DataError("there is no row to validate with: every row is absent or has weight 0")
     believed, predicted = forward(old, data.readings), forward(robot, data.readings)
     reached = inverse(robot, believed.T)
-    ok = believed.converged & predicted.converged & reached.converged
+    ok = believed.converged & predicted.converged & reached.converged & _read(data)
     if not ok.any():
         raise DataError(f"{robot.name} reaches none of the {data.n_poses} poses; check the readings and their units")
     rows = [o.take(ok[o.rows].reshape(len(o), -1).all(axis=1)) for o in rows]
     seen = replace(data, observations=tuple(rows))
-    known = (fit.local.starts if before is None else {}, fit.local.values) if isinstance(fit, Identification) else ({}, {})
-    first, last = _view(old, seen, believed, ok, known[0]), _view(robot, seen, predicted, ok, known[1])
+    own = fit.local if isinstance(fit, Identification) else None
+    kept = _kept(known if known is not None else own.values if own else {}, refit, data)
+    starts = _kept(own.starts, refit, data) if own and before is None and known is None else {}
+    first, last = _view(old, seen, believed, ok, starts), _view(robot, seen, predicted, ok, kept)
     was, now = first.residuals(rows), last.residuals(rows)
     missed = first.differences(rows, _view(old, seen, reached, ok, None))
     after = _errors(rows, now)
@@ -178,12 +190,13 @@ def validate(
         commanded_before=_errors(rows, [-r for r in was]),
         commanded_after=_errors(rows, [m - r for m, r in zip(missed, now, strict=True)]),
         not_compensable=_errors(rows, missed),
-        failed=tuple(data.labels[i] for i in np.flatnonzero(~ok)),
+        failed=tuple(data.labels[i] for i in np.flatnonzero(~ok & _read(data))),
         limit_position=limit_position,
         limit_angle=limit_angle,
         reasons=reasons,
         units=_units(robot),
-        notes=_notes(last),
+        notes=(*_notes(last), *_unread(data)),
+        alignment=_alignment(last),
     )
 
 
@@ -236,16 +249,49 @@ def _view(robot: Mechanism, data: Measurements, found: Solution, ok: np.ndarray,
     return _View(T[None], joints, local, values[None], carried)
 
 
+def _kept(known: Mapping[str, float], refit: Sequence[str], data: Measurements) -> dict[str, float]:
+    """What is known, without the frames, targets and surfaces to be found anew; DataError for a name that is not there."""
+    there = {name.rsplit(".", 1)[0] for name in data.unknowns.table.names}
+    for pattern in refit:
+        if not any(fnmatchcase(name, pattern) for name in there):
+            raise DataError(
+                f"no frame, target or surface of these measurements is called {pattern!r}{nearest(pattern, there)}; there are"
+                f" {', '.join(sorted(there)) or 'none'}"
+            )
+    return {n: v for n, v in known.items() if not any(fnmatchcase(n.rsplit(".", 1)[0], pattern) for pattern in refit)}
+
+
+def _alignment(view: _View) -> dict[str, tuple[str, ...]]:
+    """Frames, targets and surfaces by where their values come from: kept as known, or fitted to these rows."""
+    names = view.local.table.names
+    there = [name in view.carried for name in names]
+    return {
+        word: tuple(dict.fromkeys(n.rsplit(".", 1)[0] for n, c in zip(names, there, strict=True) if c is carried))
+        for word, carried in (("kept", True), ("fitted", False))
+    }
+
+
 def _notes(view: _View) -> tuple[str, ...]:
-    """Say where the unknowns of the measurements come from."""
-    parts = [name.rsplit(".", 1)[0] for name in view.local.table.names]
-    there = [name in view.carried for name in view.local.table.names]
-    notes = []
-    for carried, words in ((True, "as the fit found it"), (False, "found anew from these rows, which flatters")):
-        names = list(dict.fromkeys(p for p, c in zip(parts, there, strict=True) if c is carried))
-        if names:
-            notes.append(f"{listed(names)}: {words}")
+    """Say where the unknowns of the measurements come from, and after which best fit errors are compared."""
+    found, notes = _alignment(view), []
+    if found["kept"]:
+        notes.append(f"{listed(found['kept'])}: as the fit found it")
+    if found["fitted"]:
+        names = listed(found["fitted"])
+        notes.append(f"{names}: found anew from these rows, which flatters: errors are those after the best fit of {names}")
     return tuple(notes)
+
+
+def _read(data: Measurements) -> np.ndarray:
+    """(n,) poses all of whose readings were taken and are believed: from these a pose can be predicted."""
+    sigma = data.reading_sigma
+    return np.ones(data.n_poses, dtype=bool) if sigma is None else np.isfinite(sigma).all(axis=1)
+
+
+def _unread(data: Measurements) -> tuple[str, ...]:
+    """Say which poses are left out because a reading is missing."""
+    names = [label for label, there in zip(data.labels, _read(data), strict=True) if not there]
+    return (f"left out, a reading was not taken or is not believed: {listed(names)}",) if names else ()
 
 
 def _errors(rows: list[Observations], residuals: list[FloatArray]) -> PoseErrors:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -57,16 +57,29 @@ class Fitting:
 
         return {"none": None, "huber": Huber(), "tukey": Tukey()}[self.loss]
 
-    def split(self, data: Measurements, hold_out: float, seed: int) -> tuple[Measurements, Measurements | None]:
-        """Return the poses to fit and those to judge by, without those of --drop in either."""
+    def split(
+        self, data: Measurements, hold_out: float, seed: int, planned: Sequence[str] = ()
+    ) -> tuple[Measurements, Measurements | None]:
+        """Return the poses to fit and those to judge by, without those of --drop in either.
+
+        Parameters
+        ----------
+        hold_out : share of the poses that is drawn by `seed`. planned : names that the data hold out themselves, in its place.
+        """
         from loopcal.calibrate.left_out import without_poses
 
         kept = without_poses(data, self.drop)
+        judge = [label in planned for label in kept.labels]
+        if all(judge):
+            raise DataError("every pose of the data is marked held-out in the column 'use'; leave some to fit")
+        if any(judge):
+            return kept.take([not held for held in judge]), kept.take(judge)
         return kept.split(1 - hold_out, seed) if hold_out else (kept, None)
 
     def fit(self, robot: Mechanism, data: Measurements) -> tuple[Identification, ModelChoice | None]:
         """Identify, after choosing the set of parameters where asked."""
         from loopcal.calibrate import choose_model, identify
+        from loopcal.calibrate.outlook import equations
         from loopcal.calibrate.remedies import open_words
 
         method, loss = self.estimator(), self.robust()
@@ -74,10 +87,10 @@ class Fitting:
         chosen = robot if choice is None else choice.robot
         if choice is not None and not choice.chosen.parameters:
             raise DataError(f"{choice.sentence}; without --choose-model it is calibrated all the same")
-        free = int(chosen.parameters.free.sum())
-        if method is None and data.n_rows < free:
+        free, count = int(chosen.parameters.free.sum()), equations(chosen, data)
+        if method is None and count < free:
             raise DataError(
-                f"{data.n_rows} equations cannot determine {free} parameters; measure more poses, fix parameters, or let the "
+                f"{count} equations cannot determine {free} parameters; measure more poses, fix parameters, or let the "
                 f"stated tolerances decide what is open with --method map{open_words(chosen, data)}"
             )
         drop = tuple(label for label in self.drop if label in data.labels)
