@@ -16,13 +16,7 @@ from loopcal.calibrate.rows import rows_of
 from loopcal.calibrate.scaling import unknowns
 from loopcal.cli import main
 from loopcal.measure import (
-    Autocollimation,
-    Bearing,
-    Component,
-    Direction,
-    Distance,
     Gaussian,
-    Inclination,
     Instrument,
     JointSensor,
     Pose,
@@ -43,19 +37,6 @@ POINT = np.array([[0.03, -0.02, 0.05]])
 THREE = np.array([[0.1, 0.0, 0.02], [-0.06, 0.1, 0.03], [-0.05, -0.1, 0.01]])
 STATION = se3.pose(np.eye(3), np.array([-2.5, -1.8, 0.1]))
 TRACKER = Position(targets=("a", "b", "c"), places=THREE, unknown=("frame", "targets"))
-KINDS = {
-    "poses": Pose(unknown=("frame", "tool")),
-    "five coordinates": Component(("x", "y", "z", "phi", "theta"), "tilt-torsion", unknown=("frame",)),
-    "targets": TRACKER,
-    "distances": Distance(places=POINT, unknown=("anchor", "offset")),
-    "bearings": Bearing(places=POINT, T_base_frame=STATION, unknown=("frame",)),
-    "directions": Direction(unknown=("frame", "axis")),
-    "inclinations": Inclination(unknown=("gravity", "mounting")),
-    "autocollimations": Autocollimation(unknown=("mirror",)),
-    "separations": Separation(places=POINT, unknown=("offset",)),
-}
-HEXAPOD_RANKS = dict(zip(KINDS, (30, 35, 30, 33, 33, 30, 30, 33, 33), strict=True))
-"""Of 42; see tests/measure/test_ranks.py for those that are counted there."""
 TRUE = {
     "frame.rx": 0.3, "frame.ry": -0.2, "frame.rz": 1.0, "frame.x": 0.4, "frame.y": -0.7, "anchor.x": 0.5, "anchor.y": -0.9,
     "anchor.z": 0.1, "distance.offset": 1e-3, "separation.offset": 2e-3, "a.x": 0.11, "b.z": 0.04,
@@ -90,32 +71,6 @@ def largest(errors, size):
     """The largest error, lengths as a share of the robot's size."""
     found = [np.abs(values[np.isfinite(values)]) for values in (errors.position / size, errors.orientation)]
     return float(np.concatenate(found).max())
-
-
-TILTS = {"directions", "inclinations", "autocollimations"}
-"""The delta's platform does not turn: there is nothing to be seen of its tilts."""
-
-ALONE = [
-    (name, kind)
-    for name in ("hexapod", "3-prs", "linear-delta")
-    for kind in KINDS
-    if name != "linear-delta" or kind not in TILTS
-]
-
-
-@pytest.mark.parametrize(("name", "kind"), ALONE)
-def test_the_true_machine_is_found_from_every_kind_alone_up_to_its_gauge(name, kind):
-    robot, truth, poses = machine(name, 75)
-    data = simulate(robot.with_values(truth), poses, Instrument((seen_by(KINDS[kind]),)), 1, unknowns=true_of(KINDS[kind]))
-    some, others = data.take(np.arange(60)), data.take(np.arange(60, 75))
-    fit = identify(robot, some, LeastSquares(), allow_fewer_equations=True)
-    assert fit.converged
-    if name == "hexapod":
-        assert fit.rank == HEXAPOD_RANKS[kind]
-    # what differs along the gauge changes nothing that the kind sees, anywhere
-    found = validate(fit, others)
-    assert largest(found.after, robot.size) < 1e-9
-    assert largest(found.before, robot.size) > 1e-6
 
 
 def mixed_data(seed=1, noise: type[Gaussian] = Gaussian):
@@ -191,35 +146,6 @@ def test_intervals_of_machine_and_frame_hold_the_truth():
     assert all(fit.converged for fit in fits)
     # intervals of one fit are correlated: the band is that of as many draws as there are fits, at four standard deviations
     assert np.mean(inside) == pytest.approx(0.95, abs=4 * np.sqrt(0.95 * 0.05 / len(fits)))
-
-
-FIVE_KINDS = (
-    TRACKER,
-    Distance(places=POINT, unknown=("anchor", "offset")),
-    Inclination(unknown=("gravity", "mounting")),
-    Separation(places=POINT),
-    Component(("z",)),
-)
-
-
-def test_a_fit_of_five_kinds_beats_each_alone():
-    truth = hexapod().with_values(zoo.hexapod_truth())
-
-    def errors(*kinds):
-        found = []
-        for seed in range(3):
-            instrument = Instrument(tuple(seen_by(kind, Gaussian, 5 * UM) for kind in kinds))
-            data = simulate(truth, hexapod_poses(30, seed), instrument, seed, unknowns=true_of(*kinds))
-            fit = identify(hexapod(), data, MAP())
-            off = (fit.estimate - truth.values) / fit.tolerance
-            found.append([np.sum((fit.sd / fit.tolerance) ** 2), np.sum(off**2)])
-        return np.mean(found, axis=0)
-
-    together = errors(*FIVE_KINDS)
-    for kind in FIVE_KINDS:
-        alone = errors(kind)
-        assert together[0] < alone[0]
-        assert together[1] < alone[1]
 
 
 @pytest.mark.parametrize("block", [16, 512])

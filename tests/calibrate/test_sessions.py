@@ -4,6 +4,7 @@
 One frame alone can be wrong without a trace where the machine's own frame is free; each case here has what contradicts it.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 
@@ -31,23 +32,22 @@ def sensor(kind, **labels):
     return Sensor(kind, Gaussian(np.array(sigma)), **labels)
 
 
-def seen(poses, *sensors, seed=1, **unknowns):
+def seen(poses, *sensors, true):
     """What a true hexapod shows."""
-    truth = zoo.hexapod().with_values(zoo.hexapod_truth())
-    return simulate(truth, poses, Instrument(sensors), seed, unknowns={k.replace("__", "."): v for k, v in unknowns.items()})
+    return simulate(zoo.hexapod().with_values(zoo.hexapod_truth()), poses, Instrument(sensors), 1, unknowns=true)
 
 
-def fixed(data: Measurements, pattern: str, **values):
+def fixed(data: Measurements, pattern: str, values: Mapping[str, float] | None = None):
     """The unknowns of the data, some at these values and kept there."""
     local = local_unknowns(data.observations, data.labels)
-    return local.starting_at(local.values({k.replace("__", "."): v for k, v in values.items()})).fixed(pattern)
+    return local.starting_at(local.values(values)).fixed(pattern)
 
 
-def right(fit, **true):
+def right(fit, true: Mapping[str, float]):
     """A fit that explains the data, with these own unknowns within five standard deviations."""
     assert fit.converged
     assert fit.p_value > USUAL
-    for name, value in ((k.replace("__", "."), v) for k, v in true.items()):
+    for name, value in true.items():
         i = fit.local.names.index(name)
         assert np.isfinite(fit.local.sd[i])
         assert abs(fit.local.estimate[i] - value) < 5 * fit.local.sd[i], name
@@ -63,13 +63,13 @@ def wrong(fit):
 def test_a_base_that_drifts_is_re_measured_in_every_session():
     day = np.repeat(["morning", "noon", "evening"], 20)
     poses, kind = hexapod_poses(60), Pose(unknown=("frame",))
-    drift = {"noon__frame__x": 40 * UM, "evening__frame__x": 90 * UM, "evening__frame__ry": 100 * URAD}
-    data = seen(poses, sensor(kind, session=day), **drift)
+    drift = {"noon.frame.x": 40 * UM, "evening.frame.x": 90 * UM, "evening.frame.ry": 100 * URAD}
+    data = seen(poses, sensor(kind, session=day), true=drift)
     # the first session says where the base is, the others how far it has drifted since
-    first = {"morning__frame__x": 0.0, "morning__frame__ry": 0.0}
-    fit = identify(hexapod(), data, LeastSquares(), local=fixed(data, "morning.*", **first))
+    first = {"morning.frame.x": 0.0, "morning.frame.ry": 0.0}
+    fit = identify(hexapod(), data, LeastSquares(), local=fixed(data, "morning.*", first))
     assert fit.rank == 42
-    right(fit, **drift)
+    right(fit, drift)
     free = identify(hexapod(), data, LeastSquares())
     assert free.rank == 36
     frames = [
@@ -87,12 +87,12 @@ def test_a_station_that_was_moved_is_found_anew_and_not_taken_for_the_same():
     station = se3.pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
     theodolite = Bearing(places=POINT, T_base_frame=station, unknown=("frame",))
     poses = np.concatenate([hexapod_poses(50), hexapod_poses(50, 3)])
-    moved = {"right__frame__x": 1.4, "right__frame__y": -1.1, "right__frame__rz": 2.0}
+    moved = {"right.frame.x": 1.4, "right.frame.y": -1.1, "right.frame.rz": 2.0}
     known = Position(places=POINT)
-    data = seen(poses, sensor(theodolite, session=day), sensor(known), **moved)
+    data = seen(poses, sensor(theodolite, session=day), sensor(known), true=moved)
     fit = identify(hexapod(), data, LeastSquares())
     assert fit.rank == 39
-    right(fit, **moved, left__frame__x=-1.5)
+    right(fit, moved | {"left.frame.x": -1.5})
     one = tuple(replace(o, session=np.full(len(o), "")) for o in data.observations)
     wrong(identify(hexapod(), replace(data, observations=one), LeastSquares()))
 
@@ -116,9 +116,9 @@ def test_a_prior_on_a_frame_stands_between_a_free_and_a_fixed_one_and_is_weighed
     local = local_unknowns(data.observations, data.labels)
     free, held, known = (
         identify(robot, data, LeastSquares(), local=one)
-        for one in (local, local.with_prior("frame.*", 50 * UM), fixed(data, "*", frame__x=60 * UM))
+        for one in (local, local.with_prior("frame.*", 50 * UM), fixed(data, "*", {"frame.x": 60 * UM}))
     )
-    right(held, frame__x=60 * UM)
+    right(held, {"frame.x": 60 * UM})
     assert np.isinf(free.sd).any()
     assert np.isfinite(held.sd).all()
     assert (known.sd <= held.sd * (1 + 1e-9)).all()
@@ -130,27 +130,27 @@ def test_a_prior_on_a_frame_stands_between_a_free_and_a_fixed_one_and_is_weighed
 
 def test_a_frame_fixed_where_it_is_not_is_found_out_where_the_machine_cannot_take_it_up():
     robot, _, data = printed()
-    right(identify(robot, data, LeastSquares(), local=fixed(data, "*", frame__x=60 * UM)))
+    right(identify(robot, data, LeastSquares(), local=fixed(data, "*", {"frame.x": 60 * UM})), {})
     wrong(identify(robot, data, LeastSquares(), local=fixed(data, "*")))
 
 
 def test_a_probe_s_offset_is_found_on_planes_and_a_wrong_one_is_found_out():
     probe = Plane(unknown=("surface", "targets"), targets=("probe",), places=np.array([[0.0, 0.0, 0.06]]))
     group = np.array([f"plate{i % 3}" for i in range(60)])
-    true = {"probe__x": 2e-3, "probe__y": -1e-3, "probe__z": 0.0615}
-    data = seen(hexapod_poses(60), sensor(Pose()), sensor(probe, group=group), **true)
+    true = {"probe.x": 2e-3, "probe.y": -1e-3, "probe.z": 0.0615}
+    data = seen(hexapod_poses(60), sensor(Pose()), sensor(probe, group=group), true=true)
     fit = identify(hexapod(), data, LeastSquares())
     assert fit.rank == 42
-    right(fit, **true)
-    wrong(identify(hexapod(), data, LeastSquares(), local=fixed(data, "probe.*", **{**true, "probe__x": 2.2e-3})))
+    right(fit, true)
+    wrong(identify(hexapod(), data, LeastSquares(), local=fixed(data, "probe.*", true | {"probe.x": 2.2e-3})))
 
 
 def test_a_tool_s_offset_is_found_and_a_wrong_one_is_found_out():
-    true = {"tool__z": 0.12, "tool__rx": 0.01, "tool__y": 1e-3}
+    true = {"tool.z": 0.12, "tool.rx": 0.01, "tool.y": 1e-3}
     tool = Pose(unknown=("tool",), T_platform_tool=se3.pose(np.eye(3), np.array([0.0, 0.0, 0.1])))
     balls = Position(targets=("a", "b", "c"), places=0.1 * np.eye(3))
-    data = seen(hexapod_poses(40), sensor(tool), sensor(balls), **true)
+    data = seen(hexapod_poses(40), sensor(tool), sensor(balls), true=true)
     fit = identify(hexapod(), data, LeastSquares())
     assert fit.rank == 42
-    right(fit, **true)
-    wrong(identify(hexapod(), data, LeastSquares(), local=fixed(data, "tool.*", **{**true, "tool__y": 1.1e-3})))
+    right(fit, true)
+    wrong(identify(hexapod(), data, LeastSquares(), local=fixed(data, "tool.*", true | {"tool.y": 1.1e-3})))
