@@ -65,7 +65,6 @@ def calibrate(
       loopcal calibrate robot.yaml data.csv -o run --hold-out 0.25 --limit-position 0.02mm --limit-angle 0.01deg
       loopcal calibrate printer.yaml heights.csv -o run --noise estimated
       loopcal calibrate robot.yaml poses.csv tracker.csv inclinometer.csv -o run
-      loopcal calibrate robot.yaml data.csv -o run --loss huber --drop 17
       loopcal calibrate hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
     """  # noqa: D301
     from loopcal.calibrate import validate
