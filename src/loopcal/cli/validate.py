@@ -17,6 +17,8 @@ from loopcal.cli.options import FILE, data_argument, data_options, gate_options,
 @data_argument
 @gate_options
 @data_options
+@click.option("--refit", multiple=True, metavar="NAME",
+              help="A frame, target or surface that was set up anew since RUN, to be found from DATA.")  # fmt: skip
 @click.option("--allow-fitted-data", is_flag=True, help="Accept the very measurements that the run was fitted to.")
 @json_option
 def validate(
@@ -25,12 +27,16 @@ def validate(
     limit_position: float | None,
     limit_angle: float | None,
     allowed: Mapping[str, bool],
+    refit: tuple[str, ...],
     allow_fitted_data: bool,
     as_json: bool,
 ) -> int:
     """Compare the robot of RUN, a folder made by `loopcal calibrate` or a robot file, with DATA, one file or several.
 
     Errors are those before and after calibration; of a robot file without identified values, its own alone.
+
+    Frames, targets and surfaces that RUN found are used as it found them, by name; others are fitted to DATA, and that
+    is said.
 
     The exit code is 2 where a quality gate is not met.
 
@@ -47,7 +53,8 @@ def validate(
     measured = measurements(data, calibrated.robot, **allowed)
     if not allow_fitted_data:
         refuse_fitted_data(calibrated, data)
-    found = compare(calibrated.robot, measured, limit_position, limit_angle, before=calibrated.before)
+    known = {"known": calibrated.local, "refit": refit}
+    found = compare(calibrated.robot, measured, limit_position, limit_angle, calibrated.before, **known)
     if as_json:
         show.json_document(found.to_dict())
     else:

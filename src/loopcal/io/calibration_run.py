@@ -13,7 +13,7 @@ robot.yaml     the corrected robot file
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +35,8 @@ class CalibratedRun:
     result: dict[str, Any]
     robot: Mechanism
     before: Mechanism
+    local: Mapping[str, float] = field(default_factory=dict)
+    """Frames, targets and surfaces as the run found them: values by name, such as `tracker.x` [SI]."""
 
 
 def run_document(
@@ -84,7 +86,10 @@ def load_run(path: str | Path) -> CalibratedRun:
     run = read_run_folder(path)
     robot = load_robot(run.robot_path)
     initial = run.arrays.get("initial", robot.parameters.nominal)
-    return CalibratedRun(run.path, run.result, robot, robot.with_values(initial))
+    names = [row["name"] for row in run.result.get("fit", {}).get("local") or ()]
+    found = run.arrays.get("local_estimate")
+    local = dict(zip(names, found.tolist(), strict=True)) if found is not None and len(found) == len(names) else {}
+    return CalibratedRun(run.path, run.result, robot, robot.with_values(initial), local)
 
 
 def load_calibrated(path: str | Path) -> CalibratedRun:

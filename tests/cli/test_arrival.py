@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""At the command line: slips of convention are refused with the flag that overrides them; frames of a run are used again."""
+
+import numpy as np
+import pytest
+
+from loopcal.cli import main
+from loopcal.errors import DataError
+from loopcal.io import load_measurements, load_robot, save_measurements
+from loopcal.measure import Gaussian, Instrument, Pose, Sensor, simulate
+from loopcal.mechanism.workspace import sample
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+
+    def run(words: str) -> tuple[int, str, str]:
+        code = main(words.split())
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return tmp_path, run
+
+
+def saved(path, kind, n=9, seed=0, change=None, unknowns=None):
+    """Write what a hexapod within its tolerances shows."""
+    robot = load_robot("hexapod-42")
+    truth = robot.with_values(robot.values + 0.03e-3 * np.random.default_rng(0).standard_normal(len(robot.values)))
+    instrument = Instrument((Sensor(kind, Gaussian(np.array([5e-6] * 3 + [1e-6] * 3))),))
+    poses = sample(robot, n, seed + 1).coordinates
+    save_measurements(simulate(truth, poses, instrument, seed, controller=robot, unknowns=unknowns), path, robot)
+    if change is not None:
+        path.write_text(change(path.read_text()))
+    return robot
+
+
+def metres(text: str) -> str:
+    return text.replace("x [mm]", "x [m]").replace("y [mm]", "y [m]").replace("z [mm]", "z [m]")
+
+
+def test_a_slip_is_refused_in_one_sentence_and_overridden_by_its_flag(here) -> None:
+    folder, run = here
+    robot = saved(folder / "data.csv", Pose(), change=metres)
+    for command in ("calibrate hexapod-42 data.csv -o run", "identifiability hexapod-42 data.csv"):
+        code, out, err = run(command)
+        assert (code, out) == (1, "")
+        assert err.startswith("loopcal: data.csv: the data do not fit 'hexapod-42' as they are written: ")
+        assert "with lengths 1000 times smaller (mm written as m, or um as mm)" in err
+        assert err.endswith("correct the unit in the header, or use --allow-implausible\n")
+        assert err.count("\n") == 1
+    assert not (folder / "run").exists()
+    assert run("identifiability hexapod-42 data.csv --allow-implausible")[0] == 0
+    with pytest.raises(DataError, match="--allow-implausible"):
+        load_measurements(folder / "data.csv", robot)
+    assert load_measurements(folder / "data.csv", robot, allow_implausible=True).n_poses == 9
+
+
+def test_a_target_that_no_pose_moves_is_refused_and_overridden_by_its_flag(here) -> None:
+    folder, run = here
+
+    def frozen(text: str) -> str:
+        lines = text.splitlines()
+        first = next(i for i, line in enumerate(lines) if line.startswith("pose,")) + 1
+        tail = lines[first].split(",")[7:]
+        return "\n".join([*lines[:first], *(",".join([*line.split(",")[:7], *tail]) for line in lines[first:])]) + "\n"
+
+    saved(folder / "data.csv", Pose(), change=frozen)
+    code, out, err = run("calibrate hexapod-42 data.csv -o run")
+    assert (code, out) == (1, "")
+    assert "'pose' of kind 'pose' never moves: its readings stay within 0" in err
+    assert "or use --allow-still" in err
+    assert run("identifiability hexapod-42 data.csv --allow-still --allow-implausible")[0] == 0
+
+
+def test_validate_uses_the_frame_that_the_run_found(here) -> None:
+    folder, run = here
+    placed = {"frame.x": 0.1, "frame.rz": 0.5}
+    saved(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)
+    saved(folder / "more.csv", Pose(unknown=("frame",)), 6, 1, unknowns=placed)
+    assert run("calibrate hexapod-42 data.csv -o run")[0] == 0
+    code, out, _ = run("validate run more.csv")
+    assert code == 0
+    assert "note: frame: as the fit found it" in out
+    code, out, _ = run("validate run more.csv --refit frame")
+    assert code == 0
+    assert "errors are those after the best fit of frame" in out
+    code, _, err = run("validate run more.csv --refit tracker")
+    assert code == 1
+    assert "is called 'tracker'; there are frame" in err
