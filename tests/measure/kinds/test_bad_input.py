@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from loopcal import se3
-from loopcal.errors import DataError
+from loopcal.calibrate import identifiability
+from loopcal.errors import DataError, LoopcalError
 from loopcal.measure import (
     KINDS,
     Autocollimation,
@@ -14,6 +15,7 @@ from loopcal.measure import (
     Distance,
     Gaussian,
     Inclination,
+    Instrument,
     JointSensor,
     Line,
     Measurements,
@@ -25,6 +27,7 @@ from loopcal.measure import (
     Sphere,
     check_duplicates,
     check_moved,
+    simulate,
 )
 from tests import zoo
 
@@ -118,6 +121,41 @@ def test_a_target_that_no_pose_moves_is_named():
     with pytest.raises(DataError, match=r"'b' of kind 'position' never moves: its readings stay within .*use --allow-still"):
         check_moved(data, T, override="--allow-still")
     check_moved(data, T, allow=True)
+
+
+FOLLOWING = [kind for cls in KINDS.values() for kind in cls.examples()[:1] if kind.follows and kind.links == 1]
+
+
+@pytest.mark.parametrize("kind", FOLLOWING, ids=lambda kind: kind.name)
+def test_readings_that_never_move_are_refused_in_every_kind_that_follows_the_robot(kind):
+    kind = kind.mounted(np.eye(4))
+    T = zoo.poses_of(np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)) + np.array([0, 0, 0, 0.1, 0.1, 0.0]))
+    noise = 1e-6 * np.random.default_rng(1).normal(size=(1, 8, len(kind.noise_columns)))
+    true, still = kind.measure(T[None], noise)[0], kind.measure(np.repeat(T[:1], 8, axis=0)[None], noise)[0]
+    readings = np.arange(8.0)[:, None]
+    good, bad = (Observations.from_sigma(kind, np.arange(8), values, 1e-6) for values in (true, still))
+    check_moved(Measurements("toy", readings, (good,)), T)
+    with pytest.raises(DataError, match=f"of kind '{kind.name}' never moves: its readings stay within"):
+        check_moved(Measurements("toy", readings, (bad,)), T)
+
+
+@pytest.mark.parametrize("kind", EXAMPLES)
+def test_poses_in_one_plane_are_told_what_they_leave_open_or_refused_in_a_sentence(kind):
+    """No turn and one height: something stays open in every kind, and is named; where a frame cannot be found, that is said."""
+    robot = zoo.hexapod()
+    flat = np.column_stack([np.random.default_rng(0).uniform(-0.03, 0.03, (10, 2)), np.full(10, 0.2), np.zeros((10, 3))])
+    sensor = Sensor(kind, Gaussian(np.full(len(kind.noise_columns), 1e-5)))
+    found, refused = None, ""
+    try:
+        found = identifiability(robot, simulate(robot, zoo.poses_of(flat), Instrument((sensor,)), 0))
+    except LoopcalError as error:
+        refused = str(error)
+    if found is None:
+        assert any(words in refused for words in ("measured in one plane, so it can be on either side", "are the same turn"))
+        return
+    assert found.rank < found.n_parameters
+    assert len(found.unidentifiable) == found.n_parameters - found.rank
+    assert "not identifiable: " in "\n".join(found.sentences())
 
 
 @pytest.mark.parametrize("kind", [Plane(places=POINT), Line(places=POINT), JointSensor()])
