@@ -23,11 +23,15 @@ NAME = "cmm-constraint-2011"
 
 def reproduce(seed: int, trials: int, progress: Callable[[str], None]) -> Reproduction:
     """Repeat the paper; see `loopcal.papers.Paper.run`."""
+    return told(compute(seed, trials, progress), seed, trials)
+
+
+def told(found: Results, seed: int, trials: int) -> Reproduction:
+    """Put what was computed into tables, figures and verdicts."""
     from loopcal.papers.cmm_constraint_2011.figures import figures
     from loopcal.papers.cmm_constraint_2011.verdicts import verdicts
 
     paper = PAPERS[NAME]
-    found = compute(seed, trials, progress)
     return Reproduction(
         paper=paper.name,
         title=paper.title,

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plane and perpendicular line in two forms, surfaces as unknowns and the paper's elimination: one problem.
+
+Both see the same points of a hexapod: four groups of twelve, reached as a coordinate measuring machine holds coordinates.
+"""
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.calibrate import MAP, LeastSquares, identifiability, identify
+from loopcal.calibrate.outlook import information
+from loopcal.calibrate.plan.groups import PlaneAndLine, surface_rows
+from loopcal.calibrate.scaling import unknowns
+from loopcal.papers.cmm_constraint_2011.forms import RANK, covariance_difference, measurements
+from loopcal.papers.cmm_constraint_2011.steps import Layout, PaperRows, identify_from_rows, row_map
+from loopcal.papers.cmm_constraint_2011.study import true_machines
+
+MM = 1e-3
+NOISE = 1e-6  # [m]
+GROUPS, POINTS = 4, 12
+
+
+@pytest.fixture(scope="module")
+def planned() -> PlaneAndLine:
+    return PlaneAndLine(lc.load_robot("hexapod-nategh-agheli"), POINTS, MM, ("z",))
+
+
+@pytest.fixture(scope="module")
+def layout(planned) -> Layout:
+    return Layout(planned.robot, planned.coordinates(planned.random(GROUPS, 0)))
+
+
+def exact(layout: Layout) -> np.ndarray:
+    """Readings (1, n, 6) at which the machine as designed stands on its surfaces."""
+    return layout.held(layout.robot.parameters.nominal[None], 0.0, 0)
+
+
+def test_a_plane_and_a_line_that_name_the_same_surface_share_its_direction(layout) -> None:
+    local = measurements(layout, exact(layout)[0], NOISE).unknowns
+    names = {f"plane{g + 1}.held.{part}" for g in range(GROUPS) for part in ("u", "v", "height", "a", "b")}
+    assert set(local.table.names) == names
+    assert len(local) == 5 * GROUPS
+
+
+@pytest.mark.slow
+def test_rank_is_33_of_42_in_both_forms_and_the_nine_others_are_motions_of_base_and_platform(layout) -> None:
+    known = identifiability(layout.robot, measurements(layout, exact(layout)[0], NOISE))
+    assert known.rank == 33
+    assert known.singular_values[32] > 1e6 * known.singular_values[33]
+    meanings = [c.meaning for c in known.unidentifiable]
+    assert sum("the whole base" in m for m in meanings) == 6
+    assert sum("the whole platform turned about its" in m for m in meanings) == 3
+    rows, _ = PaperRows(layout, exact(layout), MM, NOISE).whitened(np.zeros((1, 42)), np.zeros(1, dtype=int))
+    s = np.linalg.svd(rows[0, :, :42], compute_uv=False)
+    assert s[33] < 1e-13 * s[0]
+    assert s[32] > 1e-7 * s[0]
+
+
+def test_the_papers_rows_are_what_no_motion_of_the_surfaces_changes(layout) -> None:
+    at, _, _ = layout.sloped(layout.robot.parameters.nominal[None], exact(layout))
+    each = np.eye(3 * POINTS).reshape(POINTS, 3, 3 * POINTS)
+    F, A = surface_rows(at[0], np.repeat(each[None], GROUPS, axis=0), np.full(GROUPS, 2))
+    B = row_map(*layout.levers)  # rows by points; A: held coordinates by points
+    for g in range(GROUPS):
+        held = np.linalg.lstsq(A[g].T, B[g].T, rcond=None)[0].T  # rows as sums of held coordinates
+        np.testing.assert_allclose(held @ A[g], B[g], atol=1e-12)  # [m], they are
+        np.testing.assert_allclose(held @ F[g], 0.0, atol=1e-12)  # [m2], and no surface moves them
+        assert np.linalg.matrix_rank(held) == POINTS - 2
+
+
+def test_both_forms_and_the_rows_of_planning_give_every_direction_the_same_variance(layout, planned) -> None:
+    assert covariance_difference(layout, NOISE) < 1e-9  # relative, rounding by a condition of 1e4
+    free = unknowns(layout.robot)
+    R = information(free, measurements(layout, exact(layout)[0], MM))[0][0, :42, :42]
+    rows = planned.rows(planned.random(GROUPS, 0)).reshape(-1, 42)
+    np.testing.assert_allclose(rows.T @ rows, R.T @ R, atol=1e-9 * np.abs(R.T @ R).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [LeastSquares(), MAP()], ids=["least squares", "MAP"])
+def test_both_forms_give_the_same_estimate_up_to_what_is_not_linear(layout, method) -> None:
+    truth = true_machines(layout.robot, MM, 1, 3)
+    unlike = []
+    for noise in (NOISE, 10.0 * NOISE):
+        q = layout.held(truth, noise, 3)
+        problem = PaperRows(layout, q, MM, noise)
+        paper = problem.values(identify_from_rows(problem, method, 1e-6).deviation)[0]
+        found = identify(
+            layout.robot, measurements(layout, q[0], noise), method, rank_tolerance=RANK, allow_fewer_equations=True
+        )
+        A = problem.whitened(np.zeros((1, 42)), np.zeros(1, dtype=int))[0][0, :, :42]
+        unlike.append(float(np.linalg.norm(A @ (found.robot.values - paper) / MM)))
+    assert unlike[0] < 0.02  # [sd] of all rows together
+    assert unlike[1] < 0.2
+    assert unlike[1] > 1.5 * unlike[0]  # second order: it falls with the noise
+
+
+def test_full_covariance_of_the_papers_rows_is_that_of_drawn_noise(layout) -> None:
+    d_1, d = layout.levers
+    noise = np.random.default_rng(0).normal(size=(20000, 3 * POINTS)) * NOISE
+    whitened = PaperRows(layout, exact(layout), MM, NOISE).whitener[0] @ row_map(d_1, d)[0] @ noise.T
+    # an entry of a covariance of 20000 draws has sd sqrt(2 / 20000) = 0.01 on the diagonal; 5 sd
+    np.testing.assert_allclose(np.cov(whitened), np.eye(POINTS - 2), atol=0.05)
