@@ -4,17 +4,26 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from loopcal.cli import show
 from loopcal.cli.options import FILE, draw_option, drawn_poses, instrument, instrument_options, json_option, robot_argument
+from loopcal.errors import DataError
+
+if TYPE_CHECKING:
+    from loopcal.measure import Instrument, Measurements
+    from loopcal.mechanism import Mechanism
 
 
 @click.command(short_help="Make a measurement file by simulation.")
 @robot_argument
 @click.option("--poses", type=FILE, help="CSV file of commanded poses, one column per coordinate.")
 @draw_option
+@click.option(
+    "--fill", type=FILE, metavar="SHEET", help="In place of poses and instrument: the data file of a plan to fill in."
+)
 @click.option("-o", "--output", required=True, type=FILE, help="The measurement file to write.")
 @instrument_options
 @click.option("--draw-errors", is_flag=True, help="Give the machine errors drawn from the tolerances of the robot file.")
@@ -26,6 +35,7 @@ def simulate(
     robot: str,
     poses: Path | None,
     draw: int,
+    fill: Path | None,
     output: Path,
     kind: str,
     components: str | None,
@@ -49,28 +59,60 @@ def simulate(
       loopcal simulate hexapod-42 --draw-errors --truth truth.yaml -o measurements.csv
       loopcal simulate hexapod-42 --poses poses.csv --draw-errors -o measurements.csv
       loopcal simulate truth.yaml --poses poses.csv --sigma-position 0.001mm --sigma-angle 5urad -o measurements.csv
+      loopcal simulate hexapod-42 --fill plan/measurements.csv --draw-errors --truth truth.yaml -o filled.csv
     """  # noqa: D301
     from loopcal import measure
-    from loopcal.io import load_robot, save_measurements, save_robot
-    from loopcal.io.measurement_file import load_poses
+    from loopcal.io import load_robot, save_robot
     from loopcal.io.outputs import refuse_outputs
     from loopcal.io.robot_file import robot_path
+    from loopcal.io.text_file import write_text
 
-    refuse_outputs((output, truth), (robot_path(robot), poses), force)
+    refuse_outputs((output, truth), (robot_path(robot), poses, fill), force)
     machine = load_robot(robot)
     if draw_errors:
         machine = machine.with_values(measure.sample_truth(machine, 1, seed)[0])
-    seen_by = instrument(kind, components, orientation, sigma_position, sigma_angle)
-    if poses is None:
-        targets, words = drawn_poses(machine.nominal, draw, seed)
+    if fill is not None:
+        data, text = _filled(machine, fill, seed)
     else:
-        targets, words = load_poses(poses, machine), f"{poses.name}, seed {seed}"
-    data = measure.simulate(machine, targets, seen_by, seed)
-    measure.check_strokes(data, machine)
-    save_measurements(data, output, machine, f"simulated by loopcal: {words}")
+        seen_by = instrument(kind, components, orientation, sigma_position, sigma_angle)
+        data, text = _simulated(machine, poses, draw, seen_by, seed)
+    write_text(output, text)
     if truth is not None:
         save_robot(machine, truth)
     if as_json:
         show.json_document({"output": output, "truth": truth, "n_poses": data.n_poses, "n_rows": data.n_rows, "seed": seed})
     else:
         show.say(f"{output}: {data.n_poses} poses of {machine.name}, {data.n_rows} measured values, seed {seed}")
+
+
+def _simulated(machine: Mechanism, poses: Path | None, draw: int, seen_by: Instrument, seed: int) -> tuple[Measurements, str]:
+    """Measure poses of a file, or drawn ones: what was measured, and the file that says so."""
+    from loopcal import measure
+    from loopcal.io.measurement_file import load_poses
+    from loopcal.io.measurement_writer import measurements_text
+
+    if poses is None:
+        targets, words = drawn_poses(machine.nominal, draw, seed)
+    else:
+        targets, words = load_poses(poses, machine), f"{poses.name}, seed {seed}"
+    data = measure.simulate(machine, targets, seen_by, seed)
+    measure.check_strokes(data, machine)
+    return data, measurements_text(data, machine, f"simulated by loopcal: {words}")
+
+
+def _filled(machine: Mechanism, sheet: Path, seed: int) -> tuple[Measurements, str]:
+    """Fill in the data file of a plan: what was measured, and the file that says so."""
+    from loopcal.io import load_measurements
+    from loopcal.io.instrument_file import load_instrument
+    from loopcal.io.measurement_writer import measurements_text
+    from loopcal.io.use_column import use_of, with_use
+    from loopcal.measure.fill_in import fill_in
+
+    given = click.get_current_context().get_parameter_source
+    for name in ("poses", "draw", "kind", "components", "orientation", "sigma_position", "sigma_angle"):
+        if given(name) is click.core.ParameterSource.COMMANDLINE:
+            raise DataError(f"--fill {sheet} states poses and instrument; leave out --{name.replace('_', '-')}, or --fill")
+    data = fill_in(machine, load_measurements(sheet, machine), load_instrument(sheet, machine), seed)
+    text = measurements_text(data, machine, f"simulated by loopcal: {sheet.name}, seed {seed}")
+    use = use_of([sheet])
+    return data, with_use(text, use) if use else text

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from loopcal.mechanism import Mechanism
 
 COMMANDED, LINK = "commanded.", ";"
-OWN_COLUMNS = ("pose", "block", "kind", "session", "group", "time", "temperature")
+OWN_COLUMNS = ("pose", "use", "block", "kind", "session", "group", "time", "temperature")
 """Names of columns that mean the same in every file."""
 
 ALIKE, LEAST = 1e-12, 1e-12

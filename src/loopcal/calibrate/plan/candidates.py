@@ -20,11 +20,16 @@ from loopcal.calibrate.plan.paths import between, distance, follow
 from loopcal.errors import MechanismError
 from loopcal.linalg import FloatArray
 from loopcal.mechanism import Mechanism, Solution, inverse
-from loopcal.mechanism.coordinates import read
+from loopcal.mechanism.coordinates import POSITION, read
 from loopcal.mechanism.workspace import DRAWS, FEWEST, drawn, ranges
+from loopcal.units import Dimension, unit
 
 HALVINGS = 12
 """Bisections of the line to the middle: the boundary is met to 1/4096 of it."""
+DIGITS = 5
+"""Decimal places of the robot's size, in its unit, to which coordinates are commanded; the same of a radian."""
+ROUNDING = 1e-6
+"""Part of a step that is the rounding of a bound's own number."""
 ON_BOUNDARY = 0.7
 """Share of the coordinates of a boundary pose that are put to an end of their range."""
 
@@ -97,6 +102,26 @@ def listed_candidates(robot: Mechanism, poses: FloatArray, constraints: Constrai
     return _reached(judged_by, good, np.ones(len(good), dtype=bool), refused, len(poses))
 
 
+def rounded(robot: Mechanism, coordinates: FloatArray, towards: FloatArray | None = None) -> FloatArray:
+    """Round coordinates (n, c) to a step that a person types: DIGITS of the robot's size and of a radian, in its units.
+
+    Parameters
+    ----------
+    towards : (c,) place to which everything is rounded; default: to the nearest.
+    """
+    steps = []
+    for name in robot.controlled:
+        dimension = Dimension.LENGTH if name in POSITION else Dimension.ANGLE
+        shown = unit(robot.units[dimension])
+        whole = (robot.size if name in POSITION else 1.0) / shown.factor_to_si
+        steps.append(10.0 ** (np.floor(np.log10(whole)) - DIGITS) * shown.factor_to_si)
+    counts = coordinates / np.array(steps)
+    if towards is None:
+        return np.round(counts) * steps
+    slack = np.where(coordinates > towards, ROUNDING, -ROUNDING)
+    return np.where(coordinates > towards, np.floor(counts + slack), np.ceil(counts + slack)) * steps
+
+
 def home_coordinates(robot: Mechanism) -> FloatArray:
     """Controlled coordinates (c,) of home [m, rad]."""
     return read(robot.home, robot.controlled)
@@ -120,7 +145,7 @@ def _inside(
     """Draw poses evenly (count, c) and count the refused; also how many were tried."""
     robot, parts, kept, tried = judged_by.robot, [], 0, 0
     while kept < count:
-        poses = drawn(rng, robot.controlled, wanted, count if not kept else max(count - kept, count // 10, 1))
+        poses = rounded(robot, drawn(rng, robot.controlled, wanted, count if not kept else max(count - kept, count // 10, 1)))
         verdict = judged_by.judge(inverse(robot, poses))
         refused.update(verdict.counts())
         parts.append(poses[verdict.allowed])
@@ -158,8 +183,10 @@ def _boundary(
         share = (good[open_] + bad[open_]) / 2.0
         allowed = judged_by.judge(inverse(robot, between(robot, anchor[open_], poses[open_], share))).allowed
         good[open_], bad[open_] = np.where(allowed, share, good[open_]), np.where(allowed, bad[open_], share)
-    back = between(robot, anchor, poses, good)
-    return np.where(good[:, None] == 1.0, poses, back)[good > 0.0]
+    found = np.where(good[:, None] == 1.0, poses, between(robot, anchor, poses, good))[good > 0.0]
+    # towards the middle, so that what is rounded stays inside
+    found = rounded(robot, found, middle)
+    return found[judged_by.judge(inverse(robot, found)).allowed]
 
 
 def _reached(judged_by: Rules, poses: FloatArray, even: np.ndarray, refused: Counter[str], tried: int) -> Candidates:

@@ -13,7 +13,7 @@ from loopcal.calibrate.outlook import information
 from loopcal.calibrate.plan.candidates import Candidates, candidates, listed_candidates
 from loopcal.calibrate.plan.constraints import Constraints
 from loopcal.calibrate.plan.criteria import Criterion, D, I
-from loopcal.calibrate.plan.design import Directions, Start, design_factor, directions
+from loopcal.calibrate.plan.design import Directions, Start, design_factor, directions, triangle
 from loopcal.calibrate.plan.information import Predicted, UnitRows, knowable, predicted, start_of, unit_rows, units_of
 from loopcal.calibrate.scaling import Unknowns, unknowns
 from loopcal.errors import DataError, EstimationError
@@ -78,7 +78,8 @@ class Problem:
             raise EstimationError(
                 f"the criterion is {name!r}; allowed are I (mean predicted variance of poses) and D (volume of uncertainty)"
             )
-        return I(getattr(self.wanted, target), len(self.wanted.shifts))
+        # the triangular factor of the rows gives the same trace from fewer rows
+        return I(triangle(getattr(self.wanted, target)), len(self.wanted.shifts))
 
     def accuracy(self, chosen: np.ndarray) -> Accuracy | None:
         """Return the predicted errors after measuring units (n,), none at all allowed; None where nothing bounds them."""
@@ -93,6 +94,17 @@ class Problem:
         ]
         return Accuracy(*found)
 
+    @cached_property
+    def unknown(self) -> int:
+        """How many equations it takes: parameters, or those that can be told with the instrument's own unknowns."""
+        own = self.space.own.shape[1] - int(np.any(self.units.prior != 0.0, axis=1).sum())
+        return max(len(self.free), int(self.seen.rank[0]) + max(own, 0))
+
+    @property
+    def fewest(self) -> int:
+        """Units that give as many equations as there are unknowns."""
+        return max(-(-(self.unknown - self.equations) // self.units.rows.shape[1]), 1)
+
     def require_equations(self, n: int) -> None:
         """Refuse n units that give fewer equations than there are unknowns.
 
@@ -102,10 +114,8 @@ class Problem:
             With the number of poses that it takes.
         """
         r, k, p = self.units.rows.shape[1], self.poses_in_unit, len(self.free)
-        own = self.space.own.shape[1] - int(np.any(self.units.prior != 0.0, axis=1).sum())
-        needed = max(p, int(self.seen.rank[0]) + max(own, 0))
-        if n * r + self.equations < needed:
-            least = -(-(needed - self.equations) // r) * k
+        if n < self.fewest:
+            least, needed = self.fewest * k, self.unknown
             also = f" and {self.equations} were measured already" if self.equations else ""
             raise EstimationError(
                 f"{n * k} poses give {n * r} equations{also}, but there are {needed} unknowns ({p} parameters of "

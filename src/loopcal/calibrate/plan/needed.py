@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How many poses: expected errors of good designs against their number, and the fewest that reach a goal.
+
+The relaxed design bounds what any choice of so many poses can reach, and so says below how many a goal is out of reach.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from loopcal.calibrate.plan.curve import Curve, design_curve, enough
+from loopcal.calibrate.plan.design import allowed
+from loopcal.calibrate.plan.problem import Accuracy, Problem, Target
+from loopcal.errors import EstimationError
+from loopcal.linalg import FloatArray, IntArray
+from loopcal.mechanism import Mechanism
+from loopcal.units import DISPLAY_UNITS, Dimension, unit
+
+SIZES = 6
+"""Numbers of poses on a curve."""
+WIDE = 4
+"""A curve goes from the fewest poses to this many times the number asked for."""
+MOST = 400
+"""Poses beyond which no goal is followed: more is a day's work."""
+SHAKES = 4
+"""Times that designs of a curve are shaken out of local optima."""
+DIMENSION = {"pose": Dimension.LENGTH, "position": Dimension.LENGTH, "orientation": Dimension.ANGLE}
+
+
+@dataclass(frozen=True, eq=False)
+class PoseCurve:
+    """Expected errors by the number of poses.
+
+    Attributes
+    ----------
+    poses : (k,) numbers, ascending. expected : of a good design of each. target : which error was made small.
+    values, bounds : (k,) that error [m, rad], and the smallest that any choice of so many of the candidates can have.
+    goal : asked for [m, rad], or None. at_least : poses without which the goal cannot be reached.
+    """
+
+    poses: IntArray
+    expected: tuple[Accuracy, ...]
+    target: Target
+    values: FloatArray
+    bounds: FloatArray
+    goal: float | None = None
+    at_least: int | None = None
+
+    def sentences(self, robot: Mechanism) -> list[str]:
+        """Say what the curve shows."""
+        if self.goal is not None:
+            goal = in_unit(robot, self.goal, DIMENSION[self.target])
+            reached = f"{self.poses[-1]} poses reach an expected {self.target} error of {goal} (rms)"
+            return [f"{reached}; no choice of fewer than {self.at_least} of the candidates can"]
+        pairs = zip(self.poses.tolist(), self.expected, strict=True)
+        return [f"expected errors by number of poses: {'; '.join(f'{n}: {in_words(robot, e)}' for n, e in pairs)}"]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything by name for JSON, SI."""
+        return {
+            "target": self.target,
+            "poses": self.poses.tolist(),
+            "position": [e.position for e in self.expected],
+            "orientation": [e.orientation for e in self.expected],
+            "values": self.values.tolist(),
+            "bounds": self.bounds.tolist(),
+            "goal": self.goal,
+            "at_least": self.at_least,
+        }
+
+
+def pose_curve(made: Problem, n_poses: int, target: Target = "pose", seed: int = 1) -> PoseCurve:
+    """Return expected errors from the fewest poses that there are equations for to a few times `n_poses`."""
+    k = made.poses_in_unit
+    last = min(max(WIDE * n_poses // k, 2 * made.fewest), int(allowed(made.units.rows).sum()))
+    first = min(made.fewest, last)
+    numbers = np.unique(np.append(np.geomspace(first, last, SIZES).round().astype(int), min(max(n_poses // k, first), last)))
+    wanted = made.criterion("I", target)
+    return _curve(made, design_curve(made.units.rows, numbers.tolist(), wanted, made.start, seed, SHAKES), target)
+
+
+def poses_needed(made: Problem, goal: float, target: Target, seed: int = 1) -> PoseCurve:
+    """Return the way to the fewest poses found that reach a goal; its last number is that of these poses.
+
+    Parameters
+    ----------
+    goal : root mean square of the target over the workspace [m, rad].
+
+    Raises
+    ------
+    EstimationError
+        The goal is no number above zero, or out of reach, with the best that can be had.
+    """
+    if not goal > 0.0 or not np.isfinite(goal):
+        raise EstimationError(f"the accuracy asked for is {goal:g}; give a number above 0 with its unit, such as 20um")
+    wanted, rows, k = made.criterion("I", target), made.units.rows, made.poses_in_unit
+    most = min(MOST // k, int(allowed(rows).sum()))
+    made.require_equations(most)
+    try:
+        found = enough(rows, goal**2, wanted, made.start, most, seed, SHAKES)
+    except EstimationError:
+        best = design_curve(rows, [most], wanted, made.start, seed, 0)
+        robot, dimension = made.free.robot, DIMENSION[target]
+        raise EstimationError(
+            f"an expected {target} error of {in_unit(robot, goal, dimension)} (rms) is out of reach: {most * k} poses leave "
+            f"{in_unit(robot, float(np.sqrt(best.values[0])), dimension)}, and no choice of so many less than "
+            f"{in_unit(robot, float(np.sqrt(best.bounds[0])), dimension)}; take a better instrument, or ask for less"
+        ) from None
+    if found.n < made.fewest:
+        one = design_curve(rows, [made.fewest], wanted, made.start, seed, SHAKES)
+        return _curve(made, one, target, goal, found.at_least)
+    keep = found.curve.numbers <= found.n
+    cut = Curve(
+        found.curve.numbers[keep], found.curve.values[keep], found.curve.bounds[keep], found.curve.designs[: int(keep.sum())]
+    )
+    return _curve(made, cut, target, goal, found.at_least)
+
+
+def in_unit(robot: Mechanism, value: float, dimension: Dimension) -> str:
+    """Return a number with the unit of the robot's file."""
+    symbol = robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol)
+    return f"{value / unit(symbol).factor_to_si:.3g} {symbol}"
+
+
+def in_words(robot: Mechanism, errors: Accuracy) -> str:
+    """Return errors with their units, those that there are."""
+    pairs = ((errors.position, Dimension.LENGTH), (errors.orientation, Dimension.ANGLE))
+    return ", ".join(in_unit(robot, value, dimension) for value, dimension in pairs if value > 0.0) or "nothing"
+
+
+def _curve(made: Problem, found: Curve, target: Target, goal: float | None = None, at_least: int | None = None) -> PoseCurve:
+    """Return a curve in poses and errors."""
+    k = made.poses_in_unit
+    expected = [made.accuracy(one.design.chosen) for one in found.designs]
+    assert all(e is not None for e in expected)  # no design leaves a direction open
+    known = tuple(e for e in expected if e is not None)
+    values, bounds = np.sqrt(found.values), np.sqrt(np.maximum(found.bounds, 0.0))
+    return PoseCurve(found.numbers * k, known, target, values, bounds, goal, None if at_least is None else at_least * k)

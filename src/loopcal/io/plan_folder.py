@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A plan in a folder, for whoever stands at the machine.
+
+    plan.csv           the operator's sheet: what to command, step by step, in the units of the robot file
+    measurements.csv   the data file to fill in: poses and readings are there, measured values are not
+    plan.json          everything about the plan, SI
+    plan.png           the poses and the way through them;  curve.png  expected errors by the number of poses
+
+`loopcal calibrate` reads measurements.csv when it is filled in, and holds out the poses that the plan holds out.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from loopcal.errors import FileError
+from loopcal.io.csv_table import quoted
+from loopcal.io.json_text import to_json
+from loopcal.io.measurement_writer import to_fill_in_text
+from loopcal.io.pose_rows import dimension_of
+from loopcal.io.text_file import writing
+from loopcal.io.use_column import FIT, HELD_OUT, USE, with_use
+from loopcal.units import Dimension, unit
+
+if TYPE_CHECKING:
+    from loopcal.calibrate.plan.record import Plan
+    from loopcal.mechanism import Mechanism
+
+FORMAT = 1
+SHEET, DATA, RESULT = "plan.csv", "measurements.csv", "plan.json"
+VIA = "via"
+DIGITS = 9
+
+
+def sheet_text(plan: Plan) -> str:
+    """Return the operator's sheet: steps in order, with home between two poses where the straight way is not allowed."""
+    from loopcal.calibrate.plan.candidates import home_coordinates
+    from loopcal.mechanism import inverse
+
+    robot = plan.robot
+    commanded = [_unit(robot, dimension_of(name)) for name in robot.controlled]
+    reading = [_unit(robot, actuator.dimension) for actuator in robot.actuators]
+    headers = [f"{name} [{symbol}]" for name, (symbol, _) in zip(robot.controlled, commanded, strict=True)]
+    headers += [f"{a.name} [{symbol}]" for a, (symbol, _) in zip(robot.actuators, reading, strict=True)]
+    home = home_coordinates(robot)
+    stops = []
+    for i, label in enumerate(plan.labels):
+        if plan.via_home[i]:
+            stops.append(("home", VIA, home, inverse(robot, home[None]).q[0]))
+        stops.append((label, HELD_OUT if plan.held_out[i] else FIT, plan.coordinates[i], plan.readings[i]))
+    lines = [
+        f"## Poses of {robot.name} to measure, in this order, from home; between two of them the machine moves straight in",
+        f"## {', '.join(robot.controlled)}. use: {FIT} and {HELD_OUT} are measured alike; {VIA} is only passed through.",
+        ",".join(["step", "pose", USE, *headers]),
+    ]
+    factors = [factor for _, factor in (*commanded, *reading)]
+    for step, (label, use, x, q) in enumerate(stops, 1):
+        numbers = (f"{value / factor:.{DIGITS}g}" for value, factor in zip((*x, *q), factors, strict=True))
+        lines.append(",".join([str(step), quoted(label), use, *numbers]))
+    return "\n".join(lines) + "\n"
+
+
+def data_text(plan: Plan) -> str:
+    """Return the data file to fill in."""
+    sensors = plan.instrument.sensors
+    looking = tuple(replace(s, rows=plan.units) if s.kind.links > 1 else s for s in sensors)
+    text = to_fill_in_text(plan.robot, replace(plan.instrument, sensors=looking), plan.readings, plan.labels)
+    return with_use(text, {label: HELD_OUT if held else FIT for label, held in zip(plan.labels, plan.held_out, strict=True)})
+
+
+def refuse_plan_folder(path: Path, force: bool) -> None:
+    """Refuse a folder that a plan may not replace.
+
+    Raises
+    ------
+    FileError
+        A file, or a folder that holds something and `force` is not given, or something other than a plan.
+    """
+    if path.exists() and not path.is_dir():
+        raise FileError("this is a file where the folder of a plan is to be written; choose another name", path)
+    if not path.is_dir() or not any(path.iterdir()):
+        return
+    if not force:
+        raise FileError("this folder is not empty; choose another name, or replace the plan in it with --force", path)
+    if not (path / RESULT).exists():
+        raise FileError("this folder holds something other than a plan, which --force does not replace; choose another", path)
+
+
+def write_plan_folder(
+    path: Path,
+    texts: Mapping[str, str],
+    document: Mapping[str, Any],
+    pictures: Mapping[str, Callable[[Path], None]],
+    force: bool = False,
+) -> None:
+    """Write the folder of a plan whole or not at all.
+
+    Parameters
+    ----------
+    path : the folder to make. texts : name -> text of a file. document : content of plan.json; `format` is added.
+    pictures : name -> what writes it. force : replace a plan that is there.
+
+    Raises
+    ------
+    FileError
+        The folder is in use, or cannot be written.
+    """
+    refuse_plan_folder(path, force)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with writing(path):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            temporary.mkdir()
+            for name, text in {**texts, RESULT: to_json({"format": FORMAT, **document})}.items():
+                (temporary / name).write_text(text, encoding="utf-8")
+            for name, save in pictures.items():
+                save(temporary / name)
+            if path.is_dir():
+                shutil.rmtree(path)
+            temporary.rename(path)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _unit(robot: Mechanism, dimension: Dimension) -> tuple[str, float]:
+    """Return symbol and factor of the robot's unit."""
+    found = unit(robot.units[dimension])
+    return found.symbol, found.factor_to_si

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of a plan: the poses with the way through them, and expected errors by the number of poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from loopcal.calibrate.plan.needed import DIMENSION, PoseCurve
+from loopcal.calibrate.plan.record import Plan
+from loopcal.mechanism import Mechanism
+from loopcal.mechanism.coordinates import POSITION
+from loopcal.report.draw import COLOURS, DPI
+from loopcal.units import Dimension, Unit, unit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FITTED, JUDGED, BOUND = COLOURS[0], COLOURS[1], COLOURS[2]
+"""Of fitted poses, of those to judge by, and of what no choice of poses can beat."""
+
+
+def draw_plan(plan: Plan) -> Figure:
+    """Draw the poses of a plan in pairs of controlled coordinates, with the way from pose to pose."""
+    from matplotlib.figure import Figure
+
+    names = plan.robot.controlled
+    columns = [plan.coordinates[:, i] / _unit(plan.robot, name).factor_to_si for i, name in enumerate(names)]
+    pairs = [(i, i + 1) for i in range(0, len(names) - 1, 2)] + ([(len(names) - 1, None)] if len(names) % 2 else [])
+    figure = Figure(figsize=(4.2 * len(pairs), 4.4), layout="constrained")
+    step = np.arange(1, len(plan.labels) + 1)
+    for place, (i, j) in enumerate(pairs, 1):
+        axes: Any = figure.add_subplot(1, len(pairs), place)
+        x, y = (columns[i], columns[j]) if j is not None else (step, columns[i])
+        axes.plot(x, y, color="0.7", lw=0.8, zorder=1, label="way")
+        for chosen, colour, label in ((~plan.held_out, FITTED, "to fit"), (plan.held_out, JUDGED, "to judge by")):
+            axes.plot(x[chosen], y[chosen], "o", color=colour, ms=4.5, label=label, zorder=2)
+        axes.set_xlabel(_label(plan.robot, names[i]) if j is not None else "step [1]")
+        axes.set_ylabel(_label(plan.robot, names[i if j is None else j]))
+        axes.grid(visible=True, lw=0.3)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+    held = int(plan.held_out.sum())
+    figure.suptitle(f"{plan.robot.name}: n = {plan.n_poses} poses to fit, {held} to judge by", fontsize=10)
+    return figure
+
+
+def draw_curve(robot: Mechanism, curve: PoseCurve) -> Figure:
+    """Draw expected errors by the number of poses, with the bound that no choice of so many candidates can beat."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter, ScalarFormatter
+
+    dimension = DIMENSION[curve.target]
+    shown = unit(robot.units[dimension])
+    figure = Figure(figsize=(6.4, 4.4), layout="constrained")
+    axes: Any = figure.add_subplot(1, 1, 1)
+    axes.plot(curve.poses, curve.values / shown.factor_to_si, "o-", color=FITTED, label="planned poses")
+    axes.plot(curve.poses, curve.bounds / shown.factor_to_si, "--", color=BOUND, label="no choice of poses is better")
+    if curve.goal is not None:
+        axes.axhline(curve.goal / shown.factor_to_si, color=JUDGED, lw=1.0, label="asked for")
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(ScalarFormatter())
+        axis.set_minor_formatter(NullFormatter())
+    axes.set_xticks(curve.poses, [str(n) for n in curve.poses])
+    ticks = np.geomspace(min(curve.bounds.min(), curve.goal or np.inf), curve.values.max(), 5) / shown.factor_to_si
+    axes.set_yticks(ticks, [f"{tick:.2g}" for tick in ticks])
+    axes.set_xlabel("poses to fit [1]")
+    words = "pose error, turns times size" if curve.target == "pose" else f"{curve.target} error"
+    axes.set_ylabel(f"expected {words} (rms) [{shown.symbol}]")
+    axes.grid(visible=True, which="both", lw=0.3)
+    axes.legend(frameon=False, fontsize=8)
+    axes.set_title(f"{robot.name}: n = {curve.poses[0]} to {curve.poses[-1]} poses", fontsize=10)
+    return figure
+
+
+def save_figure(path: Path, figure: Figure) -> None:
+    """Write a figure."""
+    figure.savefig(path, dpi=DPI)
+
+
+def _unit(robot: Mechanism, name: str) -> Unit:
+    return unit(robot.units[Dimension.LENGTH if name in POSITION else Dimension.ANGLE])
+
+
+def _label(robot: Mechanism, name: str) -> str:
+    return f"{name} [{_unit(robot, name).symbol}]"
