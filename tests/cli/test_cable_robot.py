@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""docs/cable-robots.md: its commands run on the example and print what it says; and what it says of a real machine."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal.cli import main
+from loopcal.io import load_measurements, load_robot
+from tests.cable_robot import NAMES, TRUTH, real, samples_text
+
+REAL = "import hp.json --format hangprinter -o robot.yaml --data samples.csv --sigma-line 0.6mm --sigma-position 0.6mm"
+CALIBRATE = "calibrate robot.yaml samples.csv -o run --method ls"
+
+
+@pytest.fixture
+def page(root, tmp_path, monkeypatch) -> str:
+    """Work in a copy of the example's folder."""
+    for path in (root / "examples" / "cable-robot").iterdir():
+        shutil.copy(path, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return (root / "docs" / "cable-robots.md").read_text("utf-8")
+
+
+@pytest.fixture
+def folder(data_folder, tmp_path, monkeypatch) -> Path:
+    """Work beside the samples of a real machine."""
+    (tmp_path / "hp.json").write_text(samples_text(real(data_folder)), "utf-8")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_commands_print_what_the_page_says_and_find_the_truth(page, capsys) -> None:
+    commands = re.findall(r"^loopcal (.*)$", page, re.MULTILINE)
+    assert [command.split()[0] for command in commands] == ["import", "calibrate"]
+    for command in commands:
+        capsys.readouterr()
+        assert main(command.split()) == 0
+    printed = re.search(r"the commands and compares -->\n```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    assert printed
+    assert capsys.readouterr().out.strip() == printed[1].strip()
+    kept = np.load("run/arrays.npz")
+    found = load_robot("run/robot.yaml")
+    off = (found.values - load_robot("truth.yaml").values) / kept["sd"]
+    assert np.abs(off).max() < 1.5
+    # where the machine stood and what its motor angles were is kept
+    assert kept["pose_estimate"].shape == (45, 4, 4)
+    assert kept["reading_estimate"].shape == (45, 4)
+
+
+def test_the_truth_of_the_example_is_that_of_its_program(root) -> None:
+    robot = load_robot(root / "examples" / "cable-robot" / "truth.yaml")
+    assert robot.parameters.names == NAMES
+    np.testing.assert_allclose(robot.values * 1e3, TRUTH, rtol=0, atol=1e-9)  # [mm]
+
+
+def test_import_writes_known_and_unknown_poses_and_says_what_it_leaves_out(folder, capsys) -> None:
+    assert main(REAL.split()) == 0
+    out = capsys.readouterr().out
+    assert "robot.yaml: 4 actuators, 21 parameters, 21 free" in out
+    assert "44 poses of 4 motor angles, 9 of them known; a line is taken to be known to 0.6 mm" in out
+    assert "41 rows of line forces are not read" in out
+    assert "next: loopcal calibrate robot.yaml samples.csv -o run" in out
+    data = load_measurements("samples.csv", load_robot("robot.yaml"))
+    assert data.n_poses == 44
+    assert data.n_rows == 27
+    (seen,) = data.observations
+    assert sorted(data.labels[i] for i in seen.rows[seen.present.all(axis=1)]) == [f"known{i}" for i in range(1, 10)]
+
+
+def test_a_real_machine_in_two_commands_gives_what_the_page_says(folder, capsys, root) -> None:
+    assert main(REAL.split()) == 0
+    assert main(CALIBRATE.split()) == 0
+    out = capsys.readouterr().out
+    assert "chi-square 52.584 with 50 degrees of freedom" in out
+    assert "note: all 44 blocks of rows fit each other" in out
+    result = json.loads((folder / "run" / "result.json").read_text())
+    rows = {row["name"]: row for row in result["fit"]["parameters"]}
+    page = (root / "docs" / "cable-robots.md").read_text("utf-8")
+    for line in "ABCD":
+        table = re.search(rf"^\| {line} \| (.*?) \| (.*?) \|$", page, re.MULTILINE)
+        assert table
+        said = [[float(number) for number in part.split(" +/- ")] for part in table[1].split(", ")]
+        published = [float(number) for number in table[2].split(", ")]
+        for axis, (value, half), other in zip("xyz", said, published, strict=True):
+            row = rows[f"{line}.anchor.{axis}"]
+            assert row["estimate"] == pytest.approx(value, abs=0.06)  # one decimal is printed [mm]
+            assert row["plus_minus"] == pytest.approx(half, rel=0.03)
+            assert abs(row["estimate"] - other) < 1.05 * row["plus_minus"]
+
+
+def test_from_json_a_format_must_be_named(folder, capsys) -> None:
+    assert main(["import", "hp.json", "-o", "robot.yaml"]) == 1
+    error = capsys.readouterr().err
+    assert "does not read it" in error
+    assert "hangprinter" in error
+    assert main([*REAL.split(), "--sigma-height", "1mm"]) == 1
+    assert "--sigma-height does not belong to the format hangprinter" in capsys.readouterr().err
+    assert not (folder / "robot.yaml").exists()
