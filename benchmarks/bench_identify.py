@@ -3,6 +3,7 @@
 
 import statistics
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 
@@ -121,3 +122,17 @@ def _memory_of_folding(robot: Mechanism, data: Measurements) -> float:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     return float(peak)
+
+
+def bench_latent() -> Metric:
+    """Fit with noisy readings, every pose an unknown, against the fit of the same data with exact ones."""
+    robot = load_robot("hexapod-42")
+    data = _measured(robot, 50)
+    uncertain = replace(data, reading_sigma=2 * UM)
+    return measure_ratio(
+        "identify.latent_of_exact",
+        lambda: identify(robot, uncertain, LeastSquares()),
+        lambda: identify(robot, data, LeastSquares()),
+        repeats=15,
+        limit=10.0,
+    )

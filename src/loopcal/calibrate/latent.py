@@ -17,12 +17,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from loopcal import engine
-from loopcal.calibrate.components import Group, Projected, components_of
+from loopcal.calibrate.components import components_of
 from loopcal.calibrate.latent_start import start_of
 from loopcal.calibrate.local import Folding, Own
 from loopcal.calibrate.moves import evaluated
 from loopcal.calibrate.scaling import Unknowns
-from loopcal.calibrate.sensed import BLOCK, Block, Residuals, Sensed
+from loopcal.calibrate.sensed import BLOCK, Residuals, Sensed
 from loopcal.calibrate.settle import Poses, Settled
 from loopcal.calibrate.standing import ByPose, ByReadings, Chart, Standing
 from loopcal.linalg import FloatArray, IntArray, empty_factor
@@ -53,8 +53,7 @@ class Memory:
         return self.best.of(trials)
 
     def keep(self, trials: IntArray, settled: Settled, cost: FloatArray) -> None:
-        """Remember the last fold and, where it is the best one yet, from where to go on."""
-        self.last, self.calm[trials] = settled, settled.calm
+        """Remember a fold, where it is the best one yet, as the place to go on from."""
         better = np.isfinite(cost) & (cost <= self.cost[trials])
         self.cost[trials[better]] = cost[better]
         if better.all() and len(trials) == len(self.cost):
@@ -130,13 +129,12 @@ class LatentRows:
         """Factor (a, p + 1, p + 1) of some trials, all but the machine settled and eliminated; which are out of reach."""
         here = self._settled(z, trials)
         factor, folding = empty_factor(len(trials), self.parameters), Folding(self.own, len(trials), self.parameters)
-        for block, group, done in self.poses.projected(here, z, trials):
+        for group, done in self.poses.projected(here, z, trials):
             rest = done.rest.reshape(len(trials), -1, done.rest.shape[-1])
             if group.cluster < 0:
                 factor = engine.accumulate(factor, rest)
             else:
                 folding.add([(group.cluster, rest)])
-            self._note(trials, block, group, done)
         cost = (factor[:, :, -1] ** 2).sum(axis=1)
         if self.own is not None and here.values is not None:
             factor = folding.finish(factor, here.values)
@@ -157,8 +155,6 @@ class LatentRows:
         """
         trials = np.arange(len(deviation))
         here = self._settled(deviation, trials, own)
-        for block, group, done in self.poses.projected(here, deviation, trials):
-            self._note(trials, block, group, done)
         shapes = [(len(trials), *s.whitener.shape[1:3]) for s in self.sensed]
         found = [Residuals(np.full(shape, np.nan), np.full(shape, np.nan)) for shape in shapes]
         for block in self.poses.blocks:
@@ -182,7 +178,7 @@ class LatentRows:
         here = self.memory.last
         assert here is not None
         wide = 0 if self.own is None else len(self.own.local)
-        for _, group, done in self.poses.projected(here, deviation, trial):
+        for group, done in self.poses.projected(here, deviation, trial):
             one = done.rest[0]
             u = one.shape[-1] - p - 1
             rows = np.zeros((*one.shape[:2], wide + p + 1))
@@ -222,25 +218,19 @@ class LatentRows:
         here = self.poses.look(deviation, np.arange(1), self.memory.take(np.arange(1)), None, own=False)
         return np.flatnonzero(~here.ok[0] & self.needed)
 
-    def standing(self, deviation: FloatArray) -> tuple[np.ndarray, Standing]:
-        """Where every pose stands (t, n) at deviations (t, p), and which of them are in reach."""
-        trials = np.arange(len(deviation))
-        here = self._settled(deviation, trials)
-        for block, group, done in self.poses.projected(here, deviation, trials):
-            self._note(trials, block, group, done)
-        self.memory.calm[trials] = here.calm
+    def standing(self) -> tuple[np.ndarray, Standing]:
+        """Where every pose stood (a, n) when the rows were looked at last, and which of them are in reach."""
+        here = self.memory.last
+        assert here is not None
         return np.asarray(here.standing.state.status == Status.CONVERGED), here.standing
 
     def _settled(self, z: FloatArray, trials: IntArray, own: FloatArray | None = None) -> Settled:
         """Poses and own unknowns where all rows fit best at deviations z (a, p), from where they stood last."""
-        return self.poses.settle(z, trials, self.memory.take(trials), own)
-
-    def _note(self, trials: IntArray, block: Block, group: Group, done: Projected) -> None:
-        """Remember how many directions of poses the rows see, and which poses have one that none sees."""
-        self.memory.rank[trials[:, None], group.components] = done.rank
-        free = self.chart.free(block.poses)[group.poses]
-        lost = done.open.reshape(*done.open.shape[:2], *free.shape[1:]) & free
-        self.memory.open[trials[:, None, None], block.poses[group.poses]] = lost.any(axis=-1)
+        here = self.poses.settle(z, trials, self.memory.take(trials), own)
+        self.memory.last = here
+        self.memory.rank[trials], self.memory.calm[trials] = here.rank, here.calm
+        self.memory.open[trials] = (here.open & self.chart.free(np.arange(len(self.member)))).any(axis=2)
+        return here
 
 
 def latent_rows(

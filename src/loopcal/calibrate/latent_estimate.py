@@ -61,9 +61,9 @@ class LatentEstimate:
         return {"pose_estimate": self.poses, "reading_estimate": self.readings}
 
 
-def latent_estimate(rows: LatentRows, data: Measurements, deviation: FloatArray) -> LatentEstimate:
-    """Return what rows (t = 1) say of the poses of their measurements at deviation (1, p)."""
-    memory, (ok, here) = rows.memory, rows.standing(deviation)
+def latent_estimate(rows: LatentRows, data: Measurements) -> LatentEstimate:
+    """Return what rows (t = 1) say of the poses of their measurements, where they were looked at last."""
+    memory, (ok, here) = rows.memory, rows.standing()
     lost = ~ok[0]
     T = np.where(lost[:, None, None], np.nan, here.state.T[0])
     sigma = np.zeros(data.readings.shape) if data.reading_sigma is None else data.reading_sigma

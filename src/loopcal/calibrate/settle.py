@@ -39,6 +39,7 @@ class Settled:
     ----------
     standing : closed. values : (a, U) of the own unknowns, None without any. moves : of every block, where there is one.
     failed : (a,) where a needed pose is out of reach. cost : (a,). calm : (a,) which came to rest.
+    rank : (a, components) directions of poses that rows see. open : (a, n, k) numbers with a part in one that none sees.
     """
 
     standing: Standing
@@ -47,6 +48,8 @@ class Settled:
     failed: np.ndarray
     cost: FloatArray
     calm: np.ndarray
+    rank: IntArray
+    open: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +67,8 @@ class Look:
     gain: FloatArray
     parts: list[tuple[IntArray, int, FloatArray]]
     factors: list[FloatArray]
+    rank: IntArray
+    open: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,9 +129,9 @@ class Poses:
             if not moved:
                 break
         alone = here.moves[0] if len(self.blocks) == 1 else None
-        return Settled(here.standing, here.values, alone, here.failed, here.cost, calm)
+        return Settled(here.standing, here.values, alone, here.failed, here.cost, calm, here.rank, here.open)
 
-    def projected(self, here: Settled, z: FloatArray, trials: IntArray) -> Iterator[tuple[Block, Group, Projected]]:
+    def projected(self, here: Settled, z: FloatArray, trials: IntArray) -> Iterator[tuple[Group, Projected]]:
         """Every group of components with its rows, poses eliminated, at settled poses."""
         k = self.chart.freedoms
         for block, groups in zip(self.blocks, self.groups, strict=True):
@@ -139,7 +144,7 @@ class Poses:
                 width = self.width(group)
                 rows = side_by_side(group, self._own_columns(kinds, block, group), k, width, len(self.unknowns))
                 done = project(rows, group.poses.shape[1] * k)
-                yield block, group, done
+                yield group, done
 
     def _own_values(self, z: FloatArray, trials: IntArray, begin: Standing) -> FloatArray:
         """Values (a, U) with which the own unknowns begin: those followed from the last fold, or found from the poses."""
@@ -158,6 +163,8 @@ class Poses:
         free, k, a = self.unknowns.values(z), self.chart.freedoms, len(trials)
         folding = Folding(self.own if own else None, a, 0)
         squares, gain = np.zeros((a, self.components)), np.zeros(a)
+        rank = np.zeros((a, self.components), dtype=np.int64)
+        unseen = np.zeros((a, len(self.member), k), dtype=bool)
         every, parts, closed = [], [], []
         for block, groups in zip(self.blocks, self.groups, strict=True):
             closed.append(self.chart.closed(free, at.at(block.poses)))
@@ -170,6 +177,8 @@ class Poses:
                 squares[:, group.components] = (rows[..., -1] ** 2).sum(axis=2)
                 done = project(rows, group.poses.shape[1] * k)
                 gain += done.gain.sum(axis=1)
+                rank[:, group.components] = done.rank
+                unseen[:, block.poses[group.poses]] = done.open.reshape(a, *group.poses.shape, k)
                 parts.append((block.poses[group.poses], group.cluster, done.best))
                 if width:
                     folding.add([(group.cluster, done.rest.reshape(a, -1, width + 1))])
@@ -186,7 +195,7 @@ class Poses:
         kept = every if len(self.blocks) == 1 else []
         factors = folding.whole(values) if own and values is not None else []
         cost = np.where(failed, np.inf, cost)
-        return Look(whole, values, kept, ok, joints, failed, cost, squares, gain, parts, factors)
+        return Look(whole, values, kept, ok, joints, failed, cost, squares, gain, parts, factors, rank, unseen)
 
     def _held(self, values: FloatArray | None) -> FloatArray | float:
         """Sum of squares (a,) of the priors of own unknowns."""
