@@ -151,10 +151,8 @@ def validate(
     limit_position, limit_angle : quality gates [m], [rad].
     before : the geometry to compare with, and that of the controller; default: what `fit` started from (for a robot:
         its nominal values).
-    known : values [SI] by name of unknowns of the measurements (frames, targets, surfaces) that an earlier fit found; they
-        are kept as they are, so that what is proved is not fitted. Default: those of `fit`.
-    refit : names of frames, targets and surfaces, such as `tracker` or `tracker*`, to be found anew all the same, because
-        they were set up anew.
+    known : values [SI] by name of frames, targets and surfaces that a fit found; they are kept. Default: those of `fit`.
+    refit : names of some of them, such as `tracker*`, to be found anew all the same, because they were set up anew.
 
     Raises
     ------
@@ -164,8 +162,7 @@ def validate(
     robot = fit.robot if isinstance(fit, Identification) else fit
     old = before or (fit.initial if isinstance(fit, Identification) else fit.nominal)
     check_actuators(data, robot)
-    rows = [o.take(o.weight > 0.0) for o in data.observations]
-    rows = [o for o in rows if len(o)]
+    rows = [some for o in data.observations if len(some := o.take(o.weight > 0.0))]
     if not rows:
         raise DataError("there is no row to validate with: every row is absent or has weight 0")
     believed, predicted = forward(old, data.readings), forward(robot, data.readings)
@@ -175,9 +172,7 @@ def validate(
         raise DataError(f"{robot.name} reaches none of the {data.n_poses} poses; check the readings and their units")
     rows = [o.take(ok[o.rows].reshape(len(o), -1).all(axis=1)) for o in rows]
     seen = replace(data, observations=tuple(rows))
-    own = fit.local if isinstance(fit, Identification) else None
-    kept = _kept(known if known is not None else own.values if own else {}, refit, data)
-    starts = _kept(own.starts, refit, data) if own and before is None and known is None else {}
+    starts, kept = _known(fit, before, known, refit, data)
     first, last = _view(old, seen, believed, ok, starts), _view(robot, seen, predicted, ok, kept)
     was, now = first.residuals(rows), last.residuals(rows)
     missed = first.differences(rows, _view(old, seen, reached, ok, None))
@@ -247,6 +242,20 @@ def _view(robot: Mechanism, data: Measurements, found: Solution, ok: np.ndarray,
         )
         values = start_values(data, T, replace(local, table=ParameterTable(entries)), joints)
     return _View(T[None], joints, local, values[None], carried)
+
+
+def _known(
+    fit: Identification | Mechanism,
+    before: Mechanism | None,
+    known: Mapping[str, float] | None,
+    refit: Sequence[str],
+    data: Measurements,
+) -> tuple[dict[str, float], dict[str, float]]:
+    """What is known of frames, targets and surfaces for the geometry before, and for the calibrated one."""
+    own = fit.local if isinstance(fit, Identification) else None
+    kept = (own.values if own else {}) if known is None else known
+    starts = own.starts if own and before is None and known is None else {}
+    return _kept(starts, refit, data), _kept(kept, refit, data)
 
 
 def _kept(known: Mapping[str, float], refit: Sequence[str], data: Measurements) -> dict[str, float]:
