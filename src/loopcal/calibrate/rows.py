@@ -329,7 +329,7 @@ def rows_of(unknowns: Unknowns, data: Measurements, local: LocalUnknowns | None 
 
     Where readings have a sigma above 0, the poses are unknowns, too.
     """
-    own = local_unknowns(data.observations, data.labels) if local is None else local
+    own = data.unknowns if local is None else local
     pairs = [(o, places) for o, places in zip(data.observations, own.places, strict=True) if len(o)]
     sensed = tuple(Sensed(o.kind, o.rows, o.measured[None], o.whitener[None], places) for o, places in pairs)
     return _rows(unknowns, data.readings[None], data.reading_sigma, sensed, 1, own, lambda _: data)
