@@ -22,8 +22,11 @@ from loopcal.calibrate.plan.scoring import Scoring, determines, make_scoring
 from loopcal.errors import EstimationError
 from loopcal.linalg import FloatArray, IntArray
 
-SHAKES = 40
-"""Times that a design is shaken by default."""
+SHAKES, LEAST_SHAKES = 1600, 20
+"""Times that a design is shaken by default: this number over the number of units, and at least so often."""
+
+GOOD = 0.99
+"""Efficiency from which a design is not shaken: what is left is not worth the time."""
 
 SHAKEN = 0.15
 """Share of the units replaced in a shake, two at least."""
@@ -52,7 +55,7 @@ def certified_design(
     criterion: Criterion,
     start: Start,
     seed: int = 0,
-    shakes: int = SHAKES,
+    shakes: int | None = None,
     repeats: bool = False,
     gap: float = 1e-3,
     first: Iterable[IntArray] = (),
@@ -62,7 +65,7 @@ def certified_design(
     Parameters
     ----------
     rows, n, criterion, start, seed, repeats, first : as of `fedorov_exchange`.
-    shakes : how often to shake. gap : of the relaxation.
+    shakes : how often to shake; default: SHAKES / n. gap : of the relaxation.
 
     Raises
     ------
@@ -80,7 +83,11 @@ def certified_design(
         raise EstimationError(TOO_FEW.format(n=n, allowed=len(usable), unknowns=space.unknowns))
     steep = np.argsort(-slopes, kind="stable")[: max(AMONG * n, FEWEST)]
     among = np.union1d(steep, chosen)
-    best, scores = _shaken(scoring, ready[among], np.searchsorted(among, chosen), weights[among], shakes, random, repeats)
+    times = max(SHAKES // n, LEAST_SHAKES) if shakes is None else shakes
+    begin = np.searchsorted(among, chosen)
+    if relaxed.efficiency(scoring.value(history[-1])) >= GOOD:
+        times = 0
+    best, scores = _shaken(scoring, ready[among], begin, weights[among], times, random, repeats)
     chosen, last = exchange(scoring, ready, among[best], random, repeats)
     values = tuple(scoring.value(score) for score in (*history, *scores, *last[1:]))
     ends = tuple(scoring.value(score) for score in (history[-1], last[-1]))
