@@ -18,11 +18,13 @@ from evidence.kinds import (
     Coverage,
     Loud,
     Silent,
+    along_gauge,
     band,
     cases,
     cover,
     instrument,
     machine,
+    pose_error,
     recover,
     with_most_unknowns,
 )
@@ -35,6 +37,7 @@ from loopcal.measure import (
     Gaussian,
     Inclination,
     Instrument,
+    Locked,
     Plane,
     Position,
     Sensor,
@@ -43,7 +46,7 @@ from loopcal.measure import (
     simulate,
     simulate_trials,
 )
-from loopcal.mechanism import sample
+from loopcal.mechanism import inverse, sample
 
 EXACT = 1e-9
 """[share of the robot's size, rad]: ranks are decided at 1e-11, and 1e-13 of rounding comes back through conditions of 1e3
@@ -149,6 +152,47 @@ def test_a_weighted_fit_of_five_kinds_beats_each_of_them_alone():
         assert (predicted < alone).all(), kind.name
         assert np.count_nonzero(made < worse) >= MOST, kind.name
         assert made.mean() < worse.mean(), kind.name
+
+
+def locked_at(truth, joint, constant, rng, n=12):
+    """Coordinates z, phi, theta (n, 3) at which a passive joint of a true 3-PRS has this value, by halving ranges of theta."""
+    z, phi = rng.uniform(0.66, 0.74, 60), rng.uniform(-np.pi, np.pi, 60)
+
+    def off(theta):
+        found = inverse(truth, np.column_stack([z, phi, theta]))
+        return found.passive[:, found.passive_names.index(joint)] - constant
+
+    low, high = np.full(60, 0.02), np.full(60, 0.5)
+    side = np.sign(off(low))
+    there = side * np.sign(off(high)) < 0.0
+    for _ in range(55):
+        middle = 0.5 * (low + high)
+        before = np.sign(off(middle)) == side
+        low, high = np.where(before, middle, low), np.where(before, high, middle)
+    return np.column_stack([z, phi, low])[there][:n]
+
+
+def test_joints_locked_at_constants_nobody_knows_recover_a_tripod_up_to_its_frames():
+    robot, rng = load_robot("3-prs"), np.random.default_rng(SEED)
+    truth = robot.with_values(sample_truth(robot, 1, SEED)[0])
+    joints = inverse(truth, np.array([[0.7, 0.0, 0.1]])).passive_names
+    usual = inverse(truth, sample(robot, 60, SEED).coordinates).passive
+    sensors, coordinates, constants = [], [], {}
+    for i, joint in enumerate(joints):
+        for k, constant in enumerate(np.quantile(usual[:, i], [0.3, 0.5, 0.7])):
+            constants[f"at{k}.{joint}.locked"] = constant
+            coordinates.append(locked_at(truth, joint, constant, rng))
+        kind = Locked(joints=(joint,), measures="angle")
+        group = np.repeat(["at0", "at1", "at2"], 12)
+        sensors.append(Sensor(kind, Silent(np.full(1, 5e-6)), rows=36 * i + np.arange(36), group=group))
+    data = simulate(truth, np.concatenate(coordinates), Instrument(tuple(sensors)), SEED, controller=truth, unknowns=constants)
+    # [rad]: a lock without play shows zeros, which is all that is measured
+    assert max(np.abs(o.measured).max() for o in data.observations) < 1e-12
+    fit = identify(robot, data, LeastSquares(), allow_fewer_equations=True)
+    assert fit.rank == 21
+    assert along_gauge(fit, data, truth.values) < EXACT
+    assert pose_error(fit.robot, truth, sample(robot, 15, SEED).solution.q, ("base", "platform")) < EXACT
+    assert fit.local.values.keys() == constants.keys()
 
 
 @pytest.fixture(scope="module")
