@@ -18,7 +18,7 @@ from loopcal.calibrate.examine import examine
 from loopcal.io.formats import hangprinter
 from loopcal.io.formats.exchange import Imported, Reading
 from loopcal.io.formats.transfer import checked
-from loopcal.measure import Measurements
+from loopcal.measure import Measurements, Observations
 from loopcal.mechanism import Mechanism
 from tests.cable_robot import NAMES, TRUTH, Reference, example, paid_out, real, reference, samples_text
 
@@ -120,6 +120,23 @@ def test_no_row_is_doubted_and_a_wrong_motor_angle_is(printer, fit):
     named = examine(identify(robot, wrong, LeastSquares()), wrong).outliers.outliers
     assert named[0].poses == ("sample25",)
     assert named[0].degrees == 1  # four lines, three freedoms
+
+
+def test_rows_of_a_file_in_which_nothing_was_measured_are_no_degrees_of_freedom(printer, fit):
+    """A file has a row for every pose, with empty cells where nobody measured: they count nowhere."""
+    robot, data = printer
+    (seen,) = data.observations
+    cells = np.full((44, 3), np.nan)
+    cells[:9] = seen.measured
+    padded = replace(data, observations=(Observations.from_sigma(seen.kind, np.arange(44), cells, SIGMA * 1e-3),))
+    same = identify(robot, padded, LeastSquares())
+    np.testing.assert_allclose(same.estimate, fit.estimate, rtol=0, atol=1e-9)  # [m]
+    ours, theirs = (examine(fit, data).outliers.influence, examine(same, padded).outliers.influence)
+    np.testing.assert_array_equal(theirs.degrees, ours.degrees)
+    np.testing.assert_allclose(theirs.distance, ours.distance, rtol=1e-6, atol=1e-9)
+    estimated = examine(identify(robot, padded, noise="estimated"), padded).outliers
+    assert estimated.outliers == ()
+    assert 0.7 < estimated.scale < 1.3
 
 
 def test_no_start_far_off_changes_the_optimum(printer, fit):

@@ -173,6 +173,9 @@ def project(rows: FloatArray, free: int) -> Projected:
         empty = np.zeros((*rows.shape[:2], 0, rows.shape[-1]))
         none = np.zeros(rows.shape[:2])
         return Projected(rows, empty, none.astype(np.int64), np.zeros((*rows.shape[:2], 0), dtype=bool), none)
+    # absent rows go last: no reflection touches them there, and what is left of the others stays apart from them
+    order = np.argsort(~rows.any(axis=-1), axis=-1, kind="stable")
+    rows = np.take_along_axis(rows, order[..., None], axis=-2)
     norm = np.linalg.norm(rows[..., :free], axis=-2)
     norm = np.where(norm > 0.0, norm, 1.0)
     q, r = np.linalg.qr(rows[..., :free] / norm[..., None, :], mode="complete")
