@@ -34,11 +34,13 @@ from loopcal.io import load_robot
 from loopcal.measure import (
     KINDS,
     Bearing,
+    Component,
     Gaussian,
     Inclination,
     Instrument,
     Locked,
     Plane,
+    Pose,
     Position,
     Sensor,
     Separation,
@@ -152,6 +154,34 @@ def test_a_weighted_fit_of_five_kinds_beats_each_of_them_alone():
         assert (predicted < alone).all(), kind.name
         assert np.count_nonzero(made < worse) >= MOST, kind.name
         assert made.mean() < worse.mean(), kind.name
+
+
+THREE = np.array([[0.1, 0.0, 0.02], [-0.06, 0.1, 0.03], [-0.05, -0.1, 0.01]])
+FRAMED = (
+    Position(targets=("a", "b", "c"), places=THREE, unknown=("frame", "targets")),
+    Pose(unknown=("frame", "tool")),
+    Bearing(places=POINT, unknown=("frame",)),
+    Component(("x", "y", "z", "phi", "theta"), "tilt-torsion", unknown=("frame",)),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", FRAMED, ids=lambda kind: kind.name)
+def test_a_frame_anywhere_gives_the_machine_of_the_known_frame_up_to_its_gauge(kind):
+    robot = load_robot("hexapod-42")
+    truth = robot.with_values(sample_truth(robot, 1, SEED)[0])
+    poses, elsewhere = sample(robot, 50, SEED).coordinates, sample(robot, 15, SEED + 1).solution.q
+    known = identify(robot, simulate(truth, poses, instrument(Pose(), 50, Silent), SEED), LeastSquares())
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        quaternion = rng.normal(size=4)
+        turn = se3.log_so3(se3.quaternion_to_matrix(quaternion / np.linalg.norm(quaternion)))
+        frame = np.concatenate([turn, rng.uniform(1.0, 2.0, 3)])
+        true = dict(zip([f"frame.{axis}" for axis in ("rx", "ry", "rz", "x", "y", "z")], frame.tolist(), strict=True))
+        data = simulate(truth, poses, instrument(kind, 50, Silent), SEED, unknowns=true)
+        fit = identify(robot, data, LeastSquares())
+        assert fit.converged
+        assert pose_error(fit.robot, known.robot, elsewhere, ("base", "platform")) < EXACT, seed
 
 
 def locked_at(truth, joint, constant, rng, n=12):
