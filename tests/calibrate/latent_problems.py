@@ -4,6 +4,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from loopcal.measure import Instrument, Measurements, Pose, Sensor, simulate
@@ -56,7 +57,7 @@ def ups_hexapod() -> Mechanism:
     return with_tolerance(build(record.expand(), record=record), 0.035e-3)
 
 
-def measured_hexapod(n: int, sigma: object, seed: int = 0, sensors: tuple[Sensor, ...] = ()) -> Measurements:
+def measured_hexapod(n: int, sigma: ArrayLike | None, seed: int = 0, sensors: tuple[Sensor, ...] = ()) -> Measurements:
     """The true hexapod at n poses, its readings noisy; measured in full, or by the sensors given."""
     truth = zoo.hexapod().with_values(zoo.hexapod_truth())
     tracker = (Sensor(Pose(), noise(*[5e-6] * 3, *[UM] * 3)),)
@@ -91,7 +92,15 @@ def dense(robot: Mechanism, data: Measurements, sigma: np.ndarray) -> tuple[np.n
         return ((plus - minus) / (2 * STEP)).T
 
     x = np.zeros(p + int(moving.sum()))
-    fit = least_squares(lambda x: rows(x[None])[0], x, jac=jacobian, method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    fit = least_squares(
+        lambda x: rows(x[None])[0],
+        x,
+        jac=jacobian,  # type: ignore[arg-type]
+        method="lm",
+        xtol=1e-14,
+        ftol=1e-14,
+        gtol=1e-14,
+    )
     _, R = np.linalg.qr(fit.jac)
     inverse = np.linalg.inv(R)
     covariance = (inverse @ inverse.T)[:p, :p] * unit[:, None] * unit

@@ -44,6 +44,18 @@ from tests.calibrate.problems import UM, hexapod, hexapod_poses, noise, tracker
 TINY = 1e-11  # [m]: (TINY / sigma of the tracker)^2 = 1e-10 is what it may change
 
 
+def sigma_of(data):
+    """The sigma of the readings, a copy."""
+    assert data.reading_sigma is not None
+    return data.reading_sigma.copy()
+
+
+def latent_of(fit):
+    """What a fit found of its poses."""
+    assert fit.latent is not None
+    return fit.latent
+
+
 def largest_difference(a, b):
     """Of two fits, in standard deviations of the second: estimates, and covariances."""
     return np.abs((a.estimate - b.estimate) / b.sd).max(), np.abs((a.covariance - b.covariance) / np.outer(b.sd, b.sd)).max()
@@ -94,19 +106,18 @@ def test_noise_missing_readings_and_linked_poses_equal_the_problem_with_every_re
     full = Sensor(Pose(), noise(*[5e-6] * 3, *[UM] * 3), rows=np.array([0, 1, 2]))
     ball = Sensor(Separation(), noise(2 * UM), rows=np.array([[1, 3], [3, 4], [0, 5]]))
     data = measured_hexapod(6, 3 * UM, sensors=(full, ball, Sensor(Position(), noise(UM, UM, UM), rows=np.array([3, 4, 5]))))
-    readings, sigma = data.readings.copy(), data.reading_sigma.copy()
+    readings, sigma = data.readings.copy(), sigma_of(data)
     readings[2, 4], sigma[2, 4] = np.nan, np.inf
     sigma[5, 0] = 0.0
     data = replace(data, readings=readings, reading_sigma=sigma)
-    expected, covariance = dense(robot, data, data.reading_sigma)
+    expected, covariance = dense(robot, data, sigma_of(data))
     found = identify(robot, data, LeastSquares())
     assert found.converged
     sd = np.sqrt(np.diag(covariance))
     assert_allclose(found.estimate, expected, atol=1e-4 * sd.min(), rtol=0)  # [m], differences
     stated = found.covariance / found.check.sigma_scale**2  # six of 42 wrong parameters are free: it is widened
     assert_allclose(stated, covariance, atol=1e-4 * sd.max() ** 2, rtol=0)
-    assert found.latent is not None
-    assert found.latent.to_dict() == {"exact": 1, "uncertain": 34, "not_taken": 1, "open": [], "calm": True}
+    assert latent_of(found).to_dict() == {"exact": 1, "uncertain": 34, "not_taken": 1, "open": [], "calm": True}
     assert {r.kind for r in found.residuals} == {"pose", "separation", "position", "readings"}
     whitened = found.residuals[-1].whitened
     assert whitened[2, 4] == 0.0
@@ -148,7 +159,7 @@ def test_redundant_readings_equal_the_problem_with_every_position_unknown(cable)
     sd = np.linalg.norm(inverse_r, axis=1)[:p] * unit
     assert_allclose(found.estimate, robot.parameters.nominal + unit * fit.x[:p], atol=1e-3 * sd.min(), rtol=0)
     assert_allclose(found.sd, sd, rtol=1e-4)  # at two solutions that differ by the noise's curvature
-    assert_allclose(found.latent.poses[:, :3, 3], fit.x[p:].reshape(-1, 3), atol=1e-7)  # [m]
+    assert_allclose(latent_of(found).poses[:, :3, 3], fit.x[p:].reshape(-1, 3), atol=1e-7)  # [m]
 
 
 def test_a_cable_robot_is_found_from_its_readings_alone_up_to_its_gauge(cable):
@@ -165,6 +176,9 @@ def test_a_cable_robot_is_found_from_its_readings_alone_up_to_its_gauge(cable):
     assert forward(robot, unseen).residual.max() > 1e-3
     found = identifiability(robot, data)
     assert (found.rank, found.n_equations) == (13, 30)
+    checked = cross_validate(robot, data, LeastSquares(), count=3)
+    assert checked.poses == ()
+    assert checked.fold.max() < 1e-3 * checked.before_fold.min()
 
 
 def test_sensors_on_legs_tell_all_but_the_frames_with_exact_readings_and_with_noisy_ones():
@@ -238,23 +252,23 @@ def test_a_pose_whose_position_alone_is_known_adds_nothing_and_is_named():
         (np.arange(12) == 11)[:, None] & (np.arange(6) < 3), np.nan, data.observations[0].measured))  # fmt: skip
     unread = (np.arange(12) == 11)[:, None]
     lost = replace(data, observations=(seen,), readings=np.where(unread, np.nan, data.readings),
-                   reading_sigma=np.where(unread, np.inf, data.reading_sigma))  # fmt: skip
+                   reading_sigma=np.where(unread, np.inf, sigma_of(data)))  # fmt: skip
     found = identify(hexapod(), lost, LeastSquares())
     assert max(largest_difference(found, known)) < 1e-6  # both fits end where steps are a millionth of the residual
     assert found.dof == known.dof
-    assert found.latent.open.tolist() == [False] * 11 + [True]
+    assert latent_of(found).open.tolist() == [False] * 11 + [True]
     assert any("not determined" in note and "pose 12" in note for note in found.notes)
 
 
 def test_a_reading_that_is_not_believed_is_found_from_the_pose():
     data = measured_hexapod(12, 2 * UM)
-    sigma = data.reading_sigma.copy()
+    sigma = sigma_of(data)
     sigma[7, 3] = np.inf
     for wrong in (5e-3, np.nan):
         readings = data.readings.copy()
         readings[7, 3] += wrong
         found = identify(hexapod(), replace(data, readings=readings, reading_sigma=sigma), LeastSquares())
-        assert found.latent.readings[7, 3] == pytest.approx(data.readings[7, 3], abs=20 * UM)
+        assert latent_of(found).readings[7, 3] == pytest.approx(data.readings[7, 3], abs=20 * UM)
         held = validate(found, replace(data, readings=readings, reading_sigma=sigma))
         assert "8" not in held.poses
         assert any("not taken" in note for note in held.notes)

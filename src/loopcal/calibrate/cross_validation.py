@@ -117,10 +117,11 @@ def cross_validate(
         if robot.parameters.free.any():
             fit = identify(robot, data.take(np.setdiff1d(np.arange(data.n_poses), held)), method, noise=noise, loss=loss)
             fitted, converged = fit.robot, converged and fit.converged
-        found = validate(fitted, unseen, before=robot)
-        labels += found.poses
-        before.append(found.before)
-        after.append(found.after)
+        if unseen.n_rows:  # else readings alone, of redundant actuators: there is a score, but no measured error
+            found = validate(fitted, unseen, before=robot)
+            labels += found.poses
+            before.append(found.before)
+            after.append(found.after)
         scores.append(_mean_square(fitted, unseen))
         plain.append(_mean_square(robot, unseen))
     return CrossValidation(tuple(labels), _joined(before), _joined(after), np.array(scores), np.array(plain), converged)
@@ -138,4 +139,4 @@ def _mean_square(robot: Mechanism, data: Measurements) -> float:
 
 
 def _joined(parts: Sequence[PoseErrors]) -> PoseErrors:
-    return PoseErrors(*(np.concatenate([getattr(part, index) for part in parts]) for index in INDICES))
+    return PoseErrors(*(np.concatenate([np.zeros(0), *(getattr(part, index) for part in parts)]) for index in INDICES))

@@ -108,8 +108,9 @@ class Poses:
     def _clusters(self) -> IntArray:
         """Cluster of own unknowns that each component's rows use, -1 without any."""
         found = np.full(self.components, -1)
-        for s in (s for s in self.sensed if self.own is not None and s.places.shape[1]):
-            np.maximum.at(found, self.member[s.first], self.own.cluster[s.places].max(axis=1))  # type: ignore[union-attr]
+        if self.own is not None:
+            for s in (s for s in self.sensed if s.places.shape[1]):
+                np.maximum.at(found, self.member[s.first], self.own.cluster[s.places].max(axis=1))
         return found
 
     def settle(self, z: FloatArray, trials: IntArray, begin: Standing, fixed: FloatArray | None = None) -> Settled:
