@@ -34,6 +34,7 @@ from loopcal.mechanism.workspace import sample
 from loopcal.units import Dimension
 
 SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5}  # [m], [rad]
+FULL = Pose()
 PAIR = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02]])
 
 
@@ -42,6 +43,7 @@ def robot_of(name: str):
     return load_robot(name)
 
 
+@cache
 def measured(name: str, kind: Kind, n: int = 10, times: float = 1.0, seed: int = 0) -> Measurements:
     """What a machine `times` its tolerances off shows, commanded by its nominal geometry."""
     robot, noise = robot_of(name), Gaussian(np.array([SIGMA[c.dimension] for c in kind.noise_columns]))
@@ -97,10 +99,10 @@ def scalar_last(values):
 STATION = se3.pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
 XYZ = Pose("euler-xyz")
 SLIPS = {
-    "mm written as m": ("hexapod-42", Pose(), scaled([3, 4, 5], 1e3), "lengths 1000 times smaller"),
+    "mm written as m": ("hexapod-42", FULL, scaled([3, 4, 5], 1e3), "lengths 1000 times smaller"),
     "inches written as mm": ("3-prs", Position(unknown=("frame",)), scaled([0, 1, 2], 1 / 25.4), "lengths 25.4 times larger"),
-    "degrees written as radians": ("hexapod-42", Pose(), scaled([0, 1, 2], 180 / np.pi), "angles 57.3 times"),
-    "milliradians written as radians": ("3-prs", Pose(), scaled([0, 1, 2], 1e3), "angles 1000 times smaller"),
+    "degrees written as radians": ("hexapod-42", FULL, scaled([0, 1, 2], 180 / np.pi), "angles 57.3 times"),
+    "milliradians written as radians": ("3-prs", FULL, scaled([0, 1, 2], 1e3), "angles 1000 times smaller"),
     "another Euler order": (
         "hexapod-42",
         XYZ,
@@ -121,7 +123,7 @@ SLIPS = {
     ),
     "rotations the other way": ("ru-pus-prs", Pose(), scaled([0, 1, 2], -1.0), "rotations inverted"),
     "scalar last": ("hexapod-42", Pose("quaternion"), scalar_last, "quaternions read scalar last"),
-    "a left-handed frame": ("hexapod-42", Pose(), left_handed, "left-handed"),
+    "a left-handed frame": ("hexapod-42", FULL, left_handed, "left-handed"),
     "x and y swapped": ("linear-delta", Position(), swapped(0, 1), "columns x and y swapped"),
     "heights as drops": ("hexapod-42", Component(("z",)), scaled([0], -1.0), "z of the other sign"),
     "targets swapped": ("3-prs", Distance(targets=("a", "b"), places=PAIR, anchor=PAIR[0] * 9), swapped(0, 1), "'a' and 'b'"),
@@ -156,7 +158,7 @@ READINGS = {
 @pytest.mark.parametrize("slip", READINGS)
 def test_a_slip_of_the_readings_is_refused_with_what_fits_instead(slip) -> None:
     change, words = READINGS[slip]
-    data = measured("hexapod-42", Pose())
+    data = measured("hexapod-42", FULL)
     found = arrival(robot_of("hexapod-42"), replace(data, readings=change(data.readings)))
     assert words in (found.other or ""), found
 
@@ -205,7 +207,7 @@ def test_true_data_of_robots_three_times_beyond_their_tolerances_pass() -> None:
 @pytest.mark.parametrize("name", ["hexapod-42", "linear-delta"])
 def test_true_data_of_a_robot_far_off_its_tolerances_are_not_refused(name) -> None:
     """Forty tolerances off: implausible, all others are tried, and none fits far better."""
-    data = measured(name, Position(unknown=("frame",)), times=40.0)
+    data = measured(name, Position(), times=40.0)
     found = arrival(robot_of(name), data)
     assert found.doubtful
     assert not found.refused
@@ -233,6 +235,7 @@ def test_too_few_rows_say_nothing() -> None:
     assert not found.refused
 
 
+@pytest.mark.slow
 def test_the_published_table_names_its_own_euler_order() -> None:
     """The hexapod study prints Rz(a) Ry(b) Rx(c), but its Table 4 was made with the angles in the opposite order."""
     from loopcal.measure import Observations
@@ -255,7 +258,7 @@ def test_the_published_table_names_its_own_euler_order() -> None:
 
 def test_the_message_names_the_override_and_the_override_works() -> None:
     robot = robot_of("hexapod-42")
-    data = changed(measured("hexapod-42", Pose()), scaled([3, 4, 5], 1e3))
+    data = changed(measured("hexapod-42", FULL), scaled([3, 4, 5], 1e3))
     with pytest.raises(DataError, match=r"correct the unit in the header, or use --allow-implausible$"):
         check_arrival(robot, data, overrides=("--allow-still", "--allow-implausible"))
     assert np.isnan(check_arrival(robot, data, allow_implausible=True).misfit)
@@ -269,7 +272,7 @@ def test_the_message_names_the_override_and_the_override_works() -> None:
 def test_every_hypothesis_is_another_reading_in_the_same_shape() -> None:
     seen: set[str] = set()
     for cls in KINDS.values():
-        for kind in cls.examples():
+        for kind in cls.examples()[:2]:
             try:
                 data = measured("hexapod-42", kind, n=5)
             except LoopcalError:
