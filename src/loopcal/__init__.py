@@ -12,10 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from loopcal.calibrate import MAP as MAP
+    from loopcal.calibrate import Constraints as Constraints
     from loopcal.calibrate import Huber as Huber
     from loopcal.calibrate import Identification as Identification
     from loopcal.calibrate import LeastSquares as LeastSquares
     from loopcal.calibrate import Ridge as Ridge
+    from loopcal.calibrate import Plan as Plan
+    from loopcal.calibrate import Sight as Sight
     from loopcal.calibrate import StepControl as StepControl
     from loopcal.calibrate import TruncatedSVD as TruncatedSVD
     from loopcal.calibrate import Tukey as Tukey
@@ -27,6 +30,8 @@ if TYPE_CHECKING:
     from loopcal.calibrate import identify as identify
     from loopcal.calibrate import identify_trials as identify_trials
     from loopcal.calibrate import parameter_error as parameter_error
+    from loopcal.calibrate import plan as plan
+    from loopcal.calibrate import plan_surfaces as plan_surfaces
     from loopcal.calibrate import pose_uncertainty as pose_uncertainty
     from loopcal.calibrate import prior_from as prior_from
     from loopcal.calibrate import recalibrate as recalibrate
@@ -64,10 +69,13 @@ _WHERE = {
     for module, names in {
         "loopcal.calibrate": (
             "MAP",
+            "Constraints",
             "Huber",
             "Identification",
             "LeastSquares",
+            "Plan",
             "Ridge",
+            "Sight",
             "StepControl",
             "TruncatedSVD",
             "Tukey",
@@ -79,6 +87,8 @@ _WHERE = {
             "identify",
             "identify_trials",
             "parameter_error",
+            "plan",
+            "plan_surfaces",
             "pose_uncertainty",
             "prior_from",
             "recalibrate",

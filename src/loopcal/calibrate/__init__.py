@@ -42,6 +42,11 @@ from loopcal.calibrate.monte_carlo import monte_carlo as monte_carlo
 from loopcal.calibrate.outliers import OutlierCheck as OutlierCheck
 from loopcal.calibrate.outliers import find_outliers as find_outliers
 from loopcal.calibrate.per_leg import identify_per_leg as identify_per_leg
+from loopcal.calibrate.plan.constraints import Constraints as Constraints
+from loopcal.calibrate.plan.constraints import Sight as Sight
+from loopcal.calibrate.plan.plan import plan as plan
+from loopcal.calibrate.plan.plan_surfaces import plan_surfaces as plan_surfaces
+from loopcal.calibrate.plan.record import Plan as Plan
 from loopcal.calibrate.pose_errors import PoseErrors as PoseErrors
 from loopcal.calibrate.pose_errors import pose_errors as pose_errors
 from loopcal.calibrate.posterior import Posterior as Posterior

@@ -161,9 +161,11 @@ def plan(
     if options["measure"] == "plane-line":
         from loopcal.cli.plan_groups import plan_groups
 
-        refused = {"--like": like, "--allowed": allowed, "--measured": measured, "--accuracy": options["accuracy"],
-                   "--poses": options["poses"], "--hold-out": options["hold_out"], "--curve": options["curve"]}  # fmt: skip
-        plan_groups(machine, output, groups, points, options["sigma_position"], refused, seed, force, as_json)
+        refused = {"--like": like, "--allowed": allowed, "--measured": measured, "--kind": options["components"]}
+        refused |= {f"--{n.replace('_', '-')}": options[n] for n in ("accuracy", "poses", "hold_out", "curve", "frames")}
+        constraints, counts = options["asked"].constraints(), (groups, points)
+        inputs = _inputs(robot, None, None, ())
+        plan_groups(machine, output, counts, options["sigma_position"], constraints, refused, inputs, seed, force, as_json)
         return
     if groups is not None or points is not None:
         raise DataError("--groups and --points belong to --measure plane-line; leave them out")

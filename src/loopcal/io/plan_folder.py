@@ -43,8 +43,8 @@ def sheet_text(plan: Plan) -> str:
     from loopcal.mechanism import inverse
 
     robot = plan.robot
-    commanded = [_unit(robot, dimension_of(name)) for name in robot.controlled]
-    reading = [_unit(robot, actuator.dimension) for actuator in robot.actuators]
+    commanded = [unit_of(robot, dimension_of(name)) for name in robot.controlled]
+    reading = [unit_of(robot, actuator.dimension) for actuator in robot.actuators]
     headers = [f"{name} [{symbol}]" for name, (symbol, _) in zip(robot.controlled, commanded, strict=True)]
     headers += [f"{a.name} [{symbol}]" for a, (symbol, _) in zip(robot.actuators, reading, strict=True)]
     home = home_coordinates(robot)
@@ -127,7 +127,7 @@ def write_plan_folder(
             shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _unit(robot: Mechanism, dimension: Dimension) -> tuple[str, float]:
+def unit_of(robot: Mechanism, dimension: Dimension) -> tuple[str, float]:
     """Return symbol and factor of the robot's unit."""
     found = unit(robot.units[dimension])
     return found.symbol, found.factor_to_si
