@@ -101,3 +101,8 @@ def test_units_that_cannot_determine_the_unknowns_together_are_refused() -> None
 def test_the_worst_direction_is_a_figure_only() -> None:
     with pytest.raises(EstimationError, match="choose the criterion D, I or A"):
         fedorov_exchange(random_rows(), 5, E(), Start.nothing(4))
+
+
+def test_an_exchange_without_a_start_is_refused() -> None:
+    with pytest.raises(EstimationError, match="ask for one at least"):
+        fedorov_exchange(random_rows(), 5, D(), Start.nothing(4), starts=0)

@@ -16,7 +16,7 @@ import numpy as np
 
 from loopcal.calibrate.plan.criteria import Criterion
 from loopcal.calibrate.plan.design import Directions, Start, allowed, directions, require_enough
-from loopcal.calibrate.plan.scoring import Scoring, determines, make_scoring
+from loopcal.calibrate.plan.scoring import GAIN, RIDGE, Scoring, determines, make_scoring
 from loopcal.calibrate.plan.swaps import see, swaps
 from loopcal.errors import EstimationError
 from loopcal.linalg import FloatArray, IntArray
@@ -24,14 +24,8 @@ from loopcal.linalg import FloatArray, IntArray
 Evaluate = Callable[[IntArray, FloatArray], FloatArray]
 """(b,) numbers of units, (b, c) coordinates -> rows (b, r, o + p), NaN where not allowed."""
 
-GAIN = 1e-7
-"""A move must multiply the efficiency by more than 1 + this."""
-
 ENOUGH = 1e-3
 """Sweeps end when one has multiplied the efficiency by less than 1 + this."""
-
-RIDGE = 1e-3
-"""Standard-deviation share of the mean design that is lent to a start that leaves directions open."""
 
 PROBES = 4
 """Units moved to random levels, per unit of the design, which with it show the directions that can be known."""

@@ -16,17 +16,10 @@ import numpy as np
 from loopcal.calibrate.plan.criteria import Criterion
 from loopcal.calibrate.plan.design import Design, Start, allowed, directions, require_enough
 from loopcal.calibrate.plan.relaxation import Relaxed
-from loopcal.calibrate.plan.scoring import Scoring, determines, make_scoring
+from loopcal.calibrate.plan.scoring import GAIN, RIDGE, Scoring, determines, make_scoring
 from loopcal.calibrate.plan.swaps import additions, see, swaps
 from loopcal.errors import EstimationError
 from loopcal.linalg import FloatArray, IntArray
-
-GAIN = 1e-7
-"""An exchange must multiply the efficiency by more than 1 + this."""
-
-RIDGE = 1e-3
-"""Standard-deviation share of the mean design that is lent to a start that leaves directions open."""
-
 
 TOO_FEW = (
     "no {n} of the {allowed} allowed candidates were found that determine all {unknowns} unknowns;"
@@ -53,7 +46,7 @@ def fedorov_exchange(
     n : units to choose. criterion : D, I or A. start : what is known before.
     seed : of the random starts; start i has always the same stream. starts : their number.
     repeats : whether a unit may be chosen more than once.
-    relaxed : the relaxed design of the same scoring: its rounding is one more start, and random starts are drawn with its
+    relaxed : the relaxed design of the same problem: its rounding is one more start, and random starts are drawn with its
         weights instead of evenly.
     first : more designs to start from; where one has fewer than n units, those are added that gain most.
 
@@ -64,7 +57,7 @@ def fedorov_exchange(
     Raises
     ------
     EstimationError
-        n units cannot determine the unknowns, or fewer are allowed than asked for.
+        n units cannot determine the unknowns, fewer are allowed than asked for, or there is nothing to start from.
     """
     space = directions(rows, start) if relaxed is None else relaxed.directions
     require_enough(n, rows, start, space, repeats)
@@ -74,6 +67,8 @@ def fedorov_exchange(
     weights = None if relaxed is None else relaxed.weights[usable]
     begins = [] if weights is None else [rounded(weights, n, repeats)]
     begins += [grown(scoring, ready, np.searchsorted(usable, chosen), n, repeats) for chosen in first]
+    if not begins and starts < 1:
+        raise EstimationError(f"an exchange of {starts} starts has nothing to begin with; ask for one at least")
     streams = np.random.default_rng(seed).spawn(len(begins) + starts)
     found = []
     for i, stream in enumerate(streams):

@@ -25,6 +25,12 @@ from loopcal.linalg import FloatArray
 SINGULAR = 1e-6
 """A design leaves a direction open of which it knows less, in standard deviations, than this share of the mean design."""
 
+GAIN = 1e-7
+"""An exchange or a move must multiply the efficiency by more than 1 + this."""
+
+RIDGE = 1e-3
+"""Standard-deviation share of the mean design that is lent to a start that leaves directions open."""
+
 
 @dataclass(frozen=True, eq=False)
 class Scoring:
