@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from loopcal.calibrate import Huber as Huber
     from loopcal.calibrate import Identification as Identification
     from loopcal.calibrate import LeastSquares as LeastSquares
-    from loopcal.calibrate import Ridge as Ridge
     from loopcal.calibrate import Plan as Plan
+    from loopcal.calibrate import Ridge as Ridge
     from loopcal.calibrate import Sight as Sight
     from loopcal.calibrate import StepControl as StepControl
     from loopcal.calibrate import TruncatedSVD as TruncatedSVD
