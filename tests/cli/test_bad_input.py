@@ -12,6 +12,7 @@ from loopcal.measure import KINDS
 from loopcal.mechanism.records import AngleTolerance, LengthTolerance, Workspace, standard_deviation
 
 ROBOT = robot_path("hexapod-42").read_text()
+PROFILE = Path("examples/exports/cmm-spheres.yaml").read_text("utf-8")
 EXAMPLE = Path("examples/hexapod-42")
 HEADER = "pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm],z [mm]"
 DATA = f"""# kind: component
@@ -153,6 +154,37 @@ DATA_CASES = {
 def test_a_bad_measurement_file_is_refused_with_its_line(refused, case, command) -> None:
     old, new, sentence = DATA_CASES[case]
     assert sentence in refused(command, data_csv=DATA.replace(old, new, 1))
+
+
+POSES = "\n".join(line.rpartition(",")[0] for line in DATA.split("\n")[3:-1])
+HEIGHTS = "# kind: component\n# components: [z]\n# noise: {z: 1 um}\npose,z [mm]\na,200\nb,201.1\n"
+SEVERAL_CASES = {
+    "a pose that is not there": (POSES, HEIGHTS + "d,203\n", "heights.csv:7: there is no pose 'd'"),
+    "other readings": (
+        POSES,
+        DATA.replace("b,1,1", "b,1,2"),
+        "heights.csv:6: pose 'b' has other readings here than in poses.csv:3",
+    ),
+    "values without a kind": (POSES, HEIGHTS.split("\n", 3)[3], "heights.csv:1: column 'z' is unknown"),
+    "a unit of the wrong kind": (POSES.replace("q2 [mm]", "q2 [deg]"), HEIGHTS, "poses.csv:1: column 'q2': 'deg' is a unit"),
+    "an empty file": ("", HEIGHTS, "poses.csv: this measurement file is empty"),
+    "no readings": (POSES.replace("b,1,1,1,1,1,1", "b,,,,,,"), HEIGHTS, "poses.csv:3: pose 'b' has no readings, here or in"),
+}
+
+
+@pytest.mark.parametrize(
+    "command", ["calibrate hexapod-42 {} -o run", "identifiability hexapod-42 {}", "validate hexapod-42 {}"]
+)
+@pytest.mark.parametrize("case", SEVERAL_CASES)
+def test_files_that_do_not_fit_together_are_refused_by_every_command(refused, case, command) -> None:
+    poses, heights, sentence = SEVERAL_CASES[case]
+    assert sentence in refused(command.format("poses.csv heights.csv"), poses_csv=poses, heights_csv=heights)
+
+
+def test_an_export_of_which_no_line_fits_the_profile_is_refused(refused) -> None:
+    files = {"cmm_yaml": PROFILE, "export_txt": "Kugel;X;Y;Z;Ø\nA1;1,0;2,0;3,0;25\n".encode("latin-1")}
+    found = refused("import export.txt --profile cmm.yaml -o data.csv", **files)
+    assert "export.txt:2: no line of this export fits cmm.yaml; this one, the first: the name 'A1' does not match K_" in found
 
 
 def test_fewer_equations_than_parameters_are_refused_with_both_numbers(refused) -> None:

@@ -72,6 +72,18 @@ def test_a_file_may_name_its_table_of_poses(files, robot) -> None:
     assert list(measurement_paths(heights)) == ["data", "poses"]
 
 
+def test_a_table_of_commanded_poses_may_stand_apart_and_in_other_units(files, robot) -> None:
+    names = [f"commanded.{name}" for name in ("x [mm]", "y [mm]", "z [m]", "roll [deg]", "pitch [deg]", "yaw [mrad]")]
+    poses = f"pose,{','.join(names)}\na,0,0,0.2,0,0,0\nb,0,0,0.2011,0,0,0\n"
+    again = poses.replace("z [m]", "z [mm]").replace("0.2011", "201.1").replace("0.2,", "200,")
+    heights = HEIGHTS.split('"c', maxsplit=1)[0]
+    data = load_measurements(files(poses=poses, heights=heights, again=again), robot)
+    assert data.labels == ("a", "b")
+    np.testing.assert_allclose(data.readings[0], 0, atol=1e-8)  # [m]: the robot file's numbers have eight digits
+    with pytest.raises(LoopcalError, match=r"again.csv:3: pose 'b' has other readings here than in .*poses.csv:3"):
+        load_measurements(files(poses=poses, heights=heights, again=again.replace("201.1", "201.2")), robot)
+
+
 def test_rows_that_compare_poses_may_stand_apart_from_the_poses(files, robot) -> None:
     lengths = "# kind: separation\n# noise: {separation: 2 um}\npose,separation [mm]\na;b,1.2\nb;λ1,2.4\n"
     data = load_measurements(files(poses=POSES, lengths=lengths), robot)
