@@ -112,10 +112,10 @@ class PlaneAndLine:
             found += [f"p{i}.a", f"p{i}.b", *(f"p{i}.{name}" for name in self.turning)]
         return tuple(found)
 
-    @property
-    def rows_each(self) -> int:
-        """Rows of a group about the machine."""
-        return self.points - 2
+    @cached_property
+    def _home(self) -> int:
+        """Orientation at home: another one lies beyond a singularity."""
+        return int(orientation_at(self.robot, self.robot.values[None], self.robot.home_state)[0, 0])
 
     def levels(self, fractions: Sequence[float] = LEVELS) -> tuple[FloatArray, ...]:
         """Values to try, coordinate by coordinate."""
@@ -216,8 +216,7 @@ class PlaneAndLine:
         values = robot.values[None]
         state = inverse_trials(robot, values, x[None])
         q = readings_at(robot, values, state)
-        home = orientation_at(robot, values, robot.home_state)[0, 0]
-        reached = (state.status == Status.CONVERGED) & (orientation_at(robot, values, state) == home)
+        reached = (state.status == Status.CONVERGED) & (state.orientation == self._home)
         for limit in limits(robot, values, q, state):
             reached = reached & (limit.margin >= 0.0)
         D = sensitivity(robot, values, q, state).parameters[0][..., free.places] * free.tolerance

@@ -30,7 +30,8 @@ class SurfaceKind(TargetKind):
     along : (3,)
         Normal of a plane, direction of a line, in the frame; of any length.
     surface : str
-        Name of the surface; its unknowns are called after it.
+        Name of the surface; its unknowns are called after it. A plane and a line of one name, stated alike, share `u` and
+        `v`: the line is perpendicular to the plane.
     Others: see `TargetKind`; "surface" and "targets" (the probe's offsets) may be unknown.
 
     Raises
