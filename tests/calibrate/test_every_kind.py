@@ -64,9 +64,9 @@ RANKS = {
     "pose": 30, "component": 30, "position": 30, "bearing": 30, "distance": 30, "separation": 30, "plane": 30, "line": 36,
     "sphere": 33, "direction": 30, "inclination": 30, "autocollimation": 30, "joint": 33, "locked": 33,
 }  # fmt: skip
-"""Of the hexapod's 42, with most unknowns. 30: the machine without base and platform frame. Line and sphere have targets that are
-known here, and a line three directions across which turns are seen. Joints turn about axes that stand in the base, whose
-orientation they see."""
+"""Of the hexapod's 42, with most unknowns. 30: the machine without base and platform frame. Targets of line and sphere are
+known here, and turns about each of the three lines are seen, as its gaps have stated directions. Joints turn about axes that
+stand in the base, whose orientation they see."""
 
 
 def test_every_registered_kind_has_a_case_on_every_robot():
