@@ -329,6 +329,9 @@ def test_too_few_readings_and_chains_too_long_are_refused(cable, monkeypatch):
     robot, truth, positions = cable
     with pytest.raises(EstimationError, match="9 equations from 9 poses cannot determine 20"):
         identify(robot, Measurements(robot.name, inverse(truth, positions[:9]).q, ()), LeastSquares())
+    alone = replace(measured_hexapod(6, UM), observations=())
+    with pytest.raises(EstimationError, match="nothing is left"):
+        identify(hexapod(), alone, LeastSquares())
     monkeypatch.setattr(components_module, "LARGEST", 30)
     data = measured_hexapod(6, UM, sensors=(Sensor(Separation(), noise(UM)), *tracker().sensors))
     with pytest.raises(EstimationError, match="link 6 poses"):

@@ -75,7 +75,12 @@ def check_count(rows: AnyRows, data: Measurements, method: Method, allow_fewer: 
     m, p = int(rows.equations[0]), method.needs(rows.parameters) + own
     if m >= p or allow_fewer:
         return
-    poses = int(np.ceil(p * data.n_poses / max(m, 1)))
+    if m == 0:
+        raise EstimationError(
+            f"nothing is left to determine {p} parameters once the {data.n_poses} poses themselves are found from what was"
+            " measured there: measure more at each pose, or state readings that can be trusted as exact (sigma 0)"
+        )
+    poses = int(np.ceil(p * data.n_poses / m))
     without = "" if p - own == rows.parameters else " without a tolerance"
     without += f" ({own} of them in frames, targets and the like)" if own else ""
     raise EstimationError(

@@ -167,7 +167,8 @@ class Projected(NamedTuple):
 def project(rows: FloatArray, free: int) -> Projected:
     """Eliminate the first `free` columns of rows (a, C, N, free + w), N >= free, directions that no row sees left out.
 
-    Columns are brought to length one; a singular value below OWN_RANK of the largest is none.
+    Columns are brought to length one; a singular value below OWN_RANK of the largest is none. What is left of rows that are
+    not finite is NaN.
     """
     if free == 0:
         empty = np.zeros((*rows.shape[:2], 0, rows.shape[-1]))
@@ -176,6 +177,9 @@ def project(rows: FloatArray, free: int) -> Projected:
     # absent rows go last: no reflection touches them there, and what is left of the others stays apart from them
     order = np.argsort(~rows.any(axis=-1), axis=-1, kind="stable")
     rows = np.take_along_axis(rows, order[..., None], axis=-2)
+    bad = np.asarray(~np.isfinite(rows).all(axis=(-1, -2)))
+    if bad.any():
+        rows = np.where(bad[..., None, None], 0.0, rows)
     norm = np.linalg.norm(rows[..., :free], axis=-2)
     norm = np.where(norm > 0.0, norm, 1.0)
     q, r = np.linalg.qr(rows[..., :free] / norm[..., None, :], mode="complete")
@@ -188,6 +192,8 @@ def project(rows: FloatArray, free: int) -> Projected:
     rest = np.concatenate([np.where(used[..., None], 0.0, top), right[..., free:, :]], axis=-2)
     size = np.abs(right).max(axis=(-1, -2), keepdims=True, initial=0.0)
     rest = np.where(np.abs(rest).max(axis=-1, keepdims=True, initial=0.0) > ROUNDING * size, rest, 0.0)
+    if bad.any():
+        rest[bad] = np.nan
     unseen = np.sqrt(np.where(used[..., None], 0.0, vt**2).sum(axis=-2)) > NULL_COMPONENT
     gain = np.where(used, top[..., -1] ** 2, 0.0).sum(axis=-1)
     return Projected(rest, best, used.sum(axis=-1), unseen, gain)

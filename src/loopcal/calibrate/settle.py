@@ -166,11 +166,15 @@ class Poses:
         squares, gain = np.zeros((a, self.components)), np.zeros(a)
         rank = np.zeros((a, self.components), dtype=np.int64)
         unseen = np.zeros((a, len(self.member), k), dtype=bool)
-        every, parts, closed = [], [], []
+        kept, parts, closed, ok, failed, joints = [], [], [], [], [], []
         for block, groups in zip(self.blocks, self.groups, strict=True):
             closed.append(self.chart.closed(free, at.at(block.poses)))
             moves = self.chart.linearised(free, closed[-1], block.poses, block.needed)
-            every.append(moves)
+            ok.append(moves.ok)
+            failed.append(moves.failed)
+            joints.append({name: np.broadcast_to(moves.joints[name], moves.ok.shape) for name in self.joints})
+            if len(self.blocks) == 1:
+                kept.append(moves)
             kinds = self._kinds(block, moves, trials, values, machine=False)
             for group in groups:
                 width = self.width(group) if own else 0
@@ -184,19 +188,16 @@ class Poses:
                 if width:
                     folding.add([(group.cluster, done.rest.reshape(a, -1, width + 1))])
         cost = squares.sum(axis=1) + (0.0 if not own else self._held(values))
-        failed = np.any([moves.failed for moves in every], axis=0)
         where = np.argsort(np.concatenate([block.poses for block in self.blocks]))
         whole = Standing(
             engine.State(**_joined([c.state for c in closed], where)), np.concatenate([c.q for c in closed], axis=1)[:, where]
         )
-        ok = np.concatenate([moves.ok for moves in every], axis=1)[:, where]
-        joints = {
-            n: np.concatenate([np.broadcast_to(m.joints[n], m.ok.shape) for m in every], axis=1)[:, where] for n in self.joints
-        }
-        kept = every if len(self.blocks) == 1 else []
+        lost = np.any(failed, axis=0)
+        seen = {name: np.concatenate([part[name] for part in joints], axis=1)[:, where] for name in self.joints}
         factors = folding.whole(values) if own and values is not None else []
-        cost = np.where(failed, np.inf, cost)
-        return Look(whole, values, kept, ok, joints, failed, cost, squares, gain, parts, factors, rank, unseen)
+        cost = np.where(lost, np.inf, cost)
+        reached = np.concatenate(ok, axis=1)[:, where]
+        return Look(whole, values, kept, reached, seen, lost, cost, squares, gain, parts, factors, rank, unseen)
 
     def _held(self, values: FloatArray | None) -> FloatArray | float:
         """Sum of squares (a,) of the priors of own unknowns."""
