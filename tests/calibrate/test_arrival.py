@@ -31,6 +31,7 @@ from loopcal.measure import (
 )
 from loopcal.measure.hypotheses import hypotheses, readings_hypotheses
 from loopcal.mechanism.workspace import sample
+from loopcal.parameters import ParameterTable
 from loopcal.units import Dimension
 
 SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5}  # [m], [rad]
@@ -233,6 +234,52 @@ def test_too_few_rows_say_nothing() -> None:
     found = arrival(robot_of("hexapod-42"), data)
     assert np.isnan(found.misfit)
     assert not found.refused
+
+
+def test_of_two_joined_instruments_the_one_in_the_wrong_unit_is_named() -> None:
+    robot, at = robot_of("hexapod-42"), sample(robot_of("hexapod-42"), 10, 1).coordinates
+    sensors = (Sensor(Position(), Gaussian(np.full(3, 1e-5))), Sensor(Inclination(), Gaussian(np.full(2, 5e-5))))
+    data = simulate(robot, at, Instrument(sensors), 0)
+    tracker, level = data.observations
+    level = replace(level, measured=level.measured * np.pi / 180.0)
+    found = arrival(robot, replace(data, observations=(tracker, level)))
+    assert found.other == "angles of kind 'inclination' 57.3 times larger (rad written as deg)"
+
+
+def test_what_is_absent_fixed_or_unread_neither_hides_a_slip_nor_looks_like_one() -> None:
+    robot, data = robot_of("hexapod-42"), measured("hexapod-42", FULL)
+    wrong = changed(data, scaled([3, 4, 5], 1e3))
+    fixed = replace(robot, parameters=ParameterTable(tuple(replace(p, free=False) for p in robot.parameters.entries)))
+    holes = (slice(None, None, 2), 4)
+    readings, sigma = np.array(data.readings), np.zeros_like(data.readings)
+    readings[0, 0], sigma[0, 0] = np.nan, np.inf
+    for machine, some, slip in (
+        (fixed, data, False),
+        (fixed, wrong, True),
+        (robot, changed(data, lambda values: values.__setitem__(holes, np.nan)), False),
+        (robot, changed(wrong, lambda values: values.__setitem__(holes, np.nan)), True),
+        (robot, replace(data, readings=readings, reading_sigma=sigma), False),
+    ):
+        found = arrival(machine, some)
+        assert found.refused == slip
+        assert ("lengths 1000 times smaller" in (found.other or "")) == slip
+    for nothing in (data.reweighted(np.zeros(10)), replace(data, observations=())):
+        assert np.isnan(arrival(robot, nothing).misfit)
+
+
+def test_large_data_are_judged_by_runs_of_neighbours_and_rows_one_off_are_seen_in_them() -> None:
+    data = measured("hexapod-42", Position(), n=200)
+    found = arrival(robot_of("hexapod-42"), replace(data, readings=np.roll(data.readings, 1, axis=0)))
+    assert found.other == "every row belonging to the readings of the row below"
+
+
+@pytest.mark.slow
+def test_readings_that_the_robot_cannot_reach_are_explained() -> None:
+    data = measured("hexapod-42", FULL, n=4)
+    found = arrival(robot_of("hexapod-42"), replace(data, readings=data.readings * 1e3))
+    assert (
+        "the robot reaches only 0 of 4 poses that were tried with these readings; with readings 1000 times" in found.sentence
+    )
 
 
 @pytest.mark.slow

@@ -40,6 +40,9 @@ are fitted by none of them twice as well."""
 ALLOWED = 4.0
 """Misfit up to which tolerances and noise are said to allow a residual."""
 
+MOST, RUNS = 120, 4
+"""Poses of large data sets by which other readings are judged, and runs of neighbours (rows may be one off) they come in."""
+
 EQUALLY = 1.2
 """Ratio of misfits up to which two conventions fit equally well; the first in the list is named, the others beside it."""
 
@@ -104,7 +107,7 @@ def arrival(robot: Mechanism, data: Measurements) -> Arrival:
     misfit = quick_misfit(free, data)
     if misfit <= IMPLAUSIBLE:
         return Arrival(misfit)
-    stated = ReadAs(free, data)
+    stated = ReadAs(free, _thinned(data))
     misfit = stated.misfit()
     if not misfit > IMPLAUSIBLE:
         return Arrival(misfit)
@@ -167,6 +170,16 @@ def _believed(data: Measurements) -> Measurements | None:
         return data
     there = np.isfinite(data.reading_sigma).all(axis=1) & np.isfinite(data.readings).all(axis=1)
     return replace(data.take(there), reading_sigma=None) if there.any() else None
+
+
+def _thinned(data: Measurements) -> Measurements:
+    """At most `MOST` poses, in runs of neighbours spread over the data; all where rows share more than their pose."""
+    n = data.n_poses
+    shared = any(o.kind.links > 1 or bool((o.group != "").any()) for o in data.observations)
+    if n <= MOST or shared:
+        return data
+    first = np.linspace(0, n - MOST // RUNS, RUNS).astype(np.intp)
+    return data.take(np.unique(first[:, None] + np.arange(MOST // RUNS)))
 
 
 def _best(free: Unknowns, stated: ReadAs, misfit: float) -> tuple[ReadAs | None, list[Hypothesis]]:
@@ -251,7 +264,7 @@ def _unexplained(stated: ReadAs, misfit: float) -> str:
 
 def _left(stated: ReadAs, misfit: float) -> str:
     if not stated.enough:
-        return f"the robot reaches only {stated.reached} of {stated.poses} poses with these readings"
+        return f"the robot reaches only {stated.reached} of {stated.poses} poses that were tried with these readings"
     return f"{_size(stated)} (rms) is left, {misfit:.2g} times what tolerances and noise allow"
 
 
