@@ -11,6 +11,7 @@ import loopcal as lc
 import loopcal.calibrate.rows as rows_module
 from loopcal import se3
 from loopcal.calibrate import MAP, LeastSquares, find_outliers, identify, identify_trials, validate
+from loopcal.calibrate.local import Own
 from loopcal.calibrate.outlook import look, scene
 from loopcal.calibrate.rows import rows_of
 from loopcal.calibrate.scaling import unknowns
@@ -236,6 +237,20 @@ def test_trials_with_unknown_frames_are_identified_as_each_alone():
         alone = identify(robot, trials.trial(i), MAP())
         assert found.converged[i]
         assert_allclose(found.values[i], alone.robot.values, rtol=0, atol=1e-10)
+
+
+def test_starts_are_sought_once_for_all_trials_that_an_instrument_looks_at(monkeypatch):
+    sought = []
+    begin = Own.begin
+    monkeypatch.setattr(Own, "begin", lambda own, trial, *rest: (sought.append(trial), begin(own, trial, *rest)))
+    robot = lc.load_robot("linear-delta")
+    kind = Position(places=POINT, unknown=("frame",))
+    trials = simulate_trials(
+        robot, sample_truth(robot, 5, 1), sample(robot, 20, 1).coordinates, Instrument((seen_by(kind, Gaussian),)), 1,
+        unknowns=true_of(kind),
+    )  # fmt: skip
+    assert identify_trials(robot, trials, MAP()).converged.all()
+    assert sought == [0]
 
 
 def test_a_known_instrument_has_no_unknowns():
