@@ -202,3 +202,11 @@ def test_sigma_columns_override_the_noise_of_the_settings(tmp_path, robot) -> No
 def test_poses_are_read_in_the_order_of_the_robots_coordinates(tmp_path, robot) -> None:
     path = write(tmp_path, "yaw [deg],x [mm],y [mm],z [mm],roll [deg],pitch [deg]\n180,1,2,3,0,0\n")
     np.testing.assert_allclose(load_poses(path, robot), [[1e-3, 2e-3, 3e-3, 0, 0, np.pi]], rtol=1e-15)
+
+
+def test_noise_is_stated_by_pattern_and_the_last_that_means_a_column_counts(tmp_path, robot) -> None:
+    text = GOOD.replace("[z]", "[z, x]").replace("z: 1 um", '"*": 2 um, z: 1 um').replace("z [mm]", "z [mm],x [mm]")
+    data = load_measurements(write(tmp_path, text.replace("200\n", "200,0\n").replace("201.1\n", "201.1,0\n")), robot)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(data.observations[0].covariance[0])), [1e-6, 2e-6], rtol=1e-15)
+    with pytest.raises(LoopcalError, match=r"data.csv:3: unknown key 'y\*' in 'noise'"):
+        load_measurements(write(tmp_path, GOOD.replace("z: 1 um", '"y*": 1 um')), robot)

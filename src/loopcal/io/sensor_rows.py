@@ -30,7 +30,7 @@ SETTINGS: Mapping[str, str] = {
     "controller": "robot file of the geometry that turned commanded coordinates into readings; default: nominal",
     "kind": "the kind of all rows, followed by its own settings and noise",
     "kinds": "label -> kind, settings and noise, where a file holds several kinds",
-    "noise": "standard deviation of each noise column, with its unit",
+    "noise": 'standard deviation of each noise column, with its unit; by name or pattern, such as `"*.x": 5 um`',
     "unknowns": "name or pattern -> what is known of an unknown of the kinds: a prior, or that it is fixed",
     "session": "session of all rows that state none in their column",
     "group": "group of all rows that state none in their column",

@@ -5,7 +5,8 @@
     orientation: euler-xyz                    then the kind's own settings: the fields of its dataclass
     T_base_frame: {x: 12 mm, yaw: 90 deg}     poses: x y z and R = Rz(yaw) Ry(pitch) Rx(roll), each with its unit
     places: [[100 mm, 0 mm, 20 mm]]           points and other lengths with their units; directions as plain numbers
-    noise: {x: 1 um, y: 1 um, z: 1 um, a: 5 urad, b: 5 urad, c: 5 urad}     standard deviations of the noise columns
+    noise: {x: 1 um, y: 1 um, z: 1 um, a: 5 urad, b: 5 urad, c: 5 urad}     standard deviations of the noise columns,
+                                              by name or pattern ("*.x": 5 um); of two that mean one the last counts
 
 A new kind needs nothing here, its fields are its settings: arrays called T_.. are poses, those in DIRECTIONS unit
 vectors, other arrays and floats lengths, the rest text.
@@ -17,6 +18,7 @@ import dataclasses
 import math
 import typing
 from collections.abc import Mapping
+from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import DataError, UnitError, nearest
@@ -94,11 +96,15 @@ def read_noise(file: YamlFile, node: Mapping[str, Any], kind: Kind, location: Lo
     if not isinstance(stated, dict):
         example = ", ".join(f"{name}: {EXAMPLES[d]}" for name, d in dimensions.items())
         raise file.error(f"'noise' must state a standard deviation for each column; write 'noise: {{{example}}}'", place)
-    refuse_unknown_keys(file, list(stated), list(dimensions), place)
-    noise = {name: _quantity(file, text, dimensions[name], (*place, name)) for name, text in stated.items()}
-    for name, sigma in noise.items():
-        if not sigma > 0:
-            raise file.error(f"the noise of {name!r} is {stated[name]}; give a number above zero", (*place, name))
+    noise: dict[str, float] = {}
+    for name, text in stated.items():
+        meant = [name] if name in dimensions else [column for column in dimensions if fnmatchcase(column, name)]
+        if not meant:
+            refuse_unknown_keys(file, [name], list(dimensions), place)
+        for column in meant:
+            noise[column] = _quantity(file, text, dimensions[column], (*place, name))
+            if not noise[column] > 0:
+                raise file.error(f"the noise of {name!r} is {text}; give a number above zero", (*place, name))
     return noise
 
 
