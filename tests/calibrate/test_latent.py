@@ -10,6 +10,8 @@ from scipy.optimize import least_squares
 from scipy.stats import binom, chi2
 
 import loopcal.calibrate.components as components_module
+import loopcal.calibrate.latent as latent_module
+import loopcal.calibrate.settle as settle_module
 from loopcal.calibrate import (
     Huber,
     LeastSquares,
@@ -298,14 +300,30 @@ def test_a_wrong_reading_is_named_and_a_loss_or_its_absence_mends_the_fit(wrong_
     assert examine(dropped, wrong_reading).outliers.outliers == ()
 
 
-def test_leaving_a_block_out_predicts_its_residual_without_it(wrong_reading):
+def test_the_distance_of_a_pose_is_what_the_sum_of_squares_loses_without_it():
     data = measured_hexapod(14, 2 * UM)
     fit = identify(hexapod(), data, LeastSquares())
     found = find_outliers(fit, data).influence
     assert found.leverage.sum() == pytest.approx(42, abs=1e-6)
     assert int(found.residuals.sum()) == 14 * 6  # six readings and six numbers of a pose, less its six freedoms
-    score = cross_validate(hexapod(), data, LeastSquares(), count=2).score
-    assert np.isfinite(score)
+    for i in (3, 11):
+        without = identify(hexapod(), data.take(np.arange(14) != i), LeastSquares())
+        assert fit.chi_square - without.chi_square == pytest.approx(found.distance[i], rel=1e-3)  # what is not linear
+
+
+def test_blocks_of_poses_change_nothing(monkeypatch):
+    sensors = (
+        Sensor(Pose(unknown=("frame",)), noise(*[5e-6] * 3, *[UM] * 3)),
+        Sensor(Separation(), noise(UM), np.array([[0, 7], [2, 3]])),
+    )
+    data = measured_hexapod(12, 2 * UM, sensors=sensors)
+    whole = identify(hexapod(), data, LeastSquares())
+    for module in (latent_module, settle_module):
+        monkeypatch.setattr(module, "BLOCK", 5)
+    parts = identify(hexapod(), data, LeastSquares())
+    assert parts.chi_square == pytest.approx(whole.chi_square, rel=1e-9)
+    assert_allclose(parts.singular_values[:36], whole.singular_values[:36], rtol=1e-9)
+    assert_allclose(latent_of(parts).readings, latent_of(whole).readings, atol=1e-9 * UM)
 
 
 def test_frames_and_noisy_readings_together_leave_what_a_known_frame_leaves_to_be_known():

@@ -61,7 +61,8 @@ def identify(
 
     Parameters
     ----------
-    robot : its values are the start, its table says what is nominal, free and tolerated. data : the measurements.
+    robot : its values are the start, its table says what is nominal, free and tolerated. data : the measurements; where a
+        reading has a sigma, given or stated by the robot, its pose is an unknown, too (docs/theory/latent.md).
     method : default `MAP(Widened())`: stated tolerances are a prior, widened where the data contradict them; with `prior`
         least squares.
     noise : "given": the sigmas of the data are true; "estimated": true up to one common factor.

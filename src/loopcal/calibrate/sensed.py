@@ -65,7 +65,7 @@ class Sensed:
     @property
     def per_pose(self) -> IntArray:
         """(r, links) poses of each row, whatever their number."""
-        return self.poses.reshape(len(self.poses), -1)
+        return self.poses.reshape(len(self.poses), self.kind.links)
 
 
 class Residuals(NamedTuple):
