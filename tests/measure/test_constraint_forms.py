@@ -4,6 +4,8 @@
 Both see the same points of a hexapod: four groups of twelve, reached as a coordinate measuring machine holds coordinates.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -38,9 +40,16 @@ def exact(layout: Layout) -> np.ndarray:
 
 def test_a_plane_and_a_line_that_name_the_same_surface_share_its_direction(layout) -> None:
     local = measurements(layout, exact(layout)[0], NOISE).unknowns
-    names = {f"plane{g + 1}.held.{part}" for g in range(GROUPS) for part in ("u", "v", "height", "a", "b")}
+    names = {f"plane{g + 1}.held_z.{part}" for g in range(GROUPS) for part in ("u", "v", "height", "a", "b")}
     assert set(local.table.names) == names
     assert len(local) == 5 * GROUPS
+
+
+def test_the_shared_surface_survives_a_measurement_file(layout, tmp_path) -> None:
+    data = measurements(layout, exact(layout)[0], NOISE)
+    lc.save_measurements(data, tmp_path / "points.csv", layout.robot)
+    read = lc.load_measurements(tmp_path / "points.csv", layout.robot)
+    assert sorted(read.unknowns.table.names) == sorted(data.unknowns.table.names)
 
 
 @pytest.mark.slow
@@ -75,6 +84,15 @@ def test_both_forms_and_the_rows_of_planning_give_every_direction_the_same_varia
     R = information(free, measurements(layout, exact(layout)[0], MM))[0][0, :42, :42]
     rows = planned.rows(planned.random(GROUPS, 0)).reshape(-1, 42)
     np.testing.assert_allclose(rows.T @ rows, R.T @ R, atol=1e-9 * np.abs(R.T @ R).max())
+
+
+def test_both_forms_agree_with_lines_along_different_axes(planned) -> None:
+    mixed = replace(planned, axes=("x", "y", "z"))
+    design = mixed.random(GROUPS, 5)
+    assert len(np.unique(design[:, 3])) > 1
+    layout = Layout(mixed.robot, mixed.coordinates(design))
+    assert len(measurements(layout, exact(layout)[0], NOISE).observations) > 2
+    assert covariance_difference(layout, NOISE) < 1e-9
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ from loopcal.calibrate.outlook import information
 from loopcal.calibrate.scaling import unknowns
 from loopcal.linalg import FloatArray
 from loopcal.measure import Line, Measurements, Observations, Plane
+from loopcal.mechanism.coordinates import POSITION
 from loopcal.papers.cmm_constraint_2011.cells import METHODS
 from loopcal.papers.cmm_constraint_2011.published import MM
 from loopcal.papers.cmm_constraint_2011.steps import Layout, PaperRows, identify_from_rows
@@ -50,19 +51,18 @@ def measurements(layout: Layout, q: FloatArray, sigma: float) -> Measurements:
 
     Parameters
     ----------
-    layout : lines along one axis of the base, the same for all groups. q : (n, a) readings [SI].
-    sigma : of a held coordinate [m].
+    layout : lines along any axes of the base. q : (n, a) readings [SI]. sigma : of a held coordinate [m].
     """
-    g, n = layout.groups, layout.points
-    number = np.arange(n).reshape(g, -1)
-    along = layout.levers[0][0] / np.linalg.norm(layout.levers[0][0])
-    stated = {"unknown": ("surface",), "surface": SURFACE, "along": along, "through": layout.robot.home[:3, 3]}
+    number = np.arange(layout.points).reshape(layout.groups, -1)
+    axis = np.abs(layout.levers[0]).argmax(axis=1)
     found = []
-    for kind, points, gaps in ((Plane(**stated), np.delete(number, 1, axis=1), 1), (Line(**stated), number[:, :2], 2)):
-        group = np.repeat([f"plane{i + 1}" for i in range(g)], points.shape[1])
-        held = np.zeros((points.size, gaps))
-        mounted = kind.mounted(layout.robot.tool)
-        found.append(Observations.from_sigma(mounted, points.ravel(), held, sigma, group=group))
+    for along in np.unique(axis):
+        stated = {"unknown": ("surface",), "surface": f"{SURFACE}_{POSITION[along]}", "through": layout.robot.home[:3, 3]}
+        plane, line = (kind(along=np.eye(3)[along], **stated).mounted(layout.robot.tool) for kind in (Plane, Line))
+        points, groups = number[axis == along], [f"plane{i + 1}" for i in np.flatnonzero(axis == along)]
+        for kind, seen, gaps in ((plane, np.delete(points, 1, axis=1), 1), (line, points[:, :2], 2)):
+            held, group = np.zeros((seen.size, gaps)), np.repeat(groups, seen.shape[1])
+            found.append(Observations.from_sigma(kind, seen.ravel(), held, sigma, group=group))
     return Measurements(layout.robot.name, q, tuple(found))
 
 
