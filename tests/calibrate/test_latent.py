@@ -236,6 +236,36 @@ def test_ellipsoids_cover_as_stated_with_noisy_readings_and_far_too_little_if_th
     assert ignored < binom.ppf(0.0005, 10, 0.95)
 
 
+def test_ellipsoids_cover_as_stated_with_redundant_readings_and_few_measured_poses(cable):
+    robot, _, positions = cable
+    n = 60
+    seen = Instrument((Sensor(Position(), noise(1e-4, 1e-4, 1e-4), rows=np.arange(8)),))
+    inside = coverage(robot, simulate_trials(robot, sample_truth(robot, n, 6), positions, seen, 6))
+    assert binom.ppf(0.0005, n, 0.95) <= inside <= binom.ppf(0.9995, n, 0.95)
+
+
+def test_recorded_readings_have_the_noise_stated_and_the_machine_stands_at_the_true_ones(cable):
+    robot, _, positions = cable
+    truth = sample_truth(robot, 40, 2)
+    seen = Instrument((Sensor(Position(), noise(UM, UM, UM)),))
+    trials = simulate_trials(robot, truth, positions, seen, 2)
+    assert trials.recorded is not None
+    sigma = np.array([a.sigma for a in robot.actuators])
+    assert_array_equal(trials.reading_sigma, np.tile(sigma, (30, 1)))  # as the robot states
+    true = np.stack([inverse(robot.with_values(v), T[:, :3, 3]).q for v, T in zip(truth, trials.T, strict=True)])
+    error = (trials.recorded - true) / sigma
+    m = error.size
+    assert chi2.ppf(1e-4, m) < (error**2).sum() < chi2.ppf(1 - 1e-4, m)
+    few = simulate_trials(robot, truth[:3], positions, seen, 2)
+    assert_array_equal(few.recorded, trials.recorded[:3])
+    exact = simulate_trials(
+        hexapod(), hexapod().values[None], hexapod_poses(3), tracker(), 0, reading_sigma=[0.0, np.inf, *[UM] * 4]
+    )
+    assert exact.recorded is not None
+    assert_array_equal(exact.recorded[0, :, 0], exact.readings[:, 0])
+    assert np.isnan(exact.recorded[0, :, 1]).all()
+
+
 def test_a_trial_is_the_same_alone_and_among_others():
     robot = hexapod()
     trials = simulate_trials(robot, sample_truth(robot, 3, 0), hexapod_poses(10), tracker(), 0, reading_sigma=2 * UM)
