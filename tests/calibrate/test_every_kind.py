@@ -186,7 +186,7 @@ def test_a_frame_anywhere_gives_the_machine_of_the_known_frame_up_to_its_gauge(k
 
 
 def locked_at(truth, joint, constant, rng, n=12):
-    """Coordinates z, phi, theta (n, 3) at which a passive joint of a true 3-PRS has this value, by halving ranges of theta."""
+    """Coordinates z, phi, theta (n, 3) at which a passive joint of a true 3-PRS has this value; theta is sought."""
     z, phi = rng.uniform(0.66, 0.74, 60), rng.uniform(-np.pi, np.pi, 60)
 
     def off(theta):
@@ -196,11 +196,18 @@ def locked_at(truth, joint, constant, rng, n=12):
     low, high = np.full(60, 0.02), np.full(60, 0.5)
     side = np.sign(off(low))
     there = side * np.sign(off(high)) < 0.0
-    for _ in range(55):
+    for _ in range(10):
         middle = 0.5 * (low + high)
         before = np.sign(off(middle)) == side
         low, high = np.where(before, middle, low), np.where(before, high, middle)
-    return np.column_stack([z, phi, low])[there][:n]
+    # what is left of 0.5 rad is half a milliradian: secants do the rest
+    at, at_off, before, before_off = high, off(high), low, off(low)
+    for _ in range(5):
+        change = at_off - before_off
+        step = np.where(change == 0.0, 0.0, -at_off * (at - before) / np.where(change == 0.0, 1.0, change))
+        before, before_off, at = at, at_off, at + step
+        at_off = off(at)
+    return np.column_stack([z, phi, at])[there][:n]
 
 
 def test_joints_locked_at_constants_nobody_knows_recover_a_tripod_up_to_its_frames():
