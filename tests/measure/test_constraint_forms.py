@@ -86,6 +86,18 @@ def test_both_forms_and_the_rows_of_planning_give_every_direction_the_same_varia
     np.testing.assert_allclose(rows.T @ rows, R.T @ R, atol=1e-9 * np.abs(R.T @ R).max())
 
 
+@pytest.mark.parametrize("name", ["6-pus", "linear-delta", "rotary-delta"])
+def test_rows_of_planning_are_those_of_surfaces_as_unknowns_on_other_robots_too(name) -> None:
+    robot = lc.load_robot(name)
+    planned = PlaneAndLine(robot, 8, MM)
+    design = planned.random(8, 0)
+    layout = Layout(robot, planned.coordinates(design))
+    free = unknowns(robot)
+    R = information(free, measurements(layout, exact(layout)[0], MM))[0][0, : len(free), : len(free)]
+    rows = planned.rows(design).reshape(-1, len(free))
+    np.testing.assert_allclose(rows.T @ rows, R.T @ R, atol=1e-9 * np.abs(R.T @ R).max())
+
+
 def test_both_forms_agree_with_lines_along_different_axes(planned) -> None:
     mixed = replace(planned, axes=("x", "y", "z"))
     design = mixed.random(GROUPS, 5)

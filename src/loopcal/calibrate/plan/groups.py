@@ -5,6 +5,7 @@ A group has k points: the foot p_0, which lies on both, p_1 on the line, the oth
 axis of the base and is reached by holding two coordinates of a coordinate measuring machine, the plane by holding the
 third. What is planned is where in the workspace each point lies and how the platform is turned there; what the instrument
 shows is only that the held coordinates agree, so direction, height and shifts of the surfaces are unknowns of the group.
+Readings of the robot count as exact.
 
 To first order, with levers L_i = p_i - p_0, the line's direction n, t_1 and t_2 across it, and its turns (u_1, u_2):
 
