@@ -15,6 +15,7 @@ import pytest
 
 from loopcal.calibrate import Identification, LeastSquares, identifiability, identify
 from loopcal.calibrate.examine import examine
+from loopcal.calibrate.reading_errors import reading_errors
 from loopcal.io.formats import hangprinter
 from loopcal.io.formats.exchange import Imported, Reading
 from loopcal.io.formats.transfer import checked
@@ -106,9 +107,24 @@ def test_the_residual_is_a_third_of_a_millimetre_and_fits_the_stated_sigmas(fit,
     assert rms.max() < 0.35  # [mm]
     (readings,) = (part for part in fit.residuals if part.kind == "readings")
     assert readings.raw.shape == (44, 4)
-    gain = np.array([a.terms["gain"] for a in printer[0].assembly.actuators])
-    lines = readings.raw * gain * 1e3  # on spools as they are guessed: 1.3 % off, and a build-up
-    np.testing.assert_allclose(np.sqrt((lines**2).mean(axis=0)), rms, rtol=0.03)
+    errors = reading_errors(fit, printer[1])
+    assert errors is not None
+    assert [error.name for error in errors] == ["a", "b", "c", "d"]
+    for i, error in enumerate(errors):
+        assert error.count == 44
+        assert error.reading == pytest.approx(np.sqrt((readings.raw[:, i] ** 2).mean()), rel=1e-6)  # [rad]
+        # the reference's are of a line at the slope of its spool, ours of the whole difference
+        assert error.joint * 1e3 == pytest.approx(rms[i], rel=1e-4)
+        assert abs(error.largest) * 1e3 == pytest.approx(np.abs(answer.lines[:, i]).max(), rel=1e-3)
+
+
+def test_errors_of_readings_leave_out_dropped_poses_and_are_none_where_readings_are_exact(printer, fit):
+    robot, data = printer
+    errors = reading_errors(identify(robot, data, LeastSquares(), drop=["sample19"]), data)
+    assert errors is not None
+    assert {error.count for error in errors} == {43}
+    assert "sample19" not in {error.pose for error in errors}
+    assert reading_errors(replace(fit, latent=None), data) is None
 
 
 def test_no_row_is_doubted_and_a_wrong_motor_angle_is(printer, fit):

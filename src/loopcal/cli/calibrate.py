@@ -18,7 +18,6 @@ from loopcal.errors import DataError
 if TYPE_CHECKING:
     from loopcal.calibrate import Identification, Validation
     from loopcal.calibrate.examine import Examination
-    from loopcal.calibrate.remedies import Remedy
     from loopcal.measure import Measurements
 
 GREW = 1.1
@@ -92,7 +91,7 @@ def calibrate(
     validation = None if unseen is None else validate(fit, unseen, limit_position, limit_angle)
     origin = made_by(sys.argv, inputs, {"hold_out": seed})
     split = None if unseen is None else {"hold_out": hold_out, "seed": seed, "held_out": unseen.labels}
-    findings = {"examination": _examined(fit, fitted), "change": change, "model_choice": choice, "remedies": _cure(fit, fitted)}
+    findings = {"change": change, "model_choice": choice} | _findings(fit, fitted)
     found = {name: _document(finding) for name, finding in findings.items() if finding is not None}
     reasons = _reasons(fit, validation)
     document = run_document(fit, validation, origin, split) | found | {"passed": not reasons, "reasons": reasons}
@@ -148,14 +147,18 @@ def _document(finding: Any) -> Any:
     return [one.to_dict() for one in finding] if isinstance(finding, tuple) else finding.to_dict()
 
 
-def _cure(fit: Identification, fitted: Measurements) -> tuple[Remedy, ...] | None:
-    """What would determine what these measurements leave open; None where nothing stays open."""
+def _findings(fit: Identification, fitted: Measurements) -> dict[str, Any]:
+    """What else is known of a fit; None where there is nothing to say."""
     from loopcal.calibrate import identifiability
+    from loopcal.calibrate.reading_errors import reading_errors
     from loopcal.calibrate.remedies import remedies
 
-    if not (fit.converged and fit.unidentifiable):
-        return None
-    return remedies(identifiability(fit.robot, fitted))
+    open_ = fit.converged and fit.unidentifiable
+    return {
+        "examination": _examined(fit, fitted),
+        "remedies": remedies(identifiability(fit.robot, fitted)) if open_ else None,
+        "reading_errors": reading_errors(fit, fitted),
+    }
 
 
 def _print(
@@ -180,6 +183,8 @@ def _print(
         show.say(f"note: {note}")
     if findings["model_choice"] is not None:
         show.say(f"\n{findings['model_choice']}")
+    if findings["reading_errors"] is not None:
+        show.reading_errors(fit.robot, findings["reading_errors"])
     if validation is not None:
         show.validation(validation, "unseen")
     else:

@@ -14,6 +14,7 @@ from loopcal.units import DISPLAY_UNITS, Dimension, Unit, unit
 
 if TYPE_CHECKING:
     from loopcal.calibrate import Validation
+    from loopcal.calibrate.reading_errors import ReadingError
     from loopcal.mechanism import Mechanism
 
 ROUNDING = 1e-12
@@ -107,6 +108,27 @@ def parameters(title: str, rows: Iterable[Mapping[str, Any]]) -> None:
             for row in rows
         ],
     )
+
+
+def reading_errors(robot: Mechanism, errors: Sequence[ReadingError]) -> None:
+    """Print how far recorded readings are from those found: as readings, and as what the actuators move."""
+    units = units_of(robot)
+    cells = []
+    for error in errors:
+        read, moved = units[error.reading_dimension], units[error.joint_dimension]
+        numbers = [error.joint / moved.factor_to_si, error.largest / moved.factor_to_si]
+        cells.append(
+            (
+                error.name,
+                number(error.reading / read.factor_to_si, digits=3),
+                read.symbol,
+                *(number(x, digits=3) for x in numbers),
+                moved.symbol,
+                error.pose,
+            )
+        )
+    headers = ("reading", "rms", "unit", "rms of what it moves", "largest", "unit", "at")
+    table(f"Readings, recorded minus found, of up to {max(e.count for e in errors)} poses", headers, cells)
 
 
 def validation(found: Validation, poses: str, before: bool = True) -> None:
