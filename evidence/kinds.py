@@ -53,6 +53,9 @@ WALK = 6
 GROUPS = 3
 """Surfaces and locks that share the poses among them."""
 
+TOGETHER = 8
+"""Fits whose own unknowns are read from one fold, which must hold all their poses at once."""
+
 FITS, NORMAL_95 = 100, 1.959963984540054
 """Fits of a case, and the 97.5 % point of the normal distribution."""
 
@@ -291,13 +294,14 @@ def _own_covered(found: IdentifiedTrials, trials: Trials, good: IntArray, own: d
     inside = []
     truth = np.array([own[name] for name in rows.own.local.table.names])
     rows.own.values[:], rows.own.started[:] = truth, True  # how starts are found is proved elsewhere
-    for i in good.tolist():
-        z = free.deviation(found.values[i : i + 1])
-        rows.fold(z, np.array([i]))
-        one = found.decomposition.take(np.array([i]))
-        local = local_estimate(rows.own, free.robot, rows.own.start, one, found.penalty[i : i + 1], 1.0, trial=i)
-        off = local.estimate - truth
-        inside.append((np.abs(off) <= NORMAL_95 * local.sd)[np.isfinite(local.sd)])
+    for first in range(0, len(good), TOGETHER):
+        some = good[first : first + TOGETHER]
+        rows.fold(free.deviation(found.values[some]), some)
+        for place, i in enumerate(some.tolist()):
+            one = found.decomposition.take(np.array([i]))
+            local = local_estimate(rows.own, free.robot, truth, one, found.penalty[i : i + 1], 1.0, i, place)
+            off = local.estimate - truth
+            inside.append((np.abs(off) <= NORMAL_95 * local.sd)[np.isfinite(local.sd)])
     return np.concatenate(inside)
 
 

@@ -103,14 +103,15 @@ def local_estimate(
     penalty: FloatArray,
     noise: float,
     trial: int = 0,
+    place: int = 0,
 ) -> LocalEstimate:
-    """Return what the last fold, of one trial alone, says of the own unknowns.
+    """Return what the last fold says of the own unknowns of one trial.
 
     Parameters
     ----------
     own : after a fold at the estimate. robot : for its units. start : (U,) values with which the fit began.
     decomposition, penalty : of the fit (t = 1). noise : variance of the whitened rows; NaN where no interval is given.
-    trial : which one was folded.
+    trial : which one. place : where it stood in that fold.
     """
     table = own.local.table
     estimate, variance = own.values[trial].copy(), np.zeros(len(table))
@@ -118,14 +119,14 @@ def local_estimate(
     known = decomposition.variances(penalty, noise)[0]
     V = decomposition.scale[:, None] * decomposition.directions[0]
     for one in own.solved:
-        S = one.slope[0]
-        estimate[one.columns] += one.shift[0]
-        slope[one.columns], unseen[one.columns] = S, one.open[0]
+        S = one.slope[place]
+        estimate[one.columns] += one.shift[place]
+        slope[one.columns], unseen[one.columns] = S, one.open[place]
         moved = S @ V
         infinite = np.linalg.norm(moved[:, np.isinf(known)], axis=1) > MOVES * np.linalg.norm(moved, axis=1)
         by_machine = (moved**2) @ np.where(np.isinf(known), 0.0, known)
-        alone = (one.inverse[0] ** 2).sum(axis=1) * noise
-        variance[one.columns] = np.where(infinite | one.open[0], np.inf, alone + by_machine)
+        alone = (one.inverse[place] ** 2).sum(axis=1) * noise
+        variance[one.columns] = np.where(infinite | one.open[place], np.inf, alone + by_machine)
     shown = tuple(_shown(robot, p) for p in table.entries)
     return LocalEstimate(table, start, estimate, np.sqrt(variance), slope, unseen, shown)
 
