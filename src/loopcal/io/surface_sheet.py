@@ -47,29 +47,28 @@ def surface_sheet_text(plan: SurfacePlan) -> str:
     return "\n".join(lines) + "\n"
 
 
-def surface_data_text(plan: SurfacePlan, readings: np.ndarray | None = None) -> str:
-    """Return the data file to fill in, with empty readings; with readings (u, k, a) [SI] the one that is filled in."""
+def surface_data_text(plan: SurfacePlan) -> str:
+    """Return the data file to fill in: the gaps are zero, the readings empty."""
     from loopcal.measure import Measurements, Observations
 
     robot = plan.robot
-    given = plan.readings if readings is None else readings
     observations = []
     for sensor in plan.instrument().sensors:
         assert sensor.rows is not None  # the plan spells them out
         zero = np.zeros((len(sensor.rows), len(sensor.kind.columns)))
         seen = Observations.from_sigma(sensor.kind, sensor.rows, zero, sensor.noise.sigma, "", sensor.group)
         observations.append(seen)
-    flat = np.asarray(given).reshape(-1, len(robot.actuators))
+    flat = plan.readings.reshape(-1, len(robot.actuators))
     text = measurements_text(Measurements(robot.name, flat, tuple(observations), labels=plan.labels), robot)
-    return _by_pose(plan, text, readings is None)
+    return _by_pose(plan, text)
 
 
-def _by_pose(plan: SurfacePlan, text: str, empty: bool) -> str:
-    """Put the rows in the order of the poses, and leave the cells of the readings empty where asked."""
+def _by_pose(plan: SurfacePlan, text: str) -> str:
+    """Put the rows in the order of the poses, and leave the cells of the readings empty."""
     lines = text.splitlines()
     first = next(i for i, line in enumerate(lines) if not line.startswith("#"))
     names = {f"{a.name} [{unit_of(plan.robot, a.dimension)[0]}]" for a in plan.robot.actuators}
-    places = {i for i, name in enumerate(lines[first].split(",")) if empty and name in names}
+    places = {i for i, name in enumerate(lines[first].split(",")) if name in names}
     order = {label: i for i, label in enumerate(plan.labels)}
     rows = sorted((line.split(",") for line in lines[first + 1 :]), key=lambda cells: order[cells[0]])
     shown = (",".join("" if i in places else cell for i, cell in enumerate(cells)) for cells in rows)

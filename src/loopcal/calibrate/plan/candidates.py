@@ -91,6 +91,7 @@ def listed_candidates(robot: Mechanism, poses: FloatArray, constraints: Constrai
         None of them is allowed, or home itself breaks a constraint.
     """
     judged_by = _at_home(robot, constraints)
+    poses = np.unique(poses, axis=0)
     verdict = judged_by.judge(inverse(robot, poses))
     refused: Counter[str] = Counter(verdict.counts())
     good = poses[verdict.allowed]
@@ -186,6 +187,7 @@ def _boundary(
     found = np.where(good[:, None] == 1.0, poses, between(robot, anchor, poses, good))[good > 0.0]
     # towards the middle, so that what is rounded stays inside
     found = rounded(robot, found, middle)
+    found = np.unique(found, axis=0)
     return found[judged_by.judge(inverse(robot, found)).allowed]
 
 

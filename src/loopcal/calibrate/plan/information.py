@@ -179,16 +179,20 @@ def _block(free: Unknowns, mounted: Instrument, readings: FloatArray, members: I
     places = places.reshape(members.shape)
     at = scene(free, readings[poses], joints_looked_at(sensor.kind for sensor in mounted.sensors))
     local = _local(mounted, places)
-    parts = []
+    parts, useless = [], np.zeros(len(members), dtype=bool)
     for i, (sensor, rows) in enumerate(_looking(mounted, places)):
         kind = sensor.kind
         own = local.of(i, local.table.nominal[None]) if kind.unknowns else None
         joints = np.stack([at.joints[name][:, rows] for name in kind.looks_at], axis=-1) if kind.looks_at else None
         measured = kind.measure(at.T[:, rows], np.zeros((1, len(rows), len(kind.noise_columns))), own, joints)[0]
+        # what cannot be measured there, such as the distance of a point from itself
+        doubted = [row for row, _ in kind.doubts(measured)]
+        useless[[row * len(members) // len(rows) for row in doubted]] = True
+        measured = np.where(np.isin(np.arange(len(rows)), doubted)[:, None], np.nan, measured)
         parts.append(Observations.from_sigma(kind, rows, measured, sensor.noise.sigma, "", ""))
     found = look(at, Measurements(free.robot.name, at.readings, tuple(parts)), local, local.values())[0, :, :-1]
     counts = [len(part) * len(part.kind.noise_columns) for part in parts]
     pieces = np.split(found, np.cumsum(counts)[:-1])
     rows = np.concatenate([piece.reshape(len(members), -1, found.shape[1]) for piece in pieces], axis=1)
-    rows[~at.reached[places].all(axis=1)] = np.nan
+    rows[useless | ~at.reached[places].all(axis=1)] = np.nan
     return rows

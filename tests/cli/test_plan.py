@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal plan` as a user meets it: sheet, data file, calibration with the poses held out that the plan holds out."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from loopcal.cli import main
+from loopcal.io import load_measurements, load_robot
+from loopcal.measure import sample_truth
+from loopcal.mechanism import forward, inverse
+from loopcal.mechanism.workspace import sample
+
+SMALL = ["--poses", "8", "--hold-out", "3", "--candidates", "40", "--kind", "position"]
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Work in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(command: str) -> int:
+    """Run a command line."""
+    return main(command.split())
+
+
+def rows_of(path) -> list[dict[str, str]]:
+    """Rows of a CSV file without its remarks."""
+    lines = [line for line in path.read_text("utf-8").splitlines() if not line.startswith("#")]
+    return list(csv.DictReader(lines))
+
+
+def test_a_plan_is_measured_filled_in_and_calibrated_with_its_own_poses_held_out(here, capsys):
+    assert main(["plan", "linear-delta", "-o", "plan", *SMALL, "--curve"]) == 0
+    said = capsys.readouterr().out
+    assert "8 poses of linear-delta to measure (position) and 3 to judge by" in said
+    assert "expected errors by number of poses" in said
+    assert {p.name for p in (here / "plan").iterdir()} == {
+        "plan.csv", "measurements.csv", "plan.json", "plan.png", "curve.png",
+    }  # fmt: skip
+    assert run("simulate linear-delta --fill plan/measurements.csv --draw-errors --truth truth.yaml -o filled.csv") == 0
+    assert run("calibrate linear-delta filled.csv -o run --limit-position 0.5mm") == 0
+    assert "Errors on 3 unseen rows" in capsys.readouterr().out
+    plan = json.loads((here / "plan" / "plan.json").read_text())
+    held = [pose["name"] for pose in plan["poses"] if pose["use"] == "held-out"]
+    result = json.loads((here / "run" / "result.json").read_text())
+    assert result["split"]["held_out"] == held
+    truth, found = load_robot("truth.yaml").values, load_robot("run/robot.yaml").values
+    assert np.linalg.norm(found - truth) < 0.3 * np.linalg.norm(load_robot("linear-delta").values - truth)
+
+
+def test_the_sheet_says_what_to_command_and_agrees_with_the_data_file(here):
+    assert main(["plan", "hexapod-42", "-o", "plan", "--poses", "10", "--candidates", "30"]) == 0
+    robot = load_robot("hexapod-42")
+    sheet = [row for row in rows_of(here / "plan" / "plan.csv") if row["use"] != "via"]
+    data = rows_of(here / "plan" / "measurements.csv")
+    assert [row["pose"] for row in sheet] == [row["pose"] for row in data]
+    assert [row["use"] for row in sheet] == [row["use"] for row in data]
+    assert [row["use"] for row in data].count("held-out") == 2
+    assert all(row["x [mm]"] == "" for row in data)
+    headers = [f"{name} [{unit}]" for name, unit in zip(robot.controlled, ["mm"] * 3 + ["deg"] * 3, strict=True)]
+    x = np.array([[float(row[header]) for header in headers] for row in sheet]) * np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
+    q = np.array([[float(row[f"q{i} [mm]"]) for i in range(1, 7)] for row in data]) * 1e-3
+    np.testing.assert_allclose(inverse(robot, x).q, q, atol=2e-9)  # [m], readings are written to a nanometre
+
+
+def test_planes_and_lines_are_planned_held_filled_in_and_calibrated(here, capsys):
+    ask = "plan hexapod-nategh-agheli -o plan --measure plane-line --groups 9 --points 6 --sigma-position 1um"
+    assert run(ask) == 0
+    assert "33 parameter combinations can be told" in capsys.readouterr().out
+    sheet = rows_of(here / "plan" / "plan.csv")
+    assert [row["role"] for row in sheet[:6]] == ["p0", "p1", "plane", "plane", "plane", "plane"]
+    assert {row["tolerance [mm]"] for row in sheet} == {"0.001"}
+    assert all(len(row["hold"].split()) == {"p0": 3, "p1": 2, "plane": 1}[row["role"]] for row in sheet)
+    assert run("calibrate hexapod-nategh-agheli plan/measurements.csv -o run") == 1
+    assert "empty" in capsys.readouterr().err
+    # the true machine is moved until its point agrees with what the sheet says to hold: its readings are the data
+    robot = load_robot("hexapod-nategh-agheli")
+    truth = robot.with_values(sample_truth(robot, 1, 3)[0])
+    commanded = [pose["commanded"] for pose in json.loads((here / "plan" / "plan.json").read_text())["poses"]]
+    q = inverse(truth, np.array([list(pose.values()) for pose in commanded])).q * 1e3
+    by_pose = {row["pose"]: [f"{value:.12g}" for value in values] for row, values in zip(sheet, q, strict=True)}
+    lines = (here / "plan" / "measurements.csv").read_text().splitlines()
+    filled = [",".join([*(c := line.split(","))[:3], *by_pose[c[0]], *c[9:]]) if line[0].isdigit() else line for line in lines]
+    (here / "filled.csv").write_text("\n".join(filled) + "\n")
+    assert load_measurements("filled.csv", robot).n_poses == 54
+    assert run("calibrate hexapod-nategh-agheli filled.csv -o run") == 0
+    # of these data nine motions of frames are unknown, but none of them changes a distance between places of the tool
+    q = sample(robot, 20, seed=4).solution.q
+    places = [forward(one, q).T[:, :3, 3] for one in (truth, robot, load_robot("run/robot.yaml"))]
+    true, before, after = (np.linalg.norm(x[:, None] - x[None], axis=2) for x in places)
+    assert np.abs(before - true).max() > 1e-4  # [m]
+    assert np.abs(after - true).max() < 1e-6  # [m], a thousandth of a millimetre without noise
+
+
+def test_json_is_one_document_with_the_names_of_the_plan(here, capsys):
+    assert main(["plan", "linear-delta", "-o", "plan", *SMALL, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["n_poses"] == 8
+    assert document["criterion"] == "I"
+    assert 0.5 < document["efficiency"] <= 1.0
+    assert document["expected"]["after"]["position"] < document["expected"]["before"]["position"]
+    written = json.loads((here / "plan" / "plan.json").read_text())
+    assert document.items() <= written.items()
+
+
+def test_an_earlier_data_file_describes_the_instrument_and_counts_as_measured(here, capsys):
+    assert run("simulate linear-delta --draw 12 --kind position --sigma-position 3um -o before.csv") == 0
+    assert run("plan linear-delta -o plan --poses 3 --candidates 40 --like before.csv --measured before.csv") == 0
+    assert "noise: {x: 3 um, y: 3 um, z: 3 um}" in (here / "plan" / "measurements.csv").read_text()
+    assert run("plan linear-delta -o other --poses 3 --like before.csv --kind pose") == 1
+    assert "leave out --kind" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--poses 2 --kind component --components z", "plan at least 9 poses"),
+        ("--poses 10 --accuracy 20um", "both --poses and --accuracy"),
+        ("--accuracy 20", "unit"),
+        ("--accuracy 1nm --kind position --candidates 30", "out of reach"),
+        ("--kind posse", "did you mean 'pose'"),
+        ("--groups 3", "belong to --measure plane-line"),
+        ("--measure plane-line --poses 10", "--poses does not go with --measure plane-line"),
+        ("--measure plane-line --points 3", "give at least 4"),
+        ("--measure plane-line --groups 1 --points 4", "plan at least"),
+        ("--min-margin 2", "share of the median"),
+        ("--max-tilt -3deg", "angle above 0"),
+        ("--seen-from 1m,2m", "give three numbers"),
+        ("--cone 20deg", "--seen-from"),
+        ("--seen-from 0m,0m,-5m --cone 10deg --candidates 30", "leave nothing of the workspace"),
+        ("--like nothing.csv", "there is no such"),
+    ],
+)
+def test_demands_that_cannot_be_met_are_refused_in_one_sentence_and_nothing_is_written(here, capsys, words, said):
+    assert run(f"plan linear-delta -o plan {words}") == 1
+    captured = capsys.readouterr()
+    assert said in captured.err
+    assert captured.err.count("\n") == 1
+    assert captured.out == ""
+    assert not (here / "plan").exists()
+
+
+def test_a_plan_is_not_replaced_without_force_and_nothing_else_ever(here, capsys):
+    assert main(["plan", "linear-delta", "-o", "plan", *SMALL]) == 0
+    assert main(["plan", "linear-delta", "-o", "plan", *SMALL]) == 1
+    assert "--force" in capsys.readouterr().err
+    assert main(["plan", "linear-delta", "-o", "plan", *SMALL, "--force"]) == 0
+    (here / "mine").mkdir()
+    (here / "mine" / "thesis.txt").write_text("x")
+    assert main(["plan", "linear-delta", "-o", "mine", *SMALL, "--force"]) == 1
+    assert "something other than a plan" in capsys.readouterr().err
+
+
+def test_the_column_use_is_checked_and_not_overruled(here, capsys):
+    assert main(["plan", "linear-delta", "-o", "plan", *SMALL]) == 0
+    assert run("simulate linear-delta --fill plan/measurements.csv -o filled.csv") == 0
+    assert run("calibrate linear-delta filled.csv -o run --hold-out 0.25") == 1
+    assert "leave out --hold-out" in capsys.readouterr().err
+    text = (here / "filled.csv").read_text()
+    (here / "wrong.csv").write_text(text.replace(",held-out,", ",perhaps,", 1))
+    assert run("calibrate linear-delta wrong.csv -o run") == 1
+    assert "'perhaps'; write fit or held-out" in capsys.readouterr().err
+    (here / "all.csv").write_text(text.replace(",fit,", ",held-out,"))
+    assert run("calibrate linear-delta all.csv -o run") == 1
+    assert "leave some to fit" in capsys.readouterr().err
