@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""docs/planning.md: a new user gets from a robot file to a compensated machine by its commands alone."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal.cli import main
+from loopcal.io import load_robot
+
+
+@pytest.fixture
+def page(root, tmp_path, monkeypatch) -> str:
+    """Work in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return (root / "docs" / "planning.md").read_text("utf-8")
+
+
+def test_every_command_of_the_page_works_as_it_stands_and_the_machine_becomes_known(page, capsys) -> None:
+    commands = [
+        line for block in re.findall(r"^```sh\n(.*?)^```", page, re.MULTILINE | re.DOTALL) for line in block.splitlines()
+    ]
+    assert len(commands) == 8
+    printed = re.search(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    targets = re.search(r"^```csv\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    assert printed
+    assert targets
+    Path("targets.csv").write_text(targets[1])
+    for command in commands:
+        if "plane-line" in command:  # tests/cli/test_plan.py
+            continue
+        assert command.startswith("loopcal ")
+        assert main(command.split()[1:]) == 0, capsys.readouterr().err
+        said = capsys.readouterr().out
+        if "-o plan " in command:
+            assert said.startswith(printed[1])
+        if " calibrate " in command:
+            assert "Errors on 4 unseen rows" in said
+        if "--accuracy" in command:
+            assert "poses reach an expected position error of 0.02 mm (rms)" in said
+    nominal, truth, found = (load_robot(name).values for name in ("printer.yaml", "truth.yaml", "run/robot.yaml"))
+    assert np.linalg.norm(found - truth) < 0.3 * np.linalg.norm(nominal - truth)
+
+
+def test_the_python_of_the_page_runs(page, capsys) -> None:
+    block = re.search(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    assert block
+    assert main(["new", "linear-delta", "-o", "printer.yaml"]) == 0
+    names: dict = {}
+    exec(block[1], names)  # noqa: S102  (our own page)
+    assert names["plan"].n_poses == 12
+    assert "12 poses of printer to measure (component) and 3 to judge by" in capsys.readouterr().out
