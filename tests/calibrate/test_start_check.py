@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from loopcal.calibrate import Start, identify, start_check
+from loopcal.calibrate import Huber, Start, Tukey, identify, start_check
 from tests import zoo
 from tests.calibrate.problems import hexapod, hexapod_data
 
@@ -30,3 +30,14 @@ def test_a_nominal_start_is_not_calibrated(noise) -> None:
 def test_the_fit_itself_is_the_best_start() -> None:
     first = identify(hexapod(), hexapod_data())
     assert start_check(identify(first.robot, hexapod_data())).verdict is Start.BEST
+
+
+@pytest.mark.parametrize("loss", [Huber(), Tukey()])
+def test_a_loss_does_not_make_the_nominal_start_look_calibrated(loss) -> None:
+    """Reweighting begins at its own last estimate, which is not the start that was given."""
+    fit = identify(hexapod(), hexapod_data(), loss=loss)
+    assert start_check(fit).verdict is Start.NOT_CALIBRATED
+    assert len(fit.cost_history) == fit.iterations + 1
+    np.testing.assert_array_equal(fit.estimate_history[0], hexapod().values[hexapod().parameters.free])
+    best = identify(fit.robot, hexapod_data(), loss=loss)
+    assert start_check(best).verdict is Start.BEST

@@ -8,7 +8,7 @@ and covariance is used as it is. Blocks are what `Measurements.block` says belon
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,7 +30,8 @@ class RobustFit:
 
     Attributes
     ----------
-    fit : Descent over the weighted rows. rows : these rows. weight : (n,) of each pose, equal within a block.
+    fit : Descent over the weighted rows; before its own, its history has one step from the start. rows : these rows.
+    weight : (n,) of each pose, equal within a block.
     """
 
     fit: Descent
@@ -58,7 +59,23 @@ def descend_robustly(
     found = RobustFit(run(rows, start), rows, np.ones(len(block)))
     if isinstance(loss, Tukey):
         found = _settle(rows, member, Huber(), found, estimate_scale, run, 100.0 * SETTLED)
-    return _settle(rows, member, loss, found, estimate_scale, run, SETTLED)
+    return _from_start(_settle(rows, member, loss, found, estimate_scale, run, SETTLED), rows, start)
+
+
+def _from_start(found: RobustFit, rows: AnyRows, start: FloatArray) -> RobustFit:
+    """Let the history begin at the start, at the weights that stand: descents since the first began at each other's ends."""
+    if found.rows is rows:
+        return found
+    every, fit = np.arange(len(start)), found.fit
+    first = found.rows.fold(start, every)[1]
+    found.rows.fold(fit.deviation, every)  # what rows remember of poses and frames is that of the fit again
+    fit = replace(
+        fit,
+        iterations=fit.iterations + 1,
+        deviation_history=np.concatenate([start[None], fit.deviation_history]),
+        cost_history=np.concatenate([first[None], fit.cost_history]),
+    )
+    return replace(found, fit=fit)
 
 
 def _settle(
