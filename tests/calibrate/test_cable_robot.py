@@ -225,6 +225,27 @@ def test_without_a_known_pose_seven_directions_are_the_frame_and_the_scale(print
     assert len(found.unidentifiable) == 7
 
 
+def test_known_positions_at_the_edge_are_worth_more_than_high_ones(printer, fit):
+    """Predicted: three of the unknown poses measured where the fit puts them, in half of a 95 % interval [mm]."""
+    data = printer[1]
+    (seen,) = data.observations
+    assert fit.latent is not None
+    at = fit.latent.poses[:, :3, 3]
+
+    def half_of(further: np.ndarray) -> np.ndarray:
+        cells = np.full((44, 3), np.nan)
+        cells[:9], cells[further] = seen.measured, at[further]
+        told = Observations.from_sigma(seen.kind, np.arange(44), cells, SIGMA * 1e-3)
+        again = identify(fit.robot, replace(data, observations=(told,)), LeastSquares())
+        return 1.96e3 * again.sd[[NAMES.index(n) for n in ("A.anchor.y", "B.anchor.x", "C.anchor.x", "D.anchor.z")]]
+
+    outermost = 9 + np.argsort(-np.linalg.norm(at[9:, :2], axis=1))[:3]
+    highest = 9 + np.argsort(-at[9:, 2])[:3]
+    np.testing.assert_allclose(half_of(outermost), [15.3, 15.4, 15.5, 14.6], rtol=0.02)
+    assert (half_of(outermost) < half_of(highest)).all()
+    np.testing.assert_allclose(half_of(np.arange(9, 44)), [9.5, 9.4, 8.8, 10.9], rtol=0.02)
+
+
 def test_the_examples_truth_lies_in_its_intervals(tmp_path, root):
     found = json.loads((root / "examples" / "cable-robot" / "samples.json").read_text("utf-8"))
     robot, data = machine(tmp_path, found, 0.5)
