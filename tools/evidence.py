@@ -23,6 +23,10 @@ ROOT = Path(__file__).resolve().parent.parent
 BLOCK = re.compile(r"(<!-- evidence: (?P<name>[\w-]+)\.(?P<table>[\w-]+) -->\n)(?P<body>.*?)(<!-- end -->)", re.DOTALL)
 
 
+class EvidenceError(Exception):
+    """A page that asks for evidence which is not there."""
+
+
 def collect(script: Path) -> dict[str, Any]:
     """Run the `collect` function of one evidence script."""
     spec = importlib.util.spec_from_file_location(f"evidence_{script.stem}", script)
@@ -84,11 +88,19 @@ def render_table(table: dict[str, Any]) -> str:
 
 
 def fill_tables(text: str, folder: Path) -> str:
-    """Return a page with each of its evidence blocks made anew from the JSON files in `folder`."""
+    """Return a page with each of its evidence blocks made anew from the JSON files in `folder`.
+
+    EvidenceError where a block names a file or a table that is not there.
+    """
 
     def fill(match: re.Match[str]) -> str:
-        document = json.loads((folder / f"{match['name']}.json").read_text(encoding="utf-8"))
-        return match[1] + render_table(document["tables"][match["table"]]) + match[5]
+        path = folder / f"{match['name']}.json"
+        if not path.exists():
+            raise EvidenceError(f"there is no {path}; run `python -m tools.evidence {match['name']}` to make it")
+        tables = json.loads(path.read_text(encoding="utf-8"))["tables"]
+        if match["table"] not in tables:
+            raise EvidenceError(f"{path} has no table {match['table']!r}; there are {', '.join(tables) or 'none'}")
+        return match[1] + render_table(tables[match["table"]]) + match[5]
 
     return BLOCK.sub(fill, text)
 
@@ -100,23 +112,35 @@ def find_pages(root: Path) -> list[Path]:
 
 def find_outdated(root: Path) -> dict[Path, str]:
     """Return the pages whose tables differ from the JSON files, with the text they should have."""
-    pages = {page: page.read_text(encoding="utf-8") for page in find_pages(root)}
-    filled = {page: fill_tables(text, root / "docs" / "evidence") for page, text in pages.items()}
-    return {page: text for page, text in filled.items() if text != pages[page]}
+    outdated = {}
+    for page in find_pages(root):
+        text = page.read_text(encoding="utf-8")
+        try:
+            filled = fill_tables(text, root / "docs" / "evidence")
+        except EvidenceError as error:
+            raise EvidenceError(f"{page.relative_to(root)}: {error}") from error
+        if filled != text:
+            outdated[page] = filled
+    return outdated
 
 
-def main() -> int:
-    """Run the scripts, then write the tables."""
+def main(arguments: list[str] | None = None) -> int:
+    """Run the scripts, then write the tables; 1 where a page asks for evidence that is not there."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", help="evidence/NAME.py scripts to run; all without")
     parser.add_argument("--tables", action="store_true", help="run no script")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
 
     scripts = [ROOT / "evidence" / f"{name}.py" for name in options.names] or sorted((ROOT / "evidence").glob("*.py"))
     start = time.perf_counter()
     if not options.tables:
         run_all(scripts)
-    for page, text in find_outdated(ROOT).items():
+    try:
+        outdated = find_outdated(ROOT)
+    except EvidenceError as error:
+        print(f"evidence: {error}", file=sys.stderr)
+        return 1
+    for page, text in outdated.items():
         page.write_text(text, encoding="utf-8")
         print(f"evidence: wrote the tables of {page.relative_to(ROOT)}")
     print(f"evidence: {time.perf_counter() - start:.1f} s in total")

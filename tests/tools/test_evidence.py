@@ -23,6 +23,26 @@ def test_a_block_is_made_anew_and_the_text_around_it_kept(tmp_path: Path) -> Non
     assert evidence.fill_tables(filled, tmp_path) == filled
 
 
+@pytest.mark.parametrize(
+    ("block", "sentence"),
+    [
+        ("recover.steps", "docs/page.md: there is no {folder}/recover.json; run `python -m tools.evidence recover` to make it"),
+        ("recovery.step", "docs/page.md: {folder}/recovery.json has no table 'step'; there are steps"),
+    ],
+)
+def test_a_page_that_asks_for_evidence_that_is_not_there_is_named_in_one_sentence(
+    block: str, sentence: str, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    folder, page = tmp_path / "docs" / "evidence", tmp_path / "docs" / "page.md"
+    evidence.write_json(folder / "recovery.json", {"tables": {"steps": TABLE}})
+    (tmp_path / "README.md").write_text("nothing\n")
+    page.write_text(f"<!-- evidence: {block} -->\n<!-- end -->\n")
+    monkeypatch.setattr(evidence, "ROOT", tmp_path)
+    assert evidence.main(["--tables"]) == 1
+    assert capsys.readouterr().err == f"evidence: {sentence.format(folder=folder)}\n"
+    assert page.read_text() == f"<!-- evidence: {block} -->\n<!-- end -->\n"
+
+
 def test_not_a_number_is_refused_and_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     evidence.write_json(path, {"value": 1})
