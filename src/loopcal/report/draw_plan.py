@@ -66,7 +66,7 @@ def draw_curve(robot: Mechanism, curve: PoseCurve) -> Figure:
         axis.set_minor_formatter(NullFormatter())
     axes.set_xticks(curve.poses, [str(n) for n in curve.poses])
     ticks = np.geomspace(min(curve.bounds.min(), curve.goal or np.inf), curve.values.max(), 5) / shown.factor_to_si
-    axes.set_yticks(ticks, [f"{tick:.2g}" for tick in ticks])
+    axes.set_yticks(ticks, [f"{tick:.3g}" for tick in ticks])
     axes.set_xlabel("poses to fit [1]")
     words = "pose error, turns times size" if curve.target == "pose" else f"{curve.target} error"
     axes.set_ylabel(f"expected {words} (rms) [{shown.symbol}]")

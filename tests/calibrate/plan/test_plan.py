@@ -132,10 +132,14 @@ def test_poses_measured_already_are_taken_into_account(tracker, found):
 def test_how_many_poses_reach_a_goal_and_below_how_many_none_can(tracker):
     needed = poses_needed(tracker, 6 * UM, "position")
     assert needed.at_least is not None
-    assert needed.values[-1] <= 6 * UM
-    assert needed.at_least <= needed.poses[-1] <= 1.2 * needed.at_least
+    assert needed.enough is not None
+    assert needed.values[needed.poses == needed.enough] <= 6 * UM
+    assert needed.at_least <= needed.enough <= 1.2 * needed.at_least
     assert (needed.bounds <= needed.values * (1 + 1e-9)).all()
     assert (np.diff(needed.values) < 0.0).all()
+    plan = planned_for(tracker, 6 * UM, "position", hold_out=20)
+    assert plan.expected.position <= 6 * UM
+    assert plan.n_poses < 1.3 * needed.at_least
     with pytest.raises(EstimationError, match=r"out of reach: \d+ poses leave .* mm, and no choice .*better instrument"):
         planned_for(tracker, 0.05 * UM, "position")
 

@@ -6,7 +6,7 @@ The relaxed design bounds what any choice of so many poses can reach, and so say
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,8 @@ class PoseCurve:
     ----------
     poses : (k,) numbers, ascending. expected : of a good design of each. target : which error was made small.
     values, bounds : (k,) that error [m, rad], and the smallest that any choice of so many of the candidates can have.
-    goal : asked for [m, rad], or None. at_least : poses without which the goal cannot be reached.
+    goal : asked for [m, rad], or None. enough : of the numbers the fewest found that reach it. at_least : poses without
+        which it cannot be reached.
     """
 
     poses: IntArray
@@ -47,13 +48,14 @@ class PoseCurve:
     values: FloatArray
     bounds: FloatArray
     goal: float | None = None
+    enough: int | None = None
     at_least: int | None = None
 
     def sentences(self, robot: Mechanism) -> list[str]:
         """Say what the curve shows."""
         if self.goal is not None:
             goal = in_unit(robot, self.goal, DIMENSION[self.target])
-            reached = f"{self.poses[-1]} poses reach an expected {self.target} error of {goal} (rms)"
+            reached = f"{self.enough} poses reach an expected {self.target} error of {goal} (rms)"
             return [f"{reached}; no choice of fewer than {self.at_least} of the candidates can"]
         pairs = zip(self.poses.tolist(), self.expected, strict=True)
         return [f"expected errors by number of poses: {'; '.join(f'{n}: {in_words(robot, e)}' for n, e in pairs)}"]
@@ -68,6 +70,7 @@ class PoseCurve:
             "values": self.values.tolist(),
             "bounds": self.bounds.tolist(),
             "goal": self.goal,
+            "enough": self.enough,
             "at_least": self.at_least,
         }
 
@@ -83,7 +86,7 @@ def pose_curve(made: Problem, n_poses: int, target: Target = "pose", seed: int =
 
 
 def poses_needed(made: Problem, goal: float, target: Target, seed: int = 1) -> PoseCurve:
-    """Return the way to the fewest poses found that reach a goal; its last number is that of these poses.
+    """Return the fewest poses found that reach a goal, on a curve of expected errors from fewer to twice as many.
 
     Parameters
     ----------
@@ -109,14 +112,16 @@ def poses_needed(made: Problem, goal: float, target: Target, seed: int = 1) -> P
             f"{in_unit(robot, float(np.sqrt(best.values[0])), dimension)}, and no choice of so many less than "
             f"{in_unit(robot, float(np.sqrt(best.bounds[0])), dimension)}; take a better instrument, or ask for less"
         ) from None
-    if found.n < made.fewest:
-        one = design_curve(rows, [made.fewest], wanted, made.start, seed, SHAKES)
-        return _curve(made, one, target, goal, found.at_least)
-    keep = found.curve.numbers <= found.n
-    cut = Curve(
-        found.curve.numbers[keep], found.curve.values[keep], found.curve.bounds[keep], found.curve.designs[: int(keep.sum())]
-    )
-    return _curve(made, cut, target, goal, found.at_least)
+    n = max(found.n, made.fewest)
+    others = np.geomspace(made.fewest, min(2 * n, int(allowed(rows).sum())), SIZES - 1).round().astype(int)
+    numbers = np.unique(np.append(others, n)).tolist()
+    curve = design_curve(rows, numbers, wanted, made.start, seed, SHAKES)
+    if n == found.n:  # the design that was found for it, where the curve's own is less good
+        place = numbers.index(n)
+        designs = (*curve.designs[:place], found.certified, *curve.designs[place + 1 :])
+        values = np.where(curve.numbers == n, np.minimum(curve.values, found.certified.design.value), curve.values)
+        curve = replace(curve, designs=designs, values=values)
+    return _curve(made, curve, target, goal, n, found.at_least)
 
 
 def in_unit(robot: Mechanism, value: float, dimension: Dimension) -> str:
@@ -131,11 +136,19 @@ def in_words(robot: Mechanism, errors: Accuracy) -> str:
     return ", ".join(in_unit(robot, value, dimension) for value, dimension in pairs if value > 0.0) or "nothing"
 
 
-def _curve(made: Problem, found: Curve, target: Target, goal: float | None = None, at_least: int | None = None) -> PoseCurve:
+def _curve(
+    made: Problem,
+    found: Curve,
+    target: Target,
+    goal: float | None = None,
+    enough_: int | None = None,
+    at_least: int | None = None,
+) -> PoseCurve:
     """Return a curve in poses and errors."""
     k = made.poses_in_unit
     expected = [made.accuracy(one.design.chosen) for one in found.designs]
     assert all(e is not None for e in expected)  # no design leaves a direction open
     known = tuple(e for e in expected if e is not None)
     values, bounds = np.sqrt(found.values), np.sqrt(np.maximum(found.bounds, 0.0))
-    return PoseCurve(found.numbers * k, known, target, values, bounds, goal, None if at_least is None else at_least * k)
+    counts = [None if units is None else units * k for units in (enough_, at_least)]
+    return PoseCurve(found.numbers * k, known, target, values, bounds, goal, *counts)

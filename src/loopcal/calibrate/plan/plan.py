@@ -32,6 +32,8 @@ DRAWS = 20
 """Sets of evenly drawn poses that a plan is compared with."""
 DECIMALS = 6
 """Of readings: a nanometre in millimetres, less than two hundredths of a microradian in degrees."""
+MORE = 12
+"""Times that poses are added where those found do not reach a goal when some are held out."""
 HELD_OUT = 4
 """One pose is held out for so many that are fitted, where nothing else is asked for."""
 
@@ -75,14 +77,6 @@ def plan(
         Fewer equations than unknowns, an unknown criterion, or a number that cannot be.
     MechanismError
         The constraints leave nothing of the workspace.
-
-    Examples
-    --------
-    >>> import loopcal as lc
-    >>> robot = lc.load_robot("hexapod-42")
-    >>> tracker = lc.Instrument((lc.Sensor(lc.Pose(), lc.Gaussian([5e-6] * 3 + [1e-6] * 3)),))
-    >>> lc.plan(robot, tracker, n_poses=12, hold_out=4, candidates=100).n_poses
-    12
     """
     given = None if poses is None else np.atleast_2d(np.asarray(poses, dtype=float))
     made = problem(robot, instrument, constraints, given, measured, candidates, seed)
@@ -104,8 +98,18 @@ def planned_for(
         No number of poses reaches it; or as `plan`.
     """
     needed = poses_needed(made, goal, target, seed)
-    planned_ = planned(made, int(needed.poses[-1]), criterion, hold_out=hold_out, target=target, seed=seed)
-    return replace(planned_, curve=needed)
+    assert needed.enough is not None  # a goal was given
+    n = needed.enough
+    # poses to judge by are taken from the candidates, and D is not what the goal counts: both can cost some more poses
+    for _ in range(MORE):
+        found = planned(made, n, criterion, hold_out=hold_out, target=target, seed=seed)
+        if found.expected.of(target, made.wanted.size) <= goal:
+            return replace(found, curve=replace(needed, enough=n))
+        n += max(n // 20, 1) * made.poses_in_unit
+    raise EstimationError(
+        f"{n} poses chosen by criterion {criterion} do not reach the error that {needed.enough} could; hold out fewer, or use "
+        "criterion I"
+    )
 
 
 def planned(

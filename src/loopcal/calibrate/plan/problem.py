@@ -39,6 +39,12 @@ class Accuracy:
     position: float
     orientation: float
 
+    def of(self, target: Target, size: float) -> float:
+        """Return the error of a target [m, rad]; of a pose with turns times the robot's size [m]."""
+        if target == "pose":
+            return float(np.hypot(self.position, size * self.orientation))
+        return self.position if target == "position" else self.orientation
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
