@@ -16,6 +16,7 @@ import pytest
 from loopcal.calibrate import Identification, LeastSquares, identifiability, identify
 from loopcal.calibrate.examine import examine
 from loopcal.calibrate.reading_errors import reading_errors
+from loopcal.calibrate.remedies import remedies
 from loopcal.io.formats import hangprinter
 from loopcal.io.formats.exchange import Imported, Reading
 from loopcal.io.formats.transfer import checked
@@ -223,6 +224,14 @@ def test_without_a_known_pose_seven_directions_are_the_frame_and_the_scale(print
     found = identifiability(fit.robot, replace(alone, observations=()))
     assert found.rank == 14
     assert len(found.unidentifiable) == 7
+    # the origin alone leaves three turns and the scale, and distances are what tells the scale
+    (seen,) = data.observations
+    origin = data.take(np.concatenate([[0], np.arange(9, 44)]))
+    found = identifiability(fit.robot, replace(origin, observations=(seen.take([0]),)))
+    assert found.rank == 17
+    told = {r.combination.names[0]: r.cures[0].words for r in remedies(found)}
+    assert len(told) == 4
+    assert told["spool.radius"].startswith("distances between two poses")
 
 
 def test_known_positions_at_the_edge_are_worth_more_than_high_ones(printer, fit):
