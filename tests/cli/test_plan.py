@@ -13,7 +13,7 @@ from loopcal.measure import sample_truth
 from loopcal.mechanism import forward, inverse
 from loopcal.mechanism.workspace import sample
 
-SMALL = ["--poses", "8", "--hold-out", "3", "--candidates", "40", "--kind", "position"]
+SMALL = ["--poses", "8", "--hold-out", "3", "--candidates", "24", "--kind", "position"]
 
 
 @pytest.fixture

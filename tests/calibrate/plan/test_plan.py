@@ -30,7 +30,7 @@ def looking(kind: str, sigma: float = 10 * UM, **settings) -> lc.Instrument:
 @pytest.fixture(scope="module")
 def tracker():
     """A hexapod to be seen by a laser tracker that measures whole poses."""
-    return problem(load_robot("hexapod-42"), looking("pose", 10 * UM), count=120, seed=1)
+    return problem(load_robot("hexapod-42"), looking("pose", 10 * UM), count=80, seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -112,8 +112,8 @@ def test_poses_to_judge_by_are_others_than_those_fitted_and_lie_inside(found, tr
 
 
 def test_a_plan_is_the_same_for_the_same_seed():
-    small = problem(load_robot("linear-delta"), looking("position"), count=40, seed=4)
-    one, other = (planned(small, 6, hold_out=2, seed=9) for _ in range(2))
+    small = problem(load_robot("linear-delta"), looking("position"), count=20, seed=4)
+    one, other = (planned(small, 4, hold_out=2, seed=9) for _ in range(2))
     np.testing.assert_array_equal(one.coordinates, other.coordinates)
     np.testing.assert_array_equal(one.held_out, other.held_out)
 
@@ -129,19 +129,20 @@ def test_poses_measured_already_are_taken_into_account(tracker, found):
     assert more.expected.position < more.before.position
 
 
-def test_how_many_poses_reach_a_goal_and_below_how_many_none_can(tracker):
-    needed = poses_needed(tracker, 6 * UM, "position")
+def test_how_many_poses_reach_a_goal_and_below_how_many_none_can():
+    made, goal = problem(load_robot("linear-delta"), looking("position", 20 * UM), count=60, seed=1), 15 * UM
+    needed = poses_needed(made, goal, "position")
     assert needed.at_least is not None
     assert needed.enough is not None
-    assert needed.values[needed.poses == needed.enough] <= 6 * UM
+    assert needed.values[needed.poses == needed.enough] <= goal
     assert needed.at_least <= needed.enough <= 1.2 * needed.at_least
     assert (needed.bounds <= needed.values * (1 + 1e-9)).all()
     assert (np.diff(needed.values) < 0.0).all()
-    plan = planned_for(tracker, 6 * UM, "position", hold_out=20)
-    assert plan.expected.position <= 6 * UM
-    assert plan.n_poses < 1.3 * needed.at_least
+    plan = planned_for(made, goal, "position", hold_out=10)
+    assert plan.expected.position <= goal
+    assert plan.n_poses < 1.5 * needed.at_least
     with pytest.raises(EstimationError, match=r"out of reach: \d+ poses leave .* mm, and no choice .*better instrument"):
-        planned_for(tracker, 0.05 * UM, "position")
+        planned_for(made, 0.05 * UM, "position")
 
 
 @pytest.mark.parametrize(
