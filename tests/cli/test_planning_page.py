@@ -18,6 +18,7 @@ def page(root, tmp_path, monkeypatch) -> str:
     return (root / "docs" / "planning.md").read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_every_command_of_the_page_works_as_it_stands_and_the_machine_becomes_known(page, capsys) -> None:
     commands = [
         line for block in re.findall(r"^```sh\n(.*?)^```", page, re.MULTILINE | re.DOTALL) for line in block.splitlines()

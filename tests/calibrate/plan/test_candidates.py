@@ -46,12 +46,13 @@ def test_what_is_refused_is_counted_by_its_reason(strict):
 
 
 @pytest.mark.parametrize("name", ["hexapod-42", "linear-delta"])
-def test_half_of_the_candidates_lie_at_the_boundary_of_the_workspace(name):
+def test_many_candidates_lie_at_the_boundary_of_the_workspace(name):
     found = candidates(load_robot(name), None, 60, seed=1)
     low, high = np.array(list(ranges(found.rules.robot).values())).T
     at_end = np.isclose(found.coordinates, low, atol=1e-6) | np.isclose(found.coordinates, high, atol=1e-6)  # [m, rad]
     edge = ~found.even
-    assert 24 <= edge.sum() <= 36
+    # of thirty that are drawn; corners drawn twice count once
+    assert 15 <= edge.sum() <= 30
     # not all: what cannot be reached there was drawn back
     assert at_end[edge].any(axis=1).mean() > 0.6
     assert ((found.coordinates >= low - 1e-9) & (found.coordinates <= high + 1e-9)).all()
