@@ -247,9 +247,11 @@ def _notes(made: Problem) -> tuple[str, ...]:
     if assumed is not None:
         notes.append(f"{assumed}; in a plan these are not taken as known")
     if made.wanted.frames:
+        one = len(made.wanted.frames) == 1
+        lies = f"frame {made.wanted.frames[0]} lies" if one else "frames base and platform lie"
         notes.append(
-            f"this instrument cannot tell how the {' and the '.join(made.wanted.frames)} frame lies as a whole; expected "
-            "errors are in the frame that the calibration defines"
+            f"this instrument cannot tell how the {lies} as a whole; expected errors are in the frame that the calibration "
+            "defines"
         )
     if rank < p:
         notes.append(

@@ -89,7 +89,11 @@ class Problem:
 
     def accuracy(self, chosen: np.ndarray) -> Accuracy | None:
         """Return the predicted errors after measuring units (n,), none at all allowed; None where nothing bounds them."""
-        factor = design_factor(self.units.rows[chosen], self.start, self.space)
+        if len(chosen):
+            factor = design_factor(self.units.rows[chosen], self.start, self.space)
+        else:  # no row of the start speaks of own unknowns and of the machine at once, see `start_of`
+            told = self.start.rows[:, self.start.own :] @ self.space.machine
+            factor = triangle(np.concatenate([told, np.zeros((told.shape[1], told.shape[1]))]))
         s = np.linalg.svd(factor, compute_uv=False)
         if not s[-1] > np.finfo(float).eps * len(s) * s[0]:
             return None
