@@ -1,105 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Starts for unknown frames, targets and surfaces are found from any orientation, without a guess."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from evidence.starts import AT_FULL_SIZE, DRAWS, KINDS, NOWHERE, draw_poses, measured_at, residuals, start
 from loopcal import se3
 from loopcal.errors import DataError
-from loopcal.measure import (
-    Autocollimation,
-    Bearing,
-    Component,
-    Direction,
-    Distance,
-    Inclination,
-    Line,
-    Measurements,
-    Observations,
-    Plane,
-    Pose,
-    Position,
-    Separation,
-    Sphere,
-    evaluate_all,
-    local_unknowns,
-    start_values,
-    whitened_rows,
-)
+from loopcal.measure import Direction, Distance, Measurements, Observations, Position, local_unknowns, start_values
 from loopcal.measure.closed_form import OCTAHEDRAL, trilateration
-from tests import zoo
 
 N = 30
-POINT = np.array([[0.03, -0.02, 0.05]])
-NOWHERE, NOWHERE_3 = np.zeros((1, 3)), np.zeros((3, 3))
-ONE = np.eye(4)
-FIVE = ("x", "y", "z", "phi", "theta")
-KINDS = {
-    "targets in a frame": Position(targets=("a", "b", "c"), places=NOWHERE_3, unknown=("frame", "targets")),
-    "a frame": Position(places=POINT, unknown=("frame",)),
-    "targets": Position(targets=("a", "b", "c"), places=NOWHERE_3, unknown=("targets",)),
-    "frame and tool of poses": Pose(unknown=("frame", "tool"), T_platform_tool=ONE),
-    "frame of poses": Pose(unknown=("frame",), T_platform_tool=ONE),
-    "frame of five coordinates": Component(FIVE, "tilt-torsion", unknown=("frame",), T_platform_tool=ONE),
-    "frame of a height and two tilts": Component(("z", "a", "b"), "euler-xyz", unknown=("frame",), T_platform_tool=ONE),
-    "point of distances": Distance(places=POINT, unknown=("anchor",)),
-    "point and zero of a wire": Distance(places=POINT, unknown=("anchor", "offset")),
-    "both ends of a wire": Distance(places=NOWHERE, unknown=("anchor", "targets")),
-    "theodolite": Bearing(places=POINT, unknown=("frame",)),
-    "theodolite and its target": Bearing(places=NOWHERE, unknown=("frame", "targets")),
-    "camera": Bearing(places=POINT, unknown=("frame",), form="camera"),
-    "frame and axis": Direction(unknown=("frame", "axis")),
-    "gravity and mounting": Inclination(unknown=("gravity", "mounting")),
-    "mirror": Autocollimation(unknown=("mirror",)),
-    "plane": Plane(places=POINT, unknown=("surface",)),
-    "line": Line(places=POINT, unknown=("surface",)),
-    "sphere": Sphere(places=POINT, unknown=("surface",)),
-    "point and zero of a ball-bar": Separation(places=NOWHERE, unknown=("targets", "offset")),
-}
-FAR = ("frame", "anchor", "sphere")
 
 
-def poses(rng, n=N):
-    return zoo.poses_of(rng.uniform(-1, 1, (n, 6)) * [0.1, 0.1, 0.1, 0.25, 0.25, 0.25] + [0, 0, 0.8, 0, 0, 0])
-
-
-def truth_of(local, rng):
-    """Values anywhere: rotations over the whole group, frames up to metres off, targets and surfaces by centimetres."""
-    values = local.values()
-    for i, name in enumerate(local.table.names):
-        owner, axis = name.rsplit(".", 1)
-        if axis in ("u", "v"):
-            values[i] = rng.uniform(-0.6, 0.6)
-        elif axis == "radius":
-            values[i] += rng.uniform(0.0, 0.02)
-        elif axis not in ("rx", "ry", "rz"):
-            reach = 2.0 if owner in FAR else 0.1
-            values[i] += rng.uniform(-reach, reach)
-    for owner in {name[:-3] for name in local.table.names if name.endswith(".rx")}:
-        quaternion = rng.normal(size=4)
-        turn = se3.log_so3(se3.quaternion_to_matrix(quaternion / np.linalg.norm(quaternion)))
-        for axis, value in zip(("rx", "ry", "rz"), turn, strict=True):
-            values[local.table.index(f"{owner}.{axis}")] = value
-    return values
-
-
-def measured_at(kind, T, rng):
-    """Noise-free rows at random true values, and these values."""
-    n, m = len(T), len(kind.noise_columns)
-    poses_seen = np.arange(n) if kind.links == 1 else np.stack([np.arange(n), (np.arange(n) + 1) % n], axis=1)
-    empty = Observations.from_sigma(kind, poses_seen, np.full((n, len(kind.columns)), np.nan), 1e-5)
-    data = Measurements("toy", np.zeros((n, 1)), (empty,))
-    local = local_unknowns(data.observations, data.labels)
-    truth = truth_of(local, rng)
-    seen = kind.measure(T[None, poses_seen], np.zeros((1, n, m)), local.of(0, truth[None]))
-    return replace(data, observations=(replace(empty, measured=seen[0]),)), local, truth
-
-
-def residuals(data, T, local, values):
-    return whitened_rows(evaluate_all(data, T[None], values[None], local), np.zeros((1, len(T), 6, 0)))[0, :, -1]
+def poses(rng):
+    return draw_poses(rng, N)
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -118,17 +37,26 @@ def test_every_unknown_is_found_without_a_guess(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["targets in a frame", "frame and tool of poses"])
-def test_starts_are_found_in_1000_of_1000_random_frames_with_a_machine_that_is_a_millimetre_off(name):
-    for seed in range(1000):
-        rng = np.random.default_rng(seed)
-        T = poses(rng, 12)
-        data, local, truth = measured_at(KINDS[name], T, rng)
-        believed = se3.exp_update(T, rng.normal(size=(12, 6)) * 1e-3)
-        found = start_values(data, believed, local)
-        turn, right = se3.exp_so3(found[:3]), se3.exp_so3(truth[:3])
-        # [rad] a millimetre over a tenth of a metre is 0.01
-        assert np.linalg.norm(se3.log_so3(turn @ right.T)) < 0.05, seed
-        assert np.sqrt(np.mean(residuals(data, believed, local, found) ** 2)) < 3e-3 / 1e-5, seed
+def test_starts_are_found_in_150_of_150_random_frames_with_a_machine_that_is_a_millimetre_off(name):
+    for seed in range(150):
+        one = start(name, seed)
+        assert one is not None
+        assert one.found, (seed, one)
+
+
+@pytest.mark.evidence
+def test_every_frame_is_found_at_full_size_and_of_others_no_more_than_one_in_200_is_missed(root):
+    path = root / "docs" / "evidence" / "starts.json"
+    if not path.exists():
+        pytest.skip("docs/evidence/starts.json is made by `make evidence`")
+    rows = json.loads(path.read_text())["tables"]["found"]["rows"]
+    assert [name for name, *_ in rows] == list(AT_FULL_SIZE)
+    for name, draws, found, _, turned in rows:
+        if turned is not None:
+            assert found == draws == DRAWS, name
+        else:  # a truth can be a length below zero, which nothing measures
+            assert draws > 0.7 * DRAWS, name
+            assert found >= 0.995 * draws, name
 
 
 def test_kinds_that_share_a_frame_start_it_together():
