@@ -19,14 +19,15 @@ from typing import Any
 import numpy as np
 
 from loopcal.calibrate.combinations import listed
-from loopcal.calibrate.read_as import ReadAs, quick_misfit, refined
+from loopcal.calibrate.read_as import MOST_LEFT_OUT, ReadAs, begun, quick_misfit, refined
 from loopcal.calibrate.scaling import Unknowns, unknowns
 from loopcal.errors import DataError
-from loopcal.linalg import FloatArray
+from loopcal.linalg import FloatArray, IntArray
 from loopcal.measure import Measurements, check_actuators, check_moved
 from loopcal.measure.checks import stays
 from loopcal.measure.hypotheses import Hypothesis, hypotheses, readings_hypotheses
 from loopcal.mechanism import Mechanism, forward
+from loopcal.mechanism.trials import plainly_reached
 from loopcal.units import DISPLAY_UNITS, Dimension, unit
 
 IMPLAUSIBLE = 10.0
@@ -42,6 +43,15 @@ ALLOWED = 4.0
 
 MOST, RUNS = 120, 4
 """Poses of large data sets by which other readings are judged, and runs of neighbours (rows may be one off) they come in."""
+
+FEW, SCREENED = 60, 20
+"""Rows, and at least poses, by which all other readings are compared before those that promise something are judged."""
+
+PROMISING, JUDGED = 2.0, 8
+"""Times that the misfit on these rows may exceed what counts as far better, and how many readings at most are judged."""
+
+NEAREST = 8
+"""Ways to read the readings that are judged where frames are unknown: those that leave least before parameters move."""
 
 EQUALLY = 1.2
 """Ratio of misfits up to which two conventions fit equally well; the first in the list is named, the others beside it."""
@@ -175,16 +185,27 @@ def _believed(data: Measurements) -> Measurements | None:
 def _thinned(data: Measurements) -> Measurements:
     """At most `MOST` poses, in runs of neighbours spread over the data; all where rows share more than their pose."""
     n = data.n_poses
-    shared = any(o.kind.links > 1 or bool((o.group != "").any()) for o in data.observations)
-    if n <= MOST or shared:
+    if n <= MOST or _shared(data):
         return data
     first = np.linspace(0, n - MOST // RUNS, RUNS).astype(np.intp)
     return data.take(np.unique(first[:, None] + np.arange(MOST // RUNS)))
 
 
+def _few(data: Measurements) -> IntArray:
+    """Poses spread over the data by which many readings are compared; all where rows share more than their pose."""
+    n = data.n_poses
+    equations = sum(o.whitener.shape[-1] * len(o) for o in data.observations)
+    count = max(SCREENED, -(-FEW * n // max(equations, 1)))
+    return np.arange(n) if n <= count or _shared(data) else np.unique(np.linspace(0, n - 1, count).astype(np.intp))
+
+
+def _shared(data: Measurements) -> bool:
+    return any(o.kind.links > 1 or bool((o.group != "").any()) for o in data.observations)
+
+
 def _best(free: Unknowns, stated: ReadAs, misfit: float) -> tuple[ReadAs | None, list[Hypothesis]]:
     """The way that fits far better than what is stated, if there is one, and others that fit as well."""
-    ranked = [(found, way) for way, found in _tried(free, stated) if found * BETTER < misfit]
+    ranked = [(found, way) for way, found in _tried(free, stated, misfit) if found * BETTER < misfit]
     ranked = [(found, way) for found, way in ranked if _tells(free, stated, way, found)]
     if not ranked:
         return None, []
@@ -197,37 +218,71 @@ def _best(free: Unknowns, stated: ReadAs, misfit: float) -> tuple[ReadAs | None,
     return (best, near[1:]) if best.found * BETTER < misfit else (None, [])
 
 
-def _tried(free: Unknowns, stated: ReadAs) -> list[tuple[Hypothesis, float]]:
-    """Hypotheses with their misfits, to first order, blunders left out; those that cannot be evaluated are not there.
+def _tried(free: Unknowns, stated: ReadAs, misfit: float) -> list[tuple[Hypothesis, float]]:
+    """Hypotheses that promise to fit far better with their misfits, to first order, blunders left out.
 
-    The readings are read otherwise only where no other way to read the measured values is allowed: each needs its own poses.
+    All are compared by few rows first. The readings are read otherwise only where no other way to read the measured values
+    is allowed: each needs its own poses.
     """
-    robot, found = free.robot, []
-    ways = tuple(hypotheses(stated.data)) if stated.enough else ()
-    if ways:
-        found += _misfits(free, stated.data, ways)
-    if any(value <= ALLOWED for _, value in found):
-        return found
-    names = tuple(a.name for a in robot.actuators)
-    for way in readings_hypotheses(stated.whole, names, tuple(a.dimension for a in robot.actuators)):
-        one = ReadAs(free, way.applied(stated.whole), hypothesis=way)
-        one.misfits()
-        one.leave_out()
-        found.append((way, one.misfit()))
+    found: list[tuple[Hypothesis, float]] = []
+    if stated.enough:
+        data = stated.data
+        few = data.take(_few(data))
+        chosen = _promising(_misfits(free, few, tuple(hypotheses(few)), quick=True), misfit)
+        ways = {way.words: way for way in hypotheses(data)}
+        found = _misfits(free, data, tuple(ways[words] for words in chosen if words in ways))
+    if not any(value <= ALLOWED for _, value in found):
+        found += _readings_tried(free, stated.whole, misfit)
     return [(way, value) for way, value in found if np.isfinite(value)]
 
 
-def _misfits(free: Unknowns, data: Measurements, ways: tuple[Hypothesis, ...]) -> list[tuple[Hypothesis, float]]:
+def _readings_tried(free: Unknowns, data: Measurements, misfit: float) -> list[tuple[Hypothesis, float]]:
+    """Hypotheses about the readings, as `_tried` gives them."""
+    robot, poses = free.robot, _few(data)
+    actuators = robot.actuators
+    ways = tuple(readings_hypotheses(data, tuple(a.name for a in actuators), tuple(a.dimension for a in actuators)))
+    every = np.stack([way.values[poses] for way in ways])
+    solved = plainly_reached(robot, robot.values[None], every.reshape(1, -1, every.shape[-1])).reshape(every.shape[:2])
+    near = np.flatnonzero(solved.mean(axis=1) >= 1.0 - MOST_LEFT_OUT)
+    begin, left = begun(free, data.take(poses), every[near], solved[near])
+    order = np.argsort(left)[:NEAREST] if len(data.unknowns) else np.arange(len(near))
+
+    def judged(way: Hypothesis, begin: FloatArray | None = None) -> float:
+        read, quick = way.applied(data), begin is not None
+        one = ReadAs(free, read.take(poses) if quick else read, hypothesis=way, quick=quick, begin=begin)
+        one.misfits()
+        one.leave_out()
+        return one.misfit()
+
+    found = [(ways[near[i]], judged(ways[near[i]], begin[i : i + 1])) for i in np.sort(order)]
+    chosen = _promising(found, misfit)
+    return [(way, judged(way)) for way, _ in found if way.words in chosen]
+
+
+def _promising(found: list[tuple[Hypothesis, float]], misfit: float) -> list[str]:
+    """Words of the best hypotheses, in the order given, that may fit far better than what is stated."""
+    bound = min(
+        PROMISING * misfit / BETTER, *sorted(value for _, value in found if np.isfinite(value))[JUDGED - 1 : JUDGED], np.inf
+    )
+    return [way.words for way, value in found if value <= bound]
+
+
+def _misfits(
+    free: Unknowns, data: Measurements, ways: tuple[Hypothesis, ...], *, quick: bool = False
+) -> list[tuple[Hypothesis, float]]:
     """Misfits of ways to read the values, all at once; where one cannot be evaluated, each half for itself."""
-    together = ReadAs(free, data, ways)
-    values = together.misfits()
-    if np.isnan(values).any() and len(ways) > 1:
-        middle = len(ways) // 2
-        return _misfits(free, data, ways[:middle]) + _misfits(free, data, ways[middle:])
-    if np.isnan(values).any():
+    if not ways:
         return []
-    together.leave_out()
-    return list(zip(ways, together.misfits().tolist(), strict=True))
+    together = ReadAs(free, data, ways, quick=quick)
+    values = together.misfits()
+    if together.failed and len(ways) > 1:
+        middle = len(ways) // 2
+        halves = (ways[:middle], ways[middle:])
+        return [one for half in halves for one in _misfits(free, data, half, quick=quick)]
+    if np.isfinite(values).all():
+        together.leave_out()
+        values = together.misfits()
+    return list(zip(ways, values.tolist(), strict=True))
 
 
 def _tells(free: Unknowns, stated: ReadAs, way: Hypothesis, found: float) -> bool:
@@ -272,7 +327,7 @@ def _size(way: ReadAs) -> str:
     """Root mean squares of the first way's residuals by dimension, in units of the robot's file, blunders left out."""
     square: dict[Dimension, list[FloatArray]] = {}
     way.misfits()
-    for s, r in zip(way.rows.sensed, way.rows.residuals(way.z[:1]), strict=True):
+    for s, r in zip(way.rows.sensed, way.residuals(), strict=True):
         there = np.einsum("rmm->rm", s.whitener[0]) != 0.0
         for j, column in enumerate(s.kind.noise_columns):
             square.setdefault(column.dimension, []).append(r.raw[0, there[:, j], j] ** 2)

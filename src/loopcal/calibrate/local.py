@@ -56,6 +56,7 @@ class Own:
     """Own unknowns of the rows of t machines: clusters, present values, and how these follow the machine.
 
     Rows and their reweighted copies share one of these: `solved` and the values belong to the last fold of any of them.
+    At most `steps` of Gauss-Newton, each halved `halvings` times at most, are taken where a fold begins.
 
     Parameters
     ----------
@@ -82,6 +83,7 @@ class Own:
         self.values = np.tile(local.values(), (trials, 1))
         self.start = local.values()
         self.started = np.zeros(trials, dtype=bool)
+        self.steps, self.halvings = STEPS, HALVINGS
         self.at = np.zeros((trials, parameters))
         self.slope = np.zeros((trials, len(local), parameters))
         self.cost = np.full(trials, np.inf)
@@ -157,13 +159,13 @@ class Own:
         """
         found = factors(values)
         cost = _squares(found)
-        for _ in range(STEPS):
+        for _ in range(self.steps):
             step, offset = self.step(found, len(values))
             far = offset > CLOSE**2 * cost + NOTHING**2
             if not far.any():
                 break
             share = far.astype(np.float64)
-            for _ in range(HALVINGS):
+            for _ in range(self.halvings):
                 found = factors(values + share[:, None] * step)
                 worse = (share > 0.0) & ~(_squares(found) <= cost)
                 if not worse.any():

@@ -22,6 +22,9 @@ OCTAHEDRAL.setflags(write=False)
 FLAT = 1e-6
 """Extent across over extent along [1] below which points lie in a plane or on a line."""
 
+SETTLED = 1e-6
+"""Change of the entries of a rotation [1] below which taking turns is over: a descent improves what it finds."""
+
 
 def linear(A: Array, b: Array) -> Array:
     """Least-squares solution of A x = b, the shortest one where it is not unique (relative rank tolerance 1e-9)."""
@@ -214,10 +217,12 @@ def directions(seen: Array, turns: Array, axis: Array | None) -> tuple[Array, Ar
     a = np.zeros((len(R), 3))
     # both steps see the rows through these 27 sums alone
     sums = np.einsum("rji,rl->ijl", turns, seen)
-    for _ in range(200):
+    for _ in range(100):
         a = np.einsum("ijl,kjl->ki", sums, R)
         a /= np.maximum(np.linalg.norm(a, axis=-1, keepdims=True), 1e-300)
-        R = nearest_rotation(np.einsum("jil,kj->kil", sums, a))
+        before, R = R, nearest_rotation(np.einsum("jil,kj->kil", sums, a))
+        if np.abs(R - before).max() < SETTLED:
+            break
     missed = np.linalg.norm(np.einsum("kij,rj->kri", R, seen) - np.einsum("rij,kj->kri", turns, a), axis=(1, 2))
     order = np.argsort(missed)
     return R[order][:6], a[order][:6]

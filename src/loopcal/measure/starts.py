@@ -6,12 +6,14 @@ by damped Gauss-Newton on the kind's own rows at fixed poses, the best one is ke
 rows together. Unknowns with a prior, and fixed ones, keep their nominal value to begin with.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from loopcal.errors import DataError
 from loopcal.measure.evaluate import evaluate_all, whitened_rows
+from loopcal.measure.kinds import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.measure.unknowns import LocalUnknowns
@@ -48,20 +50,56 @@ def start_values(
         If poses are too few or too much alike to tell where something is.
     """
     gathered = measurements.unknowns if local is None else local
-    values, free = gathered.values(), gathered.table.free
-    sought = free & np.isnan(gathered.table.tolerance)
-    if not free.any():
-        return values
-    known = ~sought
+    if not gathered.table.free.any():
+        return gathered.values()
+    values = starts_of(measurements, [o.measured[None] for o in measurements.observations], T[None], gathered)[0]
+    return _descended(measurements, T, gathered, values, joints)
+
+
+def starts_of(
+    measurements: Measurements,
+    measured: Sequence[Array],
+    T: Array,
+    local: LocalUnknowns,
+    *,
+    most: int | None = None,
+    steps: int = STEPS,
+) -> Array:
+    """Values of the local unknowns for several sets of measured values at once, kind by kind.
+
+    Parameters
+    ----------
+    measurements : whose rows these are.
+    measured : (t, r, c) of each kind.
+    T : (t | 1, n, 4, 4) T_base_platform.
+    local : see `start_values`.
+    most : candidates of each set that are improved, the best ones as they are offered; default all.
+    steps : of the descent.
+
+    Returns
+    -------
+    values : (t, U)
+
+    Raises
+    ------
+    DataError
+        See `start_values`; of several sets, one without candidates keeps the nominal values.
+    """
+    known = ~(local.table.free & np.isnan(local.table.tolerance))
+    values = np.tile(local.values(), (max((len(m) for m in measured), default=1), 1))
     for i, rows in enumerate(measurements.observations):
         if not rows.kind.unknowns or rows.kind.looks_at:
             continue
-        for members, places in _sharing(gathered.places[i]):
+        for members, places in _sharing(local.places[i]):
             if not known[places].all():
-                part = rows.take(members)
-                values[places] = _best(part, T, values[places], known[places])
+                counted = members[rows.weight[members] > 0.0]
+                if len(counted):
+                    part, fixed = rows.take(counted), known[places]
+                    values[:, places] = _best(
+                        part, measured[i][:, counted], T[:, part.rows], values[:, places], fixed, most, steps
+                    )
                 known[places] = True
-    return _descended(measurements, T, gathered, values, joints)
+    return values
 
 
 def _sharing(places: Ints) -> list[tuple[Ints, Ints]]:
@@ -70,26 +108,45 @@ def _sharing(places: Ints) -> list[tuple[Ints, Ints]]:
     return [(np.flatnonzero(member.ravel() == k), sets[k]) for k in range(len(sets))]
 
 
-def _best(rows: Observations, T: Array, values: Array, known: np.ndarray) -> Array:
-    """The best candidate (u,) for rows that share their unknowns; known ones keep their values."""
-    counted = rows.take(rows.weight > 0.0)
-    if not len(counted):
-        return values
-    poses = T[counted.rows]
-    candidates = counted.kind.starts(poses, counted.measured)
-    candidates = np.concatenate([candidates, counted.kind.nominal[None]])
-    candidates = np.where(known, values, candidates)
+def _best(
+    rows: Observations, measured: Array, poses: Array, values: Array, known: np.ndarray, most: int | None, steps: int
+) -> Array:
+    """The best candidates (t, u) for rows that share their unknowns; known ones keep their values (t, u)."""
+    kind, t = rows.kind, len(measured)
+    candidates = _candidates(kind, poses, measured)
+    k = candidates.shape[1]
+    candidates = np.where(known, values[:, None, :], candidates).reshape(t * k, -1)
 
-    def white(x: Array) -> tuple[Array, Array]:
-        found = counted.kind.evaluate(poses[None], counted.measured[None], x[:, None, :])
+    def white(x: Array, of: Ints) -> tuple[Array, Array]:
+        found = kind.evaluate(poses[of if len(poses) > 1 else [0]], measured[of if t > 1 else [0]], x[:, None, :])
         c, r, m = len(x), *found.residual.shape[1:]
         own = np.zeros((1, 1, 1, x.shape[1])) if found.own is None else found.own
-        J = counted.whitener @ np.broadcast_to(own, (c, r, m, x.shape[1]))
-        e = (counted.whitener @ np.broadcast_to(found.residual, (c, r, m))[..., None])[..., 0]
+        J = rows.whitener @ np.broadcast_to(own, (c, r, m, x.shape[1]))
+        e = (rows.whitener @ np.broadcast_to(found.residual, (c, r, m))[..., None])[..., 0]
         return e.reshape(c, -1), np.where(known, 0.0, J).reshape(c, r * m, -1)
 
-    found, cost = descended(white, candidates)
-    return found[int(np.argmin(cost))]
+    of = np.repeat(np.arange(t), k)
+    if most is not None and most < k:
+        cost = _squares(white(candidates, of)[0]).reshape(t, k)
+        chosen = (np.argsort(cost, axis=1)[:, :most] + k * np.arange(t)[:, None]).ravel()
+        candidates, of, k = candidates[chosen], of[chosen], most
+    found, cost = descended(lambda x: white(x, of), candidates, steps)
+    return found.reshape(t, k, -1)[np.arange(t), np.argmin(cost.reshape(t, k), axis=1)]
+
+
+def _candidates(kind: Kind, poses: Array, measured: Array) -> Array:
+    """What a kind offers for each set of measured values, the nominal values last, (t, k, u)."""
+    each = []
+    for j, one in enumerate(measured):
+        try:
+            offered = kind.starts(poses[j if len(poses) > 1 else 0], one)
+        except DataError:
+            if len(measured) == 1:
+                raise
+            offered = kind.nominal[None]
+        each.append(np.concatenate([offered, kind.nominal[None]]))
+    k = max(len(one) for one in each)
+    return np.stack([np.concatenate([one, np.repeat(one[-1:], k - len(one), axis=0)]) for one in each])
 
 
 def _descended(
@@ -108,13 +165,14 @@ def _descended(
     return descended(white, values[None])[0][0]
 
 
-def descended(white: Callable[[Array], tuple[Array, Array]], x: Array) -> tuple[Array, Array]:
+def descended(white: Callable[[Array], tuple[Array, Array]], x: Array, steps: int = STEPS) -> tuple[Array, Array]:
     """Least squares from several starts at once, by Gauss-Newton damped on scaled columns.
 
     Parameters
     ----------
     white : from (c, u) to residuals (c, M) and Jacobians (c, M, u)
     x : (c, u) starts
+    steps : at most
 
     Returns
     -------
@@ -123,7 +181,7 @@ def descended(white: Callable[[Array], tuple[Array, Array]], x: Array) -> tuple[
     e, J = white(x)
     cost = _squares(e)
     damping = np.full(len(x), 1e-4)
-    for _ in range(STEPS):
+    for _ in range(steps):
         norm = np.linalg.norm(J, axis=1)
         scale = np.where(norm > 0.0, norm, 1.0)
         # one triangular factor, so that the decomposition does not grow with the rows
