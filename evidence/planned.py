@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Planned against random poses: errors at unseen poses after calibration, and how many random poses do what planned ones do.
+
+Machines are drawn from their tolerances, measured with noise at planned poses and at poses drawn evenly from the workspace,
+calibrated by the default method, and judged at other poses of the workspace. A plan is made for the nominal machine, so
+that one serves all machines; every seed draws its own poses, and the first n of them are its set of n.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopcal import se3
+from loopcal.calibrate import identify_trials
+from loopcal.calibrate.plan.information import unit_rows
+from loopcal.calibrate.plan.plan import planned
+from loopcal.calibrate.plan.problem import Problem, Target, problem
+from loopcal.io import load_robot
+from loopcal.measure import Component, Gaussian, Instrument, Pose, Sensor, sample_truth, simulate_trials
+from loopcal.mechanism import Mechanism, sample
+from loopcal.mechanism.trials import forward_trials
+
+Array = NDArray[np.float64]
+
+SEED, SEEDS, MACHINES, UNSEEN, CANDIDATES = 31, 20, 5, 60, 1000
+"""Sets of random poses, machines measured at each set, poses that they are judged at, candidates of a plan."""
+
+PLANNED = (8, 12, 16, 24, 40)
+RANDOM = (*PLANNED, 80, 160)
+GLANCE = 16
+"""Number of planned poses of the short table."""
+
+SIGMA_LENGTH, SIGMA_ANGLE = 5e-6, 25e-6
+"""Noise, one standard deviation [m], [rad]."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A robot, what is measured of its pose, and the error that poses are planned to make small."""
+
+    robot: str
+    measured: str
+    target: Target
+
+
+CASES = (
+    Case("hexapod-42", "full pose", "pose"),
+    Case("hexapod-42", "position", "position"),
+    Case("3-prs", "full pose", "pose"),
+    Case("3-prs", "position", "position"),
+    Case("linear-delta", "position", "position"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Root mean square errors of s sets of poses.
+
+    Attributes
+    ----------
+    position [m], orientation [rad] : (s, m) of m machines each. expected : (s,) of the target, predicted by the plan's theory.
+    """
+
+    position: Array
+    orientation: Array
+    expected: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """A case made ready.
+
+    Attributes
+    ----------
+    made : the planning problem. drawn : the same with all random poses (seeds * most) as its units.
+    coordinates : (seeds, most, c) of these. truth : (seeds, m, p). unseen : (u, a) readings of the poses to judge at.
+    tool : (seeds, m, u, 4, 4) true poses of the tool there [m].
+    """
+
+    case: Case
+    made: Problem
+    drawn: Problem
+    coordinates: Array
+    truth: Array
+    unseen: Array
+    tool: Array
+
+    @property
+    def robot(self) -> Mechanism:
+        """The nominal machine."""
+        return self.made.free.robot
+
+    def wanted(self, position: Array | float, orientation: Array | float) -> Array:
+        """Return the error that poses are planned for [m]: turns count times the size of the robot."""
+        return np.hypot(position, self.robot.size * orientation if self.case.target == "pose" else 0.0)
+
+
+def prepare(
+    case: Case, seeds: int = SEEDS, machines: int = MACHINES, most: int = RANDOM[-1], candidates: int = CANDIDATES
+) -> Study:
+    """Draw machines and poses, and make the planning problem ready."""
+    robot = load_robot(case.robot)
+    made = problem(robot, instrument(case), count=candidates, seed=SEED)
+    pool, judged = sample(robot, seeds * most, SEED + 1), sample(robot, UNSEEN, SEED + 2)
+    rows = unit_rows(made.free, made.instrument, pool.solution.q, np.arange(seeds * most)[:, None])
+    truth, q = sample_truth(robot, seeds * machines, SEED), judged.solution.q
+    tool = forward_trials(robot, truth, q[None]).T @ robot.tool
+    sets = (seeds, machines)
+    coordinates = pool.coordinates.reshape(seeds, most, -1)
+    drawn = replace(made, units=rows)
+    return Study(case, made, drawn, coordinates, truth.reshape(*sets, -1), q, tool.reshape(*sets, UNSEEN, 4, 4))
+
+
+def instrument(case: Case) -> Instrument:
+    """Full poses or positions, in a known frame."""
+    if case.measured == "position":
+        return Instrument((Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, SIGMA_LENGTH))),))
+    return Instrument((Sensor(Pose(), Gaussian(np.array([SIGMA_ANGLE] * 3 + [SIGMA_LENGTH] * 3))),))
+
+
+def at_planned(study: Study, n: int) -> Errors:
+    """Errors of all machines, measured at the same n planned poses."""
+    found = planned(study.made, n, hold_out=0, target=study.case.target, seed=SEED)
+    seeds, machines, p = study.truth.shape
+    tool = study.tool.reshape(-1, *study.tool.shape[2:])
+    position, orientation = calibrated(study, found.coordinates, study.truth.reshape(-1, p), tool, SEED)
+    expected = np.full(seeds, float(study.wanted(found.expected.position, found.expected.orientation)))
+    shape = (seeds, machines)
+    return Errors(position.reshape(shape), orientation.reshape(shape), expected)
+
+
+def at_random(study: Study, n: int) -> Errors:
+    """Errors of the machines of each seed, measured at its own n random poses."""
+    seeds, most = study.coordinates.shape[:2]
+    sets = zip(study.coordinates, study.truth, study.tool, range(SEED + 1, SEED + 1 + seeds), strict=True)
+    found = [calibrated(study, poses[:n], truth, tool, seed) for poses, truth, tool, seed in sets]
+    position, orientation = np.stack(found, axis=1)
+    expected = [foreseen(study, study.drawn, np.arange(first, first + n)) for first in range(0, seeds * most, most)]
+    return Errors(position, orientation, np.array(expected))
+
+
+def among_candidates(study: Study, n: int) -> float:
+    """Median error predicted for as many sets of n candidates drawn at random, of which half lie at the boundary."""
+    rng, count = np.random.default_rng(SEED), len(study.made.candidates)
+    sets = [rng.choice(count, n, replace=False) for _ in study.coordinates]
+    return float(np.median([foreseen(study, study.made, chosen) for chosen in sets]))
+
+
+def foreseen(study: Study, made: Problem, chosen: NDArray[np.int64]) -> float:
+    """Return the error of the target that the plan's theory predicts for some units."""
+    found = made.accuracy(chosen)
+    assert found is not None, "tolerances bound every error"
+    return float(study.wanted(found.position, found.orientation))
+
+
+def calibrated(study: Study, poses: Array, truth: Array, tool: Array, seed: int) -> tuple[Array, Array]:
+    """Measure machines (t, p) at poses (n, c), calibrate, and return errors (t,) [m], [rad] of tool poses (t, u, 4, 4)."""
+    robot = study.robot
+    fit = identify_trials(robot, simulate_trials(robot, truth, poses, instrument(study.case), seed))
+    assert fit.converged.all(), "machines within their tolerances are always found"
+    gap = se3.difference(forward_trials(robot, fit.values, study.unseen[None]).T @ robot.tool, tool)
+    squares = (gap**2).reshape(*gap.shape[:2], 2, 3).sum(axis=3).mean(axis=1)
+    return np.sqrt(squares[:, 1]), np.sqrt(squares[:, 0])
+
+
+def matching(numbers: tuple[int, ...], errors: list[float], wanted: float) -> float | None:
+    """Return the number of poses with this error, on straight lines between logarithms; None outside of the numbers.
+
+    Parameters
+    ----------
+    errors : of each number of poses; a number that happens to be no better than a smaller one is left out.
+    """
+    best = np.minimum.accumulate(errors)
+    falling = np.append(True, best[1:] < best[:-1])
+    if not best[-1] <= wanted <= best[0]:
+        return None
+    return float(np.exp(np.interp(-np.log(wanted), -np.log(best[falling]), np.log(numbers)[falling])))
+
+
+def compare(study: Study, sizes: tuple[int, ...] = PLANNED, drawn: tuple[int, ...] = RANDOM) -> tuple[list, list]:
+    """Return rows of accuracy and rows of saving, one for each number of planned poses that gives enough equations."""
+    random = {n: at_random(study, n) for n in drawn}
+    case, accuracy, saving = study.case, [], []
+    error = {n: study.wanted(e.position, e.orientation) for n, e in random.items()}
+    medians = [float(np.median(error[n])) for n in drawn]
+    expected = [float(np.median(random[n].expected)) for n in drawn]
+    mixed = [among_candidates(study, n) for n in drawn]
+    for n in (n for n in sizes if n >= study.made.fewest):
+        plan = at_planned(study, n)
+        own, other = study.wanted(plan.position, plan.orientation), error[n]
+        better = int((_rms(own) < _rms(other)).sum())
+        turned = case.target == "pose"
+        pairs = [1e6 * float(np.median(e)) for e in (plan.position, random[n].position)]
+        turns = [1e6 * float(np.median(e)) if turned else None for e in (plan.orientation, random[n].orientation)]
+        accuracy.append([case.robot, case.measured, n, *pairs, *turns, better])
+        equal = matching(drawn, medians, float(np.median(own)))
+        theory = [matching(drawn, curve, float(plan.expected[0])) for curve in (expected, mixed)]
+        saved = None if equal is None else 100.0 * (1.0 - n / equal)
+        true = [float(_rms(own.ravel()) / _rms(plan.expected)), float(_rms(other.ravel()) / _rms(random[n].expected))]
+        saving.append([case.robot, case.measured, n, equal, saved, *theory, *true])
+    return accuracy, saving
+
+
+def at_a_glance(accuracy: list, saving: list) -> list:
+    """Return one row for each case at GLANCE poses: position errors, random poses as good, and the share saved."""
+    return [[*a[:5], *s[3:5]] for a, s in zip(accuracy, saving, strict=True) if a[2] == GLANCE]
+
+
+def _rms(errors: Array) -> Array:
+    """Root mean square over the last axis."""
+    return np.sqrt((errors**2).mean(axis=-1))
+
+
+def collect() -> dict:
+    """Every case at full size."""
+    tables = [compare(prepare(case)) for case in CASES]
+    accuracy, saving = ([row for table in tables for row in table[i]] for i in (0, 1))
+    errors = [f"{what}: {how}" for what in ("position [um]", "orientation [urad]") for how in ("planned", "random")]
+    numbers = ["random poses as good", "poses saved [%]", "predicted", "predicted, half of them at the boundary"]
+    ratios = [f"error / predicted error: {which}" for which in ("planned", "random")]
+    return {
+        "seed": SEED,
+        "seeds": SEEDS,
+        "machines per seed": MACHINES,
+        "unseen poses": UNSEEN,
+        "candidates": CANDIDATES,
+        "noise": {"length [um]": 1e6 * SIGMA_LENGTH, "angle [urad]": 1e6 * SIGMA_ANGLE},
+        "tables": {
+            "glance": {
+                "columns": ["robot", "measured", "poses", *errors[:2], *numbers[:2]],
+                "formats": ["", "", "d", ".1f", ".1f", ".0f", ".0f"],
+                "rows": at_a_glance(accuracy, saving),
+            },
+            "accuracy": {
+                "columns": ["robot", "measured", "poses", *errors, f"planned better, of {SEEDS} seeds"],
+                "formats": ["", "", "d", ".2f", ".2f", ".1f", ".1f", "d"],
+                "rows": accuracy,
+            },
+            "saving": {
+                "columns": ["robot", "measured", "planned poses", *numbers, *ratios],
+                "formats": ["", "", "d", ".0f", ".0f", ".0f", ".0f", ".2f", ".2f"],
+                "rows": saving,
+            },
+        },
+    }
