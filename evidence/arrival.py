@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Conventions tested on arrival: how often true data are doubted or refused, and which slips are refused and named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from loopcal import se3
+from loopcal.calibrate.arrival import IMPLAUSIBLE, arrival
+from loopcal.calibrate.scaling import unknowns
+from loopcal.errors import LoopcalError
+from loopcal.io import load_robot
+from loopcal.io.robot_file import shipped_robots
+from loopcal.measure import KINDS, Component, Gaussian, Instrument, Kind, Measurements, Pose, Position, Sensor, simulate
+from loopcal.mechanism import Mechanism, sample
+from loopcal.units import Dimension
+
+SEED, POSES = 3, 20
+SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5}  # [m], [rad]
+RATIO = 1e-4  # [1], of columns without a unit
+TIMES = (1.0, 3.0, 30.0)
+EVERY_KIND = ("hexapod-42", "3-prs", "linear-delta")
+"""Robots with every kind; the others are measured as full poses and as positions in an unknown frame, and up to 3 times off."""
+SLIPPED = (*EVERY_KIND, "ru-pus-prs", "rotary-delta")
+
+UNKNOWN = Position(unknown=("frame",))
+
+Change = Callable[[np.ndarray], np.ndarray]
+
+
+def measured(robot: Mechanism, kind: Kind, times: float, seed: int) -> Measurements | None:
+    """What a machine that is `times` its tolerances off shows; None where the kind or the machine cannot."""
+    noise = Gaussian(np.array([SIGMA.get(c.dimension, RATIO) for c in kind.noise_columns]))
+    free = unknowns(robot)
+    truth = robot.values.copy()
+    truth[free.places] += times * free.tolerance * np.random.default_rng((SEED, seed)).standard_normal(len(free))
+    try:
+        at = sample(robot, POSES, SEED + seed).coordinates
+        return simulate(robot.with_values(truth), at, Instrument((Sensor(kind, noise),)), seed, controller=robot)
+    except LoopcalError:
+        return None
+
+
+def cases(times: float) -> Iterator[tuple[Mechanism, Kind]]:
+    """Robots with a workspace and kinds: the first and the last example of each, far off only the first."""
+    for name in EVERY_KIND if times > 3.0 else shipped_robots():
+        robot = load_robot(name)
+        every = [kind for cls in KINDS.values() for kind in (cls.examples()[:1] + cls.examples()[1:][-1:])]
+        first = [cls.examples()[0] for cls in KINDS.values()]
+        if robot.assembly.workspace:
+            yield from ((robot, k) for k in ((first if times > 3.0 else every) if name in EVERY_KIND else (Pose(), UNKNOWN)))
+
+
+def false_alarms(times: float) -> list:
+    """One row: data sets, doubted, refused, largest misfit."""
+    misfits, refused = [], 0
+    for seed, (robot, kind) in enumerate(cases(times)):
+        data = measured(robot, kind, times, seed)
+        if data is not None:
+            found = arrival(robot, data)
+            misfits.append(found.misfit)
+            refused += found.refused
+    said = np.array(misfits)[~np.isnan(misfits)]
+    doubted = int((said > IMPLAUSIBLE).sum())
+    return [times, len(misfits), len(misfits) - len(said), float(np.median(said)), doubted, refused]
+
+
+def columns(chosen: list[int], factor: float) -> Change:
+    """Some columns times a factor."""
+
+    def change(values: np.ndarray) -> np.ndarray:
+        changed = values.copy()
+        changed[:, chosen] *= factor
+        return changed
+
+    return change
+
+
+def exchanged(order: list[int]) -> Change:
+    """Columns in another order."""
+    return lambda values: values[:, order]
+
+
+def rewritten(change: Change) -> Change:
+    """Rotations, the first three columns, written otherwise."""
+    return lambda values: np.concatenate([change(values[:, :3]), values[:, 3:]], axis=1)
+
+
+XYZ = Pose("euler-xyz")
+VALUE_SLIPS: tuple[tuple[str, Kind, Change, str], ...] = (
+    ("mm written as m", Pose(), columns([3, 4, 5], 1e3), "lengths 1000 times smaller"),
+    ("deg written as rad", Pose(), columns([0, 1, 2], 180.0 / np.pi), "angles 57.3 times smaller"),
+    ("x and y swapped", Pose(), exchanged([0, 1, 2, 4, 3, 5]), "columns x and y swapped"),
+    ("rotations inverted", Pose(), columns([0, 1, 2], -1.0), "rotations inverted"),
+    (
+        "euler-zyx for euler-xyz",
+        XYZ,
+        rewritten(lambda a: se3.matrix_to_euler(se3.euler_to_matrix(a, "xyz"), "zyx")),
+        "rotations read as euler-zyx",
+    ),
+    (
+        "moving for fixed axes",
+        XYZ,
+        rewritten(lambda a: se3.matrix_to_euler(se3.euler_to_matrix(a, "xyz"), "XYZ")),
+        "rotations read as euler-XYZ",
+    ),
+    ("inches written as mm, frame unknown", UNKNOWN, columns([0, 1, 2], 1.0 / 25.4), "lengths 25.4 times larger"),
+    ("cm written as mm, frame unknown", UNKNOWN, columns([0, 1, 2], 0.1), "lengths 10 times larger"),
+    ("drop for rise", Component(("z",)), columns([0], -1.0), "z of the other sign"),
+)
+READING_SLIPS: tuple[tuple[str, Change, str], ...] = (
+    ("two actuators swapped", lambda q: q[:, [1, 0, *range(2, q.shape[1])]], "swapped"),
+    ("readings of the other sign", lambda q: -q, "all readings of the other sign"),
+    ("rows moved by one", lambda q: np.roll(q, 1, axis=0), "row below"),
+)
+
+
+def slipped(robot: Mechanism, kind: Kind, change: Change | None, change_readings: Change | None) -> Measurements | None:
+    """Data with changed values or readings; None where the kind, the robot or the changed numbers are impossible."""
+    data = measured(robot, kind, 1.0, SEED)
+    if data is None:
+        return None
+    rows = data.observations[0]
+    try:
+        if change is not None:
+            return replace(data, observations=(replace(rows, measured=change(rows.measured)),))
+    except LoopcalError:
+        return None
+    return data if change_readings is None else replace(data, readings=change_readings(data.readings))
+
+
+def detected() -> list[list]:
+    """For each slip: data sets, those it makes implausible, refused, and named first or among others that fit as well."""
+    tried = [(name, kind, change, None, words) for name, kind, change, words in VALUE_SLIPS]
+    tried += [(name, Pose(), None, change, words) for name, change, words in READING_SLIPS]
+    machines = [load_robot(name) for name in SLIPPED]
+    rows = []
+    for name, kind, change, change_readings, words in tried:
+        every = [(robot, slipped(robot, kind, change, change_readings)) for robot in machines]
+        found = [arrival(robot, data) for robot, data in every if data is not None]
+        named = sum(any(words in one for one in (f.other or "", *f.alike)) for f in found)
+        rows.append([name, len(found), sum(f.doubtful for f in found), sum(f.refused for f in found), named])
+    return rows
+
+
+def collect() -> dict:
+    """False alarms and detection."""
+    alarms = {
+        "columns": [
+            "deviations, in tolerances",
+            "true data sets",
+            "too few rows to say",
+            "median misfit",
+            "misfit above 10, so that all else is tried",
+            "refused",
+        ],
+        "formats": [".0f", "d", "d", ".2g", "d", "d"],
+        "rows": [false_alarms(times) for times in TIMES],
+    }
+    detection = {
+        "columns": ["slip", "data sets", "misfit above 10", "refused", "named"],
+        "formats": ["", "d", "d", "d", "d"],
+        "rows": detected(),
+    }
+    return {"seed": SEED, "poses": POSES, "tables": {"false_alarms": alarms, "detection": detection}}
