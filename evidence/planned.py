@@ -25,16 +25,19 @@ from loopcal.mechanism.trials import forward_trials
 
 Array = NDArray[np.float64]
 
-SEED, SEEDS, MACHINES, UNSEEN, CANDIDATES = 31, 20, 5, 60, 1000
+SEED, SEEDS, MACHINES, UNSEEN, CANDIDATES = 31, 20, 5, 40, 1000
 """Sets of random poses, machines measured at each set, poses that they are judged at, candidates of a plan."""
 
 PLANNED = (8, 12, 16, 24, 40)
-RANDOM = (*PLANNED, 80, 160)
+RANDOM = (*PLANNED, 70, 110)
 GLANCE = 16
 """Number of planned poses of the short table."""
 
 SIGMA_LENGTH, SIGMA_ANGLE = 5e-6, 25e-6
 """Noise, one standard deviation [m], [rad]."""
+
+LOUDER = (0.2, 1.0, 10.0)
+"""Multiples of the noise at which the theory is asked."""
 
 
 @dataclass(frozen=True)
@@ -99,11 +102,16 @@ class Study:
 
 
 def prepare(
-    case: Case, seeds: int = SEEDS, machines: int = MACHINES, most: int = RANDOM[-1], candidates: int = CANDIDATES
+    case: Case,
+    seeds: int = SEEDS,
+    machines: int = MACHINES,
+    most: int = RANDOM[-1],
+    candidates: int = CANDIDATES,
+    louder: float = 1.0,
 ) -> Study:
-    """Draw machines and poses, and make the planning problem ready."""
+    """Draw machines and poses, and make the planning problem ready for a multiple of the noise."""
     robot = load_robot(case.robot)
-    made = problem(robot, instrument(case), count=candidates, seed=SEED)
+    made = problem(robot, instrument(case, louder), count=candidates, seed=SEED)
     pool, judged = sample(robot, seeds * most, SEED + 1), sample(robot, UNSEEN, SEED + 2)
     rows = unit_rows(made.free, made.instrument, pool.solution.q, np.arange(seeds * most)[:, None])
     truth, q = sample_truth(robot, seeds * machines, SEED), judged.solution.q
@@ -114,11 +122,11 @@ def prepare(
     return Study(case, made, drawn, coordinates, truth.reshape(*sets, -1), q, tool.reshape(*sets, UNSEEN, 4, 4))
 
 
-def instrument(case: Case) -> Instrument:
+def instrument(case: Case, louder: float = 1.0) -> Instrument:
     """Full poses or positions, in a known frame."""
     if case.measured == "position":
-        return Instrument((Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, SIGMA_LENGTH))),))
-    return Instrument((Sensor(Pose(), Gaussian(np.array([SIGMA_ANGLE] * 3 + [SIGMA_LENGTH] * 3))),))
+        return Instrument((Sensor(Component(("x", "y", "z")), Gaussian(louder * np.full(3, SIGMA_LENGTH))),))
+    return Instrument((Sensor(Pose(), Gaussian(louder * np.array([SIGMA_ANGLE] * 3 + [SIGMA_LENGTH] * 3))),))
 
 
 def at_planned(study: Study, n: int) -> Errors:
@@ -134,12 +142,17 @@ def at_planned(study: Study, n: int) -> Errors:
 
 def at_random(study: Study, n: int) -> Errors:
     """Errors of the machines of each seed, measured at its own n random poses."""
-    seeds, most = study.coordinates.shape[:2]
+    seeds = len(study.coordinates)
     sets = zip(study.coordinates, study.truth, study.tool, range(SEED + 1, SEED + 1 + seeds), strict=True)
     found = [calibrated(study, poses[:n], truth, tool, seed) for poses, truth, tool, seed in sets]
     position, orientation = np.stack(found, axis=1)
-    expected = [foreseen(study, study.drawn, np.arange(first, first + n)) for first in range(0, seeds * most, most)]
-    return Errors(position, orientation, np.array(expected))
+    return Errors(position, orientation, foreseen_at_random(study, n))
+
+
+def foreseen_at_random(study: Study, n: int) -> Array:
+    """Errors (seeds,) predicted for n random poses."""
+    seeds, most = study.coordinates.shape[:2]
+    return np.array([foreseen(study, study.drawn, np.arange(first, first + n)) for first in range(0, seeds * most, most)])
 
 
 def among_candidates(study: Study, n: int) -> float:
@@ -159,7 +172,7 @@ def foreseen(study: Study, made: Problem, chosen: NDArray[np.int64]) -> float:
 def calibrated(study: Study, poses: Array, truth: Array, tool: Array, seed: int) -> tuple[Array, Array]:
     """Measure machines (t, p) at poses (n, c), calibrate, and return errors (t,) [m], [rad] of tool poses (t, u, 4, 4)."""
     robot = study.robot
-    fit = identify_trials(robot, simulate_trials(robot, truth, poses, instrument(study.case), seed))
+    fit = identify_trials(robot, simulate_trials(robot, truth, poses, study.made.instrument, seed))
     assert fit.converged.all(), "machines within their tolerances are always found"
     gap = se3.difference(forward_trials(robot, fit.values, study.unseen[None]).T @ robot.tool, tool)
     squares = (gap**2).reshape(*gap.shape[:2], 2, 3).sum(axis=3).mean(axis=1)
@@ -204,6 +217,17 @@ def compare(study: Study, sizes: tuple[int, ...] = PLANNED, drawn: tuple[int, ..
     return accuracy, saving
 
 
+def by_noise(case: Case) -> list:
+    """Return how many random poses should be as good as GLANCE planned ones, at each multiple of the noise."""
+    found: list[object] = [case.robot, case.measured, GLANCE]
+    for louder in LOUDER:
+        study = prepare(case, machines=1, louder=louder)
+        plan = planned(study.made, GLANCE, hold_out=0, target=case.target, seed=SEED).expected
+        curve = [float(np.median(foreseen_at_random(study, n))) for n in RANDOM]
+        found.append(matching(RANDOM, curve, float(study.wanted(plan.position, plan.orientation))))
+    return found
+
+
 def at_a_glance(accuracy: list, saving: list) -> list:
     """Return one row for each case at GLANCE poses: position errors, random poses as good, and the share saved."""
     return [[*a[:5], *s[3:5]] for a, s in zip(accuracy, saving, strict=True) if a[2] == GLANCE]
@@ -221,6 +245,7 @@ def collect() -> dict:
     errors = [f"{what}: {how}" for what in ("position [um]", "orientation [urad]") for how in ("planned", "random")]
     numbers = ["random poses as good", "poses saved [%]", "predicted", "predicted, half of them at the boundary"]
     ratios = [f"error / predicted error: {which}" for which in ("planned", "random")]
+    noise = [f"noise {1e6 * f * SIGMA_LENGTH:g} um, {1e6 * f * SIGMA_ANGLE:g} urad" for f in LOUDER]
     return {
         "seed": SEED,
         "seeds": SEEDS,
@@ -233,6 +258,11 @@ def collect() -> dict:
                 "columns": ["robot", "measured", "poses", *errors[:2], *numbers[:2]],
                 "formats": ["", "", "d", ".1f", ".1f", ".0f", ".0f"],
                 "rows": at_a_glance(accuracy, saving),
+            },
+            "noise": {
+                "columns": ["robot", "measured", "planned poses", *noise],
+                "formats": ["", "", "d", *[".0f"] * len(LOUDER)],
+                "rows": [by_noise(case) for case in CASES if case.measured == "full pose" or case.robot == "linear-delta"],
             },
             "accuracy": {
                 "columns": ["robot", "measured", "poses", *errors, f"planned better, of {SEEDS} seeds"],

@@ -2,6 +2,7 @@
 """Are planned poses worth it? Few machines here; twenty seeds in `make evidence` (evidence/planned.py)."""
 
 import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -73,3 +74,11 @@ def test_at_least_a_quarter_of_the_poses_is_saved_and_theory_foresees_how_many(t
         # what is left of the saving where random poses, too, are drawn at the boundary
         assert 0.1 < 1.0 - n / boundary < 1.0 - n / predicted
         assert ratios == pytest.approx([1.0, 1.0], abs=0.1)
+
+
+@pytest.mark.evidence
+def test_a_plan_saves_poses_at_any_noise_and_no_more_where_tolerances_tell_more(tables):
+    for _, _, n, *numbers in tables["noise"]["rows"]:
+        assert min(numbers) > n
+        # 3 %: interpolation, and the last percent of efficiency that a plan does not look for
+        assert all(louder < 1.03 * quieter for quieter, louder in pairwise(numbers))
