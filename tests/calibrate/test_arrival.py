@@ -185,6 +185,12 @@ def test_a_slip_is_seen_through_blunders() -> None:
     assert "lengths 10 times larger" in (found.other or ""), found
 
 
+def test_a_unit_is_named_where_a_constant_in_its_place_leaves_no_frame_to_be_found() -> None:
+    data = changed(measured("linear-delta", Position(unknown=("frame",)), n=20), scaled(slice(None), 1e3))
+    found = arrival(robot_of("linear-delta"), data)
+    assert "lengths 1000 times smaller" in (found.other or ""), found
+
+
 def test_blunders_alone_are_left_to_their_own_check() -> None:
     data = measured("hexapod-42", Position(unknown=("frame",)), n=20)
     bad = changed(data, lambda values: values.__setitem__((slice(3, 5), 0), values[3:5, 0] + 0.1))

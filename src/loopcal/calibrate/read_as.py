@@ -121,7 +121,7 @@ class ReadAs:
 
     def leave_out(self) -> None:
         """Leave out the rows of each way that stand far from its others; to be called after `misfits`."""
-        if not self.enough:
+        if not self.enough or self.failed:
             return
         every = np.arange(self.t)
         sd = self.allowed()
