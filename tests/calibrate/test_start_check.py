@@ -5,6 +5,9 @@ import numpy as np
 import pytest
 
 from loopcal.calibrate import Huber, Start, Tukey, identify, start_check
+from loopcal.calibrate.prior import Prior
+from loopcal.calibrate.rows import rows_of
+from loopcal.calibrate.scaling import unknowns
 from tests import zoo
 from tests.calibrate.problems import hexapod, hexapod_data
 
@@ -41,3 +44,27 @@ def test_a_loss_does_not_make_the_nominal_start_look_calibrated(loss) -> None:
     np.testing.assert_array_equal(fit.estimate_history[0], hexapod().values[hexapod().parameters.free])
     best = identify(fit.robot, hexapod_data(), loss=loss)
     assert start_check(best).verdict is Start.BEST
+
+
+@pytest.mark.parametrize("loss", [Huber(), Tukey()])
+def test_with_a_loss_every_step_is_counted_and_the_history_is_one_way_from_the_start(loss) -> None:
+    """The first descent is not weighted yet, so that the way begins as that of a fit without a loss."""
+    plain, fit = identify(hexapod(), hexapod_data()), identify(hexapod(), hexapod_data(), loss=loss)
+    assert fit.iterations > plain.iterations
+    assert len(fit.cost_history) == len(fit.estimate_history) == fit.iterations + 1
+    np.testing.assert_array_equal(fit.estimate_history[: plain.iterations + 1], plain.estimate_history)
+    np.testing.assert_array_equal(fit.estimate_history[-1], fit.estimate)
+
+
+def test_with_a_loss_the_cost_of_the_start_is_weighted_as_that_of_the_fit_and_holds_the_prior() -> None:
+    robot, data = hexapod(), hexapod_data()
+    free = unknowns(robot)
+    spread = 0.1 * free.tolerance
+    prior = Prior(free.names, zoo.hexapod_truth(), free.tolerance, np.diag(1.0 / spread))
+    fit = identify(robot, data, prior=prior, loss=Huber())
+    assert fit.weight.min() < 0.99
+    start = free.deviation(robot.values[None])
+    rows = rows_of(free, data).weighted(fit.weight).fold(start, np.arange(1))[1][0]
+    held = (((robot.values[free.places] - prior.mean) / spread) ** 2).sum()
+    assert held > 100.0
+    assert fit.cost_history[0] == pytest.approx(rows + held, rel=1e-12)  # rounding of sums

@@ -9,7 +9,7 @@ Nielsen, Tingleff, "Methods for non-linear least squares problems" (2004); docs/
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Protocol
 
@@ -141,6 +141,15 @@ class Descent:
     step: FloatArray
     deviation_history: FloatArray
     cost_history: FloatArray
+
+    def after(self, first: Descent) -> Descent:
+        """Return this descent with the steps of the one that led to its start before its own."""
+        return replace(
+            self,
+            iterations=first.iterations + self.iterations,
+            deviation_history=np.concatenate([first.deviation_history, self.deviation_history[1:]]),
+            cost_history=np.concatenate([first.cost_history, self.cost_history[1:]]),
+        )
 
 
 def descend(

@@ -57,7 +57,8 @@ class Identification:
     check : the residual against its degrees of freedom.
     conflict : the stated tolerances against the data, where the method uses them; else None.
     residuals : of every kind. status : how the iteration ended. iterations : steps taken.
-    cost_history : (i + 1,) whitened sum of squares. estimate_history : (i + 1, p).
+    cost_history : (i + 1,) whitened sum of squares; with a loss, the first and those after the last change of weights are at
+        the final weights, those between at the weights of their time. estimate_history : (i + 1, p).
     notes : sentences that belong to the result.
     weight : (n,) of each pose by the loss, 1 without one. dropped : labels of the poses that were left out as asked.
     local : what was found of the unknowns that the measurements bring with them: frames, targets, surfaces.

@@ -90,7 +90,7 @@ def identify(
     check_count(rows, data, method, allow_fewer_equations or prior is not None)
     z = free.deviation((robot if start is None else robot.with_values(start)).values[None])
     run: Run = partial(_descended, method=method, control=control, tolerance=rank_tolerance, begin=begin, prior=prior)
-    fit, weight, weighed = _weighed(rows, data, z, loss, noise, run)
+    fit, weight, weighed = _weighed(rows, data, z, loss, noise, run, prior)
     if fit.status[0] == DescentStatus.BAD_START:
         check_start(rows, data, z, fit.cost)
     check = residual_check(fit.decomposition, fit.penalty, noise, robust=loss is not None)
@@ -104,12 +104,12 @@ def identify(
 
 
 def _weighed(
-    rows: AnyRows, data: Measurements, z: FloatArray, loss: Loss | None, noise: str, run: Run
+    rows: AnyRows, data: Measurements, z: FloatArray, loss: Loss | None, noise: str, run: Run, prior: Prior | None
 ) -> tuple[Descent, FloatArray, AnyRows]:
     """Descend, with a loss or without; return the weight (n,) of each pose, too, and the rows with these weights."""
     if loss is None:
         return run(rows, z), np.ones(data.n_poses), rows
-    robust = descend_robustly(rows, linked(data), loss, z, noise == "estimated", run)
+    robust = descend_robustly(rows, linked(data), loss, z, noise == "estimated", run, prior)
     return robust.fit, robust.weight, robust.rows
 
 
@@ -216,14 +216,7 @@ def _descended(
         return descend(problem, z, method, control, tolerance)
     z, first = descend_from_closure(rows, z, method, control, tolerance)
     fit = descend(problem, z, method, control, tolerance)
-    if first is None:
-        return fit
-    return replace(
-        fit,
-        iterations=first.iterations + fit.iterations,
-        deviation_history=np.concatenate([first.deviation_history, fit.deviation_history[1:]]),
-        cost_history=np.concatenate([first.cost_history, fit.cost_history[1:]]),
-    )
+    return fit if first is None else fit.after(first)
 
 
 def _identification(

@@ -14,6 +14,7 @@ import numpy as np
 
 from loopcal.calibrate.descent import Descent, DescentStatus
 from loopcal.calibrate.losses import Huber, Loss, Tukey
+from loopcal.calibrate.prior import Prior
 from loopcal.calibrate.rows import AnyRows
 from loopcal.linalg import FloatArray, IntArray
 
@@ -30,7 +31,8 @@ class RobustFit:
 
     Attributes
     ----------
-    fit : Descent over the weighted rows; before its own, its history has one step from the start. rows : these rows.
+    fit : Descent over the weighted rows, after all those that found the weights. The first of its costs, and those of the last
+        descent, are of these rows; those between are of the rows as they were weighted then. rows : these rows.
     weight : (n,) of each pose, equal within a block.
     """
 
@@ -46,6 +48,7 @@ def descend_robustly(
     start: FloatArray,
     estimate_scale: bool,
     run: Callable[[AnyRows, FloatArray], Descent],
+    prior: Prior | None = None,
 ) -> RobustFit:
     """Fit with a loss (one trial).
 
@@ -53,29 +56,24 @@ def descend_robustly(
     ----------
     rows : unweighted. block : (n,) block of each pose. start : (1, p) deviation.
     estimate_scale : whether the sigmas are only true up to a factor; it is then the median of the blocks' distances.
-    run : descends rows from a deviation.
+    run : descends rows, and those of the prior, from a deviation. prior : the one that `run` adds.
     """
     member = np.unique(block, return_inverse=True)[1]
     found = RobustFit(run(rows, start), rows, np.ones(len(block)))
     if isinstance(loss, Tukey):
         found = _settle(rows, member, Huber(), found, estimate_scale, run, 100.0 * SETTLED)
-    return _from_start(_settle(rows, member, loss, found, estimate_scale, run, SETTLED), rows, start)
+    return _compared(_settle(rows, member, loss, found, estimate_scale, run, SETTLED), rows, start, prior)
 
 
-def _from_start(found: RobustFit, rows: AnyRows, start: FloatArray) -> RobustFit:
-    """Let the history begin at the start, at the weights that stand: descents since the first began at each other's ends."""
+def _compared(found: RobustFit, rows: AnyRows, start: FloatArray, prior: Prior | None) -> RobustFit:
+    """Weigh the cost of the start as that of the fit, so that the two can be compared."""
     if found.rows is rows:
         return found
-    every, fit = np.arange(len(start)), found.fit
-    first = found.rows.fold(start, every)[1]
-    found.rows.fold(fit.deviation, every)  # what rows remember of poses and frames is that of the fit again
-    fit = replace(
-        fit,
-        iterations=fit.iterations + 1,
-        deviation_history=np.concatenate([start[None], fit.deviation_history]),
-        cost_history=np.concatenate([first[None], fit.cost_history]),
-    )
-    return replace(found, fit=fit)
+    every, costs = np.arange(len(start)), found.fit.cost_history.copy()
+    problem = found.rows if prior is None else prior.added(found.rows)
+    costs[0] = problem.fold(start, every)[1]
+    found.rows.fold(found.fit.deviation, every)  # what rows remember of poses and frames is that of the fit again
+    return replace(found, fit=replace(found.fit, cost_history=costs))
 
 
 def _settle(
@@ -99,7 +97,7 @@ def _settle(
         if change <= settled:
             break
         weighted = rows.weighted(weight)
-        found = RobustFit(run(weighted, found.fit.deviation), weighted, weight)
+        found = RobustFit(run(weighted, found.fit.deviation).after(found.fit), weighted, weight)
     return found
 
 
