@@ -13,10 +13,12 @@ from loopcal.calibrate.losses import block_limit
 from loopcal.calibrate.rows import rows_of
 from loopcal.calibrate.scaling import unknowns
 from loopcal.errors import DataError, EstimationError
+from loopcal.io import load_robot
 from loopcal.linalg import decompose
-from loopcal.measure import Measurements, sample_truth, simulate, simulate_trials
+from loopcal.measure import Instrument, Measurements, Position, Sensor, sample_truth, simulate, simulate_trials
+from loopcal.mechanism.workspace import sample
 from tests import zoo
-from tests.calibrate.problems import UM, URAD, hexapod, hexapod_data, hexapod_poses, tracker
+from tests.calibrate.problems import UM, URAD, hexapod, hexapod_data, hexapod_poses, noise, tracker
 
 SIGMA = np.array([5 * URAD] * 3 + [UM] * 3)  # of `tracker`
 NAMED = ("4", "23", "11")
@@ -163,3 +165,27 @@ def test_what_cannot_be_left_out_or_weighed_is_refused():
         Huber(0.0)
     with pytest.raises(EstimationError, match="Tukey loss with constant"):
         Tukey(-1.0)
+
+
+@pytest.mark.parametrize("frame", [(), ("frame",)])
+def test_the_distance_of_a_pose_set_aside_is_what_the_others_say_of_it_where_a_reading_is_missing(frame):
+    """Set aside, it stands where its own rows put it in the frame of the others, not where its search began."""
+    robot = load_robot("linear-delta")
+    truth = robot.with_values(sample_truth(robot, 1, 3)[0])
+    coordinates = sample(robot, 20, 3).coordinates
+    instrument = Instrument((Sensor(Position(unknown=frame), noise(*[10 * UM] * 3)),))
+    data = simulate(truth, coordinates, instrument, 3, reading_sigma=20 * UM)
+    assert data.reading_sigma is not None
+    readings, sigma, rows = data.readings.copy(), data.reading_sigma.copy(), data.observations[0]
+    readings[7, 0], sigma[7, 0] = np.nan, np.inf
+    measured = rows.measured.copy()
+    measured[7] += np.array([150 * UM, -150 * UM, 0.0])
+    data = replace(data, readings=readings, reading_sigma=sigma, observations=(replace(rows, measured=measured),))
+    fit = identify(robot, data, LeastSquares(), loss=Tukey())
+    assert fit.weight[7] < 0.5  # set aside in the first round
+    found = find_outliers(fit, data)
+    assert "8" in found.names
+    others = tuple(name for name in found.names if name != "8")
+    with_it, without = (identify(robot, data, LeastSquares(), drop=names) for names in (others, found.names))
+    # what is not linear over 0.1 mm
+    assert found.influence.distance[7] == pytest.approx(with_it.chi_square - without.chi_square, rel=1e-2)

@@ -172,11 +172,13 @@ class LatentRows:
     def linearised(self, deviation: FloatArray) -> Iterator[list[tuple[IntArray, FloatArray]]]:
         """Give, block by block, first poses (r,) and rows (r, m, U + p + 1) of components, their poses eliminated.
 
-        Columns as for `Rows.linearised`, poses and own unknowns where the last fold left them.
+        Columns as for `Rows.linearised`, own unknowns where the last fold left them. Poses stand where these rows put them at
+        these own unknowns: the last fold may be of rows with other weights, some of them absent, which did not move them.
         """
         trial, p = np.arange(1), self.parameters
-        here = self.memory.last
-        assert here is not None
+        last = self.memory.last
+        assert last is not None
+        here = self.poses.settle(deviation, trial, last.standing, last.values)
         wide = 0 if self.own is None else len(self.own.local)
         for group, done in self.poses.projected(here, deviation, trial):
             one = done.rest[0]
