@@ -384,3 +384,14 @@ def test_too_few_readings_and_chains_too_long_are_refused(cable, monkeypatch):
     data = measured_hexapod(6, UM, sensors=(Sensor(Separation(), noise(UM)), *tracker().sensors))
     with pytest.raises(EstimationError, match="link 6 poses"):
         identify(hexapod(), data, LeastSquares())
+
+
+def test_a_pose_left_out_is_neither_undetermined_nor_without_readings():
+    data = measured_hexapod(12, 2 * UM)
+    fit = identify(hexapod(), data, drop=("3", "9"))
+    found, out = latent_of(fit), np.isin(np.arange(12), (2, 8))
+    assert not [note for note in fit.notes if "not determined" in note]
+    assert found.to_dict() == {"exact": 0, "uncertain": 60, "not_taken": 0, "open": [], "calm": True}
+    assert_array_equal(np.isnan(found.poses).all(axis=(1, 2)), out)
+    assert_array_equal(np.isnan(found.readings).all(axis=1), out)
+    assert examine(fit, data).worth.calibrate

@@ -96,7 +96,7 @@ def identify(
     check = residual_check(fit.decomposition, fit.penalty, noise, robust=loss is not None)
     residuals = _labelled(_residuals(rows, weighed, fit.deviation), data, rows)
     result = _identification(robot, free, method, fit, check, residuals, weighed)
-    latent = latent_estimate(rows, data) if isinstance(rows, LatentRows) else None
+    latent = latent_estimate(rows, data, drop) if isinstance(rows, LatentRows) else None
     notes = (*result.notes, *_count_notes(rows, method), *_weight_notes(data, weight, loss), *_drop_notes(drop))
     return replace(
         result, weight=weight, dropped=tuple(drop), notes=(*notes, *(latent.notes() if latent else ())), latent=latent

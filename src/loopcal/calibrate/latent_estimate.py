@@ -24,9 +24,11 @@ class LatentEstimate:
 
     Attributes
     ----------
-    labels : (n,). poses : (n, 4, 4) T_base_platform [m], NaN where out of reach. readings : (n, a) [SI], the true ones.
+    labels : (n,). poses : (n, 4, 4) T_base_platform [m], NaN where out of reach or left out.
+    readings : (n, a) [SI], the true ones, NaN where left out.
     sigma : (n, a) [SI] with which the recorded ones were believed: 0 exact, infinite not at all.
-    open : (n,) poses that the data leave open in some direction; what stands there is where the search began.
+    kept : (n,) poses that were not left out as asked.
+    open : (n,) those of them that the data leave open in some direction; what stands there is where the search began.
     calm : whether the search came to rest.
     """
 
@@ -34,6 +36,7 @@ class LatentEstimate:
     poses: FloatArray
     readings: FloatArray
     sigma: FloatArray
+    kept: NDArray[np.bool_]
     open: NDArray[np.bool_]
     calm: bool
 
@@ -47,11 +50,12 @@ class LatentEstimate:
         return found
 
     def to_dict(self) -> dict[str, Any]:
-        """Return numbers of readings by how they were believed, for JSON; the arrays are in `arrays`."""
+        """Return numbers of readings by how they were believed, but of poses left out, for JSON; the arrays are in `arrays`."""
+        sigma = self.sigma[self.kept]
         return {
-            "exact": int((self.sigma == 0.0).sum()),
-            "uncertain": int(((self.sigma > 0.0) & np.isfinite(self.sigma)).sum()),
-            "not_taken": int(np.isinf(self.sigma).sum()),
+            "exact": int((sigma == 0.0).sum()),
+            "uncertain": int(((sigma > 0.0) & np.isfinite(sigma)).sum()),
+            "not_taken": int(np.isinf(sigma).sum()),
             "open": [label for label, lost in zip(self.labels, self.open, strict=True) if lost],
             "calm": self.calm,
         }
@@ -61,13 +65,18 @@ class LatentEstimate:
         return {"pose_estimate": self.poses, "reading_estimate": self.readings}
 
 
-def latent_estimate(rows: LatentRows, data: Measurements) -> LatentEstimate:
-    """Return what rows (t = 1) say of the poses of their measurements, where they were looked at last."""
+def latent_estimate(rows: LatentRows, data: Measurements, drop: Sequence[str] = ()) -> LatentEstimate:
+    """Return what rows (t = 1) say of the poses of their measurements, where they were looked at last.
+
+    `drop` : labels of poses that were left out as asked: nothing is said of them.
+    """
     memory, (ok, here) = rows.memory, rows.standing()
-    lost = ~ok[0]
-    T = np.where(lost[:, None, None], np.nan, here.state.T[0])
+    kept = ~np.isin(data.labels, drop)
+    known = ok[0] & kept
+    T = np.where(known[:, None, None], here.state.T[0], np.nan)
+    readings = np.where(kept[:, None], here.q[0], np.nan)
     sigma = np.zeros(data.readings.shape) if data.reading_sigma is None else data.reading_sigma
-    return LatentEstimate(data.labels, T, here.q[0].copy(), sigma, memory.open[0] & ~lost, bool(memory.calm[0]))
+    return LatentEstimate(data.labels, T, readings, sigma, kept, memory.open[0] & known, bool(memory.calm[0]))
 
 
 def _some(labels: Sequence[str], chosen: NDArray[np.bool_]) -> str:

@@ -64,8 +64,8 @@ def worth(fit: Identification, data: Measurements) -> Worth:
         return _open(f"{missing}; state them")
     if fit.check.failed:
         return _open("the residual does not fit the stated noise")
-    chosen = np.unique(np.linspace(0, data.n_poses - 1, min(POSES, data.n_poses)).astype(int))
-    known = data.readings if fit.latent is None else fit.latent.readings
+    known = data.readings if fit.latent is None else fit.latent.readings[fit.latent.kept]
+    chosen = np.unique(np.linspace(0, len(known) - 1, min(POSES, len(known))).astype(int))
     readings, values = known[None, chosen], fit.robot.values[None]
     state = forward_trials(fit.robot, values, readings)
     ok = np.asarray(state.status == Status.CONVERGED)[0]
