@@ -112,13 +112,13 @@ def test_names_with_commas_quotes_and_number_signs_stay_names(tmp_path, robot) -
 def test_lines_that_do_not_fit_are_listed_and_named_in_the_file(tmp_path) -> None:
     export = EXPORT + "P3;1;2\nP4;1;two;3\n;1;2;3\nP5;1.234,5;2;3\nP;6;1;2;3\nP7;1;2;3\n"
     found = converted(tmp_path, export)
-    assert found.rows == 4
-    assert [line for line, _ in found.misfits] == [6, 7, 8, 9]
+    assert found.rows == 3
+    assert [line for line, _ in found.misfits] == [6, 7, 8, 9, 10]
     reasons = " / ".join(reason for _, reason in found.misfits)
-    for part in ("it has 3 columns, but 'Z' is the column 4", "'two' is no number for 'y'", "'' is no name of a pose",
-                 "'1.234,5' is no number for 'x'"):  # fmt: skip
+    for part in ("it has 3 columns, but 'Z' is column 4", "'two' is no number for 'y'", "'' is no name of a pose",
+                 "'1.234,5' is no number for 'x'", "it has 5 cells, but the header names 4 columns"):  # fmt: skip
         assert part in reasons
-    assert "## lines that did not fit: 6, 7, 8, 9\n" in found.text
+    assert "## lines that did not fit: 6, 7, 8, 9, 10\n" in found.text
     assert found.passed + found.rows + len(found.misfits) == sum(bool(line.strip()) for line in export.split("\n"))
 
 
@@ -187,7 +187,7 @@ BAD_PROFILES = {
     "a pattern without a pose": ("from: Name", "from: Name, match: 'P.'", 5, "this pattern finds no pose"),
     "targets that nothing tells": ("position,", "position, targets: [a, b],", 5, "say how 'match' of 'pose' finds"),
     "an unknown kind": ("position", "positon", 9, "is not a kind of measurement .did you mean 'position'"),
-    "an encoding that is none": ("decimal", "encoding: utf-99\ndecimal", 3, "'utf-99' is no encoding that is known"),
+    "an encoding that is none": ("decimal", "encoding: utf-99\ndecimal", 3, "'utf-99' is no encoding of text that is known"),
     "a matrix of four": ("decimal", "matrix: [1, 2, 3, 4]\ndecimal", 3, "a matrix has nine columns"),
 }
 

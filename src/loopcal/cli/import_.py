@@ -123,9 +123,12 @@ def _export(file: Path, profile: Path, output: Path, force: bool, as_json: bool)
     write_text(output, found.text)
     if as_json:
         misfits = [{"line": line, "reason": reason} for line, reason in found.misfits]
-        show.json_document({"measurements": output, "rows": found.rows, "passed": found.passed, "misfits": misfits})
+        document = {"measurements": output, "rows": found.rows, "passed": found.passed, "misfits": misfits}
+        show.json_document(document | {"notes": found.notes})
         return 0
     show.say(f"{output}: {found.rows} rows; {found.passed} lines passed over as the profile says")
+    for note in found.notes:
+        show.say(f"note: {note}")
     for line, reason in found.misfits[:SHOWN]:
         show.say(f"note: {file}:{line} does not fit: {reason}")
     if len(found.misfits) > SHOWN:

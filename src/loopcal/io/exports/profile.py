@@ -12,21 +12,24 @@ from __future__ import annotations
 
 import codecs
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import UnitError, nearest
 from loopcal.io.context_columns import TEMPERATURE_UNITS, TIME, TIME_UNITS, is_context
+from loopcal.io.exports.cells import plain_number, with_point
+from loopcal.io.robot_file import check_format
 from loopcal.io.sensor_rows import COVARIANCE, SETTINGS, SIGMA
 from loopcal.io.sensor_settings import kind_settings, read_kind
 from loopcal.io.yaml_file import Location, YamlFile, read_yaml, refuse_unknown_keys
-from loopcal.units import symbols, unit
+from loopcal.units import Dimension, symbols, unit
 
 if TYPE_CHECKING:
-    from loopcal.measure import Kind
+    from loopcal.measure import Column, Kind
 
+FORMAT = 1
 DELIMITERS: Mapping[str, str | None] = {"comma": ",", "semicolon": ";", "tab": "\t", "spaces": None}
 DECIMALS: Mapping[str, str] = {"point": ".", "comma": ","}
 KEYS: Mapping[str, str] = {
@@ -37,7 +40,7 @@ KEYS: Mapping[str, str] = {
     "skip": "number of lines in front to pass over",
     "ignore": "pattern of lines that are none of the measurement, such as totals",
     "encoding": "of the text; utf-8 if left out, with or without byte order mark",
-    "missing": "cells that mean not measured, beside empty ones",
+    "missing": "cells that mean not measured, beside empty ones; numbers by their value: -999 is -999.000, too",
     "columns": "our column -> where it comes from",
     "readings": "actuator -> where its reading comes from, where the export holds it",
     "matrix": "nine columns of a rotation matrix, row by row, in place of the columns of an orientation",
@@ -49,6 +52,13 @@ FROM: Mapping[str, str] = {
     "match": "of pose: pattern that finds (?P<pose>..), and (?P<target>..) where each target has a line of its own",
     "format": "of time: as Python's strptime has it, such as '%d.%m.%Y %H:%M:%S'",
 }
+MEASURED = "measured."
+STATED = re.compile(r"[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\])]$")
+"""The unit behind a name in a header, as in `X [mm]` or `X (mm)`."""
+
+ALIASES: Mapping[str, str] = {"°": "deg", "°C": "degC", "°F": "degF", "µm": "um", "μm": "um", "inch": "in", '"': "in"}
+"""Units as instruments write them -> ours."""
+
 TEXTS = ("pose", "block", "session", "group")
 
 
@@ -78,7 +88,8 @@ class Source:
 class Profile:
     """A profile; its fields are the keys of KEYS.
 
-    `columns` has the readings, too; `matrix` is empty where the export has none. `kind` is what `settings` describe.
+    `columns` has the readings, too, whose names are `readings`; `matrix` is empty where the export has none. `kind` is what
+    `settings` describe; `missing_numbers` are those of `missing` that are numbers.
     """
 
     file: YamlFile
@@ -89,10 +100,16 @@ class Profile:
     ignore: re.Pattern[str] | None
     encoding: str
     missing: tuple[str, ...]
+    missing_numbers: tuple[float, ...]
     columns: Mapping[str, Source]
+    readings: tuple[str, ...]
     matrix: tuple[str | int, ...]
     kind: Kind
     settings: Mapping[str, Any]
+
+    def called(self, name: str) -> str:
+        """Return what the profile calls a column of the kind: `measured.NAME` where NAME is a reading, too."""
+        return MEASURED + name if MEASURED + name in self.columns else name
 
 
 def read_profile(path: str | Path) -> Profile:
@@ -109,6 +126,8 @@ def read_profile(path: str | Path) -> Profile:
     for key in ("delimiter", "columns", "settings"):
         if key not in content:
             raise file.error(f"this profile does not say {key!r} ({KEYS[key]}); add it")
+    if "format" in content:
+        check_format(file, FORMAT)
     kind = _kind(file)
     matrix = _matrix(file, kind)
     decimal = DECIMALS[_choice(file, "decimal", list(DECIMALS), "point")]
@@ -123,8 +142,9 @@ def read_profile(path: str | Path) -> Profile:
         _count(file, "skip"),
         _pattern(file, content["ignore"], ("ignore",)) if "ignore" in content else None,
         _encoding(file),
-        _missing(file),
+        *_missing(file, decimal),
         _columns(file, kind, bool(matrix)),
+        tuple(content.get("readings", {})),
         matrix,
         kind,
         content["settings"],
@@ -144,38 +164,65 @@ def _kind(file: YamlFile) -> Kind:
 
 def _columns(file: YamlFile, kind: Kind, matrix: bool) -> dict[str, Source]:
     """Return our columns, readings among them, with where they come from."""
-    targets = getattr(kind, "targets", ())
-    several = len(targets) > 1
+    several = len(getattr(kind, "targets", ())) > 1
     own = list(dict.fromkeys(c.name.partition(".")[2] if several else c.name for c in kind.columns))
     if matrix:
         own = own[-3:]
-    allowed = [*TEXTS, "time", "temperature", *own]
-    columns: dict[str, Source] = {}
+    dimensions, columns = _dimensions(kind, several), dict[str, Source]()
     for part in ("columns", "readings"):
         node = file.content.get(part, {})
         if not isinstance(node, dict):
             raise file.error(f"{part!r} must name columns, as {part}: {{x: {{from: X, unit: mm}}}}; correct it", (part,))
         for name, said in node.items():
-            free = part == "readings" or is_context(name) or name.startswith((SIGMA, COVARIANCE, "note"))
-            if not free and name not in allowed:
-                hint = nearest(name, allowed) or f"; there are {', '.join(allowed)}"
-                raise file.error(f"{name!r} is no column of a measurement file of the kind {kind.name!r}{hint}", (part, name))
-            columns[name] = _source(file, name, said, (part, name))
+            if part == "columns":
+                known = [*TEXTS, "time", "temperature", *own, *(MEASURED + n for n in own)]
+                beside = [*dimensions, *(SIGMA + one for one in file.content.get("readings", {}))]
+                _check_name(file, kind, name, known, [n for n in beside if n.startswith((SIGMA, COVARIANCE))])
+            elif name in columns:
+                sentence = f"{name!r} is a reading and a measured column, too"
+                raise file.error(f"{sentence}; call the measured one {MEASURED + name!r} under 'columns'", (part, name))
+            columns[name] = _source(file, name, said, (part, name), dimensions if part == "columns" else {})
     for name in own:
-        if name not in columns:
-            raise file.error(
-                f"'columns' does not say where {name!r} comes from, which the kind {kind.name!r} needs", ("columns",)
-            )
+        if sum(one in file.content["columns"] for one in (name, MEASURED + name)) != 1:
+            sentence = f"'columns' does not say where {name!r} comes from, once, which the kind {kind.name!r} needs"
+            raise file.error(sentence, ("columns",))
+    _check_targets(file, columns, several)
+    return columns
+
+
+def _check_name(file: YamlFile, kind: Kind, name: str, known: list[str], noise: list[str]) -> None:
+    """Refuse a column that a measurement file of this kind cannot have."""
+    of_noise = name.startswith((SIGMA, COVARIANCE))
+    allowed, plain = (noise, name.replace(MEASURED, "")) if of_noise else (known, name)
+    if plain not in allowed and not is_context(name) and not name.startswith("note"):
+        hint = nearest(name, allowed) or f"; there are {', '.join(allowed)}"
+        raise file.error(f"{name!r} is no column of a measurement file of the kind {kind.name!r}{hint}", ("columns", name))
+
+
+def _check_targets(file: YamlFile, columns: Mapping[str, Source], several: bool) -> None:
+    """Refuse lines of several targets that nothing tells apart."""
     match = columns["pose"].match if "pose" in columns else None
     if several and (match is None or "target" not in match.groupindex):
         raise file.error(
             "the kind has several targets, each with a line of its own; say how 'match' of 'pose' finds (?P<target>..)",
             ("columns", "pose"),
         )
-    return columns
 
 
-def _source(file: YamlFile, name: str, node: Any, place: Location) -> Source:
+def _dimensions(kind: Kind, several: bool) -> dict[str, tuple[Dimension, ...]]:
+    """Return what each column of the kind measures, and each sigma and covariance: two dimensions for a product."""
+
+    def plain(columns: Sequence[Column]) -> dict[str, Dimension]:
+        return {c.name.partition(".")[2] if several else c.name: c.dimension for c in columns}
+
+    noise = plain(kind.noise_columns)
+    found: dict[str, tuple[Dimension, ...]] = {name: (d,) for name, d in plain(kind.columns).items()}
+    found |= {SIGMA + name: (d,) for name, d in noise.items()}
+    found |= {f"{COVARIANCE}{a}.{b}": (noise[a], noise[b]) for a in noise for b in noise if a != b}
+    return found
+
+
+def _source(file: YamlFile, name: str, node: Any, place: Location, dimensions: Mapping[str, tuple[Dimension, ...]]) -> Source:
     """Return where a column comes from."""
     if not isinstance(node, dict) or "from" not in node:
         raise file.error(f"{name!r} needs 'from', a name or a place in the export, as {{from: X, unit: mm}}; correct it", place)
@@ -189,7 +236,9 @@ def _source(file: YamlFile, name: str, node: Any, place: Location) -> Source:
     if len(places) > 1 and not text:
         raise file.error(f"{name!r} is a number and comes from one column; name one", place)
     if "unit" in node:
-        _check_unit(file, name, str(node["unit"]), (*place, "unit"))
+        wanted = dimensions.get(name.replace(MEASURED, ""), ())
+        _check_unit(file, name, str(node["unit"]), (*place, "unit"), wanted)
+        _check_header(file, " ".join(map(str, places)), str(node["unit"]), (*place, "unit"))
     for key, owner in (("match", "pose"), ("format", TIME)):
         if key in node and (name != owner or not text):
             raise file.error(f"{key!r} belongs to {owner!r}, not to {name!r}; remove it", (*place, key))
@@ -201,20 +250,34 @@ def _source(file: YamlFile, name: str, node: Any, place: Location) -> Source:
     )
 
 
-def _check_unit(file: YamlFile, name: str, symbol: str, place: Location) -> None:
-    """Refuse a unit that no column can have."""
+def _check_unit(file: YamlFile, name: str, symbol: str, place: Location, wanted: tuple[Dimension, ...]) -> None:
+    """Refuse a unit that the column cannot have; `wanted` is empty where any will do."""
     if is_context(name):
         known = TIME_UNITS if name == TIME else TEMPERATURE_UNITS
         if symbol not in known:
             raise file.error(f"{symbol!r} is no unit of {name!r}; write one of {', '.join(known)}", place)
         return
-    try:
-        for part in symbol.split("*"):
-            unit(part.strip())
-    except UnitError:
-        raise file.error(
-            f"{symbol!r} is no unit{nearest(symbol, symbols())}; write one of {', '.join(symbols())}", place
-        ) from None
+    parts = [part.strip() for part in symbol.split("*")]
+    needed = wanted or (None,)
+    if len(parts) != len(needed):
+        like = "*".join("mm" for _ in needed)
+        raise file.error(f"{symbol!r} is no unit of {name!r}; write one of {len(needed)} factors, such as {like}", place)
+    for part, dimension in zip(parts, needed, strict=True):
+        try:
+            unit(part, dimension)
+        except UnitError:
+            of = f"unit of {name!r}" if part in symbols() else f"unit{nearest(part, symbols(dimension))}"
+            raise file.error(f"{part!r} is no {of}; write one of {', '.join(symbols(dimension))}", place) from None
+
+
+def _check_header(file: YamlFile, header: str, symbol: str, place: Location) -> None:
+    """Refuse a unit other than the one that the export's header states behind the name."""
+    found = STATED.search(header)
+    behind = symbol if found is None else found["unit"]
+    stated = ALIASES.get(behind, behind)
+    if stated != symbol and stated in {*symbols(), *TIME_UNITS, *TEMPERATURE_UNITS} - {"1"}:
+        sentence = f"the export heads this column {header!r}, but the unit here is {symbol!r}"
+        raise file.error(f"{sentence}; write the unit {stated}, or name the column by its place", place)
 
 
 def _matrix(file: YamlFile, kind: Kind) -> tuple[str | int, ...]:
@@ -256,12 +319,13 @@ def _pattern(file: YamlFile, text: Any, place: Location) -> re.Pattern[str]:
 
 
 def _encoding(file: YamlFile) -> str:
-    """Return the name of an encoding; UTF-8 passes over a byte order mark."""
+    """Return the name of an encoding of text; UTF-8 passes over a byte order mark."""
     name = str(file.content.get("encoding", "utf-8"))
     try:
         found = codecs.lookup(name).name
-    except LookupError:
-        sentence = f"{name!r} is no encoding that is known; write utf-8, utf-16, latin-1 or cp1252"
+        "".encode(found)  # refuses codecs that are no text, such as hex
+    except (LookupError, ValueError):
+        sentence = f"{name!r} is no encoding of text that is known; write utf-8, utf-16, latin-1 or cp1252"
         raise file.error(sentence, ("encoding",)) from None
     return "utf-8-sig" if found == "utf-8" else found
 
@@ -282,7 +346,12 @@ def _count(file: YamlFile, key: str) -> int:
     return value
 
 
-def _missing(file: YamlFile) -> tuple[str, ...]:
-    """Return the cells that mean not measured."""
+def _missing(file: YamlFile, decimal: str) -> tuple[tuple[str, ...], tuple[float, ...]]:
+    """Return the cells that mean not measured, as text, and those of them that are numbers."""
     value = file.content.get("missing", [])
-    return tuple(str(one) for one in (value if isinstance(value, list) else [value]))
+    given = value if isinstance(value, list) else [value]
+    for one in given:
+        if isinstance(one, bool) or not isinstance(one, (str, int, float)):
+            raise file.error(f"'missing' has {one!r} where the text of a cell is needed; put it in quotes", ("missing",))
+    numbers = [plain_number(with_point(one, decimal) if isinstance(one, str) else repr(one)) for one in given]
+    return tuple(str(one) for one in given), tuple(number for number in numbers if number is not None)
