@@ -7,13 +7,19 @@ import numpy as np
 import pytest
 
 from loopcal.calibrate import identify, pose_errors, validate
+from loopcal.calibrate.set_up_anew import set_up_anew
 from loopcal.errors import DataError
 from loopcal.io.json_text import to_json
-from loopcal.measure import simulate
+from loopcal.measure import Gaussian, Instrument, Pose, Sensor, simulate
 from tests import zoo
 from tests.calibrate.problems import bed, hexapod, hexapod_data, probed_heights, tracker, with_tolerance
 
 MM = 1e-3
+
+
+def tracker_in_frame() -> Instrument:
+    """Full poses in a frame that is not known."""
+    return Instrument((Sensor(Pose(unknown=("frame",)), Gaussian(np.array([5e-6] * 3 + [1e-6] * 3))),))
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +109,37 @@ def test_the_table_names_every_error_and_the_json_every_pose(validation):
     document = json.loads(to_json(validation.to_dict()))
     assert document["passed"] is True
     assert len(document["after"]["position"]["rows"]) == len(document["poses"])
+
+
+def sizes_if_moved(*moved, base=1.0, by=50.0, left=30):
+    """Sizes of errors that stay large while one of `moved` is kept."""
+    return lambda refit: (by if set(moved) - set(refit) else base, left)
+
+
+def test_of_several_kept_frames_the_moved_ones_are_named():
+    found = set_up_anew(("trk", "tool", "probe"), sizes_if_moved("trk", "probe"))
+    assert found.names == ("trk", "probe")
+    assert found.times == pytest.approx(50.0)
+    assert found.sentence.endswith("use --refit trk --refit probe")
+    # a shift of the frame is a shift of the target: refitting either is enough, so that neither alone brings it back
+    either = set_up_anew(("trk", "tool"), lambda refit: (1.0 if refit else 50.0, 30))
+    assert either.names == ("trk", "tool")
+
+
+def test_nothing_is_said_of_frames_where_errors_are_noise_alike_or_rows_are_few():
+    assert set_up_anew((), sizes_if_moved()) is None
+    assert set_up_anew(("trk",), sizes_if_moved("trk", by=2.5, base=0.5)) is None
+    assert set_up_anew(("trk",), sizes_if_moved("trk", by=50.0, base=20.0)) is None
+    assert set_up_anew(("trk",), sizes_if_moved("trk", left=7)) is None
+
+
+def test_what_is_not_known_of_the_geometry_before_is_noted_as_found_from_these_rows():
+    instrument = tracker_in_frame()
+    fit = identify(hexapod(), hexapod_data(20, 0, instrument))
+    more = hexapod_data(8, 1, instrument)
+    known = dict(fit.local.values)
+    assert any("which flatters them" in note for note in validate(fit.robot, more, known=known).notes)
+    alike = validate(fit.robot, more, known=known, known_before=fit.local.starts)
+    assert not any("flatters" in note for note in alike.notes)
+    own = validate(fit, more)
+    np.testing.assert_allclose(alike.before.position, own.before.position, rtol=1e-9)

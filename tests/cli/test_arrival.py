@@ -88,3 +88,25 @@ def test_validate_uses_the_frame_that_the_run_found(here) -> None:
     code, _, err = run("validate run more.csv --refit tracker")
     assert code == 1
     assert "is called 'tracker'; there are frame" in err
+
+
+def test_a_frame_that_was_moved_since_the_fit_is_named_and_both_errors_are_taken_with_the_frame_that_the_run_found(
+    here,
+) -> None:
+    folder, run = here
+    placed = {"frame.x": 0.1, "frame.rz": 0.5}
+    saved(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)
+    saved(folder / "moved.csv", Pose(unknown=("frame",)), 6, 1, unknowns=placed | {"frame.x": 0.105})
+    saved(folder / "one.csv", Pose(unknown=("frame",)), 1, 1, unknowns=placed | {"frame.x": 0.105})
+    assert run("calibrate hexapod-42 data.csv -o run")[0] == 0
+    code, out, _ = run("validate run moved.csv")
+    assert code == 0
+    assert "position error (rms): the same before and after calibration" in out  # 5 mm of the frame in both
+    assert "note: frame seems to have been set up anew since the fit: found anew from these rows, errors are" in out
+    assert "use --refit frame" in out
+    code, out, _ = run("validate run moved.csv --refit frame")
+    assert code == 0
+    assert "times smaller after calibration" in out
+    assert "set up anew" not in out
+    code, out, _ = run("validate run one.csv")  # one pose does not tell: six numbers, six unknowns
+    assert (code, "set up anew" in out) == (0, False)

@@ -218,6 +218,7 @@ class Identification:
             "weight": self.weight,
             "local_estimate": self.local.estimate,
             "local_sd": self.local.sd,
+            "local_start": self.local.start,
             **self.posterior.arrays(),
             **({} if self.latent is None else self.latent.arrays()),
         }

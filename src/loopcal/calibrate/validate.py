@@ -20,6 +20,7 @@ import numpy as np
 from loopcal.calibrate.combinations import listed
 from loopcal.calibrate.identification import Identification
 from loopcal.calibrate.pose_errors import INDICES, PoseErrors, pose_errors
+from loopcal.calibrate.set_up_anew import set_up_anew
 from loopcal.errors import DataError, nearest
 from loopcal.linalg import FloatArray
 from loopcal.measure import (
@@ -141,6 +142,7 @@ def validate(
     before: Mechanism | None = None,
     known: Mapping[str, float] | None = None,
     refit: Sequence[str] = (),
+    known_before: Mapping[str, float] | None = None,
 ) -> Validation:
     """Compare a calibrated robot with measurements, best with ones it was not fitted to.
 
@@ -153,6 +155,8 @@ def validate(
         its nominal values).
     known : values [SI] by name of frames, targets and surfaces that a fit found; they are kept. Default: those of `fit`.
     refit : names of some of them, such as `tracker*`, to be found anew all the same, because they were set up anew.
+    known_before : the same as `known` for the geometry before, so that like is compared with like. Default: the values with
+        which `fit` began; what is not known is found from these rows, and that is noted.
 
     Raises
     ------
@@ -172,7 +176,7 @@ def validate(
         raise DataError(f"{robot.name} reaches none of the {data.n_poses} poses; check the readings and their units")
     rows = [o.take(ok[o.rows].reshape(len(o), -1).all(axis=1)) for o in rows]
     seen = replace(data, observations=tuple(rows))
-    starts, kept = _known(fit, before, known, refit, data)
+    starts, kept = _known(fit, before, (known_before, known), refit, data)
     first, last = _view(old, seen, believed, ok, starts), _view(robot, seen, predicted, ok, kept)
     was, now = first.residuals(rows), last.residuals(rows)
     missed = first.differences(rows, _view(old, seen, reached, ok, None))
@@ -190,7 +194,7 @@ def validate(
         limit_angle=limit_angle,
         reasons=reasons,
         units=_units(robot),
-        notes=(*_notes(last), *_unread(data)),
+        notes=(*_notes(first, last), *_anew(robot, seen, predicted, ok, kept), *_unread(data)),
         alignment=_alignment(last),
     )
 
@@ -247,14 +251,15 @@ def _view(robot: Mechanism, data: Measurements, found: Solution, ok: np.ndarray,
 def _known(
     fit: Identification | Mechanism,
     before: Mechanism | None,
-    known: Mapping[str, float] | None,
+    known: tuple[Mapping[str, float] | None, Mapping[str, float] | None],
     refit: Sequence[str],
     data: Measurements,
 ) -> tuple[dict[str, float], dict[str, float]]:
     """What is known of frames, targets and surfaces for the geometry before, and for the calibrated one."""
     own = fit.local if isinstance(fit, Identification) else None
-    kept = (own.values if own else {}) if known is None else known
-    starts = own.starts if own and before is None and known is None else {}
+    then, now = known
+    kept = (own.values if own else {}) if now is None else now
+    starts = (own.starts if own and before is None and now is None else {}) if then is None else then
     return _kept(starts, refit, data), _kept(kept, refit, data)
 
 
@@ -280,15 +285,41 @@ def _alignment(view: _View) -> dict[str, tuple[str, ...]]:
     }
 
 
-def _notes(view: _View) -> tuple[str, ...]:
+def _notes(first: _View, last: _View) -> tuple[str, ...]:
     """Say where the unknowns of the measurements come from, and after which best fit errors are compared."""
-    found, notes = _alignment(view), []
+    found, notes = _alignment(last), []
     if found["kept"]:
         notes.append(f"{listed(found['kept'])}: as the fit found it")
+    unlike = [name for name in found["kept"] if name in _alignment(first)["fitted"]]
+    if unlike:
+        names = listed(unlike)
+        notes.append(f"errors before calibration are those after the best fit of {names} to these rows, which flatters them")
     if found["fitted"]:
         names = listed(found["fitted"])
         notes.append(f"{names}: found anew from these rows, which flatters: errors are those after the best fit of {names}")
     return tuple(notes)
+
+
+def _anew(robot: Mechanism, data: Measurements, found: Solution, ok: np.ndarray, kept: Mapping[str, float]) -> tuple[str, ...]:
+    """Say which of the frames, targets and surfaces that are kept seem to have been set up anew."""
+    table = data.unknowns.table
+    owner = {p.name: p.name.rsplit(".", 1)[0] for p in table.entries}
+    rows = list(data.observations)
+
+    def sizes(refit: tuple[str, ...]) -> tuple[float, int]:
+        try:
+            view = _view(robot, data, found, ok, {name: v for name, v in kept.items() if owner.get(name) not in refit})
+        except DataError:  # too few rows to find it from
+            return float("nan"), 0
+        errors = [np.where(o.present, r, 0.0) for o, r in zip(rows, view.residuals(rows), strict=True)]
+        total = sum(float(((o.whitener @ e[..., None]) ** 2).sum()) for o, e in zip(rows, errors, strict=True))
+        free = sum(p.free and owner[p.name] in refit for p in table.entries)
+        left = sum(o.n_residuals for o in rows) - free
+        return float(np.sqrt(total / max(left, 1))), left
+
+    names = dict.fromkeys(owner[p.name] for p in table.entries if p.free and p.name in kept)
+    moved = set_up_anew(tuple(names), sizes)
+    return () if moved is None else (moved.sentence,)
 
 
 def _read(data: Measurements) -> np.ndarray:

@@ -53,7 +53,7 @@ def validate(
     measured = measurements(data, calibrated.robot, **allowed)
     if not allow_fitted_data:
         refuse_fitted_data(calibrated, data)
-    known = {"known": calibrated.local, "refit": refit}
+    known = {"known": calibrated.local, "known_before": calibrated.local_before, "refit": refit}
     found = compare(calibrated.robot, measured, limit_position, limit_angle, calibrated.before, **known)
     if as_json:
         show.json_document(found.to_dict())

@@ -37,6 +37,8 @@ class CalibratedRun:
     before: Mechanism
     local: Mapping[str, float] = field(default_factory=dict)
     """Frames, targets and surfaces as the run found them: values by name, such as `tracker.x` [SI]."""
+    local_before: Mapping[str, float] = field(default_factory=dict)
+    """The same with the geometry before calibration, on the rows that were fitted."""
 
 
 def run_document(
@@ -87,9 +89,11 @@ def load_run(path: str | Path) -> CalibratedRun:
     robot = load_robot(run.robot_path)
     initial = run.arrays.get("initial", robot.parameters.nominal)
     names = [row["name"] for row in run.result.get("fit", {}).get("local") or ()]
-    found = run.arrays.get("local_estimate")
-    local = dict(zip(names, found.tolist(), strict=True)) if found is not None and len(found) == len(names) else {}
-    return CalibratedRun(run.path, run.result, robot, robot.with_values(initial), local)
+    local, start = (
+        dict(zip(names, found.tolist(), strict=True)) if found is not None and len(found) == len(names) else {}
+        for found in (run.arrays.get("local_estimate"), run.arrays.get("local_start"))
+    )
+    return CalibratedRun(run.path, run.result, robot, robot.with_values(initial), local, start)
 
 
 def load_calibrated(path: str | Path) -> CalibratedRun:
