@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of the user are never replaced without a word, and a command writes all of its files or none."""
 
+import os
 import shutil
+import stat
 from pathlib import Path
 
 import pytest
 
 from loopcal.cli import main
+from loopcal.errors import FileError
 from loopcal.io.robot_file import robot_path
+from loopcal.io.text_file import write_text
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 TARGETS = "pose,x [mm],y [mm],z [mm],roll [deg],pitch [deg],yaw [deg]\nhome,0,0,200,0,0,0\n"
@@ -81,3 +85,42 @@ def test_a_run_that_is_read_is_not_replaced(run) -> None:
     code, _, err = run("compensate run pp.csv -o run/robot.yaml --force")
     assert (code, READ in err) == (1, True)
     assert contents() == before
+
+
+def test_what_is_no_file_is_not_replaced_even_by_force(run) -> None:
+    os.mkfifo("pipe")
+    Path("link").symlink_to("pipe")
+    for name in ("pipe", "link"):
+        for words in (f"simulate robot.yaml -o {name} --force", f"new gough -o new.yaml --measurements {name} --force"):
+            code, out, err = run(words)
+            assert (code, out, err.count("\n")) == (1, "", 1)
+            assert "this is a device or a pipe, which would be replaced" in err
+        with pytest.raises(FileError, match="this is a device or a pipe"):
+            write_text(name, "text")
+    assert stat.S_ISFIFO(os.lstat("pipe").st_mode)
+    assert Path("link").is_symlink()
+    assert not Path("new.yaml").exists()
+
+
+def test_force_on_a_symbolic_link_writes_the_file_that_it_names(run) -> None:
+    Path("folder").mkdir()
+    Path("folder/real.csv").write_text("mine\n")
+    Path("link.csv").symlink_to("folder/real.csv")
+    Path("new.csv").symlink_to("folder/later.csv")
+    code, _, err = run("simulate robot.yaml -o link.csv")
+    assert (code, THERE in err) == (1, True)
+    for link, real in (("link.csv", "folder/real.csv"), ("new.csv", "folder/later.csv")):
+        assert run(f"simulate robot.yaml -o {link} --force")[0] == 0
+        assert Path(link).is_symlink()
+        assert "pose,q1" in Path(real).read_text()
+        assert not Path(real).is_symlink()
+    assert sorted(path.name for path in Path("folder").iterdir()) == ["later.csv", "real.csv"]
+
+
+def test_links_that_end_nowhere_or_outside_any_folder_are_refused(run) -> None:
+    Path("circle").symlink_to("circle")
+    Path("lost").symlink_to("nodir/file")
+    for name, sentence in (("circle", "this symbolic link ends nowhere"), ("lost", "there is no folder")):
+        code, out, err = run(f"simulate robot.yaml -o {name} --force")
+        assert (code, out, err.count("\n")) == (1, "", 1)
+        assert sentence in err

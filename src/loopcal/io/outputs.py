@@ -9,6 +9,7 @@ from pathlib import Path
 
 from loopcal.errors import FileError
 from loopcal.io.run_folder import refuse_used_folder
+from loopcal.io.text_file import target_of
 
 
 def refuse_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], force: bool) -> None:
@@ -26,20 +27,20 @@ def refuse_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None]
     Raises
     ------
     FileError
-        An output is an input or another output, is there without `force`, is a folder, or has no folder to stand in.
+        An output is an input or another output, is there without `force`, is a folder or no file, or has no folder to stand
+        in; that of the file that a symbolic link names counts.
     """
     read = [file for path in inputs if path is not None for file in (path.iterdir() if path.is_dir() else (path,))]
     wanted = [path for path in outputs if path is not None]
     for i, path in enumerate(wanted):
+        folder = target_of(path).parent
         if any(_same(path, other) for other in read):
             raise FileError("this file is read by the same command, which would replace it; choose another name", path)
         if any(_same(path, other) for other in wanted[:i]):
             raise FileError("two outputs have this name; choose another for one of them", path)
-        if path.is_dir():
-            raise FileError("this is a folder where a file name is needed; add the name of the file to write", path)
-        if not path.parent.is_dir():
-            raise FileError(f"this cannot be written because there is no folder {path.parent}; make it first", path)
-        if not os.access(path.parent, os.W_OK):
+        if not folder.is_dir():
+            raise FileError(f"this cannot be written because there is no folder {folder}; make it first", path)
+        if not os.access(folder, os.W_OK):
             raise FileError("this cannot be written (permission denied); choose another place", path)
         if path.is_file() and not force:
             raise FileError("this file exists; choose another name, or replace it with --force", path)

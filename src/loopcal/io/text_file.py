@@ -77,25 +77,46 @@ def sha256(path: str | Path) -> str:
         raise FileError(f"this file cannot be read ({_reason(error)}); check its name and permissions", path) from error
 
 
-def write_text(path: str | Path, text: str) -> None:
-    """Write a UTF-8 file whole or not at all: to a temporary name beside it, then renamed over it.
+def target_of(path: str | Path) -> Path:
+    """Return the file that is written where `path` is: itself, or what a symbolic link names.
 
     Raises
     ------
     FileError
-        The path is a folder, its folder is missing, no permission, or the disk is full.
+        There is something else than a file: a folder, a device, a pipe, a link that ends nowhere.
     """
     path = Path(path)
     if path.is_dir():
         raise FileError("this is a folder where a file name is needed; add the name of the file to write", path)
+    if path.exists() and not path.is_file():
+        raise FileError("this is a device or a pipe, which would be replaced by a file; choose the name of a file", path)
+    if not path.is_symlink():
+        return path
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError):
+        raise FileError("this symbolic link ends nowhere; choose another name", path) from None
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a UTF-8 file whole or not at all: to a temporary name beside it, then renamed over it.
+
+    A symbolic link stays one; the file that it names is written.
+
+    Raises
+    ------
+    FileError
+        The path is a folder or no file, its folder is missing, no permission, or the disk is full.
+    """
+    target = target_of(path)
     with writing(path):
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
         try:
             with temporary.open("w", encoding="utf-8", newline="\n") as stream:
                 stream.write(text)
                 stream.flush()
                 os.fsync(stream.fileno())
-            temporary.replace(path)
+            temporary.replace(target)
         finally:
             temporary.unlink(missing_ok=True)
 
