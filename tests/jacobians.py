@@ -10,6 +10,7 @@ run with jax.numpy in the place of numpy (`under_jax`), which leaves the derivat
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -123,17 +124,51 @@ def _compare(name: str, analytic: Array, reference: Array, tolerance: Array, rea
 
 
 def automatic_derivative(function: Callable[..., object], x: Array, package: str = "loopcal") -> Array:
-    """Forward-mode derivative (..., k) of a function at x (k,), in double precision."""
+    """Forward-mode derivative (..., k) of a function at x (k,), in double precision.
+
+    The whole function is compiled at once, which takes a fraction of compiling it operation by operation; where it looks at
+    the values it computes, which a compiled function cannot, it is run as it stands.
+    """
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    slope, point = jax.jacfwd(function), jax.numpy.asarray(x)
     with under_jax(package):
-        return np.asarray(jax.jacfwd(function)(jax.numpy.asarray(x)))
+        try:
+            return np.asarray(jax.jit(slope)(point))
+        except (jax.errors.TracerBoolConversionError, jax.errors.NonConcreteBooleanIndexError,
+                jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):  # fmt: skip
+            return np.asarray(slope(point))
+
+
+class _Either:
+    """A module of numpy whose functions are those of jax where an argument is jax's, else numpy's own."""
+
+    def __init__(self, plain: ModuleType, traced: ModuleType) -> None:
+        self._plain, self._traced = plain, traced
+
+    def __getattr__(self, name: str) -> object:
+        import jax
+
+        plain = getattr(self._plain, name)
+        if isinstance(plain, ModuleType):
+            return _Either(plain, getattr(self._traced, name))
+        if isinstance(plain, type) or not callable(plain):
+            return plain
+
+        def either(*args: object, **kwargs: object) -> object:
+            arrays = (a for a in jax.tree.leaves((args, kwargs)) if isinstance(a, jax.Array))
+            return plain(*args, **kwargs) if next(arrays, None) is None else getattr(self._traced, name)(*args, **kwargs)
+
+        return either
 
 
 @contextmanager
 def under_jax(package: str = "loopcal") -> Iterator[None]:
-    """Let every loaded module of a package find jax.numpy under the name `np`, and put numpy back at the end."""
+    """Let every loaded module of a package find jax.numpy under the name `np`, and put numpy back at the end.
+
+    What does not depend on the traced unknowns stays with numpy: it needs no derivative and no compiling.
+    """
     import jax.numpy
 
     modules = [
@@ -142,7 +177,7 @@ def under_jax(package: str = "loopcal") -> Iterator[None]:
         if (name == package or name.startswith(package + ".")) and getattr(module, "np", None) is np
     ]
     for module in modules:
-        vars(module)["np"] = jax.numpy
+        vars(module)["np"] = _Either(np, jax.numpy)
     try:
         yield
     finally:
