@@ -197,6 +197,6 @@ def samples_text(found: dict[str, Any]) -> str:
 
 def _rows(value: Any) -> str:
     """JSON of a value; lists of lists with one inner list on a line."""
-    if isinstance(value, list) and isinstance(value[0], list):
+    if isinstance(value, list) and value and isinstance(value[0], list):
         return "[\n    " + ",\n    ".join(json.dumps(row) for row in value) + "\n  ]"
     return json.dumps(value)

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 from loopcal import forward, inverse
+from loopcal.calibrate import identifiability
 from loopcal.errors import FileError
+from loopcal.io import load_measurements
 from loopcal.io.formats import hangprinter
 from loopcal.io.formats.exchange import Reading
 from loopcal.io.formats.transfer import checked
+from loopcal.io.measurement_writer import save_measurements
 from tests.cable_robot import NAMES, TRUTH, example, paid_out, samples_text
 
 
@@ -89,6 +92,20 @@ def test_stated_anchors_are_taken(tmp_path) -> None:
     np.testing.assert_allclose(robot.values[:16].reshape(4, 4)[:, :3] * 1e3, anchors, rtol=0, atol=1e-9)
 
 
+def test_with_stated_anchors_no_pose_need_be_known(tmp_path) -> None:
+    anchors = [[0, -1500, -90], [1200, 700, -120], [-1250, 650, -100], [0, 0, 2200]]
+    robot, imported = read(tmp_path, example() | {"anchors": anchors, "xyz_of_samp": []})
+    assert imported.measurements is not None
+    assert imported.measurements.n_rows == 0
+    save_measurements(imported.measurements, tmp_path / "samples.csv", robot, "")
+    again = load_measurements(tmp_path / "samples.csv", robot)
+    assert again.n_poses == 45
+    assert again.n_rows == 0
+    assert again.labels[0] == "sample1"
+    assert "45 poses of 4 motor angles, 0 of them known" in imported.notes[0]
+    assert identifiability(robot, imported.measurements).rank == 14  # 21 less six of the frame and one of the scale
+
+
 def test_what_a_robot_file_cannot_say_is_told(tmp_path) -> None:
     more = {"springKPerUnitLength": 2e4, "mover_weight": 2.0, "force_samp": [[1, 2, 3, 4]] * 41, "colour": "red"}
     _, imported = read(tmp_path, example() | more | {"line_lengths_when_at_origin": [1, 2, 3, 4]})
@@ -113,6 +130,7 @@ def test_what_a_robot_file_cannot_say_is_told(tmp_path) -> None:
         ({"mechanical_advantage": [2, 2, 2, 0]}, "all of it must be above zero"),
         ({"spool_gear_teeth": "many"}, "'spool_gear_teeth' is not a number"),
         ({"anchors": [[1, 2, 3]]}, "'anchors' has 1 rows for 4 lines"),
+        ({"xyz_of_samp": []}, "no pose is known; add poses to 'xyz_of_samp' (mm)"),
         ({"xyz_of_samp": [[0, 0, 0]]}, "the 1 known poses do not tell where line A is anchored"),
     ],
 )

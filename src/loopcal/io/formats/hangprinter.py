@@ -115,7 +115,8 @@ def read(path: Path, reading: Reading) -> Imported:
     Raises
     ------
     FileError
-        No JSON, a key is missing, not of numbers or not of the right length, or the known poses do not tell an anchor.
+        No JSON, a key is missing, not of numbers or not of the right length, or the known poses do not tell an anchor and the
+        file states none.
     """
     samples = parse(path)
     anchors = samples.anchors if samples.anchors is not None else anchors_from_known(samples, path)
@@ -140,7 +141,7 @@ def parse(path: Path) -> Samples:
     lines = motors.shape[1]
     if not FREEDOMS <= lines <= 26:
         raise FileError(f"'motor_pos_samp' has {lines} motors in a row; a point in space needs 3 lines or more", path)
-    known = _numbers(found, "xyz_of_samp", path, 2, FREEDOMS)
+    known = np.zeros((0, FREEDOMS)) if found.get("xyz_of_samp") == [] else _numbers(found, "xyz_of_samp", path, 2, FREEDOMS)
     if len(known) > len(motors):
         raise FileError(
             f"'xyz_of_samp' has {len(known)} poses and 'motor_pos_samp' only {len(motors)}; leave out the rest", path
@@ -165,8 +166,14 @@ def anchors_from_known(samples: Samples, path: Path) -> FloatArray:
     Raises
     ------
     FileError
-        The known poses have rank below 4: too few, or in a plane through the origin.
+        No pose is known, or the known poses have rank below 4: too few, or in a plane through the origin.
     """
+    if not len(samples.known):
+        raise FileError(
+            "no pose is known; add poses to 'xyz_of_samp' (mm), at several heights, or where each line is anchored under the"
+            " key 'anchors' (mm)",
+            path,
+        )
     x, dl = samples.known, samples.motors[: len(samples.known)] * samples.gain
     anchors = []
     for name, d in zip(samples.names, dl.T, strict=True):
@@ -225,14 +232,14 @@ def _parameters(samples: Samples) -> Iterator[str]:
 
 
 def _measurements(samples: Samples, reading: Reading) -> Measurements:
-    """All readings, and the known poses as positions of the platform."""
+    """All readings, and the known poses as positions of the platform; cells of NaN where none is known, to be filled in."""
     from loopcal.measure import Measurements, Observations
     from loopcal.measure.kinds.position import Position
 
     kind = Position().mounted(np.eye(4))
-    known = samples.known * MM
+    known = samples.known * MM if len(samples.known) else np.full((len(samples.motors), FREEDOMS), np.nan)
     seen = Observations.from_sigma(kind, np.arange(len(known)), known, reading.sigma_position)
-    labels = tuple(f"{'known' if i < len(known) else 'sample'}{i + 1}" for i in range(len(samples.motors)))
+    labels = tuple(f"{'known' if i < len(samples.known) else 'sample'}{i + 1}" for i in range(len(samples.motors)))
     return Measurements(reading.name, samples.motors, (seen,), labels=labels)
 
 
