@@ -118,9 +118,49 @@ def test_a_word_that_is_not_there_is_added_before_the_comment(tmp_path) -> None:
         ("reprap", "M665 L250 R130 H200\nM666 A0.3\n", r":2: M666 A tilts the bed"),
         ("reprap", "M665 L100 R130 H200\n", "the delta radius is 130 mm and the shortest arm 100 mm"),
         ("marlin", "M665 L250 R130 H200 B80\n", r":1: M665 B without A and C"),
+        ("reprap", "G28\nM665 L269 R130,25 H250\n", r":2: R of M665 is '130,25' where a finite number is needed"),
+        ("reprap", "M665 L269 R130 ,25 H250\n", r":1: M665 has ',25 H250' where a letter and its number are needed"),
+        ("reprap", "M665 269 R130 H250\n", r":1: M665 has '269 R130 H250' where a letter"),
+        ("reprap", "M665 L269 R130 H250\nM666 X - 0.5\n", r":2: M666 has '0.5' where a letter"),
+        ("reprap", "M665 L{var.rod} R130 H250\n", r":1: L of M665 is '{var.rod}' where a finite number"),
+        ("reprap", "M665 L269 R130 R131 H250\n", r":1: M665 has R twice"),
+        ("reprap", "G28 G20\nM665 L269 R130 H250\n", r":1: G20 asks for inches"),
+        ("marlin", "M665 L269 R130 H250 M666 X-0.5\n", r":1: M666 is not the first command of this line"),
         ("marlin", "M665 L250 R130 H200\nM666 X0.1\n", r":2: M666 X is 0.1, but Marlin takes none above zero"),
     ],
 )
 def test_bad_files_are_refused_with_their_line(tmp_path, name, text, sentence) -> None:
     with pytest.raises(FileError, match=sentence):
         imported(tmp_path, name, text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "m665 l269.1 r130.25 h300\nm666 x0.5\n",
+        "N10 M665 L269.1 R130.25 H300*33\nN11 M666 X0.5 * 12 ; stops\n",
+        "M665L269.1R130.25H300\nM666X0.5\n",
+        'M665 L269.1 (10" rods) R130.25 H300 (height\nM666 X0.5\n',
+        "G21 M665 L269.1 R130.25 H300 M666 X0.5 G28\n",
+        'M117 M665 L1 R1 H1\nM550 P"M665 R7"\nM665 L 269.1 R 130.25 H 300\nM666 X.5\n',
+    ],
+)
+def test_a_command_is_read_to_its_end_however_it_is_written(tmp_path, text) -> None:
+    robot = imported(tmp_path, "reprap", text)
+    assert [value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx([300.5, 300.0, 300.0])
+    assert [value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx([269.1] * 3)
+    assert value(robot, "radius") == pytest.approx(130.25)
+    assert exported(robot, "reprap", tmp_path / "reprap.g") == text
+
+
+def test_words_are_corrected_and_added_where_they_belong_and_checksums_follow(tmp_path) -> None:
+    text = "N1 m665 L269 R130 H300 M666 Y0.25*99 ; ours\n"
+    robot = imported(tmp_path, "reprap", text)
+    shift = 1e-3 * np.eye(len(robot.values))[robot.parameters.index("radius")]
+    shift = shift + np.deg2rad(0.5) * np.eye(len(robot.values))[robot.parameters.index("tower1.angle")]
+    written = exported(robot.with_values(robot.values + shift), "reprap", tmp_path / "reprap.g")
+    code = "N1 m665 L269 R131.000000 H300 X0.500000 M666 Y0.25"
+    checksum = 0
+    for byte in code.encode():
+        checksum ^= byte
+    assert written == f"{code}*{checksum} ; ours\n"

@@ -6,8 +6,8 @@
 
 Towers X, Y and Z stand at 210 + X, 330 + Y and 90 + Z degrees; rod k is L plus its trim. After homing each carriage backs
 off from its end stop by its adjustment and stands at height H then, so stop_k = H - adjustment_k: the opposite sign of
-RepRapFirmware's. With a bed probe the height is H less the probe's Z offset (M851). Source: Marlin's documentation of
-M665, M666 and M851, and its modules delta and motion.
+RepRapFirmware's. With a bed probe the height is H less the probe's Z offset (M851). A line holds one command.
+Source: Marlin's documentation of M665, M666 and M851, and its modules delta and motion.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ OLD = "rod trims (M665 A, B, C) need Marlin 2.0.6 or later; older ones know one 
 
 def read(path: Path, reading: Reading) -> Imported:
     """Read M665 and M666 (and the probe's offset M851); FileError for what is missing, no number or contradictory."""
-    file = gcode.read(path)
+    file = gcode.read(path, one_in_a_line=True)
     found = _present(file)
     offset = file.number("M851", "Z", 0.0)
     notes = (f"M851 Z{offset:g}: the height at home is H less this probe offset",) if offset else ()
@@ -35,7 +35,7 @@ def read(path: Path, reading: Reading) -> Imported:
 def write(source: Source, into: Path | None) -> Exported:
     """The corrected words in a file whose other bytes stay, or two lines of their own."""
     numbers = numbers_of(source, "marlin")
-    file = None if into is None else gcode.read(into)
+    file = None if into is None else gcode.read(into, one_in_a_line=True)
     lowest = min(numbers.stops)
     wanted = {("M665", "R"): numbers.radius, ("M665", "H"): lowest + (file.number("M851", "Z", 0.0) if file else 0.0)}
     wanted |= {("M665", t): a - n for t, a, n in zip(TOWERS, numbers.angles, NOMINAL_ANGLES, strict=True)}
