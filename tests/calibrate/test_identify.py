@@ -82,6 +82,14 @@ def test_beginning_from_closure_changes_nothing_where_poses_are_not_measured_in_
     a = identify(hexapod(), heights, MAP())
     b = identify(hexapod(), heights, MAP(), begin="closure")
     assert np.array_equal(a.estimate, b.estimate)
+    (note,) = set(b.notes) - set(a.notes)
+    assert note.startswith("begin closure was not used: it needs one kind that measures all poses in full")
+
+
+def test_that_uncertain_readings_cannot_begin_from_closure_is_noted(data):
+    few = replace(data.take(np.arange(10)), reading_sigma=2e-6)
+    fit = identify(hexapod(), few, MAP(), begin="closure")
+    assert "begin closure was not used: it needs exact readings; the fit began with the kinematics" in fit.notes
 
 
 def test_leaving_poses_out_by_weight_equals_removing_them(data):

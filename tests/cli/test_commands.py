@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from loopcal.cli import main
-from loopcal.io import load_robot
+from loopcal.io import load_measurements, load_robot
 from loopcal.io.calibration_run import load_run
 from loopcal.io.robot_file import shipped_robots
 
@@ -210,3 +210,20 @@ def test_drawn_errors_are_written_as_a_robot_file(run) -> None:
     drawn = load_robot("drawn.yaml")
     assert 1e-6 < np.std(drawn.values - drawn.parameters.nominal) < 1e-4  # [m], tolerance 0.029 mm
     assert run("calibrate hexapod-42 drawn.csv -o run")[0] == 0
+
+
+def test_simulated_encoders_are_as_noisy_as_asked_and_their_file_says_so(run, tmp_path) -> None:
+    words = "simulate linear-delta --draw 30 --kind position --seed 4"
+    assert run(f"{words} -o exact.csv")[0] == run(f"{words} --sigma-reading 20um,q3=0um -o noisy.csv")[0] == 0
+    robot = load_robot("linear-delta")
+    exact, noisy = (load_measurements(tmp_path / name, robot) for name in ("exact.csv", "noisy.csv"))
+    assert exact.reading_sigma is None
+    assert noisy.reading_sigma is not None
+    np.testing.assert_allclose(noisy.reading_sigma, np.tile([20e-6, 20e-6, 0.0], (30, 1)), rtol=1e-14)  # written in mm
+    error = noisy.readings - exact.readings
+    assert np.abs(error[:, 2]).max() < 1e-12  # [m], digits of the file
+    assert 30.0 < ((error[:, :2] / 20e-6) ** 2).sum() < 100.0  # chi-square of 60: 0.1 % on either side
+    assert run("simulate linear-delta --fill noisy.csv --sigma-reading 5um -o x.csv")[2].startswith("loopcal: --fill noisy.csv")
+    refused = run("identifiability linear-delta noisy.csv --sigma-reading 5um")
+    assert refused[0] == 1
+    assert "DATA states how far its readings are believed" in refused[2]

@@ -75,3 +75,31 @@ def test_options_that_contradict_each_other_are_one_sentence(run, words, sentenc
     assert (code, out) == (1, "")
     assert sentence in err
     assert err.count("\n") == 1
+
+
+def test_noisy_encoders_are_assumed_for_an_instrument_and_weaken_what_is_known(run):
+    """Readings of 1 mm beside positions of 10 um: every parameter is known worse, and none better."""
+    words = "linear-delta --draw 20 --kind position --json"
+    exact, noisy = (json.loads(run(words + more)[1])["singular_values"] for more in ("", " --sigma-reading 1mm"))
+    assert max(noisy) < 0.1 * max(exact)
+    assert (
+        run("linear-delta --draw 20 --kind position --json --sigma-reading q1=1mm,q2=1mm,q3=1mm")[1]
+        == run(words + " --sigma-reading 1mm")[1]
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("--sigma-reading 5", "--sigma-reading '5' for q1: '5' has no unit"),
+        ("--sigma-reading 5urad", "'urad' is a unit of angle, but a length is needed"),
+        ("--sigma-reading -5um", "--sigma-reading for q1 is -5um; give a number above zero, or zero for exact"),
+        ("--sigma-reading q9=5um", "--sigma-reading names 'q9'"),
+        ("--sigma-reading q1=5um,q2", "--sigma-reading 'q2' for q1: "),
+    ],
+)
+def test_a_noise_of_readings_without_sense_is_one_sentence(run, words, sentence):
+    code, out, err = run(f"linear-delta --draw 5 {words}")
+    assert (code, out) == (1, "")
+    assert sentence in err
+    assert err.count("\n") == 1

@@ -27,6 +27,14 @@ def test_every_command_has_help_with_an_example_and_json(name, capsys) -> None:
     assert "--json" in text
 
 
+def test_python_m_loopcal_is_the_command_line() -> None:
+    words = [sys.executable, "-m", "loopcal"]
+    done = subprocess.run([*words, "check", "no-such-robot"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("loopcal: ")
+    assert "no-such-robot" in done.stderr
+
+
 def test_nothing_heavy_is_imported_before_a_command_runs() -> None:
     code = "import sys, loopcal, loopcal.cli; print(*{'numpy', 'scipy', 'pydantic', 'ruamel', 'rich'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -156,6 +156,7 @@ def test_noise_of_readings_is_read_and_an_empty_cell_is_a_reading_not_taken(tmp_
         ("{q1: 5 um, q2: 0 mm}", "5 deg", r"data.csv:4: 'reading_noise': 'deg' is a unit of angle"),
         (",7,", ",-7,", r"data.csv:6: column 'sigma.q6' is below zero"),
         ("sigma.q6 [um]", "sigma.q6", r"data.csv:5: column 'sigma.q6' has no unit"),
+        (",7,", ",,", r"data.csv:6: column 'sigma.q6' is empty, and nothing else says how far this reading is believed"),
     ],
 )
 def test_noise_of_readings_without_sense_is_refused(tmp_path, robot, old, new, message) -> None:

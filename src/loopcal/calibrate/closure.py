@@ -42,6 +42,16 @@ def descend_from_closure(
     return np.where(good[:, None], fit.deviation, start), fit
 
 
+def not_used(rows: AnyRows) -> str:
+    """Return why closure cannot be linearised at the measured poses; empty where it can."""
+    if isinstance(rows, LatentRows):
+        return "begin closure was not used: it needs exact readings; the fit began with the kinematics"
+    if locate(rows) is None:
+        whole = "one kind that measures all poses in full, in a known frame, of a robot with six freedoms and no passive joints"
+        return f"begin closure was not used: it needs {whole}; the fit began with the kinematics"
+    return ""
+
+
 def locate(rows: Rows) -> FloatArray | None:
     """Return the measured poses T_base_platform (t | 1, n, 4, 4); None where they are not all measured in full."""
     robot = rows.unknowns.robot

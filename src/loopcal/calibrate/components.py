@@ -56,7 +56,7 @@ class KindRows(NamedTuple):
     residual: FloatArray
 
 
-def components_of(n: int, sensed: Sequence[Sensed], freedoms: int, labels: Sequence[str] = ()) -> IntArray:
+def components_of(n: int, sensed: Sequence[Sensed], freedoms: int) -> IntArray:
     """Return the component (n,) of each pose, numbered by their first poses.
 
     Raises

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.calibrate.checks import check_count, check_rows, check_settings, check_start
-from loopcal.calibrate.closure import descend_from_closure
+from loopcal.calibrate.closure import descend_from_closure, not_used
 from loopcal.calibrate.combinations import combinations
 from loopcal.calibrate.conflict import prior_conflict
 from loopcal.calibrate.descent import Descent, DescentStatus, StepControl, descend
@@ -97,7 +97,7 @@ def identify(
     residuals = _labelled(_residuals(rows, weighed, fit.deviation), data, rows)
     result = _identification(robot, free, method, fit, check, residuals, weighed)
     latent = latent_estimate(rows, data, drop) if isinstance(rows, LatentRows) else None
-    notes = (*result.notes, *_count_notes(rows, method), *_weight_notes(data, weight, loss), *_drop_notes(drop))
+    notes = (*result.notes, *_row_notes(rows, method, begin), *_weight_notes(data, weight, loss), *_drop_notes(drop))
     return replace(
         result, weight=weight, dropped=tuple(drop), notes=(*notes, *(latent.notes() if latent else ())), latent=latent
     )
@@ -118,12 +118,13 @@ def _residuals(rows: AnyRows, weighed: AnyRows, z: FloatArray) -> tuple[Residual
     return rows.residuals(z, None if weighed is rows else weighed.own_values(z))
 
 
-def _count_notes(rows: AnyRows, method: Method) -> list[str]:
-    """Say that tolerances alone hold some directions, where equations are fewer than parameters."""
+def _row_notes(rows: AnyRows, method: Method, begin: Begin) -> list[str]:
+    """Say where tolerances alone hold some directions, equations being fewer than parameters, and where it could not begin."""
     m, p = int(rows.equations[0]), rows.parameters
-    if m >= p or not isinstance(method, MAP):
-        return []
-    return [f"{m} equations for {p} parameters: at least {p - m} directions rest on tolerances alone"]
+    notes = [why] if begin == "closure" and (why := not_used(rows)) else []
+    if m < p and isinstance(method, MAP):
+        notes.append(f"{m} equations for {p} parameters: at least {p - m} directions rest on tolerances alone")
+    return notes
 
 
 def _weight_notes(data: Measurements, weight: FloatArray, loss: Loss | None) -> list[str]:

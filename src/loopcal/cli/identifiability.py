@@ -21,6 +21,8 @@ from loopcal.cli.options import (
     json_option,
     measurements,
     robot_argument,
+    sigma_of_readings,
+    sigma_reading_option,
 )
 from loopcal.errors import DataError
 
@@ -46,6 +48,7 @@ FRAMES = {"base": ("frame",), "tool": ("tool", "targets")}
 @click.option("-o", "--output", type=FILE, help="With --reduce: the robot file to write, the others fixed.")
 @click.option("--force", is_flag=True, help="Replace a file that is there.")
 @instrument_options
+@sigma_reading_option
 @data_options
 @json_option
 def identifiability(
@@ -57,6 +60,7 @@ def identifiability(
     reduced: bool,
     output: Path | None,
     force: bool,
+    sigma_reading: str | None,
     allowed: Mapping[str, bool],
     as_json: bool,
     **seen_by: Any,
@@ -83,7 +87,7 @@ def identifiability(
     from loopcal.io.robot_file import robot_path
     from loopcal.measure import simulate
 
-    _refuse(data, poses, seen_by, reduced, output)
+    _refuse(data, poses, seen_by | {"readings": sigma_reading}, reduced, output)
     refuse_outputs((output,), (robot_path(robot), *data, poses), force)
     machine, drawn = load_robot(robot), ""
     if data:
@@ -91,7 +95,7 @@ def identifiability(
     else:
         looking = assumed_instrument(**seen_by)
         targets, drawn = (load_poses(poses, machine), "") if poses is not None else drawn_poses(machine, draw, seed)
-        measured = simulate(machine, targets, looking, seed=0, controller=machine)
+        measured = simulate(machine, targets, looking, 0, machine, reading_sigma=sigma_of_readings(sigma_reading, machine))
     found = identifiable(machine, measured)
     cures, smaller = remedies(found), reduce(found) if reduced else None
     if smaller is not None and output is not None:
@@ -115,6 +119,8 @@ def _refuse(data: Sequence[Path], poses: Path | None, seen_by: Mapping[str, Any]
         raise DataError("there are both DATA and --poses; give measurements, or poses that could be measured, but not both")
     if data and (seen_by["measure"] or seen_by["frames"]):
         raise DataError("DATA states what is measured and what is unknown; leave out --measure and --frames, or DATA")
+    if data and seen_by["readings"]:
+        raise DataError("DATA states how far its readings are believed (reading_noise); leave out --sigma-reading, or DATA")
     if output is not None and not reduced:
         raise DataError("-o writes what --reduce finds; add --reduce, or leave out -o")
 

@@ -132,6 +132,42 @@ def instrument_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
+sigma_reading_option = click.option(
+    "--sigma-reading",
+    metavar="QUANTITY",
+    help="Standard deviation of the recorded readings, for all or such as q1=5um,q2=20urad. [default: as the robot file says]",
+)
+
+
+def sigma_of_readings(text: str | None, robot: Mechanism) -> np.ndarray | None:
+    """Return the standard deviation (a,) [SI] of each reading that --sigma-reading states; None where it is not there.
+
+    Raises
+    ------
+    DataError
+        Not a quantity above zero or zero, of another dimension than the reading, or of an actuator that is not there.
+    """
+    import numpy as np
+
+    if text is None:
+        return None
+    found = {a.name: a.sigma or 0.0 for a in robot.actuators}
+    dimensions = {a.name: a.dimension for a in robot.actuators}
+    for part in text.split(","):
+        name, equals, number = part.rpartition("=")
+        if equals and name not in found:
+            known = ", ".join(found)
+            raise DataError(f"--sigma-reading names {name!r}{nearest(name, found)}; actuators of {robot.name} are {known}")
+        for each in (name,) if equals else tuple(found):
+            try:
+                found[each] = quantity(number, dimensions[each])
+            except UnitError as error:
+                raise DataError(f"--sigma-reading {number!r} for {each}: {error}") from None
+            if not 0.0 <= found[each] < np.inf:
+                raise DataError(f"--sigma-reading for {each} is {number}; give a number above zero, or zero for exact")
+    return np.array(list(found.values()))
+
+
 def instrument(
     kind: str, components: str | None, orientation: str | None, sigma_position: float, sigma_angle: float
 ) -> Instrument:

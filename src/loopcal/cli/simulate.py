@@ -9,10 +9,22 @@ from typing import TYPE_CHECKING
 import click
 
 from loopcal.cli import show
-from loopcal.cli.options import FILE, draw_option, drawn_poses, instrument, instrument_options, json_option, robot_argument
+from loopcal.cli.options import (
+    FILE,
+    draw_option,
+    drawn_poses,
+    instrument,
+    instrument_options,
+    json_option,
+    robot_argument,
+    sigma_of_readings,
+    sigma_reading_option,
+)
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from loopcal.measure import Instrument, Measurements
     from loopcal.mechanism import Mechanism
 
@@ -26,6 +38,7 @@ if TYPE_CHECKING:
 )
 @click.option("-o", "--output", required=True, type=FILE, help="The measurement file to write.")
 @instrument_options
+@sigma_reading_option
 @click.option("--draw-errors", is_flag=True, help="Give the machine errors drawn from the tolerances of the robot file.")
 @click.option("--truth", type=FILE, help="Also write the true machine, as a robot file.")
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of poses, errors and noise.")
@@ -42,6 +55,7 @@ def simulate(
     orientation: str | None,
     sigma_position: float,
     sigma_angle: float,
+    sigma_reading: str | None,
     draw_errors: bool,
     truth: Path | None,
     seed: int,
@@ -59,6 +73,7 @@ def simulate(
       loopcal simulate hexapod-42 --draw-errors --truth truth.yaml -o measurements.csv
       loopcal simulate hexapod-42 --poses poses.csv --draw-errors -o measurements.csv
       loopcal simulate truth.yaml --poses poses.csv --sigma-position 0.001mm --sigma-angle 5urad -o measurements.csv
+      loopcal simulate linear-delta --kind position --sigma-reading 5um --draw-errors -o measurements.csv
       loopcal simulate hexapod-42 --fill plan/measurements.csv --draw-errors --truth truth.yaml -o filled.csv
     """  # noqa: D301
     from loopcal import measure
@@ -75,7 +90,7 @@ def simulate(
         data, text = _filled(machine, fill, seed)
     else:
         seen_by = instrument(kind, components, orientation, sigma_position, sigma_angle)
-        data, text = _simulated(machine, poses, draw, seen_by, seed)
+        data, text = _simulated(machine, poses, draw, seen_by, sigma_of_readings(sigma_reading, machine), seed)
     write_text(output, text)
     if truth is not None:
         save_robot(machine, truth)
@@ -85,7 +100,9 @@ def simulate(
         show.say(f"{output}: {data.n_poses} poses of {machine.name}, {data.n_rows} measured values, seed {seed}")
 
 
-def _simulated(machine: Mechanism, poses: Path | None, draw: int, seen_by: Instrument, seed: int) -> tuple[Measurements, str]:
+def _simulated(
+    machine: Mechanism, poses: Path | None, draw: int, seen_by: Instrument, sigma_reading: np.ndarray | None, seed: int
+) -> tuple[Measurements, str]:
     """Measure poses of a file, or drawn ones: what was measured, and the file that says so."""
     from loopcal import measure
     from loopcal.io.measurement_file import load_poses
@@ -95,7 +112,7 @@ def _simulated(machine: Mechanism, poses: Path | None, draw: int, seen_by: Instr
         targets, words = drawn_poses(machine.nominal, draw, seed)
     else:
         targets, words = load_poses(poses, machine), f"{poses.name}, seed {seed}"
-    data = measure.simulate(machine, targets, seen_by, seed)
+    data = measure.simulate(machine, targets, seen_by, seed, reading_sigma=sigma_reading)
     measure.check_strokes(data, machine)
     return data, measurements_text(data, machine, f"simulated by loopcal: {words}")
 
@@ -109,7 +126,7 @@ def _filled(machine: Mechanism, sheet: Path, seed: int) -> tuple[Measurements, s
     from loopcal.measure.fill_in import fill_in
 
     given = click.get_current_context().get_parameter_source
-    for name in ("poses", "draw", "kind", "components", "orientation", "sigma_position", "sigma_angle"):
+    for name in ("poses", "draw", "kind", "components", "orientation", "sigma_position", "sigma_angle", "sigma_reading"):
         if given(name) is click.core.ParameterSource.COMMANDLINE:
             raise DataError(f"--fill {sheet} states poses and instrument; leave out --{name.replace('_', '-')}, or --fill")
     data = fill_in(machine, load_measurements(sheet, machine), load_instrument(sheet, machine), seed)

@@ -4,8 +4,9 @@
     reading_noise: 5 um                     standard deviation of every reading, 0 um where they are exact
     reading_noise: {q1: 5 um, q2: 8 um}     or of some of them
 
-A column `sigma.q1 [um]` holds it where it differs from pose to pose, `inf` for a reading that is not to be believed. With
-either of them an empty reading is one that was not taken; without, it is refused.
+A column `sigma.q1 [um]` holds it where it differs from pose to pose, `inf` for a reading that is not to be believed; an empty
+cell means what the setting, or else the robot file, says, and is refused where neither says anything. With a setting or
+column an empty reading is one that was not taken; without, it is refused.
 """
 
 from __future__ import annotations
@@ -24,6 +25,10 @@ if TYPE_CHECKING:
     from loopcal.mechanism import Mechanism
 
 KEY, SIGMA = "reading_noise", "sigma."
+SAY = (
+    "and nothing else says how far this reading is believed; write its standard deviation, 0 for exact, or inf, or state"
+    " 'reading_noise' for all empty cells"
+)
 
 
 def says_noise(table: Table, robot: Mechanism) -> bool:
@@ -42,7 +47,7 @@ def read_reading_sigma(table: Table, robot: Mechanism, readings: np.ndarray) -> 
     Raises
     ------
     FileError
-        An unknown actuator, no unit or a wrong one, a number below zero.
+        An unknown actuator, no unit or a wrong one, a number below zero, an empty cell for which nothing else is said.
     """
     import numpy as np
 
@@ -59,6 +64,9 @@ def read_reading_sigma(table: Table, robot: Mechanism, readings: np.ndarray) -> 
             for row in np.flatnonzero(own < 0.0):
                 raise table.row_error(int(row), f"column {name!r} is below zero; write a standard deviation, or 0 for exact")
             sigma[:, i] = np.where(cells == "inf", np.inf, np.where(np.isnan(own), sigma[:, i], own))
+            if actuator.sigma is None:
+                for row in np.flatnonzero(np.isnan(sigma[:, i]) & ~np.isnan(readings[:, i])):
+                    raise table.row_error(int(row), f"column {name!r} is empty, {SAY}")
     return np.where(np.isnan(readings), np.inf, sigma)
 
 
