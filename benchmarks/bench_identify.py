@@ -3,6 +3,7 @@
 
 import statistics
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,12 +14,13 @@ from loopcal.calibrate.leave_one_out import path_of_methods
 from loopcal.calibrate.rows import rows_of
 from loopcal.calibrate.scaling import unknowns
 from loopcal.io import load_robot
-from loopcal.measure import Gaussian, Instrument, Measurements, Pose, Sensor, sample_truth, simulate, simulate_trials
+from loopcal.measure import Gaussian, Instrument, Measurements, Plane, Pose, Sensor, sample_truth, simulate, simulate_trials
 from loopcal.mechanism import Mechanism
 
 UM, URAD = 1e-6, 1e-6
 TRIALS = 1000
 SIZES = (1_000, 10_000, 100_000)
+GROUPS, TOUCHES = 400, 4
 
 
 def _tracker() -> Instrument:
@@ -135,4 +137,23 @@ def bench_latent() -> Metric:
         lambda: identify(robot, data, LeastSquares()),
         repeats=15,
         limit=10.0,
+    )
+
+
+def bench_groups() -> Metric:
+    """Fold the touches of 400 planes that share an unknown probe, against the same with a known one, each plane by itself."""
+    robot = load_robot("hexapod-42")
+    free, group = unknowns(robot), np.array([f"plane{i % GROUPS}" for i in range(GROUPS * TOUCHES)])
+    z = free.deviation(robot.values[None])
+
+    def folding(unknown: tuple[str, ...]) -> Callable[[], object]:
+        probe = Plane(unknown=unknown, targets=("probe",), places=np.array([[0.0, 0.0, 0.06]]))
+        touching = Instrument((Sensor(probe, Gaussian(np.full(1, 5 * UM)), group=group),))
+        rows = rows_of(free, simulate(robot, _poses(robot, len(group)), touching, 0))
+        assert rows.own is not None
+        rows.own.started[:] = True
+        return lambda: rows.fold(z, np.arange(1))
+
+    return measure_ratio(
+        "identify.shared_of_known_probe", folding(("surface", "targets")), folding(("surface",)), repeats=7, limit=1.5
     )

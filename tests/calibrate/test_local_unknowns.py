@@ -93,7 +93,8 @@ def test_the_projected_solution_is_the_joint_one():
     scale = np.linalg.norm(stacked[:, :-1], axis=0)
     joint = -np.linalg.lstsq(stacked[:, :-1] / scale, stacked[:, -1], rcond=None)[0] / scale
     assert_allclose(projected, joint[len(local) :], rtol=0, atol=1e-12 * np.abs(projected).max())
-    (done,) = rows.own.solved
+    done = rows.own.solved
+    assert done is not None
     assert_allclose(done.shift[0] + done.slope[0] @ projected, joint[: len(local)], rtol=0, atol=1e-11)
     assert rows.rows[0] == len(stacked) - len(local)
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.calibrate.local import OWN_RANK
+from loopcal.calibrate.elimination import OWN_RANK
 from loopcal.calibrate.sensed import Block, Sensed, block_of
 from loopcal.errors import EstimationError
 from loopcal.linalg import NULL_COMPONENT, FloatArray, IntArray
@@ -34,14 +34,15 @@ class Group:
     Attributes
     ----------
     components : (C,) their numbers. poses : (C, L) places in the block. height : rows kept for each, those not used zero.
-    cluster : of own unknowns that their rows use, -1 without any.
+    form, nodes : (C,) of own unknowns that their rows use, -1 without any.
     rows : for each kind: rows (k,), the component of each (k,), its first place there (k,), and its poses' places (k, links).
     """
 
     components: IntArray
     poses: IntArray
     height: int
-    cluster: int
+    form: int
+    nodes: IntArray
     rows: tuple[tuple[IntArray, IntArray, IntArray, IntArray], ...]
 
 
@@ -95,8 +96,11 @@ def component_blocks(
     return made
 
 
-def groups_of(block: Block, member: IntArray, clusters: IntArray) -> tuple[Group, ...]:
-    """Sort a block's components by poses, cluster of own unknowns (n components,) and, roughly, number of rows."""
+def groups_of(block: Block, member: IntArray, nodes: IntArray, forms: IntArray) -> tuple[Group, ...]:
+    """Sort a block's components by poses, form of own unknowns and, roughly, number of rows.
+
+    `nodes` and `forms` are those of all components, -1 where a component's rows use no own unknowns.
+    """
     own = member[block.poses]
     numbers, local, lengths = np.unique(own, return_inverse=True, return_counts=True)
     heights, starts = np.zeros(len(numbers), dtype=np.int64), []
@@ -110,7 +114,7 @@ def groups_of(block: Block, member: IntArray, clusters: IntArray) -> tuple[Group
     place = np.zeros(len(block.poses), dtype=np.int64)
     order = np.argsort(local, kind="stable")
     place[order] = np.arange(len(order)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-    form = np.column_stack([lengths, clusters[numbers], np.ceil(np.log2(np.maximum(heights, 1)))])
+    form = np.column_stack([lengths, forms[numbers], np.ceil(np.log2(np.maximum(heights, 1)))])
     groups = []
     for key in np.unique(form, axis=0):
         chosen = np.flatnonzero((form == key).all(axis=1))
@@ -123,7 +127,8 @@ def groups_of(block: Block, member: IntArray, clusters: IntArray) -> tuple[Group
         poses = np.flatnonzero(number[local] >= 0)
         ranked = np.empty((len(chosen), int(key[0])), dtype=np.int64)
         ranked[number[local[poses]], place[poses]] = poses
-        groups.append(Group(numbers[chosen], ranked, int(heights[chosen].max()), int(key[1]), tuple(parts)))
+        used = nodes[numbers[chosen]]
+        groups.append(Group(numbers[chosen], ranked, int(heights[chosen].max()), int(key[1]), used, tuple(parts)))
     return tuple(groups)
 
 

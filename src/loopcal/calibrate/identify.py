@@ -287,7 +287,7 @@ def _local(
         return nothing_local(rows.parameters)
     rows.own.cost[:] = np.inf
     if not np.isfinite(rows.fold(z, np.arange(1))[1][0]):
-        rows.own.solved = ()
+        rows.own.solved = None
     return local_estimate(rows.own, robot, rows.own.start, d, penalty, variance)
 
 

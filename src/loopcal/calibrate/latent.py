@@ -18,8 +18,9 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.calibrate.components import components_of
+from loopcal.calibrate.elimination import Factors
 from loopcal.calibrate.latent_start import start_of
-from loopcal.calibrate.local import Folding, Own
+from loopcal.calibrate.local import Own
 from loopcal.calibrate.moves import evaluated
 from loopcal.calibrate.scaling import Unknowns
 from loopcal.calibrate.sensed import BLOCK, Residuals, Sensed
@@ -128,18 +129,18 @@ class LatentRows:
     def _folded(self, z: FloatArray, trials: IntArray) -> tuple[FloatArray, np.ndarray]:
         """Factor (a, p + 1, p + 1) of some trials, all but the machine settled and eliminated; which are out of reach."""
         here = self._settled(z, trials)
-        factor, folding = empty_factor(len(trials), self.parameters), Folding(self.own, len(trials), self.parameters)
+        factor = empty_factor(len(trials), self.parameters)
+        folding = None if self.own is None else Factors(self.own.nesting, len(trials), self.parameters)
         for group, done in self.poses.projected(here, z, trials):
             rest = done.rest.reshape(len(trials), -1, done.rest.shape[-1])
-            if group.cluster < 0:
+            if folding is None or group.form < 0:
                 factor = engine.accumulate(factor, rest)
             else:
-                folding.add([(group.cluster, rest)])
+                folding.add(group.form, rest, np.repeat(folding.nesting.place[group.nodes], done.rest.shape[2]))
         cost = (factor[:, :, -1] ** 2).sum(axis=1)
-        if self.own is not None and here.values is not None:
-            factor = folding.finish(factor, here.values)
+        if self.own is not None and folding is not None and here.values is not None:
+            factor = engine.accumulate(factor, self.own.finish(folding, here.values))
             cost = np.where(here.failed, np.inf, (factor[:, :, -1] ** 2).sum(axis=1))
-            self.own.solved = tuple(folding.solved)
             self.own.keep(trials, z, here.values, cost)
         self.memory.keep(trials, here, np.where(here.failed, np.inf, cost))
         return factor, here.failed
@@ -182,13 +183,14 @@ class LatentRows:
         wide = 0 if self.own is None else len(self.own.local)
         for group, done in self.poses.projected(here, deviation, trial):
             one = done.rest[0]
-            u = one.shape[-1] - p - 1
+            w = one.shape[-1] - p - 1
             rows = np.zeros((*one.shape[:2], wide + p + 1))
-            rows[..., -p - 1 :] = one[..., u:]
-            if self.own is not None and group.cluster >= 0:
-                solved = self.own.solved[group.cluster]
-                rows[..., -p - 1 : -1] += one[..., :u] @ solved.slope[0]
-                rows[..., solved.columns] = one[..., :u] @ solved.inverse[0]
+            rows[..., -p - 1 :] = one[..., w:]
+            if self.own is not None and self.own.solved is not None and group.form >= 0:
+                path, root, slope = self.own.solved.at(group.nodes)
+                rows[..., -p - 1 : -1] += one[..., :w] @ slope
+                every, m = np.arange(len(one))[:, None, None], np.arange(one.shape[1])[:, None]
+                rows[every, m, path[:, None, :]] = one[..., :w] @ root
             yield [(self.first[group.components], rows)]
 
     def sizes(self, member: IntArray, count: int) -> IntArray:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a fit found of the unknowns that measurements bring with them: frames, targets, surfaces, offsets.
 
-Given the machine's deviation z, the best own unknowns are b = b0 + S (z - z0) with the covariance F^+ F^+' of their own;
-z has the covariance C of the fit, so that b has F^+ F^+' + S C S'. A direction of infinite variance that moves b makes
+Given the machine's deviation z, the best own unknowns are b = b0 + S (z - z0) with the covariance (F'F)^+ of their own;
+z has the covariance C of the fit, so that b has (F'F)^+ + S C S'. A direction of infinite variance that moves b makes
 it infinite, too: a frame is then known only together with the machine.
 """
 
@@ -118,15 +118,15 @@ def local_estimate(
     slope, unseen = np.zeros((len(table), own.slope.shape[2])), np.zeros(len(table), dtype=bool)
     known = decomposition.variances(penalty, noise)[0]
     V = decomposition.scale[:, None] * decomposition.directions[0]
-    for one in own.solved:
-        S = one.slope[place]
-        estimate[one.columns] += one.shift[place]
-        slope[one.columns], unseen[one.columns] = S, one.open[place]
-        moved = S @ V
+    if (done := own.solved) is not None:
+        free = own.free
+        estimate += done.shift[place]
+        slope, unseen = done.slope[place], done.open[place]
+        moved = slope[free] @ V
         infinite = np.linalg.norm(moved[:, np.isinf(known)], axis=1) > MOVES * np.linalg.norm(moved, axis=1)
         by_machine = (moved**2) @ np.where(np.isinf(known), 0.0, known)
-        alone = (one.inverse[place] ** 2).sum(axis=1) * noise
-        variance[one.columns] = np.where(infinite | one.open[place], np.inf, alone + by_machine)
+        alone = done.variance()[place, free] * noise
+        variance[free] = np.where(infinite | unseen[free], np.inf, alone + by_machine)
     shown = tuple(_shown(robot, p) for p in table.entries)
     return LocalEstimate(table, start, estimate, np.sqrt(variance), slope, unseen, shown)
 

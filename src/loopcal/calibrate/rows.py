@@ -17,8 +17,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from loopcal import engine, se3
+from loopcal.calibrate.elimination import Factors
 from loopcal.calibrate.latent import LatentRows, latent_rows
-from loopcal.calibrate.local import Folding, Own, spread_columns
+from loopcal.calibrate.local import Own, Part, fold_parts, spread_columns
 from loopcal.calibrate.moves import Last, Moves, evaluated, machine_columns
 from loopcal.calibrate.scaling import Unknowns
 from loopcal.calibrate.sensed import BLOCK, Block, Residuals, Sensed, blocks_of
@@ -102,18 +103,17 @@ class Rows:
         if self.own is not None:
             looks = [moves or self._look(block, z, trials) for block in self.blocks]
             values = self._settled(looks, z, trials)
-        folding = Folding(self.own, len(trials), p)
+        folding = None if self.own is None else Factors(self.own.nesting, len(trials), p)
         for block in self.blocks:
             found = moves or self._moves(block, z, trials)
-            parts = [(c, rows) for s in block.sensed for c, rows in self._kind_rows(s, found, trials, values)]
-            plain = [rows for c, rows in parts if c < 0]
+            parts = [part for s in block.sensed for part in self._kind_rows(s, found, trials, values)]
+            plain = [part.rows for part in parts if part.form < 0]
             if plain:
                 factor = engine.accumulate(factor, plain[0] if len(plain) == 1 else np.concatenate(plain, axis=1))
-            folding.add(parts)
+            fold_parts(folding, parts)
             lost |= found.failed
-        if self.own is not None and values is not None:
-            factor = folding.finish(factor, values)
-            self.own.solved = tuple(folding.solved)
+        if self.own is not None and folding is not None and values is not None:
+            factor = engine.accumulate(factor, self.own.finish(folding, values))
             self.own.keep(trials, z, values, np.where(lost, np.inf, (factor[:, :, -1] ** 2).sum(axis=1)))
         return factor, lost
 
@@ -157,15 +157,14 @@ class Rows:
                 m = s.whitener.shape[-1]
                 values = None if self.own is None else self.own.predicted(trial, deviation)
                 rows = np.zeros((len(s.poses), m, (0 if self.own is None else len(self.own.local)) + p + 1))
-                members = [(-1, np.arange(len(s.poses)), None)] if self.own is None else self.own.members(s)
-                for (c, part), (_, which, _) in zip(self._kind_rows(s, found, trial, values), members, strict=True):
-                    one = part.reshape(len(which), m, -1)
-                    u = one.shape[-1] - p - 1
-                    rows[which, :, -p - 1 :] = one[..., u:]
-                    if self.own is not None and c >= 0:
-                        done = self.own.solved[c]
-                        rows[which, :, -p - 1 : -1] += one[..., :u] @ done.slope[0]
-                        rows[np.ix_(which, np.arange(m), done.columns)] = one[..., :u] @ done.inverse[0]
+                for part in self._kind_rows(s, found, trial, values):
+                    one = part.rows.reshape(len(part.which), m, -1)
+                    w = one.shape[-1] - p - 1
+                    rows[part.which, :, -p - 1 :] = one[..., w:]
+                    if self.own is not None and self.own.solved is not None and part.form >= 0:
+                        path, root, slope = self.own.solved.at(part.nodes)
+                        rows[part.which, :, -p - 1 : -1] += one[..., :w] @ slope
+                        rows[part.which[:, None, None], np.arange(m)[:, None], path[:, None, :]] = one[..., :w] @ root
                 given.append((block.poses[s.first], rows))
             yield given
 
@@ -253,12 +252,13 @@ class Rows:
             else:
                 self._start(looks, int(i), trials)
 
-        def factors(values: FloatArray) -> list[FloatArray]:
-            folding = Folding(own, len(trials), 0)
+        def factors(values: FloatArray) -> Factors:
+            folding = Factors(own.nesting, len(trials), 0)
             for block, look in zip(self.blocks, looks, strict=True):
-                for s in (s for s in block.sensed if s.places.shape[1]):
-                    folding.add(list(self._kind_rows(s, look, trials, values, machine=False)))
-            return folding.whole(values)
+                using = [s for s in block.sensed if s.places.shape[1]]
+                fold_parts(folding, [part for s in using for part in self._kind_rows(s, look, trials, values, machine=False)])
+            own.fold_priors(folding, values)
+            return folding
 
         return own.settled(own.predicted(trials, z), factors)
 
@@ -298,8 +298,8 @@ class Rows:
 
     def _kind_rows(
         self, sensed: Sensed, moves: Moves, trials: IntArray, values: FloatArray | None, machine: bool = True
-    ) -> Iterator[tuple[int, FloatArray]]:
-        """Rows (a, k * m, u + p + 1) of one kind, cluster by cluster; without the p columns where `machine` is false."""
+    ) -> Iterator[Part]:
+        """Rows of one kind by the form of their nodes; without the p columns where `machine` is false."""
         if not len(sensed.poses):
             return
         found, white = evaluated(sensed, moves, trials, values)
@@ -313,15 +313,16 @@ class Rows:
             rows[..., :-1] = machine_columns(sensed, found, white, moves)
         rows[..., -1] = np.matmul(white, residual[..., None])[..., 0]
         if self.own is None:
-            yield -1, rows.reshape(a, r * m, -1)
+            every = np.arange(r)
+            yield Part(-1, every, np.full(r, -1), rows.reshape(a, r * m, -1))
             return
         own = None if found.own is None else np.matmul(white, np.broadcast_to(found.own, (a, r, m, found.own.shape[-1])))
-        for c, which, columns in self.own.members(sensed):
+        for form, which, nodes, columns in self.own.members(sensed):
             part = rows[:, which]
-            if c >= 0 and own is not None:
-                wide = spread_columns(own[:, which], columns, len(self.own.clusters[c]))
+            if form >= 0 and own is not None:
+                wide = spread_columns(own[:, which], columns, self.own.nesting.forms[form].path.shape[1])
                 part = np.concatenate([wide, part], axis=-1)
-            yield c, part.reshape(a, len(which) * m, -1)
+            yield Part(form, which, nodes, part.reshape(a, len(which) * m, -1))
 
 
 def rows_of(unknowns: Unknowns, data: Measurements, local: LocalUnknowns | None = None) -> AnyRows:

@@ -16,7 +16,8 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.calibrate.components import Group, KindRows, Projected, component_blocks, groups_of, project, side_by_side
-from loopcal.calibrate.local import CLOSE, HALVINGS, NOTHING, Folding, Own, spread_columns
+from loopcal.calibrate.elimination import Factors
+from loopcal.calibrate.local import CLOSE, HALVINGS, NOTHING, Own, spread_columns
 from loopcal.calibrate.moves import evaluated, machine_columns
 from loopcal.calibrate.scaling import Unknowns
 from loopcal.calibrate.sensed import BLOCK, Block, Sensed
@@ -65,8 +66,8 @@ class Look:
     cost: FloatArray
     squares: FloatArray
     gain: FloatArray
-    parts: list[tuple[IntArray, int, FloatArray]]
-    factors: list[FloatArray]
+    parts: list[tuple[IntArray, Group, FloatArray]]
+    factors: Factors | None
     rank: IntArray
     open: np.ndarray
 
@@ -103,15 +104,17 @@ class Poses:
         self.components = int(member.max()) + 1
         self.joints = joints_looked_at(s.kind for s in sensed)
         self.blocks = component_blocks(sensed[-1].measured[0], sensed, member, needed, BLOCK)
-        self.groups = [groups_of(block, member, self._clusters()) for block in self.blocks]
+        nodes, forms = self._nodes()
+        self.groups = [groups_of(block, member, nodes, forms) for block in self.blocks]
 
-    def _clusters(self) -> IntArray:
-        """Cluster of own unknowns that each component's rows use, -1 without any."""
-        found = np.full(self.components, -1)
+    def _nodes(self) -> tuple[IntArray, IntArray]:
+        """Innermost node of own unknowns that each component's rows use, and its form; -1 without any."""
+        found, forms = np.full(self.components, -1), np.full(self.components, -1)
         if self.own is not None:
             for s in (s for s in self.sensed if s.places.shape[1]):
-                np.maximum.at(found, self.member[s.first], self.own.cluster[s.places].max(axis=1))
-        return found
+                np.maximum.at(found, self.member[s.first], self.own.nesting.node[s.places].max(axis=1))
+            forms[found >= 0] = self.own.nesting.form[found[found >= 0]]
+        return found, forms
 
     def settle(self, z: FloatArray, trials: IntArray, begin: Standing, fixed: FloatArray | None = None) -> Settled:
         """Move poses and own unknowns to where all rows fit best at deviations z (a, p); `fixed` (a, U) holds the latter."""
@@ -162,7 +165,7 @@ class Poses:
     def look(self, z: FloatArray, trials: IntArray, at: Standing, values: FloatArray | None, own: bool) -> Look:
         """Close all poses and compare their rows; `own` tells whether the own unknowns move, too."""
         free, k, a = self.unknowns.values(z), self.chart.freedoms, len(trials)
-        folding = Folding(self.own if own else None, a, 0)
+        folding = Factors(self.own.nesting, a, 0) if own and self.own is not None else None
         squares, gain = np.zeros((a, self.components)), np.zeros(a)
         rank = np.zeros((a, self.components), dtype=np.int64)
         unseen = np.zeros((a, len(self.member), k), dtype=bool)
@@ -184,9 +187,10 @@ class Poses:
                 gain += done.gain.sum(axis=1)
                 rank[:, group.components] = done.rank
                 unseen[:, block.poses[group.poses]] = done.open.reshape(a, *group.poses.shape, k)
-                parts.append((block.poses[group.poses], group.cluster, done.best))
-                if width:
-                    folding.add([(group.cluster, done.rest.reshape(a, -1, width + 1))])
+                parts.append((block.poses[group.poses], group, done.best))
+                if width and folding is not None:
+                    places = np.repeat(folding.nesting.place[group.nodes], done.rest.shape[2])
+                    folding.add(group.form, done.rest.reshape(a, -1, width + 1), places)
         cost = squares.sum(axis=1) + (0.0 if not own else self._held(values))
         where = np.argsort(np.concatenate([block.poses for block in self.blocks]))
         whole = Standing(
@@ -194,10 +198,11 @@ class Poses:
         )
         lost = np.any(failed, axis=0)
         seen = {name: np.concatenate([part[name] for part in joints], axis=1)[:, where] for name in self.joints}
-        factors = folding.whole(values) if own and values is not None else []
+        if folding is not None and self.own is not None and values is not None:
+            self.own.fold_priors(folding, values)
         cost = np.where(lost, np.inf, cost)
         reached = np.concatenate(ok, axis=1)[:, where]
-        return Look(whole, values, kept, reached, seen, lost, cost, squares, gain, parts, factors, rank, unseen)
+        return Look(whole, values, kept, reached, seen, lost, cost, squares, gain, parts, folding, rank, unseen)
 
     def _held(self, values: FloatArray | None) -> FloatArray | float:
         """Sum of squares (a,) of the priors of own unknowns."""
@@ -210,14 +215,14 @@ class Poses:
         """Gauss-Newton step of all poses (a, n, k) and own unknowns (a, U), and by how much it lowers the squares."""
         u = np.zeros((a, len(self.member), self.chart.freedoms))
         b, gain = None, here.gain
-        if own and self.own is not None:
-            b, offset = self.own.step(here.factors, a)
+        if own and self.own is not None and here.factors is not None:
+            b, offset = self.own.step(here.factors)
             gain = gain + offset
-        for poses, cluster, best in here.parts:
-            right = np.ones((a, 1))
-            if b is not None and cluster >= 0 and self.own is not None:
-                right = np.concatenate([b[:, self.own.clusters[cluster]], right], axis=1)
-            u[:, poses] = -np.matmul(best, right[:, None, :, None])[..., 0].reshape(a, *poses.shape, -1)
+        for poses, group, best in here.parts:
+            right = np.ones((a, len(poses), 1))
+            if b is not None and group.form >= 0 and self.own is not None:
+                right = np.concatenate([b[:, self._path(group)], right], axis=2)
+            u[:, poses] = -np.matmul(best, right[..., None])[..., 0].reshape(a, *poses.shape, -1)
         return _Step(u, b, gain)
 
     def _moved(
@@ -263,22 +268,27 @@ class Poses:
         return found
 
     def _own_columns(self, kinds: Sequence[KindRows | None], block: Block, group: Group) -> list[KindRows | None]:
-        """The rows with their own unknowns at the columns of the group's cluster."""
-        if self.own is None or group.cluster < 0:
+        """The rows with their own unknowns at the columns of the paths of the group's components."""
+        if self.own is None or group.form < 0:
             return list(kinds)
-        width, found = len(self.own.clusters[group.cluster]), []
-        for kind, s in zip(kinds, block.sensed, strict=True):
+        width, found = self.width(group), []
+        for kind, s, (rows, of, _, _) in zip(kinds, block.sensed, group.rows, strict=True):
             if kind is None or kind.own is None:
                 found.append(kind)
                 continue
-            inside = self.own.free[s.places] & (self.own.cluster[s.places] == group.cluster)
-            columns = np.where(inside, self.own.column[s.places], width)
+            columns = np.full(s.places.shape, width)
+            columns[rows] = self.own.nesting.columns(group.nodes[of], s.places[rows])
             found.append(kind._replace(own=spread_columns(kind.own, columns, width)))
         return found
 
+    def _path(self, group: Group) -> IntArray:
+        """Own unknowns (C, w) of the paths of a group's components."""
+        assert self.own is not None
+        return self.own.nesting.forms[group.form].path[self.own.nesting.place[group.nodes]]
+
     def width(self, group: Group) -> int:
-        """Own unknowns of a group's rows."""
-        return 0 if self.own is None or group.cluster < 0 else len(self.own.clusters[group.cluster])
+        """Columns of own unknowns of a group's rows."""
+        return 0 if self.own is None or group.form < 0 else self.own.nesting.forms[group.form].path.shape[1]
 
 
 def _free_columns(sensed: Sensed, seen: Evaluation, white: FloatArray, moves: FreeMoves) -> FloatArray:
