@@ -205,12 +205,12 @@ def probed(groups, per_group=6, seed=1):
 
 
 def fold_of(data):
-    """Factor of one fold at the nominal machine, own unknowns from where they are stated, and the rows."""
+    """Factor of one fold at the nominal machine, own unknowns from where they are stated, and these."""
     free = unknowns(hexapod())
     rows = rows_of(free, data)
     assert rows.own is not None
     rows.own.started[:] = True
-    return rows.fold(free.deviation(hexapod().values[None]), np.arange(1))[0][0], rows
+    return rows.fold(free.deviation(hexapod().values[None]), np.arange(1))[0][0], rows.own
 
 
 def test_planes_that_share_a_probe_cost_twice_as_much_where_there_are_twice_as_many(monkeypatch):
@@ -227,10 +227,10 @@ def test_planes_that_share_a_probe_cost_twice_as_much_where_there_are_twice_as_m
     found = []
     for groups in (5, 10, 20):
         counted.update(rows=0, kept=0, widest=0)
-        _, rows = fold_of(probed(groups))
+        _, own = fold_of(probed(groups))
         # three numbers of a plane, three of the probe, the machine, the residual; dense it were 3 * groups + 46
         assert counted["widest"] == 3 + 3 + 42 + 1
-        assert int(rows.own.nesting.width.max()) == 6
+        assert int(own.nesting.width.max()) == 6
         found.append((counted["rows"], counted["kept"]))
     one, two, four = np.array(found)
     assert (four - two == 2 * (two - one)).all()

@@ -109,7 +109,7 @@ def _fold(out: FloatArray, held: int, rows: FloatArray, places: IntArray) -> Non
         stacked = np.zeros((a, len(chosen), held + int(count[chosen].max()), w))
         stacked[:, :, :held] = out[:, chosen, :held]
         stacked[:, index[places[some]], held + within[some]] = rows[:, some]
-        triangle = np.linalg.qr(stacked, mode="r")
+        triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
         out[:, chosen, : triangle.shape[2]] = triangle
 
 
