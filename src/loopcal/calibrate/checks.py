@@ -103,11 +103,10 @@ def check_start(rows: AnyRows, data: Measurements, deviation: FloatArray, cost: 
     if len(lost) == 0:
         with np.errstate(all="ignore"):
             parts = rows.residuals(deviation)
-        seen = [o for o in data.observations if len(o)]
         bad = {
             int(i)
-            for o, r in zip(seen, parts, strict=True)
-            for i in o.rows.reshape(len(o), -1)[~(np.abs(r.whitened[0]) < HUGE).all(axis=1)].ravel()
+            for s, r in zip(rows.sensed, parts, strict=True)
+            for i in s.per_pose[~(np.abs(r.whitened[0]) < HUGE).all(axis=1)].ravel()
         }
         poses = ", ".join(repr(data.labels[i]) for i in sorted(bad)[:5]) + (", ..." if len(bad) > 5 else "")
         raise EstimationError(f"residuals are not finite, or too large to square, at poses {poses}; correct these rows")

@@ -263,5 +263,5 @@ def latent_rows(
     scale = np.where(np.isinf(sigma), unseen, sigma)
     chart = ByReadings(unknowns, scale, names) if robot.program.sigma is None else ByPose(unknowns, names)
     member = components_of(n, every, chart.freedoms)
-    memory = Memory(lambda: start_of(robot, recorded, every[:-1], trials), trials, int(member.max()) + 1, n)
+    memory = Memory(lambda: start_of(robot, recorded, sigma, every[:-1], trials), trials, int(member.max()) + 1, n)
     return LatentRows(unknowns, every, trials, chart, member, own(member), memory)

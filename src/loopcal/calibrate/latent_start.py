@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where poses of uncertain readings begin: at the recorded reading, and where there is none at the measured pose, else as
-the nearest pose in the list, else at home.
+"""Where poses of uncertain readings begin: at the recorded reading, and where there is none that is believed, at the pose
+that rows measure in full, else with the reading of the nearest pose in the list, at home, or across the stroke, whichever the
+rows of the pose agree with best.
 """
 
 from __future__ import annotations
@@ -10,40 +11,39 @@ from dataclasses import replace
 
 import numpy as np
 
-from loopcal import se3
+from loopcal.calibrate.measured_poses import measured_poses, squares_at
 from loopcal.calibrate.moves import mapped
 from loopcal.calibrate.sensed import Sensed
-from loopcal.calibrate.standing import Standing
-from loopcal.linalg import FloatArray
-from loopcal.measure import Pose
+from loopcal.calibrate.standing import Standing, stroke_of
+from loopcal.linalg import FloatArray, IntArray
 from loopcal.mechanism import Mechanism, Status, inverse
 from loopcal.mechanism.trials import forward_trials, readings_at
 
-STEPS = 20
-"""Newton steps by which a pose is located from its measured components."""
+TRIED = 9
+"""Values of a missing reading, evenly across its stroke, that are tried as a start."""
 
 
-def start_of(robot: Mechanism, recorded: FloatArray, sensed: Sequence[Sensed], trials: int) -> Standing:
+def start_of(robot: Mechanism, recorded: FloatArray, sigma: FloatArray, sensed: Sequence[Sensed], trials: int) -> Standing:
     """Return where the poses of all trials begin, at the robot's present values.
 
     Parameters
     ----------
-    recorded : (t | 1, n, a) [SI], NaN where a reading was not taken. sensed : what was measured.
+    recorded : (t | 1, n, a) [SI], NaN where a reading was not taken. sigma : (n, a) [SI], infinite where it is not believed.
+    sensed : what was measured.
     """
-    missing = np.isnan(recorded)
+    missing = np.isnan(recorded) | np.isinf(sigma)
     q = _nearest(recorded, readings_at(robot, robot.values[None], robot.home_state)[0, 0])
     shape = (len(q), q.shape[1])
     state = mapped(lambda array: np.broadcast_to(array, (*shape, *array.shape[2:])), robot.home_state)
     begin = Standing(state, q)
     if missing.any():
-        T, known = measured_poses(robot, sensed, len(q), q.shape[1])
-        trial, pose = np.nonzero(missing.any(axis=2) & known)
-        if len(pose):
-            found = inverse(robot, T[trial, pose])
-            good = found.converged
-            own = np.where(missing[trial, pose], found.q, q[trial, pose])
-            there = mapped(lambda array: array[0, good], found.state)
-            begin = begin.put((trial[good], pose[good]), Standing(there, own[good]))
+        trial, pose = np.nonzero(missing.any(axis=2))
+        T, known = measured_poses(robot, sensed, trial, pose)
+        if known.any():
+            begin = _at_measured(robot, begin, missing, T[known], (trial[known], pose[known]))
+        if robot.program.sigma is None and not known.all():
+            said = np.asarray(np.isfinite(recorded[trial, pose]).all(axis=1))
+            begin = _tried(robot, begin, missing, said[~known], sensed, (trial[~known], pose[~known]))
     if robot.program.sigma is not None:
         begin = _placed(robot, begin)
     if len(q) < trials:
@@ -51,26 +51,50 @@ def start_of(robot: Mechanism, recorded: FloatArray, sensed: Sequence[Sensed], t
     return begin
 
 
-def measured_poses(robot: Mechanism, sensed: Sequence[Sensed], trials: int, n: int) -> tuple[FloatArray, np.ndarray]:
-    """Poses (t, n, 4, 4) of rows that measure one in full and in a known frame, and which there are (t, n)."""
-    T = np.tile(robot.home, (trials, n, 1, 1))
-    known = np.zeros((trials, n), dtype=bool)
-    for s in sensed:
-        if not isinstance(s.kind, Pose) or s.places.shape[1]:
-            continue
-        full = np.broadcast_to((np.einsum("trii->tri", s.whitener) != 0.0).all(axis=2), (trials, len(s.poses)))
-        measured = np.broadcast_to(s.measured, (trials, *s.measured.shape[1:]))
-        at = np.tile(robot.home, (trials, len(s.poses), 1, 1))
-        for _ in range(STEPS):
-            seen = s.kind.evaluate(at, measured)
-            slope = np.where(full[..., None, None], seen.jacobian, np.eye(6))
-            step = -np.linalg.solve(slope, np.where(full[..., None], seen.residual, 0.0)[..., None])[..., 0]
-            at = se3.exp_update(at, step)
-            if np.abs(step).max(initial=0.0) < 1e-12:
-                break
-        trial, row = np.nonzero(full & np.isfinite(at).all(axis=(2, 3)))
-        T[trial, s.poses[row]], known[trial, s.poses[row]] = at[trial, row], True
-    return T, known
+def _at_measured(
+    robot: Mechanism, begin: Standing, missing: np.ndarray, T: FloatArray, where: tuple[IntArray, IntArray]
+) -> Standing:
+    """Poses (trials, poses) begun at T (k, 4, 4), missing readings as there."""
+    found = inverse(robot, T)
+    good = found.converged
+    chosen = (where[0][good], where[1][good])
+    q = np.where(missing[chosen], found.q[good], begin.q[chosen])
+    return begin.put(chosen, Standing(mapped(lambda array: array[0, good], found.state), q))
+
+
+def _tried(
+    robot: Mechanism,
+    begin: Standing,
+    missing: np.ndarray,
+    said: np.ndarray,
+    sensed: Sequence[Sensed],
+    where: tuple[IntArray, IntArray],
+) -> Standing:
+    """Poses (trials, poses) begun at the best of a few values of the missing readings: the nearest pose's, home's, across the
+    stroke; where all were said (k,), if not believed, at these.
+    """
+    trial, pose = where
+    home = readings_at(robot, robot.values[None], robot.home_state)[0, 0]
+    width = np.array([stroke_of(robot, a) for a in robot.actuators])
+    low = np.array(
+        [h - w / 2 if a.stroke is None else a.stroke[0] for a, h, w in zip(robot.actuators, home, width, strict=True)]
+    )
+    across = low + width * ((np.arange(TRIED) + 0.5) / TRIED)[:, None]
+    own = begin.q[trial, pose]
+    others = np.concatenate([home[None], across])
+    tried = np.concatenate([own[:, None], np.where(missing[trial, pose][:, None], others, own[:, None])], axis=1)
+    count = tried.shape[1]
+    state = forward_trials(robot, robot.values[None], tried.reshape(1, -1, len(home)), follow=False)
+    closed = np.asarray(state.status[0] == Status.CONVERGED)
+    T = np.where(closed[:, None, None], state.T[0], robot.home)
+    squares = squares_at(sensed, np.repeat(trial, count), np.repeat(pose, count), T)
+    squares = np.where(closed, squares, np.inf).reshape(-1, count)
+    squares[said & np.isfinite(squares[:, 0]), 0] = -1.0
+    best = squares.argmin(axis=1)
+    good = np.isfinite(squares.min(axis=1))
+    pick = (np.arange(len(pose)) * count + best)[good]
+    there = Standing(mapped(lambda array: array[0, pick], state), tried[np.flatnonzero(good), best[good]])
+    return begin.put((trial[good], pose[good]), there)
 
 
 def _nearest(recorded: FloatArray, home: FloatArray) -> FloatArray:

@@ -3,7 +3,8 @@
 
 Gauss-Newton on both together, many trials at once: every pose is closed by the kinematics, its rows are put side by side
 with those of the poses it is linked to, its free numbers are eliminated by projection, and what is left gives the own
-unknowns; the best free numbers follow. A step that does not lower the sum of squares is halved. See docs/theory/latent.md.
+unknowns; the best free numbers follow. A step is no longer than closure is about linear, and one that does not lower the sum
+of squares, or to which Newton does not get at once, is halved. See docs/theory/latent.md.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import numpy as np
 from loopcal import engine
 from loopcal.calibrate.components import Group, KindRows, Projected, component_blocks, groups_of, project, side_by_side
 from loopcal.calibrate.elimination import Factors
-from loopcal.calibrate.local import CLOSE, HALVINGS, NOTHING, Own, spread_columns
-from loopcal.calibrate.moves import evaluated, machine_columns
+from loopcal.calibrate.local import CLOSE, NOTHING, Own, spread_columns
+from loopcal.calibrate.moves import evaluated, machine_columns, mapped
 from loopcal.calibrate.scaling import Unknowns
 from loopcal.calibrate.sensed import BLOCK, Block, Sensed
 from loopcal.calibrate.standing import Chart, FreeMoves, Standing
@@ -27,6 +28,14 @@ from loopcal.measure import Evaluation, joints_looked_at
 
 STEPS = 30
 """Gauss-Newton steps to the best poses at given parameters; two are usual."""
+
+HALVINGS = 10
+"""Halvings of a step; a pose that still gets worse by a thousandth of it stays."""
+
+STUCK = 1e-3
+"""Share of what a step promises that it must gain where it promises as much of the sum of squares: a pose at the end of its
+reach gains nothing however often it is halved.
+"""
 
 ROUNDING = 1e-12
 """Change of the sum of squares, relative, that is rounding and says nothing about a step."""
@@ -123,13 +132,15 @@ class Poses:
         if own:
             values = self._own_values(z, trials, begin)
         here = self.look(z, trials, begin, values, own)
-        calm = np.zeros(len(trials), dtype=bool)
+        calm, stuck = np.zeros(len(trials), dtype=bool), ~np.isfinite(here.cost)
         for _ in range(STEPS):
             step = self._step(here, len(trials), own)
             calm = step.gain <= CLOSE**2 * here.cost + NOTHING**2
-            if (calm | ~np.isfinite(here.cost)).all():
+            if (calm | stuck).all():
                 break
-            here, moved = self._moved(z, trials, here, step, ~calm & np.isfinite(here.cost), own)
+            before = here.cost
+            here, moved = self._moved(z, trials, here, step, ~calm & ~stuck, own)
+            stuck |= (step.gain > STUCK * before) & ~(before - here.cost > STUCK * step.gain)
             if not moved:
                 break
         alone = here.moves[0] if len(self.blocks) == 1 else None
@@ -162,8 +173,19 @@ class Poses:
                 own.begin(int(trials[i]), here.standing.state.T[i], joints)
         return own.predicted(trials, z)
 
-    def look(self, z: FloatArray, trials: IntArray, at: Standing, values: FloatArray | None, own: bool) -> Look:
-        """Close all poses and compare their rows; `own` tells whether the own unknowns move, too."""
+    def look(
+        self,
+        z: FloatArray,
+        trials: IntArray,
+        at: Standing,
+        values: FloatArray | None,
+        own: bool,
+        still: np.ndarray | None = None,
+    ) -> Look:
+        """Close all poses and compare their rows; `own` tells whether the own unknowns move, too.
+
+        Where `still` (a, n) is given, these poses are closed already, and those that Newton does not close are not followed.
+        """
         free, k, a = self.unknowns.values(z), self.chart.freedoms, len(trials)
         folding = Factors(self.own.nesting, a, 0) if own and self.own is not None else None
         squares, gain = np.zeros((a, self.components)), np.zeros(a)
@@ -171,7 +193,9 @@ class Poses:
         unseen = np.zeros((a, len(self.member), k), dtype=bool)
         kept, parts, closed, ok, failed, joints = [], [], [], [], [], []
         for block, groups in zip(self.blocks, self.groups, strict=True):
-            closed.append(self.chart.closed(free, at.at(block.poses)))
+            begin = at.at(block.poses)
+            found = self.chart.closed(free, begin, follow=still is None)
+            closed.append(found if still is None else _kept(found, begin, still[:, block.poses]))
             moves = self.chart.linearised(free, closed[-1], block.poses, block.needed)
             ok.append(moves.ok)
             failed.append(moves.failed)
@@ -233,14 +257,14 @@ class Poses:
         Without own unknowns components are independent, and only those that got worse are halved.
         """
         every = np.arange(len(self.member))
-        share = np.repeat(going[:, None], len(every), axis=1).astype(np.float64)
+        share = np.where(going[:, None], self._share(step.u, own), 0.0)
         found = here
         for i in range(HALVINGS + 1):
             at = self.chart.moved(here.standing, share[..., None] * step.u, every)
             values = here.values
             if own and step.b is not None and values is not None:
                 values = values + share[:, :1] * step.b
-            found = self.look(z, trials, at, values, own)
+            found = self.look(z, trials, at, values, own, still=share == 0.0)
             worse = going & ~(found.cost <= (1.0 + ROUNDING) * here.cost + NOTHING**2)
             if not worse.any():
                 break
@@ -249,6 +273,12 @@ class Poses:
                 bad &= ~(found.squares <= here.squares)[:, self.member] | ~found.ok
             share[bad] *= 0.5 if i < HALVINGS - 1 else 0.0
         return found, bool(share.any())
+
+    def _share(self, u: FloatArray, own: bool) -> FloatArray:
+        """Share (a, n) of steps u that is tried first: one for all poses of a component, with own unknowns for all."""
+        each, least = self.chart.share(u), np.ones((len(u), self.components))
+        np.minimum.at(least.T, self.member, each.T)
+        return np.repeat(each.min(axis=1, keepdims=True), each.shape[1], axis=1) if own else least[:, self.member]
 
     def _kinds(
         self, block: Block, moves: FreeMoves, trials: IntArray, values: FloatArray | None, machine: bool = True
@@ -301,6 +331,14 @@ def _free_columns(sensed: Sensed, seen: Evaluation, white: FloatArray, moves: Fr
         turns = np.stack([moves.turns[name][:, sensed.poses] for name in sensed.kind.looks_at], axis=2)
         columns = columns + np.matmul(seen.joints, turns)
     return np.matmul(white, columns)[:, :, None]
+
+
+def _kept(found: Standing, begin: Standing, still: np.ndarray) -> Standing:
+    """Poses as they were found, those that were still (a, n) as they began: solved anew they could end on another branch."""
+    trial, pose = np.nonzero(still)
+    if not len(trial):
+        return found
+    return found.put((trial, pose), Standing(mapped(lambda array: array[trial, pose], begin.state), begin.q[trial, pose]))
 
 
 def _joined(parts: list[engine.State], where: IntArray) -> dict:

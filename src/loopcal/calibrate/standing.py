@@ -23,11 +23,16 @@ from loopcal.calibrate.scaling import Unknowns
 from loopcal.errors import EstimationError
 from loopcal.linalg import FloatArray, IntArray
 from loopcal.measure import joint_values
-from loopcal.mechanism import Status
+from loopcal.mechanism import Mechanism, Status
+from loopcal.mechanism.assembly import Actuator
 from loopcal.mechanism.at_pose import moves_at_pose, solve_at_pose
 from loopcal.mechanism.implicit import sensitivity
 from loopcal.mechanism.passive import passive_sensitivity
 from loopcal.mechanism.trials import forward_trials
+from loopcal.units import Dimension
+
+LONGEST = 0.25
+"""Longest step of a reading, as a share of its stroke, or of a pose, of the robot's size: beyond, closure is not linear."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +81,15 @@ class Chart(Protocol):
         """(n, k) which numbers may move at all."""
         ...
 
-    def closed(self, values: FloatArray, here: Standing) -> Standing:
-        """Solve closure at parameter values (a, p) from where poses stand; what u moves stays as it is."""
+    def closed(self, values: FloatArray, here: Standing, follow: bool) -> Standing:
+        """Solve closure at parameter values (a, p) from where poses stand; what u moves stays as it is.
+
+        `follow` tells whether a pose that Newton does not solve is worth following, or a nearer one will be tried anyway.
+        """
+        ...
+
+    def share(self, u: FloatArray) -> FloatArray:
+        """Largest share (a, n) of steps u (a, n, k), at most 1, that linearised closure can be asked for."""
         ...
 
     def moved(self, here: Standing, u: FloatArray, poses: IntArray) -> Standing:
@@ -100,14 +112,19 @@ class ByReadings:
     def __init__(self, unknowns: Unknowns, scale: FloatArray, joints: tuple[str, ...]) -> None:
         self.unknowns, self.scale, self.joints = unknowns, scale, joints
         self.freedoms = scale.shape[1]
+        self.longest = LONGEST * np.array([stroke_of(unknowns.robot, a) for a in unknowns.robot.actuators])
 
     def free(self, poses: IntArray) -> np.ndarray:
         """(n, a) readings that are not exact."""
         return self.scale[poses] > 0.0
 
-    def closed(self, values: FloatArray, here: Standing) -> Standing:
+    def closed(self, values: FloatArray, here: Standing, follow: bool) -> Standing:
         """Forward kinematics."""
-        return Standing(forward_trials(self.unknowns.robot, values, here.q, here.state), here.q)
+        return Standing(forward_trials(self.unknowns.robot, values, here.q, here.state, follow), here.q)
+
+    def share(self, u: FloatArray) -> FloatArray:
+        """No reading by more than `LONGEST` of its stroke."""
+        return _share(u * self.scale, self.longest)
 
     def moved(self, here: Standing, u: FloatArray, poses: IntArray) -> Standing:
         """Readings moved."""
@@ -156,9 +173,14 @@ class ByPose:
         """(n, m): all."""
         return np.ones((len(poses), self.freedoms), dtype=bool)
 
-    def closed(self, values: FloatArray, here: Standing) -> Standing:
+    def closed(self, values: FloatArray, here: Standing, follow: bool) -> Standing:
         """Inverse kinematics of every limb."""
+        del follow
         return Standing(*solve_at_pose(self.unknowns.robot, values, here.state.T, here.state))
+
+    def share(self, u: FloatArray) -> FloatArray:
+        """No shift by more than `LONGEST` of the robot's size, no turn by more than as many radians."""
+        return _share(u * self.scale, LONGEST * np.array([1.0] * 3 + [self.unknowns.robot.size] * 3)[self.places])
 
     def moved(self, here: Standing, u: FloatArray, poses: IntArray) -> Standing:
         """Poses moved."""
@@ -181,6 +203,18 @@ class ByPose:
                     slopes[name] = _free(self.unknowns, by_parameter[:, :, i])
                     turns[name] = by_freedom[:, :, i] * self.scale
         return _safe(self.unknowns, self.joints, here, needed, D, Y, slopes, turns)
+
+
+def stroke_of(robot: Mechanism, actuator: Actuator) -> float:
+    """What an actuator can move by, about [m or rad]; where its stroke is not stated the robot's size, or a radian."""
+    if actuator.stroke is None:
+        return robot.size if actuator.dimension is Dimension.LENGTH else 1.0
+    return actuator.stroke[1] - actuator.stroke[0]
+
+
+def _share(step: FloatArray, longest: FloatArray) -> FloatArray:
+    """Share (a, n) of steps (a, n, k) that leaves each number within the longest one (k,)."""
+    return 1.0 / np.maximum(np.abs(step) / longest, 1.0).max(axis=2, initial=1.0)
 
 
 def _free(unknowns: Unknowns, by_parameter: FloatArray) -> FloatArray:

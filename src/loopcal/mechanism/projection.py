@@ -27,7 +27,7 @@ def nearest_reachable(robot: Mechanism, values: Array, T: Array, start: State | 
         return state
     for _ in range(STEPS):
         gap = se3.difference(state.T, np.broadcast_to(T, state.T.shape))
-        slope = _pose_slopes(robot, values, state)
+        slope = pose_slopes(robot, values, state)
         weight = np.array([robot.size] * 3 + [1.0] * 3)
         step = _least_squares(slope * weight[:, None], -gap * weight)
         step = np.where(np.isfinite(step), step, 0.0)
@@ -38,7 +38,7 @@ def nearest_reachable(robot: Mechanism, values: Array, T: Array, start: State | 
     return state
 
 
-def _pose_slopes(robot: Mechanism, values: Array, state: State) -> Array:
+def pose_slopes(robot: Mechanism, values: Array, state: State) -> Array:
     """d twist / d demand (t, n, 6, c) with the actuators free, demands as `coordinates.demands` counts them [1/m, 1]."""
     if shared_drives(robot.program):
         return reading_slopes(robot, values, state)

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Readings that were not taken and were found where the machine hardly was: outside the stroke, or bent the other way.
+
+Rows at the platform cannot tell the ways in which a limb bends to one pose, nor do they know of end stops. Both fit equally
+well and both are said, so that nobody takes such a reading for a measured one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from loopcal.calibrate.latent_estimate import LatentEstimate
+from loopcal.mechanism import Mechanism, inverse
+from loopcal.se3 import wrap
+from loopcal.units import DISPLAY_UNITS, Dimension, unit
+
+APART = 1e-6
+"""Difference of readings, as a share of the robot's size or in radians, above which they are two solutions, not rounding."""
+
+SHOWN = 3
+"""Readings told one by one; the others are counted."""
+
+
+def latent_doubts(robot: Mechanism, latent: LatentEstimate) -> list[str]:
+    """Return sentences on readings that were found outside their stroke or on another branch than home's.
+
+    Parameters
+    ----------
+    robot : the identified one.
+    """
+    known = np.asarray(np.isfinite(latent.poses).all(axis=(1, 2)) & ~latent.open)
+    found = np.isinf(latent.sigma) & known[:, None]
+    low, high = np.array([a.stroke or (-np.inf, np.inf) for a in robot.actuators]).T
+    outside = found & ((latent.readings < low) | (latent.readings > high))
+    beside = found & _other_branch(robot, latent, np.asarray(found.any(axis=1)))
+    notes = []
+    if outside.any():
+        notes.append(
+            f"found outside the stroke: {_named(robot, latent, outside)}; measure more at these poses, or leave them out"
+        )
+    if beside.any():
+        notes.append(
+            f"found on another branch than that of home: {_named(robot, latent, beside)}; rows at the platform fit both;"
+            " where the machine stood as at home, give the reading roughly, its sigma infinite, as a start"
+        )
+    return notes
+
+
+def _other_branch(robot: Mechanism, latent: LatentEstimate, poses: np.ndarray) -> np.ndarray:
+    """Readings (n, a) that differ from those with which home's branch reaches the same pose."""
+    other = np.zeros(latent.readings.shape, dtype=bool)
+    if poses.any():
+        home = inverse(robot, latent.poses[poses])
+        gap = latent.readings[poses] - home.q
+        turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
+        gap = np.abs(np.where(turning, wrap(gap), gap)) / np.where(turning, 1.0, robot.size)
+        other[poses] = home.converged[:, None] & (gap > APART)
+    return other
+
+
+def _named(robot: Mechanism, latent: LatentEstimate, chosen: np.ndarray) -> str:
+    """Readings by actuator and pose, with their values."""
+    words = []
+    for pose, column in np.argwhere(chosen)[:SHOWN]:
+        actuator = robot.actuators[column]
+        shown = unit(robot.units.get(actuator.dimension, DISPLAY_UNITS[actuator.dimension].symbol))
+        value = latent.readings[pose, column] / shown.factor_to_si
+        words.append(f"{actuator.name} at pose {latent.labels[pose]} ({value:.6g} {shown.symbol})")
+    more = int(chosen.sum()) - len(words)
+    return ", ".join(words) + (f" and {more} more" if more else "")
