@@ -20,6 +20,7 @@ import numpy as np
 from loopcal.calibrate.combinations import listed
 from loopcal.calibrate.identification import Identification
 from loopcal.calibrate.pose_errors import INDICES, PoseErrors, pose_errors
+from loopcal.calibrate.predicted import predicted, untold
 from loopcal.calibrate.set_up_anew import set_up_anew
 from loopcal.errors import DataError, nearest
 from loopcal.linalg import FloatArray
@@ -32,7 +33,7 @@ from loopcal.measure import (
     joints_looked_at,
     start_values,
 )
-from loopcal.mechanism import Mechanism, Solution, forward, inverse
+from loopcal.mechanism import Mechanism, Solution, inverse
 from loopcal.parameters import ParameterTable
 from loopcal.units import DISPLAY_UNITS, Dimension, unit
 
@@ -148,15 +149,13 @@ def validate(
 
     Parameters
     ----------
-    fit : the identification, or a calibrated robot.
-    data : measurements held out.
+    fit : the identification, or a calibrated robot. data : measurements held out.
     limit_position, limit_angle : quality gates [m], [rad].
     before : the geometry to compare with, and that of the controller; default: what `fit` started from (for a robot:
         its nominal values).
     known : values [SI] by name of frames, targets and surfaces that a fit found; they are kept. Default: those of `fit`.
-    refit : names of some of them, such as `tracker*`, to be found anew all the same, because they were set up anew.
-    known_before : the same as `known` for the geometry before, so that like is compared with like. Default: the values with
-        which `fit` began; what is not known is found from these rows, and that is noted.
+    refit : names of some of them, such as `tracker*`, that were set up anew, to be found from these rows.
+    known_before : the same for the geometry before, to compare like with like; default: the values with which `fit` began.
 
     Raises
     ------
@@ -169,33 +168,49 @@ def validate(
     rows = [some for o in data.observations if len(some := o.take(o.weight > 0.0))]
     if not rows:
         raise DataError("there is no row to validate with: every row is absent or has weight 0")
-    believed, predicted = forward(old, data.readings), forward(robot, data.readings)
+    (believed, _), (found, told) = predicted(old, data), predicted(robot, data)
     reached = inverse(robot, believed.T)
-    ok = believed.converged & predicted.converged & reached.converged & _read(data)
+    ok = believed.converged & found.converged & reached.converged & told
     if not ok.any():
-        raise DataError(f"{robot.name} reaches none of the {data.n_poses} poses; check the readings and their units")
+        raise DataError(_unreached(robot, told, believed.converged, found.converged))
     rows = [o.take(ok[o.rows].reshape(len(o), -1).all(axis=1)) for o in rows]
-    seen = replace(data, observations=tuple(rows))
+    seen, units = replace(data, observations=tuple(rows)), _units(robot)
     starts, kept = _known(fit, before, (known_before, known), refit, data)
-    first, last = _view(old, seen, believed, ok, starts), _view(robot, seen, predicted, ok, kept)
+    first, last = _view(old, seen, believed, ok, starts), _view(robot, seen, found, ok, kept)
     was, now = first.residuals(rows), last.residuals(rows)
     missed = first.differences(rows, _view(old, seen, reached, ok, None))
-    after = _errors(rows, now)
-    reasons = _gates(after, _labels(rows, data), limit_position, limit_angle, _units(robot))
+    after, poses = _errors(rows, now), _labels(rows, data)
     return Validation(
-        poses=_labels(rows, data),
+        poses=poses,
         before=_errors(rows, was),
         after=after,
         commanded_before=_errors(rows, [-r for r in was]),
         commanded_after=_errors(rows, [m - r for m, r in zip(missed, now, strict=True)]),
         not_compensable=_errors(rows, missed),
-        failed=tuple(data.labels[i] for i in np.flatnonzero(~ok & _read(data))),
+        failed=tuple(data.labels[i] for i in np.flatnonzero(~ok & told)),
         limit_position=limit_position,
         limit_angle=limit_angle,
-        reasons=reasons,
-        units=_units(robot),
-        notes=(*_notes(first, last), *_anew(robot, seen, predicted, ok, kept), *_unread(data)),
+        reasons=_gates(after, poses, limit_position, limit_angle, units),
+        units=units,
+        notes=(*_notes(first, last), *_anew(robot, seen, found, ok, kept), *untold(data, told)),
         alignment=_alignment(last),
+    )
+
+
+def _unreached(robot: Mechanism, told: np.ndarray, before: np.ndarray, after: np.ndarray) -> str:
+    """Say why no pose is left: readings not there, or not reached by the geometry before, or a calibration gone astray."""
+    n, some = len(told), int(before.sum())
+    if not told.any():
+        return (
+            f"none of the {n} poses has all the readings from which {robot.name} can be predicted: give readings, and a finite"
+            " sigma to those that are to be believed"
+        )
+    if not some:
+        return f"{robot.name} reaches none of the {n} poses; check the readings and their units"
+    return (
+        f"the calibrated geometry of {robot.name} cannot follow where the one before goes: with these readings that reaches"
+        f" {some} of {n} poses, the calibrated one {int(after.sum())}, and none of them the same; do not use this calibration,"
+        " and check what is stated of frames and noise"
     )
 
 
@@ -320,18 +335,6 @@ def _anew(robot: Mechanism, data: Measurements, found: Solution, ok: np.ndarray,
     names = dict.fromkeys(owner[p.name] for p in table.entries if p.free and p.name in kept)
     moved = set_up_anew(tuple(names), sizes)
     return () if moved is None else (moved.sentence,)
-
-
-def _read(data: Measurements) -> np.ndarray:
-    """(n,) poses all of whose readings were taken and are believed: from these a pose can be predicted."""
-    sigma = data.reading_sigma
-    return np.ones(data.n_poses, dtype=bool) if sigma is None else np.isfinite(sigma).all(axis=1)
-
-
-def _unread(data: Measurements) -> tuple[str, ...]:
-    """Say which poses are left out because a reading is missing."""
-    names = [label for label, there in zip(data.labels, _read(data), strict=True) if not there]
-    return (f"left out, a reading was not taken or is not believed: {listed(names)}",) if names else ()
 
 
 def _errors(rows: list[Observations], residuals: list[FloatArray]) -> PoseErrors:
