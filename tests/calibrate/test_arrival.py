@@ -348,7 +348,7 @@ def test_the_message_names_the_override_and_the_override_works() -> None:
     assert np.isnan(check_arrival(robot, data, allow_implausible=True).misfit)
     still = changed(measured("hexapod-42", Position()), lambda values: values.__setitem__(slice(1, None), values[0]))
     with pytest.raises(
-        DataError, match=r"never moves: its readings stay within 0, but the robot moves it by .*allow_still=True"
+        DataError, match=r"never moves: its readings stay within 0 mm, but the robot moves it by .*allow_still=True"
     ):
         check_arrival(robot, still)
 

@@ -124,3 +124,43 @@ def test_links_that_end_nowhere_or_outside_any_folder_are_refused(run) -> None:
         code, out, err = run(f"simulate robot.yaml -o {name} --force")
         assert (code, out, err.count("\n")) == (1, "", 1)
         assert sentence in err
+
+
+PRINTER = """[printer]
+kinematics: delta
+delta_radius: 130.25
+[stepper_a]
+step_distance: 0.0125
+position_endstop: 250
+arm_length: 269
+[stepper_b]
+step_distance: 0.0125
+[stepper_c]
+step_distance: 0.0125
+[delta_calibrate]
+radius: 50
+#*# <---------------------- SAVE_CONFIG ---------------------->
+#*# [delta_calibrate]
+#*# height0 = 0.1
+#*# height0_pos = 20000.000,20000.000,20000.000
+#*# height1 = 0.2
+#*# height1_pos = 20010.000,20000.000,20000.000
+"""
+
+
+def test_an_import_whose_calibration_fails_leaves_everything_as_it_was(run) -> None:
+    """Two heights are too few for the six parameters."""
+    Path("printer.cfg").write_text(PRINTER)
+    before = contents()
+    for words in ("-o printer.yaml --data heights.csv", "-o old.csv --data heights.csv --force"):
+        code, out, err = run(f"import printer.cfg {words} --corrected corrected.cfg")
+        assert (code, out) == (1, "")
+        assert "2 equations from 2 poses cannot determine" in err
+        assert contents() == before
+
+
+def test_the_template_of_a_kind_that_compares_poses_says_how_they_are_named(run) -> None:
+    assert run("new gough -o a.yaml --measurements m.csv --kind separation")[0] == 0
+    assert "names them in the column pose as a;b, and leaves readings empty" in Path("m.csv").read_text()
+    assert run("new gough -o b.yaml --measurements n.csv --kind position")[0] == 0
+    assert "compares two poses" not in Path("n.csv").read_text()

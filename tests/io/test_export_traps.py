@@ -2,11 +2,12 @@
 """Exports that look right and are not: cells cut in two, other headers further down, targets that contradict each other."""
 
 import json
+import re
 
 import pytest
 
 from loopcal.cli import main
-from loopcal.errors import FileError
+from loopcal.errors import FileError, LoopcalError
 from loopcal.io import load_measurements, load_robot
 from loopcal.io.exports import convert, read_profile
 
@@ -196,3 +197,35 @@ def test_the_command_tells_what_targets_say_differently(tmp_path, monkeypatch, c
     assert "note: 1 line of a further target states another time" in capsys.readouterr().out
     assert main(["import", "export.txt", "--profile", "profile.yaml", "-o", "data.csv", "--json", "--force"]) == 0
     assert len(json.loads(capsys.readouterr().out)["notes"]) == 1
+
+
+HEADER = "pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm],temperature [degC],x [mm],y [mm],z [mm]\n"
+ROWS = HEADER + "".join(f"P{i},{i},0,{i % 3},0,0,{i % 2},20,{i},2,3\n" for i in range(4))
+FRONT = "# kind: position\n# noise: {'*': 1 um}\n"
+BY_PROFILE = "or read an instrument's export as it is by 'loopcal import --profile'"
+REFUSED = {
+    "semicolons": ((FRONT + ROWS.replace(",", ";")).encode(), f"columns are separated by semicolons; .*{BY_PROFILE}"),
+    "tabs": ((FRONT + ROWS.replace(",", "\t")).encode(), f"columns are separated by tabs; .*{BY_PROFILE}"),
+    "latin-1": (("## Länge\n" + FRONT + ROWS).encode("latin-1"), f"is not UTF-8 text .*{BY_PROFILE}"),
+    "utf-16": ((FRONT + ROWS).encode("utf-16"), f"is not UTF-8 text .*{BY_PROFILE}"),
+    "capitals": ((FRONT + ROWS.replace("x [mm]", "X [mm]")).encode(), r"column 'X' is unknown \(did you mean 'x \[mm\]'\?\)"),
+    "brackets": ((FRONT + ROWS.replace("x [mm]", "x (mm)")).encode(), r"'x \(mm\)' is unknown \(did you mean 'x \[mm\]'\?\)"),
+    "both": ((FRONT + ROWS.replace("q1 [mm]", "Q1(mm)")).encode(), r"'Q1\(mm\)' is unknown \(did you mean 'q1 \[mm\]'\?\)"),
+    "ice": ((FRONT + ROWS.replace(",20,2,", ",-300,2,")).encode(), r"data.csv:6: .*is -300 degC, below absolute zero"),
+    "still": ((FRONT + re.sub(",20,.,2", ",20,1,2", ROWS)).encode(), r"stay within 0 mm, but the robot moves it by [\d.]+ mm;"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_measurement_file_of_another_program_is_refused_with_what_helps(tmp_path, case) -> None:
+    content, message = REFUSED[case]
+    (tmp_path / "data.csv").write_bytes(content)
+    with pytest.raises(LoopcalError, match=message) as caught:
+        load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"))
+    assert "\n" not in str(caught.value)
+
+
+def test_zero_kelvin_is_cold_enough(tmp_path) -> None:
+    (tmp_path / "data.csv").write_text(FRONT + ROWS.replace("[degC]", "[degF]").replace(",20,2,", ",-459.67,2,"))
+    data = load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"), allow_still=True, allow_implausible=True)
+    assert data.observations[0].context["temperature"][2] == pytest.approx(-273.15, abs=1e-9)  # [degC], rounding

@@ -82,7 +82,7 @@ def import_(
       loopcal import five-bar.urdf --closures five-bar-loops.yaml -o five-bar.yaml
     """  # noqa: D301
     from loopcal.io.formats.transfer import format_of, save_imported
-    from loopcal.io.outputs import refuse_outputs
+    from loopcal.io.outputs import all_or_none, refuse_outputs
 
     if profile is not None:
         return _export(file, profile, output, force, as_json)
@@ -95,10 +95,11 @@ def import_(
     refuse_outputs((output, data), (file, asked["closures"] or beside), force)
     refuse_outputs((output, data, corrected), (), force)  # FILE may be corrected in place
     found = source.read(file, _reading(source, output.stem, asked))
-    robot = save_imported(file, found, output, data)
-    if source.judged is not None and found.measurements is not None:
-        found = replace(found, notes=(*found.notes, *source.judged(robot, found.measurements)))
-    fit = None if corrected is None or data is None else _corrected(source, robot, file, data, corrected)
+    with all_or_none((output, data)):
+        robot = save_imported(file, found, output, data)
+        if source.judged is not None and found.measurements is not None:
+            found = replace(found, notes=(*found.notes, *source.judged(robot, found.measurements)))
+        fit = None if corrected is None or data is None else _corrected(source, robot, file, data, corrected)
     document: dict[str, Any] = {"robot": output, "data": data, "corrected": corrected, "notes": found.notes}
     if as_json:
         show.json_document(document | {"fit": None if fit is None else fit[0].to_dict(), "changes": fit and fit[1]})

@@ -27,6 +27,9 @@ TIME_UNITS: Mapping[str, tuple[float, float]] = {"s": (1.0, 0.0), "ms": (1e-3, 0
 TEMPERATURE_UNITS: Mapping[str, tuple[float, float]] = {"degC": (1.0, 0.0), "K": (1.0, -273.15), "degF": (5 / 9, -160 / 9)}
 """Unit -> factor and offset to seconds, or degrees Celsius."""
 
+ZERO, COARSE = -273.15, 1e-9
+"""Absolute zero, and how far below it rounding of another unit may lie [degC]."""
+
 
 def is_context(name: str) -> bool:
     """Tell whether a column is one of these."""
@@ -44,7 +47,7 @@ def read_context(table: Table) -> dict[str, np.ndarray]:
     Raises
     ------
     FileError
-        A unit that is none of these, a cell that is no number, or no date.
+        A unit that is none of these, a cell that is no number, or no date, a temperature below absolute zero.
     """
     import numpy as np
 
@@ -63,6 +66,11 @@ def read_context(table: Table) -> dict[str, np.ndarray]:
             math.nan if math.isnan(table.number(name, row, cell, empty=True)) else exact(cell, factor) + offset
             for row, cell in enumerate(cells)
         ]
+        for row, value in enumerate(numbers):
+            if name != TIME and value < ZERO - COARSE:
+                raise table.row_error(
+                    row, f"column {name!r} is {cells[row]} {symbol}, below absolute zero; correct it, or leave the cell empty"
+                )
         found[name] = np.array(numbers)
     return found
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,11 +28,16 @@ if TYPE_CHECKING:
     import numpy as np
 
 WHAT = "measurement file"
+BY_PROFILE = ", or read an instrument's export as it is by 'loopcal import --profile' (docs/exports.md)"
+"""What helps with text that other programs wrote."""
+
 SIDECAR_KEYS = ("kind", "kinds", "noise", "controller", "instrument", "reading_noise", "poses")
 """What tells a settings file from another YAML file of the same name."""
 
 _SETTING = re.compile(r"^#\s*[A-Za-z]\w*:(\s|$)")
 _HEADER = re.compile(r"^(?P<name>[^\[\]]*[^\[\]\s])\s*(\[(?P<unit>[^\[\]]*)\])?$")
+
+_ROUND = re.compile(r"^(?P<name>[^()]*[^()\s])\s*\((?P<unit>[^()]*)\)$")
 
 
 @dataclass(frozen=True)
@@ -155,7 +160,7 @@ def read_table(path: str | Path) -> Table:
         Unreadable file, bad settings, no header, a header that cannot be read, no rows, rows of the wrong length.
     """
     path = Path(path)
-    lines = [line.rstrip("\r") for line in read_text(path, WHAT).split("\n")]
+    lines = [line.rstrip("\r") for line in read_text(path, WHAT, BY_PROFILE).split("\n")]
     settings, first = _settings(path, lines)
     numbered = [(i + 1, line) for i, line in enumerate(lines) if i >= first and line.strip() and not line.startswith("#")]
     if not numbered:
@@ -163,12 +168,23 @@ def read_table(path: str | Path) -> Table:
     header_line, header = numbered[0]
     if "," not in header and (";" in header or "\t" in header):
         found = "semicolons" if ";" in header else "tabs"
-        raise FileError(f"columns are separated by {found}; use commas, and points in numbers", path, header_line)
+        raise FileError(f"columns are separated by {found}; use commas, and points in numbers{BY_PROFILE}", path, header_line)
     units = _header(path, header_line, header)
     rows = tuple(_row(path, line, text, len(units)) for line, text in numbered[1:])
     if not rows:
         raise FileError("this file has a header but no rows; add one row for each measured pose", path, header_line)
     return Table(path, settings, header_line, units, rows, tuple(line for line, _ in numbered[1:]))
+
+
+def meant(header: str, symbol: str | None, known: Iterable[str]) -> str:
+    """Return ` (did you mean 'x [mm]'?)` where a header is a known name but for capitals or round brackets, else nothing."""
+    found = _ROUND.match(header)
+    plain, written = (found["name"], found["unit"]) if found is not None and symbol is None else (header, symbol)
+    names = {name.casefold(): name for name in known}
+    if plain.casefold() not in names:
+        return ""
+    name = names[plain.casefold()]
+    return f" (did you mean {name if written is None else f'{name} [{written}]'!r}?)"
 
 
 def require_columns(table: Table, needed: Sequence[str], why: str) -> None:
@@ -181,7 +197,8 @@ def require_columns(table: Table, needed: Sequence[str], why: str) -> None:
     """
     for name in needed:
         if name not in table.units:
-            hint = nearest(name, table.names)
+            hints = [meant(other, symbol, [name]) for other, symbol in table.units.items()]
+            hint = next(filter(None, hints), nearest(name, table.names))
             raise table.header_error(f"there is no column {name!r}{hint}, which {why}; add it with its unit")
 
 
@@ -197,7 +214,7 @@ def sidecar(path: Path) -> Path:
 
 def stated_robot(path: str | Path) -> str | None:
     """Return the robot that a measurement file says it belongs to, None where it says none; raises FileError."""
-    lines = [line.rstrip("\r") for line in read_text(path, WHAT).split("\n")]
+    lines = [line.rstrip("\r") for line in read_text(path, WHAT, BY_PROFILE).split("\n")]
     found = _settings(Path(path), lines)[0].content.get("robot")
     return None if found is None else str(found).strip()
 

@@ -36,6 +36,12 @@ ADDED = (
 )
 """What a template says below its header."""
 
+COMPARED = (
+    f"# A row of the kind {{}} compares two poses: it names them in the column pose as a{LINK}b, and leaves readings empty;",
+    "# each of these poses has a row of its own with its readings, in which the measured value is empty.",
+)
+"""What a template says of kinds that compare poses."""
+
 
 def save_measurements(data: Measurements, path: str | Path, robot: Mechanism, remark: str = "") -> None:
     """Write measurements as a CSV file that `load_measurements` reads back.
@@ -100,7 +106,9 @@ def template_text(robot: Mechanism, instrument: Instrument) -> str:
     """
     sensors = _stated(instrument)
     units = {a.name: _unit(robot, a.dimension)[0] for a in robot.actuators}
-    return "\n".join([*_settings(robot, sensors, ""), ",".join(_template_columns(robot, sensors, units)), *ADDED]) + "\n"
+    compared = [line.format(label) for label, kind, _ in sensors if kind.links > 1 for line in COMPARED]
+    header = ",".join(_template_columns(robot, sensors, units))
+    return "\n".join([*_settings(robot, sensors, ""), header, *ADDED, *compared]) + "\n"
 
 
 def to_fill_in_text(robot: Mechanism, instrument: Instrument, readings: ArrayLike, labels: Sequence[str] = ()) -> str:

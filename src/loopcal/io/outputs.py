@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from loopcal.errors import FileError
@@ -44,6 +45,22 @@ def refuse_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None]
             raise FileError("this cannot be written (permission denied); choose another place", path)
         if path.is_file() and not force:
             raise FileError("this file exists; choose another name, or replace it with --force", path)
+
+
+@contextmanager
+def all_or_none(outputs: Sequence[Path | None]) -> Iterator[None]:
+    """Put these files back as they were before the body, or take them away, where the body fails; None is passed over."""
+    before = {path: path.read_bytes() if path.is_file() else None for path in outputs if path is not None}
+    done = False
+    try:
+        yield
+        done = True
+    finally:
+        for path, content in () if done else before.items():
+            if content is not None:
+                path.write_bytes(content)
+            elif path.is_file():
+                target_of(path).unlink()
 
 
 def refuse_run_folder(folder: Path, inputs: Sequence[Path], force: bool) -> None:

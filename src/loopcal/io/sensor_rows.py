@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from loopcal.errors import DataError, UnitError, nearest
 from loopcal.io.context_columns import is_context
-from loopcal.io.csv_table import Table, require_columns
+from loopcal.io.csv_table import Table, meant, require_columns
 from loopcal.io.pose_rows import COMMANDED, OWN_COLUMNS, measured_name
 from loopcal.io.sensor_settings import kind_settings, read_kind, read_noise
 from loopcal.io.yaml_file import Location, refuse_unknown_keys
@@ -168,7 +168,8 @@ def _refuse_unknown_columns(table: Table, robot: Mechanism, sensors: tuple[Senso
     why = "" if sensors else " (this file states no kind of measurement, so that it only says where poses are)"
     for name in table.names:
         if name not in known and not is_context(name) and not name.startswith("note"):
-            hint = nearest(name, known) or f"; columns of this file can be {', '.join(sorted(known))}"
+            hint = meant(name, table.units[name], {*known, *OWN_COLUMNS}) or nearest(name, known)
+            hint = hint or f"; columns of this file can be {', '.join(sorted(known))}"
             raise table.header_error(
                 f"column {name!r} is unknown{hint}; correct it, or call it 'note {name}' to ignore it{why}"
             )

@@ -14,7 +14,7 @@ from loopcal.errors import FileError
 BOM = "\ufeff"
 
 
-def read_text(path: str | Path, what: str) -> str:
+def read_text(path: str | Path, what: str, otherwise: str = "") -> str:
     """Return the text of a UTF-8 file; a byte order mark at its start is dropped.
 
     Parameters
@@ -23,6 +23,8 @@ def read_text(path: str | Path, what: str) -> str:
         The file.
     what : str
         What the file should be, for messages: "robot file", "measurement file".
+    otherwise : str
+        What else than saving it as UTF-8 helps; closes the message.
 
     Raises
     ------
@@ -35,10 +37,10 @@ def read_text(path: str | Path, what: str) -> str:
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
         found = f"byte 0x{raw[error.start]:02x}"
-        raise FileError(f"this {what} is not UTF-8 text ({found}); save it as UTF-8", path, line) from None
+        raise FileError(f"this {what} is not UTF-8 text ({found}); save it as UTF-8{otherwise}", path, line) from None
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
-        raise FileError(f"this {what} holds a zero byte, so it is not UTF-8 text; save it as UTF-8", path, line)
+        raise FileError(f"this {what} holds a zero byte, so it is not UTF-8 text; save it as UTF-8{otherwise}", path, line)
     if not text.strip():
         raise FileError(f"this {what} is empty; see the examples that come with loopcal for what it should hold", path)
     return text

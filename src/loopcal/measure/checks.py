@@ -13,7 +13,7 @@ from loopcal.measure.kinds import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism import Mechanism
-from loopcal.units import unit
+from loopcal.units import DISPLAY_UNITS, unit
 
 Array = NDArray[np.float64]
 
@@ -157,9 +157,11 @@ def check_moved(measurements: Measurements, T: Array, *, allow: bool = False, ov
         planned = np.ptp(expected[still.here][:, still.places], axis=0)
         if np.any(planned > PLANNED * still.noise):
             worst = int(np.argmax(planned / still.noise))
+            shown = DISPLAY_UNITS[kind.columns[still.places[worst]].dimension]
+            moved, should = (f"{range_[worst] / shown.factor_to_si:.3g} {shown}" for range_ in (still.moved, planned))
             raise DataError(
-                f"{still.target!r} of kind {kind.name!r} never moves: its readings stay within {still.moved[worst]:.3g}, but"
-                f" the robot moves it by {planned[worst]:.3g} (m or rad); check that it sits on the platform and that the"
+                f"{still.target!r} of kind {kind.name!r} never moves: its readings stay within {moved}, but"
+                f" the robot moves it by {should}; check that it sits on the platform and that the"
                 " column is its own" + _or_use(override)
             )
 
