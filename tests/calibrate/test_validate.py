@@ -2,6 +2,7 @@
 """Validation: the indices, the two errors told apart, and quality gates."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -109,6 +110,16 @@ def test_the_table_names_every_error_and_the_json_every_pose(validation):
     document = json.loads(to_json(validation.to_dict()))
     assert document["passed"] is True
     assert len(document["after"]["position"]["rows"]) == len(document["poses"])
+
+
+def test_a_geometry_that_went_astray_is_told_from_readings_that_no_geometry_reaches():
+    robot, data = hexapod(), hexapod_data(4)
+    legs = np.array([name.endswith("length") for name in robot.parameters.names])
+    astray = robot.with_values(np.where(legs, 0.2, 1.0) * robot.values)
+    with pytest.raises(DataError, match="cannot follow where the one before goes: with these readings that reaches 4 of 4"):
+        validate(astray, data, before=robot)
+    with pytest.raises(DataError, match="reaches none of the 4 poses; check the readings and their units"):
+        validate(robot, replace(data, readings=data.readings + 10.0))
 
 
 def sizes_if_moved(*moved, base=1.0, by=50.0, left=30):

@@ -110,3 +110,29 @@ def test_a_frame_that_was_moved_since_the_fit_is_named_and_both_errors_are_taken
     assert "set up anew" not in out
     code, out, _ = run("validate run one.csv")  # one pose does not tell: six numbers, six unknowns
     assert (code, "set up anew" in out) == (0, False)
+
+
+def test_a_prior_or_a_fixed_coordinate_that_the_data_contradict_is_refused_by_its_name(here) -> None:
+    folder, run = here
+    placed = {"frame.x": 0.1, "frame.rz": 0.5}
+    saved(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)
+    text = (folder / "data.csv").read_text()
+
+    def said(statement: str) -> tuple[int, str, str]:
+        (folder / "stated.csv").write_text(f"# unknowns: {{{statement}}}\n{text}")
+        return run("identifiability hexapod-42 stated.csv")
+
+    for statement, shown in (
+        ("frame.x: {start: 1500 mm, sd: 1 mm}, frame.y: {start: 0 mm, sd: 1 mm}", "not at 1500 mm (sd 1 mm)"),
+        ("frame.x: fixed", "not at 0 mm (fixed)"),
+    ):
+        code, out, err = said(statement)
+        assert (code, out, err.count("\n")) == (1, "", 1)
+        assert err.startswith("loopcal: stated.csv: the data contradict what 'unknowns' states: they put frame.x at ")
+        assert shown in err
+        assert "with frame.x left to the data" in err
+        assert err.endswith("correct or remove the statement, or use --allow-implausible\n")
+    assert said("frame.x: {start: 101 mm, sd: 1 mm}")[0] == 0
+    code, out, err = said("frame.x: {start: 105 mm, sd: 10 um}")  # noted: a robot far off its tolerances shows the same
+    assert code == 0
+    assert "note: stated.csv: the data contradict what 'unknowns' states: they put frame.x at 100" in err

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from loopcal.cli import main
+from loopcal.errors import DataError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 
@@ -58,3 +59,19 @@ def test_errors_that_grew_on_unseen_poses_are_a_reason(blundered, capsys) -> Non
     assert grown
     assert code == 2
     assert [r.split()[0] for r in document["reasons"] if "LARGER" in r] == grown
+
+
+@pytest.mark.parametrize("hold_out", ["", "--hold-out 0.25"])
+def test_a_fit_that_reaches_none_of_its_poses_is_a_reason_and_not_a_user_error(
+    blundered, capsys, monkeypatch, hold_out
+) -> None:
+    def astray(*_):
+        raise DataError("the calibrated geometry cannot follow")
+
+    monkeypatch.setattr("loopcal.calibrate.validate", astray)
+    assert main(["calibrate", "hexapod-42", "measurements.csv", "-o", "run", *hold_out.split()]) == 2
+    out, err = capsys.readouterr()
+    assert err == "loopcal: quality gate not met: the calibrated geometry cannot follow\n"
+    assert out.endswith("written to run: result.json, arrays.npz, robot.yaml\n")
+    result = json.loads((blundered / "run" / "result.json").read_text())
+    assert (result["passed"], result["reasons"]) == (False, ["the calibrated geometry cannot follow"])

@@ -21,6 +21,7 @@ import numpy as np
 from loopcal.calibrate.combinations import listed
 from loopcal.calibrate.read_as import MOST_LEFT_OUT, ReadAs, begun, quick_misfit, refined
 from loopcal.calibrate.scaling import Unknowns, unknowns
+from loopcal.calibrate.stated_unknowns import Contradiction, contradicted
 from loopcal.errors import DataError
 from loopcal.linalg import FloatArray, IntArray
 from loopcal.measure import Measurements, check_actuators, check_moved
@@ -57,6 +58,11 @@ EQUALLY = 1.2
 """Ratio of misfits up to which two conventions fit equally well; the first in the list is named, the others beside it."""
 
 
+GROSS = 100.0
+"""Misfit from which a contradiction between the data and what is stated of a frame is refused; below, robots far off their
+tolerances show the same, and it is noted."""
+
+
 @dataclass(frozen=True, eq=False)
 class Arrival:
     """The stated conventions of measurements against the robot, and the best other ones.
@@ -65,7 +71,7 @@ class Arrival:
     ----------
     misfit : root mean square of what is left over what tolerances and noise allow [1]; NaN where there are too few rows.
     other : how else the data may be meant; None where nothing else was tried, or nothing fits far better.
-    other_misfit : its misfit; NaN without one.
+    other_misfit : its misfit, or that without stated unknowns which the data contradict; NaN without one.
     alike : words of others that fit as well.
     sentence : what this means; empty where all is well.
     """
@@ -125,7 +131,12 @@ def arrival(robot: Mechanism, data: Measurements) -> Arrival:
     misfit = min(misfit, stated.misfit(), refined(stated))
     if not misfit > IMPLAUSIBLE:
         return Arrival(misfit)
+    against = contradicted(free, stated, misfit, BETTER)
+    if against is not None and against.misfit <= ALLOWED:
+        return _contradiction(misfit, against)
     best, alike = _best(free, stated, misfit)
+    if best is None and against is not None:
+        return _contradiction(misfit, against)
     if best is None:
         return Arrival(misfit, sentence="" if uncertain else _unexplained(stated, misfit))
     words = tuple(h.words for h in alike)
@@ -297,16 +308,29 @@ def _tells(free: Unknowns, stated: ReadAs, way: Hypothesis, found: float) -> boo
     return not control.misfit() < BETTER * found
 
 
+def _contradiction(misfit: float, against: Contradiction) -> Arrival:
+    """Stated unknowns without which the data fit: refused where they contradict the data grossly, else noted."""
+    sentence = (
+        f"the data contradict what 'unknowns' states: they put {listed(against.shown, 3)}; as stated, {misfit:.2g} times what"
+        f" tolerances and noise allow is left, and with {against.words} {_size(against.freed)}, {_much(against.misfit)};"
+        " correct or remove the statement"
+    )
+    return Arrival(misfit, against.words if misfit > GROSS else None, against.misfit, (), sentence)
+
+
 def _evidence(stated: ReadAs, misfit: float, best: ReadAs, alike: tuple[str, ...]) -> str:
     """The sentence that refuses."""
     way = best.hypothesis
     assert way is not None
-    much = "which is what tolerances and noise allow" if best.found <= ALLOWED else f"{best.found:.2g} times what they allow"
     others = f" (or with {listed(alike, 2)})" if alike else ""
     return (
         f"the data do not fit {stated.free.robot.name!r} as they are written: {_left(stated, misfit)}; with {way.words}"
-        f" {_size(best)} is left, {much}{others}; {way.cure}"
+        f" {_size(best)} is left, {_much(best.found)}{others}; {way.cure}"
     )
+
+
+def _much(misfit: float) -> str:
+    return "which is what tolerances and noise allow" if misfit <= ALLOWED else f"{misfit:.2g} times what they allow"
 
 
 def _unexplained(stated: ReadAs, misfit: float) -> str:

@@ -66,7 +66,6 @@ def calibrate(
       loopcal calibrate robot.yaml poses.csv tracker.csv inclinometer.csv -o run
       loopcal calibrate hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
     """  # noqa: D301
-    from loopcal.calibrate import validate
     from loopcal.calibrate.recalibrate import recalibrate
     from loopcal.io import load_robot
     from loopcal.io.calibration_run import run_document, save_run
@@ -88,15 +87,16 @@ def calibrate(
         fit, choice = fitting.fit(machine, fitted)
     else:
         fit, change = recalibrate(machine, fitted, load_prior(prior, data), free_limb, fitting.noise)
-    validation = None if unseen is None else validate(fit, unseen, limit_position, limit_angle)
+    errors, unjudged = _judged(fit, fitted if unseen is None else unseen, limit_position, limit_angle)
+    validation = None if unseen is None else errors
     origin = made_by(sys.argv, inputs, {"hold_out": seed})
     split = None if unseen is None else {"hold_out": hold_out, "seed": seed, "held_out": unseen.labels}
     findings = {"change": change, "model_choice": choice} | _findings(fit, fitted)
     found = {name: _document(finding) for name, finding in findings.items() if finding is not None}
-    reasons = _reasons(fit, validation)
+    reasons = _reasons(fit, validation, unjudged)
     document = run_document(fit, validation, origin, split) | found | {"passed": not reasons, "reasons": reasons}
     save_run(output, fit, document, force)
-    show.json_document(document) if as_json else _print(fit, validation, fitted, findings, output)
+    show.json_document(document) if as_json else _print(fit, errors, unseen is None, findings, output)
     return show.gates(reasons)
 
 
@@ -135,6 +135,18 @@ def _refuse_contradictions(hold_out: bool, gates: bool, prior: Path | None, free
             raise DataError(f"--{name} does not go with --prior, which is fitted by least squares; leave it out")
 
 
+def _judged(
+    fit: Identification, data: Measurements, limit_position: float | None = None, limit_angle: float | None = None
+) -> tuple[Validation | None, str]:
+    """Errors on poses, or why there are none: a geometry that went astray may reach no pose."""
+    from loopcal.calibrate import validate
+
+    try:
+        return validate(fit, data, limit_position, limit_angle), ""
+    except DataError as error:
+        return None, str(error)
+
+
 def _examined(fit: Identification, fitted: Measurements) -> Examination | None:
     """Examine a fit that converged."""
     from loopcal.calibrate.examine import examine
@@ -161,11 +173,9 @@ def _findings(fit: Identification, fitted: Measurements) -> dict[str, Any]:
     }
 
 
-def _print(
-    fit: Identification, validation: Validation | None, fitted: Measurements, findings: Mapping[str, Any], output: Path
-) -> None:
+def _print(fit: Identification, errors: Validation | None, fitted: bool, findings: Mapping[str, Any], output: Path) -> None:
     """Print what was found, and how well it does on unseen poses, or without any on the fitted ones."""
-    from loopcal.calibrate import start_check, validate
+    from loopcal.calibrate import start_check
 
     found = fit.to_dict()
     show.parameters(f"{fit.robot.name}: {len(fit.names)} parameters", found["parameters"])
@@ -185,18 +195,18 @@ def _print(
         show.say(f"\n{findings['model_choice']}")
     if findings["reading_errors"] is not None:
         show.reading_errors(fit.robot, findings["reading_errors"])
-    if validation is not None:
-        show.validation(validation, "unseen")
-    else:
-        show.validation(validate(fit, fitted), "fitted")
+    if errors is not None:
+        show.validation(errors, "fitted" if fitted else "unseen")
+    if errors is not None and fitted:
         show.say("these rows were fitted, so this proves nothing about other poses; keep some for that with --hold-out 0.25")
     show.say(f"\nwritten to {output}: result.json, arrays.npz, robot.yaml")
 
 
-def _reasons(fit: Identification, validation: Validation | None) -> list[str]:
-    """Return a sentence for each thing that is not good enough."""
+def _reasons(fit: Identification, validation: Validation | None, unjudged: str) -> list[str]:
+    """Return a sentence for each thing that is not good enough; `unjudged`: why there are no errors."""
     reasons = [] if fit.converged else [f"not converged: {fit.status.sentence}"]
     reasons += [fit.check.sentence] if fit.check.failed else []
+    reasons += [unjudged] if unjudged else []
     if validation is None:
         return reasons
     for index in ("position", "orientation"):
