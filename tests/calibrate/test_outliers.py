@@ -8,14 +8,17 @@ import pytest
 from scipy.stats import binom, chi2
 
 from loopcal.calibrate import MAP, Huber, LeastSquares, Tukey, find_outliers, identify
-from loopcal.calibrate.influence import influence
+from loopcal.calibrate.examine import examine
+from loopcal.calibrate.influence import Influence, influence
 from loopcal.calibrate.losses import block_limit
+from loopcal.calibrate.outliers import _in_turn, _search, _sentence, _State
 from loopcal.calibrate.rows import rows_of
 from loopcal.calibrate.scaling import unknowns
 from loopcal.errors import DataError, EstimationError
 from loopcal.io import load_robot
 from loopcal.linalg import decompose
-from loopcal.measure import Instrument, Measurements, Position, Sensor, sample_truth, simulate, simulate_trials
+from loopcal.measure import Component, Instrument, Measurements, Position, Sensor, sample_truth, simulate, simulate_trials
+from loopcal.mechanism import Mechanism
 from loopcal.mechanism.workspace import sample
 from tests import zoo
 from tests.calibrate.problems import UM, URAD, hexapod, hexapod_data, hexapod_poses, noise, tracker
@@ -189,3 +192,88 @@ def test_the_distance_of_a_pose_set_aside_is_what_the_others_say_of_it_where_a_r
     with_it, without = (identify(robot, data, LeastSquares(), drop=names) for names in (others, found.names))
     # what is not linear over 0.1 mm
     assert found.influence.distance[7] == pytest.approx(with_it.chi_square - without.chi_square, rel=1e-2)
+
+
+def probed(points: int, off: dict[int, float], sigma: float = 20 * UM) -> tuple[Mechanism, Measurements]:
+    """A delta printer's six parameters of geometry and heights (n,) at `points` of two rings, some off by lengths [m]."""
+    robot = load_robot("linear-delta")
+    names = ("radius", "tower1.angle", "tower2.angle", "tower1.stop", "tower2.stop", "tower3.stop")
+    robot = replace(robot, parameters=robot.parameters.only(names))
+    turn = np.arange(points - 1) * 2.4  # [rad], so that no two points are opposite
+    ring = np.stack([np.cos(turn), np.sin(turn)], axis=1) * np.where(np.arange(points - 1) % 2, 0.05, 0.08)[:, None]
+    coordinates = np.zeros((points, 3))
+    coordinates[1:, :2], coordinates[:, 2] = ring, sample(robot, 20, 3).coordinates[:, 2].mean()
+    heights = Instrument((Sensor(Component(("z",)), noise(sigma)),))
+    data = simulate(robot, coordinates, heights, 5)
+    rows = data.observations[0]
+    measured = rows.measured.copy()
+    for place, length in off.items():
+        measured[place] += length
+    return robot, replace(data, observations=(replace(rows, measured=measured),))
+
+
+@pytest.mark.parametrize("wrong", range(7))
+def test_with_one_degree_of_freedom_a_disagreement_is_told_and_nobody_is_blamed(wrong):
+    """All seven residuals are multiples of one number, so any height can be the wrong one."""
+    robot, data = probed(7, {wrong: 1e-3})
+    fit = identify(robot, data, LeastSquares())
+    found = find_outliers(fit, data)
+    assert found.settled
+    assert found.blocks == 7
+    assert found.names == ()
+    assert fit.check.failed
+    (group,) = found.undecided
+    assert len(group.poses) == 7
+    assert group.times == pytest.approx(np.sqrt(fit.chi_square), rel=1e-3)  # not linear over 1 mm
+    assert "7 of 7 blocks of rows disagree, and which is wrong cannot be told" in found.sentence
+    assert "which one is wrong cannot be told" in " ".join(examine(fit, data).sentences)
+
+
+def test_with_one_degree_of_freedom_and_unknown_noise_nothing_is_said_to_fit():
+    robot, data = probed(7, {3: 1e-3})
+    found = find_outliers(identify(robot, data, LeastSquares(), noise="estimated"), data)
+    assert found.outliers == found.undecided == ()
+    assert "no block of rows can be checked: one degree of freedom" in found.sentence
+
+
+def test_with_degrees_of_freedom_to_spare_the_wrong_height_is_named():
+    robot, data = probed(12, {4: 1e-3})
+    found = find_outliers(identify(robot, data, LeastSquares()), data)
+    assert found.names == ("5",)
+    assert found.undecided == ()
+
+
+def test_two_wrong_heights_that_leave_nothing_to_check_the_others_are_not_named():
+    robot, data = probed(8, {0: 1e-3, 1: -1e-3})  # no single height explains both, and any two do
+    found = find_outliers(identify(robot, data, LeastSquares()), data)
+    assert found.names == ()
+    assert "cannot be told" in found.sentence
+
+
+def test_noise_that_is_spread_over_all_rows_is_no_all_clear():
+    robot, data = probed(40, {}, 38 * UM)
+    rows = data.observations[0]
+    data = replace(data, observations=(replace(rows, covariance=rows.covariance * (20 / 38) ** 2),))
+    fit = identify(robot, data, LeastSquares())
+    found = find_outliers(fit, data, level=1e-9)  # so that none is named though all are too large
+    assert fit.check.failed
+    assert found.outliers == found.undecided == ()
+    assert found.sentence == "none of 40 blocks of rows stands out: what the noise does not explain is spread over them"
+
+
+def test_a_search_that_comes_back_to_where_it_was_is_not_settled_and_says_who_was_doubted():
+    """Blocks 0 and 1 hide each other: each is doubted while the other is set aside."""
+
+    def ask(aside: np.ndarray) -> _State:
+        distance = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
+        distance[0 if aside[1] else 1] = 100.0
+        one = np.ones(6, dtype=np.int64)
+        return _State(aside, Influence(np.full(6, 0.1), one, distance, one, distance), 1.0, 4)
+
+    whole = ask(np.zeros(6, dtype=bool))
+    visited = _search(ask, whole, whole, 0.01, 3)
+    assert [np.flatnonzero(state.aside).tolist() for state in visited] == [[1], [0]]
+    (group,) = _in_turn(visited, np.zeros(6, dtype=bool))
+    assert np.flatnonzero(group).tolist() == [0, 1]
+    fit = identify(*probed(12, {}))
+    assert "did not settle: 2 of 6 are doubted in turn" in _sentence(fit, (), 2, False, 6, 0.05)

@@ -149,6 +149,25 @@ def test_import_says_the_same_of_a_factory_default_and_not_of_printers_that_were
         assert "the stored geometry is the optimum of the firmware's own cost" in imported(name), name
 
 
+@pytest.mark.parametrize(("name", "height", "times"), [(CALIBRATED[0], None, 10.0), (CALIBRATED[1], None, 4.39),
+                                                        (CALIBRATED[2], 1, 3.51), (CALIBRATED[2], 2, 5.72),
+                                                        (CALIBRATED[2], 6, 7.0)])  # fmt: skip
+def test_seven_heights_that_disagree_get_no_all_clear_and_no_height_is_blamed(imported, capsys, name, height, times) -> None:
+    """Two printers as they were probed; and one with 0.3 mm, 15 times the noise, added to a height."""
+    imported(name)
+    lines = Path("probes.csv").read_text().split("\n")
+    for i, line in enumerate(lines):
+        if line.startswith(f"height{height},"):
+            *cells, z = line.split(",")
+            lines[i] = ",".join([*cells, str(float(z) + 0.3)])
+    Path("probes.csv").write_text("\n".join(lines))
+    assert main(["calibrate", "printer.yaml", "probes.csv", "-o", "run"]) == 2
+    out = capsys.readouterr().out
+    assert "fit each other" not in out
+    assert "7 of 7 blocks of rows disagree, and which is wrong cannot be told: measure more poses" in out
+    assert f"disagree by {times:.3g} times the noise; which one is wrong cannot be told" in out
+
+
 @pytest.mark.parametrize("name", [*CALIBRATED, FACTORY_DEFAULT, WITH_DISTANCES])
 def test_nine_parameters_from_heights_alone_are_flagged_with_the_combination_and_the_remedy(
     imported, capsys, tmp_path, data_folder, name

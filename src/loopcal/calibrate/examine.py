@@ -29,7 +29,7 @@ class Examination:
     @property
     def sentences(self) -> tuple[str, ...]:
         """All of it in words, most important first."""
-        found = [self.outliers.sentence, *_some([str(o) for o in self.outliers.outliers])]
+        found = [self.outliers.sentence, *_some([str(o) for o in (*self.outliers.outliers, *self.outliers.undecided)])]
         if self.worth.calibrate is not None:
             found.insert(0 if not self.worth.calibrate else len(found), self.worth.sentence)
         if self.lack_of_fit.groups:
