@@ -96,6 +96,20 @@ def test_sigma_covariance_and_remarks_of_each_target_stay_with_it_and_calibrate_
     assert sigma[0] == pytest.approx([4e-6, 2e-6, 2e-6, 5e-6, 2e-6, 2e-6])  # [m]
 
 
+def test_a_target_without_a_line_needs_no_sigma(tmp_path) -> None:
+    profile = TARGETS.replace("MORE", "sigma.x: {from: S, unit: um}").replace("settings:", READINGS)
+    profile = profile.replace('"*": 2 um', '"*.y": 2 um, "*.z": 2 um')
+    lines = ["P1_a;1,5;2;3;4;0;0;0;0;0;0", "P1_b;1,6;2;3;5;0;0;0;0;0;0", "P2_b;1,7;2;3;6;1;0;0;0;0;0"]
+    (tmp_path / "data.csv").write_text(converted(tmp_path, "Name;X;Y;Z;S;J1;J2;J3;J4;J5;J6\n" + "\n".join(lines), profile).text)
+    data = load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"), allow_still=True, allow_implausible=True)
+    rows = data.observations[0]
+    assert rows.present.tolist() == [[True] * 6, [False] * 3 + [True] * 3]
+    assert rows.covariance[1, 3, 3] ** 0.5 == pytest.approx(6e-6)  # [m]
+    (tmp_path / "data.csv").write_text((tmp_path / "data.csv").read_text().replace(",6,1,", ",,1,").replace(",6\n", ",\n"))
+    with pytest.raises(LoopcalError, match=r"column 'sigma.b.x' holds no number above zero"):
+        load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"), allow_still=True, allow_implausible=True)
+
+
 def test_a_target_that_gives_the_pose_another_reading_is_no_row(tmp_path) -> None:
     profile = TARGETS.replace("MORE", "").replace("settings:", READINGS)
     lines = ["P1_a;1;2;3;7,0;0;0;0;0;0", "P1_b;1;2;3;7,00;0;0;0;0;0", "P2_a;1;2;3;8;0;0;0;0;0", "P2_b;1;2;3;9;0;0;0;0;0",

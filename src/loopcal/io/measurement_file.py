@@ -79,10 +79,10 @@ def load_measurements(
     from loopcal.measure import check_duplicates, check_strokes
 
     tables = _tables(path)
-    data, files = _gathered(tables, robot), _named(tables)
+    (data, places), files = _gathered(tables, robot), _named(tables)
     try:
         check_strokes(data, robot, allow=allow_outside_stroke, override="--allow-outside-stroke")
-        check_duplicates(data, allow=allow_duplicates, override="--allow-duplicates")
+        check_duplicates(data, allow=allow_duplicates, override="--allow-duplicates", places=places)
         overrides = ("--allow-still", "--allow-implausible")
         check = {"allow_still": allow_still, "allow_implausible": allow_implausible, "overrides": overrides}
         told = check_arrival(robot, data, **check)
@@ -157,8 +157,8 @@ def _tables(path: Paths) -> tuple[Table, ...]:
     return tuple(tables)
 
 
-def _gathered(tables: Sequence[Table], robot: Mechanism) -> Measurements:
-    """Return what the files hold together."""
+def _gathered(tables: Sequence[Table], robot: Mechanism) -> tuple[Measurements, tuple[tuple[str, ...], ...]]:
+    """Return what the files hold together, and file and line of each row of each observations."""
     from loopcal.measure import Measurements
 
     sensors = [_sensors_of(table, robot, len(tables) > 1) for table in tables]
@@ -167,15 +167,17 @@ def _gathered(tables: Sequence[Table], robot: Mechanism) -> Measurements:
     poses = read_pose_rows(tables, robot)
     beside = [read_context(table) for table in tables]
     of_poses = _context_of_poses(tables, sensors, poses.members, beside, len(poses.labels))
-    observations = [
+    read = [
         [read_observations(table, robot, sensor, members, context, of_poses) for sensor in own]
         for table, own, members, context in zip(tables, sensors, poses.members, beside, strict=True)
     ]
+    observations = [[rows for rows, _ in own] for own in read]
     every = tuple(rows for own in observations for rows in own)
+    places = tuple(stands for own in read for _, stands in own)
     settings = [(table.settings, own) for table, own in zip(tables, observations, strict=True)]
     try:
         known = read_known(settings, poses.labels)
-        return Measurements(robot.name, poses.readings, every, poses.block, poses.labels, poses.sigma, known)
+        return Measurements(robot.name, poses.readings, every, poses.block, poses.labels, poses.sigma, known), places
     except DataError as error:
         raise DataError(f"{_named(tables)}: {error}") from None
 

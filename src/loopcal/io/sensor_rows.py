@@ -88,8 +88,8 @@ def read_observations(
     members: Sequence[tuple[int, ...]],
     context: Mapping[str, np.ndarray],
     of_poses: Mapping[str, np.ndarray],
-) -> Observations:
-    """Read the rows of one kind.
+) -> tuple[Observations, tuple[str, ...]]:
+    """Read the rows of one kind, and where each of them stands.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def read_observations(
         if not np.isnan(values).all():
             beside[name] = values
     try:
-        return Observations(
+        found = Observations(
             chosen.kind,
             seen[:, 0] if chosen.kind.links == 1 else seen,
             measured,
@@ -129,6 +129,7 @@ def read_observations(
         )
     except DataError as error:
         raise DataError(f"{table.path}: {error}") from None
+    return found, tuple(table.place(int(row)) for row in chosen.rows)
 
 
 def _sensors(table: Table, robot: Mechanism) -> tuple[Sensor, ...]:
@@ -198,7 +199,9 @@ def _values(table: Table, robot: Mechanism, sensor: Sensor) -> tuple[np.ndarray,
     measured = np.column_stack([table.numbers(name, dimension) for name, dimension in columns.items()])[rows]
     for i, doubt in kind.doubts(measured):
         raise table.row_error(int(rows[i]), f"this row {doubt}")
-    sigma = np.column_stack([_sigma(table, robot, sensor, i) for i in range(len(kind.noise_columns))])
+    # where the noise columns are the measured ones, what was not measured needs no sigma
+    absent = np.isnan(measured) if kind.noise_columns == kind.columns else np.zeros((len(rows), len(kind.noise_columns)), bool)
+    sigma = np.column_stack([_sigma(table, robot, sensor, i, absent[:, i]) for i in range(len(kind.noise_columns))])
     covariance = sigma[:, :, None] * np.eye(sigma.shape[1]) * sigma[:, None, :]
     for a, left in enumerate(kind.noise_columns):
         for b, right in enumerate(kind.noise_columns):
@@ -221,8 +224,11 @@ def _texts(table: Table, name: str, rows: np.ndarray) -> np.ndarray:
     return np.array([unicodedata.normalize("NFC", cells[row] or usual) for row in rows], dtype=np.str_)
 
 
-def _sigma(table: Table, robot: Mechanism, sensor: Sensor, place: int) -> np.ndarray:
-    """Return the standard deviations (r,) [SI] of one noise column: from its sigma column, else from the settings."""
+def _sigma(table: Table, robot: Mechanism, sensor: Sensor, place: int, absent: np.ndarray) -> np.ndarray:
+    """Return the standard deviations (r,) [SI] of one noise column: from its sigma column, else from the settings.
+
+    An empty cell of a value that is `absent` (r,) gets the sigma of another row, which counts for nothing.
+    """
     import numpy as np
 
     column = sensor.kind.noise_columns[place]
@@ -230,6 +236,8 @@ def _sigma(table: Table, robot: Mechanism, sensor: Sensor, place: int) -> np.nda
     if name in table.units:
         found = table.numbers(name, column.dimension)[sensor.rows]
         sigma = np.where(np.isnan(found), sensor.noise.get(column.name, np.nan), found)
+        if (stated := sigma[sigma > 0]).size:
+            sigma = np.where(absent & np.isnan(sigma), stated[0], sigma)
         for i in np.flatnonzero(~(sigma > 0)):
             sentence = f"column {name!r} holds no number above zero; write a standard deviation"
             raise table.row_error(int(sensor.rows[i]), sentence)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What measurements must satisfy beside their robot: refused with the evidence, unless the caller overrides it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple, cast
 
@@ -71,7 +71,9 @@ def check_strokes(measurements: Measurements, robot: Mechanism, *, allow: bool =
         )
 
 
-def check_duplicates(measurements: Measurements, *, allow: bool = False, override: str = "") -> None:
+def check_duplicates(
+    measurements: Measurements, *, allow: bool = False, override: str = "", places: Sequence[Sequence[str]] = ()
+) -> None:
     """Refuse a row that repeats another one to the last bit: the same readings, the same kind, the same values.
 
     Two rows of one measurement pretend to twice the information. True repeats differ in their noise; a coarse
@@ -84,14 +86,17 @@ def check_duplicates(measurements: Measurements, *, allow: bool = False, overrid
         True accepts them.
     override : str
         How a user of the caller says so; closes the message.
+    places : sequence of sequence of str
+        Where each row of each of the observations stands, such as `data.csv:12`; for the message.
 
     Raises
     ------
     DataError
-        Naming the two poses.
+        Naming the two poses, and where the rows stand.
     """
     if allow:
         return
+    stands = dict(zip(map(id, measurements.observations), places, strict=False))
     for alike in _alike(measurements.observations):
         rows = alike[0]
         poses = np.concatenate([part.rows.reshape(len(part), -1) for part in alike])
@@ -103,9 +108,12 @@ def check_duplicates(measurements: Measurements, *, allow: bool = False, overrid
         again = np.flatnonzero(first[kinds.ravel()] != np.arange(len(poses)))
         if len(again):
             second = int(again[0])
-            names = [measurements.labels[poses[i, 0]] for i in (int(first[kinds.ravel()[second]]), second)]
+            pair = (int(first[kinds.ravel()[second]]), second)
+            names = [measurements.labels[poses[i, 0]] for i in pair]
+            lines = [place for part in alike for place in stands.get(id(part), ())]
+            where = f" ({lines[pair[0]]} and {lines[pair[1]]})" if lines else ""
             raise DataError(
-                f"poses {names[0]!r} and {names[1]!r} have the same readings and the same {rows.kind.name} values to"
+                f"poses {names[0]!r} and {names[1]!r}{where} have the same readings and the same {rows.kind.name} values to"
                 " the last digit; remove one of them" + _or_use(override)
             )
 
