@@ -119,7 +119,7 @@ def test_a_geometry_that_went_astray_is_told_from_readings_that_no_geometry_reac
     with pytest.raises(DataError, match="cannot follow where the one before goes: with these readings that reaches 4 of 4"):
         validate(astray, data, before=robot)
     with pytest.raises(DataError, match="reaches none of the 4 poses; check the readings and their units"):
-        validate(robot, replace(data, readings=data.readings + 10.0))
+        validate(robot, replace(data, readings=data.readings + np.array([10.0, 0.0, 0.0, 0.0, 0.0, 0.0])))
 
 
 def sizes_if_moved(*moved, base=1.0, by=50.0, left=30):
