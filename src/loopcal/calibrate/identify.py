@@ -19,7 +19,7 @@ from loopcal.calibrate.descent import Descent, DescentStatus, StepControl, desce
 from loopcal.calibrate.filters import MAP, LeastSquares, Method, adapted
 from loopcal.calibrate.identification import Identification, KindResiduals
 from loopcal.calibrate.latent import LatentRows
-from loopcal.calibrate.latent_doubts import latent_doubts
+from loopcal.calibrate.latent_doubts import latent_doubts, uneven
 from loopcal.calibrate.latent_estimate import latent_estimate
 from loopcal.calibrate.left_out import without_poses
 from loopcal.calibrate.local_estimate import LocalEstimate, local_estimate, nothing_local, with_followers
@@ -100,6 +100,7 @@ def identify(
     latent = latent_estimate(rows, data, drop) if isinstance(rows, LatentRows) else None
     notes = (*result.notes, *_row_notes(rows, method, begin), *_weight_notes(data, weight, loss), *_drop_notes(drop))
     doubts = (*latent.notes(), *latent_doubts(result.robot, latent)) if latent else ()
+    doubts += tuple(uneven(rows)) if isinstance(rows, LatentRows) else ()
     return replace(result, weight=weight, dropped=tuple(drop), notes=(*notes, *doubts), latent=latent)
 
 

@@ -2,13 +2,15 @@
 """Readings that were not taken and were found where the machine hardly was: outside the stroke, or bent the other way.
 
 Rows at the platform cannot tell the ways in which a limb bends to one pose, nor do they know of end stops. Both fit equally
-well and both are said, so that nobody takes such a reading for a measured one.
+well and both are said, so that nobody takes such a reading for a measured one. So is a spread of sigmas that rounding
+cannot bear.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from loopcal.calibrate.latent import LatentRows
 from loopcal.calibrate.latent_estimate import LatentEstimate
 from loopcal.mechanism import Mechanism, inverse
 from loopcal.se3 import wrap
@@ -16,6 +18,9 @@ from loopcal.units import DISPLAY_UNITS, Dimension, unit
 
 APART = 1e-6
 """Difference of readings, as a share of the robot's size or in radians, above which they are two solutions, not rounding."""
+
+UNEVEN = 1e9
+"""Ratio of standard deviations beyond which whitened rows of one sort drown in the rounding of another."""
 
 SHOWN = 3
 """Readings told one by one; the others are counted."""
@@ -44,6 +49,25 @@ def latent_doubts(robot: Mechanism, latent: LatentEstimate) -> list[str]:
             " where the machine stood as at home, give the reading roughly, its sigma infinite, as a start"
         )
     return notes
+
+
+def uneven(rows: LatentRows) -> list[str]:
+    """Return a sentence where the sigmas of all rows, in sizes of the robot or radians, differ by more than rounding bears."""
+    robot = rows.unknowns.robot
+    least, most, name = np.inf, 0.0, ""
+    for s in rows.sensed:
+        weight = np.einsum("trii->tri", s.whitener)
+        for i, column in enumerate(s.kind.noise_columns):
+            there = weight[..., i][weight[..., i] > 0.0]
+            if len(there) and column.dimension in (Dimension.LENGTH, Dimension.ANGLE):
+                scale = robot.size if column.dimension is Dimension.LENGTH else 1.0
+                most = max(most, 1.0 / (there.min() * scale))
+                if 1.0 / (there.max() * scale) < least:
+                    least, name = 1.0 / (there.max() * scale), f"{s.kind.name} {column.name}"
+    if most <= UNEVEN * least:
+        return []
+    what = f"standard deviations differ by a factor of {most / least:.2g}"
+    return [f"{what}: what only the larger tell drowns in rounding and counts as not determined; check the smallest, of {name}"]
 
 
 def _other_branch(robot: Mechanism, latent: LatentEstimate, poses: np.ndarray) -> np.ndarray:

@@ -54,7 +54,7 @@ class Measurements:
     known: tuple[Known, ...] = ()
 
     def __post_init__(self) -> None:
-        readings = stored(self.readings, "readings", (None, None), allow_nan=self.reading_sigma is not None)
+        readings = _readings(self.readings, self.reading_sigma is not None)
         n = len(readings)
         if n == 0:
             raise DataError("there is no pose in these measurements; give at least one row of readings")
@@ -180,6 +180,16 @@ class Measurements:
         return replace(self, observations=parts, reading_sigma=weighted_sigma(self.reading_sigma, given))
 
 
+def _readings(readings: ArrayLike, uncertain: bool) -> Array:
+    """Checked, read-only readings (n, a); NaN stands for one that was not taken, which needs a sigma."""
+    try:
+        return stored(readings, "readings", (None, None), allow_nan=uncertain)
+    except DataError as error:
+        if not uncertain and np.isnan(np.asarray(readings, dtype=float)).any():
+            raise DataError(f"{error}, or, where it was not taken, reading_sigma = inf") from None
+        raise
+
+
 def weighted_sigma(sigma: Array | None, weight: Array) -> Array | None:
     """Standard deviations (n, a) of readings whose squares count by a weight (n,): infinite for 0; exact ones stay exact."""
     if sigma is None:
@@ -191,7 +201,12 @@ def weighted_sigma(sigma: Array | None, weight: Array) -> Array | None:
 
 def spread_sigma(sigma: ArrayLike, readings: Array) -> Array:
     """Standard deviations (n, a) of readings (n, a) from what spreads to them; DataError where that does not fit."""
-    given = np.asarray(sigma, dtype=float)
+    try:
+        if np.iscomplexobj(sigma):
+            raise TypeError
+        given = np.asarray(sigma, dtype=float)
+    except (TypeError, ValueError):
+        raise DataError(f"reading_sigma is {sigma!r}; give numbers, in metres and radians") from None
     try:
         return np.array(np.broadcast_to(given, readings.shape))
     except ValueError:
@@ -210,7 +225,8 @@ def _reading_sigma(sigma: ArrayLike, readings: Array, labels: tuple[str, ...]) -
     ):
         if np.any(wrong):
             pose, column = (int(i) for i in np.argwhere(wrong)[0])
-            raise DataError(f"pose {labels[pose]!r}: the sigma {spread[pose, column]} of reading {column + 1} {what}")
+            value = f"{spread[pose, column]:.6g}"
+            raise DataError(f"pose {labels[pose]!r}: the sigma {value} [m or rad] of reading {column + 1} {what}")
     spread.setflags(write=False)
     return spread
 

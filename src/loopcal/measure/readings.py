@@ -16,9 +16,12 @@ from loopcal.errors import DataError
 from loopcal.measure.kinds.kind import Column, Evaluation, Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism import Mechanism
-from loopcal.units import Dimension
+from loopcal.units import DISPLAY_UNITS, Dimension, unit
 
 Array = NDArray[np.float64]
+
+BEYOND = 1e6
+"""Sigma of a reading, in sizes of the robot or radians, that says no more than infinity does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,20 +78,41 @@ def believed_sigma(robot: Mechanism, given: Array | None, n: int) -> Array | Non
     Raises
     ------
     DataError
-        An exact reading of a robot with more actuators than freedoms: exact readings would contradict each other.
+        A sigma that is none, or so large that it says nothing; an exact reading of a robot with more actuators than freedoms,
+        whose poses are moved freely, readings following, so that none can be held (docs/theory/latent.md).
     """
     stated = [actuator.sigma for actuator in robot.actuators]
     if given is None:
         if not any(stated):
             return None
         given = np.tile([sigma or 0.0 for sigma in stated], (n, 1))
+    _check_sigma(robot, given)
     if robot.program.sigma is not None and np.any(given == 0.0):
         name = robot.actuators[int(np.argwhere(given == 0.0)[0, 1])].name
         raise DataError(
             f"the readings of {name} are stated to be exact, but {robot.name!r} has {len(stated)} actuators for"
-            f" {len(robot.freedoms)} freedoms, and exact readings would contradict each other; give all of them a sigma above 0"
+            f" {len(robot.freedoms)} freedoms, and with redundant actuators no reading can be held exactly; state a sigma"
+            " above 0 for each, a small one where it is very good"
         )
     return given if np.any(given != 0.0) else None
+
+
+def _check_sigma(robot: Mechanism, sigma: Array) -> None:
+    """Refuse standard deviations (n, a) that are none or beyond what any reading can be off by, naming the actuator."""
+    size = np.array([robot.size if actuator.dimension is Dimension.LENGTH else 1.0 for actuator in robot.actuators])
+    for wrong, what in (
+        (~(sigma >= 0.0), "is no standard deviation; give 0 (exact), a positive number, or infinity (not taken)"),
+        (
+            np.isfinite(sigma) & (sigma / size > BEYOND),
+            "is beyond anything that such a reading can be off by; state inf instead",
+        ),
+    ):
+        if np.any(wrong):
+            pose, column = (int(i) for i in np.argwhere(wrong)[0])
+            actuator = robot.actuators[column]
+            shown = unit(robot.units.get(actuator.dimension, DISPLAY_UNITS[actuator.dimension].symbol))
+            value = f"{sigma[pose, column] / shown.factor_to_si:.6g} {shown.symbol}"
+            raise DataError(f"the sigma {value} of the reading of {actuator.name} in row {pose + 1} {what}")
 
 
 def with_stated_sigma(robot: Mechanism, data: Measurements) -> Measurements:
