@@ -145,7 +145,7 @@ DATA_CASES = {
     "noise without a unit": ("1 um", "1", "'1' has no unit; add one of m, mm"),
     "a comma in a number": ("201.1", "201,1", "data.csv:6: this row has 9 cells"),
     "a controller of readings": ("# noise", "# controller: no.yaml\n# noise", "data.csv:3: a controller is named, but"),
-    "the same row twice": ("c,2,2,2,2,2,2,202.2", "c,1,1,1,1,1,1,201.1", "'b' and 'c' have the same readings"),
+    "the same row twice": ("c,2,2,2,2,2,2,202.2", "c,1,1,1,1,1,1,201.1", ") have the same readings and the same"),
 }
 
 

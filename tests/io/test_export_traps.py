@@ -144,6 +144,12 @@ def test_missing_numbers_are_compared_by_value_and_missing_words_by_their_letter
     assert table(converted(tmp_path, "Name;X;Y;Z\nP1;-999,00;0,0;3,5\n", comma).text)[1:] == ["P1,,,3.5"]
 
 
+@pytest.mark.parametrize("cell", ["1_0", "\uff11.5", "nan", "inf", "1.5D+3", "\u22121.5", "0x1f", "1 234"])
+def test_what_only_looks_like_a_number_is_none(tmp_path, cell) -> None:
+    found = converted(tmp_path, f"Name,X,Y,Z\nP1,1,2,3\nP2,{cell},2,3\n", BY_NAME)
+    assert found.misfits == ((3, f"{cell!r} is no number for 'x'"),)
+
+
 def test_missing_cells_of_a_rotation_matrix_are_missing(tmp_path) -> None:
     profile = """delimiter: semicolon
 missing: -999

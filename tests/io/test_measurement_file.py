@@ -188,7 +188,7 @@ def test_readings_outside_the_stroke_and_duplicates_need_to_be_allowed(tmp_path,
         load_measurements(path, robot)
     assert load_measurements(path, robot, allow_outside_stroke=True).n_poses == 2
     path = write(tmp_path, GOOD.replace("b,1,1,1,1,1,1,201.1", "b,0,0,0,0,0,0,200"))
-    with pytest.raises(DataError, match=r"'a' and 'b' \(.*data.csv:5 and .*data.csv:6\) have the same readings.*use --allow-duplicates"):
+    with pytest.raises(DataError, match=r"'a' and 'b' \(.*:5 and .*:6\) have the same.*use --allow-duplicates"):
         load_measurements(path, robot)
     assert load_measurements(path, robot, allow_duplicates=True).n_poses == 2
 
