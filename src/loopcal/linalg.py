@@ -30,6 +30,22 @@ double rounding; the weakest genuine directions seen in complete error models of
 NULL_COMPONENT = 1e-8
 """A parameter has infinite variance when null directions carry more than this of its unit vector (sqrt of rounding)."""
 
+ROUNDING = 1e-12
+"""Share of the size of its terms below which a sum of a few products is rounding: some thousand units of the last place."""
+
+
+def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:
+    """Return derivatives with zeros where they are rounding: at most ROUNDING of the size of the terms they are sums of.
+
+    A column that rows see by rounding alone must be one that they do not see BEFORE columns are brought to length one: among
+    such columns a few units of the last place are a direction like any other, and lead a step to the end of the world.
+
+    Parameters
+    ----------
+    values : any shape. size : of the terms, broadcast to it; with a size of zero, or not finite, values stay.
+    """
+    return np.where((np.abs(values) <= ROUNDING * size) & (size > 0.0) & (size < np.inf), 0.0, values)
+
 
 def empty_factor(trials: int, parameters: int) -> FloatArray:
     """Return the factor of no rows at all, zeros (t, p + 1, p + 1), into which the engine folds rows [A | b]."""

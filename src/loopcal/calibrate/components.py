@@ -18,7 +18,7 @@ import numpy as np
 from loopcal.calibrate.elimination import OWN_RANK
 from loopcal.calibrate.sensed import Block, Sensed, block_of
 from loopcal.errors import EstimationError
-from loopcal.linalg import NULL_COMPONENT, FloatArray, IntArray
+from loopcal.linalg import NULL_COMPONENT, FloatArray, IntArray, without_rounding
 
 LARGEST = 2000
 """Unknowns of one component, at most: its rows are one dense matrix."""
@@ -172,8 +172,8 @@ class Projected(NamedTuple):
 def project(rows: FloatArray, free: int) -> Projected:
     """Eliminate the first `free` columns of rows (a, C, N, free + w), N >= free, directions that no row sees left out.
 
-    Columns are brought to length one; a singular value below OWN_RANK of the largest is none. What is left of rows that are
-    not finite is NaN.
+    Columns are brought to length one; a singular value below OWN_RANK of the largest is none. A column that these take up whole
+    leaves zeros, not its rounding. What is left of rows that are not finite is NaN.
     """
     if free == 0:
         empty = np.zeros((*rows.shape[:2], 0, rows.shape[-1]))
@@ -195,6 +195,8 @@ def project(rows: FloatArray, free: int) -> Projected:
     inverse = np.divide(1.0, s, out=np.zeros_like(s), where=used)
     best = np.matmul(vt.swapaxes(-1, -2) * inverse[..., None, :], top) / norm[..., None]
     rest = np.concatenate([np.where(used[..., None], 0.0, top), right[..., free:, :]], axis=-2)
+    length = np.linalg.norm(rows[..., None, free:-1], axis=-3)
+    rest[..., :-1] = without_rounding(rest[..., :-1], length)
     size = np.abs(right).max(axis=(-1, -2), keepdims=True, initial=0.0)
     rest = np.where(np.abs(rest).max(axis=-1, keepdims=True, initial=0.0) > ROUNDING * size, rest, 0.0)
     if bad.any():

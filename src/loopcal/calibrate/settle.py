@@ -23,7 +23,7 @@ from loopcal.calibrate.moves import evaluated, machine_columns, mapped
 from loopcal.calibrate.scaling import Unknowns
 from loopcal.calibrate.sensed import BLOCK, Block, Sensed
 from loopcal.calibrate.standing import Chart, FreeMoves, Standing
-from loopcal.linalg import FloatArray, IntArray
+from loopcal.linalg import FloatArray, IntArray, without_rounding
 from loopcal.measure import Evaluation, joints_looked_at
 
 STEPS = 30
@@ -324,13 +324,19 @@ class Poses:
 def _free_columns(sensed: Sensed, seen: Evaluation, white: FloatArray, moves: FreeMoves) -> FloatArray:
     """Whitened derivatives (a, r, links, m, k) of a kind's rows by the free numbers of the poses they saw."""
     if sensed.kind.links > 1:
-        parts = [np.matmul(white, seen.jacobian[:, :, i] @ moves.Y[:, sensed.poses[:, i]]) for i in range(sensed.kind.links)]
+        every = range(sensed.kind.links)
+        parts = [np.matmul(white, by_pose(seen.jacobian[:, :, i], moves.Y[:, sensed.poses[:, i]])) for i in every]
         return np.stack(parts, axis=2)
-    columns = np.matmul(seen.jacobian, moves.Y[:, sensed.poses])
+    columns = by_pose(seen.jacobian, moves.Y[:, sensed.poses])
     if seen.joints is not None and sensed.kind.looks_at:
         turns = np.stack([moves.turns[name][:, sensed.poses] for name in sensed.kind.looks_at], axis=2)
         columns = columns + np.matmul(seen.joints, turns)
     return np.matmul(white, columns)[:, :, None]
+
+
+def by_pose(jacobian: FloatArray, Y: FloatArray) -> FloatArray:
+    """Derivatives (a, r, m, k) of rows by the free numbers of a pose, with zeros where a row does not see their move."""
+    return without_rounding(np.matmul(jacobian, Y), np.matmul(np.abs(jacobian), np.abs(Y)))
 
 
 def _kept(found: Standing, begin: Standing, still: np.ndarray) -> Standing:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal.errors import DataError
+from loopcal.linalg import without_rounding
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 
@@ -162,7 +163,7 @@ class Kind(ABC):
         values = self.values(unknowns)
         if len(values) > len(T):
             T = np.broadcast_to(T, (len(values), *T.shape[1:]))
-        result = self._evaluate(T, filled, values, np.empty((1, 1, 0)) if joints is None else joints)
+        result = self._seen(self._evaluate(T, filled, values, np.empty((1, 1, 0)) if joints is None else joints))
         present = self.present(measured)
         if np.all(present):
             return result
@@ -170,6 +171,18 @@ class Kind(ABC):
         links = present[..., None, :, None] if self.links > 1 else here
         own, moved = (None if part is None else np.where(here, part, 0.0) for part in (result.own, result.joints))
         return Evaluation(np.where(present, result.residual, 0.0), np.where(links, result.jacobian, 0.0), own, moved)
+
+    def _seen(self, found: Evaluation) -> Evaluation:
+        """Derivatives by own unknowns with zeros where these cancel, as the place of a target does between parallel poses.
+
+        They are compared with what a move of the platform does to the row. A metre stands beside a radian there: the limit
+        lies so far below all that counts that any length of machines would do.
+        """
+        if found.own is None:
+            return found
+        by_move = np.linalg.norm(found.jacobian, axis=-1)
+        by_move = by_move.sum(axis=-2) if self.links > 1 else by_move
+        return found._replace(own=without_rounding(found.own, by_move[..., None]))
 
     @property
     def neutral(self) -> Array:
