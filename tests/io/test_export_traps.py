@@ -187,6 +187,7 @@ BAD = {
     "a sigma of nothing": ("  z:", "  sigma.w: {from: C, unit: mm}\n  z:", 7, "'sigma.w' is no column .*did you mean 'sigma"),
     "another unit in the header": ("from: X, unit: mm", '"from": "X [m]", unit: mm', 5, "heads this column 'X .m.', but"),
     "degrees in the header": ("from: X, unit: mm", '"from": "X (°)", unit: mm', 5, "write the unit deg"),
+    "readings of nothing": ("settings", "readings:\nsettings", 8, "'readings' must name columns"),
     "nothing for missing": ("delimiter", "missing: [null]\ndelimiter", 2, "'missing' has None where the text of a cell"),
 }  # fmt: skip
 

@@ -169,21 +169,22 @@ def _columns(file: YamlFile, kind: Kind, matrix: bool) -> dict[str, Source]:
     if matrix:
         own = own[-3:]
     dimensions, columns = _dimensions(kind, several), dict[str, Source]()
-    for part in ("columns", "readings"):
-        node = file.content.get(part, {})
+    stated = {part: file.content.get(part, {}) for part in ("columns", "readings")}
+    for part, node in stated.items():
         if not isinstance(node, dict):
             raise file.error(f"{part!r} must name columns, as {part}: {{x: {{from: X, unit: mm}}}}; correct it", (part,))
+    for part, node in stated.items():
         for name, said in node.items():
             if part == "columns":
                 known = [*TEXTS, "time", "temperature", *own, *(MEASURED + n for n in own)]
-                beside = [*dimensions, *(SIGMA + one for one in file.content.get("readings", {}))]
+                beside = [*dimensions, *(SIGMA + one for one in stated["readings"])]
                 _check_name(file, kind, name, known, [n for n in beside if n.startswith((SIGMA, COVARIANCE))])
             elif name in columns:
                 sentence = f"{name!r} is a reading and a measured column, too"
                 raise file.error(f"{sentence}; call the measured one {MEASURED + name!r} under 'columns'", (part, name))
             columns[name] = _source(file, name, said, (part, name), dimensions if part == "columns" else {})
     for name in own:
-        if sum(one in file.content["columns"] for one in (name, MEASURED + name)) != 1:
+        if sum(one in stated["columns"] for one in (name, MEASURED + name)) != 1:
             sentence = f"'columns' does not say where {name!r} comes from, once, which the kind {kind.name!r} needs"
             raise file.error(sentence, ("columns",))
     _check_targets(file, columns, several)
