@@ -124,6 +124,8 @@ SLIPS = {
     ),
     "scalar last": ("hexapod-42", Pose("quaternion"), scalar_last, "quaternions read scalar last"),
     "a left-handed frame": ("hexapod-42", FULL, left_handed, "left-handed"),
+    "one column in inches": ("hexapod-42", FULL, scaled([3], 1.0 / 25.4), "x 25.4 times larger (inches written as mm)"),
+    "gon for degrees": ("hexapod-42", FULL, scaled([0, 1, 2], 10.0 / 9.0), "angles 10/9 times smaller (gon written as deg)"),
     "x and y swapped": ("linear-delta", Position(), swapped(0, 1), "columns x and y swapped"),
     "targets swapped": ("3-prs", Distance(targets=("a", "b"), places=PAIR, anchor=PAIR[0] * 9), swapped(0, 1), "'a' and 'b'"),
     "zenith angles": ("hexapod-42", Bearing(T_base_frame=STATION), zenith, "elevations read as zenith angles"),
@@ -197,6 +199,8 @@ def test_blunders_alone_are_left_to_their_own_check() -> None:
     found = arrival(robot_of("hexapod-42"), bad)
     assert not found.refused
     assert found.misfit < IMPLAUSIBLE  # without the two rows all is well
+    assert found.sentence.startswith("2 of 20 rows that were compared do not fit the others by far (poses 4 and 5); check")
+    assert arrival(robot_of("hexapod-42"), data).sentence == ""
 
 
 WITH_EVERY_KIND = ("3-prs",)
@@ -283,6 +287,20 @@ def test_of_two_joined_instruments_the_one_in_the_wrong_unit_is_named() -> None:
     level = replace(level, measured=level.measured * np.pi / 180.0)
     found = arrival(robot, replace(data, observations=(tracker, level)))
     assert found.other == "angles of kind 'inclination' 57.3 times larger (rad written as deg)"
+
+
+def test_of_two_files_of_one_kind_the_one_that_is_written_otherwise_is_named() -> None:
+    robot, data = robot_of("linear-delta"), measured("linear-delta", Position(), n=16)
+    rows = data.observations[0]
+    parts = rows.take(np.arange(8)), rows.take(np.arange(8, 16))
+    inches = replace(parts[1], measured=parts[1].measured / 25.4)
+    found = arrival(robot, replace(data, observations=(parts[0], inches)), ("a.csv", "b.csv"))
+    assert found.other == "lengths of b.csv 25.4 times larger (inches written as mm)"
+    readings = np.concatenate([data.readings[:8], 0.1 * data.readings[8:]])
+    found = arrival(robot, replace(data, observations=parts, readings=readings), ("a.csv", "b.csv"))
+    assert found.other == "readings of b.csv 10 times larger (cm written as mm)"
+    unnamed = readings_hypotheses(replace(data, observations=parts), ("q1", "q2", "q3"), (Dimension.LENGTH,) * 3)
+    assert "readings of part 2 of the data 10 times larger (cm written as mm)" in {way.words for way in unnamed}
 
 
 def test_what_is_absent_fixed_or_unread_neither_hides_a_slip_nor_looks_like_one() -> None:

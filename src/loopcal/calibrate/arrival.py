@@ -13,6 +13,7 @@ data are refused only where one of them fits far better: see docs/theory/arrival
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -58,6 +59,9 @@ EQUALLY = 1.2
 """Ratio of misfits up to which two conventions fit equally well; the first in the list is named, the others beside it."""
 
 
+SHOWN = 12
+"""Labels of rows that are named in one sentence."""
+
 GROSS = 100.0
 """Misfit from which a contradiction between the data and what is stated of a frame is refused; below, robots far off their
 tolerances show the same, and it is noted."""
@@ -97,13 +101,13 @@ class Arrival:
         return {**vars(self), "alike": list(self.alike), "refused": self.refused}
 
 
-def arrival(robot: Mechanism, data: Measurements) -> Arrival:
+def arrival(robot: Mechanism, data: Measurements, parts: Sequence[str] = ()) -> Arrival:
     """Compare measurements with a robot under the stated conventions and, where these are implausible, under others.
 
     Parameters
     ----------
     robot : as given, before any fit: its values, its tolerances (stated, or the default ones).
-    data : as read.
+    data : as read. parts : where the rows of each of its observations come from, such as files, for the words.
 
     Returns
     -------
@@ -130,11 +134,11 @@ def arrival(robot: Mechanism, data: Measurements) -> Arrival:
     stated.leave_out()
     misfit = min(misfit, stated.misfit(), refined(stated))
     if not misfit > IMPLAUSIBLE:
-        return Arrival(misfit)
+        return Arrival(misfit, sentence=_set_aside(stated))
     against = contradicted(free, stated, misfit, BETTER)
     if against is not None and against.misfit <= ALLOWED:
         return _contradiction(misfit, against)
-    best, alike = _best(free, stated, misfit)
+    best, alike = _best(free, stated, misfit, parts)
     if best is None and against is not None:
         return _contradiction(misfit, against)
     if best is None:
@@ -152,6 +156,7 @@ def check_arrival(
     allow_still: bool = False,
     allow_implausible: bool = False,
     overrides: tuple[str, str] = ("allow_still=True", "allow_implausible=True"),
+    parts: Sequence[str] = (),
 ) -> Arrival:
     """Refuse a target that no pose moves, and measurements of which there is clear evidence that they mean something else.
 
@@ -159,7 +164,7 @@ def check_arrival(
 
     Parameters
     ----------
-    robot, data : see `arrival`.
+    robot, data, parts : see `arrival`.
     allow_still : accept targets that no pose moves. allow_implausible : accept any convention; `arrival` is not asked.
     overrides : how a user of the caller says so (flags or arguments); they close the messages.
 
@@ -179,7 +184,7 @@ def check_arrival(
             check_moved(data.take(found.converged), found.T[found.converged], override=overrides[0])
     if allow_implausible:
         return Arrival(float("nan"))
-    told = arrival(robot, data)
+    told = arrival(robot, data, parts)
     if told.refused:
         raise DataError(f"{told.sentence}, or use {overrides[1]}")
     return told
@@ -214,9 +219,9 @@ def _shared(data: Measurements) -> bool:
     return any(o.kind.links > 1 or bool((o.group != "").any()) for o in data.observations)
 
 
-def _best(free: Unknowns, stated: ReadAs, misfit: float) -> tuple[ReadAs | None, list[Hypothesis]]:
+def _best(free: Unknowns, stated: ReadAs, misfit: float, parts: Sequence[str]) -> tuple[ReadAs | None, list[Hypothesis]]:
     """The way that fits far better than what is stated, if there is one, and others that fit as well."""
-    ranked = [(found, way) for way, found in _tried(free, stated, misfit) if found * BETTER < misfit]
+    ranked = [(found, way) for way, found in _tried(free, stated, misfit, parts) if found * BETTER < misfit]
     ranked = [(found, way) for found, way in ranked if _tells(free, stated, way, found)]
     if not ranked:
         return None, []
@@ -229,7 +234,7 @@ def _best(free: Unknowns, stated: ReadAs, misfit: float) -> tuple[ReadAs | None,
     return (best, near[1:]) if best.found * BETTER < misfit else (None, [])
 
 
-def _tried(free: Unknowns, stated: ReadAs, misfit: float) -> list[tuple[Hypothesis, float]]:
+def _tried(free: Unknowns, stated: ReadAs, misfit: float, parts: Sequence[str]) -> list[tuple[Hypothesis, float]]:
     """Hypotheses that promise to fit far better with their misfits, to first order, blunders left out.
 
     All are compared by few rows first. The readings are read otherwise only where no other way to read the measured values
@@ -239,19 +244,19 @@ def _tried(free: Unknowns, stated: ReadAs, misfit: float) -> list[tuple[Hypothes
     if stated.enough:
         data = stated.data
         few = data.take(_few(data))
-        chosen = _promising(_misfits(free, few, tuple(hypotheses(few)), quick=True), misfit)
-        ways = {way.words: way for way in hypotheses(data)}
+        chosen = _promising(_misfits(free, few, tuple(hypotheses(few, parts)), quick=True), misfit)
+        ways = {way.words: way for way in hypotheses(data, parts)}
         found = _misfits(free, data, tuple(ways[words] for words in chosen if words in ways))
     if not any(value <= ALLOWED for _, value in found):
-        found += _readings_tried(free, stated.whole, misfit)
+        found += _readings_tried(free, stated.whole, misfit, parts)
     return [(way, value) for way, value in found if np.isfinite(value)]
 
 
-def _readings_tried(free: Unknowns, data: Measurements, misfit: float) -> list[tuple[Hypothesis, float]]:
+def _readings_tried(free: Unknowns, data: Measurements, misfit: float, parts: Sequence[str]) -> list[tuple[Hypothesis, float]]:
     """Hypotheses about the readings, as `_tried` gives them."""
     robot, poses = free.robot, _few(data)
-    actuators = robot.actuators
-    ways = tuple(readings_hypotheses(data, tuple(a.name for a in actuators), tuple(a.dimension for a in actuators)))
+    named, dimensions = tuple(a.name for a in robot.actuators), tuple(a.dimension for a in robot.actuators)
+    ways = tuple(readings_hypotheses(data, named, dimensions, parts))
     every = np.stack([way.values[poses] for way in ways])
     solved = plainly_reached(robot, robot.values[None], every.reshape(1, -1, every.shape[-1])).reshape(every.shape[:2])
     near = np.flatnonzero(solved.mean(axis=1) >= 1.0 - MOST_LEFT_OUT)
@@ -331,6 +336,16 @@ def _evidence(stated: ReadAs, misfit: float, best: ReadAs, alike: tuple[str, ...
 
 def _much(misfit: float) -> str:
     return "which is what tolerances and noise allow" if misfit <= ALLOWED else f"{misfit:.2g} times what they allow"
+
+
+def _set_aside(stated: ReadAs) -> str:
+    """Which rows do not fit the others, which do fit; they stay in the data."""
+    poses = tuple(dict.fromkeys(stated.left_out))
+    rows = sum(len(o) for o in stated.data.observations)
+    return (
+        f"{len(stated.left_out)} of {rows} rows that were compared do not fit the others by far (poses {listed(poses, SHOWN)});"
+        " check their units, signs and readings: they stay in the data"
+    )
 
 
 def _unexplained(stated: ReadAs, misfit: float) -> str:

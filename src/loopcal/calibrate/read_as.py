@@ -100,6 +100,7 @@ class ReadAs:
         self.z = np.repeat(free.deviation(free.robot.values[None]), self.t, axis=0)
         self.begin = begin
         self.failed = False
+        self.left_out: tuple[str, ...] = ()
         self.rows = self._rows(self.sensed)
 
     def misfit(self) -> float:
@@ -120,7 +121,10 @@ class ReadAs:
         return _rms(_cost(factor, np.zeros_like(self.z)), self.rows.rows)
 
     def leave_out(self) -> None:
-        """Leave out the rows of each way that stand far from its others; to be called after `misfits`."""
+        """Leave out the rows of each way that stand far from its others; to be called after `misfits`.
+
+        `left_out` then has the labels of those of the first way.
+        """
         if not self.enough or self.failed:
             return
         every = np.arange(self.t)
@@ -134,6 +138,8 @@ class ReadAs:
             return
         for s, ratio in zip(self.sensed, ratios, strict=True):
             kept = ~(ratio > limit[:, None])
+            far = s.poses.reshape(len(kept[0]), -1)[~kept[0]]
+            self.left_out += tuple("/".join(self.data.labels[i] for i in poses) for poses in far)
             weights.append(replace(s, whitener=s.trials(every)[1] * kept[..., None, None]))
         if self.rows.own is not None:
             self.begin = None if self.t == 1 and not self.quick else self.rows.own.values

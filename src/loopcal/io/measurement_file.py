@@ -84,8 +84,9 @@ def load_measurements(
         check_strokes(data, robot, allow=allow_outside_stroke, override="--allow-outside-stroke")
         check_duplicates(data, allow=allow_duplicates, override="--allow-duplicates", places=places)
         overrides = ("--allow-still", "--allow-implausible")
-        check = {"allow_still": allow_still, "allow_implausible": allow_implausible, "overrides": overrides}
-        told = check_arrival(robot, data, **check)
+        allow = {"allow_still": allow_still, "allow_implausible": allow_implausible}
+        parts = [next(iter(rows), "").rpartition(":")[0] for rows in places]
+        told = check_arrival(robot, data, **allow, overrides=overrides, parts=parts)
         if told.sentence:
             logging.getLogger(__name__).warning("%s: %s", files, told.sentence)
     except DataError as error:

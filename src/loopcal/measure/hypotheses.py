@@ -6,7 +6,7 @@ convention would write them, so that one and the same evaluation judges all. The
 columns with their dimensions, its form of orientation, its sights) and know no kind by name but for the zenith angle.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
@@ -42,9 +42,14 @@ FACTORS: Mapping[Dimension, tuple[tuple[float, str], ...]] = {
         (TURN / 1e3, "17.5 times smaller (mrad written as deg)"),
         (60.0, "60 times larger (deg written as arcmin)"),
         (1.0 / 60.0, "60 times smaller (arcmin written as deg)"),
+        (0.9, "10/9 times smaller (gon written as deg)"),
+        (1.0 / 0.9, "10/9 times larger (deg written as gon)"),
     ),
 }
 """How many times larger the numbers were meant, by dimension, with the slip of the pen that does it."""
+
+OF_ONE_COLUMN = (1e3, 1e-3, 25.4, 1.0 / 25.4, TURN, 1.0 / TURN, 0.9, 1.0 / 0.9)
+"""Those of them that are tried of single columns, too."""
 
 UNIT_CURE = "correct the unit in the header"
 
@@ -99,17 +104,21 @@ class _Turned(NamedTuple):
         return changed
 
 
-def hypotheses(data: Measurements) -> Iterator[Hypothesis]:
+def hypotheses(data: Measurements, parts: Sequence[str] = ()) -> Iterator[Hypothesis]:
     """All other ways to read measurements, the likelier slip of each family first.
 
     A way that a kind itself doubts (a negative distance, tilts no direction has), or that changes no number, is left out.
+
+    Parameters
+    ----------
+    data : as written. parts : where the rows of each of its observations come from, such as files; default: not known.
     """
     several = len(data.observations) > 1
     for i, rows in enumerate(data.observations):
         if not len(rows):
             continue
         alone = sum(other.kind.name == rows.kind.name for other in data.observations) == 1
-        of = f" of {f'kind {rows.kind.name!r}' if alone else f'part {i + 1} of the data'}" if several else ""
+        of = f" of {f'kind {rows.kind.name!r}' if alone else _part(i, data, parts)}" if several else ""
         for words, cure, values, shrinks in _of_kind(rows.kind, rows.measured):
             meant = np.isfinite(values) | np.isnan(rows.measured)
             same = np.allclose(values, rows.measured, rtol=1e-12, atol=0.0, equal_nan=True)
@@ -117,13 +126,16 @@ def hypotheses(data: Measurements) -> Iterator[Hypothesis]:
                 yield Hypothesis(words.format(of=of), cure, i, values, shrinks)
 
 
-def readings_hypotheses(data: Measurements, names: tuple[str, ...], dimensions: tuple[Dimension, ...]) -> Iterator[Hypothesis]:
-    """All other ways to read the readings of actuators with these names and dimensions."""
+def readings_hypotheses(
+    data: Measurements, names: tuple[str, ...], dimensions: tuple[Dimension, ...], parts: Sequence[str] = ()
+) -> Iterator[Hypothesis]:
+    """All other ways to read the readings of actuators with these names and dimensions; see `hypotheses`."""
     q = data.readings
-    for dimension in dict.fromkeys(dimensions):
-        chosen = np.array([d is dimension for d in dimensions])
-        for factor, words in FACTORS.get(dimension, ()):
-            yield Hypothesis(f"readings {words}", UNIT_CURE, None, np.where(chosen, factor * q, q), factor < 1.0)
+    for of, poses in _readings_of(data, parts):
+        for dimension in dict.fromkeys(dimensions):
+            chosen = poses[:, None] & np.array([d is dimension for d in dimensions])
+            for factor, words in FACTORS.get(dimension, ()):
+                yield Hypothesis(f"readings{of} {words}", UNIT_CURE, None, np.where(chosen, factor * q, q), factor < 1.0)
     cure = "turn the sign of these readings, or the direction of the actuator in the robot file"
     if len(names) > 1:
         yield Hypothesis("all readings of the other sign (drop for rise)", cure, None, -q)
@@ -140,6 +152,24 @@ def readings_hypotheses(data: Measurements, names: tuple[str, ...], dimensions: 
         yield Hypothesis(words, "move the columns of the readings by one row", None, np.roll(q, shift, axis=0))
 
 
+def _part(i: int, data: Measurements, parts: Sequence[str]) -> str:
+    """Where the rows of an observation come from, told from those of the others."""
+    if len(parts) == len(data.observations) and parts.count(parts[i]) == 1:
+        return parts[i]
+    return f"part {i + 1} of the data"
+
+
+def _readings_of(data: Measurements, parts: Sequence[str]) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Words and poses (n,): all of them, and those that only the rows of one part see, where parts have poses of their own."""
+    yield "", np.ones(data.n_poses, dtype=bool)
+    sees = np.zeros((len(data.observations), data.n_poses), dtype=bool)
+    for here, rows in zip(sees, data.observations, strict=True):
+        here[rows.rows.ravel()] = True
+    for i, here in enumerate(sees & (sees.sum(axis=0) == 1)):
+        if here.any() and np.array_equal(here, sees[i]) and len(sees) > 1:
+            yield f" of {_part(i, data, parts)}", here
+
+
 def _of_kind(kind: Kind, values: Array) -> Iterator[tuple[str, str, Array, bool]]:
     """Words, cure, columns and whether they shrink, family by family."""
     for rule in (_units, _rotations, _signs, _swaps):
@@ -154,6 +184,14 @@ def _units(kind: Kind, values: Array) -> Iterator[tuple[str, str, Array, bool]]:
         if chosen.any():
             for factor, words in FACTORS[dimension]:
                 yield f"{called}{{of}} {words}", UNIT_CURE, np.where(chosen, factor * values, values), factor < 1.0
+    named = _alike(kind)
+    for name, columns in named.items():
+        dimension = kind.columns[columns[0]].dimension
+        if sum(kind.columns[other[0]].dimension is dimension for other in named.values()) > 1:
+            chosen = np.isin(np.arange(len(kind.columns)), columns)
+            for factor, words in FACTORS.get(dimension, ()):
+                if factor in OF_ONE_COLUMN:
+                    yield f"{name}{{of}} {words}", UNIT_CURE, np.where(chosen, factor * values, values), factor < 1.0
 
 
 def _rotations(kind: Kind, values: Array) -> Iterator[tuple[str, str, Array, bool]]:
