@@ -107,6 +107,15 @@ def test_too_short_a_line_and_poses_out_of_reach_are_not_allowed(robot) -> None:
     assert np.isnan(planned.rows(design)).all()
 
 
+def test_where_every_point_is_in_reach_groups_are_drawn_once_and_no_line_is_too_short(monkeypatch) -> None:
+    planned, rows, calls = PlaneAndLine(lc.load_robot("linear-delta"), 8, MM), PlaneAndLine.rows, []
+    monkeypatch.setattr(PlaneAndLine, "rows", lambda self, design: calls.append(len(design)) or rows(self, design))
+    design = planned.random(200, 1)
+    assert calls == [200]  # of lines drawn without their least length, a fifth is too short
+    assert planned._length(design).min() >= planned.shortest
+    assert np.abs(np.delete(design, 3, axis=1)).max() <= 1.0
+
+
 def test_settings_without_sense_are_refused_in_a_sentence(robot) -> None:
     for settings, words in (
         ({"points": 3}, "at least 4"),

@@ -126,7 +126,8 @@ class PlaneAndLine:
     def random(self, groups: int, seed: int | np.random.Generator = 0) -> FloatArray:
         """Draw a design (u, c): points and turns anywhere in the workspace, each line along any of the axes.
 
-        Groups that are not allowed are drawn anew, ever nearer to the middle.
+        Lines are drawn long enough. Groups that are not allowed all the same, because a pose is out of reach, are drawn anew,
+        ever nearer to the middle.
 
         Raises
         ------
@@ -136,8 +137,10 @@ class PlaneAndLine:
         rng = np.random.default_rng(seed)
         design, wrong = np.zeros((groups, len(self.names))), np.arange(groups)
         for i in range(ROUNDS):
-            drawn = rng.uniform(-1.0, 1.0, (len(wrong), len(self.names))) * NEARER**i
+            half = NEARER**i
+            drawn = rng.uniform(-half, half, (len(wrong), len(self.names)))
             drawn[:, AXIS] = rng.choice(self.levels()[AXIS], len(wrong))
+            drawn[:, 4 + len(self.turning)] = self._ends(drawn, half, rng)
             design[wrong] = drawn
             wrong = wrong[np.isnan(self.rows(drawn)).any(axis=(1, 2))]
             if not len(wrong):
@@ -196,6 +199,17 @@ class PlaneAndLine:
 
     def _axis(self, design: FloatArray) -> IntArray:
         return np.rint(design[:, AXIS]).astype(np.int64)
+
+    def _ends(self, design: FloatArray, half: float, rng: np.random.Generator) -> FloatArray:
+        """Draw where lines end (u,), evenly from what lies `shortest` or more from their foot and within `half` of the middle.
+
+        Where that is nothing, because `half` is small, the line is as long as it must be.
+        """
+        foot, wide = design[np.arange(len(design)), self._axis(design)], min(max(half, self.shortest), 1.0)
+        below = np.maximum(wide + foot - self.shortest, 0.0)
+        above = np.maximum(wide - foot - self.shortest, 0.0)
+        share = rng.uniform(0.0, 1.0, len(design)) * (below + above)
+        return np.where(share < below, share - wide, wide - (below + above) + share)
 
     def _length(self, design: FloatArray) -> FloatArray:
         """Length (u,) of the lines in half ranges."""
