@@ -127,6 +127,14 @@ def test_an_earlier_data_file_describes_the_instrument_and_counts_as_measured(he
         ("--kind posse", "did you mean 'pose'"),
         ("--groups 3", "belong to --measure plane-line"),
         ("--measure plane-line --poses 10", "--poses does not go with --measure plane-line"),
+        ("--measure plane-line --poses 0", "--poses does not go with --measure plane-line"),
+        ("--measure plane-line --hold-out 0", "--hold-out does not go with --measure plane-line, where every point is fitted"),
+        ("--measure plane-line --kind position", "--kind does not go with --measure plane-line"),
+        ("--measure plane-line --components x,y", "--components does not go with --measure plane-line"),
+        ("--measure plane-line --sigma-angle 5urad", "--sigma-angle does not go with --measure plane-line"),
+        ("--measure plane-line --criterion I", "--criterion does not go with --measure plane-line"),
+        ("--measure plane-line --candidates 100", "--candidates does not go with --measure plane-line"),
+        ("--measure plane-line --frames base", "--frames does not go with --measure plane-line"),
         ("--measure plane-line --points 3", "give at least 4"),
         ("--measure plane-line --groups 1 --points 4", "plan at least"),
         ("--min-margin 2", "share of the median"),
@@ -157,6 +165,33 @@ def test_a_plan_is_not_replaced_without_force_and_nothing_else_ever(here, capsys
     (here / "mine" / "thesis.txt").write_text("x")
     assert main(["plan", "linear-delta", "-o", "mine", *SMALL, "--force"]) == 1
     assert "something other than a plan" in capsys.readouterr().err
+
+
+def test_force_never_removes_what_was_measured_or_written_by_hand(here, capsys):
+    again = ["plan", "linear-delta", "-o", "plan", *SMALL, "--force"]
+    assert main(again) == 0
+    assert main(again) == 0
+    data = here / "plan" / "measurements.csv"
+    empty = data.read_text()
+    filled = empty.replace(",,,", ",1.5,2.5,3.5", 1)
+    data.write_text(filled)
+    capsys.readouterr()
+    assert main(again) == 1
+    said = capsys.readouterr().err
+    assert "measurements.csv" in said
+    assert "filled in or changed" in said
+    assert data.read_text() == filled
+    data.write_text(empty)
+    (here / "plan" / "notes.txt").write_text("leg 2 squeaks")
+    assert main(again) == 1
+    assert "notes.txt" in capsys.readouterr().err
+    assert (here / "plan" / "notes.txt").read_text() == "leg 2 squeaks"
+    (here / "plan" / "notes.txt").unlink()
+    document = json.loads((here / "plan" / "plan.json").read_text())
+    del document["files"]  # of a plan that tells nothing of its files, a sheet may be filled in
+    (here / "plan" / "plan.json").write_text(json.dumps(document))
+    assert main(again) == 1
+    assert data.read_text() == empty
 
 
 def test_the_column_use_is_checked_and_not_overruled(here, capsys):

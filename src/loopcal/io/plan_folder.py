@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Callable, Mapping
@@ -23,7 +24,7 @@ from loopcal.io.csv_table import quoted
 from loopcal.io.json_text import to_json
 from loopcal.io.measurement_writer import to_fill_in_text
 from loopcal.io.pose_rows import dimension_of
-from loopcal.io.text_file import writing
+from loopcal.io.text_file import sha256, writing
 from loopcal.io.use_column import FIT, HELD_OUT, USE, with_use
 from loopcal.units import Dimension, unit
 
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 SHEET, DATA, RESULT = "plan.csv", "measurements.csv", "plan.json"
+OWN = (SHEET, DATA, RESULT, "plan.png", "curve.png")
+"""All files that a plan's folder holds."""
 VIA = "via"
 DIGITS = 9
 
@@ -74,12 +77,12 @@ def data_text(plan: Plan) -> str:
 
 
 def refuse_plan_folder(path: Path, force: bool) -> None:
-    """Refuse a folder that a plan may not replace.
+    """Refuse a folder that a plan may not replace: nothing that was measured or written by hand is ever removed.
 
     Raises
     ------
     FileError
-        A file, or a folder that holds something and `force` is not given, or something other than a plan.
+        A file, or a folder that holds something and `force` is not given, or something other than a plan as it was written.
     """
     if path.exists() and not path.is_dir():
         raise FileError("this is a file where the folder of a plan is to be written; choose another name", path)
@@ -89,6 +92,26 @@ def refuse_plan_folder(path: Path, force: bool) -> None:
         raise FileError("this folder is not empty; choose another name, or replace the plan in it with --force", path)
     if not (path / RESULT).exists():
         raise FileError("this folder holds something other than a plan, which --force does not replace; choose another", path)
+    for found in sorted(path.iterdir()):
+        if found.name not in OWN or not found.is_file():
+            raise FileError("this is no part of a plan, and --force does not remove it; move it away, or choose another", found)
+    written = _written(path / RESULT)
+    for name in (DATA, SHEET):
+        if (path / name).exists() and sha256(path / name) != written.get(name):
+            raise FileError(
+                "this was filled in or changed since the plan was written, and --force does not remove it; move it away, or "
+                "choose another folder",
+                path / name,
+            )
+
+
+def _written(path: Path) -> Mapping[str, str]:
+    """Return name -> sha256 of the texts of a plan as they were written; nothing where its plan.json does not tell."""
+    try:
+        found = json.loads(path.read_bytes())["files"]
+        return {str(name): str(digest) for name, digest in found.items()}
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return {}
 
 
 def write_plan_folder(
@@ -102,8 +125,9 @@ def write_plan_folder(
 
     Parameters
     ----------
-    path : the folder to make. texts : name -> text of a file. document : content of plan.json; `format` is added.
-    pictures : name -> what writes it. force : replace a plan that is there.
+    path : the folder to make. texts : name -> text of a file. document : content of plan.json; `format`, and `files` with the
+        sha256 of each text, are added.
+    pictures : name -> what writes it. force : replace a plan that is there, see `refuse_plan_folder`.
 
     Raises
     ------
@@ -116,12 +140,16 @@ def write_plan_folder(
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             temporary.mkdir()
-            for name, text in {**texts, RESULT: to_json({"format": FORMAT, **document})}.items():
-                (temporary / name).write_text(text, encoding="utf-8")
+            for name, text in texts.items():
+                (temporary / name).write_bytes(text.encode())
+            files = {name: sha256(temporary / name) for name in texts}
+            (temporary / RESULT).write_text(to_json({"format": FORMAT, **document, "files": files}), encoding="utf-8")
             for name, save in pictures.items():
                 save(temporary / name)
             if path.is_dir():
-                shutil.rmtree(path)
+                for name in OWN:
+                    (path / name).unlink(missing_ok=True)
+                path.rmdir()
             temporary.rename(path)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
