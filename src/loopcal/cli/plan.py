@@ -159,13 +159,12 @@ def plan(
     refuse_plan_folder(output, force)
     machine = load_robot(robot)
     if options["measure"] == "plane-line":
-        from loopcal.cli.plan_groups import plan_groups
+        from loopcal.cli.plan_groups import plan_groups, refuse_others
 
-        refused = {"--like": like, "--allowed": allowed, "--measured": measured, "--kind": options["components"]}
-        refused |= {f"--{n.replace('_', '-')}": options[n] for n in ("accuracy", "poses", "hold_out", "curve", "frames")}
+        refuse_others(click.get_current_context())
         constraints, counts = options["asked"].constraints(), (groups, points)
         inputs = _inputs(robot, None, None, ())
-        plan_groups(machine, output, counts, options["sigma_position"], constraints, refused, inputs, seed, force, as_json)
+        plan_groups(machine, output, counts, options["sigma_position"], constraints, inputs, seed, force, as_json)
         return
     if groups is not None or points is not None:
         raise DataError("--groups and --points belong to --measure plane-line; leave them out")

@@ -6,7 +6,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+import click
 
 from loopcal.cli import show
 from loopcal.errors import DataError
@@ -16,6 +18,31 @@ if TYPE_CHECKING:
     from loopcal.mechanism import Mechanism
 
 GROUPS, POINTS = 10, 8
+COUNTED, HELD = "which counts --groups and --points", "where a measuring machine holds x, y or z to --sigma-position"
+CHOSEN, ALL = "which moves points within the workspace and chooses by criterion D", "where every point is fitted"
+OTHERS = {
+    **dict.fromkeys(("poses", "accuracy", "curve"), COUNTED),
+    **dict.fromkeys(("like", "kind", "components", "orientation", "sigma_angle"), HELD),
+    **dict.fromkeys(("criterion", "candidates", "allowed"), CHOSEN),
+    "hold_out": ALL,
+    "measured": "which plans as if nothing had been measured",
+    "frames": "whose surfaces are unknown in every group",
+}
+"""Options that mean nothing here, and why."""
+
+
+def refuse_others(context: click.Context) -> None:
+    """Refuse options that were given and mean nothing where planes and lines are planned.
+
+    Raises
+    ------
+    DataError
+        With the first of them, and why it means nothing.
+    """
+    for option in context.command.params:
+        given = context.get_parameter_source(option.name or "") is not click.core.ParameterSource.DEFAULT
+        if given and (why := OTHERS.get(option.name or "")) is not None:
+            raise DataError(f"{option.opts[-1]} does not go with --measure plane-line, {why}; leave it out")
 
 
 def plan_groups(
@@ -24,21 +51,17 @@ def plan_groups(
     counts: tuple[int | None, int | None],
     sigma: float,
     constraints: Constraints,
-    refused: Mapping[str, Any],
     inputs: Mapping[str, Path],
     seed: int,
     force: bool,
     as_json: bool,
 ) -> None:
-    """Plan groups, write the folder, and print; `refused` are options that mean nothing here."""
+    """Plan groups, write the folder, and print."""
     from loopcal.calibrate.plan.plan_surfaces import plan_surfaces
     from loopcal.io.plan_folder import DATA, SHEET, write_plan_folder
     from loopcal.io.run_folder import made_by
     from loopcal.io.surface_sheet import surface_data_text, surface_sheet_text
 
-    for option, value in refused.items():
-        if value:
-            raise DataError(f"{option} does not go with --measure plane-line, which counts --groups and --points; leave it out")
     groups, points = (usual if given is None else given for given, usual in zip(counts, (GROUPS, POINTS), strict=True))
     show.progress("planning ...")
     made = plan_surfaces(robot, groups, points, sigma, constraints, seed)
