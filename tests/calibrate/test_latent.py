@@ -24,6 +24,7 @@ from loopcal.calibrate import (
     identify_trials,
     validate,
 )
+from loopcal.calibrate.left_out import without_poses
 from loopcal.errors import DataError, EstimationError
 from loopcal.io import load_robot
 from loopcal.measure import (
@@ -395,3 +396,5 @@ def test_a_pose_left_out_is_neither_undetermined_nor_without_readings():
     assert_array_equal(np.isnan(found.poses).all(axis=(1, 2)), out)
     assert_array_equal(np.isnan(found.readings).all(axis=1), out)
     assert examine(fit, data).worth.calibrate
+    held = validate(fit, without_poses(data, ("3", "9")))
+    assert not [note for note in held.notes if "not taken" in note]

@@ -39,8 +39,11 @@ def predicted(robot: Mechanism, data: Measurements) -> tuple[Solution, np.ndarra
 
 
 def untold(data: Measurements, told: np.ndarray) -> tuple[str, ...]:
-    """Say which poses are left out because their readings do not tell them."""
-    names = [label for label, there in zip(data.labels, told, strict=True) if not there]
+    """Say which poses are left out because their readings do not tell them; not those without rows that count."""
+    counts = np.zeros(data.n_poses, dtype=bool)
+    for rows in data.observations:
+        counts[rows.rows[rows.weight > 0.0]] = True
+    names = [label for label, lost in zip(data.labels, counts & ~told, strict=True) if lost]
     return (f"left out, a reading was not taken or is not believed: {listed(names)}",) if names else ()
 
 
