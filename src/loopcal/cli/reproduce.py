@@ -79,7 +79,7 @@ def _print(found: Reproduction) -> None:
         _table(table)
     show.say()
     for i, verdict in enumerate(found.verdicts, 1):
-        word = "agrees" if verdict.agrees else "DOES NOT AGREE"
+        word = verdict.word.upper() if verdict.agrees is False else verdict.word.lower()
         show.say(textwrap.fill(f"{i:2}. {word}: {verdict.claim} ({verdict.where})", 112, subsequent_indent="    "))
         show.say(textwrap.fill(verdict.why, 112, initial_indent="    ", subsequent_indent="    "))
 

@@ -36,7 +36,7 @@ def png(figure: Figure, style: Mapping[str, Mapping[str, Any]]) -> bytes:
     FigureCanvasAgg(canvas)
     axes = canvas.add_subplot()
     for series in figure.series:
-        axes.plot(series.x, series.y, label=series.label, markersize=5, linewidth=1.5, **style[series.label])
+        axes.plot(series.x, series.y, label=series.label, markersize=5, linewidth=1.5 * figure.joined, **style[series.label])
     for label, value in figure.levels.items():
         axes.axhline(value, color=LEVEL, linestyle="--", linewidth=1.2)
         axes.annotate(label, (0.008, value), xycoords=("axes fraction", "data"), ha="left", va="bottom",
@@ -49,7 +49,7 @@ def png(figure: Figure, style: Mapping[str, Mapping[str, Any]]) -> bytes:
         axes.set_yscale("log")
     axes.set(title=figure.title, xlabel=figure.x_label, ylabel=figure.y_label)
     axes.grid(visible=True, color="0.9", linewidth=0.8)
-    axes.legend(fontsize=8.5, framealpha=0.9)
+    canvas.legend(fontsize=8.5, loc="outside lower center", ncols=3)  # below the axes, where no data are
     stream = BytesIO()
     canvas.savefig(stream, format="png", metadata={"Software": None})
     return stream.getvalue()

@@ -18,15 +18,20 @@ class Verdict:
 
     Attributes
     ----------
-    claim : what is stated. agrees : whether what was computed bears it out.
+    claim : what is stated. agrees : whether what was computed bears it out; None where it cannot be judged, see `why`.
     why : the evidence in a sentence or two, with the numbers of this run.
     where : its place in the paper; ASKED_HERE for what the paper does not state.
     """
 
     claim: str
-    agrees: bool
+    agrees: bool | None
     why: str
     where: str
+
+    @property
+    def word(self) -> str:
+        """The judgement."""
+        return "Open" if self.agrees is None else "Agrees" if self.agrees else "Does not agree"
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,7 @@ class Figure:
     ----------
     name : of its file. title, x_label, y_label, caption : text, with units on the axes and numbers of cases in the caption.
     series : the lines. levels : horizontal lines by label. log : axes that are logarithmic, "", "y" or "xy".
+    joined : whether points of a series are joined by lines; not where their order along x means nothing.
     """
 
     name: str
@@ -56,6 +62,7 @@ class Figure:
     series: tuple[Series, ...]
     levels: Mapping[str, float] = field(default_factory=dict)
     log: str = "y"
+    joined: bool = True
 
 
 @dataclass(frozen=True)

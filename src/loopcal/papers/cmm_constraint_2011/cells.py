@@ -25,7 +25,7 @@ class Cell:
     Attributes
     ----------
     sd, noise : standard deviations [m]. gauge_free : whether the true errors have no part that plane and line cannot tell.
-    errors : by BEFORE, LS, MAP, (t, 6) see MEASURES. iterations : (t,) of LS. failed : descents that did not converge.
+    errors : by BEFORE, LS, MAP, (t, 7) see MEASURES. iterations : (t,) of LS. failed : descents that did not converge.
     """
 
     sd: float
@@ -36,12 +36,17 @@ class Cell:
     failed: int
 
     def median(self, method: str) -> FloatArray:
-        """(6,) over the draws."""
+        """(7,) over the draws."""
         return np.median(self.errors[method], axis=0)
 
     def reduction(self, method: str) -> FloatArray:
-        """(6,) percentages by which the medians fall."""
+        """(7,) percentages by which the medians fall."""
         return 100.0 * (1.0 - self.median(method) / self.median(BEFORE))
+
+    @property
+    def ratio(self) -> float:
+        """Noise over errors, by which alone the reductions of cells differ, but for what is not linear."""
+        return float(f"{self.noise / self.sd:.6g}")
 
     def worse(self, method: str, measure: int) -> int:
         """How many machines a method makes worse."""

@@ -40,8 +40,12 @@ MEASURES = (
     "orientation, aligned [deg]",
     "parameters [mm]",
     "parameters without gauge [mm]",
+    "position, gauge at nominal [mm]",
 )
 """Root mean squares over the unseen poses, and the 2-norm of what is wrong with the 42 parameters."""
+ABSOLUTE, AT_NOMINAL, ALIGNED = FRAMES = ("absolute", "gauge at nominal", "aligned")
+"""Where the base and the platform's turn, which plane and line leave open, are put: where the least deviation leaves them;
+where poses are nearest to those as designed, which needs no truth; where they are nearest to the true ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,22 +64,29 @@ class Unseen:
         """(t, n, 4, 4) of machines (t, p) at the readings."""
         return forward_trials(self.robot, values, self.solution.q[None], self.solution.state).T
 
-    def twists(self, values: FloatArray, true: FloatArray, aligned: bool) -> FloatArray:
-        """Differences (t, n, 6) [rad, m], rotation first, of the poses of machines (t | 1, p) from true ones (t, n, 4, 4)."""
-        T = np.broadcast_to(self.poses(values), true.shape)
-        return se3.difference(best_fit(T, true) if aligned else T, true)
+    def placed(self, T: FloatArray, true: FloatArray, frame: str) -> FloatArray:
+        """Poses (t, n, 4, 4) in one of FRAMES."""
+        if frame == ABSOLUTE:
+            return T
+        return best_fit(T, true if frame == ALIGNED else np.broadcast_to(self.solution.T, true.shape))
+
+    def twists(self, values: FloatArray, true: FloatArray, frame: str) -> FloatArray:
+        """Differences (t, n, 6) [rad, m], rotation first, of the poses of machines (t | 1, p) from true ones (t, n, 4, 4).
+
+        In one of FRAMES.
+        """
+        return se3.difference(self.placed(np.broadcast_to(self.poses(values), true.shape), true, frame), true)
 
     def errors(self, values: FloatArray, truth: FloatArray, true: FloatArray) -> FloatArray:
-        """(t, 6) see MEASURES; values (t | 1, p) and truth (t, p) [m], true (t, n, 4, 4) the `poses` of the truth."""
+        """(t, 7) see MEASURES; values (t | 1, p) and truth (t, p) [m], true (t, n, 4, 4) the `poses` of the truth."""
         T = np.broadcast_to(self.poses(values), true.shape)
-        found = []
-        for predicted in (T, best_fit(T, true)):
-            squares = np.mean(se3.difference(predicted, true) ** 2, axis=1)
-            found.append(np.sqrt(squares[:, 3:].sum(axis=1)) / MM)
-            found.append(np.rad2deg(np.sqrt(squares[:, :3].sum(axis=1))))
+        found = {}
+        for frame in FRAMES:
+            squares = np.mean(se3.difference(self.placed(T, true, frame), true) ** 2, axis=1)
+            found[frame] = [np.sqrt(squares[:, 3:].sum(axis=1)) / MM, np.rad2deg(np.sqrt(squares[:, :3].sum(axis=1)))]
         wrong = values - truth
         lengths = (np.linalg.norm(e, axis=1) / MM for e in (wrong, without_gauge(self.robot, wrong)))
-        return np.stack([*found, *lengths], axis=1)
+        return np.stack([*found[ABSOLUTE], *found[ALIGNED], *lengths, found[AT_NOMINAL][0]], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,17 +145,17 @@ def true_machines(robot: Mechanism, sd: float, trials: int, seed: int, gauge_fre
     return robot.parameters.nominal + sd * (without_gauge(robot, drawn) if gauge_free else drawn)
 
 
-def best_fit(T: FloatArray, true: FloatArray) -> FloatArray:
-    """Poses (t, n, 4, 4) after the motion of the base and the turn of the platform that bring them nearest to true ones.
+def best_fit(T: FloatArray, others: FloatArray) -> FloatArray:
+    """Poses (t, n, 4, 4) after the motion of the base and the turn of the platform that bring them nearest to others.
 
     Positions fix the base's motion (their least squares), then orientations the platform's turn (nearest rotations): what
     plane and line leave open, and nothing else.
     """
-    x, y = T[..., :3, 3], true[..., :3, 3]
+    x, y = T[..., :3, 3], others[..., :3, 3]
     middle, centre = x.mean(axis=1, keepdims=True), y.mean(axis=1, keepdims=True)
     Q = nearest_rotations(np.swapaxes(y - centre, 1, 2) @ (x - middle))
     R = Q[:, None] @ T[..., :3, :3]
-    turn = nearest_rotations(np.sum(np.swapaxes(R, 2, 3) @ true[..., :3, :3], axis=1))
+    turn = nearest_rotations(np.sum(np.swapaxes(R, 2, 3) @ others[..., :3, :3], axis=1))
     return se3.pose(R @ turn[:, None], (x - middle) @ np.swapaxes(Q, 1, 2) + centre)
 
 
