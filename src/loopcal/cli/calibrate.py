@@ -95,7 +95,7 @@ def calibrate(
     found = {name: _document(finding) for name, finding in findings.items() if finding is not None}
     reasons = _reasons(fit, validation, unjudged)
     document = run_document(fit, validation, origin, split) | found | {"passed": not reasons, "reasons": reasons}
-    save_run(output, fit, document, force)
+    save_run(output, fit, document, force, fitted)
     show.json_document(document) if as_json else _print(fit, errors, unseen is None, findings, output)
     return show.gates(reasons)
 

@@ -19,7 +19,7 @@ from loopcal.cli.options import FILE, data_argument, data_options, gate_options,
 @data_options
 @click.option("--refit", multiple=True, metavar="NAME",
               help="A frame, target or surface that was set up anew since RUN, to be found from DATA.")  # fmt: skip
-@click.option("--allow-fitted-data", is_flag=True, help="Accept the very measurements that the run was fitted to.")
+@click.option("--allow-fitted-data", is_flag=True, help="Accept measurements that the run was fitted to.")
 @json_option
 def validate(
     run: Path,
@@ -51,8 +51,8 @@ def validate(
 
     calibrated = load_calibrated(run)
     measured = measurements(data, calibrated.robot, **allowed)
-    if not allow_fitted_data:
-        refuse_fitted_data(calibrated, data)
+    if not allow_fitted_data and (again := refuse_fitted_data(calibrated, data, measured)):
+        click.echo(f"loopcal: note: {again}", err=True)
     known = {"known": calibrated.local, "known_before": calibrated.local_before, "refit": refit}
     found = compare(calibrated.robot, measured, limit_position, limit_angle, calibrated.before, **known)
     if as_json:

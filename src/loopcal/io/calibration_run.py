@@ -6,7 +6,8 @@ result.json    made_by    how (see `loopcal.io.run_folder.MADE_BY`)
                start      `StartCheck.to_dict()`: the geometry of the robot file against the fit, on the fitted rows
                split      share and labels of the poses that were held out; null where none were
                validation `Validation.to_dict()` on those poses, SI; null where none were
-arrays.npz     `Identification.arrays()`, and `initial`: the values before calibration of all parameters [SI]
+arrays.npz     `Identification.arrays()`, `initial`: the values before calibration of all parameters [SI], and the rows that
+               were fitted (see `loopcal.io.fitted_rows`)
 robot.yaml     the corrected robot file
 """
 
@@ -18,12 +19,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import DataError
+from loopcal.io.fitted_rows import fitted_rows, seen_before
 from loopcal.io.measurement_file import Paths, measurement_paths
 from loopcal.io.robot_file import load_robot, robot_text, shipped_robots
 from loopcal.io.run_folder import fitted_before, read_run_folder, write_run_folder
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from loopcal.calibrate import Identification, Validation
+    from loopcal.measure import Measurements
     from loopcal.mechanism import Mechanism
 
 
@@ -39,6 +44,8 @@ class CalibratedRun:
     """Frames, targets and surfaces as the run found them: values by name, such as `tracker.x` [SI]."""
     local_before: Mapping[str, float] = field(default_factory=dict)
     """The same with the geometry before calibration, on the rows that were fitted."""
+    arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Arrays of the run, among them those of `loopcal.io.fitted_rows`."""
 
 
 def run_document(
@@ -52,7 +59,9 @@ def run_document(
     return {"made_by": dict(origin), "fit": fit.to_dict(), "start": start, "split": split, "validation": shown}
 
 
-def save_run(path: str | Path, fit: Identification, document: Mapping[str, Any], force: bool = False) -> Path:
+def save_run(
+    path: str | Path, fit: Identification, document: Mapping[str, Any], force: bool = False, fitted: Measurements | None = None
+) -> Path:
     """Write the run folder of a calibration.
 
     Parameters
@@ -65,6 +74,8 @@ def save_run(path: str | Path, fit: Identification, document: Mapping[str, Any],
         What `run_document` returned.
     force : bool
         Replace a run that is there.
+    fitted : Measurements, optional
+        What was fitted, to be known again.
 
     Raises
     ------
@@ -73,7 +84,8 @@ def save_run(path: str | Path, fit: Identification, document: Mapping[str, Any],
     MechanismError
         The robot did not come from a file.
     """
-    arrays = {**fit.arrays(), "initial": fit.initial.values}
+    rows = {} if fitted is None else fitted_rows(fitted, fit.dropped)
+    arrays = {**fit.arrays(), "initial": fit.initial.values, **rows}
     return write_run_folder(path, document, arrays, robot_text(fit.robot, fit.plus_minus), force)
 
 
@@ -93,7 +105,7 @@ def load_run(path: str | Path) -> CalibratedRun:
         dict(zip(names, found.tolist(), strict=True)) if found is not None and len(found) == len(names) else {}
         for found in (run.arrays.get("local_estimate"), run.arrays.get("local_start"))
     )
-    return CalibratedRun(run.path, run.result, robot, robot.with_values(initial), local, start)
+    return CalibratedRun(run.path, run.result, robot, robot.with_values(initial), local, start, run.arrays)
 
 
 def load_calibrated(path: str | Path) -> CalibratedRun:
@@ -111,17 +123,24 @@ def load_calibrated(path: str | Path) -> CalibratedRun:
     return CalibratedRun(path, {}, robot, robot.nominal)
 
 
-def refuse_fitted_data(run: CalibratedRun, data: Paths) -> None:
-    """Refuse to validate a run with a file of measured values that it was made from.
+def refuse_fitted_data(run: CalibratedRun, data: Paths, measured: Measurements) -> str:
+    """Refuse to validate a run with measured values that it was fitted to, as files or row by row.
+
+    Returns
+    -------
+    str
+        A note where fewer than half of the rows were fitted; else empty.
 
     Raises
     ------
     DataError
-        The file is the same to the last byte.
+        A file is the same to the last byte, or half of the rows and more were fitted.
     """
+    override = "--allow-fitted-data"
     again = fitted_before(run.result, measurement_paths(data))
     if again is not None:
         raise DataError(
             f"{again}: this run was fitted to these very measurements, which prove nothing about unseen poses; "
-            "give others, or use --allow-fitted-data"
+            f"give others, or use {override}"
         )
+    return seen_before(run.arrays, measured, override)
