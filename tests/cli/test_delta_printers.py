@@ -136,6 +136,10 @@ def test_the_page_quotes_what_is_printed_of_the_real_printer(imported, capsys, r
     out = capsys.readouterr().out
     assert "chi-square 12.909 with 10 degrees of freedom" in out
     assert "as good as the fit within the noise" in out
+    # the mixture of heights and distances as millimetres grows, though chi-square falls from 18.9
+    assert "LARGER" not in out
+    assert "error of all kinds, divided by sigma (rms): 1.21 times smaller after calibration" in out
+    assert "component         7     1.36   0.859" in out
     result = json.loads(Path("run/result.json").read_text())
     half = {row["name"]: row["plus_minus"] for row in result["fit"]["parameters"]}  # [mm, deg]
     assert all(2.05 < half[f"arm{k}.length"] < 2.45 for k in (1, 2, 3))

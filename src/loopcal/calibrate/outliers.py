@@ -66,7 +66,7 @@ class Disagreement:
 
     Attributes
     ----------
-    poses : labels of each block. times : largest disagreement, in units of the noise expected of it.
+    poses : labels of each block. times : largest disagreement with a fit to all, in units of the noise expected of it.
     """
 
     poses: tuple[tuple[str, ...], ...]
@@ -173,7 +173,7 @@ def find_outliers(fit: Identification, data: Measurements, level: float = 0.05) 
     always = np.all([state.aside for state in visited], axis=0)
     groups = _rivals(ask, end, whole, alone) if settled else _in_turn(visited, always)
     unsure = np.any(groups, axis=0) if groups else np.zeros_like(always)
-    p_value, ratio = end.p_value(), np.sqrt(np.max([state.ratio for state in (whole, *visited)], axis=0))
+    p_value, ratio = end.p_value(), np.sqrt(whole.ratio)
     outliers = tuple(
         Outlier(labels[i], float(end.found.distance[i] / end.scale**2), int(end.found.degrees[i]), float(p_value[i]))
         for i in np.argsort(p_value, kind="stable")

@@ -19,6 +19,7 @@ import numpy as np
 
 from loopcal.calibrate.combinations import listed
 from loopcal.calibrate.identification import Identification
+from loopcal.calibrate.kind_errors import KindErrors, few, kind_errors
 from loopcal.calibrate.pose_errors import INDICES, PoseErrors, pose_errors
 from loopcal.calibrate.predicted import predicted, untold
 from loopcal.calibrate.set_up_anew import set_up_anew
@@ -54,6 +55,7 @@ class Validation:
     units : display symbols of length and angle.
     notes : where unknown frames, targets and surfaces come from: from the fit, or found anew from these rows.
     alignment : the same by name: `kept` as the fit found them, `fitted` to these very rows, after which errors are compared.
+    kinds : prediction errors divided by sigma, of each kind and, last, of all.
     """
 
     poses: tuple[str, ...]
@@ -69,6 +71,7 @@ class Validation:
     units: tuple[str, str]
     notes: tuple[str, ...] = ()
     alignment: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: {"kept": (), "fitted": ()})
+    kinds: tuple[KindErrors, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -80,8 +83,20 @@ class Validation:
         after = getattr(self.after.statistics(index), statistic)
         return getattr(self.before.statistics(index), statistic) / after if after > 0.0 else np.inf
 
-    def rows(self) -> list[tuple[str, str, str, float, float, float, float]]:
-        """Return a table: error, index, unit, and max, rms, mean, sd in that unit."""
+    @property
+    def several_kinds(self) -> bool:
+        """Whether rows of several kinds are mixed; then only errors divided by sigma can be compared."""
+        return len(self.kinds) > 2
+
+    def comparisons(self) -> tuple[tuple[str, float], ...]:
+        """Return what is compared before and after calibration (rms), and how many times smaller it became."""
+        if self.several_kinds:
+            return (("error of all kinds, divided by sigma", self.kinds[-1].improvement),)
+        measured = [index for index in ("position", "orientation") if self.after.statistics(index).count]
+        return tuple((f"{index} error", self.improvement(index)) for index in measured)
+
+    def rows(self) -> list[tuple[str, str, str, int, float, float, float, float]]:
+        """Return a table: error, index, unit, number of rows that have it, and max, rms, mean, sd in that unit."""
         length, angle = (unit(symbol) for symbol in self.units)
         scale = {
             "position": (length.factor_to_si, length.symbol),
@@ -97,7 +112,7 @@ class Validation:
                 if found.count:
                     factor, symbol = scale[index]
                     four = (found.max / factor, found.rms / factor, found.mean / factor, found.sd / factor)
-                    table.append((title, index, symbol, *four))
+                    table.append((title, index, symbol, found.count, *four))
         return table
 
     def errors(self) -> dict[str, PoseErrors]:
@@ -111,10 +126,10 @@ class Validation:
         }
 
     def __str__(self) -> str:
-        head = f"{'error':<17} {'index':<20} {'max':>11} {'rms':>11} {'mean':>11} {'sd':>11} unit"
+        head = f"{'error':<17} {'index':<20} {'n':>5} {'max':>11} {'rms':>11} {'mean':>11} {'sd':>11} unit"
         lines = [f"{len(self.poses)} rows", head]
-        for title, index, symbol, *four in self.rows():
-            lines.append(f"{title:<17} {index:<20} " + " ".join(f"{x:>11.4g}" for x in four) + f" {symbol}")
+        for title, index, symbol, count, *four in self.rows():
+            lines.append(f"{title:<17} {index:<20} {count:>5} " + " ".join(f"{x:>11.4g}" for x in four) + f" {symbol}")
         if self.failed:
             lines.append(f"left out, out of reach: poses {', '.join(self.failed)}")
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes), *self.reasons])
@@ -132,6 +147,7 @@ class Validation:
             "reasons": list(self.reasons),
             "notes": list(self.notes),
             "alignment": {name: list(parts) for name, parts in self.alignment.items()},
+            "kinds": [vars(kind) for kind in self.kinds],
         }
 
 
@@ -165,7 +181,7 @@ def validate(
     robot = fit.robot if isinstance(fit, Identification) else fit
     old = before or (fit.initial if isinstance(fit, Identification) else fit.nominal)
     check_actuators(data, robot)
-    rows = [some for o in data.observations if len(some := o.take(o.weight > 0.0))]
+    rows = [some for o in data.observations if len(some := o.take((o.weight > 0.0) & o.present.any(axis=1)))]
     if not rows:
         raise DataError("there is no row to validate with: every row is absent or has weight 0")
     (believed, _), (found, told) = predicted(old, data), predicted(robot, data)
@@ -177,8 +193,7 @@ def validate(
     seen, units = replace(data, observations=tuple(rows)), _units(robot)
     starts, kept = _known(fit, before, (known_before, known), refit, data)
     first, last = _view(old, seen, believed, ok, starts), _view(robot, seen, found, ok, kept)
-    was, now = first.residuals(rows), last.residuals(rows)
-    missed = first.differences(rows, _view(old, seen, reached, ok, None))
+    was, now, missed = first.residuals(rows), last.residuals(rows), first.differences(rows, _view(old, seen, reached, ok, None))
     after, poses = _errors(rows, now), _labels(rows, data)
     return Validation(
         poses=poses,
@@ -192,8 +207,9 @@ def validate(
         limit_angle=limit_angle,
         reasons=_gates(after, poses, limit_position, limit_angle, units),
         units=units,
-        notes=(*_notes(first, last), *_anew(robot, seen, found, ok, kept), *untold(data, told)),
+        notes=(*few(after), *_notes(first, last), *_anew(robot, seen, found, ok, kept), *untold(data, told)),
         alignment=_alignment(last),
+        kinds=kind_errors(rows, was, now),
     )
 
 

@@ -209,7 +209,9 @@ def _reasons(fit: Identification, validation: Validation | None, unjudged: str) 
     reasons += [unjudged] if unjudged else []
     if validation is None:
         return reasons
-    for index in ("position", "orientation"):
-        if validation.after.statistics(index).count and (times := 1.0 / validation.improvement(index)) > GREW:
-            reasons.append(f"{index} errors on unseen poses are {times:.3g} times LARGER after calibration (rms)")
+    for name, smaller in validation.comparisons():
+        if (times := 1.0 / smaller if smaller > 0.0 else float("inf")) > GREW:
+            reasons.append(
+                f"{name.replace('error', 'errors')} on unseen poses are {times:.3g} times LARGER after calibration (rms)"
+            )
     return [*reasons, *validation.reasons]

@@ -138,25 +138,36 @@ def validation(found: Validation, poses: str, before: bool = True) -> None:
     reach.
     """
     rows = found.rows()
-    same = all(max(four) < ROUNDING for title, _, _, *four in rows if title == "not compensable")
+    same = all(max(four) < ROUNDING for title, _, _, _, *four in rows if title == "not compensable")
     if same:
         rows = [row for row in rows if row[0].startswith("predicted")]
     if not before:
         rows = [("predicted", *row[1:]) for row in rows if row[0] == "predicted after"]
-    cells = [(title, index.replace("_", " "), *(number(x, digits=4) for x in four), symbol)
-             for title, index, symbol, *four in rows]  # fmt: skip
-    table(
-        f"Errors on {len(found.poses)} {poses} rows", ("error", "of", "max", "rms", "mean", "sd", "unit"), cells, text_columns=2
-    )
+    cells = [(title, index.replace("_", " "), str(count), *(number(x, digits=4) for x in four), symbol)
+             for title, index, symbol, count, *four in rows]  # fmt: skip
+    headers = ("error", "of", "rows", "max", "rms", "mean", "sd", "unit")
+    table(f"Errors on {len(found.poses)} {poses} rows", headers, cells, text_columns=2)
+    if found.several_kinds:
+        _kinds(found, before)
     if same and before:
         say("poses after commanding have these same errors: what was measured can be corrected by the actuators in full")
-    for index in ("position", "orientation"):
-        if before and found.after.statistics(index).count:
-            say(f"{index} error (rms): {_compared(found.improvement(index))}")
+    for name, times in found.comparisons() if before else ():
+        say(f"{name} (rms): {_compared(times)}")
     if found.failed:
         say(f"left out, out of reach: poses {', '.join(found.failed)}")
     for note in found.notes:
         say(f"note: {note}")
+
+
+def _kinds(found: Validation, before: bool) -> None:
+    """Print errors of every kind in units of its sigma."""
+    if before:
+        headers = ("kind", "values", "before", "after")
+        cells = [(k.kind, str(k.count), number(k.before, digits=3), number(k.after, digits=3)) for k in found.kinds]
+    else:
+        headers = ("kind", "values", "predicted")
+        cells = [(k.kind, str(k.count), number(k.after, digits=3)) for k in found.kinds]
+    table("Errors divided by sigma (rms)", headers, cells)
 
 
 def _compared(improvement: float) -> str:
