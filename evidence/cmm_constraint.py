@@ -9,14 +9,34 @@ from typing import Any
 from loopcal.calibrate.plan.groups import PlaneAndLine
 from loopcal.linalg import FloatArray
 from loopcal.mechanism import Mechanism
-from loopcal.papers.cmm_constraint_2011.cells import BEFORE, LS, PRIOR, Cell, cell, grid
-from loopcal.papers.cmm_constraint_2011.layouts import ONE, arranged
+from loopcal.papers.cmm_constraint_2011.cells import BEFORE, LS, METHODS, PRIOR, Cell, cell, correlation, grid
+from loopcal.papers.cmm_constraint_2011.fifty import LINES, fifty
+from loopcal.papers.cmm_constraint_2011.layouts import NOISE, ONE, SET, TEN, arranged, candidates
+from loopcal.papers.cmm_constraint_2011.layouts import printed_reductions as printed
 from loopcal.papers.cmm_constraint_2011.published import MM
-from loopcal.papers.cmm_constraint_2011.study import AXES, GROUPS, MEASURES, POINTS, SWEEPS, Study, machine, plan, spread
+from loopcal.papers.cmm_constraint_2011.steps import WEIGHTS
+from loopcal.papers.cmm_constraint_2011.study import (
+    ALIGNED,
+    AXES,
+    FRAMES,
+    GROUPS,
+    MEASURES,
+    POINTS,
+    SWEEPS,
+    Study,
+    machine,
+    plan,
+    spread,
+)
 
-SEED, DRAWS, STARTS, FEW = 0, 200, 5, 40
-INDEPENDENT = (1.0, 0.01)
-"""Errors and noise [mm] of the cell that is looked at with rows taken as independent, too."""
+SEED, DRAWS, STARTS, FEW, SOME = 0, 200, 5, 40, 60
+WORDS = {
+    "printed": "as printed: weight one",
+    "distance": "divided by the distance d_1",
+    "single": "divided by the sd of each, taken as independent",
+    "full": "with their covariance",
+}
+"""Of the weights of the rows."""
 
 
 def once(planned: PlaneAndLine, design: FloatArray) -> float:
@@ -40,49 +60,107 @@ def start(robot: Mechanism, seed: int) -> tuple[Study, list]:
     return study, [seed, before, after, before / after, spent, cost]
 
 
+MEDIANS = {
+    "position, aligned [mm]": "position, aligned [mm]",
+    "position, absolute [mm]": "position [mm]",
+    "position, gauge at nominal [mm]": "position, gauge at nominal [mm]",
+    "parameters without gauge [mm]": "parameters without gauge [mm]",
+}
+"""Columns of Table 3, and which of MEASURES they are."""
+
+
 def medians(c: Cell) -> list[float]:
-    """Aligned and absolute position errors and the parameters', before, LS and MAP."""
-    chosen = [MEASURES.index(name) for name in ("position, aligned [mm]", "position [mm]", "parameters without gauge [mm]")]
-    return [float(c.median(m)[i]) for i in chosen for m in (BEFORE, LS, PRIOR)]
+    """Position errors in each frame and the parameters', before, LS and MAP."""
+    return [float(c.median(m)[MEASURES.index(name)]) for name in MEDIANS.values() for m in (BEFORE, LS, PRIOR)]
+
+
+def weighed(study: Study, full: Cell) -> list[list[Any]]:
+    """Aligned position and parameters by LS and MAP with each weighting of the rows, and LS over that as printed."""
+    cells = {w: full if w == "full" else cell(study, SET * MM, NOISE * MM, SEED, DRAWS, weights=w) for w in WEIGHTS}
+    position, parameters = (MEASURES.index(name) for name in ("position, aligned [mm]", "parameters without gauge [mm]"))
+    first = cells["printed"].median(LS)[position]
+    return [
+        [WORDS[w], *(float(c.median(m)[i]) for i in (position, parameters) for m in (LS, PRIOR)),
+         float(c.median(LS)[position] / first)]
+        for w, c in cells.items()
+    ]  # fmt: skip
+
+
+def readings(study: Study) -> list[list[Any]]:
+    """Figure 5 as printed and under every reading."""
+    found = candidates((arranged(TEN, study, SEED, SOME),), SEED, SOME)
+    rows = [[c.reading, c.truth, c.frame, *map(float, c.reductions)] for c in found]
+    return [["as printed", None, None, *map(float, printed())], *rows]
+
+
+def fifties(study: Study) -> list[list[Any]]:
+    """Mean position error before, by LS and by MAP in each frame, and how often LS converges within 5 iterations."""
+    found = [fifty(study, groups, SEED, FEW) for groups in LINES]
+    return [
+        [f.groups, frame, *(float(f.median(m, frame)[0]) for m in (BEFORE, LS, PRIOR)),
+         f.within_five if frame == ALIGNED else None]
+        for f in found for frame in FRAMES
+    ]  # fmt: skip
 
 
 def collect() -> dict[str, Any]:
-    """The 3 x 4 cells, the five starts, and one plane against ten."""
+    """The 3 x 4 cells, the five starts, one plane against ten, the weights, readings of figure 5, and fifty points."""
     robot = machine()
     study, first = start(robot, SEED)
     starts = [first, *(start(robot, seed)[1] for seed in range(SEED + 1, SEED + STARTS))]
     cells = grid(study, SEED, DRAWS, lambda _: None)
     rows = [[given, noise, *medians(c), c.worse(PRIOR, 2), c.failed] for (given, noise), c in cells.items()]
-    single = cell(study, INDEPENDENT[0] * MM, INDEPENDENT[1] * MM, SEED, DRAWS, weights="single")
     ten, one = cells["1", "0.01"], arranged(ONE, plan(robot, 1, GROUPS * POINTS, AXES, SEED, sweeps=1), SEED, FEW)
     layouts = [
         ["ten planes, a line each", first[1], first[2], *_pair(ten), DRAWS],
-        ["the same, rows taken as independent", None, None, *_pair(single), DRAWS],
         ["one plane, one line", one.drawn, one.optimised, *_pair(one.cell), FEW],
     ]
-    names = [f"{what}, {m}" for what in ("position, aligned [mm]", "position, absolute [mm]", "parameters without gauge [mm]")
-             for m in (BEFORE, LS, PRIOR)]  # fmt: skip
+    ranks = [[method, correlation(cells.values(), method), len(cells), len({c.ratio for c in cells.values()})]
+             for method in METHODS]  # fmt: skip
+    table_3 = [f"{what}, {m}" for what in MEDIANS for m in (BEFORE, LS, PRIOR)]
     return {
         "seed": SEED,
         "draws": DRAWS,
         "tables": {
-            "table_3": {
-                "columns": ["errors [mm]", "noise [mm]", *names, f"made worse by MAP, of {DRAWS}", "not converged"],
-                "formats": ["", "", *[".2g"] * 9, "d", "d"],
-                "rows": rows,
-            },
-            "exchange": {
-                "columns": ["start", "drawn [mm / mm]", "optimised [mm / mm]", "gain", "CPU [s]", "cost [evaluations]"],
-                "formats": ["d", ".3g", ".3g", ".2g", ".2g", ".2g"],
-                "rows": starts,
-            },
-            "layouts": {
-                "columns": ["100 points on", "drawn [mm / mm]", "optimised [mm / mm]", "LS [mm]", "MAP [mm]", "draws"],
-                "formats": ["", ".3g", ".3g", ".3g", ".3g", "d"],
-                "rows": layouts,
-            },
+            "table_3": table(
+                ["errors [mm]", "noise [mm]", *table_3, f"made worse by MAP, of {DRAWS}", "not converged"],
+                ["", "", *[".2g"] * len(table_3), "d", "d"],
+                rows,
+            ),
+            "exchange": table(
+                ["start", "drawn [mm / mm]", "optimised [mm / mm]", "gain", "CPU [s]", "cost [evaluations]"],
+                ["d", ".3g", ".3g", ".2g", ".2g", ".2g"],
+                starts,
+            ),
+            "layouts": table(
+                ["100 points on", "drawn [mm / mm]", "optimised [mm / mm]", "LS [mm]", "MAP [mm]", "draws"],
+                ["", ".3g", ".3g", ".3g", ".3g", "d"],
+                layouts,
+            ),
+            "weights": table(
+                ["rows", *(f"{what}, {m}" for what in ("position, aligned [mm]", "parameters [mm]") for m in (LS, PRIOR)),
+                 "position, LS, as printed = 1"],
+                ["", ".3g", ".3g", ".3g", ".3g", ".2f"],
+                weighed(study, ten),
+            ),
+            "readings": table(
+                ['"variance" read as', "true errors in", "frame", "parameters [%]", "position [%]", "orientation [%]"],
+                ["", "", "", ".0f", ".0f", ".0f"],
+                readings(study),
+            ),
+            "fifty": table(
+                ["planes", "frame", "before [mm]", "LS [mm]", "MAP [mm]", "LS within 5 iterations [%]"],
+                ["d", "", ".2g", ".2g", ".2g", ".0f"],
+                fifties(study),
+            ),
+            "correlation": table(["method", "rank correlation", "cells", "ratios"], ["", ".2f", "d", "d"], ranks),
         },
-    }
+    }  # fmt: skip
+
+
+def table(columns: list[str], formats: list[str], rows: list[list[Any]]) -> dict[str, Any]:
+    """A table as evidence/README.md describes it."""
+    return {"columns": columns, "formats": formats, "rows": rows}
 
 
 def _pair(c: Cell) -> list[float]:
