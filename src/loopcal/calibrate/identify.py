@@ -11,6 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from loopcal.calibrate.astray import astray
 from loopcal.calibrate.checks import check_count, check_rows, check_settings, check_start
 from loopcal.calibrate.closure import descend_from_closure, not_used
 from loopcal.calibrate.combinations import combinations
@@ -94,7 +95,7 @@ def identify(
     fit, weight, weighed = _weighed(rows, data, z, loss, noise, run, prior)
     if fit.status[0] == DescentStatus.BAD_START:
         check_start(rows, data, z, fit.cost)
-    check = residual_check(fit.decomposition, fit.penalty, noise, robust=loss is not None)
+    check = residual_check(fit.decomposition, fit.penalty, noise, loss is not None, fit.status[0] == DescentStatus.CONVERGED)
     residuals = _labelled(_residuals(rows, weighed, fit.deviation), data, rows)
     result = _identification(robot, free, method, fit, check, residuals, weighed)
     latent = latent_estimate(rows, data, drop) if isinstance(rows, LatentRows) else None
@@ -244,10 +245,9 @@ def _identification(
     status = DescentStatus(int(fit.status[0]))
     local = _local(rows, robot, fit.deviation, d, penalty, variance)
     open_ = with_followers(combinations(free, plain.null_space()), plain.null_space(), local)
-    notes = [check.sentence]
-    if status is not DescentStatus.CONVERGED:
-        notes.insert(0, status.sentence)
-    if conflict is not None and conflict.conflict:
+    converged = status is DescentStatus.CONVERGED
+    notes = [*([] if converged else [status.sentence]), check.sentence, *astray(free, fit.deviation[0], method, converged)]
+    if converged and conflict is not None and conflict.conflict:
         notes.append(conflict.sentence)
     notes += [f"not identifiable: {combination}" for combination in open_]
     notes += local.notes()

@@ -68,6 +68,9 @@ def start_check(fit: Identification) -> StartCheck:
     first, last = float(fit.cost_history[0]), float(fit.cost_history[-1])
     rows = sum(int(np.isfinite(r.raw).sum()) for r in fit.residuals)
     before, after = np.sqrt(first / rows), np.sqrt(last / rows)
+    if not fit.converged:
+        sentence = "the robot file's geometry cannot be compared with a best fit: the iteration did not converge"
+        return StartCheck(Start.OPEN, before, after, float("nan"), sentence)
     gain = max(first - last, 0.0)
     if gain <= NOTHING * first:
         return StartCheck(Start.BEST, before, after, 1.0, "the robot file's geometry is already the best fit to these rows")

@@ -18,6 +18,9 @@ LEVEL = 0.95
 DOUBT = 1e-3
 """Probability below which the residual is said not to fit the noise."""
 
+ASTRAY = "no interval is given and nothing is said of the noise: what is left is not the residual of a best fit"
+"""What is said of the residual where the iteration did not converge."""
+
 
 @dataclass(frozen=True)
 class ResidualCheck:
@@ -50,7 +53,9 @@ class ResidualCheck:
         return self.noise == "given" and self.p_value < DOUBT
 
 
-def residual_check(decomposition: Decomposition, penalty: FloatArray, noise: str, robust: bool = False) -> ResidualCheck:
+def residual_check(
+    decomposition: Decomposition, penalty: FloatArray, noise: str, robust: bool = False, converged: bool = True
+) -> ResidualCheck:
     """Check the residual of a fit (t = 1).
 
     chi_square = |W r|^2 + sum penalty_i y_i^2 over the directions used, with one degree of freedom for each equation
@@ -60,6 +65,7 @@ def residual_check(decomposition: Decomposition, penalty: FloatArray, noise: str
     ----------
     decomposition, penalty : of the fit. noise : "given" or "estimated".
     robust : whether a loss gave the rows weights by their residuals, so that chi_square has no known distribution.
+    converged : whether the iteration did; elsewhere than at the minimum neither noise nor intervals can be spoken of.
     """
     finite = np.where(np.isfinite(penalty), penalty, 0.0)
     left = float(decomposition.remaining(penalty)[0])
@@ -69,6 +75,8 @@ def residual_check(decomposition: Decomposition, penalty: FloatArray, noise: str
     m = float(decomposition.rows[0])
     degrees = m - float((used & (penalty == 0.0)).sum())
     dof = m - float(decomposition.filter_factors(penalty).sum())
+    if not converged:
+        return ResidualCheck(chi_square, degrees, np.nan, dof, noise, 1.0, False, ASTRAY)
     if noise == "estimated":
         enough = dof >= FEWEST_DEGREES
         scale = float(np.sqrt(left / dof)) if dof > 0 else np.nan
