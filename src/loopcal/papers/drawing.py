@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 MARKERS = "osD^vPX"
 LEVEL = "0.35"
 """Grey of a horizontal line."""
+LEGEND = 100
+"""Characters that a row of the legend holds."""
 
 
 def styles(figures: Sequence[Figure]) -> dict[str, dict[str, Any]]:
@@ -49,7 +51,9 @@ def png(figure: Figure, style: Mapping[str, Mapping[str, Any]]) -> bytes:
         axes.set_yscale("log")
     axes.set(title=figure.title, xlabel=figure.x_label, ylabel=figure.y_label)
     axes.grid(visible=True, color="0.9", linewidth=0.8)
-    canvas.legend(fontsize=8.5, loc="outside lower center", ncols=3)  # below the axes, where no data are
+    longest = max(len(series.label) for series in figure.series)
+    columns = max(1, min(6, LEGEND // (longest + 6)))  # a marker is as wide as some 6 characters
+    canvas.legend(fontsize=8.5, loc="outside lower center", ncols=columns)  # below the axes, where no data are
     stream = BytesIO()
     canvas.savefig(stream, format="png", metadata={"Software": None})
     return stream.getvalue()
