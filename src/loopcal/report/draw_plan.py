@@ -55,8 +55,10 @@ def draw_curve(robot: Mechanism, curve: PoseCurve) -> Figure:
     shown = unit(robot.units[dimension])
     figure = Figure(figsize=(6.4, 4.4), layout="constrained")
     axes: Any = figure.add_subplot(1, 1, 1)
-    axes.plot(curve.poses, curve.values / shown.factor_to_si, "o-", color=FITTED, label="planned poses")
-    axes.plot(curve.poses, curve.bounds / shown.factor_to_si, "--", color=BOUND, label="no choice of poses is better")
+    axes.plot(curve.numbers, curve.values / shown.factor_to_si, "o-", color=FITTED, label=f"planned {curve.counted}")
+    axes.plot(
+        curve.numbers, curve.bounds / shown.factor_to_si, "--", color=BOUND, label=f"no choice of {curve.counted} is better"
+    )
     if curve.goal is not None:
         axes.axhline(curve.goal / shown.factor_to_si, color=JUDGED, lw=1.0, label="asked for")
     axes.set_xscale("log")
@@ -64,15 +66,15 @@ def draw_curve(robot: Mechanism, curve: PoseCurve) -> Figure:
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(ScalarFormatter())
         axis.set_minor_formatter(NullFormatter())
-    axes.set_xticks(curve.poses, [str(n) for n in curve.poses])
+    axes.set_xticks(curve.numbers, [str(n) for n in curve.numbers])
     ticks = np.geomspace(min(curve.bounds.min(), curve.goal or np.inf), curve.values.max(), 5) / shown.factor_to_si
     axes.set_yticks(ticks, [f"{tick:.3g}" for tick in ticks])
-    axes.set_xlabel("poses to fit [1]")
+    axes.set_xlabel(f"{curve.counted} to fit [1]")
     words = "pose error, turns times size" if curve.target == "pose" else f"{curve.target} error"
     axes.set_ylabel(f"expected {words} (rms) [{shown.symbol}]")
     axes.grid(visible=True, which="both", lw=0.3)
     axes.legend(frameon=False, fontsize=8)
-    axes.set_title(f"{robot.name}: n = {curve.poses[0]} to {curve.poses[-1]} poses", fontsize=10)
+    axes.set_title(f"{robot.name}: n = {curve.numbers[0]} to {curve.numbers[-1]} {curve.counted}", fontsize=10)
     return figure
 
 

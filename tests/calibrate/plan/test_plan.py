@@ -1,14 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plans: rows are those of the estimator, what is predicted comes true, planned poses beat drawn ones, nonsense is refused."""
 
+from dataclasses import replace
+from math import comb
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 import loopcal as lc
 from loopcal.calibrate.outlook import information
+from loopcal.calibrate.plan.certified import certified_design
+from loopcal.calibrate.plan.compared import MOST, units_of
+from loopcal.calibrate.plan.criteria import D
 from loopcal.calibrate.plan.design import Start, design_factor
-from loopcal.calibrate.plan.information import start_of, unit_rows, units_of
+from loopcal.calibrate.plan.information import considered, start_of, unit_rows
 from loopcal.calibrate.plan.needed import poses_needed
 from loopcal.calibrate.plan.plan import planned, planned_for
 from loopcal.calibrate.plan.problem import problem
@@ -134,7 +140,7 @@ def test_how_many_poses_reach_a_goal_and_below_how_many_none_can():
     needed = poses_needed(made, goal, "position")
     assert needed.at_least is not None
     assert needed.enough is not None
-    assert needed.values[needed.poses == needed.enough] <= goal
+    assert needed.values[needed.numbers == needed.enough] <= goal
     assert needed.at_least <= needed.enough <= 1.2 * needed.at_least
     assert (needed.bounds <= needed.values * (1 + 1e-9)).all()
     assert (np.diff(needed.values) < 0.0).all()
@@ -161,9 +167,19 @@ def test_demands_that_cannot_be_met_are_refused_with_the_reason(tracker, ask, sa
         planned(tracker, **ask)
 
 
-def test_kinds_that_compare_poses_are_planned_in_pairs():
-    made = problem(load_robot("linear-delta"), looking("separation"), count=80, seed=1)
+@pytest.fixture(scope="module")
+def callipers():
+    """A delta of which distances between places are measured."""
+    return problem(load_robot("linear-delta"), looking("separation"), count=80, seed=1)
+
+
+def test_kinds_that_compare_poses_are_planned_in_pairs(callipers):
+    made = callipers
     found = planned(made, 24, hold_out=4)
+    judged = {i for pair in found.units[found.held_out[found.units].all(axis=1)] for i in pair}
+    assert f"12 pairs to measure (separation) and 2 to judge by, of {len(found.labels)} poses of linear-delta" in str(found)
+    assert f"of the {found.considered} pairs considered allow" in str(found)
+    assert found.considered == comb(len(made.candidates) - len(judged), 2)
     assert found.units.shape[1] == 2
     held = found.held_out[found.units]
     assert (held.all(axis=1) | ~held.any(axis=1)).all()
@@ -171,6 +187,45 @@ def test_kinds_that_compare_poses_are_planned_in_pairs():
     assert "cannot tell how the frame base lies as a whole" in str(found)
     with pytest.raises(EstimationError, match="in multiples of 2"):
         planned(made, 25)
+
+
+def test_no_choice_of_pairs_beats_what_is_said_of_pairs_not_even_all_pairs_of_few_poses(callipers):
+    made = callipers
+    assert len(made.units.members) == comb(len(made.candidates), 2)
+    # eight poses with all their 28 pairs, the best of some that are drawn
+    poses, rng, tried = np.unique(made.units.members), np.random.default_rng(0), []
+    for few in (rng.choice(poses, 8, replace=False) for _ in range(300)):
+        chosen = np.flatnonzero(np.isin(made.units.members, few).all(axis=1))
+        tried.append((made.accuracy(chosen), len(chosen)))
+    reached, pairs = min(tried, key=lambda one: one[0].position if one[0] else np.inf)
+    assert reached is not None
+    needed = poses_needed(made, reached.position, "position")
+    assert needed.at_least is not None
+    # were each pair counted as two poses, eight poses would contradict what is said
+    assert 8 < 2 * needed.at_least <= 2 * pairs == 56
+    sentence = needed.sentences(made.free.robot)[0]
+    assert f"{needed.enough} pairs reach" in sentence
+    assert f"no choice of fewer than {needed.at_least} of the {len(made.units.members)} pairs considered can" in sentence
+    assert needed.to_dict()["counted"] == "pairs"
+
+
+def test_of_many_poses_the_pairs_considered_are_different_and_tell_more_than_as_many_drawn():
+    robot, seen_by = load_robot("linear-delta"), looking("separation")
+    free, q = unknowns(robot), sample(robot, 400, seed=2).solution.q
+    mounted = seen_by.mounted(robot)
+    ours = considered(free, mounted, q, np.random.default_rng(3))
+    drawn = unit_rows(free, mounted, q, units_of(len(q), mounted, np.random.default_rng(3), len(ours.members)))
+    assert 0.9 * MOST < len(ours.members) <= MOST
+    for units in (ours, drawn):
+        assert (units.members[:, 0] < units.members[:, 1]).all()
+        assert len(np.unique(units.members, axis=0)) == len(units.members)
+    best = [certified_design(u.rows, 12, D(), Start.tolerances(len(free)), shakes=5).design.value for u in (ours, drawn)]
+    assert best[0] > best[1]
+
+
+def test_a_weak_certificate_is_called_weak(found):
+    assert "little is guaranteed" in str(replace(found, efficiency=0.4))
+    assert "little is guaranteed" not in str(found)
 
 
 def test_an_instrument_with_rows_of_its_own_is_refused():

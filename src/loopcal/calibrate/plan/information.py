@@ -12,6 +12,7 @@ that the estimate defines. Derivations: docs/theory/identification.md, docs/theo
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import comb
 
 import numpy as np
 
@@ -19,10 +20,10 @@ from loopcal import engine
 from loopcal.calibrate.accuracy import transport
 from loopcal.calibrate.frame_motions import frame_motions
 from loopcal.calibrate.outlook import look, scene, without_own
+from loopcal.calibrate.plan.compared import MOST, poses_in_unit, telling, units_of
 from loopcal.calibrate.plan.design import Start, allowed
 from loopcal.calibrate.posterior import Posterior
 from loopcal.calibrate.scaling import Unknowns
-from loopcal.errors import DataError
 from loopcal.linalg import Decomposition, FloatArray, IntArray, decompose, empty_factor
 from loopcal.measure import Instrument, LocalUnknowns, Measurements, Observations, joints_looked_at, local_unknowns
 from loopcal.mechanism import Solution
@@ -48,22 +49,26 @@ class UnitRows:
     prior: FloatArray
 
 
-def poses_in_unit(instrument: Instrument) -> int:
-    """Return how many poses are measured together; raises DataError for kinds that compare different numbers."""
-    links = sorted({sensor.kind.links for sensor in instrument.sensors} - {1})
-    if len(links) > 1:
-        raise DataError(f"kinds that compare {links[0]} and {links[1]} poses cannot be planned together; plan one of them")
-    return links[0] if links else 1
+def considered(free: Unknowns, instrument: Instrument, readings: FloatArray, rng: np.random.Generator) -> UnitRows:
+    """Return the rows of all units that a plan may choose from, at readings (n, a) of the candidates' poses.
 
+    Where poses are compared and there are too many combinations, half are drawn and half made of the poses that tell most.
 
-def units_of(poses: int, instrument: Instrument, rng: np.random.Generator) -> IntArray:
-    """Return members (N, k) of as many units as there are poses: each alone, or k different ones drawn at random."""
-    k = poses_in_unit(instrument)
-    if k == 1:
-        return np.arange(poses)[:, None]
-    if poses < k:
-        raise DataError(f"this instrument compares {k} poses, but only {poses} are allowed; relax a constraint")
-    return _drawn(poses, k, rng)
+    Raises
+    ------
+    DataError
+        See `units_of`.
+    """
+    n, k = len(readings), poses_in_unit(instrument)
+    most = MOST if k == 1 or comb(n, k) <= MOST else MOST // 2
+    first = unit_rows(free, instrument, readings, units_of(n, instrument, rng, most))
+    if most == MOST:
+        return first
+    further = telling(first.rows, first.members, n, most, rng)
+    if not len(further):
+        return first
+    rows = np.concatenate([first.rows, unit_rows(free, instrument, readings, further).rows])
+    return replace(first, rows=rows, members=np.concatenate([first.members, further]))
 
 
 def unit_rows(free: Unknowns, instrument: Instrument, readings: FloatArray, members: IntArray) -> UnitRows:
@@ -151,14 +156,6 @@ def predicted(free: Unknowns, solution: Solution, seen: Decomposition) -> Predic
     P = V[:, used] @ V[:, used].T + motions.kept @ V[:, ~used].T
     kept = moves[at.reached] @ P
     return Predicted(kept[:, :3], kept[:, 3:], free.robot.size, motions.frames)
-
-
-def _drawn(poses: int, k: int, rng: np.random.Generator) -> IntArray:
-    """Members (poses, k): every pose once first, with k - 1 others drawn at random."""
-    others = rng.integers(1, poses, (poses, k - 1))
-    if k > 2:
-        others = np.stack([rng.choice(np.arange(1, poses), k - 1, replace=False) for _ in range(poses)])
-    return np.concatenate([np.arange(poses)[:, None], (np.arange(poses)[:, None] + others) % poses], axis=1)
 
 
 def _local(mounted: Instrument, members: IntArray) -> LocalUnknowns:

@@ -2,6 +2,7 @@
 """How many poses: expected errors of good designs against their number, and the fewest that reach a goal.
 
 The relaxed design bounds what any choice of so many poses can reach, and so says below how many a goal is out of reach.
+Where poses are compared, pairs are counted in their place: few poses make many pairs, and a bound on pairs is none on poses.
 """
 
 from __future__ import annotations
@@ -32,17 +33,18 @@ DIMENSION = {"pose": Dimension.LENGTH, "position": Dimension.LENGTH, "orientatio
 
 @dataclass(frozen=True, eq=False)
 class PoseCurve:
-    """Expected errors by the number of poses.
+    """Expected errors by the number of poses, or of pairs where poses are compared.
 
     Attributes
     ----------
-    poses : (k,) numbers, ascending. expected : of a good design of each. target : which error was made small.
-    values, bounds : (k,) that error [m, rad], and the smallest that any choice of so many of the candidates can have.
-    goal : asked for [m, rad], or None. enough : of the numbers the fewest found that reach it. at_least : poses without
-        which it cannot be reached.
+    numbers : (k,) of poses or pairs, ascending. expected : of a good design of each. target : which error was made small.
+    values, bounds : (k,) that error [m, rad], and the smallest that any choice of so many of those considered can have.
+    goal : asked for [m, rad], or None. enough : of the numbers the fewest found that reach it. at_least : number below
+        which no choice of those considered reaches it. together : poses that are compared; 1 where each counts alone.
+    considered : poses or pairs to choose from.
     """
 
-    poses: IntArray
+    numbers: IntArray
     expected: tuple[Accuracy, ...]
     target: Target
     values: FloatArray
@@ -50,21 +52,31 @@ class PoseCurve:
     goal: float | None = None
     enough: int | None = None
     at_least: int | None = None
+    together: int = 1
+    considered: int = 0
+
+    @property
+    def counted(self) -> str:
+        """What the numbers count."""
+        return counted(self.together)
 
     def sentences(self, robot: Mechanism) -> list[str]:
         """Say what the curve shows."""
         if self.goal is not None:
             goal = in_unit(robot, self.goal, DIMENSION[self.target])
-            reached = f"{self.enough} poses reach an expected {self.target} error of {goal} (rms)"
-            return [f"{reached}; no choice of fewer than {self.at_least} of the candidates can"]
-        pairs = zip(self.poses.tolist(), self.expected, strict=True)
-        return [f"expected errors by number of poses: {'; '.join(f'{n}: {in_words(robot, e)}' for n, e in pairs)}"]
+            reached = f"{self.enough} {self.counted} reach an expected {self.target} error of {goal} (rms)"
+            among = "candidates" if self.together == 1 else f"{self.considered} {self.counted} considered"
+            return [f"{reached}; no choice of fewer than {self.at_least} of the {among} can"]
+        found = "; ".join(f"{n}: {in_words(robot, e)}" for n, e in zip(self.numbers.tolist(), self.expected, strict=True))
+        return [f"expected errors by number of {self.counted}: {found}"]
 
     def to_dict(self) -> dict[str, Any]:
         """Everything by name for JSON, SI."""
         return {
             "target": self.target,
-            "poses": self.poses.tolist(),
+            "counted": self.counted,
+            "considered": self.considered,
+            "numbers": self.numbers.tolist(),
             "position": [e.position for e in self.expected],
             "orientation": [e.orientation for e in self.expected],
             "values": self.values.tolist(),
@@ -107,9 +119,10 @@ def poses_needed(made: Problem, goal: float, target: Target, seed: int = 1) -> P
     except EstimationError:
         best = design_curve(rows, [most], wanted, made.start, seed, 0)
         robot, dimension = made.free.robot, DIMENSION[target]
+        considered = "" if k == 1 else f" of the {int(allowed(rows).sum())} considered"
         raise EstimationError(
-            f"an expected {target} error of {in_unit(robot, goal, dimension)} (rms) is out of reach: {most * k} poses leave "
-            f"{in_unit(robot, float(np.sqrt(best.values[0])), dimension)}, and no choice of so many less than "
+            f"an expected {target} error of {in_unit(robot, goal, dimension)} (rms) is out of reach: {most} {counted(k)} leave "
+            f"{in_unit(robot, float(np.sqrt(best.values[0])), dimension)}, and no choice of so many{considered} less than "
             f"{in_unit(robot, float(np.sqrt(best.bounds[0])), dimension)}; take a better instrument, or ask for less"
         ) from None
     n = max(found.n, made.fewest)
@@ -122,6 +135,11 @@ def poses_needed(made: Problem, goal: float, target: Target, seed: int = 1) -> P
         values = np.where(curve.numbers == n, np.minimum(curve.values, found.certified.design.value), curve.values)
         curve = replace(curve, designs=designs, values=values)
     return _curve(made, curve, target, goal, n, found.at_least)
+
+
+def counted(together: int) -> str:
+    """Return what a plan counts where so many poses are measured together."""
+    return {1: "poses", 2: "pairs"}.get(together, f"sets of {together} poses")
 
 
 def in_unit(robot: Mechanism, value: float, dimension: Dimension) -> str:
@@ -144,11 +162,10 @@ def _curve(
     enough_: int | None = None,
     at_least: int | None = None,
 ) -> PoseCurve:
-    """Return a curve in poses and errors."""
-    k = made.poses_in_unit
+    """Return a curve in errors."""
     expected = [made.accuracy(one.design.chosen) for one in found.designs]
     assert all(e is not None for e in expected)  # no design leaves a direction open
     known = tuple(e for e in expected if e is not None)
     values, bounds = np.sqrt(found.values), np.sqrt(np.maximum(found.bounds, 0.0))
-    counts = [None if units is None else units * k for units in (enough_, at_least)]
-    return PoseCurve(found.numbers * k, known, target, values, bounds, goal, *counts)
+    counts = made.poses_in_unit, int(allowed(made.units.rows).sum())
+    return PoseCurve(found.numbers, known, target, values, bounds, goal, enough_, at_least, *counts)

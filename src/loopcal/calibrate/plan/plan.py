@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from loopcal.calibrate.plan.certified import certified_design
 from loopcal.calibrate.plan.constraints import Constraints
 from loopcal.calibrate.plan.criteria import A, Criterion, E, I, evaluate
-from loopcal.calibrate.plan.design import Start, design_factor
-from loopcal.calibrate.plan.needed import pose_curve, poses_needed
+from loopcal.calibrate.plan.design import Start, allowed, design_factor
+from loopcal.calibrate.plan.needed import counted, pose_curve, poses_needed
 from loopcal.calibrate.plan.order import Visit, visiting_order
 from loopcal.calibrate.plan.problem import Accuracy, Problem, Target, problem
 from loopcal.calibrate.plan.record import Plan
@@ -24,7 +24,7 @@ from loopcal.errors import EstimationError
 from loopcal.linalg import FloatArray, IntArray
 from loopcal.measure import Instrument, Measurements
 from loopcal.mechanism import Mechanism
-from loopcal.units import unit
+from loopcal.units import Dimension, unit
 
 SHAKES = 10
 """Times that a design is shaken out of local optima: more gain some tenths of a per cent."""
@@ -32,8 +32,8 @@ GAP = 5e-3
 """Of the efficiency, up to which the bound is computed."""
 DRAWS = 20
 """Sets of evenly drawn poses that a plan is compared with."""
-DECIMALS = 6
-"""Of readings: a nanometre in millimetres, less than two hundredths of a microradian in degrees."""
+DIGITS = 8
+"""Decimal places of the robot's size, in its unit, or of a radian, to which readings are stated."""
 MORE = 12
 """Times that poses are added where those found do not reach a goal when some are held out."""
 HELD_OUT = 4
@@ -101,16 +101,16 @@ def planned_for(
     """
     needed = poses_needed(made, goal, target, seed)
     assert needed.enough is not None  # a goal was given
-    n = needed.enough
+    n, k = needed.enough, made.poses_in_unit
     # poses to judge by are taken from the candidates, and D is not what the goal counts: both can cost some more poses
     for _ in range(MORE):
-        found = planned(made, n, criterion, hold_out=hold_out, target=target, seed=seed)
+        found = planned(made, n * k, criterion, hold_out=hold_out, target=target, seed=seed)
         if found.expected.of(target, made.wanted.size) <= goal:
             return replace(found, curve=replace(needed, enough=n))
-        n += max(n // 20, 1) * made.poses_in_unit
+        n += max(n // 20, 1)
     raise EstimationError(
-        f"{n} poses chosen by criterion {criterion} do not reach the error that {needed.enough} could; hold out fewer, or use "
-        "criterion I"
+        f"{n} {counted(k)} chosen by criterion {criterion} do not reach the error that {needed.enough} could; hold out fewer, "
+        "or use criterion I"
     )
 
 
@@ -133,7 +133,7 @@ def planned(
     kept_back = _drawn_to_judge(made, held // k, rng)
     rows = np.array(made.units.rows)
     rows[np.isin(made.units.members, made.units.members[kept_back]).any(axis=1)] = np.nan
-    _require_candidates(rows, n, n_poses)
+    _require_candidates(rows, n, k)
     best = certified_design(rows, n, wanted, made.start, seed, SHAKES, gap=GAP)
     chosen = best.design.chosen
     expected = made.accuracy(chosen)
@@ -146,18 +146,20 @@ def planned(
         readings=_typed(made.free.robot, made.candidates.solution.q[visited]),
         held_out=np.isin(visited, made.units.members[kept_back]),
         via_home=visit.via_home,
-        labels=tuple(str(i + 1) for i in range(len(visited))),
+        labels=_names(made, len(visited)),
         units=units,
         criterion=criterion,
-        figures=_figures(made, rows[chosen], made.start),
+        figures=_figures(made, rows[chosen], made.start, target),
         efficiency=min(best.efficiency, 1.0),
         expected=expected,
         before=made.accuracy(np.zeros(0, dtype=np.int64)),
-        even=_even(made, n, wanted, rng),
+        even=_even(made, n, wanted, target, rng),
         length=visit.length,
         seed=seed,
         notes=_notes(made),
         curve=pose_curve(made, n_poses, target, seed) if curve else None,
+        target=target,
+        considered=int(allowed(rows).sum()),
     )
 
 
@@ -192,13 +194,13 @@ def _drawn_to_judge(made: Problem, count: int, rng: np.random.Generator) -> IntA
     return np.array(found, dtype=np.int64)
 
 
-def _require_candidates(rows: FloatArray, n: int, n_poses: int) -> None:
-    """Refuse more poses than there are to choose from."""
+def _require_candidates(rows: FloatArray, n: int, k: int) -> None:
+    """Refuse more units of k poses than there are to choose from."""
     left = int(np.isfinite(rows).all(axis=(1, 2)).sum())
     if left < n:
         raise EstimationError(
-            f"{n_poses} poses were asked for, but only {left} are left to choose from; ask for fewer, hold out fewer, or relax "
-            "a constraint"
+            f"{n} {counted(k)} were asked for, but only {left} are left to choose from; ask for fewer, hold out fewer, or "
+            "relax a constraint"
         )
 
 
@@ -214,24 +216,33 @@ def _visited(made: Problem, units: IntArray) -> tuple[IntArray, Visit, IntArray]
 
 
 def _typed(robot: Mechanism, readings: FloatArray) -> FloatArray:
-    """Round readings (m, a) to DECIMALS of the robot's units, which a person can type and no instrument tells apart."""
+    """Round readings (m, a) to DIGITS in the robot's units, which a person can type and no instrument tells apart."""
     factors = np.array([unit(robot.units[actuator.dimension]).factor_to_si for actuator in robot.actuators])
-    return np.round(readings / factors, DECIMALS) * factors
+    scale = np.array([robot.size if actuator.dimension is Dimension.LENGTH else 1.0 for actuator in robot.actuators])
+    steps = 10.0 ** (np.floor(np.log10(scale / factors)) - DIGITS)
+    # + 0: no reading is -0
+    return np.round(readings / factors / steps) * steps * factors + 0.0
 
 
-def _figures(made: Problem, rows: FloatArray, start: Start) -> dict[str, float]:
+def _names(made: Problem, count: int) -> tuple[str, ...]:
+    """Return names of poses: numbers, which go on behind the largest that was measured already."""
+    numbers = [int(name) for name in made.taken if name.isdecimal()]
+    return tuple(str(max(numbers, default=0) + i) for i in range(1, count + 1))
+
+
+def _figures(made: Problem, rows: FloatArray, start: Start, target: Target) -> dict[str, float]:
     """Return D, I, A and E of a design."""
     factor, machine = design_factor(rows, start, made.space), made.space.machine
-    criteria: tuple[Criterion, ...] = (made.criterion("D"), made.criterion("I"), A(), E())
+    criteria: tuple[Criterion, ...] = (made.criterion("D"), made.criterion("I", target), A(), E())
     return {c.name: evaluate(c, factor, machine) for c in criteria}
 
 
-def _even(made: Problem, n: int, wanted: Criterion, rng: np.random.Generator) -> Accuracy | None:
+def _even(made: Problem, n: int, wanted: Criterion, target: Target, rng: np.random.Generator) -> Accuracy | None:
     """Return the errors of the median, by I, of some sets of n units of evenly drawn poses; None where there are too few."""
     even = np.flatnonzero(made.candidates.even[made.units.members].all(axis=1) & np.isfinite(made.units.rows).all(axis=(1, 2)))
     if len(even) < n:
         return None
-    by = wanted if isinstance(wanted, I) else made.criterion("I")
+    by = wanted if isinstance(wanted, I) else made.criterion("I", target)
     sets = [rng.choice(even, n, replace=False) for _ in range(DRAWS)]
     values = [
         evaluate(by, design_factor(made.units.rows[chosen], made.start, made.space), made.space.machine) for chosen in sets

@@ -3,26 +3,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
-from loopcal.calibrate.outlook import information
+from loopcal.calibrate.outlook import equations, information
 from loopcal.calibrate.plan.candidates import Candidates, candidates, listed_candidates
 from loopcal.calibrate.plan.constraints import Constraints
 from loopcal.calibrate.plan.criteria import Criterion, D, I
 from loopcal.calibrate.plan.design import Directions, Start, design_factor, directions, triangle
-from loopcal.calibrate.plan.information import Predicted, UnitRows, knowable, predicted, start_of, unit_rows, units_of
+from loopcal.calibrate.plan.information import Predicted, UnitRows, considered, knowable, predicted, start_of
 from loopcal.calibrate.scaling import Unknowns, unknowns
 from loopcal.errors import DataError, EstimationError
 from loopcal.linalg import Decomposition, FloatArray
 from loopcal.measure import Instrument, Measurements, check_actuators
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism import Mechanism, Solution, inverse
+from loopcal.mechanism.workspace import sample
 
 PREDICTED = 200
-"""Poses of the workspace at most whose errors are predicted."""
+"""Poses of the workspace whose errors are predicted."""
+NOTHING = 1e-6
+"""Largest singular value, in information per tolerance, up to which an instrument tells nothing: what is left is rounding."""
+STILL = 1e-9
+"""Share of a pose's error up to which its position or orientation does not change at all: what is left is rounding."""
 
 Target = Literal["pose", "position", "orientation"]
 
@@ -54,7 +60,8 @@ class Problem:
     ----------
     free : the robot's unknowns. instrument : mounted on its tool. candidates : poses that may be measured.
     units : their rows. start : what is known before. seen : what all candidates together could tell, without tolerances.
-    wanted : what is to be predicted. equations : rows that were measured already.
+    wanted : what is to be predicted. equations : that measurements made already give of the robot, those taken off that
+        their own unknowns need. taken : names of poses that were measured already.
     """
 
     free: Unknowns
@@ -65,6 +72,7 @@ class Problem:
     seen: Decomposition
     wanted: Predicted
     equations: int
+    taken: tuple[str, ...] = ()
 
     @cached_property
     def space(self) -> Directions:
@@ -84,8 +92,19 @@ class Problem:
             raise EstimationError(
                 f"the criterion is {name!r}; allowed are I (mean predicted variance of poses) and D (volume of uncertainty)"
             )
+        if target != "pose" and not self._shown(target) > STILL * self._shown("pose"):
+            moves, other = ("turn", "a length") if target == "orientation" else ("move its tool", "an angle")
+            raise EstimationError(
+                f"no {target} is to be predicted: {self.free.robot.name} does not {moves}, or this instrument cannot tell by "
+                f"how much; give {other}, or choose another kind"
+            )
         # the triangular factor of the rows gives the same trace from fewer rows
         return I(triangle(getattr(self.wanted, target)), len(self.wanted.shifts))
+
+    def _shown(self, target: Target) -> float:
+        """Return how much errors of the parameters show in a target, turns times the size [m]."""
+        rows = getattr(self.wanted, target)
+        return float(np.abs(rows).max(initial=0.0)) * (self.wanted.size if target == "orientation" else 1.0)
 
     def accuracy(self, chosen: np.ndarray) -> Accuracy | None:
         """Return the predicted errors after measuring units (n,), none at all allowed; None where nothing bounds them."""
@@ -142,6 +161,7 @@ def problem(
     measured: Measurements | None = None,
     count: int = 1000,
     seed: int = 1,
+    taken: Sequence[str] = (),
 ) -> Problem:
     """Make a planning problem ready.
 
@@ -151,11 +171,17 @@ def problem(
     instrument : what will measure, with its noise. constraints : what poses must keep to.
     poses : (n, c) controlled coordinates that are allowed [m, rad]; default: about `count` drawn from the workspace.
     measured : measurements that were made already; the instrument is taken to be set up anew after them.
+    taken : names that new poses may not get, beside those of `measured`, such as of poses held out there.
+
+    Errors are predicted for PREDICTED poses drawn evenly from the workspace within the machine's own limits, wherever
+    `constraints` allow to measure; of given poses, for as many of them drawn at random.
 
     Raises
     ------
     EstimationError
-        The robot has no free parameter. MechanismError, DataError: see `candidates`, `units_of`.
+        The robot has no free parameter, or this instrument tells nothing of those there are.
+    MechanismError, DataError
+        See `candidates`, `considered`.
     """
     free = unknowns(robot)
     if not len(free):
@@ -167,19 +193,47 @@ def problem(
     rng = np.random.default_rng(seed)
     found = candidates(robot, constraints, count, rng) if poses is None else listed_candidates(robot, poses, constraints)
     mounted = instrument.mounted(robot)
-    units = unit_rows(free, mounted, found.solution.q, units_of(len(found), mounted, rng))
-    known, equations = None, 0
-    if measured is not None:
-        check_actuators(measured, robot)
-        factor, reached = information(free, measured)
-        if not reached.all():
-            lost = measured.labels[int(np.flatnonzero(~reached)[0])]
-            raise DataError(
-                f"{robot.name} does not reach the measured pose {lost!r} with the readings given there; correct the readings, "
-                "or plan with the calibrated robot file"
-            )
-        known, equations = factor[0, :-1, :-1], measured.n_rows
-    seen = knowable(free, units, known)
-    some = np.flatnonzero(found.even)[:PREDICTED]
-    wanted = predicted(free, found.solution.take(some), seen)
-    return Problem(free, mounted, found, units, start_of(free, units, known), seen, wanted, equations)
+    units = considered(free, mounted, found.solution.q, rng)
+    told = knowable(free, units)
+    if not told.singular_values.max(initial=0.0) > NOTHING:
+        kinds = ", ".join(sensor.kind.name for sensor in mounted.sensors)
+        raise EstimationError(
+            f"an instrument of kind {kinds} tells nothing of the {len(free)} free parameters of {robot.name} at any of "
+            f"{len(found)} poses; choose another kind"
+        )
+    known, given = (None, 0) if measured is None else _known(free, measured)
+    seen = told if known is None else knowable(free, units, known)
+    wanted = predicted(free, _to_predict(found, poses, seed), seen)
+    names = tuple(dict.fromkeys([*(() if measured is None else measured.labels), *taken]))
+    return Problem(free, mounted, found, units, start_of(free, units, known), seen, wanted, given, names)
+
+
+def _known(free: Unknowns, measured: Measurements) -> tuple[FloatArray, int]:
+    """Return the factor (p, p) of measurements made already, and how many equations they leave for the robot."""
+    robot = free.robot
+    check_actuators(measured, robot)
+    if not measured.n_rows:
+        raise DataError("what is said to be measured already holds no measured value; fill it in, or leave it out")
+    factor, reached = information(free, measured)
+    if not reached.all():
+        lost = measured.labels[int(np.flatnonzero(~reached)[0])]
+        raise DataError(
+            f"{robot.name} does not reach the measured pose {lost!r} with the readings given there; correct the readings, "
+            "or plan with the calibrated robot file"
+        )
+    table = measured.unknowns.table
+    own = int((table.free & np.isnan(table.tolerance)).sum())
+    return factor[0, :-1, :-1], max(equations(robot, measured) - own, 0)
+
+
+def _to_predict(found: Candidates, poses: FloatArray | None, seed: int) -> Solution:
+    """Return the poses whose errors are predicted; they depend neither on constraints nor on the candidates drawn."""
+    robot = found.rules.robot
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
+    if poses is None:
+        return sample(robot, PREDICTED, rng).solution
+    listed = np.unique(poses, axis=0)
+    solution = inverse(robot, listed)
+    bare = replace(found.rules, constraints=Constraints(min_margin=0.0))
+    reached = np.flatnonzero(bare.judge(solution).allowed)
+    return solution.take(np.sort(rng.permutation(reached)[:PREDICTED]))
