@@ -8,7 +8,9 @@ import pytest
 
 from loopcal.calibrate import MAP, LeastSquares, identify, start_check
 from loopcal.calibrate.descent import StepControl
+from loopcal.calibrate.prior import prior_from
 from loopcal.calibrate.start_check import Start
+from loopcal.errors import EstimationError
 from tests.calibrate.problems import hexapod, hexapod_data
 
 ONE_STEP = StepControl(iterations=1)
@@ -34,6 +36,11 @@ def test_a_fit_that_did_not_converge_says_nothing_of_the_noise_and_gives_no_inte
         assert ("--method map" in notes) == (method == LeastSquares())
         assert start_check(fit).verdict is Start.OPEN
         assert "did not converge" in start_check(fit).sentence
+
+
+def test_a_fit_that_did_not_converge_cannot_be_a_prior():
+    with pytest.raises(EstimationError, match="gives no uncertainty .it did not converge"):
+        prior_from(identify(hexapod(), hexapod_data(12), control=ONE_STEP).posterior)
 
 
 def test_an_estimate_far_outside_its_stated_tolerance_is_named_with_the_remedy():

@@ -131,8 +131,8 @@ def prior_from(earlier: Posterior) -> Prior:
     """
     if np.isnan(earlier.variance).any():
         raise EstimationError(
-            "the earlier calibration gives no uncertainty (too few degrees of freedom to estimate its noise), so it cannot be"
-            " a prior; make it again with the instrument's sigma"
+            "the earlier calibration gives no uncertainty (it did not converge, or too few degrees of freedom tell its noise),"
+            " so it cannot be a prior; make it again until it converges, with the instrument's sigma"
         )
     known = np.isfinite(earlier.variance)
     rows = np.linalg.inv(earlier.directions)[known] / np.sqrt(earlier.variance[known])[:, None] / earlier.unit
