@@ -103,6 +103,8 @@ def test_json_is_one_document_with_the_names_of_the_plan(here, capsys):
     document = json.loads(capsys.readouterr().out)
     assert document["n_poses"] == 8
     assert document["criterion"] == "I"
+    assert document["target"] == "pose"
+    assert document["format"] == 1
     assert 0.5 < document["efficiency"] <= 1.0
     assert document["expected"]["after"]["position"] < document["expected"]["before"]["position"]
     written = json.loads((here / "plan" / "plan.json").read_text())
@@ -125,6 +127,9 @@ def test_an_earlier_data_file_describes_the_instrument_and_counts_as_measured(he
         ("--accuracy 20", "unit"),
         ("--accuracy 1nm --kind position --candidates 30", "out of reach"),
         ("--kind posse", "did you mean 'pose'"),
+        ("--kind locked", "tells nothing of the 9 free parameters of linear-delta"),
+        ("--accuracy 10urad --kind position --candidates 30", "does not turn"),
+        ("--like robot.yaml", "is no measurement file"),
         ("--groups 3", "belong to --measure plane-line"),
         ("--measure plane-line --poses 10", "--poses does not go with --measure plane-line"),
         ("--measure plane-line --poses 0", "--poses does not go with --measure plane-line"),
@@ -192,6 +197,44 @@ def test_force_never_removes_what_was_measured_or_written_by_hand(here, capsys):
     (here / "plan" / "plan.json").write_text(json.dumps(document))
     assert main(again) == 1
     assert data.read_text() == empty
+
+
+def test_a_second_plan_goes_on_where_the_first_was_measured(here, capsys):
+    first = ["plan", "linear-delta", "-o", "one", "--poses", "8", "--hold-out", "4", "--candidates", "40", "--kind", "position"]
+    assert main(first) == 0
+    assert run("plan linear-delta -o two --kind position --poses 2 --candidates 40 --measured one/measurements.csv") == 1
+    assert "one/measurements.csv holds no measured value" in capsys.readouterr().err
+    fill = "simulate linear-delta --draw-errors --seed 2 --fill {}/measurements.csv -o {}.csv"
+    assert run(fill.format("one", "one")) == 0
+    capsys.readouterr()
+    assert run("plan linear-delta -o two --kind position --poses 2 --hold-out 1 --candidates 40 --measured one.csv") == 0
+    said = capsys.readouterr().out
+    assert "then: loopcal calibrate linear-delta one.csv two/measurements.csv -o run" in said
+    names = [row["pose"] for row in rows_of(here / "two" / "measurements.csv")]
+    assert names == ["13", "14", "15"]
+    # what the first plan promised of its 8 poses; the 4 that it holds out are not counted as known
+    promised = json.loads((here / "one" / "plan.json").read_text())["expected"]["after"]["position"]
+    known = json.loads((here / "two" / "plan.json").read_text())["expected"]["before"]["position"]
+    assert known == pytest.approx(promised, rel=1e-3)
+    assert run(fill.format("two", "two")) == 0
+    assert run("calibrate linear-delta one.csv two.csv -o run") == 0
+    assert "Errors on 5 unseen rows" in capsys.readouterr().out
+
+
+def test_the_data_file_states_the_digits_of_the_sheet(here):
+    assert main(["plan", "hexapod-42", "-o", "plan", "--poses", "10", "--candidates", "30"]) == 0
+    sheet = [row for row in rows_of(here / "plan" / "plan.csv") if row["use"] != "via"]
+    data = rows_of(here / "plan" / "measurements.csv")
+    columns = [f"q{i} [mm]" for i in range(1, 7)]
+    assert [[row[c] for c in columns] for row in data] == [[row[c] for c in columns] for row in sheet]
+    cells = [cell for row in sheet for name, cell in row.items() if "[" in name]
+    assert all(len(cell) <= 11 for cell in cells)  # sign, point and nine digits
+    assert "-0" not in cells
+
+
+def test_the_sheet_says_that_a_tilt_goes_straight_by_its_vector(here):
+    assert main(["plan", "3-prs", "-o", "plan", "--poses", "8", "--hold-out", "0", "--candidates", "30"]) == 0
+    assert "## z, theta*cos(phi), theta*sin(phi). use:" in (here / "plan" / "plan.csv").read_text()
 
 
 def test_the_column_use_is_checked_and_not_overruled(here, capsys):

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import functools
 import math
+import shlex
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -23,7 +24,7 @@ from loopcal.units import Dimension, quantity
 if TYPE_CHECKING:
     from loopcal.calibrate.plan.constraints import Constraints
     from loopcal.calibrate.plan.record import Plan
-    from loopcal.measure import Instrument
+    from loopcal.measure import Instrument, Measurements
     from loopcal.mechanism import Mechanism
 
 POSES = 40
@@ -154,7 +155,7 @@ def plan(
       loopcal plan hexapod-nategh-agheli -o plan --measure plane-line --groups 10 --points 8 --sigma-position 1um
     """  # noqa: D301
     from loopcal.io import load_robot
-    from loopcal.io.plan_folder import refuse_plan_folder
+    from loopcal.io.plan_folder import FORMAT, refuse_plan_folder
 
     refuse_plan_folder(output, force)
     machine = load_robot(robot)
@@ -173,17 +174,20 @@ def plan(
     made = _planned(machine, looking, allowed, measured, seed, options)
     _write(output, made, _inputs(robot, like, allowed, measured), force)
     if as_json:
-        show.json_document(made.to_dict())
+        show.json_document({"format": FORMAT, **made.to_dict()})
         return
     show.say(str(made))
     show.say(f"\nwritten to {output}: plan.csv to measure by, measurements.csv to fill in, plan.json, pictures")
-    show.say(f"then: loopcal calibrate {robot} {output / 'measurements.csv'} -o run")
+    files = shlex.join(str(path) for path in (*measured, output / "measurements.csv"))
+    show.say(f"then: loopcal calibrate {shlex.quote(robot)} {files} -o run")
 
 
 def _instrument(robot: Mechanism, like: Path | None, options: Mapping[str, Any]) -> Instrument:
     """Return the instrument that the options, or the settings of a file, describe."""
     from loopcal.io.instrument_file import load_instrument
 
+    if like is not None and like.suffix in (".yaml", ".yml"):
+        raise DataError(f"--like {like} is no measurement file, which is CSV; its settings stand in front of or beside it")
     names = ("measure", "frames", "kind", "components", "orientation", "sigma_position", "sigma_angle")
     if like is None:
         return assumed_instrument(**{name: options[name] for name in names})
@@ -205,7 +209,6 @@ def _planned(
     """Plan as the options ask."""
     from loopcal.calibrate.plan.plan import planned, planned_for
     from loopcal.calibrate.plan.problem import problem
-    from loopcal.cli.options import measurements
     from loopcal.io.measurement_file import load_poses
 
     goal, n = options["accuracy"], options["poses"]
@@ -214,12 +217,27 @@ def _planned(
     if goal is not None and options["curve"]:
         raise DataError("--accuracy shows its own curve; leave out --curve")
     poses = None if allowed is None else load_poses(allowed, robot)
-    before = measurements(measured, robot) if measured else None
-    made = problem(robot, looking, options["asked"].constraints(), poses, before, options["candidates"], seed)
+    before, taken = (None, ()) if not measured else _known(measured, robot)
+    made = problem(robot, looking, options["asked"].constraints(), poses, before, options["candidates"], seed, taken)
     criterion, held = options["criterion"], options["hold_out"]
     if goal is not None:
         return planned_for(made, goal[0], goal[1], criterion, hold_out=held, seed=seed)
     return planned(made, POSES if n is None else n, criterion, hold_out=held, curve=options["curve"], seed=seed)
+
+
+def _known(measured: Sequence[Path], robot: Mechanism) -> tuple[Measurements, tuple[str, ...]]:
+    """Return what earlier files measured of poses to fit, and the names of all their poses."""
+    from loopcal.cli.options import measurements
+    from loopcal.io.use_column import held_out_poses
+
+    found = measurements(measured, robot)
+    if not found.n_rows:
+        raise DataError(f"--measured {' '.join(map(str, measured))} holds no measured value; fill it in, or leave it out")
+    held = held_out_poses(measured)
+    fitted = [i for i, label in enumerate(found.labels) if label not in set(held)]
+    if not fitted:
+        raise DataError(f"--measured {' '.join(map(str, measured))} holds all its poses out; leave some to fit")
+    return (found.take(fitted) if held else found), found.labels
 
 
 def _inputs(robot: str, like: Path | None, allowed: Path | None, measured: tuple[Path, ...]) -> dict[str, Path]:

@@ -23,6 +23,7 @@ from loopcal.errors import FileError
 from loopcal.io.csv_table import quoted
 from loopcal.io.json_text import to_json
 from loopcal.io.measurement_writer import to_fill_in_text
+from loopcal.io.numbers import exact
 from loopcal.io.pose_rows import dimension_of
 from loopcal.io.text_file import sha256, writing
 from loopcal.io.use_column import FIT, HELD_OUT, USE, with_use
@@ -37,7 +38,8 @@ SHEET, DATA, RESULT = "plan.csv", "measurements.csv", "plan.json"
 OWN = (SHEET, DATA, RESULT, "plan.png", "curve.png")
 """All files that a plan's folder holds."""
 VIA = "via"
-DIGITS = 9
+DIGITS = 12
+"""Significant ones at most of a number: more than it was rounded to, less than a double has."""
 
 
 def sheet_text(plan: Plan) -> str:
@@ -58,12 +60,12 @@ def sheet_text(plan: Plan) -> str:
         stops.append((label, HELD_OUT if plan.held_out[i] else FIT, plan.coordinates[i], plan.readings[i]))
     lines = [
         f"## Poses of {robot.name} to measure, in this order, from home; between two of them the machine moves straight in",
-        f"## {', '.join(robot.controlled)}. use: {FIT} and {HELD_OUT} are measured alike; {VIA} is only passed through.",
+        f"## {straight_in(robot)}. use: {FIT} and {HELD_OUT} are measured alike; {VIA} is only passed through.",
         ",".join(["step", "pose", USE, *headers]),
     ]
     factors = [factor for _, factor in (*commanded, *reading)]
     for step, (label, use, x, q) in enumerate(stops, 1):
-        numbers = (f"{value / factor:.{DIGITS}g}" for value, factor in zip((*x, *q), factors, strict=True))
+        numbers = (_text(value, factor) for value, factor in zip((*x, *q), factors, strict=True))
         lines.append(",".join([str(step), quoted(label), use, *numbers]))
     return "\n".join(lines) + "\n"
 
@@ -72,8 +74,23 @@ def data_text(plan: Plan) -> str:
     """Return the data file to fill in."""
     sensors = plan.instrument.sensors
     looking = tuple(replace(s, rows=plan.units) if s.kind.links > 1 else s for s in sensors)
-    text = to_fill_in_text(plan.robot, replace(plan.instrument, sensors=looking), plan.readings, plan.labels)
+    factors = [unit_of(plan.robot, actuator.dimension)[1] for actuator in plan.robot.actuators]
+    # the doubles that the texts of the sheet stand for, so that both files say the same digits
+    readings = [[exact(_text(q, f), f) for q, f in zip(row, factors, strict=True)] for row in plan.readings.tolist()]
+    text = to_fill_in_text(plan.robot, replace(plan.instrument, sensors=looking), readings, plan.labels)
     return with_use(text, {label: HELD_OUT if held else FIT for label, held in zip(plan.labels, plan.held_out, strict=True)})
+
+
+def straight_in(robot: Mechanism) -> str:
+    """Say in what a way is straight; a tilt by phi and theta goes by its vector, see `loopcal.calibrate.plan.paths`."""
+    names = [name for name in robot.controlled if name not in ("phi", "theta")]
+    tilt = ["theta*cos(phi)", "theta*sin(phi)"] if "phi" in robot.controlled else []
+    return ", ".join([*names, *tilt])
+
+
+def _text(value: float, factor: float) -> str:
+    """Return a number [SI] in its unit, as short as it was rounded."""
+    return f"{value / factor + 0.0:.{DIGITS}g}"
 
 
 def refuse_plan_folder(path: Path, force: bool) -> None:

@@ -112,3 +112,9 @@ def test_evidence_certified_designs_of_shipped_robots(root: Path) -> None:
     for row in table["rows"]:
         assert row[certified] >= row[best] - 1e-6, row  # to a millionth of the efficiency
         assert row[:3] != ["hexapod-42", "full pose", "D"] or row[certified] >= 0.95
+
+
+def test_units_that_tell_nothing_leave_what_is_known_before() -> None:
+    found = certified_design(np.zeros((6, 2, 3)), 2, D(), Start.tolerances(3))
+    assert found.efficiency == 1.0
+    assert found.design.value == pytest.approx(0.0, abs=1e-12)  # log det of the unit matrix

@@ -112,6 +112,8 @@ def _solve(scoring: Scoring, ready: FloatArray, n: int, gap: float, repeats: boo
         d, d0, score = _slopes(scoring, ready, w)
         bound = min(bound, _bound(scoring, d, d0, score, n, repeats))
         w = w * np.sqrt(d)
+        if not w.sum() > 0.0:  # no unit tells anything beside the start: all designs are alike
+            return _Solution(np.full(N, n / N), d, score, score, 0)
         w *= n / w.sum()
     chosen = _begin(scoring, ready, w, n)
     inside = np.full(len(chosen), n / len(chosen))
