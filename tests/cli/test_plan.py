@@ -119,6 +119,17 @@ def test_an_earlier_data_file_describes_the_instrument_and_counts_as_measured(he
     assert "leave out --kind" in capsys.readouterr().err
 
 
+def test_surfaces_that_each_group_has_of_its_own_describe_no_instrument_to_plan_with(here, capsys):
+    settings = "# kind: plane\n# unknown: [surface]\n# noise: {gap: 1 um}\npose,group,q1 [mm],q2 [mm],q3 [mm],gap [mm]\n"
+    for groups, code in ((("a", "b"), 1), (("a", "a"), 0)):
+        text = settings + "".join(f"{i},{group},1,1,1,0\n" for i, group in enumerate(groups))
+        (here / "groups.csv").write_text(text)
+        assert run("plan linear-delta -o plan --poses 12 --hold-out 0 --candidates 40 --like groups.csv --force") == code
+    (here / "groups.csv").write_text(text.replace("1,a,", "1,b,"))
+    assert run("plan linear-delta -o other --like groups.csv") == 1
+    assert "plan planes and lines with --measure plane-line" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -130,6 +141,7 @@ def test_an_earlier_data_file_describes_the_instrument_and_counts_as_measured(he
         ("--kind locked", "tells nothing of the 9 free parameters of linear-delta"),
         ("--accuracy 10urad --kind position --candidates 30", "does not turn"),
         ("--like robot.yaml", "is no measurement file"),
+        ("--accuracy=-5um", "the accuracy asked for is -0.005 mm"),
         ("--groups 3", "belong to --measure plane-line"),
         ("--measure plane-line --poses 10", "--poses does not go with --measure plane-line"),
         ("--measure plane-line --poses 0", "--poses does not go with --measure plane-line"),
@@ -205,6 +217,8 @@ def test_a_second_plan_goes_on_where_the_first_was_measured(here, capsys):
     assert run("plan linear-delta -o two --kind position --poses 2 --candidates 40 --measured one/measurements.csv") == 1
     assert "one/measurements.csv holds no measured value" in capsys.readouterr().err
     fill = "simulate linear-delta --draw-errors --seed 2 --fill {}/measurements.csv -o {}.csv"
+    assert run("calibrate linear-delta one/measurements.csv -o run") == 1
+    assert "hold no measured value; fill in" in capsys.readouterr().err
     assert run(fill.format("one", "one")) == 0
     capsys.readouterr()
     assert run("plan linear-delta -o two --kind position --poses 2 --hold-out 1 --candidates 40 --measured one.csv") == 0

@@ -184,7 +184,7 @@ def plan(
 
 def _instrument(robot: Mechanism, like: Path | None, options: Mapping[str, Any]) -> Instrument:
     """Return the instrument that the options, or the settings of a file, describe."""
-    from loopcal.io.instrument_file import load_instrument
+    from loopcal.io.instrument_file import load_instrument_to_plan
 
     if like is not None and like.suffix in (".yaml", ".yml"):
         raise DataError(f"--like {like} is no measurement file, which is CSV; its settings stand in front of or beside it")
@@ -195,7 +195,7 @@ def _instrument(robot: Mechanism, like: Path | None, options: Mapping[str, Any])
     for name in names:
         if given(name) is click.core.ParameterSource.COMMANDLINE:
             raise DataError(f"--like {like} describes the instrument; leave out --{name.replace('_', '-')}, or --like")
-    return load_instrument(like, robot)
+    return load_instrument_to_plan(like, robot)
 
 
 def _planned(
