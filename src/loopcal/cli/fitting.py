@@ -88,6 +88,8 @@ class Fitting:
         if choice is not None and not choice.chosen.parameters:
             raise DataError(f"{choice.sentence}; without --choose-model it is calibrated all the same")
         free, count = int(chosen.parameters.free.sum()), equations(chosen, data)
+        if not data.n_rows:
+            raise DataError("the data hold no measured value; fill in what the instrument showed")
         if method is None and count < free:
             raise DataError(
                 f"{count} equations cannot determine {free} parameters; measure more poses, fix parameters, or let the "

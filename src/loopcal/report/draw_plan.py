@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from loopcal.calibrate.plan.candidates import home_coordinates
 from loopcal.calibrate.plan.needed import DIMENSION, PoseCurve
 from loopcal.calibrate.plan.record import Plan
 from loopcal.mechanism import Mechanism
@@ -30,17 +31,21 @@ def draw_plan(plan: Plan) -> Figure:
     columns = [plan.coordinates[:, i] / _unit(plan.robot, name).factor_to_si for i, name in enumerate(names)]
     pairs = [(i, i + 1) for i in range(0, len(names) - 1, 2)] + ([(len(names) - 1, None)] if len(names) % 2 else [])
     figure = Figure(figsize=(4.2 * len(pairs), 4.4), layout="constrained")
+    home = home_coordinates(plan.robot)
+    start = [home[i] / _unit(plan.robot, name).factor_to_si for i, name in enumerate(names)]
     step = np.arange(1, len(plan.labels) + 1)
     for place, (i, j) in enumerate(pairs, 1):
         axes: Any = figure.add_subplot(1, len(pairs), place)
         x, y = (columns[i], columns[j]) if j is not None else (step, columns[i])
-        axes.plot(x, y, color="0.7", lw=0.8, zorder=1, label="way")
+        first = (start[i], start[j]) if j is not None else (0.0, start[i])
+        axes.plot([first[0], *x], [first[1], *y], color="0.7", lw=0.8, zorder=1, label="way")
+        axes.plot(*first, "k+", ms=8.0, label="home", zorder=3)
         for chosen, colour, label in ((~plan.held_out, FITTED, "to fit"), (plan.held_out, JUDGED, "to judge by")):
             axes.plot(x[chosen], y[chosen], "o", color=colour, ms=4.5, label=label, zorder=2)
-        axes.set_xlabel(_label(plan.robot, names[i]) if j is not None else "step [1]")
+        axes.set_xlabel(_label(plan.robot, names[i]) if j is not None else "step [1], home is 0")
         axes.set_ylabel(_label(plan.robot, names[i if j is None else j]))
         axes.grid(visible=True, lw=0.3)
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=8)
     held = int(plan.held_out.sum())
     figure.suptitle(f"{plan.robot.name}: n = {plan.n_poses} poses to fit, {held} to judge by", fontsize=10)
     return figure
@@ -67,7 +72,8 @@ def draw_curve(robot: Mechanism, curve: PoseCurve) -> Figure:
         axis.set_major_formatter(ScalarFormatter())
         axis.set_minor_formatter(NullFormatter())
     axes.set_xticks(curve.numbers, [str(n) for n in curve.numbers])
-    ticks = np.geomspace(min(curve.bounds.min(), curve.goal or np.inf), curve.values.max(), 5) / shown.factor_to_si
+    low, high = min(curve.bounds.min(), curve.goal or np.inf), max(curve.values.max(), curve.goal or 0.0)
+    ticks = np.geomspace(low, high, 5) / shown.factor_to_si
     axes.set_yticks(ticks, [f"{tick:.3g}" for tick in ticks])
     axes.set_xlabel(f"{curve.counted} to fit [1]")
     words = "pose error, turns times size" if curve.target == "pose" else f"{curve.target} error"

@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 
 import loopcal as lc
 from loopcal.calibrate.outlook import scene
+from loopcal.calibrate.plan.needed import poses_needed
 from loopcal.calibrate.plan.plan import planned, planned_for
 from loopcal.calibrate.plan.problem import problem
 from loopcal.calibrate.scaling import unknowns
@@ -64,6 +65,14 @@ def test_an_orientation_that_the_machine_does_not_have_cannot_be_asked_for():
     made = problem(load_robot("linear-delta"), looking("position"), count=20)
     with pytest.raises(EstimationError, match=r"linear-delta does not turn.*give a length"):
         planned_for(made, 10 * URAD, "orientation")
+
+
+def test_where_equations_decide_the_number_of_poses_the_sentence_says_so():
+    made = problem(load_robot("linear-delta"), looking("position", 0.1 * UM), count=20)
+    found = poses_needed(made, 100 * UM, "position")
+    assert found.enough == 3
+    assert "3 poses reach" in found.sentences(made.free.robot)[0]
+    assert "fewer give fewer equations than there are unknowns" in found.sentences(made.free.robot)[0]
 
 
 def test_poses_get_names_that_were_not_measured_yet():

@@ -78,15 +78,6 @@ class Directions:
         """Own and machine directions together."""
         return self.own.shape[1] + self.machine.shape[1]
 
-    def outside(self, weights: FloatArray) -> float:
-        """Return the share, 0 to 1, of rows (k, p) in the machine's unknowns that lies in directions nothing can tell.
-
-        It is what I leaves out of its prediction: root of the sum of squares of that part over that of all.
-        """
-        whole = float((weights**2).sum())
-        inside = float(((weights @ self.machine) ** 2).sum())
-        return float(np.sqrt(max(whole - inside, 0.0) / whole)) if whole > 0.0 else 0.0
-
     def reduce(self, rows: FloatArray) -> FloatArray:
         """Return rows (..., o + p) in these directions, (..., o' + q), own ones first."""
         o = len(self.own)

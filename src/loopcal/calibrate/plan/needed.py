@@ -66,6 +66,8 @@ class PoseCurve:
             goal = in_unit(robot, self.goal, DIMENSION[self.target])
             reached = f"{self.enough} {self.counted} reach an expected {self.target} error of {goal} (rms)"
             among = "candidates" if self.together == 1 else f"{self.considered} {self.counted} considered"
+            if self.enough == self.numbers[0]:
+                return [f"{reached}; fewer give fewer equations than there are unknowns"]
             return [f"{reached}; no choice of fewer than {self.at_least} of the {among} can"]
         found = "; ".join(f"{n}: {in_words(robot, e)}" for n, e in zip(self.numbers.tolist(), self.expected, strict=True))
         return [f"expected errors by number of {self.counted}: {found}"]
@@ -110,7 +112,8 @@ def poses_needed(made: Problem, goal: float, target: Target, seed: int = 1) -> P
         The goal is no number above zero, or out of reach, with the best that can be had.
     """
     if not goal > 0.0 or not np.isfinite(goal):
-        raise EstimationError(f"the accuracy asked for is {goal:g}; give a number above 0 with its unit, such as 20um")
+        asked = in_unit(made.free.robot, goal, DIMENSION[target])
+        raise EstimationError(f"the accuracy asked for is {asked}; give a number above 0 with its unit, such as 20um")
     wanted, rows, k = made.criterion("I", target), made.units.rows, made.poses_in_unit
     most = min(MOST // k, int(allowed(rows).sum()))
     made.require_equations(most)
@@ -123,7 +126,8 @@ def poses_needed(made: Problem, goal: float, target: Target, seed: int = 1) -> P
         raise EstimationError(
             f"an expected {target} error of {in_unit(robot, goal, dimension)} (rms) is out of reach: {most} {counted(k)} leave "
             f"{in_unit(robot, float(np.sqrt(best.values[0])), dimension)}, and no choice of so many{considered} less than "
-            f"{in_unit(robot, float(np.sqrt(best.bounds[0])), dimension)}; take a better instrument, or ask for less"
+            f"{in_unit(robot, float(np.sqrt(best.bounds[0])), dimension)}; take a better instrument, "
+            "allow more candidates, or ask for less"
         ) from None
     n = max(found.n, made.fewest)
     others = np.geomspace(made.fewest, min(2 * n, int(allowed(rows).sum())), SIZES - 1).round().astype(int)

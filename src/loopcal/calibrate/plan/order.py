@@ -30,15 +30,12 @@ class Visit:
     Attributes
     ----------
     order : (n,) numbers of the poses. via_home : (n,) True where home is visited before the pose, because the straight way
-        is not allowed. length : of all ways from home to the last pose [m], see `paths.distance`. ways : number of pairs
-        that were followed. blocked : of which so many are not allowed.
+        is not allowed. length : of all ways from home to the last pose [m], see `paths.distance`.
     """
 
     order: IntArray
     via_home: NDArray[np.bool_]
     length: float
-    ways: int
-    blocked: int
 
 
 def visiting_order(rules: Rules, poses: FloatArray) -> Visit:
@@ -60,8 +57,7 @@ def visiting_order(rules: Rules, poses: FloatArray) -> Visit:
         known[first, second] = known[second, first] = True
         free[first, second] = free[second, first] = allowed
     via = np.concatenate([[False], ~free[order[:-1], order[1:]]])
-    pairs = np.triu_indices(n, 1)
-    return Visit(order, via, length, int(known[pairs].sum()), int((~free[pairs]).sum()))
+    return Visit(order, via, length)
 
 
 def shortest(cost: FloatArray, from_home: FloatArray) -> tuple[IntArray, float]:
