@@ -8,6 +8,7 @@ coordinates: what one sweep asks of the mechanism.
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.harness import Metric, measure_ratio, time_in_turns
 from loopcal.calibrate.outlook import scene
@@ -15,11 +16,12 @@ from loopcal.calibrate.plan.certified import certified_design
 from loopcal.calibrate.plan.coordinate import coordinate_exchange
 from loopcal.calibrate.plan.criteria import D
 from loopcal.calibrate.plan.design import Start
-from loopcal.calibrate.scaling import unknowns
+from loopcal.calibrate.scaling import Unknowns, unknowns
 from loopcal.io import load_robot
 from loopcal.mechanism import inverse
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism.workspace import Sample, sample
 
+Array = NDArray[np.float64]
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)
 """Of a full pose: rotation [rad] and position [m]."""
 
@@ -27,7 +29,7 @@ POSES, SHARES = 100, (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
 @cache
-def _hexapod():
+def _hexapod() -> tuple[Unknowns, Sample, Array, Array]:
     """The shipped hexapod's unknowns, and the half ranges of its drawn positions about their means."""
     free = unknowns(load_robot("hexapod-42"))
     drawn = sample(free.robot, 1000, 0)

@@ -129,11 +129,13 @@ def sizes_if_moved(*moved, base=1.0, by=50.0, left=30):
 
 def test_of_several_kept_frames_the_moved_ones_are_named():
     found = set_up_anew(("trk", "tool", "probe"), sizes_if_moved("trk", "probe"))
+    assert found is not None
     assert found.names == ("trk", "probe")
     assert found.times == pytest.approx(50.0)
     assert found.sentence.endswith("use --refit trk --refit probe")
     # a shift of the frame is a shift of the target: refitting either is enough, so that neither alone brings it back
     either = set_up_anew(("trk", "tool"), lambda refit: (1.0 if refit else 50.0, 30))
+    assert either is not None
     assert either.names == ("trk", "tool")
 
 

@@ -18,8 +18,14 @@ def heights(n, block=None, rows=None):
     seen = np.arange(n) if rows is None else np.asarray(rows)
     observations = Observations.from_sigma(HEIGHT, seen, 10.0 * seen[:, None], 1e-3)
     labels = tuple(f"p{i}" for i in range(n))
-    extra = {} if block is None else {"block": np.asarray(block)}
-    return Measurements("toy", np.arange(2.0 * n).reshape(n, 2), (observations,), labels=labels, **extra)
+    together = np.arange(n) if block is None else np.asarray(block)
+    return Measurements("toy", np.arange(2.0 * n).reshape(n, 2), (observations,), together, labels)
+
+
+def of_readings(data):
+    """The sigma of readings, which must be stated."""
+    assert data.reading_sigma is not None
+    return data.reading_sigma
 
 
 def poses_of(data):
@@ -115,12 +121,12 @@ def test_a_mistake_is_one_sentence(change, sentence):
 
 def test_the_sigma_of_readings_follows_their_poses():
     data = _data_with_sigma([[1e-6, np.inf], [0.0, 2e-6], [3e-6, 3e-6]], [[1.0, np.nan], [2.0, 2.0], [3.0, 3.0]])
-    assert data.take([2, 0]).reading_sigma.tolist() == [[3e-6, 3e-6], [1e-6, np.inf]]
+    assert of_readings(data.take([2, 0])).tolist() == [[3e-6, 3e-6], [1e-6, np.inf]]
     fit, held = data.split(0.6, seed=1)
-    assert len(fit.reading_sigma) + len(held.reading_sigma) == 3
+    assert len(of_readings(fit)) + len(of_readings(held)) == 3
     weighted = data.reweighted([4.0, 1.0, 0.0])
-    assert weighted.reading_sigma.tolist() == [[5e-7, np.inf], [0.0, 2e-6], [np.inf, np.inf]]
-    assert _data_with_sigma(1e-6, np.ones((3, 2))).reading_sigma.shape == (3, 2)
+    assert of_readings(weighted).tolist() == [[5e-7, np.inf], [0.0, 2e-6], [np.inf, np.inf]]
+    assert of_readings(_data_with_sigma(1e-6, np.ones((3, 2)))).shape == (3, 2)
 
 
 @pytest.mark.parametrize(

@@ -145,9 +145,7 @@ class LocalUnknowns:
         return self.table.index(name)
 
 
-def local_unknowns(
-    observations: Iterable[Labelled], labels: tuple[str, ...], known: Iterable[Known] = ()
-) -> LocalUnknowns:
+def local_unknowns(observations: Iterable[Labelled], labels: tuple[str, ...], known: Iterable[Known] = ()) -> LocalUnknowns:
     """Gather the unknowns of measurements.
 
     Parameters
