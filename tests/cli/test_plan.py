@@ -75,8 +75,11 @@ def test_planes_and_lines_are_planned_held_filled_in_and_calibrated(here, capsys
     assert "33 parameter combinations can be told" in capsys.readouterr().out
     sheet = rows_of(here / "plan" / "plan.csv")
     assert [row["role"] for row in sheet[:6]] == ["p0", "p1", "plane", "plane", "plane", "plane"]
-    assert {row["tolerance [mm]"] for row in sheet} == {"0.001"}
-    assert all(len(row["hold"].split()) == {"p0": 3, "p1": 2, "plane": 1}[row["role"]] for row in sheet)
+    assert {(row["role"] == "p0", row["tolerance [mm]"]) for row in sheet} == {(True, ""), (False, "0.001")}
+    assert {row["hold"].split()[0] for row in sheet if row["role"] == "p0"} == {"free"}
+    assert all(len(row["hold"].split(" (")[0].split()) == {"p0": 1, "p1": 2, "plane": 1}[row["role"]] for row in sheet)
+    assert run("simulate hexapod-nategh-agheli --fill plan/measurements.csv -o filled.csv") == 1
+    assert "until a measuring machine shows the held coordinates, which is not simulated" in capsys.readouterr().err
     assert run("calibrate hexapod-nategh-agheli plan/measurements.csv -o run") == 1
     assert "empty" in capsys.readouterr().err
     # the true machine is moved until its point agrees with what the sheet says to hold: its readings are the data

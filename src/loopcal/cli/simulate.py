@@ -120,7 +120,7 @@ def _simulated(
 def _filled(machine: Mechanism, sheet: Path, seed: int) -> tuple[Measurements, str]:
     """Fill in the data file of a plan: what was measured, and the file that says so."""
     from loopcal.io import load_measurements
-    from loopcal.io.instrument_file import load_instrument
+    from loopcal.io.instrument_file import load_instrument, refuse_readings_to_measure
     from loopcal.io.measurement_writer import measurements_text
     from loopcal.io.use_column import use_of, with_use
     from loopcal.measure.fill_in import fill_in
@@ -129,6 +129,7 @@ def _filled(machine: Mechanism, sheet: Path, seed: int) -> tuple[Measurements, s
     for name in ("poses", "draw", "kind", "components", "orientation", "sigma_position", "sigma_angle", "sigma_reading"):
         if given(name) is click.core.ParameterSource.COMMANDLINE:
             raise DataError(f"--fill {sheet} states poses and instrument; leave out --{name.replace('_', '-')}, or --fill")
+    refuse_readings_to_measure(sheet, machine)
     data = fill_in(machine, load_measurements(sheet, machine), load_instrument(sheet, machine), seed)
     text = measurements_text(data, machine, f"simulated by loopcal: {sheet.name}, seed {seed}")
     use = use_of([sheet])

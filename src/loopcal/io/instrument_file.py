@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from loopcal.errors import FileError
 from loopcal.io.csv_table import Table, read_table
 from loopcal.io.sensor_rows import Sensor as Found
 from loopcal.io.sensor_rows import read_sensors
@@ -53,6 +54,24 @@ def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
                 sensor.location,
             )
     return _instrument(table, found)
+
+
+def refuse_readings_to_measure(path: str | Path, robot: Mechanism) -> None:
+    """Refuse a sheet whose readings are empty because they are what is measured, where poses are to come from readings.
+
+    Raises
+    ------
+    FileError
+        No reading of any actuator is stated.
+    """
+    table = read_table(path)
+    columns = [actuator.name for actuator in robot.actuators if actuator.name in table.units]
+    if columns and table.rows and not any(cell for name in columns for cell in table.text(name)):
+        raise FileError(
+            "every reading in this sheet is empty, because the machine is to be moved until a measuring machine shows the held "
+            "coordinates, which is not simulated; fill in the readings, or simulate a plan of poses",
+            table.path,
+        )
 
 
 def _instrument(table: Table, found: Sequence[Found]) -> Instrument:

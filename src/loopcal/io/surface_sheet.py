@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from loopcal.calibrate.plan.plan_surfaces import SurfacePlan
 
 
+FREE = "free"
+"""Under hold: the foot of a group, which sets what the others are held to."""
+
+
 def surface_sheet_text(plan: SurfacePlan) -> str:
     """Return the operator's sheet: each point with the coordinates to hold, how exactly, and the nominal command."""
     robot = plan.robot
@@ -28,9 +32,10 @@ def surface_sheet_text(plan: SurfacePlan) -> str:
     headers += [f"{name} [{s}]" for name, (s, _) in zip(robot.controlled, commanded, strict=True)]
     headers += [f"{a.name} [{s}]" for a, (s, _) in zip(robot.actuators, reading, strict=True)]
     lines = [
-        f"## Points of the tool of {robot.name}, in this order. p0 is free: note where the measuring machine shows it. Every",
-        "## other point of its group is moved until the coordinates under hold agree with those of p0 within the tolerance;",
-        "## then the readings are written into the data file. Numbers here are nominal, to go there by.",
+        f"## Points of the tool of {robot.name}, in this order. p0 is free: go near to where its row says, stay there and",
+        "## note where the measuring machine shows it. Every other point of its group is moved until the coordinates under",
+        "## hold agree with those noted of p0 within the tolerance; then the readings are written into the data file, those",
+        "## of p0 into both of its rows alike, as it lies on the plane and on the line. Numbers are nominal, to go there by.",
         ",".join(headers),
     ]
     factors = [factor for _, factor in (*commanded, *reading)]
@@ -39,7 +44,8 @@ def surface_sheet_text(plan: SurfacePlan) -> str:
         for i, role in enumerate(plan.roles(k)):
             hold = plan.hold(g, i)
             cells = [str(g * k + i + 1), plan.labels[g * k + i], f"group{g + 1}", role]
-            cells += [" ".join(hold) + (f" ({VIA} home)" if plan.via_home[g, i] else ""), f"{plan.sigma / length:.{DIGITS}g}"]
+            held, exactly = (" ".join(hold), f"{plan.sigma / length:.{DIGITS}g}") if i else (FREE, "")
+            cells += [held + (f" ({VIA} home)" if plan.via_home[g, i] else ""), exactly]
             cells += [f"{plan.held[g, 0, j] / length:.{DIGITS}g}" if n in hold else "" for j, n in enumerate(POSITION)]
             numbers = (*plan.coordinates[g, i], *plan.readings[g, i])
             cells += [f"{value / factor:.{DIGITS}g}" for value, factor in zip(numbers, factors, strict=True)]
