@@ -65,7 +65,12 @@ def draw_curve(robot: Mechanism, curve: PoseCurve) -> Figure:
         curve.numbers, curve.bounds / shown.factor_to_si, "--", color=BOUND, label=f"no choice of {curve.counted} is better"
     )
     if curve.goal is not None:
-        axes.axhline(curve.goal / shown.factor_to_si, color=JUDGED, lw=1.0, label="asked for")
+        axes.axhline(
+            curve.goal / shown.factor_to_si,
+            color=JUDGED,
+            lw=1.0,
+            label=f"asked for: {curve.goal / shown.factor_to_si:.3g} {shown.symbol}",
+        )
     axes.set_xscale("log")
     axes.set_yscale("log")
     for axis in (axes.xaxis, axes.yaxis):

@@ -10,6 +10,7 @@ from loopcal.calibrate.outlook import scene
 from loopcal.calibrate.plan.needed import poses_needed
 from loopcal.calibrate.plan.plan import planned, planned_for
 from loopcal.calibrate.plan.problem import problem
+from loopcal.calibrate.plan.record import at_least
 from loopcal.calibrate.scaling import unknowns
 from loopcal.errors import EstimationError
 from loopcal.io import load_robot
@@ -73,6 +74,10 @@ def test_where_equations_decide_the_number_of_poses_the_sentence_says_so():
     assert found.enough == 3
     assert "3 poses reach" in found.sentences(made.free.robot)[0]
     assert "fewer give fewer equations than there are unknowns" in found.sentences(made.free.robot)[0]
+
+
+def test_what_is_guaranteed_is_rounded_down():
+    assert [at_least(share) for share in (0.99965, 1.0, 0.5)] == ["99.9%", "100.0%", "50.0%"]
 
 
 def test_poses_get_names_that_were_not_measured_yet():
