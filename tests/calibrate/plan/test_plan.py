@@ -192,17 +192,17 @@ def test_kinds_that_compare_poses_are_planned_in_pairs(callipers):
 def test_no_choice_of_pairs_beats_what_is_said_of_pairs_not_even_all_pairs_of_few_poses(callipers):
     made = callipers
     assert len(made.units.members) == comb(len(made.candidates), 2)
-    # eight poses with all their 28 pairs, the best of some that are drawn
+    # twelve poses with all their 66 pairs, the best of some that are drawn
     poses, rng, tried = np.unique(made.units.members), np.random.default_rng(0), []
-    for few in (rng.choice(poses, 8, replace=False) for _ in range(300)):
+    for few in (rng.choice(poses, 12, replace=False) for _ in range(300)):
         chosen = np.flatnonzero(np.isin(made.units.members, few).all(axis=1))
         tried.append((made.accuracy(chosen), len(chosen)))
     reached, pairs = min(tried, key=lambda one: one[0].position if one[0] else np.inf)
     assert reached is not None
     needed = poses_needed(made, reached.position, "position")
     assert needed.at_least is not None
-    # were each pair counted as two poses, eight poses would contradict what is said
-    assert 8 < 2 * needed.at_least <= 2 * pairs == 56
+    # were each pair counted as two poses, twelve poses would contradict what is said
+    assert 12 < 2 * needed.at_least <= 2 * pairs == 132
     sentence = needed.sentences(made.free.robot)[0]
     assert f"{needed.enough} pairs reach" in sentence
     assert f"no choice of fewer than {needed.at_least} of the {len(made.units.members)} pairs considered can" in sentence
