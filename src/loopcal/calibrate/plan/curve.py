@@ -137,9 +137,7 @@ def enough(
     return Enough(n, at_least, made[n], _curve([made[k] for k in sorted(made)]))
 
 
-def smallest(
-    value_of: Callable[[int], float], low: int, high: int, n: int, criterion: Criterion, target: float, q: int
-) -> int:
+def smallest(value_of: Callable[[int], float], low: int, high: int, n: int, criterion: Criterion, target: float, q: int) -> int:
     """Return the smallest size from low to high whose value meets the target, high + 1 where none does.
 
     Values are taken as monotone. Sizes are guessed as if the information grew with the size, and every second time the
