@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import engine
+from loopcal.calibrate.elimination import OWN_RANK
 from loopcal.calibrate.rows import rows_of
 from loopcal.calibrate.scaling import Unknowns, unknowns
 from loopcal.linalg import FloatArray, empty_factor
@@ -35,9 +36,6 @@ from loopcal.mechanism.trials import forward_trials, sensitivity
 
 BLOCK = 512
 """Rows of a kind that are made at once."""
-
-OWN_RANK = 1e-10
-"""Share of the largest singular value (columns of length one) below which a direction of the own unknowns is none."""
 
 
 @dataclass(frozen=True, eq=False)
