@@ -1,0 +1,775 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The thin adapter: the only file of the golden results that imports loopcal.
+
+Where names in loopcal move, this file changes and nothing else. Functions that report return plain dicts of arrays,
+numbers and strings; what stands under the key `kinematic` is divided by the robot's size where it is a length. Everything
+else that is passed between functions (robots, data, fits) is opaque to the cases.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from loopcal import calibrate, measure, se3
+from loopcal.calibrate.arrival import arrival
+from loopcal.calibrate.plan.coordinate import coordinate_exchange
+from loopcal.calibrate.plan.criteria import A, D
+from loopcal.calibrate.plan.design import Start
+from loopcal.calibrate.plan.fedorov import fedorov_exchange
+from loopcal.calibrate.plan.groups import PlaneAndLine
+from loopcal.calibrate.plan.problem import problem
+from loopcal.calibrate.remedies import remedies
+from loopcal.io import load_robot
+from loopcal.io.robot_file import shipped_robots
+from loopcal.measure import KINDS, Gaussian, Instrument, Known, Sensor, local_unknowns
+from loopcal.mechanism import build, forward, inverse, sample
+from loopcal.mechanism.trials import sensitivity
+from loopcal.parameters import ParameterTable
+from loopcal.units import Dimension
+
+Array = NDArray[np.float64]
+Report = dict[str, Any]
+Robot = Any
+Data = Any
+Fit = Any
+
+SIGMA = {Dimension.LENGTH: 5e-6, Dimension.ANGLE: 25e-6, Dimension.RATIO: 25e-6}
+"""Noise of all simulated measurements unless a case states another, one standard deviation [m], [rad], [1]."""
+
+
+# --- robots and kinematics -------------------------------------------------------------------------------------------
+
+
+def robot_names() -> list[str]:
+    """Name every robot that comes with loopcal."""
+    return sorted(shipped_robots())
+
+
+@cache
+def robot(name: str) -> Robot:
+    """Load a shipped robot."""
+    return load_robot(name)
+
+
+@cache
+def robot_with_leg_joints() -> Robot:
+    """Build hexapod-42 with the passive joints of its legs, so that sensors can look at them."""
+    record = replace(robot("hexapod-42").record.record, legs="ups")
+    return build(record.expand(), record=record)
+
+
+def freed(machine: Robot, endings: Sequence[str]) -> Robot:
+    """Free the parameters alone whose names end so."""
+    entries = tuple(replace(p, free=p.name.endswith(tuple(endings))) for p in machine.parameters.entries)
+    return replace(machine, parameters=ParameterTable(entries))
+
+
+def with_reading_sigma(machine: Robot, sigma: float) -> Robot:
+    """State a standard deviation of every actuator [SI]."""
+    actuators = tuple(replace(a, sigma=sigma) for a in machine.assembly.actuators)
+    return replace(machine, assembly=replace(machine.assembly, actuators=actuators))
+
+
+def true_values(machine: Robot, seed: int, trials: int = 1) -> Array:
+    """Draw true parameter values (t, p) from the tolerances."""
+    return measure.sample_truth(machine, trials, seed)
+
+
+def with_values(machine: Robot, values: Array) -> Robot:
+    """Give a robot other parameter values (p,)."""
+    return machine.with_values(values)
+
+
+def wrong_by_one_parameter(machine: Robot, values: Array, name: str, change: float) -> Array:
+    """Change one of the values (p,) [SI]."""
+    moved = values.copy()
+    moved[machine.parameters.names.index(name)] += change
+    return moved
+
+
+def wrong_by(machine: Robot, values: Array, endings: Sequence[str]) -> Array:
+    """Return true values (p,) but nominal ones for the parameters whose names end so."""
+    chosen = [name.endswith(tuple(endings)) for name in machine.parameters.names]
+    return np.where(chosen, machine.values, values)
+
+
+def poses(machine: Robot, n: int, seed: int) -> Array:
+    """Draw controlled coordinates (n, c) from the workspace."""
+    return sample(machine, n, seed).coordinates
+
+
+def readings_at(machine: Robot, coordinates: Array) -> Array:
+    """Return readings (n, a) of controlled coordinates."""
+    return inverse(machine, coordinates).q
+
+
+def passive_names(machine: Robot) -> tuple[str, ...]:
+    """Name the passive joints."""
+    return inverse(machine, machine.home[None]).passive_names
+
+
+def actuator_names(machine: Robot) -> tuple[str, ...]:
+    """Name the actuators."""
+    return tuple(a.name for a in machine.actuators)
+
+
+def transform(point: Sequence[float], turn: Sequence[float] = (0.0, 0.0, 0.0)) -> Array:
+    """Return a transform (4, 4) of a point [m] and a rotation vector [rad]."""
+    return se3.pose(se3.exp_so3(np.array(turn)), np.array(point))
+
+
+def report_kinematics(machine: Robot, values: Array, coordinates: Array) -> Report:
+    """Solve inverse and forward kinematics and sensitivities of the robot at these values."""
+    true = machine.with_values(values)
+    back = inverse(true, coordinates)
+    front = forward(true, inverse(machine, coordinates).q)
+    found = sensitivity(true, true.values[None], front.q[None], front.state)
+    rows = np.array([1.0] * 3 + [1.0 / machine.size] * 3)[:, None]
+    lengths = np.array([_size(machine, d) for d in machine.parameters.dimensions])
+    strokes = np.array([_size(machine, a.dimension) for a in machine.actuators])
+    return {
+        "parameters": list(machine.parameters.names),
+        "inverse_status": back.status,
+        "forward_status": front.status,
+        "passive_names": list(back.passive_names),
+        "kinematic": {
+            "nominal": np.nan_to_num(machine.values / lengths),
+            "inverse_readings": back.q / strokes,
+            "inverse_pose": _pose(machine, back.T),
+            "inverse_passive": back.passive,
+            "forward_pose": _pose(machine, front.T),
+            "forward_passive": front.passive,
+            "by_parameters": found.parameters[0] * rows * lengths,
+            "by_readings": found.readings[0] * rows * strokes,
+        },
+    }
+
+
+def _size(machine: Robot, dimension: Dimension) -> float:
+    """What a quantity is divided by to have no unit."""
+    return machine.size if dimension is Dimension.LENGTH else 1.0
+
+
+def _pose(machine: Robot, T: Array) -> Array:
+    """Return the upper three rows of poses, lengths over the robot's size."""
+    return T[..., :3, :] / np.array([1.0, 1.0, 1.0, machine.size])
+
+
+# --- measurements ----------------------------------------------------------------------------------------------------
+
+
+def kind_names() -> list[str]:
+    """Name every kind of measurement."""
+    return list(KINDS)
+
+
+def kind(name: str, *args: Any, **settings: Any) -> Any:
+    """Make a kind of measurement."""
+    return KINDS[name](*args, **settings)
+
+
+def most_unknown_example(name: str) -> Any:
+    """Return the last example of a kind, in which most is unknown."""
+    return KINDS[name].examples()[-1]
+
+
+def joint_example(name: str, machine: Robot) -> Any:
+    """Return the last example of a kind that looks at joints, looking at the passive ones, or the driven without any."""
+    passive = passive_names(machine)
+    return replace(most_unknown_example(name), joints=passive or actuator_names(machine), measures="angle")
+
+
+def columns_of(made: Any) -> int:
+    """Count the noise columns of a kind."""
+    return len(made.noise_columns)
+
+
+def sensor(made: Any, sigma: ArrayLike | None = None, **seen: Any) -> Any:
+    """Let a kind look with this noise at `rows`, in `session` and `group`."""
+    default = [SIGMA[c.dimension] for c in made.noise_columns]
+    noise = np.array(default) if sigma is None else np.broadcast_to(np.asarray(sigma, dtype=float), len(default)).copy()
+    return Sensor(made, Gaussian(noise), **seen)
+
+
+def sensor_of_pairs(made: Any, n: int, steps: Sequence[int] = (1, 7, 19), groups: int = 3) -> Any:
+    """Look at n poses; in pairs where the kind compares two, in groups where unknowns are a group's."""
+    every = np.arange(n)
+    rows = np.concatenate([np.stack([every, np.roll(every, -k)], axis=1) for k in steps]) if made.links == 2 else every
+    grouped = any(p.scope == "group" for p in made.unknowns)
+    group = np.array([f"g{i % groups}" for i in range(len(rows))]) if grouped else np.array("")
+    return sensor(made, rows=rows, group=group)
+
+
+def simulated(
+    machine: Robot,
+    values: Array,
+    coordinates: Array,
+    sensors: Iterable[Any],
+    seed: int,
+    unknowns: Mapping[str, float] | None = None,
+    reading_sigma: ArrayLike | None = None,
+) -> Data:
+    """Measure a machine of these true values."""
+    looking = Instrument(tuple(sensors))
+    true = machine.with_values(values)
+    return measure.simulate(true, coordinates, looking, seed, unknowns=unknowns, reading_sigma=reading_sigma)
+
+
+def simulated_trials(machine: Robot, values: Array, coordinates: Array, sensors: Iterable[Any], seed: int) -> Data:
+    """Measure machines of true values (t, p), stacked."""
+    return measure.simulate_trials(machine, values, coordinates, Instrument(tuple(sensors)), seed)
+
+
+def one_trial(trials: Data, i: int) -> Data:
+    """Return the measurements of one trial."""
+    return trials.trial(i)
+
+
+def own_truth(machine: Robot, sensors: Iterable[Any], n: int, seed: int) -> dict[str, float]:
+    """Draw true values of what the sensors do not know, within 20 mm and 0.3 rad of what is stated."""
+    reach = {Dimension.LENGTH: 0.02, Dimension.ANGLE: 0.3}
+    seeing = [s.looking(n) for s in Instrument(tuple(sensors)).mounted(machine).sensors]
+    table = local_unknowns(seeing, tuple(map(str, range(n)))).table
+    span = np.array([reach[p.dimension] for p in table.entries])
+    drawn = np.random.default_rng(seed).uniform(-span, span)
+    drawn = np.where([name.endswith("offset") for name in table.names], np.abs(drawn), drawn)
+    return dict(zip(table.names, (table.nominal + drawn).tolist(), strict=True))
+
+
+def taken(data: Data, rows: ArrayLike) -> Data:
+    """Take some poses of the data."""
+    return data.take(np.asarray(rows))
+
+
+def altered(data: Data, measured: Array, place: int = 0) -> Data:
+    """Put other measured values in the place of those of one kind."""
+    seen = list(data.observations)
+    seen[place] = replace(seen[place], measured=measured)
+    return replace(data, observations=tuple(seen))
+
+
+def measured_of(data: Data, place: int = 0) -> Array:
+    """Return a copy of the measured values (r, c) of one kind."""
+    return np.array(data.observations[place].measured)
+
+
+def readings_of(data: Data) -> tuple[Array, Array | None]:
+    """Return copies of readings (n, a) and of their sigma."""
+    sigma = data.reading_sigma
+    return np.array(data.readings), None if sigma is None else np.array(sigma)
+
+
+def with_readings(data: Data, readings: Array, sigma: Array | None) -> Data:
+    """Put other readings and sigmas into the data."""
+    return replace(data, readings=readings, reading_sigma=sigma)
+
+
+def with_known(data: Data, known: Mapping[str, tuple[float, float | None]]) -> Data:
+    """State priors of unknowns: name -> (standard deviation, value); a deviation of 0 fixes it."""
+    return replace(data, known=tuple(Known(name, sd, value) for name, (sd, value) in known.items()))
+
+
+def report_data(data: Data) -> Report:
+    """Return what was measured."""
+    seen = {f"{i}_{o.kind.name}": o.measured for i, o in enumerate(data.observations)}
+    return {"measured": seen, "readings": data.readings, "labels": list(data.labels)}
+
+
+# --- fits ------------------------------------------------------------------------------------------------------------
+
+
+def method(name: str, value: Any = None) -> Any:
+    """Make a method by its name: ls, map, map-widened, ridge, ridge-gcv, ridge-likelihood, tsvd, tsvd-gcv."""
+    from loopcal.calibrate.conflict import Widened
+
+    makers = {
+        "ls": calibrate.LeastSquares,
+        "map": lambda: calibrate.MAP() if value is None else calibrate.MAP(value),
+        "map-widened": lambda: calibrate.MAP(Widened()),
+        "ridge": lambda: calibrate.Ridge(value),
+        "ridge-gcv": lambda: calibrate.Ridge(calibrate.GCV()),
+        "ridge-likelihood": lambda: calibrate.Ridge(calibrate.MarginalLikelihood()),
+        "tsvd": lambda: calibrate.TruncatedSVD(value),
+        "tsvd-gcv": lambda: calibrate.TruncatedSVD(calibrate.TruncationGCV()),
+    }
+    return makers[name]()
+
+
+def loss(name: str, constant: float | None = None) -> Any:
+    """Make a loss by its name: huber, tukey."""
+    made = {"huber": calibrate.Huber, "tukey": calibrate.Tukey}[name]
+    return made() if constant is None else made(constant)
+
+
+def fit(machine: Robot, data: Data, how: Any = None, **options: Any) -> Fit:
+    """Identify the free parameters."""
+    return calibrate.identify(machine, data, how, **options)
+
+
+def report_fit(found: Fit, parts: bool = True) -> Report:
+    """Report estimates, standard deviations and diagnostics; with `parts` own unknowns, poses and combinations, too."""
+    check = found.check
+    result: Report = {
+        "names": list(found.names),
+        "status": found.status.name,
+        "rank": found.rank,
+        "fit": {"estimate": found.estimate, "sd": found.sd, "scale": found.tolerance},
+        "condition": found.condition,
+        "singular_values": found.singular_values,
+        "cost": found.cost_history[-1],
+        "chi_square": check.chi_square,
+        "degrees": check.degrees,
+        "dof": check.dof,
+        "p_value": check.p_value,
+        "sigma_scale": check.sigma_scale,
+        "intervals": check.intervals,
+        **_open(found.names, found.unidentifiable),
+    }
+    if not parts:
+        return result
+    finite = np.isfinite(found.sd)
+    result["half_widths"] = found.interval()[finite][:1]
+    result["weight"] = found.weight if (found.weight != 1.0).any() else "all poses count in full"
+    result["squares"] = {f"{i}_{r.kind}": (r.whitened**2).sum(axis=0) for i, r in enumerate(found.residuals)}
+    if len(found.local):
+        local = found.local
+        # where an unknown is known only together with the machine, it stands where the search for a start put it
+        told, scale = np.where(np.isinf(local.sd), np.nan, local.estimate), np.full(len(local), 1e-3)
+        result["local_names"] = list(local.names)
+        result["local_open"] = [bool(x) for x in local.open]
+        result["local"] = {"estimate": told, "sd": local.sd, "scale": scale}
+    if found.conflict is not None:
+        one = found.conflict
+        result["conflict"] = {"found": one.conflict, "statistic": one.statistic, "spread": one.spread, "p_value": one.p_value}
+    if found.latent is not None:
+        at = found.latent
+        result["latent"] = {"pose": _pose(found.robot, at.poses), "readings": at.readings, "calm": bool(at.calm)}
+        result["latent"]["open"] = [bool(x) for x in at.open]
+    return result
+
+
+def _open(names: Sequence[str], combinations: Sequence[Any]) -> Report:
+    """Report the directions that stay open: how many, which parameters, and how far each lies in them (0 to 1).
+
+    With several directions the basis in which they are told is a matter of rounding; the space that they span is not. A
+    single one is told in full, in the order of the parameters and with the sign of its first part that is not small.
+    """
+    W = np.zeros((len(combinations), len(names)))
+    for row, one in zip(W, combinations, strict=True):
+        row[[names.index(name) for name in one.names]] = one.weights
+    basis = np.linalg.svd(W, full_matrices=False)[2]
+    unseen = (basis**2).sum(axis=0)
+    result: Report = {"open": len(W), "unseen": unseen, "touched": [n for n, u in zip(names, unseen, strict=True) if u > 1e-12]}
+    if len(W) == 1:
+        first = np.flatnonzero(np.abs(W[0]) > 0.1 * np.abs(W[0]).max())[0]
+        result["combination"] = W[0] * np.sign(W[0, first])
+    return result
+
+
+def report_trials(machine: Robot, trials: Data, how: Any) -> Report:
+    """Identify stacked trials at once."""
+    found = calibrate.identify_trials(machine, trials, how)
+    free = found.unknowns
+    return {
+        "status": found.status,
+        "fit": {
+            "estimate": found.values[:, free.places],
+            "sd": found.standard_deviations(),
+            "scale": np.broadcast_to(free.tolerance, (len(found.values), len(free))),
+        },
+        "cost": found.cost,
+        "rank": found.decomposition.rank,
+        "singular_values": found.decomposition.singular_values,
+    }
+
+
+def report_leave_one_out(machine: Robot, data: Data, methods: Sequence[Any]) -> Report:
+    """Score methods by leaving out blocks, from one linearisation."""
+    found = calibrate.leave_one_out(machine, data, tuple(methods))
+    return {"score": found.score, "dof": found.dof, "best": list(methods).index(found.best)}
+
+
+def report_per_leg(machine: Robot, data: Data, steps: int) -> Report:
+    """Identify leg by leg."""
+    found = calibrate.identify_per_leg(machine, data, steps)
+    return {"values": found.robot.values, "conditions": found.conditions}
+
+
+def fix_unknowns(data: Data, pattern: str, values: Mapping[str, float] | None = None) -> Any:
+    """Return the unknowns of the data, some kept at their values."""
+    local = local_unknowns(data.observations, data.labels)
+    return local.starting_at(local.values(values)).fixed(pattern)
+
+
+def hold_unknowns(data: Data, pattern: str, sd: float) -> Any:
+    """Return the unknowns of the data, some with a prior of this standard deviation."""
+    return local_unknowns(data.observations, data.labels).with_prior(pattern, sd)
+
+
+def prior_of(earlier: Fit) -> Any:
+    """Make a prior of an earlier fit."""
+    return calibrate.prior_from(earlier.posterior)
+
+
+def report_recalibration(machine: Robot, data: Data, earlier: Fit, limb: str | None = None) -> Report:
+    """Calibrate again with an earlier fit as prior, and test for a change."""
+    found, change = calibrate.recalibrate(machine, data, earlier.posterior, limb)
+    tested = {
+        "what": change.what,
+        "names": list(change.names),
+        "moved": change.moved,
+        "change": change.change,
+        "chi_square": change.chi_square,
+        "degrees": change.degrees,
+        "p_value": change.p_value,
+    }
+    return {"again": report_fit(found, parts=False), "change": tested}
+
+
+# --- what can be known, how well, and what is wrong ------------------------------------------------------------------
+
+
+def report_identifiability(machine: Robot, data: Data, cures: bool = False) -> Report:
+    """Report what the data determine; with `cures` which further measurements would determine the rest."""
+    found = calibrate.identifiability(machine, data)
+    result: Report = {
+        "rank": found.rank,
+        "n_parameters": found.n_parameters,
+        "n_equations": found.n_equations,
+        "improved": found.improved,
+        "condition": found.condition,
+        "singular_values": found.singular_values,
+        **_open(found.unknowns.names, found.unidentifiable),
+        "weak_values": [c.singular_value for c in found.weak],
+        "indices": {name: getattr(found.indices, name) for name in ("o1", "o2", "o3", "o4", "o5")},
+        "states": [v.state for v in found.parameters],
+        "partners": [list(v.partners) for v in found.parameters],
+        "left": [v.left for v in found.parameters],
+    }
+    if cures:
+        told = remedies(found)
+        result["cures"] = [[c.words for c in r.cures] for r in told]
+        result["cures_left"] = {str(i): [c.left for c in r.cures] for i, r in enumerate(told)}
+    return result
+
+
+def instrument(sensors: Iterable[Any]) -> Any:
+    """Make an instrument."""
+    return Instrument(tuple(sensors))
+
+
+def report_validation(found: Fit, data: Data) -> Report:
+    """Report held-out errors."""
+    checked = calibrate.validate(found, data)
+    errors = {
+        name.replace(" ", "_"): {index: getattr(e, index) for index in ("position", "orientation", "integrated")}
+        for name, e in checked.errors().items()
+        if name.startswith("predicted")
+    }
+    # what is left of a commanded pose may be rounding alone: as a share of the robot's size
+    size = found.robot.size
+    commanded = {
+        name.replace(" ", "_"): {"position": e.position / size, "orientation": e.orientation}
+        for name, e in checked.errors().items()
+        if not name.startswith("predicted")
+    }
+    kinds = {k.kind: [k.before, k.after] for k in checked.kinds}
+    return {"poses": list(checked.poses), "errors": errors, "kinematic": commanded, "kinds": kinds, "passed": checked.passed}
+
+
+def report_cross_validation(machine: Robot, data: Data, how: Any, count: int, seed: int) -> Report:
+    """Score a method on folds."""
+    found = calibrate.cross_validate(machine, data, how, count=count, seed=seed)
+    return {
+        "poses": list(found.poses),
+        "score": found.score,
+        "standard_error": found.standard_error,
+        "fold": found.fold,
+        "before_fold": found.before_fold,
+        "after_position": found.after.position,
+        "converged": bool(found.converged),
+    }
+
+
+def report_model_choice(machine: Robot, data: Data, how: Any, count: int) -> Report:
+    """Choose a set of parameters by cross-validation."""
+    found = calibrate.choose_model(machine, data, None, how, count=count)
+    return {
+        "names": [c.name for c in found.candidates],
+        "parameters": [list(c.parameters) for c in found.candidates],
+        "scores": [c.validation.score for c in found.candidates],
+        "chosen": found.chosen.name,
+        "best": found.best.name,
+    }
+
+
+def report_accuracy(found: Fit, data: Data, n: int, seed: int, frame: Any = "base") -> Report:
+    """Report uncertainties over the workspace."""
+    at = calibrate.accuracy_map(found, data.readings, n, seed, frame)
+    return {
+        "names": list(at.names),
+        "coordinates": at.coordinates,
+        "sd": at.uncertainty.sd,
+        "position": at.uncertainty.position,
+        "orientation": at.uncertainty.orientation,
+        "position_ratio": at.position_ratio,
+        "orientation_ratio": at.orientation_ratio,
+        "extrapolated": [bool(x) for x in at.extrapolated],
+    }
+
+
+def report_monte_carlo(machine: Robot, coordinates: Array, sensors: Iterable[Any], where: Array, trials: int) -> Report:
+    """Compare predicted with observed uncertainties over a few drawn machines."""
+    found = calibrate.monte_carlo(machine, coordinates, Instrument(tuple(sensors)), where, trials=trials)
+    return {"predicted_sd": found.predicted.sd, "observed": found.observed, "trials": found.trials, "failed": found.failed}
+
+
+def report_compensation(found: Any, targets: Array, mode: Any, **options: Any) -> Report:
+    """Report what to command instead."""
+    done = calibrate.compensate(found, targets, mode, **options)
+    robot_ = done.robot
+    strokes = np.array([_size(robot_, a.dimension) for a in robot_.actuators])
+    rows = np.array([1.0] * 3 + [1.0 / robot_.size] * 3)
+    result: Report = {
+        "reach": [r.value for r in done.reach],
+        "kinematic": {
+            "readings": done.readings / strokes,
+            "reached": _pose(robot_, done.reached),
+            "before": done.before * rows,
+            "remaining": done.remaining * rows,
+            "not_compensable": done.not_compensable * rows,
+        },
+    }
+    if done.commands is not None:
+        result["kinematic"]["commands"] = done.commands
+    if done.uncertainty is not None:
+        result["sd"] = done.uncertainty.sd
+    return result
+
+
+def report_outliers(found: Fit, data: Data) -> Report:
+    """Report which rows do not fit the others."""
+    seen = calibrate.find_outliers(found, data)
+    return {
+        "names": list(seen.names),
+        "undecided": [[list(block) for block in one.poses] for one in seen.undecided],
+        "distance": [o.distance for o in seen.outliers],
+        "degrees": [o.degrees for o in seen.outliers],
+        "p_value": [o.p_value for o in seen.outliers],
+        "settled": bool(seen.settled),
+        "blocks": seen.blocks,
+        "scale": seen.scale,
+        "leverage": seen.influence.leverage,
+    }
+
+
+def report_examination(found: Fit, data: Data) -> Report:
+    """Report lack of fit, groups that correlate, worth of the calibration, and the start compared with the fit."""
+    seen = calibrate.examine(found, data)
+    lack, worth, start = seen.lack_of_fit, seen.worth, calibrate.start_check(found)
+    return {
+        "groups": lack.groups,
+        "pure": lack.pure,
+        "pure_degrees": lack.pure_degrees,
+        "lack": lack.lack,
+        "lack_degrees": lack.lack_degrees,
+        "p_value": lack.p_value,
+        "explained": lack.explained,
+        "worth": [worth.position_before, worth.position_after, worth.angle_before, worth.angle_after],
+        "calibrate": worth.calibrate,
+        "correlated": [list(group.names) for group in seen.correlated],
+        "start": start.verdict.name,
+        "start_before": start.before,
+        "start_after": start.after,
+    }
+
+
+def report_arrival(machine: Robot, data: Data) -> Report:
+    """Report whether stated conventions fit: as numbers and as whether another one was found."""
+    found = arrival(machine, data)
+    return {
+        "misfit": found.misfit,
+        "doubtful": bool(found.doubtful),
+        "refused": bool(found.refused),
+        "other_misfit": found.other_misfit,
+        "alike": len(found.alike),
+    }
+
+
+def report_parameter_error(found: Fit, truth: Array) -> Report:
+    """Report errors of parameters with and without what the data leave open."""
+    off = calibrate.parameter_error(found, truth)
+    return {"names": list(off.names), "raw": off.raw, "error": off.error, "dropped": len(off.dropped)}
+
+
+# --- plans -----------------------------------------------------------------------------------------------------------
+
+
+def report_plan(machine: Robot, sensors: Iterable[Any], n: int, criterion: str, **options: Any) -> Report:
+    """Plan poses; `station` and `facing` ask for a line of sight, `tilt` [rad] and `margin` for the others."""
+    found = calibrate.plan(machine, Instrument(tuple(sensors)), n, criterion, **options)
+    result: Report = {
+        "labels": list(found.labels),
+        "held_out": [bool(x) for x in found.held_out],
+        "via_home": [bool(x) for x in found.via_home],
+        "units": found.units,
+        "coordinates": found.coordinates,
+        "readings": found.readings,
+        "figures": dict(found.figures),
+        "efficiency": found.efficiency,
+        "expected": [found.expected.position, found.expected.orientation],
+        "length": found.length,
+        "considered": found.considered,
+    }
+    if found.even is not None:
+        result["even"] = [found.even.position, found.even.orientation]
+    return result
+
+
+def report_fedorov(machine: Robot, sensors: Iterable[Any], n: int, criterion: str, candidates: int, starts: int) -> Report:
+    """Choose n units from candidates by exchange: their numbers and the criterion."""
+    made = problem(machine, Instrument(tuple(sensors)), count=candidates, seed=1)
+    wanted = made.criterion(criterion, "pose")
+    found = fedorov_exchange(made.units.rows, n, wanted, made.start, seed=1, starts=starts)
+    return {"chosen": found.chosen, "value": found.value, "candidates": len(made.units.rows)}
+
+
+def report_coordinate_exchange(
+    machine: Robot, groups: int, points: int, criterion: str, sweeps: int, axes: tuple[str, ...] = ("x", "y", "z")
+) -> Report:
+    """Improve groups of points on planes and lines by coordinate exchange."""
+    planned = PlaneAndLine(machine, points, 1e-3, axes)
+    first = planned.random(groups, 1)
+    wanted = {"D": D(), "A": A()}[criterion]
+    start = Start.nothing(len(planned.unknowns))
+    found = coordinate_exchange(planned.evaluate, first, planned.levels(), wanted, start, sweeps=sweeps)
+    return {"first": first, "design": found.design, "value": found.value, "evaluated": found.evaluated}
+
+
+def report_surface_plan(machine: Robot, groups: int, points: int) -> Report:
+    """Plan points on planes and perpendicular lines."""
+    found = calibrate.plan_surfaces(machine, groups, points)
+    return {
+        "labels": list(found.labels),
+        "axis": found.axis,
+        "coordinates": found.coordinates,
+        "via_home": found.via_home,
+        "rank": found.rank,
+        "first": found.first,
+        "last": found.last,
+    }
+
+
+# --- papers ----------------------------------------------------------------------------------------------------------
+
+
+def report_hexapod_42(noise: tuple[float, float] | None, iterations: int) -> Report:
+    """Run the ten steps of the study of 42 parameters; noise: limits [mm, rad], None for exact poses."""
+    from loopcal.papers.hexapod_42 import steps
+    from loopcal.papers.hexapod_42.study_noise import limits_si
+
+    study, _ = _hexapod_42()
+    measured = steps.measured_poses(study, None if noise is None else limits_si(noise), 0)
+    found = steps.iterate(study, measured, iterations)
+    off = found.parameter_errors(study.truth)
+    return {
+        "commanded": study.commanded.q,
+        "actual": measured,
+        "conditions": found.conditions,
+        # what exact poses leave in the end is rounding: errors as shares of the first
+        "kinematic": {"integrated": found.integrated / found.integrated[0], "left": off / np.abs(off[0]).max()},
+    }
+
+
+def report_hexapod_42_table_4() -> Report:
+    """Ask which Euler order and which odd row explain the printed poses."""
+    from loopcal.papers.hexapod_42 import study_table_4
+
+    study, printed = _hexapod_42()
+    measured = printed.measured_poses.values / np.array([1e3] * 3 + [1.0] * 3)
+    orders = study_table_4.orders(study.robot, study.truth, study.poses[2:], measured[2:])
+    odd = study_table_4.outliers(study, printed, measured)
+    return {
+        "order": orders[0].formula,
+        "position": [o.position for o in orders[:6]],
+        "named": list(odd.named),
+        "first": [o.chi_square for o in odd.first],
+        "last": [o.chi_square for o in odd.last],
+    }
+
+
+def report_hexapod_42_methods(trials: int) -> Report:
+    """Compare methods on the stated noise, but least squares over all legs: ten narrow poses hardly determine it."""
+    from loopcal.papers.hexapod_42 import study_noise
+
+    found = [m for m in study_noise.methods(_hexapod_42()[0], 0, trials) if not m.method.startswith("all legs")]
+    return {"names": [m.method for m in found], "errors": [[m.parameters, m.narrow, m.wide] for m in found]}
+
+
+def _hexapod_42() -> tuple[Any, Any]:
+    from loopcal.papers.hexapod_42.compare import whole_degrees
+    from loopcal.papers.hexapod_42.published import nominal_machine, published, true_machine
+    from loopcal.papers.hexapod_42.steps import Study
+
+    printed, machine = published(), nominal_machine()
+    truth = true_machine(machine, printed.errors.values * 1e-3)
+    return Study(machine, truth, whole_degrees(printed.nominal_poses)), printed
+
+
+def report_tsvd_2016(name: str, five: bool) -> Report:
+    """Run raw ridge estimation and truncated SVD, and the library's methods, on one machine with the printed noise."""
+    from loopcal.papers.tsvd_2016 import cases
+    from loopcal.papers.tsvd_2016.steps import iterate, linearised, ridge, truncated
+
+    measured = cases.measure(name, 0)
+    measured = measured.five if five else measured
+    p = len(measured.robot.parameters)
+    nominal = measured.robot.parameters.nominal[None]
+    s = linearised(measured, nominal, np.zeros(1, dtype=np.int64))[0].singular_values[0]
+    rank = int((s > 1e-11 * s[0]).sum())
+    ks = np.array([rank, rank - 2, rank - 5])
+    run = iterate(measured, np.concatenate([truncated(ks, p), ridge(np.array([1e-3, 1e-1]), p)]))
+    library = cases.library(measured)
+    return {
+        "rank": rank,
+        "singular_values": s,
+        "converged": run.converged,
+        "diverged": run.diverged,
+        "values": run.values,
+        "errors": measured.output_errors(run.values, run.machine),
+        "library": {name: {"values": a.values, "errors": a.errors} for name, a in library.items()},
+    }
+
+
+def report_cmm_constraint_2011(groups: int, points: int, sweeps: int, trials: int) -> Report:
+    """Plan points, draw machines, and calibrate them from planes and lines in the paper's form."""
+    from loopcal.papers.cmm_constraint_2011.cells import cell
+    from loopcal.papers.cmm_constraint_2011.study import AXES, machine, plan, spread
+
+    study = plan(machine(), groups, points, AXES, 0, sweeps)
+    made = {weights: cell(study, 1e-3, 1e-5, 0, trials, weights=weights) for weights in ("printed", "full")}
+    return {
+        "design": study.optimised.design,
+        "value": study.optimised.value,
+        "spread": [spread(study.planned.rows(study.first)), spread(study.optimised.rows)],
+        "failed": [one.failed for one in made.values()],
+        "errors": {weights: dict(one.errors) for weights, one in made.items()},
+    }
+
+
+def report_cmm_constraint_2011_surfaces(groups: int, points: int, noise: float) -> Report:
+    """Calibrate one machine from planes and lines with the surfaces as unknowns."""
+    from loopcal.papers.cmm_constraint_2011 import forms
+    from loopcal.papers.cmm_constraint_2011.study import AXES, machine, plan, true_machines
+
+    study = plan(machine(), groups, points, AXES, 0, 0)
+    q = study.layout.held(true_machines(study.robot, 1e-3, 1, 0), noise, 0)
+    data = forms.measurements(study.layout, q[0], noise)
+    found = calibrate.identify(study.robot, data, calibrate.MAP(), rank_tolerance=forms.RANK)
+    return report_fit(found, parts=False)

@@ -1,0 +1,651 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The registry of golden cases: small calibrations with fixed seeds, each a function that returns plain results.
+
+Names are paths, `part/what/setting`. Noise is 5 um and 25 urad unless said otherwise: much above rounding, so that the results
+repeat to far less than a thousand-millionth of their standard deviations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+
+from tests.golden import api
+
+UM = 1e-6
+POINT = np.array([[0.03, -0.02, 0.05]])
+PAIR = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02]])
+THREE = np.array([[0.1, 0.0, 0.02], [-0.06, 0.1, 0.03], [-0.05, -0.1, 0.01]])
+STATION = api.transform((-1.5, -0.8, 0.1))
+HEXAPOD, TRIPOD, DELTA, CABLE = "hexapod-42", "3-prs", "linear-delta", "cable-4"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A named computation; slow ones take more than about a second."""
+
+    run: Callable[[], dict[str, Any]]
+    slow: bool = False
+
+
+CASES: dict[str, Case] = {}
+
+
+def add(name: str, run: Callable[..., dict[str, Any]], *given: Any, slow: bool = False, **options: Any) -> None:
+    """Register a case."""
+    assert name not in CASES, name
+    CASES[name] = Case(partial(run, *given, **options), slow)
+
+
+# --- shared set-ups --------------------------------------------------------------------------------------------------
+
+
+@cache
+def truth(name: str, seed: int = 3) -> np.ndarray:
+    """Return true values (p,) of a shipped robot."""
+    return api.true_values(api.robot(name), seed)[0]
+
+
+def measured(name: str, n: int, *sensors: Any, seed: int = 1, **options: Any) -> Any:
+    """Return measurements of a true machine at n poses; full poses unless sensors are given."""
+    robot = api.robot(name)
+    seen = sensors or (api.sensor(api.kind("pose")),)
+    return api.simulated(robot, truth(name), api.poses(robot, n, seed), seen, seed, **options)
+
+
+def fitted(name: str, data: Any, how: Any = None, **options: Any) -> dict[str, Any]:
+    """Identify a shipped robot and report."""
+    return api.report_fit(api.fit(api.robot(name), data, how, **options))
+
+
+@cache
+def usual_fit(how: str = "map", name: str = HEXAPOD) -> Any:
+    """Return the fit of a robot to 24 full poses."""
+    return api.fit(api.robot(name), measured(name, 24), api.method(how))
+
+
+# --- 1. every shipped robot ------------------------------------------------------------------------------------------
+
+
+SECOND_ORDER = ("linear-delta-6", "ls")
+"""Some directions show in second order only; least squares over them does not come to rest, so they are cut."""
+
+
+def kinematics(name: str) -> dict[str, Any]:
+    """Solve a robot at four poses, at nominal and at true values."""
+    robot = api.robot(name)
+    at = api.poses(robot, 4, 1)
+    return {
+        "poses": {"kinematic": at},
+        "nominal": api.report_kinematics(robot, robot.values, at[:2]),
+        "true": api.report_kinematics(robot, truth(name), at),
+    }
+
+
+def calibration(name: str, how: str) -> dict[str, Any]:
+    """Calibrate a robot from 24 full poses."""
+    data = measured(name, 24)
+    options = {"rank_tolerance": 3e-4} if (name, how) == SECOND_ORDER else {}
+    found = fitted(name, data, api.method(how), allow_fewer_equations=True, **options)
+    return {"data": api.report_data(data) if how == "map" else {}, **found}
+
+
+for _name in api.robot_names():
+    add(f"robots/{_name}/kinematics", kinematics, _name)
+    add(f"robots/{_name}/map", calibration, _name, "map")
+    add(f"robots/{_name}/least-squares", calibration, _name, "ls")
+
+
+# --- 2. every kind of measurement ------------------------------------------------------------------------------------
+
+
+LEAN = ("length", "base.z")
+"""Parameters that least squares finds where a kind tells so little that all 42 would be ill-conditioned."""
+
+
+def one_kind(kind: Any, n: int = 30, machine: Any = None, lean: bool = False) -> dict[str, Any]:
+    """Calibrate a hexapod from one kind, whose own unknowns are off; by least squares and by MAP."""
+    robot = machine or api.robot(HEXAPOD)
+    values = api.true_values(robot, 3)[0]
+    sensors = (api.sensor_of_pairs(kind, n),)
+    own = api.own_truth(robot, sensors, n, 5)
+    data = api.simulated(robot, values, api.poses(robot, n, 1), sensors, 1, unknowns=own)
+    less = api.with_values(api.freed(robot, LEAN), api.wrong_by(robot, values, LEAN)) if lean else robot
+    return {
+        "data": api.report_data(data)["measured"],
+        "ls": api.report_fit(api.fit(less, data, api.method("ls"), allow_fewer_equations=True)),
+        "map": api.report_fit(api.fit(robot, data, api.method("map"))),
+    }
+
+
+JOINTS = ("joint", "locked")
+MORE_ROWS = {
+    "direction": 40,
+    "inclination": 40,
+    "autocollimation": 40,
+    "plane": 60,
+    "distance": 60,
+    "sphere": 60,
+    "component": 60,
+}
+"""Poses of kinds that tell little in a row."""
+
+
+def looking_at_joints(name: str) -> dict[str, Any]:
+    """Calibrate a hexapod with joints in its legs from sensors on these."""
+    robot = api.robot_with_leg_joints()
+    return one_kind(api.joint_example(name, robot), 10, robot)
+
+
+NEARER = {"sphere": api.kind("sphere", unknown=("surface",), through=np.array([0.25, -0.15, 0.35]), surface="ball")}
+"""Instead of an example that is so far away that its unknowns are ill-conditioned."""
+
+LITTLE = ("bearing/theodolite", "bearing/camera", "distance", "distance/known", "sphere", "sphere/known")
+
+FORMS = {
+    "pose/quaternion": api.kind("pose", "quaternion"),
+    "pose/tilt-torsion": api.kind("pose", "tilt-torsion"),
+    "pose/euler-ZYX": api.kind("pose", "euler-ZYX"),
+    "component/z": api.kind("component", ("z",)),
+    "component/x,y,z,phi,theta": api.kind("component", ("x", "y", "z", "phi", "theta"), "tilt-torsion"),
+    "position/known": api.kind("position", targets=("a", "b", "c"), places=THREE),
+    "bearing/theodolite": api.kind("bearing", places=POINT, T_base_frame=STATION),
+    "bearing/camera": api.kind(
+        "bearing", T_base_frame=api.transform((0.1, -0.1, -2.5)), form="camera", unknown=("frame",), frame="camera"
+    ),
+    "distance/known": api.kind("distance", anchor=np.array([1.5, -0.8, 1.1])),
+    "sphere/known": api.kind("sphere", through=np.array([1.5, -0.8, 1.1])),
+}
+
+for _name in api.kind_names():
+    if _name in JOINTS:
+        add(f"kinds/{_name}", looking_at_joints, _name)
+    else:
+        _kind = NEARER.get(_name) or api.most_unknown_example(_name)
+        add(f"kinds/{_name}", one_kind, _kind, MORE_ROWS.get(_name, 30), lean=_name in LITTLE)
+for _name, _kind in FORMS.items():
+    _poses = 48 if _name.split("/")[0] in ("component", "distance", "sphere") else 20
+    add(f"kinds/{_name}", one_kind, _kind, _poses, lean=_name in LITTLE)
+
+
+def mixed(kinds: dict[str, Any], n: int = 24) -> dict[str, Any]:
+    """Calibrate a hexapod from several kinds at once, and say what they determine together."""
+    robot = api.robot(HEXAPOD)
+    sensors = tuple(api.sensor_of_pairs(kind, n) for kind in kinds.values())
+    own = api.own_truth(robot, sensors, n, 6)
+    data = api.simulated(robot, truth(HEXAPOD), api.poses(robot, n, 2), sensors, 2, unknowns=own)
+    return {
+        "map": fitted(HEXAPOD, data, api.method("map")),
+        "ls": fitted(HEXAPOD, data, api.method("ls"), allow_fewer_equations=True),
+        "known": api.report_identifiability(robot, data),
+    }
+
+
+PARTS = {
+    "pose": api.kind("pose"),
+    "framed-pose": api.kind("pose", unknown=("frame", "tool"), frame="tracker"),
+    "targets": api.kind("position", targets=("a", "b", "c"), places=THREE, unknown=("frame", "targets"), frame="laser"),
+    "position": api.kind("position", places=POINT, unknown=("frame",), frame="cmm"),
+    "inclination": api.kind("inclination", unknown=("gravity", "mounting"), sensor="level"),
+    "bearing": api.kind("bearing", places=POINT, T_base_frame=STATION, unknown=("frame",), frame="station"),
+    "separation": api.kind("separation", places=POINT, unknown=("offset",)),
+    "plane": api.kind("plane", places=POINT, unknown=("surface",), surface="bed"),
+    "line": api.kind("line", unknown=("surface",), along=np.array([0.6, 0.0, 0.8]), surface="ruler"),
+    "sphere": api.kind("sphere", unknown=("surface",), through=np.array([1.5, -0.8, 1.1]), surface="ball"),
+    "direction": api.kind(
+        "direction", axis=np.array([0.0, 0.6, 0.8]), unknown=("axis", "frame"), frame="gauge", axis_name="face"
+    ),
+    "mirror": api.kind("autocollimation", unknown=("frame", "mirror"), frame="collimator", mirror="mirror"),
+    "wire": api.kind("distance", anchor=np.array([0.5, -0.4, 0.6]), unknown=("offset",), anchor_name="wire"),
+    "tilt": api.kind("component", ("z", "phi", "theta"), "tilt-torsion"),
+}
+COMBINED = (
+    ("position", "inclination", "bearing", "separation", "plane"),
+    ("pose", "targets"),
+    ("framed-pose", "tilt", "wire"),
+    ("tilt", "line", "sphere"),
+    ("targets", "direction", "mirror", "separation"),
+)
+for _names in COMBINED:
+    add(f"combined/{'+'.join(_names)}", mixed, {name: PARTS[name] for name in _names})
+
+
+# --- 3. every method and loss, stacked trials ------------------------------------------------------------------------
+
+
+def by_method(how: str, value: Any, weak: bool, **options: Any) -> dict[str, Any]:
+    """Calibrate a hexapod by a method: full poses, or (weak) heights and tilts that leave directions open."""
+    sensors = (api.sensor(PARTS["tilt"]),) if weak else ()
+    return fitted(HEXAPOD, measured(HEXAPOD, 30, *sensors), api.method(how, value), **options)
+
+
+LAMBDAS = tuple(np.linspace(0.0, 4.0, 42).tolist())
+METHODS: dict[str, tuple[str, Any]] = {
+    "least-squares": ("ls", None),
+    "ridge-0.5": ("ridge", 0.5),
+    "ridge-each": ("ridge", LAMBDAS),
+    "ridge-gcv": ("ridge-gcv", None),
+    "ridge-likelihood": ("ridge-likelihood", None),
+    "tsvd-20": ("tsvd", 20),
+    "tsvd-gcv": ("tsvd-gcv", None),
+    "map": ("map", None),
+    "map-spread-3": ("map", 3.0),
+    "map-widened": ("map-widened", None),
+}
+for _name, (_how, _value) in METHODS.items():
+    add(f"methods/{_name}/poses", by_method, _how, _value, weak=False)
+    add(f"methods/{_name}/heights-and-tilts", by_method, _how, _value, weak=True, allow_fewer_equations=True)
+for _how in ("ls", "map", "map-widened"):
+    add(f"methods/noise-estimated/{_how}", by_method, _how, None, weak=False, noise="estimated")
+add("methods/begin-closure", by_method, "ls", None, weak=False, begin="closure")
+add("methods/rank-tolerance", by_method, "ls", None, weak=False, rank_tolerance=2e-2)
+add("methods/drop", by_method, "map", None, weak=False, drop=("2", "17"))
+
+
+def from_a_start() -> dict[str, Any]:
+    """Begin with values that are as far off as the true errors again."""
+    robot = api.robot(HEXAPOD)
+    far = api.true_values(robot, 77)[0]
+    return fitted(HEXAPOD, measured(HEXAPOD, 24), api.method("ls"), start=far)
+
+
+add("methods/start", from_a_start)
+
+
+def without_tolerances() -> dict[str, Any]:
+    """Free some parameters only, and hold none of them back."""
+    robot = api.freed(api.robot(HEXAPOD), ("length", "base.z"))
+    data = api.simulated(robot, api.true_values(robot, 3)[0], api.poses(robot, 20, 1), [api.sensor(api.kind("pose"))], 1)
+    return api.report_fit(api.fit(robot, data))
+
+
+add("methods/some-parameters-free", without_tolerances)
+
+
+@cache
+def blundered(name: str = HEXAPOD) -> Any:
+    """Return 30 poses of which three are off by tens of sigma."""
+    data = measured(name, 30)
+    values = api.measured_of(data)
+    rng = np.random.default_rng(4)
+    for pose in (3, 10, 22):
+        step = rng.standard_normal(6)
+        values[pose] += 25.0 * step / np.linalg.norm(step) * np.array([25 * UM] * 3 + [5 * UM] * 3)
+    return api.altered(data, values)
+
+
+def by_loss(loss: str, how: str, constant: float | None = None, **options: Any) -> dict[str, Any]:
+    """Calibrate from data with blunders, with a loss; and look for the blunders."""
+    data = blundered()
+    found = api.fit(api.robot(HEXAPOD), data, api.method(how), loss=api.loss(loss, constant), **options)
+    return api.report_fit(found) | {"outliers": api.report_outliers(found, data)}
+
+
+for _loss in ("huber", "tukey"):
+    for _how in ("ls", "map", "map-widened"):
+        add(f"losses/{_loss}/{_how}", by_loss, _loss, _how)
+add("losses/huber/constant", by_loss, "huber", "ls", 2.0)
+add("losses/tukey/noise-estimated", by_loss, "tukey", "ls", noise="estimated")
+
+
+def trials(name: str, how: str, value: Any, kinds: tuple[str, ...]) -> dict[str, Any]:
+    """Identify four machines at once."""
+    robot = api.robot(name)
+    sensors = [api.sensor(PARTS[kind]) for kind in kinds]
+    made = api.simulated_trials(robot, api.true_values(robot, 3, 4), api.poses(robot, 24, 1), sensors, 1)
+    one = api.report_fit(api.fit(robot, api.one_trial(made, 2), api.method(how, value)), parts=False)
+    return api.report_trials(robot, made, api.method(how, value)) | {"third": one}
+
+
+for _name in (HEXAPOD, TRIPOD, DELTA):
+    add(f"trials/{_name}/map", trials, _name, "map", None, ("pose",))
+add("trials/hexapod-42/least-squares", trials, HEXAPOD, "ls", None, ("pose",))
+add("trials/hexapod-42/ridge-gcv", trials, HEXAPOD, "ridge-gcv", None, ("pose",))
+add("trials/hexapod-42/tsvd-gcv", trials, HEXAPOD, "tsvd-gcv", None, ("pose",))
+add("trials/hexapod-42/unknown-frame", trials, HEXAPOD, "map", None, ("position", "inclination"))
+
+
+def left_out() -> dict[str, Any]:
+    """Score methods by leave-one-out."""
+    methods = [api.method(*one) for one in (("ls",), ("map",), ("ridge", 1e-2), ("ridge", 10.0), ("tsvd", 10), ("tsvd", 30))]
+    return api.report_leave_one_out(api.robot(HEXAPOD), measured(HEXAPOD, 24), methods)
+
+
+add("methods/leave-one-out", left_out)
+add("methods/per-leg", lambda: api.report_per_leg(api.robot(HEXAPOD), measured(HEXAPOD, 12), 3))
+
+
+# --- 4. uncertain readings, sessions, priors -------------------------------------------------------------------------
+
+
+def uncertain(name: str, sigma: float, how: str, *sensors: Any, n: int = 20) -> dict[str, Any]:
+    """Calibrate where readings have noise of their own."""
+    return fitted(name, measured(name, n, *sensors, reading_sigma=sigma), api.method(how))
+
+
+add("latent/hexapod-42/poses", uncertain, HEXAPOD, 10 * UM, "ls")
+add("latent/hexapod-42/map", uncertain, HEXAPOD, 10 * UM, "map")
+add("latent/3-prs/poses", uncertain, TRIPOD, 10 * UM, "map")
+add("latent/hexapod-42/unknown-frame", uncertain, HEXAPOD, 10 * UM, "map", api.sensor(PARTS["position"]), n=24)
+add("latent/hexapod-42/heights", uncertain, HEXAPOD, 10 * UM, "map", api.sensor(PARTS["tilt"]), n=30)
+
+
+def latent_mixed(loss: str | None = None) -> dict[str, Any]:
+    """Miss a reading, state one as exact, measure some poses in part and link others."""
+    robot = api.freed(api.robot(HEXAPOD), ("base.x", "leg2.base.z", "leg3.platform.y", "leg4.length"))
+    full = api.sensor(api.kind("pose"), rows=np.arange(10))
+    ball = api.sensor(api.kind("separation"), rows=np.array([[1, 10], [10, 11], [0, 12]]))
+    point = api.sensor(api.kind("position"), rows=np.array([10, 11, 12, 13]))
+    coordinates = api.poses(robot, 14, 1)
+    data = api.simulated(robot, api.true_values(robot, 3)[0], coordinates, [full, ball, point], 1, reading_sigma=15 * UM)
+    readings, sigma = api.readings_of(data)
+    assert sigma is not None
+    readings[2, 4], sigma[2, 4] = np.nan, np.inf
+    sigma[5, 0] = 0.0
+    data = api.with_readings(data, readings, sigma)
+    return api.report_fit(api.fit(robot, data, api.method("ls"), loss=None if loss is None else api.loss(loss)))
+
+
+add("latent/missing-reading-and-linked-poses", latent_mixed)
+add("latent/missing-reading-and-linked-poses/huber", latent_mixed, "huber")
+
+
+def nobody_measured(how: str) -> dict[str, Any]:
+    """Calibrate a cable robot from its own redundant readings, a few positions measured."""
+    robot = api.robot(CABLE)
+    seen = api.sensor(api.kind("position"), 1e-3, rows=np.arange(8))
+    data = api.simulated(robot, truth(CABLE), api.poses(robot, 24, 5), [seen], 1, reading_sigma=np.deg2rad(1.0))
+    found = api.fit(robot, data, api.method(how))
+    return api.report_fit(found) | {"known": api.report_identifiability(robot, data)}
+
+
+add("latent/cable-4/map", nobody_measured, "map")
+add("latent/cable-4/least-squares", nobody_measured, "ls")
+
+
+def missing_columns() -> dict[str, Any]:
+    """Miss components of some rows."""
+    data = measured(HEXAPOD, 24)
+    values = api.measured_of(data)
+    values[::3, 3] = np.nan
+    values[1::4, :3] = np.nan
+    values[5] = np.nan
+    return fitted(HEXAPOD, api.altered(data, values), api.method("map"))
+
+
+add("unknowns/missing-components", missing_columns)
+
+DRIFT = {"noon.frame.x": 400 * UM, "evening.frame.x": 900 * UM, "evening.frame.ry": 1e-3}
+
+
+def sessions(how: str, keep: bool) -> dict[str, Any]:
+    """Measure a base that drifts in three sessions; the first says where it is, or none does."""
+    day = np.repeat(["morning", "noon", "evening"], 10)
+    data = measured(HEXAPOD, 30, api.sensor(api.kind("pose", unknown=("frame",)), session=day), unknowns=DRIFT)
+    local = api.fix_unknowns(data, "morning.*", {"morning.frame.x": 0.0}) if keep else None
+    return fitted(HEXAPOD, data, api.method(how), local=local)
+
+
+add("unknowns/sessions/first-kept/least-squares", sessions, "ls", keep=True)
+add("unknowns/sessions/all-free/least-squares", sessions, "ls", keep=False)
+add("unknowns/sessions/all-free/map", sessions, "map", keep=False)
+
+
+def stations() -> dict[str, Any]:
+    """Look from two stations, one of which was moved."""
+    day = np.repeat(["left", "right"], 20)
+    seen = api.kind("bearing", targets=("a", "b"), places=PAIR, T_base_frame=STATION, unknown=("frame", "targets"))
+    moved = {"right.frame.x": 1.4, "right.frame.y": -1.1, "right.frame.rz": 2.0}
+    data = measured(HEXAPOD, 40, api.sensor(seen, session=day), unknowns=moved)
+    return fitted(HEXAPOD, data, api.method("map"))
+
+
+add("unknowns/stations", stations)
+
+
+def prior_of_unknowns(stated: bool) -> dict[str, Any]:
+    """Hold a frame with a prior, stated in the data or given to the fit; fix one coordinate of it."""
+    seen = api.kind("pose", unknown=("frame",), frame="tracker")
+    true = {"tracker.x": 300 * UM, "tracker.ry": 5e-4}
+    data = measured(HEXAPOD, 24, api.sensor(seen), unknowns=true)
+    if stated:
+        known = {"tracker.x": (1e-3, None), "tracker.y": (1e-4, 2e-5), "tracker.z": (0.0, 0.0)}
+        return fitted(HEXAPOD, api.with_known(data, known), api.method("ls"), allow_fewer_equations=True)
+    return fitted(HEXAPOD, data, api.method("map"), local=api.hold_unknowns(data, "tracker.*", 1e-3))
+
+
+add("unknowns/prior/stated-in-the-data", prior_of_unknowns, stated=True)
+add("unknowns/prior/given-to-the-fit", prior_of_unknowns, stated=False)
+
+
+def surfaces_in_groups() -> dict[str, Any]:
+    """Touch three unknown planes with a ball of unknown place, and two lines."""
+    plane = api.kind("plane", targets=("probe",), unknown=("surface", "targets"), surface="bed")
+    line = api.kind("line", unknown=("surface",), along=np.array([0.6, 0.0, 0.8]), surface="ruler")
+    groups = np.array([f"g{i % 3}" for i in range(42)])
+    two = np.array([f"h{i % 2}" for i in range(20)])
+    sensors = (api.sensor(plane, group=groups), api.sensor(line, rows=np.arange(20), group=two))
+    own = api.own_truth(api.robot(HEXAPOD), sensors, 42, 8)
+    return fitted(HEXAPOD, measured(HEXAPOD, 42, *sensors, unknowns=own), api.method("map"))
+
+
+add("unknowns/surfaces-in-groups", surfaces_in_groups)
+
+
+def again(change: float, limb: str | None) -> dict[str, Any]:
+    """Calibrate again after a leg became longer, an earlier fit as the prior."""
+    robot = api.robot(HEXAPOD)
+    values = api.wrong_by_one_parameter(robot, truth(HEXAPOD), "leg3.length", change)
+    data = api.simulated(robot, values, api.poses(robot, 8, 9), [api.sensor(api.kind("pose"))], 9)
+    return api.report_recalibration(robot, data, usual_fit(), limb)
+
+
+add("recalibration/unchanged", again, 0.0, None)
+add("recalibration/longer-leg", again, 300 * UM, None, slow=True)
+add("recalibration/freed-limb", again, 300 * UM, "leg3")
+
+
+def earlier_as_prior(how: str) -> dict[str, Any]:
+    """Use an earlier fit as prior knowledge of one with too few equations."""
+    few = measured(HEXAPOD, 4, seed=6)
+    return fitted(HEXAPOD, few, api.method(how), prior=api.prior_of(usual_fit("ls")))
+
+
+add("recalibration/prior-from-earlier", earlier_as_prior, "ls")
+
+
+# --- 5. plans --------------------------------------------------------------------------------------------------------
+
+
+def plan(name: str, kind: str, n: int, criterion: str, **options: Any) -> dict[str, Any]:
+    """Plan poses."""
+    return api.report_plan(api.robot(name), [api.sensor(PARTS[kind])], n, criterion, seed=1, **options)
+
+
+for _criterion in ("D", "I"):
+    add(f"plans/hexapod-42/pose/{_criterion}", plan, HEXAPOD, "pose", 10, _criterion, hold_out=3, candidates=60, slow=True)
+    add(f"plans/3-prs/pose/{_criterion}", plan, TRIPOD, "pose", 10, _criterion, hold_out=3, candidates=60, slow=True)
+add("plans/linear-delta/position/I", plan, DELTA, "position", 12, "I", hold_out=3, candidates=60, slow=True)
+add("plans/hexapod-42/pose/position", plan, HEXAPOD, "pose", 8, "I", target="position", candidates=50, slow=True)
+
+
+def plan_further() -> dict[str, Any]:
+    """Plan poses beyond those measured already."""
+    before = measured(HEXAPOD, 6)
+    return plan(HEXAPOD, "pose", 6, "I", candidates=50, hold_out=0, measured=before)
+
+
+add("plans/hexapod-42/beyond-measured", plan_further, slow=True)
+
+
+def fedorov(name: str, kind: str, n: int, criterion: str) -> dict[str, Any]:
+    """Choose candidates by exchange."""
+    return api.report_fedorov(api.robot(name), [api.sensor(PARTS[kind])], n, criterion, 60, 3)
+
+
+for _criterion in ("D", "I"):
+    add(f"plans/fedorov/hexapod-42/{_criterion}", fedorov, HEXAPOD, "pose", 10, _criterion)
+    add(f"plans/fedorov/3-prs/{_criterion}", fedorov, TRIPOD, "pose", 10, _criterion)
+
+
+def exchange(criterion: str, axes: tuple[str, ...]) -> dict[str, Any]:
+    """Move groups of points on a plane and a line by coordinate exchange."""
+    return api.report_coordinate_exchange(api.robot("hexapod-nategh-agheli"), 8, 8, criterion, 1, axes)
+
+
+add("plans/coordinate-exchange/D", exchange, "D", ("x", "y", "z"), slow=True)
+add("plans/coordinate-exchange/A", exchange, "A", ("z",), slow=True)
+
+
+add(
+    "plans/surfaces/hexapod-nategh-agheli", lambda: api.report_surface_plan(api.robot("hexapod-nategh-agheli"), 6, 8), slow=True
+)
+
+
+# --- 6. papers -------------------------------------------------------------------------------------------------------
+
+add("papers/hexapod-42/exact", api.report_hexapod_42, None, 3)
+add("papers/hexapod-42/presumed-noise", api.report_hexapod_42, (1e-6, 1e-9), 3)
+add("papers/hexapod-42/stated-noise", api.report_hexapod_42, (1e-3, 1e-6), 2)
+add("papers/hexapod-42/table-4", api.report_hexapod_42_table_4, slow=True)
+add("papers/hexapod-42/methods", api.report_hexapod_42_methods, 3)
+for _name in ("RU-PUS-PRS", "3-PRS"):
+    for _five in (False, True):
+        add(f"papers/tsvd-2016/{_name}/{5 if _five else 6}-dof", api.report_tsvd_2016, _name, _five)
+add("papers/cmm-constraint-2011/cell", api.report_cmm_constraint_2011, 8, 8, 1, 3, slow=True)
+add("papers/cmm-constraint-2011/surfaces", api.report_cmm_constraint_2011_surfaces, 8, 8, 1e-5)
+
+
+# --- 7. validation, accuracy, what is wrong --------------------------------------------------------------------------
+
+
+def validation(name: str, how: str, *kinds: str) -> dict[str, Any]:
+    """Judge a fit on poses held out."""
+    sensors = [api.sensor(PARTS[kind]) for kind in kinds]
+    data = measured(name, 32, *sensors)
+    found = api.fit(api.robot(name), api.taken(data, np.arange(24)), api.method(how))
+    return api.report_validation(found, api.taken(data, np.arange(24, 32)))
+
+
+for _name in (HEXAPOD, TRIPOD, DELTA, "ru-pus-prs", "five-bar"):
+    add(f"validation/{_name}", validation, _name, "map", "pose")
+add("validation/hexapod-42/targets", validation, HEXAPOD, "map", "targets")
+add("validation/hexapod-42/three-kinds", validation, HEXAPOD, "map", "pose", "tilt", "position")
+
+
+def accuracy(name: str, how: str, frame: str) -> dict[str, Any]:
+    """Map the accuracy of a fit."""
+    return api.report_accuracy(usual_fit(how, name), measured(name, 24), 20, 2, frame)
+
+
+add("accuracy/hexapod-42/base", accuracy, HEXAPOD, "map", "base")
+add("accuracy/hexapod-42/platform", accuracy, HEXAPOD, "ls", "platform")
+add("accuracy/3-prs/base", accuracy, TRIPOD, "map", "base")
+
+
+def accuracy_with_open_frame() -> dict[str, Any]:
+    """Map the accuracy of a fit that leaves frames open."""
+    data = measured(HEXAPOD, 30, api.sensor(PARTS["targets"]))
+    return api.report_accuracy(api.fit(api.robot(HEXAPOD), data, api.method("ls")), data, 10, 2)
+
+
+add("accuracy/hexapod-42/open-frame", accuracy_with_open_frame)
+
+
+def monte_carlo() -> dict[str, Any]:
+    """Compare with a few drawn machines."""
+    robot = api.robot(HEXAPOD)
+    where = api.poses(robot, 4, 3)
+    return api.report_monte_carlo(robot, api.poses(robot, 20, 1), [api.sensor(PARTS["pose"])], where, 10)
+
+
+add("accuracy/hexapod-42/monte-carlo", monte_carlo)
+
+
+def compensation(name: str, mode: str, **options: Any) -> dict[str, Any]:
+    """Say what to command a calibrated machine."""
+    return api.report_compensation(usual_fit("map", name), api.poses(api.robot(name), 6, 4), mode, **options)
+
+
+for _name in (HEXAPOD, TRIPOD, DELTA):
+    add(f"compensation/{_name}/readings", compensation, _name, "readings")
+    add(f"compensation/{_name}/commands", compensation, _name, "commands", steps=4)
+
+
+def outliers(how: str) -> dict[str, Any]:
+    """Name the rows that do not belong, and examine the fit."""
+    data = blundered()
+    found = api.fit(api.robot(HEXAPOD), data, api.method(how))
+    clean = usual_fit("ls")
+    return {
+        "blunders": api.report_outliers(found, data),
+        "clean": api.report_outliers(clean, measured(HEXAPOD, 24)),
+        "examined": api.report_examination(found, data),
+    }
+
+
+add("outliers/least-squares", outliers, "ls")
+add("outliers/map", outliers, "map")
+
+
+def repeats() -> dict[str, Any]:
+    """Measure every pose twice."""
+    robot = api.robot(HEXAPOD)
+    at = np.repeat(api.poses(robot, 15, 1), 2, axis=0)
+    data = api.simulated(robot, truth(HEXAPOD), at, [api.sensor(PARTS["pose"])], 1)
+    found = api.fit(robot, data, api.method("map"))
+    return api.report_examination(found, data) | {"error": api.report_parameter_error(found, truth(HEXAPOD))}
+
+
+add("validation/repeats", repeats)
+
+
+def cross_validation(how: str, value: Any = None) -> dict[str, Any]:
+    """Score a method on four folds."""
+    return api.report_cross_validation(api.robot(HEXAPOD), measured(HEXAPOD, 24), api.method(how, value), 4, 1)
+
+
+add("cross-validation/map", cross_validation, "map")
+add("cross-validation/tsvd-20", cross_validation, "tsvd", 20)
+add(
+    "cross-validation/choose-model",
+    lambda: api.report_model_choice(api.robot(DELTA), measured(DELTA, 20, api.sensor(PARTS["position"])), api.method("map"), 3),
+    slow=True,
+)
+
+
+def identifiability(name: str, *kinds: str, cures: bool = True) -> dict[str, Any]:
+    """Say what kinds determine, and what would determine the rest."""
+    robot = api.robot(name)
+    data = measured(name, 24, *[api.sensor(PARTS[kind]) for kind in kinds])
+    return api.report_identifiability(robot, data, cures)
+
+
+for _name in api.robot_names():
+    add(f"identifiability/{_name}/pose", identifiability, _name, "pose", cures=False)
+add("identifiability/hexapod-42/tilt", identifiability, HEXAPOD, "tilt")
+add("identifiability/3-prs/tilt", identifiability, TRIPOD, "tilt")
+add("identifiability/linear-delta/heights", identifiability, DELTA, "plane")
+
+
+def arrival(slip: str) -> dict[str, Any]:
+    """Ask whether data with a slip, or none, fit as they are written."""
+    data = measured(HEXAPOD, 16)
+    values = api.measured_of(data)
+    if slip == "unit":
+        values[:, :3] *= 1e3
+    elif slip == "sign":
+        values[:, 5] *= -1.0
+    elif slip == "order":
+        values[:, [3, 4]] = values[:, [4, 3]]
+    elif slip == "row":
+        values[3, 3] += 0.05
+    return api.report_arrival(api.robot(HEXAPOD), api.altered(data, values))
+
+
+for _slip in ("none", "unit", "sign", "order", "row"):
+    add(f"arrival/{_slip}", arrival, _slip, slow=_slip in ("unit", "sign", "order"))
