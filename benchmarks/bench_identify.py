@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an identification costs: against numpy's own decompositions, with a prior, for many filters, trials and poses."""
+"""What an identification costs: against numpy's own decompositions, with a prior, for many filters,
+trials and poses.
+"""
 
 import statistics
 import tracemalloc
@@ -9,12 +11,23 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.harness import Metric, measure_ratio, time_in_turns
-from loopcal.calibrate import MAP, LeastSquares, identify, identify_trials, leave_one_out
-from loopcal.calibrate.leave_one_out import path_of_methods
-from loopcal.calibrate.rows import rows_of
-from loopcal.calibrate.scaling import unknowns
+from loopcal.diagnose import leave_one_out
+from loopcal.diagnose.leave_one_out_errors import path_of_methods
+from loopcal.estimate import MAP, LeastSquares, identify, identify_trials
+from loopcal.estimate.rows import rows_of
+from loopcal.estimate.scaling import unknowns
 from loopcal.io import load_robot
-from loopcal.measure import Gaussian, Instrument, Measurements, Plane, Pose, Sensor, sample_truth, simulate, simulate_trials
+from loopcal.measure import (
+    Gaussian,
+    Instrument,
+    Measurements,
+    Plane,
+    Pose,
+    Sensor,
+    sample_truth,
+    simulate,
+    simulate_trials,
+)
 from loopcal.mechanism import Mechanism
 
 UM, URAD = 1e-6, 1e-6
@@ -40,7 +53,9 @@ def _measured(robot: Mechanism, n: int) -> Measurements:
 
 
 def bench_fit() -> Metric:
-    """Fit 42 parameters to 50 poses, against the singular value decompositions of its steps' matrices alone."""
+    """Fit 42 parameters to 50 poses, against the singular value decompositions of its steps'
+    matrices alone.
+    """
     robot = load_robot("hexapod-42")
     data = _measured(robot, 50)
     steps = identify(robot, data, LeastSquares()).iterations
@@ -51,7 +66,11 @@ def bench_fit() -> Metric:
             np.linalg.svd(A, full_matrices=False)
 
     return measure_ratio(
-        "identify.fit_of_its_svds", lambda: identify(robot, data, LeastSquares()), decompositions, repeats=31, limit=6.0
+        "identify.fit_of_its_svds",
+        lambda: identify(robot, data, LeastSquares()),
+        decompositions,
+        repeats=31,
+        limit=6.0,
     )
 
 
@@ -69,7 +88,9 @@ def bench_map() -> Metric:
 
 
 def bench_filters() -> Metric:
-    """Forty ridge parameters and all truncations with leave-one-out from one linearisation, against one fit."""
+    """Forty ridge parameters and all truncations with leave-one-out from one linearisation, against
+    one fit.
+    """
     robot = load_robot("hexapod-42")
     data = _measured(robot, 50)
     fit = identify(robot, data, LeastSquares())
@@ -84,9 +105,13 @@ def bench_filters() -> Metric:
 
 
 def bench_trials() -> Metric:
-    """A thousand simulated machines at once, against one after the other (a twentieth of them), time for each fit."""
+    """A thousand simulated machines at once, against one after the other (a twentieth of them),
+    time for each fit.
+    """
     robot = load_robot("hexapod-42")
-    trials = simulate_trials(robot, sample_truth(robot, TRIALS, 0), _poses(robot, 50), _tracker(), 0)
+    trials = simulate_trials(
+        robot, sample_truth(robot, TRIALS, 0), _poses(robot, 50), _tracker(), 0
+    )
     single = [trials.trial(i) for i in range(0, TRIALS, 20)]
     alone, together = time_in_turns(
         lambda: [identify(robot, data, LeastSquares()) for data in single],
@@ -99,17 +124,37 @@ def bench_trials() -> Metric:
 
 
 def bench_poses() -> list[Metric]:
-    """Exponent of the cost over the number of poses, and growth of the memory of folding, up to 1e5 poses."""
+    """Exponent of the cost over the number of poses, and growth of the memory of folding, up to 1e5
+    poses.
+    """
     robot = load_robot("hexapod-42")
     largest = _measured(robot, SIZES[-1])
     parts = [largest.take(np.arange(n)) for n in SIZES[:-1]] + [largest]
-    times = time_in_turns(*(lambda d=d: identify(robot, d, LeastSquares()) for d in parts), repeats=2)
+    times = time_in_turns(
+        *(lambda d=d: identify(robot, d, LeastSquares()) for d in parts), repeats=2
+    )
     seconds = [min(t) for t in times]
     exponent = float(np.polyfit(np.log(SIZES), np.log(seconds), 1)[0])
     memory = [_memory_of_folding(robot, d) for d in parts]
     return [
-        Metric("identify.exponent_of_poses", exponent, "1", "lower", 0.05, 1.05, f"{seconds[-1]:.3g} s for 1e5 poses"),
-        Metric("identify.memory_of_poses", memory[2] / memory[1], "1", "lower", 0.1, 1.1, f"{memory[2] / 1e6:.3g} MB"),
+        Metric(
+            "identify.exponent_of_poses",
+            exponent,
+            "1",
+            "lower",
+            0.05,
+            1.05,
+            f"{seconds[-1]:.3g} s for 1e5 poses",
+        ),
+        Metric(
+            "identify.memory_of_poses",
+            memory[2] / memory[1],
+            "1",
+            "lower",
+            0.1,
+            1.1,
+            f"{memory[2] / 1e6:.3g} MB",
+        ),
     ]
 
 
@@ -127,7 +172,9 @@ def _memory_of_folding(robot: Mechanism, data: Measurements) -> float:
 
 
 def bench_latent() -> Metric:
-    """Fit with noisy readings, every pose an unknown, against the fit of the same data with exact ones."""
+    """Fit with noisy readings, every pose an unknown, against the fit of the same data with exact
+    ones.
+    """
     robot = load_robot("hexapod-42")
     data = _measured(robot, 50)
     uncertain = replace(data, reading_sigma=2 * UM)
@@ -141,7 +188,9 @@ def bench_latent() -> Metric:
 
 
 def bench_groups() -> Metric:
-    """Fold the touches of 400 planes that share an unknown probe, against the same with a known one, each plane by itself."""
+    """Fold the touches of 400 planes that share an unknown probe, against the same with a known
+    one, each plane by itself.
+    """
     robot = load_robot("hexapod-42")
     free, group = unknowns(robot), np.array([f"plane{i % GROUPS}" for i in range(GROUPS * TOUCHES)])
     z = free.deviation(robot.values[None])
@@ -155,5 +204,9 @@ def bench_groups() -> Metric:
         return lambda: rows.fold(z, np.arange(1))
 
     return measure_ratio(
-        "identify.shared_of_known_probe", folding(("surface", "targets")), folding(("surface",)), repeats=7, limit=1.5
+        "identify.shared_of_known_probe",
+        folding(("surface", "targets")),
+        folding(("surface",)),
+        repeats=7,
+        limit=1.5,
     )

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Planning: coordinate exchange of 100 poses against evaluating their rows once, and a certified choice of 20 of 1000.
+"""Planning: coordinate exchange of 100 poses against evaluating their rows once, and a certified
+choice of 20 of 1000.
 
-The reference of coordinate exchange is the rows of all 100 poses, once at each of the five levels of each of the six
-coordinates: what one sweep asks of the mechanism.
+The reference of coordinate exchange is the rows of all 100 poses, once at each of the five levels
+of each of the six coordinates: what one sweep asks of the mechanism.
 """
 
 from functools import cache
@@ -11,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.harness import Metric, measure_ratio, time_in_turns
-from loopcal.calibrate.outlook import scene
-from loopcal.calibrate.plan.certified import certified_design
-from loopcal.calibrate.plan.coordinate import coordinate_exchange
-from loopcal.calibrate.plan.criteria import D
-from loopcal.calibrate.plan.design import Start
-from loopcal.calibrate.scaling import Unknowns, unknowns
+from loopcal.estimate.outlook import scene
+from loopcal.estimate.scaling import Unknowns, unknowns
 from loopcal.io import load_robot
 from loopcal.mechanism import inverse
 from loopcal.mechanism.workspace import Sample, sample
+from loopcal.planning.certified import certified_design
+from loopcal.planning.coordinate import coordinate_exchange
+from loopcal.planning.criteria import D
+from loopcal.planning.design import Start
 
 Array = NDArray[np.float64]
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)
@@ -45,7 +46,9 @@ def _rows(coordinates: np.ndarray) -> np.ndarray:
 
 
 def bench_coordinate_exchange() -> Metric:
-    """Time the improvement of 100 random poses of the hexapod, D-criterion, against one evaluation of all their rows."""
+    """Time the improvement of 100 random poses of the hexapod, D-criterion, against one evaluation
+    of all their rows.
+    """
     free, drawn, middle, half = _hexapod()
     levels = [m + h * np.array(SHARES) for m, h in zip(middle, half, strict=True)]
     begin = drawn.coordinates[:POSES]
@@ -71,5 +74,7 @@ def bench_certified_design() -> Metric:
     """Time the choice of 20 of 1000 full poses of the hexapod, with its certificate."""
     free, drawn, _, _ = _hexapod()
     rows = scene(free, drawn.solution.q).twists[0] / SIGMA[:, None]
-    (times,) = time_in_turns(lambda: certified_design(rows, 20, D(), Start.nothing(len(free))), repeats=3)
+    (times,) = time_in_turns(
+        lambda: certified_design(rows, 20, D(), Start.nothing(len(free))), repeats=3
+    )
     return Metric("plan.certified_design", min(times), "s", "lower", 1.0, 10.0, "best of 3")

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensitivities of a hexapod whose legs are chains, all displacements, against np.linalg.solve of as many 6 x 6 systems;
-and the first answer of a mechanism that has never been seen.
+"""Sensitivities of a hexapod whose legs are chains, all displacements, against np.linalg.solve of
+as many 6 x 6 systems; and the first answer of a mechanism that has never been seen.
 """
 
 import numpy as np
@@ -8,9 +8,9 @@ import numpy as np
 from benchmarks.harness import Metric, measure_ratio, time_in_turns
 from loopcal.io import load_robot
 from loopcal.mechanism import Assembly, build, forward
+from loopcal.mechanism.batch_kinematics import forward_trials, sensitivity
 from loopcal.mechanism.families.gough import Gough
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.trials import forward_trials, sensitivity
 
 POSES = 10_000
 
@@ -37,18 +37,25 @@ def _first_answer(assembly: Assembly) -> Mechanism:
 
 
 def bench_sensitivity() -> Metric:
-    """Time the sensitivities to 102 parameters (all displacements of six chains) at ten thousand poses."""
+    """Time the sensitivities to 102 parameters (all displacements of six chains) at ten thousand
+    poses.
+    """
     robot, rng = _first_answer(_record().expand()), np.random.default_rng(0)
     values, q = robot.values[None], rng.uniform(-0.02, 0.02, (1, POSES, 6))
     state = forward_trials(robot, values, q)
     A, b = rng.normal(size=(POSES, 6, 6)), rng.normal(size=(POSES, 6, 1))
     return measure_ratio(
-        "sensitivity.ups_hexapod", lambda: sensitivity(robot, values, q, state), lambda: np.linalg.solve(A, b), limit=80.0
+        "sensitivity.ups_hexapod",
+        lambda: sensitivity(robot, values, q, state),
+        lambda: np.linalg.solve(A, b),
+        limit=80.0,
     )
 
 
 def bench_first_answer() -> Metric:
-    """Time the first call of a new mechanism: build with home and all checks, and one forward solution."""
+    """Time the first call of a new mechanism: build with home and all checks, and one forward
+    solution.
+    """
     record = _record()
     assembly = record.expand()
     times, expansion = time_in_turns(lambda: _first_answer(assembly), record.expand, repeats=15)

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A benchmark gives metrics with unit, direction and tolerance, mostly ratios to a reference timed in the same run.
+"""A benchmark gives metrics with unit, direction and tolerance, mostly ratios to a reference timed
+in the same run.
 
-A ratio of two things timed in turns, A B A B ..., keeps its value on a slow or busy machine, where seconds do not.
+A ratio of two things timed in turns, A B A B ..., keeps its value on a slow or busy machine, where
+seconds do not.
 """
 
 import json
@@ -48,7 +50,9 @@ def time_once(function: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def time_in_turns(*functions: Callable[[], object], repeats: int = 7) -> tuple[tuple[float, ...], ...]:
+def time_in_turns(
+    *functions: Callable[[], object], repeats: int = 7
+) -> tuple[tuple[float, ...], ...]:
     """Time functions in turns, A B C A B C ..., after one unmeasured call of each.
 
     Returns
@@ -71,7 +75,9 @@ def measure_ratio(
     limit: float | None = None,
     direction: Literal["lower", "higher"] = "lower",
 ) -> Metric:
-    """Time `subject` and `reference` in turns; the value is the median over the rounds of subject / reference."""
+    """Time `subject` and `reference` in turns; the value is the median over the rounds of subject /
+    reference.
+    """
     ours, theirs = time_in_turns(subject, reference, repeats=repeats)
     value = statistics.median(a / b for a, b in zip(ours, theirs, strict=True))
     note = f"{statistics.median(ours):.3g} s against {statistics.median(theirs):.3g} s"
@@ -79,19 +85,27 @@ def measure_ratio(
 
 
 def find_faults(metric: Metric, baseline: dict[str, dict[str, Any]]) -> list[str]:
-    """List, a sentence each, why a metric fails the gate: beyond its limit, without a baseline or worse than it."""
+    """List, a sentence each, why a metric fails the gate: beyond its limit, without a baseline or
+    worse than it.
+    """
     shown = f"{metric.name} is {metric.value:.3g}"
     faults = []
     if metric.limit is not None and metric.is_worse_than(metric.limit):
         faults.append(f"{shown}, its limit is {metric.limit:g}")
     if metric.name not in baseline:
-        faults.append(f"{shown} and has no baseline; run `make bench-update` and commit benchmarks/baseline.json")
+        faults.append(
+            f"{shown} and has no baseline; run `make bench-update` and commit "
+            "benchmarks/baseline.json"
+        )
         return faults
     before = float(baseline[metric.name]["value"])
     margin = metric.tolerance * abs(before)
     bound = before + margin if metric.direction == "lower" else before - margin
     if metric.is_worse_than(bound):
-        faults.append(f"{shown}, its baseline is {before:.3g} and a worsening of {metric.tolerance:.0%} is allowed")
+        faults.append(
+            f"{shown}, its baseline is {before:.3g} and a worsening of {metric.tolerance:.0%} is "
+            "allowed"
+        )
     return faults
 
 
@@ -108,6 +122,8 @@ def read_baseline(path: Path) -> dict[str, dict[str, Any]]:
 def write_baseline(path: Path, metrics: Sequence[Metric], machine: dict[str, str]) -> None:
     """Merge metrics into the baseline file, which also says on which machine it was last written."""
     merged = read_baseline(path)
-    merged |= {metric.name: {k: v for k, v in asdict(metric).items() if k != "name"} for metric in metrics}
+    merged |= {
+        metric.name: {k: v for k, v in asdict(metric).items() if k != "name"} for metric in metrics
+    }
     document = {"machine": machine, "metrics": dict(sorted(merged.items()))}
     path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run the benchmarks: each function `bench_*` of each file benchmarks/bench_*.py returns one Metric or several.
+"""Run the benchmarks: each function `bench_*` of each file benchmarks/bench_*.py returns one Metric
+or several.
 
-Run as `python -m benchmarks.run`, from the root. Names given as arguments choose files: `kinematics` stands for
-bench_kinematics.py. `--gate` exits 1 when a metric is beyond its limit or worse than the committed baseline by more
-than its tolerance; what fails is measured a second time first, since other programs may have been in the way.
-`--update` rewrites the baseline.
+Run as `python -m benchmarks.run`, from the root. Names given as arguments choose files:
+`kinematics` stands for bench_kinematics.py. `--gate` exits 1 when a metric is beyond its limit or
+worse than the committed baseline by more than its tolerance; what fails is measured a second time
+first, since other programs may have been in the way. `--update` rewrites the baseline.
 """
 
 import argparse
@@ -14,7 +15,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-# Before numpy: the references are single-threaded too, so that a ratio means the same on every machine.
+# Before numpy: the references are single-threaded too, so that a ratio means the same on every
+# machine.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
@@ -28,8 +30,12 @@ Benchmark = Callable[[], Metric | list[Metric]]
 
 
 def find_benchmarks(chosen: list[str]) -> list[Benchmark]:
-    """Return the functions `bench_*` of all files `bench_*.py`, or of the chosen ones, in order of name."""
-    names = [f"bench_{name}" for name in chosen] or sorted(path.stem for path in HERE.glob("bench_*.py"))
+    """Return the functions `bench_*` of all files `bench_*.py`, or of the chosen ones, in order of
+    name.
+    """
+    names = [f"bench_{name}" for name in chosen] or sorted(
+        path.stem for path in HERE.glob("bench_*.py")
+    )
     modules = [importlib.import_module(f"benchmarks.{name}") for name in names]
     return [
         function
@@ -57,12 +63,18 @@ def show(metric: Metric, baseline: dict[str, dict]) -> None:
     """Print a metric beside its baseline and limit."""
     before = f"{baseline[metric.name]['value']:.3g}" if metric.name in baseline else "-"
     limit = f"{metric.limit:g}" if metric.limit is not None else "-"
-    print(f"{metric.name:44} {metric.value:9.3g} {metric.unit:6} {before:>9} {limit:>7}   {metric.note}", flush=True)
+    print(
+        f"{metric.name:44} {metric.value:9.3g} {metric.unit:6} {before:>9} {limit:>7}   "
+        f"{metric.note}",
+        flush=True,
+    )
 
 
 def main() -> int:
     """Run, print, and gate or update as asked."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("names", nargs="*", help="bench_NAME.py files to run; all without")
     action = parser.add_mutually_exclusive_group()
     action.add_argument("--gate", action="store_true", help="exit 1 when a metric got worse")

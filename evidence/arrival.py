@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Conventions tested on arrival: how often true data are doubted or refused, and which slips are refused and named."""
+"""Conventions tested on arrival: how often true data are doubted or refused, and which slips are
+refused and named.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +10,24 @@ from dataclasses import replace
 
 import numpy as np
 
-from loopcal import se3
-from loopcal.calibrate.arrival import IMPLAUSIBLE, arrival
-from loopcal.calibrate.scaling import unknowns
+from loopcal import geometry
+from loopcal.diagnose.conventions import IMPLAUSIBLE, arrival
 from loopcal.errors import LoopcalError
+from loopcal.estimate.scaling import unknowns
 from loopcal.io import load_robot
-from loopcal.io.robot_file import shipped_robots
-from loopcal.measure import KINDS, Component, Gaussian, Instrument, Kind, Measurements, Pose, Position, Sensor, simulate
+from loopcal.io.robot.robot_file import shipped_robots
+from loopcal.measure import (
+    KINDS,
+    Component,
+    Gaussian,
+    Instrument,
+    Kind,
+    Measurements,
+    Pose,
+    Position,
+    Sensor,
+    simulate,
+)
 from loopcal.mechanism import Mechanism, sample
 from loopcal.units import Dimension
 
@@ -23,7 +36,9 @@ SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5}  # [m], [rad]
 RATIO = 1e-4  # [1], of columns without a unit
 TIMES = (1.0, 3.0, 30.0)
 EVERY_KIND = ("hexapod-42", "3-prs", "linear-delta")
-"""Robots with every kind; the others are measured as full poses and as positions in an unknown frame, and up to 3 times off."""
+"""Robots with every kind; the others are measured as full poses and as positions in an unknown
+frame, and up to 3 times off.
+"""
 SLIPPED = (*EVERY_KIND, "ru-pus-prs", "rotary-delta")
 
 UNKNOWN = Position(unknown=("frame",))
@@ -32,26 +47,43 @@ Change = Callable[[np.ndarray], np.ndarray]
 
 
 def measured(robot: Mechanism, kind: Kind, times: float, seed: int) -> Measurements | None:
-    """What a machine that is `times` its tolerances off shows; None where the kind or the machine cannot."""
+    """What a machine that is `times` its tolerances off shows; None where the kind or the machine
+    cannot.
+    """
     noise = Gaussian(np.array([SIGMA.get(c.dimension, RATIO) for c in kind.noise_columns]))
     free = unknowns(robot)
     truth = robot.values.copy()
-    truth[free.places] += times * free.tolerance * np.random.default_rng((SEED, seed)).standard_normal(len(free))
+    truth[free.places] += (
+        times * free.tolerance * np.random.default_rng((SEED, seed)).standard_normal(len(free))
+    )
     try:
         at = sample(robot, POSES, SEED + seed).coordinates
-        return simulate(robot.with_values(truth), at, Instrument((Sensor(kind, noise),)), seed, controller=robot)
+        return simulate(
+            robot.with_values(truth), at, Instrument((Sensor(kind, noise),)), seed, controller=robot
+        )
     except LoopcalError:
         return None
 
 
 def cases(times: float) -> Iterator[tuple[Mechanism, Kind]]:
-    """Robots with a workspace and kinds: the first and the last example of each, far off only the first."""
+    """Robots with a workspace and kinds: the first and the last example of each, far off only the
+    first.
+    """
     for name in EVERY_KIND if times > 3.0 else shipped_robots():
         robot = load_robot(name)
-        every = [kind for cls in KINDS.values() for kind in (cls.examples()[:1] + cls.examples()[1:][-1:])]
+        every = [
+            kind
+            for cls in KINDS.values()
+            for kind in (cls.examples()[:1] + cls.examples()[1:][-1:])
+        ]
         first = [cls.examples()[0] for cls in KINDS.values()]
         if robot.assembly.workspace:
-            yield from ((robot, k) for k in ((first if times > 3.0 else every) if name in EVERY_KIND else (Pose(), UNKNOWN)))
+            yield from (
+                (robot, k)
+                for k in (
+                    (first if times > 3.0 else every) if name in EVERY_KIND else (Pose(), UNKNOWN)
+                )
+            )
 
 
 def false_alarms(times: float) -> list:
@@ -98,17 +130,27 @@ VALUE_SLIPS: tuple[tuple[str, Kind, Change, str], ...] = (
     (
         "euler-zyx for euler-xyz",
         XYZ,
-        rewritten(lambda a: se3.matrix_to_euler(se3.euler_to_matrix(a, "xyz"), "zyx")),
+        rewritten(lambda a: geometry.matrix_to_euler(geometry.euler_to_matrix(a, "xyz"), "zyx")),
         "rotations read as euler-zyx",
     ),
     (
         "moving for fixed axes",
         XYZ,
-        rewritten(lambda a: se3.matrix_to_euler(se3.euler_to_matrix(a, "xyz"), "XYZ")),
+        rewritten(lambda a: geometry.matrix_to_euler(geometry.euler_to_matrix(a, "xyz"), "XYZ")),
         "rotations read as euler-XYZ",
     ),
-    ("inches written as mm, frame unknown", UNKNOWN, columns([0, 1, 2], 1.0 / 25.4), "lengths 25.4 times larger"),
-    ("cm written as mm, frame unknown", UNKNOWN, columns([0, 1, 2], 0.1), "lengths 10 times larger"),
+    (
+        "inches written as mm, frame unknown",
+        UNKNOWN,
+        columns([0, 1, 2], 1.0 / 25.4),
+        "lengths 25.4 times larger",
+    ),
+    (
+        "cm written as mm, frame unknown",
+        UNKNOWN,
+        columns([0, 1, 2], 0.1),
+        "lengths 10 times larger",
+    ),
     ("drop for rise", Component(("z",)), columns([0], -1.0), "z of the other sign"),
 )
 READING_SLIPS: tuple[tuple[str, Change, str], ...] = (
@@ -118,8 +160,12 @@ READING_SLIPS: tuple[tuple[str, Change, str], ...] = (
 )
 
 
-def slipped(robot: Mechanism, kind: Kind, change: Change | None, change_readings: Change | None) -> Measurements | None:
-    """Data with changed values or readings; None where the kind, the robot or the changed numbers are impossible."""
+def slipped(
+    robot: Mechanism, kind: Kind, change: Change | None, change_readings: Change | None
+) -> Measurements | None:
+    """Data with changed values or readings; None where the kind, the robot or the changed numbers
+    are impossible.
+    """
     data = measured(robot, kind, 1.0, SEED)
     if data is None:
         return None
@@ -129,11 +175,15 @@ def slipped(robot: Mechanism, kind: Kind, change: Change | None, change_readings
             return replace(data, observations=(replace(rows, measured=change(rows.measured)),))
     except LoopcalError:
         return None
-    return data if change_readings is None else replace(data, readings=change_readings(data.readings))
+    return (
+        data if change_readings is None else replace(data, readings=change_readings(data.readings))
+    )
 
 
 def detected() -> list[list]:
-    """For each slip: data sets, those it makes implausible, refused, and named first or among others that fit as well."""
+    """For each slip: data sets, those it makes implausible, refused, and named first or among
+    others that fit as well.
+    """
     tried = [(name, kind, change, None, words) for name, kind, change, words in VALUE_SLIPS]
     tried += [(name, Pose(), None, change, words) for name, change, words in READING_SLIPS]
     machines = [load_robot(name) for name in SLIPPED]
@@ -142,7 +192,9 @@ def detected() -> list[list]:
         every = [(robot, slipped(robot, kind, change, change_readings)) for robot in machines]
         found = [arrival(robot, data) for robot, data in every if data is not None]
         named = sum(any(words in one for one in (f.other or "", *f.alike)) for f in found)
-        rows.append([name, len(found), sum(f.doubtful for f in found), sum(f.refused for f in found), named])
+        rows.append(
+            [name, len(found), sum(f.doubtful for f in found), sum(f.refused for f in found), named]
+        )
     return rows
 
 
@@ -165,4 +217,8 @@ def collect() -> dict:
         "formats": ["", "d", "d", "d", "d"],
         "rows": detected(),
     }
-    return {"seed": SEED, "poses": POSES, "tables": {"false_alarms": alarms, "detection": detection}}
+    return {
+        "seed": SEED,
+        "poses": POSES,
+        "tables": {"false_alarms": alarms, "detection": detection},
+    }

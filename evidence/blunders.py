@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Wrong rows: what a loss saves, what is named, and false alarms on clean data.
 
-The 42-parameter hexapod, 40 poses, 1 um and 5 urad. Blunders: two poses moved by 20 standard deviations in the norm of the
-row, and one row of another run (the machine without its errors of leg length).
+The 42-parameter hexapod, 40 poses, 1 um and 5 urad. Blunders: two poses moved by 20 standard
+deviations in the norm of the row, and one row of another run (the machine without its errors of leg
+length).
 """
 
 from dataclasses import replace
 
 import numpy as np
 
-from loopcal.calibrate import Huber, LeastSquares, Tukey, find_outliers, identify
+from loopcal.diagnose import find_outliers
+from loopcal.estimate import Huber, LeastSquares, Tukey, identify
 from loopcal.io import load_robot
 from loopcal.measure import Gaussian, Instrument, Measurements, Pose, Sensor, sample_truth, simulate
 
@@ -59,7 +61,9 @@ def collect() -> dict:
     for seed in range(DRAWS):
         truth, data = measured(seed)
         bad = with_blunders(truth, data, seed)
-        squares["clean"].append(np.mean((identify(ROBOT, data, LeastSquares()).estimate - truth) ** 2))
+        squares["clean"].append(
+            np.mean((identify(ROBOT, data, LeastSquares()).estimate - truth) ** 2)
+        )
         for name, loss in LOSSES.items():
             fit = identify(ROBOT, bad, LeastSquares(), loss=loss)
             found = find_outliers(fit, bad)
@@ -70,10 +74,17 @@ def collect() -> dict:
             leverage.append(float(found.influence.leverage.sum() / found.influence.residuals.sum()))
     rms = {name: float(np.sqrt(np.mean(values))) for name, values in squares.items()}
     rows = [
-        [name, rms[name] / rms["clean"], 100.0 * named[name] / (len(WRONG) * DRAWS), falsely[name] / DRAWS] for name in LOSSES
+        [
+            name,
+            rms[name] / rms["clean"],
+            100.0 * named[name] / (len(WRONG) * DRAWS),
+            falsely[name] / DRAWS,
+        ]
+        for name in LOSSES
     ]
     alarms = sum(
-        bool(find_outliers(identify(ROBOT, d, LeastSquares()), d).outliers) for d in (measured(s)[1] for s in range(CLEAN))
+        bool(find_outliers(identify(ROBOT, d, LeastSquares()), d).outliers)
+        for d in (measured(s)[1] for s in range(CLEAN))
     )
     return {
         "seeds": [0, CLEAN],
@@ -89,7 +100,12 @@ def collect() -> dict:
                 "rows": rows,
             },
             "alarms": {
-                "columns": ["clean data sets", "with an alarm [%]", "stated level [%]", "mean leverage of a row"],
+                "columns": [
+                    "clean data sets",
+                    "with an alarm [%]",
+                    "stated level [%]",
+                    "mean leverage of a row",
+                ],
                 "formats": ["d", ".1f", ".1f", ".2f"],
                 "rows": [[CLEAN, 100.0 * alarms / CLEAN, 5.0, float(np.mean(leverage))]],
             },

@@ -1,15 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration from planes and perpendicular lines: errors by noise over many draws, and what coordinate exchange gains."""
+"""Calibration from planes and perpendicular lines: errors by noise over many draws, and what
+coordinate exchange gains.
+"""
 
 from __future__ import annotations
 
 import time
 from typing import Any
 
-from loopcal.calibrate.plan.groups import PlaneAndLine
-from loopcal.linalg import FloatArray
 from loopcal.mechanism import Mechanism
-from loopcal.papers.cmm_constraint_2011.cells import BEFORE, LS, METHODS, PRIOR, Cell, cell, correlation, grid
+from loopcal.papers.cmm_constraint_2011.cells import (
+    BEFORE,
+    LS,
+    METHODS,
+    PRIOR,
+    Cell,
+    cell,
+    correlation,
+    grid,
+)
 from loopcal.papers.cmm_constraint_2011.fifty import LINES, fifty
 from loopcal.papers.cmm_constraint_2011.layouts import NOISE, ONE, SET, TEN, arranged, candidates
 from loopcal.papers.cmm_constraint_2011.layouts import printed_reductions as printed
@@ -28,6 +37,8 @@ from loopcal.papers.cmm_constraint_2011.study import (
     plan,
     spread,
 )
+from loopcal.planning.groups import PlaneAndLine
+from loopcal.typing import FloatArray
 
 SEED, DRAWS, STARTS, FEW, SOME = 0, 200, 5, 40, 60
 WORDS = {
@@ -55,7 +66,9 @@ def start(robot: Mechanism, seed: int) -> tuple[Study, list]:
     began = time.process_time()
     study = plan(robot, GROUPS, POINTS, AXES, seed, SWEEPS)
     spent = time.process_time() - began
-    before, after = (spread(rows) for rows in (study.planned.rows(study.first), study.optimised.rows))
+    before, after = (
+        spread(rows) for rows in (study.planned.rows(study.first), study.optimised.rows)
+    )
     cost = spent / once(study.planned, study.first) if seed == SEED else None
     return study, [seed, before, after, before / after, spent, cost]
 
@@ -71,13 +84,24 @@ MEDIANS = {
 
 def medians(c: Cell) -> list[float]:
     """Position errors in each frame and the parameters', before, LS and MAP."""
-    return [float(c.median(m)[MEASURES.index(name)]) for name in MEDIANS.values() for m in (BEFORE, LS, PRIOR)]
+    return [
+        float(c.median(m)[MEASURES.index(name)])
+        for name in MEDIANS.values()
+        for m in (BEFORE, LS, PRIOR)
+    ]
 
 
 def weighed(study: Study, full: Cell) -> list[list[Any]]:
-    """Aligned position and parameters by LS and MAP with each weighting of the rows, and LS over that as printed."""
-    cells = {w: full if w == "full" else cell(study, SET * MM, NOISE * MM, SEED, DRAWS, weights=w) for w in WEIGHTS}
-    position, parameters = (MEASURES.index(name) for name in ("position, aligned [mm]", "parameters without gauge [mm]"))
+    """Aligned position and parameters by LS and MAP with each weighting of the rows, and LS over
+    that as printed.
+    """
+    cells = {
+        w: full if w == "full" else cell(study, SET * MM, NOISE * MM, SEED, DRAWS, weights=w)
+        for w in WEIGHTS
+    }
+    position, parameters = (
+        MEASURES.index(name) for name in ("position, aligned [mm]", "parameters without gauge [mm]")
+    )
     first = cells["printed"].median(LS)[position]
     return [
         [WORDS[w], *(float(c.median(m)[i]) for i in (position, parameters) for m in (LS, PRIOR)),
@@ -94,7 +118,9 @@ def readings(study: Study) -> list[list[Any]]:
 
 
 def fifties(study: Study) -> list[list[Any]]:
-    """Mean position error before, by LS and by MAP in each frame, and how often LS converges within 5 iterations."""
+    """Mean position error before, by LS and by MAP in each frame, and how often LS converges within
+    5 iterations.
+    """
     found = [fifty(study, groups, SEED, FEW) for groups in LINES]
     return [
         [f.groups, frame, *(float(f.median(m, frame)[0]) for m in (BEFORE, LS, PRIOR)),
@@ -104,13 +130,21 @@ def fifties(study: Study) -> list[list[Any]]:
 
 
 def collect() -> dict[str, Any]:
-    """The 3 x 4 cells, the five starts, one plane against ten, the weights, readings of figure 5, and fifty points."""
+    """The 3 x 4 cells, the five starts, one plane against ten, the weights, readings of figure 5,
+    and fifty points.
+    """
     robot = machine()
     study, first = start(robot, SEED)
     starts = [first, *(start(robot, seed)[1] for seed in range(SEED + 1, SEED + STARTS))]
     cells = grid(study, SEED, DRAWS, lambda _: None)
-    rows = [[given, noise, *medians(c), c.worse(PRIOR, 2), c.failed] for (given, noise), c in cells.items()]
-    ten, one = cells["1", "0.01"], arranged(ONE, plan(robot, 1, GROUPS * POINTS, AXES, SEED, sweeps=1), SEED, FEW)
+    rows = [
+        [given, noise, *medians(c), c.worse(PRIOR, 2), c.failed]
+        for (given, noise), c in cells.items()
+    ]
+    ten, one = (
+        cells["1", "0.01"],
+        arranged(ONE, plan(robot, 1, GROUPS * POINTS, AXES, SEED, sweeps=1), SEED, FEW),
+    )
     layouts = [
         ["ten planes, a line each", first[1], first[2], *_pair(ten), DRAWS],
         ["one plane, one line", one.drawn, one.optimised, *_pair(one.cell), FEW],
@@ -149,7 +183,8 @@ def collect() -> dict[str, Any]:
                 readings(study),
             ),
             "fifty": table(
-                ["planes", "frame", "before [mm]", "LS [mm]", "MAP [mm]", "LS within 5 iterations [%]"],
+                ["planes", "frame", "before [mm]", "LS [mm]", "MAP [mm]", ("LS within 5 iterations "
+                                                                          "[%]")],
                 ["d", "", ".2g", ".2g", ".2g", ".0f"],
                 fifties(study),
             ),

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Are the error bars true? Coverage of 95 % intervals, chi-square, and predicted against simulated spread of poses."""
+"""Are the error bars true? Coverage of 95 % intervals, chi-square, and predicted against simulated
+spread of poses.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +11,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal import se3
-from loopcal.calibrate import MAP, LeastSquares, identify_trials
-from loopcal.calibrate.filters import Method
-from loopcal.calibrate.identify import IdentifiedTrials
-from loopcal.calibrate.steps import penalised
+from loopcal import geometry
+from loopcal.estimate import MAP, LeastSquares, identify_trials
+from loopcal.estimate.identification import IdentifiedTrials
+from loopcal.estimate.penalties import Method
+from loopcal.estimate.steps import penalised
 from loopcal.io import load_robot
-from loopcal.measure import Component, Gaussian, Instrument, Pose, Sensor, sample_truth, simulate_trials
+from loopcal.measure import (
+    Component,
+    Gaussian,
+    Instrument,
+    Pose,
+    Sensor,
+    sample_truth,
+    simulate_trials,
+)
 from loopcal.mechanism import Mechanism, sample
-from loopcal.mechanism.trials import forward_trials, sensitivity
+from loopcal.mechanism.batch_kinematics import forward_trials, sensitivity
 
 Array = NDArray[np.float64]
 
@@ -33,7 +43,8 @@ SIGMA_LENGTH, SIGMA_ANGLE = 5e-6, 25e-6
 class Case:
     """A robot, how it is measured, and by what it is identified.
 
-    `noise` multiplies the true noise over the stated one: 1 where the error bars must be true, 2 where they must not be.
+    `noise` multiplies the true noise over the stated one: 1 where the error bars must be true, 2
+    where they must not be.
     """
 
     name: str
@@ -51,7 +62,14 @@ CASES = (
     Case("3-PRS, MAP", "3-prs", "pose", 20, MAP()),
     Case("delta, least squares", "linear-delta", "component", 20, LeastSquares()),
     Case("delta, MAP", "linear-delta", "component", 20, MAP()),
-    Case("hexapod, noise twice as large as stated", "hexapod-42", "pose", 20, LeastSquares(), noise=2.0),
+    Case(
+        "hexapod, noise twice as large as stated",
+        "hexapod-42",
+        "pose",
+        20,
+        LeastSquares(),
+        noise=2.0,
+    ),
 )
 
 
@@ -59,8 +77,10 @@ CASES = (
 class Outcome:
     """What some fits of a case came to.
 
-    inside : (t, p) estimates whose 95 % interval holds the truth. chi_square : (t,) and its degrees of freedom.
-    spread : (t, n, 6) errors of the poses predicted at other readings, over their predicted standard deviations.
+    inside : (t, p) estimates whose 95 % interval holds the truth. chi_square : (t,) and its degrees
+        of freedom.
+    spread : (t, n, 6) errors of the poses predicted at other readings, over their predicted
+        standard deviations.
     """
 
     inside: NDArray[np.bool_]
@@ -72,7 +92,9 @@ class Outcome:
 def instrument(case: Case, noise: float) -> Instrument:
     """The instrument of a case with its noise multiplied."""
     if case.kind == "component":
-        return Instrument((Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, noise * SIGMA_LENGTH))),))
+        return Instrument(
+            (Sensor(Component(("x", "y", "z")), Gaussian(np.full(3, noise * SIGMA_LENGTH))),)
+        )
     sigma = np.array([SIGMA_ANGLE] * 3 + [SIGMA_LENGTH] * 3)
     return Instrument((Sensor(Pose(), Gaussian(noise * sigma)),))
 
@@ -80,7 +102,10 @@ def instrument(case: Case, noise: float) -> Instrument:
 def fits(case: Case, count: int) -> Iterator[Outcome]:
     """Simulate and identify `count` machines drawn from the tolerances, some at a time."""
     robot = load_robot(case.robot)
-    coordinates, elsewhere = sample(robot, case.poses, SEED).coordinates, sample(robot, 10, SEED + 1).solution.q
+    coordinates, elsewhere = (
+        sample(robot, case.poses, SEED).coordinates,
+        sample(robot, 10, SEED + 1).solution.q,
+    )
     for first in range(0, count, TOGETHER):
         seed = SEED + first
         truth = sample_truth(robot, min(TOGETHER, count - first), seed)
@@ -99,15 +124,31 @@ def fits(case: Case, count: int) -> Iterator[Outcome]:
         z = found.unknowns.deviation(found.values)
         chi_square = found.cost + penalised(found.decomposition, found.penalty, z)
         # a prior counts as one equation for each direction it holds
-        dof = case.poses * (3 if case.kind == "component" else 6) - found.decomposition.rank[0] + (found.penalty[0] > 0).sum()
-        yield Outcome(inside[:, decided.all(axis=0)], chi_square[good], dof, _spread(robot, found, truth, good, elsewhere))
+        dof = (
+            case.poses * (3 if case.kind == "component" else 6)
+            - found.decomposition.rank[0]
+            + (found.penalty[0] > 0).sum()
+        )
+        yield Outcome(
+            inside[:, decided.all(axis=0)],
+            chi_square[good],
+            dof,
+            _spread(robot, found, truth, good, elsewhere),
+        )
 
 
-def _spread(robot: Mechanism, found: IdentifiedTrials, truth: Array, good: NDArray[np.bool_], q: Array) -> Array:
-    """Errors of predicted poses at readings q (n, a) in their predicted standard deviations, (t, n, 6)."""
+def _spread(
+    robot: Mechanism, found: IdentifiedTrials, truth: Array, good: NDArray[np.bool_], q: Array
+) -> Array:
+    """Errors of predicted poses at readings q (n, a) in their predicted standard deviations, (t, n,
+    6).
+    """
     values = found.values[good]
-    predicted, true = forward_trials(robot, values, q[None]), forward_trials(robot, truth[good], q[None])
-    error = se3.difference(predicted.T, true.T)
+    predicted, true = (
+        forward_trials(robot, values, q[None]),
+        forward_trials(robot, truth[good], q[None]),
+    )
+    error = geometry.difference(predicted.T, true.T)
     D = sensitivity(robot, values, q[None], predicted).parameters[..., robot.parameters.free]
     C = found.decomposition.take(np.flatnonzero(good)).covariance(found.penalty[good], 1.0)
     tolerance = found.unknowns.tolerance
@@ -137,7 +178,14 @@ def collect() -> dict:
     """Every case at full size."""
     found = {case.name: judge(case) for case in CASES}
     rows = [
-        [name, int(r["fits"]), 100 * r["coverage"], 100 * r["lowest"], 100 * r["rejected"], r["pose_spread"]]
+        [
+            name,
+            int(r["fits"]),
+            100 * r["coverage"],
+            100 * r["lowest"],
+            100 * r["rejected"],
+            r["pose_spread"],
+        ]
         for name, r in found.items()
     ]
     return {

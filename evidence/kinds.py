@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every kind of measurement can do alone: rank, recovery of the machine up to its gauge, and true error bars.
+"""What every kind of measurement can do alone: rank, recovery of the machine up to its gauge, and
+true error bars.
 
-Cases are the examples of every registered kind on a hexapod, a 3-PRS and a linear delta, so that a new kind is in at once.
+Cases are the examples of every registered kind on a hexapod, a 3-PRS and a linear delta, so that a
+new kind is in at once.
 """
 
 from __future__ import annotations
@@ -12,16 +14,16 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal import se3
-from loopcal.calibrate import MAP, Identification, LeastSquares, identify, identify_trials, validate
-from loopcal.calibrate.frame_motions import frame_motions
-from loopcal.calibrate.identify import IdentifiedTrials
-from loopcal.calibrate.local_estimate import local_estimate
-from loopcal.calibrate.pose_errors import PoseErrors
-from loopcal.calibrate.rows import rows_of, rows_of_trials
+from loopcal import geometry
+from loopcal.apply import validate
+from loopcal.diagnose.frame_motions import frame_motions
+from loopcal.diagnose.pose_error_figures import PoseErrors
 from loopcal.errors import LoopcalError
+from loopcal.estimate import MAP, Identification, LeastSquares, identify, identify_trials
+from loopcal.estimate.identification import IdentifiedTrials
+from loopcal.estimate.local_estimate import local_estimate
+from loopcal.estimate.rows import rows_of, rows_of_trials
 from loopcal.io import load_robot
-from loopcal.linalg import RANK_TOLERANCE, IntArray
 from loopcal.measure import (
     KINDS,
     Gaussian,
@@ -38,6 +40,8 @@ from loopcal.measure import (
 )
 from loopcal.measure.closed_form import hand_eye, kabsch
 from loopcal.mechanism import Mechanism, build, forward, inverse, sample
+from loopcal.numerics.decomposition import RANK_TOLERANCE
+from loopcal.typing import IntArray
 from loopcal.units import Dimension
 
 Array = NDArray[np.float64]
@@ -63,7 +67,8 @@ SIGMA = {Dimension.LENGTH: 5e-6, Dimension.ANGLE: 25e-6}
 """Noise, one standard deviation [m], [rad]."""
 
 REACH = {Dimension.LENGTH: 0.02, Dimension.ANGLE: 0.3}
-"""How far true frames, targets, surfaces and offsets are from the stated ones, at most [m], [rad]."""
+"""How far true frames, targets, surfaces and offsets are from the stated ones, at most [m], [rad].
+"""
 
 
 class Silent(Gaussian):
@@ -92,7 +97,11 @@ class Case:
     @property
     def setting(self) -> str:
         """The kind, what it sees, and what of it is unknown."""
-        seen = getattr(self.kind, "components", ()) or getattr(self.kind, "orientation", "") or getattr(self.kind, "form", "")
+        seen = (
+            getattr(self.kind, "components", ())
+            or getattr(self.kind, "orientation", "")
+            or getattr(self.kind, "form", "")
+        )
         seen = seen if isinstance(seen, str) else " ".join(seen)
         targets = len(getattr(self.kind, "targets", ()))
         words = [seen, f"{targets} targets" if targets > 1 else ""]
@@ -106,11 +115,18 @@ class Case:
 
 def cases(robots: tuple[str, ...] = ROBOTS) -> tuple[Case, ...]:
     """Every example of every kind on every robot."""
-    return tuple(Case(name, _sensing(name, kind)) for name in robots for cls in KINDS.values() for kind in cls.examples())
+    return tuple(
+        Case(name, _sensing(name, kind))
+        for name in robots
+        for cls in KINDS.values()
+        for kind in cls.examples()
+    )
 
 
 def _sensing(name: str, kind: Kind) -> Kind:
-    """The kind; one that looks at joints sees all passive ones, or the driven ones where there are none."""
+    """The kind; one that looks at joints sees all passive ones, or the driven ones where there are
+    none.
+    """
     if not isinstance(kind, JointSensor):
         return kind
     robot = _robot(name, True)
@@ -144,22 +160,32 @@ def machine(case: Case) -> Mechanism:
 
 
 def instrument(kind: Kind, poses: int, noise: type[Gaussian]) -> Instrument:
-    """The kind looking at all poses; pairs of them where a row compares two, groups where unknowns are a group's."""
+    """The kind looking at all poses; pairs of them where a row compares two, groups where unknowns
+    are a group's.
+    """
     every = np.arange(poses)
-    rows = np.concatenate([np.stack([every, np.roll(every, -k)], axis=1) for k in PAIRS]) if kind.links == 2 else every
+    rows = (
+        np.concatenate([np.stack([every, np.roll(every, -k)], axis=1) for k in PAIRS])
+        if kind.links == 2
+        else every
+    )
     sigma = np.array([SIGMA[column.dimension] for column in kind.noise_columns])
     grouped = any(p.scope == "group" for p in kind.unknowns)
     group = np.array([f"g{i % GROUPS}" for i in range(len(rows))]) if grouped else np.array("")
     return Instrument((Sensor(kind, noise(sigma), rows=rows, group=group),))
 
 
-def own_truth(robot: Mechanism, looking: Instrument, poses: int, rng: np.random.Generator) -> dict[str, float]:
+def own_truth(
+    robot: Mechanism, looking: Instrument, poses: int, rng: np.random.Generator
+) -> dict[str, float]:
     """True values of the unknowns of an instrument, drawn evenly about the stated ones."""
     sensors = [sensor.looking(poses) for sensor in looking.mounted(robot).sensors]
     table = local_unknowns(sensors, tuple(map(str, range(poses)))).table  # type: ignore[arg-type]
     reach = np.array([REACH[p.dimension] for p in table.entries])
     drawn = rng.uniform(-reach, reach)
-    drawn = np.where([name.endswith("offset") for name in table.names], np.abs(drawn), drawn)  # no length below zero
+    drawn = np.where(
+        [name.endswith("offset") for name in table.names], np.abs(drawn), drawn
+    )  # no length below zero
     return dict(zip(table.names, (table.nominal + drawn).tolist(), strict=True))
 
 
@@ -167,9 +193,11 @@ def own_truth(robot: Mechanism, looking: Instrument, poses: int, rng: np.random.
 class Recovery:
     """What noise-free rows of a kind told of a machine with errors.
 
-    rank of p parameters, and refused : the sentence instead of a fit. seen : largest error of what the kind sees at poses
-    held out [m, rad, lengths as a share of the robot's size]. pose : of the poses themselves after moving the frames that
-    the kind leaves open; NaN where it leaves more open. before : of `seen` before. parameters : see `along_gauge`.
+    rank of p parameters, and refused : the sentence instead of a fit. seen : largest error of what
+    the kind sees at poses
+    held out [m, rad, lengths as a share of the robot's size]. pose : of the poses themselves after
+    moving the frames that the kind leaves open; NaN where it leaves more open. before : of `seen`
+    before. parameters : see `along_gauge`.
     """
 
     rank: int
@@ -184,7 +212,9 @@ class Recovery:
 
 
 def recover(case: Case, seed: int = SEED) -> Recovery:
-    """Identify a machine from noise-free rows of one kind, and compare it with the truth at poses held out."""
+    """Identify a machine from noise-free rows of one kind, and compare it with the truth at poses
+    held out.
+    """
     robot, rng = machine(case), np.random.default_rng(seed)
     truth = robot.with_values(sample_truth(robot, 1, seed)[0])
     looking = instrument(case.kind, POSES + HELD_OUT, Silent)
@@ -210,15 +240,21 @@ def recover(case: Case, seed: int = SEED) -> Recovery:
     )
 
 
-def pose_error(found: Mechanism, truth: Mechanism, readings: Array, frames: tuple[str, ...]) -> float:
-    """Largest error [m / size, rad] of predicted poses at readings (n, a), after the best motion of the frames named."""
+def pose_error(
+    found: Mechanism, truth: Mechanism, readings: Array, frames: tuple[str, ...]
+) -> float:
+    """Largest error [m / size, rad] of predicted poses at readings (n, a), after the best motion of
+    the frames named.
+    """
     T, true = forward(found, readings).T, forward(truth, readings).T
-    if not np.ptp(T[:, :3, :3], axis=0).max() > 1e-9:  # a platform that does not turn has no tool frame of its own
+    if (
+        not np.ptp(T[:, :3, :3], axis=0).max() > 1e-9
+    ):  # a platform that does not turn has no tool frame of its own
         turned = kabsch(T[:, :3, 3], true[:, :3, 3]) if frames else np.eye(4)
         return float(np.abs((turned @ T)[:, :3, 3] - true[:, :3, 3]).max() / found.size)
     base, tool = (None if name in frames else np.eye(4) for name in ("base", "platform"))
     F, X = hand_eye(T, true, base, tool) if frames else (np.eye(4), np.eye(4))
-    off = se3.difference(se3.inverse(F) @ T @ X, true)
+    off = geometry.difference(geometry.inverse(F) @ T @ X, true)
     return float(np.abs(off / np.array([1.0] * 3 + [found.size] * 3)).max())
 
 
@@ -229,15 +265,23 @@ def _largest(errors: PoseErrors, size: float) -> float:
 
 
 def along_gauge(fit: Identification, data: Measurements, truth: Array) -> float:
-    """Largest difference of the parameters from the truth [m / size, rad] that no motion along the gauge explains.
+    """Largest difference of the parameters from the truth [m / size, rad] that no motion along the
+    gauge explains.
 
-    From the estimate every step goes back to what explains the data by `-A^+ r` and along the null directions of A
-    towards the truth, `N N' (z_true - z)`. Where the estimate lies on the orbit of the truth it arrives there. What the
-    first step back corrects is an error of the fit, too: the larger of the two counts.
+    From the estimate every step goes back to what explains the data by `-A^+ r` and along the null
+    directions of A towards the truth, `N N' (z_true - z)`. Where the estimate lies on the orbit of
+    the truth it arrives there. What the first step back corrects is an error of the fit, too: the
+    larger of the two counts.
     """
     free = fit.unknowns
-    rows, z, goal = rows_of(free, data), free.deviation(fit.robot.values[None])[0], free.deviation(truth[None])[0]
-    unit = free.tolerance / np.array([fit.robot.size if p.dimension is Dimension.LENGTH else 1.0 for p in free.parameters])
+    rows, z, goal = (
+        rows_of(free, data),
+        free.deviation(fit.robot.values[None])[0],
+        free.deviation(truth[None])[0],
+    )
+    unit = free.tolerance / np.array(
+        [fit.robot.size if p.dimension is Dimension.LENGTH else 1.0 for p in free.parameters]
+    )
     first = None
     for _ in range(WALK):
         factor = rows.fold(z[None], np.arange(1))[0][0]
@@ -253,7 +297,8 @@ def along_gauge(fit: Identification, data: Measurements, truth: Array) -> float:
 class Coverage:
     """Which 95 % intervals of t fits hold the truth.
 
-    directions : combinations of parameters that the data know better than the tolerances. parameters : (t, p).
+    directions : combinations of parameters that the data know better than the tolerances.
+        parameters : (t, p).
     own : (t, U) frames, targets, surfaces and offsets. Intervals that are infinite are left out.
     """
 
@@ -263,7 +308,9 @@ class Coverage:
     own: NDArray[np.bool_]
 
 
-def cover(case: Case, fits: int = FITS, noise: type[Gaussian] = Gaussian, seed: int = SEED) -> Coverage:
+def cover(
+    case: Case, fits: int = FITS, noise: type[Gaussian] = Gaussian, seed: int = SEED
+) -> Coverage:
     """Simulate machines drawn from their tolerances, identify them by MAP, and look for the truth."""
     robot, rng = machine(case), np.random.default_rng(seed)
     coordinates = _commanded(case.robot, seed)[:POSES]
@@ -286,27 +333,36 @@ def cover(case: Case, fits: int = FITS, noise: type[Gaussian] = Gaussian, seed: 
     )
 
 
-def _own_covered(found: IdentifiedTrials, trials: Trials, good: IntArray, own: dict[str, float]) -> NDArray[np.bool_]:
+def _own_covered(
+    found: IdentifiedTrials, trials: Trials, good: IntArray, own: dict[str, float]
+) -> NDArray[np.bool_]:
     """Whether intervals of the own unknowns hold the truth, those that are finite."""
     rows, free = rows_of_trials(found.unknowns, trials), found.unknowns
     if rows.own is None:
         return np.zeros(0, dtype=bool)
     inside = []
     truth = np.array([own[name] for name in rows.own.local.table.names])
-    rows.own.values[:], rows.own.started[:] = truth, True  # how starts are found is proved elsewhere
+    rows.own.values[:], rows.own.started[:] = (
+        truth,
+        True,
+    )  # how starts are found is proved elsewhere
     for first in range(0, len(good), TOGETHER):
         some = good[first : first + TOGETHER]
         rows.fold(free.deviation(found.values[some]), some)
         for place, i in enumerate(some.tolist()):
             one = found.decomposition.take(np.array([i]))
-            local = local_estimate(rows.own, free.robot, truth, one, found.penalty[i : i + 1], 1.0, i, place)
+            local = local_estimate(
+                rows.own, free.robot, truth, one, found.penalty[i : i + 1], 1.0, i, place
+            )
             off = local.estimate - truth
             inside.append((np.abs(off) <= NORMAL_95 * local.sd)[np.isfinite(local.sd)])
     return np.concatenate(inside)
 
 
 def band(fits: int, p: float = 0.95) -> float:
-    """Four standard deviations of a share of as many draws as there are fits: intervals of one fit are correlated."""
+    """Four standard deviations of a share of as many draws as there are fits: intervals of one fit
+    are correlated.
+    """
     return 4.0 * float(np.sqrt(p * (1.0 - p) / fits))
 
 
@@ -322,7 +378,11 @@ def _recovery_rows() -> list[list[object]]:
     for i, case in enumerate(cases()):
         found = recover(case)
         row = rows.setdefault(i % each, [case.setting])
-        worst = float(np.nanmax([found.seen, found.pose, found.parameters])) if not found.refused else None
+        worst = (
+            float(np.nanmax([found.seen, found.pose, found.parameters]))
+            if not found.refused
+            else None
+        )
         row += [None if found.refused else f"{found.rank} of {found.p}", worst]
     return list(rows.values())
 
@@ -333,20 +393,36 @@ def _coverage_rows() -> list[list[object]]:
     loud = next(case for case in cases() if case.kind.name == "position")
     for case, noise in [*((case, Gaussian) for case in with_most_unknowns()), (loud, Loud)]:
         found = cover(case, noise=noise)
-        shares = [part.mean() if part.size else None for part in (found.directions, found.parameters, found.own)]
+        shares = [
+            part.mean() if part.size else None
+            for part in (found.directions, found.parameters, found.own)
+        ]
         told = ", noise twice as large as stated" if noise is Loud else ""
-        rows.append([case.robot, case.setting + told, found.fits, *(None if s is None else 100.0 * float(s) for s in shares)])
+        rows.append(
+            [
+                case.robot,
+                case.setting + told,
+                found.fits,
+                *(None if s is None else 100.0 * float(s) for s in shares),
+            ]
+        )
     return rows
 
 
 def collect() -> dict:
     """Every setting of every kind on every robot, and coverage of the one with most unknowns."""
     per_robot = [f"{robot}: {what}" for robot in ROBOTS for what in ("rank", "largest error")]
-    holds = [f"intervals of {what} that hold the truth [%]" for what in ("known directions", "parameters", "own unknowns")]
+    holds = [
+        f"intervals of {what} that hold the truth [%]"
+        for what in ("known directions", "parameters", "own unknowns")
+    ]
     return {
         "seed": SEED,
         "poses": POSES,
-        "noise": {"length [um]": 1e6 * SIGMA[Dimension.LENGTH], "angle [urad]": 1e6 * SIGMA[Dimension.ANGLE]},
+        "noise": {
+            "length [um]": 1e6 * SIGMA[Dimension.LENGTH],
+            "angle [urad]": 1e6 * SIGMA[Dimension.ANGLE],
+        },
         "tables": {
             "recovery": {
                 "columns": ["kind, alone", *per_robot],

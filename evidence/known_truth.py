@@ -1,25 +1,50 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which method to trust when the truth is known: errors on unseen poses before and after, robots by noise by method."""
+"""Which method to trust when the truth is known: errors on unseen poses before and after, robots by
+noise by method.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal import se3
-from loopcal.calibrate import GCV, MAP, LeastSquares, Ridge, TruncatedSVD, TruncationGCV, Widened, identify, identify_trials
-from loopcal.calibrate.choose_model import choose_model
-from loopcal.calibrate.filters import Method
+from loopcal import geometry
+from loopcal.diagnose.model_choice import choose_model
+from loopcal.estimate import (
+    GCV,
+    MAP,
+    LeastSquares,
+    Ridge,
+    TruncatedSVD,
+    TruncationGCV,
+    Widened,
+    identify,
+    identify_trials,
+)
+from loopcal.estimate.penalties import Method
 from loopcal.io import load_robot
-from loopcal.measure import Component, Gaussian, Instrument, Measurements, Pose, Sensor, sample_truth, simulate_trials
+from loopcal.measure import (
+    Component,
+    Gaussian,
+    Instrument,
+    Measurements,
+    Pose,
+    Sensor,
+    sample_truth,
+    simulate_trials,
+)
 from loopcal.mechanism import Mechanism, sample
-from loopcal.mechanism.trials import forward_trials
+from loopcal.mechanism.batch_kinematics import forward_trials
 
 Array = NDArray[np.float64]
 
 SEED, MACHINES, POSES, UNSEEN, CHOSEN = 5, 40, 25, 60, 20
 ROBOTS = ("hexapod-42", "3-prs", "ru-pus-prs", "linear-delta")
-NOISE = {"1 um, 5 urad": (1e-6, 5e-6), "10 um, 50 urad": (1e-5, 5e-5), "100 um, 500 urad": (1e-4, 5e-4)}
+NOISE = {
+    "1 um, 5 urad": (1e-6, 5e-6),
+    "10 um, 50 urad": (1e-5, 5e-5),
+    "100 um, 500 urad": (1e-4, 5e-4),
+}
 METHODS: dict[str, Method] = {
     "least squares": LeastSquares(),
     "ridge, GCV": Ridge(GCV()),
@@ -39,14 +64,17 @@ def instrument(robot: Mechanism, length: float, angle: float) -> Instrument:
 def errors(robot: Mechanism, values: Array, truth: Array, q: Array) -> Array:
     """Root mean square position error (t,) [m] of poses predicted at unseen readings q (n, a)."""
     predicted, true = forward_trials(robot, values, q[None]), forward_trials(robot, truth, q[None])
-    gap = se3.difference(predicted.T, true.T)[..., 3:]
+    gap = geometry.difference(predicted.T, true.T)[..., 3:]
     return np.sqrt((gap**2).sum(axis=2).mean(axis=1))
 
 
 def cell(name: str, noise: tuple[float, float], machines: int = MACHINES) -> dict[str, Array]:
     """Error (t,) [m] before and after each method, for machines drawn from the tolerances."""
     robot = load_robot(name)
-    coordinates, q = sample(robot, POSES, SEED).coordinates, sample(robot, UNSEEN, SEED + 1).solution.q
+    coordinates, q = (
+        sample(robot, POSES, SEED).coordinates,
+        sample(robot, UNSEEN, SEED + 1).solution.q,
+    )
     truth = sample_truth(robot, machines, SEED)
     trials = simulate_trials(robot, truth, coordinates, instrument(robot, *noise), SEED)
     found = {"before": errors(robot, np.broadcast_to(robot.values, truth.shape), truth, q)}

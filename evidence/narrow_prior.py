@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from evidence.known_truth import errors, instrument
-from loopcal.calibrate import MAP, LeastSquares, Widened, identify, identify_trials
+from loopcal.estimate import MAP, LeastSquares, Widened, identify, identify_trials
 from loopcal.io import load_robot
 from loopcal.measure import Measurements, sample_truth, simulate_trials
 from loopcal.mechanism import Mechanism, sample
@@ -21,7 +21,10 @@ NOISE = (1e-5, 5e-5)
 
 def narrowed(robot: Mechanism, factor: float) -> Mechanism:
     """The same robot, its tolerances stated smaller by a factor."""
-    entries = (replace(p, tolerance=None if p.tolerance is None else p.tolerance / factor) for p in robot.parameters.entries)
+    entries = (
+        replace(p, tolerance=None if p.tolerance is None else p.tolerance / factor)
+        for p in robot.parameters.entries
+    )
     return replace(robot, parameters=ParameterTable(tuple(entries)))
 
 
@@ -29,12 +32,21 @@ def judge(name: str, factor: float, machines: int = MACHINES) -> dict[str, float
     """Median errors [m] on unseen poses and the share of fits that name the conflict."""
     robot = load_robot(name)
     stated = narrowed(robot, factor)
-    coordinates, q = sample(robot, POSES, SEED).coordinates, sample(robot, UNSEEN, SEED + 1).solution.q
+    coordinates, q = (
+        sample(robot, POSES, SEED).coordinates,
+        sample(robot, UNSEEN, SEED + 1).solution.q,
+    )
     truth = sample_truth(robot, machines, SEED)
     trials = simulate_trials(robot, truth, coordinates, instrument(robot, *NOISE), SEED)
     found = {
-        title: float(np.median(errors(robot, identify_trials(stated, trials, method).values, truth, q)))
-        for title, method in {"least squares": LeastSquares(), "MAP": MAP(), "default": MAP(Widened())}.items()
+        title: float(
+            np.median(errors(robot, identify_trials(stated, trials, method).values, truth, q))
+        )
+        for title, method in {
+            "least squares": LeastSquares(),
+            "MAP": MAP(),
+            "default": MAP(Widened()),
+        }.items()
     }
     named = [_names_conflict(stated, trials.trial(i)) for i in range(machines)]
     return {**found, "conflict named": float(np.mean(named))}
@@ -53,7 +65,15 @@ def collect() -> dict:
         for factor in FACTORS:
             r = judge(name, factor)
             errors_um = [1e6 * r[key] for key in ("least squares", "MAP", "default")]
-            rows.append([name, factor, *errors_um, r["default"] / r["least squares"], 100 * r["conflict named"]])
+            rows.append(
+                [
+                    name,
+                    factor,
+                    *errors_um,
+                    r["default"] / r["least squares"],
+                    100 * r["conflict named"],
+                ]
+            )
     columns = [
         "robot",
         "tolerances stated too small by",
@@ -64,4 +84,8 @@ def collect() -> dict:
         "conflict named [% of fits]",
     ]
     formats = ["", ".0f", ".3g", ".3g", ".3g", ".2f", ".0f"]
-    return {"seed": SEED, "machines": MACHINES, "tables": {"narrow": {"columns": columns, "formats": formats, "rows": rows}}}
+    return {
+        "seed": SEED,
+        "machines": MACHINES,
+        "tables": {"narrow": {"columns": columns, "formats": formats, "rows": rows}},
+    }

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good are planned poses? 20 of 1000 candidates, against the certified bound, even draws and plain exchange."""
+"""How good are planned poses? 20 of 1000 candidates, against the certified bound, even draws and
+plain exchange.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.calibrate.outlook import scene
-from loopcal.calibrate.plan.certified import certified_design
-from loopcal.calibrate.plan.criteria import Criterion, D, I, evaluate
-from loopcal.calibrate.plan.design import Start, design_factor
-from loopcal.calibrate.plan.fedorov import fedorov_exchange
-from loopcal.calibrate.scaling import unknowns
+from loopcal.estimate.outlook import scene
+from loopcal.estimate.scaling import unknowns
 from loopcal.io import load_robot
 from loopcal.mechanism.workspace import sample
+from loopcal.planning.certified import certified_design
+from loopcal.planning.criteria import Criterion, D, I, evaluate
+from loopcal.planning.design import Start, design_factor
+from loopcal.planning.fedorov import fedorov_exchange
 
 CANDIDATES, POSES, STARTS, DRAWS, PREDICTED = 1000, 20, 20, 200, 200
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)
@@ -45,17 +47,26 @@ def study(case: Case) -> list[object]:
     """One row: efficiencies against the bound, and what the certified design leaves open."""
     free = unknowns(load_robot(case.robot))
     twists = scene(free, sample(free.robot, CANDIDATES, 0).solution.q).twists[0]
-    rows = (twists / SIGMA[:, None])[:, slice(0, 6) if case.measured == "full pose" else slice(3, 6)]
+    rows = (twists / SIGMA[:, None])[
+        :, slice(0, 6) if case.measured == "full pose" else slice(3, 6)
+    ]
     start, p = Start.nothing(len(free)), len(free)
-    criterion: Criterion = D() if case.criterion == "D" else I(twists[:PREDICTED, 3:].reshape(-1, p), PREDICTED)
+    criterion: Criterion = (
+        D() if case.criterion == "D" else I(twists[:PREDICTED, 3:].reshape(-1, p), PREDICTED)
+    )
     found = certified_design(rows, POSES, criterion, start)
     space, relaxed = found.design.directions, found.relaxed
     random = np.random.default_rng(0)
     even = [
-        relaxed.efficiency(evaluate(criterion, design_factor(rows[chosen], start, space), space.machine))
+        relaxed.efficiency(
+            evaluate(criterion, design_factor(rows[chosen], start, space), space.machine)
+        )
         for chosen in (random.choice(CANDIDATES, POSES, replace=False) for _ in range(DRAWS))
     ]
-    plain = [relaxed.efficiency(value) for value in fedorov_exchange(rows, POSES, criterion, start, starts=STARTS).values]
+    plain = [
+        relaxed.efficiency(value)
+        for value in fedorov_exchange(rows, POSES, criterion, start, starts=STARTS).values
+    ]
     return [
         case.robot,
         case.measured,

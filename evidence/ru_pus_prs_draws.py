@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The comparison of tsvd-2016 on many RU-PUS-PRS machines; fewer than for the 3-PRS, as fits that diverge take long."""
+"""The comparison of tsvd-2016 on many RU-PUS-PRS machines; fewer than for the 3-PRS, as fits that
+diverge take long.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The comparison of tsvd-2016 on many 3-PRS machines: raw LS, RE and TSVD at their best, and the library's methods."""
+"""The comparison of tsvd-2016 on many 3-PRS machines: raw LS, RE and TSVD at their best, and the
+library's methods.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cable robots with poses nobody measured: the shipped example made anew, and an estimator that shares nothing with loopcal's.
+"""Cable robots with poses nobody measured: the shipped example made anew, and an estimator that
+shares nothing with loopcal's.
 
-The reference has every pose as three explicit unknowns and is solved densely by scipy. With anchors a_k, lengths at zero c_k,
-spool radius r, gear g, line moved for line unwound s_k and build-up b_k, and positions x_i,
+The reference has every pose as three explicit unknowns and is solved densely by scipy. With anchors
+a_k, lengths at zero c_k, spool radius r, gear g, line moved for line unwound s_k and build-up b_k,
+and positions x_i,
 
     |x_i - a_k| = c_k + s_k (r g q_ik - b_k (g q_ik)^2 / 4),
 
@@ -22,7 +24,11 @@ from scipy.optimize import least_squares
 
 Array = NDArray[np.float64]
 NAMES = (
-    *(f"{line}.{what}" for line in "ABCD" for what in ("anchor.x", "anchor.y", "anchor.z", "length")),
+    *(
+        f"{line}.{what}"
+        for line in "ABCD"
+        for what in ("anchor.x", "anchor.y", "anchor.z", "length")
+    ),
     "spool.radius",
     *(f"{line}.buildup" for line in "ABCD"),
 )
@@ -46,9 +52,11 @@ LINE, POSITION = 0.5, 0.5
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """What the reference finds. values, sd : (21,) in the order of `NAMES` [mm] (22 with a stretch). poses : (N, 3).
+    """What the reference finds. values, sd : (21,) in the order of `NAMES` [mm] (22 with a
+    stretch). poses : (N, 3).
 
-    lines : (N, 4) residuals of the lines [mm]. positions : (K, 3). chi_square, dof, covariance : of the fit.
+    lines : (N, 4) residuals of the lines [mm]. positions : (K, 3). chi_square, dof, covariance : of
+        the fit.
     """
 
     values: Array
@@ -83,22 +91,28 @@ def paid_out(found: dict[str, Any], radius: float, buildup: Array) -> Array:
     return s * (radius * turn - buildup * turn**2 / 4)
 
 
-def motor_angles(found: dict[str, Any], radius: float, buildup: Array, paid: Array) -> tuple[Array, Array]:
+def motor_angles(
+    found: dict[str, Any], radius: float, buildup: Array, paid: Array
+) -> tuple[Array, Array]:
     """Motor angles (N, 4) [rad] that pay out this much, and the line's change per radian there."""
     gear, s = share(found)
-    # r t - b t^2 / 4 = u has the root t = 2 u / (r + sqrt(r^2 - b u)), and dt/du = 1 / sqrt(r^2 - b u)
+    # r t - b t^2 / 4 = u has the root t = 2 u / (r + sqrt(r^2 - b u)), and dt/du = 1 / sqrt(r^2 - b
+    # u)
     root = np.sqrt(radius**2 - buildup * paid / s)
     return 2 * (paid / s) / (radius + root) / gear, root * gear * s
 
 
-def reference(found: dict[str, Any], line: float, position: float, start: Array, stretch: Array | None = None) -> Reference:
+def reference(
+    found: dict[str, Any], line: float, position: float, start: Array, stretch: Array | None = None
+) -> Reference:
     """Solve densely for 21 parameters and all poses.
 
     Parameters
     ----------
-    found : samples. line : what the sigma of motor angles is in line on the spools as guessed, position : sigma [mm].
-    start : (21,) parameters to begin with [mm]. stretch : (N, 4) that lengthens the lines by an unknown factor, the last
-        parameter; none by default.
+    found : samples. line : what the sigma of motor angles is in line on the spools as guessed,
+        position : sigma [mm].
+    start : (21,) parameters to begin with [mm]. stretch : (N, 4) that lengthens the lines by an
+        unknown factor, the last parameter; none by default.
     """
     known, measured = np.array(found["xyz_of_samp"]), np.radians(found["motor_pos_samp"])
     n, k, p21 = len(measured), len(known), 21 + (stretch is not None)
@@ -156,23 +170,31 @@ def _split(p: Array) -> tuple[Array, Array, float, Array]:
 
 
 def _first_poses(found: dict[str, Any], start: Array) -> Array:
-    """Poses by least squares on the lines of each, from the known position or from above the origin."""
+    """Poses by least squares on the lines of each, from the known position or from above the
+    origin.
+    """
     known = np.array(found["xyz_of_samp"])
     a, c, r, b = _split(start)
     lengths = c + paid_out(found, r, b)
     free = [
-        least_squares(lambda x, want=want: np.linalg.norm(x - a, axis=1) - want, [0.0, 0.0, 400.0]).x
+        least_squares(
+            lambda x, want=want: np.linalg.norm(x - a, axis=1) - want, [0.0, 0.0, 400.0]
+        ).x
         for want in lengths[len(known) :]
     ]
     return np.concatenate([known, free])
 
 
 def example(seed: int = 11) -> dict[str, Any]:
-    """Samples of the example's machine: 9 known poses, 8 of them on the bed, and 36 unknown ones; with noise."""
+    """Samples of the example's machine: 9 known poses, 8 of them on the bed, and 36 unknown ones;
+    with noise.
+    """
     rng = np.random.default_rng(seed)
     ring = 0.25 * np.pi * np.arange(8)
     bed = np.column_stack([320 * np.cos(ring), 320 * np.sin(ring), np.zeros(8)])
-    unknown = np.column_stack([rng.uniform(-450, 450, 36), rng.uniform(-450, 450, 36), rng.uniform(50, 1300, 36)])
+    unknown = np.column_stack(
+        [rng.uniform(-450, 450, 36), rng.uniform(-450, 450, 36), rng.uniform(50, 1300, 36)]
+    )
     poses = np.concatenate([bed, [[40.0, -30.0, 1200.0]], unknown])
     found: dict[str, Any] = {
         "_source": f"simulated for loopcal's example, seed {seed}; the machine is truth.yaml",

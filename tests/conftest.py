@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every test relies on: one BLAS thread, 64-bit jax, reproducible hypothesis, the outside data, and strictness.
+"""What every test relies on: one BLAS thread, 64-bit jax, reproducible hypothesis, the outside
+data, and strictness.
 
-Under LOOPCAL_STRICT=1 a skip is a failure, so that nothing is left out in silence where everything should be there.
+Under LOOPCAL_STRICT=1 a skip is a failure, so that nothing is left out in silence where everything
+should be there.
 """
 
 import os
@@ -11,16 +13,19 @@ from types import ModuleType
 
 import pytest
 
-# Small matrices only: more threads cost more than they bring. Set before numpy is imported for the first time.
+# Small matrices only: more threads cost more than they bring. Set before numpy is imported for the
+# first time.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("MPLBACKEND", "Agg")
 
-from hypothesis import HealthCheck, settings  # noqa: E402  (it may import numpy)
+from hypothesis import HealthCheck, settings  # noqa: E402
 
 # The same examples in every run; no deadline, because machines differ.
-settings.register_profile("loopcal", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "loopcal", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("loopcal")
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -53,7 +58,9 @@ def jax() -> ModuleType:
 
 
 def _refuse_skip(report: pytest.TestReport | pytest.CollectReport) -> None:
-    """Turn a skip into a failure under LOOPCAL_STRICT=1; an expected failure (xfail) stays what it is."""
+    """Turn a skip into a failure under LOOPCAL_STRICT=1; an expected failure (xfail) stays what it
+    is.
+    """
     if STRICT and report.outcome == "skipped" and not hasattr(report, "wasxfail"):
         reason = report.longrepr[-1] if isinstance(report.longrepr, tuple) else report.longrepr
         report.outcome = "failed"

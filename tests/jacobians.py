@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one Jacobian checker of the whole test suite: central differences with an error bound, and automatic derivatives.
+"""The one Jacobian checker of the whole test suite: central differences with an error bound, and
+automatic derivatives.
 
-A difference proves as much as its own error allows, so the step is chosen by the smallest bound (truncation seen
-between neighbouring steps, plus rounding), the bound is part of the tolerance, and a bound too large to prove anything
-fails the test. The automatic derivative comes from jax: either from a function written for it, or from our own source
-run with jax.numpy in the place of numpy (`under_jax`), which leaves the derivative independent of ours.
+A difference proves as much as its own error allows, so the step is chosen by the smallest bound
+(truncation seen between neighbouring steps, plus rounding), the bound is part of the tolerance, and
+a bound too large to prove anything fails the test. The automatic derivative comes from jax: either
+from a function written for it, or from our own source run with jax.numpy in the place of numpy
+(`under_jax`), which leaves the derivative independent of ours.
 """
 
 import sys
@@ -17,11 +19,14 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-# Steps as fractions of the scale. Fourth-order differences are best near eps^(1/5) = 7e-4; the ladder surrounds it.
+# Steps as fractions of the scale. Fourth-order differences are best near eps^(1/5) = 7e-4; the
+# ladder surrounds it.
 _LADDER = 10.0 ** np.arange(-1.0, -5.1, -0.5)
-# Rounding of the 4-point formula: (8 + 8 + 1 + 1) / 12 ulps of the function over the step, times 4 for its own error.
+# Rounding of the 4-point formula: (8 + 8 + 1 + 1) / 12 ulps of the function over the step, times 4
+# for its own error.
 _ROUNDING = 6.0 * np.finfo(float).eps
-# The truncation of a step is judged by its change to the next; ten covers outputs that agree there by chance.
+# The truncation of a step is judged by its change to the next; ten covers outputs that agree there
+# by chance.
 _SAFETY = 10.0
 # A bound above this fraction of the largest scaled column proves nothing.
 _USEFUL = 1e-6
@@ -29,10 +34,13 @@ _USEFUL = 1e-6
 _AUTOMATIC = 1e-11
 
 
-def central_difference(function: Callable[[Array], ArrayLike], x: Array, scale: Array) -> tuple[Array, Array]:
+def central_difference(
+    function: Callable[[Array], ArrayLike], x: Array, scale: Array
+) -> tuple[Array, Array]:
     """Derivative of a function by fourth-order central differences, with an error bound.
 
-    `f' = (8 (f(h) - f(-h)) - (f(2h) - f(-2h))) / 12h`, the step of each unknown chosen from a ladder.
+    `f' = (8 (f(h) - f(-h)) - (f(2h) - f(-2h))) / 12h`, the step of each unknown chosen from a
+    ladder.
 
     Parameters
     ----------
@@ -40,7 +48,8 @@ def central_difference(function: Callable[[Array], ArrayLike], x: Array, scale: 
         From (k,) to an array (...) of any shape.
     x : (k,)
     scale : (k,)
-        Change of each unknown over which the function bends noticeably (1 rad, the size of the robot).
+        Change of each unknown over which the function bends noticeably (1 rad, the size of the
+        robot).
 
     Returns
     -------
@@ -52,11 +61,14 @@ def central_difference(function: Callable[[Array], ArrayLike], x: Array, scale: 
     for k, unit in enumerate(np.eye(x.size)):
         tries, size = [], 0.0
         for step in scale[k] * _LADDER:
-            far, near, back, behind = (np.asarray(function(x + f * step * unit)) for f in (2.0, 1.0, -1.0, -2.0))
+            far, near, back, behind = (
+                np.asarray(function(x + f * step * unit)) for f in (2.0, 1.0, -1.0, -2.0)
+            )
             tries.append((8.0 * (near - back) - (far - behind)) / (12.0 * step))
             size = max(size, float(np.max(np.abs(near))))
         errors = [
-            float(np.max(np.abs(tries[i] - tries[i + 1]))) + _ROUNDING * size / (scale[k] * _LADDER[i + 1])
+            float(np.max(np.abs(tries[i] - tries[i + 1])))
+            + _ROUNDING * size / (scale[k] * _LADDER[i + 1])
             for i in range(len(tries) - 1)
         ]
         best = int(np.argmin(errors))
@@ -92,7 +104,8 @@ def check_jacobian(
     atol_reason : str
         Why `atol` is what it is; printed on failure.
     automatic : callable, optional
-        The function for jax: another one, or `function` itself where it only calls loopcal and takes jax arrays.
+        The function for jax: another one, or `function` itself where it only calls loopcal and
+        takes jax arrays.
     package : str
         Modules whose numpy is replaced while jax traces `automatic`.
     """
@@ -102,14 +115,25 @@ def check_jacobian(
     largest = max(float(np.max(np.abs(analytic))), float(np.finfo(float).tiny))
     difference, bound = central_difference(function, point, scales)
     if analytic.shape != difference.shape:
-        raise AssertionError(f"Jacobian of shape {analytic.shape}, differences of shape {difference.shape}")
+        raise AssertionError(
+            f"Jacobian of shape {analytic.shape}, differences of shape {difference.shape}"
+        )
     scaled_bound = bound * scales
     if np.max(scaled_bound) > max(_USEFUL * largest, atol):
-        raise AssertionError(f"differences too coarse to prove anything: bound {scaled_bound}, entries to {largest:.3g}")
+        raise AssertionError(
+            f"differences too coarse to prove anything: bound {scaled_bound}, entries to "
+            f"{largest:.3g}"
+        )
     _compare("central differences", analytic, difference * scales, scaled_bound + atol, atol_reason)
     if automatic is not None:
         reference = automatic_derivative(automatic, point, package) * scales
-        _compare("jax", analytic, reference, np.full(point.size, _AUTOMATIC * largest + atol), atol_reason)
+        _compare(
+            "jax",
+            analytic,
+            reference,
+            np.full(point.size, _AUTOMATIC * largest + atol),
+            atol_reason,
+        )
 
 
 def _compare(name: str, analytic: Array, reference: Array, tolerance: Array, reason: str) -> None:
@@ -118,16 +142,21 @@ def _compare(name: str, analytic: Array, reference: Array, tolerance: Array, rea
     if np.any(wrong):
         place = tuple(int(i) for i in np.argwhere(wrong)[0])
         raise AssertionError(
-            f"{int(np.sum(wrong))} entries differ from {name}, the first at {place}: {analytic[place]:.12g} against"
-            f" {reference[place]:.12g}, error {error[place]:.2e}, allowed {tolerance[place[-1]]:.2e} (atol: {reason})"
+            f"{int(np.sum(wrong))} entries differ from {name}, the first at {place}: "
+            f"{analytic[place]:.12g} against"
+            f" {reference[place]:.12g}, error {error[place]:.2e}, allowed "
+            f"{tolerance[place[-1]]:.2e} (atol: {reason})"
         )
 
 
-def automatic_derivative(function: Callable[..., object], x: Array, package: str = "loopcal") -> Array:
+def automatic_derivative(
+    function: Callable[..., object], x: Array, package: str = "loopcal"
+) -> Array:
     """Forward-mode derivative (..., k) of a function at x (k,), in double precision.
 
-    The whole function is compiled at once, which takes a fraction of compiling it operation by operation; where it looks at
-    the values it computes, which a compiled function cannot, it is run as it stands.
+    The whole function is compiled at once, which takes a fraction of compiling it operation by
+    operation; where it looks at the values it computes, which a compiled function cannot, it is run
+    as it stands.
     """
     import jax
 
@@ -142,7 +171,9 @@ def automatic_derivative(function: Callable[..., object], x: Array, package: str
 
 
 class _Either:
-    """A module of numpy whose functions are those of jax where an argument is jax's, else numpy's own."""
+    """A module of numpy whose functions are those of jax where an argument is jax's, else numpy's
+    own.
+    """
 
     def __init__(self, plain: ModuleType, traced: ModuleType) -> None:
         self._plain, self._traced = plain, traced
@@ -158,16 +189,22 @@ class _Either:
 
         def either(*args: object, **kwargs: object) -> object:
             arrays = (a for a in jax.tree.leaves((args, kwargs)) if isinstance(a, jax.Array))
-            return plain(*args, **kwargs) if next(arrays, None) is None else getattr(self._traced, name)(*args, **kwargs)
+            return (
+                plain(*args, **kwargs)
+                if next(arrays, None) is None
+                else getattr(self._traced, name)(*args, **kwargs)
+            )
 
         return either
 
 
 @contextmanager
 def under_jax(package: str = "loopcal") -> Iterator[None]:
-    """Let every loaded module of a package find jax.numpy under the name `np`, and put numpy back at the end.
+    """Let every loaded module of a package find jax.numpy under the name `np`, and put numpy back
+    at the end.
 
-    What does not depend on the traced unknowns stays with numpy: it needs no derivative and no compiling.
+    What does not depend on the traced unknowns stays with numpy: it needs no derivative and no
+    compiling.
     """
     import jax.numpy
 

@@ -10,12 +10,16 @@ from loopcal.errors import FileError, LoopcalError, nearest
 
 
 def test_every_error_of_the_tree_is_a_loopcal_error() -> None:
-    classes = [c for _, c in inspect.getmembers(errors, inspect.isclass) if issubclass(c, Exception)]
+    classes = [
+        c for _, c in inspect.getmembers(errors, inspect.isclass) if issubclass(c, Exception)
+    ]
     assert len(classes) == 6
     assert all(issubclass(c, LoopcalError) for c in classes)
 
 
-@pytest.mark.parametrize(("line", "text"), [(7, "robot.yaml:7: bad key"), (None, "robot.yaml: bad key")])
+@pytest.mark.parametrize(
+    ("line", "text"), [(7, "robot.yaml:7: bad key"), (None, "robot.yaml: bad key")]
+)
 def test_a_file_error_names_path_and_line(line: int | None, text: str) -> None:
     error = FileError("bad key", "robot.yaml", line)
     assert str(error) == text

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from loopcal.se3 import rotation
+from loopcal.geometry import rotations
 from tests.jacobians import central_difference, check_jacobian, under_jax
 
 X = np.array([0.3, -1.2])
@@ -15,7 +15,11 @@ def curve(x):
 
 
 SLOPES = np.array(
-    [[np.cos(X[0]) * X[1], np.sin(X[0])], [X[1] * np.exp(X[0] * X[1]), X[0] * np.exp(X[0] * X[1])], [5 * X[0] ** 4, 0.0]]
+    [
+        [np.cos(X[0]) * X[1], np.sin(X[0])],
+        [X[1] * np.exp(X[0] * X[1]), X[0] * np.exp(X[0] * X[1])],
+        [5 * X[0] ** 4, 0.0],
+    ]
 )
 
 
@@ -54,9 +58,9 @@ def test_the_bound_of_the_differences_holds_and_is_small():
 def test_numpy_is_back_in_its_place_after_jax_even_after_an_error():
     def fail():
         with under_jax():
-            assert vars(rotation)["np"] is not np
+            assert vars(rotations)["np"] is not np
             raise KeyError
 
     with pytest.raises(KeyError):
         fail()
-    assert vars(rotation)["np"] is np
+    assert vars(rotations)["np"] is np

@@ -38,7 +38,10 @@ def test_a_parameter_is_found_by_name():
 
 
 def test_a_wrong_name_is_answered_with_the_nearest():
-    with pytest.raises(MechanismError, match=r"no parameter is called 'leg1.base.z'; the nearest names are leg1.base.[xy]"):
+    with pytest.raises(
+        MechanismError,
+        match=r"no parameter is called 'leg1.base.z'; the nearest names are leg1.base.[xy]",
+    ):
         TABLE.index("leg1.base.z")
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The promises that the repository makes about itself: sizes, layers, licences, and what its pages say."""
+"""The promises that the repository makes about itself: sizes, layers, licences, and what its pages
+say.
+"""
 
 import re
 import subprocess
@@ -10,20 +12,27 @@ import pytest
 
 from tools import check_sizes
 
-# Folders that exist on one machine only; put together here so that this file does not hold them itself.
-MACHINE_PATH = re.compile("|".join(f"(?<![\\w.])/{name}/" for name in ("work", "root", "tmp", "home", "Users")))
+# Folders that exist on one machine only; put together here so that this file does not hold them
+# itself.
+MACHINE_PATH = re.compile(
+    "|".join(f"(?<![\\w.])/{name}/" for name in ("work", "root", "tmp", "home", "Users"))
+)
 
 
 @pytest.fixture(scope="module")
 def tracked(root: Path) -> list[Path]:
     """Return the files that belong to the repository: committed, or new and not ignored."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
-    names = subprocess.run(command, cwd=root, check=True, capture_output=True, text=True).stdout.split("\0")
+    names = subprocess.run(
+        command, cwd=root, check=True, capture_output=True, text=True
+    ).stdout.split("\0")
     return [root / name for name in names if name and (root / name).is_file()]
 
 
 def test_changelog_has_an_unreleased_section(root: Path) -> None:
-    assert re.search(r"^## \[Unreleased\]$", (root / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE)
+    assert re.search(
+        r"^## \[Unreleased\]$", (root / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE
+    )
 
 
 def test_no_file_and_no_function_is_too_long(root: Path) -> None:
@@ -46,7 +55,9 @@ def test_a_long_file_is_reported_unless_a_reason_stands_on_top() -> None:
 def test_every_package_has_its_layer(root: Path) -> None:
     settings = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))
     contract = settings["tool"]["importlinter"]["contracts"][0]
-    layers = set(re.findall(r"\w+", " ".join(contract["layers"]))) | set(contract["exhaustive_ignores"])
+    layers = set(re.findall(r"\w+", " ".join(contract["layers"]))) | set(
+        contract["exhaustive_ignores"]
+    )
     package = root / "src" / "loopcal"
     modules = {path.stem for path in package.glob("*.py")} - {"__init__"}
     packages = {path.name for path in package.iterdir() if any(path.rglob("*.py"))}
@@ -61,21 +72,37 @@ def test_every_package_has_an_init_file_so_that_the_linters_see_it(root: Path) -
 @pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md"])
 def test_every_make_command_in_the_pages_exists(root: Path, page: str) -> None:
     targets = set(re.findall(r"^([a-z-]+):", (root / "Makefile").read_text("utf-8"), re.MULTILINE))
-    named = set(re.findall(r"(?:^|`)make (?:PYTHON=\S+ )?([a-z-]+)", (root / page).read_text("utf-8"), re.MULTILINE))
+    named = set(
+        re.findall(
+            r"(?:^|`)make (?:PYTHON=\S+ )?([a-z-]+)", (root / page).read_text("utf-8"), re.MULTILINE
+        )
+    )
     assert named, "the page names no make command"
     assert named <= targets
 
 
 def test_the_list_of_decisions_is_complete(root: Path) -> None:
     folder = root / "docs" / "decisions"
-    listed = re.findall(r"^\| \[\d\d\]\(([^)]+)\)", (folder / "README.md").read_text("utf-8"), re.MULTILINE)
-    assert listed == sorted(path.name for path in folder.glob("[0-9]*.md") if not path.name.startswith("00"))
+    listed = re.findall(
+        r"^\| \[\d\d\]\(([^)]+)\)", (folder / "README.md").read_text("utf-8"), re.MULTILINE
+    )
+    assert listed == sorted(
+        path.name for path in folder.glob("[0-9]*.md") if not path.name.startswith("00")
+    )
 
 
 def test_links_between_the_pages_lead_somewhere(root: Path, tracked: list[Path]) -> None:
     pages = [path for path in tracked if path.suffix == ".md"]
-    links = [(page, link) for page in pages for link in re.findall(r"\]\(([^)#:]+)\)", page.read_text("utf-8"))]
-    assert [f"{page.relative_to(root)}: {link}" for page, link in links if not (page.parent / link).exists()] == []
+    links = [
+        (page, link)
+        for page in pages
+        for link in re.findall(r"\]\(([^)#:]+)\)", page.read_text("utf-8"))
+    ]
+    assert [
+        f"{page.relative_to(root)}: {link}"
+        for page, link in links
+        if not (page.parent / link).exists()
+    ] == []
 
 
 def test_no_tracked_file_holds_a_path_of_one_machine(root: Path, tracked: list[Path]) -> None:
@@ -92,4 +119,6 @@ def test_no_tracked_file_holds_a_path_of_one_machine(root: Path, tracked: list[P
 def test_every_python_file_states_its_licence_first(root: Path, tracked: list[Path]) -> None:
     spdx = "# SPDX-License-Identifier: Apache-2.0\n"
     files = [path for path in tracked if path.suffix == ".py"]
-    assert [str(f.relative_to(root)) for f in files if not f.read_text("utf-8").startswith(spdx)] == []
+    assert [
+        str(f.relative_to(root)) for f in files if not f.read_text("utf-8").startswith(spdx)
+    ] == []

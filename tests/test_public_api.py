@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The public names of the package: each exists, and importing the package imports none of what stands behind them."""
+"""The public names of the package: each exists, and importing the package imports none of what
+stands behind them.
+"""
 
 import subprocess
 import sys
@@ -16,10 +18,17 @@ def test_every_public_name_exists(name) -> None:
 
 
 def test_an_unknown_name_lists_the_public_ones() -> None:
-    with pytest.raises(AttributeError, match=r"no attribute 'calibrate_all'; public names are .*identify"):
+    with pytest.raises(
+        AttributeError, match=r"no attribute 'calibrate_all'; public names are .*identify"
+    ):
         _ = loopcal.calibrate_all
 
 
 def test_importing_the_package_imports_no_numpy() -> None:
     code = "import sys, loopcal; print('numpy' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        == "False\n"
+    )

@@ -24,9 +24,12 @@ def _folder(tmp_path, monkeypatch, root) -> None:
 def test_the_python_example_runs_and_improves_the_robot(tmp_path, capsys) -> None:
     block = re.search(r"^```python\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
     assert block
-    assert len([line for line in block[1].splitlines() if line and not line.startswith("import")]) <= 10
+    assert (
+        len([line for line in block[1].splitlines() if line and not line.startswith("import")])
+        <= 10
+    )
     names: dict = {}
-    exec(block[1], names)  # noqa: S102  (our own page)
+    exec(block[1], names)  # noqa: S102
     assert names["readings"].shape == (40, 6)
     truth = load_robot("examples/hexapod-42/truth.yaml").values
     found = load_robot("calibrated.yaml").values
@@ -36,7 +39,11 @@ def test_the_python_example_runs_and_improves_the_robot(tmp_path, capsys) -> Non
 
 def test_every_line_of_the_first_half_hour_works_as_it_stands(capsys) -> None:
     part = README[README.index("## The first half hour") : README.index("## Status")]
-    lines = [line for block in re.findall(r"^```sh\n(.*?)^```", part, re.MULTILINE | re.DOTALL) for line in block.splitlines()]
+    lines = [
+        line
+        for block in re.findall(r"^```sh\n(.*?)^```", part, re.MULTILINE | re.DOTALL)
+        for line in block.splitlines()
+    ]
     assert len(lines) == 5
     for line in lines:
         assert line.startswith("loopcal ")

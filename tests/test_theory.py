@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pages of docs/theory: those that the code cites exist, links lead somewhere, and their examples hold."""
+"""The pages of docs/theory: those that the code cites exist, links lead somewhere, and their
+examples hold.
+"""
 
 import doctest
 import re
@@ -23,7 +25,11 @@ def anchors(text: str) -> set[str]:
 
 def test_every_page_that_the_code_cites_exists() -> None:
     files = (ROOT / "src").rglob("*.py")
-    cited = {name for f in files for name in re.findall(r"docs/theory/([\w-]+\.md)", f.read_text("utf-8"))}
+    cited = {
+        name
+        for f in files
+        for name in re.findall(r"docs/theory/([\w-]+\.md)", f.read_text("utf-8"))
+    }
     assert cited, "the code cites no page of theory"
     assert sorted(cited - {page.name for page in PAGES}) == []
 
@@ -48,12 +54,18 @@ def test_every_link_leads_to_a_page_and_a_heading_of_it(page: Path) -> None:
 
 def test_every_cited_key_is_in_the_list_of_references() -> None:
     known = set(re.findall(r"^- \*\*\[(\w+)\]\*\*", TEXTS[THEORY / "references.md"], re.MULTILINE))
-    cited = {key for text in TEXTS.values() for key in re.findall(r"\[([A-Z]\w+\d{2,4})\]\(references\.md\)", text)}
+    cited = {
+        key
+        for text in TEXTS.values()
+        for key in re.findall(r"\[([A-Z]\w+\d{2,4})\]\(references\.md\)", text)
+    }
     assert sorted(cited - known) == []
     assert sorted(known - cited) == []
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if EXAMPLE.search(TEXTS[page])], ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if EXAMPLE.search(TEXTS[page])], ids=lambda page: page.name
+)
 def test_the_examples_of_a_page_give_what_it_says(page: Path) -> None:
     source = "\n".join(EXAMPLE.findall(TEXTS[page]))
     example = doctest.DocTestParser().get_doctest(source, {}, page.name, str(page), 0)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small robots, data and truths that the tests share. Lengths in metres, angles in radians.
 
-A robot here is a function without arguments (cached), so that a test names what it needs and pays for it once.
+A robot here is a function without arguments (cached), so that a test names what it needs and pays
+for it once.
 """
 
 from collections.abc import Iterable
@@ -11,8 +12,18 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal import se3
-from loopcal.mechanism import Actuator, Address, Assembly, Joint, Limb, Linear, Link, Mechanism, build
+from loopcal import geometry
+from loopcal.mechanism import (
+    Actuator,
+    Address,
+    Assembly,
+    Joint,
+    Limb,
+    Linear,
+    Link,
+    Mechanism,
+    build,
+)
 from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.families.gough import Gough
 from loopcal.mechanism.families.linear_delta import LinearDelta
@@ -23,9 +34,10 @@ from loopcal.units import Dimension
 Array = NDArray[np.float64]
 MM = 1e-3
 
-# --- hexapods with 42 parameters -------------------------------------------------------------------------------------
-# "Numerical simulation of the calibration algorithm for a 6-DOF parallel mechanism": Table 2 (nominal: base, length,
-# platform, leg by leg) and Table 3 (errors, in the same order) [mm].
+# --- hexapods with 42 parameters
+# ------------------------------------------------------------------------------------- "Numerical
+# simulation of the calibration algorithm for a 6-DOF parallel mechanism": Table 2 (nominal: base,
+# length, platform, leg by leg) and Table 3 (errors, in the same order) [mm].
 HEXAPOD_BASE = np.array(
     [
         (120, -140, 0),
@@ -58,8 +70,8 @@ HEXAPOD_ERRORS = np.array(
     ]
 )
 
-# Nategh & Agheli (2009), Tables 1 and 2, as in the public repository tabathaviso/hexapod-parallel-manipulator
-# (calibration.m) [mm]: rows x, y, z; columns legs 1 to 6.
+# Nategh & Agheli (2009), Tables 1 and 2, as in the public repository
+# tabathaviso/hexapod-parallel-manipulator (calibration.m) [mm]: rows x, y, z; columns legs 1 to 6.
 NATEGH_BASE = np.array(
     [
         (305.4001, -56.4357, -248.9644, -248.9644, -56.4357, 305.4001),
@@ -95,18 +107,31 @@ NATEGH_TRUE_LENGTHS = np.array((604.4299, 607.2473, 600.4441, 605.9031, 604.5251
 @cache
 def hexapod() -> Mechanism:
     """The 42-parameter hexapod at its nominal values."""
-    return gough("hexapod", HEXAPOD_BASE * MM, HEXAPOD_PLATFORM * MM, HEXAPOD_LENGTH * MM, 0.2, (-0.075, 0.075))
+    return gough(
+        "hexapod",
+        HEXAPOD_BASE * MM,
+        HEXAPOD_PLATFORM * MM,
+        HEXAPOD_LENGTH * MM,
+        0.2,
+        (-0.075, 0.075),
+    )
 
 
 def hexapod_truth() -> Array:
     """Its true values (42,), Tables 2 and 3 added."""
-    return hexapod().values + gough_values(HEXAPOD_ERRORS[:, :3] * MM, HEXAPOD_ERRORS[:, 4:] * MM, HEXAPOD_ERRORS[:, 3] * MM)
+    return hexapod().values + gough_values(
+        HEXAPOD_ERRORS[:, :3] * MM, HEXAPOD_ERRORS[:, 4:] * MM, HEXAPOD_ERRORS[:, 3] * MM
+    )
 
 
 @cache
 def nategh() -> Mechanism:
-    """The hexapod of Nategh and Agheli at its nominal values; the lengths are those at reading zero."""
-    return gough("nategh", NATEGH_BASE * MM, NATEGH_PLATFORM * MM, NATEGH_LENGTH * MM, 0.8, (-0.4, 0.8))
+    """The hexapod of Nategh and Agheli at its nominal values; the lengths are those at reading
+    zero.
+    """
+    return gough(
+        "nategh", NATEGH_BASE * MM, NATEGH_PLATFORM * MM, NATEGH_LENGTH * MM, 0.8, (-0.4, 0.8)
+    )
 
 
 def nategh_truth() -> Array:
@@ -116,12 +141,20 @@ def nategh_truth() -> Array:
 
 def nategh_poses(rng: np.random.Generator, n: int = 18) -> Array:
     """Random poses (n, 4, 4): +-100 mm, z 650 to 950 mm, +-0.2 rad in roll, pitch and yaw."""
-    low, high = np.array([-0.1, -0.1, 0.65, -0.2, -0.2, -0.2]), np.array([0.1, 0.1, 0.95, 0.2, 0.2, 0.2])
+    low, high = (
+        np.array([-0.1, -0.1, 0.65, -0.2, -0.2, -0.2]),
+        np.array([0.1, 0.1, 0.95, 0.2, 0.2, 0.2]),
+    )
     return poses_of(rng.uniform(low, high, (n, 6)))
 
 
 def gough(
-    name: str, base: Array, platform: Array, lengths: float | Array, z: float, stroke: tuple[float, float] | None = None
+    name: str,
+    base: Array,
+    platform: Array,
+    lengths: float | Array,
+    z: float,
+    stroke: tuple[float, float] | None = None,
 ) -> Mechanism:
     """A hexapod with rod legs from its centres (6, 3) [m] and leg lengths at reading zero."""
     record = Gough(
@@ -142,10 +175,11 @@ def gough_values(base: Array, platform: Array, lengths: Array) -> Array:
 
 def poses_of(coordinates: Array) -> Array:
     """Poses (n, 4, 4) of x, y, z, roll, pitch, yaw (n, 6) [m, rad]."""
-    return se3.pose(se3.euler_to_matrix(coordinates[:, 3:], "xyz"), coordinates[:, :3])
+    return geometry.pose(geometry.euler_to_matrix(coordinates[:, 3:], "xyz"), coordinates[:, :3])
 
 
-# --- deltas and planar machines: platforms with fewer than six freedoms ----------------------------------------------
+# --- deltas and planar machines: platforms with fewer than six freedoms
+# ----------------------------------------------
 
 
 @cache
@@ -167,7 +201,9 @@ def delta(readings: str = "drop") -> Mechanism:
 
 @cache
 def five_bar() -> Mechanism:
-    """A planar machine with freedoms x and y: one limb ends in a rod, the other in a passive joint and a point."""
+    """A planar machine with freedoms x and y: one limb ends in a rod, the other in a passive joint
+    and a point.
+    """
     limbs = (
         Limb(
             "left",
@@ -179,7 +215,11 @@ def five_bar() -> Mechanism:
         ),
         Limb(
             "right",
-            (Link("pivot", place((0.07, 0, 0))), Link("crank", place((0.15, 0, 0))), Link("rod", place((0.2, 0, 0)))),
+            (
+                Link("pivot", place((0.07, 0, 0))),
+                Link("crank", place((0.15, 0, 0))),
+                Link("rod", place((0.2, 0, 0))),
+            ),
             (Joint("motor", "R", "q2", start=0.7), Joint("elbow", "R", start=1.2)),
             "ball",
             Link("pin", np.eye(4)),
@@ -190,40 +230,69 @@ def five_bar() -> Mechanism:
 
 @cache
 def planar_rrr() -> Mechanism:
-    """A planar 3-RRR with freedoms x, y and yaw: two limbs end in a point, one in a pivot rigid in the platform."""
+    """A planar 3-RRR with freedoms x, y and yaw: two limbs end in a point, one in a pivot rigid in
+    the platform.
+    """
     limbs = []
     for i, angle in enumerate(np.deg2rad((90.0, 210.0, 330.0)), start=1):
-        foot, corner = 0.3 * np.array((np.cos(angle), np.sin(angle), 0.0)), 0.06 * np.array((np.cos(angle), np.sin(angle), 0))
-        links = [Link("base", place(foot, (0, 0, angle))), Link("crank", place((0.15, 0, 0))), Link("rod", place((0.17, 0, 0)))]
+        foot, corner = (
+            0.3 * np.array((np.cos(angle), np.sin(angle), 0.0)),
+            0.06 * np.array((np.cos(angle), np.sin(angle), 0)),
+        )
+        links = [
+            Link("base", place(foot, (0, 0, angle))),
+            Link("crank", place((0.15, 0, 0))),
+            Link("rod", place((0.17, 0, 0))),
+        ]
         joints = [Joint("motor", "R", f"q{i}", start=2.2), Joint("elbow", "R", start=1.7)]
         if i == 3:
             joints.append(Joint("wrist", "R", start=-0.5))
             links.append(Link("hand", np.eye(4)))
-        limbs.append(Limb(f"arm{i}", tuple(links), tuple(joints), "rigid" if i == 3 else "ball", Link("corner", place(corner))))
+        limbs.append(
+            Limb(
+                f"arm{i}",
+                tuple(links),
+                tuple(joints),
+                "rigid" if i == 3 else "ball",
+                Link("corner", place(corner)),
+            )
+        )
     return build(assembled("3-RRR", tuple(limbs), ("rz", "x", "y"), ("x", "y", "yaw"), np.eye(4)))
 
 
-# --- a tripod machine head: passive joints, three controlled coordinates of six -------------------------------------
+# --- a tripod machine head: passive joints, three controlled coordinates of six
+# -------------------------------------
 PRS_A, PRS_B, PRS_L = 0.2, 0.35, 0.5
 
 
 @cache
 def three_prs() -> Mechanism:
-    """A 3-PRS head with the 33 parameters of ideal joints: eleven a chain, in the chain's own frame."""
+    """A 3-PRS head with the 33 parameters of ideal joints: eleven a chain, in the chain's own
+    frame.
+    """
     limbs, parameters, maps = [], [], []
     swing = float(np.arctan2(-np.sqrt(PRS_L**2 - (PRS_B - PRS_A) ** 2), PRS_A - PRS_B))
     for i in range(3):
         turn, limb = (0.0, 0.0, 2 * np.pi * i / 3), f"limb{i + 1}"
-        R = se3.exp_so3(np.array(turn))
+        R = geometry.exp_so3(np.array(turn))
         links = (
             Link("guide", place(R @ (PRS_B, 0, 0), turn)),
             Link("pin", place((0, 0, 0), (-np.pi / 2, 0, 0))),
             Link("rod", place((PRS_L, 0, 0))),
         )
         joints = (Joint("carriage", "P", f"q{i + 1}", start=0.224), Joint("pin", "R", start=swing))
-        limbs.append(Limb(limb, links, joints, "ball", Link("centre", place(R @ (PRS_A, 0, 0), turn))))
-        moved = [(limb, "centre", a) for a in "xyz"] + [(limb, "guide", a) for a in ("x", "y", "rx", "ry")]
-        moved += [(limb, "pin", "rx"), (limb, "pin", "ry"), (limb, "rod", "x"), (f"q{i + 1}", "transmission", "offset")]
+        limbs.append(
+            Limb(limb, links, joints, "ball", Link("centre", place(R @ (PRS_A, 0, 0), turn)))
+        )
+        moved = [(limb, "centre", a) for a in "xyz"] + [
+            (limb, "guide", a) for a in ("x", "y", "rx", "ry")
+        ]
+        moved += [
+            (limb, "pin", "rx"),
+            (limb, "pin", "ry"),
+            (limb, "rod", "x"),
+            (f"q{i + 1}", "transmission", "offset"),
+        ]
         for owner, element, axis in moved:
             name = f"{owner}.{element}.{axis}"
             dimension = Dimension.ANGLE if axis in AXES[:3] else Dimension.LENGTH
@@ -243,12 +312,15 @@ def three_prs() -> Mechanism:
     )
 
 
-# --- a hexapod with a limb of every kind, and a displacement at every place ------------------------------------------
+# --- a hexapod with a limb of every kind, and a displacement at every place
+# ------------------------------------------
 
 
 @cache
 def menagerie() -> Mechanism:
-    """Six limbs, no two alike: rigid, ball and distance endings behind R, P and screw joints, free or driven."""
+    """Six limbs, no two alike: rigid, ball and distance endings behind R, P and screw joints, free
+    or driven.
+    """
     return build(menagerie_assembly())
 
 
@@ -256,13 +328,29 @@ def menagerie() -> Mechanism:
 def menagerie_assembly(seed: int = 7) -> Assembly:
     """Axes and offsets are random about the legs of a hexapod, so that nothing is zero by symmetry."""
     rng = np.random.default_rng(seed)
-    home = se3.pose(se3.exp_so3(np.array([0.05, -0.08, 0.1])), np.array([0.01, -0.02, 0.25]))
-    kinds = [("RRP", "ball", 2), ("RRPRRR", "rigid", 2), ("PRR", "ball", 0), ("P", "distance", 0), ("H", "distance", 0)]
+    home = geometry.pose(
+        geometry.exp_so3(np.array([0.05, -0.08, 0.1])), np.array([0.01, -0.02, 0.25])
+    )
+    kinds = [
+        ("RRP", "ball", 2),
+        ("RRPRRR", "rigid", 2),
+        ("PRR", "ball", 0),
+        ("P", "distance", 0),
+        ("H", "distance", 0),
+    ]
     limbs = []
     for i, (joints, ending, driven) in enumerate([*kinds, ("", "distance", -1)]):
         limbs.append(
             random_limb(
-                rng, f"limb{i + 1}", joints, ending, driven, HEXAPOD_BASE[i] * MM, HEXAPOD_PLATFORM[i] * MM, home, f"q{i + 1}"
+                rng,
+                f"limb{i + 1}",
+                joints,
+                ending,
+                driven,
+                HEXAPOD_BASE[i] * MM,
+                HEXAPOD_PLATFORM[i] * MM,
+                home,
+                f"q{i + 1}",
             )
         )
     return assembled("menagerie", tuple(limbs), AXES, ("x", "y", "z", "roll", "pitch", "yaw"), home)
@@ -279,37 +367,52 @@ def random_limb(
     home: Array,
     motor: str,
 ) -> Limb:
-    """A limb that closes at `home`: joint frames at random about the line from foot to corner, H for a screw.
+    """A limb that closes at `home`: joint frames at random about the line from foot to corner, H
+    for a screw.
 
     `driven` is the joint that `motor` drives; -1 for the rod of a `distance` ending.
     """
-    attachment = se3.pose(se3.exp_so3(rng.normal(size=3)), corner)
+    attachment = geometry.pose(geometry.exp_so3(rng.normal(size=3)), corner)
     end = home @ attachment
     rod = ending == "distance"
     leg, frames = end[:3, 3] - foot, []
     for j, kind in enumerate(kinds):
         along = float(j + 0.3 * rng.uniform()) / (len(kinds) + int(rod))
         point = foot + along * leg + 0.01 * rng.normal(size=3)
-        frames.append(se3.pose(_frame(rng, leg, kind), point))
+        frames.append(geometry.pose(_frame(rng, leg, kind), point))
     tip = end
     if rod and kinds == "H":  # a crank whose arm lies across the leg, far from its dead points
-        arm = se3.hat(frames[0][:3, 2]) @ leg
-        tip = se3.pose(se3.exp_so3(rng.normal(size=3)), foot + leg * 0.2 + arm * 0.4)
+        arm = geometry.hat(frames[0][:3, 2]) @ leg
+        tip = geometry.pose(geometry.exp_so3(rng.normal(size=3)), foot + leg * 0.2 + arm * 0.4)
     elif rod:
-        tip = se3.pose(se3.exp_so3(rng.normal(size=3)), foot + leg * (0.7 if kinds else 0.0))
+        tip = geometry.pose(
+            geometry.exp_so3(rng.normal(size=3)), foot + leg * (0.7 if kinds else 0.0)
+        )
     start = rng.uniform(0.02, 0.06, len(kinds)) * np.where([k == "P" for k in kinds], 1.0, 8.0)
     joints = tuple(
-        Joint(f"joint{j + 1}", "P" if k == "P" else "R", motor if j == driven else None, 0.015 if k == "H" else 0.0, s)
+        Joint(
+            f"joint{j + 1}",
+            "P" if k == "P" else "R",
+            motor if j == driven else None,
+            0.015 if k == "H" else 0.0,
+            s,
+        )
         for j, (k, s) in enumerate(zip(kinds, start.tolist(), strict=True))
     )
     before, links = np.eye(4), []
     for j, frame in enumerate([*frames, tip]):
-        links.append(Link(f"link{j}", se3.inverse(before) @ frame))
+        links.append(Link(f"link{j}", geometry.inverse(before) @ frame))
         if j < len(kinds):
             before = frame @ _motion(joints[j])
     length = float(np.linalg.norm(end[:3, 3] - tip[:3, 3])) if rod else 0.0
     return Limb(
-        name, tuple(links), joints, ending, Link("attachment", attachment), length, motor if rod and driven < 0 else None
+        name,
+        tuple(links),
+        joints,
+        ending,
+        Link("attachment", attachment),
+        length,
+        motor if rod and driven < 0 else None,
     )
 
 
@@ -331,14 +434,24 @@ def _motion(joint: Joint) -> Array:
 
 
 def assembled(
-    name: str, limbs: tuple[Limb, ...], freedoms: tuple[str, ...], controlled: tuple[str, ...], home: Array
+    name: str,
+    limbs: tuple[Limb, ...],
+    freedoms: tuple[str, ...],
+    controlled: tuple[str, ...],
+    home: Array,
 ) -> Assembly:
-    """An assembly whose every link axis, pitch and rod length is a parameter, and every transmission offset and gain."""
+    """An assembly whose every link axis, pitch and rod length is a parameter, and every
+    transmission offset and gain.
+    """
     driven = [(m, j.kind) for limb in limbs for m, j in ((j.actuator, j) for j in limb.joints) if m]
     driven += [(limb.actuator, "P") for limb in limbs if limb.actuator]
-    actuators = tuple(Actuator(m, Dimension.ANGLE if k == "R" else Dimension.LENGTH) for m, k in sorted(driven))
+    actuators = tuple(
+        Actuator(m, Dimension.ANGLE if k == "R" else Dimension.LENGTH) for m, k in sorted(driven)
+    )
     addresses = [a for limb in limbs for a in addresses_of(limb)]
-    addresses += [Address(a.name, "transmission", term) for a in actuators for term in ("offset", "gain")]
+    addresses += [
+        Address(a.name, "transmission", term) for a in actuators for term in ("offset", "gain")
+    ]
     turns = {a.name for a in actuators if a.dimension is Dimension.ANGLE}
     parameters, maps = [], []
     for address in addresses:
@@ -346,14 +459,18 @@ def assembled(
         nominal = 1.0 if address.axis == "gain" else 0.0
         parameters.append(Parameter(name_of, _dimension(address, turns), nominal))
         maps.append(Linear(name_of, address))
-    return Assembly(name, limbs, actuators, freedoms, controlled, home, tuple(parameters), tuple(maps))
+    return Assembly(
+        name, limbs, actuators, freedoms, controlled, home, tuple(parameters), tuple(maps)
+    )
 
 
 def addresses_of(limb: Limb) -> Iterable[Address]:
     """Every number of a limb that a parameter may move."""
     for link in (*limb.links, limb.attachment):
         yield from (Address(limb.name, link.name, axis) for axis in AXES)
-    yield from (Address(limb.name, joint.name, "pitch") for joint in limb.joints if joint.kind == "R")
+    yield from (
+        Address(limb.name, joint.name, "pitch") for joint in limb.joints if joint.kind == "R"
+    )
     if limb.ending == "distance":
         yield Address(limb.name, "rod", "length")
 
@@ -367,11 +484,15 @@ def _dimension(address: Address, turns: set[str]) -> Dimension:
 
 def place(point: Iterable[float], turn: Iterable[float] = (0.0, 0.0, 0.0)) -> Array:
     """Pose (4, 4) from a position [m] and a rotation vector [rad]."""
-    return se3.pose(se3.exp_so3(np.array(list(turn), dtype=float)), np.array(list(point), dtype=float))
+    return geometry.pose(
+        geometry.exp_so3(np.array(list(turn), dtype=float)), np.array(list(point), dtype=float)
+    )
 
 
 def scaled(assembly: Assembly, s: float) -> Assembly:
-    """The same mechanism with every length multiplied by s (parameters at nominal zero or of pure links only)."""
+    """The same mechanism with every length multiplied by s (parameters at nominal zero or of pure
+    links only).
+    """
 
     def grown(link: Link) -> Link:
         T = np.array(link.transform)
@@ -379,19 +500,32 @@ def scaled(assembly: Assembly, s: float) -> Assembly:
         return replace(link, transform=T)
 
     def limb_of(limb: Limb) -> Limb:
-        joints = tuple(replace(j, pitch=j.pitch * s, start=j.start * (s if j.kind == "P" else 1.0)) for j in limb.joints)
+        joints = tuple(
+            replace(j, pitch=j.pitch * s, start=j.start * (s if j.kind == "P" else 1.0))
+            for j in limb.joints
+        )
         links = tuple(grown(link) for link in limb.links)
-        return replace(limb, links=links, joints=joints, attachment=grown(limb.attachment), length=limb.length * s)
+        return replace(
+            limb,
+            links=links,
+            joints=joints,
+            attachment=grown(limb.attachment),
+            length=limb.length * s,
+        )
 
     home = grown(Link("home", assembly.home)).transform
     return replace(assembly, limbs=tuple(limb_of(limb) for limb in assembly.limbs), home=home)
 
 
 def relocated(assembly: Assembly, G: Array) -> Assembly:
-    """The same mechanism with its base standing elsewhere: first links and home multiplied by G (4, 4) from the left."""
+    """The same mechanism with its base standing elsewhere: first links and home multiplied by G (4,
+    4) from the left.
+    """
 
     def limb_of(limb: Limb) -> Limb:
         first = replace(limb.links[0], transform=G @ limb.links[0].transform)
         return replace(limb, links=(first, *limb.links[1:]))
 
-    return replace(assembly, limbs=tuple(limb_of(limb) for limb in assembly.limbs), home=G @ assembly.home)
+    return replace(
+        assembly, limbs=tuple(limb_of(limb) for limb in assembly.limbs), home=G @ assembly.home
+    )

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Size check: no file over 400 lines and no function over 60, unless `# size: reason` stands beside it.
+"""Size check: no file over 400 lines and no function over 60, unless `# size: reason` stands beside
+it.
 
-For a file the comment stands in its first ten lines; for a function on its `def` line or on the line above.
+For a file the comment stands in its first ten lines; for a function on its `def` line or on the
+line above.
 """
 
 import ast
@@ -20,21 +22,30 @@ def check_text(name: str, text: str) -> list[str]:
     lines = text.splitlines()
     problems = []
     if len(lines) > FILE_LIMIT and not any(REASON.search(line) for line in lines[:10]):
-        problems.append(f"{name}: {len(lines)} lines, at most {FILE_LIMIT}; split it or give `# size: reason` on top")
+        problems.append(
+            f"{name}: {len(lines)} lines, at most {FILE_LIMIT}; split it or give `# size: reason` "
+            "on top"
+        )
     for node in ast.walk(ast.parse(text)):
         if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             continue
         length = (node.end_lineno or node.lineno) - node.lineno + 1
         beside = lines[max(node.lineno - 2, 0) : node.body[0].lineno]
         if length > FUNCTION_LIMIT and not any(REASON.search(line) for line in beside):
-            problems.append(f"{name}:{node.lineno}: {node.name} has {length} lines, at most {FUNCTION_LIMIT}")
+            problems.append(
+                f"{name}:{node.lineno}: {node.name} has {length} lines, at most {FUNCTION_LIMIT}"
+            )
     return problems
 
 
 def check_folders(root: Path) -> list[str]:
     """List what is too long in the Python files of `root`, a sentence each."""
     files = sorted(path for folder in FOLDERS for path in (root / folder).rglob("*.py"))
-    return [p for path in files for p in check_text(path.relative_to(root).as_posix(), path.read_text("utf-8"))]
+    return [
+        p
+        for path in files
+        for p in check_text(path.relative_to(root).as_posix(), path.read_text("utf-8"))
+    ]
 
 
 def main() -> int:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Regenerate constraints/python3.XX.txt, by installing loopcal[dev] afresh for each Python found and freezing it.
+"""Regenerate constraints/python3.XX.txt, by installing loopcal[dev] afresh for each Python found
+and freezing it.
 
-Run by `make constraints`. Pythons 3.11 to 3.14 are looked for on PATH and among pyenv's versions; the file of a
-Python that is not found is left as it is.
+Run by `make constraints`. Pythons 3.11 to 3.14 are looked for on PATH and among pyenv's versions;
+the file of a Python that is not found is left as it is.
 """
 
 import os
@@ -21,7 +22,9 @@ def find_python(minor: str) -> str | None:
     installed = sorted(str(path) for path in pyenv.glob(f"versions/{minor}.*/bin/python{minor}"))
     for candidate in (f"python{minor}", *reversed(installed)):
         try:
-            subprocess.run([candidate, "-c", "import ensurepip, venv"], check=True, capture_output=True)
+            subprocess.run(
+                [candidate, "-c", "import ensurepip, venv"], check=True, capture_output=True
+            )
         except (OSError, subprocess.CalledProcessError):
             continue
         return candidate
@@ -32,9 +35,17 @@ def freeze(python: str) -> list[str]:
     """Install loopcal[dev] into a fresh environment and return the versions of what came with it."""
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([python, "-m", "venv", folder], check=True)
-        pip = [str(Path(folder, "bin", "python")), "-m", "pip", "--quiet", "--disable-pip-version-check"]
+        pip = [
+            str(Path(folder, "bin", "python")),
+            "-m",
+            "pip",
+            "--quiet",
+            "--disable-pip-version-check",
+        ]
         subprocess.run([*pip, "install", f"{ROOT}[dev]"], check=True)
-        frozen = subprocess.run([*pip, "freeze", "--exclude", "loopcal"], check=True, capture_output=True, text=True)
+        frozen = subprocess.run(
+            [*pip, "freeze", "--exclude", "loopcal"], check=True, capture_output=True, text=True
+        )
     return frozen.stdout.splitlines()
 
 

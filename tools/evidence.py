@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run evidence/*.py, write docs/evidence/*.json, and make the tables of the documentation from those files.
+"""Run evidence/*.py, write docs/evidence/*.json, and make the tables of the documentation from
+those files.
 
-Run as `python -m tools.evidence`. `--tables` makes the tables only; names choose scripts. evidence/README.md says
-what a script returns.
+Run as `python -m tools.evidence`. `--tables` makes the tables only; names choose scripts.
+evidence/README.md says what a script returns.
 """
 
 import argparse
@@ -20,7 +21,10 @@ from typing import Any
 from tools.machine import describe_machine
 
 ROOT = Path(__file__).resolve().parent.parent
-BLOCK = re.compile(r"(<!-- evidence: (?P<name>[\w-]+)\.(?P<table>[\w-]+) -->\n)(?P<body>.*?)(<!-- end -->)", re.DOTALL)
+BLOCK = re.compile(
+    r"(<!-- evidence: (?P<name>[\w-]+)\.(?P<table>[\w-]+) -->\n)(?P<body>.*?)(<!-- end -->)",
+    re.DOTALL,
+)
 
 
 class EvidenceError(Exception):
@@ -39,7 +43,9 @@ def collect(script: Path) -> dict[str, Any]:
 
 
 def write_json(path: Path, document: dict[str, Any]) -> None:
-    """Write JSON without NaN under a temporary name and rename it, so that a reader never sees half a file."""
+    """Write JSON without NaN under a temporary name and rename it, so that a reader never sees half
+    a file.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")
     temporary.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
@@ -57,10 +63,11 @@ def run_script(script: Path) -> None:
 
 
 def run_all(scripts: list[Path]) -> None:
-    """Run scripts side by side, one on each core; those that took longest the last time begin first.
+    """Run scripts side by side, one on each core; those that took longest the last time begin
+    first.
 
-    Each process keeps its linear algebra to one thread, as the command line does: small factorisations gain nothing from
-    more, and processes would take the cores from each other.
+    Each process keeps its linear algebra to one thread, as the command line does: small
+    factorisations gain nothing from more, and processes would take the cores from each other.
     """
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
@@ -71,9 +78,15 @@ def run_all(scripts: list[Path]) -> None:
 
 
 def last_seconds(script: Path) -> float:
-    """Return how long a script took when its JSON file was made; without one it counts as the longest."""
+    """Return how long a script took when its JSON file was made; without one it counts as the
+    longest.
+    """
     path = ROOT / "docs" / "evidence" / f"{script.stem}.json"
-    return json.loads(path.read_text(encoding="utf-8"))["made"]["seconds"] if path.exists() else float("inf")
+    return (
+        json.loads(path.read_text(encoding="utf-8"))["made"]["seconds"]
+        if path.exists()
+        else float("inf")
+    )
 
 
 def render_table(table: dict[str, Any]) -> str:
@@ -96,10 +109,14 @@ def fill_tables(text: str, folder: Path) -> str:
     def fill(match: re.Match[str]) -> str:
         path = folder / f"{match['name']}.json"
         if not path.exists():
-            raise EvidenceError(f"there is no {path}; run `python -m tools.evidence {match['name']}` to make it")
+            raise EvidenceError(
+                f"there is no {path}; run `python -m tools.evidence {match['name']}` to make it"
+            )
         tables = json.loads(path.read_text(encoding="utf-8"))["tables"]
         if match["table"] not in tables:
-            raise EvidenceError(f"{path} has no table {match['table']!r}; there are {', '.join(tables) or 'none'}")
+            raise EvidenceError(
+                f"{path} has no table {match['table']!r}; there are {', '.join(tables) or 'none'}"
+            )
         return match[1] + render_table(tables[match["table"]]) + match[5]
 
     return BLOCK.sub(fill, text)
@@ -126,12 +143,16 @@ def find_outdated(root: Path) -> dict[Path, str]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the scripts, then write the tables; 1 where a page asks for evidence that is not there."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("names", nargs="*", help="evidence/NAME.py scripts to run; all without")
     parser.add_argument("--tables", action="store_true", help="run no script")
     options = parser.parse_args(arguments)
 
-    scripts = [ROOT / "evidence" / f"{name}.py" for name in options.names] or sorted((ROOT / "evidence").glob("*.py"))
+    scripts = [ROOT / "evidence" / f"{name}.py" for name in options.names] or sorted(
+        (ROOT / "evidence").glob("*.py")
+    )
     start = time.perf_counter()
     if not options.tables:
         run_all(scripts)

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write the tables of docs/files.md and docs/exports.md from what reads the files: `python -m tools.file_reference`.
+"""Write the tables of docs/files.md and docs/exports.md from what reads the files: `python -m
+tools.file_reference`.
 
-A table stands between `<!-- made by tools.file_reference: NAME -->` and `<!-- end -->`; what is around it is written by hand.
+A table stands between `<!-- made by tools.file_reference: NAME -->` and `<!-- end -->`; what is
+around it is written by hand.
 """
 
 import dataclasses
@@ -10,11 +12,11 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from loopcal.io import reference
+from loopcal.io.core import file_reference
+from loopcal.io.data.sensor_rows import SETTINGS
+from loopcal.io.data.sensor_settings import SYMBOLS, kind_settings
 from loopcal.io.exports.profile import FROM, KEYS
-from loopcal.io.run_folder import MADE_BY
-from loopcal.io.sensor_rows import SETTINGS
-from loopcal.io.sensor_settings import SYMBOLS, kind_settings
+from loopcal.io.runs.run_folder import MADE_BY
 from loopcal.measure import KINDS, Column, Kind
 from loopcal.mechanism import FAMILIES
 from loopcal.mechanism.records import Robot
@@ -23,21 +25,34 @@ from loopcal.units import Dimension
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGE, EXPORTS = DOCS / "files.md", DOCS / "exports.md"
 EXAMPLES = DOCS.parent / "examples" / "exports"
-BLOCK = re.compile(r"(<!-- made by tools.file_reference: (?P<name>[\w-]+) -->\n)(?P<body>.*?)(<!-- end -->)", re.DOTALL)
+BLOCK = re.compile(
+    r"(<!-- made by tools.file_reference: (?P<name>[\w-]+) -->\n)(?P<body>.*?)(<!-- end -->)",
+    re.DOTALL,
+)
 
 
 def table(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table."""
     lines = [headers, ["---"] * len(headers), *rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
+    return (
+        "\n".join(
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+        )
+        + "\n"
+    )
 
 
 def record_table(record: type, without: Iterable[str] = ()) -> str:
     """Return the keys of a record, those left out that `without` names."""
     left = set(without)
-    found = [key for key in reference.keys(record) if key.name not in left]
+    found = [key for key in file_reference.keys(record) if key.name not in left]
     if not any(key.meaning for key in found):
-        return "; ".join(f"`{k.name}`: {k.holds}" + (f" ({k.default})" if k.default else "") for k in found) + "\n"
+        return (
+            "; ".join(
+                f"`{k.name}`: {k.holds}" + (f" ({k.default})" if k.default else "") for k in found
+            )
+            + "\n"
+        )
     rows = [(f"`{k.name}`", k.holds, k.default, k.meaning) for k in found]
     return table(("key", "holds", "default", "meaning"), rows)
 
@@ -53,24 +68,27 @@ def common_records() -> tuple[type, ...]:
     """Return the records that several families use."""
     seen: dict[type, int] = {}
     for family in FAMILIES.values():
-        for record in reference.nested(family):
+        for record in file_reference.nested(family):
             seen[record] = seen.get(record, 0) + 1
     return tuple(record for record, count in seen.items() if count > 1)
 
 
 def families() -> str:
     """Return the keys of every family, beside the common ones."""
-    shared = [key.name for key in reference.keys(Robot)]
+    shared = [key.name for key in file_reference.keys(Robot)]
     parts = []
     for name, family in FAMILIES.items():
-        own = [record for record in reference.nested(family) if record not in common_records()]
-        parts.append(f"### `family: {name}`\n\n{reference.summary(family)}\n\n{record_table(family, shared)}")
+        own = [record for record in file_reference.nested(family) if record not in common_records()]
+        parts.append(
+            "### `family: "
+            f"{name}`\n\n{file_reference.summary(family)}\n\n{record_table(family, shared)}"
+        )
         parts += [_nested(record) for record in own]
     return "\n".join(parts)
 
 
 def _nested(record: type) -> str:
-    return f"**{record.__name__}**: {reference.summary(record)}\n\n{record_table(record)}"
+    return f"**{record.__name__}**: {file_reference.summary(record)}\n\n{record_table(record)}"
 
 
 def kinds() -> str:
@@ -79,11 +97,19 @@ def kinds() -> str:
     for name, kind in KINDS.items():
         rows = dict.fromkeys(_example(one) for one in kind.examples())
         columns = table(("settings", "columns", "noise is stated for"), rows)
-        meanings = reference.meanings_of(kind)
+        meanings = file_reference.meanings_of(kind)
         if possible := getattr(kind, "possible", ()):
-            meanings["unknown"] = f"Which of {', '.join(f'`{p}`' for p in possible)} are unknown, and identified with the robot"
-        settings = table(("setting", "meaning"), [(f"`{key}`", meanings.get(key, "")) for key in kind_settings(kind)])
-        parts.append(f"### `kind: {name}`\n\n{reference.summary(kind)}\n\n{columns}\n{settings}")
+            meanings["unknown"] = (
+                f"Which of {', '.join(f'`{p}`' for p in possible)} are unknown, and identified "
+                "with the robot"
+            )
+        settings = table(
+            ("setting", "meaning"),
+            [(f"`{key}`", meanings.get(key, "")) for key in kind_settings(kind)],
+        )
+        parts.append(
+            f"### `kind: {name}`\n\n{file_reference.summary(kind)}\n\n{columns}\n{settings}"
+        )
     return "\n".join(parts)
 
 
@@ -92,15 +118,23 @@ def _example(kind: Kind) -> tuple[str, str, str]:
     stated = []
     for field in dataclasses.fields(kind):  # type: ignore[arg-type]  # every kind is a dataclass
         value = getattr(kind, field.name)
-        if field.init and field.name in ("orientation", "components", "targets", "joints", "form") and value:
-            stated.append(f"`{field.name}: {value if isinstance(value, str) else '[' + ', '.join(value) + ']'}`")
+        if (
+            field.init
+            and field.name in ("orientation", "components", "targets", "joints", "form")
+            and value
+        ):
+            stated.append(
+                f"`{field.name}: "
+                f"{value if isinstance(value, str) else '[' + ', '.join(value) + ']'}`"
+            )
     return ", ".join(stated), _columns(kind.columns), _columns(kind.noise_columns)
 
 
 def _columns(columns: Iterable[Column]) -> str:
     """Return columns with an example of their unit."""
     return " ".join(
-        f"`{c.name}`" + ("" if c.dimension is Dimension.RATIO else f" [{SYMBOLS[c.dimension][0]}]") for c in columns
+        f"`{c.name}`" + ("" if c.dimension is Dimension.RATIO else f" [{SYMBOLS[c.dimension][0]}]")
+        for c in columns
     )
 
 
@@ -129,7 +163,13 @@ def profile_example(name: str) -> Callable[[], str]:
     return lambda: f"```yaml\n{(EXAMPLES / name).read_text('utf-8')}```\n"
 
 
-BLOCKS = {"common": common, "families": families, "kinds": kinds, "settings": settings, "made-by": made_by}
+BLOCKS = {
+    "common": common,
+    "families": families,
+    "kinds": kinds,
+    "settings": settings,
+    "made-by": made_by,
+}
 OF_EXPORTS = {"profile": profile, "profile-columns": profile_columns} | {
     name: profile_example(f"{name}.yaml") for name in ("tracker-points", "six-dof", "cmm-spheres")
 }

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which machine and which versions a number was measured with; kept beside every committed measurement."""
+"""Which machine and which versions a number was measured with; kept beside every committed
+measurement.
+"""
 
 import importlib.metadata
 import os
@@ -14,7 +16,10 @@ def describe_machine() -> dict[str, str]:
         "cores": f"{os.cpu_count()} cores",
         "system": f"{platform.system()} {platform.machine()}",
         "python": f"Python {platform.python_version()}",
-        **{name: f"{name} {importlib.metadata.version(name)}" for name in ("numpy", "scipy", "loopcal")},
+        **{
+            name: f"{name} {importlib.metadata.version(name)}"
+            for name in ("numpy", "scipy", "loopcal")
+        },
     }
 
 

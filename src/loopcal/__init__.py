@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Geometric calibration of robots with closed kinematic loops.
 
-These names are the public API; every other module may change. Each is imported when it is first used, so that
-`import loopcal` costs nothing.
+These names are the public API; every other module may change. Each is imported when it is first
+used, so that `import loopcal` costs nothing.
 """
 
 from __future__ import annotations
@@ -11,32 +11,27 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from loopcal.calibrate import MAP as MAP
-    from loopcal.calibrate import Constraints as Constraints
-    from loopcal.calibrate import Huber as Huber
-    from loopcal.calibrate import Identification as Identification
-    from loopcal.calibrate import LeastSquares as LeastSquares
-    from loopcal.calibrate import Plan as Plan
-    from loopcal.calibrate import Ridge as Ridge
-    from loopcal.calibrate import Sight as Sight
-    from loopcal.calibrate import StepControl as StepControl
-    from loopcal.calibrate import TruncatedSVD as TruncatedSVD
-    from loopcal.calibrate import Tukey as Tukey
-    from loopcal.calibrate import Validation as Validation
-    from loopcal.calibrate import accuracy_map as accuracy_map
-    from loopcal.calibrate import check_arrival as check_arrival
-    from loopcal.calibrate import compensate as compensate
-    from loopcal.calibrate import identifiability as identifiability
-    from loopcal.calibrate import identify as identify
-    from loopcal.calibrate import identify_trials as identify_trials
-    from loopcal.calibrate import parameter_error as parameter_error
-    from loopcal.calibrate import plan as plan
-    from loopcal.calibrate import plan_surfaces as plan_surfaces
-    from loopcal.calibrate import pose_uncertainty as pose_uncertainty
-    from loopcal.calibrate import prior_from as prior_from
-    from loopcal.calibrate import recalibrate as recalibrate
-    from loopcal.calibrate import validate as validate
+    from loopcal.apply import Validation as Validation
+    from loopcal.apply import accuracy_map as accuracy_map
+    from loopcal.apply import compensate as compensate
+    from loopcal.apply import pose_uncertainty as pose_uncertainty
+    from loopcal.apply import validate as validate
+    from loopcal.diagnose import check_arrival as check_arrival
+    from loopcal.diagnose import identifiability as identifiability
+    from loopcal.diagnose import parameter_error as parameter_error
     from loopcal.errors import LoopcalError as LoopcalError
+    from loopcal.estimate import MAP as MAP
+    from loopcal.estimate import Huber as Huber
+    from loopcal.estimate import Identification as Identification
+    from loopcal.estimate import LeastSquares as LeastSquares
+    from loopcal.estimate import Ridge as Ridge
+    from loopcal.estimate import StepControl as StepControl
+    from loopcal.estimate import TruncatedSVD as TruncatedSVD
+    from loopcal.estimate import Tukey as Tukey
+    from loopcal.estimate import identify as identify
+    from loopcal.estimate import identify_trials as identify_trials
+    from loopcal.estimate import prior_from as prior_from
+    from loopcal.estimate import recalibrate as recalibrate
     from loopcal.io import load_measurements as load_measurements
     from loopcal.io import load_robot as load_robot
     from loopcal.io import save_measurements as save_measurements
@@ -61,46 +56,46 @@ if TYPE_CHECKING:
     from loopcal.mechanism import inverse as inverse
     from loopcal.mechanism import sample as sample
     from loopcal.mechanism import working_modes as working_modes
+    from loopcal.planning import Constraints as Constraints
+    from loopcal.planning import Plan as Plan
+    from loopcal.planning import Sight as Sight
+    from loopcal.planning import plan as plan
+    from loopcal.planning import plan_surfaces as plan_surfaces
 
 __version__ = "0.1.0.dev0"
 
 _WHERE = {
     name: module
     for module, names in {
-        "loopcal.calibrate": (
-            "MAP",
-            "Constraints",
+        "loopcal.apply": (
+            "Validation",
+            "accuracy_map",
+            "compensate",
+            "pose_uncertainty",
+            "validate",
+        ),
+        "loopcal.diagnose": ("check_arrival", "identifiability", "parameter_error"),
+        "loopcal.errors": ("LoopcalError",),
+        "loopcal.estimate": (
             "Huber",
             "Identification",
             "LeastSquares",
-            "Plan",
+            "MAP",
             "Ridge",
-            "Sight",
             "StepControl",
             "TruncatedSVD",
             "Tukey",
-            "Validation",
-            "accuracy_map",
-            "check_arrival",
-            "compensate",
-            "identifiability",
             "identify",
             "identify_trials",
-            "parameter_error",
-            "plan",
-            "plan_surfaces",
-            "pose_uncertainty",
             "prior_from",
             "recalibrate",
-            "validate",
         ),
-        "loopcal.errors": ("LoopcalError",),
         "loopcal.io": ("load_measurements", "load_robot", "save_measurements", "save_robot"),
         "loopcal.measure": (
-            "KINDS",
             "Component",
             "Gaussian",
             "Instrument",
+            "KINDS",
             "Measurements",
             "Observations",
             "Pose",
@@ -120,17 +115,21 @@ _WHERE = {
             "sample",
             "working_modes",
         ),
+        "loopcal.planning": ("Constraints", "Plan", "Sight", "plan", "plan_surfaces"),
     }.items()
     for name in names
 }
 
-__all__ = ["__version__", *sorted(_WHERE)]  # noqa: PLE0604  # pyright: ignore[reportUnsupportedDunderAll]
+__all__ = ["__version__", *sorted(_WHERE)]  # pyright: ignore[reportUnsupportedDunderAll]  # noqa: PLE0604
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used."""
     if name not in _WHERE:
-        raise AttributeError(f"module 'loopcal' has no attribute {name!r}; public names are {', '.join(sorted(_WHERE))}")
+        raise AttributeError(
+            f"module 'loopcal' has no attribute {name!r}; public names are "
+            f"{', '.join(sorted(_WHERE))}"
+        )
     value = getattr(import_module(_WHERE[name]), name)
     globals()[name] = value
     return value

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one tree of errors: every mistake of a user raises a `LoopcalError` whose text is one clear sentence.
+"""The one tree of errors: every mistake of a user raises a `LoopcalError` whose text is one clear
+sentence.
 
-The sentence says what was found, what is allowed and what to do next. The command line prints it and exits with 1;
-anything that is not a `LoopcalError` is a mistake of our own.
+The sentence says what was found, what is allowed and what to do next. The command line prints it
+and exits with 1; anything that is not a `LoopcalError` is a mistake of our own.
 """
 
 from __future__ import annotations
@@ -13,7 +14,12 @@ from pathlib import Path
 
 
 class LoopcalError(Exception):
-    """Base of all errors that a user can cause and repair."""
+    """Base of all errors that a user can cause and repair; made from a sentence or a finding."""
+
+    @property
+    def code(self) -> str | None:
+        """Code of the finding behind this error; None where it was made from a sentence."""
+        return getattr(self.args[0], "code", None) if self.args else None
 
 
 class UnitError(LoopcalError):
@@ -57,6 +63,8 @@ class FileError(LoopcalError):
 
 
 def nearest(name: str, allowed: Iterable[str], n: int = 3) -> str:
-    """Return ` (did you mean 'a' or 'b'?)` with the allowed names closest to `name`, or nothing where none is close."""
+    """Return ` (did you mean 'a' or 'b'?)` with the allowed names closest to `name`, or nothing
+    where none is close.
+    """
     close = difflib.get_close_matches(name, list(allowed), n=n, cutoff=0.6)
     return f" (did you mean {' or '.join(repr(c) for c in close)}?)" if close else ""

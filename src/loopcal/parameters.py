@@ -8,9 +8,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loopcal.errors import MechanismError
+from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
 SCOPES = ("machine", "session", "group", "pose")
@@ -25,7 +25,8 @@ class Parameter:
     name : e.g. `leg3.base.x`.
     dimension : length [m], angle [rad] or ratio [1].
     nominal : value by design [SI].
-    tolerance : standard deviation of the true value about the nominal one [SI]; None where nothing is known.
+    tolerance : standard deviation of the true value about the nominal one [SI]; None where nothing
+        is known.
     free : False keeps it at its nominal value.
     scope : what shares one value: the machine, a session, a group of rows or a single pose.
     """
@@ -49,7 +50,9 @@ class ParameterTable:
         places: dict[str, int] = {}
         for i, entry in enumerate(self.entries):
             if entry.name in places:
-                raise MechanismError(f"parameter {entry.name!r} is defined twice; every parameter needs its own name")
+                raise MechanismError(
+                    f"parameter {entry.name!r} is defined twice; every parameter needs its own name"
+                )
             places[entry.name] = i
         object.__setattr__(self, "_places", places)
 
@@ -67,17 +70,17 @@ class ParameterTable:
         return tuple(p.dimension for p in self.entries)
 
     @property
-    def nominal(self) -> NDArray[np.float64]:
+    def nominal(self) -> FloatArray:
         """Nominal values (p,) [SI]."""
         return _frozen(p.nominal for p in self.entries)
 
     @property
-    def tolerance(self) -> NDArray[np.float64]:
+    def tolerance(self) -> FloatArray:
         """Tolerances (p,) as standard deviations [SI], NaN where none is stated."""
         return _frozen(np.nan if p.tolerance is None else p.tolerance for p in self.entries)
 
     @property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> BoolArray:
         """Which are to be identified (p,)."""
         free = np.array([p.free for p in self.entries], dtype=bool)
         free.setflags(write=False)
@@ -88,7 +91,9 @@ class ParameterTable:
         if name in self._places:
             return self._places[name]
         near = difflib.get_close_matches(name, self.names, n=3) or self.names[:3]
-        raise MechanismError(f"no parameter is called {name!r}; the nearest names are {', '.join(near)}")
+        raise MechanismError(
+            f"no parameter is called {name!r}; the nearest names are {', '.join(near)}"
+        )
 
     def only(self, names: Iterable[str]) -> ParameterTable:
         """The same table with just these parameters free."""
@@ -96,7 +101,7 @@ class ParameterTable:
         return ParameterTable(tuple(replace(p, free=p.name in chosen) for p in self.entries))
 
 
-def _frozen(values: Iterable[float]) -> NDArray[np.float64]:
+def _frozen(values: Iterable[float]) -> FloatArray:
     array = np.array(list(values), dtype=float)
     array.setflags(write=False)
     return array

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Units exist at the edge of files and tables only; inside, everything is in SI (metre, radian).
 
-A record annotates its numbers with `Length`, `Angle` or `Ratio`; the reader of files multiplies them by the factor of
-the unit that the file states, the writer divides by it.
+A record annotates its numbers with `Length`, `Angle` or `Ratio`; the reader of files multiplies
+them by the factor of the unit that the file states, the writer divides by it.
 """
 
 from __future__ import annotations
@@ -77,7 +77,11 @@ DISPLAY_UNITS: Mapping[Dimension, Unit] = {
 }
 
 # How a quantity is written, for messages.
-EXAMPLES: Mapping[Dimension, str] = {Dimension.LENGTH: "0.02mm", Dimension.ANGLE: "0.01deg", Dimension.RATIO: "1.5 1"}
+EXAMPLES: Mapping[Dimension, str] = {
+    Dimension.LENGTH: "0.02mm",
+    Dimension.ANGLE: "0.01deg",
+    Dimension.RATIO: "1.5 1",
+}
 
 
 def symbols(dimension: Dimension | None = None) -> tuple[str, ...]:
@@ -106,10 +110,13 @@ def unit(symbol: str, dimension: Dimension | None = None) -> Unit:
     found = UNITS.get(symbol)
     allowed = symbols(dimension)
     if found is None:
-        raise UnitError(f"unknown unit {symbol!r}{nearest(symbol, allowed)}; allowed are {', '.join(allowed)}")
+        raise UnitError(
+            f"unknown unit {symbol!r}{nearest(symbol, allowed)}; allowed are {', '.join(allowed)}"
+        )
     if dimension is not None and found.dimension is not dimension:
         raise UnitError(
-            f"{symbol!r} is a unit of {found.dimension.value}, but {ARTICLES[dimension]} is needed; "
+            f"{symbol!r} is a unit of {found.dimension.value}, but {ARTICLES[dimension]} is "
+            "needed; "
             f"allowed are {', '.join(allowed)}"
         )
     return found
@@ -132,9 +139,14 @@ def quantity(text: str, dimension: Dimension | None = None) -> float:
         raise UnitError(f"{text!r} is not a number with a unit; write for example {example}")
     value, symbol = float(stripped[:cut]), stripped[cut:].strip()
     if not math.isfinite(value):
-        raise UnitError(f"{text!r} is not finite; write a finite number with a unit, for example {example}")
+        raise UnitError(
+            f"{text!r} is not finite; write a finite number with a unit, for example {example}"
+        )
     if not symbol:
-        raise UnitError(f"{text!r} has no unit; add one of {', '.join(symbols(dimension))}, for example {example}")
+        raise UnitError(
+            f"{text!r} has no unit; add one of {', '.join(symbols(dimension))}, for example "
+            f"{example}"
+        )
     return value * unit(symbol, dimension).factor_to_si
 
 

@@ -15,9 +15,18 @@ BASELINE = {"fit": {"value": 4.0}}
 
 @pytest.mark.parametrize(
     ("value", "direction", "faults"),
-    [(4.9, "lower", 0), (5.1, "lower", 1), (0.1, "lower", 0), (3.1, "higher", 0), (2.9, "higher", 1), (9.0, "higher", 0)],
+    [
+        (4.9, "lower", 0),
+        (5.1, "lower", 1),
+        (0.1, "lower", 0),
+        (3.1, "higher", 0),
+        (2.9, "higher", 1),
+        (9.0, "higher", 0),
+    ],
 )
-def test_only_a_worsening_beyond_the_tolerance_fails(value: float, direction: str, faults: int) -> None:
+def test_only_a_worsening_beyond_the_tolerance_fails(
+    value: float, direction: str, faults: int
+) -> None:
     metric = Metric("fit", value, direction=direction, tolerance=0.25)  # pyright: ignore[reportArgumentType]
     assert len(harness.find_faults(metric, BASELINE)) == faults
 
@@ -35,7 +44,10 @@ def test_a_metric_without_baseline_fails_and_says_what_to_do() -> None:
 def test_the_better_of_two_measurements_is_kept() -> None:
     low, high = Metric("fit", 1.0), Metric("fit", 2.0)
     assert harness.keep_better(high, low) == harness.keep_better(low, high) == low
-    low, high = Metric("speedup", 1.0, direction="higher"), Metric("speedup", 2.0, direction="higher")
+    low, high = (
+        Metric("speedup", 1.0, direction="higher"),
+        Metric("speedup", 2.0, direction="higher"),
+    )
     assert harness.keep_better(high, low) == harness.keep_better(low, high) == high
 
 
@@ -43,10 +55,17 @@ def test_updating_keeps_the_metrics_that_were_not_measured(tmp_path: Path) -> No
     path = tmp_path / "baseline.json"
     harness.write_baseline(path, [Metric("a", 1.0), Metric("b", 2.0)], {"processor": "one"})
     harness.write_baseline(path, [Metric("b", 3.0)], {"processor": "two"})
-    assert {name: entry["value"] for name, entry in harness.read_baseline(path).items()} == {"a": 1.0, "b": 3.0}
+    assert {name: entry["value"] for name, entry in harness.read_baseline(path).items()} == {
+        "a": 1.0,
+        "b": 3.0,
+    }
     assert json.loads(path.read_text("utf-8"))["machine"] == {"processor": "two"}
 
 
 def test_a_ratio_is_that_of_the_times() -> None:
-    metric = harness.measure_ratio("sleep", lambda: time.sleep(0.03), lambda: time.sleep(0.01), repeats=5)
-    assert 2.0 < metric.value < 4.0  # [1], 3 nominally; sleeping overshoots by up to a few ms on a busy machine
+    metric = harness.measure_ratio(
+        "sleep", lambda: time.sleep(0.03), lambda: time.sleep(0.01), repeats=5
+    )
+    assert (
+        2.0 < metric.value < 4.0
+    )  # [1], 3 nominally; sleeping overshoots by up to a few ms on a busy machine

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records of real delta printers (LOOPCAL_DATA/delta_printers) as the files that a user of loopcal would have.
+"""Records of real delta printers (LOOPCAL_DATA/delta_printers) as the files that a user of loopcal
+would have.
 
-A record holds motor steps below the end stop at which the nozzle touched the bed, and the geometry that the printer's
-firmware stored. Steps times the length of one step are the readings `drop` of the family linear-delta, in mm; the height
-of the nozzle is a measurement of the component z.
+A record holds motor steps below the end stop at which the nozzle touched the bed, and the geometry
+that the printer's firmware stored. Steps times the length of one step are the readings `drop` of
+the family linear-delta, in mm; the height of the nozzle is a measurement of the component z.
 """
 
 import json
@@ -35,12 +36,18 @@ pose,q1 [mm],q2 [mm],q3 [mm],z [mm]
 
 def heights_only(data_folder: Path) -> dict[str, dict[str, Any]]:
     """Return the records without distances, by repository and file."""
-    return {name: record for name, record in every_record(data_folder).items() if not record["distances"]}
+    return {
+        name: record
+        for name, record in every_record(data_folder).items()
+        if not record["distances"]
+    }
 
 
 def every_record(data_folder: Path) -> dict[str, dict[str, Any]]:
     """Return all records, by repository and file."""
-    found = json.loads((data_folder / "delta_printers" / "real_delta_calibrations.json").read_text("utf-8"))
+    found = json.loads(
+        (data_folder / "delta_printers" / "real_delta_calibrations.json").read_text("utf-8")
+    )
     return {f"{r['source']['repo']} {r['source']['path']}": r for r in found}
 
 
@@ -49,11 +56,16 @@ def stored(record: dict[str, Any]) -> dict[str, float]:
     found = record["geometry_stored_in_config"]
     named = {"radius": found["radius"]}
     for i in range(3):
-        named |= {f"tower{i + 1}.angle": found["angles"][i], f"tower{i + 1}.stop": found["endstops"][i]}
+        named |= {
+            f"tower{i + 1}.angle": found["angles"][i],
+            f"tower{i + 1}.stop": found["endstops"][i],
+        }
     return named
 
 
-def write_files(record: dict[str, Any], folder: Path, stop_off: float = 0.0, sigma: str = "20 um") -> None:
+def write_files(
+    record: dict[str, Any], folder: Path, stop_off: float = 0.0, sigma: str = "20 um"
+) -> None:
     """Write robot.yaml and heights.csv.
 
     Parameters
@@ -75,6 +87,8 @@ def write_files(record: dict[str, Any], folder: Path, stop_off: float = 0.0, sig
     (folder / "robot.yaml").write_text(robot, "utf-8")
     rows = []
     for i, row in enumerate(record["heights"], start=1):
-        drops = [steps * step for steps, step in zip(row["stable_steps"], found["stepdist"], strict=True)]
+        drops = [
+            steps * step for steps, step in zip(row["stable_steps"], found["stepdist"], strict=True)
+        ]
         rows.append(",".join([f"point{i}", *(f"{drop:.10g}" for drop in drops), f"{row['z_mm']}"]))
     (folder / "heights.csv").write_text(DATA.format(sigma=sigma) + "\n".join(rows) + "\n", "utf-8")

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""At the command line: slips of convention are refused with the flag that overrides them; frames of a run are used again."""
+"""At the command line: slips of convention are refused with the flag that overrides them; frames of
+a run are used again.
+"""
 
 import numpy as np
 import pytest
@@ -26,10 +28,14 @@ def here(tmp_path, monkeypatch, capsys):
 def saved(path, kind, n=9, seed=0, change=None, unknowns=None):
     """Write what a hexapod within its tolerances shows."""
     robot = load_robot("hexapod-42")
-    truth = robot.with_values(robot.values + 0.03e-3 * np.random.default_rng(0).standard_normal(len(robot.values)))
+    truth = robot.with_values(
+        robot.values + 0.03e-3 * np.random.default_rng(0).standard_normal(len(robot.values))
+    )
     instrument = Instrument((Sensor(kind, Gaussian(np.array([5e-6] * 3 + [1e-6] * 3))),))
     poses = sample(robot, n, seed + 1).coordinates
-    save_measurements(simulate(truth, poses, instrument, seed, controller=robot, unknowns=unknowns), path, robot)
+    save_measurements(
+        simulate(truth, poses, instrument, seed, controller=robot, unknowns=unknowns), path, robot
+    )
     if change is not None:
         path.write_text(change(path.read_text()))
     return robot
@@ -45,7 +51,9 @@ def test_a_slip_is_refused_in_one_sentence_and_overridden_by_its_flag(here) -> N
     for command in ("calibrate hexapod-42 data.csv -o run", "identifiability hexapod-42 data.csv"):
         code, out, err = run(command)
         assert (code, out) == (1, "")
-        assert err.startswith("loopcal: data.csv: the data do not fit 'hexapod-42' as they are written: ")
+        assert err.startswith(
+            "loopcal: data.csv: the data do not fit 'hexapod-42' as they are written: "
+        )
         assert "with lengths 1000 times smaller (mm written as m, or um as mm)" in err
         assert err.endswith("correct the unit in the header, or use --allow-implausible\n")
         assert err.count("\n") == 1
@@ -63,7 +71,15 @@ def test_a_target_that_no_pose_moves_is_refused_and_overridden_by_its_flag(here)
         lines = text.splitlines()
         first = next(i for i, line in enumerate(lines) if line.startswith("pose,")) + 1
         tail = lines[first].split(",")[7:]
-        return "\n".join([*lines[:first], *(",".join([*line.split(",")[:7], *tail]) for line in lines[first:])]) + "\n"
+        return (
+            "\n".join(
+                [
+                    *lines[:first],
+                    *(",".join([*line.split(",")[:7], *tail]) for line in lines[first:]),
+                ]
+            )
+            + "\n"
+        )
 
     saved(folder / "data.csv", Pose(), change=frozen)
     code, out, err = run("calibrate hexapod-42 data.csv -o run")
@@ -96,13 +112,20 @@ def test_a_frame_that_was_moved_since_the_fit_is_named_and_both_errors_are_taken
     folder, run = here
     placed = {"frame.x": 0.1, "frame.rz": 0.5}
     saved(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)
-    saved(folder / "moved.csv", Pose(unknown=("frame",)), 6, 1, unknowns=placed | {"frame.x": 0.105})
+    saved(
+        folder / "moved.csv", Pose(unknown=("frame",)), 6, 1, unknowns=placed | {"frame.x": 0.105}
+    )
     saved(folder / "one.csv", Pose(unknown=("frame",)), 1, 1, unknowns=placed | {"frame.x": 0.105})
     assert run("calibrate hexapod-42 data.csv -o run")[0] == 0
     code, out, _ = run("validate run moved.csv")
     assert code == 0
-    assert "position error (rms): the same before and after calibration" in out  # 5 mm of the frame in both
-    assert "note: frame seems to have been set up anew since the fit: found anew from these rows, errors are" in out
+    assert (
+        "position error (rms): the same before and after calibration" in out
+    )  # 5 mm of the frame in both
+    assert (
+        "note: frame seems to have been set up anew since the fit: found anew from these rows, "
+        "errors are" in out
+    )
     assert "use --refit frame" in out
     code, out, _ = run("validate run moved.csv --refit frame")
     assert code == 0
@@ -112,7 +135,9 @@ def test_a_frame_that_was_moved_since_the_fit_is_named_and_both_errors_are_taken
     assert (code, "set up anew" in out) == (0, False)
 
 
-def test_a_prior_or_a_fixed_coordinate_that_the_data_contradict_is_refused_by_its_name(here) -> None:
+def test_a_prior_or_a_fixed_coordinate_that_the_data_contradict_is_refused_by_its_name(
+    here,
+) -> None:
     folder, run = here
     placed = {"frame.x": 0.1, "frame.rz": 0.5}
     saved(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)
@@ -123,16 +148,26 @@ def test_a_prior_or_a_fixed_coordinate_that_the_data_contradict_is_refused_by_it
         return run("identifiability hexapod-42 stated.csv")
 
     for statement, shown in (
-        ("frame.x: {start: 1500 mm, sd: 1 mm}, frame.y: {start: 0 mm, sd: 1 mm}", "not at 1500 mm (sd 1 mm)"),
+        (
+            "frame.x: {start: 1500 mm, sd: 1 mm}, frame.y: {start: 0 mm, sd: 1 mm}",
+            "not at 1500 mm (sd 1 mm)",
+        ),
         ("frame.x: fixed", "not at 0 mm (fixed)"),
     ):
         code, out, err = said(statement)
         assert (code, out, err.count("\n")) == (1, "", 1)
-        assert err.startswith("loopcal: stated.csv: the data contradict what 'unknowns' states: they put frame.x at ")
+        assert err.startswith(
+            "loopcal: stated.csv: the data contradict what 'unknowns' states: they put frame.x at "
+        )
         assert shown in err
         assert "with frame.x left to the data" in err
         assert err.endswith("correct or remove the statement, or use --allow-implausible\n")
     assert said("frame.x: {start: 101 mm, sd: 1 mm}")[0] == 0
-    code, out, err = said("frame.x: {start: 105 mm, sd: 10 um}")  # noted: a robot far off its tolerances shows the same
+    code, out, err = said(
+        "frame.x: {start: 105 mm, sd: 10 um}"
+    )  # noted: a robot far off its tolerances shows the same
     assert code == 0
-    assert "note: stated.csv: the data contradict what 'unknowns' states: they put frame.x at 100" in err
+    assert (
+        "note: stated.csv: the data contradict what 'unknowns' states: they put frame.x at 100"
+        in err
+    )

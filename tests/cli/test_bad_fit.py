@@ -16,7 +16,9 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 
 @pytest.fixture
 def blundered(tmp_path, monkeypatch) -> Path:
-    """Measurements of the example with rz of one fitted pose set to 12 degrees, in a folder of their own."""
+    """Measurements of the example with rz of one fitted pose set to 12 degrees, in a folder of
+    their own.
+    """
     monkeypatch.chdir(tmp_path)
     shutil.copy(EXAMPLE / "measurements.csv", tmp_path)
     lines = (tmp_path / "measurements.csv").read_text().split("\n")
@@ -38,12 +40,16 @@ def test_a_blundered_cell_is_told_and_widens_the_intervals(blundered, capsys) ->
     bad = out[out.index("written to good") :]
     assert "within the noise" not in bad
     assert "expected errors" not in bad
-    good, bad = (json.loads((blundered / name / "result.json").read_text()) for name in ("good", "bad"))
+    good, bad = (
+        json.loads((blundered / name / "result.json").read_text()) for name in ("good", "bad")
+    )
     assert (good["passed"], good["reasons"]) == (True, [])
     assert not bad["passed"]
     scale = bad["fit"]["sigma_scale"]
     assert scale > 100  # 12 degrees against 5 urad in one of 240 equations
-    assert scale == pytest.approx(np.sqrt(bad["fit"]["chi_square"] / bad["fit"]["degrees"]), rel=1e-12)
+    assert scale == pytest.approx(
+        np.sqrt(bad["fit"]["chi_square"] / bad["fit"]["degrees"]), rel=1e-12
+    )
     wide, narrow = (np.array([p["sd"] for p in r["fit"]["parameters"]]) for r in (bad, good))
     assert (wide > 5 * narrow).all()
 
@@ -54,7 +60,8 @@ def test_errors_that_grew_on_unseen_poses_are_a_reason(blundered, capsys) -> Non
     grown = [
         index
         for index in ("position", "orientation")
-        if document["validation"]["after"][index]["rms"] > 1.1 * document["validation"]["before"][index]["rms"]
+        if document["validation"]["after"][index]["rms"]
+        > 1.1 * document["validation"]["before"][index]["rms"]
     ]
     assert grown
     assert code == 2
@@ -68,10 +75,15 @@ def test_a_fit_that_reaches_none_of_its_poses_is_a_reason_and_not_a_user_error(
     def astray(*_):
         raise DataError("the calibrated geometry cannot follow")
 
-    monkeypatch.setattr("loopcal.calibrate.validate", astray)
-    assert main(["calibrate", "hexapod-42", "measurements.csv", "-o", "run", *hold_out.split()]) == 2
+    monkeypatch.setattr("loopcal.apply.validate", astray)
+    assert (
+        main(["calibrate", "hexapod-42", "measurements.csv", "-o", "run", *hold_out.split()]) == 2
+    )
     out, err = capsys.readouterr()
     assert err == "loopcal: quality gate not met: the calibrated geometry cannot follow\n"
     assert out.endswith("written to run: result.json, arrays.npz, robot.yaml\n")
     result = json.loads((blundered / "run" / "result.json").read_text())
-    assert (result["passed"], result["reasons"]) == (False, ["the calibrated geometry cannot follow"])
+    assert (result["passed"], result["reasons"]) == (
+        False,
+        ["the calibrated geometry cannot follow"],
+    )

@@ -7,7 +7,7 @@ import pytest
 
 from loopcal.cli import main
 from loopcal.errors import MechanismError
-from loopcal.io.robot_file import robot_path
+from loopcal.io.robot.robot_file import robot_path
 from loopcal.measure import KINDS
 from loopcal.mechanism.records import AngleTolerance, LengthTolerance, Workspace, standard_deviation
 
@@ -29,7 +29,9 @@ UNITS = "units: {length: mm, angle: deg}\n"
 
 @pytest.fixture
 def refused(tmp_path, monkeypatch, capsys):
-    """Run a command line in an empty folder with the given files; return the sentence with which it is refused."""
+    """Run a command line in an empty folder with the given files; return the sentence with which it
+    is refused.
+    """
     monkeypatch.chdir(tmp_path)
 
     def run(words: str, **files: str | bytes | None) -> str:
@@ -55,18 +57,54 @@ def refused(tmp_path, monkeypatch, capsys):
 
 
 ROBOT_CASES = {
-    "missing unit": (UNITS, "", "states no units, and a number without a unit is refused; write for example"),
-    "unit of the wrong kind": ("length: mm", "length: deg", "'deg' is not a unit of length; allowed are m, mm"),
+    "missing unit": (
+        UNITS,
+        "",
+        "states no units, and a number without a unit is refused; write for example",
+    ),
+    "unit of the wrong kind": (
+        "length: mm",
+        "length: deg",
+        "'deg' is not a unit of length; allowed are m, mm",
+    ),
     "unknown key": ("stroke:", "strok:", "unknown key 'strok' (did you mean 'stroke'?)"),
-    "duplicate key": (UNITS, UNITS * 2, "key 'units' stands here for the second time; keep one of the two"),
-    "number typed as text": (BASE, "[120, '-140', 0]", "is the text '-140' where a number is needed; write the number"),
-    "two numbers where three are needed": (BASE, "[120, -140]", "has 2 values where 3 are needed; add the missing ones"),
+    "duplicate key": (
+        UNITS,
+        UNITS * 2,
+        "key 'units' stands here for the second time; keep one of the two",
+    ),
+    "number typed as text": (
+        BASE,
+        "[120, '-140', 0]",
+        "is the text '-140' where a number is needed; write the number",
+    ),
+    "two numbers where three are needed": (
+        BASE,
+        "[120, -140]",
+        "has 2 values where 3 are needed; add the missing ones",
+    ),
     "NaN": (BASE, "[120, .nan, 0]", "is nan; every number must be finite"),
-    "a comma in a number": ("lengths: 233.238076", "lengths: 233,238", "write a point in the number, not a comma"),
-    "a list too long": ("[-75, 75]", "[-75, 75, 3]", "'stroke' has 3 values where 2 are needed; remove the others"),
+    "a comma in a number": (
+        "lengths: 233.238076",
+        "lengths: 233,238",
+        "write a point in the number, not a comma",
+    ),
+    "a list too long": (
+        "[-75, 75]",
+        "[-75, 75, 3]",
+        "'stroke' has 3 values where 2 are needed; remove the others",
+    ),
     "not YAML": (BASE, "[120, -140, 0", "this is not valid YAML"),
-    "newer format": ("format: 1", "format: 2", "has format 2, but this loopcal reads formats up to 1"),
-    "unknown family": ("family: gough", "family: gouhg", "is not a family of robots (did you mean 'gough'?)"),
+    "newer format": (
+        "format: 1",
+        "format: 2",
+        "has format 2, but this loopcal reads formats up to 1",
+    ),
+    "unknown family": (
+        "family: gough",
+        "family: gouhg",
+        "is not a family of robots (did you mean 'gough'?)",
+    ),
 }
 
 
@@ -93,12 +131,26 @@ def test_too_few_freedoms_are_named_as_well(refused) -> None:
     """A second limb that only slides along x takes y away from two motors."""
     limbs = [
         "  - name: a\n    ending: rigid\n    errors: [{of: s, shift: [y]}]",
-        "    chain: [{joint: P, name: s, axis: x, actuated: q1}, {joint: P, name: t, axis: y, actuated: q2}]",
+        (
+            "    chain: [{joint: P, name: s, axis: x, actuated: q1}, {joint: P, name: t, axis: y, "
+            "actuated: q2}]"
+        ),
         "  - {name: b, ending: rigid, chain: [{joint: P, name: s, axis: x}]}",
     ]
-    head = ["format: 1", "family: limbs", "name: locked", UNITS.strip(), "freedoms: [x, y]", "controlled: [x, y]", "limbs:"]
+    head = [
+        "format: 1",
+        "family: limbs",
+        "name: locked",
+        UNITS.strip(),
+        "freedoms: [x, y]",
+        "controlled: [x, y]",
+        "limbs:",
+    ]
     found = refused("check robot.yaml", robot_yaml="\n".join([*head, *limbs]))
-    assert "2 actuators, but the limbs leave the platform only 1 of 2 freedoms at home; it cannot shift along y" in found
+    assert (
+        "2 actuators, but the limbs leave the platform only 1 of 2 freedoms at home; it cannot "
+        "shift along y" in found
+    )
 
 
 def test_a_home_outside_the_strokes_is_noted(tmp_path, capsys) -> None:
@@ -131,25 +183,71 @@ def test_an_absent_file_is_refused(refused) -> None:
 
 
 DATA_CASES = {
-    "missing unit": ("z [mm]", "z", "data.csv:4: column 'z' has no unit; write it in brackets, for example 'z [mm]'"),
-    "unknown unit": ("z [mm]", "z [mmm]", "data.csv:4: column 'z': unknown unit 'mmm' (did you mean 'mm'?)"),
-    "unknown column": ("q1 [mm]", "qq1 [mm]", "data.csv:4: column 'qq1' is unknown (did you mean 'q1'?"),
-    "unknown setting": ("# noise", "# nois", "data.csv:3: unknown key 'nois' (did you mean 'noise'?)"),
-    "duplicate setting": ("# noise", "# kind: pose\n# noise", "data.csv:3: key 'kind' stands here for the second time"),
-    "duplicate column": ("q2 [mm]", "q1 [mm]", "data.csv:4: column 'q1' stands here for the second time"),
-    "text for a number": ("b,1,", "b,one,", "data.csv:6: column 'q1' is 'one' where a number is needed"),
-    "a cell too few": ("b,1,", "b,", "data.csv:6: this row has 7 cells, but the header names 8 columns"),
+    "missing unit": (
+        "z [mm]",
+        "z",
+        "data.csv:4: column 'z' has no unit; write it in brackets, for example 'z [mm]'",
+    ),
+    "unknown unit": (
+        "z [mm]",
+        "z [mmm]",
+        "data.csv:4: column 'z': unknown unit 'mmm' (did you mean 'mm'?)",
+    ),
+    "unknown column": (
+        "q1 [mm]",
+        "qq1 [mm]",
+        "data.csv:4: column 'qq1' is unknown (did you mean 'q1'?",
+    ),
+    "unknown setting": (
+        "# noise",
+        "# nois",
+        "data.csv:3: unknown key 'nois' (did you mean 'noise'?)",
+    ),
+    "duplicate setting": (
+        "# noise",
+        "# kind: pose\n# noise",
+        "data.csv:3: key 'kind' stands here for the second time",
+    ),
+    "duplicate column": (
+        "q2 [mm]",
+        "q1 [mm]",
+        "data.csv:4: column 'q1' stands here for the second time",
+    ),
+    "text for a number": (
+        "b,1,",
+        "b,one,",
+        "data.csv:6: column 'q1' is 'one' where a number is needed",
+    ),
+    "a cell too few": (
+        "b,1,",
+        "b,",
+        "data.csv:6: this row has 7 cells, but the header names 8 columns",
+    ),
     "NaN": ("201.1", "NaN", "data.csv:6: column 'z' is 'NaN', which is not a finite number"),
-    "a reading outside the stroke": ("b,1,", "b,80,", "q1 reads 80 mm, outside its stroke of -75 to 75 mm"),
+    "a reading outside the stroke": (
+        "b,1,",
+        "b,80,",
+        "q1 reads 80 mm, outside its stroke of -75 to 75 mm",
+    ),
     "no noise": ("# noise: {z: 1 um}\n", "", "no noise is stated for 'z'"),
     "noise without a unit": ("1 um", "1", "'1' has no unit; add one of m, mm"),
     "a comma in a number": ("201.1", "201,1", "data.csv:6: this row has 9 cells"),
-    "a controller of readings": ("# noise", "# controller: no.yaml\n# noise", "data.csv:3: a controller is named, but"),
-    "the same row twice": ("c,2,2,2,2,2,2,202.2", "c,1,1,1,1,1,1,201.1", ") have the same readings and the same"),
+    "a controller of readings": (
+        "# noise",
+        "# controller: no.yaml\n# noise",
+        "data.csv:3: a controller is named, but",
+    ),
+    "the same row twice": (
+        "c,2,2,2,2,2,2,202.2",
+        "c,1,1,1,1,1,1,201.1",
+        ") have the same readings and the same",
+    ),
 }
 
 
-@pytest.mark.parametrize("command", ["calibrate hexapod-42 data.csv -o run", "identifiability hexapod-42 data.csv"])
+@pytest.mark.parametrize(
+    "command", ["calibrate hexapod-42 data.csv -o run", "identifiability hexapod-42 data.csv"]
+)
 @pytest.mark.parametrize("case", DATA_CASES)
 def test_a_bad_measurement_file_is_refused_with_its_line(refused, case, command) -> None:
     old, new, sentence = DATA_CASES[case]
@@ -165,34 +263,62 @@ SEVERAL_CASES = {
         DATA.replace("b,1,1", "b,1,2"),
         "heights.csv:6: pose 'b' has other readings here than in poses.csv:3",
     ),
-    "values without a kind": (POSES, HEIGHTS.split("\n", 3)[3], "heights.csv:1: column 'z' is unknown"),
-    "a unit of the wrong kind": (POSES.replace("q2 [mm]", "q2 [deg]"), HEIGHTS, "poses.csv:1: column 'q2': 'deg' is a unit"),
+    "values without a kind": (
+        POSES,
+        HEIGHTS.split("\n", 3)[3],
+        "heights.csv:1: column 'z' is unknown",
+    ),
+    "a unit of the wrong kind": (
+        POSES.replace("q2 [mm]", "q2 [deg]"),
+        HEIGHTS,
+        "poses.csv:1: column 'q2': 'deg' is a unit",
+    ),
     "an empty file": ("", HEIGHTS, "poses.csv: this measurement file is empty"),
-    "no readings": (POSES.replace("b,1,1,1,1,1,1", "b,,,,,,"), HEIGHTS, "poses.csv:3: pose 'b' has no readings, here or in"),
+    "no readings": (
+        POSES.replace("b,1,1,1,1,1,1", "b,,,,,,"),
+        HEIGHTS,
+        "poses.csv:3: pose 'b' has no readings, here or in",
+    ),
 }
 
 
 @pytest.mark.parametrize(
-    "command", ["calibrate hexapod-42 {} -o run", "identifiability hexapod-42 {}", "validate hexapod-42 {}"]
+    "command",
+    ["calibrate hexapod-42 {} -o run", "identifiability hexapod-42 {}", "validate hexapod-42 {}"],
 )
 @pytest.mark.parametrize("case", SEVERAL_CASES)
-def test_files_that_do_not_fit_together_are_refused_by_every_command(refused, case, command) -> None:
+def test_files_that_do_not_fit_together_are_refused_by_every_command(
+    refused, case, command
+) -> None:
     poses, heights, sentence = SEVERAL_CASES[case]
-    assert sentence in refused(command.format("poses.csv heights.csv"), poses_csv=poses, heights_csv=heights)
+    assert sentence in refused(
+        command.format("poses.csv heights.csv"), poses_csv=poses, heights_csv=heights
+    )
 
 
 def test_an_export_of_which_no_line_fits_the_profile_is_refused(refused) -> None:
-    files = {"cmm_yaml": PROFILE, "export_txt": "Kugel;X;Y;Z;Ø\nA1;1,0;2,0;3,0;25\n".encode("latin-1")}
+    files = {
+        "cmm_yaml": PROFILE,
+        "export_txt": "Kugel;X;Y;Z;Ø\nA1;1,0;2,0;3,0;25\n".encode("latin-1"),
+    }
     found = refused("import export.txt --profile cmm.yaml -o data.csv", **files)
-    assert "export.txt:2: no line of this export fits cmm.yaml; this one, the first: the name 'A1' does not match K_" in found
+    assert (
+        "export.txt:2: no line of this export fits cmm.yaml; this one, the first: the name 'A1' "
+        "does not match K_" in found
+    )
 
 
 def test_fewer_equations_than_parameters_are_refused_with_both_numbers(refused) -> None:
     found = refused("calibrate hexapod-42 data.csv -o run --method ls", data_csv=DATA)
-    assert "3 equations from 3 poses cannot determine 42 parameters: measure at least 42 poses" in found
+    assert (
+        "3 equations from 3 poses cannot determine 42 parameters: measure at least 42 poses"
+        in found
+    )
 
 
-def test_fewer_equations_are_refused_by_default_too_unless_tolerances_are_asked_to_decide(refused) -> None:
+def test_fewer_equations_are_refused_by_default_too_unless_tolerances_are_asked_to_decide(
+    refused,
+) -> None:
     found = refused("calibrate hexapod-42 data.csv -o run", data_csv=DATA)
     assert "3 equations cannot determine 42 parameters; measure more poses" in found
     assert "--method map" in found
@@ -224,8 +350,14 @@ USAGE_CASES = {
     "unknown command": ("calibrat hexapod-42", "No such command 'calibrat'"),
     "unknown option": ("check hexapod-42 --jsn", "No such option"),
     "missing argument": ("check", "Missing argument 'ROBOT'"),
-    "limit without a unit": ("calibrate hexapod-42 d.csv -o r --limit-position 0.1", "'0.1' has no unit; add one of m"),
-    "limit of the wrong kind": ("calibrate hexapod-42 d.csv -o r --limit-angle 1mm", "'mm' is a unit of length"),
+    "limit without a unit": (
+        "calibrate hexapod-42 d.csv -o r --limit-position 0.1",
+        "'0.1' has no unit; add one of m",
+    ),
+    "limit of the wrong kind": (
+        "calibrate hexapod-42 d.csv -o r --limit-angle 1mm",
+        "'mm' is a unit of length",
+    ),
     "hold out everything": ("calibrate hexapod-42 d.csv -o r --hold-out 1", "--hold-out"),
     "unknown method": ("calibrate hexapod-42 d.csv -o r --method best", "--method"),
     "negative seed": ("simulate hexapod-42 --poses p.csv -o m.csv --seed -1", "--seed"),
@@ -239,16 +371,23 @@ def test_a_bad_command_line_is_refused(refused, case) -> None:
 
 
 def test_a_used_folder_is_refused_without_force(refused) -> None:
-    assert "this folder is not empty" in refused("calibrate hexapod-42 data.csv -o .", data_csv=DATA)
+    assert "this folder is not empty" in refused(
+        "calibrate hexapod-42 data.csv -o .", data_csv=DATA
+    )
     assert "something other than a run" in refused("calibrate hexapod-42 data.csv -o . --force")
 
 
 def test_a_controller_that_is_not_there_is_refused(refused) -> None:
     commanded = ",".join(
-        f"commanded.{name}" for name in ("x [mm]", "y [mm]", "z [mm]", "roll [deg]", "pitch [deg]", "yaw [deg]")
+        f"commanded.{name}"
+        for name in ("x [mm]", "y [mm]", "z [mm]", "roll [deg]", "pitch [deg]", "yaw [deg]")
     )
-    text = DATA.replace(HEADER, f"pose,{commanded},z [mm]").replace("# noise", "# controller: no.yaml\n# noise")
-    assert "there is no such robot file" in refused("calibrate hexapod-42 data.csv -o run", data_csv=text)
+    text = DATA.replace(HEADER, f"pose,{commanded},z [mm]").replace(
+        "# noise", "# controller: no.yaml\n# noise"
+    )
+    assert "there is no such robot file" in refused(
+        "calibrate hexapod-42 data.csv -o run", data_csv=text
+    )
 
 
 @pytest.mark.parametrize("number", [LengthTolerance(sd=-2.9e-5), LengthTolerance(limits=-2.9e-5)])
@@ -257,9 +396,13 @@ def test_tolerances_and_workspaces_are_told_with_their_units(number) -> None:
         standard_deviation(number, "base")
     with pytest.raises(MechanismError, match=r"the tolerance of tilt is 0 rad; it must"):
         standard_deviation(AngleTolerance(sd=0.0), "tilt")
-    with pytest.raises(MechanismError, match=r"the workspace of z runs from 0.3 m to 0.2 m; the first must"):
+    with pytest.raises(
+        MechanismError, match=r"the workspace of z runs from 0.3 m to 0.2 m; the first must"
+    ):
         _ = Workspace(z=(0.3, 0.2)).ranges
-    with pytest.raises(MechanismError, match=r"the workspace of yaw runs from 1 rad to -1 rad; the first must"):
+    with pytest.raises(
+        MechanismError, match=r"the workspace of yaw runs from 1 rad to -1 rad; the first must"
+    ):
         _ = Workspace(yaw=(1.0, -1.0)).ranges
 
 
@@ -267,7 +410,12 @@ def test_tolerances_and_workspaces_are_told_with_their_units(number) -> None:
 def test_another_robot_in_the_data_is_noted(tmp_path, capsys, stated, noted) -> None:
     data = tmp_path / "data.csv"
     data.write_text(f"# robot: {stated}\n{DATA}")
-    for words in (["identifiability", "hexapod-42", str(data)], ["validate", "hexapod-42", str(data)]):
+    for words in (
+        ["identifiability", "hexapod-42", str(data)],
+        ["validate", "hexapod-42", str(data)],
+    ):
         main(words)
-        said = f"loopcal: note: {data} is said to be of robot 'other-robot', but 'hexapod-42' is used"
+        said = (
+            f"loopcal: note: {data} is said to be of robot 'other-robot', but 'hexapod-42' is used"
+        )
         assert (said in capsys.readouterr().err) == noted

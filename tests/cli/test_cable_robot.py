@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/cable-robots.md: its commands run on the example and print what it says; and what it says of a real machine."""
+"""docs/cable-robots.md: its commands run on the example and print what it says; and what it says of
+a real machine.
+"""
 
 import json
 import re
@@ -40,7 +42,9 @@ def test_the_commands_print_what_the_page_says_and_find_the_truth(page, capsys) 
     for command in commands:
         capsys.readouterr()
         assert main(command.split()) == 0
-    printed = re.search(r"the commands and compares -->\n```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    printed = re.search(
+        r"the commands and compares -->\n```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL
+    )
     assert printed
     assert capsys.readouterr().out.strip() == printed[1].strip()
     kept = np.load("run/arrays.npz")
@@ -62,14 +66,18 @@ def test_import_writes_known_and_unknown_poses_and_says_what_it_leaves_out(folde
     assert main(REAL.split()) == 0
     out = capsys.readouterr().out
     assert "robot.yaml: 4 actuators, 21 parameters, 21 free" in out
-    assert "44 poses of 4 motor angles, 9 of them known; a line is taken to be known to 0.6 mm" in out
+    assert (
+        "44 poses of 4 motor angles, 9 of them known; a line is taken to be known to 0.6 mm" in out
+    )
     assert "41 rows of line forces are not read" in out
     assert "next: loopcal calibrate robot.yaml samples.csv -o run" in out
     data = load_measurements("samples.csv", load_robot("robot.yaml"))
     assert data.n_poses == 44
     assert data.n_rows == 27
     (seen,) = data.observations
-    assert sorted(data.labels[i] for i in seen.rows[seen.present.all(axis=1)]) == [f"known{i}" for i in range(1, 10)]
+    assert sorted(data.labels[i] for i in seen.rows[seen.present.all(axis=1)]) == [
+        f"known{i}" for i in range(1, 10)
+    ]
 
 
 def test_a_real_machine_in_two_commands_gives_what_the_page_says(folder, capsys, root) -> None:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands on the shipped hexapod: simulate, calibrate, validate, identifiability, with their files and exit codes."""
+"""The commands on the shipped hexapod: simulate, calibrate, validate, identifiability, with their
+files and exit codes.
+"""
 
 import json
 import shutil
@@ -10,8 +12,8 @@ import pytest
 
 from loopcal.cli import main
 from loopcal.io import load_measurements, load_robot
-from loopcal.io.calibration_run import load_run
-from loopcal.io.robot_file import shipped_robots
+from loopcal.io.robot.robot_file import shipped_robots
+from loopcal.io.runs.calibration_run import load_run
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 SIMULATE = "simulate truth.yaml --poses poses.csv --sigma-position 0.001mm --sigma-angle 5urad --seed 3 -o again.csv"
@@ -19,7 +21,9 @@ SIMULATE = "simulate truth.yaml --poses poses.csv --sigma-position 0.001mm --sig
 
 @pytest.fixture
 def run(tmp_path, monkeypatch, capsys):
-    """Run a command line in a copy of the example's folder; return exit code, standard output and standard error."""
+    """Run a command line in a copy of the example's folder; return exit code, standard output and
+    standard error.
+    """
     monkeypatch.chdir(tmp_path)
     for path in EXAMPLE.iterdir():
         shutil.copy(path, tmp_path)
@@ -34,9 +38,13 @@ def run(tmp_path, monkeypatch, capsys):
 def test_the_recipe_makes_the_shipped_measurements(run, tmp_path) -> None:
     assert run(SIMULATE)[0] == 0
     made, shipped = (tmp_path / "again.csv").read_text(), (EXAMPLE / "measurements.csv").read_text()
-    assert [line for line in made.split("\n") if "," not in line] == [line for line in shipped.split("\n") if "," not in line]
+    assert [line for line in made.split("\n") if "," not in line] == [
+        line for line in shipped.split("\n") if "," not in line
+    ]
     numbers = [np.loadtxt(text.split("\n"), delimiter=",", skiprows=7) for text in (made, shipped)]
-    np.testing.assert_allclose(*numbers, rtol=0, atol=1e-10)  # [mm, deg]: rounding of another linear algebra library
+    np.testing.assert_allclose(
+        *numbers, rtol=0, atol=1e-10
+    )  # [mm, deg]: rounding of another linear algebra library
 
 
 def test_calibrate_finds_the_true_machine_and_leaves_a_complete_run(run, tmp_path) -> None:
@@ -44,17 +52,26 @@ def test_calibrate_finds_the_true_machine_and_leaves_a_complete_run(run, tmp_pat
     assert code == 0, err
     assert "leg6.length" in out
     assert "Errors on 10 unseen rows" in out
-    assert sorted(p.name for p in (tmp_path / "out" / "run").iterdir()) == ["arrays.npz", "result.json", "robot.yaml"]
-    result = json.loads((tmp_path / "out" / "run" / "result.json").read_text(), parse_constant=pytest.fail)
+    assert sorted(p.name for p in (tmp_path / "out" / "run").iterdir()) == [
+        "arrays.npz",
+        "result.json",
+        "robot.yaml",
+    ]
+    result = json.loads(
+        (tmp_path / "out" / "run" / "result.json").read_text(), parse_constant=pytest.fail
+    )
     assert len(result["split"]["held_out"]) == 10
     assert set(result["made_by"]["inputs"]) == {"robot", "data"}
     assert result["fit"]["rank"] == 42
     truth, found = load_robot("truth.yaml").values, load_run("out/run").robot
     errors = np.abs(found.values - truth) / np.load("out/run/arrays.npz")["sd"]
-    # 42 values, 180 equations: the mean square of errors over their sd is 1 within 1 / sqrt(21) per sd; 4.5 sd allowed
+    # 42 values, 180 equations: the mean square of errors over their sd is 1 within 1 / sqrt(21) per
+    # sd; 4.5 sd allowed
     assert np.mean(errors**2) < 2.0
     after, before = (result["validation"][when]["position"]["rms"] for when in ("after", "before"))
-    assert after < 3e-6  # [m]: three times the instrument's 1 um, one for each axis and some for the fit
+    assert (
+        after < 3e-6
+    )  # [m]: three times the instrument's 1 um, one for each axis and some for the fit
     assert after < before / 15
 
 
@@ -62,11 +79,15 @@ def test_json_is_one_document_on_standard_output_and_equals_the_runs(run, tmp_pa
     code, out, _ = run("calibrate hexapod-42 measurements.csv -o run --hold-out 0.25 --json")
     assert code == 0
     assert json.loads(out) == {
-        k: v for k, v in json.loads((tmp_path / "run" / "result.json").read_text()).items() if k != "format"
+        k: v
+        for k, v in json.loads((tmp_path / "run" / "result.json").read_text()).items()
+        if k != "format"
     }
 
 
-@pytest.mark.parametrize("words", ["check hexapod-42", "identifiability hexapod-42 measurements.csv", SIMULATE])
+@pytest.mark.parametrize(
+    "words", ["check hexapod-42", "identifiability hexapod-42 measurements.csv", SIMULATE]
+)
 def test_every_command_prints_json_and_nothing_else(run, words) -> None:
     code, out, err = run(f"{words} --json")
     assert (code, err) == (0, "")
@@ -110,19 +131,28 @@ def test_a_calibration_can_start_from_a_corrected_robot_file(run) -> None:
     assert first.robot.record.text == second.robot.record.text
 
 
-@pytest.mark.parametrize("method", ["map", "ls", "ridge", "ridge --lam 0.5", "tsvd --keep 30", "tsvd"])
+@pytest.mark.parametrize(
+    "method", ["map", "ls", "ridge", "ridge --lam 0.5", "tsvd --keep 30", "tsvd"]
+)
 def test_other_methods_calibrate_too(run, method) -> None:
     # 30 of 42 directions leave more than the stated noise explains, and the exit code says so
     code = 2 if method == "tsvd --keep 30" else 0
-    assert run(f"calibrate hexapod-42 measurements.csv -o run --hold-out 0.25 --method {method}")[0] == code
+    assert (
+        run(f"calibrate hexapod-42 measurements.csv -o run --hold-out 0.25 --method {method}")[0]
+        == code
+    )
 
 
 def test_poses_are_dropped_and_weighed_only_when_asked(run) -> None:
-    code, out, _ = run("calibrate hexapod-42 measurements.csv -o run --drop 3 --drop 7 --loss tukey")
+    code, out, _ = run(
+        "calibrate hexapod-42 measurements.csv -o run --drop 3 --drop 7 --loss tukey"
+    )
     assert code == 0
     assert "left out as asked: poses 3, 7" in out
     assert "Tukey(c=4.685)" in out
-    assert "there is no pose '99'" in run("calibrate hexapod-42 measurements.csv -o run2 --drop 99")[2]
+    assert (
+        "there is no pose '99'" in run("calibrate hexapod-42 measurements.csv -o run2 --drop 99")[2]
+    )
 
 
 def test_the_result_says_how_far_the_fit_can_be_trusted(run) -> None:
@@ -150,12 +180,19 @@ def test_noise_can_be_estimated_from_the_residual(run) -> None:
 
 
 def test_an_option_of_another_method_is_refused(run) -> None:
-    assert "--lam belongs to --method ridge" in run("calibrate hexapod-42 measurements.csv -o run --lam 1")[2]
+    assert (
+        "--lam belongs to --method ridge"
+        in run("calibrate hexapod-42 measurements.csv -o run --lam 1")[2]
+    )
 
 
 def test_identifiability_names_what_heights_alone_cannot_tell(run) -> None:
-    assert "42 of 42 parameter combinations" in run("identifiability hexapod-42 measurements.csv")[1]
-    code, out, _ = run("identifiability hexapod-42 --poses poses.csv --kind component --components z")
+    assert (
+        "42 of 42 parameter combinations" in run("identifiability hexapod-42 measurements.csv")[1]
+    )
+    code, out, _ = run(
+        "identifiability hexapod-42 --poses poses.csv --kind component --components z"
+    )
     assert code == 0
     assert "not identifiable: together" in out
     code, _, err = run("identifiability hexapod-42 measurements.csv --poses poses.csv")
@@ -175,7 +212,10 @@ def test_check_shows_what_a_file_expands_into_in_its_units(run) -> None:
     out = run("check linear-delta --expand")[1]
     assert "arm3       tower      link                                       0     105     0" in out
     assert "q1         arm1/carriage   offset   493.326149     mm" in out
-    assert "radius tower1.angle arm1.length tower1.stop   arm1/tower/x, arm1/tower/y, q1/transmission/offset" in out
+    assert (
+        "radius tower1.angle arm1.length tower1.stop   arm1/tower/x, arm1/tower/y, "
+        "q1/transmission/offset" in out
+    )
     out = run("check cable-4 --expand")[1]
     assert "gain   0.10262536   mm/deg" in out  # 5.88 mm a radian
     assert "a/transmission/gain   0.0174533   (mm/deg)/mm" in out
@@ -185,7 +225,11 @@ def test_check_shows_what_a_file_expands_into_in_its_units(run) -> None:
 def test_joints_are_shown_where_they_stand_with_the_platform_at_home(run, name) -> None:
     """Not where the search for home starts (`start:`), which differs by some degrees."""
     robot, out = load_robot(name), run(f"check {name} --expand")[1]
-    shown = {tuple(row.split()[:2]): row.split()[-2] for row in out.splitlines() if " turns about z" in row}
+    shown = {
+        tuple(row.split()[:2]): row.split()[-2]
+        for row in out.splitlines()
+        if " turns about z" in row
+    }
     for group, joints in zip(robot.program.groups, robot.home_state.joints, strict=True):
         for k, i in enumerate(group.limbs):
             for j, joint in enumerate(robot.assembly.limbs[i].joints):
@@ -214,16 +258,28 @@ def test_drawn_errors_are_written_as_a_robot_file(run) -> None:
 
 def test_simulated_encoders_are_as_noisy_as_asked_and_their_file_says_so(run, tmp_path) -> None:
     words = "simulate linear-delta --draw 30 --kind position --seed 4"
-    assert run(f"{words} -o exact.csv")[0] == run(f"{words} --sigma-reading 20um,q3=0um -o noisy.csv")[0] == 0
+    assert (
+        run(f"{words} -o exact.csv")[0]
+        == run(f"{words} --sigma-reading 20um,q3=0um -o noisy.csv")[0]
+        == 0
+    )
     robot = load_robot("linear-delta")
-    exact, noisy = (load_measurements(tmp_path / name, robot) for name in ("exact.csv", "noisy.csv"))
+    exact, noisy = (
+        load_measurements(tmp_path / name, robot) for name in ("exact.csv", "noisy.csv")
+    )
     assert exact.reading_sigma is None
     assert noisy.reading_sigma is not None
-    np.testing.assert_allclose(noisy.reading_sigma, np.tile([20e-6, 20e-6, 0.0], (30, 1)), rtol=1e-14)  # written in mm
+    np.testing.assert_allclose(
+        noisy.reading_sigma, np.tile([20e-6, 20e-6, 0.0], (30, 1)), rtol=1e-14
+    )  # written in mm
     error = noisy.readings - exact.readings
     assert np.abs(error[:, 2]).max() < 1e-12  # [m], digits of the file
-    assert 30.0 < ((error[:, :2] / 20e-6) ** 2).sum() < 100.0  # chi-square of 60: 0.1 % on either side
-    assert run("simulate linear-delta --fill noisy.csv --sigma-reading 5um -o x.csv")[2].startswith("loopcal: --fill noisy.csv")
+    assert (
+        30.0 < ((error[:, :2] / 20e-6) ** 2).sum() < 100.0
+    )  # chi-square of 60: 0.1 % on either side
+    assert run("simulate linear-delta --fill noisy.csv --sigma-reading 5um -o x.csv")[2].startswith(
+        "loopcal: --fill noisy.csv"
+    )
     refused = run("identifiability linear-delta noisy.csv --sigma-reading 5um")
     assert refused[0] == 1
     assert "DATA states how far its readings are believed" in refused[2]

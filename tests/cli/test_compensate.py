@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal compensate`, and `loopcal calibrate --prior`: files with units, exit codes, refusals in a sentence."""
+"""`loopcal compensate`, and `loopcal calibrate --prior`: files with units, exit codes, refusals in
+a sentence.
+"""
 
 import json
 import shutil
@@ -10,7 +12,7 @@ import pytest
 
 from loopcal.cli import main
 from loopcal.io import load_robot
-from loopcal.io.csv_table import read_table
+from loopcal.io.core.csv_table import read_table
 from loopcal.mechanism import forward, inverse
 from loopcal.units import Dimension
 
@@ -51,10 +53,14 @@ def test_readings_from_the_file_take_the_calibrated_robot_to_the_targets(run, ma
     code, out, err = run("compensate run targets.csv -o readings.csv")
     assert code == 0, err
     assert "home" in out
-    assert "U = 2 x rms uncertainty: tool point, base axes, in the base frame of the robot file" in out
+    assert (
+        "U = 2 x rms uncertainty: tool point, base axes, in the base frame of the robot file" in out
+    )
     table = read_table(made / "readings.csv")
     q = np.column_stack([table.numbers(f"q{i}", Dimension.LENGTH) for i in range(1, 7)])
-    np.testing.assert_allclose(q, inverse(load_robot("run/robot.yaml"), WANTED).q, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        q, inverse(load_robot("run/robot.yaml"), WANTED).q, rtol=0, atol=1e-15
+    )
     assert table.text("note status") == ("reached in full",) * 2
     assert (table.numbers("note U x", Dimension.LENGTH) < 3e-6).all()  # [m], instrument 1 um
 
@@ -65,7 +71,9 @@ def test_commands_lead_the_nominal_controller_to_the_same_readings(run, made) ->
     assert "after step 4: within" in out
     table = read_table(made / "commands.csv")
     commanded = [table.numbers(f"commanded.{n}", Dimension.LENGTH) for n in "xyz"]
-    commanded += [table.numbers(f"commanded.{n}", Dimension.ANGLE) for n in ("roll", "pitch", "yaw")]
+    commanded += [
+        table.numbers(f"commanded.{n}", Dimension.ANGLE) for n in ("roll", "pitch", "yaw")
+    ]
     readings = inverse(load_robot("hexapod-42"), np.column_stack(commanded)).q
     calibrated = load_robot("run/robot.yaml")
     wanted = inverse(calibrated, WANTED).T
@@ -101,11 +109,23 @@ def test_a_target_out_of_the_machines_limits_gives_exit_code_2_and_no_reading(ru
     ("text", "sentence"),
     [
         (TARGETS.replace("roll [deg]", "roll"), "targets.csv:1: column 'roll' has no unit"),
-        (TARGETS.replace("z [mm]", "z [deg]"), "targets.csv:1: column 'z': 'deg' is a unit of angle, but a length is needed"),
-        (TARGETS.replace("yaw", "jaw"), "targets.csv:1: there is no column 'yaw' (did you mean 'jaw'?)"),
+        (
+            TARGETS.replace("z [mm]", "z [deg]"),
+            "targets.csv:1: column 'z': 'deg' is a unit of angle, but a length is needed",
+        ),
+        (
+            TARGETS.replace("yaw", "jaw"),
+            "targets.csv:1: there is no column 'yaw' (did you mean 'jaw'?)",
+        ),
         (TARGETS.replace("x [mm]", "X [mm],x [mm]"), "names 8 columns"),
-        (TARGETS.replace("0.21e3", ""), "targets.csv:3: column 'z' is empty, but every row needs it"),
-        (TARGETS.replace("left", "home"), "targets.csv:3: the name of this target stands here for the second time"),
+        (
+            TARGETS.replace("0.21e3", ""),
+            "targets.csv:3: column 'z' is empty, but every row needs it",
+        ),
+        (
+            TARGETS.replace("left", "home"),
+            "targets.csv:3: the name of this target stands here for the second time",
+        ),
         ("pose\n", "has a header but no rows"),
     ],
 )
@@ -123,16 +143,27 @@ def test_bad_targets_are_refused_in_a_sentence(run, made, text, sentence) -> Non
         ("compensate nothing targets.csv", "this is not a run folder"),
         ("compensate run nothing.csv", "nothing.csv: there is no such"),
         ("compensate run targets.csv --controller nobody", "nobody"),
-        ("calibrate hexapod-42 measurements.csv -o new --prior run", "the earlier run was fitted to these very measurements"),
-        ("calibrate hexapod-42 measurements.csv -o new --free-limb leg3", "name it with --prior RUN"),
-        ("calibrate hexapod-42 later.csv -o new --prior run --method map", "--method does not go with --prior"),
+        (
+            "calibrate hexapod-42 measurements.csv -o new --prior run",
+            "the earlier run was fitted to these very measurements",
+        ),
+        (
+            "calibrate hexapod-42 measurements.csv -o new --free-limb leg3",
+            "name it with --prior RUN",
+        ),
+        (
+            "calibrate hexapod-42 later.csv -o new --prior run --method map",
+            "--method does not go with --prior",
+        ),
         (
             "calibrate hexapod-42 later.csv -o new --prior run --free-limb leg9",
             "no free parameter of hexapod-42 belongs to 'leg9'",
         ),
     ],
 )
-def test_requests_that_make_no_sense_are_refused_in_a_sentence(run, made, later, words, sentence) -> None:
+def test_requests_that_make_no_sense_are_refused_in_a_sentence(
+    run, made, later, words, sentence
+) -> None:
     code, _, err = run(words)
     assert code == 1
     assert sentence in err
@@ -159,9 +190,13 @@ def later(made):
 
 
 def test_calibrate_with_a_prior_says_whether_the_machine_moved(run, later, made) -> None:
-    code, out, err = run("calibrate hexapod-42 later.csv -o second --prior run --free-limb leg3 --force")
+    code, out, err = run(
+        "calibrate hexapod-42 later.csv -o second --prior run --free-limb leg3 --force"
+    )
     assert code == 0, err
-    assert "leg3 has not moved beyond the noise since the earlier calibration" in " ".join(out.split())
+    assert "leg3 has not moved beyond the noise since the earlier calibration" in " ".join(
+        out.split()
+    )
     result = json.loads((made / "second" / "result.json").read_text())
     assert result["change"]["what"] == "leg3"
     assert result["change"]["moved"] is False

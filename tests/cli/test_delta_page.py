@@ -64,7 +64,9 @@ def test_what_a_list_of_points_would_tell_is_what_the_page_says(page, capsys) ->
 
 def test_thirteen_heights_leave_the_arms_where_they_were(page, tmp_path, capsys) -> None:
     lines = (tmp_path / "printer.yaml").read_text().splitlines(keepends=True)
-    (tmp_path / "nine.yaml").write_text("".join(line for line in lines if not line.startswith("fixed")))
+    (tmp_path / "nine.yaml").write_text(
+        "".join(line for line in lines if not line.startswith("fixed"))
+    )
     assert main(["identifiability", "nine.yaml", "heights.csv"]) == 0
     out = capsys.readouterr().out
     assert "9 of 9 parameter combinations" in out

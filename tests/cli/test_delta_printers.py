@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real delta printers as their owners would calibrate them: a robot file, a file of probed heights, one command.
+"""Real delta printers as their owners would calibrate them: a robot file, a file of probed heights,
+one command.
 
-What is compared with is the answer that the printers' own firmware stored, made from the same heights of equal weight.
+What is compared with is the answer that the printers' own firmware stored, made from the same
+heights of equal weight.
 """
 
 import json
@@ -23,7 +25,9 @@ CALIBRATED = (
 )
 FACTORY_DEFAULT = "danorder/Flsun-super-racer-Full-klipper-config- V400 FIXES.txt"
 WITH_DISTANCES = "RazorCopter/Klipper_FLSUN_Q5 printer [Post-Calibration].cfg"
-TOLERANCES = "tolerances: {radius: {sd: 0.5}, angles: {sd: 0.3}, arms: {sd: 0.3}, stops: {sd: 0.5}}\n"
+TOLERANCES = (
+    "tolerances: {radius: {sd: 0.5}, angles: {sd: 0.3}, arms: {sd: 0.3}, stops: {sd: 0.5}}\n"
+)
 IMPORT = "import printer.cfg -o printer.yaml --data probes.csv --force"
 CALIBRATE = "calibrate robot.yaml heights.csv -o run"
 
@@ -47,7 +51,9 @@ def test_every_record_of_heights_alone_is_tried_here(data_folder) -> None:
 
 @pytest.mark.parametrize("stop_off", [0.0, 40.0, -40.0])
 @pytest.mark.parametrize("name", CALIBRATED)
-def test_the_answer_of_the_firmware_comes_back_from_stops_far_off(calibrate, data_folder, name, stop_off) -> None:
+def test_the_answer_of_the_firmware_comes_back_from_stops_far_off(
+    calibrate, data_folder, name, stop_off
+) -> None:
     out, result = calibrate(name, "--noise estimated", stop_off=stop_off)
     answer = stored(every_record(data_folder)[name])
     found = {row["name"]: row["estimate"] for row in result["fit"]["parameters"]}
@@ -61,12 +67,19 @@ def test_the_answer_of_the_firmware_comes_back_from_stops_far_off(calibrate, dat
 def test_the_command_works_as_typed_into_a_shell(tmp_path, data_folder) -> None:
     write_files(heights_only(data_folder)[CALIBRATED[0]], tmp_path)
     command = [str(Path(sys.executable).parent / "loopcal"), *CALIBRATE.split()]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60)
-    # one degree of freedom left at 10 times the stated noise: the residual does not fit it, so the exit code is 2
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60
+    )
+    # one degree of freedom left at 10 times the stated noise: the residual does not fit it, so the
+    # exit code is 2
     assert done.returncode == 2
     assert "times what the stated noise explains" in done.stderr
     assert "printer: 6 parameters" in done.stdout
-    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == ["arrays.npz", "result.json", "robot.yaml"]
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [
+        "arrays.npz",
+        "result.json",
+        "robot.yaml",
+    ]
 
 
 def test_a_factory_default_is_flagged_as_not_calibrated(calibrate, capsys) -> None:
@@ -74,7 +87,8 @@ def test_a_factory_default_is_flagged_as_not_calibrated(calibrate, capsys) -> No
     assert result["start"]["verdict"] == "not calibrated"
     assert result["start"]["before"] / result["start"]["after"] > 5.0
     assert "NOT calibrated to these rows" in out
-    # a robot file can be judged without a fit, and the corrected one passes where the factory default does not
+    # a robot file can be judged without a fit, and the corrected one passes where the factory
+    # default does not
     assert main(["validate", "robot.yaml", "heights.csv", "--limit-position", "0.1mm"]) == 2
     assert "position error 0.2617 mm at pose point5 exceeds" in capsys.readouterr().err
     assert main(["validate", "run/robot.yaml", "heights.csv", "--limit-position", "0.1mm"]) == 0
@@ -89,7 +103,10 @@ def test_a_probe_of_unknown_sigma_leaves_that_open_and_says_so(calibrate) -> Non
 def test_one_degree_of_freedom_gives_intervals_only_with_the_sigma_of_the_probe(calibrate) -> None:
     out, result = calibrate(CALIBRATED[2], "--noise estimated")
     assert result["fit"]["dof"] == pytest.approx(1.0)
-    assert "one degree of freedom is too few for intervals unless the instrument's sigma is given" in out
+    assert (
+        "one degree of freedom is too few for intervals unless the instrument's sigma is given"
+        in out
+    )
     assert {row["plus_minus"] for row in result["fit"]["parameters"]} == {None}
     out, result = calibrate(CALIBRATED[2], "--force", sigma="0.02 mm")
     assert "too few" not in out
@@ -100,7 +117,9 @@ def test_one_degree_of_freedom_gives_intervals_only_with_the_sigma_of_the_probe(
 
 
 def test_a_geometry_from_heights_and_distances_is_not_the_best_for_heights_alone(calibrate) -> None:
-    """RazorCopter's firmware weighed 12 distances as well; its heights alone ask for something else."""
+    """RazorCopter's firmware weighed 12 distances as well; its heights alone ask for something
+    else.
+    """
     out, result = calibrate(WITH_DISTANCES, "--noise estimated")
     assert result["fit"]["rank"] == 6
     assert result["start"]["verdict"] == "open"
@@ -120,11 +139,15 @@ def imported(tmp_path, monkeypatch, capsys, data_folder):
     return run
 
 
-def test_import_says_where_a_stored_geometry_is_not_the_optimum_of_the_firmwares_own_cost(imported) -> None:
+def test_import_says_where_a_stored_geometry_is_not_the_optimum_of_the_firmwares_own_cost(
+    imported,
+) -> None:
     """Two arms of this record were stored otherwise than its heights and distances ask for."""
     assert (
-        "note: the stored geometry is NOT the optimum of the firmware's own cost: 0.6477 mm^2, where 0.6160 mm^2 can be had "
-        "(arm1.length 217.6266 -> 217.4260, arm3.length 215.7964 -> 215.6702); it was changed since, or never fitted"
+        "note: the stored geometry is NOT the optimum of the firmware's own cost: 0.6477 mm^2, "
+        "where 0.6160 mm^2 can be had "
+        "(arm1.length 217.6266 -> 217.4260, arm3.length 215.7964 -> 215.6702); it was changed "
+        "since, or never fitted"
     ) in imported(WITH_DISTANCES)
 
 
@@ -146,17 +169,26 @@ def test_the_page_quotes_what_is_printed_of_the_real_printer(imported, capsys, r
     assert half["radius"] == pytest.approx(0.53, abs=0.005)
 
 
-def test_import_says_the_same_of_a_factory_default_and_not_of_printers_that_were_calibrated(imported) -> None:
+def test_import_says_the_same_of_a_factory_default_and_not_of_printers_that_were_calibrated(
+    imported,
+) -> None:
     out = imported(FACTORY_DEFAULT)
-    assert "NOT the optimum of the firmware's own cost: 0.1179 mm^2, where 0.0019 mm^2 can be had (radius 161.7500 ->" in out
+    assert (
+        "NOT the optimum of the firmware's own cost: 0.1179 mm^2, where 0.0019 mm^2 can be had "
+        "(radius 161.7500 ->" in out
+    )
     for name in CALIBRATED:
-        assert "the stored geometry is the optimum of the firmware's own cost" in imported(name), name
+        assert "the stored geometry is the optimum of the firmware's own cost" in imported(name), (
+            name
+        )
 
 
 @pytest.mark.parametrize(("name", "height", "times"), [(CALIBRATED[0], None, 10.0), (CALIBRATED[1], None, 4.39),
                                                         (CALIBRATED[2], 1, 3.51), (CALIBRATED[2], 2, 5.72),
                                                         (CALIBRATED[2], 6, 7.0)])  # fmt: skip
-def test_seven_heights_that_disagree_get_no_all_clear_and_no_height_is_blamed(imported, capsys, name, height, times) -> None:
+def test_seven_heights_that_disagree_get_no_all_clear_and_no_height_is_blamed(
+    imported, capsys, name, height, times
+) -> None:
     """Two printers as they were probed; and one with 0.3 mm, 15 times the noise, added to a height."""
     imported(name)
     lines = Path("probes.csv").read_text().split("\n")
@@ -168,7 +200,10 @@ def test_seven_heights_that_disagree_get_no_all_clear_and_no_height_is_blamed(im
     assert main(["calibrate", "printer.yaml", "probes.csv", "-o", "run"]) == 2
     out = capsys.readouterr().out
     assert "fit each other" not in out
-    assert "7 of 7 blocks of rows disagree, and which is wrong cannot be told: measure more poses" in out
+    assert (
+        "7 of 7 blocks of rows disagree, and which is wrong cannot be told: measure more poses"
+        in out
+    )
     assert f"disagree by {times:.3g} times the noise; which one is wrong cannot be told" in out
 
 
@@ -178,7 +213,9 @@ def test_nine_parameters_from_heights_alone_are_flagged_with_the_combination_and
 ) -> None:
     imported(name)
     text = (tmp_path / "printer.yaml").read_text()
-    (tmp_path / "nine.yaml").write_text("".join(s for s in text.splitlines(keepends=True) if not s.startswith("fixed")))
+    (tmp_path / "nine.yaml").write_text(
+        "".join(s for s in text.splitlines(keepends=True) if not s.startswith("fixed"))
+    )
     write_files(every_record(data_folder)[name], tmp_path)
     assert main(["identifiability", "nine.yaml", "heights.csv"]) == 0
     out = capsys.readouterr().out

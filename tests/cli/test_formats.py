@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal import` and `loopcal export`: files of controllers in, corrected files out, nothing else in them changed."""
+"""`loopcal import` and `loopcal export`: files of controllers in, corrected files out, nothing else
+in them changed.
+"""
 
 import difflib
 import importlib
@@ -36,7 +38,11 @@ def run(command: str) -> int:
 
 def changed(before: str, after: str) -> list[str]:
     """Lines that differ, as they are afterwards."""
-    return [line[2:] for line in difflib.ndiff(before.splitlines(), after.splitlines()) if line.startswith("+ ")]
+    return [
+        line[2:]
+        for line in difflib.ndiff(before.splitlines(), after.splitlines())
+        if line.startswith("+ ")
+    ]
 
 
 @pytest.mark.parametrize("name", sorted((*FIRMWARE_CALIBRATED, WITH_DISTANCES)))
@@ -47,17 +53,26 @@ def test_a_printer_cfg_gives_its_geometry_and_every_probe(folder, data_folder, n
     robot = load_robot("printer.yaml")
     for parameter, value in stored(record).items():
         factor = np.pi / 180 if parameter.endswith("angle") else 1e-3
-        assert robot.values[robot.parameters.index(parameter)] == pytest.approx(value * factor, abs=1e-12)  # [m, rad]
+        assert robot.values[robot.parameters.index(parameter)] == pytest.approx(
+            value * factor, abs=1e-12
+        )  # [m, rad]
     data = load_measurements("data.csv", robot)
     assert data.n_rows == len(record["heights"]) + len(record["distances"])
-    steps = np.array(record["heights"][0]["stable_steps"]) * record["geometry_stored_in_config"]["stepdist"]
-    np.testing.assert_allclose(data.readings[data.labels.index("height0")], steps * 1e-3, rtol=0, atol=1e-12)  # [m]
+    steps = (
+        np.array(record["heights"][0]["stable_steps"])
+        * record["geometry_stored_in_config"]["stepdist"]
+    )
+    np.testing.assert_allclose(
+        data.readings[data.labels.index("height0")], steps * 1e-3, rtol=0, atol=1e-12
+    )  # [m]
     # the arms are to be identified only where distances can tell them
     assert int(robot.parameters.free.sum()) == (9 if record["distances"] else 6)
 
 
 @pytest.mark.parametrize("name", FIRMWARE_CALIBRATED)
-def test_one_command_corrects_a_printer_whose_stops_are_far_off(folder, capsys, data_folder, name) -> None:
+def test_one_command_corrects_a_printer_whose_stops_are_far_off(
+    folder, capsys, data_folder, name
+) -> None:
     record = every_record(data_folder)[name]
     text = printer_cfg(record, stop_off=20.0)
     (folder / "printer.cfg").write_text(text)
@@ -68,18 +83,29 @@ def test_one_command_corrects_a_printer_whose_stops_are_far_off(folder, capsys, 
     again = load_robot("again.yaml")
     for parameter, value in stored(record).items():
         factor = np.pi / 180 if parameter.endswith("angle") else 1e-3
-        assert abs(again.values[again.parameters.index(parameter)] / factor - value) < 2e-3, f"{parameter} [mm, deg]"
-    # six numbers were identified, so at most six lines are others, all of them options of the geometry
+        assert abs(again.values[again.parameters.index(parameter)] / factor - value) < 2e-3, (
+            f"{parameter} [mm, deg]"
+        )
+    # six numbers were identified, so at most six lines are others, all of them options of the
+    # geometry
     lines = changed(text, corrected)
     assert 3 <= len(lines) <= 6
-    assert all(line.removeprefix("#*# ").startswith(("delta_radius", "angle", "position_endstop")) for line in lines)
+    assert all(
+        line.removeprefix("#*# ").startswith(("delta_radius", "angle", "position_endstop"))
+        for line in lines
+    )
     assert len(text.splitlines()) == len(corrected.splitlines())
-    assert f"delta_radius {record['geometry_stored_in_config']['radius']:.6f} ->" in out or "delta_radius" not in str(lines)
+    assert (
+        f"delta_radius {record['geometry_stored_in_config']['radius']:.6f} ->" in out
+        or "delta_radius" not in str(lines)
+    )
 
 
 def test_the_chain_of_three_commands_reads_back_equal(folder, data_folder) -> None:
     record = every_record(data_folder)[FIRMWARE_CALIBRATED[0]]
-    (folder / "printer.cfg").write_bytes(b"\xef\xbb\xbf" + printer_cfg(record, stop_off=5.0).replace("\n", "\r\n").encode())
+    (folder / "printer.cfg").write_bytes(
+        b"\xef\xbb\xbf" + printer_cfg(record, stop_off=5.0).replace("\n", "\r\n").encode()
+    )
     assert run("import printer.cfg -o printer.yaml --data data.csv --sigma-height 50um") == 0
     assert run("calibrate printer.yaml data.csv -o run --noise estimated") == 0
     assert run("export run --format klipper --into printer.cfg -o corrected.cfg") == 0
@@ -96,9 +122,12 @@ def test_the_chain_of_three_commands_reads_back_equal(folder, data_folder) -> No
 
 
 def test_json_and_csv_hold_every_parameter_with_its_interval(folder, capsys, data_folder) -> None:
-    (folder / "printer.cfg").write_text(printer_cfg(every_record(data_folder)[FIRMWARE_CALIBRATED[0]]))
+    (folder / "printer.cfg").write_text(
+        printer_cfg(every_record(data_folder)[FIRMWARE_CALIBRATED[0]])
+    )
     assert run("import printer.cfg -o printer.yaml --data data.csv") == 0
-    # the real printer's rows do not fit the sigma that the import states: exit code 2, and the run is written all the same
+    # the real printer's rows do not fit the sigma that the import states: exit code 2, and the run
+    # is written all the same
     assert run("calibrate printer.yaml data.csv -o run") == 2
     assert run("export run -o found.json") == 0
     assert run("export run -o found.csv --json") == 0
@@ -125,7 +154,9 @@ def test_files_that_are_there_stay_without_force(folder, capsys, data_folder) ->
     assert (folder / "printer.yaml").read_text() == "mine"
     assert run("import printer.cfg -o printer.yaml --force") == 0
     assert run("export printer.yaml --format klipper --into printer.cfg -o printer.cfg") == 1
-    assert run("export printer.yaml --format klipper --into printer.cfg -o printer.cfg --force") == 0
+    assert (
+        run("export printer.yaml --format klipper --into printer.cfg -o printer.cfg --force") == 0
+    )
 
 
 @pytest.mark.parametrize(
@@ -136,11 +167,23 @@ def test_files_that_are_there_stay_without_force(folder, capsys, data_folder) ->
         ("import a.csv -o x.yaml", "loopcal writes the format csv, but does not read it"),
         ("import a.cfg -o x.yaml --corrected y.cfg", "say where to write them, as --data data.csv"),
         ("import a.cfg -o x.yaml --unit mm", "--unit does not belong to the format klipper"),
-        ("import a.hal -o x.yaml --sigma-height 1mm", "--sigma-height does not belong to the format linuxcnc"),
-        ("export hexapod-42 --format klipper -o x.cfg", "is not a robot of the family linear-delta"),
+        (
+            "import a.hal -o x.yaml --sigma-height 1mm",
+            "--sigma-height does not belong to the format linuxcnc",
+        ),
+        (
+            "export hexapod-42 --format klipper -o x.cfg",
+            "is not a robot of the family linear-delta",
+        ),
         ("export linear-delta --format linuxcnc -o x.hal", "is not a hexapod of the family gough"),
-        ("export linear-delta -o x.csv --into y.csv", "the format csv is written whole; leave out --into"),
-        ("export linear-delta --format klipper --into no.cfg -o x.cfg", "no.cfg: there is no such printer.cfg"),
+        (
+            "export linear-delta -o x.csv --into y.csv",
+            "the format csv is written whole; leave out --into",
+        ),
+        (
+            "export linear-delta --format klipper --into no.cfg -o x.cfg",
+            "no.cfg: there is no such printer.cfg",
+        ),
     ],
 )
 def test_bad_use_is_one_sentence(folder, capsys, command, sentence) -> None:
@@ -152,7 +195,9 @@ def test_bad_use_is_one_sentence(folder, capsys, command, sentence) -> None:
 
 
 def test_commands_and_page_name_every_format(root) -> None:
-    import_, export = (importlib.import_module(f"loopcal.cli.{name}") for name in ("import_", "export"))
+    import_, export = (
+        importlib.import_module(f"loopcal.cli.{name}") for name in ("import_", "export")
+    )
     page = (root / "docs" / "formats.md").read_text()
     assert all(f"`{name}`" in page for name in FORMATS)
     assert {*import_.FORMATS} == {name for name, found in FORMATS.items() if found.read}
@@ -163,14 +208,19 @@ def test_a_five_bar_goes_from_urdf_to_corrected_origins(folder, capsys, data_fol
     source = data_folder / "urdf_closures" / "5bar_linkage" / "robot.urdf"
     assert run(f"import {source} -o five-bar.yaml") == 0
     assert (
-        "5 rigid bodies with the base (of 8 links), 5 joints (1 close loops), 2 motors, mobility 2" in capsys.readouterr().out
+        "5 rigid bodies with the base (of 8 links), 5 joints (1 close loops), 2 motors, mobility 2"
+        in capsys.readouterr().out
     )
     assert run(f"export five-bar.yaml --format urdf --into {source} -o same.urdf") == 0
     assert (folder / "same.urdf").read_bytes() == source.read_bytes()
 
 
-def test_heights_and_distances_give_the_optimum_of_the_firmwares_own_cost(folder, capsys, data_folder) -> None:
-    """With its weighting; two of the arms that this printer's firmware stored are not the optimum (cost 0.6477)."""
+def test_heights_and_distances_give_the_optimum_of_the_firmwares_own_cost(
+    folder, capsys, data_folder
+) -> None:
+    """With its weighting; two of the arms that this printer's firmware stored are not the optimum
+    (cost 0.6477).
+    """
     record = every_record(data_folder)[WITH_DISTANCES]
     (folder / "printer.cfg").write_text(printer_cfg(record))
     sigma = 0.1 / np.sqrt(2 * len(record["distances"]) / len(record["heights"]))
@@ -179,13 +229,22 @@ def test_heights_and_distances_give_the_optimum_of_the_firmwares_own_cost(folder
     assert document["fit"]["rank"] == 9
     assert document["fit"]["chi_square"] * 0.1**2 == pytest.approx(0.6160, abs=1e-4)  # [mm^2]
     found = {row["name"]: row["estimate"] for row in document["fit"]["parameters"]}
-    best = {"arm1.length": 217.4260, "arm2.length": record["geometry_stored_in_config"]["arms"][1], "arm3.length": 215.6702}
+    best = {
+        "arm1.length": 217.4260,
+        "arm2.length": record["geometry_stored_in_config"]["arms"][1],
+        "arm3.length": 215.6702,
+    }
     for name, value in {**stored(record), **best}.items():
         if name in found:
             assert abs(found[name] - value) < 1e-3, f"{name} [mm, deg]"
-    assert len(changed((folder / "printer.cfg").read_text(), (folder / "corrected.cfg").read_text())) <= 9
+    assert (
+        len(changed((folder / "printer.cfg").read_text(), (folder / "corrected.cfg").read_text()))
+        <= 9
+    )
     assert run("import corrected.cfg -o again.yaml") == 0
     again = load_robot("again.yaml")
     for name, value in found.items():
         factor = np.pi / 180 if name.endswith("angle") else 1e-3
-        assert again.values[again.parameters.index(name)] / factor == pytest.approx(value, abs=1e-6)  # six decimals
+        assert again.values[again.parameters.index(name)] / factor == pytest.approx(
+            value, abs=1e-6
+        )  # six decimals

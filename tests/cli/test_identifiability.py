@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal identifiability`: sentences, tables, the smaller robot file, JSON, and options that contradict each other."""
+"""`loopcal identifiability`: sentences, tables, the smaller robot file, JSON, and options that
+contradict each other.
+"""
 
 import json
 
@@ -32,7 +34,10 @@ def test_five_of_six_coordinates_of_the_3_prs(run):
 
 
 def test_five_of_six_coordinates_of_the_tracker(run):
-    assert "24 of 25 parameter combinations can be identified" in run("ru-pus-prs --measure x,y,z,phi,theta")[1]
+    assert (
+        "24 of 25 parameter combinations can be identified"
+        in run("ru-pus-prs --measure x,y,z,phi,theta")[1]
+    )
 
 
 @pytest.mark.parametrize(("frames", "rank"), [("base", 36), ("tool", 36), ("base,tool", 30)])
@@ -62,10 +67,19 @@ def test_the_json_holds_all_of_it(run):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ("3-prs --measure x,y --components z", "--measure is short for --kind component --components"),
+        (
+            "3-prs --measure x,y --components z",
+            "--measure is short for --kind component --components",
+        ),
         ("3-prs --measure x,y,w", "the component 'w' is unknown"),
-        ("3-prs --frames floor", "--frames says 'floor'; what can be unknown is base, tool, or base,tool"),
-        ("3-prs --kind inclination --frames base", "--frames base means nothing to this kind of measurement"),
+        (
+            "3-prs --frames floor",
+            "--frames says 'floor'; what can be unknown is base, tool, or base,tool",
+        ),
+        (
+            "3-prs --kind inclination --frames base",
+            "--frames base means nothing to this kind of measurement",
+        ),
         ("3-prs data.csv --measure x", "DATA states what is measured"),
         ("3-prs -o smaller.yaml", "-o writes what --reduce finds"),
     ],
@@ -80,7 +94,9 @@ def test_options_that_contradict_each_other_are_one_sentence(run, words, sentenc
 def test_noisy_encoders_are_assumed_for_an_instrument_and_weaken_what_is_known(run):
     """Readings of 1 mm beside positions of 10 um: every parameter is known worse, and none better."""
     words = "linear-delta --draw 20 --kind position --json"
-    exact, noisy = (json.loads(run(words + more)[1])["singular_values"] for more in ("", " --sigma-reading 1mm"))
+    exact, noisy = (
+        json.loads(run(words + more)[1])["singular_values"] for more in ("", " --sigma-reading 1mm")
+    )
     assert max(noisy) < 0.1 * max(exact)
     assert (
         run("linear-delta --draw 20 --kind position --json --sigma-reading q1=1mm,q2=1mm,q3=1mm")[1]
@@ -93,7 +109,10 @@ def test_noisy_encoders_are_assumed_for_an_instrument_and_weaken_what_is_known(r
     [
         ("--sigma-reading 5", "--sigma-reading '5' for q1: '5' has no unit"),
         ("--sigma-reading 5urad", "'urad' is a unit of angle, but a length is needed"),
-        ("--sigma-reading -5um", "--sigma-reading for q1 is -5um; give a number above zero, or zero for exact"),
+        (
+            "--sigma-reading -5um",
+            "--sigma-reading for q1 is -5um; give a number above zero, or zero for exact",
+        ),
         ("--sigma-reading q9=5um", "--sigma-reading names 'q9'"),
         ("--sigma-reading q1=5um,q2", "--sigma-reading 'q2' for q1: "),
     ],

@@ -29,7 +29,9 @@ def test_every_command_has_help_with_an_example_and_json(name, capsys) -> None:
 
 def test_python_m_loopcal_is_the_command_line() -> None:
     words = [sys.executable, "-m", "loopcal"]
-    done = subprocess.run([*words, "check", "no-such-robot"], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [*words, "check", "no-such-robot"], capture_output=True, text=True, check=False
+    )
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith("loopcal: ")
     assert "no-such-robot" in done.stderr
@@ -46,13 +48,21 @@ def test_nothing_heavy_is_imported_before_a_command_runs() -> None:
     [
         (MechanismError("two\n  lines"), "loopcal: two lines\n"),
         (KeyboardInterrupt(), "loopcal: stopped before the end; no result was written.\n"),
-        (PermissionError(13, "Permission denied", "run"), "loopcal: run: the operating system refused (permission denied)"),
-        (OSError(28, "No space left on device"), "loopcal: the operating system refused (no space left on device)"),
+        (
+            PermissionError(13, "Permission denied", "run"),
+            "loopcal: run: the operating system refused (permission denied)",
+        ),
+        (
+            OSError(28, "No space left on device"),
+            "loopcal: the operating system refused (no space left on device)",
+        ),
         (MemoryError(), "loopcal: there is not enough memory"),
         (click.UsageError("bad"), "loopcal: bad\n"),
     ],
 )
-def test_an_error_of_the_user_becomes_one_sentence_and_exit_code_1(monkeypatch, capsys, error, sentence) -> None:
+def test_an_error_of_the_user_becomes_one_sentence_and_exit_code_1(
+    monkeypatch, capsys, error, sentence
+) -> None:
     def fail(*_args, **_kwargs):
         raise error
 
@@ -72,7 +82,9 @@ def test_a_mistake_of_our_own_is_not_hidden(monkeypatch) -> None:
 
 def test_a_reader_that_goes_away_causes_no_traceback() -> None:
     code = "import sys; from loopcal.cli import main; sys.exit(main(['check', 'hexapod-42']))"
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
         assert process.stdout is not None
         assert process.stderr is not None
         process.stdout.close()

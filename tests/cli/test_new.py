@@ -5,7 +5,7 @@ import pytest
 
 from loopcal.cli import main
 from loopcal.io import load_robot
-from loopcal.io.robot_file import shipped_robots
+from loopcal.io.robot.robot_file import shipped_robots
 from loopcal.mechanism import FAMILIES
 
 
@@ -34,13 +34,27 @@ def test_the_template_lacks_nothing_but_rows(tmp_path, capsys) -> None:
     words = "new linear-delta -o printer.yaml --measurements heights.csv --kind component --components z --sigma-position 20um"
     assert main(words.split()) == 0
     template = tmp_path / "heights.csv"
-    assert "# noise: {z: 20 um}\npose,q1 [mm],q2 [mm],q3 [mm],z [mm]\n# Below come the rows" in template.read_text()
+    assert (
+        "# noise: {z: 20 um}\npose,q1 [mm],q2 [mm],q3 [mm],z [mm]\n# Below come the rows"
+        in template.read_text()
+    )
     assert "may be added: block, session, group, time" in template.read_text()
     assert main(["calibrate", "printer.yaml", "heights.csv", "-o", "run"]) == 1
     assert "has a header but no rows; add one row for each measured pose" in capsys.readouterr().err
     rows = [f"p{i},{150 + 7 * i},{150 + i * i},{160 - 3 * i},100.0" for i in range(12)]
     template.write_text(template.read_text() + "\n".join(rows) + "\n")
-    assert main(["identifiability", "printer.yaml", "heights.csv", "--allow-still", "--allow-implausible"]) == 0
+    assert (
+        main(
+            [
+                "identifiability",
+                "printer.yaml",
+                "heights.csv",
+                "--allow-still",
+                "--allow-implausible",
+            ]
+        )
+        == 0
+    )
 
 
 def test_a_template_of_several_kinds_is_accepted_once_it_is_filled_in(tmp_path, capsys) -> None:
@@ -53,8 +67,25 @@ def test_a_template_of_several_kinds_is_accepted_once_it_is_filled_in(tmp_path, 
     rows = [f"p{i},position" + f",{i}" * 6 + f",{0.1 * i},{0.2 * i},{300 + i},," for i in range(4)]
     rows += [f"p{i},inclination,,,,,,,,,,{0.01 * i},{0.02 * i}" for i in range(4)]
     (tmp_path / "data.csv").write_text(text + "\n".join(rows) + "\n")
-    assert main(["identifiability", "robot.yaml", "data.csv", "--allow-still", "--allow-implausible"]) == 0
-    assert main(["new", "gough", "-o", "other.yaml", "--measurements", "d.csv", "--kind", "position,position"]) == 1
+    assert (
+        main(["identifiability", "robot.yaml", "data.csv", "--allow-still", "--allow-implausible"])
+        == 0
+    )
+    assert (
+        main(
+            [
+                "new",
+                "gough",
+                "-o",
+                "other.yaml",
+                "--measurements",
+                "d.csv",
+                "--kind",
+                "position,position",
+            ]
+        )
+        == 1
+    )
     assert "'position' is named twice" in capsys.readouterr().err
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of the user are never replaced without a word, and a command writes all of its files or none."""
+"""Files of the user are never replaced without a word, and a command writes all of its files or
+none.
+"""
 
 import os
 import shutil
@@ -10,8 +12,8 @@ import pytest
 
 from loopcal.cli import main
 from loopcal.errors import FileError
-from loopcal.io.robot_file import robot_path
-from loopcal.io.text_file import write_text
+from loopcal.io.core.text_file import write_text
+from loopcal.io.robot.robot_file import robot_path
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 TARGETS = "pose,x [mm],y [mm],z [mm],roll [deg],pitch [deg],yaw [deg]\nhome,0,0,200,0,0,0\n"
@@ -19,7 +21,9 @@ TARGETS = "pose,x [mm],y [mm],z [mm],roll [deg],pitch [deg],yaw [deg]\nhome,0,0,
 
 @pytest.fixture
 def run(tmp_path, monkeypatch, capsys):
-    """Run a command line in a folder with a robot and data; return exit code, standard output and standard error."""
+    """Run a command line in a folder with a robot and data; return exit code, standard output and
+    standard error.
+    """
     monkeypatch.chdir(tmp_path)
     shutil.copy(robot_path("hexapod-42"), "robot.yaml")
     shutil.copy(EXAMPLE / "measurements.csv", "data.csv")
@@ -38,7 +42,12 @@ def contents() -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in Path().rglob("*") if path.is_file()}
 
 
-READ, TWO, THERE, FOLDER = "is read by the same command", "two outputs", "this file exists", "there is no folder nodir"
+READ, TWO, THERE, FOLDER = (
+    "is read by the same command",
+    "two outputs",
+    "this file exists",
+    "there is no folder nodir",
+)
 REFUSED = {
     "simulate robot.yaml -o robot.yaml": READ,
     "simulate robot.yaml -o robot.yaml --force": READ,
@@ -60,7 +69,9 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("words", REFUSED)
-def test_what_would_replace_or_lose_a_file_is_refused_before_anything_is_written(run, words) -> None:
+def test_what_would_replace_or_lose_a_file_is_refused_before_anything_is_written(
+    run, words
+) -> None:
     before = contents()
     code, out, err = run(words)
     assert (code, out, err.count("\n")) == (1, "", 1)
@@ -78,7 +89,10 @@ def test_force_replaces_a_file_that_is_not_read(run) -> None:
 def test_a_run_that_is_read_is_not_replaced(run) -> None:
     assert run("calibrate robot.yaml data.csv -o run")[0] == 0
     before = contents()
-    for words in ("run/robot.yaml data.csv -o run --force", "robot.yaml pp.csv -o run --force --prior run"):
+    for words in (
+        "run/robot.yaml data.csv -o run --force",
+        "robot.yaml pp.csv -o run --force --prior run",
+    ):
         code, _, err = run(f"calibrate {words}")
         assert code == 1
         assert "this folder would be replaced" in err
@@ -91,7 +105,10 @@ def test_what_is_no_file_is_not_replaced_even_by_force(run) -> None:
     os.mkfifo("pipe")
     Path("link").symlink_to("pipe")
     for name in ("pipe", "link"):
-        for words in (f"simulate robot.yaml -o {name} --force", f"new gough -o new.yaml --measurements {name} --force"):
+        for words in (
+            f"simulate robot.yaml -o {name} --force",
+            f"new gough -o new.yaml --measurements {name} --force",
+        ):
             code, out, err = run(words)
             assert (code, out, err.count("\n")) == (1, "", 1)
             assert "this is a device or a pipe, which would be replaced" in err
@@ -120,7 +137,10 @@ def test_force_on_a_symbolic_link_writes_the_file_that_it_names(run) -> None:
 def test_links_that_end_nowhere_or_outside_any_folder_are_refused(run) -> None:
     Path("circle").symlink_to("circle")
     Path("lost").symlink_to("nodir/file")
-    for name, sentence in (("circle", "this symbolic link ends nowhere"), ("lost", "there is no folder")):
+    for name, sentence in (
+        ("circle", "this symbolic link ends nowhere"),
+        ("lost", "there is no folder"),
+    ):
         code, out, err = run(f"simulate robot.yaml -o {name} --force")
         assert (code, out, err.count("\n")) == (1, "", 1)
         assert sentence in err
@@ -161,6 +181,9 @@ def test_an_import_whose_calibration_fails_leaves_everything_as_it_was(run) -> N
 
 def test_the_template_of_a_kind_that_compares_poses_says_how_they_are_named(run) -> None:
     assert run("new gough -o a.yaml --measurements m.csv --kind separation")[0] == 0
-    assert "names them in the column pose as a;b, and leaves readings empty" in Path("m.csv").read_text()
+    assert (
+        "names them in the column pose as a;b, and leaves readings empty"
+        in Path("m.csv").read_text()
+    )
     assert run("new gough -o b.yaml --measurements n.csv --kind position")[0] == 0
     assert "compares two poses" not in Path("n.csv").read_text()

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal plan` as a user meets it: sheet, data file, calibration with the poses held out that the plan holds out."""
+"""`loopcal plan` as a user meets it: sheet, data file, calibration with the poses held out that the
+plan holds out.
+"""
 
 import csv
 import json
@@ -42,7 +44,13 @@ def test_a_plan_is_measured_filled_in_and_calibrated_with_its_own_poses_held_out
     assert {p.name for p in (here / "plan").iterdir()} == {
         "plan.csv", "measurements.csv", "plan.json", "plan.png", "curve.png",
     }  # fmt: skip
-    assert run("simulate linear-delta --fill plan/measurements.csv --draw-errors --truth truth.yaml -o filled.csv") == 0
+    assert (
+        run(
+            "simulate linear-delta --fill plan/measurements.csv --draw-errors --truth truth.yaml "
+            "-o filled.csv"
+        )
+        == 0
+    )
     assert run("calibrate linear-delta filled.csv -o run --limit-position 0.5mm") == 0
     assert "Errors on 3 unseen rows" in capsys.readouterr().out
     plan = json.loads((here / "plan" / "plan.json").read_text())
@@ -50,7 +58,9 @@ def test_a_plan_is_measured_filled_in_and_calibrated_with_its_own_poses_held_out
     result = json.loads((here / "run" / "result.json").read_text())
     assert result["split"]["held_out"] == held
     truth, found = load_robot("truth.yaml").values, load_robot("run/robot.yaml").values
-    assert np.linalg.norm(found - truth) < 0.3 * np.linalg.norm(load_robot("linear-delta").values - truth)
+    assert np.linalg.norm(found - truth) < 0.3 * np.linalg.norm(
+        load_robot("linear-delta").values - truth
+    )
 
 
 def test_the_sheet_says_what_to_command_and_agrees_with_the_data_file(here):
@@ -62,10 +72,17 @@ def test_the_sheet_says_what_to_command_and_agrees_with_the_data_file(here):
     assert [row["use"] for row in sheet] == [row["use"] for row in data]
     assert [row["use"] for row in data].count("held-out") == 2
     assert all(row["x [mm]"] == "" for row in data)
-    headers = [f"{name} [{unit}]" for name, unit in zip(robot.controlled, ["mm"] * 3 + ["deg"] * 3, strict=True)]
-    x = np.array([[float(row[header]) for header in headers] for row in sheet]) * np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
+    headers = [
+        f"{name} [{unit}]"
+        for name, unit in zip(robot.controlled, ["mm"] * 3 + ["deg"] * 3, strict=True)
+    ]
+    x = np.array([[float(row[header]) for header in headers] for row in sheet]) * np.array(
+        [1e-3] * 3 + [np.pi / 180.0] * 3
+    )
     q = np.array([[float(row[f"q{i} [mm]"]) for i in range(1, 7)] for row in data]) * 1e-3
-    np.testing.assert_allclose(inverse(robot, x).q, q, atol=2e-9)  # [m], readings are written to a nanometre
+    np.testing.assert_allclose(
+        inverse(robot, x).q, q, atol=2e-9
+    )  # [m], readings are written to a nanometre
 
 
 @pytest.mark.slow
@@ -75,25 +92,46 @@ def test_planes_and_lines_are_planned_held_filled_in_and_calibrated(here, capsys
     assert "33 parameter combinations can be told" in capsys.readouterr().out
     sheet = rows_of(here / "plan" / "plan.csv")
     assert [row["role"] for row in sheet[:6]] == ["p0", "p1", "plane", "plane", "plane", "plane"]
-    assert {(row["role"] == "p0", row["tolerance [mm]"]) for row in sheet} == {(True, ""), (False, "0.001")}
+    assert {(row["role"] == "p0", row["tolerance [mm]"]) for row in sheet} == {
+        (True, ""),
+        (False, "0.001"),
+    }
     assert {row["hold"].split()[0] for row in sheet if row["role"] == "p0"} == {"free"}
-    assert all(len(row["hold"].split(" (")[0].split()) == {"p0": 1, "p1": 2, "plane": 1}[row["role"]] for row in sheet)
+    assert all(
+        len(row["hold"].split(" (")[0].split()) == {"p0": 1, "p1": 2, "plane": 1}[row["role"]]
+        for row in sheet
+    )
     assert run("simulate hexapod-nategh-agheli --fill plan/measurements.csv -o filled.csv") == 1
-    assert "until a measuring machine shows the held coordinates, which is not simulated" in capsys.readouterr().err
+    assert (
+        "until a measuring machine shows the held coordinates, which is not simulated"
+        in capsys.readouterr().err
+    )
     assert run("calibrate hexapod-nategh-agheli plan/measurements.csv -o run") == 1
     assert "empty" in capsys.readouterr().err
-    # the true machine is moved until its point agrees with what the sheet says to hold: its readings are the data
+    # the true machine is moved until its point agrees with what the sheet says to hold: its
+    # readings are the data
     robot = load_robot("hexapod-nategh-agheli")
     truth = robot.with_values(sample_truth(robot, 1, 3)[0])
-    commanded = [pose["commanded"] for pose in json.loads((here / "plan" / "plan.json").read_text())["poses"]]
+    commanded = [
+        pose["commanded"] for pose in json.loads((here / "plan" / "plan.json").read_text())["poses"]
+    ]
     q = inverse(truth, np.array([list(pose.values()) for pose in commanded])).q * 1e3
-    by_pose = {row["pose"]: [f"{value:.12g}" for value in values] for row, values in zip(sheet, q, strict=True)}
+    by_pose = {
+        row["pose"]: [f"{value:.12g}" for value in values]
+        for row, values in zip(sheet, q, strict=True)
+    }
     lines = (here / "plan" / "measurements.csv").read_text().splitlines()
-    filled = [",".join([*(c := line.split(","))[:3], *by_pose[c[0]], *c[9:]]) if line[0].isdigit() else line for line in lines]
+    filled = [
+        ",".join([*(c := line.split(","))[:3], *by_pose[c[0]], *c[9:]])
+        if line[0].isdigit()
+        else line
+        for line in lines
+    ]
     (here / "filled.csv").write_text("\n".join(filled) + "\n")
     assert load_measurements("filled.csv", robot).n_poses == 54
     assert run("calibrate hexapod-nategh-agheli filled.csv -o run") == 0
-    # of these data nine motions of frames are unknown, but none of them changes a distance between places of the tool
+    # of these data nine motions of frames are unknown, but none of them changes a distance between
+    # places of the tool
     q = sample(robot, 20, seed=4).solution.q
     places = [forward(one, q).T[:, :3, 3] for one in (truth, robot, load_robot("run/robot.yaml"))]
     true, before, after = (np.linalg.norm(x[:, None] - x[None], axis=2) for x in places)
@@ -115,8 +153,17 @@ def test_json_is_one_document_with_the_names_of_the_plan(here, capsys):
 
 
 def test_an_earlier_data_file_describes_the_instrument_and_counts_as_measured(here, capsys):
-    assert run("simulate linear-delta --draw 12 --kind position --sigma-position 3um -o before.csv") == 0
-    assert run("plan linear-delta -o plan --poses 3 --candidates 40 --like before.csv --measured before.csv") == 0
+    assert (
+        run("simulate linear-delta --draw 12 --kind position --sigma-position 3um -o before.csv")
+        == 0
+    )
+    assert (
+        run(
+            "plan linear-delta -o plan --poses 3 --candidates 40 --like before.csv --measured "
+            "before.csv"
+        )
+        == 0
+    )
     assert "noise: {x: 3 um, y: 3 um, z: 3 um}" in (here / "plan" / "measurements.csv").read_text()
     assert run("plan linear-delta -o other --poses 3 --like before.csv --kind pose") == 1
     assert "leave out --kind" in capsys.readouterr().err
@@ -127,7 +174,13 @@ def test_surfaces_that_each_group_has_of_its_own_describe_no_instrument_to_plan_
     for groups, code in ((("a", "b"), 1), (("a", "a"), 0)):
         text = settings + "".join(f"{i},{group},1,1,1,0\n" for i, group in enumerate(groups))
         (here / "groups.csv").write_text(text)
-        assert run("plan linear-delta -o plan --poses 12 --hold-out 0 --candidates 40 --like groups.csv --force") == code
+        assert (
+            run(
+                "plan linear-delta -o plan --poses 12 --hold-out 0 --candidates 40 --like "
+                "groups.csv --force"
+            )
+            == code
+        )
     (here / "groups.csv").write_text(text.replace("1,a,", "1,b,"))
     assert run("plan linear-delta -o other --like groups.csv") == 1
     assert "plan planes and lines with --measure plane-line" in capsys.readouterr().err
@@ -148,12 +201,24 @@ def test_surfaces_that_each_group_has_of_its_own_describe_no_instrument_to_plan_
         ("--groups 3", "belong to --measure plane-line"),
         ("--measure plane-line --poses 10", "--poses does not go with --measure plane-line"),
         ("--measure plane-line --poses 0", "--poses does not go with --measure plane-line"),
-        ("--measure plane-line --hold-out 0", "--hold-out does not go with --measure plane-line, where every point is fitted"),
+        (
+            "--measure plane-line --hold-out 0",
+            "--hold-out does not go with --measure plane-line, where every point is fitted",
+        ),
         ("--measure plane-line --kind position", "--kind does not go with --measure plane-line"),
-        ("--measure plane-line --components x,y", "--components does not go with --measure plane-line"),
-        ("--measure plane-line --sigma-angle 5urad", "--sigma-angle does not go with --measure plane-line"),
+        (
+            "--measure plane-line --components x,y",
+            "--components does not go with --measure plane-line",
+        ),
+        (
+            "--measure plane-line --sigma-angle 5urad",
+            "--sigma-angle does not go with --measure plane-line",
+        ),
         ("--measure plane-line --criterion I", "--criterion does not go with --measure plane-line"),
-        ("--measure plane-line --candidates 100", "--candidates does not go with --measure plane-line"),
+        (
+            "--measure plane-line --candidates 100",
+            "--candidates does not go with --measure plane-line",
+        ),
         ("--measure plane-line --frames base", "--frames does not go with --measure plane-line"),
         ("--measure plane-line --points 3", "give at least 4"),
         ("--measure plane-line --groups 1 --points 4", "plan at least"),
@@ -165,7 +230,9 @@ def test_surfaces_that_each_group_has_of_its_own_describe_no_instrument_to_plan_
         ("--like nothing.csv", "there is no such"),
     ],
 )
-def test_demands_that_cannot_be_met_are_refused_in_one_sentence_and_nothing_is_written(here, capsys, words, said):
+def test_demands_that_cannot_be_met_are_refused_in_one_sentence_and_nothing_is_written(
+    here, capsys, words, said
+):
     assert run(f"plan linear-delta -o plan {words}") == 1
     captured = capsys.readouterr()
     assert said in captured.err
@@ -215,16 +282,41 @@ def test_force_never_removes_what_was_measured_or_written_by_hand(here, capsys):
 
 
 def test_a_second_plan_goes_on_where_the_first_was_measured(here, capsys):
-    first = ["plan", "linear-delta", "-o", "one", "--poses", "8", "--hold-out", "4", "--candidates", "40", "--kind", "position"]
+    first = [
+        "plan",
+        "linear-delta",
+        "-o",
+        "one",
+        "--poses",
+        "8",
+        "--hold-out",
+        "4",
+        "--candidates",
+        "40",
+        "--kind",
+        "position",
+    ]
     assert main(first) == 0
-    assert run("plan linear-delta -o two --kind position --poses 2 --candidates 40 --measured one/measurements.csv") == 1
+    assert (
+        run(
+            "plan linear-delta -o two --kind position --poses 2 --candidates 40 --measured "
+            "one/measurements.csv"
+        )
+        == 1
+    )
     assert "one/measurements.csv holds no measured value" in capsys.readouterr().err
     fill = "simulate linear-delta --draw-errors --seed 2 --fill {}/measurements.csv -o {}.csv"
     assert run("calibrate linear-delta one/measurements.csv -o run") == 1
     assert "hold no measured value; fill in" in capsys.readouterr().err
     assert run(fill.format("one", "one")) == 0
     capsys.readouterr()
-    assert run("plan linear-delta -o two --kind position --poses 2 --hold-out 1 --candidates 40 --measured one.csv") == 0
+    assert (
+        run(
+            "plan linear-delta -o two --kind position --poses 2 --hold-out 1 --candidates 40 "
+            "--measured one.csv"
+        )
+        == 0
+    )
     said = capsys.readouterr().out
     assert "then: loopcal calibrate linear-delta one.csv two/measurements.csv -o run" in said
     names = [row["pose"] for row in rows_of(here / "two" / "measurements.csv")]
@@ -243,14 +335,21 @@ def test_the_data_file_states_the_digits_of_the_sheet(here):
     sheet = [row for row in rows_of(here / "plan" / "plan.csv") if row["use"] != "via"]
     data = rows_of(here / "plan" / "measurements.csv")
     columns = [f"q{i} [mm]" for i in range(1, 7)]
-    assert [[row[c] for c in columns] for row in data] == [[row[c] for c in columns] for row in sheet]
+    assert [[row[c] for c in columns] for row in data] == [
+        [row[c] for c in columns] for row in sheet
+    ]
     cells = [cell for row in sheet for name, cell in row.items() if "[" in name]
     assert all(len(cell) <= 11 for cell in cells)  # sign, point and nine digits
     assert "-0" not in cells
 
 
 def test_the_sheet_says_that_a_tilt_goes_straight_by_its_vector(here):
-    assert main(["plan", "3-prs", "-o", "plan", "--poses", "8", "--hold-out", "0", "--candidates", "30"]) == 0
+    assert (
+        main(
+            ["plan", "3-prs", "-o", "plan", "--poses", "8", "--hold-out", "0", "--candidates", "30"]
+        )
+        == 0
+    )
     assert "## z, theta*cos(phi), theta*sin(phi). use:" in (here / "plan" / "plan.csv").read_text()
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/planning.md: a new user gets from a robot file to a compensated machine by its commands alone."""
+"""docs/planning.md: a new user gets from a robot file to a compensated machine by its commands
+alone.
+"""
 
 import re
 from pathlib import Path
@@ -19,9 +21,13 @@ def page(root, tmp_path, monkeypatch) -> str:
 
 
 @pytest.mark.slow
-def test_every_command_of_the_page_works_as_it_stands_and_the_machine_becomes_known(page, capsys) -> None:
+def test_every_command_of_the_page_works_as_it_stands_and_the_machine_becomes_known(
+    page, capsys
+) -> None:
     commands = [
-        line for block in re.findall(r"^```sh\n(.*?)^```", page, re.MULTILINE | re.DOTALL) for line in block.splitlines()
+        line
+        for block in re.findall(r"^```sh\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+        for line in block.splitlines()
     ]
     assert len(commands) == 8
     printed = re.search(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
@@ -41,7 +47,9 @@ def test_every_command_of_the_page_works_as_it_stands_and_the_machine_becomes_kn
             assert "Errors on 4 unseen rows" in said
         if "--accuracy" in command:
             assert "poses reach an expected position error of 0.02 mm (rms)" in said
-    nominal, truth, found = (load_robot(name).values for name in ("printer.yaml", "truth.yaml", "run/robot.yaml"))
+    nominal, truth, found = (
+        load_robot(name).values for name in ("printer.yaml", "truth.yaml", "run/robot.yaml")
+    )
     assert np.linalg.norm(found - truth) < 0.3 * np.linalg.norm(nominal - truth)
 
 
@@ -50,6 +58,6 @@ def test_the_python_of_the_page_runs(page, capsys) -> None:
     assert block
     assert main(["new", "linear-delta", "-o", "printer.yaml"]) == 0
     names: dict = {}
-    exec(block[1], names)  # noqa: S102  (our own page)
+    exec(block[1], names)  # noqa: S102
     assert names["plan"].n_poses == 12
     assert "12 poses of printer to measure (component) and 3 to judge by" in capsys.readouterr().out

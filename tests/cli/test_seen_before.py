@@ -9,7 +9,9 @@ from loopcal.cli import main
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 
 
-def test_validate_refuses_fitted_rows_in_another_file_and_accepts_held_out_ones(tmp_path, monkeypatch, capsys) -> None:
+def test_validate_refuses_fitted_rows_in_another_file_and_accepts_held_out_ones(
+    tmp_path, monkeypatch, capsys
+) -> None:
     monkeypatch.chdir(tmp_path)
     shutil.copy(EXAMPLE / "measurements.csv", "all.csv")
     lines = Path("all.csv").read_text().splitlines()
@@ -25,9 +27,13 @@ def test_validate_refuses_fitted_rows_in_another_file_and_accepts_held_out_ones(
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("loopcal: 8 of 8 rows are rows that this run was fitted to (poses ")
-    assert err.endswith("which prove nothing about unseen poses; give others, or use --allow-fitted-data\n")
+    assert err.endswith(
+        "which prove nothing about unseen poses; give others, or use --allow-fitted-data\n"
+    )
     assert main(["validate", "run", "part.csv", "--allow-fitted-data"]) == 0
     assert main(["validate", "run", "rest.csv"]) == 0
     assert capsys.readouterr().err == ""
     assert main(["validate", "run", "mixed.csv"]) == 0
-    assert capsys.readouterr().err.startswith("loopcal: note: 2 of 12 rows are rows that this run was fitted to")
+    assert capsys.readouterr().err.startswith(
+        "loopcal: note: 2 of 12 rows are rows that this run was fitted to"
+    )

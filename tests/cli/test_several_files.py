@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands take several measurement files, and what these know of their instruments reaches every fit."""
+"""Commands take several measurement files, and what these know of their instruments reaches every
+fit.
+"""
 
 import json
 from dataclasses import replace
@@ -10,7 +12,17 @@ import pytest
 
 from loopcal.cli import main
 from loopcal.io import load_robot, save_measurements
-from loopcal.measure import Gaussian, Inclination, Instrument, Known, Measurements, Pose, Sensor, sample_truth, simulate
+from loopcal.measure import (
+    Gaussian,
+    Inclination,
+    Instrument,
+    Known,
+    Measurements,
+    Pose,
+    Sensor,
+    sample_truth,
+    simulate,
+)
 from loopcal.mechanism.workspace import sample
 
 SD = "tracker.x: {start: 0 mm, sd: 1 mm}"
@@ -22,25 +34,48 @@ def data() -> Measurements:
     robot = load_robot("hexapod-42")
     poses = sample(robot, 20, 3).coordinates
     days = np.array(["monday"] * 11 + ["tuesday"] * 9)
-    tracker = Sensor(Pose(unknown=("frame",), frame="tracker"), Gaussian(np.repeat([2e-6, 1e-6], 3)), session=days)
+    tracker = Sensor(
+        Pose(unknown=("frame",), frame="tracker"),
+        Gaussian(np.repeat([2e-6, 1e-6], 3)),
+        session=days,
+    )
     truth = robot.with_values(sample_truth(robot, 1, 5)[0])
-    seen = simulate(truth, poses, Instrument((tracker, Sensor(Inclination(), Gaussian(np.full(2, 5e-6))))), seed=4)
+    seen = simulate(
+        truth,
+        poses,
+        Instrument((tracker, Sensor(Inclination(), Gaussian(np.full(2, 5e-6))))),
+        seed=4,
+    )
     warm = 20 + 0.1 * np.arange(20.0)
-    return replace(seen, observations=(replace(seen.observations[0], context={"temperature": warm}), seen.observations[1]))
+    return replace(
+        seen,
+        observations=(
+            replace(seen.observations[0], context={"temperature": warm}),
+            seen.observations[1],
+        ),
+    )
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch, data):
-    """The same measurements as one file, as one file for each instrument, and as a table of poses with values apart."""
+    """The same measurements as one file, as one file for each instrument, and as a table of poses
+    with values apart.
+    """
     monkeypatch.chdir(tmp_path)
     robot = load_robot("hexapod-42")
     save_measurements(data, "both.csv", robot)
     for name, rows in zip(("tracker", "tilts"), data.observations, strict=True):
         save_measurements(replace(data, observations=(rows,)), f"{name}.csv", robot)
-    lines = [line.split(",") for line in Path("tilts.csv").read_text().splitlines() if not line.startswith("#")]
+    lines = [
+        line.split(",")
+        for line in Path("tilts.csv").read_text().splitlines()
+        if not line.startswith("#")
+    ]
     front = [line for line in Path("tilts.csv").read_text().splitlines() if line.startswith("#")]
     Path("poses.csv").write_text("\n".join(",".join(cells[:7]) for cells in lines) + "\n")
-    Path("values.csv").write_text("\n".join([*front, *(",".join([cells[0], *cells[7:]]) for cells in lines)]) + "\n")
+    Path("values.csv").write_text(
+        "\n".join([*front, *(",".join([cells[0], *cells[7:]]) for cells in lines)]) + "\n"
+    )
     return tmp_path
 
 
@@ -53,10 +88,14 @@ def document(capsys, *words: str, code: int = 0):
 def test_any_division_into_files_gives_the_same_calibration(folder, capsys) -> None:
     runs = {}
     for files in ("both.csv", "tracker.csv tilts.csv", "values.csv poses.csv tracker.csv"):
-        found = document(capsys, "calibrate", "hexapod-42", *files.split(), "-o", files.split(".")[0])
+        found = document(
+            capsys, "calibrate", "hexapod-42", *files.split(), "-o", files.split(".")[0]
+        )
         runs[files] = np.array([p["estimate"] for p in found["fit"]["parameters"]])
     one, two, three = runs.values()
-    np.testing.assert_allclose(two, one, atol=1e-6)  # [mm], a thousandth of the noise: rows are folded in another order
+    np.testing.assert_allclose(
+        two, one, atol=1e-6
+    )  # [mm], a thousandth of the noise: rows are folded in another order
     np.testing.assert_allclose(three, one, atol=1e-6)
     made_by = json.loads((folder / "values" / "result.json").read_text())["made_by"]["inputs"]
     assert {role: Path(file["path"]).name for role, file in made_by.items() if role != "robot"} == {
@@ -65,7 +104,9 @@ def test_any_division_into_files_gives_the_same_calibration(folder, capsys) -> N
         np.testing.assert_array_equal(arrays["temperature_0_pose"], 20 + 0.1 * np.arange(20.0))
     assert main(["validate", "values", "poses.csv", "tracker.csv"]) == 1
     assert "tracker.csv: this run was fitted to these very measurements" in capsys.readouterr().err
-    assert main(["validate", "both", "poses.csv", "values.csv"]) == 1  # the same rows under another name
+    assert (
+        main(["validate", "both", "poses.csv", "values.csv"]) == 1
+    )  # the same rows under another name
     assert "20 of 20 rows are rows that this run was fitted to" in capsys.readouterr().err
     assert main(["validate", "both", "poses.csv", "values.csv", "--allow-fitted-data"]) == 0
 
@@ -88,10 +129,22 @@ def test_fixed_unknowns_and_priors_of_a_file_reach_identifiability(folder, capsy
 @pytest.mark.slow
 def test_a_prior_of_a_file_reaches_the_fit_and_its_held_out_part(folder, capsys) -> None:
     text = (
-        Path("tracker.csv").read_text().replace("# kind: pose", f'# unknowns: {{{SD}, "*.tracker.z": fixed}}\n# kind: pose', 1)
+        Path("tracker.csv")
+        .read_text()
+        .replace("# kind: pose", f'# unknowns: {{{SD}, "*.tracker.z": fixed}}\n# kind: pose', 1)
     )
     Path("changed.csv").write_text(text)
-    found = document(capsys, "calibrate", "hexapod-42", "changed.csv", "tilts.csv", "-o", "run", "--hold-out", "0.25")
+    found = document(
+        capsys,
+        "calibrate",
+        "hexapod-42",
+        "changed.csv",
+        "tilts.csv",
+        "-o",
+        "run",
+        "--hold-out",
+        "0.25",
+    )
     local = {row["name"]: row for row in found["fit"]["local"]}
     for day in ("monday", "tuesday"):
         assert local[f"{day}.tracker.x"]["tolerance"] == pytest.approx(1.0)  # [mm]

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mechanisms as the engine sees them, and their closure written down a second time, plainly, one limb at a time."""
+"""Mechanisms as the engine sees them, and their closure written down a second time, plainly, one
+limb at a time.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.engine import LENGTH, PITCH, Block, Group, Program, State
 from loopcal.mechanism import Mechanism
 
@@ -18,7 +20,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Case:
-    """A program with displacements e (t, ..), joint values q (t, n, a) near home, and home as the start."""
+    """A program with displacements e (t, ..), joint values q (t, n, a) near home, and home as the
+    start.
+    """
 
     name: str
     program: Program
@@ -33,13 +37,20 @@ class Case:
 
 
 def case(robot: Mechanism, t: int = 1, n: int = 5, seed: int = 1) -> Case:
-    """Random displacements of about 1e-3 of the size, joint values within some hundredths of it from home."""
+    """Random displacements of about 1e-3 of the size, joint values within some hundredths of it
+    from home.
+    """
     rng, p = np.random.default_rng(seed), robot.program
     e = rng.normal(size=(t, p.n_displacements)) * 1e-3 * unit_of_displacements(p)
     if p.freedoms == (2, 3, 4):
-        # closure of orientation is asked for about z alone; what tilts out of the plane bends its column by tilt^2 / 12
-        e *= np.concatenate([np.tile([s.axis not in (0, 1) for s in g.slots], len(g.limbs)) for g in p.groups])
-    step = np.array([0.03 * p.size if a.dimension.value == "length" else 0.05 for a in robot.actuators])
+        # closure of orientation is asked for about z alone; what tilts out of the plane bends its
+        # column by tilt^2 / 12
+        e *= np.concatenate(
+            [np.tile([s.axis not in (0, 1) for s in g.slots], len(g.limbs)) for g in p.groups]
+        )
+    step = np.array(
+        [0.03 * p.size if a.dimension.value == "length" else 0.05 for a in robot.actuators]
+    )
     q = driven(p, robot.home_state) + rng.uniform(-1, 1, (t, n, p.n_joints)) * step
     return Case(robot.name, p, e, q, robot.home_state)
 
@@ -73,18 +84,26 @@ def unknowns(program: Program, state: State, free: bool = False) -> Array:
 
 
 def motion(program: Program, state: State, of: State, free: bool = False) -> Array:
-    """Change (t, n, m + u) of the platform (as a twist, its freedoms only) and of the unknown joints since `of`."""
-    twist = se3.difference(state.T, np.broadcast_to(of.T, state.T.shape))[..., list(program.freedoms)]
-    return np.concatenate([twist, unknowns(program, state, free) - unknowns(program, of, free)], axis=-1)
+    """Change (t, n, m + u) of the platform (as a twist, its freedoms only) and of the unknown
+    joints since `of`.
+    """
+    twist = geometry.difference(state.T, np.broadcast_to(of.T, state.T.shape))[
+        ..., list(program.freedoms)
+    ]
+    return np.concatenate(
+        [twist, unknowns(program, state, free) - unknowns(program, of, free)], axis=-1
+    )
 
 
-def pose_demand(target: Array, size: float) -> Callable[[Array, NDArray[np.int64]], tuple[Array, Array]]:
+def pose_demand(
+    target: Array, size: float
+) -> Callable[[Array, NDArray[np.int64]], tuple[Array, Array]]:
     """The task of reaching poses (N, 4, 4), all six freedoms."""
 
     def task(T: Array, rows: NDArray[np.int64]) -> tuple[Array, Array]:
-        gap = se3.difference(T, target[rows])
+        gap = geometry.difference(T, target[rows])
         columns = np.zeros((len(rows), 6, 6))
-        columns[:, :3, :3] = se3.left_jacobian_inverse_so3(gap[:, :3])
+        columns[:, :3, :3] = geometry.left_jacobian_inverse_so3(gap[:, :3])
         columns[:, 3:, 3:] = np.eye(3)
         scale = np.array([size] * 3 + [1.0] * 3)
         return gap * scale, columns * scale[:, None]
@@ -92,7 +111,8 @@ def pose_demand(target: Array, size: float) -> Callable[[Array, NDArray[np.int64
     return task
 
 
-# --- closure once more, for numpy or jax, one row and one limb at a time ---------------------------------------------
+# --- closure once more, for numpy or jax, one row and one limb at a time
+# ---------------------------------------------
 
 
 _HAT = np.zeros((3, 3, 3))
@@ -116,10 +136,18 @@ def homogeneous(xp: ModuleType, R: Any, t: Any) -> Any:
     return xp.concatenate([xp.concatenate([R, t[..., None]], axis=-1), last], axis=-2)
 
 
-def limb_rows(xp: ModuleType, group: Group, k: int, size: float, T: Any, theta: Any, own: Any) -> Any:
-    """Closure residual of limb k: T (4, 4), joint values theta (J + 1,), the limb's own displacements."""
+def limb_rows(
+    xp: ModuleType, group: Group, k: int, size: float, T: Any, theta: Any, own: Any
+) -> Any:
+    """Closure residual of limb k: T (4, 4), joint values theta (J + 1,), the limb's own
+    displacements.
+    """
     count = len(group.joints)
-    place, pitch_of, length_of = np.zeros((count + 2, 6, len(own))), np.zeros((count, len(own))), np.zeros(len(own))
+    place, pitch_of, length_of = (
+        np.zeros((count + 2, 6, len(own))),
+        np.zeros((count, len(own))),
+        np.zeros(len(own)),
+    )
     for s, slot in enumerate(group.slots):
         if slot.axis == PITCH:
             pitch_of[slot.element, s] = 1.0
@@ -135,7 +163,9 @@ def limb_rows(xp: ModuleType, group: Group, k: int, size: float, T: Any, theta: 
     if count:
         turns = np.array([letter == "R" for letter in group.joints])
         advance = theta[:count] * xp.where(turns, group.pitch[k] + pitch_of @ own, 1.0)
-        moved = homogeneous(xp, rotation(xp, (theta[:count] * turns)[:, None] * z), advance[:, None] * z)
+        moved = homogeneous(
+            xp, rotation(xp, (theta[:count] * turns)[:, None] * z), advance[:, None] * z
+        )
         for j in range(count):
             tip = tip @ moved[j] @ placed[j + 1]
     end = T @ placed[-1]
@@ -162,17 +192,23 @@ def open_by(program: Program, state: State, e: Array) -> Array:
     return out
 
 
-# --- what the blocks of `linearise` say, solved row by row -----------------------------------------------------------
+# --- what the blocks of `linearise` say, solved row by row
+# -----------------------------------------------------------
 
 
 def spread(program: Program, parts: tuple[Block, ...]) -> tuple[Array, Array, Array]:
-    """Rows of all limbs, one after the other, against freedoms, displacements and joint values: (t, n, c, m | s | a)."""
+    """Rows of all limbs, one after the other, against freedoms, displacements and joint values: (t,
+    n, c, m | s | a).
+    """
     A, E, Q = [], [], []
     for group, block in zip(program.groups, parts, strict=True):
         own = np.arange(program.n_displacements)[group.columns].reshape(len(group.limbs), -1)
         for k in range(len(group.limbs)):
             t, n, _, r = block.A.shape[:4]
-            slots, drives = np.zeros((t, n, r, program.n_displacements)), np.zeros((t, n, r, program.n_joints))
+            slots, drives = (
+                np.zeros((t, n, r, program.n_displacements)),
+                np.zeros((t, n, r, program.n_joints)),
+            )
             slots[..., own[k]] = block.E[:, :, k]
             for j, columns in enumerate(group.actuator):
                 if columns[0] >= 0:
@@ -199,13 +235,18 @@ def slopes(program: Program, blocks: Any, free: bool = False) -> Array:
     for group, block in zip(program.groups, blocks.passive, strict=True):
         own = np.arange(program.n_displacements)[group.columns].reshape(len(group.limbs), -1)
         for k in range(len(group.limbs)):
-            U, E_k = block.U[:, :, k], np.zeros((*block.U.shape[:2], block.U.shape[3], program.n_displacements))
+            U, E_k = (
+                block.U[:, :, k],
+                np.zeros((*block.U.shape[:2], block.U.shape[3], program.n_displacements)),
+            )
             E_k[..., own[k]] = block.E[:, :, k]
             Q_k = np.zeros((*U.shape[:3], program.n_joints))
             for j, columns in enumerate(group.actuator):
                 if columns[0] >= 0:
                     Q_k[..., columns[k]] = block.Q[:, :, k, :, j]
-            own_rows = np.concatenate([np.zeros((*U.shape[:3], m)), E_k] if free else [E_k, Q_k], axis=-1)
+            own_rows = np.concatenate(
+                [np.zeros((*U.shape[:3], m)), E_k] if free else [E_k, Q_k], axis=-1
+            )
             rows = block.A[:, :, k] @ platform + own_rows
             parts.append(-np.linalg.solve(U, rows))
     return np.concatenate(parts, axis=2)

@@ -23,7 +23,9 @@ def test_blocks_of_rows_give_the_factor_of_all_rows(engine, rows):
     assert_array_equal(factor, np.triu(factor))
     scale = np.linalg.norm(rows, axis=1, keepdims=True)
     whole = np.linalg.qr(rows, mode="r")
-    assert_allclose(np.abs(factor / scale), np.abs(whole / scale), atol=1e-14)  # columns of length one, 40 rows
+    assert_allclose(
+        np.abs(factor / scale), np.abs(whole / scale), atol=1e-14
+    )  # columns of length one, 40 rows
 
 
 def test_absent_rows_are_rows_of_zeros(engine, rows):
@@ -38,7 +40,9 @@ def test_absent_rows_are_rows_of_zeros(engine, rows):
 def test_null_directions_stay_at_rounding_and_not_at_its_root(engine, rows):
     rows[..., 6] = rows[..., 5] * 2 - rows[..., 4]
     scaled = rows / np.linalg.norm(rows, axis=1, keepdims=True)
-    factor = engine.accumulate(engine.accumulate(np.zeros((3, 7, 7)), scaled[:, :20]), scaled[:, 20:])
+    factor = engine.accumulate(
+        engine.accumulate(np.zeros((3, 7, 7)), scaled[:, :20]), scaled[:, 20:]
+    )
     s = np.linalg.svd(factor, compute_uv=False)
     assert (s[:, -1] <= 1e-14 * s[:, 0]).all()
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The columns of `linearise` against the solver itself (central differences) and against jax on a plainly written closure."""
+"""The columns of `linearise` against the solver itself (central differences) and against jax on a
+plainly written closure.
+"""
 
 from functools import cache
 
@@ -23,13 +25,16 @@ from tests.engine.cases import (
 )
 from tests.jacobians import check_jacobian
 
-RESIDUAL = 3e-8  # [size per size]: closure of 1e-13 times a condition of some tens, over a step of some 1e-4
+# [size per size]: closure of 1e-13 times a condition of some tens, over a step of some 1e-4
+RESIDUAL = 3e-8
 
 SCALE = 0.1  # [rad] and [size]: over this, the mechanisms bend noticeably
 
 
 def independent_slopes(some, state, row, free=False):
-    """d (platform, unknown joints) / d (displacements, joint values) of one row by jax and a dense solution; as `slopes`."""
+    """d (platform, unknown joints) / d (displacements, joint values) of one row by jax and a dense
+    solution; as `slopes`.
+    """
     p, m = some.program, len(some.program.freedoms)
     F, G, place = [], [], m
     n_unknown = m + unknowns(p, state, free).shape[-1]
@@ -52,11 +57,15 @@ def independent_slopes(some, state, row, free=False):
     F, G = np.concatenate(F), np.concatenate(G)
     if not free:
         return -np.linalg.solve(F, G)
-    return np.concatenate([np.zeros((m, p.n_displacements)), -np.linalg.solve(F[:, m:], G[:, : p.n_displacements])])
+    return np.concatenate(
+        [np.zeros((m, p.n_displacements)), -np.linalg.solve(F[:, m:], G[:, : p.n_displacements])]
+    )
 
 
 def limb_slopes(program, group, k, T, theta, e):
-    """Rows of a limb against the platform's twist (6), its joints (J + 1) and its own displacements, by jax."""
+    """Rows of a limb against the platform's twist (6), its joints (J + 1) and its own
+    displacements, by jax.
+    """
     own = e[group.columns].reshape(len(group.limbs), -1)[k]
     derivative = compiled(group.joints, group.ending, group.rows, group.slots, program.size)
     numbers = group.links[k : k + 1], group.pitch[k : k + 1], group.length[k : k + 1]
@@ -73,7 +82,19 @@ def compiled(letters, ending, chosen, slots, size):
     count = len(letters) + 1
 
     def rows(v, T, links, pitch, length):
-        limb = Group((0,), letters, np.empty((0, 1), np.int64), (), ending, chosen, links, pitch, length, slots, slice(0))
+        limb = Group(
+            (0,),
+            letters,
+            np.empty((0, 1), np.int64),
+            (),
+            ending,
+            chosen,
+            links,
+            pitch,
+            length,
+            slots,
+            slice(0),
+        )
         twist, joints, own = v[:6], v[6 : 6 + count], v[6 + count :]
         moved = homogeneous(jnp, rotation(jnp, twist[:3]) @ T[:3, :3], T[:3, 3] + twist[3:])
         return limb_rows(jnp, limb, 0, size, moved, joints, own)
@@ -81,7 +102,9 @@ def compiled(letters, ending, chosen, slots, size):
     return jax.jit(jax.jacfwd(rows))
 
 
-@pytest.mark.parametrize("robot", ["menagerie", "three_prs", "hexapod", "delta", "five_bar", "planar_rrr"])
+@pytest.mark.parametrize(
+    "robot", ["menagerie", "three_prs", "hexapod", "delta", "five_bar", "planar_rrr"]
+)
 def test_every_displacement_and_joint_moves_the_mechanism_as_linearised(engine, robot):
     some = case(getattr(zoo, robot)(), n=2)
     p = some.program
@@ -90,7 +113,11 @@ def test_every_displacement_and_joint_moves_the_mechanism_as_linearised(engine, 
     analytic = slopes(p, engine.linearise(p, some.e, some.q, state))[0]
     s, a = p.n_displacements, p.n_joints
     turning = [
-        g.actuator[j, k] for g in p.groups for j in range(len(g.joints)) if g.joints[j] == "R" for k in range(len(g.limbs))
+        g.actuator[j, k]
+        for g in p.groups
+        for j in range(len(g.joints))
+        if g.joints[j] == "R"
+        for k in range(len(g.limbs))
     ]
     unit = np.concatenate([unit_of_displacements(p), np.full(a, p.size)])
     unit[[s + i for i in turning if i >= 0]] = 1.0
@@ -118,7 +145,9 @@ def test_free_actuators_follow_the_platform_as_linearised(engine, robot):
     p = some.program
     state = engine.solve(p, some.e, some.q, some.home)
     s, m = p.n_displacements, 6
-    analytic = slopes(p, engine.linearise(p, some.e, some.q, state, free=True), free=True)[0][:, m:, m:]
+    analytic = slopes(p, engine.linearise(p, some.e, some.q, state, free=True), free=True)[0][
+        :, m:, m:
+    ]
     unit = unit_of_displacements(p)
     moved = np.eye(s) * unit
     task = pose_demand(np.broadcast_to(state.T, (s, 2, 4, 4)).reshape(-1, 4, 4), p.size)
@@ -132,11 +161,15 @@ def test_free_actuators_follow_the_platform_as_linearised(engine, robot):
         atol=RESIDUAL * SCALE, atol_reason="closure of two states over the step",
     )  # fmt: skip
     for row in range(2):
-        assert_close_columns(analytic[row], independent_slopes(some, state, row, free=True)[m:], unit)
+        assert_close_columns(
+            analytic[row], independent_slopes(some, state, row, free=True)[m:], unit
+        )
 
 
 def assert_close_columns(found, reference, unit):
-    """Columns agree to rounding of the largest entry (a few hundred operations, times the condition)."""
+    """Columns agree to rounding of the largest entry (a few hundred operations, times the
+    condition).
+    """
     assert_allclose(found * unit, reference * unit, atol=1e-11 * np.abs(reference * unit).max())
 
 
@@ -159,6 +192,8 @@ def test_rows_that_failed_do_not_stop_the_others(engine):
     q[0, 2] = np.nan
     state = engine.solve(some.program, some.e, q, some.home)
     blocks = engine.linearise(some.program, some.e, q, state)
-    clean = engine.linearise(some.program, some.e, some.q, engine.solve(some.program, some.e, some.q, some.home))
+    clean = engine.linearise(
+        some.program, some.e, some.q, engine.solve(some.program, some.e, some.q, some.home)
+    )
     for mine, other in zip(blocks.closure, clean.closure, strict=True):
         assert_array_equal(mine.E[:, [0, 1, 3, 4]], other.E[:, [0, 1, 3, 4]])

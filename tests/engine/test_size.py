@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The engine in NumPy is specification and default: it has to stay small enough to be read in one sitting."""
+"""The engine in NumPy is specification and default: it has to stay small enough to be read in one
+sitting.
+"""
 
 import ast
 from pathlib import Path
@@ -18,4 +20,11 @@ def test_the_engine_imports_numpy_and_nothing_of_loopcal(root: Path):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             found |= {name for name in names if not name.startswith("loopcal.engine")}
-    assert found <= {"numpy", "numpy.typing", "__future__", "collections.abc", "dataclasses", "typing"}
+    assert found <= {
+        "numpy",
+        "numpy.typing",
+        "__future__",
+        "collections.abc",
+        "dataclasses",
+        "typing",
+    }

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `solve` promises: closed loops or a mark, and for every row the same bits whatever stands beside it."""
+"""What `solve` promises: closed loops or a mark, and for every row the same bits whatever stands
+beside it.
+"""
 
 from dataclasses import replace
 
@@ -7,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.engine.program import EXHAUSTED, NOT_FINITE, STALLED, Slot  # what all engines share
 from loopcal.mechanism import build
 from tests import zoo
@@ -37,7 +39,9 @@ def test_every_row_converges_and_its_loops_are_closed(engine, some):
     assert state.residual.max() <= CLOSED * some.program.size
     assert open_by(some.program, state, some.e).max() <= CLOSED * some.program.size
     assert_allclose(
-        state.T[..., :3, :3] @ state.T[..., :3, :3].swapaxes(-1, -2), np.broadcast_to(np.eye(3), (1, 5, 3, 3)), atol=1e-14
+        state.T[..., :3, :3] @ state.T[..., :3, :3].swapaxes(-1, -2),
+        np.broadcast_to(np.eye(3), (1, 5, 3, 3)),
+        atol=1e-14,
     )
     assert state.iterations.max() <= 10
 
@@ -50,25 +54,37 @@ def test_actuated_joints_hold_the_values_asked_for(engine, some):
 def test_the_platform_moves_in_its_freedoms_only(engine, some):
     state = engine.solve(some.program, some.e, some.q, some.home)
     others = [i for i in range(6) if i not in some.program.freedoms]
-    assert_allclose(se3.difference(state.T, np.broadcast_to(some.home.T, state.T.shape))[..., others], 0.0, atol=1e-16)
+    assert_allclose(
+        geometry.difference(state.T, np.broadcast_to(some.home.T, state.T.shape))[..., others],
+        0.0,
+        atol=1e-16,
+    )
 
 
 def test_a_converged_state_is_a_fixed_point(engine, some):
     state = engine.solve(some.program, some.e, some.q, some.home)
     again = engine.solve(some.program, some.e, some.q, state)
-    assert_allclose(again.T, state.T, atol=2e-14)  # [1] and [m]: rounding times the condition of these robots
+    assert_allclose(
+        again.T, state.T, atol=2e-14
+    )  # [1] and [m]: rounding times the condition of these robots
     assert again.iterations.max() <= 2
 
 
 def test_free_joints_come_back_from_the_pose(engine):
     for robot in (zoo.menagerie(), zoo.hexapod()):
         one = case(robot)
-        one = replace(one, q=one.home_q + 0.1 * (one.q - one.home_q))  # near enough for the working mode of home
+        one = replace(
+            one, q=one.home_q + 0.1 * (one.q - one.home_q)
+        )  # near enough for the working mode of home
         state = engine.solve(one.program, one.e, one.q, one.home)
         task = pose_demand(state.T.reshape(-1, 4, 4), one.program.size)
-        back = engine.solve(one.program, one.e, np.broadcast_to(one.home_q, one.q.shape), one.home, task, free=True)
+        back = engine.solve(
+            one.program, one.e, np.broadcast_to(one.home_q, one.q.shape), one.home, task, free=True
+        )
         assert_array_equal(back.status, engine.CONVERGED)
-        assert_allclose(driven(one.program, back), one.q, atol=1e-13)  # [m, rad] rounding times a condition near 10
+        assert_allclose(
+            driven(one.program, back), one.q, atol=1e-13
+        )  # [m, rad] rounding times a condition near 10
         assert_allclose(back.T, state.T, atol=1e-14)
 
 
@@ -98,14 +114,20 @@ def test_a_row_does_not_depend_on_its_neighbours_bit_for_bit(engine, some):
 def test_the_order_of_rows_does_not_matter_bit_for_bit(engine, some):
     order = np.array([3, 1, 4, 0, 2])
     together = engine.solve(some.program, some.e, some.q, some.home)
-    assert_same(rows_of(together, [0], order), engine.solve(some.program, some.e, some.q[:, order], some.home))
+    assert_same(
+        rows_of(together, [0], order),
+        engine.solve(some.program, some.e, some.q[:, order], some.home),
+    )
 
 
 def test_thousands_of_rows_equal_a_few_alone_bit_for_bit(engine):
     some = case(zoo.menagerie(), n=6000)
     together = engine.solve(some.program, some.e, some.q, some.home)
     for r in (0, 2047, 2048, 4095, 4096, 5999):
-        assert_same(rows_of(together, [0], [r]), engine.solve(some.program, some.e, some.q[:, [r]], some.home))
+        assert_same(
+            rows_of(together, [0], [r]),
+            engine.solve(some.program, some.e, some.q[:, [r]], some.home),
+        )
 
 
 def test_failing_rows_are_marked_and_leave_the_others_alone(engine, some):
@@ -114,7 +136,9 @@ def test_failing_rows_are_marked_and_leave_the_others_alone(engine, some):
     state = engine.solve(some.program, some.e, bad, some.home)
     assert_array_equal(state.status[0, [1, 3, 5, 7]], NOT_FINITE)
     good = [0, 2, 4, 6, 8, 9]
-    assert_same(rows_of(state, [0], good), engine.solve(some.program, some.e, bad[:, good], some.home))
+    assert_same(
+        rows_of(state, [0], good), engine.solve(some.program, some.e, bad[:, good], some.home)
+    )
 
 
 def test_displacements_that_are_not_finite_mark_their_trial(engine):
@@ -179,7 +203,8 @@ def test_arguments_are_left_alone(engine, some):
 
 
 def test_orientation_changes_sign_with_the_mirrored_mode(engine):
-    # a linear delta's nozzle above its carriages is the mirrored mode; between the two lies a singularity
+    # a linear delta's nozzle above its carriages is the mirrored mode; between the two lies a
+    # singularity
     some = case(zoo.delta())
     T = np.array(some.home.T)
     T[0, 0, 2, 3] += 2 * 0.24  # [m] from below to above the carriages
@@ -203,6 +228,12 @@ def test_slots_of_the_menagerie_cover_every_place_of_a_limb():
     program = zoo.menagerie().program
     assert {g.ending for g in program.groups} == {"rigid", "ball", "distance"}
     for group in program.groups:
-        expected = {Slot(element, axis) for element in range(len(group.joints) + 2) for axis in range(6)}
+        expected = {
+            Slot(element, axis) for element in range(len(group.joints) + 2) for axis in range(6)
+        }
         assert expected <= set(group.slots)
-    assert len(unit_of_displacements(program)) == program.n_displacements == len(zoo.menagerie().parameters) - 12
+    assert (
+        len(unit_of_displacements(program))
+        == program.n_displacements
+        == len(zoo.menagerie().parameters) - 12
+    )

@@ -1,2 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Golden results: numbers that loopcal computed before its redesign, and the means to compute them again."""
+"""Golden results: numbers that loopcal computed before its redesign, and the means to compute them
+again.
+"""

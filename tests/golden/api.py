@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The thin adapter: the only file of the golden results that imports loopcal.
 
-Where names in loopcal move, this file changes and nothing else. Functions that report return plain dicts of arrays,
-numbers and strings; what stands under the key `kinematic` is divided by the robot's size where it is a length. Everything
-else that is passed between functions (robots, data, fits) is opaque to the cases.
+Where names in loopcal move, this file changes and nothing else. Functions that report return plain
+dicts of arrays, numbers and strings; what stands under the key `kinematic` is divided by the
+robot's size where it is a length. Everything else that is passed between functions (robots, data,
+fits) is opaque to the cases.
 """
 
 from __future__ import annotations
@@ -16,21 +17,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopcal import calibrate, measure, se3
-from loopcal.calibrate.arrival import arrival
-from loopcal.calibrate.plan.coordinate import coordinate_exchange
-from loopcal.calibrate.plan.criteria import A, D
-from loopcal.calibrate.plan.design import Start
-from loopcal.calibrate.plan.fedorov import fedorov_exchange
-from loopcal.calibrate.plan.groups import PlaneAndLine
-from loopcal.calibrate.plan.problem import problem
-from loopcal.calibrate.remedies import remedies
+from loopcal import apply, diagnose, estimate, geometry, measure, planning
+from loopcal.diagnose.conventions import arrival
+from loopcal.diagnose.suggestions import remedies
 from loopcal.io import load_robot
-from loopcal.io.robot_file import shipped_robots
+from loopcal.io.robot.robot_file import shipped_robots
 from loopcal.measure import KINDS, Gaussian, Instrument, Known, Sensor, local_unknowns
 from loopcal.mechanism import build, forward, inverse, sample
-from loopcal.mechanism.trials import sensitivity
+from loopcal.mechanism.batch_kinematics import sensitivity
 from loopcal.parameters import ParameterTable
+from loopcal.planning.coordinate import coordinate_exchange
+from loopcal.planning.criteria import A, D
+from loopcal.planning.design import Start
+from loopcal.planning.fedorov import fedorov_exchange
+from loopcal.planning.groups import PlaneAndLine
+from loopcal.planning.problem import problem
 from loopcal.units import Dimension
 
 Array = NDArray[np.float64]
@@ -40,10 +41,13 @@ Data = Any
 Fit = Any
 
 SIGMA = {Dimension.LENGTH: 5e-6, Dimension.ANGLE: 25e-6, Dimension.RATIO: 25e-6}
-"""Noise of all simulated measurements unless a case states another, one standard deviation [m], [rad], [1]."""
+"""Noise of all simulated measurements unless a case states another, one standard deviation [m],
+[rad], [1].
+"""
 
 
-# --- robots and kinematics -------------------------------------------------------------------------------------------
+# --- robots and kinematics
+# -------------------------------------------------------------------------------------------
 
 
 def robot_names() -> list[str]:
@@ -66,7 +70,9 @@ def robot_with_leg_joints() -> Robot:
 
 def freed(machine: Robot, endings: Sequence[str]) -> Robot:
     """Free the parameters alone whose names end so."""
-    entries = tuple(replace(p, free=p.name.endswith(tuple(endings))) for p in machine.parameters.entries)
+    entries = tuple(
+        replace(p, free=p.name.endswith(tuple(endings))) for p in machine.parameters.entries
+    )
     return replace(machine, parameters=ParameterTable(entries))
 
 
@@ -121,7 +127,7 @@ def actuator_names(machine: Robot) -> tuple[str, ...]:
 
 def transform(point: Sequence[float], turn: Sequence[float] = (0.0, 0.0, 0.0)) -> Array:
     """Return a transform (4, 4) of a point [m] and a rotation vector [rad]."""
-    return se3.pose(se3.exp_so3(np.array(turn)), np.array(point))
+    return geometry.pose(geometry.exp_so3(np.array(turn)), np.array(point))
 
 
 def report_kinematics(machine: Robot, values: Array, coordinates: Array) -> Report:
@@ -161,7 +167,8 @@ def _pose(machine: Robot, T: Array) -> Array:
     return T[..., :3, :] / np.array([1.0, 1.0, 1.0, machine.size])
 
 
-# --- measurements ----------------------------------------------------------------------------------------------------
+# --- measurements
+# ----------------------------------------------------------------------------------------------------
 
 
 def kind_names() -> list[str]:
@@ -180,9 +187,13 @@ def most_unknown_example(name: str) -> Any:
 
 
 def joint_example(name: str, machine: Robot) -> Any:
-    """Return the last example of a kind that looks at joints, looking at the passive ones, or the driven without any."""
+    """Return the last example of a kind that looks at joints, looking at the passive ones, or the
+    driven without any.
+    """
     passive = passive_names(machine)
-    return replace(most_unknown_example(name), joints=passive or actuator_names(machine), measures="angle")
+    return replace(
+        most_unknown_example(name), joints=passive or actuator_names(machine), measures="angle"
+    )
 
 
 def columns_of(made: Any) -> int:
@@ -193,14 +204,24 @@ def columns_of(made: Any) -> int:
 def sensor(made: Any, sigma: ArrayLike | None = None, **seen: Any) -> Any:
     """Let a kind look with this noise at `rows`, in `session` and `group`."""
     default = [SIGMA[c.dimension] for c in made.noise_columns]
-    noise = np.array(default) if sigma is None else np.broadcast_to(np.asarray(sigma, dtype=float), len(default)).copy()
+    noise = (
+        np.array(default)
+        if sigma is None
+        else np.broadcast_to(np.asarray(sigma, dtype=float), len(default)).copy()
+    )
     return Sensor(made, Gaussian(noise), **seen)
 
 
 def sensor_of_pairs(made: Any, n: int, steps: Sequence[int] = (1, 7, 19), groups: int = 3) -> Any:
-    """Look at n poses; in pairs where the kind compares two, in groups where unknowns are a group's."""
+    """Look at n poses; in pairs where the kind compares two, in groups where unknowns are a
+    group's.
+    """
     every = np.arange(n)
-    rows = np.concatenate([np.stack([every, np.roll(every, -k)], axis=1) for k in steps]) if made.links == 2 else every
+    rows = (
+        np.concatenate([np.stack([every, np.roll(every, -k)], axis=1) for k in steps])
+        if made.links == 2
+        else every
+    )
     grouped = any(p.scope == "group" for p in made.unknowns)
     group = np.array([f"g{i % groups}" for i in range(len(rows))]) if grouped else np.array("")
     return sensor(made, rows=rows, group=group)
@@ -218,10 +239,14 @@ def simulated(
     """Measure a machine of these true values."""
     looking = Instrument(tuple(sensors))
     true = machine.with_values(values)
-    return measure.simulate(true, coordinates, looking, seed, unknowns=unknowns, reading_sigma=reading_sigma)
+    return measure.simulate(
+        true, coordinates, looking, seed, unknowns=unknowns, reading_sigma=reading_sigma
+    )
 
 
-def simulated_trials(machine: Robot, values: Array, coordinates: Array, sensors: Iterable[Any], seed: int) -> Data:
+def simulated_trials(
+    machine: Robot, values: Array, coordinates: Array, sensors: Iterable[Any], seed: int
+) -> Data:
     """Measure machines of true values (t, p), stacked."""
     return measure.simulate_trials(machine, values, coordinates, Instrument(tuple(sensors)), seed)
 
@@ -281,39 +306,44 @@ def report_data(data: Data) -> Report:
     return {"measured": seen, "readings": data.readings, "labels": list(data.labels)}
 
 
-# --- fits ------------------------------------------------------------------------------------------------------------
+# --- fits
+# ------------------------------------------------------------------------------------------------------------
 
 
 def method(name: str, value: Any = None) -> Any:
-    """Make a method by its name: ls, map, map-widened, ridge, ridge-gcv, ridge-likelihood, tsvd, tsvd-gcv."""
-    from loopcal.calibrate.conflict import Widened
+    """Make a method by its name: ls, map, map-widened, ridge, ridge-gcv, ridge-likelihood, tsvd,
+    tsvd-gcv.
+    """
+    from loopcal.estimate.conflict import Widened
 
     makers = {
-        "ls": calibrate.LeastSquares,
-        "map": lambda: calibrate.MAP() if value is None else calibrate.MAP(value),
-        "map-widened": lambda: calibrate.MAP(Widened()),
-        "ridge": lambda: calibrate.Ridge(value),
-        "ridge-gcv": lambda: calibrate.Ridge(calibrate.GCV()),
-        "ridge-likelihood": lambda: calibrate.Ridge(calibrate.MarginalLikelihood()),
-        "tsvd": lambda: calibrate.TruncatedSVD(value),
-        "tsvd-gcv": lambda: calibrate.TruncatedSVD(calibrate.TruncationGCV()),
+        "ls": estimate.LeastSquares,
+        "map": lambda: estimate.MAP() if value is None else estimate.MAP(value),
+        "map-widened": lambda: estimate.MAP(Widened()),
+        "ridge": lambda: estimate.Ridge(value),
+        "ridge-gcv": lambda: estimate.Ridge(estimate.GCV()),
+        "ridge-likelihood": lambda: estimate.Ridge(estimate.MarginalLikelihood()),
+        "tsvd": lambda: estimate.TruncatedSVD(value),
+        "tsvd-gcv": lambda: estimate.TruncatedSVD(estimate.TruncationGCV()),
     }
     return makers[name]()
 
 
 def loss(name: str, constant: float | None = None) -> Any:
     """Make a loss by its name: huber, tukey."""
-    made = {"huber": calibrate.Huber, "tukey": calibrate.Tukey}[name]
+    made = {"huber": estimate.Huber, "tukey": estimate.Tukey}[name]
     return made() if constant is None else made(constant)
 
 
 def fit(machine: Robot, data: Data, how: Any = None, **options: Any) -> Fit:
     """Identify the free parameters."""
-    return calibrate.identify(machine, data, how, **options)
+    return estimate.identify(machine, data, how, **options)
 
 
 def report_fit(found: Fit, parts: bool = True) -> Report:
-    """Report estimates, standard deviations and diagnostics; with `parts` own unknowns, poses and combinations, too."""
+    """Report estimates, standard deviations and diagnostics; with `parts` own unknowns, poses and
+    combinations, too.
+    """
     check = found.check
     result: Report = {
         "names": list(found.names),
@@ -336,36 +366,57 @@ def report_fit(found: Fit, parts: bool = True) -> Report:
     finite = np.isfinite(found.sd)
     result["half_widths"] = found.interval()[finite][:1]
     result["weight"] = found.weight if (found.weight != 1.0).any() else "all poses count in full"
-    result["squares"] = {f"{i}_{r.kind}": (r.whitened**2).sum(axis=0) for i, r in enumerate(found.residuals)}
+    result["squares"] = {
+        f"{i}_{r.kind}": (r.whitened**2).sum(axis=0) for i, r in enumerate(found.residuals)
+    }
     if len(found.local):
         local = found.local
-        # where an unknown is known only together with the machine, it stands where the search for a start put it
-        told, scale = np.where(np.isinf(local.sd), np.nan, local.estimate), np.full(len(local), 1e-3)
+        # where an unknown is known only together with the machine, it stands where the search for a
+        # start put it
+        told, scale = (
+            np.where(np.isinf(local.sd), np.nan, local.estimate),
+            np.full(len(local), 1e-3),
+        )
         result["local_names"] = list(local.names)
         result["local_open"] = [bool(x) for x in local.open]
         result["local"] = {"estimate": told, "sd": local.sd, "scale": scale}
     if found.conflict is not None:
         one = found.conflict
-        result["conflict"] = {"found": one.conflict, "statistic": one.statistic, "spread": one.spread, "p_value": one.p_value}
+        result["conflict"] = {
+            "found": one.conflict,
+            "statistic": one.statistic,
+            "spread": one.spread,
+            "p_value": one.p_value,
+        }
     if found.latent is not None:
         at = found.latent
-        result["latent"] = {"pose": _pose(found.robot, at.poses), "readings": at.readings, "calm": bool(at.calm)}
+        result["latent"] = {
+            "pose": _pose(found.robot, at.poses),
+            "readings": at.readings,
+            "calm": bool(at.calm),
+        }
         result["latent"]["open"] = [bool(x) for x in at.open]
     return result
 
 
 def _open(names: Sequence[str], combinations: Sequence[Any]) -> Report:
-    """Report the directions that stay open: how many, which parameters, and how far each lies in them (0 to 1).
+    """Report the directions that stay open: how many, which parameters, and how far each lies in
+    them (0 to 1).
 
-    With several directions the basis in which they are told is a matter of rounding; the space that they span is not. A
-    single one is told in full, in the order of the parameters and with the sign of its first part that is not small.
+    With several directions the basis in which they are told is a matter of rounding; the space that
+    they span is not. A single one is told in full, in the order of the parameters and with the sign
+    of its first part that is not small.
     """
     W = np.zeros((len(combinations), len(names)))
     for row, one in zip(W, combinations, strict=True):
         row[[names.index(name) for name in one.names]] = one.weights
     basis = np.linalg.svd(W, full_matrices=False)[2]
     unseen = (basis**2).sum(axis=0)
-    result: Report = {"open": len(W), "unseen": unseen, "touched": [n for n, u in zip(names, unseen, strict=True) if u > 1e-12]}
+    result: Report = {
+        "open": len(W),
+        "unseen": unseen,
+        "touched": [n for n, u in zip(names, unseen, strict=True) if u > 1e-12],
+    }
     if len(W) == 1:
         first = np.flatnonzero(np.abs(W[0]) > 0.1 * np.abs(W[0]).max())[0]
         result["combination"] = W[0] * np.sign(W[0, first])
@@ -374,7 +425,7 @@ def _open(names: Sequence[str], combinations: Sequence[Any]) -> Report:
 
 def report_trials(machine: Robot, trials: Data, how: Any) -> Report:
     """Identify stacked trials at once."""
-    found = calibrate.identify_trials(machine, trials, how)
+    found = estimate.identify_trials(machine, trials, how)
     free = found.unknowns
     return {
         "status": found.status,
@@ -391,13 +442,15 @@ def report_trials(machine: Robot, trials: Data, how: Any) -> Report:
 
 def report_leave_one_out(machine: Robot, data: Data, methods: Sequence[Any]) -> Report:
     """Score methods by leaving out blocks, from one linearisation."""
-    found = calibrate.leave_one_out(machine, data, tuple(methods))
+    found = diagnose.leave_one_out(machine, data, tuple(methods))
     return {"score": found.score, "dof": found.dof, "best": list(methods).index(found.best)}
 
 
 def report_per_leg(machine: Robot, data: Data, steps: int) -> Report:
     """Identify leg by leg."""
-    found = calibrate.identify_per_leg(machine, data, steps)
+    from loopcal.papers.per_leg import identify_per_leg
+
+    found = identify_per_leg(machine, data, steps)
     return {"values": found.robot.values, "conditions": found.conditions}
 
 
@@ -414,12 +467,14 @@ def hold_unknowns(data: Data, pattern: str, sd: float) -> Any:
 
 def prior_of(earlier: Fit) -> Any:
     """Make a prior of an earlier fit."""
-    return calibrate.prior_from(earlier.posterior)
+    return estimate.prior_from(earlier.posterior)
 
 
-def report_recalibration(machine: Robot, data: Data, earlier: Fit, limb: str | None = None) -> Report:
+def report_recalibration(
+    machine: Robot, data: Data, earlier: Fit, limb: str | None = None
+) -> Report:
     """Calibrate again with an earlier fit as prior, and test for a change."""
-    found, change = calibrate.recalibrate(machine, data, earlier.posterior, limb)
+    found, change = estimate.recalibrate(machine, data, earlier.posterior, limb)
     tested = {
         "what": change.what,
         "names": list(change.names),
@@ -432,12 +487,15 @@ def report_recalibration(machine: Robot, data: Data, earlier: Fit, limb: str | N
     return {"again": report_fit(found, parts=False), "change": tested}
 
 
-# --- what can be known, how well, and what is wrong ------------------------------------------------------------------
+# --- what can be known, how well, and what is wrong
+# ------------------------------------------------------------------
 
 
 def report_identifiability(machine: Robot, data: Data, cures: bool = False) -> Report:
-    """Report what the data determine; with `cures` which further measurements would determine the rest."""
-    found = calibrate.identifiability(machine, data)
+    """Report what the data determine; with `cures` which further measurements would determine the
+    rest.
+    """
+    found = diagnose.identifiability(machine, data)
     result: Report = {
         "rank": found.rank,
         "n_parameters": found.n_parameters,
@@ -466,9 +524,11 @@ def instrument(sensors: Iterable[Any]) -> Any:
 
 def report_validation(found: Fit, data: Data) -> Report:
     """Report held-out errors."""
-    checked = calibrate.validate(found, data)
+    checked = apply.validate(found, data)
     errors = {
-        name.replace(" ", "_"): {index: getattr(e, index) for index in ("position", "orientation", "integrated")}
+        name.replace(" ", "_"): {
+            index: getattr(e, index) for index in ("position", "orientation", "integrated")
+        }
         for name, e in checked.errors().items()
         if name.startswith("predicted")
     }
@@ -480,12 +540,18 @@ def report_validation(found: Fit, data: Data) -> Report:
         if not name.startswith("predicted")
     }
     kinds = {k.kind: [k.before, k.after] for k in checked.kinds}
-    return {"poses": list(checked.poses), "errors": errors, "kinematic": commanded, "kinds": kinds, "passed": checked.passed}
+    return {
+        "poses": list(checked.poses),
+        "errors": errors,
+        "kinematic": commanded,
+        "kinds": kinds,
+        "passed": checked.passed,
+    }
 
 
 def report_cross_validation(machine: Robot, data: Data, how: Any, count: int, seed: int) -> Report:
     """Score a method on folds."""
-    found = calibrate.cross_validate(machine, data, how, count=count, seed=seed)
+    found = diagnose.cross_validate(machine, data, how, count=count, seed=seed)
     return {
         "poses": list(found.poses),
         "score": found.score,
@@ -499,7 +565,7 @@ def report_cross_validation(machine: Robot, data: Data, how: Any, count: int, se
 
 def report_model_choice(machine: Robot, data: Data, how: Any, count: int) -> Report:
     """Choose a set of parameters by cross-validation."""
-    found = calibrate.choose_model(machine, data, None, how, count=count)
+    found = diagnose.choose_model(machine, data, None, how, count=count)
     return {
         "names": [c.name for c in found.candidates],
         "parameters": [list(c.parameters) for c in found.candidates],
@@ -511,7 +577,7 @@ def report_model_choice(machine: Robot, data: Data, how: Any, count: int) -> Rep
 
 def report_accuracy(found: Fit, data: Data, n: int, seed: int, frame: Any = "base") -> Report:
     """Report uncertainties over the workspace."""
-    at = calibrate.accuracy_map(found, data.readings, n, seed, frame)
+    at = apply.accuracy_map(found, data.readings, n, seed, frame)
     return {
         "names": list(at.names),
         "coordinates": at.coordinates,
@@ -524,15 +590,24 @@ def report_accuracy(found: Fit, data: Data, n: int, seed: int, frame: Any = "bas
     }
 
 
-def report_monte_carlo(machine: Robot, coordinates: Array, sensors: Iterable[Any], where: Array, trials: int) -> Report:
+def report_monte_carlo(
+    machine: Robot, coordinates: Array, sensors: Iterable[Any], where: Array, trials: int
+) -> Report:
     """Compare predicted with observed uncertainties over a few drawn machines."""
-    found = calibrate.monte_carlo(machine, coordinates, Instrument(tuple(sensors)), where, trials=trials)
-    return {"predicted_sd": found.predicted.sd, "observed": found.observed, "trials": found.trials, "failed": found.failed}
+    found = apply.monte_carlo(
+        machine, coordinates, Instrument(tuple(sensors)), where, trials=trials
+    )
+    return {
+        "predicted_sd": found.predicted.sd,
+        "observed": found.observed,
+        "trials": found.trials,
+        "failed": found.failed,
+    }
 
 
 def report_compensation(found: Any, targets: Array, mode: Any, **options: Any) -> Report:
     """Report what to command instead."""
-    done = calibrate.compensate(found, targets, mode, **options)
+    done = apply.compensate(found, targets, mode, **options)
     robot_ = done.robot
     strokes = np.array([_size(robot_, a.dimension) for a in robot_.actuators])
     rows = np.array([1.0] * 3 + [1.0 / robot_.size] * 3)
@@ -555,7 +630,7 @@ def report_compensation(found: Any, targets: Array, mode: Any, **options: Any) -
 
 def report_outliers(found: Fit, data: Data) -> Report:
     """Report which rows do not fit the others."""
-    seen = calibrate.find_outliers(found, data)
+    seen = diagnose.find_outliers(found, data)
     return {
         "names": list(seen.names),
         "undecided": [[list(block) for block in one.poses] for one in seen.undecided],
@@ -570,9 +645,11 @@ def report_outliers(found: Fit, data: Data) -> Report:
 
 
 def report_examination(found: Fit, data: Data) -> Report:
-    """Report lack of fit, groups that correlate, worth of the calibration, and the start compared with the fit."""
-    seen = calibrate.examine(found, data)
-    lack, worth, start = seen.lack_of_fit, seen.worth, calibrate.start_check(found)
+    """Report lack of fit, groups that correlate, worth of the calibration, and the start compared
+    with the fit.
+    """
+    seen = diagnose.examine(found, data)
+    lack, worth, start = seen.lack_of_fit, seen.worth, diagnose.start_check(found)
     return {
         "groups": lack.groups,
         "pure": lack.pure,
@@ -581,7 +658,12 @@ def report_examination(found: Fit, data: Data) -> Report:
         "lack_degrees": lack.lack_degrees,
         "p_value": lack.p_value,
         "explained": lack.explained,
-        "worth": [worth.position_before, worth.position_after, worth.angle_before, worth.angle_after],
+        "worth": [
+            worth.position_before,
+            worth.position_after,
+            worth.angle_before,
+            worth.angle_after,
+        ],
         "calibrate": worth.calibrate,
         "correlated": [list(group.names) for group in seen.correlated],
         "start": start.verdict.name,
@@ -604,16 +686,26 @@ def report_arrival(machine: Robot, data: Data) -> Report:
 
 def report_parameter_error(found: Fit, truth: Array) -> Report:
     """Report errors of parameters with and without what the data leave open."""
-    off = calibrate.parameter_error(found, truth)
-    return {"names": list(off.names), "raw": off.raw, "error": off.error, "dropped": len(off.dropped)}
+    off = diagnose.parameter_error(found, truth)
+    return {
+        "names": list(off.names),
+        "raw": off.raw,
+        "error": off.error,
+        "dropped": len(off.dropped),
+    }
 
 
-# --- plans -----------------------------------------------------------------------------------------------------------
+# --- plans
+# -----------------------------------------------------------------------------------------------------------
 
 
-def report_plan(machine: Robot, sensors: Iterable[Any], n: int, criterion: str, **options: Any) -> Report:
-    """Plan poses; `station` and `facing` ask for a line of sight, `tilt` [rad] and `margin` for the others."""
-    found = calibrate.plan(machine, Instrument(tuple(sensors)), n, criterion, **options)
+def report_plan(
+    machine: Robot, sensors: Iterable[Any], n: int, criterion: str, **options: Any
+) -> Report:
+    """Plan poses; `station` and `facing` ask for a line of sight, `tilt` [rad] and `margin` for the
+    others.
+    """
+    found = planning.plan(machine, Instrument(tuple(sensors)), n, criterion, **options)
     result: Report = {
         "labels": list(found.labels),
         "held_out": [bool(x) for x in found.held_out],
@@ -632,7 +724,9 @@ def report_plan(machine: Robot, sensors: Iterable[Any], n: int, criterion: str, 
     return result
 
 
-def report_fedorov(machine: Robot, sensors: Iterable[Any], n: int, criterion: str, candidates: int, starts: int) -> Report:
+def report_fedorov(
+    machine: Robot, sensors: Iterable[Any], n: int, criterion: str, candidates: int, starts: int
+) -> Report:
     """Choose n units from candidates by exchange: their numbers and the criterion."""
     made = problem(machine, Instrument(tuple(sensors)), count=candidates, seed=1)
     wanted = made.criterion(criterion, "pose")
@@ -641,20 +735,32 @@ def report_fedorov(machine: Robot, sensors: Iterable[Any], n: int, criterion: st
 
 
 def report_coordinate_exchange(
-    machine: Robot, groups: int, points: int, criterion: str, sweeps: int, axes: tuple[str, ...] = ("x", "y", "z")
+    machine: Robot,
+    groups: int,
+    points: int,
+    criterion: str,
+    sweeps: int,
+    axes: tuple[str, ...] = ("x", "y", "z"),
 ) -> Report:
     """Improve groups of points on planes and lines by coordinate exchange."""
     planned = PlaneAndLine(machine, points, 1e-3, axes)
     first = planned.random(groups, 1)
     wanted = {"D": D(), "A": A()}[criterion]
     start = Start.nothing(len(planned.unknowns))
-    found = coordinate_exchange(planned.evaluate, first, planned.levels(), wanted, start, sweeps=sweeps)
-    return {"first": first, "design": found.design, "value": found.value, "evaluated": found.evaluated}
+    found = coordinate_exchange(
+        planned.evaluate, first, planned.levels(), wanted, start, sweeps=sweeps
+    )
+    return {
+        "first": first,
+        "design": found.design,
+        "value": found.value,
+        "evaluated": found.evaluated,
+    }
 
 
 def report_surface_plan(machine: Robot, groups: int, points: int) -> Report:
     """Plan points on planes and perpendicular lines."""
-    found = calibrate.plan_surfaces(machine, groups, points)
+    found = planning.plan_surfaces(machine, groups, points)
     return {
         "labels": list(found.labels),
         "axis": found.axis,
@@ -666,11 +772,14 @@ def report_surface_plan(machine: Robot, groups: int, points: int) -> Report:
     }
 
 
-# --- papers ----------------------------------------------------------------------------------------------------------
+# --- papers
+# ----------------------------------------------------------------------------------------------------------
 
 
 def report_hexapod_42(noise: tuple[float, float] | None, iterations: int) -> Report:
-    """Run the ten steps of the study of 42 parameters; noise: limits [mm, rad], None for exact poses."""
+    """Run the ten steps of the study of 42 parameters; noise: limits [mm, rad], None for exact
+    poses.
+    """
     from loopcal.papers.hexapod_42 import steps
     from loopcal.papers.hexapod_42.study_noise import limits_si
 
@@ -683,7 +792,10 @@ def report_hexapod_42(noise: tuple[float, float] | None, iterations: int) -> Rep
         "actual": measured,
         "conditions": found.conditions,
         # what exact poses leave in the end is rounding: errors as shares of the first
-        "kinematic": {"integrated": found.integrated / found.integrated[0], "left": off / np.abs(off[0]).max()},
+        "kinematic": {
+            "integrated": found.integrated / found.integrated[0],
+            "left": off / np.abs(off[0]).max(),
+        },
     }
 
 
@@ -705,11 +817,20 @@ def report_hexapod_42_table_4() -> Report:
 
 
 def report_hexapod_42_methods(trials: int) -> Report:
-    """Compare methods on the stated noise, but least squares over all legs: ten narrow poses hardly determine it."""
+    """Compare methods on the stated noise, but least squares over all legs: ten narrow poses hardly
+    determine it.
+    """
     from loopcal.papers.hexapod_42 import study_noise
 
-    found = [m for m in study_noise.methods(_hexapod_42()[0], 0, trials) if not m.method.startswith("all legs")]
-    return {"names": [m.method for m in found], "errors": [[m.parameters, m.narrow, m.wide] for m in found]}
+    found = [
+        m
+        for m in study_noise.methods(_hexapod_42()[0], 0, trials)
+        if not m.method.startswith("all legs")
+    ]
+    return {
+        "names": [m.method for m in found],
+        "errors": [[m.parameters, m.narrow, m.wide] for m in found],
+    }
 
 
 def _hexapod_42() -> tuple[Any, Any]:
@@ -723,7 +844,9 @@ def _hexapod_42() -> tuple[Any, Any]:
 
 
 def report_tsvd_2016(name: str, five: bool) -> Report:
-    """Run raw ridge estimation and truncated SVD, and the library's methods, on one machine with the printed noise."""
+    """Run raw ridge estimation and truncated SVD, and the library's methods, on one machine with
+    the printed noise.
+    """
     from loopcal.papers.tsvd_2016 import cases
     from loopcal.papers.tsvd_2016.steps import iterate, linearised, ridge, truncated
 
@@ -753,7 +876,10 @@ def report_cmm_constraint_2011(groups: int, points: int, sweeps: int, trials: in
     from loopcal.papers.cmm_constraint_2011.study import AXES, machine, plan, spread
 
     study = plan(machine(), groups, points, AXES, 0, sweeps)
-    made = {weights: cell(study, 1e-3, 1e-5, 0, trials, weights=weights) for weights in ("printed", "full")}
+    made = {
+        weights: cell(study, 1e-3, 1e-5, 0, trials, weights=weights)
+        for weights in ("printed", "full")
+    }
     return {
         "design": study.optimised.design,
         "value": study.optimised.value,
@@ -771,5 +897,5 @@ def report_cmm_constraint_2011_surfaces(groups: int, points: int, noise: float) 
     study = plan(machine(), groups, points, AXES, 0, 0)
     q = study.layout.held(true_machines(study.robot, 1e-3, 1, 0), noise, 0)
     data = forms.measurements(study.layout, q[0], noise)
-    found = calibrate.identify(study.robot, data, calibrate.MAP(), rank_tolerance=forms.RANK)
+    found = estimate.identify(study.robot, data, estimate.MAP(), rank_tolerance=forms.RANK)
     return report_fit(found, parts=False)

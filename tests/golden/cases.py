@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The registry of golden cases: small calibrations with fixed seeds, each a function that returns plain results.
+"""The registry of golden cases: small calibrations with fixed seeds, each a function that returns
+plain results.
 
-Names are paths, `part/what/setting`. Noise is 5 um and 25 urad unless said otherwise: much above rounding, so that the results
-repeat to far less than a thousand-millionth of their standard deviations.
+Names are paths, `part/what/setting`. Noise is 5 um and 25 urad unless said otherwise: much above
+rounding, so that the results repeat to far less than a thousand-millionth of their standard
+deviations.
 """
 
 from __future__ import annotations
@@ -35,13 +37,16 @@ class Case:
 CASES: dict[str, Case] = {}
 
 
-def add(name: str, run: Callable[..., dict[str, Any]], *given: Any, slow: bool = False, **options: Any) -> None:
+def add(
+    name: str, run: Callable[..., dict[str, Any]], *given: Any, slow: bool = False, **options: Any
+) -> None:
     """Register a case."""
     assert name not in CASES, name
     CASES[name] = Case(partial(run, *given, **options), slow)
 
 
-# --- shared set-ups --------------------------------------------------------------------------------------------------
+# --- shared set-ups
+# --------------------------------------------------------------------------------------------------
 
 
 @cache
@@ -68,11 +73,14 @@ def usual_fit(how: str = "map", name: str = HEXAPOD) -> Any:
     return api.fit(api.robot(name), measured(name, 24), api.method(how))
 
 
-# --- 1. every shipped robot ------------------------------------------------------------------------------------------
+# --- 1. every shipped robot
+# ------------------------------------------------------------------------------------------
 
 
 SECOND_ORDER = ("linear-delta-6", "ls")
-"""Some directions show in second order only; least squares over them does not come to rest, so they are cut."""
+"""Some directions show in second order only; least squares over them does not come to rest, so they
+are cut.
+"""
 
 
 def kinematics(name: str) -> dict[str, Any]:
@@ -100,11 +108,14 @@ for _name in api.robot_names():
     add(f"robots/{_name}/least-squares", calibration, _name, "ls")
 
 
-# --- 2. every kind of measurement ------------------------------------------------------------------------------------
+# --- 2. every kind of measurement
+# ------------------------------------------------------------------------------------
 
 
 LEAN = ("length", "base.z")
-"""Parameters that least squares finds where a kind tells so little that all 42 would be ill-conditioned."""
+"""Parameters that least squares finds where a kind tells so little that all 42 would be
+ill-conditioned.
+"""
 
 
 def one_kind(kind: Any, n: int = 30, machine: Any = None, lean: bool = False) -> dict[str, Any]:
@@ -114,7 +125,11 @@ def one_kind(kind: Any, n: int = 30, machine: Any = None, lean: bool = False) ->
     sensors = (api.sensor_of_pairs(kind, n),)
     own = api.own_truth(robot, sensors, n, 5)
     data = api.simulated(robot, values, api.poses(robot, n, 1), sensors, 1, unknowns=own)
-    less = api.with_values(api.freed(robot, LEAN), api.wrong_by(robot, values, LEAN)) if lean else robot
+    less = (
+        api.with_values(api.freed(robot, LEAN), api.wrong_by(robot, values, LEAN))
+        if lean
+        else robot
+    )
     return {
         "data": api.report_data(data)["measured"],
         "ls": api.report_fit(api.fit(less, data, api.method("ls"), allow_fewer_equations=True)),
@@ -141,21 +156,38 @@ def looking_at_joints(name: str) -> dict[str, Any]:
     return one_kind(api.joint_example(name, robot), 10, robot)
 
 
-NEARER = {"sphere": api.kind("sphere", unknown=("surface",), through=np.array([0.25, -0.15, 0.35]), surface="ball")}
+NEARER = {
+    "sphere": api.kind(
+        "sphere", unknown=("surface",), through=np.array([0.25, -0.15, 0.35]), surface="ball"
+    )
+}
 """Instead of an example that is so far away that its unknowns are ill-conditioned."""
 
-LITTLE = ("bearing/theodolite", "bearing/camera", "distance", "distance/known", "sphere", "sphere/known")
+LITTLE = (
+    "bearing/theodolite",
+    "bearing/camera",
+    "distance",
+    "distance/known",
+    "sphere",
+    "sphere/known",
+)
 
 FORMS = {
     "pose/quaternion": api.kind("pose", "quaternion"),
     "pose/tilt-torsion": api.kind("pose", "tilt-torsion"),
     "pose/euler-ZYX": api.kind("pose", "euler-ZYX"),
     "component/z": api.kind("component", ("z",)),
-    "component/x,y,z,phi,theta": api.kind("component", ("x", "y", "z", "phi", "theta"), "tilt-torsion"),
+    "component/x,y,z,phi,theta": api.kind(
+        "component", ("x", "y", "z", "phi", "theta"), "tilt-torsion"
+    ),
     "position/known": api.kind("position", targets=("a", "b", "c"), places=THREE),
     "bearing/theodolite": api.kind("bearing", places=POINT, T_base_frame=STATION),
     "bearing/camera": api.kind(
-        "bearing", T_base_frame=api.transform((0.1, -0.1, -2.5)), form="camera", unknown=("frame",), frame="camera"
+        "bearing",
+        T_base_frame=api.transform((0.1, -0.1, -2.5)),
+        form="camera",
+        unknown=("frame",),
+        frame="camera",
     ),
     "distance/known": api.kind("distance", anchor=np.array([1.5, -0.8, 1.1])),
     "sphere/known": api.kind("sphere", through=np.array([1.5, -0.8, 1.1])),
@@ -188,19 +220,39 @@ def mixed(kinds: dict[str, Any], n: int = 24) -> dict[str, Any]:
 PARTS = {
     "pose": api.kind("pose"),
     "framed-pose": api.kind("pose", unknown=("frame", "tool"), frame="tracker"),
-    "targets": api.kind("position", targets=("a", "b", "c"), places=THREE, unknown=("frame", "targets"), frame="laser"),
+    "targets": api.kind(
+        "position",
+        targets=("a", "b", "c"),
+        places=THREE,
+        unknown=("frame", "targets"),
+        frame="laser",
+    ),
     "position": api.kind("position", places=POINT, unknown=("frame",), frame="cmm"),
     "inclination": api.kind("inclination", unknown=("gravity", "mounting"), sensor="level"),
-    "bearing": api.kind("bearing", places=POINT, T_base_frame=STATION, unknown=("frame",), frame="station"),
+    "bearing": api.kind(
+        "bearing", places=POINT, T_base_frame=STATION, unknown=("frame",), frame="station"
+    ),
     "separation": api.kind("separation", places=POINT, unknown=("offset",)),
     "plane": api.kind("plane", places=POINT, unknown=("surface",), surface="bed"),
-    "line": api.kind("line", unknown=("surface",), along=np.array([0.6, 0.0, 0.8]), surface="ruler"),
-    "sphere": api.kind("sphere", unknown=("surface",), through=np.array([1.5, -0.8, 1.1]), surface="ball"),
-    "direction": api.kind(
-        "direction", axis=np.array([0.0, 0.6, 0.8]), unknown=("axis", "frame"), frame="gauge", axis_name="face"
+    "line": api.kind(
+        "line", unknown=("surface",), along=np.array([0.6, 0.0, 0.8]), surface="ruler"
     ),
-    "mirror": api.kind("autocollimation", unknown=("frame", "mirror"), frame="collimator", mirror="mirror"),
-    "wire": api.kind("distance", anchor=np.array([0.5, -0.4, 0.6]), unknown=("offset",), anchor_name="wire"),
+    "sphere": api.kind(
+        "sphere", unknown=("surface",), through=np.array([1.5, -0.8, 1.1]), surface="ball"
+    ),
+    "direction": api.kind(
+        "direction",
+        axis=np.array([0.0, 0.6, 0.8]),
+        unknown=("axis", "frame"),
+        frame="gauge",
+        axis_name="face",
+    ),
+    "mirror": api.kind(
+        "autocollimation", unknown=("frame", "mirror"), frame="collimator", mirror="mirror"
+    ),
+    "wire": api.kind(
+        "distance", anchor=np.array([0.5, -0.4, 0.6]), unknown=("offset",), anchor_name="wire"
+    ),
     "tilt": api.kind("component", ("z", "phi", "theta"), "tilt-torsion"),
 }
 COMBINED = (
@@ -214,11 +266,14 @@ for _names in COMBINED:
     add(f"combined/{'+'.join(_names)}", mixed, {name: PARTS[name] for name in _names})
 
 
-# --- 3. every method and loss, stacked trials ------------------------------------------------------------------------
+# --- 3. every method and loss, stacked trials
+# ------------------------------------------------------------------------
 
 
 def by_method(how: str, value: Any, weak: bool, **options: Any) -> dict[str, Any]:
-    """Calibrate a hexapod by a method: full poses, or (weak) heights and tilts that leave directions open."""
+    """Calibrate a hexapod by a method: full poses, or (weak) heights and tilts that leave
+    directions open.
+    """
     sensors = (api.sensor(PARTS["tilt"]),) if weak else ()
     return fitted(HEXAPOD, measured(HEXAPOD, 30, *sensors), api.method(how, value), **options)
 
@@ -238,7 +293,14 @@ METHODS: dict[str, tuple[str, Any]] = {
 }
 for _name, (_how, _value) in METHODS.items():
     add(f"methods/{_name}/poses", by_method, _how, _value, weak=False)
-    add(f"methods/{_name}/heights-and-tilts", by_method, _how, _value, weak=True, allow_fewer_equations=True)
+    add(
+        f"methods/{_name}/heights-and-tilts",
+        by_method,
+        _how,
+        _value,
+        weak=True,
+        allow_fewer_equations=True,
+    )
 for _how in ("ls", "map", "map-widened"):
     add(f"methods/noise-estimated/{_how}", by_method, _how, None, weak=False, noise="estimated")
 add("methods/begin-closure", by_method, "ls", None, weak=False, begin="closure")
@@ -259,7 +321,13 @@ add("methods/start", from_a_start)
 def without_tolerances() -> dict[str, Any]:
     """Free some parameters only, and hold none of them back."""
     robot = api.freed(api.robot(HEXAPOD), ("length", "base.z"))
-    data = api.simulated(robot, api.true_values(robot, 3)[0], api.poses(robot, 20, 1), [api.sensor(api.kind("pose"))], 1)
+    data = api.simulated(
+        robot,
+        api.true_values(robot, 3)[0],
+        api.poses(robot, 20, 1),
+        [api.sensor(api.kind("pose"))],
+        1,
+    )
     return api.report_fit(api.fit(robot, data))
 
 
@@ -281,7 +349,9 @@ def blundered(name: str = HEXAPOD) -> Any:
 def by_loss(loss: str, how: str, constant: float | None = None, **options: Any) -> dict[str, Any]:
     """Calibrate from data with blunders, with a loss; and look for the blunders."""
     data = blundered()
-    found = api.fit(api.robot(HEXAPOD), data, api.method(how), loss=api.loss(loss, constant), **options)
+    found = api.fit(
+        api.robot(HEXAPOD), data, api.method(how), loss=api.loss(loss, constant), **options
+    )
     return api.report_fit(found) | {"outliers": api.report_outliers(found, data)}
 
 
@@ -296,8 +366,12 @@ def trials(name: str, how: str, value: Any, kinds: tuple[str, ...]) -> dict[str,
     """Identify four machines at once."""
     robot = api.robot(name)
     sensors = [api.sensor(PARTS[kind]) for kind in kinds]
-    made = api.simulated_trials(robot, api.true_values(robot, 3, 4), api.poses(robot, 24, 1), sensors, 1)
-    one = api.report_fit(api.fit(robot, api.one_trial(made, 2), api.method(how, value)), parts=False)
+    made = api.simulated_trials(
+        robot, api.true_values(robot, 3, 4), api.poses(robot, 24, 1), sensors, 1
+    )
+    one = api.report_fit(
+        api.fit(robot, api.one_trial(made, 2), api.method(how, value)), parts=False
+    )
     return api.report_trials(robot, made, api.method(how, value)) | {"third": one}
 
 
@@ -311,7 +385,10 @@ add("trials/hexapod-42/unknown-frame", trials, HEXAPOD, "map", None, ("position"
 
 def left_out() -> dict[str, Any]:
     """Score methods by leave-one-out."""
-    methods = [api.method(*one) for one in (("ls",), ("map",), ("ridge", 1e-2), ("ridge", 10.0), ("tsvd", 10), ("tsvd", 30))]
+    methods = [
+        api.method(*one)
+        for one in (("ls",), ("map",), ("ridge", 1e-2), ("ridge", 10.0), ("tsvd", 10), ("tsvd", 30))
+    ]
     return api.report_leave_one_out(api.robot(HEXAPOD), measured(HEXAPOD, 24), methods)
 
 
@@ -319,7 +396,8 @@ add("methods/leave-one-out", left_out)
 add("methods/per-leg", lambda: api.report_per_leg(api.robot(HEXAPOD), measured(HEXAPOD, 12), 3))
 
 
-# --- 4. uncertain readings, sessions, priors -------------------------------------------------------------------------
+# --- 4. uncertain readings, sessions, priors
+# -------------------------------------------------------------------------
 
 
 def uncertain(name: str, sigma: float, how: str, *sensors: Any, n: int = 20) -> dict[str, Any]:
@@ -330,24 +408,45 @@ def uncertain(name: str, sigma: float, how: str, *sensors: Any, n: int = 20) -> 
 add("latent/hexapod-42/poses", uncertain, HEXAPOD, 10 * UM, "ls")
 add("latent/hexapod-42/map", uncertain, HEXAPOD, 10 * UM, "map")
 add("latent/3-prs/poses", uncertain, TRIPOD, 10 * UM, "map")
-add("latent/hexapod-42/unknown-frame", uncertain, HEXAPOD, 10 * UM, "map", api.sensor(PARTS["position"]), n=24)
-add("latent/hexapod-42/heights", uncertain, HEXAPOD, 10 * UM, "map", api.sensor(PARTS["tilt"]), n=30)
+add(
+    "latent/hexapod-42/unknown-frame",
+    uncertain,
+    HEXAPOD,
+    10 * UM,
+    "map",
+    api.sensor(PARTS["position"]),
+    n=24,
+)
+add(
+    "latent/hexapod-42/heights", uncertain, HEXAPOD, 10 * UM, "map", api.sensor(PARTS["tilt"]), n=30
+)
 
 
 def latent_mixed(loss: str | None = None) -> dict[str, Any]:
     """Miss a reading, state one as exact, measure some poses in part and link others."""
-    robot = api.freed(api.robot(HEXAPOD), ("base.x", "leg2.base.z", "leg3.platform.y", "leg4.length"))
+    robot = api.freed(
+        api.robot(HEXAPOD), ("base.x", "leg2.base.z", "leg3.platform.y", "leg4.length")
+    )
     full = api.sensor(api.kind("pose"), rows=np.arange(10))
     ball = api.sensor(api.kind("separation"), rows=np.array([[1, 10], [10, 11], [0, 12]]))
     point = api.sensor(api.kind("position"), rows=np.array([10, 11, 12, 13]))
     coordinates = api.poses(robot, 14, 1)
-    data = api.simulated(robot, api.true_values(robot, 3)[0], coordinates, [full, ball, point], 1, reading_sigma=15 * UM)
+    data = api.simulated(
+        robot,
+        api.true_values(robot, 3)[0],
+        coordinates,
+        [full, ball, point],
+        1,
+        reading_sigma=15 * UM,
+    )
     readings, sigma = api.readings_of(data)
     assert sigma is not None
     readings[2, 4], sigma[2, 4] = np.nan, np.inf
     sigma[5, 0] = 0.0
     data = api.with_readings(data, readings, sigma)
-    return api.report_fit(api.fit(robot, data, api.method("ls"), loss=None if loss is None else api.loss(loss)))
+    return api.report_fit(
+        api.fit(robot, data, api.method("ls"), loss=None if loss is None else api.loss(loss))
+    )
 
 
 add("latent/missing-reading-and-linked-poses", latent_mixed)
@@ -358,7 +457,9 @@ def nobody_measured(how: str) -> dict[str, Any]:
     """Calibrate a cable robot from its own redundant readings, a few positions measured."""
     robot = api.robot(CABLE)
     seen = api.sensor(api.kind("position"), 1e-3, rows=np.arange(8))
-    data = api.simulated(robot, truth(CABLE), api.poses(robot, 24, 5), [seen], 1, reading_sigma=np.deg2rad(1.0))
+    data = api.simulated(
+        robot, truth(CABLE), api.poses(robot, 24, 5), [seen], 1, reading_sigma=np.deg2rad(1.0)
+    )
     found = api.fit(robot, data, api.method(how))
     return api.report_fit(found) | {"known": api.report_identifiability(robot, data)}
 
@@ -385,7 +486,9 @@ DRIFT = {"noon.frame.x": 400 * UM, "evening.frame.x": 900 * UM, "evening.frame.r
 def sessions(how: str, keep: bool) -> dict[str, Any]:
     """Measure a base that drifts in three sessions; the first says where it is, or none does."""
     day = np.repeat(["morning", "noon", "evening"], 10)
-    data = measured(HEXAPOD, 30, api.sensor(api.kind("pose", unknown=("frame",)), session=day), unknowns=DRIFT)
+    data = measured(
+        HEXAPOD, 30, api.sensor(api.kind("pose", unknown=("frame",)), session=day), unknowns=DRIFT
+    )
     local = api.fix_unknowns(data, "morning.*", {"morning.frame.x": 0.0}) if keep else None
     return fitted(HEXAPOD, data, api.method(how), local=local)
 
@@ -398,7 +501,13 @@ add("unknowns/sessions/all-free/map", sessions, "map", keep=False)
 def stations() -> dict[str, Any]:
     """Look from two stations, one of which was moved."""
     day = np.repeat(["left", "right"], 20)
-    seen = api.kind("bearing", targets=("a", "b"), places=PAIR, T_base_frame=STATION, unknown=("frame", "targets"))
+    seen = api.kind(
+        "bearing",
+        targets=("a", "b"),
+        places=PAIR,
+        T_base_frame=STATION,
+        unknown=("frame", "targets"),
+    )
     moved = {"right.frame.x": 1.4, "right.frame.y": -1.1, "right.frame.rz": 2.0}
     data = measured(HEXAPOD, 40, api.sensor(seen, session=day), unknowns=moved)
     return fitted(HEXAPOD, data, api.method("map"))
@@ -414,8 +523,12 @@ def prior_of_unknowns(stated: bool) -> dict[str, Any]:
     data = measured(HEXAPOD, 24, api.sensor(seen), unknowns=true)
     if stated:
         known = {"tracker.x": (1e-3, None), "tracker.y": (1e-4, 2e-5), "tracker.z": (0.0, 0.0)}
-        return fitted(HEXAPOD, api.with_known(data, known), api.method("ls"), allow_fewer_equations=True)
-    return fitted(HEXAPOD, data, api.method("map"), local=api.hold_unknowns(data, "tracker.*", 1e-3))
+        return fitted(
+            HEXAPOD, api.with_known(data, known), api.method("ls"), allow_fewer_equations=True
+        )
+    return fitted(
+        HEXAPOD, data, api.method("map"), local=api.hold_unknowns(data, "tracker.*", 1e-3)
+    )
 
 
 add("unknowns/prior/stated-in-the-data", prior_of_unknowns, stated=True)
@@ -458,19 +571,62 @@ def earlier_as_prior(how: str) -> dict[str, Any]:
 add("recalibration/prior-from-earlier", earlier_as_prior, "ls")
 
 
-# --- 5. plans --------------------------------------------------------------------------------------------------------
+# --- 5. plans
+# --------------------------------------------------------------------------------------------------------
 
 
 def plan(name: str, kind: str, n: int, criterion: str, **options: Any) -> dict[str, Any]:
     """Plan poses."""
-    return api.report_plan(api.robot(name), [api.sensor(PARTS[kind])], n, criterion, seed=1, **options)
+    return api.report_plan(
+        api.robot(name), [api.sensor(PARTS[kind])], n, criterion, seed=1, **options
+    )
 
 
 for _criterion in ("D", "I"):
-    add(f"plans/hexapod-42/pose/{_criterion}", plan, HEXAPOD, "pose", 10, _criterion, hold_out=3, candidates=60, slow=True)
-    add(f"plans/3-prs/pose/{_criterion}", plan, TRIPOD, "pose", 10, _criterion, hold_out=3, candidates=60, slow=True)
-add("plans/linear-delta/position/I", plan, DELTA, "position", 12, "I", hold_out=3, candidates=60, slow=True)
-add("plans/hexapod-42/pose/position", plan, HEXAPOD, "pose", 8, "I", target="position", candidates=50, slow=True)
+    add(
+        f"plans/hexapod-42/pose/{_criterion}",
+        plan,
+        HEXAPOD,
+        "pose",
+        10,
+        _criterion,
+        hold_out=3,
+        candidates=60,
+        slow=True,
+    )
+    add(
+        f"plans/3-prs/pose/{_criterion}",
+        plan,
+        TRIPOD,
+        "pose",
+        10,
+        _criterion,
+        hold_out=3,
+        candidates=60,
+        slow=True,
+    )
+add(
+    "plans/linear-delta/position/I",
+    plan,
+    DELTA,
+    "position",
+    12,
+    "I",
+    hold_out=3,
+    candidates=60,
+    slow=True,
+)
+add(
+    "plans/hexapod-42/pose/position",
+    plan,
+    HEXAPOD,
+    "pose",
+    8,
+    "I",
+    target="position",
+    candidates=50,
+    slow=True,
+)
 
 
 def plan_further() -> dict[str, Any]:
@@ -494,7 +650,9 @@ for _criterion in ("D", "I"):
 
 def exchange(criterion: str, axes: tuple[str, ...]) -> dict[str, Any]:
     """Move groups of points on a plane and a line by coordinate exchange."""
-    return api.report_coordinate_exchange(api.robot("hexapod-nategh-agheli"), 8, 8, criterion, 1, axes)
+    return api.report_coordinate_exchange(
+        api.robot("hexapod-nategh-agheli"), 8, 8, criterion, 1, axes
+    )
 
 
 add("plans/coordinate-exchange/D", exchange, "D", ("x", "y", "z"), slow=True)
@@ -502,11 +660,14 @@ add("plans/coordinate-exchange/A", exchange, "A", ("z",), slow=True)
 
 
 add(
-    "plans/surfaces/hexapod-nategh-agheli", lambda: api.report_surface_plan(api.robot("hexapod-nategh-agheli"), 6, 8), slow=True
+    "plans/surfaces/hexapod-nategh-agheli",
+    lambda: api.report_surface_plan(api.robot("hexapod-nategh-agheli"), 6, 8),
+    slow=True,
 )
 
 
-# --- 6. papers -------------------------------------------------------------------------------------------------------
+# --- 6. papers
+# -------------------------------------------------------------------------------------------------------
 
 add("papers/hexapod-42/exact", api.report_hexapod_42, None, 3)
 add("papers/hexapod-42/presumed-noise", api.report_hexapod_42, (1e-6, 1e-9), 3)
@@ -520,7 +681,8 @@ add("papers/cmm-constraint-2011/cell", api.report_cmm_constraint_2011, 8, 8, 1, 
 add("papers/cmm-constraint-2011/surfaces", api.report_cmm_constraint_2011_surfaces, 8, 8, 1e-5)
 
 
-# --- 7. validation, accuracy, what is wrong --------------------------------------------------------------------------
+# --- 7. validation, accuracy, what is wrong
+# --------------------------------------------------------------------------
 
 
 def validation(name: str, how: str, *kinds: str) -> dict[str, Any]:
@@ -560,7 +722,9 @@ def monte_carlo() -> dict[str, Any]:
     """Compare with a few drawn machines."""
     robot = api.robot(HEXAPOD)
     where = api.poses(robot, 4, 3)
-    return api.report_monte_carlo(robot, api.poses(robot, 20, 1), [api.sensor(PARTS["pose"])], where, 10)
+    return api.report_monte_carlo(
+        robot, api.poses(robot, 20, 1), [api.sensor(PARTS["pose"])], where, 10
+    )
 
 
 add("accuracy/hexapod-42/monte-carlo", monte_carlo)
@@ -568,7 +732,9 @@ add("accuracy/hexapod-42/monte-carlo", monte_carlo)
 
 def compensation(name: str, mode: str, **options: Any) -> dict[str, Any]:
     """Say what to command a calibrated machine."""
-    return api.report_compensation(usual_fit("map", name), api.poses(api.robot(name), 6, 4), mode, **options)
+    return api.report_compensation(
+        usual_fit("map", name), api.poses(api.robot(name), 6, 4), mode, **options
+    )
 
 
 for _name in (HEXAPOD, TRIPOD, DELTA):
@@ -598,7 +764,9 @@ def repeats() -> dict[str, Any]:
     at = np.repeat(api.poses(robot, 15, 1), 2, axis=0)
     data = api.simulated(robot, truth(HEXAPOD), at, [api.sensor(PARTS["pose"])], 1)
     found = api.fit(robot, data, api.method("map"))
-    return api.report_examination(found, data) | {"error": api.report_parameter_error(found, truth(HEXAPOD))}
+    return api.report_examination(found, data) | {
+        "error": api.report_parameter_error(found, truth(HEXAPOD))
+    }
 
 
 add("validation/repeats", repeats)
@@ -606,14 +774,18 @@ add("validation/repeats", repeats)
 
 def cross_validation(how: str, value: Any = None) -> dict[str, Any]:
     """Score a method on four folds."""
-    return api.report_cross_validation(api.robot(HEXAPOD), measured(HEXAPOD, 24), api.method(how, value), 4, 1)
+    return api.report_cross_validation(
+        api.robot(HEXAPOD), measured(HEXAPOD, 24), api.method(how, value), 4, 1
+    )
 
 
 add("cross-validation/map", cross_validation, "map")
 add("cross-validation/tsvd-20", cross_validation, "tsvd", 20)
 add(
     "cross-validation/choose-model",
-    lambda: api.report_model_choice(api.robot(DELTA), measured(DELTA, 20, api.sensor(PARTS["position"])), api.method("map"), 3),
+    lambda: api.report_model_choice(
+        api.robot(DELTA), measured(DELTA, 20, api.sensor(PARTS["position"])), api.method("map"), 3
+    ),
     slow=True,
 )
 

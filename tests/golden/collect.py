@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute all golden results anew and write the fixture: `python -m tests.golden.collect`.
 
-With names of cases (or beginnings of names) behind it, only these are computed and the others kept; `--time` shows how
-long each takes.
+With names of cases (or beginnings of names) behind it, only these are computed and the others kept;
+`--time` shows how long each takes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,11 @@ def collect(chosen: tuple[str, ...] = (), timed: bool = False) -> None:
             if timed:
                 print(f"{time.perf_counter() - begun:8.2f} s  {name}", flush=True)  # noqa: T201
     ordered = {name: results[name] for name in CASES if name in results}
-    versions = {"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__}
+    versions = {
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+    }
     compare.write(versions, ordered)
 
 

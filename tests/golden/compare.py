@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """How golden results are written, read and compared.
 
-A result is a nested dict; it is stored flat, `part/part/name` -> value. Strings, whole numbers and truth values must be
-equal. Numbers are compared by where they stand, all with one relative tolerance (1e-9) but for kinematics:
+A result is a nested dict; it is stored flat, `part/part/name` -> value. Strings, whole numbers and
+truth values must be equal. Numbers are compared by where they stand, all with one relative
+tolerance (1e-9) but for kinematics:
 
     .../estimate       difference over the `sd` beside it; where that is infinite, none or zero, over the `scale` beside it
     .../sd             element by element
@@ -36,7 +37,9 @@ def flatten(result: Mapping[str, Any], at: str = "") -> Flat:
 
 
 def plain(value: Any) -> Any:
-    """Return arrays and numpy's numbers as lists and Python's numbers; floats stay exact (17 significant digits)."""
+    """Return arrays and numpy's numbers as lists and Python's numbers; floats stay exact (17
+    significant digits).
+    """
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, list | tuple):
@@ -45,7 +48,9 @@ def plain(value: Any) -> Any:
 
 
 def differences(golden: Flat, found: Flat, factor: float = 1.0) -> Iterator[str]:
-    """Yield a sentence for every value that is not what it was; tolerances are multiplied by `factor`."""
+    """Yield a sentence for every value that is not what it was; tolerances are multiplied by
+    `factor`.
+    """
     for path in sorted(golden.keys() ^ found.keys()):
         yield f"{path}: {'is missing' if path in golden else 'is new'}"
     for path in sorted(golden.keys() & found.keys()):
@@ -62,9 +67,14 @@ def differences(golden: Flat, found: Flat, factor: float = 1.0) -> Iterator[str]
 
 
 def distance(path: str, was: np.ndarray, now: np.ndarray, golden: Flat) -> float:
-    """Return the largest difference in units of its tolerance; infinite where NaN or infinite ones are not the same."""
+    """Return the largest difference in units of its tolerance; infinite where NaN or infinite ones
+    are not the same.
+    """
     finite = np.isfinite(was)
-    if not np.array_equal(was[~finite], now[~finite], equal_nan=True) or not np.isfinite(now[finite]).all():
+    if (
+        not np.array_equal(was[~finite], now[~finite], equal_nan=True)
+        or not np.isfinite(now[finite]).all()
+    ):
         return np.inf
     if not finite.any():
         return 0.0
@@ -79,7 +89,10 @@ def _allowed(path: str, was: np.ndarray, finite: np.ndarray, golden: Flat) -> np
     if "kinematic" in parts:
         return KINEMATIC * np.maximum(largest, 1.0)
     if parts[-1] == "estimate":
-        sd, scale = (np.array(golden[path.removesuffix("estimate") + name], dtype=float) for name in ("sd", "scale"))
+        sd, scale = (
+            np.array(golden[path.removesuffix("estimate") + name], dtype=float)
+            for name in ("sd", "scale")
+        )
         return TOLERANCE * np.where(np.isfinite(sd) & (sd > 0.0), sd, scale)
     if parts[-1] == "sd":
         return TOLERANCE * np.abs(was)
@@ -89,7 +102,9 @@ def _allowed(path: str, was: np.ndarray, finite: np.ndarray, golden: Flat) -> np
 
 
 def is_numeric(value: Any) -> bool:
-    """Return whether a value is a float, or nested lists with a float in them and nothing but numbers."""
+    """Return whether a value is a float, or nested lists with a float in them and nothing but
+    numbers.
+    """
     leaves = list(_leaves(value))
     return any(isinstance(x, float) for x in leaves) and all(
         isinstance(x, int | float) and not isinstance(x, bool) for x in leaves
@@ -109,12 +124,19 @@ def _short(value: Any) -> str:
     return text if len(text) < 200 else f"{text[:200]}..."
 
 
-def write(information: Mapping[str, Any], results: Mapping[str, Flat], path: Path = FIXTURE) -> None:
-    """Write the fixture, one value a line so that changes can be read in git; NaN and Infinity as Python's json has them."""
+def write(
+    information: Mapping[str, Any], results: Mapping[str, Flat], path: Path = FIXTURE
+) -> None:
+    """Write the fixture, one value a line so that changes can be read in git; NaN and Infinity as
+    Python's json has them.
+    """
     lines = ["{", f'"information": {json.dumps(dict(information))},', '"results": {']
     for i, (case, flat) in enumerate(results.items()):
         lines.append(f"{json.dumps(case)}: {{")
-        values = [f"  {json.dumps(name)}: {json.dumps(value, separators=(',', ':'))}" for name, value in flat.items()]
+        values = [
+            f"  {json.dumps(name)}: {json.dumps(value, separators=(',', ':'))}"
+            for name, value in flat.items()
+        ]
         lines.append(",\n".join(values))
         lines.append("}" + ("," if i + 1 < len(results) else ""))
     path.write_text("\n".join([*lines, "}", "}", ""]))

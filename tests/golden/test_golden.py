@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every number that loopcal computed before its redesign is still what it was; see `compare` for how closely.
+"""Every number that loopcal computed before its redesign is still what it was; see `compare` for
+how closely.
 
-Where the adapter `api` was changed for a new name and a case fails, the redesign changed a result. The fixture is made by
-`python -m tests.golden.collect`; it is not made anew to let a change pass that nobody can explain.
+Where the adapter `api` was changed for a new name and a case fails, the redesign changed a result.
+The fixture is made by `python -m tests.golden.collect`; it is not made anew to let a change pass
+that nobody can explain.
 """
 
 import numpy as np
@@ -23,7 +25,11 @@ def test_the_fixture_has_every_case_and_no_other():
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if case.slow else []) for name, case in CASES.items()]
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] if case.slow else [])
+        for name, case in CASES.items()
+    ],
 )
 def test_results_are_what_they_were(name):
     factor, _ = EXCEPTIONS.get(name, (1.0, ""))
@@ -33,7 +39,11 @@ def test_results_are_what_they_were(name):
 
 GIVEN = compare.flatten(
     {
-        "fit": {"estimate": np.array([1.0, 2.0]), "sd": np.array([1e-5, np.inf]), "scale": np.array([1e-3, 1e-3])},
+        "fit": {
+            "estimate": np.array([1.0, 2.0]),
+            "sd": np.array([1e-5, np.inf]),
+            "scale": np.array([1e-3, 1e-3]),
+        },
         "kinematic": {"pose": np.array([0.5, 0.25])},
         "singular_values": np.array([1e4, 1e-12]),
         "names": ["a", "b"],

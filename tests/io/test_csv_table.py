@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CSV tables: units in the header, settings in front or beside, one sentence with the line for each mistake."""
+"""CSV tables: units in the header, settings in front or beside, one sentence with the line for each
+mistake.
+"""
 
 import math
 
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.io.csv_table import read_table, require_columns
+from loopcal.io.core.csv_table import read_table, require_columns
 from loopcal.units import Dimension
 
 GOOD = """# kind: pose
@@ -29,7 +31,9 @@ def write(folder, text: str | bytes):
 def read_all(path):
     table = read_table(path)
     require_columns(table, ["q.leg1"], "is a reading")
-    return table.numbers("q.leg1", Dimension.LENGTH, empty=False), table.numbers("rx", Dimension.ANGLE)
+    return table.numbers("q.leg1", Dimension.LENGTH, empty=False), table.numbers(
+        "rx", Dimension.ANGLE
+    )
 
 
 def test_columns_come_in_si_with_nan_for_what_was_not_measured(tmp_path) -> None:
@@ -49,8 +53,15 @@ def test_a_byte_order_mark_and_windows_line_ends_are_accepted(tmp_path) -> None:
     assert read_all(path)[0].tolist() == pytest.approx([0.2335, 0.2345], rel=4e-16)
 
 
-def test_a_sidecar_holds_the_settings_and_makes_comments_of_what_begins_with_a_hash(tmp_path) -> None:
-    path = write(tmp_path, GOOD.replace("# kind: pose", "# measured on a cold day").replace("# noise: {x: 0.001 mm}\n", ""))
+def test_a_sidecar_holds_the_settings_and_makes_comments_of_what_begins_with_a_hash(
+    tmp_path,
+) -> None:
+    path = write(
+        tmp_path,
+        GOOD.replace("# kind: pose", "# measured on a cold day").replace(
+            "# noise: {x: 0.001 mm}\n", ""
+        ),
+    )
     (tmp_path / "data.yaml").write_text("kind: component\n")
     assert read_table(path).settings.content == {"kind": "component"}
 
@@ -65,7 +76,12 @@ def test_a_sidecar_holds_the_settings_and_makes_comments_of_what_begins_with_a_h
         ("# kind: pose", "# kind: pose\n# kind: pose", 2, "second time"),
         ("q.leg1 [mm]", "q.leg1", 4, "column 'q.leg1' has no unit; write it in brackets"),
         ("q.leg1 [mm]", "q.leg1 []", 4, "column 'q.leg1': unknown unit ''"),
-        ("q.leg1 [mm]", "q.leg1 [mmm]", 4, "column 'q.leg1': unknown unit 'mmm' .did you mean 'mm'"),
+        (
+            "q.leg1 [mm]",
+            "q.leg1 [mmm]",
+            4,
+            "column 'q.leg1': unknown unit 'mmm' .did you mean 'mm'",
+        ),
         ("q.leg1 [mm]", "q.leg1 [deg]", 4, "'deg' is a unit of angle, but a length is needed"),
         ("q.leg1 [mm]", "q.leg2 [mm]", 4, "no column 'q.leg1' .did you mean 'q.leg2'"),
         ("q.leg1 [mm]", "q.leg1 [mm", 4, "column 2 is headed 'q.leg1 .mm'"),
@@ -79,10 +95,17 @@ def test_a_sidecar_holds_the_settings_and_makes_comments_of_what_begins_with_a_h
         ("p2,234.5,", "p2,234.5,NaN", 8, "is 'NaN', which is not a finite number; leave empty"),
         ("p2,234.5,", "p2,234.5,inf", 8, "not a finite number"),
         ("p2,234.5,", 'p2,"234.5,', 8, "not CSV"),
-        ("pose,q.leg1 [mm],rx [mrad]", "pose;q.leg1 [mm];rx [mrad]", 4, "separated by semicolons; use commas"),
+        (
+            "pose,q.leg1 [mm],rx [mrad]",
+            "pose;q.leg1 [mm];rx [mrad]",
+            4,
+            "separated by semicolons; use commas",
+        ),
     ],
 )
-def test_a_mistake_is_one_sentence_with_its_line(tmp_path, old: str, new: str, line: int | None, message: str) -> None:
+def test_a_mistake_is_one_sentence_with_its_line(
+    tmp_path, old: str, new: str, line: int | None, message: str
+) -> None:
     path = write(tmp_path, GOOD.replace(old, new, 1))
     with pytest.raises(FileError, match=message) as caught:
         read_all(path)
@@ -111,12 +134,16 @@ def test_a_robot_file_of_the_same_name_is_no_sidecar(tmp_path) -> None:
 def test_settings_in_front_and_beside_are_refused(tmp_path, beside) -> None:
     path = write(tmp_path, GOOD)
     (tmp_path / "data.yaml").write_text(beside)
-    with pytest.raises(FileError, match=r"at the top of this file and in data.yaml; keep one of the two"):
+    with pytest.raises(
+        FileError, match=r"at the top of this file and in data.yaml; keep one of the two"
+    ):
         read_table(path)
 
 
 @pytest.mark.parametrize("beside", ["title: a plot\n", "- a\n- list\n", "not: [yaml\n", ""])
-def test_some_other_yaml_file_of_the_same_name_does_not_matter_to_settings_in_front(tmp_path, beside) -> None:
+def test_some_other_yaml_file_of_the_same_name_does_not_matter_to_settings_in_front(
+    tmp_path, beside
+) -> None:
     path = write(tmp_path, GOOD)
     (tmp_path / "data.yaml").write_text(beside)
     assert read_table(path).settings.content["kind"] == "pose"

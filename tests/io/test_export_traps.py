@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exports that look right and are not: cells cut in two, other headers further down, targets that contradict each other."""
+"""Exports that look right and are not: cells cut in two, other headers further down, targets that
+contradict each other.
+"""
 
 import json
 import re
@@ -32,7 +34,11 @@ columns:
   MORE
 settings: {kind: position, targets: [a, b], unknown: [frame], frame: cmm, noise: {"*": 2 um}}
 """
-READINGS = "readings: {" + ", ".join(f"q{i}: {{from: J{i}, unit: mm}}" for i in range(1, 7)) + "}\nsettings:"
+READINGS = (
+    "readings: {"
+    + ", ".join(f"q{i}: {{from: J{i}, unit: mm}}" for i in range(1, 7))
+    + "}\nsettings:"
+)
 
 
 def converted(folder, export: str, profile: str):
@@ -48,18 +54,47 @@ def table(text: str) -> list[str]:
 @pytest.mark.parametrize(
     ("export", "delimiter", "misfits", "rows"),
     [
-        ("Name,X,Y,Z\n1,1,5,2,5,3,5\n2,1,2,3\n3,1,2,3,\n", "comma", {2: "it has 7 cells, but the header names 4"}, 2),
-        ("Name,X,Y,Z,R,S,T,U\n1,1,5,2,5,3,5\n2,1,2,3,,,,\n", "comma", {2: "it has 7 cells, but the header names 8"}, 1),
-        ("Name,X,Y,Z,R,S,T,U\n1,1,5,2,5,3,5,,,\n2,1,2,3,,,,\n", "comma", {2: "it has 9 cells, but the header"}, 1),
-        ("Name X Y Z\nPose 1 10 20 30\nP2 1 2 3\n", "spaces", {2: "it has 5 cells, but the header names 4"}, 1),
-        ("Name X Y Z R\nP1 20 30 7\nP2 1 2 3 4\n", "spaces", {2: "it has 4 cells, but the header names 5"}, 1),
+        (
+            "Name,X,Y,Z\n1,1,5,2,5,3,5\n2,1,2,3\n3,1,2,3,\n",
+            "comma",
+            {2: "it has 7 cells, but the header names 4"},
+            2,
+        ),
+        (
+            "Name,X,Y,Z,R,S,T,U\n1,1,5,2,5,3,5\n2,1,2,3,,,,\n",
+            "comma",
+            {2: "it has 7 cells, but the header names 8"},
+            1,
+        ),
+        (
+            "Name,X,Y,Z,R,S,T,U\n1,1,5,2,5,3,5,,,\n2,1,2,3,,,,\n",
+            "comma",
+            {2: "it has 9 cells, but the header"},
+            1,
+        ),
+        (
+            "Name X Y Z\nPose 1 10 20 30\nP2 1 2 3\n",
+            "spaces",
+            {2: "it has 5 cells, but the header names 4"},
+            1,
+        ),
+        (
+            "Name X Y Z R\nP1 20 30 7\nP2 1 2 3 4\n",
+            "spaces",
+            {2: "it has 4 cells, but the header names 5"},
+            1,
+        ),
         ("Name;X;Y;Z;Note\nP1;1;2;3\nP2;1;2;3;good\n", "semicolon", {}, 2),
     ],
 )
-def test_a_line_with_other_cells_than_the_header_is_no_row(tmp_path, export, delimiter, misfits, rows) -> None:
+def test_a_line_with_other_cells_than_the_header_is_no_row(
+    tmp_path, export, delimiter, misfits, rows
+) -> None:
     found = converted(tmp_path, export, BY_NAME.replace("comma", delimiter))
     assert (found.rows, [line for line, _ in found.misfits]) == (rows, list(misfits))
-    assert all(part in reason for (_, reason), part in zip(found.misfits, misfits.values(), strict=True))
+    assert all(
+        part in reason for (_, reason), part in zip(found.misfits, misfits.values(), strict=True)
+    )
 
 
 def test_without_a_header_a_line_with_other_cells_than_most_is_no_row(tmp_path) -> None:
@@ -69,7 +104,9 @@ def test_without_a_header_a_line_with_other_cells_than_most_is_no_row(tmp_path) 
 
 
 def test_below_another_header_columns_are_read_by_that_one(tmp_path) -> None:
-    found = converted(tmp_path, "Name,X,Y,Z\n1,1,2,3\nName,X,Y,Z\n2,4,5,6\nZ,Y,R,X,Name\n9,8,0,7,3\n", BY_NAME)
+    found = converted(
+        tmp_path, "Name,X,Y,Z\n1,1,2,3\nName,X,Y,Z\n2,4,5,6\nZ,Y,R,X,Name\n9,8,0,7,3\n", BY_NAME
+    )
     assert table(found.text)[1:] == ["1,1,2,3", "2,4,5,6", "3,7,8,9"]
     assert (found.passed, found.misfits) == (3, ())
 
@@ -79,19 +116,31 @@ def test_a_later_header_that_names_a_column_twice_is_refused(tmp_path) -> None:
         converted(tmp_path, "Name,X,Y,Z\n1,1,2,3\nName,X,X,Y,Z\n", BY_NAME)
 
 
-def test_sigma_covariance_and_remarks_of_each_target_stay_with_it_and_calibrate_reads_them(tmp_path) -> None:
+def test_sigma_covariance_and_remarks_of_each_target_stay_with_it_and_calibrate_reads_them(
+    tmp_path,
+) -> None:
     more = "sigma.x: {from: S, unit: um}\n  cov.x.y: {from: C, unit: um*um}\n  note rms: {from: R}"
     profile = TARGETS.replace("MORE", more).replace("settings:", READINGS)
-    lines = ["P1_a;1,5;2;3;4;1;r1;0;0;0;0;0;0", "P1_b;1,6;2;3;5;2;r2;0;0;0;0;0;0", "P2_b;1,7;2;3;6;3;r3;1;0;0;0;0;0"]
+    lines = [
+        "P1_a;1,5;2;3;4;1;r1;0;0;0;0;0;0",
+        "P1_b;1,6;2;3;5;2;r2;0;0;0;0;0;0",
+        "P2_b;1,7;2;3;6;3;r3;1;0;0;0;0;0",
+    ]
     found = converted(tmp_path, "Name;X;Y;Z;S;C;R;J1;J2;J3;J4;J5;J6\n" + "\n".join(lines), profile)
     header, *rows = table(found.text)
     cells = [dict(zip(header.split(","), row.split(","), strict=True)) for row in rows]
     assert (found.rows, found.misfits) == (2, ())
-    assert (cells[0]["sigma.a.x [um]"], cells[0]["sigma.b.x [um]"], cells[1]["sigma.a.x [um]"]) == ("4", "5", "")
+    assert (cells[0]["sigma.a.x [um]"], cells[0]["sigma.b.x [um]"], cells[1]["sigma.a.x [um]"]) == (
+        "4",
+        "5",
+        "",
+    )
     assert (cells[0]["cov.a.x.a.y [um*um]"], cells[0]["cov.b.x.b.y [um*um]"]) == ("1", "2")
     assert (cells[0]["note rms a"], cells[0]["note rms b"]) == ("r1", "r2")
     (tmp_path / "data.csv").write_text(found.text)
-    data = load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"), allow_still=True, allow_implausible=True)
+    data = load_measurements(
+        tmp_path / "data.csv", load_robot("hexapod-42"), allow_still=True, allow_implausible=True
+    )
     sigma = data.observations[0].covariance.diagonal(axis1=1, axis2=2) ** 0.5
     assert sigma[0] == pytest.approx([4e-6, 2e-6, 2e-6, 5e-6, 2e-6, 2e-6])  # [m]
 
@@ -99,15 +148,30 @@ def test_sigma_covariance_and_remarks_of_each_target_stay_with_it_and_calibrate_
 def test_a_target_without_a_line_needs_no_sigma(tmp_path) -> None:
     profile = TARGETS.replace("MORE", "sigma.x: {from: S, unit: um}").replace("settings:", READINGS)
     profile = profile.replace('"*": 2 um', '"*.y": 2 um, "*.z": 2 um')
-    lines = ["P1_a;1,5;2;3;4;0;0;0;0;0;0", "P1_b;1,6;2;3;5;0;0;0;0;0;0", "P2_b;1,7;2;3;6;1;0;0;0;0;0"]
-    (tmp_path / "data.csv").write_text(converted(tmp_path, "Name;X;Y;Z;S;J1;J2;J3;J4;J5;J6\n" + "\n".join(lines), profile).text)
-    data = load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"), allow_still=True, allow_implausible=True)
+    lines = [
+        "P1_a;1,5;2;3;4;0;0;0;0;0;0",
+        "P1_b;1,6;2;3;5;0;0;0;0;0;0",
+        "P2_b;1,7;2;3;6;1;0;0;0;0;0",
+    ]
+    (tmp_path / "data.csv").write_text(
+        converted(tmp_path, "Name;X;Y;Z;S;J1;J2;J3;J4;J5;J6\n" + "\n".join(lines), profile).text
+    )
+    data = load_measurements(
+        tmp_path / "data.csv", load_robot("hexapod-42"), allow_still=True, allow_implausible=True
+    )
     rows = data.observations[0]
     assert rows.present.tolist() == [[True] * 6, [False] * 3 + [True] * 3]
     assert rows.covariance[1, 3, 3] ** 0.5 == pytest.approx(6e-6)  # [m]
-    (tmp_path / "data.csv").write_text((tmp_path / "data.csv").read_text().replace(",6,1,", ",,1,").replace(",6\n", ",\n"))
+    (tmp_path / "data.csv").write_text(
+        (tmp_path / "data.csv").read_text().replace(",6,1,", ",,1,").replace(",6\n", ",\n")
+    )
     with pytest.raises(LoopcalError, match=r"column 'sigma.b.x' holds no number above zero"):
-        load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"), allow_still=True, allow_implausible=True)
+        load_measurements(
+            tmp_path / "data.csv",
+            load_robot("hexapod-42"),
+            allow_still=True,
+            allow_implausible=True,
+        )
 
 
 def test_a_target_that_gives_the_pose_another_reading_is_no_row(tmp_path) -> None:
@@ -122,29 +186,50 @@ def test_a_target_that_gives_the_pose_another_reading_is_no_row(tmp_path) -> Non
     assert found.rows == 2
 
 
-def test_targets_at_another_temperature_have_rows_of_their_own_and_another_time_is_told(tmp_path) -> None:
+def test_targets_at_another_temperature_have_rows_of_their_own_and_another_time_is_told(
+    tmp_path,
+) -> None:
     more = "temperature: {from: T, unit: degC}\n  time: {from: When}"
-    lines = ["P1_a;1;2;3;20;2026-05-04T10:00:00", "P1_b;1;2;3;20,0;2026-05-04T10:00:07", "P2_a;1;2;3;20;", "P2_b;1;2;3;21;"]
-    found = converted(tmp_path, "Name;X;Y;Z;T;When\n" + "\n".join(lines), TARGETS.replace("MORE", more))
+    lines = [
+        "P1_a;1;2;3;20;2026-05-04T10:00:00",
+        "P1_b;1;2;3;20,0;2026-05-04T10:00:07",
+        "P2_a;1;2;3;20;",
+        "P2_b;1;2;3;21;",
+    ]
+    found = converted(
+        tmp_path, "Name;X;Y;Z;T;When\n" + "\n".join(lines), TARGETS.replace("MORE", more)
+    )
     assert table(found.text) == [
         "pose,temperature [degC],time,a.x [mm],a.y [mm],a.z [mm],b.x [mm],b.y [mm],b.z [mm]",
         "P1,20,2026-05-04T10:00:00,1,2,3,1,2,3",
         "P2,20,,1,2,3,,,",
         "P2,21,,,,,1,2,3",
     ]
-    assert found.notes == ("1 line of a further target states another time than the first line of the row, whose time is kept",)
+    assert found.notes == (
+        (
+            "1 line of a further target states another time than the first line of the row, whose "
+            "time "
+            "is kept"
+        ),
+    )
     assert f"## {found.notes[0]}\n" in found.text
 
 
 def test_missing_numbers_are_compared_by_value_and_missing_words_by_their_letters(tmp_path) -> None:
     profile = BY_NAME.replace("columns:", "missing: [-999.0, 0, 'n/a']\ncolumns:", 1)
-    found = converted(tmp_path, "Name,X,Y,Z\n0.5,-999.0000,-999,0.000\nP2,n/a,1,-9.99e2\nP3,-99,1e-9,2\n", profile)
+    found = converted(
+        tmp_path, "Name,X,Y,Z\n0.5,-999.0000,-999,0.000\nP2,n/a,1,-9.99e2\nP3,-99,1e-9,2\n", profile
+    )
     assert table(found.text)[1:] == ["0.5,,,", "P2,,1,", "P3,-99,1e-9,2"]
     comma = profile.replace("comma", "semicolon\ndecimal: comma").replace("-999.0", "'-999,0'")
-    assert table(converted(tmp_path, "Name;X;Y;Z\nP1;-999,00;0,0;3,5\n", comma).text)[1:] == ["P1,,,3.5"]
+    assert table(converted(tmp_path, "Name;X;Y;Z\nP1;-999,00;0,0;3,5\n", comma).text)[1:] == [
+        "P1,,,3.5"
+    ]
 
 
-@pytest.mark.parametrize("cell", ["1_0", "\uff11.5", "nan", "inf", "1.5D+3", "\u22121.5", "0x1f", "1 234"])
+@pytest.mark.parametrize(
+    "cell", ["1_0", "\uff11.5", "nan", "inf", "1.5D+3", "\u22121.5", "0x1f", "1 234"]
+)
 def test_what_only_looks_like_a_number_is_none(tmp_path, cell) -> None:
     found = converted(tmp_path, f"Name,X,Y,Z\nP1,1,2,3\nP2,{cell},2,3\n", BY_NAME)
     assert found.misfits == ((3, f"{cell!r} is no number for 'x'"),)
@@ -174,7 +259,10 @@ settings: {kind: joint, joints: [q1], noise: {"*": 2 um}}
 def test_a_joint_that_is_read_and_measured_has_two_columns(tmp_path) -> None:
     found = converted(tmp_path, "Name,B1,J1,S\n1,5,7,3\n", JOINT)
     assert table(found.text) == ["pose,sigma.measured.q1 [um],q1 [mm],measured.q1 [mm]", "1,3,7,5"]
-    with pytest.raises(FileError, match=r"'q1' is a reading and a measured column, too; call the measured one 'measured.q1'"):
+    with pytest.raises(
+        FileError,
+        match=r"'q1' is a reading and a measured column, too; call the measured one 'measured.q1'",
+    ):
         converted(tmp_path, "Name,B1,J1\n1,5,7\n", JOINT.replace("  measured.q1", "  q1"))
 
 
@@ -182,13 +270,22 @@ BAD = {
     "hex": ("delimiter", "encoding: hex\ndelimiter", 2, "'hex' is no encoding of text"),
     "rot13": ("delimiter", "encoding: rot13\ndelimiter", 2, "'rot13' is no encoding of text"),
     "a newer format": ("format: 1", "format: 7", 1, "this file has format 7"),
-    "an angle for a length": ("from: X, unit: mm", "from: X, unit: deg", 5, "'deg' is no unit of 'x'; write one of m, mm"),
-    "one unit for a covariance": ("  z:", "  cov.x.y: {from: C, unit: mm}\n  z:", 7, "'mm' is no unit of .*of 2 factors"),
-    "a sigma of nothing": ("  z:", "  sigma.w: {from: C, unit: mm}\n  z:", 7, "'sigma.w' is no column .*did you mean 'sigma"),
+    "an angle for a length": ("from: X, unit: mm", "from: X, unit: deg", 5, ("'deg' is no unit of "
+                                                                            "'x'; write one of m, "
+                                                                            "mm")),
+    "one unit for a covariance": ("  z:", "  cov.x.y: {from: C, unit: mm}\n  z:", 7, ("'mm' is no "
+                                                                                     "unit of .*of "
+                                                                                     "2 factors")),
+    "a sigma of nothing": ("  z:", "  sigma.w: {from: C, unit: mm}\n  z:", 7, ("'sigma.w' is no "
+                                                                              "column .*did you "
+                                                                              "mean 'sigma")),
     "another unit in the header": ("from: X, unit: mm", '"from": "X [m]", unit: mm', 5, "heads this column 'X .m.', but"),
-    "degrees in the header": ("from: X, unit: mm", '"from": "X (°)", unit: mm', 5, "write the unit deg"),
+    "degrees in the header": ("from: X, unit: mm", '"from": "X (°)", unit: mm', 5, ("write the "
+                                                                                    "unit "
+                                                                                   "deg")),
     "readings of nothing": ("settings", "readings:\nsettings", 8, "'readings' must name columns"),
-    "nothing for missing": ("delimiter", "missing: [null]\ndelimiter", 2, "'missing' has None where the text of a cell"),
+    "nothing for missing": ("delimiter", "missing: [null]\ndelimiter", 2, ("'missing' has None "
+                                                                          "where the text of a cell")),
 }  # fmt: skip
 
 
@@ -204,9 +301,13 @@ def test_a_profile_that_would_fail_later_is_refused_at_its_line(tmp_path, case) 
 @pytest.mark.parametrize("word", ["null", "true", "No", "a"])
 def test_settings_that_yaml_would_take_for_something_else_are_quoted(tmp_path, word) -> None:
     profile = BY_NAME.replace("settings: {", f"settings: {{session: '{word}', poses: poses.csv, ")
-    (tmp_path / "poses.csv").write_text("pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm]\n1,0,0,0,0,0,0\n")
+    (tmp_path / "poses.csv").write_text(
+        "pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm]\n1,0,0,0,0,0,0\n"
+    )
     (tmp_path / "data.csv").write_text(converted(tmp_path, "Name,X,Y,Z\n1,1,2,3\n", profile).text)
-    data = load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"), allow_still=True, allow_implausible=True)
+    data = load_measurements(
+        tmp_path / "data.csv", load_robot("hexapod-42"), allow_still=True, allow_implausible=True
+    )
     assert data.observations[0].session.tolist() == [word]
 
 
@@ -216,24 +317,64 @@ def test_the_command_tells_what_targets_say_differently(tmp_path, monkeypatch, c
     converted(tmp_path, lines, TARGETS.replace("MORE", "time: {from: When}"))
     assert main(["import", "export.txt", "--profile", "profile.yaml", "-o", "data.csv"]) == 0
     assert "note: 1 line of a further target states another time" in capsys.readouterr().out
-    assert main(["import", "export.txt", "--profile", "profile.yaml", "-o", "data.csv", "--json", "--force"]) == 0
+    assert (
+        main(
+            [
+                "import",
+                "export.txt",
+                "--profile",
+                "profile.yaml",
+                "-o",
+                "data.csv",
+                "--json",
+                "--force",
+            ]
+        )
+        == 0
+    )
     assert len(json.loads(capsys.readouterr().out)["notes"]) == 1
 
 
-HEADER = "pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm],temperature [degC],x [mm],y [mm],z [mm]\n"
+HEADER = (
+    "pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm],temperature [degC],x [mm],y [mm],z [mm]\n"
+)
 ROWS = HEADER + "".join(f"P{i},{i},0,{i % 3},0,0,{i % 2},20,{i},2,3\n" for i in range(4))
 FRONT = "# kind: position\n# noise: {'*': 1 um}\n"
 BY_PROFILE = "or read an instrument's export as it is by 'loopcal import --profile'"
 REFUSED = {
-    "semicolons": ((FRONT + ROWS.replace(",", ";")).encode(), f"columns are separated by semicolons; .*{BY_PROFILE}"),
-    "tabs": ((FRONT + ROWS.replace(",", "\t")).encode(), f"columns are separated by tabs; .*{BY_PROFILE}"),
-    "latin-1": (("## Länge\n" + FRONT + ROWS).encode("latin-1"), f"is not UTF-8 text .*{BY_PROFILE}"),
+    "semicolons": (
+        (FRONT + ROWS.replace(",", ";")).encode(),
+        f"columns are separated by semicolons; .*{BY_PROFILE}",
+    ),
+    "tabs": (
+        (FRONT + ROWS.replace(",", "\t")).encode(),
+        f"columns are separated by tabs; .*{BY_PROFILE}",
+    ),
+    "latin-1": (
+        ("## Länge\n" + FRONT + ROWS).encode("latin-1"),
+        f"is not UTF-8 text .*{BY_PROFILE}",
+    ),
     "utf-16": ((FRONT + ROWS).encode("utf-16"), f"is not UTF-8 text .*{BY_PROFILE}"),
-    "capitals": ((FRONT + ROWS.replace("x [mm]", "X [mm]")).encode(), r"column 'X' is unknown \(did you mean 'x \[mm\]'\?\)"),
-    "brackets": ((FRONT + ROWS.replace("x [mm]", "x (mm)")).encode(), r"'x \(mm\)' is unknown \(did you mean 'x \[mm\]'\?\)"),
-    "both": ((FRONT + ROWS.replace("q1 [mm]", "Q1(mm)")).encode(), r"'Q1\(mm\)' is unknown \(did you mean 'q1 \[mm\]'\?\)"),
-    "ice": ((FRONT + ROWS.replace(",20,2,", ",-300,2,")).encode(), r"data.csv:6: .*is -300 degC, below absolute zero"),
-    "still": ((FRONT + re.sub(",20,.,2", ",20,1,2", ROWS)).encode(), r"stay within 0 mm, but the robot moves it by [\d.]+ mm;"),
+    "capitals": (
+        (FRONT + ROWS.replace("x [mm]", "X [mm]")).encode(),
+        r"column 'X' is unknown \(did you mean 'x \[mm\]'\?\)",
+    ),
+    "brackets": (
+        (FRONT + ROWS.replace("x [mm]", "x (mm)")).encode(),
+        r"'x \(mm\)' is unknown \(did you mean 'x \[mm\]'\?\)",
+    ),
+    "both": (
+        (FRONT + ROWS.replace("q1 [mm]", "Q1(mm)")).encode(),
+        r"'Q1\(mm\)' is unknown \(did you mean 'q1 \[mm\]'\?\)",
+    ),
+    "ice": (
+        (FRONT + ROWS.replace(",20,2,", ",-300,2,")).encode(),
+        r"data.csv:6: .*is -300 degC, below absolute zero",
+    ),
+    "still": (
+        (FRONT + re.sub(",20,.,2", ",20,1,2", ROWS)).encode(),
+        r"stay within 0 mm, but the robot moves it by [\d.]+ mm;",
+    ),
 }
 
 
@@ -247,6 +388,12 @@ def test_a_measurement_file_of_another_program_is_refused_with_what_helps(tmp_pa
 
 
 def test_zero_kelvin_is_cold_enough(tmp_path) -> None:
-    (tmp_path / "data.csv").write_text(FRONT + ROWS.replace("[degC]", "[degF]").replace(",20,2,", ",-459.67,2,"))
-    data = load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"), allow_still=True, allow_implausible=True)
-    assert data.observations[0].context["temperature"][2] == pytest.approx(-273.15, abs=1e-9)  # [degC], rounding
+    (tmp_path / "data.csv").write_text(
+        FRONT + ROWS.replace("[degC]", "[degF]").replace(",20,2,", ",-459.67,2,")
+    )
+    data = load_measurements(
+        tmp_path / "data.csv", load_robot("hexapod-42"), allow_still=True, allow_implausible=True
+    )
+    assert data.observations[0].context["temperature"][2] == pytest.approx(
+        -273.15, abs=1e-9
+    )  # [degC], rounding

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.cli import main
 from loopcal.errors import FileError
 from loopcal.io import load_measurements, load_robot
@@ -16,7 +16,11 @@ from loopcal.measure import evaluate_all, start_values, whitened_rows
 from loopcal.mechanism import forward
 
 EXAMPLES = Path("examples/exports").resolve()
-CASES = {"tracker-points.txt": (8, 3, [27]), "six-dof.txt": (8, 2, []), "cmm-spheres.csv": (8, 3, [])}
+CASES = {
+    "tracker-points.txt": (8, 3, [27]),
+    "six-dof.txt": (8, 2, []),
+    "cmm-spheres.csv": (8, 3, []),
+}
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +36,12 @@ def test_the_examples_are_imported_and_fit_the_robot_they_were_invented_for_with
     monkeypatch.chdir(tmp_path)
     (tmp_path / "poses.csv").write_bytes((EXAMPLES / "poses.csv").read_bytes())
     profile = (EXAMPLES / name).with_suffix(".yaml")
-    assert main(["import", str(EXAMPLES / name), "--profile", str(profile), "-o", "data.csv", "--json"]) == 0
+    assert (
+        main(
+            ["import", str(EXAMPLES / name), "--profile", str(profile), "-o", "data.csv", "--json"]
+        )
+        == 0
+    )
     rows, passed, misfits = CASES[name]
     document = json.loads(capsys.readouterr().out)
     assert (document["rows"], document["passed"]) == (rows, passed)
@@ -40,7 +49,9 @@ def test_the_examples_are_imported_and_fit_the_robot_they_were_invented_for_with
     data = load_measurements("data.csv", robot)
     T = forward(robot, data.readings).T
     values = start_values(data, T)
-    white = whitened_rows(evaluate_all(data, T[None], values[None]), np.zeros((1, len(T), 6, 0)))[0, :, -1]
+    white = whitened_rows(evaluate_all(data, T[None], values[None]), np.zeros((1, len(T), 6, 0)))[
+        0, :, -1
+    ]
     degrees = data.n_rows - len(data.unknowns)
     assert white @ white < 2.5 * degrees  # chi-square, 11 degrees or more: above once in 400
     assert white @ white > 0.2 * degrees
@@ -92,8 +103,14 @@ def test_line_ends_byte_order_marks_and_quotes_make_no_difference(tmp_path, raw)
 
 
 def test_an_encoding_can_be_stated(tmp_path) -> None:
-    named = PROFILE.replace("from: Name", "from: Prüfpunkt").replace("decimal", "encoding: utf-16\ndecimal")
-    text = converted(tmp_path, EXPORT.replace("Name", "Prüfpunkt").replace("P1", "Fläche 1").encode("utf-16"), named).text
+    named = PROFILE.replace("from: Name", "from: Prüfpunkt").replace(
+        "decimal", "encoding: utf-16\ndecimal"
+    )
+    text = converted(
+        tmp_path,
+        EXPORT.replace("Name", "Prüfpunkt").replace("P1", "Fläche 1").encode("utf-16"),
+        named,
+    ).text
     assert rows_of(text)[0] == "Fläche 1,1.5,2,3"
 
 
@@ -106,7 +123,9 @@ def test_names_with_commas_quotes_and_number_signs_stay_names(tmp_path, robot) -
     (tmp_path / "data.csv").write_text(converted(tmp_path, export).text)
     data = load_measurements([tmp_path / "poses.csv", tmp_path / "data.csv"], robot)
     assert data.labels == (name, "P2")
-    np.testing.assert_array_equal(data.observations[0].measured, [[0.0015, 0.002, 0.003], [0.004, 0.005, 0.0006]])
+    np.testing.assert_array_equal(
+        data.observations[0].measured, [[0.0015, 0.002, 0.003], [0.004, 0.005, 0.0006]]
+    )
 
 
 def test_lines_that_do_not_fit_are_listed_and_named_in_the_file(tmp_path) -> None:
@@ -119,12 +138,17 @@ def test_lines_that_do_not_fit_are_listed_and_named_in_the_file(tmp_path) -> Non
                  "'1.234,5' is no number for 'x'", "it has 5 cells, but the header names 4 columns"):  # fmt: skip
         assert part in reasons
     assert "## lines that did not fit: 6, 7, 8, 9, 10\n" in found.text
-    assert found.passed + found.rows + len(found.misfits) == sum(bool(line.strip()) for line in export.split("\n"))
+    assert found.passed + found.rows + len(found.misfits) == sum(
+        bool(line.strip()) for line in export.split("\n")
+    )
 
 
 def test_rotation_matrices_become_quaternions(tmp_path) -> None:
-    R = se3.exp_so3(np.random.default_rng(2).normal(size=(3, 3)))
-    lines = [";".join([f"P{i}", *(f"{v:.5f}" for v in r.ravel()), "1", "2", "3"]) for i, r in enumerate(R)]
+    R = geometry.exp_so3(np.random.default_rng(2).normal(size=(3, 3)))
+    lines = [
+        ";".join([f"P{i}", *(f"{v:.5f}" for v in r.ravel()), "1", "2", "3"])
+        for i, r in enumerate(R)
+    ]
     broken = "B;" + ";".join(["1"] * 9) + ";1;2;3"
     profile = """delimiter: semicolon
 matrix: [2, 3, 4, 5, 6, 7, 8, 9, 10]
@@ -132,14 +156,18 @@ columns: {pose: {from: 1}, x: {from: 11, unit: mm}, y: {from: 12, unit: mm}, z: 
 settings: {kind: pose, orientation: quaternion}
 """
     found = converted(tmp_path, "\n".join([*lines, broken]), profile)
-    assert [reason for _, reason in found.misfits] == ["the nine numbers are no rotation matrix (off by 3)"]
+    assert [reason for _, reason in found.misfits] == [
+        "the nine numbers are no rotation matrix (off by 3)"
+    ]
     cells = np.array([row.split(",") for row in rows_of(found.text)])
-    read = se3.quaternion_to_matrix(cells[:, 1:5].astype(float))
+    read = geometry.quaternion_to_matrix(cells[:, 1:5].astype(float))
     np.testing.assert_allclose(read, R, atol=1e-5)  # the five decimals of the export
 
 
 def test_targets_with_lines_of_their_own_share_a_row_and_repeats_get_another(tmp_path) -> None:
-    profile = PROFILE.replace("{from: Name}", "{from: Name, match: '(?P<pose>P.)-(?P<target>.)'}").replace(
+    profile = PROFILE.replace(
+        "{from: Name}", "{from: Name, match: '(?P<pose>P.)-(?P<target>.)'}"
+    ).replace(
         "kind: position, noise: {x: 1 um, y: 1 um, z: 1 um}", "kind: position, targets: [a, b]"
     )
     lines = ["P1-a;1;1;1", "P1-b;2;2;2", "P1-b;2;2;3", "P2-b;3;3;3", "P2-c;3;3;3"]
@@ -150,21 +178,27 @@ def test_targets_with_lines_of_their_own_share_a_row_and_repeats_get_another(tmp
 
 BAD_EXPORTS = {
     "an empty file": (" \n", "export.txt: this export is empty; export it again"),
-    "a preamble alone": ("Liste\n", "export.txt:1: no line names the columns Name, X, Y, Z, as .*profile.yaml says"),
-    "another header": ("A;B;C\n1;2;3\n", "export.txt:1: no line names the columns Name, X, Y, Z.*the first, has 'A . B . C'"),
+    "a preamble alone": ("Liste\n", ("export.txt:1: no line names the columns Name, X, Y, Z, as "
+                                    ".*profile.yaml says")),
+    "another header": ("A;B;C\n1;2;3\n", ("export.txt:1: no line names the columns Name, X, Y, "
+                                         "Z.*the first, has 'A . B . C'")),
     "other separators": (EXPORT.replace(";", "\t"), "no line names the columns"),
     "numbers of another country": (
         "Name;X;Y;Z\nP1;1.5;2.5;3\n",
-        "export.txt:2: no line of this export fits .*profile.yaml; this one, the first: '1.5' is no number for 'x'",
+        ("export.txt:2: no line of this export fits .*profile.yaml; this one, the first: '1.5' is "
+        "no number for 'x'"),
     ),
     "a header alone": ("Name;X;Y;Z\n", "every line of this export is passed over"),
-    "another encoding": ("Name;X;Y;Z\nø1;1;2;3\n".encode("latin-1"), "export.txt:2: byte 0xf8 is not utf-8.*state 'encoding'"),
+    "another encoding": ("Name;X;Y;Z\nø1;1;2;3\n".encode("latin-1"), ("export.txt:2: byte 0xf8 is "
+                                                                     "not utf-8.*state 'encoding'")),
     "a header twice": ("Name;X;X;Y;Z\nP;1;1;2;3\n", "export.txt:1: two columns are headed 'X'"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", BAD_EXPORTS)
-def test_an_export_that_the_profile_does_not_fit_is_refused_with_its_first_line_and_the_reason(tmp_path, case) -> None:
+def test_an_export_that_the_profile_does_not_fit_is_refused_with_its_first_line_and_the_reason(
+    tmp_path, case
+) -> None:
     export, message = BAD_EXPORTS[case]
     with pytest.raises(FileError, match=message) as caught:
         converted(tmp_path, export)
@@ -173,22 +207,82 @@ def test_an_export_that_the_profile_does_not_fit_is_refused_with_its_first_line_
 
 BAD_PROFILES = {
     "no delimiter": ("delimiter: semicolon\n", "", None, "does not say 'delimiter'"),
-    "an unknown one": ("semicolon", "pipe", 2, "'delimiter' is 'pipe'; write one of comma, semicolon, tab, spaces"),
-    "a comma for two things": ("semicolon", "comma", 3, "a comma cannot be the decimal mark and stand between columns"),
+    "an unknown one": (
+        "semicolon",
+        "pipe",
+        2,
+        "'delimiter' is 'pipe'; write one of comma, semicolon, tab, spaces",
+    ),
+    "a comma for two things": (
+        "semicolon",
+        "comma",
+        3,
+        "a comma cannot be the decimal mark and stand between columns",
+    ),
     "an unknown key": ("decimal", "decimals", 3, "unknown key 'decimals'.*did you mean 'decimal'"),
-    "a column that is none": ("  z:", "  zz:", 8, "'zz' is no column of a measurement file of the kind 'position'"),
-    "a column forgotten": ("  z: {from: Z, unit: mm}\n", "", 4, "does not say where 'z' comes from"),
+    "a column that is none": (
+        "  z:",
+        "  zz:",
+        8,
+        "'zz' is no column of a measurement file of the kind 'position'",
+    ),
+    "a column forgotten": (
+        "  z: {from: Z, unit: mm}\n",
+        "",
+        4,
+        "does not say where 'z' comes from",
+    ),
     "no unit": ("from: Z, unit: mm", "from: Z", 8, "'z' needs the unit of its numbers; add it"),
-    "a unit that is none": ("from: Z, unit: mm", "from: Z, unit: mmm", 8, "'mmm' is no unit.*did you mean 'mm'"),
+    "a unit that is none": (
+        "from: Z, unit: mm",
+        "from: Z, unit: mmm",
+        8,
+        "'mmm' is no unit.*did you mean 'mm'",
+    ),
     "a unit of text": ("from: Name", "from: Name, unit: mm", 5, "'pose' is text and has no unit"),
-    "a place that is none": ("from: Z", "from: 0", 8, "0 is neither a name in the export's header nor a place"),
+    "a place that is none": (
+        "from: Z",
+        "from: 0",
+        8,
+        "0 is neither a name in the export's header nor a place",
+    ),
     "no place": ("{from: Z, unit: mm}", "Z", 8, "'z' needs 'from'"),
-    "a pattern that is none": ("from: Name", "from: Name, match: '('", 5, "is no regular expression"),
-    "a pattern without a pose": ("from: Name", "from: Name, match: 'P.'", 5, "this pattern finds no pose"),
-    "targets that nothing tells": ("position,", "position, targets: [a, b],", 5, "say how 'match' of 'pose' finds"),
-    "an unknown kind": ("position", "positon", 9, "is not a kind of measurement .did you mean 'position'"),
-    "an encoding that is none": ("decimal", "encoding: utf-99\ndecimal", 3, "'utf-99' is no encoding of text that is known"),
-    "a matrix of four": ("decimal", "matrix: [1, 2, 3, 4]\ndecimal", 3, "a matrix has nine columns"),
+    "a pattern that is none": (
+        "from: Name",
+        "from: Name, match: '('",
+        5,
+        "is no regular expression",
+    ),
+    "a pattern without a pose": (
+        "from: Name",
+        "from: Name, match: 'P.'",
+        5,
+        "this pattern finds no pose",
+    ),
+    "targets that nothing tells": (
+        "position,",
+        "position, targets: [a, b],",
+        5,
+        "say how 'match' of 'pose' finds",
+    ),
+    "an unknown kind": (
+        "position",
+        "positon",
+        9,
+        "is not a kind of measurement .did you mean 'position'",
+    ),
+    "an encoding that is none": (
+        "decimal",
+        "encoding: utf-99\ndecimal",
+        3,
+        "'utf-99' is no encoding of text that is known",
+    ),
+    "a matrix of four": (
+        "decimal",
+        "matrix: [1, 2, 3, 4]\ndecimal",
+        3,
+        "a matrix has nine columns",
+    ),
 }
 
 
@@ -202,7 +296,9 @@ def test_a_profile_without_sense_is_refused_at_its_line(tmp_path, case) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_options_that_do_not_go_with_a_profile_and_files_that_are_there_are_refused(tmp_path, monkeypatch, capsys) -> None:
+def test_options_that_do_not_go_with_a_profile_and_files_that_are_there_are_refused(
+    tmp_path, monkeypatch, capsys
+) -> None:
     monkeypatch.chdir(tmp_path)
     converted(tmp_path)
     words = ["import", "export.txt", "--profile", "profile.yaml", "-o", "data.csv"]

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows that a run was fitted to are known again in other files, orders and units, and repeats are not taken for them."""
+"""Rows that a run was fitted to are known again in other files, orders and units, and repeats are
+not taken for them.
+"""
 
 from dataclasses import replace
 
@@ -7,9 +9,9 @@ import numpy as np
 import pytest
 
 from loopcal.errors import DataError
-from loopcal.io.fitted_rows import fitted_rows, seen_before
+from loopcal.io.data.fitted_rows import fitted_rows, seen_before
 from loopcal.measure import Measurements
-from tests.calibrate.problems import hexapod_data
+from tests.estimate.problems import hexapod_data
 
 FITTED = hexapod_data(20)
 STORED = fitted_rows(FITTED)
@@ -37,7 +39,9 @@ def test_a_part_of_the_fitted_rows_is_refused_in_another_order_and_after_roundin
     again = replace(some, observations=(replace(rows, measured=rows.measured * (1.0 + 1e-12)),))
     for data in (some, again):
         with pytest.raises(
-            DataError, match=r"^4 of 4 rows are rows that this run was fitted to .*; give others, or use --flag$"
+            DataError,
+            match=r"^4 of 4 rows are rows that this run was fitted to .*; give others, or use "
+            r"--flag$",
         ):
             seen_before(STORED, data, "--flag")
 
@@ -45,15 +49,24 @@ def test_a_part_of_the_fitted_rows_is_refused_in_another_order_and_after_roundin
 def test_repeats_and_other_rows_are_unseen() -> None:
     rows = FITTED.observations[0]
     sigma = np.sqrt(np.einsum("rii->ri", rows.covariance))
-    noise = 0.1 * sigma * np.random.default_rng(0).standard_normal(rows.measured.shape)  # a tenth of what a repeat has
-    assert seen_before(STORED, replace(FITTED, observations=(replace(rows, measured=rows.measured + noise),))) == ""
+    noise = (
+        0.1 * sigma * np.random.default_rng(0).standard_normal(rows.measured.shape)
+    )  # a tenth of what a repeat has
+    assert (
+        seen_before(
+            STORED, replace(FITTED, observations=(replace(rows, measured=rows.measured + noise),))
+        )
+        == ""
+    )
     assert seen_before(STORED, OTHER) == ""
     assert seen_before({}, FITTED) == ""
 
 
 def test_few_fitted_rows_among_unseen_ones_are_named() -> None:
     found = seen_before(STORED, joined(FITTED.take(np.arange(3)), OTHER))
-    assert found.startswith("3 of 23 rows are rows that this run was fitted to (poses 1, 2, 3), which prove nothing")
+    assert found.startswith(
+        "3 of 23 rows are rows that this run was fitted to (poses 1, 2, 3), which prove nothing"
+    )
 
 
 def test_poses_that_were_left_out_of_the_fit_are_unseen() -> None:

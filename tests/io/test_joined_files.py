@@ -1,13 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several measurement files as one set: poses joined by name, each file with its own units, settings and noise."""
+"""Several measurement files as one set: poses joined by name, each file with its own units,
+settings and noise.
+"""
 
 import numpy as np
 import pytest
 
 from loopcal.errors import LoopcalError
 from loopcal.io import load_measurements, load_robot, save_measurements
-from loopcal.io.measurement_file import measurement_paths
-from loopcal.measure import Component, Gaussian, Inclination, Instrument, Measurements, Observations, Sensor, simulate
+from loopcal.io.data.measurement_file import measurement_paths
+from loopcal.measure import (
+    Component,
+    Gaussian,
+    Inclination,
+    Instrument,
+    Measurements,
+    Observations,
+    Sensor,
+    simulate,
+)
 
 Q = ",".join(f"q{i} [mm]" for i in range(1, 7))
 POSES = f'pose,{Q}\na,0,0,0,0,0,0\nb,1,1,1,1,1,1\n"c, ""third"" #1",2,2,2,2,2,2\nλ1,3,3,3,3,3,3\n'
@@ -52,7 +63,9 @@ def test_a_table_of_poses_and_the_files_of_two_instruments_are_one_set(files, ro
     assert heights.rows.tolist() == [1, 0, 2, 3]
     np.testing.assert_array_equal(heights.measured[:, 0], [0.2011, 0.2, 0.2022, 0.2033])
     assert tilts.rows.tolist() == [1, 4]
-    np.testing.assert_allclose(tilts.measured[:, 0], np.array([10, 20]) * np.pi / 648000, rtol=1e-15)
+    np.testing.assert_allclose(
+        tilts.measured[:, 0], np.array([10, 20]) * np.pi / 648000, rtol=1e-15
+    )
     np.testing.assert_array_equal(tilts.measured[:, 1], [1e-4, 2e-4])
 
 
@@ -73,19 +86,30 @@ def test_a_file_may_name_its_table_of_poses(files, robot) -> None:
 
 
 def test_a_table_of_commanded_poses_may_stand_apart_and_in_other_units(files, robot) -> None:
-    names = [f"commanded.{name}" for name in ("x [mm]", "y [mm]", "z [m]", "roll [deg]", "pitch [deg]", "yaw [mrad]")]
+    names = [
+        f"commanded.{name}"
+        for name in ("x [mm]", "y [mm]", "z [m]", "roll [deg]", "pitch [deg]", "yaw [mrad]")
+    ]
     poses = f"pose,{','.join(names)}\na,0,0,0.2,0,0,0\nb,0,0,0.2011,0,0,0\n"
     again = poses.replace("z [m]", "z [mm]").replace("0.2011", "201.1").replace("0.2,", "200,")
     heights = HEIGHTS.split('"c', maxsplit=1)[0]
     data = load_measurements(files(poses=poses, heights=heights, again=again), robot)
     assert data.labels == ("a", "b")
-    np.testing.assert_allclose(data.readings[0], 0, atol=1e-8)  # [m]: the robot file's numbers have eight digits
-    with pytest.raises(LoopcalError, match=r"again.csv:3: pose 'b' has other readings here than in .*poses.csv:3"):
-        load_measurements(files(poses=poses, heights=heights, again=again.replace("201.1", "201.2")), robot)
+    np.testing.assert_allclose(
+        data.readings[0], 0, atol=1e-8
+    )  # [m]: the robot file's numbers have eight digits
+    with pytest.raises(
+        LoopcalError, match=r"again.csv:3: pose 'b' has other readings here than in .*poses.csv:3"
+    ):
+        load_measurements(
+            files(poses=poses, heights=heights, again=again.replace("201.1", "201.2")), robot
+        )
 
 
 def test_rows_that_compare_poses_may_stand_apart_from_the_poses(files, robot) -> None:
-    lengths = "# kind: separation\n# noise: {separation: 2 um}\npose,separation [mm]\na;b,1.2\nb;λ1,2.4\n"
+    lengths = (
+        "# kind: separation\n# noise: {separation: 2 um}\npose,separation [mm]\na;b,1.2\nb;λ1,2.4\n"
+    )
     data = load_measurements(files(poses=POSES, lengths=lengths), robot)
     assert data.observations[0].rows.tolist() == [[0, 1], [1, 3]]
 
@@ -94,12 +118,20 @@ def test_files_of_any_two_instruments_give_what_one_file_gives(tmp_path, robot) 
     poses = np.random.default_rng(3).uniform([-20, -20, 190], [20, 20, 210], (5, 3)) * 1e-3
     T = np.tile(np.eye(4), (5, 1, 1))
     T[:, :3, 3] = poses
-    sensors = (Sensor(Component(("z",)), Gaussian(np.array([1e-6]))), Sensor(Inclination(), Gaussian(np.full(2, 5e-6))))
+    sensors = (
+        Sensor(Component(("z",)), Gaussian(np.array([1e-6]))),
+        Sensor(Inclination(), Gaussian(np.full(2, 5e-6))),
+    )
     data = simulate(robot, T, Instrument(sensors), seed=2)
     for i, rows in enumerate(data.observations):
-        save_measurements(Measurements(robot.name, data.readings, (rows,)), tmp_path / f"{i}.csv", robot)
+        save_measurements(
+            Measurements(robot.name, data.readings, (rows,)), tmp_path / f"{i}.csv", robot
+        )
     save_measurements(data, tmp_path / "both.csv", robot)
-    one, two = (load_measurements(p, robot) for p in (tmp_path / "both.csv", [tmp_path / "0.csv", tmp_path / "1.csv"]))
+    one, two = (
+        load_measurements(p, robot)
+        for p in (tmp_path / "both.csv", [tmp_path / "0.csv", tmp_path / "1.csv"])
+    )
     np.testing.assert_array_equal(one.readings, two.readings)
     for a, b, original in zip(one.observations, two.observations, data.observations, strict=True):
         np.testing.assert_array_equal(a.measured, b.measured)
@@ -117,20 +149,31 @@ pose,z [mm]
 """
 IN_BLOCKS = {
     "poses": POSES.replace("pose,", "block,pose,").replace("\n", "\n1,", 4),
-    "tilts": TILTS.replace("pose,", "block,pose,").replace("\nb,", "\n2,b,").replace("\nd", "\n2,d"),
+    "tilts": TILTS.replace("pose,", "block,pose,")
+    .replace("\nb,", "\n2,b,")
+    .replace("\nd", "\n2,d"),
 }
 NO_POSES = {"heights": "# poses: p.csv\n" + HEIGHTS}
 REFUSED = {
     "other readings": (
         {"poses": POSES, "tilts": TILTS.replace("b,.001", "b,.0011")},
-        r"tilts.csv:4: pose 'b' has other readings here than in .*poses.csv:3; poses of one name are one pose",
+        (r"tilts.csv:4: pose 'b' has other readings here than in .*poses.csv:3; poses of one name "
+        r"are one pose"),
     ),
-    "readings nowhere": ({"poses": POSES, "heights": HEIGHTS.replace("λ1", "e")}, r"heights.csv:8: there is no pose 'e'"),
-    "no names": ({"poses": POSES, "heights": HEIGHTS.replace("pose,z", "note,z")}, "joined by name, and this one names none"),
-    "no kind at all": ({"poses": POSES, "more": POSES.replace("a,0", "f,0")}, "neither this file nor the others state a kind"),
+    "readings nowhere": ({"poses": POSES, "heights": HEIGHTS.replace("λ1", "e")}, (r"heights.csv:8: "
+                                                                                  r"there is no "
+                                                                                  r"pose 'e'")),
+    "no names": ({"poses": POSES, "heights": HEIGHTS.replace("pose,z", "note,z")}, ("joined by "
+                                                                                   "name, and this "
+                                                                                   "one names none")),
+    "no kind at all": ({"poses": POSES, "more": POSES.replace("a,0", "f,0")}, ("neither this file "
+                                                                              "nor the others "
+                                                                              "state a kind")),
     "a kind forgotten": (
-        {"poses": POSES, "heights": HEIGHTS.replace("# kind: component\n# components: [z]\n# noise: {z: 1 um}\n", "")},
-        r"heights.csv:1: column 'z' is unknown.*states no kind of measurement, so that it only says where poses are",
+        {"poses": POSES, "heights": HEIGHTS.replace("# kind: component\n# components: [z]\n# "
+                                                    "noise: {z: 1 um}\n", "")},
+        (r"heights.csv:1: column 'z' is unknown.*states no kind of measurement, so that it only "
+        r"says where poses are"),
     ),
     "settings of a kind in a table of poses": (
         {"poses": "# noise: {z: 1 um}\n" + POSES, "heights": HEIGHTS},
@@ -146,20 +189,25 @@ REFUSED = {
     ),
     "the same rows in two files": (
         {"poses": POSES, "heights": HEIGHTS, "copy": "## a copy\n" + HEIGHTS},
-        r"'b' and 'b' \(.*heights.csv:5 and .*copy.csv:6\) have the same readings and the same component values",
+        (r"'b' and 'b' \(.*heights.csv:5 and .*copy.csv:6\) have the same readings and the same "
+        r"component values"),
     ),
     "an empty cell of the readings": (
         {"poses": POSES.replace("b,1,", "b,,"), "heights": HEIGHTS},
-        "poses.csv:3: column 'q1' is empty; write its value, or state 'reading_noise' where empty means not read",
+        ("poses.csv:3: column 'q1' is empty; write its value, or state 'reading_noise' where empty "
+        "means not read"),
     ),
-    "another block": (IN_BLOCKS, r"tilts.csv:4: pose 'b' is in block '2' here, but in '1' in .*poses.csv:3"),
+    "another block": (IN_BLOCKS, (r"tilts.csv:4: pose 'b' is in block '2' here, but in '1' in "
+                                 r".*poses.csv:3")),
     "other noise of readings": (
         {"poses": "# reading_noise: 5 um\n" + POSES, "tilts": "# reading_noise: 6 um\n" + TILTS},
         r"tilts.csv:5: pose 'b' has other sigma here than in .*poses.csv:4",
     ),
-    "an empty file": ({"poses": POSES, "heights": "\n"}, "heights.csv: this measurement file is empty"),
+    "an empty file": ({"poses": POSES, "heights": "\n"}, ("heights.csv: this measurement file is "
+                                                         "empty")),
     "a header alone": ({"poses": POSES, "heights": HEIGHTS[: HEIGHTS.index("b,")]}, "heights.csv:4: .* a header but no rows"),
-    "a table of poses that is not there": (NO_POSES, r"heights.csv:1: there is no file .*p.csv, which 'poses' names"),
+    "a table of poses that is not there": (NO_POSES, (r"heights.csv:1: there is no file .*p.csv, "
+                                                     r"which 'poses' names")),
     "a frame stated twice": (
         {"poses": POSES,
          "mo": SPLIT.format("x").replace("# frame", "# unknowns: {x.tracker.x: fixed}\n# frame") + "a,200\nb,201\n",
@@ -185,16 +233,23 @@ def test_a_file_given_twice_is_refused(files, robot) -> None:
         load_measurements([], robot)
 
 
-def test_names_are_joined_whatever_their_unicode_form_line_ends_and_byte_order_mark(files, robot) -> None:
+def test_names_are_joined_whatever_their_unicode_form_line_ends_and_byte_order_mark(
+    files, robot
+) -> None:
     poses, heights = files(poses=POSES.replace("λ1", "é"), heights=HEIGHTS)
-    heights.write_bytes(b"\xef\xbb\xbf" + HEIGHTS.replace("λ1", "e\u0301").replace("\n", "\r\n").encode())
+    heights.write_bytes(
+        b"\xef\xbb\xbf" + HEIGHTS.replace("λ1", "e\u0301").replace("\n", "\r\n").encode()
+    )
     data = load_measurements([poses, heights], robot)
     assert data.labels[-1] == "é"
     assert data.observations[0].rows.tolist() == [1, 0, 2, 3]
 
 
 def test_a_setting_names_the_session_of_a_whole_file(files, robot) -> None:
-    monday, tuesday = SPLIT.format("monday") + "a,200\nb,201\n", SPLIT.format("tuesday") + "λ1,203\n"
+    monday, tuesday = (
+        SPLIT.format("monday") + "a,200\nb,201\n",
+        SPLIT.format("tuesday") + "λ1,203\n",
+    )
     data = load_measurements(files(poses=POSES, mo=monday, tu=tuesday), robot)
     assert [set(rows.session.tolist()) for rows in data.observations] == [{"monday"}, {"tuesday"}]
     assert {name.split(".")[0] for name in data.unknowns.table.names} == {"monday", "tuesday"}

@@ -1,17 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sessions, groups, what is known of frames, noise of readings, times and temperatures come back to the last bit."""
+"""Sessions, groups, what is known of frames, noise of readings, times and temperatures come back to
+the last bit.
+"""
 
 import numpy as np
 import pytest
 
 from loopcal.errors import DataError, LoopcalError
 from loopcal.io import load_measurements, load_robot, save_measurements
-from loopcal.io.measurement_writer import to_fill_in_text
-from loopcal.io.numbers import exact, exactly
-from loopcal.measure import Component, Gaussian, Instrument, Known, Measurements, Observations, Position, Sensor
+from loopcal.io.core.numbers import exact, exactly
+from loopcal.io.data.measurement_writer import to_fill_in_text
+from loopcal.measure import (
+    Component,
+    Gaussian,
+    Instrument,
+    Known,
+    Measurements,
+    Observations,
+    Position,
+    Sensor,
+)
 
 LABELS = ("a", "b,1", 'say "c"', "#d", "λ")
-UNKNOWNS = '{monday.tracker.x: {start: 12 mm, sd: 1 mm}, "*.tracker.r?": {sd: 2 mrad}, ball.x: fixed}'
+UNKNOWNS = (
+    '{monday.tracker.x: {start: 12 mm, sd: 1 mm}, "*.tracker.r?": {sd: 2 mrad}, ball.x: fixed}'
+)
 HEADER = ",".join(["pose,session"] + [f"q{i} [mm]" for i in range(1, 7)] + ["x [mm],y [mm],z [mm]"])
 TEXT = f"""# kind: position
 # targets: [ball]
@@ -40,27 +53,44 @@ def write(folder, text: str):
 def random_measurements(robot, seed: int) -> Measurements:
     """Everything a file can hold, in numbers that use all bits of a double."""
     draw = np.random.default_rng(seed)
-    tracker = Position(targets=("ball",), unknown=("frame", "targets"), frame="tracker").mounted(robot.tool)
+    tracker = Position(targets=("ball",), unknown=("frame", "targets"), frame="tracker").mounted(
+        robot.tool
+    )
     height = Component(("z",)).mounted(robot.tool)
     days = np.array(["monday", "monday", "tuesday", "day, 3", ""])
-    first = Observations.from_sigma(tracker, np.arange(5), draw.normal(size=(5, 3)), 5e-6, session=days)
-    second = Observations.from_sigma(height, np.arange(4), draw.normal(size=(4, 1)), 1e-6, group=np.array(list("xxyy")))
+    first = Observations.from_sigma(
+        tracker, np.arange(5), draw.normal(size=(5, 3)), 5e-6, session=days
+    )
+    second = Observations.from_sigma(
+        height, np.arange(4), draw.normal(size=(4, 1)), 1e-6, group=np.array(list("xxyy"))
+    )
     time = np.array([1.7e9 + 1 / 3, np.nan, *draw.uniform(0, 1e5, 3)])
     first = Observations(first.kind, first.rows, first.measured, first.covariance, session=first.session,
                          context={"time": time, "temperature.frame": 20 + draw.normal(size=5)})  # fmt: skip
-    readings, sigma = draw.uniform(-0.05, 0.05, (5, 6)), np.tile([0.0, 5e-6, 0.0, 0.0, 1e-5 / 3, 0.0], (5, 1))
+    readings, sigma = (
+        draw.uniform(-0.05, 0.05, (5, 6)),
+        np.tile([0.0, 5e-6, 0.0, 0.0, 1e-5 / 3, 0.0], (5, 1)),
+    )
     sigma[:, 2] = draw.uniform(1e-6, 2e-6, 5)
     sigma[1, 3] = sigma[2, 5] = sigma[2, 3] = np.inf
     readings[1, 3] = np.nan
-    known = (Known("monday.tracker.x", 1e-3 / 3, 0.1 + 0.2), Known("tuesday.tracker.rz"), Known("ball.y", 0.0, 1 / 7))
-    return Measurements(robot.name, readings, (first, second), labels=LABELS, reading_sigma=sigma, known=known)
+    known = (
+        Known("monday.tracker.x", 1e-3 / 3, 0.1 + 0.2),
+        Known("tuesday.tracker.rz"),
+        Known("ball.y", 0.0, 1 / 7),
+    )
+    return Measurements(
+        robot.name, readings, (first, second), labels=LABELS, reading_sigma=sigma, known=known
+    )
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_every_column_comes_back_to_the_last_bit(tmp_path, robot, seed) -> None:
     data = random_measurements(robot, seed)
     save_measurements(data, tmp_path / "data.csv", robot)
-    again = load_measurements(tmp_path / "data.csv", robot, allow_still=True, allow_implausible=True)  # numbers drawn at random
+    again = load_measurements(
+        tmp_path / "data.csv", robot, allow_still=True, allow_implausible=True
+    )  # numbers drawn at random
     assert again.labels == data.labels
     assert again.known == data.known
     np.testing.assert_array_equal(again.readings, data.readings)
@@ -80,7 +110,9 @@ def test_every_column_comes_back_to_the_last_bit(tmp_path, robot, seed) -> None:
 @pytest.mark.parametrize("factor", [1.0, 1e-3, 1e-6, 0.0254, np.pi / 180, np.pi / 648000])
 def test_any_double_is_written_so_that_it_is_read_as_itself(factor) -> None:
     draw = np.random.default_rng(1)
-    values = np.concatenate([draw.normal(size=500) * 10.0 ** draw.integers(-15, 6, 500), [0.0, 1.0, 1e-3, 5e-324]])
+    values = np.concatenate(
+        [draw.normal(size=500) * 10.0 ** draw.integers(-15, 6, 500), [0.0, 1.0, 1e-3, 5e-324]]
+    )
     assert all(exact(exactly(float(value), factor), factor) == value for value in values)
     assert exactly(0.2, 1e-3) == "200"
 
@@ -89,7 +121,10 @@ def test_known_unknowns_are_patterns_with_units_and_stay_with_every_part(tmp_pat
     data = load_measurements(write(tmp_path, TEXT), robot)
     table = data.take([0, 1]).unknowns.table
     entry = {e.name: e for e in table.entries}
-    assert (entry["monday.tracker.x"].nominal, entry["monday.tracker.x"].tolerance) == (0.012, 0.001)
+    assert (entry["monday.tracker.x"].nominal, entry["monday.tracker.x"].tolerance) == (
+        0.012,
+        0.001,
+    )
     assert entry["monday.tracker.rx"].tolerance == 0.002
     assert entry["monday.tracker.y"].tolerance is None
     assert not entry["monday.ball.x"].free
@@ -104,19 +139,33 @@ KNOWN_CASES = {
         "no unknown of this file is called 'ball.q'; there are monday.tracker.rx",
     ),
     "no unit": ("sd: 1 mm", "sd: 1", "'sd': '1' has no unit"),
-    "an angle for a length": ("start: 12 mm", "start: 12 mrad", "'start': 'mrad' is a unit of angle, but a length is needed"),
-    "a sigma of nothing": ("sd: 1 mm", "sd: 0 mm", "the standard deviation is 0 mm; give a number above zero"),
+    "an angle for a length": (
+        "start: 12 mm",
+        "start: 12 mrad",
+        "'start': 'mrad' is a unit of angle, but a length is needed",
+    ),
+    "a sigma of nothing": (
+        "sd: 1 mm",
+        "sd: 0 mm",
+        "the standard deviation is 0 mm; give a number above zero",
+    ),
     "a start alone": ("start: 12 mm, sd: 1 mm", "start: 12 mm", "says not or not clearly how well"),
     "fixed and not": ("sd: 1 mm", "sd: 1 mm, fixed: true", "says not or not clearly how well"),
     "a wish": ("ball.x: fixed", "ball.x: free", "this says 'free' of an unknown; write 'fixed'"),
-    "a misspelt key": ("sd: 1 mm", "sd: 1 mm, stat: 3 mm", "unknown key 'stat'.*did you mean 'start'"),
+    "a misspelt key": (
+        "sd: 1 mm",
+        "sd: 1 mm, stat: 3 mm",
+        "unknown key 'stat'.*did you mean 'start'",
+    ),
     "lengths and angles": ("tracker.r?", "tracker.*", "this means lengths and angles together"),
     "a list": (UNKNOWNS, "[ball.x]", "'unknowns' must name unknowns"),
 }
 
 
 @pytest.mark.parametrize("case", KNOWN_CASES)
-def test_a_statement_about_unknowns_without_sense_is_refused_at_its_line(tmp_path, robot, case) -> None:
+def test_a_statement_about_unknowns_without_sense_is_refused_at_its_line(
+    tmp_path, robot, case
+) -> None:
     old, new, message = KNOWN_CASES[case]
     assert old in TEXT
     with pytest.raises(LoopcalError, match=message) as caught:
@@ -135,11 +184,17 @@ c,2,2,2,2,2,2,inf,202.2
 """
 
 
-def test_noise_of_readings_is_read_and_an_empty_cell_is_a_reading_not_taken(tmp_path, robot) -> None:
+def test_noise_of_readings_is_read_and_an_empty_cell_is_a_reading_not_taken(
+    tmp_path, robot
+) -> None:
     data = load_measurements(write(tmp_path, READINGS), robot)
     assert data.reading_sigma is not None
-    np.testing.assert_allclose(data.reading_sigma[:, 0], 5e-6, rtol=1e-15)  # one rounding of 5 * 1e-6
-    np.testing.assert_array_equal(data.reading_sigma[:, 1:5], 0.0)  # stated as exact, and not stated
+    np.testing.assert_allclose(
+        data.reading_sigma[:, 0], 5e-6, rtol=1e-15
+    )  # one rounding of 5 * 1e-6
+    np.testing.assert_array_equal(
+        data.reading_sigma[:, 1:5], 0.0
+    )  # stated as exact, and not stated
     assert data.reading_sigma[:, 5].tolist() == [7e-6, np.inf, np.inf]
     assert np.isnan(data.readings).tolist() == [[False] * 6, [False] * 5 + [True], [False] * 6]
     kept = data.take([2, 1])
@@ -156,7 +211,15 @@ def test_noise_of_readings_is_read_and_an_empty_cell_is_a_reading_not_taken(tmp_
         ("{q1: 5 um, q2: 0 mm}", "5 deg", r"data.csv:4: 'reading_noise': 'deg' is a unit of angle"),
         (",7,", ",-7,", r"data.csv:6: column 'sigma.q6' is below zero"),
         ("sigma.q6 [um]", "sigma.q6", r"data.csv:5: column 'sigma.q6' has no unit"),
-        (",7,", ",,", r"data.csv:6: column 'sigma.q6' is empty, and nothing else says how far this reading is believed"),
+        (
+            ",7,",
+            ",,",
+            (
+                r"data.csv:6: column 'sigma.q6' is empty, and nothing else says how far this "
+                r"reading "
+                r"is believed"
+            ),
+        ),
     ],
 )
 def test_noise_of_readings_without_sense_is_refused(tmp_path, robot, old, new, message) -> None:
@@ -176,17 +239,30 @@ b,,,,1,1,1,1,1,1,201.1
 
 def test_times_and_temperatures_are_kept_through_every_part(tmp_path, robot) -> None:
     data = load_measurements(write(tmp_path, CONTEXT), robot)
-    np.testing.assert_array_equal(data.observations[0].context["time"], [1777890151.5, 1777890152.0, np.nan])  # UTC
+    np.testing.assert_array_equal(
+        data.observations[0].context["time"], [1777890151.5, 1777890152.0, np.nan]
+    )  # UTC
     np.testing.assert_array_equal(data.observations[0].context["temperature"], [20.5, 21.5, np.nan])
     np.testing.assert_array_equal(data.context["temperature"], [21.0, np.nan])
     np.testing.assert_array_equal(data.context["temperature.frame"], [20.0, np.nan])
-    np.testing.assert_array_equal(data.take([0]).observations[0].context["temperature"], [20.5, 21.5])
-    assert data.split(0.5, seed=1)[0].observations[0].context.keys() == {"time", "temperature", "temperature.frame"}
+    np.testing.assert_array_equal(
+        data.take([0]).observations[0].context["temperature"], [20.5, 21.5]
+    )
+    assert data.split(0.5, seed=1)[0].observations[0].context.keys() == {
+        "time",
+        "temperature",
+        "temperature.frame",
+    }
 
 
 def test_what_stands_beside_a_pose_is_taken_by_its_rows_in_other_files(tmp_path, robot) -> None:
-    rows = "\n".join(f"{name},{t},{q},{q},{q},{q},{q},{q}" for name, t, q in (("a", 20, 0), ("b", 22, 1), ("c", "", 2)))
-    (tmp_path / "poses.csv").write_text(f"pose,temperature [degC],{','.join(f'q{i} [mm]' for i in range(1, 7))}\n{rows}\n")
+    rows = "\n".join(
+        f"{name},{t},{q},{q},{q},{q},{q},{q}"
+        for name, t, q in (("a", 20, 0), ("b", 22, 1), ("c", "", 2))
+    )
+    (tmp_path / "poses.csv").write_text(
+        f"pose,temperature [degC],{','.join(f'q{i} [mm]' for i in range(1, 7))}\n{rows}\n"
+    )
     text = "# kind: separation\n# noise: {separation: 2 um}\n# poses: poses.csv\npose,separation [mm]\na;b,1.2\nb;c,1.3\n"
     data = load_measurements(write(tmp_path, text), robot)
     np.testing.assert_array_equal(data.observations[0].context["temperature"], [21.0, np.nan])
@@ -195,20 +271,32 @@ def test_what_stands_beside_a_pose_is_taken_by_its_rows_in_other_files(tmp_path,
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("[degC]", "[mm]", "column 'temperature' has the unit 'mm'; write one of .degC., .K., .degF."),
+        (
+            "[degC]",
+            "[mm]",
+            "column 'temperature' has the unit 'mm'; write one of .degC., .K., .degF.",
+        ),
         (" [degC]", "", "column 'temperature' has no unit"),
-        ("2026-05-04T10:22:31.5", "4.5.2026 10:22", r"data.csv:5: column 'time' is '4.5.2026 10:22' where a date and time"),
+        (
+            "2026-05-04T10:22:31.5",
+            "4.5.2026 10:22",
+            r"data.csv:5: column 'time' is '4.5.2026 10:22' where a date and time",
+        ),
         ("temperature.frame", "temperature.", "column 'temperature.' is unknown"),
         (",20.5,", ",warm,", "column 'temperature' is 'warm' where a number is needed"),
     ],
 )
-def test_times_and_temperatures_without_sense_are_refused(tmp_path, robot, old, new, message) -> None:
+def test_times_and_temperatures_without_sense_are_refused(
+    tmp_path, robot, old, new, message
+) -> None:
     with pytest.raises(LoopcalError, match=message):
         load_measurements(write(tmp_path, CONTEXT.replace(old, new, 1)), robot)
 
 
 @pytest.mark.parametrize("name", ["a;b", "two\nlines", " a", ""])
-def test_a_name_that_a_file_cannot_hold_is_refused_before_anything_is_written(tmp_path, robot, name) -> None:
+def test_a_name_that_a_file_cannot_hold_is_refused_before_anything_is_written(
+    tmp_path, robot, name
+) -> None:
     data = Measurements(robot.name, np.zeros((1, 6)), (), labels=(name,))
     with pytest.raises(DataError, match="cannot be written: names of poses"):
         save_measurements(data, tmp_path / "data.csv", robot)
@@ -231,7 +319,10 @@ def test_a_file_to_fill_in_holds_the_poses_and_becomes_measurements(tmp_path, ro
     assert empty.n_rows == 0
     np.testing.assert_array_equal(empty.readings, readings)
     lines = text.rstrip("\n").split("\n")
-    filled = [line.removesuffix(",,,") + f",1{i},20,200" if line.endswith(",,,") else line for i, line in enumerate(lines)]
+    filled = [
+        line.removesuffix(",,,") + f",1{i},20,200" if line.endswith(",,,") else line
+        for i, line in enumerate(lines)
+    ]
     data = load_measurements(write(tmp_path, "\n".join(filled)), robot)
     assert data.n_rows == 9
     assert set(data.observations[0].session.tolist()) == {"monday"}

@@ -1,15 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurement files: every kind comes back as it was written, and every mistake is one sentence with its line."""
+"""Measurement files: every kind comes back as it was written, and every mistake is one sentence
+with its line.
+"""
 
 import numpy as np
 import pytest
 
 from loopcal.errors import DataError, LoopcalError
 from loopcal.io import load_measurements, load_robot, save_measurements
-from loopcal.io.measurement_file import load_poses
-from loopcal.io.measurement_writer import template_text
-from loopcal.io.sensor_settings import kind_settings
-from loopcal.measure import KINDS, Component, Gaussian, Instrument, Measurements, Observations, Pose, Sensor, simulate
+from loopcal.io.data.measurement_file import load_poses
+from loopcal.io.data.measurement_writer import template_text
+from loopcal.io.data.sensor_settings import kind_settings
+from loopcal.measure import (
+    KINDS,
+    Component,
+    Gaussian,
+    Instrument,
+    Measurements,
+    Observations,
+    Pose,
+    Sensor,
+    simulate,
+)
 from loopcal.mechanism import inverse
 
 EXAMPLES = [kind for cls in KINDS.values() for kind in cls.examples()]
@@ -35,7 +47,9 @@ def sensor(kind) -> Sensor:
 
 
 def assert_same(data, again) -> None:
-    np.testing.assert_allclose(again.readings, data.readings, rtol=1e-15, atol=0)  # one rounding in and out of the unit
+    np.testing.assert_allclose(
+        again.readings, data.readings, rtol=1e-15, atol=0
+    )  # one rounding in and out of the unit
     assert again.block.tolist() == data.block.tolist()
     assert again.labels == data.labels
     for old, new in zip(data.observations, again.observations, strict=True):
@@ -43,11 +57,15 @@ def assert_same(data, again) -> None:
         assert old.rows.tolist() == new.rows.tolist()
         np.testing.assert_allclose(new.measured, old.measured, rtol=1e-15, atol=0)
         scale = np.sqrt(np.einsum("rii,rjj->rij", old.covariance, old.covariance))
-        np.testing.assert_allclose(new.covariance / scale, old.covariance / scale, atol=1e-9)  # the writer's EQUAL
+        np.testing.assert_allclose(
+            new.covariance / scale, old.covariance / scale, atol=1e-9
+        )  # the writer's EQUAL
 
 
 def measured_by(robot, poses, kind) -> Measurements:
-    """Rows of any kind: numbers that no kind doubts, each pose (or each pair of neighbours) seen once."""
+    """Rows of any kind: numbers that no kind doubts, each pose (or each pair of neighbours) seen
+    once.
+    """
     generator = np.random.default_rng(11)
     links = np.arange(len(poses) - kind.links + 1)[:, None] + np.arange(kind.links)
     values = generator.uniform(0.1, 0.2, (len(links), len(kind.columns)))
@@ -62,19 +80,27 @@ def measured_by(robot, poses, kind) -> Measurements:
 
 
 @pytest.mark.parametrize("kind", EXAMPLES, ids=IDS)
-def test_measurements_of_every_kind_come_back_as_they_were_written(tmp_path, robot, poses, kind) -> None:
+def test_measurements_of_every_kind_come_back_as_they_were_written(
+    tmp_path, robot, poses, kind
+) -> None:
     data = measured_by(robot, poses, kind)
     save_measurements(data, tmp_path / "data.csv", robot, "a test")
     loaded = load_measurements(tmp_path / "data.csv", robot, **ANY)
     assert_same(data, loaded)
     for field in kind_settings(type(kind)):
         old, new = (getattr(d.observations[0].kind, field) for d in (data, loaded))
-        same = old == new if isinstance(old, (str, tuple, type(None))) else np.allclose(old, new, rtol=1e-15, atol=1e-15)
+        same = (
+            old == new
+            if isinstance(old, (str, tuple, type(None)))
+            else np.allclose(old, new, rtol=1e-15, atol=1e-15)
+        )
         assert same, field
 
 
 def test_several_kinds_share_a_file(tmp_path, robot, poses) -> None:
-    instrument = Instrument((sensor(Component(("z",))), sensor(Pose("quaternion")), sensor(Component(("x", "z")))))
+    instrument = Instrument(
+        (sensor(Component(("z",))), sensor(Pose("quaternion")), sensor(Component(("x", "z"))))
+    )
     data = simulate(robot, poses, instrument, seed=1)
     save_measurements(data, tmp_path / "data.csv", robot)
     assert_same(data, load_measurements(tmp_path / "data.csv", robot))
@@ -92,7 +118,9 @@ def test_frame_tool_repeats_absence_and_correlated_noise_come_back(tmp_path, rob
     again = np.concatenate([rows.rows, [3]])
     repeated = np.concatenate([measured, measured[3:4] + 1e-7])
     several = Observations(rows.kind, again, repeated, np.concatenate([covariance, covariance[:1]]))
-    data = type(data)(robot.name, data.readings, (several,), np.array([0, 0, 1, 1, 2, 3]), tuple("abcdef"))
+    data = type(data)(
+        robot.name, data.readings, (several,), np.array([0, 0, 1, 1, 2, 3]), tuple("abcdef")
+    )
     save_measurements(data, tmp_path / "data.csv", robot)
     loaded = load_measurements(tmp_path / "data.csv", robot)
     assert_same(data, loaded)
@@ -107,7 +135,13 @@ def test_frame_tool_repeats_absence_and_correlated_noise_come_back(tmp_path, rob
 @pytest.mark.parametrize("kind", EXAMPLES, ids=IDS)
 def test_a_template_lacks_only_the_rows(tmp_path, robot, poses, kind) -> None:
     path = tmp_path / "data.csv"
-    instrument = Instrument((Sensor(kind.mounted(robot.tool), Gaussian(np.linspace(1e-6, 2e-6, len(kind.noise_columns)))),))
+    instrument = Instrument(
+        (
+            Sensor(
+                kind.mounted(robot.tool), Gaussian(np.linspace(1e-6, 2e-6, len(kind.noise_columns)))
+            ),
+        )
+    )
     path.write_text(template_text(robot, instrument))
     with pytest.raises(LoopcalError, match="a header but no rows"):
         load_measurements(path, robot)
@@ -118,7 +152,9 @@ def test_a_template_lacks_only_the_rows(tmp_path, robot, poses, kind) -> None:
     assert "session, group" in template[len(head) :]
     assert full.count("\n") == head.count("\n") + 6 + (5 if kind.links > 1 else 0)
     (tmp_path / "filled.csv").write_text(template + full[len(head) :])
-    assert_same(*(load_measurements(tmp_path / name, robot, **ANY) for name in ("full.csv", "filled.csv")))
+    assert_same(
+        *(load_measurements(tmp_path / name, robot, **ANY) for name in ("full.csv", "filled.csv"))
+    )
 
 
 HEADER = "pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm],z [mm]"
@@ -142,7 +178,9 @@ def test_commanded_coordinates_become_readings_of_the_controller(tmp_path, robot
     text = GOOD.replace(HEADER, f"pose,{names},z [mm]").replace("a,0,0,0,0,0,0", "a,0,0,200,0,0,0")
     text = text.replace("b,1,1,1,1,1,1", "b,0,0,200,0,0,5")
     data = load_measurements(write(tmp_path, text), robot.with_values(robot.values + 1e-3))
-    np.testing.assert_allclose(data.readings[0], 0, atol=1e-8)  # [m]: the file's numbers have eight digits
+    np.testing.assert_allclose(
+        data.readings[0], 0, atol=1e-8
+    )  # [m]: the file's numbers have eight digits
     controller = robot.record.text.replace("lengths: 233.238076", "lengths: 223.238076")
     (tmp_path / "controller.yaml").write_text(controller)
     data = load_measurements(write(tmp_path, "# controller: controller.yaml\n" + text), robot)
@@ -152,8 +190,18 @@ def test_commanded_coordinates_become_readings_of_the_controller(tmp_path, robot
 @pytest.mark.parametrize(
     ("old", "new", "line", "message"),
     [
-        ("# kind: component\n", "", None, "do not say what kind of measurement this is; write '# kind: pose'"),
-        ("component\n", "komponent\n", 1, "'komponent' is not a kind of measurement .did you mean 'component'"),
+        (
+            "# kind: component\n",
+            "",
+            None,
+            "do not say what kind of measurement this is; write '# kind: pose'",
+        ),
+        (
+            "component\n",
+            "komponent\n",
+            1,
+            "'komponent' is not a kind of measurement .did you mean 'component'",
+        ),
         ("[z]", "[q]", 2, "component 'q' is unknown"),
         ("[z]", "[3]", 2, "'components' is .3. where text is needed"),
         ("# components", "# componets", 2, "unknown key 'componets' .did you mean 'components'"),
@@ -165,7 +213,12 @@ def test_commanded_coordinates_become_readings_of_the_controller(tmp_path, robot
         ("# kind", "# format: 9\n# kind", 1, "has format 9"),
         ("z [mm]", "z", 4, "column 'z' has no unit"),
         ("z [mm]", "zz [mm]", 4, "column 'zz' is unknown .did you mean 'z'"),
-        ("q3 [mm]", "note [mm]", 4, "there is no column 'q3'.*which is the reading of an actuator of hexapod-42"),
+        (
+            "q3 [mm]",
+            "note [mm]",
+            4,
+            "there is no column 'q3'.*which is the reading of an actuator of hexapod-42",
+        ),
         ("z [mm]", "commanded.z [mm]", 4, "there are readings .'q1'. and commanded coordinates"),
         ("b,1,", "a,1,", 6, "pose 'a' has other readings here than in line 5"),
         ("b,1,", ",1,", 6, "column 'pose' is empty"),
@@ -184,29 +237,51 @@ def test_a_mistake_is_one_sentence_with_its_line(tmp_path, robot, old, new, line
 
 def test_readings_outside_the_stroke_and_duplicates_need_to_be_allowed(tmp_path, robot) -> None:
     path = write(tmp_path, GOOD.replace("b,1,", "b,90,"))
-    with pytest.raises(DataError, match=r"data.csv: pose 'b': q1 reads 90 mm.*use --allow-outside-stroke"):
+    with pytest.raises(
+        DataError, match=r"data.csv: pose 'b': q1 reads 90 mm.*use --allow-outside-stroke"
+    ):
         load_measurements(path, robot)
     assert load_measurements(path, robot, allow_outside_stroke=True).n_poses == 2
     path = write(tmp_path, GOOD.replace("b,1,1,1,1,1,1,201.1", "b,0,0,0,0,0,0,200"))
-    with pytest.raises(DataError, match=r"'a' and 'b' \(.*:5 and .*:6\) have the same.*use --allow-duplicates"):
+    with pytest.raises(
+        DataError, match=r"'a' and 'b' \(.*:5 and .*:6\) have the same.*use --allow-duplicates"
+    ):
         load_measurements(path, robot)
     assert load_measurements(path, robot, allow_duplicates=True).n_poses == 2
 
 
 def test_sigma_columns_override_the_noise_of_the_settings(tmp_path, robot) -> None:
-    text = GOOD.replace("z [mm]", "z [mm],sigma.z [um]").replace("200\n", "200,\n").replace("201.1", "201.1,3")
+    text = (
+        GOOD.replace("z [mm]", "z [mm],sigma.z [um]")
+        .replace("200\n", "200,\n")
+        .replace("201.1", "201.1,3")
+    )
     data = load_measurements(write(tmp_path, text), robot)
-    np.testing.assert_allclose(np.sqrt(data.observations[0].covariance[:, 0, 0]), [1e-6, 3e-6], rtol=1e-15)
+    np.testing.assert_allclose(
+        np.sqrt(data.observations[0].covariance[:, 0, 0]), [1e-6, 3e-6], rtol=1e-15
+    )
 
 
 def test_poses_are_read_in_the_order_of_the_robots_coordinates(tmp_path, robot) -> None:
     path = write(tmp_path, "yaw [deg],x [mm],y [mm],z [mm],roll [deg],pitch [deg]\n180,1,2,3,0,0\n")
-    np.testing.assert_allclose(load_poses(path, robot), [[1e-3, 2e-3, 3e-3, 0, 0, np.pi]], rtol=1e-15)
+    np.testing.assert_allclose(
+        load_poses(path, robot), [[1e-3, 2e-3, 3e-3, 0, 0, np.pi]], rtol=1e-15
+    )
 
 
-def test_noise_is_stated_by_pattern_and_the_last_that_means_a_column_counts(tmp_path, robot) -> None:
-    text = GOOD.replace("[z]", "[z, x]").replace("z: 1 um", '"*": 2 um, z: 1 um').replace("z [mm]", "z [mm],x [mm]")
-    data = load_measurements(write(tmp_path, text.replace("200\n", "200,0\n").replace("201.1\n", "201.1,0\n")), robot)
-    np.testing.assert_allclose(np.sqrt(np.diagonal(data.observations[0].covariance[0])), [1e-6, 2e-6], rtol=1e-15)
+def test_noise_is_stated_by_pattern_and_the_last_that_means_a_column_counts(
+    tmp_path, robot
+) -> None:
+    text = (
+        GOOD.replace("[z]", "[z, x]")
+        .replace("z: 1 um", '"*": 2 um, z: 1 um')
+        .replace("z [mm]", "z [mm],x [mm]")
+    )
+    data = load_measurements(
+        write(tmp_path, text.replace("200\n", "200,0\n").replace("201.1\n", "201.1,0\n")), robot
+    )
+    np.testing.assert_allclose(
+        np.sqrt(np.diagonal(data.observations[0].covariance[0])), [1e-6, 2e-6], rtol=1e-15
+    )
     with pytest.raises(LoopcalError, match=r"data.csv:3: unknown key 'y\*' in 'noise'"):
         load_measurements(write(tmp_path, GOOD.replace("z: 1 um", '"y*": 1 um')), robot)

@@ -8,8 +8,8 @@ from typing import Literal
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.io.records import read_record, read_units
-from loopcal.io.yaml_file import parse_yaml, read_yaml
+from loopcal.io.core.records import read_record, read_units
+from loopcal.io.core.yaml_file import parse_yaml, read_yaml
 from loopcal.units import Angle, Length, Ratio
 
 Vector = tuple[Length, Length, Length]
@@ -82,7 +82,12 @@ def test_numbers_are_scaled_to_si_and_defaults_are_not() -> None:
         ("- [1, 2, 3]", "- [1]", 7, "'leg.base entry 1' has 1 values where 3 are needed"),
         ("- [1, 2, 3]", "- [1, 2, 3, 4]", 7, "has 4 values where 3 are needed; remove"),
         ("- [1, 2, 3]", "- 5", 7, "is the number 5 where a list is needed"),
-        ("[1, 2, 3]", "[1, '2', 3]", 7, "is the text '2' where a number is needed; write the number without quotes"),
+        (
+            "[1, 2, 3]",
+            "[1, '2', 3]",
+            7,
+            "is the text '2' where a number is needed; write the number without quotes",
+        ),
         ("[1, 2, 3]", "[1, 2mm, 3]", 7, "is the text '2mm' where a number is needed"),
         ("[1, 2, 3]", "[1, nan, 3]", 7, "is the text 'nan' where a number is needed"),
         ("[1, 2, 3]", "[1, .nan, 3]", 7, "is nan; every number must be finite"),
@@ -108,7 +113,9 @@ def test_numbers_are_scaled_to_si_and_defaults_are_not() -> None:
         (GOOD, "- 1\n- 2\n", None, "holds no 'key: value' lines"),
     ],
 )
-def test_what_does_not_fit_is_one_sentence_with_its_line(old: str, new: str, line: int | None, message: str) -> None:
+def test_what_does_not_fit_is_one_sentence_with_its_line(
+    old: str, new: str, line: int | None, message: str
+) -> None:
     with pytest.raises(FileError, match=message) as caught:
         read(GOOD.replace(old, new, 1))
     assert caught.value.line == line
@@ -132,7 +139,9 @@ def test_a_byte_order_mark_is_accepted_and_does_not_shift_lines(tmp_path) -> Non
         (b"a: 1\nb: \0\n", 2, "zero byte"),
     ],
 )
-def test_bytes_that_are_no_text_are_refused(tmp_path, content: bytes, line: int | None, message: str) -> None:
+def test_bytes_that_are_no_text_are_refused(
+    tmp_path, content: bytes, line: int | None, message: str
+) -> None:
     path = tmp_path / "robot.yaml"
     path.write_bytes(content)
     with pytest.raises(FileError, match=message) as caught:

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robot files: shipped robots load, corrected files add one table and nothing else, mistakes name their line."""
+"""Robot files: shipped robots load, corrected files add one table and nothing else, mistakes name
+their line.
+"""
 
 import numpy as np
 import pytest
 
 from loopcal.errors import FileError, LoopcalError, MechanismError
-from loopcal.io.robot_file import load_robot, robot_path, save_robot, shipped_robots
+from loopcal.io.robot.robot_file import load_robot, robot_path, save_robot, shipped_robots
 from loopcal.mechanism import build
 
 HEXAPOD = robot_path("hexapod-42").read_text()
@@ -38,7 +40,9 @@ def test_saving_the_nominal_robot_gives_its_file_back_byte_for_byte(tmp_path, ro
     assert (tmp_path / "copy.yaml").read_text() == HEXAPOD
 
 
-def test_identified_values_are_applied_and_deleting_the_table_restores_the_nominal(tmp_path, robot) -> None:
+def test_identified_values_are_applied_and_deleting_the_table_restores_the_nominal(
+    tmp_path, robot
+) -> None:
     path = tmp_path / "corrected.yaml"
     truth = robot.values + np.random.default_rng(3).normal(0.0, 1e-4, len(robot.values))
     save_robot(robot.with_values(truth), path, np.full(len(truth), 2.5e-7))
@@ -46,7 +50,9 @@ def test_identified_values_are_applied_and_deleting_the_table_restores_the_nomin
     assert text.startswith(HEXAPOD)
     assert "+/-: 0.00025, unit: mm}" in text
     loaded = load_robot(path)
-    np.testing.assert_allclose(loaded.values, truth, rtol=1e-15, atol=0)  # one rounding of value / unit * unit
+    np.testing.assert_allclose(
+        loaded.values, truth, rtol=1e-15, atol=0
+    )  # one rounding of value / unit * unit
     assert np.array_equal(loaded.parameters.nominal, robot.parameters.nominal)
     save_robot(loaded.nominal, tmp_path / "nominal.yaml")
     assert (tmp_path / "nominal.yaml").read_text() == HEXAPOD
@@ -84,7 +90,11 @@ def test_a_robot_that_came_from_no_file_cannot_be_saved(tmp_path, robot) -> None
         ("format: 1\n", "", "states no format; begin it with 'format: 1'"),
         ("format: 1", "format: 2", "format 2, but this loopcal reads formats up to 1"),
         ("format: 1", "format: one", "'format' is 'one' where a whole number is needed"),
-        ("family: gough", "family: guogh", "'guogh' is not a family of robots .*did you mean 'gough'"),
+        (
+            "family: gough",
+            "family: guogh",
+            "'guogh' is not a family of robots .*did you mean 'gough'",
+        ),
         ("family: gough\n", "", "names no family; write 'family:' and one of .*gough"),
         ("units: {length: mm, angle: deg}\n", "", "states no units"),
         ("stroke: [-75, 75]", "strokes: [-75, 75]", "unknown key 'strokes' .did you mean 'stroke'"),
@@ -92,26 +102,47 @@ def test_a_robot_that_came_from_no_file_cannot_be_saved(tmp_path, robot) -> None
         ("[120, -140, 0]", "[120, -140]", "'base entry 1' has 2 values where 3 are needed"),
         ("[120, -140, 0]", "[120, '-140', 0]", "is the text '-140' where a number is needed"),
         ("[120, -140, 0]", "[120, .nan, 0]", "is nan; every number must be finite"),
-        ("home: {z: 200}", "home: {z: 200}\nhome: {z: 200}", "key 'home' stands here for the second time"),
+        (
+            "home: {z: 200}",
+            "home: {z: 200}\nhome: {z: 200}",
+            "key 'home' stands here for the second time",
+        ),
         ("home: {z: 200}", "home: {zz: 200}", "unknown key 'zz' in 'home'"),
-        ("lengths: 233.238076 ", "lengths: long ", "'lengths' is the text 'long' where a number is needed"),
+        (
+            "lengths: 233.238076 ",
+            "lengths: long ",
+            "'lengths' is the text 'long' where a number is needed",
+        ),
         ("legs: rod", "legs: pole", "'legs' is 'pole'.*; allowed: 'rod'"),
     ],
 )
-def test_a_mistake_in_a_robot_file_names_its_line(tmp_path, old: str, new: str, message: str) -> None:
+def test_a_mistake_in_a_robot_file_names_its_line(
+    tmp_path, old: str, new: str, message: str
+) -> None:
     assert old in HEXAPOD
     text = HEXAPOD.replace(old, new, 1)
     with pytest.raises(FileError, match=message) as caught:
         load_robot(write(tmp_path, text))
-    assert caught.value.line == (text[: text.rindex(new)].count("\n") + new.count("\n") + 1 if new else None)
+    assert caught.value.line == (
+        text[: text.rindex(new)].count("\n") + new.count("\n") + 1 if new else None
+    )
 
 
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ("{name: leg1.base.q, value: 1, unit: mm}", "'leg1.base.q' is not a parameter of this robot .did you mean 'leg1.base"),
-        ("{name: leg1.base.x, value: 1, unit: deg}", "the unit of 'leg1.base.x': 'deg' is a unit of angle"),
-        ("{name: leg1.base.x, value: a, unit: mm}", "the value of 'leg1.base.x' is 'a' where a number"),
+        (
+            "{name: leg1.base.q, value: 1, unit: mm}",
+            "'leg1.base.q' is not a parameter of this robot .did you mean 'leg1.base",
+        ),
+        (
+            "{name: leg1.base.x, value: 1, unit: deg}",
+            "the unit of 'leg1.base.x': 'deg' is a unit of angle",
+        ),
+        (
+            "{name: leg1.base.x, value: a, unit: mm}",
+            "the value of 'leg1.base.x' is 'a' where a number",
+        ),
         ("{name: leg1.base.x, value: 1}", "has no 'unit'"),
         ("{name: leg1.base.x, vale: 1, unit: mm}", "unknown key 'vale' .*did you mean 'value'"),
         ("5", "each row of this table must be"),
@@ -130,16 +161,23 @@ def test_parameters_are_fixed_by_name_or_pattern(tmp_path) -> None:
     assert held == ["leg1.base.x", *(f"leg{i}.length" for i in range(1, 7))]
     record = load_robot(tmp_path / "robot.yaml").record.record
     assert build(record.assembly()).parameters == table  # the same robot without its file
-    with pytest.raises(FileError, match=r"'leg1.base.q' fixes no parameter of this robot .did you mean 'leg1.base"):
+    with pytest.raises(
+        FileError, match=r"'leg1.base.q' fixes no parameter of this robot .did you mean 'leg1.base"
+    ):
         load_robot(write(tmp_path, HEXAPOD + "fixed: [leg1.base.q]\n"))
 
 
 def test_a_robot_that_cannot_be_built_names_its_file(tmp_path) -> None:
     path = write(tmp_path, HEXAPOD.replace("  - [120, 140, 0]\n", ""))
-    with pytest.raises(LoopcalError, match=r"robot.yaml: hexapod-42 has 5 base and 6 platform centres"):
+    with pytest.raises(
+        LoopcalError, match=r"robot.yaml: hexapod-42 has 5 base and 6 platform centres"
+    ):
         load_robot(path)
 
 
 def test_a_robot_that_is_nowhere_lists_the_shipped_ones() -> None:
-    with pytest.raises(FileError, match=r"no such robot file .did you mean 'hexapod-42'.*shipped robots: .*hexapod-42"):
+    with pytest.raises(
+        FileError,
+        match=r"no such robot file .did you mean 'hexapod-42'.*shipped robots: .*hexapod-42",
+    ):
         load_robot("hexapod-43")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.io.json_text import to_json
-from loopcal.io.run_folder import MADE_BY, made_by, read_run_folder, write_run_folder
+from loopcal.io.core.json_text import to_json
+from loopcal.io.runs.run_folder import MADE_BY, made_by, read_run_folder, write_run_folder
 from loopcal.units import Dimension
 
 
@@ -27,7 +27,9 @@ def test_what_is_written_is_read_back(tmp_path) -> None:
 
 def test_a_run_is_replaced_only_with_force(tmp_path) -> None:
     write(tmp_path / "run")
-    with pytest.raises(FileError, match="not empty; choose another name, or replace the run in it with --force"):
+    with pytest.raises(
+        FileError, match="not empty; choose another name, or replace the run in it with --force"
+    ):
         write(tmp_path / "run", value=2.5)
     assert read_run_folder(tmp_path / "run").result["value"] == 1.5
     write(tmp_path / "run", force=True, value=2.5)
@@ -67,7 +69,13 @@ def test_what_is_no_run_is_refused(tmp_path) -> None:
 
 
 def test_json_has_null_and_a_reason_where_a_number_is_not_finite() -> None:
-    text = to_json({"rows": [{"sd": math.inf}, {"sd": np.float64(0.5)}], "a": np.array([math.nan]), "d": Dimension.ANGLE})
+    text = to_json(
+        {
+            "rows": [{"sd": math.inf}, {"sd": np.float64(0.5)}],
+            "a": np.array([math.nan]),
+            "d": Dimension.ANGLE,
+        }
+    )
     document = json.loads(text)
     assert document["rows"] == [{"sd": None}, {"sd": 0.5}]
     assert document["d"] == "angle"
@@ -80,5 +88,7 @@ def test_a_run_says_how_it_was_made(tmp_path) -> None:
     data.write_bytes(b"abc")
     origin = made_by(["loopcal", "calibrate"], {"data": data}, {"split": 1})
     assert set(origin) == set(MADE_BY)
-    assert origin["inputs"]["data"]["sha256"].startswith("ba7816bf8f01cfea")  # SHA-256 of "abc", FIPS 180-2 B.1
+    assert origin["inputs"]["data"]["sha256"].startswith(
+        "ba7816bf8f01cfea"
+    )  # SHA-256 of "abc", FIPS 180-2 B.1
     assert set(origin["versions"]) == {"loopcal", "python", "numpy", "scipy"}

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plane and perpendicular line in two forms, surfaces as unknowns and the paper's elimination: one problem.
+"""Plane and perpendicular line in two forms, surfaces as unknowns and the paper's elimination: one
+problem.
 
-Both see the same points of a hexapod: four groups of twelve, reached as a coordinate measuring machine holds coordinates.
+Both see the same points of a hexapod: four groups of twelve, reached as a coordinate measuring
+machine holds coordinates.
 """
 
 from dataclasses import replace
@@ -10,13 +12,14 @@ import numpy as np
 import pytest
 
 import loopcal as lc
-from loopcal.calibrate import MAP, LeastSquares, identifiability, identify
-from loopcal.calibrate.outlook import information
-from loopcal.calibrate.plan.groups import PlaneAndLine, surface_rows
-from loopcal.calibrate.scaling import unknowns
+from loopcal.diagnose import identifiability
+from loopcal.estimate import MAP, LeastSquares, identify
+from loopcal.estimate.outlook import information
+from loopcal.estimate.scaling import unknowns
 from loopcal.papers.cmm_constraint_2011.forms import RANK, covariance_difference, measurements
 from loopcal.papers.cmm_constraint_2011.steps import Layout, PaperRows, identify_from_rows, row_map
 from loopcal.papers.cmm_constraint_2011.study import true_machines
+from loopcal.planning.groups import PlaneAndLine, surface_rows
 
 MM = 1e-3
 NOISE = 1e-6  # [m]
@@ -40,7 +43,11 @@ def exact(layout: Layout) -> np.ndarray:
 
 def test_a_plane_and_a_line_that_name_the_same_surface_share_its_direction(layout) -> None:
     local = measurements(layout, exact(layout)[0], NOISE).unknowns
-    names = {f"plane{g + 1}.held_z.{part}" for g in range(GROUPS) for part in ("u", "v", "height", "a", "b")}
+    names = {
+        f"plane{g + 1}.held_z.{part}"
+        for g in range(GROUPS)
+        for part in ("u", "v", "height", "a", "b")
+    }
     assert set(local.table.names) == names
     assert len(local) == 5 * GROUPS
 
@@ -53,14 +60,18 @@ def test_the_shared_surface_survives_a_measurement_file(layout, tmp_path) -> Non
 
 
 @pytest.mark.slow
-def test_rank_is_33_of_42_in_both_forms_and_the_nine_others_are_motions_of_base_and_platform(layout) -> None:
+def test_rank_is_33_of_42_in_both_forms_and_the_nine_others_are_motions_of_base_and_platform(
+    layout,
+) -> None:
     known = identifiability(layout.robot, measurements(layout, exact(layout)[0], NOISE))
     assert known.rank == 33
     assert known.singular_values[32] > 1e6 * known.singular_values[33]
     meanings = [c.meaning for c in known.unidentifiable]
     assert sum("the whole base" in m for m in meanings) == 6
     assert sum("the whole platform turned about its" in m for m in meanings) == 3
-    rows, _ = PaperRows(layout, exact(layout), MM, NOISE).whitened(np.zeros((1, 42)), np.zeros(1, dtype=int))
+    rows, _ = PaperRows(layout, exact(layout), MM, NOISE).whitened(
+        np.zeros((1, 42)), np.zeros(1, dtype=int)
+    )
     s = np.linalg.svd(rows[0, :, :42], compute_uv=False)
     assert s[33] < 1e-13 * s[0]
     assert s[32] > 1e-7 * s[0]
@@ -78,7 +89,9 @@ def test_the_papers_rows_are_what_no_motion_of_the_surfaces_changes(layout) -> N
         assert np.linalg.matrix_rank(held) == POINTS - 2
 
 
-def test_both_forms_and_the_rows_of_planning_give_every_direction_the_same_variance(layout, planned) -> None:
+def test_both_forms_and_the_rows_of_planning_give_every_direction_the_same_variance(
+    layout, planned
+) -> None:
     assert covariance_difference(layout, NOISE) < 1e-9  # relative, rounding by a condition of 1e4
     free = unknowns(layout.robot)
     R = information(free, measurements(layout, exact(layout)[0], MM))[0][0, :42, :42]
@@ -93,7 +106,9 @@ def test_rows_of_planning_are_those_of_surfaces_as_unknowns_on_other_robots_too(
     design = planned.random(8, 0)
     layout = Layout(robot, planned.coordinates(design))
     free = unknowns(robot)
-    R = information(free, measurements(layout, exact(layout)[0], MM))[0][0, : len(free), : len(free)]
+    R = information(free, measurements(layout, exact(layout)[0], MM))[0][
+        0, : len(free), : len(free)
+    ]
     rows = planned.rows(design).reshape(-1, len(free))
     np.testing.assert_allclose(rows.T @ rows, R.T @ R, atol=1e-9 * np.abs(R.T @ R).max())
 
@@ -117,7 +132,11 @@ def test_both_forms_give_the_same_estimate_up_to_what_is_not_linear(layout, meth
         problem = PaperRows(layout, q, MM, noise)
         paper = problem.values(identify_from_rows(problem, method, 1e-6).deviation)[0]
         found = identify(
-            layout.robot, measurements(layout, q[0], noise), method, rank_tolerance=RANK, allow_fewer_equations=True
+            layout.robot,
+            measurements(layout, q[0], noise),
+            method,
+            rank_tolerance=RANK,
+            allow_fewer_equations=True,
         )
         A = problem.whitened(np.zeros((1, 42)), np.zeros(1, dtype=int))[0][0, :, :42]
         unlike.append(float(np.linalg.norm(A @ (found.robot.values - paper) / MM)))
@@ -129,6 +148,8 @@ def test_both_forms_give_the_same_estimate_up_to_what_is_not_linear(layout, meth
 def test_full_covariance_of_the_papers_rows_is_that_of_drawn_noise(layout) -> None:
     d_1, d = layout.levers
     noise = np.random.default_rng(0).normal(size=(20000, 3 * POINTS)) * NOISE
-    whitened = PaperRows(layout, exact(layout), MM, NOISE).whitener[0] @ row_map(d_1, d)[0] @ noise.T
+    whitened = (
+        PaperRows(layout, exact(layout), MM, NOISE).whitener[0] @ row_map(d_1, d)[0] @ noise.T
+    )
     # an entry of a covariance of 20000 draws has sd sqrt(2 / 20000) = 0.01 on the diagonal; 5 sd
     np.testing.assert_allclose(np.cov(whitened), np.eye(POINTS - 2), atol=0.05)

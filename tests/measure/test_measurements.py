@@ -29,7 +29,9 @@ def of_readings(data):
 
 
 def poses_of(data):
-    """Original indices, after checking that readings, labels, rows and values still belong together."""
+    """Original indices, after checking that readings, labels, rows and values still belong
+    together.
+    """
     original = (data.readings[:, 0] / 2).astype(int)
     assert data.labels == tuple(f"p{i}" for i in original)
     rows = data.observations[0]
@@ -53,7 +55,9 @@ def test_a_split_at_three_quarters_gives_thirty_and_ten_of_forty():
     assert list(poses_of(fit)) == sorted(poses_of(fit))
 
 
-@given(st.lists(st.integers(0, 6), min_size=2, max_size=40), st.floats(0.01, 0.99), st.integers(0, 99))
+@given(
+    st.lists(st.integers(0, 6), min_size=2, max_size=40), st.floats(0.01, 0.99), st.integers(0, 99)
+)
 def test_a_split_keeps_blocks_whole_and_loses_nothing(block, fraction, seed):
     data = heights(len(block), block)
     if len(set(block)) == 1:
@@ -104,10 +108,16 @@ def test_weights_of_poses_reach_their_rows_in_the_same_shape():
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"readings": [[1.0, np.nan], [0.0, 0.0]]}, "readings: row 1, column 2 is nan; give a finite number"),
+        (
+            {"readings": [[1.0, np.nan], [0.0, 0.0]]},
+            "readings: row 1, column 2 is nan; give a finite number",
+        ),
         ({"readings": [1.0, 2.0]}, r"readings has shape \(2,\)"),
         ({"readings": np.empty((0, 2))}, "there is no pose"),
-        ({"readings": [[1.0, 2.0]]}, "row 2 of kind 'component' refers to pose 1, but the 1 poses are 0 to 0"),
+        (
+            {"readings": [[1.0, 2.0]]},
+            "row 2 of kind 'component' refers to pose 1, but the 1 poses are 0 to 0",
+        ),
         ({"block": np.array([1])}, "give one whole number for each pose"),
         ({"labels": ("a",)}, "there are 1 labels for 2 poses"),
     ],
@@ -120,7 +130,9 @@ def test_a_mistake_is_one_sentence(change, sentence):
 
 
 def test_the_sigma_of_readings_follows_their_poses():
-    data = _data_with_sigma([[1e-6, np.inf], [0.0, 2e-6], [3e-6, 3e-6]], [[1.0, np.nan], [2.0, 2.0], [3.0, 3.0]])
+    data = _data_with_sigma(
+        [[1e-6, np.inf], [0.0, 2e-6], [3e-6, 3e-6]], [[1.0, np.nan], [2.0, 2.0], [3.0, 3.0]]
+    )
     assert of_readings(data.take([2, 0])).tolist() == [[3e-6, 3e-6], [1e-6, np.inf]]
     fit, held = data.split(0.6, seed=1)
     assert len(of_readings(fit)) + len(of_readings(held)) == 3

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure import Component, Observations, Pose
 
@@ -27,7 +27,9 @@ def test_the_whitener_is_the_inverse_lower_cholesky_factor():
     W = data.whitener
     expected = np.tril(np.linalg.inv(np.linalg.cholesky(C)))
     size = np.abs(expected).max(axis=2, keepdims=True)
-    assert_allclose(W / size, expected / size, atol=1e-10)  # [1], ulps times a condition of up to 1e5
+    assert_allclose(
+        W / size, expected / size, atol=1e-10
+    )  # [1], ulps times a condition of up to 1e5
     assert_allclose(W @ C @ np.swapaxes(W, 1, 2), np.broadcast_to(np.eye(6), C.shape), atol=1e-10)
 
 
@@ -37,9 +39,12 @@ def test_missing_components_equal_leaving_them_out_of_the_covariance(there, seed
     C = covariances(1, 3, seed)
     measured = np.where(there, np.random.default_rng(seed).normal(size=3), np.nan)[None]
     data = Observations(POINT, np.array([0]), measured, C)
-    T = se3.exp_update(np.eye(4), np.random.default_rng(seed).normal(size=6))[None, None]
+    T = geometry.exp_update(np.eye(4), np.random.default_rng(seed).normal(size=6))[None, None]
     result = data.evaluate(T)
-    white, slopes = data.whitener[0] @ result.residual[0, 0], data.whitener[0] @ result.jacobian[0, 0]
+    white, slopes = (
+        data.whitener[0] @ result.residual[0, 0],
+        data.whitener[0] @ result.jacobian[0, 0],
+    )
     assert_allclose(np.delete(white, here), 0.0, atol=0.0)
     assert_allclose(np.delete(slopes, here, axis=0), 0.0, atol=0.0)
     W = np.linalg.inv(np.linalg.cholesky(C[0][np.ix_(here, here)]))
@@ -60,7 +65,9 @@ def test_a_weight_multiplies_the_square_and_zero_makes_a_row_absent_in_the_same_
     C = covariances(3, 3)
     one = Observations(POINT, np.arange(3), np.zeros((3, 3)), C)
     weighed = one.reweighted([1.0, 0.25, 0.0])
-    assert_allclose(weighed.whitener, one.whitener * np.array([1.0, 0.5, 0.0])[:, None, None], rtol=1e-15)
+    assert_allclose(
+        weighed.whitener, one.whitener * np.array([1.0, 0.5, 0.0])[:, None, None], rtol=1e-15
+    )
     assert (one.n_residuals, weighed.n_residuals) == (9, 6)
 
 
@@ -84,18 +91,39 @@ def test_arrays_are_copies_that_cannot_be_written():
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"measured": np.zeros((2, 4))}, r"measured values of kind 'component' has shape \(2, 4\); give .*\(2, 3\)"),
-        ({"measured": [[1.0, np.inf, 0.0], [0.0] * 3]}, "row 1, column 2 is inf; give a finite number or NaN"),
+        (
+            {"measured": np.zeros((2, 4))},
+            r"measured values of kind 'component' has shape \(2, 4\); give .*\(2, 3\)",
+        ),
+        (
+            {"measured": [[1.0, np.inf, 0.0], [0.0] * 3]},
+            "row 1, column 2 is inf; give a finite number or NaN",
+        ),
         ({"rows": [0.5, 1.0]}, "give whole numbers of shape"),
         ({"rows": [0]}, "has shape"),
-        ({"covariance": np.diag([1.0, 0.0, 1.0])}, "covariance of row 1 has a variance that is not above 0"),
-        ({"covariance": [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}, "row 1 is not positive definite"),
-        ({"covariance": [[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}, "row 1 is not positive definite"),
-        ({"covariance": [[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}, "row 1 is not symmetric"),
+        (
+            {"covariance": np.diag([1.0, 0.0, 1.0])},
+            "covariance of row 1 has a variance that is not above 0",
+        ),
+        (
+            {"covariance": [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]},
+            "row 1 is not positive definite",
+        ),
+        (
+            {"covariance": [[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]},
+            "row 1 is not positive definite",
+        ),
+        (
+            {"covariance": [[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]},
+            "row 1 is not symmetric",
+        ),
         ({"weight": [1.0, -1.0]}, "weight of row 2 is -1; use 0 to leave a row out"),
         ({"weight": [1.0, np.nan]}, "the weight: row 2 is nan"),
         ({"covariance": np.eye(2)}, r"covariance has shape \(2, 2\); give \(2, 3, 3\) or \(3, 3\)"),
-        ({"weight": [1.0, 1.0, 1.0]}, r"the weight has shape \(3,\); give one number for each of 2 rows"),
+        (
+            {"weight": [1.0, 1.0, 1.0]},
+            r"the weight has shape \(3,\); give one number for each of 2 rows",
+        ),
     ],
 )
 def test_a_mistake_is_one_sentence(change, sentence):
@@ -112,7 +140,10 @@ def test_the_row_with_the_broken_covariance_is_named():
 
 
 def test_a_sigma_of_the_wrong_length_names_the_columns():
-    with pytest.raises(DataError, match=r"sigma has shape \(2,\); give one number, or one for each of rx, ry, rz, x, y, z"):
+    with pytest.raises(
+        DataError,
+        match=r"sigma has shape \(2,\); give one number, or one for each of rx, ry, rz, x, y, z",
+    ):
         Observations.from_sigma(POSE, [0], np.zeros((1, 6)), [1.0, 2.0])
     with pytest.raises(DataError, match=r"give \(r, 6\): rx, ry, rz, x, y, z"):
         Observations.from_sigma(POSE, [0], np.zeros((1, 5)), 1.0)

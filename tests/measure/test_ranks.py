@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What each kind can tell of a hexapod's 42 parameters: ranks against counts of what it cannot see.
 
-Six are lost to each unknown frame, three to a point's unknown orientation or to an orientation's unknown place, and so on;
-the numbers were computed beforehand for two hexapods by other code.
+Six are lost to each unknown frame, three to a point's unknown orientation or to an orientation's
+unknown place, and so on; the numbers were computed beforehand for two hexapods by other code.
 """
 
 import numpy as np
 import pytest
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.measure import (
     Autocollimation,
     Bearing,
@@ -29,11 +29,11 @@ from loopcal.measure import (
     simulate_trials,
     whitened_rows,
 )
-from loopcal.mechanism.trials import forward_trials, sensitivity
+from loopcal.mechanism.batch_kinematics import forward_trials, sensitivity
 from tests import zoo
 
 FIVE = ("x", "y", "z", "phi", "theta")
-STATION = se3.pose(np.eye(3), np.array([-2.5, -1.8, 0.1]))
+STATION = geometry.pose(np.eye(3), np.array([-2.5, -1.8, 0.1]))
 FAR = np.array([0.7, -0.4, 0.1])
 POINT = np.array([[0.03, -0.02, 0.05]])
 BOTH = ("frame", "tool")
@@ -47,21 +47,33 @@ CASES = {
     "positions": (Position(places=POINT), 39),
     "positions of an unknown target": (Position(places=POINT, unknown=("targets",)), 36),
     "positions in an unknown frame": (Position(places=POINT, unknown=("frame",)), 33),
-    "positions in an unknown frame, target unknown": (Position(places=POINT, unknown=("frame", "targets")), 30),
+    "positions in an unknown frame, target unknown": (
+        Position(places=POINT, unknown=("frame", "targets")),
+        30,
+    ),
     "three targets": (Position(targets=("a", "b", "c"), places=0.1 * np.eye(3)), 42),
-    "three targets, all unknown": (Position(targets=("a", "b", "c"), places=0.1 * np.eye(3), unknown=("frame", "targets")), 30),
+    "three targets, all unknown": (
+        Position(targets=("a", "b", "c"), places=0.1 * np.eye(3), unknown=("frame", "targets")),
+        30,
+    ),
     "orientation": (Component(("a", "b", "c"), "euler-xyz"), 36),
     "five coordinates": (Component(FIVE, "tilt-torsion"), 41),
     "five coordinates, base unknown": (Component(FIVE, "tilt-torsion", unknown=("frame",)), 35),
     "height and two tilts": (Component(("z", "a", "b"), "euler-xyz"), 39),
     "roll and pitch": (Inclination(), 35),
     "roll and pitch, gravity unknown": (Inclination(unknown=("gravity",)), 33),
-    "roll and pitch, gravity and mounting unknown": (Inclination(unknown=("gravity", "mounting")), 30),
+    "roll and pitch, gravity and mounting unknown": (
+        Inclination(unknown=("gravity", "mounting")),
+        30,
+    ),
     "ball-bar": (Separation(places=POINT), 33),
     "distance to an unknown point": (Distance(places=POINT, anchor=FAR, unknown=("anchor",)), 33),
     "sphere": (Sphere(places=POINT, through=FAR, unknown=("surface",)), 33),
     "bearing": (Bearing(places=POINT, T_base_frame=STATION), 39),
-    "bearing, station unknown": (Bearing(places=POINT, T_base_frame=STATION, unknown=("frame",)), 33),
+    "bearing, station unknown": (
+        Bearing(places=POINT, T_base_frame=STATION, unknown=("frame",)),
+        33,
+    ),
     "plane": (Plane(places=POINT, unknown=("surface",)), 33),
     # gaps a and b across the line are told apart, so a turn about the line is seen
     "line": (Line(places=POINT, along=np.array([0.6, 0.0, 0.8]), unknown=("surface",)), 34),
@@ -83,12 +95,16 @@ def sensors(kind):
 
 
 def singular_values(robot, poses, instrument):
-    """Singular values of the machine's columns, with those of the kind's unknowns projected out, all scaled."""
+    """Singular values of the machine's columns, with those of the kind's unknowns projected out,
+    all scaled.
+    """
     trials = simulate_trials(robot, robot.values, poses, instrument, seed=1, controller=robot)
     data = trials.trial(0)
     state = forward_trials(robot, robot.values[None], data.readings[None])
     D = sensitivity(robot, robot.values[None], data.readings[None], state).parameters
-    rows = whitened_rows(evaluate_all(data, state.T, trials.local.values()[None], trials.local), D)[0]
+    rows = whitened_rows(evaluate_all(data, state.T, trials.local.values()[None], trials.local), D)[
+        0
+    ]
     p = len(robot.parameters)
     machine, own = rows[:, :p], rows[:, p:-1]
     if own.shape[1]:
@@ -112,7 +128,10 @@ def robot():
 @pytest.fixture(scope="module")
 def generic():
     rng = np.random.default_rng(12)
-    low, high = np.array([-0.1, -0.1, 0.65, -0.3, -0.3, -0.3]), np.array([0.1, 0.1, 0.95, 0.3, 0.3, 0.3])
+    low, high = (
+        np.array([-0.1, -0.1, 0.65, -0.3, -0.3, -0.3]),
+        np.array([0.1, 0.1, 0.95, 0.3, 0.3, 0.3]),
+    )
     return zoo.poses_of(rng.uniform(low, high, (len(ALL), 6)))
 
 
@@ -127,19 +146,28 @@ def test_planes_and_perpendicular_lines_touched_at_poses_on_them_tell_33(robot):
     turns = zoo.poses_of(rng.uniform(-0.3, 0.3, (180, 6)))[:, :3, :3]
     points, seen, first = [], [], 0
     for axis in np.eye(3):
-        for touched, kind in ((np.eye(3) - np.outer(axis, axis), Plane), (np.outer(axis, axis), Line)):
+        for touched, kind in (
+            (np.eye(3) - np.outer(axis, axis), Plane),
+            (np.outer(axis, axis), Line),
+        ):
             points.append(np.array([0.0, 0.0, 0.8]) + rng.uniform(-0.1, 0.1, (30, 3)) @ touched)
             through = np.array([0.0, 0.0, 0.8])
-            made = kind(places=POINT, through=through, along=axis, unknown=("surface",), surface=f"surface{first}")
+            made = kind(
+                places=POINT,
+                through=through,
+                along=axis,
+                unknown=("surface",),
+                surface=f"surface{first}",
+            )
             noise = Gaussian(np.full(len(made.noise_columns), 1e-5))
             seen.append(Sensor(made, noise, rows=np.arange(first, first + 30)))
             first += 30
-    poses = se3.pose(turns, np.concatenate(points) - (turns @ POINT[0]))
+    poses = geometry.pose(turns, np.concatenate(points) - (turns @ POINT[0]))
     check_rank(singular_values(robot, poses, Instrument(tuple(seen))), 33)
 
 
 def test_ball_bar_and_tilts_in_one_fit_tell_more_than_each_alone(robot, generic):
     both = Instrument(sensors(Separation(places=POINT)).sensors + sensors(Inclination()).sensors)
-    # the ball-bar leaves six of the base and three of the tool's orientation; level gravity gives two of the base and the
-    # mounting all three of the tool
+    # the ball-bar leaves six of the base and three of the tool's orientation; level gravity gives
+    # two of the base and the mounting all three of the tool
     check_rank(singular_values(robot, generic, both), 38)

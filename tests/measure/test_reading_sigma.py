@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Standard deviations of readings that cannot be meant are refused in a sentence that names the actuator and the unit."""
+"""Standard deviations of readings that cannot be meant are refused in a sentence that names the
+actuator and the unit.
+"""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from loopcal.calibrate import LeastSquares, identify
 from loopcal.errors import DataError
+from loopcal.estimate import LeastSquares, identify
 from loopcal.io import load_robot
 from loopcal.measure import Gaussian, Instrument, Measurements, Position, Sensor, simulate
 from loopcal.mechanism.workspace import sample
@@ -30,22 +32,38 @@ def test_what_is_no_number_is_refused_as_given(given):
 
 def test_a_reading_that_is_not_there_asks_for_an_infinite_sigma():
     with pytest.raises(
-        DataError, match=r"row 1, column 2 is nan; give a finite number, or, where it was not taken, reading_sigma"
+        DataError,
+        match=r"row 1, column 2 is nan; give a finite number, or, where it was not taken, "
+        r"reading_sigma",
     ):
         Measurements("r", [[0.0, np.nan]], ())  # type: ignore[arg-type]
     with pytest.raises(
-        DataError, match=r"pose '1': the sigma 2e-05 \[m or rad\] of reading 2 belongs to a reading that is not"
+        DataError,
+        match=r"pose '1': the sigma 2e-05 \[m or rad\] of reading 2 belongs to a reading that is "
+        r"not",
     ):
-        Measurements("r", [[0.0, np.nan]], (), reading_sigma=0.1 + 0.2 - 0.29998)  # type: ignore[arg-type]
+        Measurements("r", [[0.0, np.nan]], (), reading_sigma=0.1 + 0.2 - 0.29998)  # type: ignore
 
 
 @pytest.mark.parametrize(
     ("name", "sigma", "said"),
     [
-        ("linear-delta", 1e12, r"the sigma 1e\+15 mm of the reading of slide1 in row 1 is beyond .* state inf instead"),
+        (
+            "linear-delta",
+            1e12,
+            r"the sigma 1e\+15 mm of the reading of slide1 in row 1 is beyond .* state inf instead",
+        ),
         ("linear-delta", 1e200, "state inf instead"),
-        ("rotary-delta", 2e6, "in row 1 is beyond anything that such a reading can be off by; state inf instead"),
-        ("linear-delta", -1e-5, r"the sigma -0\.01 mm of the reading of slide1 in row 1 is no standard deviation"),
+        (
+            "rotary-delta",
+            2e6,
+            "in row 1 is beyond anything that such a reading can be off by; state inf instead",
+        ),
+        (
+            "linear-delta",
+            -1e-5,
+            r"the sigma -0\.01 mm of the reading of slide1 in row 1 is no standard deviation",
+        ),
         ("linear-delta", np.nan, "is no standard deviation"),
     ],
 )
@@ -57,14 +75,19 @@ def test_a_sigma_that_says_nothing_is_refused_by_the_name_of_the_actuator(name, 
     if sigma > 0.0:
         robot, data = data_of(name)
         with pytest.raises(DataError, match=said):
-            identify(robot, replace(data, reading_sigma=np.full(data.readings.shape, sigma)), LeastSquares())
+            identify(
+                robot,
+                replace(data, reading_sigma=np.full(data.readings.shape, sigma)),
+                LeastSquares(),
+            )
 
 
 def test_one_exact_reading_among_redundant_ones_is_refused_as_a_limit_of_the_method():
     robot, data = data_of("cable-4")
     exact = replace(data, reading_sigma=np.array([0.0, 1e-3, 1e-3, 1e-3]))
     with pytest.raises(
-        DataError, match="with redundant actuators no reading can be held exactly; state a sigma above 0"
+        DataError,
+        match="with redundant actuators no reading can be held exactly; state a sigma above 0",
     ) as error:
         identify(robot, exact, LeastSquares())
     assert "contradict" not in str(error.value)

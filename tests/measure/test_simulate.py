@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure import (
     Component,
@@ -35,15 +35,23 @@ from tests import zoo
 
 SIGMA = np.array([5e-6, 5e-6, 5e-6, 1e-6, 1e-6, 1e-6])
 COMMANDED = zoo.poses_of(
-    np.random.default_rng(4).uniform(-1.0, 1.0, (12, 6)) * [0.01, 0.01, 0.01, 0.05, 0.05, 0.05] + [0, 0, 0.2, 0, 0, 0]
+    np.random.default_rng(4).uniform(-1.0, 1.0, (12, 6)) * [0.01, 0.01, 0.01, 0.05, 0.05, 0.05]
+    + [0, 0, 0.2, 0, 0, 0]
 )
-TRACKER = Instrument((Sensor(Pose(), Gaussian(SIGMA)), Sensor(Component(("z",)), Uniform(np.array([1e-6])))))
+TRACKER = Instrument(
+    (Sensor(Pose(), Gaussian(SIGMA)), Sensor(Component(("z",)), Uniform(np.array([1e-6]))))
+)
 
 
 @pytest.fixture(scope="module")
 def robot():
     robot = zoo.hexapod()
-    return replace(robot, parameters=ParameterTable(tuple(replace(p, tolerance=5e-5) for p in robot.parameters.entries)))
+    return replace(
+        robot,
+        parameters=ParameterTable(
+            tuple(replace(p, tolerance=5e-5) for p in robot.parameters.entries)
+        ),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +60,12 @@ def truth(robot):
 
 
 def test_commanded_poses_become_the_readings_of_the_controllers_geometry(robot, truth):
-    assert_allclose(readings_from_commanded(robot, COMMANDED), inverse(robot, COMMANDED).q, atol=0.0)
-    assert_allclose(simulate(truth, COMMANDED, TRACKER, seed=1).readings, inverse(robot, COMMANDED).q, atol=0.0)
+    assert_allclose(
+        readings_from_commanded(robot, COMMANDED), inverse(robot, COMMANDED).q, atol=0.0
+    )
+    assert_allclose(
+        simulate(truth, COMMANDED, TRACKER, seed=1).readings, inverse(robot, COMMANDED).q, atol=0.0
+    )
     own = simulate(truth, COMMANDED, TRACKER, seed=1, controller=truth).readings
     assert_allclose(own, inverse(truth, COMMANDED).q, atol=0.0)
 
@@ -71,7 +83,7 @@ def test_a_true_machine_is_seen_where_its_own_geometry_puts_it(robot, truth):
     trials = simulate_trials(robot, truth.values, COMMANDED, TRACKER, seed=1)
     white = (trials.trial(0).observations[0].whitener @ _residual(trials)[..., None])[..., 0]
     assert np.abs(white).max() < 5.0
-    moved = se3.difference(trials.T[0], COMMANDED)
+    moved = geometry.difference(trials.T[0], COMMANDED)
     assert np.abs(moved[:, 3:]).max() > 20 * SIGMA[-1]
     # The rods of the true machine are as long as its readings say.
     assert_allclose(inverse(truth, trials.T[0]).q, trials.readings, atol=1e-12)
@@ -97,20 +109,25 @@ def test_trial_i_is_the_same_in_every_study_and_simulate_is_trial_0(robot):
 
 def test_a_second_sensor_does_not_change_the_noise_of_the_first(robot):
     alone = simulate(robot, COMMANDED, Instrument(TRACKER.sensors[:1]), seed=3)
-    assert np.array_equal(alone.observations[0].measured, simulate(robot, COMMANDED, TRACKER, seed=3).observations[0].measured)
+    assert np.array_equal(
+        alone.observations[0].measured,
+        simulate(robot, COMMANDED, TRACKER, seed=3).observations[0].measured,
+    )
 
 
 def test_true_values_have_the_tolerances_as_standard_deviations(robot):
     drawn = sample_truth(robot, 4000, seed=2)
     scatter = (drawn - robot.parameters.nominal).std(axis=0) / robot.parameters.tolerance
-    # Relative sd of a standard deviation from 4000 draws is 1 / sqrt(8000) = 1.1 %; 42 of them stay within 4.5 of those.
+    # Relative sd of a standard deviation from 4000 draws is 1 / sqrt(8000) = 1.1 %; 42 of them stay
+    # within 4.5 of those.
     assert np.all(np.abs(scatter - 1.0) < 0.05)
 
 
 def test_noise_has_the_spread_it_states():
     for noise in (Gaussian(SIGMA), Uniform(SIGMA)):
         drawn = noise.draw(stream(1, 0), 20000)
-        # 1 / sqrt(40000) = 0.5 % for the normal one, less for the uniform one; six columns within five of those
+        # 1 / sqrt(40000) = 0.5 % for the normal one, less for the uniform one; six columns within
+        # five of those
         assert_allclose(drawn.std(axis=0), noise.sigma, rtol=0.025)
     assert np.all(np.abs(Uniform(SIGMA).draw(stream(1, 0), 20000)) <= SIGMA)
 
@@ -156,14 +173,18 @@ def test_readings_outside_the_stroke_are_refused_by_name_value_and_stroke(robot)
     readings = data.readings.copy()
     readings[3, 1] = high + 0.002
     outside = Measurements(robot.name, readings, data.observations)
-    with pytest.raises(DataError, match=r"pose '4': .* reads .* mm, outside its stroke of .* mm; .* or use --here"):
+    with pytest.raises(
+        DataError, match=r"pose '4': .* reads .* mm, outside its stroke of .* mm; .* or use --here"
+    ):
         check_strokes(outside, robot, override="--here")
     check_strokes(outside, robot, allow=True)
 
 
 def test_readings_of_another_robot_are_refused_with_the_actuators(robot):
     data = Measurements("delta", np.zeros((2, 3)), ())
-    with pytest.raises(DataError, match=f"3 columns, but '{robot.name}' has 6 actuators: {robot.actuators[0].name}"):
+    with pytest.raises(
+        DataError, match=f"3 columns, but '{robot.name}' has 6 actuators: {robot.actuators[0].name}"
+    ):
         check_actuators(data, robot)
 
 
@@ -173,7 +194,9 @@ def test_a_row_given_twice_is_refused():
     once = Measurements("toy", np.array([[1.0], [1.0], [2.0]]), (rows,))
     check_duplicates(once)
     twice = Measurements("toy", np.ones((3, 1)), (rows,))
-    with pytest.raises(DataError, match="poses '1' and '3' have the same readings and the same component values"):
+    with pytest.raises(
+        DataError, match="poses '1' and '3' have the same readings and the same component values"
+    ):
         check_duplicates(twice)
     check_duplicates(twice, allow=True)
 
@@ -184,18 +207,28 @@ def test_true_values_of_unknowns_are_seen_and_unknown_names_are_refused(robot):
     at = {"tracker.x": 1.0, "tracker.rz": np.pi / 2, "ball.z": 0.1}
     data = simulate(robot, COMMANDED, instrument, seed=1, unknowns=at)
     point = (COMMANDED @ [0.0, 0.0, 0.1, 1.0])[:, :3]
-    seen = np.stack([point[:, 1], 1.0 - point[:, 0], point[:, 2]], axis=1)  # turned by a quarter about z, one metre off
+    seen = np.stack(
+        [point[:, 1], 1.0 - point[:, 0], point[:, 2]], axis=1
+    )  # turned by a quarter about z, one metre off
     assert_allclose(data.observations[0].measured, seen, atol=1e-8)
     trials = simulate_trials(robot, robot.values, COMMANDED, instrument, seed=1, unknowns=at)
     assert trials.local.values()[trials.local.table.index("tracker.x")] == 1.0
-    with pytest.raises(DataError, match=r"no unknown of these measurements is called 'traker\.x'.*did you mean 'tracker\.x'"):
+    with pytest.raises(
+        DataError,
+        match=r"no unknown of these measurements is called 'traker\.x'.*did you mean 'tracker\.x'",
+    ):
         simulate(robot, COMMANDED, instrument, seed=1, unknowns={"traker.x": 1.0})
 
 
 def test_rows_may_see_some_poses_compare_two_and_stand_in_sessions(robot):
     pairs = np.array([[0, 5], [3, 1]])
     bar = Sensor(Separation(), Gaussian(np.array([1e-9])), rows=pairs)
-    some = Sensor(Position(), Gaussian(np.full(3, 1e-9)), rows=np.array([2, 2, 7]), session=np.array(["a", "a", "b"]))
+    some = Sensor(
+        Position(),
+        Gaussian(np.full(3, 1e-9)),
+        rows=np.array([2, 2, 7]),
+        session=np.array(["a", "a", "b"]),
+    )
     every = Sensor(Separation(), Gaussian(np.array([1e-9])))
     data = simulate(robot, COMMANDED, Instrument((bar, some, every)), seed=1)
     place = COMMANDED[:, :3, 3]

@@ -8,10 +8,27 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from evidence.starts import AT_FULL_SIZE, DRAWS, KINDS, NOWHERE, draw_poses, measured_at, residuals, start
-from loopcal import se3
+from evidence.starts import (
+    AT_FULL_SIZE,
+    DRAWS,
+    KINDS,
+    NOWHERE,
+    draw_poses,
+    measured_at,
+    residuals,
+    start,
+)
+from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.measure import Direction, Distance, Measurements, Observations, Position, local_unknowns, start_values
+from loopcal.measure import (
+    Direction,
+    Distance,
+    Measurements,
+    Observations,
+    Position,
+    local_unknowns,
+    start_values,
+)
 from loopcal.measure.closed_form import OCTAHEDRAL, trilateration
 
 N = 30
@@ -66,7 +83,10 @@ def test_kinds_that_share_a_frame_start_it_together():
     data, _, truth = measured_at(balls, T, rng)
     axis = Direction(unknown=("frame",))
     seen = axis.measure(T[None], np.zeros((1, N, 2)), truth[None, None, :3])[0]
-    both = replace(data, observations=(Observations.from_sigma(axis, np.arange(N), seen, 1e-5), *data.observations))
+    both = replace(
+        data,
+        observations=(Observations.from_sigma(axis, np.arange(N), seen, 1e-5), *data.observations),
+    )
     local = local_unknowns(both.observations, both.labels)
     assert len(local) == 9
     assert_allclose(residuals(both, T, local, start_values(both, T, local)), 0.0, atol=1e-3)
@@ -75,10 +95,15 @@ def test_kinds_that_share_a_frame_start_it_together():
 def test_sessions_are_started_one_by_one():
     rng = np.random.default_rng(1)
     T = poses(rng)
-    parts = [measured_at(KINDS["targets in a frame"], T[half], rng)[0].observations[0] for half in (slice(0, 15), slice(15, N))]
+    parts = [
+        measured_at(KINDS["targets in a frame"], T[half], rng)[0].observations[0]
+        for half in (slice(0, 15), slice(15, N))
+    ]
     kind = parts[0].kind
     measured = np.concatenate([part.measured for part in parts])
-    rows = Observations.from_sigma(kind, np.arange(N), measured, 1e-5, session=np.repeat(["mon", "tue"], 15))
+    rows = Observations.from_sigma(
+        kind, np.arange(N), measured, 1e-5, session=np.repeat(["mon", "tue"], 15)
+    )
     data = Measurements("toy", np.zeros((N, 1)), (rows,))
     local = local_unknowns(data.observations, data.labels)
     assert len(local) == 2 * 15
@@ -103,10 +128,14 @@ def test_points_in_one_plane_need_a_word_on_the_side():
     T = poses(rng)
     T[:, 2, 3] = 0.8
     data, local, truth = measured_at(Distance(places=NOWHERE, unknown=("anchor",)), T, rng)
-    with pytest.raises(DataError, match=r"'anchor' were all measured in one plane, so it can be on either side"):
+    with pytest.raises(
+        DataError, match=r"'anchor' were all measured in one plane, so it can be on either side"
+    ):
         start_values(data, T, local)
     side = np.array([0.0, 0.0, 0.8 + np.sign(truth[2] - 0.8)])
-    rows = replace(data.observations[0], kind=Distance(places=NOWHERE, unknown=("anchor",), anchor=side))
+    rows = replace(
+        data.observations[0], kind=Distance(places=NOWHERE, unknown=("anchor",), anchor=side)
+    )
     found = start_values(replace(data, observations=(rows,)), T)
     assert_allclose(found, truth, atol=1e-7)
 
@@ -116,15 +145,21 @@ def test_points_on_a_line_leave_a_turn_open_and_are_refused():
     T = poses(rng)
     T[:, :3, 3] = np.array([0.1, 0.2, 0.3]) * np.linspace(0, 1, N)[:, None]
     data, local, _ = measured_at(Position(places=NOWHERE, unknown=("frame",)), T, rng)
-    with pytest.raises(DataError, match=r"the 30 positions lie on a line, about which the frame 'frame' could turn"):
+    with pytest.raises(
+        DataError, match=r"the 30 positions lie on a line, about which the frame 'frame' could turn"
+    ):
         start_values(data, T, local)
 
 
 def test_the_24_rotations_of_a_cube_leave_none_out():
     assert OCTAHEDRAL.shape == (24, 3, 3)
-    assert_allclose(OCTAHEDRAL @ np.swapaxes(OCTAHEDRAL, 1, 2), np.broadcast_to(np.eye(3), (24, 3, 3)), atol=0.0)
+    assert_allclose(
+        OCTAHEDRAL @ np.swapaxes(OCTAHEDRAL, 1, 2), np.broadcast_to(np.eye(3), (24, 3, 3)), atol=0.0
+    )
     quaternion = np.random.default_rng(0).normal(size=(2000, 4))
-    R = se3.quaternion_to_matrix(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))
+    R = geometry.quaternion_to_matrix(
+        quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+    )
     trace = np.einsum("nij,kij->nk", R, OCTAHEDRAL).max(axis=1)
     assert np.rad2deg(np.arccos((trace.min() - 1.0) / 2.0)) < 63.0
 
@@ -132,7 +167,9 @@ def test_the_24_rotations_of_a_cube_leave_none_out():
 def test_trilateration_gives_both_sides_of_a_plane():
     flat = np.random.default_rng(0).uniform(-1, 1, (10, 3)) * [1, 1, 0]
     centre = np.array([0.3, -0.2, 0.7])
-    found, offsets = trilateration(flat, np.linalg.norm(flat - centre, axis=1) + 0.1, with_offset=True)
+    found, offsets = trilateration(
+        flat, np.linalg.norm(flat - centre, axis=1) + 0.1, with_offset=True
+    )
     assert_allclose(np.sort(found[:, 2]), [-0.7, 0.7], atol=1e-9)
     assert_allclose(found[:, :2], np.tile(centre[:2], (2, 1)), atol=1e-9)
     assert_allclose(offsets, 0.1, atol=1e-9)

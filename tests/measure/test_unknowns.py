@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure import (
     Component,
@@ -20,14 +20,20 @@ from loopcal.measure import (
     whitened_rows,
 )
 
-TRACKER = Position(targets=("ball",), places=np.zeros((1, 3)), unknown=("frame", "targets"), frame="tracker")
+TRACKER = Position(
+    targets=("ball",), places=np.zeros((1, 3)), unknown=("frame", "targets"), frame="tracker"
+)
 AXIS = Direction(unknown=("frame",), frame="tracker")
 BED = Plane(unknown=("surface",), places=np.zeros((1, 3)), surface="bed")
 LEVEL = ("0", "1", "2", "3")
 
 
 def rows(kind, count=4, **labels):
-    seen = np.arange(count) if kind.links == 1 else np.stack([np.arange(count), np.roll(np.arange(count), 1)], axis=1)
+    seen = (
+        np.arange(count)
+        if kind.links == 1
+        else np.stack([np.arange(count), np.roll(np.arange(count), 1)], axis=1)
+    )
     measured = np.ones((count, len(kind.columns)))
     if isinstance(kind, Direction):
         measured = np.tile([0.0, 0.0, 1.0], (count, 1))
@@ -37,7 +43,15 @@ def rows(kind, count=4, **labels):
 def test_kinds_that_name_the_same_frame_share_its_unknowns():
     local = local_unknowns([rows(TRACKER), rows(AXIS)], LEVEL)
     turns = ["tracker.rx", "tracker.ry", "tracker.rz"]
-    assert list(local.table.names) == [*turns, "tracker.x", "tracker.y", "tracker.z", "ball.x", "ball.y", "ball.z"]
+    assert list(local.table.names) == [
+        *turns,
+        "tracker.x",
+        "tracker.y",
+        "tracker.z",
+        "ball.x",
+        "ball.y",
+        "ball.z",
+    ]
     assert np.array_equal(local.places[1], np.tile([0, 1, 2], (4, 1)))
 
 
@@ -48,9 +62,18 @@ def test_every_session_and_every_group_has_its_own():
     assert local.table.names[0] == "mon.tracker.rx"
     assert np.array_equal(local.places[0][:, 0], [0, 0, 9, 9])
     groups = local_unknowns([rows(BED, group=np.array(["a", "b", "a", "b"]))], LEVEL)
-    assert groups.table.names == ("a.bed.u", "a.bed.v", "a.bed.height", "b.bed.u", "b.bed.v", "b.bed.height")
+    assert groups.table.names == (
+        "a.bed.u",
+        "a.bed.v",
+        "a.bed.height",
+        "b.bed.u",
+        "b.bed.v",
+        "b.bed.height",
+    )
     assert np.array_equal(groups.places[0][:, 2], [2, 5, 2, 5])
-    both = local_unknowns([rows(BED, session=sessions, group=np.array(["a", "b", "a", "b"]))], LEVEL)
+    both = local_unknowns(
+        [rows(BED, session=sessions, group=np.array(["a", "b", "a", "b"]))], LEVEL
+    )
     assert "mon.a.bed.u" in both.table.names
 
 
@@ -58,8 +81,14 @@ def test_one_name_stated_in_two_ways_is_refused():
     elsewhere = Position(targets=("ball",), places=np.ones((1, 3)), unknown=("targets",))
     with pytest.raises(DataError, match=r"states the unknown 'ball.x' as 1 .*another one as 0"):
         local_unknowns([rows(TRACKER), rows(elsewhere)], LEVEL)
-    turned = Direction(unknown=("frame",), frame="tracker", T_base_frame=se3.pose(se3.axis_rotation(0.1, 0), np.zeros(3)))
-    with pytest.raises(DataError, match=r"counts the unknowns of 'tracker' from another orientation"):
+    turned = Direction(
+        unknown=("frame",),
+        frame="tracker",
+        T_base_frame=geometry.pose(geometry.axis_rotation(0.1, 0), np.zeros(3)),
+    )
+    with pytest.raises(
+        DataError, match=r"counts the unknowns of 'tracker' from another orientation"
+    ):
         local_unknowns([rows(TRACKER), rows(turned)], LEVEL)
     clash = Position(targets=("frame",), places=np.zeros((1, 3)), unknown=("frame", "targets"))
     with pytest.raises(DataError, match=r"calls two unknowns 'frame\.x'"):
@@ -74,7 +103,9 @@ def test_priors_fixed_values_and_values_by_name():
     assert local.values({"tracker.y": 2.0})[4] == 2.0
     assert local.matching({"tracker.y": 2.0, "other.x": 1.0})[4] == 2.0
     assert local.starting_at(np.arange(9.0)).table.nominal[8] == 8.0
-    with pytest.raises(DataError, match=r"no unknown of these measurements is called 'traker.x'.*tracker.x"):
+    with pytest.raises(
+        DataError, match=r"no unknown of these measurements is called 'traker.x'.*tracker.x"
+    ):
         local.values({"traker.x": 1.0})
     with pytest.raises(DataError, match="no unknown of these measurements is called"):
         local.fixed("camera.*")
@@ -84,15 +115,19 @@ def test_priors_fixed_values_and_values_by_name():
 
 def test_all_rows_stand_in_one_matrix_with_every_unknown_in_its_column():
     rng = np.random.default_rng(3)
-    T = se3.exp_update(np.eye(4), rng.uniform(-0.3, 0.3, (2, 4, 6)))
-    parts = (rows(TRACKER, session=np.array(["a", "a", "b", "b"])), rows(Separation(places=np.ones((1, 3)))), rows(AXIS))
+    T = geometry.exp_update(np.eye(4), rng.uniform(-0.3, 0.3, (2, 4, 6)))
+    parts = (
+        rows(TRACKER, session=np.array(["a", "a", "b", "b"])),
+        rows(Separation(places=np.ones((1, 3)))),
+        rows(AXIS),
+    )
     data = Measurements("toy", np.zeros((4, 1)), parts)
     local = local_unknowns(parts, data.labels).fixed("a.ball.x")
     values = local.values() + rng.uniform(-0.1, 0.1, len(local))
     D = rng.normal(size=(1, 4, 6, 5))
 
     def white(machine, step):
-        moved = se3.exp_update(T, (D @ machine)[..., :])
+        moved = geometry.exp_update(T, (D @ machine)[..., :])
         return whitened_rows(evaluate_all(data, moved, (values + step)[None], local), D)
 
     found = white(np.zeros(5), np.zeros(len(local)))
@@ -104,17 +139,23 @@ def test_all_rows_stand_in_one_matrix_with_every_unknown_in_its_column():
         step[column] = 1e-6
         difference = (white(step[:5], step[5:]) - white(-step[:5], -step[5:]))[..., -1] / 2e-6
         fixed = column - 5 == local.table.index("a.ball.x")
-        # [1 / SI] over whitened residuals of size 1e3: second derivatives times the step, and rounding over it
+        # [1 / SI] over whitened residuals of size 1e3: second derivatives times the step, and
+        # rounding over it
         assert_allclose(found[..., column], 0.0 if fixed else difference, atol=2e-4)
 
 
 def test_rows_of_weight_zero_and_absent_components_are_zero_in_the_same_shape():
     measured = np.ones((4, 3))
     measured[1, 2] = np.nan
-    part = Observations.from_sigma(TRACKER, np.arange(4), measured, 1e-3).reweighted([1.0, 1.0, 0.0, 1.0])
+    part = Observations.from_sigma(TRACKER, np.arange(4), measured, 1e-3).reweighted(
+        [1.0, 1.0, 0.0, 1.0]
+    )
     data = Measurements("toy", np.zeros((4, 1)), (part,))
     T = np.broadcast_to(np.eye(4), (1, 4, 4, 4))
-    found = whitened_rows(evaluate_all(data, T, local_unknowns([part], data.labels).values()[None]), np.zeros((1, 4, 6, 2)))
+    found = whitened_rows(
+        evaluate_all(data, T, local_unknowns([part], data.labels).values()[None]),
+        np.zeros((1, 4, 6, 2)),
+    )
     empty = ~found[0].any(axis=1)
     assert found.shape == (1, 12, 2 + 9 + 1)
     assert np.flatnonzero(empty).tolist() == [5, 6, 7, 8]

@@ -10,13 +10,14 @@ from numpy.testing import assert_allclose
 from loopcal.errors import DataError, MechanismError
 from loopcal.io import load_robot
 from loopcal.mechanism import build, coordinates, forward, inverse, states
-from loopcal.mechanism.assembly_modes import assembly_modes, working_modes
 from loopcal.mechanism.families.gough import Gough
+from loopcal.mechanism.modes import assembly_modes, working_modes
 from loopcal.mechanism.records import Pose
 from tests import zoo
 
 # P. Dietmaier, "The Stewart-Gough platform of general geometry can have 40 real postures" (1998,
-# doi:10.1007/978-94-015-9064-8_1); numbers as in the tests of Drake's global inverse kinematics. Dimensionless.
+# doi:10.1007/978-94-015-9064-8_1); numbers as in the tests of Drake's global inverse kinematics.
+# Dimensionless.
 DIETMAIER_BASE = (
     (0.0, 0.0, 0.0),
     (1.107915, 0.0, 0.0),
@@ -38,7 +39,13 @@ DIETMAIER_LENGTHS = (1.0, 0.645275, 1.086284, 1.503439, 1.281933, 0.771071)
 
 def dietmaier():
     home = Pose(z=0.8, roll=0.3, pitch=0.2, yaw=0.5)
-    record = Gough("dietmaier", base=DIETMAIER_BASE, platform=DIETMAIER_PLATFORM, lengths=DIETMAIER_LENGTHS, home=home)
+    record = Gough(
+        "dietmaier",
+        base=DIETMAIER_BASE,
+        platform=DIETMAIER_PLATFORM,
+        lengths=DIETMAIER_LENGTHS,
+        home=home,
+    )
     return build(record.expand())
 
 
@@ -58,24 +65,35 @@ def test_dietmaiers_hexapod_has_forty_modes(seed):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("robot", "coordinates", "modes", "above"),
-    [(zoo.hexapod, (0.013, -0.007, 0.205, 0.05, -0.08, 0.11), 8, 4), (zoo.nategh, (0.03, -0.02, 0.8, 0.1, -0.05, 0.15), 16, 8)],
+    [
+        (zoo.hexapod, (0.013, -0.007, 0.205, 0.05, -0.08, 0.11), 8, 4),
+        (zoo.nategh, (0.03, -0.02, 0.8, 0.1, -0.05, 0.15), 16, 8),
+    ],
 )
-def test_hexapods_with_plane_base_and_platform_have_as_many_modes_above_as_below(robot, coordinates, modes, above):
+def test_hexapods_with_plane_base_and_platform_have_as_many_modes_above_as_below(
+    robot, coordinates, modes, above
+):
     machine = robot()
     at = inverse(machine, np.array(coordinates))
     found = assembly_modes(machine, at.q[0])
     assert (len(found), int((found.solution.T[:, 2, 3] > 0).sum())) == (modes, above)
-    assert np.abs(found.solution.T - at.T).max(axis=(1, 2)).min() < 1e-9  # the pose it came from is among them
+    assert (
+        np.abs(found.solution.T - at.T).max(axis=(1, 2)).min() < 1e-9
+    )  # the pose it came from is among them
 
 
-@pytest.mark.parametrize(("name", "modes"), [("five-bar", 2), ("linear-delta", 2), ("rotary-delta", 2), ("cable-4", 1)])
+@pytest.mark.parametrize(
+    ("name", "modes"), [("five-bar", 2), ("linear-delta", 2), ("rotary-delta", 2), ("cable-4", 1)]
+)
 def test_known_machines_have_as_many_assembly_modes_as_spheres_or_circles_meet(name, modes):
     robot = load_robot(name)
     at = inverse(robot, robot.home[None])
     assert len(assembly_modes(robot, at.q[0], quiet=4096)) == modes
 
 
-@pytest.mark.parametrize(("name", "modes"), [("five-bar", 4), ("3-rrr", 8), ("rotary-delta", 8), ("3-prs", 8)])
+@pytest.mark.parametrize(
+    ("name", "modes"), [("five-bar", 4), ("3-rrr", 8), ("rotary-delta", 8), ("3-prs", 8)]
+)
 def test_each_limb_with_one_drive_doubles_the_working_modes(name, modes):
     robot = load_robot(name)
     target = inverse(robot, robot.home[None])
@@ -121,7 +139,9 @@ def test_a_wrong_number_of_readings_is_refused():
 @pytest.mark.parametrize("stroke", [None, (5.0, 11.0)])
 def test_working_modes_have_readings_within_a_turn_and_start_with_the_one_at_home(stroke):
     assembly = zoo.five_bar().assembly
-    robot = build(replace(assembly, actuators=tuple(replace(a, stroke=stroke) for a in assembly.actuators)))
+    robot = build(
+        replace(assembly, actuators=tuple(replace(a, stroke=stroke) for a in assembly.actuators))
+    )
     found = working_modes(robot, target_of(robot))
     low, high = stroke or (-np.pi, np.pi)
     home = inverse(robot, robot.home[None]).q[0]

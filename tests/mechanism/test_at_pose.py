@@ -1,19 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Redundant actuators with the pose given: readings and passive joints follow it and the parameters, against differences."""
+"""Redundant actuators with the pose given: readings and passive joints follow it and the
+parameters, against differences.
+"""
 
 import numpy as np
 from numpy.testing import assert_allclose
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.mechanism import Joint, Limb, Link, Status, build, forward, inverse
-from loopcal.mechanism.at_pose import moves_at_pose, solve_at_pose
-from loopcal.mechanism.passive import passive_sensitivity
+from loopcal.mechanism.passive_joints import passive_sensitivity
+from loopcal.mechanism.pose_driven import moves_at_pose, solve_at_pose
 from tests import zoo
 from tests.jacobians import check_jacobian
 
 
 def planar_with_four_arms():
-    """A planar platform on four arms with two passive joints each, all lengths and offsets parameters."""
+    """A planar platform on four arms with two passive joints each, all lengths and offsets
+    parameters.
+    """
     limbs = []
     for i, angle in enumerate(np.deg2rad((80.0, 170.0, 260.0, 350.0)), start=1):
         axis = np.array((np.cos(angle), np.sin(angle), 0.0))
@@ -21,7 +25,9 @@ def planar_with_four_arms():
                  Link("rod", zoo.place((0.17, 0, 0))))  # fmt: skip
         joints = (Joint("motor", "R", f"q{i}", start=2.2), Joint("elbow", "R", start=1.7))
         limbs.append(Limb(f"arm{i}", links, joints, "ball", Link("corner", zoo.place(0.06 * axis))))
-    return build(zoo.assembled("4-RRR", tuple(limbs), ("rz", "x", "y"), ("x", "y", "yaw"), np.eye(4)))
+    return build(
+        zoo.assembled("4-RRR", tuple(limbs), ("rz", "x", "y"), ("x", "y", "yaw"), np.eye(4))
+    )
 
 
 def standing(robot, seed=0):
@@ -52,7 +58,12 @@ def test_readings_and_passive_joints_follow_pose_and_parameters_as_differences_s
     moved[range(3), list(freedoms)] = 1.0
 
     def joints(x):  # one trial a parameter or freedom
-        at = np.concatenate([np.tile(T, (p, 1, 1, 1)), se3.exp_update(np.tile(T, (3, 1, 1, 1)), x[0] * moved[:, None])])
+        at = np.concatenate(
+            [
+                np.tile(T, (p, 1, 1, 1)),
+                geometry.exp_update(np.tile(T, (3, 1, 1, 1)), x[0] * moved[:, None]),
+            ]
+        )
         every = np.concatenate([values + x[0] * np.eye(p), np.tile(values, (3, 1))])
         new, readings = solve_at_pose(robot, every, at, state)
         elbows = np.concatenate([new.joints[0][:, 0, k, 1:2] for k in range(4)], axis=1)
@@ -60,7 +71,14 @@ def test_readings_and_passive_joints_follow_pose_and_parameters_as_differences_s
 
     both = [np.concatenate(parts, axis=-1)[0, 0] for parts in (found.readings, found.passive)]
     expected = np.concatenate(both).T[..., None]
-    check_jacobian(joints, expected, np.zeros(1), scale=0.1, atol=1e-6, atol_reason="closure to 1e-13, step 1e-4")
+    check_jacobian(
+        joints,
+        expected,
+        np.zeros(1),
+        scale=0.1,
+        atol=1e-6,
+        atol_reason="closure to 1e-13, step 1e-4",
+    )
 
 
 def test_along_consistent_readings_pose_and_readings_say_the_same():
@@ -68,6 +86,8 @@ def test_along_consistent_readings_pose_and_readings_say_the_same():
     values, _, state, q = standing(robot)
     found = moves_at_pose(robot, values, q, state)
     by_reading = passive_sensitivity(robot, values, q, state)
-    turned = by_reading.readings[0, 0] @ found.readings[1][0, 0]  # passive by readings, readings by pose
+    turned = (
+        by_reading.readings[0, 0] @ found.readings[1][0, 0]
+    )  # passive by readings, readings by pose
     assert_allclose(turned, found.passive[1][0, 0], atol=1e-9)  # [rad/m]
     assert inverse(robot, np.zeros((1, 3))).converged.all()

@@ -9,9 +9,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.errors import MechanismError
+from loopcal.geometry import inverse as back
 from loopcal.mechanism import Joint, Limb, Link, build, forward, inverse
-from loopcal.mechanism.assembly_modes import assembly_modes
-from loopcal.se3 import inverse as back
+from loopcal.mechanism.modes import assembly_modes
 from tests import zoo
 
 HOME = zoo.place((0.01, -0.02, 0.25), (0.05, -0.08, 0.1))
@@ -44,21 +44,34 @@ def sps(i, apart=0.0):
     F, length = leg_frame(i)
     top = F @ zoo.place((0, 0, length))
     askew = zoo.place((0, 0, 0), (0.3, 0.2, 0))
-    frames = [F @ ABOUT_X @ zoo.place((0, apart, 0)), F @ ABOUT_Y, F @ askew @ zoo.place((apart, 0, 0)), F]
+    frames = [
+        F @ ABOUT_X @ zoo.place((0, apart, 0)),
+        F @ ABOUT_Y,
+        F @ askew @ zoo.place((apart, 0, 0)),
+        F,
+    ]
     frames += [top @ ABOUT_X, top @ ABOUT_Y, top @ askew]
-    joints = tuple(Joint(f"j{n}", k, f"q{i + 1}" if k == "P" else None) for n, k in enumerate("RRRPRRR", start=1))
+    joints = tuple(
+        Joint(f"j{n}", k, f"q{i + 1}" if k == "P" else None)
+        for n, k in enumerate("RRRPRRR", start=1)
+    )
     return through(f"leg{i + 1}", frames, joints, zoo.HEXAPOD_PLATFORM[i] * zoo.MM)
 
 
 def universal(i, loose):
-    """Leg RRRPRR with its third axis along the slide; `loose`: the axis behind the slide is along it too, else askew."""
+    """Leg RRRPRR with its third axis along the slide; `loose`: the axis behind the slide is along
+    it too, else askew.
+    """
     F, length = leg_frame(i)
     middle = F @ zoo.place((0, 0, length / 2))
     if not loose:
         middle = middle @ zoo.place((0.02, 0.01, 0), (0.4, -0.5, 0))
     askew = F @ zoo.place((0.01, -0.02, length), (0.9, 0.3, 0.2))
     frames = [F @ ABOUT_X, F @ ABOUT_Y, F, F, middle, askew]
-    joints = tuple(Joint(f"j{n}", k, f"q{i + 1}" if k == "P" else None) for n, k in enumerate("RRRPRR", start=1))
+    joints = tuple(
+        Joint(f"j{n}", k, f"q{i + 1}" if k == "P" else None)
+        for n, k in enumerate("RRRPRR", start=1)
+    )
     return through(f"leg{i + 1}", frames, joints, zoo.HEXAPOD_PLATFORM[i] * zoo.MM)
 
 
@@ -71,7 +84,9 @@ def test_a_limb_with_its_own_geometry_is_judged_on_its_own_in_any_order(odd):
     limbs = [sps(i, 0.02 if i == odd else 0.0) for i in range(6)]
     said = set()
     for shift in range(6):
-        with pytest.raises(MechanismError, match=f"limb 'leg{odd + 1}' has 7 joints, but 6 closure equations") as error:
+        with pytest.raises(
+            MechanismError, match=f"limb 'leg{odd + 1}' has 7 joints, but 6 closure equations"
+        ) as error:
             build(machine(np.roll(np.array(limbs, dtype=object), shift)))
         said.add(str(error.value))
     assert len(said) == 1
@@ -80,19 +95,29 @@ def test_a_limb_with_its_own_geometry_is_judged_on_its_own_in_any_order(odd):
 def test_the_order_of_limbs_that_differ_in_rank_changes_nothing():
     limbs = [universal(i, loose=i == 2) for i in range(5)]
     orders = [(0, 1, 2, 3, 4), (2, 0, 1, 3, 4), (4, 3, 1, 0, 2)]
-    robots = [build(machine([limbs[i] for i in order], ("x", "y", "z", "roll", "pitch"))) for order in orders]
+    robots = [
+        build(machine([limbs[i] for i in order], ("x", "y", "z", "roll", "pitch")))
+        for order in orders
+    ]
     target = np.array([[0.012, -0.018, 0.252, 0.06, -0.07]])
     poses = [inverse(robot, target) for robot in robots]
     for robot, found in zip(robots, poses, strict=True):
         assert found.converged.all()
         assert_allclose(found.T, poses[0].T, atol=1e-12)
         assert_allclose(forward(robot, found.q).T, found.T, atol=1e-11)
-        held = [(limb, j) for g in robot.program.groups for limb in g.limbs for j, h in enumerate(g.held) if h]
+        held = [
+            (limb, j)
+            for g in robot.program.groups
+            for limb in g.limbs
+            for j, h in enumerate(g.held)
+            if h
+        ]
         (limb, joint), (note,) = held[0], robot.notes
         assert len(held) == 1
         assert note == (
             "limb leg3 can spin about itself without moving the platform; "
-            f"its joint {robot.assembly.limbs[limb].joints[joint].name} is held at 0 rad, which changes no pose"
+            f"its joint {robot.assembly.limbs[limb].joints[joint].name} is held at 0 rad, which "
+            "changes no pose"
         )
 
 
@@ -100,7 +125,10 @@ def test_what_the_note_says_of_a_held_joint_is_true():
     limbs = [universal(i, loose=i == 2) for i in range(5)]
     robot = build(machine(limbs, ("x", "y", "z", "roll", "pitch")))
     joint = robot.notes[0].split("its joint ")[1].split()[0]
-    turned = replace(limbs[2], joints=tuple(replace(j, start=0.4) if j.name == joint else j for j in limbs[2].joints))
+    turned = replace(
+        limbs[2],
+        joints=tuple(replace(j, start=0.4) if j.name == joint else j for j in limbs[2].joints),
+    )
     other = build(machine([*limbs[:2], turned, *limbs[3:]], ("x", "y", "z", "roll", "pitch")))
     assert f"joint {joint} is held at 0.4 rad" in other.notes[0]
     q = inverse(robot, np.array([[0.012, -0.018, 0.252, 0.06, -0.07]])).q
@@ -113,8 +141,17 @@ def planar(freedoms):
     for i, angle in enumerate(np.deg2rad((90.0, 210.0, 330.0)), start=1):
         out = np.array((np.cos(angle), np.sin(angle), 0.0))
         base, hand = Link("base", zoo.place(0.3 * out, (0, 0, angle))), Link("hand", np.eye(4))
-        links = (base, Link("crank", zoo.place((0.15, 0, 0))), Link("rod", zoo.place((0.17, 0, 0))), hand)
-        joints = (Joint("motor", "R", f"q{i}", start=2.2), Joint("elbow", "R", start=1.7), Joint("wrist", "R", start=-0.5))
+        links = (
+            base,
+            Link("crank", zoo.place((0.15, 0, 0))),
+            Link("rod", zoo.place((0.17, 0, 0))),
+            hand,
+        )
+        joints = (
+            Joint("motor", "R", f"q{i}", start=2.2),
+            Joint("elbow", "R", start=1.7),
+            Joint("wrist", "R", start=-0.5),
+        )
         limbs.append(Limb(f"arm{i}", links, joints, "rigid", Link("corner", zoo.place(0.06 * out))))
     return build(zoo.assembled("3-RRR", tuple(limbs), freedoms, ("x", "y", "yaw"), np.eye(4)))
 
@@ -123,7 +160,10 @@ def test_a_planar_machine_with_all_six_freedoms_is_solved_like_one_with_three_an
     whole, flat = planar(zoo.AXES), planar(("rz", "x", "y"))
     assert flat.notes == ()
     assert whole.notes == (
-        "6 closure equations repeat others: it closes only for exact geometry; state freedoms: [rz, x, y] to leave them out",
+        (
+            "6 closure equations repeat others: it closes only for exact geometry; state freedoms: "
+            "[rz, x, y] to leave them out"
+        ),
     )
     asked = np.random.default_rng(0).uniform((-0.06, -0.06, -0.45), (0.06, 0.06, 0.45), (300, 3))
     found = inverse(flat, asked)
@@ -154,12 +194,22 @@ def spherical():
     for i in range(3):
         turn = zoo.place((0, 0, 0), (0, 0, 2 * np.pi * i / 3))
         bend = zoo.place((0, 0, 0), (np.pi / 3, 0, 0))
-        links = (Link("base", turn @ zoo.place((0, 0, 0), (np.pi / 4, 0, 0))), Link("crank", bend), Link("rod", bend))
-        joints = (Joint("motor", "R", f"q{i + 1}", start=0.6), Joint("elbow", "R", start=1.4), Joint("wrist", "R", start=0.5))
+        links = (
+            Link("base", turn @ zoo.place((0, 0, 0), (np.pi / 4, 0, 0))),
+            Link("crank", bend),
+            Link("rod", bend),
+        )
+        joints = (
+            Joint("motor", "R", f"q{i + 1}", start=0.6),
+            Joint("elbow", "R", start=1.4),
+            Joint("wrist", "R", start=0.5),
+        )
         tip = turn @ zoo.place((0, 0, 0), (np.pi / 4, 0, 0))
         for joint, link in zip(joints, (bend, bend, np.eye(4)), strict=True):
             tip = tip @ zoo.place((0, 0, 0), (0, 0, joint.start)) @ link
-        limbs.append(Limb(f"arm{i + 1}", (*links, Link("hand", np.eye(4))), joints, "rigid", Link("on", tip)))
+        limbs.append(
+            Limb(f"arm{i + 1}", (*links, Link("hand", np.eye(4))), joints, "rigid", Link("on", tip))
+        )
     freedoms, wanted = ("rx", "ry", "rz"), ("roll", "pitch", "yaw")
     return build(zoo.assembled("wrist", tuple(limbs), freedoms, wanted, np.eye(4)))
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.mechanism import coordinates
 from tests.jacobians import check_jacobian
@@ -25,7 +25,7 @@ SIZE = 0.3
 def poses(n, tilt=1.2, seed=3):
     rng = np.random.default_rng(seed)
     angles = rng.uniform([-3.0, 0.05, -3.0], [3.0, tilt, 3.0], (n, 3))
-    return se3.pose(se3.tilt_torsion_to_matrix(*angles.T), rng.normal(size=(n, 3)))
+    return geometry.pose(geometry.tilt_torsion_to_matrix(*angles.T), rng.normal(size=(n, 3)))
 
 
 @pytest.mark.parametrize("names", SETS)
@@ -41,10 +41,10 @@ def test_coordinates_are_read_back_as_they_were_set(names, part):
 
 
 def test_coordinates_not_named_stay_as_they_are():
-    base = se3.pose(np.eye(3), np.array([1.0, 2.0, 3.0]))
+    base = geometry.pose(np.eye(3), np.array([1.0, 2.0, 3.0]))
     T = coordinates.pose(np.array([[0.5, 0.2]]), ("z", "yaw"), base)
     assert_allclose(T[0, :3, 3], [1.0, 2.0, 0.5])
-    assert_allclose(T[0, :3, :3], se3.axis_rotation(0.2, 2))
+    assert_allclose(T[0, :3, :3], geometry.axis_rotation(0.2, 2))
 
 
 @pytest.mark.parametrize("names", [*SETS, ("roll",), ("psi",)])
@@ -55,7 +55,9 @@ def test_slopes_of_every_coordinate_agree_with_differences(names, off):
     _, columns = coordinates.demands(T, target, names, SIZE)
 
     def moved(x):
-        return coordinates.demands(se3.exp_update(T, np.broadcast_to(x, (5, 6))), target, names, SIZE)[0]
+        return coordinates.demands(
+            geometry.exp_update(T, np.broadcast_to(x, (5, 6))), target, names, SIZE
+        )[0]
 
     check_jacobian(moved, columns, np.zeros(6), scale=0.05)
 
@@ -63,7 +65,7 @@ def test_slopes_of_every_coordinate_agree_with_differences(names, off):
 @pytest.mark.parametrize("names", [("x", "y", "z", "phi", "theta", "psi"), ("z", "phi", "theta")])
 @pytest.mark.parametrize("phi", [0.0, 2.0])
 def test_slopes_are_regular_at_zero_tilt(names, phi):
-    T = se3.pose(se3.tilt_torsion_to_matrix(phi, 0.0, 0.4), np.ones(3))[None]
+    T = geometry.pose(geometry.tilt_torsion_to_matrix(phi, 0.0, 0.4), np.ones(3))[None]
     values = {"x": 1.0, "y": 1.0, "z": 1.0, "phi": phi, "theta": 0.0, "psi": 0.4}
     target = np.array([[values[n] for n in names]])
     residual, columns = coordinates.demands(T, target, names, SIZE)
@@ -71,7 +73,7 @@ def test_slopes_are_regular_at_zero_tilt(names, phi):
     assert np.linalg.matrix_rank(columns[0]) == len(names)
 
     def moved(x):
-        return coordinates.demands(se3.exp_update(T, x[None]), target, names, SIZE)[0]
+        return coordinates.demands(geometry.exp_update(T, x[None]), target, names, SIZE)[0]
 
     check_jacobian(moved, columns, np.zeros(6), scale=0.05)
 

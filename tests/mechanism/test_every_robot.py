@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every robot that comes with loopcal, 1e5 random rows inside its strokes: each returns to its mode, or it is said why not.
+"""Every robot that comes with loopcal, 1e5 random rows inside its strokes: each returns to its
+mode, or it is said why not.
 
 A new file in src/loopcal/robots is picked up by itself.
 """
@@ -11,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from loopcal import se3
-from loopcal.io.robot_file import load_robot, shipped_robots
+from loopcal import geometry
+from loopcal.io.robot.robot_file import load_robot, shipped_robots
 from loopcal.mechanism import Mechanism, Solution, Status, forward, inverse
 
 Array = NDArray[np.float64]
@@ -28,7 +29,9 @@ def robot(name: str) -> Mechanism:
 
 
 def drawn(machine: Mechanism, rng: np.random.Generator, n: int, wide: float = 1.0) -> Array:
-    """Random controlled coordinates (n, c), evenly in ranges of the workspace widened about their middle."""
+    """Random controlled coordinates (n, c), evenly in ranges of the workspace widened about their
+    middle.
+    """
     low, high = np.array([machine.assembly.workspace[name] for name in machine.controlled]).T
     middle, half = (low + high) / 2, (high - low) / 2
     return middle + wide * half * rng.uniform(-1.0, 1.0, (n, len(low)))
@@ -46,7 +49,9 @@ def rows_inside(machine: Mechanism, seed: int) -> Iterator[Solution]:
     while found < ROWS:
         there = inverse(machine, drawn(machine, rng, BLOCK))
         tried += BLOCK
-        some = there.take(np.flatnonzero(there.converged & inside(machine, there.q))[: ROWS - found])
+        some = there.take(
+            np.flatnonzero(there.converged & inside(machine, there.q))[: ROWS - found]
+        )
         found += len(some.q)
         assert found >= 0.5 * min(tried, ROWS)
         yield some
@@ -55,12 +60,14 @@ def rows_inside(machine: Mechanism, seed: int) -> Iterator[Solution]:
 def returned(there: Solution, back: Solution) -> NDArray[np.bool_]:
     """Rows that came back to where they were."""
     # [rad, m] Newton stops below 1e-13 of the size; the rest is the condition of the mechanism
-    return back.converged & (np.abs(se3.difference(back.T, there.T)).max(axis=1) < 1e-8)
+    return back.converged & (np.abs(geometry.difference(back.T, there.T)).max(axis=1) < 1e-8)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
-def test_a_hundred_thousand_rows_inside_the_strokes_return_to_their_mode_and_the_rest_say_why(name: str) -> None:
+def test_a_hundred_thousand_rows_inside_the_strokes_return_to_their_mode_and_the_rest_say_why(
+    name: str,
+) -> None:
     machine, total, home = robot(name), 0, 0
     for there in rows_inside(machine, seed=20):
         back = forward(machine, there.q)
@@ -94,12 +101,16 @@ def test_what_cannot_be_reached_is_marked_and_never_raised(name: str) -> None:
 def test_readings_beyond_all_strokes_and_nonsense_are_marked_and_never_raised(name: str) -> None:
     machine = robot(name)
     low, high = np.array([a.stroke for a in machine.actuators]).T
-    q = np.random.default_rng(22).uniform(low - 3 * (high - low), high + 3 * (high - low), (100, len(low)))
+    q = np.random.default_rng(22).uniform(
+        low - 3 * (high - low), high + 3 * (high - low), (100, len(low))
+    )
     q[0], q[1] = np.nan, np.inf
     back = forward(machine, q)
     assert back.status[0] == back.status[1] == Status.NOT_FINITE
     assert np.isfinite(back.T[back.converged]).all()
-    if len(machine.actuators) == len(machine.controlled):  # lines that contradict each other leave a residual
+    if len(machine.actuators) == len(
+        machine.controlled
+    ):  # lines that contradict each other leave a residual
         assert back.residual[back.converged].max(initial=0.0) <= 1e-9 * machine.size
     for row in np.flatnonzero(~back.converged):
         assert back.explain(int(row))

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inverse and forward kinematics over whole workspaces: closed, back where they came from, and never an exception."""
+"""Inverse and forward kinematics over whole workspaces: closed, back where they came from, and
+never an exception.
+"""
 
 import numpy as np
 import pytest
@@ -7,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from loopcal import engine, se3
+from loopcal import engine, geometry
 from loopcal.errors import DataError
 from loopcal.mechanism import Status, build, forward, inverse
-from loopcal.mechanism.trials import forward_trials
+from loopcal.mechanism.batch_kinematics import forward_trials
 from tests import zoo
 from tests.engine.cases import driven, spread
 
@@ -18,7 +20,10 @@ ALL = ["menagerie", "three_prs", "hexapod", "nategh", "delta", "five_bar", "plan
 BOXES = {
     "hexapod": ([-0.04, -0.04, 0.17, -0.24, -0.24, -0.24], [0.04, 0.04, 0.23, 0.24, 0.24, 0.24]),
     "nategh": ([-0.1, -0.1, 0.65, -0.2, -0.2, -0.2], [0.1, 0.1, 0.95, 0.2, 0.2, 0.2]),
-    "menagerie": ([0.007, -0.023, 0.247, 0.03, -0.10, 0.08], [0.013, -0.017, 0.253, 0.07, -0.06, 0.12]),
+    "menagerie": (
+        [0.007, -0.023, 0.247, 0.03, -0.10, 0.08],
+        [0.013, -0.017, 0.253, 0.07, -0.06, 0.12],
+    ),
     "delta": ([-0.08, -0.08, 0.0], [0.08, 0.08, 0.2]),
     "three_prs": ([0.65, -np.pi, 0.0], [0.75, np.pi, 0.6]),
     "five_bar": ([-0.05, 0.2], [0.05, 0.28]),
@@ -27,7 +32,9 @@ BOXES = {
 
 
 def sampled(name, n, seed=7):
-    """A robot and n solutions of its inverse kinematics all over its workspace, those within the strokes."""
+    """A robot and n solutions of its inverse kinematics all over its workspace, those within the
+    strokes.
+    """
     robot, (low, high) = getattr(zoo, name)(), BOXES[name]
     sol = inverse(robot, np.random.default_rng(seed).uniform(low, high, (n, len(low))))
     strokes = np.array([a.stroke or (-np.inf, np.inf) for a in robot.actuators]).T
@@ -37,15 +44,21 @@ def sampled(name, n, seed=7):
 
 def gap_of(robot, T, reference):
     """Distance of poses as a fraction of the robot's size, a rotation vector counting as such (n,)."""
-    return np.linalg.norm(se3.difference(T, reference) / np.array([1.0] * 3 + [robot.size] * 3), axis=1)
+    return np.linalg.norm(
+        geometry.difference(T, reference) / np.array([1.0] * 3 + [robot.size] * 3), axis=1
+    )
 
 
 def condition(robot, state):
-    """Condition of the closure's Jacobian, rows in the size of the robot, columns per radian and per size (n,)."""
+    """Condition of the closure's Jacobian, rows in the size of the robot, columns per radian and
+    per size (n,).
+    """
     e, _ = robot.slots(robot.values[None])
     blocks = engine.linearise(robot.program, e, driven(robot.program, state), state)
     A = spread(robot.program, blocks.closure)[0][0]
-    return np.linalg.cond(A / np.array([robot.size if f < 3 else 1.0 for f in robot.program.freedoms]))
+    return np.linalg.cond(
+        A / np.array([robot.size if f < 3 else 1.0 for f in robot.program.freedoms])
+    )
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -75,7 +88,8 @@ def test_a_hundred_thousand_rows_from_home_come_back_or_say_that_they_are_in_ano
     assert back.residual.max() <= 1e-13 * robot.size
     home = (back.status == Status.CONVERGED) & (gap_of(robot, back.T, target) < 1e-9)
     assert home.mean() >= 0.999
-    # the rest are true solutions of the same readings in another mode: their inverse gives the readings back
+    # the rest are true solutions of the same readings in another mode: their inverse gives the
+    # readings back
     if not home.all():
         again = inverse(robot, back.T[~home])
         assert_allclose(again.q, sol.q[inside][~home], atol=1e-12)
@@ -95,7 +109,9 @@ def test_thousands_of_rows_from_home_come_back(name):
 def test_any_readings_within_the_strokes_close_or_are_marked(name):
     robot = getattr(zoo, name)()
     stroke = np.array([a.stroke for a in robot.actuators]).T
-    sol = forward(robot, np.random.default_rng(11).uniform(stroke[0], stroke[1], (1000, len(robot.actuators))))
+    sol = forward(
+        robot, np.random.default_rng(11).uniform(stroke[0], stroke[1], (1000, len(robot.actuators)))
+    )
     closed = np.isin(sol.status, (Status.CONVERGED, Status.OTHER_MODE))
     assert (sol.residual[closed] <= 1e-13 * robot.size).all()
     assert (sol.residual[sol.status == Status.UNREACHABLE] > 1e-9 * robot.size).all()
@@ -107,7 +123,10 @@ def test_unreachable_and_broken_rows_are_marked_and_the_others_untouched():
     q[1, 0], q[2, 3], q[3, 0], q[4] = 2.0, np.nan, np.inf, 0.01
     sol = forward(robot, q)
     assert sol.status[1] in (Status.UNREACHABLE, Status.NOT_CONVERGED)
-    assert_array_equal(sol.status[[0, 2, 3, 4]], [Status.CONVERGED, Status.NOT_FINITE, Status.NOT_FINITE, Status.CONVERGED])
+    assert_array_equal(
+        sol.status[[0, 2, 3, 4]],
+        [Status.CONVERGED, Status.NOT_FINITE, Status.NOT_FINITE, Status.CONVERGED],
+    )
     assert sol.residual[1] > 0.01
     assert_array_equal(sol.T[4], forward(robot, q[4]).T[0])
     assert "closed" in sol.explain(0)
@@ -121,9 +140,14 @@ def test_every_status_has_its_sentence():
 
 
 def test_wrong_shapes_are_one_clear_sentence():
-    with pytest.raises(DataError, match=r"5 readings a row were given, but hexapod has 6 actuators \(q1, q2"):
+    with pytest.raises(
+        DataError, match=r"5 readings a row were given, but hexapod has 6 actuators \(q1, q2"
+    ):
         forward(zoo.hexapod(), np.zeros((2, 5)))
-    with pytest.raises(DataError, match=r"a target of shape \(2, 5\) was given; allowed are \(n, 4, 4\) poses or \(n, 3\)"):
+    with pytest.raises(
+        DataError,
+        match=r"a target of shape \(2, 5\) was given; allowed are \(n, 4, 4\) poses or \(n, 3\)",
+    ):
         inverse(zoo.delta(), np.zeros((2, 5)))
 
 
@@ -167,7 +191,9 @@ def test_the_order_of_rows_does_not_matter_bit_for_bit():
 coordinate = st.floats(0.0, 1.0)
 
 
-@pytest.mark.parametrize("name", ["menagerie", "three_prs", "hexapod", "delta", "five_bar", "planar_rrr"])
+@pytest.mark.parametrize(
+    "name", ["menagerie", "three_prs", "hexapod", "delta", "five_bar", "planar_rrr"]
+)
 def test_forward_after_inverse_is_the_identity(name):
     robot, (low, high) = getattr(zoo, name)(), (np.array(side) for side in BOXES[name])
 
@@ -175,7 +201,7 @@ def test_forward_after_inverse_is_the_identity(name):
     @given(st.lists(coordinate, min_size=len(low), max_size=len(low)))
     def holds(part):
         sol = inverse(robot, low + np.array(part) * (high - low))
-        assert_allclose(se3.difference(forward(robot, sol.q).T, sol.T), 0.0, atol=1e-12)
+        assert_allclose(geometry.difference(forward(robot, sol.q).T, sol.T), 0.0, atol=1e-12)
 
     holds()
 
@@ -196,7 +222,7 @@ def test_units_scale_out(s):
 @settings(max_examples=20)
 @given(st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6))
 def test_readings_do_not_depend_on_where_the_base_stands(twist):
-    G = se3.exp_update(np.eye(4), np.array(twist))
+    G = geometry.exp_update(np.eye(4), np.array(twist))
     here, there = zoo.hexapod(), build(zoo.relocated(zoo.hexapod().assembly, G))
     _, sol, _ = sampled("hexapod", 5)
     assert_allclose(inverse(there, G @ sol.T).q, sol.q, atol=1e-14)

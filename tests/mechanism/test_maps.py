@@ -7,7 +7,15 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.errors import MechanismError
 from loopcal.mechanism import Actuator
-from loopcal.mechanism.transmission import TERMS, frequency, joint_values, nominal_terms, readings_of, slope, term_columns
+from loopcal.mechanism.transmission import (
+    TERMS,
+    frequency,
+    joint_values,
+    nominal_terms,
+    readings_of,
+    slope,
+    term_columns,
+)
 from loopcal.units import Dimension
 from tests import zoo
 from tests.jacobians import check_jacobian
@@ -22,8 +30,15 @@ def test_displacements_follow_the_parameters(name):
         e, tau = robot.slots(values + x)
         return np.concatenate([e, tau.reshape(2, -1)], axis=1)
 
-    scale = np.array([1.0 if d is not Dimension.LENGTH else 0.2 * robot.size for d in robot.parameters.dimensions])
-    check_jacobian(slots, robot.slots.jacobian(values), np.zeros(len(robot.parameters)), scale=scale)
+    scale = np.array(
+        [
+            1.0 if d is not Dimension.LENGTH else 0.2 * robot.size
+            for d in robot.parameters.dimensions
+        ]
+    )
+    check_jacobian(
+        slots, robot.slots.jacobian(values), np.zeros(len(robot.parameters)), scale=scale
+    )
 
 
 def test_shared_maps_of_a_delta_have_the_slopes_they_say():
@@ -85,7 +100,9 @@ def test_transmission_has_the_slopes_it_says():
 
 def test_transmission_is_inverted_to_rounding():
     tau, w = nominal_terms(ACTUATORS)[None], frequency(ACTUATORS)
-    assert_allclose(readings_of(joint_values(READINGS, tau, w), tau, w), READINGS, rtol=0, atol=1e-16 / 0.9 * 10)
+    assert_allclose(
+        readings_of(joint_values(READINGS, tau, w), tau, w), READINGS, rtol=0, atol=1e-16 / 0.9 * 10
+    )
 
 
 def test_an_actuator_without_period_has_no_harmonics():
@@ -97,7 +114,9 @@ def test_an_actuator_without_period_has_no_harmonics():
 
 def test_values_are_checked_and_frozen():
     robot = zoo.hexapod()
-    with pytest.raises(MechanismError, match=r"hexapod has 42 parameters, but \(41,\) values were given"):
+    with pytest.raises(
+        MechanismError, match=r"hexapod has 42 parameters, but \(41,\) values were given"
+    ):
         robot.with_values(np.zeros(41))
     broken = np.array(robot.values)
     broken[13] = np.nan

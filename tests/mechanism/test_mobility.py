@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mechanisms that cannot work are refused when they are built, each with one sentence that says what to mend."""
+"""Mechanisms that cannot work are refused when they are built, each with one sentence that says
+what to mend.
+"""
 
 from dataclasses import replace
 
@@ -34,7 +36,9 @@ def five_legs():
 
 def a_rod_too_many():
     """Six driven legs and a seventh rod of fixed length."""
-    rod = replace(HEXAPOD.limbs[0], name="rod", actuator=None, attachment=HEXAPOD.limbs[3].attachment)
+    rod = replace(
+        HEXAPOD.limbs[0], name="rod", actuator=None, attachment=HEXAPOD.limbs[3].attachment
+    )
     gap = HEXAPOD.home @ rod.attachment.transform[:, 3] - rod.links[0].transform[:, 3]
     return replace(HEXAPOD, limbs=(*HEXAPOD.limbs, replace(rod, length=float(np.linalg.norm(gap)))))
 
@@ -43,7 +47,11 @@ def regular():
     """Platform similar to the base and not turned: the singular hexapod."""
     base = zoo.HEXAPOD_BASE * zoo.MM
     limbs = tuple(
-        replace(limb, links=(Link("base", zoo.place(b)),), attachment=Link("platform", zoo.place(0.6 * b)))
+        replace(
+            limb,
+            links=(Link("base", zoo.place(b)),),
+            attachment=Link("platform", zoo.place(0.6 * b)),
+        )
         for limb, b in zip(HEXAPOD.limbs, base, strict=True)
     )
     return replace(HEXAPOD, limbs=limbs)
@@ -52,18 +60,29 @@ def regular():
 WRONG = {
     "five legs": (
         five_legs,
-        r"hexapod: with every actuator held the platform can still move at home: (turn|shift) .*5 of 6 freedoms",
+        (
+            r"hexapod: with every actuator held the platform can still move at home: (turn|shift) "
+            r".*5 "
+            r"of 6 freedoms"
+        ),
     ),
     "similar base and platform": (regular, r"the platform can still move at home"),
     "a rod too many": (
         a_rod_too_many,
-        r"hexapod: 6 actuators, but the limbs leave the platform only 5 of 6 freedoms at home; it cannot .*over-constrained",
+        (
+            r"hexapod: 6 actuators, but the limbs leave the platform only 5 of 6 freedoms at home; "
+            r"it "
+            r"cannot .*over-constrained"
+        ),
     ),
     "a coordinate too few": (
         lambda: replace(PRS, controlled=("z",)),
         r"3-PRS can be moved in 3 freedoms or more, but 1 controlled coordinates are named",
     ),
-    "a coordinate nobody moves": (lambda: replace(PRS, controlled=("z", "x", "psi")), r"cannot all be chosen freely at home"),
+    "a coordinate nobody moves": (
+        lambda: replace(PRS, controlled=("z", "x", "psi")),
+        r"cannot all be chosen freely at home",
+    ),
     "an unknown coordinate": (
         lambda: replace(PRS, controlled=("z", "tilt", "x")),
         r"'tilt' is not a coordinate; allowed are x, y, z",
@@ -84,9 +103,14 @@ WRONG = {
         lambda: with_limb(PRS, 1, name="limb1"),
         r"two limbs are called 'limb1'; every limb needs its own name",
     ),
-    "an actuator twice": (lambda: replace(HEXAPOD, actuators=HEXAPOD.actuators[:1] * 2), r"two actuators are called 'q1'"),
+    "an actuator twice": (
+        lambda: replace(HEXAPOD, actuators=HEXAPOD.actuators[:1] * 2),
+        r"two actuators are called 'q1'",
+    ),
     "an actuator without a joint": (
-        lambda: replace(HEXAPOD, actuators=(*HEXAPOD.actuators, Actuator("spare", Dimension.LENGTH))),
+        lambda: replace(
+            HEXAPOD, actuators=(*HEXAPOD.actuators, Actuator("spare", Dimension.LENGTH))
+        ),
         r"actuator 'spare' drives 0 joints; it must drive one",
     ),
     "a joint driven by nobody": (
@@ -125,7 +149,9 @@ def test_a_parameter_mapped_onto_nothing_is_refused():
         Address("leg9", "base", "x"),
     ):
         wrong = replace(HEXAPOD, parameters=(parameter,), maps=(Linear("a", address),))
-        with pytest.raises(MechanismError, match=f"mapped onto {address}, which this mechanism does not have"):
+        with pytest.raises(
+            MechanismError, match=f"mapped onto {address}, which this mechanism does not have"
+        ):
             build(wrong)
 
 
@@ -134,5 +160,7 @@ def test_a_serial_arm_alone_is_a_mechanism_too():
         "arm", (Link("base", np.eye(4)), Link("upper", zoo.place((0.3, 0, 0))), Link("lower", zoo.place((0.2, 0, 0)))),
         (Joint("a", "R", "q1", start=0.3), Joint("b", "R", "q2", start=0.8)), "ball", Link("hand", np.eye(4)),
     )  # fmt: skip
-    robot = build(zoo.assembled("arm", (limb,), ("x", "y"), ("x", "y"), zoo.place((0.35, 0.25, 0.0))))
+    robot = build(
+        zoo.assembled("arm", (limb,), ("x", "y"), ("x", "y"), zoo.place((0.35, 0.25, 0.0)))
+    )
     assert robot.home_state.status[0, 0] == 0

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kinematics against numbers that LinuxCNC's genhexkins and lineardeltakins printed (see the data's README)."""
+"""Kinematics against numbers that LinuxCNC's genhexkins and lineardeltakins printed (see the data's
+README).
+"""
 
 import csv
 import json
@@ -8,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.mechanism import Status, build, forward, inverse
 from loopcal.mechanism.families.linear_delta import LinearDelta
 from loopcal.mechanism.records import Pose
@@ -28,9 +30,13 @@ def oracles(data_folder):
 
 @pytest.fixture(scope="module")
 def hexapod(oracles):
-    """The hexapod, its 200 poses, their strut lengths and the poses that genhexkins found back; lengths in its unit."""
+    """The hexapod, its 200 poses, their strut lengths and the poses that genhexkins found back;
+    lengths in its unit.
+    """
     geometry = json.loads((oracles / "genhexkins_geometry.json").read_text("utf-8"))
-    robot = zoo.gough("genhexkins", np.array(geometry["base"]), np.array(geometry["platform"]), 0.0, 20.0)
+    robot = zoo.gough(
+        "genhexkins", np.array(geometry["base"]), np.array(geometry["platform"]), 0.0, 20.0
+    )
     path = oracles / "genhexkins_default_200poses.csv"
     degrees = np.array([1.0, 1.0, 1.0, *[np.pi / 180] * 3])
     put_in = zoo.poses_of(columns(path, "x y z a_deg b_deg c_deg") * degrees)
@@ -50,20 +56,25 @@ def test_forward_kinematics_of_genhexkins_lengths_find_its_poses(hexapod):
     robot, poses, lengths, found = hexapod
     sol = forward(robot, inverse(robot, poses).q)
     assert_array_equal(sol.status, Status.CONVERGED)
-    assert_allclose(se3.difference(sol.T, poses), 0.0, atol=1e-10)
+    assert_allclose(geometry.difference(sol.T, poses), 0.0, atol=1e-10)
     theirs = forward(robot, lengths)
     assert_array_equal(theirs.status, Status.CONVERGED)
-    assert_allclose(se3.difference(theirs.T, found), 0.0, atol=1e-7)  # its own iteration stops there
+    assert_allclose(
+        geometry.difference(theirs.T, found), 0.0, atol=1e-7
+    )  # its own iteration stops there
 
 
 def test_lineardeltakins_gives_the_same_carriages_and_poses(oracles):
-    # its carriages are counted upwards; R 130.25 and L 269 are its defaults, towers at 90, 210 and 330 degrees
+    # its carriages are counted upwards; R 130.25 and L 269 are its defaults, towers at 90, 210 and
+    # 330 degrees
     record = LinearDelta(
         name="lineardeltakins", radius=130.25, angles=tuple(np.deg2rad((90.0, 210.0, 330.0)).tolist()), arms=269.0,
         stops=-float(np.sqrt(269.0**2 - 130.25**2)), readings="height", home=Pose(z=50.0),
     )  # fmt: skip
     robot, path = build(record.expand()), oracles / "lineardeltakins_default_200poses.csv"
-    points, carriages, found = (columns(path, names) for names in ("x y z", "j0 j1 j2", "fk_x fk_y fk_z"))
+    points, carriages, found = (
+        columns(path, names) for names in ("x y z", "j0 j1 j2", "fk_x fk_y fk_z")
+    )
     sol = inverse(robot, points)
     assert len(points) == 200
     assert_array_equal(sol.status, Status.CONVERGED)

@@ -6,11 +6,11 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from loopcal.mechanism import build, forward
+from loopcal.mechanism.batch_kinematics import forward_trials
 from loopcal.mechanism.families.gough import Gough
 from loopcal.mechanism.kinematics import solution_of
-from loopcal.mechanism.passive import passive_sensitivity
+from loopcal.mechanism.passive_joints import passive_sensitivity
 from loopcal.mechanism.records import Pose
-from loopcal.mechanism.trials import forward_trials
 from loopcal.units import Dimension
 from tests import zoo
 from tests.jacobians import check_jacobian
@@ -42,10 +42,21 @@ def test_passive_joints_follow_parameters_and_readings_as_differences_say(name):
     moved, p = np.diag(unit), values.shape[1]
 
     def joints(x):  # one trial a parameter or reading
-        at = forward_trials(robot, values + x[0] * moved[:, :p], q + x[0] * moved[:, None, p:], start=state)
-        by_limb = sorted((limb, g, k) for g, group in enumerate(robot.program.groups) for k, limb in enumerate(group.limbs))
+        at = forward_trials(
+            robot, values + x[0] * moved[:, :p], q + x[0] * moved[:, None, p:], start=state
+        )
+        by_limb = sorted(
+            (limb, g, k)
+            for g, group in enumerate(robot.program.groups)
+            for k, limb in enumerate(group.limbs)
+        )
         return np.concatenate(
-            [at.joints[g][:, 0, k, : len(robot.program.groups[g].joints)][:, passive(robot, limb)] for limb, g, k in by_limb],
+            [
+                at.joints[g][:, 0, k, : len(robot.program.groups[g].joints)][
+                    :, passive(robot, limb)
+                ]
+                for limb, g, k in by_limb
+            ],
             axis=1,
         )
 
@@ -57,7 +68,9 @@ def test_passive_joints_follow_parameters_and_readings_as_differences_say(name):
 
 
 def passive(robot, limb):
-    return [j for j, joint in enumerate(robot.assembly.limbs[limb].joints) if joint.actuator is None]
+    return [
+        j for j, joint in enumerate(robot.assembly.limbs[limb].joints) if joint.actuator is None
+    ]
 
 
 def test_blocks_of_rows_change_nothing():
@@ -76,13 +89,16 @@ def test_blocks_of_rows_change_nothing():
 def test_failed_rows_hold_no_numbers():
     robot, q = ups(), np.zeros((1, 2, 6))
     q[0, 1, 2] = np.nan
-    found = passive_sensitivity(robot, robot.values[None], q, forward_trials(robot, robot.values[None], q))
+    found = passive_sensitivity(
+        robot, robot.values[None], q, forward_trials(robot, robot.values[None], q)
+    )
     assert np.isfinite(found.parameters[0, 0]).all()
     assert np.isnan(found.parameters[0, 1]).all()
 
 
 def test_a_driven_slide_does_not_make_the_joint_below_it_a_spinning_one():
-    # once the slide was taken at zero, where a universal joint turns nothing, and both its axes were held
+    # once the slide was taken at zero, where a universal joint turns nothing, and both its axes
+    # were held
     robot = ups()
     assert robot.notes == ()
     assert_array_equal([g.held for g in robot.program.groups], [(False, False, False)])

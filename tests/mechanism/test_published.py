@@ -4,12 +4,13 @@
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.mechanism import Status, forward, inverse
 from tests import zoo
 
-# Table 4 of "Numerical simulation of the calibration algorithm for a 6-DOF parallel mechanism": poses asked for (PT: X, Y, Z
-# [mm]; alpha, beta, gamma in whole degrees, printed there in rad) and poses reached (PP, as printed: mm, rad).
+# Table 4 of "Numerical simulation of the calibration algorithm for a 6-DOF parallel mechanism":
+# poses asked for (PT: X, Y, Z [mm]; alpha, beta, gamma in whole degrees, printed there in rad) and
+# poses reached (PP, as printed: mm, rad).
 TABLE_4 = """
  10   0 200  1  2  3   10.02907 -0.04008  199.991   0.017814  0.034796  0.051874
  10  10 200  2 -2  1   10.0562   9.9385   199.9848  0.0352   -0.0350    0.0174
@@ -23,9 +24,9 @@ TABLE_4 = """
   0   0 210  2 -2  2   0.034993 -0.04456  209.9916  0.035298 -0.03502   0.034362
 """
 WITHOUT_LENGTH_ERRORS = 1  # row A2 of the table is the same machine without its six length errors
-FIRST_ERROR = (
-    0.058938  # the largest integrated error of the ten poses: norm in position [mm] plus norm in the three angles [rad]
-)
+# the largest integrated error of the ten poses: norm in position [mm] plus norm in the three angles
+# [rad]  # noqa: ERA001
+FIRST_ERROR = 0.058938
 
 
 def commanded():
@@ -37,7 +38,9 @@ def reached(truth):
     robot = zoo.hexapod()
     sol = forward(robot.with_values(truth), inverse(robot, commanded()).q)
     assert_array_equal(sol.status, Status.CONVERGED)
-    return np.concatenate([sol.T[:, :3, 3] / zoo.MM, se3.matrix_to_euler(sol.T[:, :3, :3], "xyz")], axis=1)
+    return np.concatenate(
+        [sol.T[:, :3, 3] / zoo.MM, geometry.matrix_to_euler(sol.T[:, :3, :3], "xyz")], axis=1
+    )
 
 
 def test_table_4_is_met_to_one_unit_of_the_last_digit():
@@ -46,14 +49,19 @@ def test_table_4_is_met_to_one_unit_of_the_last_digit():
     nominal = zoo.hexapod().values.reshape(6, 7)
     truth = zoo.hexapod_truth().reshape(6, 7)
     found = reached(truth.ravel())
-    found[WITHOUT_LENGTH_ERRORS] = reached(np.column_stack([truth[:, :6], nominal[:, 6]]).ravel())[WITHOUT_LENGTH_ERRORS]
+    found[WITHOUT_LENGTH_ERRORS] = reached(np.column_stack([truth[:, :6], nominal[:, 6]]).ravel())[
+        WITHOUT_LENGTH_ERRORS
+    ]
     off = np.abs(found - np.array(printed, dtype=float)) / units
     assert off.max() <= 1.0
     assert np.delete(off > 0.5, WITHOUT_LENGTH_ERRORS, axis=0).sum() <= 2
 
 
 def test_the_first_error_is_the_published_one():
-    target = np.concatenate([commanded()[:, :3, 3] / zoo.MM, se3.matrix_to_euler(commanded()[:, :3, :3], "xyz")], axis=1)
+    target = np.concatenate(
+        [commanded()[:, :3, 3] / zoo.MM, geometry.matrix_to_euler(commanded()[:, :3, :3], "xyz")],
+        axis=1,
+    )
     error = reached(zoo.hexapod_truth()) - target
     integrated = np.linalg.norm(error[:, :3], axis=1) + np.linalg.norm(error[:, 3:], axis=1)
     assert round(integrated.max(), 6) == FIRST_ERROR
@@ -61,20 +69,25 @@ def test_the_first_error_is_the_published_one():
 
 def test_a_hexapods_legs_are_distances_between_their_centres():
     poses = commanded()
-    legs = poses[:, None, :3, 3] + zoo.HEXAPOD_PLATFORM * zoo.MM @ poses[:, :3, :3].swapaxes(1, 2) - zoo.HEXAPOD_BASE * zoo.MM
+    legs = (
+        poses[:, None, :3, 3]
+        + zoo.HEXAPOD_PLATFORM * zoo.MM @ poses[:, :3, :3].swapaxes(1, 2)
+        - zoo.HEXAPOD_BASE * zoo.MM
+    )
     lengths = np.linalg.norm(legs, axis=-1) - zoo.HEXAPOD_LENGTH * zoo.MM
     assert_allclose(inverse(zoo.hexapod(), poses).q, lengths, rtol=0, atol=1e-15)
 
 
 def test_a_3_prs_meets_its_closed_form_with_the_parasitic_motion():
-    # N = (a/2)(1 - cos theta)(-cos 2 phi, sin 2 phi), zero torsion; q from the right triangle of rod and carriage
+    # N = (a/2)(1 - cos theta)(-cos 2 phi, sin 2 phi), zero torsion; q from the right triangle of
+    # rod and carriage
     rng = np.random.default_rng(2)
     z, phi, theta = rng.uniform([0.65, -np.pi, 0.0], [0.75, np.pi, np.deg2rad(35)], (60, 3)).T
     sol = inverse(zoo.three_prs(), np.stack([z, phi, theta], axis=1))
     assert_array_equal(sol.status, Status.CONVERGED)
     half = zoo.PRS_A / 2 * (1 - np.cos(theta))
     N = np.stack([-half * np.cos(2 * phi), half * np.sin(2 * phi), z], axis=1)
-    R = se3.tilt_torsion_to_matrix(phi, theta, 0.0 * phi)
+    R = geometry.tilt_torsion_to_matrix(phi, theta, 0.0 * phi)
     assert_allclose(sol.T[:, :3, 3], N, atol=1e-13)
     assert_allclose(sol.T[:, :3, :3], R, atol=1e-13)
     for i, angle in enumerate(2 * np.pi * np.arange(3) / 3):
@@ -82,7 +95,7 @@ def test_a_3_prs_meets_its_closed_form_with_the_parasitic_motion():
         c = N + zoo.PRS_A * R @ out - zoo.PRS_B * out
         carriage = c[:, 2] - np.sqrt(zoo.PRS_L**2 - c[:, 0] ** 2 - c[:, 1] ** 2)
         assert_allclose(sol.q[:, i], carriage, atol=1e-13)
-    assert_allclose(se3.difference(forward(zoo.three_prs(), sol.q).T, sol.T), 0.0, atol=1e-12)
+    assert_allclose(geometry.difference(forward(zoo.three_prs(), sol.q).T, sol.T), 0.0, atol=1e-12)
 
 
 def test_passive_joints_of_a_3_prs_are_its_rods_swings():
@@ -96,7 +109,10 @@ def test_a_linear_deltas_nozzle_hangs_below_its_carriages():
     points = np.random.default_rng(3).uniform([-0.08, -0.08, 0.0], [0.08, 0.08, 0.2], (50, 3))
     record = robot.record
     towers = record.radius * np.column_stack([np.cos(record.angles), np.sin(record.angles)])
-    height = np.sqrt(np.array(record.arms) ** 2 - ((points[:, None, :2] - towers) ** 2).sum(-1)) + points[:, 2:]
+    height = (
+        np.sqrt(np.array(record.arms) ** 2 - ((points[:, None, :2] - towers) ** 2).sum(-1))
+        + points[:, 2:]
+    )
     drop = np.array(record.stops) + np.sqrt(np.array(record.arms) ** 2 - record.radius**2) - height
     assert_allclose(inverse(robot, points).q, drop, rtol=0, atol=1e-14)
 
@@ -107,4 +123,6 @@ def test_a_five_bar_is_two_triangles():
     for k, (pivot, crank, rod, side) in enumerate([(-0.07, 0.1, 0.22, 1), (0.07, 0.15, 0.2, -1)]):
         d = np.hypot(points[:, 0] - pivot, points[:, 1])
         inner = np.arccos((crank**2 + d**2 - rod**2) / (2 * crank * d))
-        assert_allclose(sol.q[:, k], np.arctan2(points[:, 1], points[:, 0] - pivot) + side * inner, atol=1e-13)
+        assert_allclose(
+            sol.q[:, k], np.arctan2(points[:, 1], points[:, 0] - pivot) + side * inner, atol=1e-13
+        )

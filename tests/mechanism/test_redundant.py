@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""More actuators than freedoms: the pose is the least-squares one, each reading weighed by its own standard deviation."""
+"""More actuators than freedoms: the pose is the least-squares one, each reading weighed by its own
+standard deviation.
+"""
 
 from dataclasses import replace
 
@@ -10,7 +12,7 @@ from scipy.optimize import least_squares
 
 from loopcal.io import load_robot
 from loopcal.mechanism import Actuator, Link, Status, build, forward, inverse
-from loopcal.mechanism.trials import forward_trials, sensitivity
+from loopcal.mechanism.batch_kinematics import forward_trials, sensitivity
 from loopcal.units import Dimension
 from tests import zoo
 from tests.jacobians import check_jacobian
@@ -22,7 +24,12 @@ def cable_robot(sigmas=None):
     if sigmas is None:
         return build(assembly)
     return build(
-        replace(assembly, actuators=tuple(replace(a, sigma=s) for a, s in zip(assembly.actuators, sigmas, strict=True)))
+        replace(
+            assembly,
+            actuators=tuple(
+                replace(a, sigma=s) for a, s in zip(assembly.actuators, sigmas, strict=True)
+            ),
+        )
     )
 
 
@@ -30,7 +37,10 @@ def line_lengths(robot, q):
     """Length of each line at readings q (a,), from the assembly's own numbers."""
     terms = [a.terms for a in robot.actuators]
     driven = np.array(
-        [t.get("offset", 0.0) + t.get("gain", 1.0) * r + t.get("curve", 0.0) * r**2 for t, r in zip(terms, q, strict=True)]
+        [
+            t.get("offset", 0.0) + t.get("gain", 1.0) * r + t.get("curve", 0.0) * r**2
+            for t, r in zip(terms, q, strict=True)
+        ]
     )
     return driven + np.array([limb.length for limb in robot.assembly.limbs])
 
@@ -64,7 +74,11 @@ def test_contradicting_readings_give_the_pose_of_least_squares(sigmas):
     gains = np.array([abs(a.terms.get("gain", 1.0)) for a in robot.actuators])
     for i, row in enumerate(q):
         # scipy stops at about the square root of rounding in x, the gap being millimetres
-        assert_allclose(sol.T[i, :3, 3], best_position(robot, row, np.array(sigmas) * gains), atol=1e-7 * robot.size)
+        assert_allclose(
+            sol.T[i, :3, 3],
+            best_position(robot, row, np.array(sigmas) * gains),
+            atol=1e-7 * robot.size,
+        )
     assert (sol.residual > 1e-6).all()
 
 
@@ -88,7 +102,14 @@ def test_poses_follow_readings_as_linearised():
         state = forward_trials(robot, values, readings[None, None])
         return sensitivity(robot, values, readings[None, None], state).readings[0, 0, 3:]
 
-    check_jacobian(position, slopes(q[0]), q[0], scale=1e-2, atol=1e-9, atol_reason="poses solved to 1e-13, steps of 1e-2")
+    check_jacobian(
+        position,
+        slopes(q[0]),
+        q[0],
+        scale=1e-2,
+        atol=1e-9,
+        atol_reason="poses solved to 1e-13, steps of 1e-2",
+    )
 
 
 def hexapod_with_seven_legs():
@@ -99,17 +120,22 @@ def hexapod_with_seven_legs():
     links = {"links": (Link("base", foot),), "attachment": Link("platform", corner)}
     leg = replace(assembly.limbs[0], name="leg7", actuator="q7", length=length, **links)
     actuators = (*assembly.actuators, Actuator("q7", Dimension.LENGTH))
-    return build(replace(assembly, limbs=(*assembly.limbs, leg), actuators=actuators, parameters=(), maps=()))
+    return build(
+        replace(assembly, limbs=(*assembly.limbs, leg), actuators=actuators, parameters=(), maps=())
+    )
 
 
 def test_a_wrong_local_minimum_far_from_home_is_left_or_marked():
     robot = hexapod_with_seven_legs()
     reach = np.array([0.12, 0.12, 0.12, 1.2, 1.2, 1.2])
-    asked = np.array([0, 0, 0.2, 0, 0, 0]) + np.random.default_rng(0).uniform(-1, 1, (600, 6)) * reach
+    asked = (
+        np.array([0, 0, 0.2, 0, 0, 0]) + np.random.default_rng(0).uniform(-1, 1, (600, 6)) * reach
+    )
     found = inverse(robot, asked)
     found = found.take(found.converged)
     again = forward(robot, found.q)
-    # readings agree with each other here: what stays open is a minimum beside the pose they came from
+    # readings agree with each other here: what stays open is a minimum beside the pose they came
+    # from
     assert again.residual[again.converged].max() < 1e-2 * robot.size
     right = np.abs(again.T - found.T).max(axis=(1, 2)) < 1e-9
     assert 0.85 < right.mean() < 1

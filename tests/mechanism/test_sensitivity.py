@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How poses follow parameters and readings: derivatives, their batch, and what can be known of 42 and 33 parameters."""
+"""How poses follow parameters and readings: derivatives, their batch, and what can be known of 42
+and 33 parameters.
+"""
 
 from dataclasses import replace
 
@@ -7,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.mechanism import Address, Linear, build
-from loopcal.mechanism.trials import forward_trials, sensitivity
+from loopcal.mechanism.batch_kinematics import forward_trials, sensitivity
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 from tests import zoo
@@ -30,10 +32,15 @@ def hexapod_legs(jnp, values, q, T, twist):
 
 
 def delta_arms(jnp, values, q, T, twist):
-    """Plain closure of a linear delta (3,): distance of the nozzle from each carriage, less the arm."""
+    """Plain closure of a linear delta (3,): distance of the nozzle from each carriage, less the
+    arm.
+    """
     radius, towers = values[0], values[1:].reshape(3, 3)
     angle, arm, stop = towers.T
-    carriage = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), stop + jnp.sqrt(arm**2 - radius**2) - q], axis=1)
+    carriage = jnp.stack(
+        [radius * jnp.cos(angle), radius * jnp.sin(angle), stop + jnp.sqrt(arm**2 - radius**2) - q],
+        axis=1,
+    )
     return jnp.sqrt(((T[:3, 3] + twist[3:] - carriage) ** 2).sum(axis=1)) - arm
 
 
@@ -51,13 +58,16 @@ def test_sensitivity_of_the_families_agrees_with_differences_and_jax(name, legs,
 
     both = np.concatenate([found.parameters[0], found.readings[0]], axis=-1)
     scale = np.concatenate(
-        [[1.0 if d is Dimension.ANGLE else robot.size for d in robot.parameters.dimensions], np.full(q.shape[2], robot.size)]
+        [
+            [1.0 if d is Dimension.ANGLE else robot.size for d in robot.parameters.dimensions],
+            np.full(q.shape[2], robot.size),
+        ]
     )
     moved = np.diag(scale)
 
     def solved(x):  # one trial a parameter or reading
         v, r = values + x[0] * moved[:, : values.size], q + x[0] * moved[:, None, values.size :]
-        return se3.difference(forward_trials(robot, v, r, start=state).T, state.T)
+        return geometry.difference(forward_trials(robot, v, r, start=state).T, state.T)
 
     check_jacobian(
         solved, (both * scale).transpose(2, 0, 1)[..., None], np.zeros(1), scale=0.1,
@@ -68,7 +78,11 @@ def test_sensitivity_of_the_families_agrees_with_differences_and_jax(name, legs,
     for row in range(4):
         at = q[0, row], state.T[0, row]
         F = jax.jacfwd(lambda y, at=at: legs(jnp, values[0], *at, y))(np.zeros(6))[:, free]
-        G = jax.jacfwd(lambda v, at=at: legs(jnp, v[: values.size], at[0] + v[values.size :], at[1], np.zeros(6)))(x)
+        G = jax.jacfwd(
+            lambda v, at=at: legs(
+                jnp, v[: values.size], at[0] + v[values.size :], at[1], np.zeros(6)
+            )
+        )(x)
         assert_allclose(both[row][free], -np.linalg.solve(F, G), atol=1e-11)
 
 
@@ -78,11 +92,13 @@ def test_sensitivity_of_any_mechanism_agrees_with_differences(name):
     values, q = robot.values[None], sol.q[None]
     state = forward_trials(robot, values, q, start=sol.state)
     found = sensitivity(robot, values, q, state)
-    unit = np.array([robot.size if d is Dimension.LENGTH else 1.0 for d in robot.parameters.dimensions])
+    unit = np.array(
+        [robot.size if d is Dimension.LENGTH else 1.0 for d in robot.parameters.dimensions]
+    )
 
     def solved(x):  # one trial a parameter
         moved = forward_trials(robot, values + x[0] * np.diag(unit), q, start=state)
-        return se3.difference(moved.T, np.broadcast_to(state.T, moved.T.shape))
+        return geometry.difference(moved.T, np.broadcast_to(state.T, moved.T.shape))
 
     check_jacobian(
         solved, (found.parameters[0] * unit).transpose(2, 0, 1)[..., None], np.zeros(1), scale=0.1,
@@ -100,14 +116,25 @@ def test_transmission_terms_enter_the_pose_with_their_slopes():
 
     def solved(x):
         v = np.concatenate([values[0, :42], x[:-6]])[None]
-        return se3.difference(forward_trials(robot, v, q + x[-6:], start=state).T[0], state.T[0])
+        return geometry.difference(
+            forward_trials(robot, v, q + x[-6:], start=state).T[0], state.T[0]
+        )
 
     x = np.concatenate([values[0, 42:], np.zeros(6)])
-    check_jacobian(solved, both, x, scale=0.002, atol=1e-10, atol_reason="closure to 1e-13, condition 30, step 1e-4")
+    check_jacobian(
+        solved,
+        both,
+        x,
+        scale=0.002,
+        atol=1e-10,
+        atol_reason="closure to 1e-13, condition 30, step 1e-4",
+    )
 
 
 def with_harmonics(robot):
-    """The same robot whose first two actuators have every transmission term as a parameter, on a 5 mm screw."""
+    """The same robot whose first two actuators have every transmission term as a parameter, on a 5
+    mm screw.
+    """
     terms = ("offset", "gain", "sin1", "cos1", "sin2", "cos2")
     assembly, extra, maps = robot.assembly, [], []
     for name in ("q1", "q2"):
@@ -115,9 +142,16 @@ def with_harmonics(robot):
             dimension = Dimension.RATIO if term == "gain" else Dimension.LENGTH
             extra.append(Parameter(f"{name}.{term}", dimension, float(term == "gain")))
             maps.append(Linear(f"{name}.{term}", Address(name, "transmission", term)))
-    actuators = tuple(replace(a, period=0.005) if a.name in ("q1", "q2") else a for a in assembly.actuators)
+    actuators = tuple(
+        replace(a, period=0.005) if a.name in ("q1", "q2") else a for a in assembly.actuators
+    )
     return build(
-        replace(assembly, parameters=(*assembly.parameters, *extra), maps=(*assembly.maps, *maps), actuators=actuators)
+        replace(
+            assembly,
+            parameters=(*assembly.parameters, *extra),
+            maps=(*assembly.maps, *maps),
+            actuators=actuators,
+        )
     )
 
 
@@ -143,20 +177,33 @@ def test_failed_rows_hold_no_numbers_and_do_not_stop_the_others():
     assert np.isfinite(found.parameters[0, [0, 2]]).all()
 
 
-# --- what can be known: frames that are not known are six extra columns each -----------------------------------------
+# --- what can be known: frames that are not known are six extra columns each
+# -----------------------------------------
 
 
 def scaled_matrix(name, n=40):
-    """Sensitivities of n poses, angles in sizes of the robot; columns for the unknown base and tool frame beside them."""
+    """Sensitivities of n poses, angles in sizes of the robot; columns for the unknown base and tool
+    frame beside them.
+    """
     robot, sol, _ = sampled(name, n)
     state = forward_trials(robot, noisy(robot, 1e-4), sol.q[None], start=sol.state)
     D = sensitivity(robot, noisy(robot, 1e-4), sol.q[None], state).parameters[0]
     T, eye, zero = state.T[0], np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3, 3))
-    base = np.concatenate([np.concatenate([eye, zero], axis=2), np.concatenate([-se3.hat(T[:, :3, 3]), eye], axis=2)], axis=1)
+    base = np.concatenate(
+        [
+            np.concatenate([eye, zero], axis=2),
+            np.concatenate([-geometry.hat(T[:, :3, 3]), eye], axis=2),
+        ],
+        axis=1,
+    )
     R = T[:, :3, :3]
-    tool = np.concatenate([np.concatenate([R, zero], axis=2), np.concatenate([zero, R], axis=2)], axis=1)
+    tool = np.concatenate(
+        [np.concatenate([R, zero], axis=2), np.concatenate([zero, R], axis=2)], axis=1
+    )
     rows = np.array([robot.size] * 3 + [1.0] * 3)[:, None]
-    columns = np.array([1.0 if d is Dimension.ANGLE else robot.size for d in robot.parameters.dimensions])
+    columns = np.array(
+        [1.0 if d is Dimension.ANGLE else robot.size for d in robot.parameters.dimensions]
+    )
     return D * rows * columns / robot.size, base * rows / robot.size, tool * rows / robot.size, T
 
 
@@ -174,7 +221,12 @@ def rank_beside(matrix, *unknown):
 def test_each_unknown_frame_costs_six_parameters(name, count):
     D, base, tool, _ = scaled_matrix(name)
     assert D.shape[-1] == count
-    for unknown, rank in (((), count), ((base,), count - 6), ((tool,), count - 6), ((base, tool), count - 12)):
+    for unknown, rank in (
+        ((), count),
+        ((base,), count - 6),
+        ((tool,), count - 6),
+        ((base, tool), count - 12),
+    ):
         found, s = rank_beside(D, *unknown)
         assert found == rank
         assert (s[rank:] < 1e-13).all()  # null to rounding; from J'J it would be 1e-7

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from loopcal.errors import DataError
 from loopcal.io import load_robot
 from loopcal.mechanism import inverse
-from loopcal.mechanism.singularity import along_path, singularity, typical
+from loopcal.mechanism.singularities import along_path, singularity, typical
 from tests import zoo
 
 
@@ -20,14 +20,24 @@ def test_the_margin_of_a_hexapod_is_that_of_its_plucker_lines():
     u = p + T[:, None, :3, 3] - zoo.HEXAPOD_BASE * zoo.MM
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
     lines = np.concatenate([np.cross(p, u) / robot.size, u], axis=-1)
-    assert_allclose(found.margin, np.linalg.svd(lines, compute_uv=False)[:, -1], atol=1e-14)  # [m/m] rounding
-    assert (found.orientation == np.sign(np.linalg.det(lines)) * found.orientation[0] * np.sign(np.linalg.det(lines))[0]).all()
-    assert_allclose(found.drive_margin, 1.0, atol=1e-14)  # a rod pushes along itself, whatever the pose
+    assert_allclose(
+        found.margin, np.linalg.svd(lines, compute_uv=False)[:, -1], atol=1e-14
+    )  # [m/m] rounding
+    assert (
+        found.orientation
+        == np.sign(np.linalg.det(lines)) * found.orientation[0] * np.sign(np.linalg.det(lines))[0]
+    ).all()
+    assert_allclose(
+        found.drive_margin, 1.0, atol=1e-14
+    )  # a rod pushes along itself, whatever the pose
 
 
 def test_a_hexapod_turned_by_a_right_angle_can_turn_freely():
     # Fichter's singularity: a symmetric platform turned by 90 degrees about its normal
-    found = singularity(zoo.hexapod(), np.array([[0.0, 0.0, 0.2, 0.0, 0.0, np.pi / 2], [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]]))
+    found = singularity(
+        zoo.hexapod(),
+        np.array([[0.0, 0.0, 0.2, 0.0, 0.0, np.pi / 2], [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]]),
+    )
     assert found.margin[0] < 1e-9  # [m/m] six printed digits of the centres
     assert found.near.tolist() == [True, False]
     assert "turn about z" in found.motion(0)
@@ -53,7 +63,9 @@ def test_a_path_that_cannot_go_on_says_where():
     path[:, 2], path[:, 0] = 0.1, np.linspace(0.0, 0.6, 12)
     found = along_path(robot, coordinates=path, medians=typical(robot))
     lost = int(np.flatnonzero(np.isnan(found.margin))[0])
-    assert (lost, True) in [(step, text.startswith("not reached from here")) for step, text in found.warnings]
+    assert (lost, True) in [
+        (step, text.startswith("not reached from here")) for step, text in found.warnings
+    ]
 
 
 def test_readings_and_coordinates_of_one_path_agree():
@@ -76,7 +88,9 @@ def test_an_outstretched_crank_moves_nothing():
 
 def test_without_a_workspace_home_is_the_measure():
     robot = zoo.planar_rrr()
-    assert typical(robot)[0] == pytest.approx(singularity(robot, robot.home[None], (1.0, 1.0)).margin[0], abs=1e-12)
+    assert typical(robot)[0] == pytest.approx(
+        singularity(robot, robot.home[None], (1.0, 1.0)).margin[0], abs=1e-12
+    )
 
 
 def test_redundant_drives_have_a_margin_and_no_sign():
@@ -85,7 +99,9 @@ def test_redundant_drives_have_a_margin_and_no_sign():
     assert found.orientation[0] == 0
 
 
-@pytest.mark.parametrize("given", [{}, {"readings": np.zeros((2, 6)), "coordinates": np.zeros((2, 6))}])
+@pytest.mark.parametrize(
+    "given", [{}, {"readings": np.zeros((2, 6)), "coordinates": np.zeros((2, 6))}]
+)
 def test_a_path_is_readings_or_coordinates(given):
     with pytest.raises(DataError, match="one of the two"):
         along_path(zoo.hexapod(), **given)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Positions drawn from a workspace: even, inside every stroke, the same for a seed; an empty workspace is said."""
+"""Positions drawn from a workspace: even, inside every stroke, the same for a seed; an empty
+workspace is said.
+"""
 
 from dataclasses import replace
 
@@ -20,7 +22,9 @@ def test_positions_are_inside_ranges_and_strokes_and_forward_leads_back():
     low, high = np.array([robot.assembly.workspace[name] for name in robot.controlled]).T
     assert ((found.coordinates >= low) & (found.coordinates <= high)).all()
     assert np.abs(found.solution.q).max() <= 0.075
-    assert_allclose(forward(robot, found.solution.q).T, found.solution.T, atol=1e-12)  # [1, m]: rounding over Newton
+    assert_allclose(
+        forward(robot, found.solution.q).T, found.solution.T, atol=1e-12
+    )  # [1, m]: rounding over Newton
     assert 0.95 < found.share < 1.0
     assert all(name.startswith("stroke of q") for name in found.lost)
 
@@ -37,16 +41,21 @@ def test_tilt_is_even_over_the_cap():
     theta = found.coordinates[:, robot.controlled.index("theta")]
     low, high = robot.assembly.workspace["theta"]
     share = (np.cos(low) - np.cos(theta)) / (np.cos(low) - np.cos(high))
-    # uniform on (0, 1): the mean of 4000 is within 4 standard deviations of a half in all but 6 of 1e5 seeds
+    # uniform on (0, 1): the mean of 4000 is within 4 standard deviations of a half in all but 6 of
+    # 1e5 seeds
     assert abs(share.mean() - 0.5) < 4 / np.sqrt(12 * 4000)
     assert abs(np.quantile(share, 0.1) - 0.1) < 4 * np.sqrt(0.09 / 4000)
 
 
 def test_an_empty_workspace_is_said_with_its_reason():
     robot = with_workspace({"x": (5.0, 6.0), "y": (-0.08, 0.08), "z": (0.0, 0.2)})
-    with pytest.raises(MechanismError, match=r"workspace is empty: 0 of .* because the loops cannot be closed"):
+    with pytest.raises(
+        MechanismError, match=r"workspace is empty: 0 of .* because the loops cannot be closed"
+    ):
         sample(robot, 10)
-    robot = with_workspace({"x": (-0.08, 0.08), "y": (-0.08, 0.08), "z": (0.0, 0.2)}, stroke=(0.9, 1.0))
+    robot = with_workspace(
+        {"x": (-0.08, 0.08), "y": (-0.08, 0.08), "z": (0.0, 0.2)}, stroke=(0.9, 1.0)
+    )
     with pytest.raises(MechanismError, match="because stroke of q1 is exceeded"):
         sample(robot, 10)
 
@@ -59,5 +68,7 @@ def test_a_range_that_is_missing_is_named():
 def with_workspace(ranges, stroke=None):
     assembly = replace(zoo.delta().assembly, workspace=ranges)
     if stroke:
-        assembly = replace(assembly, actuators=tuple(replace(a, stroke=stroke) for a in assembly.actuators))
+        assembly = replace(
+            assembly, actuators=tuple(replace(a, stroke=stroke) for a in assembly.actuators)
+        )
     return build(assembly)

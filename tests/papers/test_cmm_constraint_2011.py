@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration from planes and perpendicular lines repeated: the paper's equations, its claims, and the same on many machines.
+"""Calibration from planes and perpendicular lines repeated: the paper's equations, its claims, and
+the same on many machines.
 
-The small version below draws 6 machines, leaves out sweeps of the exchange, and holds wide bounds; those of the tests marked
-`evidence` are over 200.
+The small version below draws 6 machines, leaves out sweeps of the exchange, and holds wide bounds;
+those of the tests marked `evidence` are over 200.
 """
 
 import json
@@ -13,19 +14,31 @@ import numpy as np
 import pytest
 from scipy.stats import beta
 
-from loopcal import se3
-from loopcal.calibrate import LeastSquares
+from loopcal import geometry
+from loopcal.estimate import LeastSquares
 from loopcal.mechanism import forward
-from loopcal.mechanism.trials import forward_trials
+from loopcal.mechanism.batch_kinematics import forward_trials
 from loopcal.papers import PAPERS
 from loopcal.papers.cmm_constraint_2011.cells import BEFORE, LS, PRIOR, cell, grid
 from loopcal.papers.cmm_constraint_2011.compare import told
 from loopcal.papers.cmm_constraint_2011.fifty import LINES, fifty
 from loopcal.papers.cmm_constraint_2011.forms import compare_forms
 from loopcal.papers.cmm_constraint_2011.gauge import NAMES, gauge_directions, without_gauge
-from loopcal.papers.cmm_constraint_2011.layouts import ANY, ONE, TEN, arranged, candidates, weights_compared
+from loopcal.papers.cmm_constraint_2011.layouts import (
+    ANY,
+    ONE,
+    TEN,
+    arranged,
+    candidates,
+    weights_compared,
+)
 from loopcal.papers.cmm_constraint_2011.published import MM, published
-from loopcal.papers.cmm_constraint_2011.steps import PaperRows, equations, identify_from_rows, row_map
+from loopcal.papers.cmm_constraint_2011.steps import (
+    PaperRows,
+    equations,
+    identify_from_rows,
+    row_map,
+)
 from loopcal.papers.cmm_constraint_2011.study import (
     AXES,
     GROUPS,
@@ -44,7 +57,10 @@ ROOT = Path(__file__).parents[2]
 DOC = ROOT / "docs" / "papers" / "cmm-constraint-2011.md"
 DRAWS = 6
 ALIGNED = MEASURES.index("position, aligned [mm]")
-ABSOLUTE_POSITION, NOMINAL = MEASURES.index("position [mm]"), MEASURES.index("position, gauge at nominal [mm]")
+ABSOLUTE_POSITION, NOMINAL = (
+    MEASURES.index("position [mm]"),
+    MEASURES.index("position, gauge at nominal [mm]"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +88,10 @@ def test_printed_quotients_are_judged_with_their_rounding() -> None:
     given = published().table_4
     assert [name for name, g in given.items() if not g.follows] == ["orientation, mean"]
     low, high = given["orientation, mean"].possible
-    assert (round(low, 2), round(high, 2)) == (4.14, 6.2)  # 1.45 / 0.35 and 1.55 / 0.25, against 3.9
+    assert (round(low, 2), round(high, 2)) == (
+        4.14,
+        6.2,
+    )  # 1.45 / 0.35 and 1.55 / 0.25, against 3.9
     low, high = given["position, standard deviation"].possible
     assert low < 4.3 < high  # 0.5 / 0.1 = 5, but 0.45 / 0.15 = 3
     assert [round(g.reduction) for g in published().figure_5.values() if g.before] == [83, 87]
@@ -86,7 +105,9 @@ def test_nine_directions_move_the_base_or_turn_the_platform_about_the_end_point(
         T = forward(robot.with_values(robot.values + step * direction), at.q, at).T
         moved = (T[:, :3, 3] - at.T[:, :3, 3]) / step
         k = np.eye(3)[i % 3]
-        expected = (np.tile(k, (len(moved), 1)), np.cross(k, at.T[:, :3, 3]), np.zeros_like(moved))[i // 3]
+        expected = (np.tile(k, (len(moved), 1)), np.cross(k, at.T[:, :3, 3]), np.zeros_like(moved))[
+            i // 3
+        ]
         np.testing.assert_allclose(moved, expected, atol=1e-5)  # second order of a step of 1e-6
     rows = study.optimised.rows.reshape(-1, 42)
     assert np.abs(rows @ gauge_directions(robot).T).max() < 1e-13 * np.abs(rows).max()
@@ -104,10 +125,14 @@ def test_equation_17_is_the_slope_of_14_and_the_noise_map_that_by_the_points(stu
         moved[:, place] += step, -step
         x = forward_trials(robot, moved, q, layout.state).T[:, :, :3, 3].reshape(2, *at.shape[1:])
         products = -equations(x, np.repeat(J, 2, axis=0))[1]
-        np.testing.assert_allclose((products[0] - products[1]) / (2 * step), a[0, ..., place], atol=1e-8)  # [m2 per m]
+        np.testing.assert_allclose(
+            (products[0] - products[1]) / (2 * step), a[0, ..., place], atol=1e-8
+        )  # [m2 per m]
     shift = 1e-7 * np.random.default_rng(0).normal(size=at.shape)
     by_map = (row_map(*layout.levers) @ shift[0].reshape(GROUPS, -1, 1))[..., 0]
-    np.testing.assert_allclose(-equations(at + shift, J)[1][0], by_map, atol=1e-12)  # [m2], second order of 1e-7
+    np.testing.assert_allclose(
+        -equations(at + shift, J)[1][0], by_map, atol=1e-12
+    )  # [m2], second order of 1e-7
 
 
 def test_true_machines_stand_where_held_but_for_the_noise(study) -> None:
@@ -118,27 +143,39 @@ def test_true_machines_stand_where_held_but_for_the_noise(study) -> None:
     assert abs(noise.std() - 1.0) < 5.0 / np.sqrt(2 * noise.size)  # 5 sd of a sd
     np.testing.assert_allclose(off[:, :, :3, :3], 0.0, atol=1e-9)  # orientations as commanded
     more = study.layout.held(true_machines(study.robot, MM, 3, 0), 1e-4, 0)
-    np.testing.assert_allclose(more[:2], q, atol=1e-12)  # [m] a machine is the same however many there are
+    np.testing.assert_allclose(
+        more[:2], q, atol=1e-12
+    )  # [m] a machine is the same however many there are
 
 
-def test_alignment_takes_out_motions_of_the_base_and_turns_of_the_platform_and_nothing_else(study) -> None:
+def test_alignment_takes_out_motions_of_the_base_and_turns_of_the_platform_and_nothing_else(
+    study,
+) -> None:
     true = study.unseen.solution.T[None]
-    base = se3.pose(se3.exp_so3(np.array([0.1, -0.2, 0.3])), np.array([0.3, 0.1, -0.2]))
-    turn = se3.pose(se3.exp_so3(np.array([0.2, 0.1, -0.1])), np.zeros(3))
+    base = geometry.pose(geometry.exp_so3(np.array([0.1, -0.2, 0.3])), np.array([0.3, 0.1, -0.2]))
+    turn = geometry.pose(geometry.exp_so3(np.array([0.2, 0.1, -0.1])), np.zeros(3))
     np.testing.assert_allclose(best_fit(base @ true @ turn, true), true, atol=1e-12)
-    shifted = true @ se3.pose(np.eye(3), np.array([1e-3, 0.0, 0.0]))
-    assert np.abs(best_fit(shifted, true)[..., :3, 3] - true[..., :3, 3]).max() > 1e-5  # [m] that is no motion of the base
+    shifted = true @ geometry.pose(np.eye(3), np.array([1e-3, 0.0, 0.0]))
+    assert (
+        np.abs(best_fit(shifted, true)[..., :3, 3] - true[..., :3, 3]).max() > 1e-5
+    )  # [m] that is no motion of the base
 
 
-def test_what_nothing_tells_moves_absolute_errors_and_neither_those_at_nominal_nor_those_aligned(study) -> None:
+def test_what_nothing_tells_moves_absolute_errors_and_neither_those_at_nominal_nor_those_aligned(
+    study,
+) -> None:
     truth = true_machines(study.robot, 0.1 * MM, 1, 0)
     true = study.unseen.poses(truth)
     values = study.robot.parameters.nominal[None]
     here = study.unseen.errors(values, truth, true)[0]
-    assert here[NOMINAL] == pytest.approx(here[ABSOLUTE_POSITION], rel=1e-9)  # as designed it is at nominal already
+    assert here[NOMINAL] == pytest.approx(
+        here[ABSOLUTE_POSITION], rel=1e-9
+    )  # as designed it is at nominal already
     step = 1e-5  # of a direction that has length one
     for direction in gauge_directions(study.robot):
-        moved = study.unseen.errors(values + step * direction / np.linalg.norm(direction), truth, true)[0]
+        moved = study.unseen.errors(
+            values + step * direction / np.linalg.norm(direction), truth, true
+        )[0]
         # second order: some 1e-5 of the step, which is 0.01 mm
         assert moved[NOMINAL] == pytest.approx(here[NOMINAL], abs=1e-6)
         assert moved[ALIGNED] == pytest.approx(here[ALIGNED], abs=1e-6)
@@ -149,7 +186,9 @@ def test_what_nothing_tells_moves_absolute_errors_and_neither_those_at_nominal_n
 
 
 def test_large_absolute_errors_of_least_squares_are_where_the_gauge_was_put(study) -> None:
-    """The same answers, moved along what no row tells to where poses are nearest to those as designed."""
+    """The same answers, moved along what no row tells to where poses are nearest to those as
+    designed.
+    """
     loud = cell(study, 0.01 * MM, 0.1 * MM, 0, DRAWS)
     before, ls = loud.median(BEFORE), loud.median(LS)
     assert ls[ABSOLUTE_POSITION] > 10.0 * ls[NOMINAL]
@@ -186,7 +225,9 @@ def test_rank_is_33_for_1_to_30_planes(found) -> None:
 
 
 @pytest.mark.slow
-def test_least_squares_errs_by_the_noise_and_map_by_less_where_noise_is_as_large_as_errors(found) -> None:
+def test_least_squares_errs_by_the_noise_and_map_by_less_where_noise_is_as_large_as_errors(
+    found,
+) -> None:
     for (given, _), c in found.cells.items():
         assert c.failed == 0
         ratio = c.median(LS)[ALIGNED] * MM / c.noise
@@ -225,7 +266,9 @@ def test_the_verdicts_are_these(found) -> None:
     ):
         assert [a for claim, a in judged.items() if words in claim] == [agrees], words
     for table in reproduction.tables:
-        assert np.isfinite([x for row in table.rows for x in row if isinstance(x, float)]).all(), table.name
+        assert np.isfinite([x for row in table.rows for x in row if isinstance(x, float)]).all(), (
+            table.name
+        )
     made_by = {"command": ["loopcal"], "versions": {"loopcal": "1", "numpy": "2"}}
     told_page = page(reproduction, made_by)
     assert "nine directions" in told_page
@@ -234,7 +277,11 @@ def test_the_verdicts_are_these(found) -> None:
     assert {len(s.x) for s in four.series} == {12}
     assert not four.joined
     assert {"figure_4", "figure_5"} <= {f.name for f in reproduction.figures}
-    assert all(np.isfinite(s.y).all() and len(s.x) == len(s.y) > 1 for f in reproduction.figures for s in f.series)
+    assert all(
+        np.isfinite(s.y).all() and len(s.x) == len(s.y) > 1
+        for f in reproduction.figures
+        for s in f.series
+    )
 
 
 def test_75_per_cent_is_no_matter_of_luck() -> None:
@@ -256,7 +303,9 @@ def test_the_same_seed_gives_the_same_numbers(study) -> None:
 def test_the_page_of_the_documentation_names_every_module_and_no_missing_one() -> None:
     folder = ROOT / "src" / "loopcal" / "papers" / "cmm_constraint_2011"
     named = set(re.findall(r"`(\w+\.(?:py|yaml))`", DOC.read_text("utf-8")))
-    assert named == {path.name for path in folder.iterdir() if path.suffix in {".py", ".yaml"}} - {"__init__.py"}
+    assert named == {path.name for path in folder.iterdir() if path.suffix in {".py", ".yaml"}} - {
+        "__init__.py"
+    }
     assert "cmm-constraint-2011" in PAPERS
 
 
@@ -295,17 +344,35 @@ def test_evidence_the_covariance_of_the_rows_is_worth_a_sixth_and_independence_n
     assert share["with their covariance"] == pytest.approx(0.84, abs=0.04)
     assert share["divided by the distance d_1"] == pytest.approx(0.93, abs=0.04)
     assert share["divided by the sd of each, taken as independent"] > 0.9
-    assert rows["divided by the sd of each, taken as independent"][0] == pytest.approx(0.025, rel=0.2)  # [mm] an earlier study
-    assert rows["with their covariance"][3] == min(numbers[3] for numbers in rows.values())  # parameters by MAP
+    assert rows["divided by the sd of each, taken as independent"][0] == pytest.approx(
+        0.025, rel=0.2
+    )  # [mm] an earlier study
+    assert rows["with their covariance"][3] == min(
+        numbers[3] for numbers in rows.values()
+    )  # parameters by MAP
 
 
 @pytest.mark.evidence
-def test_evidence_absolute_errors_of_least_squares_hang_on_the_gauge_and_aligned_ones_on_the_data() -> None:
+def test_evidence_absolute_errors_of_least_squares_hang_on_the_gauge_and_aligned_ones_on_the_data() -> (
+    None
+):
     tables = evidence()["tables"]
     columns = tables["table_3"]["columns"]
-    loud = dict(zip(columns, next(r for r in tables["table_3"]["rows"] if r[:2] == ["0.01", "0.1"]), strict=True))
+    loud = dict(
+        zip(
+            columns,
+            next(r for r in tables["table_3"]["rows"] if r[:2] == ["0.01", "0.1"]),
+            strict=True,
+        )
+    )
     assert loud["position, absolute [mm], LS"] > 15.0 * loud["position, gauge at nominal [mm], LS"]
-    quiet = dict(zip(columns, next(r for r in tables["table_3"]["rows"] if r[:2] == ["1", "0.0001"]), strict=True))
+    quiet = dict(
+        zip(
+            columns,
+            next(r for r in tables["table_3"]["rows"] if r[:2] == ["1", "0.0001"]),
+            strict=True,
+        )
+    )
     assert quiet["position, absolute [mm], LS"] < 0.5 * quiet["position, gauge at nominal [mm], LS"]
     fifty_points = {(planes, frame): numbers for planes, frame, *numbers in tables["fifty"]["rows"]}
     for planes in (1, 5):
@@ -317,18 +384,23 @@ def test_evidence_absolute_errors_of_least_squares_hang_on_the_gauge_and_aligned
         assert prior < 0.2 * before
     assert fifty_points[1, "aligned"][1] > fifty_points[1, "aligned"][0]
     assert fifty_points[5, "aligned"][1] < 0.6 * fifty_points[5, "aligned"][0]
-    # one plane: all of 40 machines within 5 iterations; five: 14 of them, between 9 and 20 in 95 % of draws
+    # one plane: all of 40 machines within 5 iterations; five: 14 of them, between 9 and 20 in 95 %
+    # of draws
     assert fifty_points[1, "aligned"][3] >= 90.0
     assert 20.0 < fifty_points[5, "aligned"][3] < 55.0
 
 
 @pytest.mark.evidence
-def test_evidence_figure_5_comes_near_where_the_gauge_is_out_and_parameters_do_not_where_it_is_in() -> None:
+def test_evidence_figure_5_comes_near_where_the_gauge_is_out_and_parameters_do_not_where_it_is_in() -> (
+    None
+):
     rows = evidence()["tables"]["readings"]["rows"]
     printed, found = rows[0][3:], {tuple(row[:3]): row[3:] for row in rows[1:]}
     for reading in (("gauge-free", "absolute"), ("all 42", "aligned"), ("gauge-free", "aligned")):
         assert np.abs(np.subtract(found["standard deviation", *reading], printed)).max() < 20.0
     assert found["standard deviation", "all 42", "absolute"][0] < 54.0 < printed[0]
-    assert all(numbers[0] < 0.0 for (reading, *_), numbers in found.items() if reading == "variance")
+    assert all(
+        numbers[0] < 0.0 for (reading, *_), numbers in found.items() if reading == "variance"
+    )
     ranks = evidence()["tables"]["correlation"]["rows"]
     assert all(cells == 12 and ratios == 6 and rank > 0.7 for _, rank, cells, ratios in ranks)

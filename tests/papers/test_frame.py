@@ -19,14 +19,37 @@ MADE_BY = {"command": ["loopcal", "reproduce", "small"], "versions": {"loopcal":
 
 def small() -> Reproduction:
     printed = Printed.parse({"A": "0.12 -3E-05", "B": "7 1.50"})
-    comparison = Comparison("one", "Table 1", ("x [mm]", "y [mm]"), printed, np.array([[0.125, -2e-5], [9.0, 1.5]]))
-    figure = Figure(
-        "curve", "Curve", "step [1]", "error [mm]", "Of 1 pose.", (Series("a", (0.0, 1.0), (1.0, 0.1)),), {"rule": 0.5}
+    comparison = Comparison(
+        "one", "Table 1", ("x [mm]", "y [mm]"), printed, np.array([[0.125, -2e-5], [9.0, 1.5]])
     )
-    extra = Table("extra", "Extra", ("case", "value"), (("p", 1.0), ("q", None), ("r", 3.0)), ("", ".1f"), shown=2)
+    figure = Figure(
+        "curve",
+        "Curve",
+        "step [1]",
+        "error [mm]",
+        "Of 1 pose.",
+        (Series("a", (0.0, 1.0), (1.0, 0.1)),),
+        {"rule": 0.5},
+    )
+    extra = Table(
+        "extra",
+        "Extra",
+        ("case", "value"),
+        (("p", 1.0), ("q", None), ("r", 3.0)),
+        ("", ".1f"),
+        shown=2,
+    )
     verdict = Verdict("It holds.", False, "It does not.", ASKED_HERE)
     return Reproduction(
-        "small", "A title", "a source", ("About.",), {"seed": 0}, (comparison,), (extra,), (verdict,), (figure,)
+        "small",
+        "A title",
+        "a source",
+        ("About.",),
+        {"seed": 0},
+        (comparison,),
+        (extra,),
+        (verdict,),
+        (figure,),
     )
 
 
@@ -44,8 +67,14 @@ def test_published_numbers_stay_text_as_printed() -> None:
 
 def test_the_page_shows_published_beside_computed_and_marks_what_differs() -> None:
     text = page(small(), MADE_BY)
-    assert "| B | published | 7 | 1.50 |\n|  | computed | 9.0 | 1.500 |\n|  | difference | **2.0e+00** | 0 |" in text
-    assert "**Does not agree:** It holds. (not a statement of the paper, asked here)\n   It does not." in text
+    assert (
+        "| B | published | 7 | 1.50 |\n|  | computed | 9.0 | 1.500 |\n|  | difference | "
+        "**2.0e+00** | 0 |" in text
+    )
+    assert (
+        "**Does not agree:** It holds. (not a statement of the paper, asked here)\n   It does not."
+        in text
+    )
     assert "| q | - |" in text
     assert "The first 2 of 3 rows" in text
     assert "(figures/curve.png)" in text
@@ -59,7 +88,12 @@ def test_a_folder_holds_page_tables_and_figures_and_is_not_overwritten_unasked(t
     }
     assert (folder / "figures" / "curve.png").read_bytes().startswith(b"\x89PNG")
     with (folder / "tables" / "extra.csv").open() as stream:
-        assert list(csv.reader(stream)) == [["case", "value"], ["p", "1.0"], ["q", ""], ["r", "3.0"]]
+        assert list(csv.reader(stream)) == [
+            ["case", "value"],
+            ["p", "1.0"],
+            ["q", ""],
+            ["r", "3.0"],
+        ]
     with pytest.raises(FileError, match="--force"):
         write_folder(folder, small(), MADE_BY)
     (folder / "old").touch()
@@ -77,7 +111,10 @@ def test_an_unknown_paper_and_impossible_sizes_are_refused() -> None:
 
 
 def test_every_paper_is_named_as_it_is_registered() -> None:
-    assert all(isinstance(one, Paper) and name == one.name and one.title and one.source for name, one in PAPERS.items())
+    assert all(
+        isinstance(one, Paper) and name == one.name and one.title and one.source
+        for name, one in PAPERS.items()
+    )
 
 
 def test_the_command_lists_papers(capsys) -> None:
@@ -87,7 +124,9 @@ def test_the_command_lists_papers(capsys) -> None:
     assert [p["name"] for p in json.loads(capsys.readouterr().out)["papers"]] == list(PAPERS)
 
 
-def test_the_command_refuses_an_unknown_paper_and_a_used_folder_in_one_sentence(capsys, tmp_path) -> None:
+def test_the_command_refuses_an_unknown_paper_and_a_used_folder_in_one_sentence(
+    capsys, tmp_path
+) -> None:
     assert main(["reproduce", "hexapod42"]) == 1
     assert capsys.readouterr().err.startswith("loopcal: 'hexapod42' is not a paper")
     (tmp_path / "mine.txt").touch()
@@ -98,7 +137,9 @@ def test_the_command_refuses_an_unknown_paper_and_a_used_folder_in_one_sentence(
 
 
 @pytest.mark.slow
-def test_the_command_repeats_a_paper_and_writes_the_same_document_that_it_prints(capsys, tmp_path) -> None:
+def test_the_command_repeats_a_paper_and_writes_the_same_document_that_it_prints(
+    capsys, tmp_path
+) -> None:
     folder = tmp_path / "out"
     assert main(["reproduce", "hexapod-42", "--trials", "2", "-o", str(folder), "--json"]) == 0
     out, err = capsys.readouterr()

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The 42-parameter hexapod study repeated: what agrees with print, what does not, and that each judgement is computed.
+"""The 42-parameter hexapod study repeated: what agrees with print, what does not, and that each
+judgement is computed.
 
-Statistics are over 20 drawings (seed 0). Their bounds are written out beside them, and hold for seeds 0 to 6 too: a root
-mean square over 20 drawings of few independent directions is sure to some 15 %.
+Statistics are over 20 drawings (seed 0). Their bounds are written out beside them, and hold for
+seeds 0 to 6 too: a root mean square over 20 drawings of few independent directions is sure to some
+15 %.
 """
 
 import re
@@ -11,14 +13,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.calibrate import LeastSquares, identify_trials
+from loopcal.estimate import LeastSquares, identify_trials
 from loopcal.mechanism import forward
 from loopcal.papers import PAPERS
 from loopcal.papers.hexapod_42.compare import Results, compute
 from loopcal.papers.hexapod_42.leg_form import LegForm
 from loopcal.papers.hexapod_42.published import MM
-from loopcal.papers.hexapod_42.steps import actual_poses, iterate, measured_poses, measurements, twists
-from loopcal.papers.hexapod_42.study_noise import PRESUMED, STATED, limits_si, published_sizes, simulated
+from loopcal.papers.hexapod_42.steps import (
+    actual_poses,
+    iterate,
+    measured_poses,
+    measurements,
+    twists,
+)
+from loopcal.papers.hexapod_42.study_noise import (
+    PRESUMED,
+    STATED,
+    limits_si,
+    published_sizes,
+    simulated,
+)
 from loopcal.papers.hexapod_42.verdicts import recovered_noise, verdicts
 
 pytestmark = pytest.mark.slow
@@ -37,7 +51,12 @@ def table(found: Results, name: str) -> list[tuple]:
 
 def test_table_4_follows_from_tables_2_and_3_to_one_unit_of_the_last_digit(found) -> None:
     fourth = found.comparisons["table_4"]
-    actual = np.array([label.endswith((" PP", " E1")) and not label.startswith("A2 ") for label in fourth.published.labels])
+    actual = np.array(
+        [
+            label.endswith((" PP", " E1")) and not label.startswith("A2 ")
+            for label in fourth.published.labels
+        ]
+    )
     assert actual.sum() == 18
     assert fourth.within[actual].all()
     assert not fourth.within[fourth.published.labels.index("A2 PP")].all()
@@ -48,7 +67,8 @@ def test_only_the_order_rz_ry_rx_with_alpha_about_x_fits_table_4(found) -> None:
     best, second = found.orders[:2]
     assert len({o.formula for o in found.orders}) == 72
     assert best.formula == "Rz(gamma) Ry(beta) Rx(alpha)"
-    # [mm, rad] rounding of the coarsest digits, 1e-4 / sqrt(12) = 2.9e-5 and 1e-5 / sqrt(12) = 2.9e-6
+    # [mm, rad] rounding of the coarsest digits, 1e-4 / sqrt(12) = 2.9e-5 and 1e-5 / sqrt(12) =
+    # 2.9e-6
     assert best.position < 2.9e-5
     assert best.rotation < 2.9e-6
     assert second.position > 1.5 * best.position
@@ -65,14 +85,19 @@ def test_row_a2_and_no_other_is_named_an_outlier(found) -> None:
 
 
 def test_noise_free_steps_are_those_of_the_paper(found) -> None:
-    for run, second in ((found.exact, 2e-8), (found.frozen, 3e-6)):  # [mm] matrix made anew; one matrix
+    for run, second in (
+        (found.exact, 2e-8),
+        (found.frozen, 3e-6),
+    ):  # [mm] matrix made anew; one matrix
         errors = np.abs(run.parameter_errors(found.study.truth)).max(axis=1) / MM
         assert run.integrated[0] == pytest.approx(0.058938, abs=5e-7)  # [mm + rad], last digit
         assert errors[1] == pytest.approx(1.6e-3, rel=0.1)
         assert errors[2] < second
         assert run.needed(found.printed.threshold) == found.printed.iterations == 2
     assert np.abs(found.exact.parameter_errors(found.study.truth)[3]).max() / MM < 1e-8
-    np.testing.assert_array_equal(np.round(found.exact.conditions), [5822, 3501, 4924, 4570, 3385, 4683])
+    np.testing.assert_array_equal(
+        np.round(found.exact.conditions), [5822, 3501, 4924, 4570, 3385, 4683]
+    )
 
 
 def test_with_the_stated_noise_the_rule_is_never_met_and_parameters_get_worse(found) -> None:
@@ -88,12 +113,18 @@ def test_with_the_stated_noise_the_rule_is_never_met_and_parameters_get_worse(fo
     assert 0.008 < alone.wide < 0.03  # [mm]
 
 
-def test_leg_by_leg_has_2_4_times_the_standard_deviation_of_all_legs_weighted_together(found) -> None:
+def test_leg_by_leg_has_2_4_times_the_standard_deviation_of_all_legs_weighted_together(
+    found,
+) -> None:
     study, sd = found.study, limits_si(STATED) / np.sqrt(3.0)
     legs, actual = LegForm.at(study.robot, study.commanded), actual_poses(study)
     unit = np.eye(60).reshape(60, 10, 6) * sd  # exact to first order: each of 60 noises on its own
-    alone = np.sqrt(np.sum([legs.change(twists(noise, actual, study.order)) ** 2 for noise in unit], axis=0))
-    together = identify_trials(study.robot, simulated(study, 0, 2), LeastSquares()).standard_deviations()[0]
+    alone = np.sqrt(
+        np.sum([legs.change(twists(noise, actual, study.order)) ** 2 for noise in unit], axis=0)
+    )
+    together = identify_trials(
+        study.robot, simulated(study, 0, 2), LeastSquares()
+    ).standard_deviations()[0]
     rms = [float(np.sqrt(np.mean(values**2)) / MM) for values in (alone, together)]
     np.testing.assert_allclose(rms, [0.199, 0.084], rtol=0.03)  # [mm]
     assert rms[0] / rms[1] == pytest.approx(2.4, abs=0.1)
@@ -110,7 +141,9 @@ def test_tables_5_and_6_fit_noise_a_thousand_times_smaller_than_stated(found) ->
             assert not level.holds(sizes)
 
 
-def test_table_6_holds_residuals_of_this_problem_and_a_shift_of_all_poses_leaves_none(found) -> None:
+def test_table_6_holds_residuals_of_this_problem_and_a_shift_of_all_poses_leaves_none(
+    found,
+) -> None:
     study = found.study
     legs = LegForm.at(study.truth, forward(study.truth, study.commanded.q, study.commanded))
     actual = actual_poses(study)
@@ -120,7 +153,9 @@ def test_table_6_holds_residuals_of_this_problem_and_a_shift_of_all_poses_leaves
 
     printed = found.printed.pose_errors_after.values * np.array([MM] * 3 + [1.0] * 3)
     assert explained(printed).max() < 0.1
-    assert explained(np.random.default_rng(0).normal(size=(10, 6)) * limits_si(PRESUMED)).mean() > 0.7
+    assert (
+        explained(np.random.default_rng(0).normal(size=(10, 6)) * limits_si(PRESUMED)).mean() > 0.7
+    )
     offset = recovered_noise(found).mean(axis=0)
     np.testing.assert_allclose(offset[:3] / MM, [3.1e-5, -1.1e-5, -1.0e-5], atol=1e-6)  # [mm]
     # what is left, 3 % of 3e-5 mm at most in a leg, hides below the residuals
@@ -138,8 +173,14 @@ def test_rounding_of_table_4_spoils_the_papers_own_method(found) -> None:
 def test_the_steps_and_simulated_trials_draw_the_same_noise(found) -> None:
     made, study = simulated(found.study, 3, 2), found.study
     for trial in range(2):
-        ours = measurements(study, measured_poses(study, limits_si(STATED), 3, trial)).observations[0].measured
-        np.testing.assert_allclose(made.measured[0][trial], ours, rtol=0, atol=1e-13)  # [rad, m] rounding
+        ours = (
+            measurements(study, measured_poses(study, limits_si(STATED), 3, trial))
+            .observations[0]
+            .measured
+        )
+        np.testing.assert_allclose(
+            made.measured[0][trial], ours, rtol=0, atol=1e-13
+        )  # [rad, m] rounding
 
 
 def test_iterations_without_end_are_said_to_be_none(found) -> None:
@@ -169,7 +210,12 @@ def test_the_verdicts_are_these(found) -> None:
 
 def test_a_verdict_follows_what_is_computed(found) -> None:
     wrong = found.orders[1:]
-    changed = Results(**{**vars(found), "orders": (*[o for o in wrong if o.formula == "Rz(alpha) Ry(beta) Rx(gamma)"], *wrong)})
+    changed = Results(
+        **{
+            **vars(found),
+            "orders": (*[o for o in wrong if o.formula == "Rz(alpha) Ry(beta) Rx(gamma)"], *wrong),
+        }
+    )
     claim = next(v for v in verdicts(changed) if "equation (2)" in v.claim)
     assert claim.agrees
 
@@ -184,4 +230,6 @@ def test_the_same_seed_gives_the_same_reproduction() -> None:
 def test_the_page_of_the_documentation_names_every_module_and_no_missing_one() -> None:
     folder = Path(__file__).parents[2] / "src" / "loopcal" / "papers" / "hexapod_42"
     named = set(re.findall(r"`(\w+\.(?:py|yaml))`", DOC.read_text("utf-8")))
-    assert named == {path.name for path in folder.iterdir() if path.suffix in {".py", ".yaml"}} - {"__init__.py"}
+    assert named == {path.name for path in folder.iterdir() if path.suffix in {".py", ".yaml"}} - {
+        "__init__.py"
+    }

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LS, RE and TSVD on two parallel manipulators repeated: the paper's steps, its claims, and the same on many machines.
+"""LS, RE and TSVD on two parallel manipulators repeated: the paper's steps, its claims, and the
+same on many machines.
 
-The small version below draws 10 machines; its bounds are wide, because a median of ten is sure to some 20 %. The tests
-marked `evidence` hold the bounds at full size.
+The small version below draws 10 machines; its bounds are wide, because a median of ten is sure to
+some 20 %. The tests marked `evidence` hold the bounds at full size.
 """
 
 import json
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from loopcal.measure import Noise, Uniform
-from loopcal.mechanism.trials import forward_trials
+from loopcal.mechanism.batch_kinematics import forward_trials
 from loopcal.papers import PAPERS
 from loopcal.papers.tsvd_2016.cases import LS, PRIOR, RANKED, RE, TSVD, WHITENED, spacing
 from loopcal.papers.tsvd_2016.compare import compute
@@ -31,7 +32,14 @@ from loopcal.papers.tsvd_2016.draws import (
 )
 from loopcal.papers.tsvd_2016.figures import figures
 from loopcal.papers.tsvd_2016.published import published
-from loopcal.papers.tsvd_2016.steps import iterate, least_squares, linearised, ridge, truncated, units
+from loopcal.papers.tsvd_2016.steps import (
+    iterate,
+    least_squares,
+    linearised,
+    ridge,
+    truncated,
+    units,
+)
 from loopcal.papers.tsvd_2016.study import (
     ANGLE_ERRORS,
     LENGTH_ERRORS,
@@ -84,7 +92,9 @@ def identification_matrix(measured: Study) -> np.ndarray:
 
     def seen(values: np.ndarray) -> np.ndarray:
         T = forward_trials(robot, values, measured.trials.readings[None], measured.commanded).T
-        around = measured.kind.measure(measured.commanded.T, np.zeros((1, T.shape[1], 6)))  # nominal: phi does not wrap
+        around = measured.kind.measure(
+            measured.commanded.T, np.zeros((1, T.shape[1], 6))
+        )  # nominal: phi does not wrap
         return (measured.kind.evaluate(T, around).residual * RAW).reshape(len(values), -1)
 
     return (seen(nominal + shifts) - seen(nominal - shifts)).T / (2 * step)
@@ -93,8 +103,22 @@ def identification_matrix(measured: Study) -> np.ndarray:
 def test_appendix_1_is_read_as_printed() -> None:
     noise = published().noise
     assert noise.values.shape == (36, 6)
-    assert noise.rows["1"] == ("0.006294", "-0.003925", "-0.007118", "0.000092", "0.000087", "0.000162")
-    assert noise.rows["36"] == ("0.008664", "-0.006628", "-0.004280", "-0.000036", "-0.000082", "0.000151")
+    assert noise.rows["1"] == (
+        "0.006294",
+        "-0.003925",
+        "-0.007118",
+        "0.000092",
+        "0.000087",
+        "0.000162",
+    )
+    assert noise.rows["36"] == (
+        "0.008664",
+        "-0.006628",
+        "-0.004280",
+        "-0.000036",
+        "-0.000082",
+        "0.000151",
+    )
     assert np.abs(noise.values[:, :3]).max() == 0.009989
     assert np.abs(noise.values[:, 3:]).max() == 0.000174
     assert (np.abs(published().noise_si) <= LIMITS).all()
@@ -121,20 +145,36 @@ def test_poses_errors_and_range_are_as_stated() -> None:
 def test_a_step_is_that_of_the_printed_formulas(name) -> None:
     measured = study(name, true_values(machine(name), 1, 0), AppendixNoise())
     H, p, lam, k = identification_matrix(measured), len(measured.robot.parameters), 0.01, 15
-    kind, T = measured.kind, forward_trials(measured.robot, measured.robot.values[None], measured.trials.readings[None]).T
+    kind, T = (
+        measured.kind,
+        forward_trials(
+            measured.robot, measured.robot.values[None], measured.trials.readings[None]
+        ).T,
+    )
     D = -(kind.evaluate(T, measured.trials.measured[0]).residual * RAW).ravel()
     U, s, Vt = np.linalg.svd(H, full_matrices=False)
-    by_hand = (np.linalg.solve(H.T @ H + lam * np.eye(p), H.T @ D), Vt[:k].T @ (U[:, :k].T @ D / s[:k]))
-    for penalty, expected in zip((ridge(np.array([lam]), p), truncated(np.array([k]), p)), by_hand, strict=True):
-        step = (iterate(measured, penalty, limit=1).values - measured.robot.values)[0] / units(measured.robot)
-        np.testing.assert_allclose(step, expected, rtol=0, atol=1e-5)  # [mm, rad], central differences
+    by_hand = (
+        np.linalg.solve(H.T @ H + lam * np.eye(p), H.T @ D),
+        Vt[:k].T @ (U[:, :k].T @ D / s[:k]),
+    )
+    for penalty, expected in zip(
+        (ridge(np.array([lam]), p), truncated(np.array([k]), p)), by_hand, strict=True
+    ):
+        step = (iterate(measured, penalty, limit=1).values - measured.robot.values)[0] / units(
+            measured.robot
+        )
+        np.testing.assert_allclose(
+            step, expected, rtol=0, atol=1e-5
+        )  # [mm, rad], central differences
     found, _ = linearised(measured, measured.robot.values[None], FIRST)
     np.testing.assert_allclose(found.singular_values[0], s, rtol=1e-5, atol=1e-8)
 
 
 def test_ridge_in_every_step_is_a_filter_that_forgets_lambda() -> None:
     robot = machine("3-PRS")
-    small = robot.values + 1e-2 * (true_values(robot, 1, 0) - robot.values)  # so small that the problem is linear
+    small = robot.values + 1e-2 * (
+        true_values(robot, 1, 0) - robot.values
+    )  # so small that the problem is linear
     measured = study("3-PRS", small, NoNoise())
     d, _ = linearised(measured, robot.values[None], FIRST)
     lam = 0.01
@@ -142,7 +182,9 @@ def test_ridge_in_every_step_is_a_filter_that_forgets_lambda() -> None:
         values = iterate(measured, ridge(np.array([lam]), 33), limit=m).values
         f = 1.0 - (lam / (d.singular_values**2 + lam)) ** m
         expected = d.deviation(f * d.projections / d.singular_values) * units(robot)
-        np.testing.assert_allclose(values - robot.values, expected, rtol=0, atol=5e-10)  # [m, rad] of 4e-6, second order
+        np.testing.assert_allclose(
+            values - robot.values, expected, rtol=0, atol=5e-10
+        )  # [m, rad] of 4e-6, second order
 
 
 def test_exact_measurements_give_the_true_parameters() -> None:
@@ -150,13 +192,17 @@ def test_exact_measurements_give_the_true_parameters() -> None:
     truth = true_values(robot, 2, 0)
     run = iterate(study("3-PRS", truth, NoNoise()), least_squares(33), np.arange(2))
     assert run.converged.all()
-    np.testing.assert_allclose(run.values, truth, rtol=0, atol=1e-9)  # [m, rad], rounding times 1 / 4e-4
+    np.testing.assert_allclose(
+        run.values, truth, rtol=0, atol=1e-9
+    )  # [m, rad], rounding times 1 / 4e-4
 
 
 def test_tsvd_with_all_singular_values_is_ls_and_settings_do_not_disturb_each_other(tripod) -> None:
     both = iterate(tripod, np.concatenate([least_squares(33), truncated(np.array([33, 22]), 33)]))
     np.testing.assert_array_equal(both.values[0], both.values[1])
-    np.testing.assert_allclose(both.values[2], iterate(tripod, truncated(np.array([22]), 33)).values[0], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(
+        both.values[2], iterate(tripod, truncated(np.array([22]), 33)).values[0], rtol=0, atol=1e-13
+    )
 
 
 def test_lambda_runs_from_the_smallest_singular_value_to_1_in_equal_intervals_and_ratios() -> None:
@@ -167,13 +213,20 @@ def test_lambda_runs_from_the_smallest_singular_value_to_1_in_equal_intervals_an
 
 
 def test_without_psi_the_numbers_are_the_same_otherwise(tripod) -> None:
-    np.testing.assert_array_equal(tripod.five.trials.measured[0], tripod.trials.measured[0][..., :5])
-    np.testing.assert_allclose(tripod.five.trials.instrument.sensors[0].noise.sigma, Uniform(LIMITS[:5]).sigma)
+    np.testing.assert_array_equal(
+        tripod.five.trials.measured[0], tripod.trials.measured[0][..., :5]
+    )
+    np.testing.assert_allclose(
+        tripod.five.trials.instrument.sensors[0].noise.sigma, Uniform(LIMITS[:5]).sigma
+    )
 
 
 @pytest.mark.slow
 def test_5_dof_measurement_leaves_one_combination_open_and_nothing_else(found) -> None:
-    for name, p, parameters in (("3-PRS", 33, {"a1y", "a2y", "a3y"}), ("RU-PUS-PRS", 25, {"a1y", "a2x", "thU2z"})):
+    for name, p, parameters in (
+        ("3-PRS", 33, {"a1y", "a2y", "a3y"}),
+        ("RU-PUS-PRS", 25, {"a1y", "a2x", "thU2z"}),
+    ):
         six, five = found.case(name, 6), found.case(name, 5)
         assert (six.rank, five.rank, five.known.rank) == (p, p - 1, p - 1)
         assert five.singular_values[-1] < 1e-11
@@ -184,7 +237,9 @@ def test_5_dof_measurement_leaves_one_combination_open_and_nothing_else(found) -
         assert five.normal_equations > 1e3  # [mm], from an inverse that is rounding
         assert six.normal_equations < 1e2
         # rank detection alone: as good as with 6-DOF
-        np.testing.assert_allclose(five.answers[RANKED].errors[:2], six.answers[LS].errors[:2], rtol=0.02)
+        np.testing.assert_allclose(
+            five.answers[RANKED].errors[:2], six.answers[LS].errors[:2], rtol=0.02
+        )
         assert (five.answers[PRIOR].errors[:2] < 1.2 * six.answers[PRIOR].errors[:2]).all()
 
 
@@ -301,13 +356,17 @@ def test_evidence_map_is_better_than_raw_methods_and_near_gcv_and_hindsight() ->
             assert column(document, "ratios", high)[f"MAP over {method}"] < 1.0
         assert column(document, "ratios", ratio)[f"MAP over {CROSS}"] < 1.05
         assert column(document, "ratios", ratio)[f"MAP over {HINDSIGHT}"] < 1.15
-        assert column(document, "ratios", low)[f"MAP over {HINDSIGHT}"] >= 1.0  # nothing beats hindsight
+        assert (
+            column(document, "ratios", low)[f"MAP over {HINDSIGHT}"] >= 1.0
+        )  # nothing beats hindsight
 
 
 @pytest.mark.evidence
 def test_evidence_curves_of_the_3_prs_are_u_shaped_and_5_dof_costs_nothing() -> None:
     document = evidence("three_prs_draws")
-    assert all(inside for algorithm in document["minimum_inside"].values() for inside in algorithm.values())
+    assert all(
+        inside for algorithm in document["minimum_inside"].values() for inside in algorithm.values()
+    )
     for number in (1, 3):  # position, angle
         medians = column(document, "medians", number)
         assert medians[RAW_FIVE] == pytest.approx(medians[RAW_LS], rel=0.02)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of robots: every shipped one can be drawn, what is drawn lies where it is, and units stand on the axes."""
+"""Pictures of robots: every shipped one can be drawn, what is drawn lies where it is, and units
+stand on the axes.
+"""
 
 from pathlib import Path
 
@@ -37,7 +39,10 @@ def test_rods_run_from_base_to_platform_in_millimetres():
     above = draw(robot).axes[1]
     lines = [np.array(line.get_data()).T for line in above.lines]
     for base, top in zip(zoo.HEXAPOD_BASE, zoo.HEXAPOD_PLATFORM, strict=True):
-        assert any(line.shape == (2, 2) and np.allclose(line, [base[:2], top[:2]], atol=1e-6) for line in lines)
+        assert any(
+            line.shape == (2, 2) and np.allclose(line, [base[:2], top[:2]], atol=1e-6)
+            for line in lines
+        )
 
 
 def test_a_pose_of_a_solution_moves_the_platform():

@@ -8,11 +8,18 @@ import pytest
 
 from tools import evidence
 
-TABLE = {"columns": ["step", "median [mm]"], "formats": ["d", ".2g"], "rows": [[1, 0.3123], [2, None]]}
+TABLE = {
+    "columns": ["step", "median [mm]"],
+    "formats": ["d", ".2g"],
+    "rows": [[1, 0.3123], [2, None]],
+}
 
 
 def test_a_missing_value_is_shown_as_a_dash() -> None:
-    assert evidence.render_table(TABLE) == "| step | median [mm] |\n| --- | --- |\n| 1 | 0.31 |\n| 2 | - |\n"
+    assert (
+        evidence.render_table(TABLE)
+        == "| step | median [mm] |\n| --- | --- |\n| 1 | 0.31 |\n| 2 | - |\n"
+    )
 
 
 def test_a_block_is_made_anew_and_the_text_around_it_kept(tmp_path: Path) -> None:
@@ -26,8 +33,17 @@ def test_a_block_is_made_anew_and_the_text_around_it_kept(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("block", "sentence"),
     [
-        ("recover.steps", "docs/page.md: there is no {folder}/recover.json; run `python -m tools.evidence recover` to make it"),
-        ("recovery.step", "docs/page.md: {folder}/recovery.json has no table 'step'; there are steps"),
+        (
+            "recover.steps",
+            (
+                "docs/page.md: there is no {folder}/recover.json; run `python -m tools.evidence "
+                "recover` to make it"
+            ),
+        ),
+        (
+            "recovery.step",
+            "docs/page.md: {folder}/recovery.json has no table 'step'; there are steps",
+        ),
     ],
 )
 def test_a_page_that_asks_for_evidence_that_is_not_there_is_named_in_one_sentence(

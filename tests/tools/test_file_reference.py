@@ -7,7 +7,7 @@ import re
 import pytest
 
 from loopcal.cli import main
-from loopcal.io import reference
+from loopcal.io.core import file_reference as reference
 from loopcal.measure import KINDS
 from loopcal.mechanism import FAMILIES
 from loopcal.mechanism.families.linear_delta import LinearDelta
@@ -21,7 +21,9 @@ def test_the_page_is_up_to_date() -> None:
     assert {m["name"] for m in file_reference.BLOCK.finditer(PAGE)} == set(file_reference.BLOCKS)
     exports = file_reference.EXPORTS.read_text("utf-8")
     assert file_reference.written(exports) == exports, "run `make docs`"
-    assert {m["name"] for m in file_reference.BLOCK.finditer(exports)} == set(file_reference.OF_EXPORTS)
+    assert {m["name"] for m in file_reference.BLOCK.finditer(exports)} == set(
+        file_reference.OF_EXPORTS
+    )
 
 
 def test_every_family_and_kind_is_there() -> None:
@@ -34,7 +36,10 @@ def test_every_family_and_kind_is_there() -> None:
 def test_keys_come_with_what_they_hold_and_what_it_means() -> None:
     found = {key.name: key for key in reference.keys(LinearDelta)}
     assert found["radius"] == reference.Key(
-        "radius", "length", "0", "horizontal distance from a rod's upper to its lower end with the nozzle in the centre"
+        "radius",
+        "length",
+        "0",
+        "horizontal distance from a rod's upper to its lower end with the nozzle in the centre",
     )
     assert found["readings"].holds == "`drop` or `height`"
     assert found["arms"].holds == "length or list of length"
@@ -43,7 +48,20 @@ def test_keys_come_with_what_they_hold_and_what_it_means() -> None:
 
 def test_every_key_of_a_run_is_described(tmp_path, monkeypatch, root) -> None:
     monkeypatch.chdir(root / "examples" / "hexapod-42")
-    assert main(["calibrate", "hexapod-42", "measurements.csv", "-o", str(tmp_path / "run"), "--hold-out", "0.25"]) == 0
+    assert (
+        main(
+            [
+                "calibrate",
+                "hexapod-42",
+                "measurements.csv",
+                "-o",
+                str(tmp_path / "run"),
+                "--hold-out",
+                "0.25",
+            ]
+        )
+        == 0
+    )
     result = json.loads((tmp_path / "run" / "result.json").read_text(), parse_constant=pytest.fail)
     described = set(re.findall(r"`(\w+)`", PAGE[PAGE.index("## Run folders") :]))
     keys = set(result) - {"nulls"}

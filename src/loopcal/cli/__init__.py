@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line: parse, call one library function, print.
 
-`main` is the one place where an error becomes a sentence and an exit code: 0 good, 1 user error, 2 a quality gate not
-met. Nothing heavier than click is imported before a command runs, so that `loopcal --help` answers at once.
+`main` is the one place where an error becomes a sentence and an exit code: 0 good, 1 user error, 2
+a quality gate not met. Nothing heavier than click is imported before a command runs, so that
+`loopcal --help` answers at once.
 """
 
 from __future__ import annotations
@@ -41,7 +42,19 @@ def commands() -> None:
     """  # noqa: D301
 
 
-for _command in (new, check, plan, simulate, identifiability, calibrate, validate, compensate, reproduce, import_, export):
+for _command in (
+    new,
+    check,
+    plan,
+    simulate,
+    identifiability,
+    calibrate,
+    validate,
+    compensate,
+    reproduce,
+    import_,
+    export,
+):
     commands.add_command(_command)
 
 
@@ -53,8 +66,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments : sequence of str, optional
         Words after `loopcal`; default those of the process.
     """
-    # many small factorisations: threads of the linear algebra wait for each other more than they help (5000 poses on two
-    # cores: 0.3 s with one, 5 s and more with two); whoever sets these variables decides
+    # many small factorisations: threads of the linear algebra wait for each other more than they
+    # help (5000 poses on two cores: 0.3 s with one, 5 s and more with two); whoever sets these
+    # variables decides
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     notes, logger = _Notes(), logging.getLogger("loopcal")
@@ -73,12 +87,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (KeyboardInterrupt, click.exceptions.Abort):
         return _refuse("stopped before the end; no result was written.")
     except BrokenPipeError:
-        # The reader of our output went away (`loopcal ... | head`); keep the interpreter from complaining at exit.
+        # The reader of our output went away (`loopcal ... | head`); keep the interpreter from
+        # complaining at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
-        return _refuse(f"{place}the operating system refused ({(error.strerror or str(error)).lower()}); check the place.")
+        return _refuse(
+            f"{place}the operating system refused ({(error.strerror or str(error)).lower()}); "
+            "check the place."
+        )
     except MemoryError:
         return _refuse("there is not enough memory for this; use fewer poses at a time.")
     finally:

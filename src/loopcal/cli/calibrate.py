@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal calibrate`: identify a robot from measurements, prove it on held-out poses, keep it in a run folder."""
+"""`loopcal calibrate`: identify a robot from measurements, prove it on held-out poses, keep it in a
+run folder.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +14,26 @@ import click
 
 from loopcal.cli import show
 from loopcal.cli.fitting import Fitting, fit_options
-from loopcal.cli.options import FILE, data_argument, data_options, gate_options, json_option, measurements, robot_argument
+from loopcal.cli.options import (
+    FILE,
+    data_argument,
+    data_options,
+    gate_options,
+    json_option,
+    measurements,
+    robot_argument,
+)
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
-    from loopcal.calibrate import Identification, Validation
-    from loopcal.calibrate.examine import Examination
+    from loopcal.apply import Validation
+    from loopcal.diagnose.examination import Examination
+    from loopcal.estimate import Identification
     from loopcal.measure import Measurements
 
 GREW = 1.1
-"""Times by which errors on unseen poses are said to have grown: less is the noise of those poses."""
+"""Times by which errors on unseen poses are said to have grown: less is the noise of those poses.
+"""
 
 
 @click.command(short_help="Identify a robot's parameters from measurements.")
@@ -31,10 +43,25 @@ GREW = 1.1
 @click.option("--hold-out", type=click.FloatRange(0, 1, max_open=True), default=0.0, metavar="SHARE",
               help="Share of the poses to keep from the fit and to judge it by, such as 0.25.")  # fmt: skip
 @fit_options
-@click.option("--prior", type=FILE, metavar="RUN", help="An earlier run on this machine; what it knew is kept.")
-@click.option("--free-limb", metavar="LIMB", help="With --prior: a limb that was repaired, such as leg3, starts anew.")
+@click.option(
+    "--prior",
+    type=FILE,
+    metavar="RUN",
+    help="An earlier run on this machine; what it knew is kept.",
+)
+@click.option(
+    "--free-limb",
+    metavar="LIMB",
+    help="With --prior: a limb that was repaired, such as leg3, starts anew.",
+)
 @gate_options
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the held-out choice.")
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=1,
+    show_default=True,
+    help="Seed of the held-out choice.",
+)
 @data_options
 @click.option("--force", is_flag=True, help="Replace a run that is there.")
 @json_option
@@ -53,93 +80,133 @@ def calibrate(
     force: bool,
     as_json: bool,
 ) -> int:
-    """Identify the free parameters of ROBOT from DATA and write a run folder with the corrected robot file.
+    """Identify the free parameters of ROBOT from DATA and write a run folder with the corrected
+    robot file.
 
-    DATA may be several files, joined by the names of poses. The exit code is 2 where a quality gate is not met, the iteration
-    did not converge, the residual does not fit the stated noise, or errors on unseen poses grew; the run folder is written.
+    DATA may be several files, joined by the names of poses. The exit code is 2 where a quality gate
+    is not met, the iteration did not converge, the residual does not fit the stated noise, or
+    errors on unseen poses grew; the run folder is written.
 
     \b
     Examples:
       loopcal calibrate hexapod-42 measurements.csv -o run --hold-out 0.25
-      loopcal calibrate robot.yaml data.csv -o run --hold-out 0.25 --limit-position 0.02mm --limit-angle 0.01deg
-      loopcal calibrate printer.yaml heights.csv -o run --noise estimated
-      loopcal calibrate robot.yaml poses.csv tracker.csv inclinometer.csv -o run
-      loopcal calibrate hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
+      loopcal calibrate robot.yaml data.csv -o run --hold-out 0.25 --limit-position 0.02mm
+      --limit-angle 0.01deg loopcal calibrate printer.yaml heights.csv -o run --noise estimated
+      loopcal calibrate robot.yaml poses.csv tracker.csv inclinometer.csv -o run loopcal calibrate
+      hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
     """  # noqa: D301
-    from loopcal.calibrate.recalibrate import recalibrate
+    from loopcal.estimate.recalibration import recalibrate
     from loopcal.io import load_robot
-    from loopcal.io.calibration_run import run_document, save_run
-    from loopcal.io.compensation_file import load_prior
-    from loopcal.io.outputs import refuse_run_folder
-    from loopcal.io.run_folder import made_by
+    from loopcal.io.core.outputs import refuse_run_folder
+    from loopcal.io.runs.calibration_run import run_document, save_run
+    from loopcal.io.runs.compensation_file import load_prior
+    from loopcal.io.runs.run_folder import made_by
 
     planned = _held_out(data, hold_out)
     _refuse_contradictions(
-        hold_out > 0 or bool(planned), limit_position is not None or limit_angle is not None, prior, free_limb
+        hold_out > 0 or bool(planned),
+        limit_position is not None or limit_angle is not None,
+        prior,
+        free_limb,
     )
     inputs, machine = _inputs(robot, data, prior), load_robot(robot)
     refuse_run_folder(output, list(inputs.values()), force)
     measured = measurements(data, machine, **allowed)
     fitted, unseen = fitting.split(measured, hold_out, seed, planned)
-    show.progress(f"identifying {int(machine.parameters.free.sum())} parameters from {fitted.n_rows} equations ...")
+    show.progress(
+        f"identifying {int(machine.parameters.free.sum())} parameters from {fitted.n_rows} "
+        "equations ..."
+    )
     choice = change = None
     if prior is None:
         fit, choice = fitting.fit(machine, fitted)
     else:
-        fit, change = recalibrate(machine, fitted, load_prior(prior, data), free_limb, fitting.noise)
-    errors, unjudged = _judged(fit, fitted if unseen is None else unseen, limit_position, limit_angle)
+        fit, change = recalibrate(
+            machine, fitted, load_prior(prior, data), free_limb, fitting.noise
+        )
+    errors, unjudged = _judged(
+        fit, fitted if unseen is None else unseen, limit_position, limit_angle
+    )
     validation = None if unseen is None else errors
     origin = made_by(sys.argv, inputs, {"hold_out": seed})
-    split = None if unseen is None else {"hold_out": hold_out, "seed": seed, "held_out": unseen.labels}
+    split = (
+        None if unseen is None else {"hold_out": hold_out, "seed": seed, "held_out": unseen.labels}
+    )
     findings = {"change": change, "model_choice": choice} | _findings(fit, fitted)
     found = {name: _document(finding) for name, finding in findings.items() if finding is not None}
     reasons = _reasons(fit, validation, unjudged)
-    document = run_document(fit, validation, origin, split) | found | {"passed": not reasons, "reasons": reasons}
+    document = (
+        run_document(fit, validation, origin, split)
+        | found
+        | {"passed": not reasons, "reasons": reasons}
+    )
     save_run(output, fit, document, force, fitted)
-    show.json_document(document) if as_json else _print(fit, errors, unseen is None, findings, output)
+    show.json_document(document) if as_json else _print(
+        fit, errors, unseen is None, findings, output
+    )
     return show.gates(reasons)
 
 
 def _inputs(robot: str, data: Sequence[Path], prior: Path | None) -> dict[str, Path]:
     """Return the files that are read."""
-    from loopcal.io.measurement_file import measurement_paths
-    from loopcal.io.robot_file import robot_path
-    from loopcal.io.run_folder import RESULT
+    from loopcal.io.data.measurement_file import measurement_paths
+    from loopcal.io.robot.robot_file import robot_path
+    from loopcal.io.runs.run_folder import RESULT
 
-    return {"robot": robot_path(robot), **measurement_paths(data), **({} if prior is None else {"prior": prior / RESULT})}
+    return {
+        "robot": robot_path(robot),
+        **measurement_paths(data),
+        **({} if prior is None else {"prior": prior / RESULT}),
+    }
 
 
 def _held_out(data: Sequence[Path], hold_out: float) -> tuple[str, ...]:
     """Return the poses that the data hold out themselves; refuse to draw others beside them."""
-    from loopcal.io.use_column import USE, held_out_poses
+    from loopcal.io.data.use_column import USE, held_out_poses
 
     planned = held_out_poses(data)
     if planned and hold_out:
         raise DataError(
-            f"the column {USE!r} of the data says which poses are held out ({len(planned)} of them); leave out --hold-out, or "
+            f"the column {USE!r} of the data says which poses are held out ({len(planned)} of "
+            "them); leave out --hold-out, or "
             "the column"
         )
     return planned
 
 
-def _refuse_contradictions(hold_out: bool, gates: bool, prior: Path | None, free_limb: str | None) -> None:
-    """Refuse quality gates without unseen poses, and options that do not go with, or without, --prior."""
+def _refuse_contradictions(
+    hold_out: bool, gates: bool, prior: Path | None, free_limb: str | None
+) -> None:
+    """Refuse quality gates without unseen poses, and options that do not go with, or without,
+    --prior.
+    """
     if gates and not hold_out:
-        raise DataError("a quality gate is judged on unseen poses; say which share to keep for it, as --hold-out 0.25")
+        raise DataError(
+            "a quality gate is judged on unseen poses; say which share to keep for it, as "
+            "--hold-out 0.25"
+        )
     if prior is None and free_limb is not None:
-        raise DataError("--free-limb needs the run in which the other limbs were known; name it with --prior RUN")
+        raise DataError(
+            "--free-limb needs the run in which the other limbs were known; name it with --prior "
+            "RUN"
+        )
     given = click.get_current_context().get_parameter_source
     for option in ("method", "lam", "keep", "loss", "choose_model"):
         if prior is not None and given(option) is click.core.ParameterSource.COMMANDLINE:
             name = option.replace("_", "-")
-            raise DataError(f"--{name} does not go with --prior, which is fitted by least squares; leave it out")
+            raise DataError(
+                f"--{name} does not go with --prior, which is fitted by least squares; leave it out"
+            )
 
 
 def _judged(
-    fit: Identification, data: Measurements, limit_position: float | None = None, limit_angle: float | None = None
+    fit: Identification,
+    data: Measurements,
+    limit_position: float | None = None,
+    limit_angle: float | None = None,
 ) -> tuple[Validation | None, str]:
     """Errors on poses, or why there are none: a geometry that went astray may reach no pose."""
-    from loopcal.calibrate import validate
+    from loopcal.apply import validate
 
     try:
         return validate(fit, data, limit_position, limit_angle), ""
@@ -149,7 +216,7 @@ def _judged(
 
 def _examined(fit: Identification, fitted: Measurements) -> Examination | None:
     """Examine a fit that converged."""
-    from loopcal.calibrate.examine import examine
+    from loopcal.diagnose.examination import examine
 
     return examine(fit, fitted) if fit.converged else None
 
@@ -161,9 +228,9 @@ def _document(finding: Any) -> Any:
 
 def _findings(fit: Identification, fitted: Measurements) -> dict[str, Any]:
     """What else is known of a fit; None where there is nothing to say."""
-    from loopcal.calibrate import identifiability
-    from loopcal.calibrate.reading_errors import reading_errors
-    from loopcal.calibrate.remedies import remedies
+    from loopcal.diagnose import identifiability
+    from loopcal.diagnose.actuator_reading_errors import reading_errors
+    from loopcal.diagnose.suggestions import remedies
 
     open_ = fit.converged and fit.unidentifiable
     return {
@@ -173,9 +240,17 @@ def _findings(fit: Identification, fitted: Measurements) -> dict[str, Any]:
     }
 
 
-def _print(fit: Identification, errors: Validation | None, fitted: bool, findings: Mapping[str, Any], output: Path) -> None:
-    """Print what was found, and how well it does on unseen poses, or without any on the fitted ones."""
-    from loopcal.calibrate import start_check
+def _print(
+    fit: Identification,
+    errors: Validation | None,
+    fitted: bool,
+    findings: Mapping[str, Any],
+    output: Path,
+) -> None:
+    """Print what was found, and how well it does on unseen poses, or without any on the fitted
+    ones.
+    """
+    from loopcal.diagnose import start_check
 
     found = fit.to_dict()
     show.parameters(f"{fit.robot.name}: {len(fit.names)} parameters", found["parameters"])
@@ -183,8 +258,12 @@ def _print(fit: Identification, errors: Validation | None, fitted: bool, finding
         show.say()
         show.parameters(f"Measurements: {len(fit.local)} unknowns", found["local"])
     show.say()
-    show.say(f"{fit.status.sentence} after {fit.iterations} steps; rank {fit.rank} of {len(fit.names)}")
-    degrees = f"{fit.check.degrees:.4g} degree{'' if round(fit.check.degrees) == 1 else 's'} of freedom"
+    show.say(
+        f"{fit.status.sentence} after {fit.iterations} steps; rank {fit.rank} of {len(fit.names)}"
+    )
+    degrees = (
+        f"{fit.check.degrees:.4g} degree{'' if round(fit.check.degrees) == 1 else 's'} of freedom"
+    )
     show.say(f"chi-square {fit.chi_square:.5g} with {degrees}")
     show.say(f"note: {start_check(fit).sentence}")
     examined: Examination | None = findings["examination"]
@@ -198,12 +277,17 @@ def _print(fit: Identification, errors: Validation | None, fitted: bool, finding
     if errors is not None:
         show.validation(errors, "fitted" if fitted else "unseen")
     if errors is not None and fitted:
-        show.say("these rows were fitted, so this proves nothing about other poses; keep some for that with --hold-out 0.25")
+        show.say(
+            "these rows were fitted, so this proves nothing about other poses; keep some for that "
+            "with --hold-out 0.25"
+        )
     show.say(f"\nwritten to {output}: result.json, arrays.npz, robot.yaml")
 
 
 def _reasons(fit: Identification, validation: Validation | None, unjudged: str) -> list[str]:
-    """Return a sentence for each thing that is not good enough; `unjudged`: why there are no errors."""
+    """Return a sentence for each thing that is not good enough; `unjudged`: why there are no
+    errors.
+    """
     reasons = [] if fit.converged else [f"not converged: {fit.status.sentence}"]
     reasons += [fit.check.sentence] if fit.check.failed else []
     reasons += [unjudged] if unjudged else []
@@ -212,6 +296,7 @@ def _reasons(fit: Identification, validation: Validation | None, unjudged: str) 
     for name, smaller in validation.comparisons():
         if (times := 1.0 / smaller if smaller > 0.0 else float("inf")) > GREW:
             reasons.append(
-                f"{name.replace('error', 'errors')} on unseen poses are {times:.3g} times LARGER after calibration (rms)"
+                f"{name.replace('error', 'errors')} on unseen poses are {times:.3g} times LARGER "
+                "after calibration (rms)"
             )
     return [*reasons, *validation.reasons]

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal compensate`: readings, or shifted commands, that take the calibrated machine to its targets."""
+"""`loopcal compensate`: readings, or shifted commands, that take the calibrated machine to its
+targets.
+"""
 
 from __future__ import annotations
 
@@ -13,17 +15,25 @@ from loopcal.cli.options import FILE, json_option
 from loopcal.units import Dimension
 
 if TYPE_CHECKING:
-    from loopcal.calibrate.compensate import Compensation
+    from loopcal.apply.compensation import Compensation
 
 
 @click.command(short_help="Readings or shifted commands for targets.")
 @click.argument("run", metavar="RUN", type=FILE)
 @click.argument("targets", metavar="TARGETS", type=FILE)
-@click.option("-o", "--output", type=FILE, help="The CSV file to write; without it the CSV text is printed.")
+@click.option(
+    "-o", "--output", type=FILE, help="The CSV file to write; without it the CSV text is printed."
+)
 @click.option("--mode", type=click.Choice(("readings", "commands")), default="readings", show_default=True,
               help="Set the actuators, or shift what a closed controller is commanded.")  # fmt: skip
-@click.option("--controller", metavar="ROBOT", help="Robot file of the controller's geometry; default: the nominal robot.")
-@click.option("--steps", type=click.IntRange(min=1), default=3, show_default=True, help="Steps of the shift.")
+@click.option(
+    "--controller",
+    metavar="ROBOT",
+    help="Robot file of the controller's geometry; default: the nominal robot.",
+)
+@click.option(
+    "--steps", type=click.IntRange(min=1), default=3, show_default=True, help="Steps of the shift."
+)
 @click.option("--force", is_flag=True, help="Replace a file that is there.")
 @json_option
 def compensate(
@@ -36,10 +46,11 @@ def compensate(
     force: bool,
     as_json: bool,
 ) -> int:
-    """Compute what to tell the machine of RUN so that it goes to TARGETS, a CSV file of controlled coordinates.
+    """Compute what to tell the machine of RUN so that it goes to TARGETS, a CSV file of controlled
+    coordinates.
 
-    RUN is a folder made by `loopcal calibrate`, or a robot file (then no uncertainty is known). Each target says what
-    can be compensated, what no actuator can remove, and how sure the pose is.
+    RUN is a folder made by `loopcal calibrate`, or a robot file (then no uncertainty is known).
+    Each target says what can be compensated, what no actuator can remove, and how sure the pose is.
 
     The exit code is 2 where a target cannot be reached within the machine's limits.
 
@@ -48,18 +59,26 @@ def compensate(
       loopcal compensate run targets.csv -o readings.csv
       loopcal compensate run targets.csv --mode commands -o commands.csv
     """  # noqa: D301
-    from loopcal.calibrate.compensate import compensate as compute
-    from loopcal.calibrate.posterior import Posterior
+    from loopcal.apply.compensation import compensate as compute
+    from loopcal.estimate.posteriors import Posterior
     from loopcal.io import load_robot
-    from loopcal.io.compensation_file import compensation_text, load_calibrated_or_posterior, load_targets
-    from loopcal.io.outputs import refuse_outputs
-    from loopcal.io.text_file import write_text
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.core.text_file import write_text
+    from loopcal.io.runs.compensation_file import (
+        compensation_text,
+        load_calibrated_or_posterior,
+        load_targets,
+    )
 
-    refuse_outputs((output,), (run, targets, None if controller is None else Path(controller)), force)
+    refuse_outputs(
+        (output,), (run, targets, None if controller is None else Path(controller)), force
+    )
     known = load_calibrated_or_posterior(run)
     robot = known.robot if isinstance(known, Posterior) else known
     wanted, labels = load_targets(targets, robot)
-    found = compute(known, wanted, mode, None if controller is None else load_robot(controller), steps, labels)
+    found = compute(
+        known, wanted, mode, None if controller is None else load_robot(controller), steps, labels
+    )
     text = compensation_text(found)
     if output is not None:
         write_text(output, text)
@@ -70,7 +89,11 @@ def compensate(
     else:
         _print(found)
         show.say(f"\nwritten to {output}")
-    return show.gates(f"target {label!r} {found.sentences[i]}" for i, label in enumerate(labels) if not found.good[i])
+    return show.gates(
+        f"target {label!r} {found.sentences[i]}"
+        for i, label in enumerate(labels)
+        if not found.good[i]
+    )
 
 
 def _print(found: Compensation) -> None:
@@ -79,7 +102,14 @@ def _print(found: Compensation) -> None:
 
     units = show.units_of(found.robot)
     length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
-    headers = ["target", "status", f"before [{length}]", f"after [{length}]", f"before [{angle}]", f"after [{angle}]"]
+    headers = [
+        "target",
+        "status",
+        f"before [{length}]",
+        f"after [{length}]",
+        f"before [{angle}]",
+        f"after [{angle}]",
+    ]
     columns = [np.linalg.norm(e[:, part], axis=1) / u.factor_to_si
                for part, u in ((slice(3, 6), length), (slice(0, 3), angle))
                for e in (found.before, found.remaining)]  # fmt: skip
@@ -93,7 +123,9 @@ def _print(found: Compensation) -> None:
         (label, found.reach[i].value, *(show.number(float(c[i]), digits=3) for c in columns))
         for i, label in enumerate(found.labels)
     ]
-    show.table(f"{found.robot.name}: {len(rows)} targets, {found.mode}", headers, rows, text_columns=2)
+    show.table(
+        f"{found.robot.name}: {len(rows)} targets, {found.mode}", headers, rows, text_columns=2
+    )
     if found.commands is not None:
         for step in range(1, len(found.residual_position)):
             off = np.nanmax(found.residual_position[step]) / length.factor_to_si

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a robot file expands into, whatever its family: limbs with their links and joints, transmissions, and how parameters
-enter. Numbers are in the units of the file; each link is placed in the frame before it.
+"""What a robot file expands into, whatever its family: limbs with their links and joints,
+transmissions, and how parameters enter. Numbers are in the units of the file; each link is placed
+in the frame before it.
 """
 
 from __future__ import annotations
@@ -28,13 +29,32 @@ def assembly(robot: Mechanism) -> None:
     words = f"lengths in {units[Dimension.LENGTH]}, angles in {units[Dimension.ANGLE]}"
     place = ("x", "y", "z", "roll", "pitch", "yaw")
     values = _at_home(robot)
-    rows = [row for i, limb in enumerate(robot.assembly.limbs) for row in _limb(limb, values[i], units)]
+    rows = [
+        row for i, limb in enumerate(robot.assembly.limbs) for row in _limb(limb, values[i], units)
+    ]
     rows += [("platform", "home", "T_base_platform", *_place(robot.assembly.home, units), "")]
     rows += [("platform", "tool", "T_platform_tool", *_place(robot.assembly.tool, units), "")]
-    show.table(f"Limbs, from base to platform ({words})", ("limb", "element", "is", *place, "at home"), rows, text_columns=3)
-    rows = [row for actuator in robot.actuators for row in _transmission(robot, actuator.name, units)]
-    show.table("Transmissions: reading to joint value", ("actuator", "drives", "term", "value", "unit"), rows, text_columns=3)
-    show.table("Maps: how parameters enter", ("parameter", "moves", "by", "unit"), _maps(robot, units), text_columns=2)
+    show.table(
+        f"Limbs, from base to platform ({words})",
+        ("limb", "element", "is", *place, "at home"),
+        rows,
+        text_columns=3,
+    )
+    rows = [
+        row for actuator in robot.actuators for row in _transmission(robot, actuator.name, units)
+    ]
+    show.table(
+        "Transmissions: reading to joint value",
+        ("actuator", "drives", "term", "value", "unit"),
+        rows,
+        text_columns=3,
+    )
+    show.table(
+        "Maps: how parameters enter",
+        ("parameter", "moves", "by", "unit"),
+        _maps(robot, units),
+        text_columns=2,
+    )
 
 
 def _at_home(robot: Mechanism) -> dict[int, np.ndarray]:
@@ -53,23 +73,36 @@ def _limb(limb: Limb, values: np.ndarray, units: Units) -> list[tuple[str, ...]]
             words, dimension = JOINTS[joint.kind]
             driven = f", driven by {joint.actuator}" if joint.actuator else ""
             pitch = (
-                f", {_shown(joint.pitch, units[Dimension.LENGTH])} {units[Dimension.LENGTH]} in a radian" if joint.pitch else ""
+                f", {_shown(joint.pitch, units[Dimension.LENGTH])} {units[Dimension.LENGTH]} in a "
+                "radian"
+                if joint.pitch
+                else ""
             )
             home = f"{_shown(float(values[i]), units[dimension])} {units[dimension]}"
-            rows.append((limb.name, joint.name, f"{joint.kind} {words}{pitch}{driven}", *[""] * 6, home))
+            rows.append(
+                (limb.name, joint.name, f"{joint.kind} {words}{pitch}{driven}", *[""] * 6, home)
+            )
     length = units[Dimension.LENGTH]
     rod = f", {_shown(limb.length, length)} {length}" if limb.ending == "distance" else ""
     driven = f", driven by {limb.actuator}" if limb.actuator else ""
     rows.append((limb.name, "ending", f"{limb.ending}{rod}{driven}", *[""] * 6, ""))
-    rows.append((limb.name, limb.attachment.name, "on the platform", *_place(limb.attachment.transform, units), ""))
+    rows.append(
+        (
+            limb.name,
+            limb.attachment.name,
+            "on the platform",
+            *_place(limb.attachment.transform, units),
+            "",
+        )
+    )
     return rows
 
 
 def _place(T: np.ndarray, units: Units) -> tuple[str, ...]:
     """Return x y z roll pitch yaw of a transform (4, 4) as text."""
-    from loopcal import se3
+    from loopcal import geometry
 
-    angles = se3.matrix_to_euler(T[:3, :3], "xyz")
+    angles = geometry.matrix_to_euler(T[:3, :3], "xyz")
     lengths = tuple(_shown(float(x), units[Dimension.LENGTH]) for x in T[:3, 3])
     return lengths + tuple(_shown(float(a), units[Dimension.ANGLE]) for a in angles)
 
@@ -77,7 +110,12 @@ def _place(T: np.ndarray, units: Units) -> tuple[str, ...]:
 def _transmission(robot: Mechanism, name: str, units: Units) -> list[tuple[str, ...]]:
     """Return the rows of an actuator: the terms that are not zero."""
     actuator = next(a for a in robot.actuators if a.name == name)
-    driven = [f"{limb.name}/{j.name}" for limb in robot.assembly.limbs for j in limb.joints if j.actuator == name]
+    driven = [
+        f"{limb.name}/{j.name}"
+        for limb in robot.assembly.limbs
+        for j in limb.joints
+        if j.actuator == name
+    ]
     driven += [f"{limb.name}/rod" for limb in robot.assembly.limbs if limb.actuator == name]
     reading, joint = units[actuator.dimension], units[_joint_dimension(robot, name)]
     rows = []
@@ -85,7 +123,15 @@ def _transmission(robot: Mechanism, name: str, units: Units) -> list[tuple[str, 
         if value:
             power = POWERS.get(term, 0)
             number = value * reading.factor_to_si**power / joint.factor_to_si
-            rows.append((name, ", ".join(driven), term, show.number(number, digits=9), _per(joint, reading, power)))
+            rows.append(
+                (
+                    name,
+                    ", ".join(driven),
+                    term,
+                    show.number(number, digits=9),
+                    _per(joint, reading, power),
+                )
+            )
     return rows
 
 
@@ -105,7 +151,11 @@ def _maps(robot: Mechanism, units: Units) -> list[tuple[str, ...]]:
         factor, symbol = _moved(robot, entry.address, units)
         number = entry.coefficient * parameter.factor_to_si / factor
         unit = (
-            "1" if parameter.symbol == symbol else f"{symbol}/{parameter}" if "/" not in symbol else f"({symbol})/{parameter}"
+            "1"
+            if parameter.symbol == symbol
+            else f"{symbol}/{parameter}"
+            if "/" not in symbol
+            else f"({symbol})/{parameter}"
         )
         rows.append((entry.parameter, str(entry.address), show.number(number), unit))
     for shared in robot.assembly.shared:
@@ -129,7 +179,12 @@ def _moved(robot: Mechanism, address: Address, units: Units) -> tuple[float, str
 
 def _joint_dimension(robot: Mechanism, actuator: str) -> Dimension:
     """Return the dimension of the joint that an actuator drives."""
-    kinds = [joint.kind for limb in robot.assembly.limbs for joint in limb.joints if joint.actuator == actuator]
+    kinds = [
+        joint.kind
+        for limb in robot.assembly.limbs
+        for joint in limb.joints
+        if joint.actuator == actuator
+    ]
     return JOINTS[kinds[0]][1] if kinds else Dimension.LENGTH
 
 

@@ -13,10 +13,10 @@ import click
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
-    from loopcal.calibrate import Identification
-    from loopcal.calibrate.choose_model import ModelChoice
-    from loopcal.calibrate.filters import Method
-    from loopcal.calibrate.losses import Loss
+    from loopcal.diagnose.model_choice import ModelChoice
+    from loopcal.estimate import Identification
+    from loopcal.estimate.losses import Loss
+    from loopcal.estimate.penalties import Method
     from loopcal.measure import Measurements
     from loopcal.mechanism import Mechanism
 
@@ -38,12 +38,13 @@ class Fitting:
 
     def estimator(self) -> Method | None:
         """Return the method that the options describe; None for the library's own choice."""
-        from loopcal.calibrate import GCV, MAP, LeastSquares, Ridge, TruncatedSVD, TruncationGCV
+        from loopcal.estimate import GCV, MAP, LeastSquares, Ridge, TruncatedSVD, TruncationGCV
 
         for option, value, needs in (("--lam", self.lam, "ridge"), ("--keep", self.keep, "tsvd")):
             if value is not None and self.method != needs:
                 raise DataError(
-                    f"{option} belongs to --method {needs}, not to {self.method}; leave it out, or change the method"
+                    f"{option} belongs to --method {needs}, not to {self.method}; leave it out, or "
+                    "change the method"
                 )
         if self.method == "ridge":
             return Ridge(GCV() if self.lam is None else self.lam)
@@ -53,7 +54,7 @@ class Fitting:
 
     def robust(self) -> Loss | None:
         """Return the loss that the options describe."""
-        from loopcal.calibrate import Huber, Tukey
+        from loopcal.estimate import Huber, Tukey
 
         return {"none": None, "huber": Huber(), "tukey": Tukey()}[self.loss]
 
@@ -64,35 +65,48 @@ class Fitting:
 
         Parameters
         ----------
-        hold_out : share of the poses that is drawn by `seed`. planned : names that the data hold out themselves, in its place.
+        hold_out : share of the poses that is drawn by `seed`. planned : names that the data hold
+            out themselves, in its place.
         """
-        from loopcal.calibrate.left_out import without_poses
+        from loopcal.estimate.left_out import without_poses
 
         kept = without_poses(data, self.drop)
         judge = [label in planned for label in kept.labels]
         if all(judge):
-            raise DataError("every pose of the data is marked held-out in the column 'use'; leave some to fit")
+            raise DataError(
+                "every pose of the data is marked held-out in the column 'use'; leave some to fit"
+            )
         if any(judge):
             return kept.take([not held for held in judge]), kept.take(judge)
         return kept.split(1 - hold_out, seed) if hold_out else (kept, None)
 
-    def fit(self, robot: Mechanism, data: Measurements) -> tuple[Identification, ModelChoice | None]:
+    def fit(
+        self, robot: Mechanism, data: Measurements
+    ) -> tuple[Identification, ModelChoice | None]:
         """Identify, after choosing the set of parameters where asked."""
-        from loopcal.calibrate import choose_model, identify
-        from loopcal.calibrate.outlook import equations
-        from loopcal.calibrate.remedies import open_words
+        from loopcal.diagnose import choose_model
+        from loopcal.diagnose.suggestions import open_words
+        from loopcal.estimate import identify
+        from loopcal.estimate.outlook import equations
 
         method, loss = self.estimator(), self.robust()
-        choice = choose_model(robot, data, method=method, noise=self.noise, loss=loss) if self.choose_model else None
+        choice = (
+            choose_model(robot, data, method=method, noise=self.noise, loss=loss)
+            if self.choose_model
+            else None
+        )
         chosen = robot if choice is None else choice.robot
         if choice is not None and not choice.chosen.parameters:
-            raise DataError(f"{choice.sentence}; without --choose-model it is calibrated all the same")
+            raise DataError(
+                f"{choice.sentence}; without --choose-model it is calibrated all the same"
+            )
         free, count = int(chosen.parameters.free.sum()), equations(chosen, data)
         if not data.n_rows:
             raise DataError("the data hold no measured value; fill in what the instrument showed")
         if method is None and count < free:
             raise DataError(
-                f"{count} equations cannot determine {free} parameters; measure more poses, fix parameters, or let the "
+                f"{count} equations cannot determine {free} parameters; measure more poses, fix "
+                "parameters, or let the "
                 f"stated tolerances decide what is open with --method map{open_words(chosen, data)}"
             )
         drop = tuple(label for label in self.drop if label in data.labels)
@@ -110,17 +124,22 @@ def fit_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
     for option in (
         click.option("--choose-model", is_flag=True,
-                     help="Free only as many parameters as unseen poses justify: offsets, with lengths, ideal, complete."),
-        click.option("--drop", multiple=True, metavar="POSE", help="Leave this pose out; may be given several times."),
+                     help="Free only as many parameters as unseen poses justify: offsets, with "
+                          "lengths, ideal, complete."),
+        click.option("--drop", multiple=True, metavar="POSE", help="Leave this pose out; may be "
+                                                                   "given several times."),
         click.option("--loss", type=click.Choice(LOSSES), default=LOSSES[0], show_default=True,
                      help="Whether poses far from the fit count less."),
         click.option("--noise", type=click.Choice(("given", "estimated")), default="given", show_default=True,
                      help="Whether the stated noise is true, or only up to one common factor."),
         click.option("--keep", type=click.IntRange(min=0), metavar="K",
-                     help="For tsvd: how many directions; chosen by cross-validation where not given."),
-        click.option("--lam", type=click.FloatRange(min=0), help="For ridge; chosen by cross-validation where not given."),
+                     help="For tsvd: how many directions; chosen by cross-validation where not "
+                          "given."),
+        click.option("--lam", type=click.FloatRange(min=0), help="For ridge; chosen by "
+                                                                 "cross-validation where not given."),
         click.option("--method", type=click.Choice(METHODS), default=METHODS[0], show_default=True,
-                     help="How to estimate: auto is map (stated tolerances as prior) with tolerances widened where the"
+                     help="How to estimate: auto is map (stated tolerances as prior) with "
+                          "tolerances widened where the"
                           " data contradict them; ls is least squares."),
     ):  # fmt: skip
         packed = option(packed)

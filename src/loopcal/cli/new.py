@@ -18,8 +18,16 @@ if TYPE_CHECKING:
 
 @click.command(short_help="Write a robot file, and a measurement file, to fill in.")
 @click.argument("family", metavar="FAMILY")
-@click.option("-o", "--output", required=True, type=FILE, help="The robot file to write; the robot is called after it.")
-@click.option("--measurements", type=FILE, help="Also write a measurement file with the columns, but no rows.")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=FILE,
+    help="The robot file to write; the robot is called after it.",
+)
+@click.option(
+    "--measurements", type=FILE, help="Also write a measurement file with the columns, but no rows."
+)
 @instrument_options
 @click.option("--force", is_flag=True, help="Replace files that are there.")
 @json_option
@@ -35,18 +43,21 @@ def new(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Write a robot file of FAMILY (gough, linear-delta, 3-prs, ru-pus-prs, limbs), or a copy of a shipped robot.
+    """Write a robot file of FAMILY (gough, linear-delta, 3-prs, ru-pus-prs, limbs), or a copy of a
+    shipped robot.
 
-    It holds a robot that works, for your own numbers to be put in. The options of the instrument are for --measurements.
+    It holds a robot that works, for your own numbers to be put in. The options of the instrument
+    are for --measurements.
 
     \b
     Examples:
       loopcal new gough -o my-hexapod.yaml --measurements tracker.csv
-      loopcal new linear-delta -o printer.yaml --measurements heights.csv --kind component --components z
+      loopcal new linear-delta -o printer.yaml --measurements heights.csv --kind component
+      --components z
     """  # noqa: D301
-    from loopcal.io.new_robot import new_robot_text
-    from loopcal.io.outputs import refuse_outputs
-    from loopcal.io.text_file import write_text
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.core.text_file import write_text
+    from loopcal.io.robot.new_robot import new_robot_text
 
     seen_by = instrument(kind, components, orientation, sigma_position, sigma_angle)
     refuse_outputs((output, measurements), (), force)
@@ -58,15 +69,20 @@ def new(
     if as_json:
         show.json_document({"robot": output, "measurements": measurements})
         return
-    show.say(f"{output}: a working robot to put your own numbers into; then: loopcal check {output}")
+    show.say(
+        f"{output}: a working robot to put your own numbers into; then: loopcal check {output}"
+    )
     if measurements is not None:
-        show.say(f"{measurements}: columns without rows; fill in and: loopcal calibrate {output} {measurements} -o run")
+        show.say(
+            f"{measurements}: columns without rows; fill in and: loopcal calibrate {output} "
+            f"{measurements} -o run"
+        )
 
 
 def _template(robot_text: str, seen_by: Instrument) -> str:
     """Return a measurement file without rows for a robot that is not written yet."""
     from loopcal.io import load_robot
-    from loopcal.io.measurement_writer import template_text
+    from loopcal.io.data.measurement_writer import template_text
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.yaml"

@@ -23,7 +23,9 @@ FILE = click.Path(path_type=Path)
 
 robot_argument = click.argument("robot", metavar="ROBOT")
 data_argument = click.argument("data", metavar="DATA...", type=FILE, nargs=-1, required=True)
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
+json_option = click.option(
+    "--json", "as_json", is_flag=True, help="Print one JSON document and nothing else."
+)
 
 
 class Quantity(click.ParamType):
@@ -34,7 +36,9 @@ class Quantity(click.ParamType):
     def __init__(self, dimension: Dimension) -> None:
         self.dimension = dimension
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
         """Return the SI value, or fail with what is allowed."""
         if isinstance(value, float):
             return value
@@ -52,15 +56,20 @@ def gate_options(command: Callable[..., Any]) -> Callable[..., Any]:
     ):
         what = "position" if dimension is Dimension.LENGTH else "orientation"
         text = f"Quality gate, such as {example}: exit with 2 where the largest {what} error on unseen poses is above it."
-        command = click.option(name, type=Quantity(dimension), metavar="QUANTITY", help=text)(command)
+        command = click.option(name, type=Quantity(dimension), metavar="QUANTITY", help=text)(
+            command
+        )
     return command
 
 
 def data_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the flags that let implausible measurements pass; the command gets them as `allowed`, for `measurements`."""
+    """Add the flags that let implausible measurements pass; the command gets them as `allowed`, for
+    `measurements`.
+    """
     flags = {
         "allow_duplicates": "Accept rows that repeat another to the last digit.",
-        "allow_implausible": "Accept values that fit far better in another unit, order, sign or column.",
+        "allow_implausible": "Accept values that fit far better in another unit, order, sign or "
+        "column.",
         "allow_outside_stroke": "Accept readings outside the stroke of their actuator.",
         "allow_still": "Accept a target that no pose moves.",
     }
@@ -76,7 +85,8 @@ def data_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) -> Measurements:
-    """Read measurement files as one set, with a note on standard error where one says that it is of another robot.
+    """Read measurement files as one set, with a note on standard error where one says that it is of
+    another robot.
 
     Raises
     ------
@@ -84,20 +94,26 @@ def measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) -> Me
         See `loopcal.io.load_measurements`.
     """
     from loopcal.io import load_measurements
-    from loopcal.io.csv_table import stated_robot
+    from loopcal.io.core.csv_table import stated_robot
 
     found = load_measurements(paths, robot, **allowed)
     for path in paths:
         stated = stated_robot(path)
         if stated is not None and stated != robot.name:
-            click.echo(f"loopcal: note: {path} is said to be of robot {stated!r}, but {robot.name!r} is used", err=True)
+            click.echo(
+                f"loopcal: note: {path} is said to be of robot {stated!r}, but {robot.name!r} is "
+                "used",
+                err=True,
+            )
     return found
 
 
 def draw_option(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add how many poses are drawn where none are given; `drawn_poses` draws them."""
     text = "Where no poses are given: how many to draw evenly from the workspace that the robot file states."
-    return click.option("--draw", type=click.IntRange(min=1), default=40, show_default=True, metavar="N", help=text)(command)
+    return click.option(
+        "--draw", type=click.IntRange(min=1), default=40, show_default=True, metavar="N", help=text
+    )(command)
 
 
 def drawn_poses(robot: Mechanism, count: int, seed: int) -> tuple[np.ndarray, str]:
@@ -124,9 +140,11 @@ def instrument_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--sigma-position", type=length, default="0.01mm", show_default=True, metavar="QUANTITY",
                      help="Standard deviation of each measured length."),
         click.option("--orientation", help=f"How angles are written: {forms}"),
-        click.option("--components", help="For the kind component: which coordinates, such as z or x,y,z."),
+        click.option("--components", help="For the kind component: which coordinates, such as z or "
+                                          "x,y,z."),
         click.option("--kind", default="pose", show_default=True,
-                     help="Kind of measurement: pose, component, position, bearing, ...; or several, as position,inclination."),
+                     help="Kind of measurement: pose, component, position, bearing, ...; or "
+                          "several, as position,inclination."),
     ):  # fmt: skip
         command = option(command)
     return command
@@ -135,17 +153,20 @@ def instrument_options(command: Callable[..., Any]) -> Callable[..., Any]:
 sigma_reading_option = click.option(
     "--sigma-reading",
     metavar="QUANTITY",
-    help="Standard deviation of the recorded readings, for all or such as q1=5um,q2=20urad. [default: as the robot file says]",
+    help="Standard deviation of the recorded readings, for all or such as q1=5um,q2=20urad. "
+    "[default: as the robot file says]",
 )
 
 
 def sigma_of_readings(text: str | None, robot: Mechanism) -> np.ndarray | None:
-    """Return the standard deviation (a,) [SI] of each reading that --sigma-reading states; None where it is not there.
+    """Return the standard deviation (a,) [SI] of each reading that --sigma-reading states; None
+    where it is not there.
 
     Raises
     ------
     DataError
-        Not a quantity above zero or zero, of another dimension than the reading, or of an actuator that is not there.
+        Not a quantity above zero or zero, of another dimension than the reading, or of an actuator
+        that is not there.
     """
     import numpy as np
 
@@ -157,19 +178,29 @@ def sigma_of_readings(text: str | None, robot: Mechanism) -> np.ndarray | None:
         name, equals, number = part.rpartition("=")
         if equals and name not in found:
             known = ", ".join(found)
-            raise DataError(f"--sigma-reading names {name!r}{nearest(name, found)}; actuators of {robot.name} are {known}")
+            raise DataError(
+                f"--sigma-reading names {name!r}{nearest(name, found)}; actuators of {robot.name} "
+                f"are {known}"
+            )
         for each in (name,) if equals else tuple(found):
             try:
                 found[each] = quantity(number, dimensions[each])
             except UnitError as error:
                 raise DataError(f"--sigma-reading {number!r} for {each}: {error}") from None
             if not 0.0 <= found[each] < np.inf:
-                raise DataError(f"--sigma-reading for {each} is {number}; give a number above zero, or zero for exact")
+                raise DataError(
+                    f"--sigma-reading for {each} is {number}; give a number above zero, or zero "
+                    "for exact"
+                )
     return np.array(list(found.values()))
 
 
 def instrument(
-    kind: str, components: str | None, orientation: str | None, sigma_position: float, sigma_angle: float
+    kind: str,
+    components: str | None,
+    orientation: str | None,
+    sigma_position: float,
+    sigma_angle: float,
 ) -> Instrument:
     """Return the instrument that `instrument_options` describe.
 
@@ -180,7 +211,7 @@ def instrument(
     """
     import numpy as np
 
-    from loopcal.io.sensor_settings import kind_settings
+    from loopcal.io.data.sensor_settings import kind_settings
     from loopcal.measure import KINDS, Gaussian, Instrument, Sensor
 
     kinds, made = kind.split(","), []
@@ -189,13 +220,24 @@ def instrument(
     sigma = {Dimension.LENGTH: sigma_position, Dimension.ANGLE: sigma_angle}
     for i, one in enumerate(kinds):
         if one not in KINDS:
-            raise DataError(f"{one!r} is not a kind of measurement{nearest(one, KINDS)}; known are {', '.join(KINDS)}")
+            raise DataError(
+                f"{one!r} is not a kind of measurement{nearest(one, KINDS)}; known are "
+                f"{', '.join(KINDS)}"
+            )
         if one in kinds[:i]:
-            raise DataError(f"the kind {one!r} is named twice; name it once, and write the other into the file by hand")
+            raise DataError(
+                f"the kind {one!r} is named twice; name it once, and write the other into the file "
+                "by hand"
+            )
         known = kind_settings(KINDS[one])
         looking = KINDS[one](**{name: value for name, value in settings.items() if name in known})
-        made.append(Sensor(looking, Gaussian(np.array([sigma[c.dimension] for c in looking.noise_columns]))))
+        made.append(
+            Sensor(looking, Gaussian(np.array([sigma[c.dimension] for c in looking.noise_columns])))
+        )
     for name in settings:
         if not any(name in kind_settings(KINDS[one]) for one in kinds):
-            raise DataError(f"--{name} does not belong to the kind {kind!r}; leave it out, or choose another kind")
+            raise DataError(
+                f"--{name} does not belong to the kind {kind!r}; leave it out, or choose another "
+                "kind"
+            )
     return Instrument(tuple(made))

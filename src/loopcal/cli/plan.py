@@ -22,10 +22,10 @@ from loopcal.errors import DataError, UnitError
 from loopcal.units import Dimension, quantity
 
 if TYPE_CHECKING:
-    from loopcal.calibrate.plan.constraints import Constraints
-    from loopcal.calibrate.plan.record import Plan
     from loopcal.measure import Instrument, Measurements
     from loopcal.mechanism import Mechanism
+    from loopcal.planning.constraints import Constraints
+    from loopcal.planning.result import Plan
 
 POSES = 40
 
@@ -35,7 +35,9 @@ class Goal(click.ParamType):
 
     name = "quantity"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, str]:
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, str]:
         """Return the SI value and what it is of, or fail with what is allowed."""
         if isinstance(value, tuple):
             return value
@@ -61,17 +63,25 @@ class Asked:
 
     def constraints(self) -> Constraints:
         """Return the constraints that the options describe."""
-        from loopcal.calibrate.plan.constraints import Constraints, Sight
+        from loopcal.planning.constraints import Constraints, Sight
 
         if self.seen_from is None:
             given = click.get_current_context().get_parameter_source
             for name in ("facing", "cone", "nearest", "farthest"):
                 if given(name) is click.core.ParameterSource.COMMANDLINE:
-                    raise DataError(f"--{name} is about a line of sight; say from where, with --seen-from")
+                    raise DataError(
+                        f"--{name} is about a line of sight; say from where, with --seen-from"
+                    )
             return Constraints(self.min_margin, self.max_tilt)
         station = _three(self.seen_from, "--seen-from", Dimension.LENGTH)
         facing = _three(self.facing, "--facing", None)
-        sight = Sight(station, facing, self.cone, self.nearest, math.inf if self.farthest is None else self.farthest)
+        sight = Sight(
+            station,
+            facing,
+            self.cone,
+            self.nearest,
+            math.inf if self.farthest is None else self.farthest,
+        )
         return Constraints(self.min_margin, self.max_tilt, sight)
 
 
@@ -85,16 +95,20 @@ def constraint_options(command: Callable[..., Any]) -> Callable[..., Any]:
         return command(**given, asked=asked)
 
     for option in (
-        click.option("--farthest", type=length, metavar="QUANTITY", help="Largest distance of the target."),
+        click.option("--farthest", type=length, metavar="QUANTITY", help="Largest distance of the "
+                                                                         "target."),
         click.option("--nearest", type=length, default="0mm", metavar="QUANTITY", help="Smallest distance of the target."),
         click.option("--cone", type=angle, default="90deg", show_default=True, metavar="QUANTITY",
                      help="With --seen-from: half the angle within which the target can be seen."),
         click.option("--facing", default="0,0,1", show_default=True, metavar="X,Y,Z",
                      help="With --seen-from: where the target faces, in the axes of the platform."),
-        click.option("--seen-from", metavar="X,Y,Z", help="Where the instrument stands in the base frame, as 1.5m,-0.8m,1.1m."),
-        click.option("--max-tilt", type=angle, metavar="QUANTITY", help="Largest tilt of the platform, such as 20deg."),
+        click.option("--seen-from", metavar="X,Y,Z", help="Where the instrument stands in the base "
+                                                          "frame, as 1.5m,-0.8m,1.1m."),
+        click.option("--max-tilt", type=angle, metavar="QUANTITY", help="Largest tilt of the "
+                                                                        "platform, such as 20deg."),
         click.option("--min-margin", type=float, default=0.1, show_default=True,
-                     help="Smallest distance from a singularity, as a share of the workspace's median."),
+                     help="Smallest distance from a singularity, as a share of the workspace's "
+                          "median."),
     ):  # fmt: skip
         packed = option(packed)
     return packed
@@ -104,27 +118,79 @@ def constraint_options(command: Callable[..., Any]) -> Callable[..., Any]:
 @robot_argument
 @click.option("-o", "--output", required=True, type=FILE, help="The folder to make.")
 @click.option("--poses", type=int, metavar="N", help=f"Number of poses to fit (default {POSES}).")
-@click.option("--accuracy", type=Goal(), metavar="QUANTITY", help="In place of --poses: as many as this error takes, as 20um.")
+@click.option(
+    "--accuracy",
+    type=Goal(),
+    metavar="QUANTITY",
+    help="In place of --poses: as many as this error takes, as 20um.",
+)
 @click.option(
     "--criterion",
     type=click.Choice(("I", "D")),
     default="I",
     show_default=True,
-    help="What is made small: I the mean predicted variance of poses, D the uncertainty of the parameters.",
+    help="What is made small: I the mean predicted variance of poses, D the uncertainty of the "
+    "parameters.",
 )
-@click.option("--hold-out", type=int, metavar="N", help="Further poses to judge by, drawn evenly (default: one for four).")
-@click.option("--like", type=FILE, metavar="DATA", help="Measurement file whose settings describe the instrument.")
-@click.option("--measure", metavar="NAMES", help="Short for --kind component: some of x,y,z,phi,theta,psi; or plane-line.")
-@click.option("--frames", metavar="NAMES", help="What else is unknown: base (the instrument's frame in it), tool, or both.")
+@click.option(
+    "--hold-out",
+    type=int,
+    metavar="N",
+    help="Further poses to judge by, drawn evenly (default: one for four).",
+)
+@click.option(
+    "--like",
+    type=FILE,
+    metavar="DATA",
+    help="Measurement file whose settings describe the instrument.",
+)
+@click.option(
+    "--measure",
+    metavar="NAMES",
+    help="Short for --kind component: some of x,y,z,phi,theta,psi; or plane-line.",
+)
+@click.option(
+    "--frames",
+    metavar="NAMES",
+    help="What else is unknown: base (the instrument's frame in it), tool, or both.",
+)
 @instrument_options
-@click.option("--groups", type=int, metavar="N", help="With --measure plane-line: number of planes with a line.")
+@click.option(
+    "--groups",
+    type=int,
+    metavar="N",
+    help="With --measure plane-line: number of planes with a line.",
+)
 @click.option("--points", type=int, metavar="N", help="With --measure plane-line: points of each.")
-@click.option("--allowed", type=FILE, metavar="CSV", help="The poses to choose from; default: drawn from the workspace.")
-@click.option("--measured", type=FILE, multiple=True, metavar="DATA", help="Measurements made already; several times.")
+@click.option(
+    "--allowed",
+    type=FILE,
+    metavar="CSV",
+    help="The poses to choose from; default: drawn from the workspace.",
+)
+@click.option(
+    "--measured",
+    type=FILE,
+    multiple=True,
+    metavar="DATA",
+    help="Measurements made already; several times.",
+)
 @constraint_options
-@click.option("--candidates", type=click.IntRange(min=10), default=1000, show_default=True, help="Poses drawn to choose from.")
+@click.option(
+    "--candidates",
+    type=click.IntRange(min=10),
+    default=1000,
+    show_default=True,
+    help="Poses drawn to choose from.",
+)
 @click.option("--curve", is_flag=True, help="Also tell expected errors by the number of poses.")
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of all random choices.")
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=1,
+    show_default=True,
+    help="Seed of all random choices.",
+)
 @click.option("--force", is_flag=True, help="Replace a plan that is there.")
 @json_option
 def plan(
@@ -140,10 +206,12 @@ def plan(
     as_json: bool,
     **options: Any,
 ) -> None:
-    """Plan which poses of ROBOT to measure with an instrument, and write a folder with a sheet and a data file to fill in.
+    """Plan which poses of ROBOT to measure with an instrument, and write a folder with a sheet and
+    a data file to fill in.
 
-    The instrument is described by --measure (or --kind, --components, --orientation), --frames and the sigmas, or by the
-    settings of a measurement file with --like. Strokes, joint limits and cones of ROBOT are always kept to, on the way too.
+    The instrument is described by --measure (or --kind, --components, --orientation), --frames and
+    the sigmas, or by the settings of a measurement file with --like. Strokes, joint limits and
+    cones of ROBOT are always kept to, on the way too.
 
     \b
     Examples:
@@ -152,10 +220,11 @@ def plan(
       loopcal plan 3-prs -o plan --measure x,y,z,phi,theta --max-tilt 20deg --min-margin 0.2 --curve
       loopcal plan hexapod-42 -o plan --kind position --seen-from 1.5m,-0.8m,0.6m --cone 60deg
       loopcal plan my-hexapod.yaml -o plan --like tracker.csv --measured last-week.csv --poses 12
-      loopcal plan hexapod-nategh-agheli -o plan --measure plane-line --groups 10 --points 8 --sigma-position 1um
+      loopcal plan hexapod-nategh-agheli -o plan --measure plane-line --groups 10 --points 8
+      --sigma-position 1um
     """  # noqa: D301
     from loopcal.io import load_robot
-    from loopcal.io.plan_folder import FORMAT, refuse_plan_folder
+    from loopcal.io.runs.plan_folder import FORMAT, refuse_plan_folder
 
     refuse_plan_folder(output, force)
     machine = load_robot(robot)
@@ -165,7 +234,17 @@ def plan(
         refuse_others(click.get_current_context())
         constraints, counts = options["asked"].constraints(), (groups, points)
         inputs = _inputs(robot, None, None, ())
-        plan_groups(machine, output, counts, options["sigma_position"], constraints, inputs, seed, force, as_json)
+        plan_groups(
+            machine,
+            output,
+            counts,
+            options["sigma_position"],
+            constraints,
+            inputs,
+            seed,
+            force,
+            as_json,
+        )
         return
     if groups is not None or points is not None:
         raise DataError("--groups and --points belong to --measure plane-line; leave them out")
@@ -177,24 +256,41 @@ def plan(
         show.json_document({"format": FORMAT, **made.to_dict()})
         return
     show.say(str(made))
-    show.say(f"\nwritten to {output}: plan.csv to measure by, measurements.csv to fill in, plan.json, pictures")
+    show.say(
+        f"\nwritten to {output}: plan.csv to measure by, measurements.csv to fill in, plan.json, "
+        "pictures"
+    )
     files = shlex.join(str(path) for path in (*measured, output / "measurements.csv"))
     show.say(f"then: loopcal calibrate {shlex.quote(robot)} {files} -o run")
 
 
 def _instrument(robot: Mechanism, like: Path | None, options: Mapping[str, Any]) -> Instrument:
     """Return the instrument that the options, or the settings of a file, describe."""
-    from loopcal.io.instrument_file import load_instrument_to_plan
+    from loopcal.io.data.instrument_file import load_instrument_to_plan
 
     if like is not None and like.suffix in (".yaml", ".yml"):
-        raise DataError(f"--like {like} is no measurement file, which is CSV; its settings stand in front of or beside it")
-    names = ("measure", "frames", "kind", "components", "orientation", "sigma_position", "sigma_angle")
+        raise DataError(
+            f"--like {like} is no measurement file, which is CSV; its settings stand in front of "
+            "or beside it"
+        )
+    names = (
+        "measure",
+        "frames",
+        "kind",
+        "components",
+        "orientation",
+        "sigma_position",
+        "sigma_angle",
+    )
     if like is None:
         return assumed_instrument(**{name: options[name] for name in names})
     given = click.get_current_context().get_parameter_source
     for name in names:
         if given(name) is click.core.ParameterSource.COMMANDLINE:
-            raise DataError(f"--like {like} describes the instrument; leave out --{name.replace('_', '-')}, or --like")
+            raise DataError(
+                f"--like {like} describes the instrument; leave out --{name.replace('_', '-')}, or "
+                "--like"
+            )
     return load_instrument_to_plan(like, robot)
 
 
@@ -207,42 +303,63 @@ def _planned(
     options: Mapping[str, Any],
 ) -> Plan:
     """Plan as the options ask."""
-    from loopcal.calibrate.plan.plan import planned, planned_for
-    from loopcal.calibrate.plan.problem import problem
-    from loopcal.io.measurement_file import load_poses
+    from loopcal.io.data.measurement_file import load_poses
+    from loopcal.planning.pose_planning import planned, planned_for
+    from loopcal.planning.problem import problem
 
     goal, n = options["accuracy"], options["poses"]
     if goal is not None and n is not None:
-        raise DataError("there are both --poses and --accuracy; give the number of poses, or what they are to reach")
+        raise DataError(
+            "there are both --poses and --accuracy; give the number of poses, or what they are to "
+            "reach"
+        )
     if goal is not None and options["curve"]:
         raise DataError("--accuracy shows its own curve; leave out --curve")
     poses = None if allowed is None else load_poses(allowed, robot)
     before, taken = (None, ()) if not measured else _known(measured, robot)
-    made = problem(robot, looking, options["asked"].constraints(), poses, before, options["candidates"], seed, taken)
+    made = problem(
+        robot,
+        looking,
+        options["asked"].constraints(),
+        poses,
+        before,
+        options["candidates"],
+        seed,
+        taken,
+    )
     criterion, held = options["criterion"], options["hold_out"]
     if goal is not None:
         return planned_for(made, goal[0], goal[1], criterion, hold_out=held, seed=seed)
-    return planned(made, POSES if n is None else n, criterion, hold_out=held, curve=options["curve"], seed=seed)
+    return planned(
+        made, POSES if n is None else n, criterion, hold_out=held, curve=options["curve"], seed=seed
+    )
 
 
 def _known(measured: Sequence[Path], robot: Mechanism) -> tuple[Measurements, tuple[str, ...]]:
     """Return what earlier files measured of poses to fit, and the names of all their poses."""
     from loopcal.cli.options import measurements
-    from loopcal.io.use_column import held_out_poses
+    from loopcal.io.data.use_column import held_out_poses
 
     found = measurements(measured, robot)
     if not found.n_rows:
-        raise DataError(f"--measured {' '.join(map(str, measured))} holds no measured value; fill it in, or leave it out")
+        raise DataError(
+            f"--measured {' '.join(map(str, measured))} holds no measured value; fill it in, or "
+            "leave it out"
+        )
     held = held_out_poses(measured)
     fitted = [i for i, label in enumerate(found.labels) if label not in set(held)]
     if not fitted:
-        raise DataError(f"--measured {' '.join(map(str, measured))} holds all its poses out; leave some to fit")
+        raise DataError(
+            f"--measured {' '.join(map(str, measured))} holds all its poses out; leave some to fit"
+        )
     return (found.take(fitted) if held else found), found.labels
 
 
-def _inputs(robot: str, like: Path | None, allowed: Path | None, measured: tuple[Path, ...]) -> dict[str, Path]:
+def _inputs(
+    robot: str, like: Path | None, allowed: Path | None, measured: tuple[Path, ...]
+) -> dict[str, Path]:
     """Return the files that are read."""
-    from loopcal.io.robot_file import robot_path
+    from loopcal.io.robot.robot_file import robot_path
 
     files = {"robot": robot_path(robot), "like": like, "allowed": allowed}
     files |= {f"measured {i}": path for i, path in enumerate(measured, 1)}
@@ -251,15 +368,17 @@ def _inputs(robot: str, like: Path | None, allowed: Path | None, measured: tuple
 
 def _write(output: Path, made: Plan, inputs: Mapping[str, Path], force: bool) -> None:
     """Write the folder."""
-    from loopcal.io.plan_folder import DATA, SHEET, data_text, sheet_text, write_plan_folder
-    from loopcal.io.run_folder import made_by
+    from loopcal.io.runs.plan_folder import DATA, SHEET, data_text, sheet_text, write_plan_folder
+    from loopcal.io.runs.run_folder import made_by
     from loopcal.report.draw_plan import draw_curve, draw_plan, save_figure
 
     texts = {SHEET: sheet_text(made), DATA: data_text(made)}
     document = made.to_dict() | {"made_by": made_by(sys.argv, inputs, {"plan": made.seed})}
     pictures = {"plan.png": functools.partial(save_figure, figure=draw_plan(made))}
     if made.curve is not None:
-        pictures["curve.png"] = functools.partial(save_figure, figure=draw_curve(made.robot, made.curve))
+        pictures["curve.png"] = functools.partial(
+            save_figure, figure=draw_curve(made.robot, made.curve)
+        )
     write_plan_folder(output, texts, document, pictures, force)
 
 

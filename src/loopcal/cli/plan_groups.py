@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal plan --measure plane-line`: points on planes and lines that a coordinate measuring machine holds."""
+"""`loopcal plan --measure plane-line`: points on planes and lines that a coordinate measuring
+machine holds.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +16,18 @@ from loopcal.cli import show
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
-    from loopcal.calibrate.plan.constraints import Constraints
     from loopcal.mechanism import Mechanism
+    from loopcal.planning.constraints import Constraints
 
 GROUPS, POINTS = 10, 8
-COUNTED, HELD = "which counts --groups and --points", "where a measuring machine holds x, y or z to --sigma-position"
-CHOSEN, ALL = "which moves points within the workspace and chooses by criterion D", "where every point is fitted"
+COUNTED, HELD = (
+    "which counts --groups and --points",
+    "where a measuring machine holds x, y or z to --sigma-position",
+)
+CHOSEN, ALL = (
+    "which moves points within the workspace and chooses by criterion D",
+    "where every point is fitted",
+)
 OTHERS = {
     **dict.fromkeys(("poses", "accuracy", "curve"), COUNTED),
     **dict.fromkeys(("like", "kind", "components", "orientation", "sigma_angle"), HELD),
@@ -40,9 +48,14 @@ def refuse_others(context: click.Context) -> None:
         With the first of them, and why it means nothing.
     """
     for option in context.command.params:
-        given = context.get_parameter_source(option.name or "") is not click.core.ParameterSource.DEFAULT
+        given = (
+            context.get_parameter_source(option.name or "")
+            is not click.core.ParameterSource.DEFAULT
+        )
         if given and (why := OTHERS.get(option.name or "")) is not None:
-            raise DataError(f"{option.opts[-1]} does not go with --measure plane-line, {why}; leave it out")
+            raise DataError(
+                f"{option.opts[-1]} does not go with --measure plane-line, {why}; leave it out"
+            )
 
 
 def plan_groups(
@@ -57,19 +70,30 @@ def plan_groups(
     as_json: bool,
 ) -> None:
     """Plan groups, write the folder, and print."""
-    from loopcal.calibrate.plan.plan_surfaces import plan_surfaces
-    from loopcal.io.plan_folder import DATA, SHEET, write_plan_folder
-    from loopcal.io.run_folder import made_by
-    from loopcal.io.surface_sheet import surface_data_text, surface_sheet_text
+    from loopcal.io.data.surface_sheet import surface_data_text, surface_sheet_text
+    from loopcal.io.runs.plan_folder import DATA, SHEET, write_plan_folder
+    from loopcal.io.runs.run_folder import made_by
+    from loopcal.planning.surface_groups import plan_surfaces
 
-    groups, points = (usual if given is None else given for given, usual in zip(counts, (GROUPS, POINTS), strict=True))
+    groups, points = (
+        usual if given is None else given
+        for given, usual in zip(counts, (GROUPS, POINTS), strict=True)
+    )
     show.progress("planning ...")
     made = plan_surfaces(robot, groups, points, sigma, constraints, seed)
     document = made.to_dict() | {"made_by": made_by(sys.argv, inputs, {"plan": seed})}
-    write_plan_folder(output, {SHEET: surface_sheet_text(made), DATA: surface_data_text(made)}, document, {}, force)
+    write_plan_folder(
+        output,
+        {SHEET: surface_sheet_text(made), DATA: surface_data_text(made)},
+        document,
+        {},
+        force,
+    )
     if as_json:
         show.json_document(made.to_dict())
         return
     show.say(str(made))
-    show.say(f"\nwritten to {output}: plan.csv to measure by, measurements.csv to fill in, plan.json")
+    show.say(
+        f"\nwritten to {output}: plan.csv to measure by, measurements.csv to fill in, plan.json"
+    )
     show.say(f"then: loopcal calibrate {inputs['robot']} {output / DATA} -o run")

@@ -20,16 +20,34 @@ if TYPE_CHECKING:
 
 @click.command(short_help="Repeat a published study, printed numbers beside computed ones.")
 @click.argument("paper", metavar="[PAPER]", required=False)
-@click.option("-o", "--output", type=FILE, metavar="FOLDER", help="Write a page, all tables (CSV, JSON) and figures (PNG).")
+@click.option(
+    "-o",
+    "--output",
+    type=FILE,
+    metavar="FOLDER",
+    help="Write a page, all tables (CSV, JSON) and figures (PNG).",
+)
 @click.option("--seed", default=0, show_default=True, help="Of everything that is drawn.")
-@click.option("--trials", type=int, metavar="N", help="Drawings behind each statistical number.  [default: 50]")
+@click.option(
+    "--trials",
+    type=int,
+    metavar="N",
+    help="Drawings behind each statistical number.  [default: 50]",
+)
 @click.option("--force", is_flag=True, help="Replace an earlier result in FOLDER.")
 @json_option
-def reproduce(paper: str | None, output: Path | None, seed: int, trials: int | None, force: bool, as_json: bool) -> None:
+def reproduce(
+    paper: str | None,
+    output: Path | None,
+    seed: int,
+    trials: int | None,
+    force: bool,
+    as_json: bool,
+) -> None:
     """Repeat the study PAPER; without PAPER, list those that can be repeated.
 
-    Every number called computed comes from running the code now; statements of the paper that it does not bear out are
-    named, with the reason.
+    Every number called computed comes from running the code now; statements of the paper that it
+    does not bear out are named, with the reason.
 
     \b
     Examples:
@@ -45,12 +63,12 @@ def reproduce(paper: str | None, output: Path | None, seed: int, trials: int | N
         return
     chosen = PAPERS[paper] if paper in PAPERS else paper_called(paper)
     if output is not None:
-        from loopcal.io.run_folder import refuse_used_folder
+        from loopcal.io.runs.run_folder import refuse_used_folder
 
         refuse_used_folder(output, force)
     found = chosen.run(seed, TRIALS if trials is None else trials, show.progress)
     if output is not None:
-        from loopcal.io.run_folder import made_by
+        from loopcal.io.runs.run_folder import made_by
         from loopcal.papers.writing import write_folder
 
         write_folder(output, found, made_by(["loopcal", *sys.argv[1:]], {}, {"seed": seed}), force)
@@ -58,7 +76,11 @@ def reproduce(paper: str | None, output: Path | None, seed: int, trials: int | N
         show.json_document(found.to_dict())
         return
     _print(found)
-    show.say(f"\nwritten to {output}: page.md, tables, figures" if output else "\nall tables and figures: add -o FOLDER")
+    show.say(
+        f"\nwritten to {output}: page.md, tables, figures"
+        if output
+        else "\nall tables and figures: add -o FOLDER"
+    )
 
 
 def _list(as_json: bool) -> None:
@@ -66,7 +88,13 @@ def _list(as_json: bool) -> None:
     from loopcal.papers import PAPERS
 
     if as_json:
-        show.json_document({"papers": [{"name": p.name, "title": p.title, "source": p.source} for p in PAPERS.values()]})
+        show.json_document(
+            {
+                "papers": [
+                    {"name": p.name, "title": p.title, "source": p.source} for p in PAPERS.values()
+                ]
+            }
+        )
         return
     for one in PAPERS.values():
         show.say(f"{one.name}\n    {one.title}\n    {one.source}")
@@ -80,7 +108,11 @@ def _print(found: Reproduction) -> None:
     show.say()
     for i, verdict in enumerate(found.verdicts, 1):
         word = verdict.word.upper() if verdict.agrees is False else verdict.word.lower()
-        show.say(textwrap.fill(f"{i:2}. {word}: {verdict.claim} ({verdict.where})", 112, subsequent_indent="    "))
+        show.say(
+            textwrap.fill(
+                f"{i:2}. {word}: {verdict.claim} ({verdict.where})", 112, subsequent_indent="    "
+            )
+        )
         show.say(textwrap.fill(verdict.why, 112, initial_indent="    ", subsequent_indent="    "))
 
 

@@ -13,8 +13,8 @@ import click
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit, unit
 
 if TYPE_CHECKING:
-    from loopcal.calibrate import Validation
-    from loopcal.calibrate.reading_errors import ReadingError
+    from loopcal.apply import Validation
+    from loopcal.diagnose.actuator_reading_errors import ReadingError
     from loopcal.mechanism import Mechanism
 
 ROUNDING = 1e-12
@@ -39,19 +39,23 @@ def progress(text: str) -> None:
 
 
 def json_document(document: Mapping[str, Any]) -> None:
-    """Print one JSON document; see `loopcal.io.json_text`."""
-    from loopcal.io.json_text import to_json
+    """Print one JSON document; see `loopcal.io.core.json_text`."""
+    from loopcal.io.core.json_text import to_json
 
     click.echo(to_json(document), nl=False)
 
 
-def table(title: str, headers: Sequence[str], rows: Iterable[Sequence[str]], text_columns: int = 1) -> None:
+def table(
+    title: str, headers: Sequence[str], rows: Iterable[Sequence[str]], text_columns: int = 1
+) -> None:
     """Print a table; the first `text_columns` columns are left-aligned, the others right-aligned."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
-    shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    shown = Table(
+        title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False
+    )
     for i, header in enumerate(headers):
         shown.add_column(header, justify="left" if i < text_columns else "right", no_wrap=True)
     for row in rows:
@@ -67,7 +71,10 @@ def table(title: str, headers: Sequence[str], rows: Iterable[Sequence[str]], tex
 
 def units_of(robot: Mechanism) -> dict[Dimension, Unit]:
     """Return the units in which a robot's numbers are shown: those of its file."""
-    return {**DISPLAY_UNITS, **{dimension: unit(symbol) for dimension, symbol in robot.units.items()}}
+    return {
+        **DISPLAY_UNITS,
+        **{dimension: unit(symbol) for dimension, symbol in robot.units.items()},
+    }
 
 
 def number(value: float, plus_minus: float | None = None, digits: int = 6) -> str:
@@ -86,7 +93,9 @@ def number(value: float, plus_minus: float | None = None, digits: int = 6) -> st
 
 
 def uncertainty(plus_minus: float) -> str:
-    """Return an uncertainty to two digits, or in a word why there is none: not determined, or no interval possible."""
+    """Return an uncertainty to two digits, or in a word why there is none: not determined, or no
+    interval possible.
+    """
     if math.isnan(plus_minus):
         return "not given"
     return "unknown" if math.isinf(plus_minus) else number(plus_minus, plus_minus)
@@ -111,7 +120,9 @@ def parameters(title: str, rows: Iterable[Mapping[str, Any]]) -> None:
 
 
 def reading_errors(robot: Mechanism, errors: Sequence[ReadingError]) -> None:
-    """Print how far recorded readings are from those found: as readings, and as what the actuators move."""
+    """Print how far recorded readings are from those found: as readings, and as what the actuators
+    move.
+    """
     units = units_of(robot)
     cells = []
     for error in errors:
@@ -128,14 +139,18 @@ def reading_errors(robot: Mechanism, errors: Sequence[ReadingError]) -> None:
             )
         )
     headers = ("reading", "rms", "unit", "rms of what it moves", "largest", "unit", "at")
-    table(f"Readings, recorded minus found, of up to {max(e.count for e in errors)} poses", headers, cells)
+    table(
+        f"Readings, recorded minus found, of up to {max(e.count for e in errors)} poses",
+        headers,
+        cells,
+    )
 
 
 def validation(found: Validation, poses: str, before: bool = True) -> None:
     """Print errors before and after calibration, or of one geometry alone.
 
-    Errors after commanding are left out where they are those of the prediction because nothing is out of the actuators'
-    reach.
+    Errors after commanding are left out where they are those of the prediction because nothing is
+    out of the actuators' reach.
     """
     rows = found.rows()
     same = all(max(four) < ROUNDING for title, _, _, _, *four in rows if title == "not compensable")
@@ -150,7 +165,10 @@ def validation(found: Validation, poses: str, before: bool = True) -> None:
     if found.several_kinds:
         _kinds(found, before)
     if same and before:
-        say("poses after commanding have these same errors: what was measured can be corrected by the actuators in full")
+        say(
+            "poses after commanding have these same errors: what was measured can be corrected by "
+            "the actuators in full"
+        )
     for name, times in found.comparisons() if before else ():
         say(f"{name} (rms): {_compared(times)}")
     if found.failed:
@@ -163,7 +181,10 @@ def _kinds(found: Validation, before: bool) -> None:
     """Print errors of every kind in units of its sigma."""
     if before:
         headers = ("kind", "values", "before", "after")
-        cells = [(k.kind, str(k.count), number(k.before, digits=3), number(k.after, digits=3)) for k in found.kinds]
+        cells = [
+            (k.kind, str(k.count), number(k.before, digits=3), number(k.after, digits=3))
+            for k in found.kinds
+        ]
     else:
         headers = ("kind", "values", "predicted")
         cells = [(k.kind, str(k.count), number(k.after, digits=3)) for k in found.kinds]
@@ -176,7 +197,11 @@ def _compared(improvement: float) -> str:
         return "the same before and after calibration"
     if improvement > 1.0:
         return f"{improvement:.3g} times smaller after calibration"
-    return f"{1.0 / improvement:.3g} times LARGER after calibration" if improvement > 0.0 else "LARGER after calibration"
+    return (
+        f"{1.0 / improvement:.3g} times LARGER after calibration"
+        if improvement > 0.0
+        else "LARGER after calibration"
+    )
 
 
 def gates(reasons: Iterable[str]) -> int:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal simulate`: measure a simulated machine, for trying things out before anybody buys time on an instrument."""
+"""`loopcal simulate`: measure a simulated machine, for trying things out before anybody buys time
+on an instrument.
+"""
 
 from __future__ import annotations
 
@@ -34,14 +36,27 @@ if TYPE_CHECKING:
 @click.option("--poses", type=FILE, help="CSV file of commanded poses, one column per coordinate.")
 @draw_option
 @click.option(
-    "--fill", type=FILE, metavar="SHEET", help="In place of poses and instrument: the data file of a plan to fill in."
+    "--fill",
+    type=FILE,
+    metavar="SHEET",
+    help="In place of poses and instrument: the data file of a plan to fill in.",
 )
 @click.option("-o", "--output", required=True, type=FILE, help="The measurement file to write.")
 @instrument_options
 @sigma_reading_option
-@click.option("--draw-errors", is_flag=True, help="Give the machine errors drawn from the tolerances of the robot file.")
+@click.option(
+    "--draw-errors",
+    is_flag=True,
+    help="Give the machine errors drawn from the tolerances of the robot file.",
+)
 @click.option("--truth", type=FILE, help="Also write the true machine, as a robot file.")
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of poses, errors and noise.")
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=1,
+    show_default=True,
+    help="Seed of poses, errors and noise.",
+)
 @click.option("--force", is_flag=True, help="Replace files that are there.")
 @json_option
 def simulate(
@@ -62,25 +77,28 @@ def simulate(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Command ROBOT to poses by its nominal geometry, and write down what an instrument would see of the true machine.
+    """Command ROBOT to poses by its nominal geometry, and write down what an instrument would see
+    of the true machine.
 
     Without --poses, poses are drawn evenly from the workspace that the robot file states.
 
-    The true machine has the identified values of the robot file where it has any, or drawn ones with --draw-errors.
+    The true machine has the identified values of the robot file where it has any, or drawn ones
+    with --draw-errors.
 
     \b
     Examples:
       loopcal simulate hexapod-42 --draw-errors --truth truth.yaml -o measurements.csv
       loopcal simulate hexapod-42 --poses poses.csv --draw-errors -o measurements.csv
-      loopcal simulate truth.yaml --poses poses.csv --sigma-position 0.001mm --sigma-angle 5urad -o measurements.csv
-      loopcal simulate linear-delta --kind position --sigma-reading 5um --draw-errors -o measurements.csv
-      loopcal simulate hexapod-42 --fill plan/measurements.csv --draw-errors --truth truth.yaml -o filled.csv
+      loopcal simulate truth.yaml --poses poses.csv --sigma-position 0.001mm --sigma-angle 5urad -o
+      measurements.csv loopcal simulate linear-delta --kind position --sigma-reading 5um
+      --draw-errors -o measurements.csv loopcal simulate hexapod-42 --fill plan/measurements.csv
+      --draw-errors --truth truth.yaml -o filled.csv
     """  # noqa: D301
     from loopcal import measure
     from loopcal.io import load_robot, save_robot
-    from loopcal.io.outputs import refuse_outputs
-    from loopcal.io.robot_file import robot_path
-    from loopcal.io.text_file import write_text
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.core.text_file import write_text
+    from loopcal.io.robot.robot_file import robot_path
 
     refuse_outputs((output, truth), (robot_path(robot), poses, fill), force)
     machine = load_robot(robot)
@@ -90,23 +108,41 @@ def simulate(
         data, text = _filled(machine, fill, seed)
     else:
         seen_by = instrument(kind, components, orientation, sigma_position, sigma_angle)
-        data, text = _simulated(machine, poses, draw, seen_by, sigma_of_readings(sigma_reading, machine), seed)
+        data, text = _simulated(
+            machine, poses, draw, seen_by, sigma_of_readings(sigma_reading, machine), seed
+        )
     write_text(output, text)
     if truth is not None:
         save_robot(machine, truth)
     if as_json:
-        show.json_document({"output": output, "truth": truth, "n_poses": data.n_poses, "n_rows": data.n_rows, "seed": seed})
+        show.json_document(
+            {
+                "output": output,
+                "truth": truth,
+                "n_poses": data.n_poses,
+                "n_rows": data.n_rows,
+                "seed": seed,
+            }
+        )
     else:
-        show.say(f"{output}: {data.n_poses} poses of {machine.name}, {data.n_rows} measured values, seed {seed}")
+        show.say(
+            f"{output}: {data.n_poses} poses of {machine.name}, {data.n_rows} measured values, "
+            f"seed {seed}"
+        )
 
 
 def _simulated(
-    machine: Mechanism, poses: Path | None, draw: int, seen_by: Instrument, sigma_reading: np.ndarray | None, seed: int
+    machine: Mechanism,
+    poses: Path | None,
+    draw: int,
+    seen_by: Instrument,
+    sigma_reading: np.ndarray | None,
+    seed: int,
 ) -> tuple[Measurements, str]:
     """Measure poses of a file, or drawn ones: what was measured, and the file that says so."""
     from loopcal import measure
-    from loopcal.io.measurement_file import load_poses
-    from loopcal.io.measurement_writer import measurements_text
+    from loopcal.io.data.measurement_file import load_poses
+    from loopcal.io.data.measurement_writer import measurements_text
 
     if poses is None:
         targets, words = drawn_poses(machine.nominal, draw, seed)
@@ -120,17 +156,31 @@ def _simulated(
 def _filled(machine: Mechanism, sheet: Path, seed: int) -> tuple[Measurements, str]:
     """Fill in the data file of a plan: what was measured, and the file that says so."""
     from loopcal.io import load_measurements
-    from loopcal.io.instrument_file import load_instrument, refuse_readings_to_measure
-    from loopcal.io.measurement_writer import measurements_text
-    from loopcal.io.use_column import use_of, with_use
-    from loopcal.measure.fill_in import fill_in
+    from loopcal.io.data.instrument_file import load_instrument, refuse_readings_to_measure
+    from loopcal.io.data.measurement_writer import measurements_text
+    from loopcal.io.data.use_column import use_of, with_use
+    from loopcal.measure.sheet_simulation import fill_in
 
     given = click.get_current_context().get_parameter_source
-    for name in ("poses", "draw", "kind", "components", "orientation", "sigma_position", "sigma_angle", "sigma_reading"):
+    for name in (
+        "poses",
+        "draw",
+        "kind",
+        "components",
+        "orientation",
+        "sigma_position",
+        "sigma_angle",
+        "sigma_reading",
+    ):
         if given(name) is click.core.ParameterSource.COMMANDLINE:
-            raise DataError(f"--fill {sheet} states poses and instrument; leave out --{name.replace('_', '-')}, or --fill")
+            raise DataError(
+                f"--fill {sheet} states poses and instrument; leave out "
+                f"--{name.replace('_', '-')}, or --fill"
+            )
     refuse_readings_to_measure(sheet, machine)
-    data = fill_in(machine, load_measurements(sheet, machine), load_instrument(sheet, machine), seed)
+    data = fill_in(
+        machine, load_measurements(sheet, machine), load_instrument(sheet, machine), seed
+    )
     text = measurements_text(data, machine, f"simulated by loopcal: {sheet.name}, seed {seed}")
     use = use_of([sheet])
     return data, with_use(text, use) if use else text

@@ -9,7 +9,14 @@ from pathlib import Path
 import click
 
 from loopcal.cli import show
-from loopcal.cli.options import FILE, data_argument, data_options, gate_options, json_option, measurements
+from loopcal.cli.options import (
+    FILE,
+    data_argument,
+    data_options,
+    gate_options,
+    json_option,
+    measurements,
+)
 
 
 @click.command(short_help="Judge a calibration, or a robot file, by measurements.")
@@ -18,8 +25,11 @@ from loopcal.cli.options import FILE, data_argument, data_options, gate_options,
 @gate_options
 @data_options
 @click.option("--refit", multiple=True, metavar="NAME",
-              help="A frame, target or surface that was set up anew since RUN, to be found from DATA.")  # fmt: skip
-@click.option("--allow-fitted-data", is_flag=True, help="Accept measurements that the run was fitted to.")
+              help="A frame, target or surface that was set up anew since RUN, to be found from "
+                   "DATA.")  # fmt: skip
+@click.option(
+    "--allow-fitted-data", is_flag=True, help="Accept measurements that the run was fitted to."
+)
 @json_option
 def validate(
     run: Path,
@@ -31,12 +41,14 @@ def validate(
     allow_fitted_data: bool,
     as_json: bool,
 ) -> int:
-    """Compare the robot of RUN, a folder made by `loopcal calibrate` or a robot file, with DATA, one file or several.
+    """Compare the robot of RUN, a folder made by `loopcal calibrate` or a robot file, with DATA,
+    one file or several.
 
-    Errors are those before and after calibration; of a robot file without identified values, its own alone.
+    Errors are those before and after calibration; of a robot file without identified values, its
+    own alone.
 
-    Frames, targets and surfaces that RUN found are used as it found them, by name; others are fitted to DATA, and that
-    is said.
+    Frames, targets and surfaces that RUN found are used as it found them, by name; others are
+    fitted to DATA, and that is said.
 
     The exit code is 2 where a quality gate is not met.
 
@@ -46,15 +58,17 @@ def validate(
       loopcal validate run more-measurements.csv --limit-position 0.02mm --limit-angle 0.01deg
       loopcal validate robot.yaml measurements.csv --limit-position 0.1mm
     """  # noqa: D301
-    from loopcal.calibrate import validate as compare
-    from loopcal.io.calibration_run import load_calibrated, refuse_fitted_data
+    from loopcal.apply import validate as compare
+    from loopcal.io.runs.calibration_run import load_calibrated, refuse_fitted_data
 
     calibrated = load_calibrated(run)
     measured = measurements(data, calibrated.robot, **allowed)
     if not allow_fitted_data and (again := refuse_fitted_data(calibrated, data, measured)):
         click.echo(f"loopcal: note: {again}", err=True)
     known = {"known": calibrated.local, "known_before": calibrated.local_before, "refit": refit}
-    found = compare(calibrated.robot, measured, limit_position, limit_angle, calibrated.before, **known)
+    found = compare(
+        calibrated.robot, measured, limit_position, limit_angle, calibrated.before, **known
+    )
     if as_json:
         show.json_document(found.to_dict())
     else:

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the engine is told of a mechanism: its structure, apart from every number that is estimated.
 
-A limb is a chain from the base to a tip (link 0, joint 0, link 1, ..., link J) and one ending that ties the tip to an
-attachment frame on the platform: `rigid` (6 rows: rotation times the size, position), `ball` (3: position) or `distance`
-(1: |attachment - tip| - length). A joint moves along or about the z axis of the frame it stands in: `R` turns by theta and
-advances by pitch * theta, `P` advances by theta. Limbs of one structure form a group and are evaluated together. The rod of
-a `distance` ending counts as joint J, whose value is added to the rod's length.
+A limb is a chain from the base to a tip (link 0, joint 0, link 1, ..., link J) and one ending that
+ties the tip to an attachment frame on the platform: `rigid` (6 rows: rotation times the size,
+position), `ball` (3: position) or `distance` (1: |attachment - tip| - length). A joint moves along
+or about the z axis of the frame it stands in: `R` turns by theta and advances by pitch * theta, `P`
+advances by theta. Limbs of one structure form a group and are evaluated together. The rod of a
+`distance` ending counts as joint J, whose value is added to the rod's length.
 """
 
 from __future__ import annotations
@@ -15,14 +16,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from loopcal.typing import FloatArray, IntArray
+
 PITCH, LENGTH, CONVERGED, STALLED, EXHAUSTED, NOT_FINITE = 6, 7, 0, 1, 2, 3
 
 
 @dataclass(frozen=True)
 class Slot:
-    """A displacement that parameters can move, in every limb of a group: `element` counts the links 0..J and J + 1 for the
-    attachment; `axis` is 0..5 for (rx, ry, rz, x, y, z) in that link's frame, PITCH of joint `element`, LENGTH of the rod.
+    """A displacement that parameters can move, in every limb of a group: `element` counts the links
+    0..J and J + 1 for the attachment; `axis` is 0..5 for (rx, ry, rz, x, y, z) in that link's
+    frame, PITCH of joint `element`, LENGTH of the rod.
     """
 
     element: int
@@ -34,23 +37,26 @@ class Group:
     """Limbs of one structure: k of them, with J joints each.
 
     limbs : (k,) positions of these limbs in the mechanism. joints : one letter a joint, R or P.
-    actuator : (J + 1, k) column of q that drives the joint, -1 where it is passive; the last row belongs to the rod.
+    actuator : (J + 1, k) column of q that drives the joint, -1 where it is passive; the last row
+        belongs to the rod.
     held : (J,) joints that keep their start value: those that only spin a limb about itself.
-    ending : rigid, ball or distance. rows : which of its rows count (positions in a twist); (0,) for distance.
+    ending : rigid, ball or distance. rows : which of its rows count (positions in a twist); (0,)
+        for distance.
     links : (k, J + 2, 4, 4) nominal link transforms, the attachment last [m].
-    pitch : (k, J) nominal advance per turn angle [m/rad]. length : (k,) nominal length of the rod [m].
+    pitch : (k, J) nominal advance per turn angle [m/rad]. length : (k,) nominal length of the rod
+        [m].
     slots : displacements present; columns : their place in e, limb by limb.
     """
 
     limbs: tuple[int, ...]
     joints: str
-    actuator: NDArray[np.int64]
+    actuator: IntArray
     held: tuple[bool, ...]
     ending: str
     rows: tuple[int, ...]
-    links: Array
-    pitch: Array
-    length: Array
+    links: FloatArray
+    pitch: FloatArray
+    length: FloatArray
     slots: tuple[Slot, ...]
     columns: slice
 
@@ -68,7 +74,8 @@ class Program:
     groups : the limbs. freedoms : positions in a twist of the platform's m freedoms.
     size : characteristic length [m]; angles times size compare with lengths.
     n_displacements, n_joints : lengths of e and of q.
-    sigma : (n_joints,) standard deviations of q that weigh redundant actuators, None where there is no redundancy.
+    sigma : (n_joints,) standard deviations of q that weigh redundant actuators, None where there is
+        no redundancy.
     """
 
     groups: tuple[Group, ...]
@@ -83,36 +90,43 @@ class Program:
 class State:
     """Where the mechanism stands, for t trials and n poses.
 
-    T : (t, n, 4, 4) platform in base [m]. joints : one (t, n, k, J + 1) array a group: all joint values [m, rad].
-    status : (t, n) CONVERGED; STALLED: no closure near here; EXHAUSTED: out of iterations; NOT_FINITE or singular.
+    T : (t, n, 4, 4) platform in base [m]. joints : one (t, n, k, J + 1) array a group: all joint
+        values [m, rad].
+    status : (t, n) CONVERGED; STALLED: no closure near here; EXHAUSTED: out of iterations;
+        NOT_FINITE or singular.
     residual : (t, n) norm of the closure residual [m]. iterations : (t, n) Newton steps taken.
-    orientation : (t, n) sign of the determinant of the closure Jacobian; it changes only through a singularity.
+    orientation : (t, n) sign of the determinant of the closure Jacobian; it changes only through a
+        singularity.
     """
 
-    T: Array
-    joints: tuple[Array, ...]
+    T: FloatArray
+    joints: tuple[FloatArray, ...]
     status: NDArray[np.int8]
-    residual: Array
-    iterations: NDArray[np.int64]
+    residual: FloatArray
+    iterations: IntArray
     orientation: NDArray[np.int8]
 
 
 @dataclass(frozen=True)
 class Block:
-    """Linearised closure of a group in its c' rows: U dtheta + A y + E de + Q dq, shapes (t, n, k, c', columns).
+    """Linearised closure of a group in its c' rows: U dtheta + A y + E de + Q dq, shapes (t, n, k,
+    c', columns).
 
-    theta: the eliminated joints (U is triangular); y: the platform's freedoms in base axes; e, q: all of a limb's own.
+    theta: the eliminated joints (U is triangular); y: the platform's freedoms in base axes; e, q:
+    all of a limb's own.
     """
 
-    U: Array
-    A: Array
-    E: Array
-    Q: Array
+    U: FloatArray
+    A: FloatArray
+    E: FloatArray
+    Q: FloatArray
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """Closure linearised, by group: the rows left (U is empty), the rows that give the eliminated joints, and these joints."""
+    """Closure linearised, by group: the rows left (U is empty), the rows that give the eliminated
+    joints, and these joints.
+    """
 
     closure: tuple[Block, ...]
     passive: tuple[Block, ...]

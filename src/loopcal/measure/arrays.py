@@ -4,14 +4,15 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
+from loopcal.typing import FloatArray
 
-Array = NDArray[np.float64]
 
-
-def stored(value: ArrayLike, what: str, shape: Sequence[int | None], *, allow_nan: bool = False) -> Array:
+def stored(
+    value: ArrayLike, what: str, shape: Sequence[int | None], *, allow_nan: bool = False
+) -> FloatArray:
     """Read-only float64 copy of an array, after checking its shape and its numbers.
 
     Parameters
@@ -34,7 +35,9 @@ def stored(value: ArrayLike, what: str, shape: Sequence[int | None], *, allow_na
         If the shape differs or a number is not finite.
     """
     array = np.array(value, dtype=float)
-    if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
+    if array.ndim != len(shape) or any(
+        n is not None and n != m for n, m in zip(shape, array.shape, strict=True)
+    ):
         wanted = ", ".join("any" if n is None else str(n) for n in shape)
         raise DataError(f"{what} has shape {array.shape}; give an array of shape ({wanted})")
     wrong = np.isinf(array) if allow_nan else ~np.isfinite(array)
@@ -42,12 +45,14 @@ def stored(value: ArrayLike, what: str, shape: Sequence[int | None], *, allow_na
         place = tuple(int(i) + 1 for i in np.argwhere(wrong)[0])
         where = f"row {place[0]}" + (f", column {place[1]}" if len(place) > 1 else "")
         value = array[tuple(i - 1 for i in place)]
-        raise DataError(f"{what}: {where} is {value}; give a finite number" + (" or NaN" if allow_nan else ""))
+        raise DataError(
+            f"{what}: {where} is {value}; give a finite number" + (" or NaN" if allow_nan else "")
+        )
     array.setflags(write=False)
     return array
 
 
-def stored_pose(value: ArrayLike, what: str) -> Array:
+def stored_pose(value: ArrayLike, what: str) -> FloatArray:
     """Read-only pose (4, 4), after checking that it is one.
 
     Raises
@@ -60,7 +65,9 @@ def stored_pose(value: ArrayLike, what: str) -> Array:
     error = float(np.max(np.abs(R @ R.T - np.eye(3))))
     if error > 1e-9 or np.linalg.det(R) < 0.0 or not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
         raise DataError(
-            f"{what} is not a pose: its rotation part is off by {error:.2g} from a right-handed rotation or its last"
-            " row is not 0 0 0 1; give R with R R' = 1 to 1e-9, det R = 1, and the translation [m] in the last column"
+            f"{what} is not a pose: its rotation part is off by {error:.2g} from a right-handed "
+            "rotation or its last"
+            " row is not 0 0 0 1; give R with R R' = 1 to 1e-9, det R = 1, and the translation [m] "
+            "in the last column"
         )
     return T

@@ -1,21 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames, points and surfaces from measurements in closed form, as starts that need no guess. Arrays only; SI.
+"""Frames, points and surfaces from measurements in closed form, as starts that need no guess.
+Arrays only; SI.
 
-A rotation that enters squares linearly is found on the whole rotation group: `rotations` minimises a quadratic form of
-its nine entries from 24 orientations spread evenly over all of them.
+A rotation that enters squares linearly is found on the whole rotation group: `rotations` minimises
+a quadratic form of its nine entries from 24 orientations spread evenly over all of them.
 """
 
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
-from loopcal import se3
+from loopcal import geometry
+from loopcal.typing import FloatArray
 
-Array = NDArray[np.float64]
-
-_SIGNED = [np.eye(3)[list(order)] * sign for order in permutations(range(3)) for sign in product((1.0, -1.0), repeat=3)]
-OCTAHEDRAL: Array = np.array([R for R in _SIGNED if np.linalg.det(R) > 0.0])
+_SIGNED = [
+    np.eye(3)[list(order)] * sign
+    for order in permutations(range(3))
+    for sign in product((1.0, -1.0), repeat=3)
+]
+OCTAHEDRAL: FloatArray = np.array([R for R in _SIGNED if np.linalg.det(R) > 0.0])
 """The 24 rotations (24, 3, 3) of a cube: none is further than 63 degrees from the nearest."""
 OCTAHEDRAL.setflags(write=False)
 
@@ -23,15 +26,19 @@ FLAT = 1e-6
 """Extent across over extent along [1] below which points lie in a plane or on a line."""
 
 SETTLED = 1e-6
-"""Change of the entries of a rotation [1] below which taking turns is over: a descent improves what it finds."""
+"""Change of the entries of a rotation [1] below which taking turns is over: a descent improves what
+it finds.
+"""
 
 
-def linear(A: Array, b: Array) -> Array:
-    """Least-squares solution of A x = b, the shortest one where it is not unique (relative rank tolerance 1e-9)."""
+def linear(A: FloatArray, b: FloatArray) -> FloatArray:
+    """Least-squares solution of A x = b, the shortest one where it is not unique (relative rank
+    tolerance 1e-9).
+    """
     return np.asarray(np.linalg.lstsq(A, b, rcond=1e-9)[0], dtype=float)
 
 
-def nearest_rotation(M: Array) -> Array:
+def nearest_rotation(M: FloatArray) -> FloatArray:
     """Rotations (.., 3, 3) nearest to matrices (.., 3, 3)."""
     U, _, V = np.linalg.svd(M)
     sign = np.ones(M.shape[:-1])
@@ -39,20 +46,23 @@ def nearest_rotation(M: Array) -> Array:
     return (U * sign[..., None, :]) @ V
 
 
-def kabsch(points: Array, seen: Array) -> Array:
+def kabsch(points: FloatArray, seen: FloatArray) -> FloatArray:
     """Pose T (4, 4) that takes points (r, 3) nearest to others (r, 3), in the mean square.
 
-    Source: Umeyama, IEEE Transactions on Pattern Analysis 13(4) 376, 1991, doi 10.1109/34.88573, without the scale.
+    Source: Umeyama, IEEE Transactions on Pattern Analysis 13(4) 376, 1991, doi 10.1109/34.88573,
+    without the scale.
     """
     middle, centre = points.mean(axis=0), seen.mean(axis=0)
     R = nearest_rotation((seen - centre).T @ (points - middle))
-    return se3.pose(R, centre - R @ middle)
+    return geometry.pose(R, centre - R @ middle)
 
 
-def rotations(H: Array, g: Array, best: int = 3) -> Array:
-    """Rotations (k, 3, 3) at the lowest local minima of `v' H v - 2 g' v`, v the nine entries of R row by row.
+def rotations(H: FloatArray, g: FloatArray, best: int = 3) -> FloatArray:
+    """Rotations (k, 3, 3) at the lowest local minima of `v' H v - 2 g' v`, v the nine entries of R
+    row by row.
 
-    Gauss-Newton on the group from the rotation nearest to the unconstrained minimum and from the 24 of a cube.
+    Gauss-Newton on the group from the rotation nearest to the unconstrained minimum and from the 24
+    of a cube.
 
     Parameters
     ----------
@@ -68,10 +78,14 @@ def rotations(H: Array, g: Array, best: int = 3) -> Array:
     for _ in range(40):
         residual = R.reshape(-1, 9) @ root.T - target
         # dR = hat(w) R for w along each axis
-        J = root @ np.stack([(se3.hat(axis) @ R).reshape(-1, 9) for axis in np.eye(3)], axis=-1)
+        J = root @ np.stack(
+            [(geometry.hat(axis) @ R).reshape(-1, 9) for axis in np.eye(3)], axis=-1
+        )
         A = np.swapaxes(J, -1, -2) @ J + damping * np.eye(3)
-        step = np.asarray(-np.linalg.solve(A, np.swapaxes(J, -1, -2) @ residual[..., None])[..., 0], dtype=float)
-        moved = se3.exp_so3(step) @ R
+        step = np.asarray(
+            -np.linalg.solve(A, np.swapaxes(J, -1, -2) @ residual[..., None])[..., 0], dtype=float
+        )
+        moved = geometry.exp_so3(step) @ R
         new = _cost(root, target, moved)
         better = new <= cost
         R, cost = np.where(better[:, None, None], moved, R), np.where(better, new, cost)
@@ -81,28 +95,36 @@ def rotations(H: Array, g: Array, best: int = 3) -> Array:
     return distinct(R[np.argsort(cost)])[:best]
 
 
-def distinct(R: Array) -> Array:
+def distinct(R: FloatArray) -> FloatArray:
     """Those of rotations (k, 3, 3) that are further than 0.02 from all before them."""
-    kept: list[Array] = []
+    kept: list[FloatArray] = []
     for one in R:
         if all(np.abs(one - other).max() > 0.02 for other in kept):
             kept.append(one)
     return np.array(kept)
 
 
-def hand_eye(T: Array, seen: Array, frame: Array | None, tool: Array | None) -> tuple[Array, Array]:
+def hand_eye(
+    T: FloatArray, seen: FloatArray, frame: FloatArray | None, tool: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
     """Frame F and tool X with `F seen = T X`; one of them may be known.
 
-    Rotations: the trace of `sum R_F' R_T R_X R_seen'` is largest at the leading singular vectors of `sum R_T kron R_seen`
-    (Shah, Journal of Mechanisms and Robotics 5(3) 031007, 2013, doi 10.1115/1.4024473). Translations: linear.
+    Rotations: the trace of `sum R_F' R_T R_X R_seen'` is largest at the leading singular vectors of
+    `sum R_T kron R_seen` (Shah, Journal of Mechanisms and Robotics 5(3) 031007, 2013, doi
+    10.1115/1.4024473). Translations: linear.
 
     Parameters
     ----------
-    T : (r, 4, 4) T_base_platform. seen : (r, 4, 4) T_frame_tool. frame, tool : (4, 4), None where unknown.
+    T : (r, 4, 4) T_base_platform. seen : (r, 4, 4) T_frame_tool. frame, tool : (4, 4), None where
+        unknown.
     """
     A, B = T[:, :3, :3], seen[:, :3, :3]
     if tool is not None:
-        R_F = nearest_rotation(np.einsum("rij,jk,rlk->il", A, tool[:3, :3], B)) if frame is None else frame[:3, :3]
+        R_F = (
+            nearest_rotation(np.einsum("rij,jk,rlk->il", A, tool[:3, :3], B))
+            if frame is None
+            else frame[:3, :3]
+        )
         R_X = tool[:3, :3]
     elif frame is not None:
         R_F = frame[:3, :3]
@@ -128,11 +150,14 @@ def hand_eye(T: Array, seen: Array, frame: Array | None, tool: Array | None) -> 
     found = linear(np.concatenate(columns, axis=-1).reshape(known.size, -1), known.ravel())
     t_F = found[:3] if frame is None else frame[:3, 3]
     t_X = found[-3:] if tool is None else tool[:3, 3]
-    return se3.pose(R_F, t_F), se3.pose(R_X, t_X)
+    return geometry.pose(R_F, t_F), geometry.pose(R_X, t_X)
 
 
-def frame_and_points(seen: Array, moving: Array, known: Array) -> tuple[Array, Array]:
-    """Frames and points from what a frame saw of points on a moving body: `R seen + t = moving p + known`.
+def frame_and_points(
+    seen: FloatArray, moving: FloatArray, known: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Frames and points from what a frame saw of points on a moving body: `R seen + t = moving p +
+    known`.
 
     Given R, the rest is linear; eliminating it leaves a quadratic form of R.
 
@@ -145,20 +170,23 @@ def frame_and_points(seen: Array, moving: Array, known: Array) -> tuple[Array, A
     frames : (k, 4, 4) candidates. points : (k, w) with each.
     """
     q, w = len(seen), moving.shape[-1]
-    C = np.concatenate([moving, -np.broadcast_to(np.eye(3), (q, 3, 3))], axis=-1).reshape(3 * q, w + 3)
+    C = np.concatenate([moving, -np.broadcast_to(np.eye(3), (q, 3, 3))], axis=-1).reshape(
+        3 * q, w + 3
+    )
     M = (np.eye(3)[None, :, :, None] * seen[:, None, None, :]).reshape(3 * q, 9)
     Q = _range(C)
     b = known.ravel()
     M_out, b_out = M - Q @ (Q.T @ M), b - Q @ (Q.T @ b)
     R = rotations(M_out.T @ M_out, M_out.T @ b_out)
     rest = linear(C, (M @ R.reshape(-1, 9).T) - b[:, None]).T
-    return se3.pose(R, rest[:, w:]), rest[:, :w]
+    return geometry.pose(R, rest[:, w:]), rest[:, :w]
 
 
-def resection(rays: Array, points: Array) -> Array:
+def resection(rays: FloatArray, points: FloatArray) -> FloatArray:
     """Frames (k, 4, 4) of a station from unit rays (r, 3) in it towards points (r, 3) in the base.
 
-    `(1 - b b') (A p - s) = 0` with A = R' and s = R' t: linear in both; eliminating s leaves a quadratic form of A.
+    `(1 - b b') (A p - s) = 0` with A = R' and s = R' t: linear in both; eliminating s leaves a
+    quadratic form of A.
     """
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     middle = points.mean(axis=0)
@@ -171,34 +199,45 @@ def resection(rays: Array, points: Array) -> Array:
     ahead = np.einsum("ri,kij,rj->kr", rays, A, points - middle) - np.einsum("ri,ki->kr", rays, s)
     order = np.argsort(-np.mean(ahead > 0.0, axis=1), kind="stable")
     R = np.swapaxes(A, -1, -2)
-    return se3.pose(R, (R @ s[..., None])[..., 0] + middle)[order]
+    return geometry.pose(R, (R @ s[..., None])[..., 0] + middle)[order]
 
 
-def trilateration(points: Array, distances: Array, *, with_offset: bool) -> tuple[Array, Array]:
-    """Points c and offsets o with `|p - c| + o = d`; both sides of a plane in or near which all points lie.
+def trilateration(
+    points: FloatArray, distances: FloatArray, *, with_offset: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Points c and offsets o with `|p - c| + o = d`; both sides of a plane in or near which all
+    points lie.
 
     `|p|^2 - d^2 = 2 p'c - 2 d o - (|c|^2 - o^2)` is linear in c, o and the bracket.
 
     Returns
     -------
-    centres : (k, 3), offsets : (k,); k = 3, or 2 (one on each side) where the points lie in a plane.
+    centres : (k, 3), offsets : (k,); k = 3, or 2 (one on each side) where the points lie in a
+        plane.
     """
     middle = points.mean(axis=0)
     p = points - middle
     _, s, axes = np.linalg.svd(p, full_matrices=False)
-    columns = [2.0 * p, -np.ones((len(p), 1))] + ([-2.0 * distances[:, None]] if with_offset else [])
+    columns = [2.0 * p, -np.ones((len(p), 1))] + (
+        [-2.0 * distances[:, None]] if with_offset else []
+    )
     found = linear(np.concatenate(columns, axis=1), np.sum(p * p, axis=1) - distances**2)
     offset, centre, normal = found[4] if with_offset else 0.0, found[:3], axes[2]
     foot = centre - (centre @ normal) * normal
-    height = np.sqrt(max(float(np.mean((distances - offset) ** 2 - np.sum((p - foot) ** 2, axis=1))), 0.0))
+    height = np.sqrt(
+        max(float(np.mean((distances - offset) ** 2 - np.sum((p - foot) ** 2, axis=1))), 0.0)
+    )
     centres = foot + height * np.array([[1.0], [-1.0]]) * normal
     if s[2] > FLAT * s[0]:
         centres = np.concatenate([centre[None], centres])
     return middle + centres, np.full(len(centres), offset)
 
 
-def directions(seen: Array, turns: Array, axis: Array | None) -> tuple[Array, Array]:
-    """Orientations R and directions a with `R seen = turns a`, both unknown (or the direction known), best first.
+def directions(
+    seen: FloatArray, turns: FloatArray, axis: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Orientations R and directions a with `R seen = turns a`, both unknown (or the direction
+    known), best first.
 
     Each is found in closed form from the other, in turn, from 24 orientations.
 
@@ -223,22 +262,24 @@ def directions(seen: Array, turns: Array, axis: Array | None) -> tuple[Array, Ar
         before, R = R, nearest_rotation(np.einsum("jil,kj->kil", sums, a))
         if np.abs(R - before).max() < SETTLED:
             break
-    missed = np.linalg.norm(np.einsum("kij,rj->kri", R, seen) - np.einsum("rij,kj->kri", turns, a), axis=(1, 2))
+    missed = np.linalg.norm(
+        np.einsum("kij,rj->kri", R, seen) - np.einsum("rij,kj->kri", turns, a), axis=(1, 2)
+    )
     order = np.argsort(missed)
     return R[order][:6], a[order][:6]
 
 
-def _cost(root: Array, target: Array, R: Array) -> Array:
+def _cost(root: FloatArray, target: FloatArray, R: FloatArray) -> FloatArray:
     return np.sum((R.reshape(-1, 9) @ root.T - target) ** 2, axis=-1)
 
 
-def _square_root(H: Array) -> Array:
+def _square_root(H: FloatArray) -> FloatArray:
     """A matrix S with S'S = H."""
     values, vectors = np.linalg.eigh(H)
     return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
 
 
-def _range(C: Array) -> Array:
+def _range(C: FloatArray) -> FloatArray:
     """Orthonormal basis of the columns of C."""
     U, s, _ = np.linalg.svd(C, full_matrices=False)
     return U[:, s > 1e-9 * s[0]]

@@ -26,7 +26,8 @@ class Sensor:
     kind : Kind
     noise : Noise
     rows : (r,) or (r, links) int, optional
-        Poses of each row. Default: every pose once; where rows link poses, each with the next and the last with the first.
+        Poses of each row. Default: every pose once; where rows link poses, each with the next and
+        the last with the first.
     session, group : text or (r,) text, optional
         See `Observations`.
 
@@ -46,17 +47,23 @@ class Sensor:
         names = ", ".join(column.name for column in self.kind.noise_columns)
         if len(self.noise.sigma) != len(self.kind.noise_columns):
             raise DataError(
-                f"the noise of kind {self.kind.name!r} has {len(self.noise.sigma)} numbers; give one for each of {names}"
+                f"the noise of kind {self.kind.name!r} has {len(self.noise.sigma)} numbers; give "
+                f"one for each of {names}"
             )
 
     def looking(self, n_poses: int) -> Self:
-        """The sensor with its rows, sessions and groups spelt out for n poses; DataError where a pose is not there."""
+        """The sensor with its rows, sessions and groups spelt out for n poses; DataError where a
+        pose is not there.
+        """
         rows = self._rows(n_poses)
         if rows.size and (rows.min() < 0 or rows.max() >= n_poses):
             raise DataError(
-                f"the kind {self.kind.name!r} is to see poses up to {int(rows.max())} of 0 to {n_poses - 1}; correct it"
+                f"the kind {self.kind.name!r} is to see poses up to {int(rows.max())} of 0 to "
+                f"{n_poses - 1}; correct it"
             )
-        spread = {name: labels(getattr(self, name), len(rows), name) for name in ("session", "group")}
+        spread = {
+            name: labels(getattr(self, name), len(rows), name) for name in ("session", "group")
+        }
         return replace(self, rows=rows, **spread)
 
     def _rows(self, n: int) -> Ints:
@@ -65,7 +72,9 @@ class Sensor:
         if self.kind.links == 1:
             return np.arange(n)
         if n < 2:
-            raise DataError(f"the kind {self.kind.name!r} compares poses, but there is {n}; give at least 2")
+            raise DataError(
+                f"the kind {self.kind.name!r} compares poses, but there is {n}; give at least 2"
+            )
         first = np.arange(n if n > 2 else 1)
         return np.stack([first, (first + 1) % n], axis=-1)
 

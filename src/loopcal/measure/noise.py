@@ -5,12 +5,11 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
 from loopcal.measure.arrays import stored
-
-Array = NDArray[np.float64]
+from loopcal.typing import FloatArray
 
 
 class Noise(ABC):
@@ -18,18 +17,20 @@ class Noise(ABC):
 
     @property
     @abstractmethod
-    def sigma(self) -> Array:
+    def sigma(self) -> FloatArray:
         """Standard deviations (m,) [SI]."""
 
     @abstractmethod
-    def draw(self, generator: np.random.Generator, n: int) -> Array:
+    def draw(self, generator: np.random.Generator, n: int) -> FloatArray:
         """Noise of n rows, (n, m) [SI]."""
 
 
-def _positive(value: ArrayLike, what: str) -> Array:
+def _positive(value: ArrayLike, what: str) -> FloatArray:
     array = stored(value, what, (None,))
     if np.any(array <= 0.0):
-        raise DataError(f"{what} holds {float(np.min(array)):.6g}; give a number above 0 for each column")
+        raise DataError(
+            f"{what} holds {float(np.min(array)):.6g}; give a number above 0 for each column"
+        )
     return array
 
 
@@ -37,36 +38,38 @@ def _positive(value: ArrayLike, what: str) -> Array:
 class Gaussian(Noise):
     """Normal noise with standard deviations `sd` (m,) [SI]; DataError unless each is above 0."""
 
-    sd: Array
+    sd: FloatArray
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sd", _positive(self.sd, "the sigma of the noise"))
 
     @property
-    def sigma(self) -> Array:
+    def sigma(self) -> FloatArray:
         """Standard deviations (m,) [SI]."""
         return self.sd
 
-    def draw(self, generator: np.random.Generator, n: int) -> Array:
+    def draw(self, generator: np.random.Generator, n: int) -> FloatArray:
         """Noise of n rows, (n, m) [SI]."""
         return generator.standard_normal((n, len(self.sd))) * self.sd
 
 
 @dataclass(frozen=True, eq=False)
 class Uniform(Noise):
-    """Noise anywhere between -limit and +limit (m,) [SI]: sigma = limit / sqrt(3); DataError unless each is above 0."""
+    """Noise anywhere between -limit and +limit (m,) [SI]: sigma = limit / sqrt(3); DataError unless
+    each is above 0.
+    """
 
-    limit: Array
+    limit: FloatArray
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "limit", _positive(self.limit, "the limits of the noise"))
 
     @property
-    def sigma(self) -> Array:
+    def sigma(self) -> FloatArray:
         """Standard deviations (m,) [SI]."""
         return self.limit / np.sqrt(3.0)
 
-    def draw(self, generator: np.random.Generator, n: int) -> Array:
+    def draw(self, generator: np.random.Generator, n: int) -> FloatArray:
         """Noise of n rows, (n, m) [SI]."""
         return generator.uniform(-1.0, 1.0, (n, len(self.limit))) * self.limit
 

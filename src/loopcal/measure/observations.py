@@ -12,16 +12,17 @@ from loopcal.errors import DataError
 from loopcal.measure.arrays import stored
 from loopcal.measure.kinds import Evaluation, Kind
 from loopcal.measure.whitening import whitener
+from loopcal.typing import BoolArray, FloatArray
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
-Bools = NDArray[np.bool_]
+Bools = BoolArray
 Texts = NDArray[np.str_]
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Rows of one kind. Absence never changes a shape: a component that is NaN, or a row of weight 0, whitens to zero.
+    """Rows of one kind. Absence never changes a shape: a component that is NaN, or a row of weight
+    0, whitens to zero.
 
     Parameters
     ----------
@@ -32,40 +33,42 @@ class Observations:
     measured : (r, c) [SI]
         NaN where not measured.
     covariance : (r, m, m) or (m, m) [SI]
-        Of the residuals, see `from_sigma` and `Kind.noise_map`; entries of absent components are not looked at.
+        Of the residuals, see `from_sigma` and `Kind.noise_map`; entries of absent components are
+        not looked at.
     weight : (r,), optional
         Factor of the squared whitened residual; 0 makes a row absent. Default 1.
     session, group : text or (r,) text, optional
-        Rows of one session share the kind's frames and targets, rows of one group its surface. Default: one of each,
-        without a name.
+        Rows of one session share the kind's frames and targets, rows of one group its surface.
+        Default: one of each, without a name.
     context : name -> (r,), optional
-        What stood beside each row and enters no equation: `time` [s], `temperature` and `temperature.PLACE` [degC], NaN
-        where it was not noted.
+        What stood beside each row and enters no equation: `time` [s], `temperature` and
+        `temperature.PLACE` [degC], NaN where it was not noted.
 
     Attributes
     ----------
     present : (r, m) bool
         Residuals that can be formed; a row of weight 0 keeps its own here.
     whitener : (r, m, m)
-        Inverse lower Cholesky factor of the covariance of what is present, times the root of the weight.
+        Inverse lower Cholesky factor of the covariance of what is present, times the root of the
+        weight.
 
     Raises
     ------
     DataError
-        If shapes do not fit the kind, a number is infinite, a covariance is not positive definite, a weight is
-        negative, a row links a pose with itself, or the kind doubts a row.
+        If shapes do not fit the kind, a number is infinite, a covariance is not positive definite,
+        a weight is negative, a row links a pose with itself, or the kind doubts a row.
     """
 
     kind: Kind
     rows: Ints
-    measured: Array
-    covariance: Array
-    weight: Array = field(default_factory=lambda: np.array(1.0))
+    measured: FloatArray
+    covariance: FloatArray
+    weight: FloatArray = field(default_factory=lambda: np.array(1.0))
     session: Texts = field(default_factory=lambda: np.array(""))
     group: Texts = field(default_factory=lambda: np.array(""))
-    context: Mapping[str, Array] = field(default_factory=dict)
+    context: Mapping[str, FloatArray] = field(default_factory=dict)
     present: Bools = field(init=False, repr=False)
-    whitener: Array = field(init=False, repr=False)
+    whitener: FloatArray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         kind = self.kind
@@ -73,22 +76,41 @@ class Observations:
             raise DataError(f"the kind {kind.name!r} has no tool yet; use kind.mounted(robot.tool)")
         rows = indices(self.rows, kind)
         c, m, r = len(kind.columns), len(kind.noise_columns), len(rows)
-        measured = stored(self.measured, f"measured values of kind {kind.name!r}", (r, c), allow_nan=True)
-        weight = stored(_spread(self.weight, (r,), "the weight", f"one number for each of {r} rows"), "the weight", (r,))
+        measured = stored(
+            self.measured, f"measured values of kind {kind.name!r}", (r, c), allow_nan=True
+        )
+        weight = stored(
+            _spread(self.weight, (r,), "the weight", f"one number for each of {r} rows"),
+            "the weight",
+            (r,),
+        )
         if np.any(weight < 0.0):
             i = int(np.flatnonzero(weight < 0.0)[0])
-            raise DataError(f"the weight of row {i + 1} is {weight[i]:.6g}; use 0 to leave a row out, or a positive number")
+            raise DataError(
+                f"the weight of row {i + 1} is {weight[i]:.6g}; use 0 to leave a row out, or a "
+                "positive number"
+            )
         for i, doubt in kind.doubts(measured):
             raise DataError(f"row {i + 1} of kind {kind.name!r} {doubt}")
         present = kind.present(measured)
-        covariance = _spread(self.covariance, (r, m, m), "covariance", f"({r}, {m}, {m}) or ({m}, {m})")
+        covariance = _spread(
+            self.covariance, (r, m, m), "covariance", f"({r}, {m}, {m}) or ({m}, {m})"
+        )
         W = whitener(covariance, present, weight)
         for array in (rows, covariance, present, W):
             array.setflags(write=False)
         values = {"rows": rows, "measured": measured, "covariance": covariance, "weight": weight}
         values |= {name: labels(getattr(self, name), r, name) for name in ("session", "group")}
-        context = {name: stored(v, f"the context {name!r}", (r,), allow_nan=True) for name, v in self.context.items()}
-        for name, array in {**values, "context": context, "present": present, "whitener": W}.items():
+        context = {
+            name: stored(v, f"the context {name!r}", (r,), allow_nan=True)
+            for name, v in self.context.items()
+        }
+        for name, array in {
+            **values,
+            "context": context,
+            "present": present,
+            "whitener": W,
+        }.items():
             object.__setattr__(self, name, array)
 
     @classmethod
@@ -101,7 +123,8 @@ class Observations:
         session: str | Texts = "",
         group: str | Texts = "",
     ) -> Self:
-        """Rows with independent noise of the kind's noise columns, mapped to the residuals by `N diag(sigma^2) N'`.
+        """Rows with independent noise of the kind's noise columns, mapped to the residuals by `N
+        diag(sigma^2) N'`.
 
         Parameters
         ----------
@@ -129,7 +152,14 @@ class Observations:
             raise _wrong_columns(kind, values.shape)
         N = kind.noise_map(values)
         covariance = (N * (sd * sd)[:, None, :]) @ np.swapaxes(N, -1, -2)
-        return cls(kind, np.asarray(rows), values, covariance, session=np.asarray(session), group=np.asarray(group))
+        return cls(
+            kind,
+            np.asarray(rows),
+            values,
+            covariance,
+            session=np.asarray(session),
+            group=np.asarray(group),
+        )
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -139,7 +169,9 @@ class Observations:
         """How many residuals count: present, in rows of weight above 0."""
         return int(np.count_nonzero(self.present & (self.weight > 0.0)[:, None]))
 
-    def evaluate(self, T: Array, unknowns: Array | None = None, joints: Array | None = None) -> Evaluation:
+    def evaluate(
+        self, T: FloatArray, unknowns: FloatArray | None = None, joints: FloatArray | None = None
+    ) -> Evaluation:
         """Residuals and derivatives of all rows at the poses of all n readings.
 
         Parameters
@@ -182,14 +214,16 @@ def indices(rows: ArrayLike, kind: Kind) -> Ints:
     if given.ndim != wanted or (wanted == 2 and given.shape[1] != kind.links) or not whole:
         shape = "(r,)" if wanted == 1 else f"(r, {kind.links})"
         raise DataError(
-            f"rows of kind {kind.name!r} have shape {given.shape} and type {given.dtype}; give whole numbers of shape"
+            f"rows of kind {kind.name!r} have shape {given.shape} and type {given.dtype}; give "
+            "whole numbers of shape"
             f" {shape}: the index of the pose each row saw"
         )
     if wanted == 2:
         same = np.flatnonzero(given[:, 0] == given[:, 1])
         if len(same):
             raise DataError(
-                f"row {int(same[0]) + 1} of kind {kind.name!r} links pose {int(given[same[0], 0])} with itself; name two poses"
+                f"row {int(same[0]) + 1} of kind {kind.name!r} links pose {int(given[same[0], 0])} "
+                "with itself; name two poses"
             )
     return given.astype(np.intp)
 
@@ -199,14 +233,15 @@ def labels(value: ArrayLike, r: int, what: str) -> Texts:
     given = np.asarray(value)
     if given.dtype.kind != "U" or given.shape not in ((), (r,)):
         raise DataError(
-            f"the {what} has shape {given.shape} and type {given.dtype}; give one text, or one for each of {r} rows"
+            f"the {what} has shape {given.shape} and type {given.dtype}; give one text, or one for "
+            f"each of {r} rows"
         )
     spread = np.array(np.broadcast_to(given, (r,)))
     spread.setflags(write=False)
     return spread
 
 
-def _spread(value: ArrayLike, shape: tuple[int, ...], what: str, wanted: str) -> Array:
+def _spread(value: ArrayLike, shape: tuple[int, ...], what: str, wanted: str) -> FloatArray:
     """Copy of an array spread over a shape; DataError where it does not fit."""
     given = np.asarray(value, dtype=float)
     try:
@@ -217,4 +252,7 @@ def _spread(value: ArrayLike, shape: tuple[int, ...], what: str, wanted: str) ->
 
 def _wrong_columns(kind: Kind, shape: tuple[int, ...]) -> DataError:
     names = ", ".join(column.name for column in kind.columns)
-    return DataError(f"measured values of kind {kind.name!r} have shape {shape}; give (r, {len(kind.columns)}): {names}")
+    return DataError(
+        f"measured values of kind {kind.name!r} have shape {shape}; give (r, {len(kind.columns)}): "
+        f"{names}"
+    )

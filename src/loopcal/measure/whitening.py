@@ -1,24 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whitening: from covariances to matrices that give residuals unit variance, with zero rows for absent components."""
+"""Whitening: from covariances to matrices that give residuals unit variance, with zero rows for
+absent components.
+"""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loopcal.errors import DataError
+from loopcal.typing import BoolArray, FloatArray
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+Bools = BoolArray
 
-# Smallest pivot [1] of a correlation matrix: below it a component repeats the others to seven digits, and the inverse
-# keeps fewer digits than a measurement has.
+# Smallest pivot [1] of a correlation matrix: below it a component repeats the others to seven
+# digits, and the inverse keeps fewer digits than a measurement has.
 _SMALLEST_PIVOT = 1e-7
 
 
-def whitener(covariance: Array, present: Bools, weight: Array) -> Array:
-    """Matrices W with `W C W' = weight` on the present components, zero rows and columns for the absent ones.
+def whitener(covariance: FloatArray, present: Bools, weight: FloatArray) -> FloatArray:
+    """Matrices W with `W C W' = weight` on the present components, zero rows and columns for the
+    absent ones.
 
-    W is the inverse lower Cholesky factor. Leaving a component out of a Gaussian drops its row and column of C; here
-    they are put to those of the identity, which keeps the shape and gives the same factor for the rest.
+    W is the inverse lower Cholesky factor. Leaving a component out of a Gaussian drops its row and
+    column of C; here they are put to those of the identity, which keeps the shape and gives the
+    same factor for the rest.
 
     Parameters
     ----------
@@ -41,7 +44,10 @@ def whitener(covariance: Array, present: Bools, weight: Array) -> Array:
     own = np.eye(present.shape[1], dtype=bool)
     C = np.where(both, covariance, 0.0) + (own & ~both)
     variance = np.einsum("rii->ri", C)
-    _refuse(~np.all(np.isfinite(C), axis=(1, 2)) | ~np.all(variance > 0.0, axis=1), "has a variance that is not above 0")
+    _refuse(
+        ~np.all(np.isfinite(C), axis=(1, 2)) | ~np.all(variance > 0.0, axis=1),
+        "has a variance that is not above 0",
+    )
     sd = np.sqrt(variance)
     correlation = C / (sd[:, :, None] * sd[:, None, :])
     asymmetric = np.abs(correlation - np.swapaxes(correlation, 1, 2)) > 1e-9
@@ -52,7 +58,10 @@ def whitener(covariance: Array, present: Bools, weight: Array) -> Array:
         smallest = np.linalg.eigvalsh(correlation)[:, 0]
         _refuse(smallest <= max(float(np.min(smallest)), 0.0), "is not positive definite")
         raise
-    _refuse(np.min(np.einsum("rii->ri", L), axis=1) < _SMALLEST_PIVOT, "is not positive definite to rounding")
+    _refuse(
+        np.min(np.einsum("rii->ri", L), axis=1) < _SMALLEST_PIVOT,
+        "is not positive definite to rounding",
+    )
     W = np.tril(np.linalg.inv(L)) / sd[:, None, :]
     return np.where(both, W, 0.0) * np.sqrt(weight)[:, None, None]
 
@@ -61,6 +70,7 @@ def _refuse(wrong: Bools, what: str) -> None:
     if np.any(wrong):
         row = int(np.flatnonzero(wrong)[0]) + 1
         raise DataError(
-            f"the covariance of row {row} {what}; give each component a standard deviation above 0 and correlations"
+            f"the covariance of row {row} {what}; give each component a standard deviation above 0 "
+            "and correlations"
             " between -1 and 1 that fit together"
         )

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The generic description of a mechanism that every family expands into: limbs, actuators, parameters and their maps."""
+"""The generic description of a mechanism that every family expands into: limbs, actuators,
+parameters and their maps.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +10,15 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loopcal.parameters import Parameter
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
-Array = NDArray[np.float64]
 AXES = ("rx", "ry", "rz", "x", "y", "z")
-"""Axes of a displacement in a link's own frame; `pitch` and `length` are the other two things that can move."""
+"""Axes of a displacement in a link's own frame; `pitch` and `length` are the other two things that
+can move.
+"""
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class Link:
     """
 
     name: str
-    transform: Array
+    transform: FloatArray
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,8 @@ class Joint:
     ----------
     name : unique in its limb. kind : R or P. actuator : name of what drives it, None if passive.
     pitch : advance per turn angle of a screw [m/rad], R only.
-    start : value to begin from when the home position is computed [m or rad]; it picks the working mode.
+    start : value to begin from when the home position is computed [m or rad]; it picks the working
+        mode.
     limits : allowed values (low, high) [m or rad].
     """
 
@@ -56,8 +60,8 @@ class Joint:
 class Cone:
     """How far a rod may lean at one of its ends: within `angle` [rad] of `axis` (3,).
 
-    `end` is `tip` (axis in the frame of the chain's tip, rod pointing to the platform) or `attachment` (axis in the
-    attachment's frame, rod pointing to the tip).
+    `end` is `tip` (axis in the frame of the chain's tip, rod pointing to the platform) or
+    `attachment` (axis in the attachment's frame, rod pointing to the tip).
     """
 
     end: str
@@ -67,13 +71,16 @@ class Cone:
 
 @dataclass(frozen=True)
 class Limb:
-    """A serial chain from the base to the platform: link, joint, link, ..., link, ending, attachment.
+    """A serial chain from the base to the platform: link, joint, link, ..., link, ending,
+    attachment.
 
     Attributes
     ----------
-    links : one more than joints. ending : rigid, ball or distance. attachment : on the platform, in its frame.
+    links : one more than joints. ending : rigid, ball or distance. attachment : on the platform, in
+        its frame.
     length : nominal length of the rod of a `distance` ending at joint value zero [m].
-    actuator : what drives that length, None for a rod of fixed length. cones : how far the rod may lean.
+    actuator : what drives that length, None for a rod of fixed length. cones : how far the rod may
+        lean.
     """
 
     name: str
@@ -88,10 +95,12 @@ class Limb:
 
 @dataclass(frozen=True)
 class Address:
-    """A number that parameters can move: a limb's link axis, pitch or rod length, or a term of an actuator's transmission.
+    """A number that parameters can move: a limb's link axis, pitch or rod length, or a term of an
+    actuator's transmission.
 
-    `owner` is a limb or an actuator; `element` a link or joint of the limb, `rod`, or `transmission`; `axis` one of AXES,
-    `pitch`, `length`, or a term (see `loopcal.mechanism.transmission`).
+    `owner` is a limb or an actuator; `element` a link or joint of the limb, `rod`, or
+    `transmission`; `axis` one of AXES, `pitch`, `length`, or a term (see
+    `loopcal.mechanism.transmission`).
     """
 
     owner: str
@@ -112,7 +121,9 @@ class Linear:
 
 
 class Shared(Protocol):
-    """Map of several parameters onto several addresses by a smooth function (delta radius, tower angle)."""
+    """Map of several parameters onto several addresses by a smooth function (delta radius, tower
+    angle).
+    """
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -124,11 +135,11 @@ class Shared(Protocol):
         """Addresses, o of them."""
         ...
 
-    def value(self, inputs: Array) -> Array:
+    def value(self, inputs: FloatArray) -> FloatArray:
         """(t, i) -> (t, o); what counts is the change from the value at nominal."""
         ...
 
-    def jacobian(self, inputs: Array) -> Array:
+    def jacobian(self, inputs: FloatArray) -> FloatArray:
         """(t, i) -> (t, o, i)."""
         ...
 
@@ -139,10 +150,13 @@ class Actuator:
 
     Attributes
     ----------
-    name : column of the readings. dimension : of the reading. stroke : allowed readings (low, high) [m or rad].
-    terms : nominal transmission, reading to joint value, by name of the term (default: joint value = reading).
+    name : column of the readings. dimension : of the reading. stroke : allowed readings (low, high)
+        [m or rad].
+    terms : nominal transmission, reading to joint value, by name of the term (default: joint value
+        = reading).
     period : reading per turn of whatever makes the harmonics [m or rad], 0 where there are none.
-    sigma : standard deviation of the reading, used to weigh redundant readings against each other [m or rad].
+    sigma : standard deviation of the reading, used to weigh redundant readings against each other
+        [m or rad].
     """
 
     name: str
@@ -160,7 +174,8 @@ class Assembly:
     Attributes
     ----------
     name, source : for people. limbs, actuators : in the order of readings and tables.
-    freedoms : the platform's freedoms, of AXES in base axes. controlled : coordinates the machine is commanded in.
+    freedoms : the platform's freedoms, of AXES in base axes. controlled : coordinates the machine
+        is commanded in.
     home : (4, 4) T_base_platform of the home pose; only its controlled coordinates must be exact.
     tool : (4, 4) T_platform_tool. workspace : coordinate -> (low, high) [m, rad].
     parameters, maps, shared : the unknowns and how they enter.
@@ -171,10 +186,10 @@ class Assembly:
     actuators: tuple[Actuator, ...]
     freedoms: tuple[str, ...]
     controlled: tuple[str, ...]
-    home: Array
+    home: FloatArray
     parameters: tuple[Parameter, ...]
     maps: tuple[Linear, ...]
     shared: tuple[Shared, ...] = ()
-    tool: Array = field(default_factory=lambda: np.eye(4))
+    tool: FloatArray = field(default_factory=lambda: np.eye(4))
     workspace: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     source: str = ""

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coordinates a machine is commanded in, and their slopes in the platform's twist.
 
-Names: `x y z` of the platform's origin in base; `phi theta psi` tilt-and-torsion, R = Rz(phi) Ry(theta) Rz(psi - phi);
-`roll pitch yaw`, R = Rz(yaw) Ry(pitch) Rx(roll). phi and theta together are asked for as a unit normal, which stays
-regular at zero tilt. Formulas: docs/theory/conventions.md.
+Names: `x y z` of the platform's origin in base; `phi theta psi` tilt-and-torsion, R = Rz(phi)
+Ry(theta) Rz(psi - phi); `roll pitch yaw`, R = Rz(yaw) Ry(pitch) Rx(roll). phi and theta together
+are asked for as a unit normal, which stays regular at zero tilt. Formulas:
+docs/theory/conventions.md.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from loopcal import se3
-from loopcal.engine import Array
+from loopcal import geometry
 from loopcal.errors import MechanismError
+from loopcal.typing import FloatArray
 
 POSITION = ("x", "y", "z")
 TILT = ("phi", "theta", "psi")
@@ -29,24 +30,25 @@ def check_names(names: tuple[str, ...]) -> None:
         raise MechanismError(f"a coordinate is named twice in {', '.join(names)}; name each once")
     if set(names) & set(TILT) and set(names) & set(EULER):
         raise MechanismError(
-            f"{', '.join(names)} mixes roll-pitch-yaw with phi-theta-psi; describe the orientation by one of the two"
+            f"{', '.join(names)} mixes roll-pitch-yaw with phi-theta-psi; describe the orientation "
+            "by one of the two"
         )
     if ("phi" in names) != ("theta" in names):
         raise MechanismError("phi and theta are the direction of one normal; name both or neither")
 
 
-def read(T: Array, names: tuple[str, ...]) -> Array:
+def read(T: FloatArray, names: tuple[str, ...]) -> FloatArray:
     """Values of these coordinates (.., c) at poses T (.., 4, 4) [m, rad]."""
     found = {name: T[..., i, 3] for i, name in enumerate(POSITION)}
     if set(names) & set(TILT):
-        found |= dict(zip(TILT, se3.matrix_to_tilt_torsion(T[..., :3, :3]), strict=True))
+        found |= dict(zip(TILT, geometry.matrix_to_tilt_torsion(T[..., :3, :3]), strict=True))
     if set(names) & set(EULER):
-        angles = se3.matrix_to_euler(T[..., :3, :3], "xyz")
+        angles = geometry.matrix_to_euler(T[..., :3, :3], "xyz")
         found |= {name: angles[..., i] for i, name in enumerate(EULER)}
     return np.stack([found[name] for name in names], axis=-1)
 
 
-def pose(values: Array, names: tuple[str, ...], base: Array) -> Array:
+def pose(values: FloatArray, names: tuple[str, ...], base: FloatArray) -> FloatArray:
     """Poses (.., 4, 4) with these coordinates; the coordinates not named stay as in `base` (4, 4)."""
     T = np.array(np.broadcast_to(base, (*values.shape[:-1], 4, 4)))
     given = {name: values[..., i] for i, name in enumerate(names)}
@@ -55,14 +57,16 @@ def pose(values: Array, names: tuple[str, ...], base: Array) -> Array:
             T[..., i, 3] = given[name]
     zero = np.zeros(values.shape[:-1])
     if set(names) & set(TILT):
-        T[..., :3, :3] = se3.tilt_torsion_to_matrix(*(given.get(name, zero) for name in TILT))
+        T[..., :3, :3] = geometry.tilt_torsion_to_matrix(*(given.get(name, zero) for name in TILT))
     if set(names) & set(EULER):
         angles = np.stack([given.get(name, zero) for name in EULER], axis=-1)
-        T[..., :3, :3] = se3.euler_to_matrix(angles, "xyz")
+        T[..., :3, :3] = geometry.euler_to_matrix(angles, "xyz")
     return T
 
 
-def demands(T: Array, target: Array, names: tuple[str, ...], size: float) -> tuple[Array, Array]:
+def demands(
+    T: FloatArray, target: FloatArray, names: tuple[str, ...], size: float
+) -> tuple[FloatArray, FloatArray]:
     """How far poses are from the coordinates asked for, and the slopes of that in the twist.
 
     Parameters
@@ -83,21 +87,31 @@ def demands(T: Array, target: Array, names: tuple[str, ...], size: float) -> tup
     rotation, wanted = T[:, :3, :3], {name: target[:, i] for i, name in enumerate(names)}
     if "phi" in wanted:
         places = [names.index("phi"), names.index("theta")]
-        residual[:, places], columns[:, places, :3] = _normal(rotation, wanted["phi"], wanted["theta"], size)
+        residual[:, places], columns[:, places, :3] = _normal(
+            rotation, wanted["phi"], wanted["theta"], size
+        )
     if "psi" in wanted:
         place, angle, row = names.index("psi"), *_torsion(rotation)
-        residual[:, place], columns[:, place, :3] = size * se3.wrap(angle - wanted["psi"]), size * row
+        residual[:, place], columns[:, place, :3] = (
+            size * geometry.wrap(angle - wanted["psi"]),
+            size * row,
+        )
     if set(EULER) & set(names):
-        angles = se3.matrix_to_euler(rotation, "xyz")
-        rates = se3.euler_rates_inverse(angles, "xyz")
+        angles = geometry.matrix_to_euler(rotation, "xyz")
+        rates = geometry.euler_rates_inverse(angles, "xyz")
         for i, name in enumerate(EULER):
             if name in wanted:
                 place = names.index(name)
-                residual[:, place], columns[:, place, :3] = size * se3.wrap(angles[:, i] - wanted[name]), size * rates[:, i]
+                residual[:, place], columns[:, place, :3] = (
+                    size * geometry.wrap(angles[:, i] - wanted[name]),
+                    size * rates[:, i],
+                )
     return residual, columns
 
 
-def _normal(rotation: Array, phi: Array, theta: Array, size: float) -> tuple[Array, Array]:
+def _normal(
+    rotation: FloatArray, phi: FloatArray, theta: FloatArray, size: float
+) -> tuple[FloatArray, FloatArray]:
     """The unit normal against the one asked for, in two directions across it."""
     s, c = np.sin(theta), np.cos(theta)
     across = np.stack(
@@ -113,8 +127,10 @@ def _normal(rotation: Array, phi: Array, theta: Array, size: float) -> tuple[Arr
     return size * residual, size * np.cross(normal[:, None], across)
 
 
-def _torsion(rotation: Array) -> tuple[Array, Array]:
+def _torsion(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
     """psi (N,) and its slope in the angular velocity (N, 3)."""
     # d psi = (ez + n) . omega / (1 + cos theta): across everything that phi and theta turn about
     normal = rotation[:, :, 2]
-    return se3.matrix_to_tilt_torsion(rotation)[2], (normal + np.array([0.0, 0.0, 1.0])) / (1.0 + normal[:, 2:])
+    return geometry.matrix_to_tilt_torsion(rotation)[2], (normal + np.array([0.0, 0.0, 1.0])) / (
+        1.0 + normal[:, 2:]
+    )

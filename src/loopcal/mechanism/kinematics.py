@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopcal.engine import Array, State
+from loopcal.engine import State
 from loopcal.errors import DataError
 from loopcal.mechanism import states
+from loopcal.mechanism.batch_kinematics import forward_trials, inverse_trials, readings_at
 from loopcal.mechanism.model import Mechanism, Status
 from loopcal.mechanism.projection import nearest_reachable
-from loopcal.mechanism.trials import forward_trials, inverse_trials, readings_at
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 APART = 1e-9
 """Gap [m] above which a converged row, which then has redundant readings, is not called closed."""
@@ -32,16 +33,17 @@ class Solution:
     ----------
     T : (n, 4, 4) platform in base [m]. q : (n, a) readings [m or rad].
     passive : (n, j) passive joint values, limb by limb [m or rad]; `passive_names` names them.
-    status : (n,) members of Status. residual : (n,) closure residual [m]. iterations : (n,) Newton steps.
+    status : (n,) members of Status. residual : (n,) closure residual [m]. iterations : (n,) Newton
+        steps.
     """
 
-    T: Array
-    q: Array
-    passive: Array
+    T: FloatArray
+    q: FloatArray
+    passive: FloatArray
     passive_names: tuple[str, ...]
     status: NDArray[np.int8]
-    residual: Array
-    iterations: NDArray[np.int64]
+    residual: FloatArray
+    iterations: IntArray
     state: State
 
     def __repr__(self) -> str:
@@ -51,13 +53,16 @@ class Solution:
         return f"Solution of {len(self.q)} rows, {lost} not closed, the others to {gap * 1e3:.2g} mm{first}"
 
     @property
-    def converged(self) -> NDArray[np.bool_]:
+    def converged(self) -> BoolArray:
         """(n,) True where the loops are closed in the mode of the start."""
         return self.status == Status.CONVERGED
 
     def take(self, rows: NDArray[Any]) -> Solution:
         """These rows, by position or by a mask (n,)."""
-        cut = {name: getattr(self, name)[rows] for name in ("T", "q", "passive", "status", "residual", "iterations")}
+        cut = {
+            name: getattr(self, name)[rows]
+            for name in ("T", "q", "passive", "status", "residual", "iterations")
+        }
         return replace(self, **cut, state=states.take(self.state, rows))
 
     def explain(self, row: int) -> str:
@@ -73,7 +78,8 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
 
     Parameters
     ----------
-    q : (n, a) readings [m or rad], or (n, 2 a) with their directions of approach (+1, -1, 0 unknown) behind them.
+    q : (n, a) readings [m or rad], or (n, 2 a) with their directions of approach (+1, -1, 0
+        unknown) behind them.
     start : a solution of one row or n rows that chooses the assembly mode.
 
     Returns
@@ -86,12 +92,18 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
         q has another number of columns than the robot has actuators.
     """
     readings = np.atleast_2d(np.asarray(q, dtype=float))
-    if readings.ndim != 2 or readings.shape[1] not in (len(robot.actuators), 2 * len(robot.actuators)):
+    if readings.ndim != 2 or readings.shape[1] not in (
+        len(robot.actuators),
+        2 * len(robot.actuators),
+    ):
         raise DataError(
-            f"{readings.shape[-1]} readings a row were given, but {robot.name} has {len(robot.actuators)} actuators "
+            f"{readings.shape[-1]} readings a row were given, but {robot.name} has "
+            f"{len(robot.actuators)} actuators "
             f"({', '.join(a.name for a in robot.actuators)})"
         )
-    state = forward_trials(robot, robot.values[None], readings[None], None if start is None else start.state)
+    state = forward_trials(
+        robot, robot.values[None], readings[None], None if start is None else start.state
+    )
     return solution_of(robot, state, readings[:, : len(robot.actuators)])
 
 
@@ -100,9 +112,10 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
 
     Parameters
     ----------
-    target : (n, 4, 4) platform in base, or (n, c) controlled coordinates in the order of `robot.controlled` [m, rad]. A
-        pose that the machine has too few freedoms for is projected: of the reachable poses the one is taken that minimises
-        |log(R R_target')|^2 size^2 + |t - t_target|^2, with `robot.size`.
+    target : (n, 4, 4) platform in base, or (n, c) controlled coordinates in the order of
+        `robot.controlled` [m, rad]. A pose that the machine has too few freedoms for is projected:
+        of the reachable poses the one is taken that minimises |log(R R_target')|^2 size^2 + |t -
+        t_target|^2, with `robot.size`.
     start : solution that chooses the working mode (default: home).
 
     Returns
@@ -125,13 +138,14 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
         state = inverse_trials(robot, values, np.atleast_2d(wanted)[None], begin)
     else:
         raise DataError(
-            f"a target of shape {wanted.shape} was given; allowed are (n, 4, 4) poses or (n, {c}) coordinates "
+            f"a target of shape {wanted.shape} was given; allowed are (n, 4, 4) poses or (n, {c}) "
+            "coordinates "
             f"({', '.join(robot.controlled)})"
         )
     return solution_of(robot, state, readings_at(robot, values, state)[0])
 
 
-def _check_poses(T: Array) -> None:
+def _check_poses(T: FloatArray) -> None:
     """Refuse matrices that are no pose: the first bad row and why."""
     R = T[:, :3, :3]
     finite = np.asarray(np.isfinite(T).all(axis=(1, 2)))
@@ -143,12 +157,17 @@ def _check_poses(T: Array) -> None:
     if len(wrong):
         row = int(wrong[0])
         reason = (
-            "its last row is not 0 0 0 1" if not bottom[row] else "its upper left 3 x 3 is not a rotation (R'R = I, det +1)"
+            "its last row is not 0 0 0 1"
+            if not bottom[row]
+            else "its upper left 3 x 3 is not a rotation (R'R = I, det +1)"
         )
-        raise DataError(f"target {row} is no pose: {reason}; give T_base_platform as (n, 4, 4) homogeneous matrices")
+        raise DataError(
+            f"target {row} is no pose: {reason}; give T_base_platform as (n, 4, 4) homogeneous "
+            "matrices"
+        )
 
 
-def solution_of(robot: Mechanism, state: State, q: Array) -> Solution:
+def solution_of(robot: Mechanism, state: State, q: FloatArray) -> Solution:
     """The solution of a state (1, n) and its readings (n, a)."""
     names, columns = [], []
     for group, joints in zip(robot.program.groups, state.joints, strict=True):

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which parameters and readings stand in the equations of which limb: worked out once for a mechanism."""
+"""Which parameters and readings stand in the equations of which limb: worked out once for a
+mechanism.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loopcal.engine import Group, Program
 from loopcal.mechanism.transmission import TERMS
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
-Columns = slice | NDArray[np.int64]
+Columns = slice | IntArray
 
 
 @dataclass(frozen=True)
@@ -21,8 +23,10 @@ class LimbMap:
     Attributes
     ----------
     own : its displacements in e. parameters : the parameters that its equations hold.
-    plain : whether each of these parameters is exactly one of its displacements, in the same order and counted alike.
-    drives : for each driven joint: the joint, its actuator, and the transmission terms that parameters move.
+    plain : whether each of these parameters is exactly one of its displacements, in the same order
+        and counted alike.
+    drives : for each driven joint: the joint, its actuator, and the transmission terms that
+        parameters move.
     readings : the actuators, as columns.
     """
 
@@ -33,12 +37,21 @@ class LimbMap:
     readings: Columns
 
 
-def limb_maps(program: Program, matrix: NDArray[np.float64], touches: NDArray[np.bool_]) -> tuple[tuple[LimbMap, ...], ...]:
-    """The limb maps of each group, from the linear map (s, p) and which parameters may move which slots (s, p)."""
-    return tuple(tuple(_limb_map(program, g, k, matrix, touches) for k in range(len(g.limbs))) for g in program.groups)
+def limb_maps(
+    program: Program, matrix: FloatArray, touches: BoolArray
+) -> tuple[tuple[LimbMap, ...], ...]:
+    """The limb maps of each group, from the linear map (s, p) and which parameters may move which
+    slots (s, p).
+    """
+    return tuple(
+        tuple(_limb_map(program, g, k, matrix, touches) for k in range(len(g.limbs)))
+        for g in program.groups
+    )
 
 
-def _limb_map(program: Program, group: Group, k: int, matrix: NDArray[np.float64], touches: NDArray[np.bool_]) -> LimbMap:
+def _limb_map(
+    program: Program, group: Group, k: int, matrix: FloatArray, touches: BoolArray
+) -> LimbMap:
     width = len(group.slots)
     own = slice(group.columns.start + k * width, group.columns.start + (k + 1) * width)
     touched, drives = touches[own].any(axis=0), []
@@ -47,16 +60,24 @@ def _limb_map(program: Program, group: Group, k: int, matrix: NDArray[np.float64
             first = program.n_displacements + len(TERMS) * int(columns[k])
             terms = touches[first : first + len(TERMS)]
             touched = touched | terms.any(axis=0)
-            drives.append((j, int(columns[k]), tuple(int(i) for i in np.flatnonzero(terms.any(axis=1)))))
+            drives.append(
+                (j, int(columns[k]), tuple(int(i) for i in np.flatnonzero(terms.any(axis=1))))
+            )
     places = np.flatnonzero(touched)
     linear = np.array_equal(touches[own][:, places], np.eye(width, len(places), dtype=bool))
-    plain = linear and width == len(places) and np.array_equal(matrix[own][:, places], np.eye(width))
+    plain = (
+        linear and width == len(places) and np.array_equal(matrix[own][:, places], np.eye(width))
+    )
     return LimbMap(
-        own, as_columns(places), plain, tuple(drives), as_columns(np.array([a for _, a, _ in drives], dtype=np.int64))
+        own,
+        as_columns(places),
+        plain,
+        tuple(drives),
+        as_columns(np.array([a for _, a, _ in drives], dtype=np.int64)),
     )
 
 
-def as_columns(places: NDArray[np.int64]) -> Columns:
+def as_columns(places: IntArray) -> Columns:
     """Places as a slice where they are consecutive: a view in the place of a copy."""
     if len(places) and (np.diff(places) == 1).all():
         return slice(int(places[0]), int(places[-1]) + 1)

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.engine import Array, State
+from loopcal.engine import State
 from loopcal.mechanism.frames import limb_frames
 from loopcal.mechanism.model import Mechanism
+from loopcal.typing import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)
@@ -25,15 +26,15 @@ class Limit:
     name: str
     low: float
     high: float
-    value: Array
+    value: FloatArray
 
     @property
-    def margin(self) -> Array:
+    def margin(self) -> FloatArray:
         """Distance to the nearer bound (t, n), negative outside [m or rad]."""
         return np.minimum(self.value - self.low, self.high - self.value)
 
 
-def limits(robot: Mechanism, values: Array, q: Array, state: State) -> tuple[Limit, ...]:
+def limits(robot: Mechanism, values: FloatArray, q: FloatArray, state: State) -> tuple[Limit, ...]:
     """Everything that limits the machine, at readings q (t | 1, n, a) and their states (t, n)."""
     found = [
         Limit(f"stroke of {a.name}", *a.stroke, np.broadcast_to(q[..., i], state.status.shape))
@@ -53,20 +54,27 @@ def limits(robot: Mechanism, values: Array, q: Array, state: State) -> tuple[Lim
     return tuple(found)
 
 
-def within(robot: Mechanism, values: Array, q: Array, state: State) -> tuple[NDArray[np.bool_], NDArray[np.object_]]:
-    """Which rows are allowed (t, n), and what forbids the others in words (t, n), '' where nothing does."""
+def within(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+) -> tuple[BoolArray, NDArray[np.object_]]:
+    """Which rows are allowed (t, n), and what forbids the others in words (t, n), '' where nothing
+    does.
+    """
     allowed, why = np.ones(state.status.shape, bool), np.full(state.status.shape, "", dtype=object)
     for limit in limits(robot, values, q, state):
         # a bound itself is allowed, up to the rounding of its own number
         outside = ~(limit.margin >= -1e-12 * max(abs(limit.low), abs(limit.high)))
         first = outside & allowed
         for row in zip(*np.nonzero(first), strict=True):
-            why[row] = f"{limit.name} is {limit.value[row]:.6g}, allowed are {limit.low:.6g} to {limit.high:.6g} (SI units)"
+            why[row] = (
+                f"{limit.name} is {limit.value[row]:.6g}, allowed are {limit.low:.6g} to "
+                f"{limit.high:.6g} (SI units)"
+            )
         allowed &= ~outside
     return allowed, why
 
 
-def _cones(robot: Mechanism, values: Array, state: State) -> list[Limit]:
+def _cones(robot: Mechanism, values: FloatArray, state: State) -> list[Limit]:
     """Angles between rods and the axes of their cones."""
     found = []
     for limb, frames in zip(robot.assembly.limbs, limb_frames(robot, values, state), strict=True):
@@ -75,6 +83,8 @@ def _cones(robot: Mechanism, values: Array, state: State) -> list[Limit]:
         for cone in limb.cones:
             frame, sign = (frames[:, :, -2], 1.0) if cone.end == "tip" else (frames[:, :, -1], -1.0)
             axis = frame[..., :3, :3] @ (np.array(cone.axis) / np.linalg.norm(cone.axis))
-            lean = np.arctan2(np.linalg.norm(np.cross(axis, rod), axis=-1), sign * (axis * rod).sum(axis=-1))
+            lean = np.arctan2(
+                np.linalg.norm(np.cross(axis, rod), axis=-1), sign * (axis * rod).sum(axis=-1)
+            )
             found.append(Limit(f"lean of {limb.name} at its {cone.end}", 0.0, cone.angle, lean))
     return found

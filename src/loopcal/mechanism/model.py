@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A mechanism: its structure compiled for the engine, its parameters, and their maps onto displacements."""
+"""A mechanism: its structure compiled for the engine, its parameters, and their maps onto
+displacements.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +12,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from loopcal.engine import Array, Program, State
+from loopcal.engine import Program, State
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import Actuator, Assembly, Shared
 from loopcal.mechanism.limb_maps import LimbMap, limb_maps
 from loopcal.parameters import ParameterTable
+from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 
@@ -48,23 +51,24 @@ _SENTENCES = {
 class SlotMap:
     """From parameter values to displacements e and transmission terms tau.
 
-    slots(v) = M (v - nominal) + sum over shared maps of [g(v) - g(nominal)]; the first `n_displacements` slots are e, the
-    others the terms of the actuators, (a, 8) row by row.
+    slots(v) = M (v - nominal) + sum over shared maps of [g(v) - g(nominal)]; the first
+    `n_displacements` slots are e, the others the terms of the actuators, (a, 8) row by row.
 
     Attributes
     ----------
-    matrix : (s, p). shared : with, for each, the positions of its inputs and outputs. n_displacements : length of e.
+    matrix : (s, p). shared : with, for each, the positions of its inputs and outputs.
+        n_displacements : length of e.
     terms : (a, 8) nominal transmission terms. frequency : (a,) of their harmonics.
     """
 
-    matrix: Array
+    matrix: FloatArray
     shared: tuple[tuple[Shared, tuple[int, ...], tuple[int, ...]], ...]
-    nominal: Array
+    nominal: FloatArray
     n_displacements: int
-    terms: Array
-    frequency: Array
+    terms: FloatArray
+    frequency: FloatArray
 
-    def __call__(self, values: Array) -> tuple[Array, Array]:
+    def __call__(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Values (t, p) -> e (t, n_displacements), tau (t, a, 8)."""
         slots = np.zeros((len(values), len(self.matrix)))
         change = values - self.nominal
@@ -79,22 +83,25 @@ class SlotMap:
         return e, self.terms + tau.reshape(-1, *self.terms.shape)
 
     @cached_property
-    def _layers(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64], Array]]:
+    def _layers(self) -> list[tuple[IntArray, IntArray, FloatArray]]:
         """The matrix as (slots, parameters, coefficients), each slot once in a layer."""
         rows, columns = np.nonzero(self.matrix)
         nth = np.arange(len(rows)) - np.searchsorted(rows, rows)
         layers = (nth == i for i in range(nth.max(initial=-1) + 1))
-        return [(rows[layer], columns[layer], self.matrix[rows[layer], columns[layer]]) for layer in layers]
+        return [
+            (rows[layer], columns[layer], self.matrix[rows[layer], columns[layer]])
+            for layer in layers
+        ]
 
     @cached_property
-    def touches(self) -> NDArray[np.bool_]:
+    def touches(self) -> BoolArray:
         """Which parameters may move which slots, (s, p)."""
         touches = self.matrix != 0
         for _, inputs, outputs in self.shared:
             touches[np.ix_(outputs, inputs)] = True
         return touches
 
-    def jacobian(self, values: Array) -> Array:
+    def jacobian(self, values: FloatArray) -> FloatArray:
         """d slots / d values, (t, s, p)."""
         J = np.repeat(self.matrix[None], len(values), axis=0)
         for shared, inputs, outputs in self.shared:
@@ -111,7 +118,8 @@ class Mechanism:
 
     Attributes
     ----------
-    assembly : the generic description it was compiled from. record : the family record (None if built by hand).
+    assembly : the generic description it was compiled from. record : the family record (None if
+        built by hand).
     parameters : the unknowns. values : (p,) their present values [SI], read-only.
     size : characteristic length [m]; angles times size compare with lengths.
     home : (4, 4) T_base_platform of the home pose; home_readings : (a,) [m or rad].
@@ -121,7 +129,7 @@ class Mechanism:
 
     assembly: Assembly
     parameters: ParameterTable
-    values: Array
+    values: FloatArray
     program: Program
     slots: SlotMap
     size: float
@@ -151,12 +159,12 @@ class Mechanism:
         return self.assembly.controlled
 
     @property
-    def tool(self) -> Array:
+    def tool(self) -> FloatArray:
         """T_platform_tool (4, 4)."""
         return self.assembly.tool
 
     @property
-    def home(self) -> Array:
+    def home(self) -> FloatArray:
         """T_base_platform (4, 4) of the home pose."""
         return self.home_state.T[0, 0]
 
@@ -171,10 +179,15 @@ class Mechanism:
         return self.with_values(self.parameters.nominal)
 
     def with_values(self, values: ArrayLike) -> Mechanism:
-        """The same robot with other parameter values (p,) [SI]; raises MechanismError for a wrong count or NaN."""
+        """The same robot with other parameter values (p,) [SI]; raises MechanismError for a wrong
+        count or NaN.
+        """
         new = np.array(values, dtype=float)
         if new.shape != (len(self.parameters),):
-            raise MechanismError(f"{self.name} has {len(self.parameters)} parameters, but {new.shape} values were given")
+            raise MechanismError(
+                f"{self.name} has {len(self.parameters)} parameters, but {new.shape} values were "
+                "given"
+            )
         if not np.isfinite(new).all():
             bad = self.parameters.names[int(np.flatnonzero(~np.isfinite(new))[0])]
             raise MechanismError(f"the value of {bad} is not finite; give a number")

@@ -8,7 +8,8 @@ from dataclasses import fields
 
 import numpy as np
 
-from loopcal.engine import Array, Program, State
+from loopcal.engine import Program, State
+from loopcal.typing import FloatArray
 
 
 def _each(make: Callable[..., np.ndarray], *states: State) -> State:
@@ -16,7 +17,11 @@ def _each(make: Callable[..., np.ndarray], *states: State) -> State:
     found = {}
     for f in fields(State):
         parts = [getattr(s, f.name) for s in states]
-        found[f.name] = tuple(make(*g) for g in zip(*parts, strict=True)) if f.name == "joints" else make(*parts)
+        found[f.name] = (
+            tuple(make(*g) for g in zip(*parts, strict=True))
+            if f.name == "joints"
+            else make(*parts)
+        )
     return State(**found)
 
 
@@ -46,7 +51,7 @@ def put(state: State, trial: np.ndarray, pose: np.ndarray, new: State) -> State:
     return _each(replaced, state, new)
 
 
-def actuated(program: Program, state: State) -> Array:
+def actuated(program: Program, state: State) -> FloatArray:
     """Values of the actuated joints (t, n, a) [m or rad]."""
     out = np.zeros((*state.T.shape[:2], program.n_joints))
     for group, joints in zip(program.groups, state.joints, strict=True):

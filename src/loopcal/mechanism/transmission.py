@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """From an actuator's reading to the value of the joint it drives.
 
-    joint = offset + gain r + curve r^2 + sin1 sin(w r) + cos1 cos(w r) + sin2 sin(2 w r) + cos2 cos(2 w r) + backlash d / 2
+    joint = offset + gain r + curve r^2 + sin1 sin(w r) + cos1 cos(w r) + sin2 sin(2 w r) + cos2
+    cos(2 w r) + backlash d / 2
 
-with w = 2 pi / period and d = +1 or -1 the direction in which the reading was approached (0 where it is not known). A gear
-ratio or spool radius is a gain, a spool whose radius grows with what is wound on it a curve: r = r0 - b phi / 2 pays out
-r0 phi - b phi^2 / 4. Derivation: docs/theory/parameters.md.
+with w = 2 pi / period and d = +1 or -1 the direction in which the reading was approached (0 where
+it is not known). A gear ratio or spool radius is a gain, a spool whose radius grows with what is
+wound on it a curve: r = r0 - b phi / 2 pays out r0 phi - b phi^2 / 4. Derivation:
+docs/theory/parameters.md.
 
 Readings are (t, n, a), or (t, n, 2 a) with the directions of approach behind them.
 """
@@ -17,30 +19,43 @@ from collections.abc import Sequence
 import numpy as np
 
 from loopcal.errors import MechanismError
-from loopcal.mechanism.assembly import Actuator, Array
+from loopcal.mechanism.assembly import Actuator
+from loopcal.typing import FloatArray
 
 TERMS = ("offset", "gain", "curve", "sin1", "cos1", "sin2", "cos2", "backlash")
-"""Terms in the order of the last axis of tau (t, a, 8), each in the joint's unit per power of the reading's unit."""
+"""Terms in the order of the last axis of tau (t, a, 8), each in the joint's unit per power of the
+reading's unit.
+"""
 
 
-def nominal_terms(actuators: Sequence[Actuator]) -> Array:
-    """Nominal transmission terms (a, 8); raises MechanismError for an unknown term or a gain of zero."""
+def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
+    """Nominal transmission terms (a, 8); raises MechanismError for an unknown term or a gain of
+    zero.
+    """
     for actuator in actuators:
         wrong = sorted(set(actuator.terms) - set(TERMS))
         if wrong:
-            raise MechanismError(f"actuator {actuator.name!r} has a term {wrong[0]!r}; allowed are {', '.join(TERMS)}")
+            raise MechanismError(
+                f"actuator {actuator.name!r} has a term {wrong[0]!r}; allowed are "
+                f"{', '.join(TERMS)}"
+            )
         if actuator.terms.get("gain", 1.0) == 0.0:
-            raise MechanismError(f"actuator {actuator.name!r} has a gain of zero, so its reading moves nothing; give its gain")
-    rows = [[a.terms.get(term, 1.0 if term == "gain" else 0.0) for term in TERMS] for a in actuators]
+            raise MechanismError(
+                f"actuator {actuator.name!r} has a gain of zero, so its reading moves nothing; "
+                "give its gain"
+            )
+    rows = [
+        [a.terms.get(term, 1.0 if term == "gain" else 0.0) for term in TERMS] for a in actuators
+    ]
     return np.array(rows, dtype=float).reshape(-1, len(TERMS))
 
 
-def frequency(actuators: Sequence[Actuator]) -> Array:
+def frequency(actuators: Sequence[Actuator]) -> FloatArray:
     """Angular frequency of the harmonics (a,) [rad per unit of reading], 0 where there are none."""
     return np.array([2 * np.pi / a.period if a.period else 0.0 for a in actuators])
 
 
-def term_columns(q: Array, w: Array) -> list[Array]:
+def term_columns(q: FloatArray, w: FloatArray) -> list[FloatArray]:
     """Derivative of the joint values in each term, eight arrays (t | 1, n, a)."""
     r, approach = split(q, len(w))
     # with w = 0 the cosines would repeat the offset
@@ -50,13 +65,16 @@ def term_columns(q: Array, w: Array) -> list[Array]:
     return [np.ones_like(r), r, r * r, *waves, 0.5 * approach]
 
 
-def joint_values(q: Array, tau: Array, w: Array) -> Array:
+def joint_values(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
     """Joint values (t, n, a) of readings q under terms tau (t | 1, a, 8)."""
     columns = term_columns(q, w)
-    return sum((columns[i] * tau[:, None, :, i] for i in range(1, len(TERMS))), start=columns[0] * tau[:, None, :, 0])
+    return sum(
+        (columns[i] * tau[:, None, :, i] for i in range(1, len(TERMS))),
+        start=columns[0] * tau[:, None, :, 0],
+    )
 
 
-def slope(q: Array, tau: Array, w: Array) -> Array:
+def slope(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
     """d joint / d reading (t, n, a)."""
     r, _ = split(q, len(w))
     turn = w * r
@@ -66,8 +84,10 @@ def slope(q: Array, tau: Array, w: Array) -> Array:
     return gain + 2 * curve * r + first + second
 
 
-def readings_of(joints: Array, tau: Array, w: Array) -> Array:
-    """Readings (t, n, a) that give these joint values, approach not counted: the linear part, then Newton on the rest."""
+def readings_of(joints: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+    """Readings (t, n, a) that give these joint values, approach not counted: the linear part, then
+    Newton on the rest.
+    """
     readings = (joints - tau[:, None, :, 0]) / tau[:, None, :, 1]
     if not tau[..., 2:7].any():
         return readings
@@ -79,6 +99,6 @@ def readings_of(joints: Array, tau: Array, w: Array) -> Array:
     return readings
 
 
-def split(q: Array, a: int) -> tuple[Array, Array]:
+def split(q: FloatArray, a: int) -> tuple[FloatArray, FloatArray]:
     """Readings and directions of approach (zero where none were given)."""
     return q[..., :a], q[..., a:] if q.shape[-1] == 2 * a else np.zeros_like(q[..., :a])

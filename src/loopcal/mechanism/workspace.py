@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Positions spread evenly over the stated workspace, as far as the machine reaches them within its strokes and limits."""
+"""Positions spread evenly over the stated workspace, as far as the machine reaches them within its
+strokes and limits.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +10,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from loopcal.engine import Array
 from loopcal.errors import MechanismError
+from loopcal.mechanism.batch_kinematics import orientation_at
 from loopcal.mechanism.kinematics import Solution, inverse
 from loopcal.mechanism.limits import limits
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.trials import orientation_at
+from loopcal.typing import BoolArray, FloatArray
 
 DRAWS, FEWEST = 2000, 1e-3
-"""Positions drawn before a workspace is called empty, and the share of them that must be reachable."""
+"""Positions drawn before a workspace is called empty, and the share of them that must be reachable.
+"""
 
 
 @dataclass(frozen=True)
@@ -27,11 +29,13 @@ class Sample:
 
     Attributes
     ----------
-    coordinates : (n, c) controlled coordinates [m, rad]. solution : their readings and poses, n rows.
-    share : share of the stated ranges that the machine reaches. lost : what stops it elsewhere, in words, with the count.
+    coordinates : (n, c) controlled coordinates [m, rad]. solution : their readings and poses, n
+        rows.
+    share : share of the stated ranges that the machine reaches. lost : what stops it elsewhere, in
+        words, with the count.
     """
 
-    coordinates: Array
+    coordinates: FloatArray
     solution: Solution
     share: float
     lost: Mapping[str, int]
@@ -40,8 +44,9 @@ class Sample:
 def sample(robot: Mechanism, n: int, seed: int | np.random.Generator = 0) -> Sample:
     """Draw n positions evenly from the ranges of `workspace`, those out of reach drawn anew.
 
-    Coordinates are uniform in their ranges; phi and theta are uniform over the area of the sphere that they enclose. Left
-    out is what cannot be closed, exceeds a stroke, a joint's limits or a cone, or lies beyond a singularity from home.
+    Coordinates are uniform in their ranges; phi and theta are uniform over the area of the sphere
+    that they enclose. Left out is what cannot be closed, exceeds a stroke, a joint's limits or a
+    cone, or lies beyond a singularity from home.
 
     Parameters
     ----------
@@ -54,12 +59,13 @@ def sample(robot: Mechanism, n: int, seed: int | np.random.Generator = 0) -> Sam
     Raises
     ------
     MechanismError
-        The robot states no range for a controlled coordinate, or almost nothing of its workspace can be reached.
+        The robot states no range for a controlled coordinate, or almost nothing of its workspace
+        can be reached.
     """
     rng = np.random.default_rng(seed)
     wanted = ranges(robot)
     lost: Counter[str] = Counter()
-    parts: list[Array] = []
+    parts: list[FloatArray] = []
     kept = tried = 0
     while kept < n or not tried:
         coordinates = drawn(rng, robot.controlled, wanted, max(n, DRAWS // 8))
@@ -69,11 +75,14 @@ def sample(robot: Mechanism, n: int, seed: int | np.random.Generator = 0) -> Sam
         if tried >= DRAWS and kept < FEWEST * tried:
             raise MechanismError(_empty(robot, kept, tried, lost))
     coordinates = np.concatenate(parts)[:n]
-    return Sample(coordinates, inverse(robot, coordinates), kept / tried, dict((+lost).most_common()))
+    return Sample(
+        coordinates, inverse(robot, coordinates), kept / tried, dict((+lost).most_common())
+    )
 
 
 def ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
-    """Range of every controlled coordinate [m, rad]; phi runs all the way round where it is not stated.
+    """Range of every controlled coordinate [m, rad]; phi runs all the way round where it is not
+    stated.
 
     Raises
     ------
@@ -86,14 +95,22 @@ def ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
     missing = [name for name in robot.controlled if name not in stated]
     if missing:
         raise MechanismError(
-            f"{robot.name} states no workspace for {', '.join(missing)}; add `workspace:` with a range for each of "
+            f"{robot.name} states no workspace for {', '.join(missing)}; add `workspace:` with a "
+            "range for each of "
             f"{', '.join(robot.controlled)} to its file"
         )
     return {name: stated[name] for name in robot.controlled}
 
 
-def drawn(rng: np.random.Generator, names: tuple[str, ...], within: Mapping[str, tuple[float, float]], n: int) -> Array:
-    """Coordinates (n, c) spread evenly over their ranges [m, rad], whether the machine reaches them or not."""
+def drawn(
+    rng: np.random.Generator,
+    names: tuple[str, ...],
+    within: Mapping[str, tuple[float, float]],
+    n: int,
+) -> FloatArray:
+    """Coordinates (n, c) spread evenly over their ranges [m, rad], whether the machine reaches them
+    or not.
+    """
     columns = []
     for name in names:
         low, high = within[name]
@@ -105,7 +122,7 @@ def drawn(rng: np.random.Generator, names: tuple[str, ...], within: Mapping[str,
     return np.stack(columns, axis=-1)
 
 
-def _reached(robot: Mechanism, coordinates: Array, lost: Counter[str]) -> NDArray[np.bool_]:
+def _reached(robot: Mechanism, coordinates: FloatArray, lost: Counter[str]) -> BoolArray:
     """Which rows the machine reaches (n,); why it does not reach the others is added to `lost`."""
     values, found = robot.values[None], inverse(robot, coordinates)
     good = np.array(found.converged)
@@ -114,7 +131,10 @@ def _reached(robot: Mechanism, coordinates: Array, lost: Counter[str]) -> NDArra
         outside = good & ~(limit.margin[0] >= 0)
         lost[f"{limit.name} is exceeded"] += int(outside.sum())
         good &= ~outside
-    beyond = good & (orientation_at(robot, values, found.state)[0] != orientation_at(robot, values, robot.home_state)[0, 0])
+    beyond = good & (
+        orientation_at(robot, values, found.state)[0]
+        != orientation_at(robot, values, robot.home_state)[0, 0]
+    )
     lost["a singularity lies between it and home"] += int(beyond.sum())
     return good & ~beyond
 
@@ -123,6 +143,7 @@ def _empty(robot: Mechanism, kept: int, drawn: int, lost: Counter[str]) -> str:
     """The sentence for a workspace that cannot be reached."""
     reason, count = lost.most_common(1)[0]
     return (
-        f"{robot.name}: the workspace is empty: {kept} of {drawn} positions drawn from it can be reached, most often because "
+        f"{robot.name}: the workspace is empty: {kept} of {drawn} positions drawn from it can be "
+        "reached, most often because "
         f"{reason} ({count} of them); correct `workspace:`, the strokes or the limits"
     )

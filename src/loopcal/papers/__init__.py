@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Published studies, repeated: the same steps by this library's functions, published numbers beside computed ones.
+"""Published studies, repeated: the same steps by this library's functions, published numbers beside
+computed ones.
 
-One folder a paper: `published.yaml` (the printed numbers and statements, with their place), `steps.py` (what the paper
-does), `compare.py` (what agrees and what does not). A further paper is one more folder and its line in PAPERS. Nothing is
-imported before a paper is run.
+One folder a paper: `published.yaml` (the printed numbers and statements, with their place),
+`steps.py` (what the paper does), `compare.py` (what agrees and what does not). A further paper is
+one more folder and its line in PAPERS. Nothing is imported before a paper is run.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ class Paper:
     source: str
     module: str
 
-    def run(self, seed: int = 0, trials: int = TRIALS, progress: Callable[[str], None] | None = None) -> Reproduction:
+    def run(
+        self, seed: int = 0, trials: int = TRIALS, progress: Callable[[str], None] | None = None
+    ) -> Reproduction:
         """Repeat the study.
 
         Parameters
@@ -51,7 +54,9 @@ class Paper:
             A seed below zero, or fewer than 2 trials.
         """
         if seed < 0 or trials < 2:
-            raise DataError(f"seed {seed} with {trials} trials: give a seed of 0 or more, and 2 trials or more")
+            raise DataError(
+                f"seed {seed} with {trials} trials: give a seed of 0 or more, and 2 trials or more"
+            )
         return import_module(self.module).reproduce(seed, trials, progress or (lambda _: None))
 
 
@@ -60,19 +65,23 @@ PAPERS: Mapping[str, Paper] = {
     for paper in (
         Paper(
             "hexapod-42",
-            "Numerical simulation of the calibration of a hexapod: 42 parameters, 10 poses, least squares leg by leg",
-            "study of a 6-DOF parallel mechanism with 42 kinematic parameters, read as text; no DOI known to us",
+            "Numerical simulation of the calibration of a hexapod: 42 parameters, 10 poses, least "
+            "squares leg by leg",
+            "study of a 6-DOF parallel mechanism with 42 kinematic parameters, read as text; no "
+            "DOI known to us",
             "loopcal.papers.hexapod_42.compare",
         ),
         Paper(
             "tsvd-2016",
-            "Least squares, ridge estimation and truncated SVD compared on a 3-PRS and an RU-PUS-PRS manipulator",
+            "Least squares, ridge estimation and truncated SVD compared on a 3-PRS and an "
+            "RU-PUS-PRS manipulator",
             "Advances in Mechanical Engineering 2016, doi:10.1177/1687814016667908",
             "loopcal.papers.tsvd_2016.compare",
         ),
         Paper(
             "cmm-constraint-2011",
-            "A hexapod calibrated from points on planes and perpendicular lines, held by a coordinate measuring machine",
+            "A hexapod calibrated from points on planes and perpendicular lines, held by a "
+            "coordinate measuring machine",
             "International Journal of Advanced Robotic Systems 2011, doi:10.5772/45684",
             "loopcal.papers.cmm_constraint_2011.compare",
         ),
@@ -89,5 +98,8 @@ def paper(name: str) -> Paper:
         No paper is called so.
     """
     if name not in PAPERS:
-        raise DataError(f"{name!r} is not a paper that can be repeated{nearest(name, PAPERS)}; known are {', '.join(PAPERS)}")
+        raise DataError(
+            f"{name!r} is not a paper that can be repeated{nearest(name, PAPERS)}; known are "
+            f"{', '.join(PAPERS)}"
+        )
     return PAPERS[name]

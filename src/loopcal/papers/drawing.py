@@ -20,7 +20,10 @@ LEGEND = 100
 def styles(figures: Sequence[Figure]) -> dict[str, dict[str, Any]]:
     """Return colour and marker of each label."""
     labels = dict.fromkeys(series.label for figure in figures for series in figure.series)
-    return {label: {"color": f"C{i % 10}", "marker": MARKERS[i % len(MARKERS)]} for i, label in enumerate(labels)}
+    return {
+        label: {"color": f"C{i % 10}", "marker": MARKERS[i % len(MARKERS)]}
+        for i, label in enumerate(labels)
+    }
 
 
 def png(figure: Figure, style: Mapping[str, Mapping[str, Any]]) -> bytes:
@@ -38,7 +41,14 @@ def png(figure: Figure, style: Mapping[str, Mapping[str, Any]]) -> bytes:
     FigureCanvasAgg(canvas)
     axes = canvas.add_subplot()
     for series in figure.series:
-        axes.plot(series.x, series.y, label=series.label, markersize=5, linewidth=1.5 * figure.joined, **style[series.label])
+        axes.plot(
+            series.x,
+            series.y,
+            label=series.label,
+            markersize=5,
+            linewidth=1.5 * figure.joined,
+            **style[series.label],
+        )
     for label, value in figure.levels.items():
         axes.axhline(value, color=LEVEL, linestyle="--", linewidth=1.2)
         axes.annotate(label, (0.008, value), xycoords=("axes fraction", "data"), ha="left", va="bottom",
@@ -53,7 +63,9 @@ def png(figure: Figure, style: Mapping[str, Mapping[str, Any]]) -> bytes:
     axes.grid(visible=True, color="0.9", linewidth=0.8)
     longest = max(len(series.label) for series in figure.series)
     columns = max(1, min(6, LEGEND // (longest + 6)))  # a marker is as wide as some 6 characters
-    canvas.legend(fontsize=8.5, loc="outside lower center", ncols=columns)  # below the axes, where no data are
+    canvas.legend(
+        fontsize=8.5, loc="outside lower center", ncols=columns
+    )  # below the axes, where no data are
     stream = BytesIO()
     canvas.savefig(stream, format="png", metadata={"Software": None})
     return stream.getvalue()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numbers as printed, digit by digit, and tables that put computed ones beside them.
 
-The last printed digit is the yardstick: a computed number agrees when it is within one unit of it. So printed numbers
-are read as text ("0.0352" has the unit 1e-4, "-9E-05" the unit 1e-5).
+The last printed digit is the yardstick: a computed number agrees when it is within one unit of it.
+So printed numbers are read as text ("0.0352" has the unit 1e-4, "-9E-05" the unit 1e-5).
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from loopcal.typing import BoolArray, FloatArray
+
 Cell = str | float | int | bool | None
 ROUNDING = 1e-9
 """Of a unit, by which a difference may exceed it: decimal numbers are no binary ones."""
@@ -29,7 +29,8 @@ class Table:
     Attributes
     ----------
     name : of its file. title, note : what it shows. columns : their names, with units.
-    formats : format specification of each column on a page ("" for text). shown : rows on a page, None for all.
+    formats : format specification of each column on a page ("" for text). shown : rows on a page,
+        None for all.
     """
 
     name: str
@@ -43,7 +44,8 @@ class Table:
     def text(self) -> list[tuple[str, ...]]:
         """Rows as a page shows them; a dash for what is not there."""
         return [
-            tuple(_text(cell, spec) for cell, spec in zip(row, self.formats, strict=True)) for row in self.rows[: self.shown]
+            tuple(_text(cell, spec) for cell, spec in zip(row, self.formats, strict=True))
+            for row in self.rows[: self.shown]
         ]
 
     def to_dict(self) -> dict[str, Any]:
@@ -68,12 +70,12 @@ class Printed:
         return tuple(self.rows)
 
     @cached_property
-    def values(self) -> Array:
+    def values(self) -> FloatArray:
         """(r, c) the numbers, in the units they are printed in."""
         return np.array([[float(cell) for cell in row] for row in self.rows.values()])
 
     @cached_property
-    def unit(self) -> Array:
+    def unit(self) -> FloatArray:
         """(r, c) one unit of the last digit."""
         return np.array([[last_digit(cell) for cell in row] for row in self.rows.values()])
 
@@ -89,7 +91,8 @@ class Comparison:
     Attributes
     ----------
     name : of its file. title, note : what is compared. columns : of the printed block, with units.
-    published : as printed. computed : (r, c). yardstick : (r, c) difference within which they agree; default: a unit of the
+    published : as printed. computed : (r, c). yardstick : (r, c) difference within which they
+    agree; default: a unit of the
     last printed digit.
     """
 
@@ -97,22 +100,22 @@ class Comparison:
     title: str
     columns: tuple[str, ...]
     published: Printed
-    computed: Array
+    computed: FloatArray
     note: str = ""
-    yardstick: Array | None = None
+    yardstick: FloatArray | None = None
 
     @cached_property
-    def difference(self) -> Array:
+    def difference(self) -> FloatArray:
         """(r, c) computed - published."""
         return self.computed - self.published.values
 
     @cached_property
-    def step(self) -> Array:
+    def step(self) -> FloatArray:
         """(r, c) within which they agree."""
         return self.published.unit if self.yardstick is None else self.yardstick
 
     @cached_property
-    def within(self) -> NDArray[np.bool_]:
+    def within(self) -> BoolArray:
         """(r, c) which numbers agree."""
         return np.abs(self.difference) <= self.step * (1.0 + ROUNDING)
 
@@ -146,15 +149,38 @@ class Comparison:
             for i, (label, texts) in enumerate(self.published.rows.items())
             for j, (column, printed) in enumerate(zip(self.columns, texts, strict=True))
         ]
-        columns = ("row", "column", "published", "computed", "difference", "unit of the last digit", "within one unit")
-        return Table(self.name, self.title, columns, tuple(rows), ("", "", "", ".9g", ".2g", ".0e", ""), self.note)
+        columns = (
+            "row",
+            "column",
+            "published",
+            "computed",
+            "difference",
+            "unit of the last digit",
+            "within one unit",
+        )
+        return Table(
+            self.name,
+            self.title,
+            columns,
+            tuple(rows),
+            ("", "", "", ".9g", ".2g", ".0e", ""),
+            self.note,
+        )
 
     def side_by_side(self) -> Table:
-        """In the layout of the paper, three lines a row: published, computed, difference (in bold where too large)."""
+        """In the layout of the paper, three lines a row: published, computed, difference (in bold
+        where too large).
+        """
         lines: list[tuple[Cell, ...]] = []
         for i, (label, texts) in enumerate(self.published.rows.items()):
             lines.append((label, "published", *texts))
-            lines.append(("", "computed", *(_like(*pair) for pair in zip(self.computed[i], texts, strict=True))))
+            lines.append(
+                (
+                    "",
+                    "computed",
+                    *(_like(*pair) for pair in zip(self.computed[i], texts, strict=True)),
+                )
+            )
             shown = [f"{d:.1e}" if d else "0" for d in self.difference[i]]
             marked = (d if ok else f"**{d}**" for d, ok in zip(shown, self.within[i], strict=True))
             lines.append(("", "difference", *marked))

@@ -18,7 +18,8 @@ class Verdict:
 
     Attributes
     ----------
-    claim : what is stated. agrees : whether what was computed bears it out; None where it cannot be judged, see `why`.
+    claim : what is stated. agrees : whether what was computed bears it out; None where it cannot be
+        judged, see `why`.
     why : the evidence in a sentence or two, with the numbers of this run.
     where : its place in the paper; ASKED_HERE for what the paper does not state.
     """
@@ -49,9 +50,12 @@ class Figure:
 
     Attributes
     ----------
-    name : of its file. title, x_label, y_label, caption : text, with units on the axes and numbers of cases in the caption.
-    series : the lines. levels : horizontal lines by label. log : axes that are logarithmic, "", "y" or "xy".
-    joined : whether points of a series are joined by lines; not where their order along x means nothing.
+    name : of its file. title, x_label, y_label, caption : text, with units on the axes and numbers
+        of cases in the caption.
+    series : the lines. levels : horizontal lines by label. log : axes that are logarithmic, "", "y"
+        or "xy".
+    joined : whether points of a series are joined by lines; not where their order along x means
+        nothing.
     """
 
     name: str
@@ -71,9 +75,11 @@ class Reproduction:
 
     Attributes
     ----------
-    paper, title, source : which. about : what was done, a paragraph each. settings : seed and sizes of this run.
+    paper, title, source : which. about : what was done, a paragraph each. settings : seed and sizes
+        of this run.
     comparisons : published beside computed numbers, one for each table of the paper.
-    tables : what was computed beyond them. verdicts : what agrees and what does not, and why. figures : as data.
+    tables : what was computed beyond them. verdicts : what agrees and what does not, and why.
+        figures : as data.
     """
 
     paper: str
@@ -91,14 +97,25 @@ class Reproduction:
         return Table(
             "summary",
             "Published beside computed",
-            ("table", "numbers", "within one unit of the last digit", "largest difference [units of the last digit]"),
-            tuple((c.title, c.count, c.agreeing, float((abs(c.difference) / c.step).max())) for c in self.comparisons),
+            (
+                "table",
+                "numbers",
+                "within one unit of the last digit",
+                "largest difference [units of the last digit]",
+            ),
+            tuple(
+                (c.title, c.count, c.agreeing, float((abs(c.difference) / c.step).max()))
+                for c in self.comparisons
+            ),
             formats=("", "d", "d", ".2g"),
         )
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything by attribute name, for JSON."""
-        parts = {name: getattr(self, name) for name in ("paper", "title", "source", "about", "settings", "verdicts", "figures")}
+        parts = {
+            name: getattr(self, name)
+            for name in ("paper", "title", "source", "about", "settings", "verdicts", "figures")
+        }
         parts["summary"] = self.summary().to_dict()
         parts["comparisons"] = [c.table().to_dict() for c in self.comparisons]
         return parts | {"tables": [table.to_dict() for table in self.tables]}

@@ -19,9 +19,9 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from loopcal.io.json_text import to_json
-from loopcal.io.run_folder import RESULT, refuse_used_folder
-from loopcal.io.text_file import writing
+from loopcal.io.core.json_text import to_json
+from loopcal.io.core.text_file import writing
+from loopcal.io.runs.run_folder import RESULT, refuse_used_folder
 
 if TYPE_CHECKING:
     from loopcal.papers.printed import Table
@@ -35,22 +35,28 @@ def page(found: Reproduction, made_by: Mapping[str, Any]) -> str:
 
     Parameters
     ----------
-    found : what to tell. made_by : see `loopcal.io.run_folder.made_by`.
+    found : what to tell. made_by : see `loopcal.io.runs.run_folder.made_by`.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=FileSystemLoader(Path(__file__).parent),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     return environment.get_template(TEMPLATE).render(found=found, made_by=made_by)
 
 
-def write_folder(path: str | Path, found: Reproduction, made_by: Mapping[str, Any], force: bool = False) -> Path:
+def write_folder(
+    path: str | Path, found: Reproduction, made_by: Mapping[str, Any], force: bool = False
+) -> Path:
     """Write a reproduction whole or not at all; return the folder.
 
     Parameters
     ----------
-    path : folder to make. found : what to write. made_by : where it comes from. force : replace an earlier one.
+    path : folder to make. found : what to write. made_by : where it comes from. force : replace an
+        earlier one.
 
     Raises
     ------

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A picture of a mechanism: its limbs, joints, rods, platform and tool, in space and from above.
 
-One limb has one colour in both views. A short line through a point is the axis of a turning joint, a dashed one the guide
-of a sliding joint; a filled point is driven. Nothing here decides anything: where links are is `mechanism.frames`.
+One limb has one colour in both views. A short line through a point is the axis of a turning joint,
+a dashed one the guide of a sliding joint; a filled point is driven. Nothing here decides anything:
+where links are is `mechanism.frames`.
 """
 
 from __future__ import annotations
@@ -14,39 +15,51 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.engine import Array
 from loopcal.errors import FileError
 from loopcal.mechanism import Mechanism, Solution
 from loopcal.mechanism.frames import limb_frames
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension, unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f")
-"""Of the limbs in turn; told apart by colour-blind readers too (Okabe and Ito, the yellow left out)."""
+"""Of the limbs in turn; told apart by colour-blind readers too (Okabe and Ito, the yellow left
+out).
+"""
 AXIS, GUIDE = 0.06, 0.12
-"""Half the length of a turning joint's axis, and how far a guide is drawn beyond what slides, over the robot's size."""
+"""Half the length of a turning joint's axis, and how far a guide is drawn beyond what slides, over
+the robot's size.
+"""
 DPI = 150
 FORMATS = (".png", ".svg", ".pdf")
 
 
 @dataclass(frozen=True)
 class Stroke:
-    """A line (n, 3) [m] of the picture, or points where it has no style, with what matplotlib shall make of it."""
+    """A line (n, 3) [m] of the picture, or points where it has no style, with what matplotlib shall
+    make of it.
+    """
 
-    points: Array
+    points: FloatArray
     style: dict[str, Any]
 
 
 def draw(robot: Mechanism, solution: Solution | None = None, row: int = 0) -> Figure:
-    """Draw a robot at a row of a solution (default: home), with the axes in the length unit of its file."""
+    """Draw a robot at a row of a solution (default: home), with the axes in the length unit of its
+    file.
+    """
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     state = robot.home_state if solution is None else solution.take(np.array([row])).state
     length = unit(robot.units[Dimension.LENGTH])
-    strokes = list(_strokes(robot, [f[0, 0] for f in limb_frames(robot, robot.values[None], state)], state.T[0, 0]))
+    strokes = list(
+        _strokes(
+            robot, [f[0, 0] for f in limb_frames(robot, robot.values[None], state)], state.T[0, 0]
+        )
+    )
     strokes = [Stroke(s.points / length.factor_to_si, s.style) for s in strokes]
     everything = np.concatenate([s.points for s in strokes])
     low, high = everything.min(axis=0), everything.max(axis=0)
@@ -68,43 +81,69 @@ def draw(robot: Mechanism, solution: Solution | None = None, row: int = 0) -> Fi
     return figure
 
 
-def save_picture(path: Path, robot: Mechanism, solution: Solution | None = None, row: int = 0) -> None:
-    """Write the picture to a file whose ending says the format; raises FileError for one that is not in FORMATS."""
+def save_picture(
+    path: Path, robot: Mechanism, solution: Solution | None = None, row: int = 0
+) -> None:
+    """Write the picture to a file whose ending says the format; raises FileError for one that is
+    not in FORMATS.
+    """
     if path.suffix.lower() not in FORMATS:
         raise FileError(
-            f"a picture cannot be written as {path.suffix or 'no format'!r}; end its name in {', '.join(FORMATS)}", path
+            f"a picture cannot be written as {path.suffix or 'no format'!r}; end its name in "
+            f"{', '.join(FORMATS)}",
+            path,
         )
     draw(robot, solution, row).savefig(path, dpi=DPI)
 
 
-def _strokes(robot: Mechanism, limbs: list[Array], T: Array) -> Iterator[Stroke]:
+def _strokes(robot: Mechanism, limbs: list[FloatArray], T: FloatArray) -> Iterator[Stroke]:
     """Everything drawn [m]: first one line a limb, then its parts, then platform, base and tool."""
     for i, frames in enumerate(limbs):
         chain = frames[:-1, :3, 3]
-        yield Stroke(chain, {"color": COLOURS[i % len(COLOURS)], "lw": 2.5, "solid_capstyle": "round"})
+        yield Stroke(
+            chain, {"color": COLOURS[i % len(COLOURS)], "lw": 2.5, "solid_capstyle": "round"}
+        )
     for i, (limb, frames) in enumerate(zip(robot.assembly.limbs, limbs, strict=True)):
         colour, points = COLOURS[i % len(COLOURS)], frames[:, :3, 3]
         for j, joint in enumerate(limb.joints):
             axis, face = frames[j, :3, 2], colour if joint.actuator else "white"
             if joint.kind == "P":
                 slid = (points[j + 1] - points[j]) @ axis
-                ends = np.array([min(slid, 0.0) - GUIDE * robot.size, max(slid, 0.0) + GUIDE * robot.size])
-                yield Stroke(points[j] + ends[:, None] * axis, {"color": colour, "lw": 1.0, "ls": (0, (4, 3))})
+                ends = np.array(
+                    [min(slid, 0.0) - GUIDE * robot.size, max(slid, 0.0) + GUIDE * robot.size]
+                )
+                yield Stroke(
+                    points[j] + ends[:, None] * axis,
+                    {"color": colour, "lw": 1.0, "ls": (0, (4, 3))},
+                )
                 at = points[j] + slid * axis
             else:
                 at = points[j]
-                yield Stroke(at + np.array([[-1.0], [1.0]]) * AXIS * robot.size * axis, {"color": "black", "lw": 1.2})
-            yield Stroke(at[None], _dot("s" if joint.kind == "P" else "o", colour, face, 8.0 if joint.actuator else 5.0))
+                yield Stroke(
+                    at + np.array([[-1.0], [1.0]]) * AXIS * robot.size * axis,
+                    {"color": "black", "lw": 1.2},
+                )
+            yield Stroke(
+                at[None],
+                _dot(
+                    "s" if joint.kind == "P" else "o", colour, face, 8.0 if joint.actuator else 5.0
+                ),
+            )
         if limb.ending == "distance":
             face = colour if limb.actuator else "white"
             yield Stroke(points[-2:], {"color": colour, "lw": 1.6})
-            yield Stroke(points[-2:].mean(axis=0)[None] if limb.actuator else points[-2:-1], _dot("D", colour, face))
+            yield Stroke(
+                points[-2:].mean(axis=0)[None] if limb.actuator else points[-2:-1],
+                _dot("D", colour, face),
+            )
         if limb.ending != "rigid":
             yield Stroke(points[-1:], _dot("o", colour, "white"))
-    yield from _bodies(robot, np.array([f[-1, :3, 3] for f in limbs]), np.array([f[0, :3, 3] for f in limbs]), T)
+    yield from _bodies(
+        robot, np.array([f[-1, :3, 3] for f in limbs]), np.array([f[0, :3, 3] for f in limbs]), T
+    )
 
 
-def _bodies(robot: Mechanism, top: Array, foot: Array, T: Array) -> Iterator[Stroke]:
+def _bodies(robot: Mechanism, top: FloatArray, foot: FloatArray, T: FloatArray) -> Iterator[Stroke]:
     """Platform, base, their frames, and the tool."""
     yield Stroke(_outline(foot), {"color": "0.6", "lw": 1.0, "ls": ":"})
     yield Stroke(_outline(top), {"color": "0.25", "lw": 2.0})
@@ -117,8 +156,10 @@ def _bodies(robot: Mechanism, top: Array, foot: Array, T: Array) -> Iterator[Str
     yield Stroke(tool[None, :3, 3], _dot("*", "black", "black", 8.0))
 
 
-def _outline(points: Array) -> Array:
-    """Points (n, 3) in the order of their angle about the middle, closed; as they are where they lie on a line."""
+def _outline(points: FloatArray) -> FloatArray:
+    """Points (n, 3) in the order of their angle about the middle, closed; as they are where they
+    lie on a line.
+    """
     offset = points - points.mean(axis=0)
     _, s, V = np.linalg.svd(offset, full_matrices=True)
     if len(points) < 3 or s[1] < 1e-6 * max(s[0], 1e-300):
@@ -131,7 +172,7 @@ def _dot(marker: str, edge: str, face: str, size: float = 5.0) -> dict[str, Any]
     return {"marker": marker, "ls": "none", "ms": size, "mec": edge, "mfc": face, "mew": 1.2}
 
 
-def _label(space: Any, above: Any, limb: Stroke, name: str, middle: Array) -> None:
+def _label(space: Any, above: Any, limb: Stroke, name: str, middle: FloatArray) -> None:
     """The limb's name beside its foot, away from the middle of the picture."""
     foot = limb.points[0]
     away = foot[:2] - middle[:2]
@@ -145,7 +186,7 @@ def _label(space: Any, above: Any, limb: Stroke, name: str, middle: Array) -> No
     space.text(*foot, f" {name}", fontsize=8, color=limb.style["color"])
 
 
-def _finish(space: Any, above: Any, low: Array, high: Array, symbol: str) -> None:
+def _finish(space: Any, above: Any, low: FloatArray, high: FloatArray, symbol: str) -> None:
     """Equal scales, and units on all axes."""
     middle, reach = (low + high) / 2, np.maximum(high - low, 0.15 * (high - low).max()) * 0.55
     for axis, m, r in zip("xyz", middle, reach, strict=True):

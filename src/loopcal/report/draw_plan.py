@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of a plan: the poses with the way through them, and expected errors by the number of poses."""
+"""Pictures of a plan: the poses with the way through them, and expected errors by the number of
+poses.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.calibrate.plan.candidates import home_coordinates
-from loopcal.calibrate.plan.needed import DIMENSION, PoseCurve
-from loopcal.calibrate.plan.record import Plan
 from loopcal.mechanism import Mechanism
 from loopcal.mechanism.coordinates import POSITION
+from loopcal.planning.candidates import home_coordinates
+from loopcal.planning.needed import DIMENSION, PoseCurve
+from loopcal.planning.result import Plan
 from loopcal.report.draw import COLOURS, DPI
 from loopcal.units import Dimension, Unit, unit
 
@@ -28,8 +30,13 @@ def draw_plan(plan: Plan) -> Figure:
     from matplotlib.figure import Figure
 
     names = plan.robot.controlled
-    columns = [plan.coordinates[:, i] / _unit(plan.robot, name).factor_to_si for i, name in enumerate(names)]
-    pairs = [(i, i + 1) for i in range(0, len(names) - 1, 2)] + ([(len(names) - 1, None)] if len(names) % 2 else [])
+    columns = [
+        plan.coordinates[:, i] / _unit(plan.robot, name).factor_to_si
+        for i, name in enumerate(names)
+    ]
+    pairs = [(i, i + 1) for i in range(0, len(names) - 1, 2)] + (
+        [(len(names) - 1, None)] if len(names) % 2 else []
+    )
     figure = Figure(figsize=(4.2 * len(pairs), 4.4), layout="constrained")
     home = home_coordinates(plan.robot)
     start = [home[i] / _unit(plan.robot, name).factor_to_si for i, name in enumerate(names)]
@@ -40,19 +47,32 @@ def draw_plan(plan: Plan) -> Figure:
         first = (start[i], start[j]) if j is not None else (0.0, start[i])
         axes.plot([first[0], *x], [first[1], *y], color="0.7", lw=0.8, zorder=1, label="way")
         axes.plot(*first, "k+", ms=8.0, label="home", zorder=3)
-        for chosen, colour, label in ((~plan.held_out, FITTED, "to fit"), (plan.held_out, JUDGED, "to judge by")):
+        for chosen, colour, label in (
+            (~plan.held_out, FITTED, "to fit"),
+            (plan.held_out, JUDGED, "to judge by"),
+        ):
             axes.plot(x[chosen], y[chosen], "o", color=colour, ms=4.5, label=label, zorder=2)
         axes.set_xlabel(_label(plan.robot, names[i]) if j is not None else "step [1], home is 0")
         axes.set_ylabel(_label(plan.robot, names[i if j is None else j]))
         axes.grid(visible=True, lw=0.3)
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+    figure.legend(
+        *figure.axes[0].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=4,
+        frameon=False,
+        fontsize=8,
+    )
     held = int(plan.held_out.sum())
-    figure.suptitle(f"{plan.robot.name}: n = {plan.n_poses} poses to fit, {held} to judge by", fontsize=10)
+    figure.suptitle(
+        f"{plan.robot.name}: n = {plan.n_poses} poses to fit, {held} to judge by", fontsize=10
+    )
     return figure
 
 
 def draw_curve(robot: Mechanism, curve: PoseCurve) -> Figure:
-    """Draw expected errors by the number of poses, with the bound that no choice of so many candidates can beat."""
+    """Draw expected errors by the number of poses, with the bound that no choice of so many
+    candidates can beat.
+    """
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter, ScalarFormatter
 
@@ -60,9 +80,19 @@ def draw_curve(robot: Mechanism, curve: PoseCurve) -> Figure:
     shown = unit(robot.units[dimension])
     figure = Figure(figsize=(6.4, 4.4), layout="constrained")
     axes: Any = figure.add_subplot(1, 1, 1)
-    axes.plot(curve.numbers, curve.values / shown.factor_to_si, "o-", color=FITTED, label=f"planned {curve.counted}")
     axes.plot(
-        curve.numbers, curve.bounds / shown.factor_to_si, "--", color=BOUND, label=f"no choice of {curve.counted} is better"
+        curve.numbers,
+        curve.values / shown.factor_to_si,
+        "o-",
+        color=FITTED,
+        label=f"planned {curve.counted}",
+    )
+    axes.plot(
+        curve.numbers,
+        curve.bounds / shown.factor_to_si,
+        "--",
+        color=BOUND,
+        label=f"no choice of {curve.counted} is better",
     )
     if curve.goal is not None:
         axes.axhline(
@@ -77,7 +107,10 @@ def draw_curve(robot: Mechanism, curve: PoseCurve) -> Figure:
         axis.set_major_formatter(ScalarFormatter())
         axis.set_minor_formatter(NullFormatter())
     axes.set_xticks(curve.numbers, [str(n) for n in curve.numbers])
-    low, high = min(curve.bounds.min(), curve.goal or np.inf), max(curve.values.max(), curve.goal or 0.0)
+    low, high = (
+        min(curve.bounds.min(), curve.goal or np.inf),
+        max(curve.values.max(), curve.goal or 0.0),
+    )
     ticks = np.geomspace(low, high, 5) / shown.factor_to_si
     axes.set_yticks(ticks, [f"{tick:.3g}" for tick in ticks])
     axes.set_xlabel(f"{curve.counted} to fit [1]")
@@ -85,7 +118,9 @@ def draw_curve(robot: Mechanism, curve: PoseCurve) -> Figure:
     axes.set_ylabel(f"expected {words} (rms) [{shown.symbol}]")
     axes.grid(visible=True, which="both", lw=0.3)
     axes.legend(frameon=False, fontsize=8)
-    axes.set_title(f"{robot.name}: n = {curve.numbers[0]} to {curve.numbers[-1]} {curve.counted}", fontsize=10)
+    axes.set_title(
+        f"{robot.name}: n = {curve.numbers[0]} to {curve.numbers[-1]} {curve.counted}", fontsize=10
+    )
     return figure
 
 

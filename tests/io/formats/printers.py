@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records of real delta printers as the printer.cfg that their firmware would have: our own lines around their numbers."""
+"""Records of real delta printers as the printer.cfg that their firmware would have: our own lines
+around their numbers.
+"""
 
 from typing import Any
 
@@ -32,7 +34,8 @@ SAVED = """
 
 
 def printer_cfg(record: dict[str, Any], stop_off: float = 0.0) -> str:
-    """Return the text; tower a's numbers in the main part, the others saved, and Klipper's defaults left out.
+    """Return the text; tower a's numbers in the main part, the others saved, and Klipper's defaults
+    left out.
 
     Parameters
     ----------
@@ -44,7 +47,10 @@ def printer_cfg(record: dict[str, Any], stop_off: float = 0.0) -> str:
     for k, axis in enumerate("abc"):
         # half of the step by a gear of 2:1, so that all of Klipper's ways to say it are read
         rotation = found["stepdist"][k] * 200 * 16
-        step = [f"rotation_distance: {rotation!r}\nmicrosteps: 16", f"step_distance = {found['stepdist'][k]!r}"][k % 2]
+        step = [
+            f"rotation_distance: {rotation!r}\nmicrosteps: 16",
+            f"step_distance = {found['stepdist'][k]!r}",
+        ][k % 2]
         if k == 2:
             step = f"rotation_distance: {rotation!r}\nmicrosteps: 4\nfull_steps_per_rotation: 400\ngear_ratio: 80:40"
         text += STEPPER.format(axis=axis, k=k, step=step)
@@ -56,14 +62,24 @@ def printer_cfg(record: dict[str, Any], stop_off: float = 0.0) -> str:
         if k == 2 and found["angles"][k] == 90.0:
             lines = lines[1:]
         saved += "".join(f"#*# {line}\n" for line in (f"[stepper_{axis}]", *lines)) + "#*#\n"
-    return text + "gcode: ; not ours\n    G28\n" + SAVED + saved + "#*# [delta_calibrate]\n" + _probed(record)
+    return (
+        text
+        + "gcode: ; not ours\n    G28\n"
+        + SAVED
+        + saved
+        + "#*# [delta_calibrate]\n"
+        + _probed(record)
+    )
 
 
 def _probed(record: dict[str, Any]) -> str:
     lines = []
     for name, rows in (("height", record["heights"]), ("manual_height", record["manual_heights"])):
         for i, row in enumerate(rows):
-            lines += [f"{name}{i} = {row['z_mm']}", f"{name}{i}_pos = {_steps(row['stable_steps'])}"]
+            lines += [
+                f"{name}{i} = {row['z_mm']}",
+                f"{name}{i}_pos = {_steps(row['stable_steps'])}",
+            ]
     for i, row in enumerate(record["distances"]):
         lines.append(f"distance{i} = {row['d_mm']}")
         lines += [f"distance{i}_pos{n} = {_steps(row[f'stable_steps_{n}'])}" for n in (1, 2)]

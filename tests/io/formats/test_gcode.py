@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""M665 and M666 of Marlin and RepRapFirmware: read, written, written into a file, and what they do not share."""
+"""M665 and M666 of Marlin and RepRapFirmware: read, written, written into a file, and what they do
+not share.
+"""
 
 import math
 from pathlib import Path
@@ -51,16 +53,26 @@ def value(robot: Mechanism, name: str) -> float:
 
 def test_reprap_stops_are_the_homed_height_plus_the_adjustments(tmp_path) -> None:
     robot = imported(tmp_path, "reprap", REPRAP)
-    assert [value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx([302.0, 301.3, 301.2])
-    assert [value(robot, f"tower{k}.angle") for k in (1, 2, 3)] == pytest.approx([209.9, 330.2, 90.0])
-    assert [value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx([269.1, 269.2, 269.3])
+    assert [value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx(
+        [302.0, 301.3, 301.2]
+    )
+    assert [value(robot, f"tower{k}.angle") for k in (1, 2, 3)] == pytest.approx(
+        [209.9, 330.2, 90.0]
+    )
+    assert [value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx(
+        [269.1, 269.2, 269.3]
+    )
     assert value(robot, "radius") == pytest.approx(130.25)
 
 
 def test_marlin_stops_are_the_height_less_the_adjustments_and_the_probe(tmp_path) -> None:
     robot = imported(tmp_path, "marlin", MARLIN)
-    assert [value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx([302.0, 301.5, 301.75])
-    assert [value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx([269.1, 269.2, 269.0])
+    assert [value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx(
+        [302.0, 301.5, 301.75]
+    )
+    assert [value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx(
+        [269.1, 269.2, 269.0]
+    )
 
 
 @pytest.mark.parametrize(("name", "text"), [("reprap", REPRAP), ("marlin", MARLIN)])
@@ -81,8 +93,14 @@ def test_corrected_words_read_back_equal_and_nothing_else_changes(tmp_path, name
         # six decimals are written; two such numbers make a stop [mm, deg]
         np.testing.assert_allclose(again.values, robot.values, rtol=0, atol=9e-9)
         if into is not None:
-            changed = [(a, b) for a, b in zip(text.splitlines(), written.splitlines(), strict=True) if a != b]
-            assert [a for a, _ in changed] == [line for line in text.splitlines() if "M665" in line or "M666" in line]
+            changed = [
+                (a, b)
+                for a, b in zip(text.splitlines(), written.splitlines(), strict=True)
+                if a != b
+            ]
+            assert [a for a, _ in changed] == [
+                line for line in text.splitlines() if "M665" in line or "M666" in line
+            ]
             assert ("B140.0" in written) == ("B140.0" in text)
         if into is not None:
             into.write_text(text)
@@ -92,7 +110,10 @@ def test_the_two_firmwares_say_the_same_printer_with_opposite_signs(tmp_path) ->
     robot = imported(tmp_path, "reprap", REPRAP)
     marlin = exported(robot, "marlin")
     assert "M666 X0.000000 " not in marlin
-    assert "M666 X-0.800000 Y-0.100000 Z-0.000000" in marlin or "M666 X-0.800000 Y-0.100000 Z0.000000" in marlin
+    assert (
+        "M666 X-0.800000 Y-0.100000 Z-0.000000" in marlin
+        or "M666 X-0.800000 Y-0.100000 Z0.000000" in marlin
+    )
     again = imported(tmp_path, "marlin", marlin)
     np.testing.assert_allclose(again.values, robot.values, rtol=0, atol=2e-9)
 
@@ -104,7 +125,10 @@ def test_a_word_that_is_not_there_is_added_before_the_comment(tmp_path) -> None:
     save_robot(robot.with_values(robot.values + shift), tmp_path / "other.yaml")
     moved = load_robot(tmp_path / "other.yaml")
     (tmp_path / "reprap.g").write_bytes(text.encode())
-    assert exported(moved, "reprap", tmp_path / "reprap.g") == "M665 L250 R130 H300 X0.057296 ; ours\r\n"
+    assert (
+        exported(moved, "reprap", tmp_path / "reprap.g")
+        == "M665 L250 R130 H300 X0.057296 ; ours\r\n"
+    )
 
 
 @pytest.mark.parametrize(
@@ -114,19 +138,47 @@ def test_a_word_that_is_not_there_is_added_before_the_comment(tmp_path) -> None:
         ("reprap", "M665 R1 H2\n", "M665 states no L"),
         ("reprap", "G20\nM665 L2 R1 H2\n", r":1: G20 asks for inches"),
         ("reprap", "G28\nM665 L2:2:2:2 R1 H2\n", r":2: L of M665 has 4 lengths"),
-        ("reprap", "M665 L250 R130 H2-3\n", r":1: H of M665 is '2-3' where a finite number is needed"),
+        (
+            "reprap",
+            "M665 L250 R130 H2-3\n",
+            r":1: H of M665 is '2-3' where a finite number is needed",
+        ),
         ("reprap", "M665 L250 R130 H200\nM666 A0.3\n", r":2: M666 A tilts the bed"),
-        ("reprap", "M665 L100 R130 H200\n", "the delta radius is 130 mm and the shortest arm 100 mm"),
+        (
+            "reprap",
+            "M665 L100 R130 H200\n",
+            "the delta radius is 130 mm and the shortest arm 100 mm",
+        ),
         ("marlin", "M665 L250 R130 H200 B80\n", r":1: M665 B without A and C"),
-        ("reprap", "G28\nM665 L269 R130,25 H250\n", r":2: R of M665 is '130,25' where a finite number is needed"),
-        ("reprap", "M665 L269 R130 ,25 H250\n", r":1: M665 has ',25 H250' where a letter and its number are needed"),
+        (
+            "reprap",
+            "G28\nM665 L269 R130,25 H250\n",
+            r":2: R of M665 is '130,25' where a finite number is needed",
+        ),
+        (
+            "reprap",
+            "M665 L269 R130 ,25 H250\n",
+            r":1: M665 has ',25 H250' where a letter and its number are needed",
+        ),
         ("reprap", "M665 269 R130 H250\n", r":1: M665 has '269 R130 H250' where a letter"),
         ("reprap", "M665 L269 R130 H250\nM666 X - 0.5\n", r":2: M666 has '0.5' where a letter"),
-        ("reprap", "M665 L{var.rod} R130 H250\n", r":1: L of M665 is '{var.rod}' where a finite number"),
+        (
+            "reprap",
+            "M665 L{var.rod} R130 H250\n",
+            r":1: L of M665 is '{var.rod}' where a finite number",
+        ),
         ("reprap", "M665 L269 R130 R131 H250\n", r":1: M665 has R twice"),
         ("reprap", "G28 G20\nM665 L269 R130 H250\n", r":1: G20 asks for inches"),
-        ("marlin", "M665 L269 R130 H250 M666 X-0.5\n", r":1: M666 is not the first command of this line"),
-        ("marlin", "M665 L250 R130 H200\nM666 X0.1\n", r":2: M666 X is 0.1, but Marlin takes none above zero"),
+        (
+            "marlin",
+            "M665 L269 R130 H250 M666 X-0.5\n",
+            r":1: M666 is not the first command of this line",
+        ),
+        (
+            "marlin",
+            "M665 L250 R130 H200\nM666 X0.1\n",
+            r":2: M666 X is 0.1, but Marlin takes none above zero",
+        ),
     ],
 )
 def test_bad_files_are_refused_with_their_line(tmp_path, name, text, sentence) -> None:
@@ -147,7 +199,9 @@ def test_bad_files_are_refused_with_their_line(tmp_path, name, text, sentence) -
 )
 def test_a_command_is_read_to_its_end_however_it_is_written(tmp_path, text) -> None:
     robot = imported(tmp_path, "reprap", text)
-    assert [value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx([300.5, 300.0, 300.0])
+    assert [value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx(
+        [300.5, 300.0, 300.0]
+    )
     assert [value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx([269.1] * 3)
     assert value(robot, "radius") == pytest.approx(130.25)
     assert exported(robot, "reprap", tmp_path / "reprap.g") == text
@@ -157,7 +211,9 @@ def test_words_are_corrected_and_added_where_they_belong_and_checksums_follow(tm
     text = "N1 m665 L269 R130 H300 M666 Y0.25*99 ; ours\n"
     robot = imported(tmp_path, "reprap", text)
     shift = 1e-3 * np.eye(len(robot.values))[robot.parameters.index("radius")]
-    shift = shift + np.deg2rad(0.5) * np.eye(len(robot.values))[robot.parameters.index("tower1.angle")]
+    shift = (
+        shift + np.deg2rad(0.5) * np.eye(len(robot.values))[robot.parameters.index("tower1.angle")]
+    )
     written = exported(robot.with_values(robot.values + shift), "reprap", tmp_path / "reprap.g")
     code = "N1 m665 L269 R131.000000 H300 X0.500000 M666 Y0.25"
     checksum = 0

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of a hanging printer: anchors from known poses, spools in the robot file, poses nobody measured, and bad files."""
+"""Samples of a hanging printer: anchors from known poses, spools in the robot file, poses nobody
+measured, and bad files.
+"""
 
 import json
 from typing import Any
@@ -8,13 +10,13 @@ import numpy as np
 import pytest
 
 from loopcal import forward, inverse
-from loopcal.calibrate import identifiability
+from loopcal.diagnose import identifiability
 from loopcal.errors import FileError
 from loopcal.io import load_measurements
+from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.formats import hangprinter
 from loopcal.io.formats.exchange import Reading
 from loopcal.io.formats.transfer import checked
-from loopcal.io.measurement_writer import save_measurements
 from tests.cable_robot import NAMES, TRUTH, example, paid_out, samples_text
 
 
@@ -46,7 +48,9 @@ def test_known_poses_are_measured_and_the_others_keep_their_readings(tmp_path) -
     (seen,) = data.observations
     np.testing.assert_array_equal(seen.rows, np.arange(9))
     np.testing.assert_allclose(seen.measured * 1e3, found["xyz_of_samp"], rtol=1e-14)
-    np.testing.assert_allclose(np.sqrt(np.diagonal(seen.covariance, axis1=1, axis2=2)), 0.6e-3, rtol=1e-14)
+    np.testing.assert_allclose(
+        np.sqrt(np.diagonal(seen.covariance, axis1=1, axis2=2)), 0.6e-3, rtol=1e-14
+    )
     assert data.labels[8:10] == ("known9", "sample10")
 
 
@@ -59,7 +63,9 @@ def test_sigma_of_a_line_becomes_that_of_its_motor(tmp_path) -> None:
 
 
 def test_line_that_builds_up_is_paid_out_as_the_spools_say(tmp_path) -> None:
-    """At the poses that the readings of the true machine reach, lines are as long as the closed form of the spools says."""
+    """At the poses that the readings of the true machine reach, lines are as long as the closed
+    form of the spools says.
+    """
     found = example()
     robot, _ = read(tmp_path, found)
     true = robot.with_values(TRUTH * 1e-3)
@@ -83,13 +89,17 @@ def test_anchors_start_exactly_from_known_poses_without_noise_and_buildup(tmp_pa
     path = tmp_path / "samples.json"
     path.write_text(json.dumps(found | {"motor_pos_samp": np.degrees(moved / gain).tolist()}))
     made = hangprinter.anchors_from_known(hangprinter.parse(path), path)
-    np.testing.assert_allclose(made, anchors, rtol=0, atol=1e-6)  # [mm], condition 1e3 of lengths of 1e3 mm
+    np.testing.assert_allclose(
+        made, anchors, rtol=0, atol=1e-6
+    )  # [mm], condition 1e3 of lengths of 1e3 mm
 
 
 def test_stated_anchors_are_taken(tmp_path) -> None:
     anchors = [[0, -1500, -90], [1200, 700, -120], [-1250, 650, -100], [0, 0, 2200]]
     robot, _ = read(tmp_path, example() | {"anchors": anchors, "xyz_of_samp": [[0, 0, 0]]})
-    np.testing.assert_allclose(robot.values[:16].reshape(4, 4)[:, :3] * 1e3, anchors, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        robot.values[:16].reshape(4, 4)[:, :3] * 1e3, anchors, rtol=0, atol=1e-9
+    )
 
 
 def test_with_stated_anchors_no_pose_need_be_known(tmp_path) -> None:
@@ -103,11 +113,18 @@ def test_with_stated_anchors_no_pose_need_be_known(tmp_path) -> None:
     assert again.n_rows == 0
     assert again.labels[0] == "sample1"
     assert "45 poses of 4 motor angles, 0 of them known" in imported.notes[0]
-    assert identifiability(robot, imported.measurements).rank == 14  # 21 less six of the frame and one of the scale
+    assert (
+        identifiability(robot, imported.measurements).rank == 14
+    )  # 21 less six of the frame and one of the scale
 
 
 def test_what_a_robot_file_cannot_say_is_told(tmp_path) -> None:
-    more = {"springKPerUnitLength": 2e4, "mover_weight": 2.0, "force_samp": [[1, 2, 3, 4]] * 41, "colour": "red"}
+    more = {
+        "springKPerUnitLength": 2e4,
+        "mover_weight": 2.0,
+        "force_samp": [[1, 2, 3, 4]] * 41,
+        "colour": "red",
+    }
     _, imported = read(tmp_path, example() | more | {"line_lengths_when_at_origin": [1, 2, 3, 4]})
     notes = " | ".join(imported.notes)
     assert "41 rows of line forces are not read" in notes
@@ -121,12 +138,24 @@ def test_what_a_robot_file_cannot_say_is_told(tmp_path) -> None:
     ("change", "sentence"),
     [
         ({"motor_pos_samp": None}, "'motor_pos_samp' is not a list of rows of numbers"),
-        ({"motor_pos_samp": [[1, 2, 3, 4], [1, 2, 3]]}, "'motor_pos_samp' is not a list of rows of numbers"),
-        ({"motor_pos_samp": [[1, 2]]}, "has 2 motors in a row; a point in space needs 3 lines or more"),
-        ({"motor_pos_samp": [[1, 2, 3, 4]]}, "'xyz_of_samp' has 9 poses and 'motor_pos_samp' only 1"),
+        (
+            {"motor_pos_samp": [[1, 2, 3, 4], [1, 2, 3]]},
+            "'motor_pos_samp' is not a list of rows of numbers",
+        ),
+        (
+            {"motor_pos_samp": [[1, 2]]},
+            "has 2 motors in a row; a point in space needs 3 lines or more",
+        ),
+        (
+            {"motor_pos_samp": [[1, 2, 3, 4]]},
+            "'xyz_of_samp' has 9 poses and 'motor_pos_samp' only 1",
+        ),
         ({"xyz_of_samp": [[1, 2]]}, "'xyz_of_samp' is not a list of rows of numbers, 3 in each"),
         ({"xyz_of_samp": [[1, 2, float("inf")]]}, "'xyz_of_samp' is not a list of rows of numbers"),
-        ({"mechanical_advantage": [2, 2, 2]}, "'mechanical_advantage' is not a list of numbers, 4 in all"),
+        (
+            {"mechanical_advantage": [2, 2, 2]},
+            "'mechanical_advantage' is not a list of numbers, 4 in all",
+        ),
         ({"mechanical_advantage": [2, 2, 2, 0]}, "all of it must be above zero"),
         ({"spool_gear_teeth": "many"}, "'spool_gear_teeth' is not a number"),
         ({"anchors": [[1, 2, 3]]}, "'anchors' has 1 rows for 4 lines"),
@@ -147,7 +176,10 @@ def test_known_poses_in_the_plane_of_the_origin_are_refused_with_the_remedy(tmp_
         read(tmp_path, found | {"xyz_of_samp": flat})
 
 
-@pytest.mark.parametrize(("text", "sentence"), [("{\n  [", r"samples.json:2: this is no JSON"), ("[1]", "'motor_pos_samp'")])
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [("{\n  [", r"samples.json:2: this is no JSON"), ("[1]", "'motor_pos_samp'")],
+)
 def test_what_is_no_file_of_samples_is_refused(tmp_path, text, sentence) -> None:
     path = tmp_path / "samples.json"
     path.write_text(text)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Klipper's printer.cfg: which option counts, Klipper's defaults, options that are not there yet, and bad files."""
+"""Klipper's printer.cfg: which option counts, Klipper's defaults, options that are not there yet,
+and bad files.
+"""
 
 import numpy as np
 import pytest
@@ -51,12 +53,19 @@ def test_defaults_are_those_of_klipper_and_the_main_part_hides_the_saved_one(tmp
 @pytest.mark.parametrize("text", [SHORT, SHORT + SAVED, SHORT.rstrip("\n"), SHORT + "\n\n"])
 def test_numbers_that_were_left_out_are_added_to_the_saved_block(tmp_path, text) -> None:
     robot = read(tmp_path, text)
-    moved = robot.with_values(robot.values + 1e-3 * np.arange(1, 11) * (np.array(robot.parameters.names) != "tower3.angle"))
+    moved = robot.with_values(
+        robot.values
+        + 1e-3 * np.arange(1, 11) * (np.array(robot.parameters.names) != "tower3.angle")
+    )
     written = klipper.write(Source(moved), tmp_path / "printer.cfg").text
     again = read(tmp_path, written)
-    np.testing.assert_allclose(again.values, moved.values, rtol=0, atol=1e-8)  # six decimals [mm, deg]
+    np.testing.assert_allclose(
+        again.values, moved.values, rtol=0, atol=1e-8
+    )  # six decimals [mm, deg]
     # without the new lines the old ones are left, but for the numbers that were changed
-    assert written.startswith("[printer]\nkinematics: delta\ndelta_radius: 131.000000\n[stepper_a]\narm_length = ")
+    assert written.startswith(
+        "[printer]\nkinematics: delta\ndelta_radius: 131.000000\n[stepper_a]\narm_length = "
+    )
     assert "rotation_distance: 40\nmicrosteps: 16\n[stepper_b]\n[stepper_c]\n" in written
     assert written.count("SAVE_CONFIG") == 1
     assert written.count("[stepper_b]") == 2
@@ -75,7 +84,11 @@ def test_without_a_file_a_block_to_paste_is_written(tmp_path) -> None:
     block = klipper.write(Source(robot), None).text
     assert block.startswith("#*# <------")
     assert all(line.startswith("#*#") for line in block.splitlines())
-    pasted = SHORT.replace("delta_radius: 130\n", "").replace("position_endstop: 300\n", "") + "\n" + block
+    pasted = (
+        SHORT.replace("delta_radius: 130\n", "").replace("position_endstop: 300\n", "")
+        + "\n"
+        + block
+    )
     np.testing.assert_array_equal(read(tmp_path, pasted).values, robot.values)
 
 
@@ -83,12 +96,24 @@ def test_without_a_file_a_block_to_paste_is_written(tmp_path) -> None:
     ("change", "sentence"),
     [
         (("kinematics: delta", "kinematics: corexy"), ":2: kinematics is 'corexy'"),
-        (("delta_radius: 130", ""), r"option 'delta_radius' of \[printer\] is missing, and has no default|is missing"),
+        (
+            ("delta_radius: 130", ""),
+            r"option 'delta_radius' of \[printer\] is missing, and has no default|is missing",
+        ),
         (("delta_radius: 130", "[include geometry.cfg]"), "it may stand in geometry.cfg"),
-        (("position_endstop: 300", "position_endstop: high"), ":6: 'position_endstop' of .* is 'high' where a finite number"),
+        (
+            ("position_endstop: 300", "position_endstop: high"),
+            ":6: 'position_endstop' of .* is 'high' where a finite number",
+        ),
         (("position_endstop: 300", "position_endstop: inf"), ":6: "),
-        (("arm_length = 250", "arm_length = 120"), "the delta radius is 130 mm and the shortest arm 120 mm"),
-        (("[stepper_c]\n", "[delta_calibrate]\nheight0: 0\nheight0_pos: 1,2\n"), ":12: 'height0_pos' .* has 2 numbers"),
+        (
+            ("arm_length = 250", "arm_length = 120"),
+            "the delta radius is 130 mm and the shortest arm 120 mm",
+        ),
+        (
+            ("[stepper_c]\n", "[delta_calibrate]\nheight0: 0\nheight0_pos: 1,2\n"),
+            ":12: 'height0_pos' .* has 2 numbers",
+        ),
         (("[stepper_c]\n", "[delta_calibrate]\nheight0: 0\n"), "'height0_pos' of .* is missing"),
         (
             ("[stepper_c]\n", "[delta_calibrate]\nheight0: 0\nheight0_pos: 1,2,3\n"),
@@ -104,12 +129,16 @@ def test_bad_files_are_refused_in_one_sentence(tmp_path, change, sentence) -> No
 
 @pytest.mark.parametrize("ratio", ["80", "80:0", "a:b", "1:2:3"])
 def test_gear_ratios_that_are_none_are_refused(tmp_path, ratio) -> None:
-    (tmp_path / "printer.cfg").write_text(SHORT.replace("microsteps: 16", f"microsteps: 16\ngear_ratio: {ratio}"))
+    (tmp_path / "printer.cfg").write_text(
+        SHORT.replace("microsteps: 16", f"microsteps: 16\ngear_ratio: {ratio}")
+    )
     with pytest.raises(FileError, match=":9: gear_ratio is"):
         klipper.step_distance(printer_cfg.read(tmp_path / "printer.cfg"), "stepper_a")
 
 
 def test_steps_of_geared_motors(tmp_path) -> None:
-    (tmp_path / "printer.cfg").write_text(SHORT.replace("microsteps: 16", "microsteps: 16\ngear_ratio: 57:11, 2:1"))
+    (tmp_path / "printer.cfg").write_text(
+        SHORT.replace("microsteps: 16", "microsteps: 16\ngear_ratio: 57:11, 2:1")
+    )
     found = klipper.step_distance(printer_cfg.read(tmp_path / "printer.cfg"), "stepper_a")
     assert found == pytest.approx(40 / (200 * 16 * 57 / 11 * 2), rel=1e-15)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LinuxCNC's genhexkins settings: against numbers that LinuxCNC's own code printed, read, corrected, and bad files."""
+"""LinuxCNC's genhexkins settings: against numbers that LinuxCNC's own code printed, read,
+corrected, and bad files.
+"""
 
 import json
 from pathlib import Path
@@ -7,15 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal import se3
+from loopcal import geometry as rigid
 from loopcal.errors import DataError, FileError
-from loopcal.io import load_robot, robot_file
+from loopcal.io import load_robot
 from loopcal.io.formats import linuxcnc
 from loopcal.io.formats.exchange import Reading, Source
 from loopcal.io.formats.transfer import checked
+from loopcal.io.robot import robot_file
 from loopcal.mechanism import Mechanism, inverse
 
-PINS = {"base": "base", "platform": "platform", "base-n": "base_joint_axis", "platform-n": "platform_joint_axis"}
+PINS = {
+    "base": "base",
+    "platform": "platform",
+    "base-n": "base_joint_axis",
+    "platform-n": "platform_joint_axis",
+}
 
 
 def hal(geometry: dict, lead: float = 0.0, lift: float = 0.0) -> str:
@@ -34,7 +42,9 @@ def hal(geometry: dict, lead: float = 0.0, lift: float = 0.0) -> str:
 def read(folder: Path, text: str, **options) -> Mechanism:
     path = folder / "hexapod.hal"
     path.write_text(text)
-    return checked(path, linuxcnc.read(path, Reading("hexapod", **{"length_unit": "mm", **options})))
+    return checked(
+        path, linuxcnc.read(path, Reading("hexapod", **{"length_unit": "mm", **options}))
+    )
 
 
 @pytest.fixture
@@ -44,18 +54,24 @@ def geometry(data_folder) -> dict:
 
 @pytest.mark.parametrize("lift", [0.0, 7.5])
 @pytest.mark.parametrize(("lead", "oracle"), [(0.0, "default"), (4.0, "screwlead4")])
-def test_strut_lengths_are_those_of_linuxcnc(tmp_path, data_folder, geometry, lead, oracle, lift) -> None:
+def test_strut_lengths_are_those_of_linuxcnc(
+    tmp_path, data_folder, geometry, lead, oracle, lift
+) -> None:
     robot = read(tmp_path, hal(geometry, lead, lift), home_height=0.020)
-    table = np.genfromtxt(data_folder / "kinematics_oracles" / f"genhexkins_{oracle}_200poses.csv", delimiter=",", names=True)
+    table = np.genfromtxt(
+        data_folder / "kinematics_oracles" / f"genhexkins_{oracle}_200poses.csv",
+        delimiter=",",
+        names=True,
+    )
     angles = np.radians(np.stack([table[f"{axis}_deg"] for axis in "abc"], axis=1))
     position = np.stack([table[axis] for axis in "xyz"], axis=1) * 1e-3
-    found = inverse(robot, se3.pose(se3.euler_to_matrix(angles, "xyz"), position))
+    found = inverse(robot, rigid.pose(rigid.euler_to_matrix(angles, "xyz"), position))
     assert found.converged.all()
     expected = np.stack([table[f"L{n}"] for n in range(6)], axis=1) * 1e-3
     off = np.abs(found.q - expected)
     if lead:
         # asin(sin a) is a while no strut turns past a quarter turn from where it was at home
-        R, struts = se3.euler_to_matrix(angles, "xyz"), np.array(geometry["platform"])
+        R, struts = rigid.euler_to_matrix(angles, "xyz"), np.array(geometry["platform"])
         along = position[:, None] * 1e3 + struts @ np.swapaxes(R, 1, 2) - np.array(geometry["base"])
         along /= np.linalg.norm(along, axis=2, keepdims=True)
         low, high = (
@@ -78,10 +94,16 @@ def test_a_calibrated_hexapod_reads_back_equal_and_nothing_else_changes(tmp_path
     written = linuxcnc.write(Source(moved), tmp_path / "hexapod.hal")
     again = read(tmp_path, written.text)
     centres = [i for i, name in enumerate(names) if not name.endswith("length")]
-    np.testing.assert_allclose(again.values[centres], moved.values[centres], rtol=0, atol=1e-15)  # [m]
-    changed = [a for a, b in zip(text.splitlines(), written.text.splitlines(), strict=True) if a != b]
+    np.testing.assert_allclose(
+        again.values[centres], moved.values[centres], rtol=0, atol=1e-15
+    )  # [m]
+    changed = [
+        a for a, b in zip(text.splitlines(), written.text.splitlines(), strict=True) if a != b
+    ]
     assert len(changed) == 36
-    assert all(line.startswith(("setp genhexkins.base.", "setp genhexkins.platform.")) for line in changed)
+    assert all(
+        line.startswith(("setp genhexkins.base.", "setp genhexkins.platform.")) for line in changed
+    )
     assert written.text.count("# as built") == text.count("# as built")
     # lengths have no pin, and that is said
     said = [note for note in written.notes if note.startswith("not said by genhexkins: strut")]
@@ -89,15 +111,21 @@ def test_a_calibrated_hexapod_reads_back_equal_and_nothing_else_changes(tmp_path
     assert "HOME_OFFSET of [JOINT_0]" in said[0]
 
 
-def test_an_unchanged_hexapod_leaves_the_file_alone_and_lines_of_its_own_read_back(tmp_path, geometry) -> None:
+def test_an_unchanged_hexapod_leaves_the_file_alone_and_lines_of_its_own_read_back(
+    tmp_path, geometry
+) -> None:
     text = hal(geometry).rstrip("\n")
     robot = read(tmp_path, text)
     assert linuxcnc.write(Source(robot), tmp_path / "hexapod.hal").text == text
-    np.testing.assert_array_equal(read(tmp_path, linuxcnc.write(Source(robot), None).text).values, robot.values)
+    np.testing.assert_array_equal(
+        read(tmp_path, linuxcnc.write(Source(robot), None).text).values, robot.values
+    )
 
 
 def test_a_pin_that_was_left_at_zero_is_added(tmp_path, geometry) -> None:
-    text = "".join(line for line in hal(geometry).splitlines(keepends=True) if ".base.0.z" not in line)
+    text = "".join(
+        line for line in hal(geometry).splitlines(keepends=True) if ".base.0.z" not in line
+    )
     robot = read(tmp_path, text)
     values = robot.values.copy()
     values[robot.parameters.index("leg1.base.z")] = 2.5e-4
@@ -114,7 +142,9 @@ def test_screws_of_several_leads_are_refused(tmp_path, geometry) -> None:
     robot = read(tmp_path, hal(geometry, 4.0))
     source = robot.record
     assert isinstance(source, robot_file.RobotSource)
-    (tmp_path / "two.yaml").write_text(source.text.replace("  lead: [", "  lead: [5.0, 4, 4, 4, 4, 4]  # ["))
+    (tmp_path / "two.yaml").write_text(
+        source.text.replace("  lead: [", "  lead: [5.0, 4, 4, 4, 4, 4]  # [")
+    )
     with pytest.raises((DataError, FileError), match="screws of different lead"):
         linuxcnc.write(Source(load_robot(tmp_path / "two.yaml")), None)
 
@@ -124,10 +154,16 @@ def test_screws_of_several_leads_are_refused(tmp_path, geometry) -> None:
     [
         (("genhexkins.", "hexkins."), {}, "there is no 'setp genhexkins...' in this file"),
         (("setp genhexkins.base.0.x", "# setp"), {}, "there is no 'setp genhexkins.base.0.x ..'"),
-        (("base.0.y 13.25", "base.0.y [HEX]B0Y"), {}, r":5: genhexkins.base.0.y is '\[HEX\]B0Y' where a finite number"),
+        (
+            ("base.0.y 13.25", "base.0.y [HEX]B0Y"),
+            {},
+            r":5: genhexkins.base.0.y is '\[HEX\]B0Y' where a finite number",
+        ),
         (("", ""), {"length_unit": None}, "a HAL file states no unit of length"),
     ],
 )
-def test_bad_files_are_refused_in_one_sentence(tmp_path, geometry, change, options, sentence) -> None:
+def test_bad_files_are_refused_in_one_sentence(
+    tmp_path, geometry, change, options, sentence
+) -> None:
     with pytest.raises(FileError, match=sentence):
         read(tmp_path, hal(geometry).replace(*change) if change[0] else hal(geometry), **options)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""URDF with loop closures: what is in the two public files, agreement with the tree's own kinematics, origins out."""
+"""URDF with loop closures: what is in the two public files, agreement with the tree's own
+kinematics, origins out.
+"""
 
 import re
 from pathlib import Path
@@ -15,7 +17,8 @@ from loopcal.mechanism import Mechanism, forward, inverse
 
 FIVE_BAR, DELTA = "5bar_linkage", "robot_delta"
 FRAME = {FIVE_BAR: "effector", DELTA: "eff"}
-# bodies with the base, joints, loops, mobility: by hand from the drawings; 3 (bodies - 1) - 2 joints = mobility in a plane
+# bodies with the base, joints, loops, mobility: by hand from the drawings; 3 (bodies - 1) - 2
+# joints = mobility in a plane
 COUNTS = {FIVE_BAR: (5, 5, 1, 2), DELTA: (9, 11, 3, 2)}
 
 
@@ -52,7 +55,9 @@ def test_the_loops_are_closed_at_home(read, name) -> None:
 
 @pytest.mark.parametrize("name", COUNTS)
 def test_poses_are_those_of_the_tree_with_its_loops_closed(files, read, name) -> None:
-    """The tree's joints closed by Newton on all of its loops, the branches too, against the limbs of the robot file."""
+    """The tree's joints closed by Newton on all of its loops, the branches too, against the limbs
+    of the robot file.
+    """
     robot, tree = read[name][1], urdf_tree.read(files[name])
     body, frame = tree.body(FRAME[name]), tree.in_body(FRAME[name])
     loops = urdf_loops.read(tree, files[name].with_name("robot.yaml"))
@@ -61,7 +66,9 @@ def test_poses_are_those_of_the_tree_with_its_loops_closed(files, read, name) ->
     q = np.array([[one.values[motor] for motor in loops.motors] for one in near])
     found = forward(robot, q)
     assert found.converged.all()
-    np.testing.assert_allclose(found.T, [one.places[body] @ frame for one in near], rtol=0, atol=1e-11)  # [m, 1]
+    np.testing.assert_allclose(
+        found.T, [one.places[body] @ frame for one in near], rtol=0, atol=1e-11
+    )  # [m, 1]
 
 
 @pytest.mark.parametrize("name", COUNTS)
@@ -73,7 +80,9 @@ def test_an_unchanged_robot_leaves_the_file_byte_for_byte(files, read, name) -> 
 def test_only_attributes_of_origins_change(files, read, name) -> None:
     robot = moved(read[name][1])
     before, after = files[name].read_text(), urdf.write(Source(robot), files[name]).text
-    changed = [(a, b) for a, b in zip(before.splitlines(), after.splitlines(), strict=True) if a != b]
+    changed = [
+        (a, b) for a, b in zip(before.splitlines(), after.splitlines(), strict=True) if a != b
+    ]
     assert len(changed) == {FIVE_BAR: 6, DELTA: 7}[name]
     for a, b in changed:
         assert re.sub(r'(xyz|rpy)="[^"]*"', "", a) == re.sub(r'(xyz|rpy)="[^"]*"', "", b)
@@ -110,14 +119,14 @@ def test_a_urdf_needs_a_file_to_be_corrected(read) -> None:
 
 
 def test_another_machine_is_not_corrected(tmp_path, files, read) -> None:
-    (tmp_path / "other.urdf").write_text(files[FIVE_BAR].read_text().replace('xyz="0.1000', 'xyz="0.2000'))
+    (tmp_path / "other.urdf").write_text(
+        files[FIVE_BAR].read_text().replace('xyz="0.1000', 'xyz="0.2000')
+    )
     with pytest.raises(FileError, match="export into the URDF that it came from"):
         urdf.write(Source(read[FIVE_BAR][1]), tmp_path / "other.urdf")
 
 
-JOINT = (
-    '<joint name="a" type="revolute"><origin xyz="0 0 1"/><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/></joint>'
-)
+JOINT = '<joint name="a" type="revolute"><origin xyz="0 0 1"/><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/></joint>'
 
 
 @pytest.mark.parametrize(
@@ -126,20 +135,33 @@ JOINT = (
         ("<robot><link name='a'>", ":1: this is no XML"),
         ("<!DOCTYPE robot><robot/>", ":1: a document type is no part of a URDF"),
         (
-            "<robot><link name='base'/><link name='arm'/>\n" + JOINT.replace("0 0 1", "0 1", 1) + "</robot>",
+            "<robot><link name='base'/><link name='arm'/>\n"
+            + JOINT.replace("0 0 1", "0 1", 1)
+            + "</robot>",
             ":2: xyz of joint 'a' is",
         ),
         (
-            "<robot><link name='base'/><link name='arm'/>\n" + JOINT.replace("revolute", "planar") + "</robot>",
+            "<robot><link name='base'/><link name='arm'/>\n"
+            + JOINT.replace("revolute", "planar")
+            + "</robot>",
             ":2: joint 'a' is of type",
         ),
-        ("<robot><link name='base'/>\n" + JOINT + "</robot>", ":2: joint 'a' names the link 'arm', which is not there"),
-        ("<robot><link name='base'/><link name='arm'/></robot>", "a URDF has one root link, this has 2"),
+        (
+            "<robot><link name='base'/>\n" + JOINT + "</robot>",
+            ":2: joint 'a' names the link 'arm', which is not there",
+        ),
+        (
+            "<robot><link name='base'/><link name='arm'/></robot>",
+            "a URDF has one root link, this has 2",
+        ),
         (
             "<robot><link name='base'/><link name='arm'/>\n" + JOINT + JOINT + "</robot>",
             ":2: joint 'a' stands here for the second time",
         ),
-        ("<robot><link name='base'/><link name='arm'/>\n" + JOINT + "</robot>", "name the file of closures, as --closures"),
+        (
+            "<robot><link name='base'/><link name='arm'/>\n" + JOINT + "</robot>",
+            "name the file of closures, as --closures",
+        ),
     ],
 )
 def test_bad_files_are_refused_in_one_sentence(tmp_path, text, sentence) -> None:
@@ -151,7 +173,10 @@ def test_bad_files_are_refused_in_one_sentence(tmp_path, text, sentence) -> None
 @pytest.mark.parametrize(
     ("closures", "sentence"),
     [
-        ("closed_loop: [[a, b]]\ntype: ['6d']\nname_mot: [a]\n", ":1: the closure 'b' is no joint of a.urdf"),
+        (
+            "closed_loop: [[a, b]]\ntype: ['6d']\nname_mot: [a]\n",
+            ":1: the closure 'b' is no joint of a.urdf",
+        ),
         ("closed_loop: []\ntype: []\nname_mot: []\n", "no motor is named"),
         ("closed_loop: [[a, a]]\ntype: ['3d']\nname_mot: []\n", ":2: closure 'a' is of type '3d'"),
         ("closed_loop: 1\n", "write 'closed_loop:' as a list of pairs"),
@@ -159,7 +184,9 @@ def test_bad_files_are_refused_in_one_sentence(tmp_path, text, sentence) -> None
     ],
 )
 def test_bad_closures_are_refused_in_one_sentence(tmp_path, closures, sentence) -> None:
-    (tmp_path / "a.urdf").write_text("<robot><link name='base'/><link name='arm'/>\n" + JOINT + "</robot>")
+    (tmp_path / "a.urdf").write_text(
+        "<robot><link name='base'/><link name='arm'/>\n" + JOINT + "</robot>"
+    )
     (tmp_path / "a.yaml").write_text(closures)
     with pytest.raises(LoopcalError, match=sentence):
         urdf.read(tmp_path / "a.urdf", Reading("a"))

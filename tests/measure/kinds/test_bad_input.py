@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from loopcal import se3
-from loopcal.calibrate import identifiability
+from loopcal import geometry
+from loopcal.diagnose import identifiability
 from loopcal.errors import DataError, LoopcalError
 from loopcal.measure import (
     KINDS,
@@ -32,23 +32,42 @@ from loopcal.measure import (
 from tests import zoo
 
 POINT = np.zeros((1, 3))
-EXAMPLES = [pytest.param(kind, id=f"{name}-{i}") for name, cls in KINDS.items() for i, kind in enumerate(cls.examples())]
+EXAMPLES = [
+    pytest.param(kind, id=f"{name}-{i}")
+    for name, cls in KINDS.items()
+    for i, kind in enumerate(cls.examples())
+]
 
 
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
         (lambda: Position(targets=()), "the targets are none: name at least one"),
-        (lambda: Position(targets=("a", "a")), "the targets are a, a: name at least one, and each once"),
-        (lambda: Position(targets=("a", "b"), places=POINT), r"the places of the targets has shape \(1, 3\); .*\(2, 3\)"),
+        (
+            lambda: Position(targets=("a", "a")),
+            "the targets are a, a: name at least one, and each once",
+        ),
+        (
+            lambda: Position(targets=("a", "b"), places=POINT),
+            r"the places of the targets has shape \(1, 3\); .*\(2, 3\)",
+        ),
         (
             lambda: Position(unknown=("tracker",)),
             "'tracker' cannot be unknown in the kind 'position'; what can be is frame, targets",
         ),
         (lambda: Position(T_base_frame=2.0 * np.eye(4)), "T_base_frame is not a pose"),
-        (lambda: Bearing(form="telescope"), "the form of a bearing is 'telescope'; use theodolite or camera"),
-        (lambda: Distance(anchor=np.array([0.0, np.nan, 0.0])), "the anchor: row 2 is nan; give a finite number"),
-        (lambda: Plane(along=np.zeros(3)), "the direction of the surface is 0, 0, 0, which points nowhere"),
+        (
+            lambda: Bearing(form="telescope"),
+            "the form of a bearing is 'telescope'; use theodolite or camera",
+        ),
+        (
+            lambda: Distance(anchor=np.array([0.0, np.nan, 0.0])),
+            "the anchor: row 2 is nan; give a finite number",
+        ),
+        (
+            lambda: Plane(along=np.zeros(3)),
+            "the direction of the surface is 0, 0, 0, which points nowhere",
+        ),
         (lambda: Sphere(radius=0.0), "the radius of a sphere is 0.0 m; give a length above 0"),
         (lambda: Direction(axis=np.zeros(3)), "the axis is 0, 0, 0, which points nowhere"),
         (lambda: Inclination(unknown=("frame",)), "what can be is mounting, gravity"),
@@ -64,31 +83,43 @@ def test_settings_that_make_no_kind(make, sentence):
 @pytest.mark.parametrize(
     ("kind", "row", "sentence"),
     [
-        (Distance(places=POINT), [0.0], "row 2 of kind 'distance' has a distance of 0 m; a distance is above 0"),
+        (
+            Distance(places=POINT),
+            [0.0],
+            "row 2 of kind 'distance' has a distance of 0 m; a distance is above 0",
+        ),
         (Separation(places=POINT), [-0.1], "has a distance of -0.1 m"),
         (Direction(), [0.0, 0.6, 0.7], "has a direction of length 0.921954; it must be 1 to 1e-3"),
         (Direction(), [0.0, np.nan, 1.0], "has only a part of its direction"),
         (Inclination(), [0.9, 0.9], "has tilts of 51.5662 and 51.5662 deg, which no direction has"),
         (Inclination(), [2.0, 0.0], "has tilts of 114.592 and 0 deg"),
-        (Autocollimation(), [0.0, 1.6], "has an angle of 91.6732 deg, at which a mirror faces away"),
+        (
+            Autocollimation(),
+            [0.0, 1.6],
+            "has an angle of 91.6732 deg, at which a mirror faces away",
+        ),
     ],
 )
 def test_rows_that_no_instrument_shows(kind, row, sentence):
-    good = {"distance": [1.0], "separation": [1.0], "direction": [0.0, 0.0, 1.0]}.get(kind.name, [0.0, 0.0])
+    good = {"distance": [1.0], "separation": [1.0], "direction": [0.0, 0.0, 1.0]}.get(
+        kind.name, [0.0, 0.0]
+    )
     poses = np.arange(2) if kind.links == 1 else np.array([[0, 1], [1, 0]])
     with pytest.raises(DataError, match=sentence):
         Observations.from_sigma(kind, poses, [good, row], 1e-4)
 
 
 def test_a_row_that_compares_a_pose_with_itself():
-    with pytest.raises(DataError, match="row 2 of kind 'separation' links pose 3 with itself; name two poses"):
+    with pytest.raises(
+        DataError, match="row 2 of kind 'separation' links pose 3 with itself; name two poses"
+    ):
         Observations.from_sigma(Separation(places=POINT), [[0, 1], [3, 3]], np.ones((2, 1)), 1e-4)
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
 def test_a_covariance_that_is_not_positive_definite_and_rows_that_repeat(kind):
     kind = kind.mounted(np.eye(4))
-    T = se3.exp_update(np.eye(4), np.random.default_rng(0).uniform(-0.4, 0.4, (1, 3, 6)))
+    T = geometry.exp_update(np.eye(4), np.random.default_rng(0).uniform(-0.4, 0.4, (1, 3, 6)))
     rows = np.array([0, 1, 1]) if kind.links == 1 else np.array([[0, 1], [1, 2], [1, 2]])
     m = len(kind.noise_columns)
     measured = kind.measure(T[:, rows], np.zeros((1, 3, m)))[0]
@@ -96,7 +127,9 @@ def test_a_covariance_that_is_not_positive_definite_and_rows_that_repeat(kind):
         Observations(kind, rows, measured, np.zeros((m, m)))
     twice = Observations.from_sigma(kind, rows, measured, 1e-4)
     data = Measurements("toy", np.arange(3.0)[:, None], (twice,))
-    with pytest.raises(DataError, match=f"poses '2' and '2' have the same readings and the same {kind.name} values"):
+    with pytest.raises(
+        DataError, match=f"poses '2' and '2' have the same readings and the same {kind.name} values"
+    ):
         check_duplicates(data)
     apart = Observations.from_sigma(kind, rows, measured, 1e-4, group=np.array(["a", "b", "c"]))
     check_duplicates(Measurements("toy", np.arange(3.0)[:, None], (apart,)))
@@ -115,43 +148,80 @@ def test_a_target_that_no_pose_moves_is_named():
     noise = 1e-5 * np.random.default_rng(1).normal(size=(1, 8, 6))
     measured = kind.measure(T[None], noise)[0]
     readings = np.arange(8.0)[:, None]
-    check_moved(Measurements("toy", readings, (Observations.from_sigma(kind, np.arange(8), measured, 1e-5),)), T)
+    check_moved(
+        Measurements(
+            "toy", readings, (Observations.from_sigma(kind, np.arange(8), measured, 1e-5),)
+        ),
+        T,
+    )
     measured[:, 3:] = measured[0, 3:] + noise[0, :, 3:]
-    data = Measurements("toy", readings, (Observations.from_sigma(kind, np.arange(8), measured, 1e-5),))
-    with pytest.raises(DataError, match=r"'b' of kind 'position' never moves: its readings stay within .*use --allow-still"):
+    data = Measurements(
+        "toy", readings, (Observations.from_sigma(kind, np.arange(8), measured, 1e-5),)
+    )
+    with pytest.raises(
+        DataError,
+        match=r"'b' of kind 'position' never moves: its readings stay within .*use --allow-still",
+    ):
         check_moved(data, T, override="--allow-still")
     check_moved(data, T, allow=True)
 
 
-FOLLOWING = [kind for cls in KINDS.values() for kind in cls.examples()[:1] if kind.follows and kind.links == 1]
+FOLLOWING = [
+    kind
+    for cls in KINDS.values()
+    for kind in cls.examples()[:1]
+    if kind.follows and kind.links == 1
+]
 
 
 @pytest.mark.parametrize("kind", FOLLOWING, ids=lambda kind: kind.name)
 def test_readings_that_never_move_are_refused_in_every_kind_that_follows_the_robot(kind):
     kind = kind.mounted(np.eye(4))
-    T = zoo.poses_of(np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)) + np.array([0, 0, 0, 0.1, 0.1, 0.0]))
+    T = zoo.poses_of(
+        np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)) + np.array([0, 0, 0, 0.1, 0.1, 0.0])
+    )
     noise = 1e-6 * np.random.default_rng(1).normal(size=(1, 8, len(kind.noise_columns)))
-    true, still = kind.measure(T[None], noise)[0], kind.measure(np.repeat(T[:1], 8, axis=0)[None], noise)[0]
+    true, still = (
+        kind.measure(T[None], noise)[0],
+        kind.measure(np.repeat(T[:1], 8, axis=0)[None], noise)[0],
+    )
     readings = np.arange(8.0)[:, None]
-    good, bad = (Observations.from_sigma(kind, np.arange(8), values, 1e-6) for values in (true, still))
+    good, bad = (
+        Observations.from_sigma(kind, np.arange(8), values, 1e-6) for values in (true, still)
+    )
     check_moved(Measurements("toy", readings, (good,)), T)
-    with pytest.raises(DataError, match=f"of kind '{kind.name}' never moves: its readings stay within"):
+    with pytest.raises(
+        DataError, match=f"of kind '{kind.name}' never moves: its readings stay within"
+    ):
         check_moved(Measurements("toy", readings, (bad,)), T)
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
 def test_poses_in_one_plane_are_told_what_they_leave_open_or_refused_in_a_sentence(kind):
-    """No turn and one height: something stays open in every kind, and is named; where a frame cannot be found, that is said."""
+    """No turn and one height: something stays open in every kind, and is named; where a frame
+    cannot be found, that is said.
+    """
     robot = zoo.hexapod()
-    flat = np.column_stack([np.random.default_rng(0).uniform(-0.03, 0.03, (10, 2)), np.full(10, 0.2), np.zeros((10, 3))])
+    flat = np.column_stack(
+        [
+            np.random.default_rng(0).uniform(-0.03, 0.03, (10, 2)),
+            np.full(10, 0.2),
+            np.zeros((10, 3)),
+        ]
+    )
     sensor = Sensor(kind, Gaussian(np.full(len(kind.noise_columns), 1e-5)))
     found, refused = None, ""
     try:
-        found = identifiability(robot, simulate(robot, zoo.poses_of(flat), Instrument((sensor,)), 0))
+        found = identifiability(
+            robot, simulate(robot, zoo.poses_of(flat), Instrument((sensor,)), 0)
+        )
     except LoopcalError as error:
         refused = str(error)
     if found is None:
-        assert any(words in refused for words in ("measured in one plane, so it can be on either side", "are the same turn"))
+        assert any(
+            words in refused
+            for words in ("measured in one plane, so it can be on either side", "are the same turn")
+        )
         return
     assert found.rank < found.n_parameters
     assert len(found.unidentifiable) == found.n_parameters - found.rank

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kind `component`: subsets, wrapped angles, the normal near zero tilt, mapped covariances, refusals."""
+"""Kind `component`: subsets, wrapped angles, the normal near zero tilt, mapped covariances,
+refusals.
+"""
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure import Component, Observations, Pose
 from loopcal.measure.kinds.component import FLAT
@@ -15,13 +17,15 @@ FIVE = Component(("x", "y", "z", "phi", "theta"), "tilt-torsion", T_platform_too
 
 
 def poses_of(phi, theta, psi):
-    return se3.pose(se3.tilt_torsion_to_matrix(*np.broadcast_arrays(phi, theta, psi)), np.zeros(3))[None]
+    return geometry.pose(
+        geometry.tilt_torsion_to_matrix(*np.broadcast_arrays(phi, theta, psi)), np.zeros(3)
+    )[None]
 
 
 def test_a_probed_height_is_z_of_the_tool_alone():
-    T_platform_tool = se3.pose(np.eye(3), np.array([0.0, 0.1, -0.2]))
+    T_platform_tool = geometry.pose(np.eye(3), np.array([0.0, 0.1, -0.2]))
     height = Component(T_platform_tool=T_platform_tool)
-    T = se3.pose(se3.axis_rotation(0.5, 0), np.array([1.0, 2.0, 3.0]))[None, None]
+    T = geometry.pose(geometry.axis_rotation(0.5, 0), np.array([1.0, 2.0, 3.0]))[None, None]
     residual, jacobian, own, _ = height.evaluate(T, np.array([[[3.0]]]))
     assert own is None
     assert_allclose(residual, 0.1 * np.sin(0.5) - 0.2 * np.cos(0.5), atol=1e-15)
@@ -30,7 +34,9 @@ def test_a_probed_height_is_z_of_the_tool_alone():
 
 def test_angle_differences_wrap_across_half_a_turn():
     kind = Component(("a", "c"), "euler-xyz", T_platform_tool=np.eye(4))
-    T = se3.pose(se3.euler_to_matrix(np.array([np.pi - 1e-3, 0.2, -np.pi + 2e-3]), "xyz"), np.zeros(3))[None, None]
+    T = geometry.pose(
+        geometry.euler_to_matrix(np.array([np.pi - 1e-3, 0.2, -np.pi + 2e-3]), "xyz"), np.zeros(3)
+    )[None, None]
     residual = kind.evaluate(T, np.array([[[-np.pi + 1e-3, np.pi - 2e-3]]])).residual
     assert_allclose(residual[0, 0], [-2e-3, 4e-3], atol=1e-15)
 
@@ -49,22 +55,28 @@ def test_near_zero_tilt_the_normal_stands_in_for_phi_and_theta(theta):
     assert_allclose(FIVE.evaluate(T, measured).residual, -noise, atol=1e-15)
 
     def residual(x):
-        return FIVE.evaluate(se3.exp_update(T, x), measured).residual
+        return FIVE.evaluate(geometry.exp_update(T, x), measured).residual
 
     result = FIVE.evaluate(T, measured)
-    # jax cannot pass the angles of zero tilt themselves, which the normal replaces: 0 times their infinite slope.
+    # jax cannot pass the angles of zero tilt themselves, which the normal replaces: 0 times their
+    # infinite slope.
     automatic = residual if theta > 1e-6 else None
     check_jacobian(residual, result.jacobian, np.zeros(6), scale=0.02, automatic=automatic)
 
 
 def test_the_information_does_not_jump_where_the_normal_takes_over():
     covariance = np.diag([1e-10, 1e-10, 1e-10, 1e-12, 1e-12, 1e-12])[None]
-    measured = np.array([[0.0, 0.0, 0.0, 0.7, FLAT * (1 - 1e-9)], [0.0, 0.0, 0.0, 0.7, FLAT * (1 + 1e-9)]])
+    measured = np.array(
+        [[0.0, 0.0, 0.0, 0.7, FLAT * (1 - 1e-9)], [0.0, 0.0, 0.0, 0.7, FLAT * (1 + 1e-9)]]
+    )
     T = poses_of(measured[:, 3], measured[:, 4], np.zeros(2))
-    data = Observations(FIVE, np.arange(2), measured, FIVE.covariance_of_rotation(measured, covariance))
+    data = Observations(
+        FIVE, np.arange(2), measured, FIVE.covariance_of_rotation(measured, covariance)
+    )
     white = data.whitener @ data.evaluate(T).jacobian[0]
     information = np.swapaxes(white, -1, -2) @ white
-    # [1/m^2, 1/rad^2] relative 1e-7: the same two directions of the normal, in angles and in components
+    # [1/m^2, 1/rad^2] relative 1e-7: the same two directions of the normal, in angles and in
+    # components
     assert_allclose(information[0], information[1], atol=1e-7 * information.max())
 
 
@@ -73,27 +85,33 @@ def test_a_covariance_of_rotation_is_mapped_to_the_angles_as_by_drawing():
     kind = Component(("z", "a", "b", "c"), "euler-xyz", T_platform_tool=np.eye(4))
     A = rng.normal(size=(6, 6))
     C = 1e-8 * (A @ A.T + np.eye(6))
-    T = se3.exp_update(np.eye(4), np.array([0.4, 0.8, -0.3, 0.0, 0.0, 0.0]))[None, None]
+    T = geometry.exp_update(np.eye(4), np.array([0.4, 0.8, -0.3, 0.0, 0.0, 0.0]))[None, None]
     exact = kind.measure(T, np.zeros((1, 1, 4)))
-    drawn = se3.exp_update(T, rng.multivariate_normal(np.zeros(6), C, size=(1, 20000)))
+    drawn = geometry.exp_update(T, rng.multivariate_normal(np.zeros(6), C, size=(1, 20000)))
     scatter = np.cov((kind.measure(drawn, np.zeros((1, 1, 4))) - exact)[0].T)
     mapped = kind.covariance_of_rotation(exact[0], C[None])[0]
     # relative 5 %: four sigma of a variance from 20000 draws is 4 sqrt(2 / 20000) = 4 %
-    assert_allclose(scatter, mapped, atol=0.05 * np.sqrt(np.outer(np.diag(mapped), np.diag(mapped))).max())
+    assert_allclose(
+        scatter, mapped, atol=0.05 * np.sqrt(np.outer(np.diag(mapped), np.diag(mapped))).max()
+    )
 
 
 def test_all_six_components_carry_the_information_of_the_full_pose():
     C = np.diag([1e-10, 2e-10, 3e-10, 1e-12, 2e-12, 3e-12])
-    T = se3.exp_update(np.eye(4), np.array([0.4, 0.6, -0.3, 0.1, 0.2, 0.3]))[None, None]
+    T = geometry.exp_update(np.eye(4), np.array([0.4, 0.6, -0.3, 0.1, 0.2, 0.3]))[None, None]
     kinds = (
         Pose(T_platform_tool=np.eye(4)),
         Component(("a", "b", "c", "x", "y", "z"), "euler-ZYX", T_platform_tool=np.eye(4)),
-        Component(("x", "y", "z", "phi", "theta", "psi"), "tilt-torsion", T_platform_tool=np.eye(4)),
+        Component(
+            ("x", "y", "z", "phi", "theta", "psi"), "tilt-torsion", T_platform_tool=np.eye(4)
+        ),
     )
     found = []
     for kind in kinds:
         measured = kind.measure(T, np.zeros((1, 1, 6)))[0]
-        covariance = C[None] if isinstance(kind, Pose) else kind.covariance_of_rotation(measured, C[None])
+        covariance = (
+            C[None] if isinstance(kind, Pose) else kind.covariance_of_rotation(measured, C[None])
+        )
         data = Observations(kind, np.array([0]), measured, covariance)
         white = data.whitener @ data.evaluate(T).jacobian[0]
         found.append(np.swapaxes(white, -1, -2) @ white)
@@ -112,7 +130,15 @@ def test_all_six_components_carry_the_information_of_the_full_pose():
         (("phi",), "tilt-torsion", "phi is measured without theta"),
         (("x",), "rotation-vector", "cannot be measured one by one"),
         (("a",), "euler-xxy", "is not one of the 24"),
-        (("a",), "rpy", "the orientation 'rpy' is unknown: use rotation-vector, quaternion, tilt-torsion, or euler-"),
+        (
+            ("a",),
+            "rpy",
+            (
+                "the orientation 'rpy' is unknown: use rotation-vector, quaternion, tilt-torsion, "
+                "or "
+                "euler-"
+            ),
+        ),
     ],
 )
 def test_what_cannot_be_measured_is_refused_with_what_can(components, orientation, sentence):
@@ -122,5 +148,7 @@ def test_what_cannot_be_measured_is_refused_with_what_can(components, orientatio
 
 def test_a_measured_gimbal_lock_is_refused_with_the_way_out():
     kind = Component(("a", "b"), "euler-xyz", T_platform_tool=np.eye(4))
-    with pytest.raises(DataError, match=r"row 2 .* b = 90 deg, where a and c of euler-xyz are the same turn"):
+    with pytest.raises(
+        DataError, match=r"row 2 .* b = 90 deg, where a and c of euler-xyz are the same turn"
+    ):
         Observations.from_sigma(kind, np.arange(2), np.array([[0.1, 0.2], [0.1, np.pi / 2]]), 1e-4)

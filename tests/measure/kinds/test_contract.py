@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every kind must satisfy. The tests loop over `KINDS` and the examples of each, so a new kind is in at once."""
+"""What every kind must satisfy. The tests loop over `KINDS` and the examples of each, so a new kind
+is in at once.
+"""
 
 import dataclasses
 
@@ -7,25 +9,29 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure import KINDS, Observations
 from loopcal.units import Dimension
 from tests.jacobians import check_jacobian
 
-INSTANCES = [(f"{name}-{i}", kind) for name, cls in KINDS.items() for i, kind in enumerate(cls.examples())]
+INSTANCES = [
+    (f"{name}-{i}", kind) for name, cls in KINDS.items() for i, kind in enumerate(cls.examples())
+]
 EXAMPLES = [pytest.param(kind, id=name) for name, kind in INSTANCES]
 WITH_UNKNOWNS = [pytest.param(kind, id=name) for name, kind in INSTANCES if kind.unknowns]
 WITH_JOINTS = [pytest.param(kind, id=name) for name, kind in INSTANCES if kind.looks_at]
-T_BASE_FRAME = se3.exp_update(np.eye(4), np.array([0.5, 0.1, -0.9, 1.1, -0.7, 0.3]))
-T_PLATFORM_TOOL = se3.exp_update(np.eye(4), np.array([0.3, -0.5, 0.2, 0.02, -0.05, 0.11]))
+T_BASE_FRAME = geometry.exp_update(np.eye(4), np.array([0.5, 0.1, -0.9, 1.1, -0.7, 0.3]))
+T_PLATFORM_TOOL = geometry.exp_update(np.eye(4), np.array([0.3, -0.5, 0.2, 0.02, -0.05, 0.11]))
 every_kind = pytest.mark.parametrize("kind", EXAMPLES)
 
 
 def platform_poses(kind, t, r, seed=0, spread=0.4):
     """Random platform poses (t, r, 4, 4), with an axis of links where the kind has them."""
     shape = (t, r, 6) if kind.links == 1 else (t, r, kind.links, 6)
-    return se3.exp_update(np.eye(4), np.random.default_rng(seed).uniform(-spread, spread, shape))
+    return geometry.exp_update(
+        np.eye(4), np.random.default_rng(seed).uniform(-spread, spread, shape)
+    )
 
 
 def placed(kind):
@@ -40,7 +46,9 @@ def own_unknowns(kind, seed=2):
     """Values of the kind's unknowns (1, 1, u) off their nominal ones, None where it has none."""
     if not kind.unknowns:
         return None
-    return kind.nominal[None, None] + np.random.default_rng(seed).uniform(-0.2, 0.2, (1, 1, len(kind.unknowns)))
+    return kind.nominal[None, None] + np.random.default_rng(seed).uniform(
+        -0.2, 0.2, (1, 1, len(kind.unknowns))
+    )
 
 
 def joints_of(kind, T, seed=3):
@@ -52,7 +60,9 @@ def joints_of(kind, T, seed=3):
 
 def measured_near(kind, T, size, seed=1):
     """Readings of the true poses with errors of this size in the noise columns."""
-    noise = size * np.random.default_rng(seed).uniform(-1.0, 1.0, (*T.shape[:2], len(kind.noise_columns)))
+    noise = size * np.random.default_rng(seed).uniform(
+        -1.0, 1.0, (*T.shape[:2], len(kind.noise_columns))
+    )
     return kind.measure(T, noise, own_unknowns(kind), joints_of(kind, T)), noise
 
 
@@ -91,7 +101,9 @@ def test_the_residual_of_a_noise_free_reading_is_zero(kind):
     T = platform_poses(kind, 2, 50)
     measured, _ = measured_near(kind, T, 0.0)
     residual = evaluated(kind, T, measured).residual
-    assert_allclose(residual, 0.0, atol=1e-13)  # [m, rad], ulps over the sine of the smallest tilt, about 0.01
+    assert_allclose(
+        residual, 0.0, atol=1e-13
+    )  # [m, rad], ulps over the sine of the smallest tilt, about 0.01
 
 
 @every_kind
@@ -101,7 +113,9 @@ def test_the_residual_of_a_noisy_reading_is_the_mapped_noise_with_the_sign_turne
     measured, noise = measured_near(kind, T, 1e-6)
     residual = evaluated(kind, T, measured).residual
     expected = -(kind.noise_map(measured) @ noise[..., None])[..., 0]
-    assert_allclose(residual, expected, atol=1e-11)  # [m, rad], the square of the noise times the bend of the angles
+    assert_allclose(
+        residual, expected, atol=1e-11
+    )  # [m, rad], the square of the noise times the bend of the angles
 
 
 def check_derivatives(kind, error, *, with_jax):
@@ -111,7 +125,11 @@ def check_derivatives(kind, error, *, with_jax):
     measured, _ = measured_near(kind, T, error)
     values, joints = own_unknowns(kind), joints_of(kind, T)
     found = kind.evaluate(T, measured, values, joints)
-    parts = [found.jacobian] if kind.links == 1 else [found.jacobian[:, :, link] for link in range(kind.links)]
+    parts = (
+        [found.jacobian]
+        if kind.links == 1
+        else [found.jacobian[:, :, link] for link in range(kind.links)]
+    )
     if kind.looks_at:  # differences of nothing prove nothing
         assert not found.jacobian.any()
         parts = []
@@ -119,8 +137,12 @@ def check_derivatives(kind, error, *, with_jax):
     shape = (6,) if kind.links == 1 else (kind.links, 6)
 
     def residual(x):
-        moved = se3.exp_update(T, x[:n].reshape(shape)) if n else T  # the same small motion in every row and trial
-        return kind.evaluate(moved, measured, None if values is None else values + x[n:], joints).residual
+        moved = (
+            geometry.exp_update(T, x[:n].reshape(shape)) if n else T
+        )  # the same small motion in every row and trial
+        return kind.evaluate(
+            moved, measured, None if values is None else values + x[n:], joints
+        ).residual
 
     if found.own is not None:
         parts.append(found.own)
@@ -129,7 +151,15 @@ def check_derivatives(kind, error, *, with_jax):
         reason = "[rad] per 0.05 rad, rounding of angles near small tilt"
         automatic = residual if with_jax else None
         zero = np.zeros(jacobian.shape[-1])
-        check_jacobian(residual, jacobian, zero, scale=0.05, automatic=automatic, atol=1e-13, atol_reason=reason)
+        check_jacobian(
+            residual,
+            jacobian,
+            zero,
+            scale=0.05,
+            automatic=automatic,
+            atol=1e-13,
+            atol_reason=reason,
+        )
 
 
 @every_kind
@@ -170,7 +200,10 @@ def test_unknowns_may_differ_from_row_to_row_and_from_trial_to_trial(kind):
     assert_allclose(kind.evaluate(T, measured, values, joints).residual, 0.0, atol=1e-13)
     one = (slice(1, 2), slice(2, 3))
     alone = kind.measure(
-        T[one], np.zeros((1, 1, len(kind.noise_columns))), values[one], None if joints is None else joints[one]
+        T[one],
+        np.zeros((1, 1, len(kind.noise_columns))),
+        values[one],
+        None if joints is None else joints[one],
     )
     assert_allclose(alone[0, 0], measured[1, 2], atol=1e-14)
     assert np.abs(together.residual).max() > 1e-3
@@ -206,8 +239,11 @@ def test_rows_do_not_depend_on_their_batch(kind):
     for i, j in ((0, 0), (2, 5)):
         one = (slice(i, i + 1), slice(j, j + 1))
         joints = joints_of(kind, T)
-        alone = kind.evaluate(T[one], measured[one], own_unknowns(kind), None if joints is None else joints[one])
-        # numpy takes another path through vectorised sines and small products for other lengths: a rounding each
+        alone = kind.evaluate(
+            T[one], measured[one], own_unknowns(kind), None if joints is None else joints[one]
+        )
+        # numpy takes another path through vectorised sines and small products for other lengths: a
+        # rounding each
         assert_allclose(alone.residual[0, 0], together.residual[i, j], atol=1e-14)
         assert_allclose(alone.jacobian[0, 0], together.jacobian[i, j], atol=1e-12)
 
@@ -218,7 +254,9 @@ def test_a_kind_that_needs_a_tool_says_so_and_keeps_its_own(kind):
         assert kind.mounted(T_PLATFORM_TOOL) is kind
         return
     with pytest.raises(DataError, match=r"use kind\.mounted\(robot\.tool\)"):
-        Observations(kind, np.array([0]), np.zeros((1, len(kind.columns))), np.eye(len(kind.noise_columns)))
+        Observations(
+            kind, np.array([0]), np.zeros((1, len(kind.columns))), np.eye(len(kind.noise_columns))
+        )
     once = kind.mounted(T_PLATFORM_TOOL)
     assert once.is_mounted
     assert once.mounted(np.eye(4)) is once

@@ -18,7 +18,7 @@ from loopcal.measure import (
     whitened_rows,
 )
 from loopcal.mechanism import inverse
-from loopcal.mechanism.trials import forward_trials
+from loopcal.mechanism.batch_kinematics import forward_trials
 from tests import zoo
 
 COMMANDED = np.random.default_rng(2).uniform([0.65, -np.pi, 0.05], [0.75, np.pi, 0.2], (8, 3))
@@ -36,7 +36,9 @@ def robot():
 
 def test_a_sensor_on_a_passive_joint_shows_its_value_and_the_offset(robot):
     kind = JointSensor(joints=("limb2.pin", "limb1.pin"), measures="angle", unknown=("offset",))
-    data = simulate(robot, COMMANDED, Instrument((sensor(kind),)), 1, unknowns={"limb1.pin.joint": 0.1})
+    data = simulate(
+        robot, COMMANDED, Instrument((sensor(kind),)), 1, unknowns={"limb1.pin.joint": 0.1}
+    )
     solution = inverse(robot, COMMANDED)
     expected = [solution.passive[:, solution.passive_names.index(name)] for name in kind.joints]
     shown = np.stack(expected, axis=1) + np.array([0.0, 0.1])
@@ -52,7 +54,13 @@ def test_an_encoder_is_a_sensor_on_a_driven_joint(robot):
 def test_a_lock_holds_at_a_constant_of_its_group(robot):
     kind = Locked(joints=("q1",))
     groups = np.repeat(["a", "b"], 4)
-    data = simulate(robot, COMMANDED, Instrument((sensor(kind, group=groups),)), 1, unknowns={"a.q1.locked": 0.2})
+    data = simulate(
+        robot,
+        COMMANDED,
+        Instrument((sensor(kind, group=groups),)),
+        1,
+        unknowns={"a.q1.locked": 0.2},
+    )
     slip = data.readings[:, 0] - np.repeat([0.2, 0.0], 4)
     assert_allclose(data.observations[0].measured[:, 0], slip, atol=1e-8)
 
@@ -66,7 +74,11 @@ def test_rows_of_joints_follow_the_joints(robot):
     parts = evaluate_all(data, state.T, np.zeros((1, 0)), joints=values)
     rows = whitened_rows(parts, np.ones((1, 8, 6, 4)), slopes)
     assert rows.shape == (1, 16, 5)
-    assert_allclose(rows[0, :, :4] * TINY, np.stack([slopes[n][0] for n in kind.looks_at], axis=1).reshape(16, 4), rtol=1e-12)
+    assert_allclose(
+        rows[0, :, :4] * TINY,
+        np.stack([slopes[n][0] for n in kind.looks_at], axis=1).reshape(16, 4),
+        rtol=1e-12,
+    )
     with pytest.raises(DataError, match=r"needs the values of joint 'limb1\.pin'"):
         evaluate_all(data, state.T, np.zeros((1, 0)))
 

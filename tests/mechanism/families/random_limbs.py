@@ -1,31 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mechanisms of random structure, closed by construction: joints at random places about random axes, all at zero at home."""
+"""Mechanisms of random structure, closed by construction: joints at random places about random
+axes, all at zero at home.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal import engine, se3
+from loopcal import engine, geometry
 from loopcal.engine import State
 from loopcal.mechanism import Mechanism, build, states
+from loopcal.mechanism.batch_kinematics import readings_at
 from loopcal.mechanism.families.limb_records import JointRecord, LimbRecord, Prismatic, Revolute
 from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.records import Point, Pose
 from loopcal.mechanism.transmission import joint_values
-from loopcal.mechanism.trials import readings_at
 from loopcal.units import Dimension
 
 Array = NDArray[np.float64]
 PASSIVE = {"rigid": 6, "ball": 3, "distance": 1}
-"""Rows of closure; a limb with that many passive joints less c takes c freedoms from the platform."""
+"""Rows of closure; a limb with that many passive joints less c takes c freedoms from the platform.
+"""
 
 
 def random_mechanism(seed: int, limbs: int) -> Limbs:
-    """`limbs` (6, 3 or 2) limbs that each take as many freedoms as one actuated joint gives back to all of them: 6 / limbs."""
+    """`limbs` (6, 3 or 2) limbs that each take as many freedoms as one actuated joint gives back to
+    all of them: 6 / limbs.
+    """
     rng = np.random.default_rng(seed)
     taken = 6 // limbs
     allowed = [ending for ending, rows in PASSIVE.items() if rows >= taken]
     found = tuple(_limb(rng, f"limb{i + 1}", str(rng.choice(allowed)), taken) for i in range(limbs))
-    controlled = {6: ("x", "y", "z", "roll", "pitch", "yaw"), 3: ("x", "y", "z"), 2: ("x", "y")}[limbs]
+    controlled = {6: ("x", "y", "z", "roll", "pitch", "yaw"), 3: ("x", "y", "z"), 2: ("x", "y")}[
+        limbs
+    ]
     return Limbs(name=f"random {seed}", limbs=found, controlled=controlled, error_model="complete")
 
 
@@ -34,19 +41,34 @@ def expected_rank(record: Limbs) -> int:
     total = 0
     for limb in record.limbs:
         turning = sum(isinstance(j, Revolute) for j in limb.chain)
-        passive = sum(j.actuated is None for j in limb.chain if isinstance(j, (Revolute, Prismatic)))
-        total += 4 * turning + 2 * (len(limb.chain) - turning) + (7 if limb.ending == "distance" else 6) - passive
+        passive = sum(
+            j.actuated is None for j in limb.chain if isinstance(j, (Revolute, Prismatic))
+        )
+        total += (
+            4 * turning
+            + 2 * (len(limb.chain) - turning)
+            + (7 if limb.ending == "distance" else 6)
+            - passive
+        )
     return total
 
 
 def wander(machine: Mechanism, n: int, seed: int) -> tuple[State, Array]:
-    """States (1, m) near home, at most 0.3 rad and 60 mm away in each reading, and their readings (1, m, a)."""
+    """States (1, m) near home, at most 0.3 rad and 60 mm away in each reading, and their readings
+    (1, m, a).
+    """
     rng = np.random.default_rng(seed)
     width = [0.3 if a.dimension is Dimension.ANGLE else 0.06 for a in machine.actuators]
-    q = readings_at(machine, machine.values[None], machine.home_state) + rng.uniform(-1, 1, (1, n, len(width))) * width
+    q = (
+        readings_at(machine, machine.values[None], machine.home_state)
+        + rng.uniform(-1, 1, (1, n, len(width))) * width
+    )
     e, tau = machine.slots(machine.values[None])
-    state = engine.solve(machine.program, e, joint_values(q, tau, machine.slots.frequency), machine.home_state)
-    # random machines have small workspaces: rows that do not close, or closed elsewhere, are left out
+    state = engine.solve(
+        machine.program, e, joint_values(q, tau, machine.slots.frequency), machine.home_state
+    )
+    # random machines have small workspaces: rows that do not close, or closed elsewhere, are left
+    # out
     good = (state.status[0] == 0) & (state.orientation[0] == machine.home_state.orientation[0, 0])
     return states.take(state, good), q[:, good]
 
@@ -57,24 +79,31 @@ def _limb(rng: np.random.Generator, name: str, ending: str, taken: int) -> LimbR
     drive = f"{name}.q"
     rod_drives = ending == "distance" and rng.random() < 0.4
     count = passive + (0 if rod_drives else 1)
-    # a tip must be able to turn about three axes if its orientation is tied, so at most two of six joints slide
+    # a tip must be able to turn about three axes if its orientation is tied, so at most two of six
+    # joints slide
     slides = int(rng.integers(0, min(2, count) + 1)) if count else 0
     driven = -1 if rod_drives else int(rng.integers(count))
     kinds = rng.permutation(["P"] * slides + ["R"] * (count - slides))
     # two passive slides in a row are one sliding plane, in which their directions have no meaning
-    while any(kinds[i] == kinds[i + 1] == "P" and driven not in (i, i + 1) for i in range(count - 1)):
+    while any(
+        kinds[i] == kinds[i + 1] == "P" and driven not in (i, i + 1) for i in range(count - 1)
+    ):
         kinds = rng.permutation(kinds)
     T, chain = np.eye(4), []
     for i, kind in enumerate(kinds):
         place = _place(rng)
         T = T @ place.matrix
-        chain.append(_joint(str(kind), place, rng.standard_normal(3), drive if i == driven else None))
+        chain.append(
+            _joint(str(kind), place, rng.standard_normal(3), drive if i == driven else None)
+        )
     tip = _place(rng)
     T = T @ tip.matrix
     if ending == "distance":
         attach = tuple(float(x) for x in rng.uniform(-0.3, 0.3, 3))
         length = float(np.linalg.norm(T[:3, 3] - attach))
-        return LimbRecord(name, ending, _point(attach), tuple(chain), tip, length, drive if rod_drives else None)
+        return LimbRecord(
+            name, ending, _point(attach), tuple(chain), tip, length, drive if rod_drives else None
+        )
     return LimbRecord(name, "ball" if ending == "ball" else "rigid", _pose(T), tuple(chain), tip)
 
 
@@ -92,7 +121,7 @@ def _place(rng: np.random.Generator) -> Pose:
 
 def _pose(T: Array) -> Pose:
     x, y, z = (float(v) for v in T[:3, 3])
-    roll, pitch, yaw = (float(v) for v in se3.matrix_to_euler(T[:3, :3], "xyz"))
+    roll, pitch, yaw = (float(v) for v in geometry.matrix_to_euler(T[:3, :3], "xyz"))
     return Pose(x, y, z, roll, pitch, yaw)
 
 

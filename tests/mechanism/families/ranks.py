@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What poses and parameters share in the tests of families: scaled sensitivities, ranks with their gap, known frames.
+"""What poses and parameters share in the tests of families: scaled sensitivities, ranks with their
+gap, known frames.
 
-Angles count as lengths at 200 mm per radian, in rows and columns. Ranks come from the singular values of the stacked
-matrix, never from its normal equations, and a rank without a gap below it fails.
+Angles count as lengths at 200 mm per radian, in rows and columns. Ranks come from the singular
+values of the stacked matrix, never from its normal equations, and a rank without a gap below it
+fails.
 """
 
 from collections.abc import Sequence
@@ -10,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.mechanism import Mechanism, Solution, inverse
-from loopcal.mechanism.trials import sensitivity
+from loopcal.mechanism.batch_kinematics import sensitivity
 from loopcal.units import Dimension
 
 Array = NDArray[np.float64]
@@ -20,27 +22,40 @@ ARM = 0.2  # [m/rad]
 
 
 def coordinates(robot: Mechanism, n: int, seed: int) -> Array:
-    """Random controlled coordinates (n, c) in the workspace [m, rad]; those without a range stay zero."""
+    """Random controlled coordinates (n, c) in the workspace [m, rad]; those without a range stay
+    zero.
+    """
     ranges = robot.assembly.workspace
     rng = np.random.default_rng(seed)
-    return np.stack([rng.uniform(*ranges.get(name, (0.0, 0.0)), n) for name in robot.controlled], axis=1)
+    return np.stack(
+        [rng.uniform(*ranges.get(name, (0.0, 0.0)), n) for name in robot.controlled], axis=1
+    )
 
 
 def scaled_sensitivity(robot: Mechanism, solution: Solution) -> Array:
     """(n, 6, p) platform twist per parameter, all lengths [m / m]."""
-    return scaled(robot, sensitivity(robot, robot.values[None], solution.q[None], solution.state).parameters[0])
+    return scaled(
+        robot,
+        sensitivity(robot, robot.values[None], solution.q[None], solution.state).parameters[0],
+    )
 
 
 def scaled(robot: Mechanism, D: Array) -> Array:
     """A sensitivity (.., 6, p) with all angles as lengths."""
-    columns = np.array([1.0 if d is Dimension.LENGTH else 1 / ARM for d in robot.parameters.dimensions])
+    columns = np.array(
+        [1.0 if d is Dimension.LENGTH else 1 / ARM for d in robot.parameters.dimensions]
+    )
     return D * np.array([ARM] * 3 + [1.0] * 3)[:, None] * columns
 
 
 def perturbed(robot: Mechanism, size: float, seed: int) -> Mechanism:
-    """Parameters moved at random by `size` [m], angles by size / 200 mm [rad]: no axis stays parallel to another."""
+    """Parameters moved at random by `size` [m], angles by size / 200 mm [rad]: no axis stays
+    parallel to another.
+    """
     rng = np.random.default_rng(seed)
-    scale = np.array([1.0 if d is Dimension.LENGTH else 1 / ARM for d in robot.parameters.dimensions])
+    scale = np.array(
+        [1.0 if d is Dimension.LENGTH else 1 / ARM for d in robot.parameters.dimensions]
+    )
     return robot.with_values(robot.values + size * scale * rng.standard_normal(len(robot.values)))
 
 
@@ -52,25 +67,29 @@ def solved(robot: Mechanism, n: int = 80, seed: int = 3) -> Solution:
 
 
 def measured(D: Array, T: Array, what: str) -> Array:
-    """Rows of a measurement: full, positions, orientation, or 5-dof (no rotation about the platform's normal)."""
+    """Rows of a measurement: full, positions, orientation, or 5-dof (no rotation about the
+    platform's normal).
+    """
     if what == "positions":
         return D[:, 3:]
     if what == "orientation":
         return D[:, :3]
     if what == "5-dof":
-        turned = np.einsum("nij,njp->nip", se3.hat(-T[:, :3, 2]), D[:, :3])
+        turned = np.einsum("nij,njp->nip", geometry.hat(-T[:, :3, 2]), D[:, :3])
         return np.concatenate([turned, D[:, 3:]], axis=1)
     assert what == "full"
     return D
 
 
 def frame_columns(T: Array, base: bool, tool: bool) -> Array:
-    """Twists (n, 6, 0 | 6 | 12) that an unknown frame of the instrument, of the target, or both give, scaled as above."""
+    """Twists (n, 6, 0 | 6 | 12) that an unknown frame of the instrument, of the target, or both
+    give, scaled as above.
+    """
     n, found = len(T), []
     if base:
         block = np.zeros((n, 6, 6))
         block[:, :3, :3] = np.eye(3)
-        block[:, 3:, :3] = -se3.hat(T[:, :3, 3]) / ARM
+        block[:, 3:, :3] = -geometry.hat(T[:, :3, 3]) / ARM
         block[:, 3:, 3:] = np.eye(3)
         found.append(block)
     if tool:
@@ -81,15 +100,21 @@ def frame_columns(T: Array, base: bool, tool: bool) -> Array:
 
 
 def rank(rows: Array, tolerance: float = 1e-12, gap: float = 1e3) -> int:
-    """Rank of the stacked rows (n, m, p) at a relative tolerance; the first value cut must lie `gap` below the last kept."""
+    """Rank of the stacked rows (n, m, p) at a relative tolerance; the first value cut must lie
+    `gap` below the last kept.
+    """
     s = np.linalg.svd(rows.reshape(-1, rows.shape[-1]), compute_uv=False)
     kept = int((s > tolerance * s[0]).sum())
     if kept < len(s):
-        assert s[kept - 1] > gap * s[kept], f"no gap: {s[kept - 1] / s[0]:.1e} and {s[kept] / s[0]:.1e}"
+        assert s[kept - 1] > gap * s[kept], (
+            f"no gap: {s[kept - 1] / s[0]:.1e} and {s[kept] / s[0]:.1e}"
+        )
     return kept
 
 
-def ranks(robot: Mechanism, kinds: Sequence[str], seed: int = 3, n: int = 80, **limits: float) -> list[int]:
+def ranks(
+    robot: Mechanism, kinds: Sequence[str], seed: int = 3, n: int = 80, **limits: float
+) -> list[int]:
     """Ranks of several kinds of measurement, frames known."""
     solution = solved(robot, n, seed)
     D = scaled_sensitivity(robot, solution)
@@ -100,8 +125,12 @@ FRAMES = ((True, False), (False, True), (True, True))
 """Unknown: base, tool, both."""
 
 
-def told_apart(robot: Mechanism, kind: str, frames: Sequence[tuple[bool, bool]] = FRAMES, n: int = 80) -> list[int]:
-    """Parameters determined beside unknown frames: rank of all columns less the rank of the frames' own."""
+def told_apart(
+    robot: Mechanism, kind: str, frames: Sequence[tuple[bool, bool]] = FRAMES, n: int = 80
+) -> list[int]:
+    """Parameters determined beside unknown frames: rank of all columns less the rank of the frames'
+    own.
+    """
     solution = solved(robot, n)
     D, found = scaled_sensitivity(robot, solution), []
     for base, tool in frames:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every robot that comes with loopcal must do. A new file in src/loopcal/robots is picked up by itself."""
+"""What every robot that comes with loopcal must do. A new file in src/loopcal/robots is picked up
+by itself.
+"""
 
 from functools import cache
 from pathlib import Path
@@ -7,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal import se3
-from loopcal.io.robot_file import load_robot, shipped_robots
+from loopcal import geometry
+from loopcal.io.robot.robot_file import load_robot, shipped_robots
 from loopcal.mechanism import Mechanism, coordinates, forward, inverse
-from loopcal.mechanism.trials import forward_trials, readings_at, sensitivity
+from loopcal.mechanism.batch_kinematics import forward_trials, readings_at, sensitivity
 from loopcal.units import Dimension
 from tests.jacobians import check_jacobian
 from tests.mechanism.families.ranks import coordinates as random_coordinates
@@ -29,7 +31,7 @@ def test_it_closes_at_home_where_its_file_says(name: str) -> None:
     assert machine.home_state.residual.max() <= 1e-12 * machine.size
     home = machine.assembly.home
     read = [coordinates.read(T, machine.controlled) for T in (machine.home, home)]
-    tilt = se3.log_so3(machine.home[:3, :3] @ home[:3, :3].T)
+    tilt = geometry.log_so3(machine.home[:3, :3] @ home[:3, :3].T)
     if "phi" in machine.controlled and abs(tilt).max() < 1e-12:  # phi is anything at zero tilt
         read = [np.delete(r, machine.controlled.index("phi")) for r in read]
     np.testing.assert_allclose(*read, atol=1e-12)
@@ -82,26 +84,49 @@ def test_its_sensitivities_are_the_derivatives_of_its_forward_kinematics(name: s
     known = sensitivity(machine, values[None], q, state)
 
     def by_value(x: np.ndarray) -> np.ndarray:
-        return se3.difference(forward_trials(machine, x[None], q, state).T[0], state.T[0])
+        return geometry.difference(forward_trials(machine, x[None], q, state).T[0], state.T[0])
 
     def by_reading(x: np.ndarray) -> np.ndarray:
-        return se3.difference(forward_trials(machine, values[None], q + x, state).T[0], state.T[0])
+        return geometry.difference(
+            forward_trials(machine, values[None], q + x, state).T[0], state.T[0]
+        )
 
     # the difference of two rotations is a logarithm, whose slope at zero is the angular velocity
     length, angle = 0.02 * machine.size, 0.02
-    scale = np.array([length if d is Dimension.LENGTH else angle for d in machine.parameters.dimensions])
+    scale = np.array(
+        [length if d is Dimension.LENGTH else angle for d in machine.parameters.dimensions]
+    )
     reason = "[m] Newton's own accuracy over the smallest step"
-    check_jacobian(by_value, known.parameters[0], values, scale=scale, atol=1e-9 * machine.size, atol_reason=reason)
-    scale = np.array([length if a.dimension is Dimension.LENGTH else angle for a in machine.actuators])
+    check_jacobian(
+        by_value,
+        known.parameters[0],
+        values,
+        scale=scale,
+        atol=1e-9 * machine.size,
+        atol_reason=reason,
+    )
+    scale = np.array(
+        [length if a.dimension is Dimension.LENGTH else angle for a in machine.actuators]
+    )
     zero = np.zeros(len(scale))
-    check_jacobian(by_reading, known.readings[0], zero, scale=scale, atol=1e-9 * machine.size, atol_reason=reason)
+    check_jacobian(
+        by_reading,
+        known.readings[0],
+        zero,
+        scale=scale,
+        atol=1e-9 * machine.size,
+        atol_reason=reason,
+    )
 
 
 def test_every_robot_has_its_row_in_the_documentation() -> None:
     """| name | family | .. | parameters | ..; the table has no others."""
     page = (Path(__file__).parents[3] / "docs" / "robots.md").read_text("utf-8")
     table = page[page.index("| name | family |") :].split("\n\n")[0]
-    rows = [[cell.strip().strip("`") for cell in line.split("|")[1:-1]] for line in table.splitlines()[2:]]
+    rows = [
+        [cell.strip().strip("`") for cell in line.split("|")[1:-1]]
+        for line in table.splitlines()[2:]
+    ]
     assert sorted(row[0] for row in rows) == sorted(ROBOTS)
     for name, _, _, _, parameters, _ in rows:
         assert int(parameters) == len(robot(name).parameters), name

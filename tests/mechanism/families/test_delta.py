@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The delta with three rods and the one with six: alike where they must be, and what only the six can do."""
+"""The delta with three rods and the one with six: alike where they must be, and what only the six
+can do.
+"""
 
 from functools import cache
 
@@ -7,14 +9,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from loopcal import se3
-from loopcal.io.robot_file import load_robot
+from loopcal import geometry
+from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism import Mechanism, build, forward, inverse
-from loopcal.mechanism.families.limb_records import Copies, LengthDrive, LimbRecord, NamedLength, Onto, Prismatic, Shifts
+from loopcal.mechanism.batch_kinematics import sensitivity
+from loopcal.mechanism.families.limb_records import (
+    Copies,
+    LengthDrive,
+    LimbRecord,
+    NamedLength,
+    Onto,
+    Prismatic,
+    Shifts,
+)
 from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.families.linear_delta import LinearDelta
 from loopcal.mechanism.records import Pose, Workspace
-from loopcal.mechanism.trials import sensitivity
 from tests.mechanism.families.ranks import coordinates
 
 Array = NDArray[np.float64]
@@ -30,7 +40,9 @@ def uneven() -> Mechanism:
     """Six rods, each of its own length, joints displaced: the platform tilts by milliradians."""
     machine = robot("linear-delta-6")
     rng = np.random.default_rng(4)
-    return machine.with_values(machine.values + machine.parameters.tolerance * rng.standard_normal(len(machine.values)))
+    return machine.with_values(
+        machine.values + machine.parameters.tolerance * rng.standard_normal(len(machine.values))
+    )
 
 
 def slopes(machine: Mechanism, q: Array) -> tuple[Array, Array]:
@@ -49,11 +61,27 @@ PLACE = Workspace(x=(-0.06, 0.06), y=(-0.06, 0.06), z=(0.0, 0.25))
 def exact() -> tuple[Mechanism, Mechanism]:
     """Both of one geometry to the last digit, as no file with nine digits gives it."""
     angles = tuple(np.deg2rad((210.0, 330.0, 90.0)).tolist())
-    three = LinearDelta(name="three", radius=RADIUS, angles=angles, arms=ARM, stops=STOP, home=Pose(z=0.12), workspace=PLACE)
+    three = LinearDelta(
+        name="three",
+        radius=RADIUS,
+        angles=angles,
+        arms=ARM,
+        stops=STOP,
+        home=Pose(z=0.12),
+        workspace=PLACE,
+    )
     limbs = tuple(
         LimbRecord(
             name=name,
-            chain=(Prismatic(joint="P", name="carriage", at=(TIP + RADIUS, y, 0.0), actuated="q", start=0.12 + DROP),),
+            chain=(
+                Prismatic(
+                    joint="P",
+                    name="carriage",
+                    at=(TIP + RADIUS, y, 0.0),
+                    actuated="q",
+                    start=0.12 + DROP,
+                ),
+            ),
             ending="distance",
             length=ARM,
             attach=(TIP, y, 0.0),
@@ -66,7 +94,9 @@ def exact() -> tuple[Mechanism, Mechanism]:
     six = Limbs(
         name="six",
         controlled=("x", "y", "z"),
-        actuators={"q": LengthDrive(reads="length", gain=-1.0, offset=STOP + DROP, unknown=("offset",))},
+        actuators={
+            "q": LengthDrive(reads="length", gain=-1.0, offset=STOP + DROP, unknown=("offset",))
+        },
         limbs=limbs,
         parameters=(NamedLength(name="radius", length=TIP + RADIUS, maps=radius),),
         home=Pose(z=0.12),
@@ -80,7 +110,9 @@ def test_three_and_six_rods_agree_in_readings_poses_and_common_slopes() -> None:
 
 
 def test_the_files_of_three_and_six_rods_agree_to_the_nine_digits_of_an_offset() -> None:
-    compare(robot("linear-delta"), robot("linear-delta-6"), 1e-8)  # [m] 5e-10 in the offset, times slopes of up to 10 / m
+    compare(
+        robot("linear-delta"), robot("linear-delta-6"), 1e-8
+    )  # [m] 5e-10 in the offset, times slopes of up to 10 / m
 
 
 def compare(three: Mechanism, six: Mechanism, atol: float) -> None:
@@ -92,15 +124,17 @@ def compare(three: Mechanism, six: Mechanism, atol: float) -> None:
     np.testing.assert_allclose(pose.T, forward(three, q).T, rtol=0, atol=atol)
     (D, J), (E, K) = slopes(three, q), slopes(six, q)
     np.testing.assert_allclose(K, J, rtol=0, atol=atol)
-    # in the six a rod's length is one of two, and its height does not depend on radius and rod: the firmware's offset
-    # stop + sqrt(arm^2 - radius^2) does
+    # in the six a rod's length is one of two, and its height does not depend on radius and rod: the
+    # firmware's offset stop + sqrt(arm^2 - radius^2) does
     index, other = three.parameters.index, six.parameters.index
     common = np.zeros_like(E[..., 0])
     for k in (1, 2, 3):
         offset = E[..., other(f"q{k}.offset")]
         np.testing.assert_allclose(offset, D[..., index(f"tower{k}.stop")], rtol=0, atol=atol)
         both = E[..., other(f"left{k}.length")] + E[..., other(f"right{k}.length")]
-        np.testing.assert_allclose(both + ARM / DROP * offset, D[..., index(f"arm{k}.length")], rtol=0, atol=atol)
+        np.testing.assert_allclose(
+            both + ARM / DROP * offset, D[..., index(f"arm{k}.length")], rtol=0, atol=atol
+        )
         common += offset
     outwards = E[..., other("radius")] - RADIUS / DROP * common
     np.testing.assert_allclose(outwards, D[..., index("radius")], rtol=0, atol=atol)
@@ -112,7 +146,7 @@ def test_uneven_rods_tilt_the_platform_and_the_position_is_still_reached() -> No
     there = inverse(machine, xyz)
     assert there.converged.all()
     np.testing.assert_allclose(there.T[:, :3, 3], xyz, rtol=0, atol=1e-12)  # [m]
-    tilt = np.linalg.norm(se3.log_so3(there.T[:, :3, :3]), axis=1)
+    tilt = np.linalg.norm(geometry.log_so3(there.T[:, :3, :3]), axis=1)
     assert 1e-4 < np.median(tilt) < 0.1
     # both rods of a carriage at one height
     group, joints = machine.program.groups[0], there.state.joints[0]

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hexapods: columns against the leg equation, legs as rods and as chains, the screw against another program, ranks."""
+"""Hexapods: columns against the leg equation, legs as rods and as chains, the screw against another
+program, ranks.
+"""
 
 import json
 from dataclasses import replace
@@ -10,16 +12,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from loopcal import se3
+from loopcal import geometry as rigid
 from loopcal.errors import MechanismError
 from loopcal.mechanism import Mechanism, build, forward, inverse
+from loopcal.mechanism.batch_kinematics import sensitivity
 from loopcal.mechanism.families.gough import Gough, GoughCones
 from loopcal.mechanism.families.ups import Screw
 from loopcal.mechanism.limits import within
 from loopcal.mechanism.records import LengthTolerance, Pose, Workspace
-from loopcal.mechanism.trials import sensitivity
 from tests import zoo
-from tests.mechanism.families.ranks import perturbed, rank, ranks, scaled_sensitivity, solved, told_apart
+from tests.mechanism.families.ranks import (
+    perturbed,
+    rank,
+    ranks,
+    scaled_sensitivity,
+    solved,
+    told_apart,
+)
 
 Array = NDArray[np.float64]
 KINDS = ("full", "5-dof", "positions", "orientation")
@@ -36,7 +45,12 @@ ROD = Gough(
     lengths=zoo.HEXAPOD_LENGTH * zoo.MM,
     home=Pose(z=0.2),
     workspace=Workspace(
-        x=(-0.04, 0.04), y=(-0.04, 0.04), z=(0.17, 0.23), roll=(-0.25, 0.25), pitch=(-0.25, 0.25), yaw=(-0.25, 0.25)
+        x=(-0.04, 0.04),
+        y=(-0.04, 0.04),
+        z=(0.17, 0.23),
+        roll=(-0.25, 0.25),
+        pitch=(-0.25, 0.25),
+        yaw=(-0.25, 0.25),
     ),
 )
 CHAIN = replace(ROD, legs="ups")
@@ -48,7 +62,9 @@ def robot(record: Gough) -> Mechanism:
 
 
 def moved(machine: Mechanism) -> Mechanism:
-    """With the published errors of all 42 parameters, a thousand times their size would be 50 mm: use ten times, 0.5 mm."""
+    """With the published errors of all 42 parameters, a thousand times their size would be 50 mm:
+    use ten times, 0.5 mm.
+    """
     return machine.with_values(machine.values + 10 * zoo.HEXAPOD_ERRORS.reshape(-1)[ORDER] * zoo.MM)
 
 
@@ -56,7 +72,8 @@ def moved(machine: Mechanism) -> Mechanism:
 ORDER = np.concatenate([7 * leg + np.array([0, 1, 2, 4, 5, 6, 3]) for leg in range(6)])
 
 
-# --- the 42 parameters -----------------------------------------------------------------------------------------------
+# --- the 42 parameters
+# -----------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("record", [ROD, CHAIN], ids=["rod", "ups"])
 def test_columns_are_those_of_the_leg_equation(record: Gough) -> None:
     """u . dt + (R p x u) . omega = dl + u . db - u . R dp, six legs: D = J^-1 G."""
@@ -89,10 +106,13 @@ def test_rods_and_chains_agree_in_names_pose_residual_and_sensitivities() -> Non
     np.testing.assert_allclose(back.T, there.T, rtol=0, atol=1e-12)  # [m, 1]
     assert max(there.residual.max(), back.residual.max()) < 1e-12  # [m]
     D = [
-        sensitivity(machine, machine.values[None], one.q[None], found.state) for machine, found in ((rod, there), (chain, back))
+        sensitivity(machine, machine.values[None], one.q[None], found.state)
+        for machine, found in ((rod, there), (chain, back))
     ]
     size = np.abs(D[0].parameters).max()  # [rad/m] about 10
-    np.testing.assert_allclose(D[1].parameters, D[0].parameters, rtol=0, atol=1e-12 * max(size, 1.0))
+    np.testing.assert_allclose(
+        D[1].parameters, D[0].parameters, rtol=0, atol=1e-12 * max(size, 1.0)
+    )
     np.testing.assert_allclose(D[1].readings, D[0].readings, rtol=0, atol=1e-12 * max(size, 1.0))
 
 
@@ -111,23 +131,32 @@ def test_ranks_of_the_42_parameters() -> None:
         ("positions", True, False, 33),
     ],
 )
-def test_unknown_frames_cost_the_42_parameters_what_they_add(kind: str, base: bool, tool: bool, expected: int) -> None:
+def test_unknown_frames_cost_the_42_parameters_what_they_add(
+    kind: str, base: bool, tool: bool, expected: int
+) -> None:
     for record in (ROD, CHAIN):
         assert told_apart(robot(record), kind, [(base, tool)]) == [expected]
 
 
-# --- complete models -------------------------------------------------------------------------------------------------
+# --- complete models
+# -------------------------------------------------------------------------------------------------
 COMPLETE = replace(CHAIN, error_model="complete")
 REAL = replace(COMPLETE, spherical="axes")
 
 
 @pytest.mark.parametrize(
     ("record", "size", "expected"),
-    [(COMPLETE, 0.0, [48, 47, 45]), (COMPLETE, 2e-3, [84, 83, 81]), (REAL, 0.0, [66, 65, 63]), (REAL, 4e-3, [138, 137, 135])],
+    [
+        (COMPLETE, 0.0, [48, 47, 45]),
+        (COMPLETE, 2e-3, [84, 83, 81]),
+        (REAL, 0.0, [66, 65, 63]),
+        (REAL, 4e-3, [138, 137, 135]),
+    ],
     ids=["perfect balls, nominal", "perfect balls, moved", "nominal", "moved"],
 )
 def test_ranks_of_the_complete_model(record: Gough, size: float, expected: list[int]) -> None:
-    # moved by 2 mm and 10 mrad (4 mm, 20 mrad): at smaller errors the last directions sink into rounding
+    # moved by 2 mm and 10 mrad (4 mm, 20 mrad): at smaller errors the last directions sink into
+    # rounding
     assert ranks(perturbed(robot(record), size, seed=5), KINDS[:3], n=150) == expected
 
 
@@ -136,8 +165,12 @@ def test_each_unknown_frame_costs_the_complete_model_six() -> None:
     assert told_apart(machine, "full", n=150) == [132, 132, 126]
 
 
-@pytest.mark.parametrize(("record", "size", "expected"), [(REAL, 0.0, 60), (REAL, 4e-3, 132)], ids=["nominal", "moved"])
-def test_orientation_alone_costs_the_complete_model_six(record: Gough, size: float, expected: int) -> None:
+@pytest.mark.parametrize(
+    ("record", "size", "expected"), [(REAL, 0.0, 60), (REAL, 4e-3, 132)], ids=["nominal", "moved"]
+)
+def test_orientation_alone_costs_the_complete_model_six(
+    record: Gough, size: float, expected: int
+) -> None:
     # the moves of base and tool, three each, turn nothing: 66 - 6, 138 - 6
     assert ranks(perturbed(robot(record), size, seed=5), ["orientation"], n=150) == [expected]
 
@@ -151,18 +184,31 @@ def test_the_complete_model_moves_the_42_parameters_along() -> None:
     assert rank(np.concatenate([large, small], axis=2)) == rank(large) == 66
 
 
-# --- refusals --------------------------------------------------------------------------------------------------------
+# --- refusals
+# --------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("record", "sentence"),
     [
-        (replace(ROD, error_model="complete"), "legs: rod with error_model: complete.*state legs: ups"),
+        (
+            replace(ROD, error_model="complete"),
+            "legs: rod with error_model: complete.*state legs: ups",
+        ),
         (replace(ROD, spherical="axes"), "legs: rod with spherical: axes.*state legs: ups"),
         (replace(ROD, screw=Screw()), "legs: rod with a screw.*state legs: ups"),
         (replace(CHAIN, spherical="axes"), "spherical: axes.*state error_model: complete"),
-        (replace(CHAIN, screw=Screw(0.004, ((0, 0, 1),) * 5, ((1, 0, 0),) * 6)), "names 5 base_axes and 6 platform_axes"),
-        (replace(CHAIN, screw=Screw(0.004, ((0, 0, 0),) * 6, ((1, 0, 0),) * 6)), r"joint axis of leg1 is \[0, 0, 0\]"),
+        (
+            replace(CHAIN, screw=Screw(0.004, ((0, 0, 1),) * 5, ((1, 0, 0),) * 6)),
+            "names 5 base_axes and 6 platform_axes",
+        ),
+        (
+            replace(CHAIN, screw=Screw(0.004, ((0, 0, 0),) * 6, ((1, 0, 0),) * 6)),
+            r"joint axis of leg1 is \[0, 0, 0\]",
+        ),
         (replace(ROD, base=ROD.base[:5]), "5 base and 6 platform centres"),
-        (replace(ROD, tolerances=replace(ROD.tolerances, base=LengthTolerance())), "state either sd or limits"),
+        (
+            replace(ROD, tolerances=replace(ROD.tolerances, base=LengthTolerance())),
+            "state either sd or limits",
+        ),
     ],
 )
 def test_what_a_form_cannot_carry_is_refused_with_the_way_out(record: Gough, sentence: str) -> None:
@@ -170,7 +216,8 @@ def test_what_a_form_cannot_carry_is_refused_with_the_way_out(record: Gough, sen
         record.expand()
 
 
-# --- the screw, against LinuxCNC's genhexkins ------------------------------------------------------------------------
+# --- the screw, against LinuxCNC's genhexkins
+# ------------------------------------------------------------------------
 LEAD = 4.0  # unit of the file, here taken as a metre
 
 
@@ -181,29 +228,46 @@ def genhexkins(data_folder: Path) -> tuple[dict[str, Array], Array, Array]:
     geometry = json.loads((folder / "genhexkins_geometry.json").read_text())
     rows = np.genfromtxt(folder / "genhexkins_screwlead4_200poses.csv", delimiter=",", names=True)
     angles = np.radians(np.stack([rows[c] for c in ("a_deg", "b_deg", "c_deg")], axis=1))
-    T = se3.pose(se3.euler_to_matrix(angles, "xyz"), np.stack([rows[c] for c in "xyz"], axis=1))
+    T = rigid.pose(rigid.euler_to_matrix(angles, "xyz"), np.stack([rows[c] for c in "xyz"], axis=1))
     struts = np.stack([rows[f"L{leg}"] for leg in range(6)], axis=1)
-    return {key: np.array(geometry[key]) for key in geometry if not key.startswith("_") and key != "units"}, T, struts
+    return (
+        {
+            key: np.array(geometry[key])
+            for key in geometry
+            if not key.startswith("_") and key != "units"
+        },
+        T,
+        struts,
+    )
 
 
 def folded(geometry: dict[str, Array], T: Array) -> NDArray[np.bool_]:
-    """Where the platform's joint axis has turned past a quarter turn from the base's, seen along the leg, (n, 6)."""
+    """Where the platform's joint axis has turned past a quarter turn from the base's, seen along
+    the leg, (n, 6).
+    """
     R = T[:, None, :3, :3]
     v = T[:, None, :3, 3] + (R @ geometry["platform"][..., None])[..., 0] - geometry["base"]
     s = v / np.linalg.norm(v, axis=2, keepdims=True)
-    low, high = geometry["base_joint_axis"] + 0 * v, (R @ geometry["platform_joint_axis"][..., None])[..., 0]
+    low, high = (
+        geometry["base_joint_axis"] + 0 * v,
+        (R @ geometry["platform_joint_axis"][..., None])[..., 0],
+    )
     return (low * high).sum(2) - (low * s).sum(2) * (high * s).sum(2) < 0
 
 
 def screw_hexapod(geometry: dict[str, Array], fold: NDArray[np.bool_], home: Array) -> Mechanism:
     """Hexapod whose screws do what genhexkins does with asin(sin a) for the angle a.
 
-    Past a quarter turn that is the screw of the other hand, counted from the other side of its axis.
+    Past a quarter turn that is the screw of the other hand, counted from the other side of its
+    axis.
     """
     sign = np.where(fold, -1.0, 1.0)
     x, y, z = home[:3, 3]
-    roll, pitch, yaw = se3.matrix_to_euler(home[:3, :3], "xyz")
-    axes = points(geometry["base_joint_axis"]), points(geometry["platform_joint_axis"] * sign[:, None])
+    roll, pitch, yaw = rigid.matrix_to_euler(home[:3, :3], "xyz")
+    axes = (
+        points(geometry["base_joint_axis"]),
+        points(geometry["platform_joint_axis"] * sign[:, None]),
+    )
     record = Gough(
         name="genhexkins",
         base=points(geometry["base"]),
@@ -215,18 +279,21 @@ def screw_hexapod(geometry: dict[str, Array], fold: NDArray[np.bool_], home: Arr
     return build(record.expand())
 
 
-def test_the_screw_gives_all_strut_lengths_and_poses_of_genhexkins(genhexkins: tuple[dict[str, Array], Array, Array]) -> None:
+def test_the_screw_gives_all_strut_lengths_and_poses_of_genhexkins(
+    genhexkins: tuple[dict[str, Array], Array, Array],
+) -> None:
     geometry, T, struts = genhexkins
     patterns, place = np.unique(folded(geometry, T), axis=0, return_inverse=True)
     checked = 0
     for i, pattern in enumerate(patterns):
         rows = np.flatnonzero(place.reshape(-1) == i)
         machine = screw_hexapod(geometry, pattern, T[rows[0]])
-        # walk there in twenty steps: a screw that overtakes half a turn on the way stands a turn further
+        # walk there in twenty steps: a screw that overtakes half a turn on the way stands a turn
+        # further
         start = None
-        twist = se3.difference(T[rows], T[rows[:1]] + 0 * T[rows])
+        twist = rigid.difference(T[rows], T[rows[:1]] + 0 * T[rows])
         for part in np.linspace(0.05, 1.0, 20):
-            pose = se3.exp_update(T[rows[:1]] + 0 * T[rows], part * twist)
+            pose = rigid.exp_update(T[rows[:1]] + 0 * T[rows], part * twist)
             start = inverse(machine, pose, start)
         assert start is not None
         assert start.converged.all()
@@ -234,7 +301,9 @@ def test_the_screw_gives_all_strut_lengths_and_poses_of_genhexkins(genhexkins: t
         np.testing.assert_allclose(start.q, struts[rows], rtol=0, atol=1e-9)  # printed to 1e-12
         back = forward(machine, struts[rows])
         assert back.converged.all()
-        np.testing.assert_allclose(back.T, T[rows], rtol=0, atol=1e-7)  # printed poses are exact to 1e-10
+        np.testing.assert_allclose(
+            back.T, T[rows], rtol=0, atol=1e-7
+        )  # printed poses are exact to 1e-10
         checked += len(rows)
     assert checked == 200
 
@@ -247,9 +316,15 @@ def test_a_screw_without_lead_is_a_plain_leg() -> None:
 
 
 def test_the_screw_adds_its_lead_for_each_turn_of_the_upper_joint_about_the_leg() -> None:
-    """length + reading = |t + R p - b| + lead a / (2 pi), a from the lower axis to the upper one about the leg."""
+    """length + reading = |t + R p - b| + lead a / (2 pi), a from the lower axis to the upper one
+    about the leg.
+    """
     lead, low, high = 0.004, np.array([1.0, 0.0, 0.0]), np.array([0.6, 0.8, 0.0])
-    machine = robot(replace(CHAIN, screw=Screw(lead, points(np.tile(low, (6, 1))), points(np.tile(high, (6, 1))))))
+    machine = robot(
+        replace(
+            CHAIN, screw=Screw(lead, points(np.tile(low, (6, 1))), points(np.tile(high, (6, 1))))
+        )
+    )
     solution = solved(machine, 30)
     for T, q in zip(solution.T, solution.q, strict=True):
         v = T[:3, 3] + machine_points(ROD.platform) @ T[:3, :3].T - machine_points(ROD.base)
@@ -257,7 +332,9 @@ def test_the_screw_adds_its_lead_for_each_turn_of_the_upper_joint_about_the_leg(
         s, upper = v / length[:, None], T[:3, :3] @ high
         across = np.cross(s, low)  # with low's part across s, a right-handed frame about s
         a = np.arctan2(across @ upper, s * (s @ low)[:, None] @ -upper + low @ upper)
-        np.testing.assert_allclose(q, length + lead * a / (2 * np.pi) - ROD.lengths, rtol=0, atol=1e-12)  # [m]
+        np.testing.assert_allclose(
+            q, length + lead * a / (2 * np.pi) - ROD.lengths, rtol=0, atol=1e-12
+        )  # [m]
 
 
 def machine_points(listed: tuple[tuple[float, float, float], ...]) -> Array:

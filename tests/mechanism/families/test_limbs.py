@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mechanisms written limb by limb: the same machine in another hand, random structures, drives, refusals."""
+"""Mechanisms written limb by limb: the same machine in another hand, random structures, drives,
+refusals.
+"""
 
 from dataclasses import replace
 from functools import cache
@@ -9,8 +11,9 @@ import numpy as np
 import pytest
 
 from loopcal.errors import LoopcalError, MechanismError
-from loopcal.io.robot_file import load_robot
+from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism import Mechanism, build, forward, inverse
+from loopcal.mechanism.batch_kinematics import sensitivity
 from loopcal.mechanism.families.limb_records import (
     AngleDrive,
     Copies,
@@ -31,7 +34,6 @@ from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.families.three_prs import ThreePrs
 from loopcal.mechanism.limits import within
 from loopcal.mechanism.records import LengthTolerance, Pose
-from loopcal.mechanism.trials import sensitivity
 from tests.mechanism.families.random_limbs import built, expected_rank, random_mechanism, wander
 from tests.mechanism.families.ranks import rank, scaled, solved
 
@@ -88,11 +90,18 @@ def test_a_tripod_in_thirty_lines_is_the_3_prs(tmp_path: Path) -> None:
 
 
 def _tilt(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.arctan2(T[:, 1, 2], T[:, 0, 2]), np.arctan2(np.hypot(T[:, 0, 2], T[:, 1, 2]), T[:, 2, 2])
+    return np.arctan2(T[:, 1, 2], T[:, 0, 2]), np.arctan2(
+        np.hypot(T[:, 0, 2], T[:, 1, 2]), T[:, 2, 2]
+    )
 
 
-# --- random structures -----------------------------------------------------------------------------------------------
-RANDOM = [(6, seed) for seed in range(10)] + [(3, 100 + seed) for seed in range(6)] + [(2, 200 + seed) for seed in range(3)]
+# --- random structures
+# -----------------------------------------------------------------------------------------------
+RANDOM = (
+    [(6, seed) for seed in range(10)]
+    + [(3, 100 + seed) for seed in range(6)]
+    + [(2, 200 + seed) for seed in range(3)]
+)
 
 
 @cache
@@ -105,23 +114,36 @@ def test_there_are_more_than_fifty_random_limbs() -> None:
 
 
 @pytest.mark.parametrize(("limbs", "seed"), RANDOM)
-def test_the_complete_model_of_a_random_mechanism_has_the_rank_of_the_counting_rule(limbs: int, seed: int) -> None:
-    """Places and axes are random, so nothing needs perturbing; kept singular values are above 1e-10 of the largest."""
+def test_the_complete_model_of_a_random_mechanism_has_the_rank_of_the_counting_rule(
+    limbs: int, seed: int
+) -> None:
+    """Places and axes are random, so nothing needs perturbing; kept singular values are above 1e-10
+    of the largest.
+    """
     record, machine = random_mechanism(seed, limbs), random_robot(limbs, seed)
     state, q = wander(machine, 400, seed)
     assert state.T.shape[1] >= 40  # six rows each, for at most 142 parameters
     D = sensitivity(machine, machine.values[None], q, state).parameters[0, :150]
     assert rank(scaled(machine, D), tolerance=1e-10) == expected_rank(record)
     offsets = len(machine.actuators)
-    free = sum(j.actuated is None for limb in record.limbs for j in limb.chain if isinstance(j, (Revolute, Prismatic)))
+    free = sum(
+        j.actuated is None
+        for limb in record.limbs
+        for j in limb.chain
+        if isinstance(j, (Revolute, Prismatic))
+    )
     assert (
         len(machine.parameters)
         == expected_rank(record) + free + sum(1 for limb in record.limbs if limb.actuated is None)
-        == expected_rank(record) + free + offsets - sum(limb.actuated is not None for limb in record.limbs)
+        == expected_rank(record)
+        + free
+        + offsets
+        - sum(limb.actuated is not None for limb in record.limbs)
     )
 
 
-# --- what a file may say ---------------------------------------------------------------------------------------------
+# --- what a file may say
+# ---------------------------------------------------------------------------------------------
 SLIDER = Limbs(  # two rods from driven slides to a point in the plane
     name="slider",
     freedoms=("x", "y"),
@@ -157,12 +179,20 @@ def test_copies_turn_places_and_axes_and_number_the_names() -> None:
 
 def test_a_spool_pays_out_its_radius_and_what_it_builds_up() -> None:
     """length = offset + r q + b q^2 / (4 pi)."""
-    spool = SpoolDrive("angle", radius=0.02, buildup=0.001, offset=0.05, unknown=("offset", "radius", "buildup", "backlash"))
+    spool = SpoolDrive(
+        "angle",
+        radius=0.02,
+        buildup=0.001,
+        offset=0.05,
+        unknown=("offset", "radius", "buildup", "backlash"),
+    )
     machine = build(replace(SLIDER, actuators={"q": spool}).expand())
     plain = build(SLIDER.expand())
     xy = np.array([[-0.02, -0.08], [-0.06, -0.01]])
     angle, slide = inverse(machine, xy).q, inverse(plain, xy).q
-    np.testing.assert_allclose(0.05 + 0.02 * angle + 0.001 * angle**2 / (4 * np.pi), slide, rtol=0, atol=1e-12)  # [m]
+    np.testing.assert_allclose(
+        0.05 + 0.02 * angle + 0.001 * angle**2 / (4 * np.pi), slide, rtol=0, atol=1e-12
+    )  # [m]
     values = machine.values.copy()
     values[machine.parameters.index("q1.buildup")] += 0.0005
     thicker = inverse(machine.with_values(values), xy).q
@@ -171,7 +201,9 @@ def test_a_spool_pays_out_its_radius_and_what_it_builds_up() -> None:
 
 
 def test_a_named_parameter_moves_all_that_it_is_mapped_onto() -> None:
-    """A radius common to both slides, and a turn of the frame that they stand on: 0.3 m arm along y of the placed frame."""
+    """A radius common to both slides, and a turn of the frame that they stand on: 0.3 m arm along y
+    of the placed frame.
+    """
     radius = NamedLength("radius", 0.3, (Onto("rod", "P1", "x"),), LengthTolerance(sd=1e-4))
     turn = NamedAngle("turn", 0.0, (Onto("rod", "P1", "y", arm=0.3), Onto("rod", "P1", "rz")))
     machine = build(replace(SLIDER, parameters=(radius, turn)).expand())
@@ -180,12 +212,18 @@ def test_a_named_parameter_moves_all_that_it_is_mapped_onto() -> None:
     values[machine.parameters.index("radius")] = 0.31
     wider = with_limb(chain=(replace(SLIDER.limbs[0].chain[0], at=(0.31, 0.0, 0.0)),))
     xy = np.array([[-0.02, -0.08], [-0.06, -0.01]])
-    np.testing.assert_allclose(inverse(machine.with_values(values), xy).q, inverse(build(wider.expand()), xy).q, atol=1e-12)
+    np.testing.assert_allclose(
+        inverse(machine.with_values(values), xy).q, inverse(build(wider.expand()), xy).q, atol=1e-12
+    )
     solution = inverse(machine, xy)
-    D = sensitivity(machine, machine.values[None], solution.q[None], solution.state).parameters[0, :, 3:5]
+    D = sensitivity(machine, machine.values[None], solution.q[None], solution.state).parameters[
+        0, :, 3:5
+    ]
     # the whole machine turned by da moves the point by da z x (x, y)
     expected = np.stack([-xy[:, 1], xy[:, 0]], axis=1)
-    np.testing.assert_allclose(D[..., machine.parameters.index("turn")], expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        D[..., machine.parameters.index("turn")], expected, rtol=0, atol=1e-12
+    )
 
 
 def test_joints_made_of_others_move_like_them() -> None:
@@ -195,21 +233,32 @@ def test_joints_made_of_others_move_like_them() -> None:
         Universal("U", at=(0.3, 0.0, 0.0), axes=("y", "z"), start=(-2.2, 0.0)),
         Prismatic("P", axis="x", actuated="q", start=0.5),
     )
-    limb = LimbRecord("leg", "ball", chain=chain, copies=Copies(3), errors=(Shifts("U1", ("x", "y")),))
-    record = replace(SLIDER, limbs=(limb,), freedoms=("x", "y", "z"), controlled=("x", "y", "z"), home=Pose(z=0.4))
+    limb = LimbRecord(
+        "leg", "ball", chain=chain, copies=Copies(3), errors=(Shifts("U1", ("x", "y")),)
+    )
+    record = replace(
+        SLIDER,
+        limbs=(limb,),
+        freedoms=("x", "y", "z"),
+        controlled=("x", "y", "z"),
+        home=Pose(z=0.4),
+    )
     machine = build(record.expand())
     xyz = np.array([[-0.02, -0.08, 0.3], [0.06, -0.01, 0.5]])
     angle = 2 * np.pi / 3 * np.arange(3)
     feet = 0.3 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     distance = np.linalg.norm(xyz[:, None] - feet, axis=2)
     np.testing.assert_allclose(inverse(machine, xyz).q, distance, rtol=0, atol=1e-12)  # [m]
-    np.testing.assert_allclose(forward(machine, distance).T[:, :3, 3], xyz, rtol=0, atol=1e-12)  # [m]
+    np.testing.assert_allclose(
+        forward(machine, distance).T[:, :3, 3], xyz, rtol=0, atol=1e-12
+    )  # [m]
 
 
 def test_limits_and_cones_of_a_file_are_told() -> None:
     chain = (replace(SLIDER.limbs[0].chain[0], limits=(-1.0, 0.45)),)
     machine = build(with_limb(chain=chain, cones=(RodCone("tip", "-x", 0.9),)).expand())
-    # the first slide goes up with y, as long as its rod lies across; the rods lean more where the point comes near them
+    # the first slide goes up with y, as long as its rod lies across; the rods lean more where the
+    # point comes near them
     solution = inverse(machine, np.array([[-0.05, -0.05], [-0.05, 0.1], [0.02, -0.05]]))
     allowed, why = within(machine, machine.values[None], solution.q[None], solution.state)
     assert allowed.tolist() == [[True, False, False]]
@@ -222,23 +271,50 @@ CASES = {
         replace(SLIDER, limbs=(*SLIDER.limbs, replace(SLIDER.limbs[0], name="branch", on="rod"))),
         "limb 'branch' starts on limb 'rod': loopcal has no limbs that branch from limbs",
     ),
-    "end on a limb": (with_limb(to="elbow"), "limb 'rod' ends on 'elbow': loopcal has no limbs that branch"),
-    "nothing unknown": (replace(SLIDER, limbs=(replace(SLIDER.limbs[0], errors=()),), actuators={}), "names no unknown"),
-    "idle drive": (replace(SLIDER, actuators={**SLIDER.actuators, "z": LengthDrive("length")}), "'z' drives no joint"),
-    "wrong drive": (replace(SLIDER, actuators={"q": AngleDrive("angle")}), "drives a joint that slides; state reads: length"),
+    "end on a limb": (
+        with_limb(to="elbow"),
+        "limb 'rod' ends on 'elbow': loopcal has no limbs that branch",
+    ),
+    "nothing unknown": (
+        replace(SLIDER, limbs=(replace(SLIDER.limbs[0], errors=()),), actuators={}),
+        "names no unknown",
+    ),
+    "idle drive": (
+        replace(SLIDER, actuators={**SLIDER.actuators, "z": LengthDrive("length")}),
+        "'z' drives no joint",
+    ),
+    "wrong drive": (
+        replace(SLIDER, actuators={"q": AngleDrive("angle")}),
+        "drives a joint that slides; state reads: length",
+    ),
     "no such term": (
         replace(SLIDER, actuators={"q": LengthDrive("length", unknown=("radius",))}),
         "no term 'radius'; allowed are offset, gain, backlash",
     ),
-    "no period": (replace(SLIDER, actuators={"q": LengthDrive("length", unknown=("sin1",))}), "unknown sin1, but no period"),
-    "no such element": (with_limb(errors=(Shifts("hinge", ("x",)),)), "'rod1' has no 'hinge'; it has P1, tip, platform"),
-    "length of no rod": (with_limb(errors=(Shifts("P1", ("length",)),)), "'length' belongs to a rod"),
-    "rod of a ball": (with_limb(ending="ball"), "ends ball and states a length, drive or cone of a rod"),
+    "no period": (
+        replace(SLIDER, actuators={"q": LengthDrive("length", unknown=("sin1",))}),
+        "unknown sin1, but no period",
+    ),
+    "no such element": (
+        with_limb(errors=(Shifts("hinge", ("x",)),)),
+        "'rod1' has no 'hinge'; it has P1, tip, platform",
+    ),
+    "length of no rod": (
+        with_limb(errors=(Shifts("P1", ("length",)),)),
+        "'length' belongs to a rod",
+    ),
+    "rod of a ball": (
+        with_limb(ending="ball"),
+        "ends ball and states a length, drive or cone of a rod",
+    ),
     "tilt alone": (
         with_limb(chain=(Revolute("R"),), actuated="q", errors=(Tilts("R1", ("rx",), alone=True),)),
         "which only a sliding joint allows",
     ),
-    "axis zero": (with_limb(chain=(Prismatic("P", axis=(0.0, 0.0, 0.0), actuated="q"),)), "give it a direction"),
+    "axis zero": (
+        with_limb(chain=(Prismatic("P", axis=(0.0, 0.0, 0.0), actuated="q"),)),
+        "give it a direction",
+    ),
     "no copies": (with_limb(copies=Copies(0)), "has 0 copies"),
     "unknown owner": (
         replace(SLIDER, parameters=(NamedLength("r", 0.1, (Onto("arm", "P1", "x"),)),)),
@@ -251,7 +327,9 @@ CASES = {
 def test_what_cannot_be_is_told_in_a_sentence(case: str) -> None:
     record, sentence = CASES[case]
     if case == "wrong drive":
-        record = replace(record, limbs=(replace(record.limbs[0], errors=(Shifts("rod", ("length",)),)),))
+        record = replace(
+            record, limbs=(replace(record.limbs[0], errors=(Shifts("rod", ("length",)),)),)
+        )
     with pytest.raises(MechanismError) as found:
         record.expand()
     assert sentence in str(found.value)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from loopcal.errors import LoopcalError
-from loopcal.io.robot_file import load_robot, robot_path, shipped_robots
+from loopcal.io.robot.robot_file import load_robot, robot_path, shipped_robots
 from loopcal.mechanism import Mechanism, inverse
 
 LIMBS = tuple(name for name in shipped_robots() if "family: limbs" in robot_path(name).read_text())
@@ -24,10 +24,13 @@ def changed(tmp_path: Path, name: str, *changes: tuple[str, str], more: str = ""
     return load_robot(path)
 
 
-# --- the complete model beside named unknowns ------------------------------------------------------------------------
+# --- the complete model beside named unknowns
+# ------------------------------------------------------------------------
 @pytest.mark.parametrize("name", LIMBS)
 def test_every_shipped_file_also_loads_with_the_complete_model(tmp_path: Path, name: str) -> None:
-    """What the file names keeps its name and tolerance; a drive has one offset; nothing stands there twice."""
+    """What the file names keeps its name and tolerance; a drive has one offset; nothing stands
+    there twice.
+    """
     ideal, complete = load_robot(name), changed(tmp_path, name, more="error_model: complete")
     assert set(ideal.parameters.names) <= set(complete.parameters.names)
     assert len(complete.parameters) > len(ideal.parameters)
@@ -37,16 +40,27 @@ def test_every_shipped_file_also_loads_with_the_complete_model(tmp_path: Path, n
     assert np.linalg.matrix_rank(matrix) == len(complete.parameters)
 
 
-def test_a_named_error_about_another_axis_than_the_one_of_its_name_takes_none_away(tmp_path: Path) -> None:
-    """A motor about y has the own axes z, x, y: `motor.x` of the file is its second, so the first stays, as `.own`."""
-    machine = changed(tmp_path, "rotary-delta", ("shift: [x, y, z]", "shift: [x]"), more="error_model: complete")
-    moved = {m.parameter: m.address.axis for m in machine.assembly.maps if m.parameter.startswith("arm1.motor.")}
+def test_a_named_error_about_another_axis_than_the_one_of_its_name_takes_none_away(
+    tmp_path: Path,
+) -> None:
+    """A motor about y has the own axes z, x, y: `motor.x` of the file is its second, so the first
+    stays, as `.own`.
+    """
+    machine = changed(
+        tmp_path, "rotary-delta", ("shift: [x, y, z]", "shift: [x]"), more="error_model: complete"
+    )
+    moved = {
+        m.parameter: m.address.axis
+        for m in machine.assembly.maps
+        if m.parameter.startswith("arm1.motor.")
+    }
     assert moved == {
         "arm1.motor.x": "y", "arm1.motor.x.own": "x", "arm1.motor.rx": "rx", "arm1.motor.ry": "ry"
     }  # fmt: skip
 
 
-# --- left out or mistyped --------------------------------------------------------------------------------------------
+# --- left out or mistyped
+# --------------------------------------------------------------------------------------------
 def refused(tmp_path: Path, name: str, *changes: tuple[str, str], more: str = "") -> str:
     """The one sentence that a changed file is refused with."""
     with pytest.raises(LoopcalError) as found:
@@ -58,10 +72,20 @@ def refused(tmp_path: Path, name: str, *changes: tuple[str, str], more: str = ""
 FREEDOMS = {
     "controlled left out": (
         ("controlled: [x, y]\n", ""),
-        "five-bar names no controlled coordinate; state one for each freedom, of x, y, z, roll, pitch, yaw, phi, theta, psi",
+        (
+            "five-bar names no controlled coordinate; state one for each freedom, of x, y, z, "
+            "roll, "
+            "pitch, yaw, phi, theta, psi"
+        ),
     ),
-    "controlled empty": (("controlled: [x, y]", "controlled: []"), "five-bar names no controlled coordinate"),
-    "freedoms empty": (("freedoms: [x, y]", "freedoms: []"), "five-bar has no freedoms; state those its platform has, of rx,"),
+    "controlled empty": (
+        ("controlled: [x, y]", "controlled: []"),
+        "five-bar names no controlled coordinate",
+    ),
+    "freedoms empty": (
+        ("freedoms: [x, y]", "freedoms: []"),
+        "five-bar has no freedoms; state those its platform has, of rx,",
+    ),
     "freedoms twice": (
         ("freedoms: [x, y]", "freedoms: [x, x, y]"),
         "the freedom 'x' is named twice in x, x, y; name each once",
@@ -70,7 +94,9 @@ FREEDOMS = {
 
 
 @pytest.mark.parametrize("case", FREEDOMS)
-def test_freedoms_and_coordinates_are_named_once_and_not_left_out(tmp_path: Path, case: str) -> None:
+def test_freedoms_and_coordinates_are_named_once_and_not_left_out(
+    tmp_path: Path, case: str
+) -> None:
     change, sentence = FREEDOMS[case]
     assert sentence in refused(tmp_path, "five-bar", change)
 
@@ -81,7 +107,10 @@ TYPED = {
         "limb 'arm' ends in a rod that no drive moves, of length 0 m; it needs a positive `length:`",
     ),
     "rod of no length": (("length: 480", "length: 0"), "it needs a positive `length:`"),
-    "rod of negative length": (("length: 480", "length: -480"), "of length -0.48 m; it needs a positive `length:`"),
+    "rod of negative length": (
+        ("length: 480", "length: -480"),
+        "of length -0.48 m; it needs a positive `length:`",
+    ),
     "stroke reversed": (
         ("stroke: [-45, 95]", "stroke: [90, 10]"),
         "the stroke of q1 runs from 1.5708 to 0.174533 rad; the first must be smaller",
@@ -92,13 +121,18 @@ TYPED = {
     ),
     "drive mistyped": (
         ("actuated: q", "actuated: w"),
-        "actuator 'q' drives no joint; write 'actuated: q' at one, or leave it out; joints are driven by w1, w2, w3",
+        (
+            "actuator 'q' drives no joint; write 'actuated: q' at one, or leave it out; joints are "
+            "driven by w1, w2, w3"
+        ),
     ),
 }
 
 
 @pytest.mark.parametrize("case", TYPED)
-def test_lengths_ranges_and_drives_that_cannot_be_are_told_in_a_sentence(tmp_path: Path, case: str) -> None:
+def test_lengths_ranges_and_drives_that_cannot_be_are_told_in_a_sentence(
+    tmp_path: Path, case: str
+) -> None:
     change, sentence = TYPED[case]
     assert sentence in refused(tmp_path, "rotary-delta", change)
 
@@ -116,11 +150,15 @@ def test_a_file_without_limbs_is_told_so(tmp_path: Path) -> None:
     text = robot_path("rotary-delta").read_text()
     path = tmp_path / "none.yaml"
     path.write_text(text[: text.index("limbs:\n")] + "limbs: []\n" + text[text.index("home:") :])
-    with pytest.raises(LoopcalError, match="rotary-delta has no limbs; write those that join the base to the platform"):
+    with pytest.raises(
+        LoopcalError,
+        match="rotary-delta has no limbs; write those that join the base to the platform",
+    ):
         load_robot(path)
 
 
-# --- named parameters and their maps ---------------------------------------------------------------------------------
+# --- named parameters and their maps
+# ---------------------------------------------------------------------------------
 def named(kind: str, onto: str) -> str:
     """A parameter `p` of a kind, mapped once."""
     return f"parameters: [{{name: p, {kind}: 1, tolerance: {{sd: 1}}, maps: [{{{onto}}}]}}]"
@@ -136,10 +174,22 @@ MAPS = {
         ("angle", "limb: arm, element: rod, axis: length"),
         "is an angle and length of 'arm' a length; state an",
     ),
-    "ratio onto x": (("ratio", ON_ARM + "x"), "parameter 'p' is a ratio and x of 'arm' a length; state an `arm:`"),
-    "length onto rx": (("length", ON_ARM + "rx"), "parameter 'p' is a length and rx of 'arm' an angle; state it as an angle"),
-    "arm of a length": (("length", ON_ARM + "x, arm: 2"), "parameter 'p' is a length with an arm; leave the arm out"),
-    "arm onto rx": (("angle", ON_ARM + "rx, arm: 2"), "is an angle with an arm and rx of 'arm' an angle; leave the arm out"),
+    "ratio onto x": (
+        ("ratio", ON_ARM + "x"),
+        "parameter 'p' is a ratio and x of 'arm' a length; state an `arm:`",
+    ),
+    "length onto rx": (
+        ("length", ON_ARM + "rx"),
+        "parameter 'p' is a length and rx of 'arm' an angle; state it as an angle",
+    ),
+    "arm of a length": (
+        ("length", ON_ARM + "x, arm: 2"),
+        "parameter 'p' is a length with an arm; leave the arm out",
+    ),
+    "arm onto rx": (
+        ("angle", ON_ARM + "rx, arm: 2"),
+        "is an angle with an arm and rx of 'arm' an angle; leave the arm out",
+    ),
     "length onto offset": (
         ("length", "limb: q1, element: transmission, axis: offset"),
         "is a length and offset of 'q1' an angle; state it as an angle",
@@ -148,7 +198,10 @@ MAPS = {
         ("angle", "limb: q1, element: transmission, axis: gain"),
         "is an angle and gain of 'q1' a ratio; state it as a ratio",
     ),
-    "pitch": (("length", ON_ARM + "pitch"), "parameter 'p' is mapped onto 'pitch'; use lead, the advance in one turn"),
+    "pitch": (
+        ("length", ON_ARM + "pitch"),
+        "parameter 'p' is mapped onto 'pitch'; use lead, the advance in one turn",
+    ),
 }
 
 

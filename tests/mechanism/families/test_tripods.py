@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""3-PRS and RU-PUS-PRS: columns against the error models written out by hand, ranks, null directions.
+"""3-PRS and RU-PUS-PRS: columns against the error models written out by hand, ranks, null
+directions.
 
-The formulas here are those of docs/theory/tripods.md, from the loops |v_i| = l_i, v_i . r_i = 0 and so on, and share no
-code with the package.
+The formulas here are those of docs/theory/tripods.md, from the loops |v_i| = l_i, v_i . r_i = 0 and
+so on, and share no code with the package.
 """
 
 from dataclasses import replace
@@ -15,20 +16,40 @@ from numpy.typing import NDArray
 from loopcal.engine.closure import geometry
 from loopcal.errors import MechanismError
 from loopcal.mechanism import Mechanism, build
+from loopcal.mechanism.batch_kinematics import sensitivity
 from loopcal.mechanism.families.ru_pus_prs import LEFT_OUT, RuPusPrs
 from loopcal.mechanism.families.three_prs import ThreePrs
 from loopcal.mechanism.records import Pose, Workspace
-from loopcal.mechanism.trials import sensitivity
-from tests.mechanism.families.ranks import measured, null_vector, perturbed, rank, ranks, scaled_sensitivity, solved, told_apart
+from tests.mechanism.families.ranks import (
+    measured,
+    null_vector,
+    perturbed,
+    rank,
+    ranks,
+    scaled_sensitivity,
+    solved,
+    told_apart,
+)
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 TILTS = {"phi": (-np.pi, np.pi), "theta": (0.02, 0.6)}
 THREE_PRS = ThreePrs(
-    name="3-prs", platform_radius=0.2, base_radius=0.35, rod=0.5, home=Pose(z=0.7), workspace=Workspace(z=(0.65, 0.75), **TILTS)
+    name="3-prs",
+    platform_radius=0.2,
+    base_radius=0.35,
+    rod=0.5,
+    home=Pose(z=0.7),
+    workspace=Workspace(z=(0.65, 0.75), **TILTS),
 )
 RU_PUS_PRS = RuPusPrs(
-    name="ru-pus-prs", platform_radius=0.3, base_radius=0.4, rod=0.5, post=0.6, home=Pose(z=0.6), workspace=Workspace(**TILTS)
+    name="ru-pus-prs",
+    platform_radius=0.3,
+    base_radius=0.4,
+    rod=0.5,
+    post=0.6,
+    home=Pose(z=0.6),
+    workspace=Workspace(**TILTS),
 )
 KINDS = ("full", "5-dof", "positions", "orientation")
 EX, EY, EZ = np.eye(3)
@@ -39,22 +60,31 @@ def robot(record: ThreePrs | RuPusPrs) -> Mechanism:
     return build(record.expand())
 
 
-# --- the error models by hand ----------------------------------------------------------------------------------------
+# --- the error models by hand
+# ----------------------------------------------------------------------------------------
 def spin(angle: float) -> Array:
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
-def sphere_row(N: Array, R: Array, a: Array, b: Array, q: float, Z: Array, tags: dict[str, str]) -> tuple[Array, dict]:
-    """w . dN + (R a x w) . om = dl + w . [Z db + s dq + q Z (dthBy, -dthBx, 0)] - w . R Z da: twist row, parameter slopes."""
+def sphere_row(
+    N: Array, R: Array, a: Array, b: Array, q: float, Z: Array, tags: dict[str, str]
+) -> tuple[Array, dict]:
+    """w . dN + (R a x w) . om = dl + w . [Z db + s dq + q Z (dthBy, -dthBx, 0)] - w . R Z da: twist
+    row, parameter slopes.
+    """
     v = N + R @ a - b - q * EZ
     w = v / np.linalg.norm(v)
     slopes = {tags["l"]: 1.0} | guided(w, R, q, Z, tags)
     return np.concatenate([np.cross(R @ a, w), w]), slopes
 
 
-def hinge_row(N: Array, R: Array, a: Array, b: Array, q: float, Z: Array, r: Array, tags: dict) -> tuple[Array, dict]:
-    """r . dN + (R a x r) . om = r . [Z db + s dq + q Z (dthBy, -dthBx, 0)] - r . R Z da - v . dr, dr = (Z dthC) x r."""
+def hinge_row(
+    N: Array, R: Array, a: Array, b: Array, q: float, Z: Array, r: Array, tags: dict
+) -> tuple[Array, dict]:
+    """r . dN + (R a x r) . om = r . [Z db + s dq + q Z (dthBy, -dthBx, 0)] - r . R Z da - v . dr,
+    dr = (Z dthC) x r.
+    """
     v = N + R @ a - b - q * EZ
     slopes = guided(r, R, q, Z, tags)
     for axis in "xyz":
@@ -72,7 +102,18 @@ def guided(w: Array, R: Array, q: float, Z: Array, tags: dict[str, str]) -> dict
 
 def tags(i: int, joint: str) -> dict[str, str]:
     """The paper's names of the parameters of chain i."""
-    keys = ("ax", "ay", "az", "bx", "by", "q", "l", "thBx", "thBy", *(f"thC{axis}" for axis in joint))
+    keys = (
+        "ax",
+        "ay",
+        "az",
+        "bx",
+        "by",
+        "q",
+        "l",
+        "thBx",
+        "thBy",
+        *(f"thC{axis}" for axis in joint),
+    )
     return {key: f"{key[:-1]}{i}{key[-1]}" if key[-1] in "xyz" else f"{key}{i}" for key in keys}
 
 
@@ -88,20 +129,31 @@ def three_prs_rows(N: Array, R: Array, q: Array) -> list[tuple[Array, dict]]:
 
 
 def ru_pus_prs_rows(N: Array, R: Array, q: Array) -> list[tuple[Array, dict]]:
-    """The six loops of the RU-PUS-PRS: two rods, the hinge of chain 2, |N| = r, n . N = 0, u1 . R u2 = 0."""
+    """The six loops of the RU-PUS-PRS: two rods, the hinge of chain 2, |N| = r, n . N = 0, u1 . R
+    u2 = 0.
+    """
     a1, b1, a2, b2 = -0.3 * EX, -0.4 * EX, 0.3 * EY, 0.4 * EY
     eye, u1, u2 = np.eye(3), EX, R @ EY
     zero = np.zeros(3)
-    post = {"thU1y": -u2 @ np.cross(EY, u1), "thU1z": -u2 @ np.cross(EZ, u1), "thOz": -u2 @ np.cross(EZ, u1)}
+    post = {
+        "thU1y": -u2 @ np.cross(EY, u1),
+        "thU1z": -u2 @ np.cross(EZ, u1),
+        "thOz": -u2 @ np.cross(EZ, u1),
+    }
     post |= {"thU2x": -u1 @ R @ np.cross(EX, EY), "thU2z": -u1 @ R @ np.cross(EZ, EY)}
     return [
         sphere_row(N, R, a1, b1, q[0], eye, tags(1, "")),
         sphere_row(N, R, a2, b2, q[1], eye, tags(2, "")),
         hinge_row(N, R, a2, b2, q[1], eye, EX, tags(2, "yz")),
         (np.concatenate([zero, N / np.linalg.norm(N)]), {"r": 1.0}),
-        # the pivot along n = y: its turn about x tips the post sideways, that about z leaves N where it is
-        (np.concatenate([zero, EY]), {"thOx": -N @ np.cross(EX, EY), "thOz": -N @ np.cross(EZ, EY)}),
-        # u1 is carried by the post: it turns with the pivot about z, and about y with N, du1 = dN_x / r (y x x)
+        # the pivot along n = y: its turn about x tips the post sideways, that about z leaves N
+        # where it is
+        (
+            np.concatenate([zero, EY]),
+            {"thOx": -N @ np.cross(EX, EY), "thOz": -N @ np.cross(EZ, EY)},
+        ),
+        # u1 is carried by the post: it turns with the pivot about z, and about y with N, du1 = dN_x
+        # / r (y x x)
         (np.concatenate([np.cross(u2, u1), -EX * (u2 @ EZ) / np.linalg.norm(N)]), post),
     ]
 
@@ -127,19 +179,25 @@ def test_columns_are_those_of_the_error_model_written_out(case: str) -> None:
     solution = solved(machine)
     D = sensitivity(machine, machine.values[None], solution.q[None], solution.state).parameters[0]
     expected = np.stack(
-        [by_hand(rows(T[:3, 3], T[:3, :3], q), machine.parameters.names) for T, q in zip(solution.T, solution.q, strict=True)]
+        [
+            by_hand(rows(T[:3, 3], T[:3, :3], q), machine.parameters.names)
+            for T, q in zip(solution.T, solution.q, strict=True)
+        ]
     )
     # [m/m, rad/m, ..] condition of the six loops 1e2 times rounding
     np.testing.assert_allclose(D, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
-# --- the closure by hand, at any parameters --------------------------------------------------------------------------
+# --- the closure by hand, at any parameters
+# --------------------------------------------------------------------------
 def cross_matrix(w: Array | Complex) -> Complex:
     return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]], dtype=complex)
 
 
 def turned(w: Array | Complex) -> Complex:
-    """exp of small angles as its series, which takes complex numbers; 0.1^12 / 12! is far below rounding."""
+    """exp of small angles as its series, which takes complex numbers; 0.1^12 / 12! is far below
+    rounding.
+    """
     W, term, total = cross_matrix(w), np.eye(3, dtype=complex), np.eye(3, dtype=complex)
     for k in range(1, 12):
         term = term @ W / k
@@ -150,8 +208,9 @@ def turned(w: Array | Complex) -> Complex:
 class Loops:
     """The loops as equations of (platform, pivot's angle, parameters), without first-order steps.
 
-    The paper's derivatives hold at zero angles. Beyond, two angles of one axis act as one turn exp((x, y, z)), and the joint
-    on a tilted guide takes that turn back and its own in one: r = exp(thB) exp(thC - thB) r0.
+    The paper's derivatives hold at zero angles. Beyond, two angles of one axis act as one turn
+    exp((x, y, z)), and the joint on a tilted guide takes that turn back and its own in one: r =
+    exp(thB) exp(thC - thB) r0.
     """
 
     def __init__(self, names: tuple[str, ...], values: Array | Complex) -> None:
@@ -160,7 +219,9 @@ class Loops:
     def vector(self, name: str) -> Complex:
         return np.array([self.of.get(f"{name}{axis}", 0.0) for axis in "xyz"], dtype=complex)
 
-    def limb(self, i: int, N: Complex, R: Complex, q: float, Z: Array, hinge: Array | None) -> list[complex]:
+    def limb(
+        self, i: int, N: Complex, R: Complex, q: float, Z: Array, hinge: Array | None
+    ) -> list[complex]:
         guide = turned(self.vector(f"thB{i}"))
         s = Z @ guide @ EZ
         v = N + R @ Z @ self.vector(f"a{i}") - Z @ self.vector(f"b{i}") - (self.of[f"q{i}"] + q) * s
@@ -188,14 +249,20 @@ class Loops:
         return float(np.arctan2(x, z))
 
 
-def by_closure(kind: str, names: tuple[str, ...], values: Array, T: Array, q: Array) -> tuple[Array, Array]:
-    """Residuals (7,) and D (6, p) of the loops by complex steps, which have no truncation and no cancellation."""
+def by_closure(
+    kind: str, names: tuple[str, ...], values: Array, T: Array, q: Array
+) -> tuple[Array, Array]:
+    """Residuals (7,) and D (6, p) of the loops by complex steps, which have no truncation and no
+    cancellation.
+    """
     N, R, h = T[:3, 3], T[:3, :3], 1e-30
     start = Loops(names, values).pivot(N) if kind == "ru_pus_prs" else 0.0
 
     def loops(x: Array | Complex, p: Array | Complex) -> Complex:
         moved = Loops(names, values + p)
-        return np.asarray(getattr(moved, kind)(N + x[3:6], (np.eye(3) + cross_matrix(x[:3])) @ R, start + x[6], q))
+        return np.asarray(
+            getattr(moved, kind)(N + x[3:6], (np.eye(3) + cross_matrix(x[:3])) @ R, start + x[6], q)
+        )
 
     def steps(n: int) -> Complex:
         return np.asarray(1j * h * np.eye(n), dtype=complex)
@@ -208,16 +275,24 @@ def by_closure(kind: str, names: tuple[str, ...], values: Array, T: Array, q: Ar
 
 @pytest.mark.parametrize("size", [1e-3, 1e-2])
 @pytest.mark.parametrize("case", CASES)
-def test_columns_at_moved_parameters_are_those_of_the_closure_written_out(case: str, size: float) -> None:
-    # [m] and angles of 5 (50) mrad: centres, guides, joints and post all displaced, also against each other
+def test_columns_at_moved_parameters_are_those_of_the_closure_written_out(
+    case: str, size: float
+) -> None:
+    # [m] and angles of 5 (50) mrad: centres, guides, joints and post all displaced, also against
+    # each other
     record, rows = CASES[case]
     machine = perturbed(robot(record), size, seed=11)
     solution = solved(machine, 40)
     D = sensitivity(machine, machine.values[None], solution.q[None], solution.state).parameters[0]
     kind, names = rows.__name__.removesuffix("_rows"), machine.parameters.names
-    found = [by_closure(kind, names, machine.values, T, q) for T, q in zip(solution.T, solution.q, strict=True)]
+    found = [
+        by_closure(kind, names, machine.values, T, q)
+        for T, q in zip(solution.T, solution.q, strict=True)
+    ]
     expected = np.stack([slopes for _, slopes in found])
-    assert max(np.abs(residual).max() for residual, _ in found) < 1e-12  # [m, 1] the machine stands on these loops
+    assert (
+        max(np.abs(residual).max() for residual, _ in found) < 1e-12
+    )  # [m, 1] the machine stands on these loops
     # [m/m, rad/m, ..] condition of the loops 1e2 times rounding
     np.testing.assert_allclose(D, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
@@ -237,14 +312,27 @@ def test_both_derivations_by_hand_agree_at_nominal_parameters(case: str) -> None
 def test_the_declared_names_are_eleven_a_chain_and_twenty_five() -> None:
     names = robot(THREE_PRS).parameters.names
     assert len(names) == 33
-    assert names[:11] == ("a1x", "a1y", "a1z", "b1x", "b1y", "q1", "l1", "thB1x", "thB1y", "thC1x", "thC1z")
+    assert names[:11] == (
+        "a1x",
+        "a1y",
+        "a1z",
+        "b1x",
+        "b1y",
+        "q1",
+        "l1",
+        "thB1x",
+        "thB1y",
+        "thC1x",
+        "thC1z",
+    )
     names = robot(RU_PUS_PRS).parameters.names
     assert len(names) == 25
     assert set(robot(CASES["RU-PUS-PRS, 27"][0]).parameters.names) - set(names) == set(LEFT_OUT)
     assert names[-5:] == ("r", "thOx", "thU1y", "thU2x", "thU2z")
 
 
-# --- what can be told apart ------------------------------------------------------------------------------------------
+# --- what can be told apart
+# ------------------------------------------------------------------------------------------
 def test_ranks_of_the_3_prs_are_33_and_lose_one_without_torsion_and_three_without_angles() -> None:
     assert ranks(robot(THREE_PRS), KINDS) == [33, 32, 30, 27]
 
@@ -258,10 +346,11 @@ def test_an_unknown_frame_costs_the_3_prs_six_parameters_and_two_cost_twelve() -
 def test_an_unknown_frame_costs_the_tracker_the_motions_that_its_parameters_can_follow() -> None:
     """A frame costs as many as it has motions that a change of the parameters repeats; by counting.
 
-    Base, 5 (20): all moves and turns but the one about z, for the twenty-five leave out the post's thOz and thU1z; its
-    other motions the post's angles and length follow, for its end N stands still in all poses. The 27 lose all 6 (20 of 26).
-    Tool, 3 (22): the turns, by a1 a2 thU2; a move would shift the universal joint on the platform, which has no parameter.
-    Both, 8 (17): the sum. Without torsion one less where the tool is known, none where its turn about the normal is lost.
+    Base, 5 (20): all moves and turns but the one about z, for the twenty-five leave out the post's
+    thOz and thU1z; its other motions the post's angles and length follow, for its end N stands
+    still in all poses. The 27 lose all 6 (20 of 26). Tool, 3 (22): the turns, by a1 a2 thU2; a move
+    would shift the universal joint on the platform, which has no parameter. Both, 8 (17): the sum.
+    Without torsion one less where the tool is known, none where its turn about the normal is lost.
     """
     machine = robot(RU_PUS_PRS)
     assert told_apart(machine, "full") == [20, 22, 17]
@@ -274,7 +363,9 @@ def test_without_torsion_the_3_prs_cannot_see_its_three_balls_turned_together() 
     solution = solved(machine)
     found = null_vector(measured(scaled_sensitivity(machine, solution), solution.T, "5-dof"))
     expected = np.isin(machine.parameters.names, ("a1y", "a2y", "a3y")) / np.sqrt(3)
-    np.testing.assert_allclose(np.abs(found @ expected), 1.0, atol=1e-9)  # rounding over the next singular value, 4e-5
+    np.testing.assert_allclose(
+        np.abs(found @ expected), 1.0, atol=1e-9
+    )  # rounding over the next singular value, 4e-5
 
 
 def test_fourteen_natural_parameters_a_chain_reduce_to_the_eleven_by_dropping_three() -> None:
@@ -284,7 +375,11 @@ def test_fourteen_natural_parameters_a_chain_reduce_to_the_eleven_by_dropping_th
     solution = solved(machine)
     D = scaled_sensitivity(machine, solution)
     assert rank(D) == 33
-    dropped = [f"{letter}{chain}{axis}" for letter, axis in (("b", "z"), ("thB", "z"), ("thC", "y")) for chain in "123"]
+    dropped = [
+        f"{letter}{chain}{axis}"
+        for letter, axis in (("b", "z"), ("thB", "z"), ("thC", "y"))
+        for chain in "123"
+    ]
     # an angle about its own axis changes nothing, the foot's height what the offset changes
     for name in dropped:
         column = D[..., machine.parameters.index(name)]
@@ -307,7 +402,9 @@ def test_a_tilted_guide_does_not_turn_the_joint_on_the_carriage() -> None:
     np.testing.assert_allclose(g.turn[0][..., 0, 0] @ g.turn[1][..., 0, 0] @ EZ, EY, atol=1e-15)
 
 
-def test_twenty_seven_parameters_of_the_tracker_have_rank_26_because_pivot_and_first_axis_turn_alike() -> None:
+def test_twenty_seven_parameters_of_the_tracker_have_rank_26_because_pivot_and_first_axis_turn_alike() -> (
+    None
+):
     machine = robot(CASES["RU-PUS-PRS, 27"][0])
     solution = solved(machine)
     D = scaled_sensitivity(machine, solution)
@@ -325,7 +422,9 @@ def test_without_torsion_the_tracker_cannot_see_its_two_balls_turned_together() 
     found = null_vector(measured(scaled_sensitivity(machine, solution), solution.T, "5-dof"))
     found *= np.sign(found[machine.parameters.index("a1y")])
     # mostly a1y = a2x, and a small angle of the second axis on the platform
-    assert found[machine.parameters.index("a1y")] == pytest.approx(found[machine.parameters.index("a2x")], rel=1e-6)
+    assert found[machine.parameters.index("a1y")] == pytest.approx(
+        found[machine.parameters.index("a2x")], rel=1e-6
+    )
     largest = np.array(machine.parameters.names)[np.argsort(-np.abs(found))[:3]]
     assert set(largest) == {"a1y", "a2x", "thU2z"}
 
@@ -336,10 +435,14 @@ def test_a_model_of_points_refuses_joints_of_axes() -> None:
 
 
 def test_a_rod_too_short_is_told_in_words() -> None:
-    with pytest.raises(MechanismError, match="rod of chain1 is 100 mm long, but its ball is 150 mm"):
+    with pytest.raises(
+        MechanismError, match="rod of chain1 is 100 mm long, but its ball is 150 mm"
+    ):
         replace(THREE_PRS, rod=0.1).expand()
 
 
 def test_the_origin_of_the_trackers_platform_stays_where_it_is() -> None:
     solution = solved(robot(RU_PUS_PRS))
-    np.testing.assert_allclose(solution.T[:, :3, 3], [[0, 0, 0.6]] * len(solution.T), atol=1e-12)  # [m] rounding
+    np.testing.assert_allclose(
+        solution.T[:, :3, 3], [[0, 0, 0.6]] * len(solution.T), atol=1e-12
+    )  # [m] rounding

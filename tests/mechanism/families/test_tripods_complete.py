@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Complete error models of the tripods: ranks at nominal and perturbed geometry, with unknown frames, with perfect joints."""
+"""Complete error models of the tripods: ranks at nominal and perturbed geometry, with unknown
+frames, with perfect joints.
+"""
 
 from dataclasses import replace
 
@@ -8,7 +10,15 @@ import pytest
 
 from loopcal.mechanism.families.ru_pus_prs import RuPusPrs
 from loopcal.mechanism.families.three_prs import ThreePrs
-from tests.mechanism.families.ranks import measured, perturbed, rank, ranks, scaled_sensitivity, solved, told_apart
+from tests.mechanism.families.ranks import (
+    measured,
+    perturbed,
+    rank,
+    ranks,
+    scaled_sensitivity,
+    solved,
+    told_apart,
+)
 from tests.mechanism.families.test_tripods import KINDS, RU_PUS_PRS, THREE_PRS, robot
 
 
@@ -23,8 +33,11 @@ from tests.mechanism.families.test_tripods import KINDS, RU_PUS_PRS, THREE_PRS, 
     ],
     ids=["perfect balls", "perfect balls, moved", "nominal", "moved", "tracker"],
 )
-def test_ranks_of_the_complete_models(record: ThreePrs | RuPusPrs, size: float, expected: list[int]) -> None:
-    # moved by 2 mm and 10 mrad (tracker: 6 mm, 30 mrad): at smaller errors the last directions sink into rounding
+def test_ranks_of_the_complete_models(
+    record: ThreePrs | RuPusPrs, size: float, expected: list[int]
+) -> None:
+    # moved by 2 mm and 10 mrad (tracker: 6 mm, 30 mrad): at smaller errors the last directions sink
+    # into rounding
     assert ranks(perturbed(robot(record), size, seed=7), KINDS[:3], n=120) == expected
 
 
@@ -47,7 +60,8 @@ def test_each_unknown_frame_costs_the_complete_models_six(
 ) -> None:
     machine = perturbed(robot(record), size, seed=7)
     assert told_apart(machine, "full", n=120) == expected
-    # without torsion one less with the tool known; with it unknown, its turn about the normal was lost already
+    # without torsion one less with the tool known; with it unknown, its turn about the normal was
+    # lost already
     assert told_apart(machine, "5-dof", n=120) == [expected[0] - 1, *expected[1:]]
 
 
@@ -62,12 +76,15 @@ def test_each_unknown_frame_costs_the_complete_models_six(
     ],
     ids=["3-PRS", "3-PRS, nominal", "3-PRS, perfect balls", "tracker"],
 )
-def test_orientation_alone_costs_the_complete_models_six(record: ThreePrs | RuPusPrs, size: float, expected: int) -> None:
+def test_orientation_alone_costs_the_complete_models_six(
+    record: ThreePrs | RuPusPrs, size: float, expected: int
+) -> None:
     assert ranks(perturbed(robot(record), size, seed=7), ["orientation"], n=120) == [expected]
 
 
 def test_the_tracker_with_perfect_balls_has_35_and_with_a_perfect_cross_33() -> None:
-    """PUS 9, PRS 11 and the post's three revolute joints 3 * 3 + 6 = 15: 35 (C = 3R + 6 for a chain of passive R).
+    """PUS 9, PRS 11 and the post's three revolute joints 3 * 3 + 6 = 15: 35 (C = 3R + 6 for a chain
+    of passive R).
 
     The published 33 takes the universal joint as ideal too: its axes meet and are square, two less.
     """

@@ -7,7 +7,9 @@ import math
 
 
 def with_point(text: str, decimal: str) -> str:
-    """Return a number that is written with this decimal mark with a point; a point that is none becomes no number."""
+    """Return a number that is written with this decimal mark with a point; a point that is none
+    becomes no number.
+    """
     return text if decimal == "." else text.replace(".", "?").replace(decimal, ".")
 
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From an export to the text of a measurement file, as a profile says: numbers keep their digits, no line goes unseen.
+"""From an export to the text of a measurement file, as a profile says: numbers keep their digits,
+no line goes unseen.
 
-Every line is a row, is passed over as the profile says (blank, a comment, skipped, ignored, the header), or does not fit;
-lines of the last sort are listed with the reason.
+Every line is a row, is passed over as the profile says (blank, a comment, skipped, ignored, the
+header), or does not fit; lines of the last sort are listed with the reason.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from loopcal.errors import FileError
-from loopcal.io.csv_table import quoted
+from loopcal.io.core.csv_table import quoted
+from loopcal.io.data.measurement_file import FORMAT
+from loopcal.io.data.pose_rows import LINK
+from loopcal.io.data.sensor_rows import COVARIANCE
 from loopcal.io.exports.cells import plain_number, with_point
 from loopcal.io.exports.lines import Line, Misfit, check_count, read_lines, unlike_most
 from loopcal.io.exports.profile import Profile, Source
 from loopcal.io.exports.rows import Rows, headers
-from loopcal.io.measurement_file import FORMAT
-from loopcal.io.pose_rows import LINK
-from loopcal.io.sensor_rows import COVARIANCE
 
 PLAIN = re.compile(r"(?!(?i:null|true|false|yes|no|on|off|y|n)$)[A-Za-z](?:[\w /.-]*[\w/.-])?")
 """Text that YAML reads as itself."""
@@ -90,15 +91,24 @@ def convert(path: str | Path, profile: Profile) -> Converted:
     misfits.sort()
     if not rows.rows:
         if not misfits:
-            raise FileError("every line of this export is passed over as the profile says; correct the profile", path)
+            raise FileError(
+                "every line of this export is passed over as the profile says; correct the profile",
+                path,
+            )
         number, reason = misfits[0]
-        raise FileError(f"no line of this export fits {profile.file.path}; this one, the first: {reason}", path, number)
+        raise FileError(
+            f"no line of this export fits {profile.file.path}; this one, the first: {reason}",
+            path,
+            number,
+        )
     text = _text(path, profile, rows, misfits)
     return Converted(text, len(rows.rows), lines.passed, tuple(misfits), rows.notes)
 
 
 def _row(line: Line, profile: Profile) -> dict[str, str]:
-    """Return our column -> cell of one line, `target` among them where the name of a pose tells it; raises Misfit."""
+    """Return our column -> cell of one line, `target` among them where the name of a pose tells it;
+    raises Misfit.
+    """
     row: dict[str, str] = {}
     for name, source in profile.columns.items():
         given = [_cell(line, place) for place in source.places]
@@ -115,21 +125,33 @@ def _row(line: Line, profile: Profile) -> dict[str, str]:
     if "pose" in profile.columns and (not row["pose"] or LINK in row["pose"]):
         raise Misfit(f"{row['pose']!r} is no name of a pose: it is empty, or holds {LINK!r}")
     if profile.matrix:
-        row |= _quaternion([_number(_cell(line, place), profile, "matrix") for place in profile.matrix])
+        row |= _quaternion(
+            [_number(_cell(line, place), profile, "matrix") for place in profile.matrix]
+        )
     return row
 
 
 def _cell(line: Line, place: str | int) -> str:
     """Return a cell by the header's name, or its place."""
-    at = line.header.places[place] if isinstance(place, str) and line.header is not None else int(place) - 1
+    at = (
+        line.header.places[place]
+        if isinstance(place, str) and line.header is not None
+        else int(place) - 1
+    )
     if at >= len(line.cells):
-        called = f"{place!r} is column {at + 1}" if isinstance(place, str) else f"column {place} is needed"
+        called = (
+            f"{place!r} is column {at + 1}"
+            if isinstance(place, str)
+            else f"column {place} is needed"
+        )
         raise Misfit(f"it has {len(line.cells)} columns, but {called}")
     return line.cells[at]
 
 
 def _number(text: str, profile: Profile, name: str) -> str:
-    """Return a finite number with a decimal point, its digits as they are; nothing for nothing, or what is missing."""
+    """Return a finite number with a decimal point, its digits as they are; nothing for nothing, or
+    what is missing.
+    """
     if not text or text in profile.missing:
         return ""
     plain = with_point(text, profile.decimal)
@@ -146,8 +168,14 @@ def _named(given: Sequence[str], source: Source) -> dict[str, str]:
     name = " ".join(given).strip()
     found = source.match.fullmatch(name) if source.match is not None else None
     if source.match is None or found is None:
-        raise Misfit(f"the name {name!r} does not match {source.match.pattern if source.match else ''}")
-    return {key: (value or "").strip() for key, value in found.groupdict().items() if key in {"pose", "target"}}
+        raise Misfit(
+            f"the name {name!r} does not match {source.match.pattern if source.match else ''}"
+        )
+    return {
+        key: (value or "").strip()
+        for key, value in found.groupdict().items()
+        if key in {"pose", "target"}
+    }
 
 
 def _time(text: str, source: Source) -> str:
@@ -155,16 +183,22 @@ def _time(text: str, source: Source) -> str:
     if not text:
         return ""
     try:
-        return (datetime.fromisoformat(text) if source.time is None else datetime.strptime(text, source.time)).isoformat()
+        return (
+            datetime.fromisoformat(text)
+            if source.time is None
+            else datetime.strptime(text, source.time)
+        ).isoformat()
     except ValueError:
-        raise Misfit(f"the time {text!r} is not written as {source.time or 'ISO 8601, 2026-05-04T10:22:31'}") from None
+        raise Misfit(
+            f"the time {text!r} is not written as {source.time or 'ISO 8601, 2026-05-04T10:22:31'}"
+        ) from None
 
 
 def _quaternion(numbers: Sequence[str]) -> dict[str, str]:
     """Return qw qx qy qz of a rotation matrix, row by row; empty where the whole of it is."""
     import numpy as np
 
-    from loopcal import se3
+    from loopcal import geometry
 
     names = ("qw", "qx", "qy", "qz")
     if not all(numbers):
@@ -176,21 +210,38 @@ def _quaternion(numbers: Sequence[str]) -> dict[str, str]:
     if off > SQUARE or np.linalg.det(R) < 0.0:
         raise Misfit(f"the nine numbers are no rotation matrix (off by {off:.2g})")
     U, _, Vt = np.linalg.svd(R)  # the rotation next to what was rounded to a few decimals
-    return dict(zip(names, (repr(float(q)) for q in se3.matrix_to_quaternion(U @ Vt)), strict=True))
+    return dict(
+        zip(names, (repr(float(q)) for q in geometry.matrix_to_quaternion(U @ Vt)), strict=True)
+    )
 
 
 def _text(path: Path, profile: Profile, rows: Rows, misfits: Sequence[tuple[int, str]]) -> str:
     """Return the measurement file."""
     columns = headers(profile)
     lines = [" ".join(f"## read from {path.name} by {profile.file.path.name}".split())]
-    lines += [f"## lines that did not fit: {', '.join(str(number) for number, _ in misfits)}"] if misfits else []
+    lines += (
+        [f"## lines that did not fit: {', '.join(str(number) for number, _ in misfits)}"]
+        if misfits
+        else []
+    )
     lines += [f"## {note}" for note in rows.notes]
-    lines += [f"# {key}: {_flow(value)}" for key, value in {"format": FORMAT, **profile.settings}.items()]
-    lines.append(",".join(name if symbol is None else f"{name} [{symbol}]" for name, symbol in columns.items()))
+    lines += [
+        f"# {key}: {_flow(value)}" for key, value in {"format": FORMAT, **profile.settings}.items()
+    ]
+    lines.append(
+        ",".join(
+            name if symbol is None else f"{name} [{symbol}]" for name, symbol in columns.items()
+        )
+    )
     for i, row in enumerate(rows.rows):
         cells = {"pose": str(i + 1), **row}
         # a target without a line has no covariance
-        lines.append(",".join(quoted(cells.get(name, "0" if name.startswith(COVARIANCE) else "")) for name in columns))
+        lines.append(
+            ",".join(
+                quoted(cells.get(name, "0" if name.startswith(COVARIANCE) else ""))
+                for name in columns
+            )
+        )
     return "\n".join(lines) + "\n"
 
 

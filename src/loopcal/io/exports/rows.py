@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of the measurement file: one for each line of an export, or one for the lines of several targets of a pose.
+"""Rows of the measurement file: one for each line of an export, or one for the lines of several
+targets of a pose.
 
-What belongs to a target (its values, their sigma and covariance, remarks) gets a column for each target. What belongs to the
-pose, its readings, is the same in all of its lines or a line does not fit. Lines that say anything else differently have
-rows of their own; only the time is that of the first line of a row, since a row has one.
+What belongs to a target (its values, their sigma and covariance, remarks) gets a column for each
+target. What belongs to the pose, its readings, is the same in all of its lines or a line does not
+fit. Lines that say anything else differently have rows of their own; only the time is that of the
+first line of a row, since a row has one.
 """
 
 from __future__ import annotations
@@ -11,11 +13,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from loopcal.io.context_columns import TIME
+from loopcal.io.data.context_columns import TIME
+from loopcal.io.data.sensor_rows import COVARIANCE, SIGMA
 from loopcal.io.exports.cells import plain_number
 from loopcal.io.exports.lines import Misfit
 from loopcal.io.exports.profile import Profile
-from loopcal.io.sensor_rows import COVARIANCE, SIGMA
 
 
 @dataclass
@@ -28,7 +30,8 @@ class Rows:
     _later: int = 0
 
     def enter(self, row: dict[str, str]) -> None:
-        """Add a row, or where targets have lines of their own, put this target into the last row of its pose.
+        """Add a row, or where targets have lines of their own, put this target into the last row of
+        its pose.
 
         Raises
         ------
@@ -46,7 +49,11 @@ class Rows:
         if len(targets) == 1:
             self.rows.append(shared)
             return
-        values = {_of_target(name, target): shared.pop(name) for name in list(shared) if _is_of_target(name, self.profile)}
+        values = {
+            _of_target(name, target): shared.pop(name)
+            for name in list(shared)
+            if _is_of_target(name, self.profile)
+        }
         self._check_readings(shared)
         last = self.rows[-1] if self.rows else {}
         if not any(name in last for name in values) and _agree(last, shared):
@@ -61,7 +68,11 @@ class Rows:
         """What lines of several targets say differently."""
         if not self._later:
             return ()
-        count = "1 line of a further target states" if self._later == 1 else f"{self._later} lines of further targets state"
+        count = (
+            "1 line of a further target states"
+            if self._later == 1
+            else f"{self._later} lines of further targets state"
+        )
         return (f"{count} another time than the first line of the row, whose time is kept",)
 
     def _check_readings(self, row: Mapping[str, str]) -> None:
@@ -70,8 +81,13 @@ class Rows:
         for name in self.profile.readings:
             cell, before = row[name], first.get(name, "")
             if cell and before and not _same(cell, before):
-                raise Misfit(f"{name!r} is {cell} here, but {before} in a line of the pose {row['pose']!r} before")
-        first.update({name: row[name] for name in self.profile.readings if row[name] and not first.get(name)})
+                raise Misfit(
+                    f"{name!r} is {cell} here, but {before} in a line of the pose {row['pose']!r} "
+                    "before"
+                )
+        first.update(
+            {name: row[name] for name in self.profile.readings if row[name] and not first.get(name)}
+        )
 
 
 def headers(profile: Profile) -> dict[str, str | None]:
@@ -81,11 +97,17 @@ def headers(profile: Profile) -> dict[str, str | None]:
     targets: tuple[str, ...] = getattr(profile.kind, "targets", ())
     if len(targets) < 2:
         own = [profile.called(column.name) for column in profile.kind.columns]
-        return {"pose": None} | {n: u for n, u in units.items() if n not in own} | {n: units[n] for n in own}
+        return (
+            {"pose": None}
+            | {n: u for n, u in units.items() if n not in own}
+            | {n: units[n] for n in own}
+        )
     pose = {name: symbol for name, symbol in units.items() if not _is_of_target(name, profile)}
     values = list(dict.fromkeys(column.name.partition(".")[2] for column in profile.kind.columns))
     beside = [name for name in units if _is_of_target(name, profile) and name not in values]
-    each = [(name, target) for target in targets for name in values] + [(n, t) for n in beside for t in targets]
+    each = [(name, target) for target in targets for name in values] + [
+        (n, t) for n in beside for t in targets
+    ]
     return {"pose": None} | pose | {_of_target(name, target): units[name] for name, target in each}
 
 
@@ -101,12 +123,20 @@ def _of_target(name: str, target: str) -> str:
     if name.startswith("note"):
         return f"{name} {target}"
     if name.startswith(COVARIANCE):
-        return COVARIANCE + ".".join(f"{target}.{part}" for part in name.removeprefix(COVARIANCE).split("."))
-    return f"{SIGMA}{target}.{name.removeprefix(SIGMA)}" if name.startswith(SIGMA) else f"{target}.{name}"
+        return COVARIANCE + ".".join(
+            f"{target}.{part}" for part in name.removeprefix(COVARIANCE).split(".")
+        )
+    return (
+        f"{SIGMA}{target}.{name.removeprefix(SIGMA)}"
+        if name.startswith(SIGMA)
+        else f"{target}.{name}"
+    )
 
 
 def _agree(last: Mapping[str, str], row: Mapping[str, str]) -> bool:
-    """Tell whether two lines are of one pose, session, group and block, and say nothing else differently but the time."""
+    """Tell whether two lines are of one pose, session, group and block, and say nothing else
+    differently but the time.
+    """
     alike = all(last.get(name) == row.get(name) for name in ("pose", "session", "group", "block"))
     said = [name for name in row if name != TIME and last.get(name) and row[name]]
     return alike and all(_same(last[name], row[name]) for name in said)

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of other programs, one format in each module: read as a robot file and measurements, written corrected.
+"""Files of other programs, one format in each module: read as a robot file and measurements,
+written corrected.
 
-A format is a `Format` with `read`, `write` or both; its line in `FORMATS` is all that the command line needs.
+A format is a `Format` with `read`, `write` or both; its line in `FORMATS` is all that the command
+line needs.
 """
 
 from collections.abc import Mapping

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nine numbers of a linear delta, in the mm and degrees that printer firmware speaks, to and from a robot file."""
+"""The nine numbers of a linear delta, in the mm and degrees that printer firmware speaks, to and
+from a robot file.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,8 @@ Three = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class DeltaNumbers:
-    """Radius, tower angles, arms and end stops [mm, deg]: the stop is the height of the nozzle over the bed, in the
-    centre, with this tower's carriage at its end stop.
+    """Radius, tower angles, arms and end stops [mm, deg]: the stop is the height of the nozzle over
+    the bed, in the centre, with this tower's carriage at its end stop.
     """
 
     radius: float
@@ -50,7 +52,9 @@ readings: drop       # carriage positions count down from the end stops
 home: {{z: 0}}
 workspace: {{x: {side}, y: {side}, z: [0, {top:g}]}}     # taken; say how far the nozzle really goes
 {fixed}"""
-FIXED = "fixed: [arm*.length]     # heights alone cannot tell the arms from the rest; distances can\n"
+FIXED = (
+    "fixed: [arm*.length]     # heights alone cannot tell the arms from the rest; distances can\n"
+)
 
 
 def robot_text(found: DeltaNumbers, name: str, path: Path, program: str, arms_known: bool) -> str:

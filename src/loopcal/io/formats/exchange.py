@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a format of another program gives and takes: imported text, exported text, and what could not be expressed."""
+"""What a format of another program gives and takes: imported text, exported text, and what could
+not be expressed.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +22,14 @@ HEIGHT_SIGMA = 20e-6
 UNCHANGED = "every number was already this one; nothing was changed"
 
 LINE_SIGMA = POSITION_SIGMA = 1e-3
-"""Standard deviations of a line's length and of a known position of a cable robot, where nothing is known [m]."""
+"""Standard deviations of a line's length and of a known position of a cable robot, where nothing is
+known [m].
+"""
 
 DISTANCE_SIGMA = 0.1e-3
-"""Standard deviation of a distance by callipers on a printed part where nothing is known of them [m]."""
+"""Standard deviation of a distance by callipers on a printed part where nothing is known of them
+[m].
+"""
 
 
 @dataclass(frozen=True)
@@ -32,10 +38,14 @@ class Reading:
 
     Attributes
     ----------
-    name : of the robot. sigma_height, sigma_distance : noise of measurements in the file [m], which no format states.
-    length_unit : symbol of the unit of lengths, for formats that state none. home_height : z of the home pose [m].
-    closures : the file of loop closures, for formats that keep them apart. platform : the link that is the platform.
-    sigma_line, sigma_position : noise of lines and of known positions of a cable robot [m], which no format states.
+    name : of the robot. sigma_height, sigma_distance : noise of measurements in the file [m], which
+        no format states.
+    length_unit : symbol of the unit of lengths, for formats that state none. home_height : z of the
+        home pose [m].
+    closures : the file of loop closures, for formats that keep them apart. platform : the link that
+        is the platform.
+    sigma_line, sigma_position : noise of lines and of known positions of a cable robot [m], which
+        no format states.
     """
 
     name: str
@@ -66,7 +76,9 @@ class Imported:
 
 @dataclass(frozen=True)
 class Source:
-    """What is exported: a robot, and where a run made it, half of the 95 % interval by parameter (unit of the file)."""
+    """What is exported: a robot, and where a run made it, half of the 95 % interval by parameter
+    (unit of the file).
+    """
 
     robot: Mechanism
     plus_minus: Mapping[str, float | None] = field(default_factory=dict)
@@ -91,10 +103,14 @@ class Format:
 
     Attributes
     ----------
-    name, what : its name on the command line, and one line on it. endings : of file names that are taken for it.
-    read : from a file. write : of a source, into the file given (all else in it stays as it is) or as a text of its own.
-    takes_file : whether `write` can correct a file. reads : options of `Reading` that `read` looks at.
-    judged : sentences on what the other program stored, from the robot and the measurements that were read.
+    name, what : its name on the command line, and one line on it. endings : of file names that are
+        taken for it.
+    read : from a file. write : of a source, into the file given (all else in it stays as it is) or
+        as a text of its own.
+    takes_file : whether `write` can correct a file. reads : options of `Reading` that `read` looks
+        at.
+    judged : sentences on what the other program stored, from the robot and the measurements that
+        were read.
     """
 
     name: str
@@ -108,11 +124,14 @@ class Format:
 
 
 def record_of(source: Source, family: type, format_name: str, words: str) -> Any:
-    """The family's record of a robot that came from a file; DataError where it is of another family."""
+    """The family's record of a robot that came from a file; DataError where it is of another
+    family.
+    """
     record = getattr(source.robot.record, "record", None)
     if not isinstance(record, family):
         raise DataError(
-            f"{source.robot.name} is not {words}, which is all that the format {format_name} can hold; use json or csv"
+            f"{source.robot.name} is not {words}, which is all that the format {format_name} can "
+            "hold; use json or csv"
         )
     return record
 
@@ -124,7 +143,9 @@ def number(text: str, what: str, path: Path, line: int) -> float:
     except ValueError:
         value = float("nan")
     if value - value != 0.0 or "_" in text:
-        raise FileError(f"{what} is {text!r} where a finite number is needed; correct it", path, line)
+        raise FileError(
+            f"{what} is {text!r} where a finite number is needed; correct it", path, line
+        )
     return value
 
 

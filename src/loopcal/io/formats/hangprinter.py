@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of a hanging printer: motor angles of n lines at poses of which some are known, for auto-calibration.
+"""Samples of a hanging printer: motor angles of n lines at poses of which some are known, for
+auto-calibration.
 
-A JSON file of lengths in mm and motor angles in degrees, counted from where all motors read zero. With spool radius r0, gear
-g = motor teeth / spool teeth, m runs of line in the tackle, s lines on a spool and a build-up k (r^2 grows by k for each mm
-that is wound), motor angle q pays out
+A JSON file of lengths in mm and motor angles in degrees, counted from where all motors read zero.
+With spool radius r0, gear g = motor teeth / spool teeth, m runs of line in the tackle, s lines on a
+spool and a build-up k (r^2 grows by k for each mm that is wound), motor angle q pays out
 
     dL = (s / m) (r0 g q - k (g q)^2 / 4)
 
-which is exact: dr/d(g q) = -k / 2. Spool radius and build-up become named parameters of the robot file, the anchors and the
-lengths at zero its errors. Known poses are measurements of the kind `position`; a pose nobody measured keeps its readings
-alone, and n - 3 equations. Source of the keys: the program auto-calibration-simulation-for-hangprinter.
+which is exact: dr/d(g q) = -k / 2. Spool radius and build-up become named parameters of the robot
+file, the anchors and the lengths at zero its errors. Known poses are measurements of the kind
+`position`; a pose nobody measured keeps its readings alone, and n - 3 equations. Source of the
+keys: the program auto-calibration-simulation-for-hangprinter.
 """
 
 from __future__ import annotations
@@ -24,30 +26,35 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.errors import FileError
+from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.exchange import Format, Imported, Reading
-from loopcal.io.text_file import read_text
 
 if TYPE_CHECKING:
-    from loopcal.linalg import FloatArray
     from loopcal.measure import Measurements
+    from loopcal.typing import FloatArray
 
 MM, DEG = 1e-3, math.pi / 180.0
 FREEDOMS = 3
 KNOWN_ROUNDING = 1e-6
-"""Singular value, relative to the largest, below which the known poses do not tell an anchor [1]."""
+"""Singular value, relative to the largest, below which the known poses do not tell an anchor [1].
+"""
 
 NOT_READ = {
-    "force_samp": "line forces are not read: lines of a robot file do not stretch, so stretch stays in the residuals",
-    "springKPerUnitLength": "the stiffness of the lines is not read: what they stretch stays in the residuals",
+    "force_samp": "line forces are not read: lines of a robot file do not stretch, so stretch "
+    "stays in the residuals",
+    "springKPerUnitLength": "the stiffness of the lines is not read: what they stretch stays in "
+    "the residuals",
     "mover_weight": "the weight of the platform is not read: forces play no part",
-    "line_lengths_when_at_origin": "the lengths taped at the origin are not read: anchors start from the known poses",
+    "line_lengths_when_at_origin": "the lengths taped at the origin are not read: anchors start "
+    "from the known poses",
 }
 """Keys that have no place in a robot file, and what that means."""
 
 IGNORED = ("_source", "abc_axis_min_force_limit", "abc_axis_max_force_limit")
 
 ROBOT = """\
-# Read from {origin}, samples of a hanging printer. Readings are motor angles, zero at the origin, paying out as they grow.
+# Read from {origin}, samples of a hanging printer. Readings are motor angles, zero at the origin,
+# paying out as they grow.
 format: 1
 family: limbs
 name: {name}
@@ -56,9 +63,11 @@ units: {{length: mm, angle: deg}}
 
 freedoms: [x, y, z]
 controlled: [x, y, z]
-actuators:                # radius: line paid out per radian of the motor; sigma: what {sigma:g} mm of line are
+# radius: line paid out per radian of the motor; sigma: what {sigma:g} mm of line are
+actuators:
 {drives}
-limbs:                    # lengths at readings of zero; anchors start from the known poses, tolerances are of that start
+# lengths at readings of zero; anchors start from the known poses, tolerances are of that start
+limbs:
 {limbs}
 parameters:               # of the spools; buildup: growth of radius^2 for each length that is wound
 {parameters}
@@ -76,12 +85,15 @@ ONTO = "{{limb: {drive}, element: transmission, axis: {axis}, coefficient: {coef
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What a file holds, n lines and N poses of which the first K are known. Lengths [mm], angles [rad].
+    """What a file holds, n lines and N poses of which the first K are known. Lengths [mm], angles
+    [rad].
 
     Attributes
     ----------
-    radius, mechanical_advantage, lines_per_spool : (n,). gear : turns of the spool for one of the motor.
-    motors : (N, n). known : (K, 3). anchors : (n, 3) where the file states them, else None. notes : what was not read.
+    radius, mechanical_advantage, lines_per_spool : (n,). gear : turns of the spool for one of the
+        motor.
+    motors : (N, n). known : (K, 3). anchors : (n, 3) where the file states them, else None. notes :
+        what was not read.
     """
 
     radius: FloatArray
@@ -115,14 +127,16 @@ def read(path: Path, reading: Reading) -> Imported:
     Raises
     ------
     FileError
-        No JSON, a key is missing, not of numbers or not of the right length, or the known poses do not tell an anchor and the
-        file states none.
+        No JSON, a key is missing, not of numbers or not of the right length, or the known poses do
+        not tell an anchor and the file states none.
     """
     samples = parse(path)
     anchors = samples.anchors if samples.anchors is not None else anchors_from_known(samples, path)
     assumed = (
-        f"{len(samples.motors)} poses of {len(samples.names)} motor angles, {len(samples.known)} of them known; a line is taken"
-        f" to be known to {reading.sigma_line / MM:g} mm and a known pose to {reading.sigma_position / MM:g} mm, which the file"
+        f"{len(samples.motors)} poses of {len(samples.names)} motor angles, {len(samples.known)} "
+        "of them known; a line is taken"
+        f" to be known to {reading.sigma_line / MM:g} mm and a known pose to "
+        f"{reading.sigma_position / MM:g} mm, which the file"
         " does not state"
     )
     text = robot_text(samples, anchors, path, reading)
@@ -134,17 +148,32 @@ def parse(path: Path) -> Samples:
     try:
         found = json.loads(read_text(path, "file of samples"))
     except json.JSONDecodeError as error:
-        raise FileError(f"this is no JSON ({error.msg}); correct it, or state another --format", path, error.lineno) from None
+        raise FileError(
+            f"this is no JSON ({error.msg}); correct it, or state another --format",
+            path,
+            error.lineno,
+        ) from None
     if not isinstance(found, dict) or "motor_pos_samp" not in found:
-        raise FileError("there is no key 'motor_pos_samp', so these are no samples of a hanging printer", path)
+        raise FileError(
+            "there is no key 'motor_pos_samp', so these are no samples of a hanging printer", path
+        )
     motors = _numbers(found, "motor_pos_samp", path, 2)
     lines = motors.shape[1]
     if not FREEDOMS <= lines <= 26:
-        raise FileError(f"'motor_pos_samp' has {lines} motors in a row; a point in space needs 3 lines or more", path)
-    known = np.zeros((0, FREEDOMS)) if found.get("xyz_of_samp") == [] else _numbers(found, "xyz_of_samp", path, 2, FREEDOMS)
+        raise FileError(
+            f"'motor_pos_samp' has {lines} motors in a row; a point in space needs 3 lines or more",
+            path,
+        )
+    known = (
+        np.zeros((0, FREEDOMS))
+        if found.get("xyz_of_samp") == []
+        else _numbers(found, "xyz_of_samp", path, 2, FREEDOMS)
+    )
     if len(known) > len(motors):
         raise FileError(
-            f"'xyz_of_samp' has {len(known)} poses and 'motor_pos_samp' only {len(motors)}; leave out the rest", path
+            f"'xyz_of_samp' has {len(known)} poses and 'motor_pos_samp' only {len(motors)}; leave "
+            "out the rest",
+            path,
         )
     teeth = [_positive(found, key, path, 0) for key in ("motor_gear_teeth", "spool_gear_teeth")]
     radius, advantage, per_spool = (
@@ -153,9 +182,13 @@ def parse(path: Path) -> Samples:
     )
     anchors = _numbers(found, "anchors", path, 2, FREEDOMS) if "anchors" in found else None
     if anchors is not None and len(anchors) != lines:
-        raise FileError(f"'anchors' has {len(anchors)} rows for {lines} lines; give one for each", path)
+        raise FileError(
+            f"'anchors' has {len(anchors)} rows for {lines} lines; give one for each", path
+        )
     gear = float(teeth[0] / teeth[1])
-    return Samples(radius, advantage, per_spool, gear, motors * DEG, known, anchors, tuple(_notes(found)))
+    return Samples(
+        radius, advantage, per_spool, gear, motors * DEG, known, anchors, tuple(_notes(found))
+    )
 
 
 def anchors_from_known(samples: Samples, path: Path) -> FloatArray:
@@ -166,22 +199,28 @@ def anchors_from_known(samples: Samples, path: Path) -> FloatArray:
     Raises
     ------
     FileError
-        No pose is known, or the known poses have rank below 4: too few, or in a plane through the origin.
+        No pose is known, or the known poses have rank below 4: too few, or in a plane through the
+        origin.
     """
     if not len(samples.known):
         raise FileError(
-            "no pose is known; add poses to 'xyz_of_samp' (mm), at several heights, or where each line is anchored under the"
+            "no pose is known; add poses to 'xyz_of_samp' (mm), at several heights, or where each "
+            "line is anchored under the"
             " key 'anchors' (mm)",
             path,
         )
     x, dl = samples.known, samples.motors[: len(samples.known)] * samples.gain
     anchors = []
     for name, d in zip(samples.names, dl.T, strict=True):
-        a, _, rank, s = np.linalg.lstsq(np.column_stack([x, d]), 0.5 * ((x * x).sum(axis=1) - d * d), rcond=KNOWN_ROUNDING)
+        a, _, rank, s = np.linalg.lstsq(
+            np.column_stack([x, d]), 0.5 * ((x * x).sum(axis=1) - d * d), rcond=KNOWN_ROUNDING
+        )
         if rank < FREEDOMS + 1:
             raise FileError(
-                f"the {len(x)} known poses do not tell where line {name} is anchored (rank {rank} of 4, singular values "
-                f"{', '.join(f'{value:.3g}' for value in s)}); know poses at several heights, or add the key 'anchors' (mm)",
+                f"the {len(x)} known poses do not tell where line {name} is anchored (rank {rank} "
+                "of 4, singular values "
+                f"{', '.join(f'{value:.3g}' for value in s)}); know poses at several heights, or "
+                "add the key 'anchors' (mm)",
                 path,
             )
         anchors.append(a[:FREEDOMS])
@@ -193,11 +232,17 @@ def robot_text(samples: Samples, anchors: FloatArray, path: Path, reading: Readi
     sigma = reading.sigma_line / MM
     lengths = np.linalg.norm(anchors, axis=1)
     drives = [
-        f"  {name.lower()}: {{reads: angle, radius: {_written(gain)}, sigma: {_written(sigma / gain / DEG, 7)}}}"
+        f"  {name.lower()}: {{reads: angle, radius: {_written(gain)}, sigma: "
+        f"{_written(sigma / gain / DEG, 7)}}}"
         for name, gain in zip(samples.names, samples.gain, strict=True)
     ]
     limbs = [
-        LIMB.format(name=name, tip=[float(_written(v)) for v in a], length=_written(length), drive=name.lower())
+        LIMB.format(
+            name=name,
+            tip=[float(_written(v)) for v in a],
+            length=_written(length),
+            drive=name.lower(),
+        )
         for name, a, length in zip(samples.names, anchors, lengths, strict=True)
     ]
     return ROBOT.format(
@@ -220,32 +265,54 @@ def _parameters(samples: Samples) -> Iterator[str]:
     for i, radius in enumerate(samples.radius.tolist()):
         groups.setdefault(radius, []).append(i)
     for radius, members in groups.items():
-        name = "spool.radius" if len(groups) == 1 else f"spool{'-'.join(samples.names[i] for i in members)}.radius"
+        name = (
+            "spool.radius"
+            if len(groups) == 1
+            else f"spool{'-'.join(samples.names[i] for i in members)}.radius"
+        )
         maps = ", ".join(
-            ONTO.format(drive=samples.names[i].lower(), axis="gain", coefficient=_written(slope[i])) for i in members
+            ONTO.format(drive=samples.names[i].lower(), axis="gain", coefficient=_written(slope[i]))
+            for i in members
         )
         yield PARAMETER.format(name=name, nominal=_written(radius), sd=3, maps=maps)
     for i, name in enumerate(samples.names):
         # dL = .. - k (g q)^2 / 4 of the line unwound
-        onto = ONTO.format(drive=name.lower(), axis="curve", coefficient=_written(-samples.gear * slope[i] / 4))
+        onto = ONTO.format(
+            drive=name.lower(), axis="curve", coefficient=_written(-samples.gear * slope[i] / 4)
+        )
         yield PARAMETER.format(name=f"{name}.buildup", nominal=0, sd=0.3, maps=onto)
 
 
 def _measurements(samples: Samples, reading: Reading) -> Measurements:
-    """All readings, and the known poses as positions of the platform; cells of NaN where none is known, to be filled in."""
+    """All readings, and the known poses as positions of the platform; cells of NaN where none is
+    known, to be filled in.
+    """
     from loopcal.measure import Measurements, Observations
     from loopcal.measure.kinds.position import Position
 
     kind = Position().mounted(np.eye(4))
-    known = samples.known * MM if len(samples.known) else np.full((len(samples.motors), FREEDOMS), np.nan)
+    known = (
+        samples.known * MM
+        if len(samples.known)
+        else np.full((len(samples.motors), FREEDOMS), np.nan)
+    )
     seen = Observations.from_sigma(kind, np.arange(len(known)), known, reading.sigma_position)
-    labels = tuple(f"{'known' if i < len(samples.known) else 'sample'}{i + 1}" for i in range(len(samples.motors)))
+    labels = tuple(
+        f"{'known' if i < len(samples.known) else 'sample'}{i + 1}"
+        for i in range(len(samples.motors))
+    )
     return Measurements(reading.name, samples.motors, (seen,), labels=labels)
 
 
 def _notes(found: dict[str, Any]) -> Iterator[str]:
     """What is not read of a file."""
-    read_keys = {"motor_pos_samp", "xyz_of_samp", "motor_gear_teeth", "spool_gear_teeth", "spool_r_in_origin_first_guess"}
+    read_keys = {
+        "motor_pos_samp",
+        "xyz_of_samp",
+        "motor_gear_teeth",
+        "spool_gear_teeth",
+        "spool_r_in_origin_first_guess",
+    }
     read_keys |= {"mechanical_advantage", "lines_per_spool", "anchors"}
     for key, sentence in NOT_READ.items():
         if key == "force_samp" and key in found:
@@ -257,7 +324,9 @@ def _notes(found: dict[str, Any]) -> Iterator[str]:
         yield f"the key {key!r} is not known and not read"
 
 
-def _positive(found: dict[str, Any], key: str, path: Path, ndim: int, width: int | None = None) -> FloatArray:
+def _positive(
+    found: dict[str, Any], key: str, path: Path, ndim: int, width: int | None = None
+) -> FloatArray:
     """Numbers above zero."""
     values = _numbers(found, key, path, ndim, width)
     if not (values > 0).all():
@@ -265,7 +334,9 @@ def _positive(found: dict[str, Any], key: str, path: Path, ndim: int, width: int
     return values
 
 
-def _numbers(found: dict[str, Any], key: str, path: Path, ndim: int, width: int | None = None) -> FloatArray:
+def _numbers(
+    found: dict[str, Any], key: str, path: Path, ndim: int, width: int | None = None
+) -> FloatArray:
     """An array of finite numbers of `ndim` axes, the last of `width`; FileError otherwise."""
     wanted = ("a number", "a list of numbers", "a list of rows of numbers")[ndim]
     wanted += "" if width is None else f", {width} in {'all' if ndim == 1 else 'each'}"
@@ -275,7 +346,12 @@ def _numbers(found: dict[str, Any], key: str, path: Path, ndim: int, width: int 
         values = np.array(found[key], dtype=float)
     except (TypeError, ValueError):
         values = np.full(1, np.nan)
-    if values.ndim != ndim or values.size == 0 or not np.isfinite(values).all() or (width and values.shape[-1] != width):
+    if (
+        values.ndim != ndim
+        or values.size == 0
+        or not np.isfinite(values).all()
+        or (width and values.shape[-1] != width)
+    ):
         raise FileError(f"{key!r} is not {wanted}; correct it", path)
     return values
 
@@ -285,4 +361,10 @@ def _written(value: float, digits: int = 12) -> str:
     return f"{float(value):.{digits}g}"
 
 
-FORMAT = Format("hangprinter", "samples of a hanging printer (JSON)", (), read, reads=("sigma_line", "sigma_position"))
+FORMAT = Format(
+    "hangprinter",
+    "samples of a hanging printer (JSON)",
+    (),
+    read,
+    reads=("sigma_line", "sigma_position"),
+)

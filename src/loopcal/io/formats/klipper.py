@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Klipper's printer.cfg of a delta printer: geometry, what `DELTA_CALIBRATE` probed, and the corrected geometry back.
+"""Klipper's printer.cfg of a delta printer: geometry, what `DELTA_CALIBRATE` probed, and the
+corrected geometry back.
 
-Tower k = a, b, c has `angle`, `arm_length` and `position_endstop` in [stepper_k]; `delta_radius` is in [printer]. A stable
-position counts the motor steps of each tower below its end stop, so that readings do not depend on the geometry:
-reading = steps * rotation_distance / (microsteps * full_steps_per_rotation * gear_ratio), or older `step_distance`.
-[delta_calibrate] holds heights (`height0`, `height0_pos`, also `manual_height0`) and distances (`distance0`,
-`distance0_pos1`, `distance0_pos2`). Source: the documents "Configuration reference" and "Delta calibrate" of Klipper.
+Tower k = a, b, c has `angle`, `arm_length` and `position_endstop` in [stepper_k]; `delta_radius` is
+in [printer]. A stable position counts the motor steps of each tower below its end stop, so that
+readings do not depend on the geometry: reading = steps * rotation_distance / (microsteps *
+full_steps_per_rotation * gear_ratio), or older `step_distance`. [delta_calibrate] holds heights
+(`height0`, `height0_pos`, also `manual_height0`) and distances (`distance0`, `distance0_pos1`,
+`distance0_pos2`). Source: the documents "Configuration reference" and "Delta calibrate" of Klipper.
 """
 
 from __future__ import annotations
@@ -17,8 +19,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from loopcal.io.formats import printer_cfg
-from loopcal.io.formats.delta import NOMINAL_ANGLES, DeltaNumbers, Three, numbers_of, robot_text, same, three, written
-from loopcal.io.formats.exchange import UNCHANGED, Exported, Format, Imported, Reading, Source, byte_order_mark
+from loopcal.io.formats.delta import (
+    NOMINAL_ANGLES,
+    DeltaNumbers,
+    Three,
+    numbers_of,
+    robot_text,
+    same,
+    three,
+    written,
+)
+from loopcal.io.formats.exchange import (
+    UNCHANGED,
+    Exported,
+    Format,
+    Imported,
+    Reading,
+    Source,
+    byte_order_mark,
+)
 from loopcal.io.formats.printer_cfg import PrinterConfig
 
 if TYPE_CHECKING:
@@ -32,7 +51,9 @@ FULL_STEPS = 200.0
 
 @dataclass(frozen=True)
 class _Probes:
-    """Stable positions [steps] by label, heights [mm] (label, value) and distances [mm] (label, label, value)."""
+    """Stable positions [steps] by label, heights [mm] (label, value) and distances [mm] (label,
+    label, value).
+    """
 
     positions: dict[str, Three]
     heights: list[tuple[str, float]]
@@ -40,32 +61,50 @@ class _Probes:
 
 
 def read(path: Path, reading: Reading) -> Imported:
-    """Read geometry and measurements; FileError for what is missing or no number, or a printer that is no delta."""
+    """Read geometry and measurements; FileError for what is missing or no number, or a printer that
+    is no delta.
+    """
     cfg = printer_cfg.read(path)
     if (kind := cfg.text("printer", "kinematics")) != "delta":
         raise cfg.error(
-            f"kinematics is {kind!r}; loopcal reads Klipper's delta printers (kinematics: delta)", "printer", "kinematics"
+            f"kinematics is {kind!r}; loopcal reads Klipper's delta printers (kinematics: delta)",
+            "printer",
+            "kinematics",
         )
     probes = _probes(cfg)
-    text = robot_text(geometry(cfg), reading.name, path, "a printer.cfg of Klipper", bool(probes.distances))
+    text = robot_text(
+        geometry(cfg), reading.name, path, "a printer.cfg of Klipper", bool(probes.distances)
+    )
     if not probes.positions:
-        return Imported(text, None, ("the file holds no probed heights; run DELTA_CALIBRATE and SAVE_CONFIG to have them",))
+        return Imported(
+            text,
+            None,
+            ("the file holds no probed heights; run DELTA_CALIBRATE and SAVE_CONFIG to have them",),
+        )
     steps = [step_distance(cfg, section) for section in STEPPERS]
     notes = [
-        f"{len(probes.heights)} heights and {len(probes.distances)} distances; Klipper states no noise: taken are "
-        f"{reading.sigma_height * 1e3:g} mm" + (f" and {reading.sigma_distance * 1e3:g} mm" if probes.distances else "")
+        f"{len(probes.heights)} heights and {len(probes.distances)} distances; Klipper states no "
+        "noise: taken are "
+        f"{reading.sigma_height * 1e3:g} mm"
+        + (f" and {reading.sigma_distance * 1e3:g} mm" if probes.distances else "")
     ]
     return Imported(text, _measurements(probes, steps, reading), tuple(notes))
 
 
 def geometry(cfg: PrinterConfig) -> DeltaNumbers:
-    """The numbers that count, with Klipper's defaults: the arm and stop of tower a for all, angles 210, 330, 90."""
+    """The numbers that count, with Klipper's defaults: the arm and stop of tower a for all, angles
+    210, 330, 90.
+    """
     arm = cfg.number(STEPPERS[0], "arm_length")
     stop = cfg.number(STEPPERS[0], "position_endstop")
-    angles = [cfg.number(s, "angle", nominal) for s, nominal in zip(STEPPERS, NOMINAL_ANGLES, strict=True)]
+    angles = [
+        cfg.number(s, "angle", nominal) for s, nominal in zip(STEPPERS, NOMINAL_ANGLES, strict=True)
+    ]
     arms = [cfg.number(s, "arm_length", arm) for s in STEPPERS]
     stops = [cfg.number(s, "position_endstop", stop) for s in STEPPERS]
-    return DeltaNumbers(cfg.number("printer", "delta_radius"), three(angles), three(arms), three(stops))
+    return DeltaNumbers(
+        cfg.number("printer", "delta_radius"), three(angles), three(arms), three(stops)
+    )
 
 
 def step_distance(cfg: PrinterConfig, section: str) -> float:
@@ -75,20 +114,32 @@ def step_distance(cfg: PrinterConfig, section: str) -> float:
         if found is None:
             cfg.text(section, "rotation_distance")
         return _positive(cfg, section, "step_distance", found or 0.0)
-    rotation = _positive(cfg, section, "rotation_distance", cfg.number(section, "rotation_distance"))
+    rotation = _positive(
+        cfg, section, "rotation_distance", cfg.number(section, "rotation_distance")
+    )
     micro = _positive(cfg, section, "microsteps", cfg.number(section, "microsteps"))
-    full = _positive(cfg, section, "full_steps_per_rotation", cfg.number(section, "full_steps_per_rotation", FULL_STEPS))
+    full = _positive(
+        cfg,
+        section,
+        "full_steps_per_rotation",
+        cfg.number(section, "full_steps_per_rotation", FULL_STEPS),
+    )
     return rotation / (micro * full * _gear_ratio(cfg, section))
 
 
 def write(source: Source, into: Path | None) -> Exported:
-    """The corrected numbers in a printer.cfg whose other bytes stay; without one, a saved block to paste."""
+    """The corrected numbers in a printer.cfg whose other bytes stay; without one, a saved block to
+    paste.
+    """
     wanted = numbers_of(source, "klipper")
     if into is None:
         cfg = printer_cfg.parse((), Path("printer.cfg"))
         for section, option, value in _options(wanted):
             cfg = cfg.replaced(section, option, written(value))
-        return Exported("".join(cfg.lines).lstrip("\n"), ("a SAVE_CONFIG block; --into printer.cfg corrects a whole file",))
+        return Exported(
+            "".join(cfg.lines).lstrip("\n"),
+            ("a SAVE_CONFIG block; --into printer.cfg corrects a whole file",),
+        )
     cfg = printer_cfg.read(into)
     notes = []
     for section, option, value in _options(wanted):
@@ -98,7 +149,8 @@ def write(source: Source, into: Path | None) -> Exported:
         cfg = cfg.replaced(section, option, written(value))
         line = cfg.options[section, option].line + 1
         notes.append(
-            f"line {line}: [{section}] {option} {'added as' if present is None else f'{present:.6f} ->'} {written(value)}"
+            f"line {line}: [{section}] {option} "
+            f"{'added as' if present is None else f'{present:.6f} ->'} {written(value)}"
         )
     return Exported(byte_order_mark(into) + "".join(cfg.lines), tuple(notes or [UNCHANGED]))
 
@@ -112,7 +164,9 @@ def _options(wanted: DeltaNumbers) -> Iterator[tuple[str, str, float]]:
 
 
 def _present(cfg: PrinterConfig, section: str, option: str) -> float | None:
-    """The number that counts now, by Klipper's defaults where none is written; None where there is none at all."""
+    """The number that counts now, by Klipper's defaults where none is written; None where there is
+    none at all.
+    """
     if cfg.has(section, option):
         return cfg.number(section, option)
     if option == "angle" and section in STEPPERS:
@@ -176,18 +230,26 @@ def _gear_ratio(cfg: PrinterConfig, section: str) -> float:
         except (ValueError, ZeroDivisionError):
             ratio = float("nan")
     if not 0 < ratio < float("inf"):
-        raise cfg.error(f"gear_ratio is {text!r}; write it as 80:16, or 57:11, 2:1 for several gears", section, "gear_ratio")
+        raise cfg.error(
+            f"gear_ratio is {text!r}; write it as 80:16, or 57:11, 2:1 for several gears",
+            section,
+            "gear_ratio",
+        )
     return ratio
 
 
 def _positive(cfg: PrinterConfig, section: str, option: str, value: float) -> float:
     if not value > 0:
-        raise cfg.error(f"{option!r} of [{section}] is {value:g}; it must be greater than zero", section, option)
+        raise cfg.error(
+            f"{option!r} of [{section}] is {value:g}; it must be greater than zero", section, option
+        )
     return value
 
 
 def judged(robot: Mechanism, measured: Measurements) -> tuple[str, ...]:
-    """Whether the stored geometry is the optimum of Klipper's own cost; nothing where the probes do not determine one."""
+    """Whether the stored geometry is the optimum of Klipper's own cost; nothing where the probes do
+    not determine one.
+    """
     from loopcal.io.formats.stored_answer import stored_answer
 
     found = stored_answer(robot, measured)

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LinuxCNC's genhexkins: a hexapod's joints, and the lead of its screws, as `setp` lines of a HAL file.
+"""LinuxCNC's genhexkins: a hexapod's joints, and the lead of its screws, as `setp` lines of a HAL
+file.
 
     setp genhexkins.base.N.x ..        centre of a joint on the base (platform.N: on the platform), N = 0..5
     setp genhexkins.base-n.N.x ..      axis of that joint (platform-n.N likewise), used where screw-lead is not 0
     setp genhexkins.screw-lead ..      change of a strut's length in one turn
 
-A strut's joint position is the distance between its centres (plus the screw's correction), so the lengths of the robot
-file are zero, and what a calibration adds to them shifts the zero of the joint, which these pins cannot say.
-The correction is screw-lead * asin(sin a) / (2 pi) of the angle a about the strut between the two axes, where loopcal has
-the angle itself: the same for less than a quarter turn. A strut that stands beyond one at home is read as what the formula
-makes of it there, a screw of the other hand counted from the other side of its axis (-lead, -platform-n).
-`spindle-offset` and `tool-offset` are added to z of all centres. No unit is stated: it is the machine's. Source: the
-documentation of genhexkins (LinuxCNC, "Kinematics").
+A strut's joint position is the distance between its centres (plus the screw's correction), so the
+lengths of the robot file are zero, and what a calibration adds to them shifts the zero of the
+joint, which these pins cannot say. The correction is screw-lead * asin(sin a) / (2 pi) of the angle
+a about the strut between the two axes, where loopcal has the angle itself: the same for less than a
+quarter turn. A strut that stands beyond one at home is read as what the formula makes of it there,
+a screw of the other hand counted from the other side of its axis (-lead, -platform-n).
+`spindle-offset` and `tool-offset` are added to z of all centres. No unit is stated: it is the
+machine's. Source: the documentation of genhexkins (LinuxCNC, "Kinematics").
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from loopcal.errors import DataError, FileError
+from loopcal.io.core.numbers import shortest
+from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.exchange import (
     UNCHANGED,
     Exported,
@@ -35,8 +39,6 @@ from loopcal.io.formats.exchange import (
     number,
     record_of,
 )
-from loopcal.io.numbers import shortest
-from loopcal.io.text_file import read_text
 from loopcal.mechanism.families.gough import Gough
 from loopcal.units import Dimension, unit
 
@@ -47,7 +49,8 @@ CLOSE = 1e-12
 """Relative difference of what counts as the same number."""
 
 ROBOT = """\
-# Read from {origin}, the genhexkins settings of LinuxCNC. Strut lengths are readings: lengths at reading zero are 0.
+# Read from {origin}, the genhexkins settings of LinuxCNC. Strut lengths are readings: lengths at
+# reading zero are 0.
 format: 1
 family: gough
 name: {name}
@@ -93,35 +96,59 @@ class _Hal:
             if default is not None:
                 return default
             raise FileError(
-                f"there is no 'setp {name} ..'; loopcal takes no other machine's numbers for yours; add it", self.path
+                f"there is no 'setp {name} ..'; loopcal takes no other machine's numbers for "
+                "yours; add it",
+                self.path,
             )
         return number(found.text, name, self.path, found.line + 1)
 
     def point(self, kind: str, n: int) -> Point:
         """Coordinates of a centre or axis; LinuxCNC has z at 0 where it is not set."""
-        x, y, z = (self.number(f"genhexkins.{kind}.{n}.{axis}", 0.0 if axis == "z" else None) for axis in "xyz")
+        x, y, z = (
+            self.number(f"genhexkins.{kind}.{n}.{axis}", 0.0 if axis == "z" else None)
+            for axis in "xyz"
+        )
         return x, y, z
 
 
 def read(path: Path, reading: Reading) -> Imported:
-    """Read the pins; FileError for those that are missing or no number, or where no unit was stated."""
+    """Read the pins; FileError for those that are missing or no number, or where no unit was
+    stated.
+    """
     hal = _read(path)
     if reading.length_unit is None:
-        raise FileError("a HAL file states no unit of length; say the machine's, as --unit mm or --unit in", path)
+        raise FileError(
+            "a HAL file states no unit of length; say the machine's, as --unit mm or --unit in",
+            path,
+        )
     symbol = unit(reading.length_unit, Dimension.LENGTH)
     lift, lead = sum(hal.number(name, 0.0) for name in OFFSETS), hal.number(LEAD, 0.0)
-    centres = {kind: [_lifted(hal.point(kind, n), lift) for n in range(6)] for kind in ("base", "platform")}
+    centres = {
+        kind: [_lifted(hal.point(kind, n), lift) for n in range(6)] for kind in ("base", "platform")
+    }
     notes = []
     if reading.home_height is None:
         home = sum((x * x + y * y) ** 0.5 for x, y, _ in centres["base"]) / 6
-        notes.append(f"home is {home:g} {symbol} above the base, the radius of its joints; correct it, or state --home-z")
+        notes.append(
+            f"home is {home:g} {symbol} above the base, the radius of its joints; correct it, or "
+            "state --home-z"
+        )
     else:
         home = reading.home_height / symbol.factor_to_si
     screw = ""
     if lead:
-        axes = {kind: [hal.point(f"{kind}-n", n) for n in range(6)] for kind in ("base", "platform")}
+        axes = {
+            kind: [hal.point(f"{kind}-n", n) for n in range(6)] for kind in ("base", "platform")
+        }
         signs = [
-            _hand(centres["base"][n], centres["platform"][n], axes["base"][n], axes["platform"][n], home) for n in range(6)
+            _hand(
+                centres["base"][n],
+                centres["platform"][n],
+                axes["base"][n],
+                axes["platform"][n],
+                home,
+            )
+            for n in range(6)
         ]
         turned = [_scaled(axis, sign) for axis, sign in zip(axes["platform"], signs, strict=True)]
         leads = lead if min(signs) > 0 else [sign * lead for sign in signs]
@@ -147,7 +174,11 @@ def write(source: Source, into: Path | None) -> Exported:
     hal = _Hal(Path("hexapod.hal"), (), {}) if into is None else _read(into)
     lift = sum(hal.number(name, 0.0) for name in OFFSETS)
     lead = hal.number(LEAD) if LEAD in hal.pins else None
-    notes = [] if into is not None else [f"numbers are in {symbol}; the machine's unit of length must be that"]
+    notes = (
+        []
+        if into is not None
+        else [f"numbers are in {symbol}; the machine's unit of length must be that"]
+    )
     lines, changes = list(hal.lines), []
     if lines and not lines[-1].endswith("\n"):
         lines[-1] += "\n"
@@ -170,23 +201,33 @@ def write(source: Source, into: Path | None) -> Exported:
         lines[-1] = lines[-1].removesuffix("\n")
     notes += _unsaid(source, symbol.factor_to_si, symbol.symbol)
     mark = "" if into is None else byte_order_mark(into)
-    return Exported(mark + "".join(lines), (*(() if into is None else changes or (UNCHANGED,)), *notes))
+    return Exported(
+        mark + "".join(lines), (*(() if into is None else changes or (UNCHANGED,)), *notes)
+    )
 
 
-def _pins(source: Source, record: Gough, factor: float, lift: float, present: float | None) -> Iterator[tuple[str, float]]:
+def _pins(
+    source: Source, record: Gough, factor: float, lift: float, present: float | None
+) -> Iterator[tuple[str, float]]:
     """Pin -> value in the file's unit; `present` is the lead there, whose sign is kept."""
     values = source.values()
     for n in range(6):
         for kind in ("base", "platform"):
             for axis in "xyz":
                 value = values[f"leg{n + 1}.{kind}.{axis}"] / factor
-                yield f"genhexkins.{kind}.{n}.{axis}", float(shortest(value - (lift if axis == "z" else 0.0), 1.0))
+                yield (
+                    f"genhexkins.{kind}.{n}.{axis}",
+                    float(shortest(value - (lift if axis == "z" else 0.0), 1.0)),
+                )
     if record.screw is None:
         return
     legs = record.screw.legs()
     lead = abs(legs[0].lead) if present is None else math.copysign(legs[0].lead, present)
     if any(abs(abs(leg.lead) - abs(lead)) > CLOSE * abs(lead) for leg in legs):
-        raise DataError(f"{source.robot.name} has screws of different lead, but genhexkins has one for all; use json or csv")
+        raise DataError(
+            f"{source.robot.name} has screws of different lead, but genhexkins has one for all; "
+            "use json or csv"
+        )
     yield LEAD, lead / factor
     for n, leg in enumerate(legs):
         upper = _scaled(leg.platform_axis, math.copysign(1.0, leg.lead * lead))
@@ -202,7 +243,8 @@ def _unsaid(source: Source, factor: float, symbol: str) -> Iterator[str]:
         length = values.pop(f"leg{n + 1}.length", 0.0) / factor
         if abs(length) > CLOSE:
             yield (
-                f"not said by genhexkins: strut {n} is {shortest(length, 1.0)} {symbol} long at reading zero; "
+                f"not said by genhexkins: strut {n} is {shortest(length, 1.0)} {symbol} long at "
+                "reading zero; "
                 f"add this to HOME_OFFSET of [JOINT_{n}] in the INI file"
             )
     said = re.compile(r"leg\d\.(base|platform)\.[xyz]$")
@@ -220,12 +262,18 @@ def _read(path: Path) -> _Hal:
         if found := SETP.match(line):
             pins[found.group(1)] = _Pin(found.group(3), i, found.start(3))
     if not pins:
-        raise FileError("there is no 'setp genhexkins...' in this file; name the HAL file that sets the geometry", path)
+        raise FileError(
+            "there is no 'setp genhexkins...' in this file; name the HAL file that sets the "
+            "geometry",
+            path,
+        )
     return _Hal(path, lines, pins)
 
 
 def _hand(base: Point, top: Point, low: Point, high: Point, home: float) -> float:
-    """-1 where the axes stand beyond a quarter turn about the strut at home, else 1; home: height of the platform."""
+    """-1 where the axes stand beyond a quarter turn about the strut at home, else 1; home: height
+    of the platform.
+    """
     strut = (top[0] - base[0], top[1] - base[1], top[2] + home - base[2])
     square = _dot(strut, strut)
     across = _dot(low, high) * square - _dot(low, strut) * _dot(high, strut)
@@ -237,7 +285,9 @@ def _dot(one: Point, other: Point) -> float:
 
 
 def _scaled(axis: Point, sign: float) -> Point:
-    return (axis[0], axis[1], axis[2]) if sign > 0 else (0.0 - axis[0], 0.0 - axis[1], 0.0 - axis[2])
+    return (
+        (axis[0], axis[1], axis[2]) if sign > 0 else (0.0 - axis[0], 0.0 - axis[1], 0.0 - axis[2])
+    )
 
 
 def _lifted(point: Point, lift: float) -> Point:
@@ -249,5 +299,10 @@ def _list(points: list[Point], indent: int) -> str:
 
 
 FORMAT = Format(
-    "linuxcnc", "genhexkins settings of a LinuxCNC hexapod", (".hal",), read, write, reads=("length_unit", "home_height")
+    "linuxcnc",
+    "genhexkins settings of a LinuxCNC hexapod",
+    (".hal",),
+    read,
+    write,
+    reads=("length_unit", "home_height"),
 )

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identified parameters as JSON or CSV, for programs that loopcal does not know: name, nominal, value, +/-, unit.
+"""Identified parameters as JSON or CSV, for programs that loopcal does not know: name, nominal,
+value, +/-, unit.
 
-Numbers are in the units of the robot's file and read back as the same doubles. `plus_minus` is half of the 95 % interval,
-empty (null in JSON) where it is not known or not finite.
+Numbers are in the units of the robot's file and read back as the same doubles. `plus_minus` is half
+of the 95 % interval, empty (null in JSON) where it is not known or not finite.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from loopcal.io.core.numbers import shortest
 from loopcal.io.formats.exchange import Exported, Format, Source
-from loopcal.io.numbers import shortest
 from loopcal.units import unit
 
 FORMAT = 1
@@ -57,7 +58,9 @@ def to_json(source: Source, into: Path | None) -> Exported:
         for row in rows(source)
     ]
     document = {"format": FORMAT, "robot": source.robot.name, "parameters": found}
-    return Exported(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n", _notes(source))
+    return Exported(
+        json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n", _notes(source)
+    )
 
 
 def _notes(source: Source) -> tuple[str, ...]:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A Klipper configuration as lines in which single values can be changed, and nothing else.
 
-Options stand as `name: value` or `name = value` in `[sections]`; what `SAVE_CONFIG` stored follows a header line, with
-`#*# ` before each line. An option in the main part hides one of the same name that was saved. Source: the documents
-"Configuration reference" and "G-Codes" (SAVE_CONFIG) of Klipper, and how its configfile module reads the two parts.
+Options stand as `name: value` or `name = value` in `[sections]`; what `SAVE_CONFIG` stored follows
+a header line, with `#*# ` before each line. An option in the main part hides one of the same name
+that was saved. Source: the documents "Configuration reference" and "G-Codes" (SAVE_CONFIG) of
+Klipper, and how its configfile module reads the two parts.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from loopcal.errors import FileError
+from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.exchange import number
-from loopcal.io.text_file import read_text
 
 MARK = "#*#"
 HEADER = "#*# <---------------------- SAVE_CONFIG ---------------------->"
@@ -43,7 +44,8 @@ class PrinterConfig:
     Attributes
     ----------
     lines : with their ends. options : (section, option) -> the one that counts.
-    saved : section -> line of its header in the saved part. header : line at which that part begins, None without one.
+    saved : section -> line of its header in the saved part. header : line at which that part
+        begins, None without one.
     """
 
     path: Path
@@ -66,41 +68,60 @@ class PrinterConfig:
         """An option's text; FileError where it is not there."""
         found = self.options.get((section, option))
         if found is None:
-            hint = f" (it may stand in {', '.join(self.includes)}; put it into this file)" if self.includes else ""
+            hint = (
+                f" (it may stand in {', '.join(self.includes)}; put it into this file)"
+                if self.includes
+                else ""
+            )
             raise FileError(
-                f"option {option!r} of [{section}] is missing{hint}, and there is no default for it; add it", self.path
+                f"option {option!r} of [{section}] is missing{hint}, and there is no default for "
+                "it; add it",
+                self.path,
             )
         return found.value
 
     def number(self, section: str, option: str, default: float | None = None) -> float:
-        """An option's number, or the default where it is not there; FileError where it is no number."""
+        """An option's number, or the default where it is not there; FileError where it is no
+        number.
+        """
         if default is not None and not self.has(section, option):
             return default
         text = self.text(section, option)
-        return number(text, f"{option!r} of [{section}]", self.path, self.options[section, option].line + 1)
+        return number(
+            text, f"{option!r} of [{section}]", self.path, self.options[section, option].line + 1
+        )
 
     def three(self, section: str, option: str) -> tuple[float, float, float]:
         """An option's three numbers with commas between."""
         parts = self.text(section, option).split(",")
         if len(parts) != 3:
             raise self.error(
-                f"{option!r} of [{section}] has {len(parts)} numbers where steps of three towers are needed; correct it",
+                f"{option!r} of [{section}] has {len(parts)} numbers where steps of three towers "
+                "are needed; correct it",
                 section,
                 option,
             )
         line = self.options[section, option].line + 1
-        a, b, c = (number(part.strip(), f"{option!r} of [{section}]", self.path, line) for part in parts)
+        a, b, c = (
+            number(part.strip(), f"{option!r} of [{section}]", self.path, line) for part in parts
+        )
         return a, b, c
 
     def replaced(self, section: str, option: str, value: str) -> PrinterConfig:
-        """The same with another value of an option; one that is not there is added to the saved part."""
+        """The same with another value of an option; one that is not there is added to the saved
+        part.
+        """
         found = self.options.get((section, option))
         if found is None:
             return self._added(section, option, value)
         line = self.lines[found.line]
         changed = line[: found.start] + value + line[found.start + len(found.value) :]
         lines = (*self.lines[: found.line], changed, *self.lines[found.line + 1 :])
-        return replace(self, lines=lines, options={**self.options, (section, option): replace(found, value=value)})
+        return replace(
+            self,
+            lines=lines,
+            options={**self.options, (section, option): replace(found, value=value)},
+        )
 
     def _added(self, section: str, option: str, value: str) -> PrinterConfig:
         end = "\r\n" if self.lines and self.lines[0].endswith("\r\n") else "\n"
@@ -139,7 +160,8 @@ def parse(lines: Sequence[str], path: Path) -> PrinterConfig:
         if header is not None and i >= header:
             if not line.startswith(MARK) or line[3:4] not in ("", " ", "\n", "\r"):
                 raise FileError(
-                    f"this line stands below SAVE_CONFIG without {MARK!r}, so Klipper ignores the block; move it up",
+                    f"this line stands below SAVE_CONFIG without {MARK!r}, so Klipper ignores the "
+                    "block; move it up",
                     path,
                     i + 1,
                 )

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from loopcal.errors import DataError, FileError, MechanismError
-from loopcal.io.calibration_run import load_calibrated
+from loopcal.io.core.text_file import write_text
+from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.exchange import Exported, Format, Imported, Source
-from loopcal.io.measurement_writer import save_measurements
-from loopcal.io.robot_file import load_robot
-from loopcal.io.text_file import write_text
+from loopcal.io.robot.robot_file import load_robot
+from loopcal.io.runs.calibration_run import load_calibrated
 
 if TYPE_CHECKING:
     from loopcal.mechanism import Mechanism
@@ -33,7 +33,10 @@ def format_of(path: Path, name: str | None) -> Format:
     for found in FORMATS.values():
         if path.suffix.lower() in found.endings:
             return found
-    raise FileError(f"the name of this file tells no format; state one as --format, of {', '.join(FORMATS)}", path)
+    raise FileError(
+        f"the name of this file tells no format; state one as --format, of {', '.join(FORMATS)}",
+        path,
+    )
 
 
 def checked(path: Path, imported: Imported) -> Mechanism:
@@ -67,7 +70,8 @@ def save_imported(path: Path, imported: Imported, output: Path, data: Path | Non
     if data is not None:
         if imported.measurements is None:
             raise DataError(
-                f"{path}: there are no measurements in this file; leave out --data and --corrected, or measure first"
+                f"{path}: there are no measurements in this file; leave out --data and "
+                "--corrected, or measure first"
             )
         save_measurements(imported.measurements, data, robot, f"read from {path.name}")
     write_text(output, imported.robot_text)
@@ -104,7 +108,10 @@ def exported(source: Source, target: Format, into: Path | None) -> Exported:
         The file to correct cannot be read, or is of another kind.
     """
     if target.write is None:
-        raise DataError(f"loopcal reads the format {target.name}, but does not write it; known are {', '.join(names('write'))}")
+        raise DataError(
+            f"loopcal reads the format {target.name}, but does not write it; known are "
+            f"{', '.join(names('write'))}"
+        )
     if into is not None and not target.takes_file:
         raise DataError(f"the format {target.name} is written whole; leave out --into")
     return target.write(source, into)

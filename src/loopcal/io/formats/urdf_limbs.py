@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """From bodies and joints to limbs: paths between base and platform that share nothing else.
 
-Where other bodies branch from the limbs, loopcal has no form for them, with one exception: if they do no more than keep
-the platform from turning (the parallelograms of a delta), the platform's freedoms say the same, and one path for each
-motor is left.
+Where other bodies branch from the limbs, loopcal has no form for them, with one exception: if they
+do no more than keep the platform from turning (the parallelograms of a delta), the platform's
+freedoms say the same, and one path for each motor is left.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class Cut:
 
 
 def cut(loops: Loops, platform: str) -> Cut:
-    """Limbs of a mechanism, at the home pose nearest to zero of those where joints and platform are held firmly.
+    """Limbs of a mechanism, at the home pose nearest to zero of those where joints and platform are
+    held firmly.
 
     Raises
     ------
@@ -77,7 +78,13 @@ def _cut(loops: Loops, platform: str) -> Cut:
     if limbs is None:
         raise _branches(loops, platform)
     used = {edge.name for limb in limbs for edge in limb}
-    return Cut(loops, platform, limbs, freedoms, tuple(edge.name for edge in loops.edges if edge.name not in used))
+    return Cut(
+        loops,
+        platform,
+        limbs,
+        freedoms,
+        tuple(edge.name for edge in loops.edges if edge.name not in used),
+    )
 
 
 def _freedoms(loops: Loops, platform: str) -> tuple[str, ...]:
@@ -95,7 +102,11 @@ def _whole(loops: Loops, platform: str) -> tuple[Path, ...] | None:
     for first in [edge for edge in loops.edges if loops.base in (edge.one, edge.other)]:
         body, path = loops.base, [first]
         while (body := other_end(path[-1], body)) != platform:
-            onward = [edge for edge in loops.edges if edge is not path[-1] and body in (edge.one, edge.other)]
+            onward = [
+                edge
+                for edge in loops.edges
+                if edge is not path[-1] and body in (edge.one, edge.other)
+            ]
             if len(onward) != 1 or body == loops.base:
                 return None
             path.append(onward[0])
@@ -105,7 +116,9 @@ def _whole(loops: Loops, platform: str) -> tuple[Path, ...] | None:
 
 
 def _driven(loops: Loops, platform: str) -> tuple[Path, ...] | None:
-    """The shortest path through each motor on the base; None where two of them meet before the platform."""
+    """The shortest path through each motor on the base; None where two of them meet before the
+    platform.
+    """
     limbs, taken = [], {loops.base}
     for first in [edge for edge in loops.tree if edge.name in loops.motors]:
         if first.one != loops.base:
@@ -138,11 +151,15 @@ def _branches(loops: Loops, platform: str) -> FileError:
         names = [edge.name for edge in loops.edges if body in (edge.one, edge.other)]
         if body not in (loops.base, platform) and len(names) > 2:
             return loops.urdf.error(
-                f"joints {', '.join(names)} meet in {body!r}, so a limb branches from a limb, which loopcal cannot express; "
+                f"joints {', '.join(names)} meet in {body!r}, so a limb branches from a limb, "
+                "which loopcal cannot express; "
                 f"choose a platform other than {platform!r} (--platform), or leave the branch out",
                 names[-1],
             )
-    return FileError(f"no limbs join base and platform {platform!r}; choose another one (--platform)", loops.urdf.path)
+    return FileError(
+        f"no limbs join base and platform {platform!r}; choose another one (--platform)",
+        loops.urdf.path,
+    )
 
 
 def other_end(edge: Edge, body: str) -> str:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kinds of measurements, one file each; `KINDS` is the registry that files, templates, documentation and tests read."""
+"""Kinds of measurements, one file each; `KINDS` is the registry that files, templates,
+documentation and tests read.
+"""
 
 from loopcal.measure.kinds.autocollimation import Autocollimation as Autocollimation
 from loopcal.measure.kinds.bearing import Bearing as Bearing
@@ -22,4 +24,6 @@ from loopcal.measure.kinds.sphere import Sphere as Sphere
 _POINTS: tuple[type[Kind], ...] = (Position, Bearing, Distance, Separation, Plane, Line, Sphere)
 _AIMS: tuple[type[Kind], ...] = (Direction, Inclination, Autocollimation)
 
-KINDS: dict[str, type[Kind]] = {kind.name: kind for kind in (Pose, Component, *_POINTS, *_AIMS, JointSensor, Locked)}
+KINDS: dict[str, type[Kind]] = {
+    kind.name: kind for kind in (Pose, Component, *_POINTS, *_AIMS, JointSensor, Locked)
+}

@@ -6,26 +6,24 @@ from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure.closed_form import resection
 from loopcal.measure.kinds import parts
 from loopcal.measure.kinds.kind import Column
 from loopcal.measure.kinds.target import TargetKind, points_of
 from loopcal.measure.kinds.tool import stacked
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Bearing(TargetKind):
     """Two angles of each target. Residual: differences of angles, wrapped.
 
-    theodolite: `azimuth = atan2(y, x)`, `elevation = atan2(z, hypot(x, y))`. camera, which looks along its z axis:
-    `azimuth = atan2(x, z)`, `elevation = atan2(y, z)`.
+    theodolite: `azimuth = atan2(y, x)`, `elevation = atan2(z, hypot(x, y))`. camera, which looks
+    along its z axis: `azimuth = atan2(x, z)`, `elevation = atan2(y, z)`.
 
     Parameters
     ----------
@@ -42,7 +40,10 @@ class Bearing(TargetKind):
     form: str = "theodolite"
 
     name: ClassVar[str] = "bearing"
-    per_target: ClassVar[tuple[Column, ...]] = (Column("azimuth", Dimension.ANGLE), Column("elevation", Dimension.ANGLE))
+    per_target: ClassVar[tuple[Column, ...]] = (
+        Column("azimuth", Dimension.ANGLE),
+        Column("elevation", Dimension.ANGLE),
+    )
     wraps: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -53,16 +54,24 @@ class Bearing(TargetKind):
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
         """A theodolite, a camera at an unknown station, and two targets."""
-        station = se3.pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
-        behind = se3.pose(np.eye(3), np.array([0.1, -0.1, -2.5]))
+        station = geometry.pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
+        behind = geometry.pose(np.eye(3), np.array([0.1, -0.1, -2.5]))
         pair = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02]])
         return (
             cls(T_base_frame=station),
             cls(T_base_frame=behind, form="camera", unknown=("frame",), frame="camera"),
-            cls(targets=("a", "b"), places=pair, T_base_frame=station, unknown=("frame", "targets"), frame="station"),
+            cls(
+                targets=("a", "b"),
+                places=pair,
+                T_base_frame=station,
+                unknown=("frame", "targets"),
+                frame="station",
+            ),
         )
 
-    def predict(self, x: Array, values: Array) -> tuple[Array, Array, Mapping[str, Array]]:
+    def predict(
+        self, x: FloatArray, values: FloatArray
+    ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
         """Both angles of points x (.., k, 3) and their slopes."""
         a, b, c = x[..., 0], x[..., 1], x[..., 2]
         zero = np.zeros_like(a)
@@ -79,7 +88,7 @@ class Bearing(TargetKind):
         slopes = np.stack([np.stack(first, axis=-1), np.stack(second, axis=-1)], axis=-2)
         return np.stack(angles, axis=-1), slopes, {}
 
-    def rays(self, measured: Array) -> Array:
+    def rays(self, measured: FloatArray) -> FloatArray:
         """Unit vectors (.., 3) of measured angles (.., 2)."""
         azimuth, elevation = measured[..., 0], measured[..., 1]
         if self.form == "camera":
@@ -88,9 +97,11 @@ class Bearing(TargetKind):
             ray = np.where((np.cos(azimuth) < 0.0)[..., None], -ray, ray)
             return ray / np.linalg.norm(ray, axis=-1, keepdims=True)
         level = np.cos(elevation)
-        return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
+        return np.stack(
+            [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1
+        )
 
-    def starts(self, T: Array, measured: Array) -> Array:
+    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """The station by resection, targets where they are stated."""
         _, _, points, seen = points_of(self, T, measured)
         if "frame" not in self.unknown or len(seen) < 4:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kind `component`: some of the tool's coordinates and declared angles in a frame; z alone is a probed height.
+"""Kind `component`: some of the tool's coordinates and declared angles in a frame; z alone is a
+probed height.
 
-Angles are the ones the data declare, their differences wrapped. Near zero tilt the azimuth phi loses its meaning; there
-the x and y components of the unit normal stand in for theta and phi.
+Angles are the ones the data declare, their differences wrapped. Near zero tilt the azimuth phi
+loses its meaning; there the x and y components of the unit normal stand in for theta and phi.
 """
 
 from dataclasses import dataclass, field
@@ -11,19 +12,20 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.errors import DataError
+from loopcal.geometry.orientation_forms import Orientation, orientation
 from loopcal.measure.closed_form import kabsch
 from loopcal.measure.kinds import parts
 from loopcal.measure.kinds.kind import Bools, Column, Evaluation
 from loopcal.measure.kinds.tool import POSITION, ToolKind
-from loopcal.measure.orientation import Orientation, orientation
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
-Array = NDArray[np.float64]
-
 FLAT = 0.05
-"""Measured tilt [rad] below which the normal stands in for phi and theta; phi is there twenty times as noisy."""
+"""Measured tilt [rad] below which the normal stands in for phi and theta; phi is there twenty times
+as noisy.
+"""
 
 GIMBAL = 1e-3
 """Smallest |det E| of measured angles [1]; below it a and c are the same turn to a thousandth."""
@@ -31,29 +33,32 @@ GIMBAL = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Component(ToolKind):
-    """Some coordinates of the tool. Residual: `predicted - measured` of each, angles wrapped into (-pi, pi].
+    """Some coordinates of the tool. Residual: `predicted - measured` of each, angles wrapped into
+    (-pi, pi].
 
-    With E of the declared angles, Q the turn from base to frame and a the arm from platform origin to tool,
-    `d(angles) = E^-1 Q omega` and `d t = Q (v + omega x a)`. Where the measured tilt is below `FLAT`, the residuals
-    called theta and phi are the differences of the normal's x and y [rad], with `d n = (Q omega) x n`; a sigma stated
-    for theta and phi is then taken as theirs.
+    With E of the declared angles, Q the turn from base to frame and a the arm from platform origin
+    to tool, `d(angles) = E^-1 Q omega` and `d t = Q (v + omega x a)`. Where the measured tilt is
+    below `FLAT`, the residuals called theta and phi are the differences of the normal's x and y
+    [rad], with `d n = (Q omega) x n`; a sigma stated for theta and phi is then taken as theirs.
 
     Parameters
     ----------
     components : tuple of str
         In the order of the columns: x y z, and the angles of the declared orientation.
     orientation : str, optional
-        Form of the angles, "tilt-torsion" (phi theta psi) or "euler-" with an order (a b c); needed as soon as an angle
-        is measured.
+        Form of the angles, "tilt-torsion" (phi theta psi) or "euler-" with an order (a b c); needed
+        as soon as an angle is measured.
     form, _places_among
-        The orientation's form, and the place of each component among all: three angles (if declared), then x y z.
+        The orientation's form, and the place of each component among all: three angles (if
+        declared), then x y z.
     T_base_frame, T_platform_tool, unknown, frame
         See `ToolKind`.
 
     Raises
     ------
     DataError
-        If a component is unknown or named twice, or the angles are not declared, or phi comes without theta.
+        If a component is unknown or named twice, or the angles are not declared, or phi comes
+        without theta.
     """
 
     components: tuple[str, ...] = ("z",)
@@ -70,7 +75,8 @@ class Component(ToolKind):
         form = None if self.orientation is None else orientation(self.orientation)
         if form is not None and not form.angles:
             raise DataError(
-                f"components of a {form.name} cannot be measured one by one: declare tilt-torsion or euler- with an"
+                f"components of a {form.name} cannot be measured one by one: declare tilt-torsion "
+                "or euler- with an"
                 " order such as euler-xyz, or use the kind 'pose'"
             )
         allowed = (() if form is None else form.columns) + POSITION
@@ -83,13 +89,20 @@ class Component(ToolKind):
     def _check(self, allowed: tuple[str, ...]) -> None:
         for name in self.components:
             if name not in allowed:
-                hint = "; declare an orientation to measure angles" if self.orientation is None else ""
-                raise DataError(f"the component {name!r} is unknown: use some of {', '.join(allowed)}{hint}")
+                hint = (
+                    "; declare an orientation to measure angles" if self.orientation is None else ""
+                )
+                raise DataError(
+                    f"the component {name!r} is unknown: use some of {', '.join(allowed)}{hint}"
+                )
         if not self.components or len(set(self.components)) < len(self.components):
             named = ", ".join(self.components) or "nothing"
             raise DataError(f"the components are {named}: name at least one, and each once")
         if "phi" in self.components and "theta" not in self.components:
-            raise DataError("phi is measured without theta, but means nothing where theta is zero: measure both or none")
+            raise DataError(
+                "phi is measured without theta, but means nothing where theta is zero: measure "
+                "both or none"
+            )
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
@@ -108,9 +121,12 @@ class Component(ToolKind):
     @property
     def columns(self) -> tuple[Column, ...]:
         """The components as named."""
-        return tuple(Column(name, Dimension.LENGTH if name in POSITION else Dimension.ANGLE) for name in self.components)
+        return tuple(
+            Column(name, Dimension.LENGTH if name in POSITION else Dimension.ANGLE)
+            for name in self.components
+        )
 
-    def doubts(self, measured: Array) -> tuple[tuple[int, str], ...]:
+    def doubts(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
         """Rows whose Euler angles are at the point where the first and the last turn are one."""
         if self.form is None or "b" not in self.components:
             return ()
@@ -121,7 +137,8 @@ class Component(ToolKind):
             (
                 int(i),
                 (
-                    f"has b = {np.rad2deg(middle[i]):.6g} deg, where a and c of {self.form.name} are the same turn;"
+                    f"has b = {np.rad2deg(middle[i]):.6g} deg, where a and c of {self.form.name} "
+                    "are the same turn;"
                     " declare another order, or use the kind 'pose'"
                 ),
             )
@@ -129,25 +146,35 @@ class Component(ToolKind):
         )
 
     @property
-    def neutral(self) -> Array:
+    def neutral(self) -> FloatArray:
         """NaN, which each component sorts out for itself."""
         return np.full(len(self.components), np.nan)
 
-    def _evaluate(self, T: Array, measured: Array, values: Array, joints: Array) -> Evaluation:
+    def _evaluate(
+        self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
+    ) -> Evaluation:
         seen = self.seen(T, values)
         predicted, slopes = self._predict(seen)
         difference = predicted - np.where(np.isnan(measured), predicted, measured)
         residual = difference
         if self.form is not None:
-            residual = np.where(self._places_among < 3, se3.wrap(difference), difference)
+            residual = np.where(self._places_among < 3, geometry.wrap(difference), difference)
         moved = self.transport(T, values)
         rows = slopes @ moved
         if not self._has_normal:
             return self.split(residual, rows)
         return self._flattened(residual, rows, seen, measured, moved)
 
-    def measure(self, T: Array, noise: Array, unknowns: Array | None = None, joints: Array | None = None) -> Array:
-        """Columns (t, r, m) of the tool with noise added; near zero tilt the noise of phi and theta is the normal's."""
+    def measure(
+        self,
+        T: FloatArray,
+        noise: FloatArray,
+        unknowns: FloatArray | None = None,
+        joints: FloatArray | None = None,
+    ) -> FloatArray:
+        """Columns (t, r, m) of the tool with noise added; near zero tilt the noise of phi and theta
+        is the normal's.
+        """
         seen = self.seen(T, unknowns)
         exact, _ = self._predict(seen)
         noisy = exact + noise
@@ -161,16 +188,20 @@ class Component(ToolKind):
         noisy = np.where(flat[..., None] & (places == theta), tilt[..., None], noisy)
         return np.where(flat[..., None] & (places == phi), azimuth[..., None], noisy)
 
-    def starts(self, T: Array, measured: Array) -> Array:
+    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """The frame from positions, where all three are measured; else in 24 orientations."""
         whole = ~np.any(np.isnan(measured), axis=-1)
-        if self.unknown != ("frame",) or not set(POSITION) <= set(self.components) or np.count_nonzero(whole) < 3:
+        if (
+            self.unknown != ("frame",)
+            or not set(POSITION) <= set(self.components)
+            or np.count_nonzero(whole) < 3
+        ):
             return super().starts(T, measured)
         point = (T @ self._tool())[whole, :3, 3]
         seen = measured[whole][:, [self.components.index(name) for name in POSITION]]
         return parts.frame_values(self.T_base_frame, kabsch(seen, point))[None]
 
-    def covariance_of_rotation(self, measured: Array, covariance: Array) -> Array:
+    def covariance_of_rotation(self, measured: FloatArray, covariance: FloatArray) -> FloatArray:
         """Covariance of the residuals from that of the tool's rotation error and position.
 
         Parameters
@@ -189,13 +220,16 @@ class Component(ToolKind):
         angles = np.stack([self._value(values, name) for name in self._angle_names], axis=-1)
         position = np.zeros((*values.shape[:-1], 3))
         rotation = np.broadcast_to(np.eye(3), (*values.shape[:-1], 3, 3))
-        seen = se3.pose(rotation if self.form is None else self.form.to_matrix(angles), position)
+        seen = geometry.pose(
+            rotation if self.form is None else self.form.to_matrix(angles), position
+        )
         rows = self._slopes(angles)
         if self._has_normal:
             rows = np.where(self._flat(measured), self._normal_rows(seen, rows), rows)
         return rows @ covariance @ np.swapaxes(rows, -1, -2)
 
-    # --- pieces ------------------------------------------------------------------------------------------------------
+    # --- pieces
+    # ------------------------------------------------------------------------------------------------------
 
     @property
     def _angle_names(self) -> tuple[str, ...]:
@@ -210,18 +244,26 @@ class Component(ToolKind):
         """Places of theta and phi among the components."""
         return self.components.index("theta"), self.components.index("phi")
 
-    def _value(self, values: Array, name: str) -> Array:
-        return values[..., self.components.index(name)] if name in self.components else np.zeros(values.shape[:-1])
+    def _value(self, values: FloatArray, name: str) -> FloatArray:
+        return (
+            values[..., self.components.index(name)]
+            if name in self.components
+            else np.zeros(values.shape[:-1])
+        )
 
-    def _predict(self, seen: Array) -> tuple[Array, Array]:
-        """Components (..., m) of tool poses (..., 4, 4), and their derivative (..., m, 6) by the tool's twist."""
+    def _predict(self, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Components (..., m) of tool poses (..., 4, 4), and their derivative (..., m, 6) by the
+        tool's twist.
+        """
         position = seen[..., :3, 3]
         if self.form is None:
             return position[..., self._places_among], self._slopes(np.zeros((1, 1, 3)))
         angles = self.form.from_matrix(seen[..., :3, :3])
-        return np.concatenate([angles, position], axis=-1)[..., self._places_among], self._slopes(angles)
+        return np.concatenate([angles, position], axis=-1)[..., self._places_among], self._slopes(
+            angles
+        )
 
-    def _slopes(self, angles: Array) -> Array:
+    def _slopes(self, angles: FloatArray) -> FloatArray:
         """Derivative (..., m, 6) of the components by the tool's twist, in axes of the frame."""
         identity, zero = np.eye(3), np.zeros((3, 3))
         shape = (*angles.shape[:-1], 3, 6)
@@ -232,22 +274,40 @@ class Component(ToolKind):
             rows = np.concatenate([turning, rows], axis=-2)
         return rows[..., self._places_among, :]
 
-    def _flat(self, measured: Array) -> Bools:
-        """Rows (..., 1, 1) whose normal stands in for phi and theta: both measured, and little tilt."""
+    def _flat(self, measured: FloatArray) -> Bools:
+        """Rows (..., 1, 1) whose normal stands in for phi and theta: both measured, and little
+        tilt.
+        """
         theta, phi = self._normal_places
         flat = (np.abs(measured[..., theta]) < FLAT) & ~np.isnan(measured[..., phi])
         return flat[..., None, None]
 
-    def _normal_rows(self, seen: Array, rows: Array) -> Array:
-        """The derivative (..., m, 6), with rows of the normal's x and y for theta and phi: `d n = omega x n`."""
-        normal = -se3.hat(seen[..., :3, 2])
-        x, y = (np.concatenate([normal[..., i, :], np.zeros_like(normal[..., i, :])], axis=-1) for i in range(2))
+    def _normal_rows(self, seen: FloatArray, rows: FloatArray) -> FloatArray:
+        """The derivative (..., m, 6), with rows of the normal's x and y for theta and phi: `d n =
+        omega x n`.
+        """
+        normal = -geometry.hat(seen[..., :3, 2])
+        x, y = (
+            np.concatenate([normal[..., i, :], np.zeros_like(normal[..., i, :])], axis=-1)
+            for i in range(2)
+        )
         theta, phi = self._normal_places
         places = np.arange(len(self.components))[:, None]
-        return np.where(places == theta, x[..., None, :], np.where(places == phi, y[..., None, :], rows))
+        return np.where(
+            places == theta, x[..., None, :], np.where(places == phi, y[..., None, :], rows)
+        )
 
-    def _flattened(self, residual: Array, rows: Array, seen: Array, measured: Array, moved: Array) -> Evaluation:
-        """The evaluation with the normal in place of phi and theta where the measured tilt is small."""
+    def _flattened(
+        self,
+        residual: FloatArray,
+        rows: FloatArray,
+        seen: FloatArray,
+        measured: FloatArray,
+        moved: FloatArray,
+    ) -> Evaluation:
+        """The evaluation with the normal in place of phi and theta where the measured tilt is
+        small.
+        """
         flat = self._flat(measured)
         theta, phi = self._normal_places
         places = np.arange(len(self.components))
@@ -255,7 +315,11 @@ class Component(ToolKind):
         azimuth = np.where(np.isnan(measured[..., phi]), 0.0, measured[..., phi])
         x = seen[..., 0, 2] - np.cos(azimuth) * tilt
         y = seen[..., 1, 2] - np.sin(azimuth) * tilt
-        normal = np.where(places == theta, x[..., None], np.where(places == phi, y[..., None], residual))
+        normal = np.where(
+            places == theta, x[..., None], np.where(places == phi, y[..., None], residual)
+        )
         slopes = self._normal_rows(seen, np.zeros((1, 1, len(self.components), 6))) @ moved
         chosen = flat & ((places == theta) | (places == phi))[:, None]
-        return self.split(np.where(chosen[..., 0], normal, residual), np.where(chosen, slopes, rows))
+        return self.split(
+            np.where(chosen[..., 0], normal, residual), np.where(chosen, slopes, rows)
+        )

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kind `distance`: from a fixed point to points of the platform, by a wire, an interferometer or a ballbar."""
+"""Kind `distance`: from a fixed point to points of the platform, by a wire, an interferometer or a
+ballbar.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loopcal.errors import DataError
 from loopcal.measure.arrays import stored
@@ -16,14 +17,14 @@ from loopcal.measure.kinds.kind import Column
 from loopcal.measure.kinds.target import TargetKind, length_of, offset_of, points_of
 from loopcal.measure.kinds.tool import stacked
 from loopcal.parameters import Parameter
+from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Distance(TargetKind):
-    """Distance to a fixed point c. Residual: `|x - c| + offset - measured`, with slope `(x - c) / |x - c|`.
+    """Distance to a fixed point c. Residual: `|x - c| + offset - measured`, with slope `(x - c) /
+    |x - c|`.
 
     Parameters
     ----------
@@ -39,7 +40,7 @@ class Distance(TargetKind):
         As `TargetKind`.
     """
 
-    anchor: Array = field(default_factory=lambda: np.zeros(3))
+    anchor: FloatArray = field(default_factory=lambda: np.zeros(3))
     anchor_name: str = "anchor"
 
     name: ClassVar[str] = "distance"
@@ -63,9 +64,15 @@ class Distance(TargetKind):
 
     def own_part(self, name: str) -> tuple[Parameter, ...]:
         """Three unknowns of the fixed point, one of the offset."""
-        return parts.point_part(self.anchor_name, self.anchor) if name == "anchor" else self.offset_part()
+        return (
+            parts.point_part(self.anchor_name, self.anchor)
+            if name == "anchor"
+            else self.offset_part()
+        )
 
-    def predict(self, x: Array, values: Array) -> tuple[Array, Array, Mapping[str, Array]]:
+    def predict(
+        self, x: FloatArray, values: FloatArray
+    ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
         """Distances (.., k, 1) and unit vectors."""
         own = self.part(values, "anchor")
         offset, blocks = offset_of(self, values)
@@ -76,30 +83,39 @@ class Distance(TargetKind):
             blocks["anchor"] = -unit
         return length + offset, unit, blocks
 
-    def doubts(self, measured: Array) -> tuple[tuple[int, str], ...]:
+    def doubts(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
         """Rows with a distance that is none."""
         return not_above_zero(measured)
 
-    def starts(self, T: Array, measured: Array) -> Array:
+    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """The fixed point by trilateration, targets where they are stated.
 
         Raises
         ------
         DataError
-            If all points lie in a plane and nothing is said of the side on which the fixed point is.
+            If all points lie in a plane and nothing is said of the side on which the fixed point
+            is.
         """
         _, _, points, seen = points_of(self, T, measured)
         if "anchor" not in self.unknown or len(seen) < 4:
             return self.nominal[None]
         inside = (points - self.T_base_frame[:3, 3]) @ self.T_base_frame[:3, :3]
         with_offset = "offset" in self.unknown
-        found = [trilateration(inside, seen[:, 0], with_offset=flag) for flag in {False, with_offset}]
+        found = [
+            trilateration(inside, seen[:, 0], with_offset=flag) for flag in {False, with_offset}
+        ]
         centres, offsets = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
         side = self._sides(inside, centres)
-        return stacked(self, {"anchor": centres[side], "offset": offsets[side, None]}, int(np.count_nonzero(side)))
+        return stacked(
+            self,
+            {"anchor": centres[side], "offset": offsets[side, None]},
+            int(np.count_nonzero(side)),
+        )
 
-    def _sides(self, points: Array, centres: Array) -> NDArray[np.bool_]:
-        """Which centres (k,) are on the stated side of a plane that all points (q, 3) lie in; all, if there is none."""
+    def _sides(self, points: FloatArray, centres: FloatArray) -> BoolArray:
+        """Which centres (k,) are on the stated side of a plane that all points (q, 3) lie in; all,
+        if there is none.
+        """
         middle = points.mean(axis=0)
         _, s, axes = np.linalg.svd(points - middle, full_matrices=False)
         if s[2] > FLAT * s[0] or "targets" in self.unknown:
@@ -107,16 +123,15 @@ class Distance(TargetKind):
         stated = (self.anchor - middle) @ axes[2]
         if not self.anchor.any() or abs(stated) <= FLAT * s[0]:
             raise DataError(
-                f"the distances to {self.anchor_name!r} were all measured in one plane, so it can be on either side of it;"
+                f"the distances to {self.anchor_name!r} were all measured in one plane, so it can "
+                "be on either side of it;"
                 " state 'anchor' roughly where it is, or measure poses off the plane"
             )
         return (centres - middle) @ axes[2] * stated >= 0.0
 
 
-def not_above_zero(measured: Array) -> tuple[tuple[int, str], ...]:
+def not_above_zero(measured: FloatArray) -> tuple[tuple[int, str], ...]:
     """Rows (index, sentence) of distances (r, c) that are zero or negative."""
     wrong = np.argwhere(measured <= 0.0)
-    sentence = (
-        "has a distance of {:.6g} m; a distance is above 0, so correct it, or leave the cell empty where nothing was read"
-    )
+    sentence = "has a distance of {:.6g} m; a distance is above 0, so correct it, or leave the cell empty where nothing was read"
     return tuple((int(i), sentence.format(measured[i, j])) for i, j in wrong)

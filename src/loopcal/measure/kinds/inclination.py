@@ -5,22 +5,21 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loopcal.measure.arrays import stored_pose
 from loopcal.measure.kinds.aim import AimKind
 from loopcal.measure.kinds.kind import Column, chosen
 from loopcal.measure.kinds.surface import stored_direction
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Inclination(AimKind):
     """Elevations of a sensor's x and y axis above the horizontal. Residual: differences of angles.
 
-    With the upward vertical d in axes of the sensor: `tilt_x = atan2(d_x, hypot(d_y, d_z))`, `tilt_y` likewise.
+    With the upward vertical d in axes of the sensor: `tilt_x = atan2(d_x, hypot(d_y, d_z))`,
+    `tilt_y` likewise.
 
     Parameters
     ----------
@@ -36,11 +35,12 @@ class Inclination(AimKind):
     Raises
     ------
     DataError
-        If the vertical has no length, the mounting is no pose, or something else is said to be unknown.
+        If the vertical has no length, the mounting is no pose, or something else is said to be
+        unknown.
     """
 
-    up: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
-    T_platform_sensor: Array = field(default_factory=lambda: np.eye(4))
+    up: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    T_platform_sensor: FloatArray = field(default_factory=lambda: np.eye(4))
     sensor: str = "inclinometer"
 
     name: ClassVar[str] = "inclination"
@@ -49,13 +49,19 @@ class Inclination(AimKind):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "up", stored_direction(self.up, "the vertical"))
-        object.__setattr__(self, "T_platform_sensor", stored_pose(self.T_platform_sensor, "T_platform_sensor"))
+        object.__setattr__(
+            self, "T_platform_sensor", stored_pose(self.T_platform_sensor, "T_platform_sensor")
+        )
         object.__setattr__(self, "unknown", chosen(self.unknown, self.possible, self.name))
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
         """A base that stands level, an unknown vertical, and an unknown mounting too."""
-        return (cls(), cls(unknown=("gravity",)), cls(unknown=("mounting", "gravity"), sensor="level"))
+        return (
+            cls(),
+            cls(unknown=("gravity",)),
+            cls(unknown=("mounting", "gravity"), sensor="level"),
+        )
 
     @property
     def columns(self) -> tuple[Column, ...]:
@@ -63,11 +69,11 @@ class Inclination(AimKind):
         return (Column("tilt_x", Dimension.ANGLE), Column("tilt_y", Dimension.ANGLE))
 
     @property
-    def stated(self) -> tuple[str, Array, str, Array]:
+    def stated(self) -> tuple[str, FloatArray, str, FloatArray]:
         """Mounting and vertical."""
         return self.sensor, self.T_platform_sensor[:3, :3], "gravity", self.up
 
-    def predict(self, d: Array) -> tuple[Array, Array]:
+    def predict(self, d: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Both elevations (.., 2) and their slopes (.., 2, 3)."""
         x, y, z = d[..., 0], d[..., 1], d[..., 2]
         level_x, level_y = np.sqrt(y * y + z * z), np.sqrt(x * x + z * z)
@@ -77,26 +83,32 @@ class Inclination(AimKind):
         second = np.stack([-x * y / level_y, level_y, -y * z / level_y], axis=-1)
         return angles, np.stack([first, second], axis=-2)
 
-    def directions(self, measured: Array) -> Array:
+    def directions(self, measured: FloatArray) -> FloatArray:
         """The upward vertical in the sensor, which stands nearer upright than upside down."""
         side = np.sin(measured)
         rest = np.sqrt(np.maximum(1.0 - np.sum(side * side, axis=-1, keepdims=True), 0.0))
         d = np.concatenate([side, rest], axis=-1)
         return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
-    def readings(self, measured: Array) -> tuple[Array, ...]:
+    def readings(self, measured: FloatArray) -> tuple[FloatArray, ...]:
         """The vertical in an upright sensor, and in one that hangs upside down and shows the same."""
         upright = self.directions(measured)
-        return (upright, upright * np.array([1.0, 1.0, -1.0])) if "mounting" in self.unknown else (upright,)
+        return (
+            (upright, upright * np.array([1.0, 1.0, -1.0]))
+            if "mounting" in self.unknown
+            else (upright,)
+        )
 
-    def doubts(self, measured: Array) -> tuple[tuple[int, str], ...]:
+    def doubts(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
         """Rows whose two tilts no direction can have."""
         with np.errstate(invalid="ignore"):
             wrong = np.flatnonzero(
-                (np.sum(np.sin(measured) ** 2, axis=-1) > 1.0) | np.any(np.abs(measured) > np.pi / 2, axis=-1)
+                (np.sum(np.sin(measured) ** 2, axis=-1) > 1.0)
+                | np.any(np.abs(measured) > np.pi / 2, axis=-1)
             )
         sentence = (
-            "has tilts of {:.6g} and {:.6g} deg, which no direction has: elevations of two axes at right angles add up to"
+            "has tilts of {:.6g} and {:.6g} deg, which no direction has: elevations of two axes at "
+            "right angles add up to"
             " at most 90 deg; check the unit"
         )
         return tuple((int(i), sentence.format(*np.rad2deg(measured[i]))) for i in wrong)

@@ -1,34 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kind `joint`: sensors on joints, passive ones or driven ones; a driven joint's is its noisy encoder."""
+"""Kind `joint`: sensors on joints, passive ones or driven ones; a driven joint's is its noisy
+encoder.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure.kinds.kind import Column, Evaluation, Kind, chosen
 from loopcal.parameters import Parameter
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JointSensor(Kind):
     """Values of joints. Residual: `joint + offset - measured`, angles wrapped.
 
-    The poses do not matter, but the joints' values do: they and their derivatives by the robot's parameters come from the
-    mechanism. A driven joint's value is the reading itself; where readings are uncertain they are unknowns of their pose,
-    and this kind is the row that ties them to what the encoder showed.
+    The poses do not matter, but the joints' values do: they and their derivatives by the robot's
+    parameters come from the mechanism. A driven joint's value is the reading itself; where readings
+    are uncertain they are unknowns of their pose, and this kind is the row that ties them to what
+    the encoder showed.
 
     Parameters
     ----------
     joints : tuple of str
-        Passive joints as `limb.joint`, driven ones by the name of their actuator; these are the columns, too.
+        Passive joints as `limb.joint`, driven ones by the name of their actuator; these are the
+        columns, too.
     measures : str
         "length" or "angle", what the joints move by.
     unknown : tuple of str
@@ -52,7 +54,9 @@ class JointSensor(Kind):
     def __post_init__(self) -> None:
         joints = (self.joints,) if isinstance(self.joints, str) else tuple(self.joints)
         if not joints or len(set(joints)) < len(joints):
-            raise DataError(f"the joints are {', '.join(joints) or 'none'}: name at least one, and each once")
+            raise DataError(
+                f"the joints are {', '.join(joints) or 'none'}: name at least one, and each once"
+            )
         if self.measures not in ("length", "angle"):
             raise DataError(f"the joints measure {self.measures!r}; use length or angle")
         object.__setattr__(self, "joints", joints)
@@ -81,27 +85,41 @@ class JointSensor(Kind):
     @property
     def parts(self) -> Mapping[str, tuple[Parameter, ...]]:
         """An offset for each joint."""
-        made = tuple(Parameter(f"{joint}.{self.name}", self.dimension, 0.0, scope=self.scope) for joint in self.joints)
+        made = tuple(
+            Parameter(f"{joint}.{self.name}", self.dimension, 0.0, scope=self.scope)
+            for joint in self.joints
+        )
         return {"offset": made} if self.unknown else {}
 
-    def _evaluate(self, T: Array, measured: Array, values: Array, joints: Array) -> Evaluation:
+    def _evaluate(
+        self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
+    ) -> Evaluation:
         residual = self.predict(joints, values) - measured
         if self.dimension is Dimension.ANGLE:
-            residual = se3.wrap(residual)
+            residual = geometry.wrap(residual)
         m = len(self.joints)
         still = np.zeros((*residual.shape, 6))
         slope = np.broadcast_to(np.eye(m), (*residual.shape, m))
         return Evaluation(residual, still, self.sign * slope if self.unknown else None, slope)
 
-    def predict(self, joints: Array, values: Array) -> Array:
+    def predict(self, joints: FloatArray, values: FloatArray) -> FloatArray:
         """What the sensors show (t, r, m)."""
         own = self.part(values, "offset")
         return joints if own is None else joints + self.sign * own
 
-    def starts(self, T: Array, measured: Array) -> Array:
+    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Nothing is known from poses alone; offsets start at zero and enter linearly."""
         return self.nominal[None]
 
-    def measure(self, T: Array, noise: Array, unknowns: Array | None = None, joints: Array | None = None) -> Array:
+    def measure(
+        self,
+        T: FloatArray,
+        noise: FloatArray,
+        unknowns: FloatArray | None = None,
+        joints: FloatArray | None = None,
+    ) -> FloatArray:
         """Columns (t, r, m) with noise added."""
-        return self.predict(np.zeros_like(noise) if joints is None else joints, self.values(unknowns)) + noise
+        return (
+            self.predict(np.zeros_like(noise) if joints is None else joints, self.values(unknowns))
+            + noise
+        )

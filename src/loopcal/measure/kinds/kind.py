@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a kind of measurement is: columns, and a residual with its derivatives.
 
-Adding a kind takes one file with one frozen dataclass, and its line in `KINDS`; files, templates, documentation and the
-contract tests follow from what this class asks for. A kind knows nothing of robots: it is given platform poses.
+Adding a kind takes one file with one frozen dataclass, and its line in `KINDS`; files, templates,
+documentation and the contract tests follow from what this class asks for. A kind knows nothing of
+robots: it is given platform poses.
 
-Shapes: t trials, r rows, c columns as written in files, m residuals (often c), u unknowns of the kind, j joints it looks
-at. A kind with `links` > 1 compares several poses in one row and has an axis l for them: T (t, r, l, 4, 4), jacobian
-(t, r, l, m, 6). Values of unknowns are plain numbers that add up; how a frame or a direction is written in them, see
-`loopcal.measure.kinds.parts`.
+Shapes: t trials, r rows, c columns as written in files, m residuals (often c), u unknowns of the
+kind, j joints it looks at. A kind with `links` > 1 compares several poses in one row and has an
+axis l for them: T (t, r, l, 4, 4), jacobian (t, r, l, m, 6). Values of unknowns are plain numbers
+that add up; how a frame or a direction is written in them, see `loopcal.measure.kinds.parts`.
 """
 
 from abc import ABC, abstractmethod
@@ -16,15 +17,14 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loopcal.errors import DataError
-from loopcal.linalg import without_rounding
+from loopcal.numerics.decomposition import without_rounding
 from loopcal.parameters import Parameter
+from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+Bools = BoolArray
 
 
 @dataclass(frozen=True)
@@ -36,23 +36,25 @@ class Column:
 
 
 class Evaluation(NamedTuple):
-    """Residuals (predicted - measured) with their derivatives; rows and components not measured are zero in all three.
+    """Residuals (predicted - measured) with their derivatives; rows and components not measured are
+    zero in all three.
 
     Attributes
     ----------
     residual : (t, r, m) [SI]
     jacobian : (t, r, m, 6)
-        By the platform twist (omega, v) in base axes; with an axis of links before m where there are several.
+        By the platform twist (omega, v) in base axes; with an axis of links before m where there
+        are several.
     own : (t, r, m, u) or None
         By the kind's own unknowns, None where it has none.
     joints : (t, r, m, j) or None
         By the values of the joints it looks at, None where it looks at poses only.
     """
 
-    residual: Array
-    jacobian: Array
-    own: Array | None = None
-    joints: Array | None = None
+    residual: FloatArray
+    jacobian: FloatArray
+    own: FloatArray | None = None
+    joints: FloatArray | None = None
 
 
 class Kind(ABC):
@@ -65,9 +67,11 @@ class Kind(ABC):
     links : int
         How many poses one row compares.
     follows : bool
-        Whether columns that stay the same while the robot moves are a mistake; touched surfaces and locks stay at 0.
+        Whether columns that stay the same while the robot moves are a mistake; touched surfaces and
+        locks stay at 0.
     said : str
-        What is measured, for sentences that advise it with nothing unknown; "the" and the name where empty.
+        What is measured, for sentences that advise it with nothing unknown; "the" and the name
+        where empty.
     """
 
     name: ClassVar[str]
@@ -101,8 +105,10 @@ class Kind(ABC):
         return {self.name: tuple(range(len(self.columns)))}
 
     @property
-    def references(self) -> Mapping[str, Array]:
-        """What unknowns of a name are counted from (a frame's stated orientation); kinds that share the name must agree."""
+    def references(self) -> Mapping[str, FloatArray]:
+        """What unknowns of a name are counted from (a frame's stated orientation); kinds that share
+        the name must agree.
+        """
         return {}
 
     @property
@@ -113,10 +119,14 @@ class Kind(ABC):
     @classmethod
     @abstractmethod
     def examples(cls) -> "tuple[Kind, ...]":
-        """Instances that together show every setting; documentation, templates and contract tests use them."""
+        """Instances that together show every setting; documentation, templates and contract tests
+        use them.
+        """
 
-    def mounted(self, T_platform_tool: Array) -> Self:
-        """The kind for a robot with this tool (4, 4); the same object where the tool does not matter or is stated."""
+    def mounted(self, T_platform_tool: FloatArray) -> Self:
+        """The kind for a robot with this tool (4, 4); the same object where the tool does not
+        matter or is stated.
+        """
         del T_platform_tool
         return self
 
@@ -125,16 +135,24 @@ class Kind(ABC):
         """Whether the kind knows all it needs to be evaluated."""
         return True
 
-    def present(self, measured: Array) -> Bools:
-        """Which residuals (..., m) can be formed from columns (..., c); NaN stands for what was not measured."""
+    def present(self, measured: FloatArray) -> Bools:
+        """Which residuals (..., m) can be formed from columns (..., c); NaN stands for what was not
+        measured.
+        """
         return ~np.isnan(measured)
 
-    def doubts(self, measured: Array) -> tuple[tuple[int, str], ...]:
+    def doubts(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
         """Rows (index, sentence) of columns (r, c) that cannot mean what they say."""
         del measured
         return ()
 
-    def evaluate(self, T: Array, measured: Array, unknowns: Array | None = None, joints: Array | None = None) -> Evaluation:
+    def evaluate(
+        self,
+        T: FloatArray,
+        measured: FloatArray,
+        unknowns: FloatArray | None = None,
+        joints: FloatArray | None = None,
+    ) -> Evaluation:
         """Residuals and derivatives at platform poses.
 
         Parameters
@@ -158,25 +176,40 @@ class Kind(ABC):
             If the kind looks at joints and none are given.
         """
         if self.looks_at and joints is None:
-            raise DataError(f"the kind {self.name!r} needs the values of {', '.join(self.looks_at)}; hand them over as joints")
+            raise DataError(
+                f"the kind {self.name!r} needs the values of {', '.join(self.looks_at)}; hand them "
+                "over as joints"
+            )
         filled = np.where(np.isnan(measured), self.neutral, measured)
         values = self.values(unknowns)
         if len(values) > len(T):
             T = np.broadcast_to(T, (len(values), *T.shape[1:]))
-        result = self._seen(self._evaluate(T, filled, values, np.empty((1, 1, 0)) if joints is None else joints))
+        result = self._seen(
+            self._evaluate(T, filled, values, np.empty((1, 1, 0)) if joints is None else joints)
+        )
         present = self.present(measured)
         if np.all(present):
             return result
         here = present[..., None]
         links = present[..., None, :, None] if self.links > 1 else here
-        own, moved = (None if part is None else np.where(here, part, 0.0) for part in (result.own, result.joints))
-        return Evaluation(np.where(present, result.residual, 0.0), np.where(links, result.jacobian, 0.0), own, moved)
+        own, moved = (
+            None if part is None else np.where(here, part, 0.0)
+            for part in (result.own, result.joints)
+        )
+        return Evaluation(
+            np.where(present, result.residual, 0.0),
+            np.where(links, result.jacobian, 0.0),
+            own,
+            moved,
+        )
 
     def _seen(self, found: Evaluation) -> Evaluation:
-        """Derivatives by own unknowns with zeros where these cancel, as the place of a target does between parallel poses.
+        """Derivatives by own unknowns with zeros where these cancel, as the place of a target does
+        between parallel poses.
 
-        They are compared with what a move of the platform does to the row. A metre stands beside a radian there: the limit
-        lies so far below all that counts that any length of machines would do.
+        They are compared with what a move of the platform does to the row. A metre stands beside a
+        radian there: the limit lies so far below all that counts that any length of machines would
+        do.
         """
         if found.own is None:
             return found
@@ -185,24 +218,36 @@ class Kind(ABC):
         return found._replace(own=without_rounding(found.own, by_move[..., None]))
 
     @property
-    def neutral(self) -> Array:
+    def neutral(self) -> FloatArray:
         """Columns (c,) that stand where nothing was measured, so that nothing becomes NaN."""
         return np.zeros(len(self.columns))
 
     @abstractmethod
-    def _evaluate(self, T: Array, measured: Array, values: Array, joints: Array) -> Evaluation:
-        """`evaluate` with unknowns and measured values filled in; anything finite may come where nothing was measured."""
+    def _evaluate(
+        self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
+    ) -> Evaluation:
+        """`evaluate` with unknowns and measured values filled in; anything finite may come where
+        nothing was measured.
+        """
 
-    def starts(self, T: Array, measured: Array) -> Array:
-        """Candidates (k, u) for the unknowns of rows that share them, from poses T (r, 4, 4) and columns (r, c) alone.
+    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+        """Candidates (k, u) for the unknowns of rows that share them, from poses T (r, 4, 4) and
+        columns (r, c) alone.
 
-        Found in closed form where there is one; `loopcal.measure.starts` improves and compares them.
+        Found in closed form where there is one; `loopcal.measure.initial_values` improves and
+        compares them.
         """
         del T, measured
         return self.nominal[None]
 
     @abstractmethod
-    def measure(self, T: Array, noise: Array, unknowns: Array | None = None, joints: Array | None = None) -> Array:
+    def measure(
+        self,
+        T: FloatArray,
+        noise: FloatArray,
+        unknowns: FloatArray | None = None,
+        joints: FloatArray | None = None,
+    ) -> FloatArray:
         """Columns that an instrument with this noise would write.
 
         Parameters
@@ -221,23 +266,24 @@ class Kind(ABC):
             With `evaluate(T, measured).residual = -noise_map(measured) noise` to first order.
         """
 
-    def noise_map(self, measured: Array) -> Array:
+    def noise_map(self, measured: FloatArray) -> FloatArray:
         """Matrix (..., m, m) by which errors of the noise columns enter the residuals (up to sign)."""
         m = len(self.noise_columns)
         return np.broadcast_to(np.eye(m), (*measured.shape[:-1], m, m))
 
-    # --- for the kinds themselves ------------------------------------------------------------------------------------
+    # --- for the kinds themselves
+    # ------------------------------------------------------------------------------------
 
     @property
-    def nominal(self) -> Array:
+    def nominal(self) -> FloatArray:
         """Nominal values (u,) of the unknowns."""
         return np.array([parameter.nominal for parameter in self.unknowns])
 
-    def values(self, unknowns: Array | None) -> Array:
+    def values(self, unknowns: FloatArray | None) -> FloatArray:
         """The values given, or the nominal ones (1, 1, u)."""
         return self.nominal[None, None] if unknowns is None else unknowns
 
-    def part(self, values: Array, name: str) -> Array | None:
+    def part(self, values: FloatArray, name: str) -> FloatArray | None:
         """Values (.., w) of one part, None where it is known."""
         first = 0
         for part, parameters in self.parts.items():
@@ -246,8 +292,9 @@ class Kind(ABC):
             first += len(parameters)
         return None
 
-    def columns_of(self, blocks: Mapping[str, Array], shape: tuple[int, ...]) -> Array:
-        """Put derivatives side by side: the twist, then every part of the unknowns, zeros where a block is missing.
+    def columns_of(self, blocks: Mapping[str, FloatArray], shape: tuple[int, ...]) -> FloatArray:
+        """Put derivatives side by side: the twist, then every part of the unknowns, zeros where a
+        block is missing.
 
         Parameters
         ----------
@@ -261,11 +308,17 @@ class Kind(ABC):
         """
         widths = {"twist": 6} | {name: len(part) for name, part in self.parts.items()}
         return np.concatenate(
-            [np.broadcast_to(blocks.get(name, np.zeros(w)), (*shape, w)) for name, w in widths.items()], axis=-1
+            [
+                np.broadcast_to(blocks.get(name, np.zeros(w)), (*shape, w))
+                for name, w in widths.items()
+            ],
+            axis=-1,
         )
 
-    def split(self, residual: Array, rows: Array) -> Evaluation:
-        """The evaluation of residuals (t, r, m) whose derivatives (t, r, m, 6 + u) stand side by side."""
+    def split(self, residual: FloatArray, rows: FloatArray) -> Evaluation:
+        """The evaluation of residuals (t, r, m) whose derivatives (t, r, m, 6 + u) stand side by
+        side.
+        """
         return Evaluation(residual, rows[..., :6], rows[..., 6:] if self.parts else None)
 
 
@@ -274,5 +327,8 @@ def chosen(unknown: tuple[str, ...], possible: tuple[str, ...], kind: str) -> tu
     named = (unknown,) if isinstance(unknown, str) else tuple(unknown)
     for name in named:
         if name not in possible:
-            raise DataError(f"{name!r} cannot be unknown in the kind {kind!r}; what can be is {', '.join(possible)}")
+            raise DataError(
+                f"{name!r} cannot be unknown in the kind {kind!r}; what can be is "
+                f"{', '.join(possible)}"
+            )
     return named

@@ -10,9 +10,11 @@ from loopcal.measure.kinds.kind import Column
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Locked(JointSensor):
-    """Joints held fixed. Residual: `joint - constant - slip`, with one unknown constant for each group of rows.
+    """Joints held fixed. Residual: `joint - constant - slip`, with one unknown constant for each
+    group of rows.
 
-    The column is the slip of the lock, 0 where nothing else is known; its noise is the play of the lock.
+    The column is the slip of the lock, 0 where nothing else is known; its noise is the play of the
+    lock.
 
     Parameters
     ----------

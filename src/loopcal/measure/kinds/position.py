@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kind `position`: points of the platform in a frame, as a tracker sees reflectors or a CMM touches spheres."""
+"""Kind `position`: points of the platform in a frame, as a tracker sees reflectors or a CMM touches
+spheres.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loopcal.errors import DataError
 from loopcal.measure.closed_form import FLAT, frame_and_points, kabsch, linear
@@ -14,13 +15,13 @@ from loopcal.measure.kinds import parts
 from loopcal.measure.kinds.kind import Column
 from loopcal.measure.kinds.target import TargetKind, points_of
 from loopcal.measure.kinds.tool import position_columns, stacked
-
-Array = NDArray[np.float64]
+from loopcal.typing import FloatArray
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Position(TargetKind):
-    """Positions of one or several targets. Residual: `x_predicted - x_measured` in axes of the frame.
+    """Positions of one or several targets. Residual: `x_predicted - x_measured` in axes of the
+    frame.
 
     Parameters
     ----------
@@ -41,11 +42,13 @@ class Position(TargetKind):
             cls(targets=("a", "b", "c"), places=corners, unknown=("targets", "frame")),
         )
 
-    def predict(self, x: Array, values: Array) -> tuple[Array, Array, Mapping[str, Array]]:
+    def predict(
+        self, x: FloatArray, values: FloatArray
+    ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
         """The points themselves."""
         return x, np.eye(3), {}
 
-    def starts(self, T: Array, measured: Array) -> Array:
+    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Frame and targets in closed form.
 
         Raises
@@ -59,7 +62,8 @@ class Position(TargetKind):
         extent = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
         if "frame" in self.unknown and extent[1] <= FLAT * extent[0]:
             raise DataError(
-                f"the {len(seen)} positions lie on a line, about which the frame {self.frame!r} could turn; measure poses off"
+                f"the {len(seen)} positions lie on a line, about which the frame {self.frame!r} "
+                "could turn; measure poses off"
                 " the line, or state T_base_frame as known"
             )
         if "targets" not in self.unknown:

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kind `separation`: the distance between where a point was at two poses, by a ballbar or callipers on a printed part."""
+"""Kind `separation`: the distance between where a point was at two poses, by a ballbar or callipers
+on a printed part.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loopcal.measure.kinds.distance import not_above_zero
 from loopcal.measure.kinds.kind import Column, Evaluation
 from loopcal.measure.kinds.target import TargetKind, length_of, offset_of
 from loopcal.parameters import Parameter
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -25,7 +25,8 @@ class Separation(TargetKind):
 
     Parameters
     ----------
-    See `TargetKind`; "targets" and "offset" (the callipers' zero, the width of a printed line) may be unknown.
+    See `TargetKind`; "targets" and "offset" (the callipers' zero, the width of a printed line) may
+    be unknown.
     """
 
     name: ClassVar[str] = "separation"
@@ -43,17 +44,21 @@ class Separation(TargetKind):
         """One unknown: the offset."""
         return self.offset_part()
 
-    def doubts(self, measured: Array) -> tuple[tuple[int, str], ...]:
+    def doubts(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
         """Rows with a distance that is none."""
         return not_above_zero(measured)
 
-    def predict(self, x: Array, values: Array) -> tuple[Array, Array, Mapping[str, Array]]:
+    def predict(
+        self, x: FloatArray, values: FloatArray
+    ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
         """Length (.., k, 1) of differences x (.., k, 3), and unit vectors."""
         offset, blocks = offset_of(self, values)
         length, unit = length_of(x)
         return length + offset, unit[..., None, :], blocks
 
-    def _linked(self, T: Array, values: Array) -> tuple[Array, Array, Array | None]:
+    def _linked(
+        self, T: FloatArray, values: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
         """Columns (t, r, m), derivatives (t, r, 2, m, 6) and (t, r, m, u)."""
         x, rows = self.sight(T, values[..., None, :])
         predicted, unit, blocks = self.predict(x[..., 1, :, :] - x[..., 0, :, :], values)
@@ -64,10 +69,18 @@ class Separation(TargetKind):
             return predicted[..., 0], jacobian, None
         return predicted[..., 0], jacobian, own[..., 0, 6:]
 
-    def _evaluate(self, T: Array, measured: Array, values: Array, joints: Array) -> Evaluation:
+    def _evaluate(
+        self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
+    ) -> Evaluation:
         predicted, jacobian, own = self._linked(T, values)
         return Evaluation(predicted - measured, jacobian, own)
 
-    def measure(self, T: Array, noise: Array, unknowns: Array | None = None, joints: Array | None = None) -> Array:
+    def measure(
+        self,
+        T: FloatArray,
+        noise: FloatArray,
+        unknowns: FloatArray | None = None,
+        joints: FloatArray | None = None,
+    ) -> FloatArray:
         """Columns (t, r, c) with noise added."""
         return self._linked(T, self.values(unknowns))[0] + noise

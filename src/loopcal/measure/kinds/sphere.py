@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loopcal.errors import DataError
 from loopcal.measure.closed_form import trilateration
@@ -16,9 +15,8 @@ from loopcal.measure.kinds.surface import SurfaceKind
 from loopcal.measure.kinds.target import length_of
 from loopcal.measure.kinds.tool import stacked
 from loopcal.parameters import Parameter
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension, Length
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -61,7 +59,9 @@ class Sphere(SurfaceKind):
         radius = Parameter(f"{self.surface}.radius", Dimension.LENGTH, self.radius, scope="group")
         return (*parts.point_part(self.surface, self.through, "group"), radius)
 
-    def predict(self, x: Array, values: Array) -> tuple[Array, Array, Mapping[str, Array]]:
+    def predict(
+        self, x: FloatArray, values: FloatArray
+    ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
         """Distances (.., k, 1) from the sphere."""
         own = self.part(values, "surface")
         if own is None:
@@ -72,10 +72,14 @@ class Sphere(SurfaceKind):
         blocks = {"surface": -np.concatenate([unit, np.ones_like(unit[..., :1])], axis=-1)}
         return length - own[..., None, 3:], unit, blocks
 
-    def starts(self, T: Array, measured: Array) -> Array:
-        """Centre and radius by trilateration: distances from the centre are gaps and a common offset, the radius."""
+    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+        """Centre and radius by trilateration: distances from the centre are gaps and a common
+        offset, the radius.
+        """
         x, gaps = self.touched(T, measured)
         if "surface" not in self.unknown or len(x) < 4:
             return self.nominal[None]
         centres, offsets = trilateration(x, gaps[:, 0], with_offset=True)
-        return stacked(self, {"surface": np.concatenate([centres, -offsets[:, None]], axis=-1)}, len(centres))
+        return stacked(
+            self, {"surface": np.concatenate([centres, -offsets[:, None]], axis=-1)}, len(centres)
+        )

@@ -7,22 +7,21 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure.arrays import stored, stored_pose
 from loopcal.measure.kinds import parts
 from loopcal.measure.kinds.kind import Column, Evaluation, Kind, chosen
 from loopcal.parameters import Parameter
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TargetKind(Kind):
-    """A kind that is a function of points p of the platform, seen from a frame at `x = R_f' (R p + t - t_f)`.
+    """A kind that is a function of points p of the platform, seen from a frame at `x = R_f' (R p +
+    t - t_f)`.
 
     With h = R p + t - t_f: `dx = R_f' (v + omega x R p) + R_f' R dp - R_f' (v_f + omega_f x h)`.
 
@@ -31,11 +30,13 @@ class TargetKind(Kind):
     targets : tuple of str
         Names of the k targets that one row sees; with several, columns are called `a.x` and so on.
     places : (k, 3) [m], optional
-        Targets on the platform; default: the origin of the robot's tool. Where unknown, the values they are counted from.
+        Targets on the platform; default: the origin of the robot's tool. Where unknown, the values
+        they are counted from.
     T_base_frame : (4, 4), optional
         Frame of the instrument in the base; default: the base itself.
     unknown : tuple of str
-        Which of `possible` are unknown; each has one value for a session (surfaces: for a group of rows).
+        Which of `possible` are unknown; each has one value for a session (surfaces: for a group of
+        rows).
     frame : str
         Name of the frame; kinds that name the same one share its unknowns.
 
@@ -46,8 +47,8 @@ class TargetKind(Kind):
     """
 
     targets: tuple[str, ...] = ("target",)
-    places: Array | None = None
-    T_base_frame: Array = field(default_factory=lambda: np.eye(4))
+    places: FloatArray | None = None
+    T_base_frame: FloatArray = field(default_factory=lambda: np.eye(4))
     unknown: tuple[str, ...] = ()
     frame: str = "frame"
 
@@ -58,19 +59,25 @@ class TargetKind(Kind):
     def __post_init__(self) -> None:
         targets = (self.targets,) if isinstance(self.targets, str) else tuple(self.targets)
         if not targets or len(set(targets)) < len(targets):
-            raise DataError(f"the targets are {', '.join(targets) or 'none'}: name at least one, and each once")
+            raise DataError(
+                f"the targets are {', '.join(targets) or 'none'}: name at least one, and each once"
+            )
         object.__setattr__(self, "targets", targets)
         if self.places is not None:
-            places = stored(np.atleast_2d(self.places), "the places of the targets", (len(targets), 3))
+            places = stored(
+                np.atleast_2d(self.places), "the places of the targets", (len(targets), 3)
+            )
             object.__setattr__(self, "places", places)
         object.__setattr__(self, "T_base_frame", stored_pose(self.T_base_frame, "T_base_frame"))
         object.__setattr__(self, "unknown", chosen(self.unknown, self.possible, self.name))
 
-    def mounted(self, T_platform_tool: Array) -> Self:
+    def mounted(self, T_platform_tool: FloatArray) -> Self:
         """The kind with its targets at the tool's origin, unless their places are stated."""
         if self.is_mounted:
             return self
-        return replace(self, places=np.repeat(T_platform_tool[None, :3, 3], len(self.targets), axis=0))
+        return replace(
+            self, places=np.repeat(T_platform_tool[None, :3, 3], len(self.targets), axis=0)
+        )
 
     @property
     def is_mounted(self) -> bool:
@@ -83,7 +90,9 @@ class TargetKind(Kind):
         if len(self.targets) == 1:
             return self.per_target
         return tuple(
-            Column(f"{target}.{column.name}", column.dimension) for target in self.targets for column in self.per_target
+            Column(f"{target}.{column.name}", column.dimension)
+            for target in self.targets
+            for column in self.per_target
         )
 
     @property
@@ -96,7 +105,9 @@ class TargetKind(Kind):
                 found[name] = parts.frame_part(self.frame, self.T_base_frame)
             elif name == "targets":
                 named = zip(self.targets, places, strict=True)
-                found[name] = tuple(p for target, place in named for p in parts.point_part(target, place))
+                found[name] = tuple(
+                    p for target, place in named for p in parts.point_part(target, place)
+                )
             else:
                 found[name] = self.own_part(name)
         return found
@@ -112,52 +123,62 @@ class TargetKind(Kind):
         raise NotImplementedError(name)
 
     @property
-    def references(self) -> Mapping[str, Array]:
+    def references(self) -> Mapping[str, FloatArray]:
         """The stated orientation of the frame."""
         return {self.frame: self.T_base_frame[:3, :3]} if "frame" in self.unknown else {}
 
-    def sight(self, T: Array, values: Array) -> tuple[Array, Array]:
-        """Targets x (.., k, 3) in the frame, and their derivative (.., k, 3, 6 + u), at poses T (.., 4, 4)."""
+    def sight(self, T: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Targets x (.., k, 3) in the frame, and their derivative (.., k, 3, 6 + u), at poses T
+        (.., 4, 4).
+        """
         own = self.part(values, "frame")
         frame = parts.frame_at(self.T_base_frame, own)
         R, Q = T[..., None, :3, :3], np.swapaxes(frame[..., None, :3, :3], -1, -2)
         arm = (R @ self.places_at(values)[..., None])[..., 0]
         lever = arm + T[..., None, :3, 3] - frame[..., None, :3, 3]
         identity = np.broadcast_to(np.eye(3), (*arm.shape, 3))
-        blocks = {"twist": Q @ np.concatenate([-se3.hat(arm), identity], axis=-1)}
+        blocks = {"twist": Q @ np.concatenate([-geometry.hat(arm), identity], axis=-1)}
         if own is not None:
-            blocks["frame"] = Q @ np.concatenate([se3.hat(lever), -identity], axis=-1) @ parts.frame_slope(own)[..., None, :, :]
+            blocks["frame"] = (
+                Q
+                @ np.concatenate([geometry.hat(lever), -identity], axis=-1)
+                @ parts.frame_slope(own)[..., None, :, :]
+            )
         if "targets" in self.unknown:
             k = len(self.targets)
             each = (Q @ R)[..., None, :] * np.eye(k)[:, None, :, None]
             blocks["targets"] = each.reshape(*each.shape[:-4], k, 3, 3 * k)
         return (Q @ lever[..., None])[..., 0], self.columns_of(blocks, lever.shape)
 
-    def places_at(self, values: Array) -> Array:
+    def places_at(self, values: FloatArray) -> FloatArray:
         """Targets (.., k, 3) on the platform."""
         own = self.part(values, "targets")
         if own is not None:
             return own.reshape(*own.shape[:-1], len(self.targets), 3)
         return self.placed()
 
-    def placed(self) -> Array:
+    def placed(self) -> FloatArray:
         """Stated places (k, 3); DataError before the kind is mounted."""
         if self.places is None:
             raise DataError(
-                f"the kind {self.name!r} does not know its targets: use kind.mounted(robot.tool), or state their places"
+                f"the kind {self.name!r} does not know its targets: use kind.mounted(robot.tool), "
+                "or state their places"
             )
         return self.places
 
     @abstractmethod
-    def predict(self, x: Array, values: Array) -> tuple[Array, Array, Mapping[str, Array]]:
+    def predict(
+        self, x: FloatArray, values: FloatArray
+    ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
         """What would be read of targets x (.., k, 3) in the frame.
 
         Returns
         -------
-        predicted : (.., k, g). by_x : (.., k, g, 3). own : part -> (.., k, g, w), for the parts that only this kind has.
+        predicted : (.., k, g). by_x : (.., k, g, 3). own : part -> (.., k, g, w), for the parts
+            that only this kind has.
         """
 
-    def _predicted(self, T: Array, values: Array) -> tuple[Array, Array]:
+    def _predicted(self, T: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Columns (.., m) and derivatives (.., m, 6 + u)."""
         x, rows = self.sight(T, values)
         predicted, by_x, own = self.predict(x, values)
@@ -165,14 +186,24 @@ class TargetKind(Kind):
         if own:
             rows = rows + self.columns_of(own, predicted.shape)
         m = predicted.shape[-1] * predicted.shape[-2]
-        return predicted.reshape(*predicted.shape[:-2], m), rows.reshape(*rows.shape[:-3], m, rows.shape[-1])
+        return predicted.reshape(*predicted.shape[:-2], m), rows.reshape(
+            *rows.shape[:-3], m, rows.shape[-1]
+        )
 
-    def _evaluate(self, T: Array, measured: Array, values: Array, joints: Array) -> Evaluation:
+    def _evaluate(
+        self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
+    ) -> Evaluation:
         predicted, rows = self._predicted(T, values)
         residual = predicted - measured
-        return self.split(se3.wrap(residual) if self.wraps else residual, rows)
+        return self.split(geometry.wrap(residual) if self.wraps else residual, rows)
 
-    def measure(self, T: Array, noise: Array, unknowns: Array | None = None, joints: Array | None = None) -> Array:
+    def measure(
+        self,
+        T: FloatArray,
+        noise: FloatArray,
+        unknowns: FloatArray | None = None,
+        joints: FloatArray | None = None,
+    ) -> FloatArray:
         """Columns (t, r, c) with noise added."""
         return self._predicted(T, self.values(unknowns))[0] + noise
 
@@ -181,7 +212,7 @@ class TargetKind(Kind):
         return (Parameter(f"{self.name}.offset", Dimension.LENGTH, 0.0, scope="session"),)
 
 
-def offset_of(kind: Kind, values: Array) -> tuple[Array, dict[str, Array]]:
+def offset_of(kind: Kind, values: FloatArray) -> tuple[FloatArray, dict[str, FloatArray]]:
     """The offset (.., 1, 1) of all readings, zero where known, and its derivative as a part."""
     own = kind.part(values, "offset")
     if own is None:
@@ -189,12 +220,15 @@ def offset_of(kind: Kind, values: Array) -> tuple[Array, dict[str, Array]]:
     return own[..., None, :], {"offset": np.ones((1, 1, 1))}
 
 
-def points_of(kind: TargetKind, T: Array, measured: Array) -> tuple[Array, Array, Array, Array]:
+def points_of(
+    kind: TargetKind, T: FloatArray, measured: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Every target that was seen as a row of its own, at nominal unknowns.
 
     Returns
     -------
-    moving : (q, 3, 3 k) with `moving p + origin` the point in the base, p the places of all targets.
+    moving : (q, 3, 3 k) with `moving p + origin` the point in the base, p the places of all
+        targets.
     origin : (q, 3). points : (q, 3) in the base. seen : (q, g).
     """
     k = len(kind.targets)
@@ -207,8 +241,10 @@ def points_of(kind: TargetKind, T: Array, measured: Array) -> tuple[Array, Array
     return moving[whole], origin[whole], points[whole], seen[whole]
 
 
-def length_of(x: Array) -> tuple[Array, Array]:
-    """Lengths (.., 1) of vectors (.., 3) and unit vectors; those of length zero have none, and get zeros."""
+def length_of(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Lengths (.., 1) of vectors (.., 3) and unit vectors; those of length zero have none, and get
+    zeros.
+    """
     square = np.sum(x * x, axis=-1, keepdims=True)
     safe = np.sqrt(np.where(square > 0.0, square, 1.0))
     return np.where(square > 0.0, safe, 0.0), x / safe

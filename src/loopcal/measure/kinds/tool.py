@@ -6,18 +6,16 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure.arrays import stored_pose
 from loopcal.measure.closed_form import OCTAHEDRAL
 from loopcal.measure.kinds import parts
 from loopcal.measure.kinds.kind import Column, Kind, chosen
 from loopcal.parameters import Parameter
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension
-
-Array = NDArray[np.float64]
 
 POSITION = ("x", "y", "z")
 
@@ -34,7 +32,8 @@ class ToolKind(Kind):
     Parameters
     ----------
     T_base_frame : (4, 4), optional
-        Instrument frame in the base; default: the base itself. Where unknown, the value it is counted from.
+        Instrument frame in the base; default: the base itself. Where unknown, the value it is
+        counted from.
     T_platform_tool : (4, 4), optional
         Tool on the platform; default: the robot's own, filled in by `mounted`.
     unknown : tuple of str
@@ -48,8 +47,8 @@ class ToolKind(Kind):
         If one of them is not a pose, or something else is said to be unknown.
     """
 
-    T_base_frame: Array = field(default_factory=lambda: np.eye(4))
-    T_platform_tool: Array | None = None
+    T_base_frame: FloatArray = field(default_factory=lambda: np.eye(4))
+    T_platform_tool: FloatArray | None = None
     unknown: tuple[str, ...] = ()
     frame: str = "frame"
 
@@ -59,9 +58,11 @@ class ToolKind(Kind):
         object.__setattr__(self, "T_base_frame", stored_pose(self.T_base_frame, "T_base_frame"))
         object.__setattr__(self, "unknown", chosen(self.unknown, self.possible, self.name))
         if self.T_platform_tool is not None:
-            object.__setattr__(self, "T_platform_tool", stored_pose(self.T_platform_tool, "T_platform_tool"))
+            object.__setattr__(
+                self, "T_platform_tool", stored_pose(self.T_platform_tool, "T_platform_tool")
+            )
 
-    def mounted(self, T_platform_tool: Array) -> Self:
+    def mounted(self, T_platform_tool: FloatArray) -> Self:
         """The kind with this tool (4, 4), unless it has one of its own."""
         return self if self.is_mounted else replace(self, T_platform_tool=T_platform_tool)
 
@@ -78,46 +79,57 @@ class ToolKind(Kind):
         return {name: parts.frame_part(*stated[name]) for name in self.unknown}
 
     @property
-    def references(self) -> Mapping[str, Array]:
+    def references(self) -> Mapping[str, FloatArray]:
         """The stated orientations."""
-        stated = {"frame": (self.frame, self.T_base_frame[:3, :3]), "tool": ("tool", self._tool()[:3, :3])}
+        stated = {
+            "frame": (self.frame, self.T_base_frame[:3, :3]),
+            "tool": ("tool", self._tool()[:3, :3]),
+        }
         return dict(stated[name] for name in self.unknown)
 
-    def seen(self, T: Array, values: Array | None = None) -> Array:
-        """T_frame_tool (.., 4, 4) at platform poses T_base_platform (.., 4, 4) and values (.., u) of the unknowns."""
+    def seen(self, T: FloatArray, values: FloatArray | None = None) -> FloatArray:
+        """T_frame_tool (.., 4, 4) at platform poses T_base_platform (.., 4, 4) and values (.., u)
+        of the unknowns.
+        """
         frame, tool = self._places(self.values(values))
-        return se3.inverse(frame) @ (T @ tool)
+        return geometry.inverse(frame) @ (T @ tool)
 
-    def transport(self, T: Array, values: Array | None = None) -> Array:
-        """Map (.., 6, 6 + u) to the tool's twist in axes of the frame, from platform twist and unknowns."""
+    def transport(self, T: FloatArray, values: FloatArray | None = None) -> FloatArray:
+        """Map (.., 6, 6 + u) to the tool's twist in axes of the frame, from platform twist and
+        unknowns.
+        """
         values = self.values(values)
         frame, tool = self._places(values)
         Q = np.swapaxes(frame[..., :3, :3], -1, -2)
         arm = (T[..., :3, :3] @ tool[..., :3, 3:])[..., 0]
-        blocks = {"twist": se3.transport(arm, Q)}
+        blocks = {"twist": geometry.transport(arm, Q)}
         own = self.part(values, "frame")
         if own is not None:
             # what moves the frame moves the tool the other way, seen from it
             lever = arm + T[..., :3, 3] - frame[..., :3, 3]
-            blocks["frame"] = -se3.transport(lever, Q) @ parts.frame_slope(own)
+            blocks["frame"] = -geometry.transport(lever, Q) @ parts.frame_slope(own)
         own = self.part(values, "tool")
         if own is not None:
-            blocks["tool"] = se3.transport(np.zeros(3), Q @ T[..., :3, :3]) @ parts.frame_slope(own)
+            blocks["tool"] = geometry.transport(
+                np.zeros(3), Q @ T[..., :3, :3]
+            ) @ parts.frame_slope(own)
         return self.columns_of(blocks, (*T.shape[:-2], 6))
 
-    def starts(self, T: Array, measured: Array) -> Array:
-        """The frame in 24 orientations, spread evenly over all, with the frame's origin where it is stated."""
+    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+        """The frame in 24 orientations, spread evenly over all, with the frame's origin where it is
+        stated.
+        """
         if "frame" not in self.unknown:
             return self.nominal[None]
-        frames = se3.pose(OCTAHEDRAL @ self.T_base_frame[:3, :3], self.T_base_frame[:3, 3])
+        frames = geometry.pose(OCTAHEDRAL @ self.T_base_frame[:3, :3], self.T_base_frame[:3, 3])
         return stacked(self, {"frame": parts.frame_values(self.T_base_frame, frames)}, len(frames))
 
-    def _places(self, values: Array) -> tuple[Array, Array]:
+    def _places(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Frame and tool (.., 4, 4)."""
         frame = parts.frame_at(self.T_base_frame, self.part(values, "frame"))
         return frame, parts.frame_at(self._tool(), self.part(values, "tool"))
 
-    def _tool(self) -> Array:
+    def _tool(self) -> FloatArray:
         if self.T_platform_tool is None:
             raise DataError(
                 f"the kind {self.name!r} does not know its tool: use kind.mounted(robot.tool),"
@@ -126,7 +138,7 @@ class ToolKind(Kind):
         return self.T_platform_tool
 
 
-def stacked(kind: Kind, found: Mapping[str, Array], count: int) -> Array:
+def stacked(kind: Kind, found: Mapping[str, FloatArray], count: int) -> FloatArray:
     """Candidates (count, u) from values (count, w) or (w,) of some parts; the others stay nominal."""
     columns = []
     for name, parameters in kind.parts.items():

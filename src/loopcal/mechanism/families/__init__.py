@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Families of robots: one file each, a record of what the robot file says and its expansion into limbs and parameters.
+"""Families of robots: one file each, a record of what the robot file says and its expansion into
+limbs and parameters.
 
 Adding a family touches its own file and one line here; nothing below this package knows any family.
 """

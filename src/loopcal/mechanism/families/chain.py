@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writing a limb as people see it: joints placed in the frame carried so far, about any axis.
 
-The engine's joints all move along the z axis of the frame they stand in, so a link takes in two turns, T_j = A_{j-1}^-1
-P_j A_j: P_j places the joint in the carried frame, A_j turns z onto its axis. At joint values zero the carried frame is
-the base frame displaced by the placements alone. Derivation: docs/theory/parameters.md.
+The engine's joints all move along the z axis of the frame they stand in, so a link takes in two
+turns, T_j = A_{j-1}^-1 P_j A_j: P_j places the joint in the carried frame, A_j turns z onto its
+axis. At joint values zero the carried frame is the base frame displaced by the placements alone.
+Derivation: docs/theory/parameters.md.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal import se3
-from loopcal.engine import Array
+from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES, Address, Cone, Joint, Limb, Linear, Link
+from loopcal.typing import FloatArray
 
 EX, EY, EZ = np.eye(3)
 
@@ -35,8 +36,8 @@ class Step:
 
     name: str
     kind: str
-    place: Array
-    axis: Array
+    place: FloatArray
+    axis: FloatArray
     actuator: str | None = None
     pitch: float = 0.0
     start: float = 0.0
@@ -49,13 +50,14 @@ class Placed:
 
     Attributes
     ----------
-    turns : name of a link -> (3, 3) R_carried_link, the rotation that takes the link's own axes to the carried ones.
+    turns : name of a link -> (3, 3) R_carried_link, the rotation that takes the link's own axes to
+        the carried ones.
     places : name of a link -> (4, 4) its placement in the frame carried before it [m].
     """
 
     limb: Limb
-    turns: Mapping[str, Array]
-    places: Mapping[str, Array]
+    turns: Mapping[str, FloatArray]
+    places: Mapping[str, FloatArray]
 
     @property
     def name(self) -> str:
@@ -71,9 +73,9 @@ class Placed:
 def placed(
     name: str,
     steps: tuple[Step, ...],
-    tip: Array,
+    tip: FloatArray,
     ending: str,
-    attachment: Array,
+    attachment: FloatArray,
     length: float = 0.0,
     actuator: str | None = None,
     cones: tuple[Cone, ...] = (),
@@ -83,7 +85,8 @@ def placed(
     Parameters
     ----------
     steps : the joints from base to tip; the first placement is in the base frame.
-    tip : (4, 4) of the tip in the frame carried last [m]; the link is called `tip`, or `base` in a limb without joints.
+    tip : (4, 4) of the tip in the frame carried last [m]; the link is called `tip`, or `base` in a
+        limb without joints.
     attachment : (4, 4) in the platform frame [m]; the link is called `platform`.
     length, actuator, cones : of the rod of a `distance` ending [m].
     """
@@ -92,19 +95,31 @@ def placed(
     for step in steps:
         turn = axis_frame(step.axis, step.name)
         links.append(Link(step.name, back @ step.place @ _turned(turn)))
-        joints.append(Joint(step.name, step.kind, step.actuator, step.pitch, step.start, step.limits))
+        joints.append(
+            Joint(step.name, step.kind, step.actuator, step.pitch, step.start, step.limits)
+        )
         turns[step.name], places[step.name] = turn, step.place
         back = _turned(turn.T)
     last = "tip" if steps else "base"
     links.append(Link(last, back @ tip))
     turns |= {last: np.eye(3), "platform": np.eye(3)}
     places |= {last: tip, "platform": attachment}
-    limb = Limb(name, tuple(links), tuple(joints), ending, Link("platform", attachment), length, actuator, cones)
+    limb = Limb(
+        name,
+        tuple(links),
+        tuple(joints),
+        ending,
+        Link("platform", attachment),
+        length,
+        actuator,
+        cones,
+    )
     return Placed(limb, turns, places)
 
 
-def axis_frame(axis: Array, name: str) -> Array:
-    """A rotation (3, 3) whose third column is along `axis`; x, y and z give a cyclic change of axes.
+def axis_frame(axis: FloatArray, name: str) -> FloatArray:
+    """A rotation (3, 3) whose third column is along `axis`; x, y and z give a cyclic change of
+    axes.
 
     Raises
     ------
@@ -122,16 +137,26 @@ def axis_frame(axis: Array, name: str) -> Array:
     return np.array([x, np.cross(z, x), z], dtype=float).T
 
 
-def moved(parameter: str, limb: Placed, element: str, axis: str, coefficient: float = 1.0) -> tuple[Linear, ...]:
-    """Maps of a parameter that moves an element along, or turns it about, an axis of the frame carried there.
+def moved(
+    parameter: str, limb: Placed, element: str, axis: str, coefficient: float = 1.0
+) -> tuple[Linear, ...]:
+    """Maps of a parameter that moves an element along, or turns it about, an axis of the frame
+    carried there.
 
-    A move along x is a move along up to three axes of the link's own frame: the components of R_carried_link' e_x.
+    A move along x is a move along up to three axes of the link's own frame: the components of
+    R_carried_link' e_x.
     """
-    return towards(parameter, limb, element, axis in AXES[:3], coefficient * np.eye(3)[AXES.index(axis) % 3])
+    return towards(
+        parameter, limb, element, axis in AXES[:3], coefficient * np.eye(3)[AXES.index(axis) % 3]
+    )
 
 
-def towards(parameter: str, limb: Placed, element: str, turns: bool, direction: Array) -> tuple[Linear, ...]:
-    """Maps of a parameter that turns an element about (or moves it along) `direction`, in the frame carried there."""
+def towards(
+    parameter: str, limb: Placed, element: str, turns: bool, direction: FloatArray
+) -> tuple[Linear, ...]:
+    """Maps of a parameter that turns an element about (or moves it along) `direction`, in the frame
+    carried there.
+    """
     own = limb.turns[element].T @ direction
     axes = AXES[:3] if turns else AXES[3:]
     # what is below rounding of a direction is no component
@@ -143,10 +168,11 @@ def towards(parameter: str, limb: Placed, element: str, turns: bool, direction: 
 
 
 def tilted(parameter: str, limb: Placed, element: str, axis: str) -> tuple[Linear, ...]:
-    """Maps of a parameter that turns the axis of a sliding joint and leaves what slides on it unturned.
+    """Maps of a parameter that turns the axis of a sliding joint and leaves what slides on it
+    unturned.
 
-    exp(w) A_j [slide] A_j^-1 P A_k exp(w') keeps the orientation P A_k where w' = -(P A_k)' w; the shift of what is placed
-    off the slide is undone to first order.
+    exp(w) A_j [slide] A_j^-1 P A_k exp(w') keeps the orientation P A_k where w' = -(P A_k)' w; the
+    shift of what is placed off the slide is undone to first order.
 
     Raises
     ------
@@ -157,7 +183,8 @@ def tilted(parameter: str, limb: Placed, element: str, axis: str) -> tuple[Linea
     place = names.index(element)
     if place >= len(limb.limb.joints) or limb.limb.joints[place].kind != "P":
         raise MechanismError(
-            f"{parameter} tilts {element!r} of {limb.name!r} alone, which only a sliding joint allows; let it turn what follows"
+            f"{parameter} tilts {element!r} of {limb.name!r} alone, which only a sliding joint "
+            "allows; let it turn what follows"
         )
     w, behind = np.eye(3)[AXES.index(axis)], limb.places[names[place + 1]]
     undo = towards(parameter, limb, names[place + 1], True, -behind[:3, :3].T @ w)
@@ -166,15 +193,15 @@ def tilted(parameter: str, limb: Placed, element: str, axis: str) -> tuple[Linea
     return (*moved(parameter, limb, element, axis), *undo, *back)
 
 
-def at(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Array:
+def at(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> FloatArray:
     """(4, 4) translation [m]."""
-    return se3.pose(np.eye(3), np.array([x, y, z]))
+    return geometry.pose(np.eye(3), np.array([x, y, z]))
 
 
-def turn_about(axis: str, angle: float) -> Array:
+def turn_about(axis: str, angle: float) -> FloatArray:
     """(4, 4) rotation about x, y or z [rad]."""
-    return _turned(se3.exp_so3(angle * np.eye(3)["xyz".index(axis)]))
+    return _turned(geometry.exp_so3(angle * np.eye(3)["xyz".index(axis)]))
 
 
-def _turned(R: Array) -> Array:
-    return se3.pose(R, np.zeros(3))
+def _turned(R: FloatArray) -> FloatArray:
+    return geometry.pose(R, np.zeros(3))

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Error models: named parameters and their maps, by hand for `ideal`, by rule for `complete`.
 
-`complete` gives every link transform six displacements, in its own frame (z along the joint), less what the joint's own
-freedom absorbs: R keeps rx, ry, x, y; P keeps rx, ry; an actuated joint keeps its offset. A `rigid` ending adds six of
-the platform's side (those of the tip would repeat them), `ball` and `distance` three of the tip and three of the
-attachment, `distance` the length of a rod that is not actuated; an actuated one has its offset. Of a limb with r turning
-and p sliding joints that makes 4 r + 2 p + 6 (7 for a rod) plus the offsets. 4 r + 2 p + 6 (7) less the passive joints
-of them can be told apart in general, which is the counting rule C = 3R + P + E + 6L + 6(F - 1) limb by limb. Derivation:
-docs/theory/parameters.md.
+`complete` gives every link transform six displacements, in its own frame (z along the joint), less
+what the joint's own freedom absorbs: R keeps rx, ry, x, y; P keeps rx, ry; an actuated joint keeps
+its offset. A `rigid` ending adds six of the platform's side (those of the tip would repeat them),
+`ball` and `distance` three of the tip and three of the attachment, `distance` the length of a rod
+that is not actuated; an actuated one has its offset. Of a limb with r turning and p sliding joints
+that makes 4 r + 2 p + 6 (7 for a rod) plus the offsets. 4 r + 2 p + 6 (7) less the passive joints
+of them can be told apart in general, which is the counting rule C = 3R + P + E + 6L + 6(F - 1) limb
+by limb. Derivation: docs/theory/parameters.md.
 """
 
 from __future__ import annotations
@@ -36,13 +37,21 @@ class Errors:
         return Errors(self.parameters + other.parameters, self.maps + other.maps)
 
     def beside(self, named: Errors) -> Errors:
-        """These, less those whose effect `named` and the ones before have already; a name that is taken gets `.own`."""
-        place = {address: i for i, address in enumerate(dict.fromkeys(m.address for m in (*named.maps, *self.maps)))}
+        """These, less those whose effect `named` and the ones before have already; a name that is
+        taken gets `.own`.
+        """
+        place = {
+            address: i
+            for i, address in enumerate(dict.fromkeys(m.address for m in (*named.maps, *self.maps)))
+        }
         taken, left, basis = {p.name for p in named.parameters}, Errors(), np.zeros((0, len(place)))
         for errors in (named, self):
             rows = dict.fromkeys((p.name for p in errors.parameters), np.zeros(len(place)))
             for entry in errors.maps:
-                rows[entry.parameter] = rows[entry.parameter] + entry.coefficient * np.eye(len(place))[place[entry.address]]
+                rows[entry.parameter] = (
+                    rows[entry.parameter]
+                    + entry.coefficient * np.eye(len(place))[place[entry.address]]
+                )
             for parameter in errors.parameters:
                 row = rows[parameter.name]
                 rest = row - (basis @ row) @ basis
@@ -50,12 +59,19 @@ class Errors:
                     continue
                 basis = np.vstack([basis, rest / np.linalg.norm(rest)])
                 if errors is self:
-                    left += self._called(parameter, f"{parameter.name}.own" if parameter.name in taken else parameter.name)
+                    left += self._called(
+                        parameter,
+                        f"{parameter.name}.own" if parameter.name in taken else parameter.name,
+                    )
         return left
 
     def _called(self, parameter: Parameter, name: str) -> Errors:
         """One of the parameters with its maps, under a name."""
-        maps = tuple(replace(entry, parameter=name) for entry in self.maps if entry.parameter == parameter.name)
+        maps = tuple(
+            replace(entry, parameter=name)
+            for entry in self.maps
+            if entry.parameter == parameter.name
+        )
         return Errors((replace(parameter, name=name),), maps)
 
 
@@ -72,14 +88,23 @@ class Spread:
 
 
 def quantity(
-    name: str, dimension: Dimension, nominal: float, tolerance: float | None, *maps: Linear, free: bool = True
+    name: str,
+    dimension: Dimension,
+    nominal: float,
+    tolerance: float | None,
+    *maps: Linear,
+    free: bool = True,
 ) -> Errors:
     """One named parameter."""
     return Errors((Parameter(name, dimension, float(nominal), tolerance, free),), maps)
 
 
-def point(limb: Placed, element: str, axes: str, tolerance: float | None, label: str = "") -> Errors:
-    """Coordinates of a link's origin in the frame carried before it, `limb.element.x` and so on; nominal as placed."""
+def point(
+    limb: Placed, element: str, axes: str, tolerance: float | None, label: str = ""
+) -> Errors:
+    """Coordinates of a link's origin in the frame carried before it, `limb.element.x` and so on;
+    nominal as placed.
+    """
     found = Errors()
     for axis in axes:
         name = f"{limb.name}.{label or element}.{axis}"
@@ -97,13 +122,23 @@ def rod_length(limb: Placed, tolerance: float | None) -> Errors:
     return quantity(name, Dimension.LENGTH, limb.limb.length, tolerance, Linear(name, address))
 
 
-def offset(name: str, actuator: str, dimension: Dimension, nominal: float, tolerance: float | None) -> Errors:
+def offset(
+    name: str, actuator: str, dimension: Dimension, nominal: float, tolerance: float | None
+) -> Errors:
     """What a driven joint's value is at reading zero."""
-    return quantity(name, dimension, nominal, tolerance, Linear(name, Address(actuator, "transmission", "offset")))
+    return quantity(
+        name,
+        dimension,
+        nominal,
+        tolerance,
+        Linear(name, Address(actuator, "transmission", "offset")),
+    )
 
 
 def complete(limb: Placed, spread: Spread, offsets: bool = True) -> Errors:
-    """The complete error model of a limb (see the module); `offsets` False where the family names its own."""
+    """The complete error model of a limb (see the module); `offsets` False where the family names
+    its own.
+    """
     found = Errors()
     for joint in limb.limb.joints:
         for axis in KEPT[joint.kind]:
@@ -129,7 +164,9 @@ def _displacement(limb: Placed, element: str, axis: str, spread: Spread) -> Erro
     """One displacement of a link in its own frame, nominally zero."""
     name = f"{limb.name}.{element}.{axis}"
     dimension = Dimension.ANGLE if axis in AXES[:3] else Dimension.LENGTH
-    return quantity(name, dimension, 0.0, spread.of(axis), Linear(name, Address(limb.name, element, axis)))
+    return quantity(
+        name, dimension, 0.0, spread.of(axis), Linear(name, Address(limb.name, element, axis))
+    )
 
 
 def _in_frame_before(name: str, limb: Placed, element: str, axis: str) -> tuple[Linear, ...]:

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gough-Stewart platforms: six legs of variable length between joint centres on the base and on the platform.
+"""Gough-Stewart platforms: six legs of variable length between joint centres on the base and on the
+platform.
 
-With `legs: rod` a leg is the distance between its two centres, l_i = |t + R p_i - b_i| = length_i + reading_i: seven
-parameters a leg, 42 in all. With `legs: ups` it is the chain that is really there (see `ups.py`), which can carry the
-complete error model and a screw that turns with the joints. Derivation: docs/theory/hexapod.md.
+With `legs: rod` a leg is the distance between its two centres, l_i = |t + R p_i - b_i| = length_i +
+reading_i: seven parameters a leg, 42 in all. With `legs: ups` it is the chain that is really there
+(see `ups.py`), which can carry the complete error model and a screw that turns with the joints.
+Derivation: docs/theory/hexapod.md.
 """
 
 from __future__ import annotations
@@ -11,20 +13,29 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from loopcal.engine import Array
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly, Cone
 from loopcal.mechanism.families.chain import Placed, at, placed
 from loopcal.mechanism.families.errors import Errors, Spread, complete, offset, point, rod_length
 from loopcal.mechanism.families.prs import check_spherical
 from loopcal.mechanism.families.ups import Screw, ScrewLeg, screw_leg, ups_leg
-from loopcal.mechanism.records import AngleTolerance, LengthTolerance, Point, Robot, per_leg, standard_deviation
+from loopcal.mechanism.records import (
+    AngleTolerance,
+    LengthTolerance,
+    Point,
+    Robot,
+    per_leg,
+    standard_deviation,
+)
+from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length
 
 
 @dataclass(frozen=True)
 class GoughTolerances:
-    """Tolerances of joint centres on base and platform, of the leg lengths, and of link angles in the complete model."""
+    """Tolerances of joint centres on base and platform, of the leg lengths, and of link angles in
+    the complete model.
+    """
 
     base: LengthTolerance | None = None
     platform: LengthTolerance | None = None
@@ -51,8 +62,10 @@ class Gough(Robot):
     lengths : length of a leg at reading zero [m], one for all or one each.
     stroke : allowed readings (low, high) [m]. cones : of the joints of rods.
     legs : form of the legs, a `rod` or the chain `ups`.
-    spherical : with `ups`, the upper joint as a perfect `point`, or as three `axes` with errors of their own.
-    screw : with `ups`, a screw in every leg; its nut turns with the lower joint, its spindle with the upper one.
+    spherical : with `ups`, the upper joint as a perfect `point`, or as three `axes` with errors of
+        their own.
+    screw : with `ups`, a screw in every leg; its nut turns with the lower joint, its spindle with
+        the upper one.
     error_model : `ideal`, 42 parameters, or `complete`, which needs `ups`.
     tolerances : of the parameters; `links` and `angles` are of the complete model.
     """
@@ -69,7 +82,9 @@ class Gough(Robot):
     tolerances: GoughTolerances = field(default_factory=GoughTolerances)
 
     def expand(self) -> Assembly:
-        """Six legs in the form stated; raises MechanismError for other than six, or a model the form cannot carry."""
+        """Six legs in the form stated; raises MechanismError for other than six, or a model the
+        form cannot carry.
+        """
         self._check()
         lengths = per_leg(self.lengths, 6, "lengths")
         screws = self.screw.legs() if self.screw else (None,) * 6
@@ -80,7 +95,11 @@ class Gough(Robot):
             # a rod has its length in the ending, a chain in the offset of its sliding joint
             terms = {} if self.legs == "rod" else {"offset": length}
             actuators.append(Actuator(motor, Dimension.LENGTH, self.stroke, terms))
-            errors += self._complete(leg, motor, length) if self.error_model == "complete" else self._ideal(leg, motor, length)
+            errors += (
+                self._complete(leg, motor, length)
+                if self.error_model == "complete"
+                else self._ideal(leg, motor, length)
+            )
         return Assembly(
             name=self.name,
             source=self.source,
@@ -98,7 +117,8 @@ class Gough(Robot):
     def _check(self) -> None:
         if len(self.base) != 6 or len(self.platform) != 6:
             raise MechanismError(
-                f"{self.name} has {len(self.base)} base and {len(self.platform)} platform centres; a hexapod has six of each"
+                f"{self.name} has {len(self.base)} base and {len(self.platform)} platform centres; "
+                "a hexapod has six of each"
             )
         asked = [
             words
@@ -109,14 +129,18 @@ class Gough(Robot):
             )
             if found
         ]
-        check_spherical(self.name, self.spherical, "complete" if self.legs == "rod" else self.error_model)
+        check_spherical(
+            self.name, self.spherical, "complete" if self.legs == "rod" else self.error_model
+        )
         if self.legs == "ups" and self.cones != GoughCones():
             raise MechanismError(
-                f"{self.name} states cones with legs: ups, whose joints are not told as cones; state legs: rod"
+                f"{self.name} states cones with legs: ups, whose joints are not told as cones; "
+                "state legs: rod"
             )
         if self.legs == "rod" and asked:
             raise MechanismError(
-                f"{self.name} states legs: rod with {asked[0]}, but a rod has no joints that could carry it; state legs: ups"
+                f"{self.name} states legs: rod with {asked[0]}, but a rod has no joints that could "
+                "carry it; state legs: ups"
             )
 
     def _leg(self, i: int, length: float, screw: ScrewLeg | None) -> Placed:
@@ -127,21 +151,30 @@ class Gough(Robot):
             return placed(leg, (), ends[0], "distance", ends[1], length, motor, self._cones(*ends))
         if screw:
             return screw_leg(leg, motor, self.base[i], self.platform[i], self.home.matrix, screw)
-        return ups_leg(leg, motor, self.base[i], self.platform[i], self.home.matrix, self.spherical == "axes")
+        return ups_leg(
+            leg, motor, self.base[i], self.platform[i], self.home.matrix, self.spherical == "axes"
+        )
 
-    def _cones(self, base: Array, top: Array) -> tuple[Cone, ...]:
+    def _cones(self, base: FloatArray, top: FloatArray) -> tuple[Cone, ...]:
         """The cones of a rod between these centres (4, 4), about its direction at home."""
         home = self.home.matrix
         rod = (home @ top)[:3, 3] - base[:3, 3]
-        ends = (("tip", self.cones.base, rod), ("attachment", self.cones.platform, -home[:3, :3].T @ rod))
+        ends = (
+            ("tip", self.cones.base, rod),
+            ("attachment", self.cones.platform, -home[:3, :3].T @ rod),
+        )
         return tuple(
-            Cone(end, (float(axis[0]), float(axis[1]), float(axis[2])), angle) for end, angle, axis in ends if angle is not None
+            Cone(end, (float(axis[0]), float(axis[1]), float(axis[2])), angle)
+            for end, angle, axis in ends
+            if angle is not None
         )
 
     def _ideal(self, leg: Placed, motor: str, length: float) -> Errors:
         """Two centres and a length, the same in both forms."""
         sd = self.tolerances
-        base = point(leg, leg.elements[0], "xyz", standard_deviation(sd.base, "the base centres"), "base")
+        base = point(
+            leg, leg.elements[0], "xyz", standard_deviation(sd.base, "the base centres"), "base"
+        )
         top = point(leg, "platform", "xyz", standard_deviation(sd.platform, "the platform centres"))
         own = standard_deviation(sd.length, "the leg lengths")
         if self.legs == "rod":
@@ -151,6 +184,11 @@ class Gough(Robot):
     def _complete(self, leg: Placed, motor: str, length: float) -> Errors:
         """Every link, and the length."""
         sd = self.tolerances
-        spread = Spread(standard_deviation(sd.links, "the links"), standard_deviation(sd.angles, "the link angles"))
+        spread = Spread(
+            standard_deviation(sd.links, "the links"),
+            standard_deviation(sd.angles, "the link angles"),
+        )
         own = standard_deviation(sd.length, "the leg lengths")
-        return complete(leg, spread, offsets=False) + offset(f"{leg.name}.length", motor, Dimension.LENGTH, length, own)
+        return complete(leg, spread, offsets=False) + offset(
+            f"{leg.name}.length", motor, Dimension.LENGTH, length, own
+        )

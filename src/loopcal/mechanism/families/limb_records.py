@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a file of the family `limbs` may say: joints, limbs, drives and named parameters, as plain records.
+"""What a file of the family `limbs` may say: joints, limbs, drives and named parameters, as plain
+records.
 
-Frames: a limb carries a frame from the base to its tip. `at:` places a joint in it, as [x, y, z] or as a whole pose, and
-`axis:` is a direction in the frame so placed. With all joints at zero and no placement turned, all axes are those of the
-base (of a copy: turned with it).
+Frames: a limb carries a frame from the base to its tip. `at:` places a joint in it, as [x, y, z] or
+as a whole pose, and `axis:` is a direction in the frame so placed. With all joints at zero and no
+placement turned, all axes are those of the base (of a copy: turned with it).
 """
 
 from __future__ import annotations
@@ -14,9 +15,16 @@ from typing import Literal
 
 import numpy as np
 
-from loopcal.engine import Array
 from loopcal.errors import MechanismError
-from loopcal.mechanism.records import AngleTolerance, LengthTolerance, Point, Pose, RatioTolerance, translation
+from loopcal.mechanism.records import (
+    AngleTolerance,
+    LengthTolerance,
+    Point,
+    Pose,
+    RatioTolerance,
+    translation,
+)
+from loopcal.typing import FloatArray
 from loopcal.units import Angle, Length, Ratio
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"] | tuple[Ratio, Ratio, Ratio]
@@ -26,21 +34,22 @@ Moving = Literal["x", "y", "z", "length"]
 Turning = Literal["rx", "ry", "rz"]
 
 
-def direction(axis: Axis) -> Array:
+def direction(axis: Axis) -> FloatArray:
     """An axis as a vector (3,)."""
     if isinstance(axis, str):
         return (-1.0 if axis.startswith("-") else 1.0) * np.eye(3)["xyz".index(axis[-1])]
     return np.array(axis, dtype=float)
 
 
-def place_matrix(place: Place) -> Array:
+def place_matrix(place: Place) -> FloatArray:
     """A placement as (4, 4)."""
     return place.matrix if isinstance(place, Pose) else translation(place)
 
 
 @dataclass(frozen=True)
 class Revolute:
-    """A turning joint; `lead` is its advance along the axis in one turn (a screw), `start` its angle near home.
+    """A turning joint; `lead` is its advance along the axis in one turn (a screw), `start` its
+    angle near home.
 
     `limits` are its allowed values (low, high).
     """
@@ -93,7 +102,9 @@ class Cylindrical:
 
 @dataclass(frozen=True)
 class Spherical:
-    """Three turning joints about z, then y, then x through one point (singular where the second is at 90 degrees)."""
+    """Three turning joints about z, then y, then x through one point (singular where the second is
+    at 90 degrees).
+    """
 
     joint: Literal["S"]
     name: str = ""
@@ -106,7 +117,8 @@ JointRecord = Revolute | Prismatic | Universal | Cylindrical | Spherical
 
 @dataclass(frozen=True)
 class Copies:
-    """The same limb several times, turned about an axis of base and platform; numbers 1, 2, .. are added to its names.
+    """The same limb several times, turned about an axis of base and platform; numbers 1, 2, .. are
+    added to its names.
 
     Copy i is turned by start + (i - 1) step; a step that is not given divides the full turn.
     """
@@ -119,10 +131,12 @@ class Copies:
 
 @dataclass(frozen=True)
 class Shifts:
-    """Unknown lengths of a limb: where an element is in the frame placed there, or the rod's length.
+    """Unknown lengths of a limb: where an element is in the frame placed there, or the rod's
+    length.
 
-    `of` is a joint, `tip` (`base` in a limb without joints), `platform` or `rod`; parameters are called
-    `limb.NAME.axis`, or `limb.NAME` for a rod's length, with NAME = `of` where no `name` is given.
+    `of` is a joint, `tip` (`base` in a limb without joints), `platform` or `rod`; parameters are
+    called `limb.NAME.axis`, or `limb.NAME` for a rod's length, with NAME = `of` where no `name` is
+    given.
     """
 
     of: str
@@ -133,7 +147,9 @@ class Shifts:
 
 @dataclass(frozen=True)
 class Tilts:
-    """Unknown angles of a limb: turns of a joint's axis, with what follows; or of a slide's axis alone (`alone: true`)."""
+    """Unknown angles of a limb: turns of a joint's axis, with what follows; or of a slide's axis
+    alone (`alone: true`).
+    """
 
     of: str
     tilt: tuple[Turning, ...]
@@ -152,7 +168,9 @@ class LinkTolerances:
 
 @dataclass(frozen=True)
 class RodCone:
-    """How far a rod may lean from an axis at its `tip` (rod towards the platform) or `attachment` (rod towards the tip)."""
+    """How far a rod may lean from an axis at its `tip` (rod towards the platform) or `attachment`
+    (rod towards the tip).
+    """
 
     end: Literal["tip", "attachment"]
     axis: Axis
@@ -166,10 +184,14 @@ class LimbRecord:
     Attributes
     ----------
     on, to : what it starts from and ends on; only `base` and `platform` exist.
-    chain : its joints. tip : its end, in the frame carried last; of a limb without joints, its point on the base.
-    ending : `rigid`, `ball` (tip and attachment meet in a point), `distance` (a rod of `length` lies between them).
-    attach : the attachment in the platform frame. actuated : the drive of a `distance` of changing length.
-    cones : how far that rod may lean. copies : repeat it around an axis. errors : its unknowns in the ideal model.
+    chain : its joints. tip : its end, in the frame carried last; of a limb without joints, its
+        point on the base.
+    ending : `rigid`, `ball` (tip and attachment meet in a point), `distance` (a rod of `length`
+        lies between them).
+    attach : the attachment in the platform frame. actuated : the drive of a `distance` of changing
+        length.
+    cones : how far that rod may lean. copies : repeat it around an axis. errors : its unknowns in
+        the ideal model.
     """
 
     name: str
@@ -188,10 +210,11 @@ class LimbRecord:
 
 @dataclass(frozen=True)
 class LengthDrive:
-    """A drive whose reading is a length. joint value = offset + gain * reading + harmonics of the period.
+    """A drive whose reading is a length. joint value = offset + gain * reading + harmonics of the
+    period.
 
-    `unknown` names terms to identify (offset, gain, backlash, and with a period sin1, cos1, sin2, cos2), with the tolerances
-    `length` and, of the gain, `ratio`.
+    `unknown` names terms to identify (offset, gain, backlash, and with a period sin1, cos1, sin2,
+    cos2), with the tolerances `length` and, of the gain, `ratio`.
     """
 
     reads: Literal["length"]
@@ -207,7 +230,9 @@ class LengthDrive:
 
 @dataclass(frozen=True)
 class AngleDrive:
-    """A drive whose reading is an angle and turns a joint. joint value = offset + gain * reading + harmonics."""
+    """A drive whose reading is an angle and turns a joint. joint value = offset + gain * reading +
+    harmonics.
+    """
 
     reads: Literal["angle"]
     stroke: tuple[Angle, Angle] | None = None
@@ -224,9 +249,10 @@ class AngleDrive:
 class SpoolDrive:
     """A drive whose reading is an angle and moves a length.
 
-    joint value = offset + radius * reading + buildup * reading^2 / (4 pi) + harmonics. `radius` is the length paid out per
-    radian of the reading (spool radius with gears and tackle; a spindle's lead / 2 pi), negative where a growing reading
-    shortens; `buildup` is how much it grows in one turn of the reading.
+    joint value = offset + radius * reading + buildup * reading^2 / (4 pi) + harmonics. `radius` is
+    the length paid out per radian of the reading (spool radius with gears and tackle; a spindle's
+    lead / 2 pi), negative where a growing reading shortens; `buildup` is how much it grows in one
+    turn of the reading.
     """
 
     reads: Literal["angle"]
@@ -247,16 +273,32 @@ Drive = LengthDrive | AngleDrive | SpoolDrive
 
 @dataclass(frozen=True)
 class Onto:
-    """Where a named parameter enters: axis `axis` of the frame placed at `element` of `limb` (of all its copies).
+    """Where a named parameter enters: axis `axis` of the frame placed at `element` of `limb` (of
+    all its copies).
 
-    With `limb` the name of a drive, `element` is `transmission` and `axis` one of its terms. The displacement is
-    coefficient * change, or arm * change for an angle or ratio that moves a length [arm per radian]. `lead` is a screw's
-    advance in one turn (`pitch`, the engine's advance in a radian, is refused); a `curve` counts per radian or metre.
+    With `limb` the name of a drive, `element` is `transmission` and `axis` one of its terms. The
+    displacement is coefficient * change, or arm * change for an angle or ratio that moves a length
+    [arm per radian]. `lead` is a screw's advance in one turn (`pitch`, the engine's advance in a
+    radian, is refused); a `curve` counts per radian or metre.
     """
 
     limb: str
     element: str
-    axis: Literal["rx", "ry", "rz", "x", "y", "z", "length", "lead", "pitch", "offset", "gain", "curve", "backlash"]
+    axis: Literal[
+        "rx",
+        "ry",
+        "rz",
+        "x",
+        "y",
+        "z",
+        "length",
+        "lead",
+        "pitch",
+        "offset",
+        "gain",
+        "curve",
+        "backlash",
+    ]
     coefficient: Ratio = 1.0
     arm: Length | None = None
 
@@ -298,7 +340,14 @@ Named = NamedLength | NamedAngle | NamedRatio
 class LimbsFile:
     """The fields of a `limbs` file beside those that every robot has; see `Limbs`."""
 
-    freedoms: tuple[Literal["rx", "ry", "rz", "x", "y", "z"], ...] = ("rx", "ry", "rz", "x", "y", "z")
+    freedoms: tuple[Literal["rx", "ry", "rz", "x", "y", "z"], ...] = (
+        "rx",
+        "ry",
+        "rz",
+        "x",
+        "y",
+        "z",
+    )
     controlled: tuple[str, ...] = ()
     actuators: Mapping[str, Drive] = field(default_factory=dict)
     limbs: tuple[LimbRecord, ...] = ()
@@ -308,12 +357,16 @@ class LimbsFile:
 
 
 def refuse_branch(limb: LimbRecord, names: tuple[str, ...]) -> None:
-    """Refuse a limb that does not join base and platform; raises MechanismError naming what it hangs on."""
+    """Refuse a limb that does not join base and platform; raises MechanismError naming what it
+    hangs on.
+    """
     for key, found, allowed in (("starts on", limb.on, "base"), ("ends on", limb.to, "platform")):
         if found == allowed:
             continue
         what = f"limb {found!r}" if found in names else f"{found!r}"
         raise MechanismError(
-            f"limb {limb.name!r} {key} {what}: loopcal has no limbs that branch from limbs; every limb must join the base "
-            f"to the platform, so let it {key.replace('s on', ' on')} the {allowed}, or model the branch as limbs of its own"
+            f"limb {limb.name!r} {key} {what}: loopcal has no limbs that branch from limbs; every "
+            "limb must join the base "
+            f"to the platform, so let it {key.replace('s on', ' on')} the {allowed}, or model the "
+            "branch as limbs of its own"
         )

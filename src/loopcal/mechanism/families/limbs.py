@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Any mechanism of limbs between base and platform, written out joint by joint: one short file is a robot.
+"""Any mechanism of limbs between base and platform, written out joint by joint: one short file is a
+robot.
 
-`error_model: ideal` takes the unknowns that the file names (`errors:` of a limb, `unknown:` of a drive, `parameters:`),
-`complete` six for every link transform less what its joint absorbs, beside the named ones. How to write such a file:
-docs/robots.md.
+`error_model: ideal` takes the unknowns that the file names (`errors:` of a limb, `unknown:` of a
+drive, `parameters:`), `complete` six for every link transform less what its joint absorbs, beside
+the named ones. How to write such a file: docs/robots.md.
 """
 
 from __future__ import annotations
@@ -15,7 +16,17 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES, Address, Assembly, Cone, Linear
-from loopcal.mechanism.families.chain import EX, EY, EZ, Placed, Step, moved, placed, tilted, turn_about
+from loopcal.mechanism.families.chain import (
+    EX,
+    EY,
+    EZ,
+    Placed,
+    Step,
+    moved,
+    placed,
+    tilted,
+    turn_about,
+)
 from loopcal.mechanism.families.drives import actuator, drive_errors
 from loopcal.mechanism.families.errors import Errors, Spread, complete, offset, quantity
 from loopcal.mechanism.families.limb_records import (
@@ -51,25 +62,35 @@ class Limbs(LimbsFile, Robot):
     Attributes
     ----------
     freedoms : of the platform, in base axes. controlled : coordinates it is commanded in.
-    actuators : drives by name; a drive that is not listed reads the joint's value. In a limb with copies, `q` means q1, q2, ..
-    limbs : from base to platform. error_model, parameters : see the module. tolerances : of the complete model.
+    actuators : drives by name; a drive that is not listed reads the joint's value. In a limb with
+        copies, `q` means q1, q2, ..
+    limbs : from base to platform. error_model, parameters : see the module. tolerances : of the
+        complete model.
     """
 
     def expand(self) -> Assembly:
         """All copies of all limbs; raises MechanismError for what cannot be."""
         if not self.limbs:
-            raise MechanismError(f"{self.name} has no limbs; write those that join the base to the platform")
+            raise MechanismError(
+                f"{self.name} has no limbs; write those that join the base to the platform"
+            )
         names = tuple(limb.name for limb in self.limbs)
         for limb in self.limbs:
             refuse_branch(limb, names)
         members = {limb.name: tuple(_copies(limb)) for limb in self.limbs}
         everyone = [one for limb in self.limbs for one in members[limb.name]]
         # a drive that several limbs name is one drive
-        drives = tuple({drive[0]: drive for one in everyone for drive in self._drives(one)}.values())
+        drives = tuple(
+            {drive[0]: drive for one in everyone for drive in self._drives(one)}.values()
+        )
         errors = sum((_limb_errors(one) for one in everyone), start=Errors())
-        errors += sum((drive_errors(name, drive, turns) for name, drive, turns in drives), start=Errors())
+        errors += sum(
+            (drive_errors(name, drive, turns) for name, drive, turns in drives), start=Errors()
+        )
         by_name = {name: (drive, turns) for name, drive, turns in drives}
-        errors += sum((_named(named, members, by_name) for named in self.parameters), start=Errors())
+        errors += sum(
+            (_named(named, members, by_name) for named in self.parameters), start=Errors()
+        )
         if self.error_model == "complete":
             errors = self._complete(everyone, drives).beside(errors) + errors
         self._check(errors, tuple(by_name))
@@ -89,16 +110,19 @@ class Limbs(LimbsFile, Robot):
 
     def _check(self, errors: Errors, drives: tuple[str, ...]) -> None:
         idle = [
-            name for name in self.actuators if name not in drives and not any(d.rstrip("0123456789") == name for d in drives)
+            name
+            for name in self.actuators
+            if name not in drives and not any(d.rstrip("0123456789") == name for d in drives)
         ]
         if idle:
             raise MechanismError(
-                f"actuator {idle[0]!r} drives no joint; write 'actuated: {idle[0]}' at one, or leave it out"
-                + (f"; joints are driven by {', '.join(drives)}" if drives else "")
+                f"actuator {idle[0]!r} drives no joint; write 'actuated: {idle[0]}' at one, or "
+                "leave it out" + (f"; joints are driven by {', '.join(drives)}" if drives else "")
             )
         if not errors.parameters:
             raise MechanismError(
-                f"{self.name} names no unknown; give a limb 'errors:', a drive 'unknown:', or state error_model: complete"
+                f"{self.name} names no unknown; give a limb 'errors:', a drive 'unknown:', or "
+                "state error_model: complete"
             )
 
     def _drives(self, one: _Member) -> Iterator[tuple[str, Drive, bool]]:
@@ -107,20 +131,33 @@ class Limbs(LimbsFile, Robot):
         driven = [(j.actuator, j.kind == "R") for j in limb.joints if j.actuator]
         for name, turns in (*driven, *([(limb.actuator, False)] if limb.actuator else [])):
             plain = AngleDrive("angle") if turns else LengthDrive("length")
-            drive = self.actuators.get(name) or self.actuators.get(name.removesuffix(one.suffix)) or plain
+            drive = (
+                self.actuators.get(name)
+                or self.actuators.get(name.removesuffix(one.suffix))
+                or plain
+            )
             if turns != isinstance(drive, AngleDrive):
                 found = "turns" if turns else "slides"
                 raise MechanismError(
                     f"actuator {name!r} drives a joint that {found}; state "
-                    + ("reads: angle without a radius" if turns else "reads: length, or reads: angle with a radius")
+                    + (
+                        "reads: angle without a radius"
+                        if turns
+                        else "reads: length, or reads: angle with a radius"
+                    )
                 )
             yield name, drive, turns
 
-    def _complete(self, everyone: list[_Member], drives: tuple[tuple[str, Drive, bool], ...]) -> Errors:
+    def _complete(
+        self, everyone: list[_Member], drives: tuple[tuple[str, Drive, bool], ...]
+    ) -> Errors:
         """All errors of all limbs, and the offset of every drive once, however many limbs it moves."""
         length = standard_deviation(self.tolerances.lengths, "the lengths")
         angle = standard_deviation(self.tolerances.angles, "the angles")
-        found = sum((complete(one.placed, Spread(length, angle), offsets=False) for one in everyone), start=Errors())
+        found = sum(
+            (complete(one.placed, Spread(length, angle), offsets=False) for one in everyone),
+            start=Errors(),
+        )
         for name, drive, turns in drives:
             dimension, sd = (Dimension.ANGLE, angle) if turns else (Dimension.LENGTH, length)
             found += offset(f"{name}.offset", name, dimension, drive.offset, sd)
@@ -167,11 +204,21 @@ def _placed(limb: LimbRecord, name: str, suffix: str, turn: np.ndarray) -> Place
         )
     if limb.ending == "distance" and not limb.actuated and not limb.length > 0:
         raise MechanismError(
-            f"limb {limb.name!r} ends in a rod that no drive moves, of length {limb.length:g} m; it needs a positive `length:`"
+            f"limb {limb.name!r} ends in a rod that no drive moves, of length {limb.length:g} m; "
+            "it needs a positive `length:`"
         )
     drive = limb.actuated + suffix if limb.actuated else None
     cones = tuple(Cone(cone.end, _plain(direction(cone.axis)), cone.angle) for cone in limb.cones)
-    return placed(name, tuple(steps), tip, limb.ending, turn @ place_matrix(limb.attach), limb.length, drive, cones)
+    return placed(
+        name,
+        tuple(steps),
+        tip,
+        limb.ending,
+        turn @ place_matrix(limb.attach),
+        limb.length,
+        drive,
+        cones,
+    )
 
 
 def _steps(joint: JointRecord, name: str, suffix: str) -> list[Step]:
@@ -180,15 +227,21 @@ def _steps(joint: JointRecord, name: str, suffix: str) -> list[Step]:
     if isinstance(joint, Revolute):
         motor = joint.actuated + suffix if joint.actuated else None
         pitch = joint.lead / (2 * np.pi)
-        return [Step(name, "R", place, direction(joint.axis), motor, pitch, joint.start, joint.limits)]
+        return [
+            Step(name, "R", place, direction(joint.axis), motor, pitch, joint.start, joint.limits)
+        ]
     if isinstance(joint, Prismatic):
         motor = joint.actuated + suffix if joint.actuated else None
-        return [Step(name, "P", place, direction(joint.axis), motor, 0.0, joint.start, joint.limits)]
+        return [
+            Step(name, "P", place, direction(joint.axis), motor, 0.0, joint.start, joint.limits)
+        ]
     if isinstance(joint, Cylindrical):
         axis = direction(joint.axis)
         turn = Step(f"{name}.turn", "R", place, axis, start=joint.start)
         return [turn, Step(f"{name}.slide", "P", here, axis, start=joint.slide_start)]
-    axes = [direction(axis) for axis in joint.axes] if isinstance(joint, Universal) else [EZ, EY, EX]
+    axes = (
+        [direction(axis) for axis in joint.axes] if isinstance(joint, Universal) else [EZ, EY, EX]
+    )
     return [
         Step(f"{name}.{i + 1}", "R", place if i == 0 else here, axis, start=start)
         for i, (axis, start) in enumerate(zip(axes, joint.start, strict=True))
@@ -197,7 +250,10 @@ def _steps(joint: JointRecord, name: str, suffix: str) -> list[Step]:
 
 def _limb_errors(one: _Member) -> Errors:
     """Unknowns that a limb's record names."""
-    parts = (_shifts(one.placed, e) if isinstance(e, Shifts) else _tilts(one.placed, e) for e in one.record.errors)
+    parts = (
+        _shifts(one.placed, e) if isinstance(e, Shifts) else _tilts(one.placed, e)
+        for e in one.record.errors
+    )
     return sum(parts, start=Errors())
 
 
@@ -221,7 +277,10 @@ def _shifts(limb: Placed, entry: Shifts) -> Errors:
 
 def _check_rod(limb: Placed, entry: Shifts) -> None:
     if limb.limb.ending != "distance" or entry.of != "rod":
-        raise MechanismError(f"{limb.name!r}: 'length' belongs to a rod; write 'of: rod' in a limb that ends in a distance")
+        raise MechanismError(
+            f"{limb.name!r}: 'length' belongs to a rod; write 'of: rod' in a limb that ends in a "
+            "distance"
+        )
 
 
 def _tilts(limb: Placed, entry: Tilts) -> Errors:
@@ -230,20 +289,26 @@ def _tilts(limb: Placed, entry: Tilts) -> Errors:
     element = _element(limb, entry.of)
     for axis in entry.tilt:
         name = f"{limb.name}.{entry.name or entry.of}.{axis}"
-        maps = tilted(name, limb, element, axis) if entry.alone else moved(name, limb, element, axis)
+        maps = (
+            tilted(name, limb, element, axis) if entry.alone else moved(name, limb, element, axis)
+        )
         found += quantity(name, Dimension.ANGLE, 0.0, sd, *maps)
     return found
 
 
 def _element(limb: Placed, name: str) -> str:
-    """A link of a limb; a joint of several is meant by its first. Raises MechanismError listing what there is."""
+    """A link of a limb; a joint of several is meant by its first. Raises MechanismError listing
+    what there is.
+    """
     for found in (name, f"{name}.1", f"{name}.turn"):
         if found in limb.elements:
             return found
     raise MechanismError(f"limb {limb.name!r} has no {name!r}; it has {', '.join(limb.elements)}")
 
 
-def _named(named: Named, members: dict[str, tuple[_Member, ...]], drives: Mapping[str, tuple[Drive, bool]]) -> Errors:
+def _named(
+    named: Named, members: dict[str, tuple[_Member, ...]], drives: Mapping[str, tuple[Drive, bool]]
+) -> Errors:
     """A parameter with maps of its own."""
     if isinstance(named, NamedLength):
         nominal = named.length
@@ -255,7 +320,10 @@ def _named(named: Named, members: dict[str, tuple[_Member, ...]], drives: Mappin
 
 
 def _onto(
-    named: Named, entry: Onto, members: dict[str, tuple[_Member, ...]], drives: Mapping[str, tuple[Drive, bool]]
+    named: Named,
+    entry: Onto,
+    members: dict[str, tuple[_Member, ...]],
+    drives: Mapping[str, tuple[Drive, bool]],
 ) -> Iterator[Linear]:
     """One entry of a parameter's maps, for every copy that it means."""
     name, (axis, coefficient) = named.name, engine_axis(named.name, entry)
@@ -263,14 +331,21 @@ def _onto(
         check_units(named, entry, drives[entry.limb])
         yield Linear(name, Address(entry.limb, entry.element, axis), coefficient)
         return
-    found = members.get(entry.limb) or tuple(m for ms in members.values() for m in ms if m.placed.name == entry.limb)
+    found = members.get(entry.limb) or tuple(
+        m for ms in members.values() for m in ms if m.placed.name == entry.limb
+    )
     if not found:
         known = ", ".join((*members, *sorted(drives)))
-        raise MechanismError(f"parameter {name!r} is mapped onto {entry.limb!r}, which is not there; known are {known}")
+        raise MechanismError(
+            f"parameter {name!r} is mapped onto {entry.limb!r}, which is not there; known are "
+            f"{known}"
+        )
     check_units(named, entry, None)
     for one in found:
         if axis in AXES:
-            yield from moved(name, one.placed, _element(one.placed, entry.element), axis, coefficient)
+            yield from moved(
+                name, one.placed, _element(one.placed, entry.element), axis, coefficient
+            )
         else:
             yield Linear(name, Address(one.placed.name, entry.element, axis), coefficient)
 

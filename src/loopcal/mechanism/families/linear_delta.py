@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linear deltas as printer firmware sees them: three carriages on vertical towers, three rods that meet in one point.
+"""Linear deltas as printer firmware sees them: three carriages on vertical towers, three rods that
+meet in one point.
 
-Tower k stands at radius (cos angle_k, sin angle_k); with the carriage at reading r its rod ends at the height
-z_k = stop_k + sqrt(arm_k^2 - radius^2) - r (`readings: drop`, counted down from the end stop) or
-z_k = stop_k + sqrt(arm_k^2 - radius^2) + r (`readings: height`); the nozzle is the lower point at distance arm_k from all
-three. Radius and angles are shared parameters (docs/theory/delta.md).
+Tower k stands at radius (cos angle_k, sin angle_k); with the carriage at reading r its rod ends at
+the height z_k = stop_k + sqrt(arm_k^2 - radius^2) - r (`readings: drop`, counted down from the end
+stop) or z_k = stop_k + sqrt(arm_k^2 - radius^2) + r (`readings: height`); the nozzle is the lower
+point at distance arm_k from all three. Radius and angles are shared parameters
+(docs/theory/delta.md).
 """
 
 from __future__ import annotations
@@ -14,11 +16,18 @@ from typing import Literal
 
 import numpy as np
 
-from loopcal.engine import Array
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import Actuator, Address, Assembly, Joint, Limb, Linear, Link
-from loopcal.mechanism.records import AngleTolerance, LengthTolerance, Robot, per_leg, standard_deviation, translation
+from loopcal.mechanism.records import (
+    AngleTolerance,
+    LengthTolerance,
+    Robot,
+    per_leg,
+    standard_deviation,
+    translation,
+)
 from loopcal.parameters import Parameter
+from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length
 
 
@@ -34,7 +43,8 @@ class DeltaTolerances:
 
 @dataclass(frozen=True)
 class TowerMap:
-    """(radius, angle, arm, stop) -> displacement of the tower in x and y, and offset of the carriage.
+    """(radius, angle, arm, stop) -> displacement of the tower in x and y, and offset of the
+    carriage.
 
     x = radius cos angle, y = radius sin angle, offset = stop + sqrt(arm^2 - radius^2).
     """
@@ -42,17 +52,24 @@ class TowerMap:
     inputs: tuple[str, ...]
     outputs: tuple[Address, ...]
 
-    def value(self, inputs: Array) -> Array:
+    def value(self, inputs: FloatArray) -> FloatArray:
         """(t, 4) [m, rad, m, m] -> (t, 3) [m]."""
         radius, angle, arm, stop = inputs.T
-        return np.stack([radius * np.cos(angle), radius * np.sin(angle), stop + np.sqrt(arm**2 - radius**2)], axis=1)
+        return np.stack(
+            [radius * np.cos(angle), radius * np.sin(angle), stop + np.sqrt(arm**2 - radius**2)],
+            axis=1,
+        )
 
-    def jacobian(self, inputs: Array) -> Array:
+    def jacobian(self, inputs: FloatArray) -> FloatArray:
         """(t, 4) -> (t, 3, 4)."""
         radius, angle, arm, _ = inputs.T
         c, s, zero = np.cos(angle), np.sin(angle), np.zeros_like(radius)
         height = np.sqrt(arm**2 - radius**2)
-        rows = [[c, -radius * s, zero, zero], [s, radius * c, zero, zero], [-radius / height, zero, arm / height, zero + 1.0]]
+        rows = [
+            [c, -radius * s, zero, zero],
+            [s, radius * c, zero, zero],
+            [-radius / height, zero, arm / height, zero + 1.0],
+        ]
         return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
 
 
@@ -62,10 +79,13 @@ class LinearDelta(Robot):
 
     Attributes
     ----------
-    radius : horizontal distance from a rod's upper to its lower end with the nozzle in the centre [m].
-    angles : of the towers [rad]; the third fixes what the base frame's x axis is and stays as it is.
+    radius : horizontal distance from a rod's upper to its lower end with the nozzle in the centre
+        [m].
+    angles : of the towers [rad]; the third fixes what the base frame's x axis is and stays as it
+        is.
     arms : lengths of the rods [m], one or three. stops : end-stop heights [m], one or three.
-    readings : `drop` below the end stop or `height` above the lowest carriage position. stroke : allowed readings [m].
+    readings : `drop` below the end stop or `height` above the lowest carriage position. stroke :
+        allowed readings [m].
     """
 
     radius: Length = 0.0
@@ -80,10 +100,13 @@ class LinearDelta(Robot):
         """Three limbs: a driven carriage on a tower, then a rod; the platform keeps x, y and z."""
         arms, stops = per_leg(self.arms, 3, "arms"), per_leg(self.stops, 3, "stops")
         if len(self.angles) != 3:
-            raise MechanismError(f"{self.name} has {len(self.angles)} tower angles; a linear delta has three")
+            raise MechanismError(
+                f"{self.name} has {len(self.angles)} tower angles; a linear delta has three"
+            )
         if not min(arms) > self.radius > 0:
             raise MechanismError(
-                f"{self.name} has a radius of {self.radius * 1e3:g} mm and an arm of {min(arms) * 1e3:g} mm; "
+                f"{self.name} has a radius of {self.radius * 1e3:g} mm and an arm of "
+                f"{min(arms) * 1e3:g} mm; "
                 "the radius must be positive and every arm longer than it"
             )
         sd = {
@@ -102,7 +125,9 @@ class LinearDelta(Robot):
             limbs.append(Limb(limb, links, joints, "distance", Link("nozzle", np.eye(4)), arm))
             sign = -1.0 if self.readings == "drop" else 1.0
             offset = stop + np.sqrt(arm**2 - self.radius**2)
-            actuators.append(Actuator(motor, Dimension.LENGTH, self.stroke, {"offset": offset, "gain": sign}))
+            actuators.append(
+                Actuator(motor, Dimension.LENGTH, self.stroke, {"offset": offset, "gain": sign})
+            )
             parameters += [
                 Parameter(f"tower{k}.angle", Dimension.ANGLE, angle, sd["angles"], free=k < 3),
                 Parameter(f"arm{k}.length", Dimension.LENGTH, arm, sd["arms"]),
@@ -112,7 +137,11 @@ class LinearDelta(Robot):
             shared.append(
                 TowerMap(
                     ("radius", f"tower{k}.angle", f"arm{k}.length", f"tower{k}.stop"),
-                    (Address(limb, "tower", "x"), Address(limb, "tower", "y"), Address(motor, "transmission", "offset")),
+                    (
+                        Address(limb, "tower", "x"),
+                        Address(limb, "tower", "y"),
+                        Address(motor, "transmission", "offset"),
+                    ),
                 )
             )
         return Assembly(

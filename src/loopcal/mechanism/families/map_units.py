@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a named parameter and what it is mapped onto have the same unit, and the factor between them."""
+"""Whether a named parameter and what it is mapped onto have the same unit, and the factor between
+them.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,14 @@ import math
 
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES
-from loopcal.mechanism.families.limb_records import Drive, Named, NamedAngle, NamedLength, Onto, SpoolDrive
+from loopcal.mechanism.families.limb_records import (
+    Drive,
+    Named,
+    NamedAngle,
+    NamedLength,
+    Onto,
+    SpoolDrive,
+)
 from loopcal.units import Dimension
 
 WORDS = {Dimension.LENGTH: "a length", Dimension.ANGLE: "an angle", Dimension.RATIO: "a ratio"}
@@ -22,7 +31,8 @@ def dimension_of(named: Named) -> Dimension:
 
 
 def engine_axis(name: str, entry: Onto) -> tuple[str, float]:
-    """The axis of the engine that an entry moves and the change of it per unit: a lead is per turn, a pitch per radian.
+    """The axis of the engine that an entry moves and the change of it per unit: a lead is per turn,
+    a pitch per radian.
 
     Raises
     ------
@@ -30,13 +40,18 @@ def engine_axis(name: str, entry: Onto) -> tuple[str, float]:
         The axis `pitch`, which a file calls by its lead.
     """
     if entry.axis == "pitch":
-        raise MechanismError(f"parameter {name!r} is mapped onto 'pitch'; use lead, the advance in one turn")
+        raise MechanismError(
+            f"parameter {name!r} is mapped onto 'pitch'; use lead, the advance in one turn"
+        )
     coefficient = entry.coefficient * (1.0 if entry.arm is None else entry.arm)
-    return ("pitch", coefficient * PER_RADIAN) if entry.axis == "lead" else (entry.axis, coefficient)
+    return (
+        ("pitch", coefficient * PER_RADIAN) if entry.axis == "lead" else (entry.axis, coefficient)
+    )
 
 
 def check_units(named: Named, entry: Onto, drive: tuple[Drive, bool] | None) -> None:
-    """Refuse a map between unlike units; `drive` is the one that `limb` names, and whether its joint turns.
+    """Refuse a map between unlike units; `drive` is the one that `limb` names, and whether its
+    joint turns.
 
     A ratio stands for a slope where it turns something. Raises MechanismError with what to state.
     """
@@ -45,7 +60,9 @@ def check_units(named: Named, entry: Onto, drive: tuple[Drive, bool] | None) -> 
     onto = f"{entry.axis} of {entry.limb!r} {WORDS[needed]}"
     if entry.arm is not None:
         if found is Dimension.LENGTH:
-            raise MechanismError(f"{what} with an arm; leave the arm out, which turns an angle into a length")
+            raise MechanismError(
+                f"{what} with an arm; leave the arm out, which turns an angle into a length"
+            )
         if needed is not Dimension.LENGTH:
             raise MechanismError(f"{what} with an arm and {onto}; leave the arm out")
         return
@@ -53,7 +70,9 @@ def check_units(named: Named, entry: Onto, drive: tuple[Drive, bool] | None) -> 
     if found is needed or slope:
         return
     if needed is Dimension.LENGTH:
-        raise MechanismError(f"{what} and {onto}; state an `arm:` [length per radian], or the parameter as a length")
+        raise MechanismError(
+            f"{what} and {onto}; state an `arm:` [length per radian], or the parameter as a length"
+        )
     raise MechanismError(f"{what} and {onto}; state it as {WORDS[needed]}")
 
 

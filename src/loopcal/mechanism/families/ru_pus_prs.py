@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """RU-PUS-PRS solar trackers: a platform on a post, turned in two angles by two carriages.
 
-Chain 1 (PUS) ends at (-a1, 0, 0) of the platform with its guide at (-b1, 0), chain 2 (PRS) at (0, a2, 0) with its guide at
-(0, b2) and its revolute joint along x; both guides are vertical. Chain 3 (RU) is the post: a revolute joint along y in the
-base's origin, a link of length r to the platform's origin, there a universal joint with its first axis along x on the link
-and its second along y of the platform. So the platform's origin stays where it is and only phi and theta are free.
+Chain 1 (PUS) ends at (-a1, 0, 0) of the platform with its guide at (-b1, 0), chain 2 (PRS) at (0,
+a2, 0) with its guide at (0, b2) and its revolute joint along x; both guides are vertical. Chain 3
+(RU) is the post: a revolute joint along y in the base's origin, a link of length r to the
+platform's origin, there a universal joint with its first axis along x on the link and its second
+along y of the platform. So the platform's origin stays where it is and only phi and theta are free.
 
-Parameters: those of doi:10.1177/1687814016667908, which prints twenty-five without listing them all. Chain 1 has a1x a1y
-a1z b1x b1y q1 l1 thB1x thB1y, chain 2 the same and thC2y thC2z, chain 3 r and turns of its three axes, thOx thOz (revolute
-joint), thU1y thU1z (first axis) and thU2x thU2z (second). That is `twenty-seven`, of rank 26: thOz turns post
-and first axis together, just as thU1z does. `twenty-five` leaves out thOz, and thU1z, which thU2z nearly repeats: our
-choice. Derivation: docs/theory/tripods.md.
+Parameters: those of doi:10.1177/1687814016667908, which prints twenty-five without listing them
+all. Chain 1 has a1x a1y a1z b1x b1y q1 l1 thB1x thB1y, chain 2 the same and thC2y thC2z, chain 3 r
+and turns of its three axes, thOx thOz (revolute joint), thU1y thU1z (first axis) and thU2x thU2z
+(second). That is `twenty-seven`, of rank 26: thOz turns post and first axis together, just as thU1z
+does. `twenty-five` leaves out thOz, and thU1z, which thU2z nearly repeats: our choice. Derivation:
+docs/theory/tripods.md.
 """
 
 from __future__ import annotations
@@ -45,7 +47,9 @@ POST_ANGLES = (
     ("thU2x", "platform", "rx"),
     ("thU2z", "platform", "rz"),
 )
-"""Turns of the post's axes: name, element, axis in the frame carried there (that of the base, or of the platform)."""
+"""Turns of the post's axes: name, element, axis in the frame carried there (that of the base, or of
+the platform).
+"""
 
 LEFT_OUT = ("thOz", "thU1z")
 """What the twenty-five leave out of the twenty-seven."""
@@ -57,9 +61,12 @@ class RuPusPrs(Robot):
 
     Attributes
     ----------
-    platform_radius, base_radius, rod, post : a, b, l and r [m]. stroke : allowed readings (low, high) [m].
-    error_model : `ideal`, the named parameters, or `complete`. parameters : with `ideal`, which set (see the module).
-    spherical : joints at the rods' ends as perfect `point`s, or with `complete` as `axes` with errors of their own.
+    platform_radius, base_radius, rod, post : a, b, l and r [m]. stroke : allowed readings (low,
+        high) [m].
+    error_model : `ideal`, the named parameters, or `complete`. parameters : with `ideal`, which set
+        (see the module).
+    spherical : joints at the rods' ends as perfect `point`s, or with `complete` as `axes` with
+        errors of their own.
     tolerances : of lengths and angles.
     """
 
@@ -76,14 +83,25 @@ class RuPusPrs(Robot):
     def expand(self) -> Assembly:
         """Three limbs under a free platform."""
         check_spherical(self.name, self.spherical, self.error_model)
-        a, b, axes, home = self.platform_radius, self.base_radius, self.spherical == "axes", self.home.matrix
+        a, b, axes, home = (
+            self.platform_radius,
+            self.base_radius,
+            self.spherical == "axes",
+            self.home.matrix,
+        )
         first = Frames(at(-b), at(-a), self.rod, home)
         second = Frames(at(0.0, b), at(0.0, a), self.rod, home)
-        rod, tripod = pus_limb("chain1", "q1", first, axes), prs_limb("chain2", "q2", second, "x", axes)
+        rod, tripod = (
+            pus_limb("chain1", "q1", first, axes),
+            prs_limb("chain2", "q2", second, "x", axes),
+        )
         post = self._post()
         length, angle = self.tolerances.length, self.tolerances.angle
         if self.error_model == "complete":
-            errors = sum((complete(limb, Spread(length, angle)) for limb in (rod, tripod, post)), start=Errors())
+            errors = sum(
+                (complete(limb, Spread(length, angle)) for limb in (rod, tripod, post)),
+                start=Errors(),
+            )
         else:
             errors = (
                 ends(rod, 1, first, length)
@@ -120,8 +138,12 @@ class RuPusPrs(Robot):
 
     def _post_errors(self, post: Placed, length: float | None, angle: float | None) -> Errors:
         """r and the angles of the post."""
-        found = quantity("r", Dimension.LENGTH, self.post, length, *moved("r", post, "universal1", "z"))
+        found = quantity(
+            "r", Dimension.LENGTH, self.post, length, *moved("r", post, "universal1", "z")
+        )
         for name, element, axis in POST_ANGLES:
             if self.parameters == "twenty-seven" or name not in LEFT_OUT:
-                found += quantity(name, Dimension.ANGLE, 0.0, angle, *moved(name, post, element, axis))
+                found += quantity(
+                    name, Dimension.ANGLE, 0.0, angle, *moved(name, post, element, axis)
+                )
         return found

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""3-PRS tripods: three carriages on vertical guides, rods that swing in vertical planes, balls on the platform.
+"""3-PRS tripods: three carriages on vertical guides, rods that swing in vertical planes, balls on
+the platform.
 
-Chain i stands at the angle 120 (i - 1) degrees, with the chain frame Rz(angle): guide along z, revolute joint along y,
-foot of the guide at x = base_radius, ball at x = platform_radius. The machine moves in z and tilts (phi, theta); x, y and
-psi follow. Parameters: the eleven a chain of doi:10.1177/1687814016667908 (a.x a.y a.z b.x b.y q l thB.x thB.y thC.x
-thC.z, the point standing for the chain's number), or fourteen natural ones: of the three more, b.z repeats q, and thB.z and
+Chain i stands at the angle 120 (i - 1) degrees, with the chain frame Rz(angle): guide along z,
+revolute joint along y, foot of the guide at x = base_radius, ball at x = platform_radius. The
+machine moves in z and tilts (phi, theta); x, y and psi follow. Parameters: the eleven a chain of
+doi:10.1177/1687814016667908 (a.x a.y a.z b.x b.y q l thB.x thB.y thC.x thC.z, the point standing
+for the chain's number), or fourteen natural ones: of the three more, b.z repeats q, and thB.z and
 thC.y turn an axis about itself. Derivation: docs/theory/tripods.md.
 """
 
@@ -42,7 +44,8 @@ class ThreePrs(Robot):
     platform_radius, base_radius, rod : a, b and l [m]. stroke : allowed readings (low, high) [m].
     error_model : `ideal`, the named parameters, or `complete`.
     parameters : with `ideal`, the `eleven` a chain that can be told apart, or all `fourteen`.
-    spherical : upper joints as perfect `point`s, or with `complete` as three `axes` with errors of their own.
+    spherical : upper joints as perfect `point`s, or with `complete` as three `axes` with errors of
+        their own.
     tolerances : of lengths and angles.
     """
 
@@ -61,7 +64,12 @@ class ThreePrs(Robot):
         limbs, errors = [], Errors()
         for number in (1, 2, 3):
             turn = turn_about("z", 2 * np.pi / 3 * (number - 1))
-            frames = Frames(turn @ at(self.base_radius), turn @ at(self.platform_radius), self.rod, self.home.matrix)
+            frames = Frames(
+                turn @ at(self.base_radius),
+                turn @ at(self.platform_radius),
+                self.rod,
+                self.home.matrix,
+            )
             limb = prs_limb(f"chain{number}", f"q{number}", frames, "y", self.spherical == "axes")
             limbs.append(limb)
             errors += self._errors(limb, number, frames)
@@ -69,7 +77,9 @@ class ThreePrs(Robot):
             name=self.name,
             source=self.source,
             limbs=tuple(limb.limb for limb in limbs),
-            actuators=tuple(Actuator(f"q{number}", Dimension.LENGTH, self.stroke) for number in (1, 2, 3)),
+            actuators=tuple(
+                Actuator(f"q{number}", Dimension.LENGTH, self.stroke) for number in (1, 2, 3)
+            ),
             freedoms=AXES,
             controlled=("z", "phi", "theta"),
             home=self.home.matrix,

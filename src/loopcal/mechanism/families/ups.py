@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A hexapod's leg as the chain that it is: universal joint, driven slide, then a ball or a screw and a second universal joint.
+"""A hexapod's leg as the chain that it is: universal joint, driven slide, then a ball or a screw
+and a second universal joint.
 
-Two turning joints across the leg point its slide at the upper centre; a `ball` closes the chain, or three axes through
-that centre and a `rigid` ending where they shall have errors of their own.
+Two turning joints across the leg point its slide at the upper centre; a `ball` closes the chain, or
+three axes through that centre and a `rigid` ending where they shall have errors of their own.
 
-In a leg with a screw the nut is carried by the lower universal joint and the spindle by the upper one, so the length
-follows |t + R p - b| = length + reading - lead a / (2 pi), where a is the angle about the leg from the lower joint's axis
-to the upper one's, both seen along the leg and zero where they are parallel. This is the correction of LinuxCNC's
-genhexkins, which takes asin(sin a) in the place of a. Derivation: docs/theory/hexapod.md.
+In a leg with a screw the nut is carried by the lower universal joint and the spindle by the upper
+one, so the length follows |t + R p - b| = length + reading - lead a / (2 pi), where a is the angle
+about the leg from the lower joint's axis to the upper one's, both seen along the leg and zero where
+they are parallel. This is the correction of LinuxCNC's genhexkins, which takes asin(sin a) in the
+place of a. Derivation: docs/theory/hexapod.md.
 """
 
 from __future__ import annotations
@@ -16,11 +18,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal import se3
-from loopcal.engine import Array
+from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.mechanism.families.chain import EX, EY, EZ, Placed, Step, at, placed
 from loopcal.mechanism.records import per_leg
+from loopcal.typing import FloatArray
 from loopcal.units import Length, Ratio
 
 Direction = tuple[Ratio, Ratio, Ratio]
@@ -41,8 +43,10 @@ class Screw:
 
     Attributes
     ----------
-    lead : change of length in one turn [m], one for all legs or one each; negative for a left-handed screw.
-    base_axes, platform_axes : direction of the joint axis that is fixed to the base (platform), leg by leg.
+    lead : change of length in one turn [m], one for all legs or one each; negative for a
+        left-handed screw.
+    base_axes, platform_axes : direction of the joint axis that is fixed to the base (platform), leg
+        by leg.
     """
 
     lead: Length | tuple[Length, ...] = 0.0
@@ -53,18 +57,24 @@ class Screw:
         """The six screws; raises MechanismError for another number."""
         if len(self.base_axes) != 6 or len(self.platform_axes) != 6:
             raise MechanismError(
-                f"the screw names {len(self.base_axes)} base_axes and {len(self.platform_axes)} platform_axes; name six of each"
+                f"the screw names {len(self.base_axes)} base_axes and {len(self.platform_axes)} "
+                "platform_axes; name six of each"
             )
         leads = per_leg(self.lead, 6, "the screw's lead")
-        return tuple(ScrewLeg(*one) for one in zip(leads, self.base_axes, self.platform_axes, strict=True))
+        return tuple(
+            ScrewLeg(*one) for one in zip(leads, self.base_axes, self.platform_axes, strict=True)
+        )
 
 
-def ups_leg(name: str, motor: str, base: Direction, top: Direction, home: Array, axes: bool) -> Placed:
+def ups_leg(
+    name: str, motor: str, base: Direction, top: Direction, home: FloatArray, axes: bool
+) -> Placed:
     """A leg whose joints are all at zero in the home pose.
 
     Parameters
     ----------
-    base, top : centres in base and platform frame [m]. home : (4, 4) T_base_platform of the home pose.
+    base, top : centres in base and platform frame [m]. home : (4, 4) T_base_platform of the home
+        pose.
     axes : True for an upper joint of three axes, False for a ball.
     """
     b, gap = _along(name, base, top, home)
@@ -79,24 +89,36 @@ def ups_leg(name: str, motor: str, base: Direction, top: Direction, home: Array,
     )
     if not axes:
         return placed(name, steps, np.eye(4), "ball", at(*top))
-    turned = se3.pose(home[:3, :3], np.zeros(3))
-    ball = tuple(Step(f"ball{i + 1}", "R", turned if i == 0 else np.eye(4), axis) for i, axis in enumerate((EZ, EY, EX)))
+    turned = geometry.pose(home[:3, :3], np.zeros(3))
+    ball = tuple(
+        Step(f"ball{i + 1}", "R", turned if i == 0 else np.eye(4), axis)
+        for i, axis in enumerate((EZ, EY, EX))
+    )
     return placed(name, (*steps, *ball), np.eye(4), "rigid", at(*top))
 
 
-def screw_leg(name: str, motor: str, base: Direction, top: Direction, home: Array, screw: ScrewLeg) -> Placed:
-    """A leg with a screw, in which the reading alone drives the slide; raises MechanismError for an axis along the leg."""
+def screw_leg(
+    name: str, motor: str, base: Direction, top: Direction, home: FloatArray, screw: ScrewLeg
+) -> Placed:
+    """A leg with a screw, in which the reading alone drives the slide; raises MechanismError for an
+    axis along the leg.
+    """
     b, gap = _along(name, base, top, home)
     length = float(np.linalg.norm(gap))
     s = gap / length
-    lower, upper = _direction(name, screw.base_axis), home[:3, :3] @ _direction(name, screw.platform_axis)
+    lower, upper = (
+        _direction(name, screw.base_axis),
+        home[:3, :3] @ _direction(name, screw.platform_axis),
+    )
     for axis in (lower, upper):
         if np.linalg.norm(np.cross(axis, s)) < 1e-6:
-            raise MechanismError(f"a screw's joint axis lies along {name} at home; give it another direction")
+            raise MechanismError(
+                f"a screw's joint axis lies along {name} at home; give it another direction"
+            )
     low, high = _across(s, lower), _across(s, upper)
     turned = float(np.arctan2(np.cross(low, high) @ s, low @ high))
     # at zero the spindle stands turned back by the angle that it has at home
-    back = se3.pose(se3.exp_so3(-turned * s), np.zeros(3))
+    back = geometry.pose(geometry.exp_so3(-turned * s), np.zeros(3))
     steps = (
         Step("universal1", "R", at(*b), lower),
         Step("universal2", "R", np.eye(4), np.cross(s, low)),
@@ -105,10 +127,12 @@ def screw_leg(name: str, motor: str, base: Direction, top: Direction, home: Arra
         Step("universal3", "R", back, np.cross(s, high)),
         Step("universal4", "R", np.eye(4), upper),
     )
-    return placed(name, steps, se3.pose(home[:3, :3], np.zeros(3)), "rigid", at(*top))
+    return placed(name, steps, geometry.pose(home[:3, :3], np.zeros(3)), "rigid", at(*top))
 
 
-def _along(name: str, base: Direction, top: Direction, home: Array) -> tuple[Array, Array]:
+def _along(
+    name: str, base: Direction, top: Direction, home: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Lower centre and the way to the upper one at home [m]."""
     b = np.array(base, dtype=float)
     gap = home[:3, :3] @ np.array(top, dtype=float) + home[:3, 3] - b
@@ -117,7 +141,7 @@ def _along(name: str, base: Direction, top: Direction, home: Array) -> tuple[Arr
     return b, gap
 
 
-def _across(s: Array, axis: Array) -> Array:
+def _across(s: FloatArray, axis: FloatArray) -> FloatArray:
     """The unit vector across s nearest to `axis`, or any where they are parallel."""
     part = axis - float(axis @ s) * s
     if np.linalg.norm(part) < 1e-6 * np.linalg.norm(axis):
@@ -125,7 +149,7 @@ def _across(s: Array, axis: Array) -> Array:
     return np.array(part / np.linalg.norm(part), dtype=float)
 
 
-def _direction(name: str, axis: Direction) -> Array:
+def _direction(name: str, axis: Direction) -> FloatArray:
     """A unit vector (3,); raises MechanismError where it is zero."""
     length = float(np.linalg.norm(axis))
     if not length > 0:

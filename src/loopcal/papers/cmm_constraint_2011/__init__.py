@@ -1,2 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A hexapod calibrated from points on planes and on perpendicular lines (doi:10.5772/45684), repeated."""
+"""A hexapod calibrated from points on planes and on perpendicular lines (doi:10.5772/45684),
+repeated.
+"""

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Table 3 again: true machines of three sizes of errors, four levels of noise, many draws, least squares and MAP."""
+"""Table 3 again: true machines of three sizes of errors, four levels of noise, many draws, least
+squares and MAP.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.calibrate.filters import MAP, LeastSquares, Method
-from loopcal.linalg import FloatArray, IntArray
+from loopcal.estimate.penalties import MAP, LeastSquares, Method
 from loopcal.papers.cmm_constraint_2011.published import MM, published
 from loopcal.papers.cmm_constraint_2011.steps import PaperRows, Weights, identify_from_rows
 from loopcal.papers.cmm_constraint_2011.study import MEASURES, Study, true_machines
+from loopcal.typing import FloatArray, IntArray
 
 BEFORE, LS, PRIOR = "before", "LS", "MAP"
 METHODS: Mapping[str, Method] = {LS: LeastSquares(), PRIOR: MAP()}
@@ -24,8 +26,10 @@ class Cell:
 
     Attributes
     ----------
-    sd, noise : standard deviations [m]. gauge_free : whether the true errors have no part that plane and line cannot tell.
-    errors : by BEFORE, LS, MAP, (t, 7) see MEASURES. iterations : (t,) of LS. failed : descents that did not converge.
+    sd, noise : standard deviations [m]. gauge_free : whether the true errors have no part that
+        plane and line cannot tell.
+    errors : by BEFORE, LS, MAP, (t, 7) see MEASURES. iterations : (t,) of LS. failed : descents
+        that did not converge.
     """
 
     sd: float
@@ -45,7 +49,9 @@ class Cell:
 
     @property
     def ratio(self) -> float:
-        """Noise over errors, by which alone the reductions of cells differ, but for what is not linear."""
+        """Noise over errors, by which alone the reductions of cells differ, but for what is not
+        linear.
+        """
         return float(f"{self.noise / self.sd:.6g}")
 
     def worse(self, method: str, measure: int) -> int:
@@ -54,13 +60,21 @@ class Cell:
 
 
 def cell(
-    study: Study, sd: float, noise: float, seed: int, trials: int, gauge_free: bool = False, weights: Weights = "full"
+    study: Study,
+    sd: float,
+    noise: float,
+    seed: int,
+    trials: int,
+    gauge_free: bool = False,
+    weights: Weights = "full",
 ) -> Cell:
-    """Draw true machines, hold their coordinates with noise, identify by each method, compare at unseen poses.
+    """Draw true machines, hold their coordinates with noise, identify by each method, compare at
+    unseen poses.
 
     Parameters
     ----------
-    sd, noise : standard deviations [m], of a parameter and of a coordinate of a point. The prior of MAP has this sd.
+    sd, noise : standard deviations [m], of a parameter and of a coordinate of a point. The prior of
+        MAP has this sd.
     """
     truth = true_machines(study.robot, sd, trials, seed, gauge_free)
     problem = PaperRows(study.layout, study.layout.held(truth, noise, seed), sd, noise, weights)
@@ -75,7 +89,9 @@ def cell(
     return Cell(sd, noise, gauge_free, errors, iterations, failed)
 
 
-def grid(study: Study, seed: int, trials: int, progress: Callable[[str], None]) -> dict[tuple[str, str], Cell]:
+def grid(
+    study: Study, seed: int, trials: int, progress: Callable[[str], None]
+) -> dict[tuple[str, str], Cell]:
     """Compute the 3 x 4 cells by (set, noise) as printed, read as standard deviations."""
     cells = {}
     for given in published().sets:
@@ -88,7 +104,9 @@ def grid(study: Study, seed: int, trials: int, progress: Callable[[str], None]) 
 def correlation(cells: Iterable[Cell], method: str) -> float:
     """Rank correlation over cells of the reductions of parameter error and position error."""
     both = np.array([c.reduction(method) for c in cells])
-    return spearman(both[:, MEASURES.index("parameters [mm]")], both[:, MEASURES.index("position [mm]")])
+    return spearman(
+        both[:, MEASURES.index("parameters [mm]")], both[:, MEASURES.index("position [mm]")]
+    )
 
 
 def spearman(x: FloatArray, y: FloatArray) -> float:

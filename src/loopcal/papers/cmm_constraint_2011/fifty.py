@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's experiment, simulated: fifty points spread over the workspace, then independent full poses (its Table 4)."""
+"""The paper's experiment, simulated: fifty points spread over the workspace, then independent full
+poses (its Table 4).
+"""
 
 from __future__ import annotations
 
@@ -7,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.linalg import FloatArray, IntArray
 from loopcal.papers.cmm_constraint_2011.cells import METHODS
 from loopcal.papers.cmm_constraint_2011.published import MM, published
 from loopcal.papers.cmm_constraint_2011.steps import PaperRows, identify_from_rows
 from loopcal.papers.cmm_constraint_2011.study import AXES, FRAMES, Study, plan, true_machines
 from loopcal.papers.printed import Table
+from loopcal.typing import FloatArray, IntArray
 
 SD = 1.0e-3
 """Of the true errors [m]: those of set 3."""
@@ -53,11 +55,15 @@ class Fifty:
 
 
 def fifty(study: Study, groups: int, seed: int, trials: int) -> Fifty:
-    """Calibrate machines from fifty random points on `groups` planes, the noise that of the paper's measuring machine."""
+    """Calibrate machines from fifty random points on `groups` planes, the noise that of the paper's
+    measuring machine.
+    """
     points = published().measured // groups
     layout = plan(study.robot, groups, points, AXES, seed + 2, sweeps=0).layout
     truth = true_machines(study.robot, SD, trials, seed)
-    problem = PaperRows(layout, layout.held(truth, published().accuracy, seed), SD, published().accuracy)
+    problem = PaperRows(
+        layout, layout.held(truth, published().accuracy, seed), SD, published().accuracy
+    )
     true, nominal = study.unseen.poses(truth), study.robot.parameters.nominal[None]
     machines, found = {"before": nominal}, {}
     for name, method in METHODS.items():
@@ -76,7 +82,9 @@ def _statistics(twists: FloatArray) -> FloatArray:
     """(t, 4) see STATISTICS, of differences (t, n, 6)."""
     position = np.linalg.norm(twists[:, :, 3:], axis=2) / MM
     orientation = np.rad2deg(np.linalg.norm(twists[:, :, :3], axis=2))
-    return np.stack([part(e, axis=1) for e in (position, orientation) for part in (np.mean, np.std)], axis=1)
+    return np.stack(
+        [part(e, axis=1) for e in (position, orientation) for part in (np.mean, np.std)], axis=1
+    )
 
 
 def fifty_table(found: tuple[Fifty, ...]) -> Table:
@@ -88,10 +96,16 @@ def fifty_table(found: tuple[Fifty, ...]) -> Table:
             rows.append((words, frame, method, *map(float, one.median(method, frame))))
     columns = ("50 points on", "frame", "method", *STATISTICS)
     note = (
-        f"Medians of {len(found[0].iterations)} machines with errors of 1 mm, noise {published().accuracy / MM:g} mm (the"
-        " stated accuracy of the measuring machine), points drawn at random, errors at 100 other poses. Absolute: base and"
-        " platform where the least deviation leaves them; gauge at nominal: where poses are nearest to those as designed, an"
-        " equally good answer to the same data; aligned: nearest to the true ones, which is what the data can be judged by."
+        f"Medians of {len(found[0].iterations)} machines with errors of 1 mm, noise "
+        f"{published().accuracy / MM:g} mm (the"
+        " stated accuracy of the measuring machine), points drawn at random, errors at 100 other "
+        "poses. Absolute: base and"
+        " platform where the least deviation leaves them; gauge at nominal: where poses are "
+        "nearest to those as designed, an"
+        " equally good answer to the same data; aligned: nearest to the true ones, which is what "
+        "the data can be judged by."
     )
     title = "Fifty points, verified by full poses (in place of Table 4)"
-    return Table("table_4", title, columns, tuple(rows), ("", "", "", ".3g", ".3g", ".3g", ".3g"), note)
+    return Table(
+        "table_4", title, columns, tuple(rows), ("", "", "", ".3g", ".3g", ".3g", ".3g"), note
+    )

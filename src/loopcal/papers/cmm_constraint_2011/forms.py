@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same points as the library takes them: surfaces with unknown direction, height and shifts, one set for each group.
+"""The same points as the library takes them: surfaces with unknown direction, height and shifts,
+one set for each group.
 
-Kinds `plane` and `line` that name the same surface share the unknowns of that name, so that the line is perpendicular to
-the plane by construction. Measured gaps are zero: the coordinates were held.
+Kinds `plane` and `line` that name the same surface share the unknowns of that name, so that the
+line is perpendicular to the plane by construction. Measured gaps are zero: the coordinates were
+held.
 """
 
 from __future__ import annotations
@@ -11,10 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.calibrate import identify
-from loopcal.calibrate.outlook import information
-from loopcal.calibrate.scaling import unknowns
-from loopcal.linalg import FloatArray
+from loopcal.estimate import identify
+from loopcal.estimate.outlook import information
+from loopcal.estimate.scaling import unknowns
 from loopcal.measure import Line, Measurements, Observations, Plane
 from loopcal.mechanism.coordinates import POSITION
 from loopcal.papers.cmm_constraint_2011.cells import METHODS
@@ -22,14 +23,17 @@ from loopcal.papers.cmm_constraint_2011.published import MM
 from loopcal.papers.cmm_constraint_2011.steps import Layout, PaperRows, identify_from_rows
 from loopcal.papers.cmm_constraint_2011.study import Study, true_machines
 from loopcal.papers.printed import Table
+from loopcal.typing import FloatArray
 
 SURFACE = "held"
 ERRORS, NOISES = 1e-3, (1e-6, 1e-5)
 """Standard deviations [m] of parameters and of held coordinates."""
 
 RANK = 1e-5
-"""Relative rank tolerance. Turning the whole base turns what is left between points and line, too; where this is not zero a
-first-order row sees the turn, though the sum of squares does not change. Such singular values are some 1e-6 of the largest."""
+"""Relative rank tolerance. Turning the whole base turns what is left between points and line, too;
+where this is not zero a
+first-order row sees the turn, though the sum of squares does not change. Such singular values are
+some 1e-6 of the largest."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,8 @@ class Forms:
 
     Attributes
     ----------
-    rows : noise [mm], method, rank with surfaces as unknowns, largest difference of the estimates [sd].
+    rows : noise [mm], method, rank with surfaces as unknowns, largest difference of the estimates
+        [sd].
     covariance : largest relative difference of a variance.
     """
 
@@ -51,16 +56,30 @@ def measurements(layout: Layout, q: FloatArray, sigma: float) -> Measurements:
 
     Parameters
     ----------
-    layout : lines along any axes of the base. q : (n, a) readings [SI]. sigma : of a held coordinate [m].
+    layout : lines along any axes of the base. q : (n, a) readings [SI]. sigma : of a held
+        coordinate [m].
     """
     number = np.arange(layout.points).reshape(layout.groups, -1)
     axis = np.abs(layout.levers[0]).argmax(axis=1)
     found = []
     for along in np.unique(axis):
-        stated = {"unknown": ("surface",), "surface": f"{SURFACE}_{POSITION[along]}", "through": layout.robot.home[:3, 3]}
-        plane, line = (kind(along=np.eye(3)[along], **stated).mounted(layout.robot.tool) for kind in (Plane, Line))
-        points, groups = number[axis == along], [f"plane{i + 1}" for i in np.flatnonzero(axis == along)]
-        for kind, seen, gaps in ((plane, np.delete(points, 1, axis=1), 1), (line, points[:, :2], 2)):
+        stated = {
+            "unknown": ("surface",),
+            "surface": f"{SURFACE}_{POSITION[along]}",
+            "through": layout.robot.home[:3, 3],
+        }
+        plane, line = (
+            kind(along=np.eye(3)[along], **stated).mounted(layout.robot.tool)
+            for kind in (Plane, Line)
+        )
+        points, groups = (
+            number[axis == along],
+            [f"plane{i + 1}" for i in np.flatnonzero(axis == along)],
+        )
+        for kind, seen, gaps in (
+            (plane, np.delete(points, 1, axis=1), 1),
+            (line, points[:, :2], 2),
+        ):
             held, group = np.zeros((seen.size, gaps)), np.repeat(groups, seen.shape[1])
             found.append(Observations.from_sigma(kind, seen.ravel(), held, sigma, group=group))
     return Measurements(layout.robot.name, q, tuple(found))
@@ -83,7 +102,9 @@ def compare_forms(study: Study, seed: int) -> Forms:
 
 
 def covariance_difference(layout: Layout, noise: float) -> float:
-    """Largest relative difference of the variances that both forms give any direction, on surfaces reached exactly."""
+    """Largest relative difference of the variances that both forms give any direction, on surfaces
+    reached exactly.
+    """
     robot = layout.robot
     q = layout.held(robot.parameters.nominal[None], 0.0, 0)
     free = unknowns(robot)
@@ -95,25 +116,45 @@ def covariance_difference(layout: Layout, noise: float) -> float:
 
 def forms_table(found: Forms) -> Table:
     """Both forms side by side."""
-    columns = ("noise [mm]", "method", "rank, surfaces as unknowns", "difference of the estimates [sd]")
+    columns = (
+        "noise [mm]",
+        "method",
+        "rank, surfaces as unknowns",
+        "difference of the estimates [sd]",
+    )
     note = (
-        f"One machine with errors of {ERRORS / MM:g} mm; surfaces as unknowns (`identify`) against the paper's rows with full"
-        " covariance. Differences are the largest along the 33 directions and fall with the noise: beyond the linear part the"
+        f"One machine with errors of {ERRORS / MM:g} mm; surfaces as unknowns (`identify`) against "
+        "the paper's rows with full"
+        " covariance. Differences are the largest along the 33 directions and fall with the noise: "
+        "beyond the linear part the"
         " forms differ. On surfaces that are reached exactly, variances of any direction differ by"
         f" {found.covariance:.0e} of themselves."
     )
-    return Table("forms", "The two forms of the constraint", columns, found.rows, (".3g", "", "d", ".1e"), note)
+    return Table(
+        "forms",
+        "The two forms of the constraint",
+        columns,
+        found.rows,
+        (".3g", "", "d", ".1e"),
+        note,
+    )
 
 
 def _in_sds(problem: PaperRows, change: FloatArray) -> FloatArray:
-    """A change of the parameters (p,) [m] along the identifiable directions, in standard deviations (rank,)."""
+    """A change of the parameters (p,) [m] along the identifiable directions, in standard deviations
+    (rank,).
+    """
     s, vt = _seen(problem)
     return s * (vt @ change) / problem.sd
 
 
 def _seen(problem: PaperRows) -> tuple[FloatArray, FloatArray]:
-    """Singular values and directions of the paper's rows that count, of the first machine as designed."""
-    A = problem.whitened(np.zeros((1, problem.parameters)), np.zeros(1, dtype=np.int64))[0][0, :, :-1]
+    """Singular values and directions of the paper's rows that count, of the first machine as
+    designed.
+    """
+    A = problem.whitened(np.zeros((1, problem.parameters)), np.zeros(1, dtype=np.int64))[0][
+        0, :, :-1
+    ]
     _, s, vt = np.linalg.svd(A, full_matrices=False)
     kept = s > 1e-10 * s[0]
     return s[kept], vt[kept]

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the paper prints and states, as far as our text of it goes, and whether its quotients follow from its numbers."""
+"""What the paper prints and states, as far as our text of it goes, and whether its quotients follow
+from its numbers.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ class Stated:
 
     Attributes
     ----------
-    before, after : as printed, "" where not. stated : percentage or factor, as printed. unit : of before and after.
+    before, after : as printed, "" where not. stated : percentage or factor, as printed. unit : of
+        before and after.
     """
 
     stated: str
@@ -41,7 +44,9 @@ class Stated:
     @property
     def possible(self) -> tuple[float, float]:
         """Least and largest factor of numbers that are rounded to those printed."""
-        (b, h), (c, k) = ((float(text), 0.5 * last_digit(text)) for text in (self.before, self.after))
+        (b, h), (c, k) = (
+            (float(text), 0.5 * last_digit(text)) for text in (self.before, self.after)
+        )
         return (b - h) / (c + k), (b + h) / (c - k)
 
     @property
@@ -58,8 +63,10 @@ class Published:
 
     Attributes
     ----------
-    source : what we have of the paper. parameters, simulated, measured : counts. sets, noises : as printed, in mm.
-    repeatability, accuracy : of the measuring machine [m]. figure_5, table_4 : improvements. statements : with their place.
+    source : what we have of the paper. parameters, simulated, measured : counts. sets, noises : as
+        printed, in mm.
+    repeatability, accuracy : of the measuring machine [m]. figure_5, table_4 : improvements.
+        statements : with their place.
     """
 
     source: str
@@ -78,9 +85,11 @@ class Published:
 @cache
 def published() -> Published:
     """Read published.yaml."""
-    from loopcal.io.yaml_file import read_yaml
+    from loopcal.io.core.yaml_file import read_yaml
 
-    content: dict[str, Any] = read_yaml(Path(__file__).with_name("published.yaml"), "file of published numbers").content
+    content: dict[str, Any] = read_yaml(
+        Path(__file__).with_name("published.yaml"), "file of published numbers"
+    ).content
     return Published(
         source=content["source"],
         parameters=int(content["parameters"]),

@@ -5,15 +5,16 @@
     (17) a_i e = c_i                            a_i = d_i'(J_1 - J_0) + d_1'(J_i - J_0),  c_i = -d_i'd_1
     (18) e = (A'A)^-1 A'c, again and again
 
-with d_i = p_i - p_0 by forward kinematics at the present parameters and J_i their slopes. The frame of the coordinate
-measuring machine has dropped out. Points of a group share p_0 and p_1, so their rows are correlated: noise dp of the
-points moves row i by B dp,
+with d_i = p_i - p_0 by forward kinematics at the present parameters and J_i their slopes. The frame
+of the coordinate measuring machine has dropped out. Points of a group share p_0 and p_1, so their
+rows are correlated: noise dp of the points moves row i by B dp,
 
     d(d_i'd_1) = d_1'dp_i + d_i'dp_1 - (d_1 + d_i)'dp_0
 
-and the covariance of the rows is B S B'. The paper gives every row weight one. A'A is singular, see gauge.py: least
-squares here is that of `loopcal.calibrate`, which takes the smallest deviation along what no row tells. Derivation, and why
-this equals surfaces as unknowns: docs/theory/constraint.md.
+and the covariance of the rows is B S B'. The paper gives every row weight one. A'A is singular, see
+gauge.py: least squares here is that of `loopcal.calibrate`, which takes the smallest deviation
+along what no row tells. Derivation, and why this equals surfaces as unknowns:
+docs/theory/constraint.md.
 """
 
 from __future__ import annotations
@@ -24,17 +25,24 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from loopcal.calibrate.descent import Descent, StepControl, descend
-from loopcal.calibrate.filters import Method
 from loopcal.engine import State
-from loopcal.linalg import FloatArray, IntArray
+from loopcal.estimate.descent import Descent, StepControl, descend
+from loopcal.estimate.penalties import Method
 from loopcal.measure import stream
 from loopcal.mechanism import Mechanism, Status
+from loopcal.mechanism.batch_kinematics import (
+    forward_trials,
+    inverse_trials,
+    readings_at,
+    sensitivity,
+)
 from loopcal.mechanism.coordinates import POSITION
-from loopcal.mechanism.trials import forward_trials, inverse_trials, readings_at, sensitivity
+from loopcal.typing import FloatArray, IntArray
 
 Weights = Literal["printed", "distance", "single", "full"]
-"""Rows as printed; divided by |d_1|, a distance from the plane; divided by their own sd; with their full covariance."""
+"""Rows as printed; divided by |d_1|, a distance from the plane; divided by their own sd; with their
+full covariance.
+"""
 WEIGHTS: tuple[Weights, ...] = get_args(Weights)
 
 
@@ -44,8 +52,8 @@ class Layout:
 
     Attributes
     ----------
-    robot : as designed; the origin of its platform is the end point. coordinates : (g, k, 6) controlled [m, rad] of g groups:
-        p_0, p_1 on the line, the others in the plane.
+    robot : as designed; the origin of its platform is the end point. coordinates : (g, k, 6)
+        controlled [m, rad] of g groups: p_0, p_1 on the line, the others in the plane.
     """
 
     robot: Mechanism
@@ -82,22 +90,32 @@ class Layout:
         return levers(self.state.T[0, :, :3, 3].reshape(self.groups, -1, 3))
 
     def held(self, truth: FloatArray, sigma: float, seed: int) -> FloatArray:
-        """Readings (t, n, a) at which true machines (t, p) [SI] hold the coordinates of the measuring machine.
+        """Readings (t, n, a) at which true machines (t, p) [SI] hold the coordinates of the
+        measuring machine.
 
-        The true end point stands where it was commanded to, but for Gaussian noise of `sigma` [m] in x, y and z.
-        Trial i draws the same numbers whatever sigma and however many trials there are.
+        The true end point stands where it was commanded to, but for Gaussian noise of `sigma` [m]
+        in x, y and z. Trial i draws the same numbers whatever sigma and however many trials there
+        are.
         """
-        noise = np.stack([stream(seed, trial).standard_normal((self.points, 3)) for trial in range(len(truth))])
+        noise = np.stack(
+            [stream(seed, trial).standard_normal((self.points, 3)) for trial in range(len(truth))]
+        )
         target = np.repeat(self.flat[None], len(truth), axis=0)
         target[:, :, [self.robot.controlled.index(name) for name in POSITION]] += sigma * noise
         return readings_at(self.robot, truth, inverse_trials(self.robot, truth, target, self.state))
 
-    def sloped(self, values: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray, np.ndarray]:
-        """Points (t, g, k, 3) [m], their slopes (t, g, k, 3, p), and which machines reach all of them (t,)."""
+    def sloped(
+        self, values: FloatArray, q: FloatArray
+    ) -> tuple[FloatArray, FloatArray, np.ndarray]:
+        """Points (t, g, k, 3) [m], their slopes (t, g, k, 3, p), and which machines reach all of
+        them (t,).
+        """
         state = forward_trials(self.robot, values, q, self.state)
         D = sensitivity(self.robot, values, q, state).parameters[:, :, 3:]
         shape = (len(values), self.groups, -1, 3)
-        reached = np.all(state.status == Status.CONVERGED, axis=1) & np.isfinite(D).all(axis=(1, 2, 3))
+        reached = np.all(state.status == Status.CONVERGED, axis=1) & np.isfinite(D).all(
+            axis=(1, 2, 3)
+        )
         return state.T[:, :, :3, 3].reshape(shape), D.reshape(*shape, D.shape[3]), reached
 
 
@@ -107,7 +125,8 @@ class PaperRows:
 
     Attributes
     ----------
-    layout : the points. q : (t, n, a) readings. sd : of a parameter, in which deviations are counted [m].
+    layout : the points. q : (t, n, a) readings. sd : of a parameter, in which deviations are
+        counted [m].
     weights : of the rows. sigma : of the noise of a point [m].
     """
 
@@ -129,7 +148,9 @@ class PaperRows:
 
     @cached_property
     def whitener(self) -> FloatArray:
-        """(g, k - 2, k - 2) what the rows of a group are multiplied by; made at the points as commanded."""
+        """(g, k - 2, k - 2) what the rows of a group are multiplied by; made at the points as
+        commanded.
+        """
         return whitener(*self.layout.levers, self.sigma, self.weights)
 
     def values(self, deviation: FloatArray) -> FloatArray:
@@ -137,14 +158,16 @@ class PaperRows:
         return self.layout.robot.parameters.nominal + self.sd * deviation
 
     def whitened(self, deviation: FloatArray, trials: IntArray) -> tuple[FloatArray, np.ndarray]:
-        """Rows (a, m, p + 1), [A | residual], of some machines at deviations (a, p), and which machines reach all points."""
+        """Rows (a, m, p + 1), [A | residual], of some machines at deviations (a, p), and which
+        machines reach all points.
+        """
         at, J, reached = self.layout.sloped(self.values(deviation), self.q[trials])
         A, c = equations(at, J * self.sd)
         rows = self.whitener @ np.concatenate([A, -c[..., None]], axis=-1)
         return rows.reshape(len(trials), self.layout.equations, -1), reached
 
     def fold(self, deviation: FloatArray, trials: IntArray) -> tuple[FloatArray, FloatArray]:
-        """See `loopcal.calibrate.descent.Problem`."""
+        """See `loopcal.estimate.descent.Problem`."""
         if not deviation.any() and len(trials) == len(self.q):
             factor, cost = self.nominal_fold
             return factor.copy(), cost.copy()
@@ -166,8 +189,8 @@ class PaperRows:
 def identify_from_rows(problem: PaperRows, method: Method, relative: float = 1e-2) -> Descent:
     """Iterate (18) with the library's filters and step control, from the machine as designed.
 
-    The last step changes the residuals by at most `relative` of their norm and is still taken, so that the next one would
-    change them by its square or so.
+    The last step changes the residuals by at most `relative` of their norm and is still taken, so
+    that the next one would change them by its square or so.
     """
     begin = np.zeros((len(problem.q), problem.parameters))
     return descend(problem, begin, method, StepControl(relative=relative))
@@ -179,7 +202,9 @@ def levers(at: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def equations(at: FloatArray, J: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Equations (17): a (.., k - 2, p) and c (.., k - 2) of points (.., k, 3) [m] with slopes J (.., k, 3, p)."""
+    """Equations (17): a (.., k - 2, p) and c (.., k - 2) of points (.., k, 3) [m] with slopes J
+    (.., k, 3, p).
+    """
     d_1, d = levers(at)
     slope_1 = J[..., 1, :, :] - J[..., 0, :, :]
     slope = J[..., 2:, :, :] - J[..., :1, :, :]
@@ -188,7 +213,9 @@ def equations(at: FloatArray, J: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def row_map(d_1: FloatArray, d: FloatArray) -> FloatArray:
-    """B (g, k - 2, 3 k): how displacements of the points (p_0, p_1, p_2 ..) move the rows d_i'd_1 of a group."""
+    """B (g, k - 2, 3 k): how displacements of the points (p_0, p_1, p_2 ..) move the rows d_i'd_1
+    of a group.
+    """
     g, r = d.shape[:2]
     B = np.zeros((g, r, r + 2, 3))
     B[:, :, 0] = -(d + d_1[:, None])
@@ -198,9 +225,11 @@ def row_map(d_1: FloatArray, d: FloatArray) -> FloatArray:
 
 
 def whitener(d_1: FloatArray, d: FloatArray, sigma: float, weights: Weights) -> FloatArray:
-    """W (g, k - 2, k - 2) for rows of points with noise of `sigma` [m] in x, y and z: S = sigma^2 1.
+    """W (g, k - 2, k - 2) for rows of points with noise of `sigma` [m] in x, y and z: S = sigma^2
+    1.
 
-    "printed": all rows alike, divided by the root mean square of their sds, so that a prior can be set against them.
+    "printed": all rows alike, divided by the root mean square of their sds, so that a prior can be
+    set against them.
     """
     B = row_map(d_1, d)
     one = np.broadcast_to(np.eye(d.shape[1]), (*d.shape[:2], d.shape[1]))
@@ -212,4 +241,6 @@ def whitener(d_1: FloatArray, d: FloatArray, sigma: float, weights: Weights) -> 
         return one / (length * np.sqrt(np.mean((sd / length) ** 2)))[..., None]
     if weights == "single":
         return one / sd[..., None]
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(sigma**2 * B @ np.swapaxes(B, 1, 2))), dtype=np.float64)
+    return np.asarray(
+        np.linalg.inv(np.linalg.cholesky(sigma**2 * B @ np.swapaxes(B, 1, 2))), dtype=np.float64
+    )

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is given and what is asked: robot, points, true machines, and the errors by which a calibration is judged.
+"""What is given and what is asked: robot, points, true machines, and the errors by which a
+calibration is judged.
 
-Robot and workspace are ours, those of the robot file hexapod-nategh-agheli: the paper's Tables 1 and 2 are not in our text.
+Robot and workspace are ours, those of the robot file hexapod-nategh-agheli: the paper's Tables 1
+and 2 are not in our text.
 """
 
 from __future__ import annotations
@@ -11,18 +13,18 @@ from functools import cached_property
 
 import numpy as np
 
-from loopcal import se3
-from loopcal.calibrate.plan.coordinate import MovedDesign, coordinate_exchange
-from loopcal.calibrate.plan.criteria import D
-from loopcal.calibrate.plan.design import Start
-from loopcal.calibrate.plan.groups import PlaneAndLine
-from loopcal.linalg import FloatArray
+from loopcal import geometry
 from loopcal.measure import stream
 from loopcal.mechanism import Mechanism, Solution, sample
-from loopcal.mechanism.trials import forward_trials
+from loopcal.mechanism.batch_kinematics import forward_trials
 from loopcal.papers.cmm_constraint_2011.gauge import without_gauge
 from loopcal.papers.cmm_constraint_2011.published import MM
 from loopcal.papers.cmm_constraint_2011.steps import Layout
+from loopcal.planning.coordinate import MovedDesign, coordinate_exchange
+from loopcal.planning.criteria import D
+from loopcal.planning.design import Start
+from loopcal.planning.groups import PlaneAndLine
+from loopcal.typing import FloatArray
 
 ROBOT = "hexapod-nategh-agheli"
 GROUPS, POINTS = 10, 10
@@ -42,10 +44,13 @@ MEASURES = (
     "parameters without gauge [mm]",
     "position, gauge at nominal [mm]",
 )
-"""Root mean squares over the unseen poses, and the 2-norm of what is wrong with the 42 parameters."""
+"""Root mean squares over the unseen poses, and the 2-norm of what is wrong with the 42 parameters.
+"""
 ABSOLUTE, AT_NOMINAL, ALIGNED = FRAMES = ("absolute", "gauge at nominal", "aligned")
-"""Where the base and the platform's turn, which plane and line leave open, are put: where the least deviation leaves them;
-where poses are nearest to those as designed, which needs no truth; where they are nearest to the true ones."""
+"""Where the base and the platform's turn, which plane and line leave open, are put: where the least
+deviation leaves them;
+where poses are nearest to those as designed, which needs no truth; where they are nearest to the
+true ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,24 +73,36 @@ class Unseen:
         """Poses (t, n, 4, 4) in one of FRAMES."""
         if frame == ABSOLUTE:
             return T
-        return best_fit(T, true if frame == ALIGNED else np.broadcast_to(self.solution.T, true.shape))
+        return best_fit(
+            T, true if frame == ALIGNED else np.broadcast_to(self.solution.T, true.shape)
+        )
 
     def twists(self, values: FloatArray, true: FloatArray, frame: str) -> FloatArray:
-        """Differences (t, n, 6) [rad, m], rotation first, of the poses of machines (t | 1, p) from true ones (t, n, 4, 4).
+        """Differences (t, n, 6) [rad, m], rotation first, of the poses of machines (t | 1, p) from
+        true ones (t, n, 4, 4).
 
         In one of FRAMES.
         """
-        return se3.difference(self.placed(np.broadcast_to(self.poses(values), true.shape), true, frame), true)
+        return geometry.difference(
+            self.placed(np.broadcast_to(self.poses(values), true.shape), true, frame), true
+        )
 
     def errors(self, values: FloatArray, truth: FloatArray, true: FloatArray) -> FloatArray:
-        """(t, 7) see MEASURES; values (t | 1, p) and truth (t, p) [m], true (t, n, 4, 4) the `poses` of the truth."""
+        """(t, 7) see MEASURES; values (t | 1, p) and truth (t, p) [m], true (t, n, 4, 4) the
+        `poses` of the truth.
+        """
         T = np.broadcast_to(self.poses(values), true.shape)
         found = {}
         for frame in FRAMES:
-            squares = np.mean(se3.difference(self.placed(T, true, frame), true) ** 2, axis=1)
-            found[frame] = [np.sqrt(squares[:, 3:].sum(axis=1)) / MM, np.rad2deg(np.sqrt(squares[:, :3].sum(axis=1)))]
+            squares = np.mean(geometry.difference(self.placed(T, true, frame), true) ** 2, axis=1)
+            found[frame] = [
+                np.sqrt(squares[:, 3:].sum(axis=1)) / MM,
+                np.rad2deg(np.sqrt(squares[:, :3].sum(axis=1))),
+            ]
         wrong = values - truth
-        lengths = (np.linalg.norm(e, axis=1) / MM for e in (wrong, without_gauge(self.robot, wrong)))
+        lengths = (
+            np.linalg.norm(e, axis=1) / MM for e in (wrong, without_gauge(self.robot, wrong))
+        )
         return np.stack([*found[ABSOLUTE], *found[ALIGNED], *lengths, found[AT_NOMINAL][0]], axis=1)
 
 
@@ -95,7 +112,8 @@ class Study:
 
     Attributes
     ----------
-    planned : how groups are written as designs. first, optimised : before and after coordinate exchange. seed : of both.
+    planned : how groups are written as designs. first, optimised : before and after coordinate
+        exchange. seed : of both.
     """
 
     robot: Mechanism
@@ -122,41 +140,62 @@ def machine() -> Mechanism:
     return load_robot(ROBOT)
 
 
-def plan(robot: Mechanism, groups: int, points: int, axes: tuple[str, ...], seed: int, sweeps: int) -> Study:
-    """Draw groups at random and improve them by coordinate exchange for log det of what they tell; 0 sweeps: as drawn."""
+def plan(
+    robot: Mechanism, groups: int, points: int, axes: tuple[str, ...], seed: int, sweeps: int
+) -> Study:
+    """Draw groups at random and improve them by coordinate exchange for log det of what they tell;
+    0 sweeps: as drawn.
+    """
     planned = PlaneAndLine(robot, points, MM, axes)
     first = planned.random(groups, seed)
     found = coordinate_exchange(
-        planned.evaluate, first, planned.levels(), D(), Start.nothing(len(planned.unknowns)), sweeps=sweeps
+        planned.evaluate,
+        first,
+        planned.levels(),
+        D(),
+        Start.nothing(len(planned.unknowns)),
+        sweeps=sweeps,
     )
     return Study(robot, planned, first, found, seed)
 
 
 def spread(rows: FloatArray) -> float:
-    """Root mean square sd of the identifiable directions [mm per mm of noise], of rows for a noise of 1 mm."""
+    """Root mean square sd of the identifiable directions [mm per mm of noise], of rows for a noise
+    of 1 mm.
+    """
     s = np.linalg.svd(rows.reshape(-1, rows.shape[-1]), compute_uv=False)
     s = s[s > 1e-10 * s[0]]
     return float(np.sqrt(np.mean(1.0 / s**2)))
 
 
-def true_machines(robot: Mechanism, sd: float, trials: int, seed: int, gauge_free: bool = False) -> FloatArray:
-    """(t, p) [m] nominal values with Gaussian errors; machine i has the same errors, scaled, whatever sd and trials."""
-    drawn = np.stack([stream(seed, trial, TRUTH).standard_normal(len(robot.parameters)) for trial in range(trials)])
+def true_machines(
+    robot: Mechanism, sd: float, trials: int, seed: int, gauge_free: bool = False
+) -> FloatArray:
+    """(t, p) [m] nominal values with Gaussian errors; machine i has the same errors, scaled,
+    whatever sd and trials.
+    """
+    drawn = np.stack(
+        [
+            stream(seed, trial, TRUTH).standard_normal(len(robot.parameters))
+            for trial in range(trials)
+        ]
+    )
     return robot.parameters.nominal + sd * (without_gauge(robot, drawn) if gauge_free else drawn)
 
 
 def best_fit(T: FloatArray, others: FloatArray) -> FloatArray:
-    """Poses (t, n, 4, 4) after the motion of the base and the turn of the platform that bring them nearest to others.
+    """Poses (t, n, 4, 4) after the motion of the base and the turn of the platform that bring them
+    nearest to others.
 
-    Positions fix the base's motion (their least squares), then orientations the platform's turn (nearest rotations): what
-    plane and line leave open, and nothing else.
+    Positions fix the base's motion (their least squares), then orientations the platform's turn
+    (nearest rotations): what plane and line leave open, and nothing else.
     """
     x, y = T[..., :3, 3], others[..., :3, 3]
     middle, centre = x.mean(axis=1, keepdims=True), y.mean(axis=1, keepdims=True)
     Q = nearest_rotations(np.swapaxes(y - centre, 1, 2) @ (x - middle))
     R = Q[:, None] @ T[..., :3, :3]
     turn = nearest_rotations(np.sum(np.swapaxes(R, 2, 3) @ others[..., :3, :3], axis=1))
-    return se3.pose(R @ turn[:, None], (x - middle) @ np.swapaxes(Q, 1, 2) + centre)
+    return geometry.pose(R @ turn[:, None], (x - middle) @ np.swapaxes(Q, 1, 2) + centre)
 
 
 def nearest_rotations(M: FloatArray) -> FloatArray:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The 42-parameter hexapod: ten poses, errors assumed, poses simulated, parameters identified leg by leg.
+"""The 42-parameter hexapod: ten poses, errors assumed, poses simulated, parameters identified leg
+by leg.
 
-published.yaml holds what is printed; steps.py does what the paper does; studies.py varies it; compare.py judges.
+published.yaml holds what is printed; steps.py does what the paper does; studies.py varies it;
+compare.py judges.
 """

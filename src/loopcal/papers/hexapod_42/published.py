@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from loopcal.mechanism import Mechanism
-from loopcal.papers.printed import Array, Printed
+from loopcal.papers.printed import Printed
+from loopcal.typing import FloatArray
 
 MM = 1e-3
 LEGS = tuple(f"leg{i}" for i in range(1, 7))
@@ -22,7 +23,9 @@ PARAMETERS = ("base.x", "base.y", "base.z", "length", "platform.x", "platform.y"
 PARAMETER_COLUMNS = ("XB", "YB", "ZB", "l", "XP", "YP", "ZP")
 POSE_COLUMNS = ("X [mm]", "Y [mm]", "Z [mm]", "alpha [rad]", "beta [rad]", "gamma [rad]")
 ODD_POSE = "A2"
-"""The row of Table 4 that is of another machine; that it is so is found, not assumed: see `outliers` in studies.py."""
+"""The row of Table 4 that is of another machine; that it is so is found, not assumed: see
+`outliers` in studies.py.
+"""
 
 
 @dataclass(frozen=True)
@@ -65,13 +68,18 @@ class Published:
 @cache
 def published() -> Published:
     """Read published.yaml."""
-    from loopcal.io.yaml_file import read_yaml
+    from loopcal.io.core.yaml_file import read_yaml
 
-    content: dict[str, Any] = read_yaml(Path(__file__).with_name("published.yaml"), "file of published numbers").content
+    content: dict[str, Any] = read_yaml(
+        Path(__file__).with_name("published.yaml"), "file of published numbers"
+    ).content
     poses, fifth, sixth = content["table_4"], content["table_5"], content["table_6"]
     return Published(
         source=content["source"],
-        statements={name: content[name] for name in ("rotation", "threshold", "iterations", "noise", "poses")},
+        statements={
+            name: content[name]
+            for name in ("rotation", "threshold", "iterations", "noise", "poses")
+        },
         nominal=Printed.parse(content["table_2"]),
         errors=Printed.parse(content["table_3"]),
         nominal_poses=Printed.parse(poses["PT"]),
@@ -91,13 +99,13 @@ def nominal_machine() -> Mechanism:
     return load_robot("hexapod-42")
 
 
-def true_machine(robot: Mechanism, errors: Array, leg_lengths: bool = True) -> Mechanism:
+def true_machine(robot: Mechanism, errors: FloatArray, leg_lengths: bool = True) -> Mechanism:
     """The hexapod with errors.
 
     Parameters
     ----------
-    robot : nominal. errors : (6, 7) [m] in the layout of Table 3. leg_lengths : False leaves out the errors of the leg
-        lengths.
+    robot : nominal. errors : (6, 7) [m] in the layout of Table 3. leg_lengths : False leaves out
+        the errors of the leg lengths.
     """
     assumed = errors.copy()
     if not leg_lengths:
@@ -105,17 +113,19 @@ def true_machine(robot: Mechanism, errors: Array, leg_lengths: bool = True) -> M
     return robot.with_values(robot.parameters.nominal + to_values(robot, assumed))
 
 
-def to_values(robot: Mechanism, table: Array) -> Array:
+def to_values(robot: Mechanism, table: FloatArray) -> FloatArray:
     """(p,) in the robot's order of a table (6, 7) in the paper's layout."""
     values = np.zeros(len(robot.parameters))
     values[_places(robot)] = table
     return values
 
 
-def to_table(robot: Mechanism, values: Array) -> Array:
+def to_table(robot: Mechanism, values: FloatArray) -> FloatArray:
     """(6, 7) in the paper's layout of values (p,) in the robot's order."""
     return values[_places(robot)]
 
 
 def _places(robot: Mechanism) -> np.ndarray:
-    return np.array([[robot.parameters.index(f"{leg}.{name}") for name in PARAMETERS] for leg in LEGS])
+    return np.array(
+        [[robot.parameters.index(f"{leg}.{name}") for name in PARAMETERS] for leg in LEGS]
+    )

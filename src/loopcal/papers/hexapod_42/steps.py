@@ -13,8 +13,9 @@
  9 max dQint <= epsilon?                               |
 10 if not, on from step 5 with the corrected errors   /
 
-Least squares is `identify_per_leg`, one step at a time, every equation of weight one and every parameter of scale one.
-Poses are (x, y, z, alpha, beta, gamma) [m, rad] in the paper's order. Derivation: docs/theory/hexapod.md.
+Least squares is `identify_per_leg`, one step at a time, every equation of weight one and every
+parameter of scale one. Poses are (x, y, z, alpha, beta, gamma) [m, rad] in the paper's order.
+Derivation: docs/theory/hexapod.md.
 """
 
 from __future__ import annotations
@@ -24,15 +25,19 @@ from functools import cached_property
 
 import numpy as np
 
-from loopcal import se3
-from loopcal.calibrate import identify_per_leg, pose_errors
-from loopcal.measure import Measurements, Observations, Orientation, Pose, orientation, stream
+from loopcal import geometry
+from loopcal.diagnose import pose_errors
+from loopcal.geometry import Orientation, orientation
+from loopcal.measure import Measurements, Observations, Pose, stream
 from loopcal.mechanism import Mechanism, Solution, forward, inverse
 from loopcal.papers.hexapod_42.leg_form import LegForm
-from loopcal.papers.printed import Array
+from loopcal.papers.per_leg import identify_per_leg
+from loopcal.typing import FloatArray
 
 ORDER = "xyz"
-"""R = Rz(gamma) Ry(beta) Rx(alpha), with which Table 4 was made; not what equation (2) says, see `orders` in studies.py."""
+"""R = Rz(gamma) Ry(beta) Rx(alpha), with which Table 4 was made; not what equation (2) says, see
+`orders` in studies.py.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +46,13 @@ class Study:
 
     Attributes
     ----------
-    robot : the machine as designed. truth : with its errors. poses : (n, 6) nominal [m, rad]. order : Euler order.
+    robot : the machine as designed. truth : with its errors. poses : (n, 6) nominal [m, rad]. order
+        : Euler order.
     """
 
     robot: Mechanism
     truth: Mechanism
-    poses: Array
+    poses: FloatArray
     order: str = ORDER
 
     @cached_property
@@ -54,7 +60,7 @@ class Study:
         """Nominal poses and the leg readings that the nominal machine answers them with."""
         return inverse(self.robot, transforms(self.poses, self.order))
 
-    def reached(self, machine: Mechanism) -> Array:
+    def reached(self, machine: Mechanism) -> FloatArray:
         """(n, 6) poses [m, rad] of a machine at the readings of the nominal one."""
         return coordinates(forward(machine, self.commanded.q, self.commanded).T, self.order)
 
@@ -65,31 +71,37 @@ class Iterations:
 
     Attributes
     ----------
-    machines : (k + 1) corrected machines. pose_errors : (k + 1, n, 6) measured minus corrected [m, rad].
-    integrated : (k + 1,) max dQint [mm + rad]. conditions : (6,) condition of each leg's matrix in the first iteration.
+    machines : (k + 1) corrected machines. pose_errors : (k + 1, n, 6) measured minus corrected [m,
+        rad].
+    integrated : (k + 1,) max dQint [mm + rad]. conditions : (6,) condition of each leg's matrix in
+        the first iteration.
     """
 
     machines: tuple[Mechanism, ...]
-    pose_errors: Array
-    integrated: Array
-    conditions: Array
+    pose_errors: FloatArray
+    integrated: FloatArray
+    conditions: FloatArray
 
     def needed(self, threshold: float) -> int | None:
         """Iterations until max dQint is at most the threshold; None where it never is."""
         met = np.flatnonzero(self.integrated[1:] <= threshold)
         return int(met[0]) + 1 if len(met) else None
 
-    def parameter_errors(self, truth: Mechanism) -> Array:
+    def parameter_errors(self, truth: Mechanism) -> FloatArray:
         """(k + 1, p) true minus corrected parameters [m]."""
         return truth.values - np.stack([machine.values for machine in self.machines])
 
 
-def actual_poses(study: Study) -> Array:
-    """Step 2: (n, 6) true poses [m, rad] at the readings with which the nominal machine answers the nominal poses."""
+def actual_poses(study: Study) -> FloatArray:
+    """Step 2: (n, 6) true poses [m, rad] at the readings with which the nominal machine answers the
+    nominal poses.
+    """
     return study.reached(study.truth)
 
 
-def measured_poses(study: Study, noise: Array | None = None, seed: int = 0, trial: int = 0) -> Array:
+def measured_poses(
+    study: Study, noise: FloatArray | None = None, seed: int = 0, trial: int = 0
+) -> FloatArray:
     """Step 3: (n, 6) true poses with noise uniform in +-`noise` (6,) [m, rad]; none: exact.
 
     The numbers drawn are those of `simulate_trials` for the same seed and trial.
@@ -101,14 +113,15 @@ def measured_poses(study: Study, noise: Array | None = None, seed: int = 0, tria
     return actual + np.roll(drawn, 3, axis=1) * noise  # a kind has its angles first
 
 
-def iterate(study: Study, measured: Array, limit: int = 4, renewed: bool = True) -> Iterations:
-    """Steps 4 to 10: a fixed number of iterations, so that what happens after the rule is met is seen too.
+def iterate(study: Study, measured: FloatArray, limit: int = 4, renewed: bool = True) -> Iterations:
+    """Steps 4 to 10: a fixed number of iterations, so that what happens after the rule is met is
+    seen too.
 
     Parameters
     ----------
     study : what is given. measured : (n, 6) [m, rad]. limit : number of iterations.
-    renewed : whether the matrix is made anew at every corrected machine; the paper does not say. False: that of the
-        nominal machine throughout.
+    renewed : whether the matrix is made anew at every corrected machine; the paper does not say.
+        False: that of the nominal machine throughout.
 
     Raises
     ------
@@ -132,8 +145,12 @@ def iterate(study: Study, measured: Array, limit: int = 4, renewed: bool = True)
     return Iterations(tuple(machines), stacked, integrated(stacked), conditions)
 
 
-def measurements(study: Study, measured: Array, sigma: Array | float = 1.0) -> Measurements:
-    """Measured poses (n, 6) [m, rad] as measurements, with a sigma of one unless sigmas (n, 6) [m, rad] are given."""
+def measurements(
+    study: Study, measured: FloatArray, sigma: FloatArray | float = 1.0
+) -> Measurements:
+    """Measured poses (n, 6) [m, rad] as measurements, with a sigma of one unless sigmas (n, 6) [m,
+    rad] are given.
+    """
     kind = Pose(form_name(study.order)).mounted(study.robot.tool)
     sd = sigma if isinstance(sigma, float) else np.roll(sigma, 3, axis=1)
     rows = Observations.from_sigma(kind, np.arange(len(measured)), np.roll(measured, 3, axis=1), sd)
@@ -141,25 +158,27 @@ def measurements(study: Study, measured: Array, sigma: Array | float = 1.0) -> M
     return Measurements(study.robot.name, study.commanded.q, (rows,), labels=labels)
 
 
-def integrated(errors: Array) -> Array:
-    """Largest dQint (k,) [mm + rad] over the poses of errors (k, n, 6) [m, rad]: equations (15) to (17)."""
+def integrated(errors: FloatArray) -> FloatArray:
+    """Largest dQint (k,) [mm + rad] over the poses of errors (k, n, 6) [m, rad]: equations (15) to
+    (17).
+    """
     return np.array([pose_errors(e[:, :3], e[:, 3:]).statistics("integrated").max for e in errors])
 
 
-def transforms(poses: Array, order: str) -> Array:
+def transforms(poses: FloatArray, order: str) -> FloatArray:
     """(n, 4, 4) of poses (n, 6) [m, rad]."""
-    return se3.pose(form(order).to_matrix(poses[:, 3:]), poses[:, :3])
+    return geometry.pose(form(order).to_matrix(poses[:, 3:]), poses[:, :3])
 
 
-def coordinates(T: Array, order: str) -> Array:
+def coordinates(T: FloatArray, order: str) -> FloatArray:
     """(n, 6) [m, rad] of poses (n, 4, 4)."""
     return np.concatenate([T[:, :3, 3], form(order).from_matrix(T[:, :3, :3])], axis=1)
 
 
-def difference(first: Array, second: Array) -> Array:
+def difference(first: FloatArray, second: FloatArray) -> FloatArray:
     """Differences (n, 6) of coordinates, angles wrapped."""
     change = first - second
-    return np.concatenate([change[:, :3], se3.wrap(change[:, 3:])], axis=1)
+    return np.concatenate([change[:, :3], geometry.wrap(change[:, 3:])], axis=1)
 
 
 def form(order: str) -> Orientation:
@@ -172,7 +191,7 @@ def form_name(order: str) -> str:
     return f"euler-{order}"
 
 
-def twists(errors: Array, poses: Array, order: str) -> Array:
+def twists(errors: FloatArray, poses: FloatArray, order: str) -> FloatArray:
     """Twists (n, 6), rotation first, of errors (n, 6) [m, rad] of coordinates near poses (n, 6)."""
     omega = form(order).rates(poses[:, 3:]) @ errors[:, 3:, None]
     return np.concatenate([omega[..., 0], errors[:, :3]], axis=1)

@@ -27,7 +27,9 @@ def figures(found: Results) -> tuple[Figure, ...]:
     histories = []
     for freedoms, algorithms in ((6, (LS, RE, TSVD)), (5, (RE, TSVD))):
         case = found.case("RU-PUS-PRS", freedoms)
-        histories += [_history(case, algorithm, unit) for algorithm in algorithms for unit in ("mm", "rad")]
+        histories += [
+            _history(case, algorithm, unit) for algorithm in algorithms for unit in ("mm", "rad")
+        ]
     return (*medians, *curves, *histories, _steps(found))
 
 
@@ -36,14 +38,18 @@ def _curve(case: Case, algorithm: str) -> Figure:
     sweep = case.ridge if algorithm == RE else case.truncated
     there = ~sweep.runs.diverged
     x = tuple(map(float, sweep.settings[there]))
-    series = tuple(Series(label, x, tuple(map(float, sweep.errors[there, i]))) for i, label in enumerate((POSITION, ANGLE)))
+    series = tuple(
+        Series(label, x, tuple(map(float, sweep.errors[there, i])))
+        for i, label in enumerate((POSITION, ANGLE))
+    )
     number, part = NUMBERS[case.study.name, case.study.freedoms], "a" if algorithm == RE else "b"
     best = case.answers[algorithm]
     prior = case.answers[PRIOR].errors
     lost = "" if there.all() else f" Diverged: {int((~there).sum())} settings, not drawn."
     return Figure(
         f"figure_{number}{part}", f"Figure {number}({part}): {algorithm}, {case.name}", SETTING[algorithm], ERRORS,
-        f"One machine with our dimensions, 36 poses measured with the noise of Appendix 1, errors over 96 poses. Bottom:"
+        "One machine with our dimensions, 36 poses measured with the noise of Appendix 1, errors "
+        "over 96 poses. Bottom:"
         f" {best.setting}.{lost} Dashed: MAP, without any setting.", series,
         {f"MAP, {POSITION}": float(prior[0]), f"MAP, {ANGLE}": float(prior[1])}, "xy" if algorithm == RE else "y",
     )  # fmt: skip
@@ -55,12 +61,16 @@ def _medians(drawn: Draws, algorithm: str) -> Figure:
     curve = drawn.curve(algorithm)[-len(settings) :]
     there = np.isfinite(curve).all(axis=1)
     x = tuple(map(float, np.asarray(settings, dtype=np.float64)[there]))
-    series = tuple(Series(label, x, tuple(map(float, curve[there, i]))) for i, label in enumerate((POSITION, ANGLE)))
+    series = tuple(
+        Series(label, x, tuple(map(float, curve[there, i])))
+        for i, label in enumerate((POSITION, ANGLE))
+    )
     prior = drawn.median(PRIOR)
     return Figure(
         f"medians_{drawn.name.lower().replace('-', '_')}_{algorithm.lower()}",
         f"{algorithm}, {drawn.name}, 6-DOF: medians over machines", SETTING[algorithm], ERRORS,
-        f"Medians over {len(drawn)} drawn machines and noises, errors over 96 poses each. Dashed: MAP, without any setting.",
+        f"Medians over {len(drawn)} drawn machines and noises, errors over 96 poses each. Dashed: "
+        "MAP, without any setting.",
         series, {f"MAP, {POSITION}": float(prior[0]), f"MAP, {ANGLE}": float(prior[1])}, "xy" if algorithm == RE else "y",
     )  # fmt: skip
 
@@ -74,16 +84,22 @@ def _history(case: Case, algorithm: str, unit: str) -> Figure:
     values = history(case, algorithm)
     k = tuple(float(i) for i in range(len(values)))
     series = [
-        Series(robot.parameters.names[i] if i in named else f"_{robot.parameters.names[i]}", k, tuple(map(float, values[:, i])))
+        Series(
+            robot.parameters.names[i] if i in named else f"_{robot.parameters.names[i]}",
+            k,
+            tuple(map(float, values[:, i])),
+        )
         for i in (*named, *(i for i in chosen if i not in named))
     ]  # matplotlib leaves a label that begins with _ out of the legend
     number = HISTORIES[case.study.freedoms]
     what = "lengths" if unit == "mm" else "angles"
     setting = "" if algorithm == LS else f" ({case.answers[algorithm].setting})"
     return Figure(
-        f"figure_{number}_{algorithm.lower()}_{what}", f"Figure {number}: {algorithm}{setting}, {what}", "iteration [1]",
+        f"figure_{number}_{algorithm.lower()}_{what}", f"Figure {number}: {algorithm}{setting}, "
+                                                       f"{what}", "iteration [1]",
         f"identified error [{unit}]",
-        f"{case.name}: {len(chosen)} of {len(robot.parameters)} parameters; named are the {len(named)} largest. All numbers:"
+        f"{case.name}: {len(chosen)} of {len(robot.parameters)} parameters; named are the "
+        f"{len(named)} largest. All numbers:"
         f" tables/history_{file_name(case)}.csv.", tuple(series), log="",
     )  # fmt: skip
 

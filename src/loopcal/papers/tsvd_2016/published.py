@@ -9,8 +9,8 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
-from loopcal.linalg import FloatArray
 from loopcal.papers.printed import Printed
+from loopcal.typing import FloatArray
 
 MM = 1e-3
 NOISE_COLUMNS = ("X [mm]", "Y [mm]", "Z [mm]", "phi [rad]", "theta [rad]", "psi [rad]")
@@ -44,9 +44,11 @@ class Published:
 @cache
 def published() -> Published:
     """Read published.yaml."""
-    from loopcal.io.yaml_file import read_yaml
+    from loopcal.io.core.yaml_file import read_yaml
 
-    content: dict[str, Any] = read_yaml(Path(__file__).with_name("published.yaml"), "file of published numbers").content
+    content: dict[str, Any] = read_yaml(
+        Path(__file__).with_name("published.yaml"), "file of published numbers"
+    ).content
     return Published(
         source=content["source"],
         noise=Printed.parse(content["appendix_1"]),

@@ -11,9 +11,10 @@
  8 e + de; again from step 5 unless |de| is small     `iterate`
  9 save e
 
-Raw numbers as in the paper: millimetres and radians, every equation and every parameter of weight one, and the filter acts
-on the step. With H = U S V' and s_i = S_ii the step is de = sum f_i (u_i'D / s_i) v_i, where f_i = 1 for LS,
-s_i^2 / (s_i^2 + lambda) for RE, and 1 for i <= k, else 0, for TSVD.
+Raw numbers as in the paper: millimetres and radians, every equation and every parameter of weight
+one, and the filter acts on the step. With H = U S V' and s_i = S_ii the step is de = sum f_i (u_i'D
+/ s_i) v_i, where f_i = 1 for LS, s_i^2 / (s_i^2 + lambda) for RE, and 1 for i <= k, else 0, for
+TSVD.
 """
 
 from __future__ import annotations
@@ -23,15 +24,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal import engine
-from loopcal.linalg import Decomposition, FloatArray, IntArray, decompose, empty_factor
 from loopcal.mechanism import Mechanism, Status
-from loopcal.mechanism.trials import forward_trials, sensitivity
+from loopcal.mechanism.batch_kinematics import forward_trials, sensitivity
+from loopcal.numerics.decomposition import Decomposition, decompose, empty_factor
 from loopcal.papers.tsvd_2016.published import MM
 from loopcal.papers.tsvd_2016.study import Study
+from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
 ENOUGH = 1e-6
-"""Largest component of a step [mm, rad] at which the iteration ends; the paper's is not in our text."""
+"""Largest component of a step [mm, rad] at which the iteration ends; the paper's is not in our
+text.
+"""
 
 LIMIT = 20
 """Iterations at most; ridge steps shorten slowly."""
@@ -47,7 +51,8 @@ class Iterations:
     Attributes
     ----------
     values : (t, p) identified parameters [SI], NaN where diverged. history : (k + 1, t, p) [SI].
-    steps : (k, t) largest component of each step [mm, rad], NaN after the end. count : (t,) iterations done.
+    steps : (k, t) largest component of each step [mm, rad], NaN after the end. count : (t,)
+        iterations done.
     converged, diverged : (t,); neither: `LIMIT` was met. machine : (t,) as given.
     """
 
@@ -75,7 +80,9 @@ def truncated(k: IntArray, parameters: int) -> FloatArray:
     return np.where(np.arange(parameters) < np.asarray(k)[:, None], 0.0, np.inf)
 
 
-def iterate(study: Study, penalty: FloatArray, machine: IntArray | None = None, limit: int = LIMIT) -> Iterations:
+def iterate(
+    study: Study, penalty: FloatArray, machine: IntArray | None = None, limit: int = LIMIT
+) -> Iterations:
     """Steps 5 to 9.
 
     Parameters
@@ -104,10 +111,14 @@ def iterate(study: Study, penalty: FloatArray, machine: IntArray | None = None, 
         steps.append(np.full(t, np.nan))
         steps[-1][active] = size
     final = np.where(diverged[:, None], np.nan, values)
-    return Iterations(final, np.stack(history), np.stack(steps), count, ~running & ~diverged, diverged, machine)
+    return Iterations(
+        final, np.stack(history), np.stack(steps), count, ~running & ~diverged, diverged, machine
+    )
 
 
-def linearised(study: Study, values: FloatArray, machine: IntArray) -> tuple[Decomposition, np.ndarray]:
+def linearised(
+    study: Study, values: FloatArray, machine: IntArray
+) -> tuple[Decomposition, np.ndarray]:
     """Steps 5 and 6 and the decomposition of H, and which of the settings (a,) reach all poses.
 
     Parameters
@@ -121,9 +132,14 @@ def linearised(study: Study, values: FloatArray, machine: IntArray) -> tuple[Dec
     state = forward_trials(robot, at, readings, study.commanded)
     reached = (state.status == Status.CONVERGED).all(axis=1)
     T = np.where(reached[:, None, None, None], state.T, np.eye(4))
-    D = np.where(reached[:, None, None, None], sensitivity(robot, at, readings, state).parameters, 0.0) * units(robot)
+    D = np.where(
+        reached[:, None, None, None], sensitivity(robot, at, readings, state).parameters, 0.0
+    ) * units(robot)
     if shared:
-        T, reached = np.broadcast_to(T, (len(values), *T.shape[1:])), np.broadcast_to(reached, len(values))
+        T, reached = (
+            np.broadcast_to(T, (len(values), *T.shape[1:])),
+            np.broadcast_to(reached, len(values)),
+        )
     seen = kind.evaluate(T, measured[machine])
     raw = np.where([c.dimension is Dimension.LENGTH for c in kind.columns], 1.0 / MM, 1.0)
     H = np.matmul(seen.jacobian * raw[:, None], D)

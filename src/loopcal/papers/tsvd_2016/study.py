@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is given: machines, poses to measure, errors to find, noise, and the range over which output errors are taken.
+"""What is given: machines, poses to measure, errors to find, noise, and the range over which output
+errors are taken.
 
-Dimensions, poses, true errors and output range are ours: the paper's Tables 1 to 4 are not in our text. Its noise is
-(Appendix 1). Poses are written as the paper does, x, y, z, phi, theta, psi with tilt and torsion.
+Dimensions, poses, true errors and output range are ours: the paper's Tables 1 to 4 are not in our
+text. Its noise is (Appendix 1). Poses are written as the paper does, x, y, z, phi, theta, psi with
+tilt and torsion.
 """
 
 from __future__ import annotations
@@ -12,13 +14,22 @@ from functools import cached_property
 
 import numpy as np
 
-from loopcal import se3
+from loopcal import geometry
 from loopcal.engine import State
-from loopcal.linalg import FloatArray, IntArray
-from loopcal.measure import Component, Instrument, Noise, Sensor, Trials, Uniform, simulate_trials, stream
+from loopcal.measure import (
+    Component,
+    Instrument,
+    Noise,
+    Sensor,
+    Trials,
+    Uniform,
+    simulate_trials,
+    stream,
+)
 from loopcal.mechanism import Mechanism, Solution, inverse
-from loopcal.mechanism.trials import forward_trials
+from loopcal.mechanism.batch_kinematics import forward_trials
 from loopcal.papers.tsvd_2016.published import MM, published
+from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
 ROBOTS = {"RU-PUS-PRS": "ru-pus-prs", "3-PRS": "3-prs"}
@@ -35,7 +46,12 @@ HEIGHTS = (0.65, 0.7, 0.75)
 """Of measured poses and output range [m], where z is free."""
 LIMITS = np.array([0.01e-3] * 3 + [np.deg2rad(0.01)] * 3)
 """Of the noise [m, rad], as Appendix 1 shows."""
-MEASURES = ("position [mm]", "phi and theta [deg]", "direction of the normal [deg]", "parameters [tolerances]")
+MEASURES = (
+    "position [mm]",
+    "phi and theta [deg]",
+    "direction of the normal [deg]",
+    "parameters [tolerances]",
+)
 ERRORS = 3  # purpose of a random stream
 
 
@@ -62,7 +78,8 @@ class Study:
 
     Attributes
     ----------
-    name : of the structure in the paper. robot : as designed. trials : true machines and what was measured of them.
+    name : of the structure in the paper. robot : as designed. trials : true machines and what was
+        measured of them.
     """
 
     name: str
@@ -88,8 +105,12 @@ class Study:
 
     @cached_property
     def commanded(self) -> State:
-        """Where the machine as designed stands at the readings, (1, 36): from there corrected machines are solved."""
-        return forward_trials(self.robot, self.robot.parameters.nominal[None], self.trials.readings[None])
+        """Where the machine as designed stands at the readings, (1, 36): from there corrected
+        machines are solved.
+        """
+        return forward_trials(
+            self.robot, self.robot.parameters.nominal[None], self.trials.readings[None]
+        )
 
     @cached_property
     def grid(self) -> Solution:
@@ -105,25 +126,36 @@ class Study:
         return forward_trials(self.robot, values, self.grid.q[None], self.grid.state).T
 
     def output_errors(self, values: FloatArray, machine: IntArray | None = None) -> FloatArray:
-        """Differences of predicted from true poses over the output range at equal readings, and of the parameters.
+        """Differences of predicted from true poses over the output range at equal readings, and of
+        the parameters.
 
         Parameters
         ----------
-        values : (a, p) identified [SI]; NaN rows give NaN. machine : (a,) of which machine; default: one row each.
+        values : (a, p) identified [SI]; NaN rows give NaN. machine : (a,) of which machine;
+            default: one row each.
 
         Returns
         -------
-        errors : (a, 4) root mean squares, see MEASURES. psi counts in none of them: the paper holds it unnecessary.
+        errors : (a, 4) root mean squares, see MEASURES. psi counts in none of them: the paper holds
+            it unnecessary.
         """
         found = np.isfinite(values).all(axis=1, keepdims=True)
         machine = np.arange(len(values)) if machine is None else machine
-        T, true = self._outputs(np.where(found, values, self.robot.values)), self.true_outputs[machine]
+        T, true = (
+            self._outputs(np.where(found, values, self.robot.values)),
+            self.true_outputs[machine],
+        )
         position = np.sum((T[..., :3, 3] - true[..., :3, 3]) ** 2, axis=-1) / MM**2
-        first, second = (se3.matrix_to_tilt_torsion(x[..., :3, :3]) for x in (T, true))
-        angles = sum(np.rad2deg(se3.wrap(a - b)) ** 2 for a, b in zip(first[:2], second[:2], strict=True))
+        first, second = (geometry.matrix_to_tilt_torsion(x[..., :3, :3]) for x in (T, true))
+        angles = sum(
+            np.rad2deg(geometry.wrap(a - b)) ** 2
+            for a, b in zip(first[:2], second[:2], strict=True)
+        )
         normal = np.rad2deg(1.0) ** 2 * np.sum((T[..., :3, 2] - true[..., :3, 2]) ** 2, axis=-1)
         parameters = ((values - self.trials.truth[machine]) / self.robot.parameters.tolerance) ** 2
-        squares = [np.asarray(square).mean(axis=1) for square in (position, angles, normal, parameters)]
+        squares = [
+            np.asarray(square).mean(axis=1) for square in (position, angles, normal, parameters)
+        ]
         return np.where(found, np.sqrt(np.stack(squares, axis=1)), np.nan)
 
 
@@ -132,11 +164,16 @@ def study(name: str, truth: FloatArray, noise: Noise | None = None, seed: int = 
 
     Parameters
     ----------
-    name : one of ROBOTS. truth : (t, p) [SI]. noise : default drawn within +-0.01 mm and +-0.01 deg. seed : of the noise.
+    name : one of ROBOTS. truth : (t, p) [SI]. noise : default drawn within +-0.01 mm and +-0.01
+        deg. seed : of the noise.
     """
     robot = machine(name)
-    instrument = Instrument((Sensor(Component(COLUMNS, "tilt-torsion"), Uniform(LIMITS) if noise is None else noise),))
-    return Study(name, robot, simulate_trials(robot, truth, measured_poses(robot), instrument, seed))
+    instrument = Instrument(
+        (Sensor(Component(COLUMNS, "tilt-torsion"), Uniform(LIMITS) if noise is None else noise),)
+    )
+    return Study(
+        name, robot, simulate_trials(robot, truth, measured_poses(robot), instrument, seed)
+    )
 
 
 def machine(name: str) -> Mechanism:
@@ -147,14 +184,18 @@ def machine(name: str) -> Mechanism:
 
 
 def measured_poses(robot: Mechanism) -> FloatArray:
-    """(36, c) controlled coordinates [m, rad]: 12 azimuths at tilts of 10, 20 and 30 degrees; z in turn where it is free."""
+    """(36, c) controlled coordinates [m, rad]: 12 azimuths at tilts of 10, 20 and 30 degrees; z in
+    turn where it is free.
+    """
     phi, theta = (g.ravel() for g in np.meshgrid(np.arange(AZIMUTHS) * 360.0 / AZIMUTHS, TILTS))
     i = np.arange(len(phi))
     return _coordinates(robot, phi, theta, np.array(HEIGHTS)[(i // AZIMUTHS + i) % 3])
 
 
 def output_range(robot: Mechanism) -> FloatArray:
-    """(96, c) controlled coordinates [m, rad]: tilts of 5 to 35 degrees at azimuths between the measured ones too."""
+    """(96, c) controlled coordinates [m, rad]: tilts of 5 to 35 degrees at azimuths between the
+    measured ones too.
+    """
     heights = HEIGHTS if "z" in robot.controlled else (0.0,)
     count = EVALUATED // (len(EVALUATED_TILTS) * len(heights))
     phi, theta, z = np.meshgrid(np.arange(count) * 360.0 / count, EVALUATED_TILTS, heights)
@@ -162,9 +203,13 @@ def output_range(robot: Mechanism) -> FloatArray:
 
 
 def true_values(robot: Mechanism, trials: int, seed: int) -> FloatArray:
-    """(t, p) [SI] nominal values with errors of a drawn size and sign; machine i is the same however many there are."""
+    """(t, p) [SI] nominal values with errors of a drawn size and sign; machine i is the same
+    however many there are.
+    """
     table = robot.parameters
-    low, high = np.array([LENGTH_ERRORS if d is Dimension.LENGTH else ANGLE_ERRORS for d in table.dimensions]).T
+    low, high = np.array(
+        [LENGTH_ERRORS if d is Dimension.LENGTH else ANGLE_ERRORS for d in table.dimensions]
+    ).T
     values = []
     for trial in range(trials):
         drawn = stream(seed, trial, ERRORS)
@@ -174,7 +219,7 @@ def true_values(robot: Mechanism, trials: int, seed: int) -> FloatArray:
 
 
 def _coordinates(robot: Mechanism, phi: FloatArray, theta: FloatArray, z: FloatArray) -> FloatArray:
-    given = {"phi": se3.wrap(np.deg2rad(phi)), "theta": np.deg2rad(theta), "z": z}
+    given = {"phi": geometry.wrap(np.deg2rad(phi)), "theta": np.deg2rad(theta), "z": z}
     return np.column_stack([given[name] for name in robot.controlled])
 
 

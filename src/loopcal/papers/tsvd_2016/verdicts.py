@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What agrees with the paper and what does not, and why: each sentence is made from the numbers of this run."""
+"""What agrees with the paper and what does not, and why: each sentence is made from the numbers of
+this run.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from loopcal.linalg import FloatArray
 from loopcal.papers.reproduction import ASKED_HERE, Verdict
 from loopcal.papers.tsvd_2016.cases import CHOSEN, LS, PRIOR, RANKED, RE, TSVD, Answer, Case
 from loopcal.papers.tsvd_2016.cases import CROSS as CASE_CROSS
@@ -28,6 +29,7 @@ from loopcal.papers.tsvd_2016.published import MM, published
 from loopcal.papers.tsvd_2016.steps import units
 from loopcal.papers.tsvd_2016.study import LIMITS
 from loopcal.papers.tsvd_2016.tables import Results
+from loopcal.typing import FloatArray
 
 NEAR = 0.1
 """k close to the number of parameters: within this share of it."""
@@ -58,13 +60,17 @@ def _said(name: str, agrees: bool, why: str, claim: str | None = None) -> Verdic
 def _noise() -> Verdict:
     shares = published().noise_si / LIMITS
     largest, rms = np.abs(published().noise.values).max(axis=0), float(np.sqrt(np.mean(shares**2)))
-    spread = 3.0 * np.sqrt(4.0 / 45.0 / shares.size) / (2.0 / np.sqrt(3.0))  # three standard deviations of such an rms
+    spread = (
+        3.0 * np.sqrt(4.0 / 45.0 / shares.size) / (2.0 / np.sqrt(3.0))
+    )  # three standard deviations of such an rms
     fits = bool(np.abs(shares).max() <= 1.0 and abs(rms - 1.0 / np.sqrt(3.0)) < spread)
     return Verdict(
         "Appendix 1 is uniform noise within +-0.01 mm and +-0.01 deg.",
         fits,
-        f"Its {shares.size} numbers reach {largest[:3].max():.6f} mm and {largest[3:].max():.6f} rad"
-        f" ({np.rad2deg(largest[3:].max()):.4f} deg); their rms is {rms:.3f} of the limit, that of uniform noise 0.577.",
+        f"Its {shares.size} numbers reach {largest[:3].max():.6f} mm and {largest[3:].max():.6f} "
+        "rad"
+        f" ({np.rad2deg(largest[3:].max()):.4f} deg); their rms is {rms:.3f} of the limit, that of "
+        "uniform noise 0.577.",
         ASKED_HERE,
     )
 
@@ -77,7 +83,11 @@ def _curves(found: Results) -> list[Verdict]:
         for i, error in enumerate(("position", "angle")):
             inside = {algorithm: interior(drawn.curve(algorithm)[:, i]) for algorithm in (RE, TSVD)}
             words = f"{_shape(drawn, RE, i)}; {_shape(drawn, TSVD, i)}."
-            made.append(_said("u_shape", all(inside.values()), words, f"{claim} Here: {drawn.name}, {error}."))
+            made.append(
+                _said(
+                    "u_shape", all(inside.values()), words, f"{claim} Here: {drawn.name}, {error}."
+                )
+            )
     return made
 
 
@@ -101,8 +111,10 @@ def _better(found: Results) -> Verdict:
         gains.append(f"{drawn.name} RE {_pair(ratio[0])}, TSVD {_pair(ratio[1])}{lost}")
     return _said(
         "slightly_better", agrees,
-        f"Medians over {len(found.draws[0])} machines, as parts of LS (position, angle), at lambda and k chosen for each"
-        f" machine by its true error: {'; '.join(gains)}. So large a gain is there because raw units leave LS worse than it"
+        f"Medians over {len(found.draws[0])} machines, as parts of LS (position, angle), at lambda "
+        "and k chosen for each"
+        f" machine by its true error: {'; '.join(gains)}. So large a gain is there because raw "
+        "units leave LS worse than it"
         " need be: see whitened LS.",
     )  # fmt: skip
 
@@ -111,19 +123,27 @@ def _best(found: Results) -> Verdict:
     rows, agrees = [], True
     for case in found.cases:
         raw, prior = [case.answers[m].errors for m in (RE, TSVD)], case.answers[PRIOR].errors
-        others = [raw[0], prior] + ([case.answers[LS].errors] if not case.answers[LS].diverged else [])
+        others = [raw[0], prior] + (
+            [case.answers[LS].errors] if not case.answers[LS].diverged else []
+        )
         best = bool(all((raw[1][:2] <= other[:2]).all() for other in others))
         agrees &= best
-        rows.append(f"{case.name}: TSVD {_errors(raw[1])}, RE {_errors(raw[0])}, MAP {_errors(prior)}")
-    return _said("tsvd_best", agrees, f"One machine each, the noise of Appendix 1. {'; '.join(rows)}.")
+        rows.append(
+            f"{case.name}: TSVD {_errors(raw[1])}, RE {_errors(raw[0])}, MAP {_errors(prior)}"
+        )
+    return _said(
+        "tsvd_best", agrees, f"One machine each, the noise of Appendix 1. {'; '.join(rows)}."
+    )
 
 
 def _five(found: Results) -> tuple[Verdict, ...]:
     fives = [case for case in found.cases if case.study.freedoms == 5]
     diverged = all(case.answers[LS].diverged for case in fives)
     nulls = "; ".join(
-        f"{case.study.name}: rank {case.rank} of {len(case.singular_values)}, singular value {case.singular_values[-1]:.0e}"
-        f" after {case.singular_values[-2]:.1e}, {' and '.join(map(str, case.known.unidentifiable))}"
+        f"{case.study.name}: rank {case.rank} of {len(case.singular_values)}, singular value "
+        f"{case.singular_values[-1]:.0e}"
+        f" after {case.singular_values[-2]:.1e}, "
+        f"{' and '.join(map(str, case.known.unidentifiable))}"
         for case in fives
     )
     steps = " and ".join(f"{case.normal_equations:.0e}" for case in fives)
@@ -133,24 +153,29 @@ def _five(found: Results) -> tuple[Verdict, ...]:
         as_good &= bool((five[:2] <= 1.1 * six[:2]).all())
         pairs.append(f"{case.study.name}: {_errors(five)}, with 6-DOF {_errors(six)}")
     many = "; ".join(
-        f"{d.name}: whitened LS {_errors(d.median(WHITENED_FIVE))} against {_errors(d.median(MANY_WHITENED))}, MAP"
+        f"{d.name}: whitened LS {_errors(d.median(WHITENED_FIVE))} against "
+        f"{_errors(d.median(MANY_WHITENED))}, MAP"
         f" {_errors(d.median(PRIOR_FIVE))}"
         for d in found.draws
     )
     return (
         _said(
             "ls_fails", diverged,
-            f"As printed, yes: the inverse of H'H asks for a first step of {steps} mm or rad, a number made of rounding. What"
-            f" fails is the formula. One combination of parameters changes nothing that is measured. {nulls}.",
+            f"As printed, yes: the inverse of H'H asks for a first step of {steps} mm or rad, a "
+            "number made of rounding. What"
+            " fails is the formula. One combination of parameters changes nothing that is "
+            f"measured. {nulls}.",
         ),
         Verdict(
             "LS cannot be used with 5-DOF measurement.", not as_good,
-            f"Leaving that one direction alone is enough, no lambda is needed: {'; '.join(pairs)} (one machine, Appendix 1)."
+            f"Leaving that one direction alone is enough, no lambda is needed: {'; '.join(pairs)} "
+            "(one machine, Appendix 1)."
             f" Over many machines {many}.", ASKED_HERE,
         ),
         _said(
             "no_solution", not as_good,
-            "A whole line of parameters reproduces what is measured equally well, the true ones among them but for the noise."
+            "A whole line of parameters reproduces what is measured equally well, the true ones "
+            "among them but for the noise."
             " Where on the line one stands changes psi alone, which is neither measured nor needed.",
         ),
         _six_better(found),
@@ -163,7 +188,9 @@ def _six_better(found: Results) -> Verdict:
         six, five = drawn.median(PRIOR)[3], drawn.median(PRIOR_FIVE)[3]
         agrees &= bool(five > six)
         raw = f"raw LS {drawn.median(RAW_LS)[3]:.2g} and {drawn.median(RAW_FIVE)[3]:.2g}"
-        words.append(f"{drawn.name} MAP {six:.3g} tolerances rms with six, {five:.3g} with five ({raw})")
+        words.append(
+            f"{drawn.name} MAP {six:.3g} tolerances rms with six, {five:.3g} with five ({raw})"
+        )
     why = f"Medians of parameter errors: {'; '.join(words)}. By little: psi tells one combination more."
     return _said("six_better", agrees, why)
 
@@ -176,7 +203,8 @@ def _deviate(found: Results) -> Verdict:
         lengths = units(case.study.robot) == MM
         errors = [np.abs(case.answers[m].values - true)[lengths].max() / MM for m in (LS, PRIOR)]
         agrees &= bool(errors[0] > 0.1)
-        words.append(f"{name}: LS misses one by {errors[0]:.2g} mm at a position error of {case.answers[LS].errors[0]:.2g} mm,"
+        words.append(f"{name}: LS misses one by {errors[0]:.2g} mm at a position error of "
+                     f"{case.answers[LS].errors[0]:.2g} mm,"
                      f" MAP by {errors[1]:.2g} mm at {case.answers[PRIOR].errors[0]:.2g} mm")  # fmt: skip
     return _said("deviate", agrees, f"True errors are 0.05 to 0.1 mm. {'; '.join(words)}.")
 
@@ -188,13 +216,16 @@ def _faster(found: Results) -> Verdict:
         re, tsvd = case.answers[RE], case.answers[TSVD]
         agrees &= tsvd.converged and tsvd.iterations <= min(ls.iterations, re.iterations)
         words.append(
-            f"{case.name}: LS {_needed(ls)}, RE {_needed(re)}, TSVD {_needed(tsvd)}, MAP {case.answers[PRIOR].iterations}"
+            f"{case.name}: LS {_needed(ls)}, RE {_needed(re)}, TSVD {_needed(tsvd)}, MAP "
+            f"{case.answers[PRIOR].iterations}"
         )
     return _said(
         "faster",
         agrees,
-        f"Iterations until no component of a step exceeds 1e-6 mm or rad: {'; '.join(words)} (LS with 5-DOF: with rank"
-        " detection). Dropping weak directions keeps the steps small and the problem nearly linear; RE repeats short steps.",
+        f"Iterations until no component of a step exceeds 1e-6 mm or rad: {'; '.join(words)} (LS "
+        "with 5-DOF: with rank"
+        " detection). Dropping weak directions keeps the steps small and the problem nearly "
+        "linear; RE repeats short steps.",
     )  # fmt: skip
 
 
@@ -203,29 +234,42 @@ def _lambda(found: Results) -> tuple[Verdict, ...]:
     within = all(1e-5 * 0.5 <= value <= 1.0 for value in best.values())
     words = ", ".join(f"{name} {value:.2g}" for name, value in best.items())
     wandering = ", ".join(f"{lam:.2g} after {count}" for count, lam, _ in found.steps)
-    chosen = ", ".join(f"{case.name} {case.answers[CASE_CROSS].setting.removesuffix(CHOSEN)}" for case in found.cases)
+    chosen = ", ".join(
+        f"{case.name} {case.answers[CASE_CROSS].setting.removesuffix(CHOSEN)}"
+        for case in found.cases
+    )
     ratios = [drawn.ratio(CROSS, RAW_RE)[:2] for drawn in found.draws]
-    parts = "; ".join(f"{drawn.name} {_pair(ratio)}" for drawn, ratio in zip(found.draws, ratios, strict=True))
+    parts = "; ".join(
+        f"{drawn.name} {_pair(ratio)}" for drawn, ratio in zip(found.draws, ratios, strict=True)
+    )
     return (
         _said(
             "lambda_range", within,
-            f"Bottoms found here: {words}. But lambda acts on each step, so that its best value wanders with the number of"
+            f"Bottoms found here: {words}. But lambda acts on each step, so that its best value "
+            "wanders with the number of"
             f" iterations (3-PRS, 6-DOF: {wandering}).",
         ),
         _said(
             "no_rule", bool(np.min(ratios) >= 1.0),
-            "With rows whitened, columns scaled by tolerance and the total deviation penalised lambda is 1 where noise and"
-            f" tolerances are known (MAP), and cross-validation finds it from the data alone: {chosen}. Errors with it, as"
+            "With rows whitened, columns scaled by tolerance and the total deviation penalised "
+            "lambda is 1 where noise and"
+            " tolerances are known (MAP), and cross-validation finds it from the data alone: "
+            f"{chosen}. Errors with it, as"
             f" parts of those of RE at its best: {parts}.",
         ),
     )  # fmt: skip
 
 
 def _near(found: Results) -> Verdict:
-    best = {case.name: (int(case.truncated.settings[case.truncated.best]), len(case.singular_values)) for case in found.cases}
+    best = {
+        case.name: (int(case.truncated.settings[case.truncated.best]), len(case.singular_values))
+        for case in found.cases
+    }
     agrees = all(p - NEAR * p <= k < p for k, p in best.values())
     words = ", ".join(f"{name} {k} of {p}" for name, (k, p) in best.items())
-    return _said("k_near_j", agrees, f"Bottoms: {words}. 'Close' is taken as within a tenth of that number.")
+    return _said(
+        "k_near_j", agrees, f"Bottoms: {words}. 'Close' is taken as within a tenth of that number."
+    )
 
 
 def _asked(found: Results) -> tuple[Verdict, ...]:
@@ -233,29 +277,39 @@ def _asked(found: Results) -> tuple[Verdict, ...]:
     tripod, tracker = found.drawn("3-PRS"), found.drawn("RU-PUS-PRS")
     raw = (RAW_LS, RAW_RE, RAW_TSVD)
     every = all((d.ratio(PRIOR, m)[:2] < 1.0).all() for d in (tripod, tracker) for m in raw)
-    near = bool((tripod.ratio(PRIOR, CROSS)[:2] < 1.05).all() and (tripod.ratio(PRIOR, HINDSIGHT)[:2] < 1.15).all())
+    near = bool(
+        (tripod.ratio(PRIOR, CROSS)[:2] < 1.05).all()
+        and (tripod.ratio(PRIOR, HINDSIGHT)[:2] < 1.15).all()
+    )
     parts = [d.ratio(MANY_WHITENED, RAW_LS)[1] for d in (tripod, tracker)]
     first = found.case("3-PRS", 6)
     return (
         Verdict(
             "Millimetres and radians may be mixed with weight one.", bool(min(parts) > 0.9),
-            f"Dividing rows by their noise alone, nothing else changed, makes the angle error of LS {_times(parts[0])}"
-            f" (3-PRS) and {_times(parts[1])} (RU-PUS-PRS) of the raw one. Angles in radians are small numbers and hardly"
-            f" count. Condition for the 3-PRS: {_raw(first):.0e} raw, {first.known.condition:.0e} whitened and scaled.",
+            "Dividing rows by their noise alone, nothing else changed, makes the angle error of "
+            f"LS {_times(parts[0])}"
+            f" (3-PRS) and {_times(parts[1])} (RU-PUS-PRS) of the raw one. Angles in radians are "
+            "small numbers and hardly"
+            f" count. Condition for the 3-PRS: {_raw(first):.0e} raw, {first.known.condition:.0e} "
+            "whitened and scaled.",
             ASKED_HERE,
         ),
         Verdict(
-            "MAP with the tolerances as prior is better than raw LS, RE and TSVD at their best, in position and in angle.",
+            "MAP with the tolerances as prior is better than raw LS, RE and TSVD at their best, in "
+            "position and in angle.",
             every,
             "; ".join(
-                f"{d.name}: MAP {_errors(d.median(PRIOR))}, raw LS {_errors(d.median(RAW_LS))}, best RE"
+                f"{d.name}: MAP {_errors(d.median(PRIOR))}, raw LS {_errors(d.median(RAW_LS))}, "
+                "best RE"
                 f" {_errors(d.median(RAW_RE))}, best TSVD {_errors(d.median(RAW_TSVD))}" for d in (tripod, tracker)
             ) + f" (medians over {len(tripod)} machines).", ASKED_HERE,
         ),
         Verdict(
-            "On the 3-PRS MAP is within 5 % of GCV and within 15 % of the best lambda that hindsight can choose.", near,
+            "On the 3-PRS MAP is within 5 % of GCV and within 15 % of the best lambda that "
+            "hindsight can choose.", near,
             f"Ratios of medians (position, angle): {_pair(tripod.ratio(PRIOR, CROSS)[:2])} and"
-            f" {_pair(tripod.ratio(PRIOR, HINDSIGHT)[:2])}; on the RU-PUS-PRS {_pair(tracker.ratio(PRIOR, CROSS)[:2])} and"
+            f" {_pair(tripod.ratio(PRIOR, HINDSIGHT)[:2])}; on the RU-PUS-PRS "
+            f"{_pair(tracker.ratio(PRIOR, CROSS)[:2])} and"
             f" {_pair(tracker.ratio(PRIOR, HINDSIGHT)[:2])}.", ASKED_HERE,
         ),
     )  # fmt: skip

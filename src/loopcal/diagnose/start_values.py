@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Was the robot calibrated to these measurements before the fit? What the fit gained over its
+start, against the noise.
+
+Where the start is the truth and the noise is what was stated, the gain chi_square(start) -
+chi_square(fit) has a chi-square distribution with as many degrees of freedom as directions were
+fitted. Where the noise is not stated, or the stated one does not explain what the fit leaves, the
+gain per direction over the residual per degree of freedom has an F distribution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from loopcal.estimate.result import Identification
+from loopcal.estimate.statistics import DOUBT, FEWEST_DEGREES
+
+NOTHING = 1e-3
+"""Share of the start's chi-square below which a gain is none: other rounding, the last digits of a
+file.
+"""
+
+
+class Start(Enum):
+    """What is known of the geometry from which a fit started."""
+
+    BEST = "best"
+    WITHIN_NOISE = "within noise"
+    NOT_CALIBRATED = "not calibrated"
+    OPEN = "open"
+
+
+@dataclass(frozen=True)
+class StartCheck:
+    """The geometry from which a fit started, against the measurements.
+
+    Attributes
+    ----------
+    verdict : see `Start`.
+    before, after : root mean square of the residuals in units of the stated sigma, of the start and
+        of the fit [1].
+    p_value : probability of such a gain where the start is the truth; NaN where it cannot be said.
+    sentence : what this means.
+    """
+
+    verdict: Start
+    before: float
+    after: float
+    p_value: float
+    sentence: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the attributes by name for JSON."""
+        return {**vars(self), "verdict": self.verdict.value}
+
+
+def start_check(fit: Identification) -> StartCheck:
+    """Compare the geometry from which a fit started with the fit, on the fitted measurements.
+
+    Parameters
+    ----------
+    fit : its start is the robot that was given (`initial`).
+
+    Returns
+    -------
+    StartCheck
+    """
+    first, last = float(fit.cost_history[0]), float(fit.cost_history[-1])
+    rows = sum(int(np.isfinite(r.raw).sum()) for r in fit.residuals)
+    before, after = np.sqrt(first / rows), np.sqrt(last / rows)
+    if not fit.converged:
+        sentence = "the robot file's geometry cannot be compared with a best fit: the iteration did not converge"
+        return StartCheck(Start.OPEN, before, after, float("nan"), sentence)
+    gain = max(first - last, 0.0)
+    if gain <= NOTHING * first:
+        return StartCheck(
+            Start.BEST,
+            before,
+            after,
+            1.0,
+            "the robot file's geometry is already the best fit to these rows",
+        )
+    p_value = _p_value(fit, gain, last)
+    ratio = (
+        f"its residuals are {before / after:.3g} times those of the fit"
+        if after > 0.0
+        else "the fit leaves no residual"
+    )
+    if p_value < DOUBT:
+        sentence = f"the robot file's geometry is NOT calibrated to these rows: {ratio}, which noise does not explain"
+        return StartCheck(Start.NOT_CALIBRATED, before, after, p_value, sentence)
+    if fit.dof < FEWEST_DEGREES and not _trusted(fit):
+        sentence = f"the robot file's geometry: {ratio}; whether noise explains that can only be said with its true sigma"
+        return StartCheck(Start.OPEN, before, after, p_value, sentence)
+    if fit.check.failed:
+        sentence = f"the robot file's geometry: {ratio}; neither fits the stated noise, so which is better cannot be said"
+        return StartCheck(Start.OPEN, before, after, p_value, sentence)
+    sentence = f"the robot file's geometry is as good as the fit within the noise ({ratio})"
+    return StartCheck(Start.WITHIN_NOISE, before, after, p_value, sentence)
+
+
+def _trusted(fit: Identification) -> bool:
+    """Whether the noise is stated, and explains what the fit leaves (or nothing is left to tell)."""
+    return fit.noise == "given" and not fit.check.failed
+
+
+def _p_value(fit: Identification, gain: float, last: float) -> float:
+    """Probability of a larger gain by noise alone: of the stated noise where it is trusted, else of
+    the residual's.
+    """
+    from scipy.special import chdtrc, fdtrc
+
+    if _trusted(fit):
+        return float(chdtrc(fit.rank, gain))
+    if fit.dof < 1.0 or last <= 0.0:
+        return float("nan")
+    return float(fdtrc(fit.rank, fit.dof, gain / fit.rank / (last / fit.dof)))

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An earlier calibration as the prior of the next one: its whitened rows, appended to the factor of
+the new rows.
+
+A posterior e ~ N(mean, C), C = diag(unit) V diag(var) V' diag(unit), is the rows B (e - mean) of
+unit variance with B = diag(var)^(-1/2) V^-1 diag(1 / unit); a direction of infinite variance has no
+row. Least squares over these and the new rows is the estimate from both calibrations together. A
+limb that was repaired is freed by eliminating its columns from B (an orthogonal reduction, which is
+the marginal distribution of the others). V is well conditioned (orthonormal, if no parameter is
+exempt from a prior); J'J and C are never inverted. See docs/theory/uncertainty.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from loopcal import engine
+from loopcal.errors import EstimationError, nearest
+from loopcal.estimate.posteriors import Posterior
+from loopcal.estimate.rows import AnyRows
+from loopcal.mechanism import Mechanism
+from loopcal.numerics.decomposition import RANK_TOLERANCE
+from loopcal.typing import FloatArray, IntArray
+
+PARALLEL = 1e-2
+"""Sine of the angle up to which two null directions are one and the same, seen from two estimates.
+"""
+
+ELIMINATED = 1e-11
+"""Share of the largest singular value below which an eliminated column counts as dependent on the
+others.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Rows B (e - mean) of independent errors of unit variance.
+
+    Attributes
+    ----------
+    names : (p,) parameters. mean, unit : (p,) [SI], `unit` makes columns comparable. rows : (r, p)
+        B [1 / SI].
+    """
+
+    names: tuple[str, ...]
+    mean: FloatArray
+    unit: FloatArray
+    rows: FloatArray
+
+    def added(self, rows: AnyRows) -> WithPrior:
+        """Return the problem of these rows and the prior's, as the descent sees it."""
+        return WithPrior(rows, self)
+
+    def without(self, names: Sequence[str]) -> Prior:
+        """Return what this prior says of the other parameters when nothing is said of these."""
+        gone = np.isin(self.names, names)
+        u, s, _ = np.linalg.svd((self.rows * self.unit)[:, gone], full_matrices=True)
+        rank = int((s > ELIMINATED * s[0]).sum()) if len(s) else 0
+        rows = u[:, rank:].T @ self.rows
+        rows[:, gone] = 0.0
+        return replace(self, rows=rows)
+
+    def toleranced(self, names: Sequence[str], mean: FloatArray, tolerance: FloatArray) -> Prior:
+        """Return this prior with independent rows (e - mean) / tolerance for some parameters it
+        says nothing of.
+        """
+        places = [self.names.index(name) for name in names]
+        more, centre = np.zeros((len(names), len(self.names))), self.mean.copy()
+        more[np.arange(len(names)), places] = 1.0 / tolerance
+        centre[places] = mean
+        return Prior(self.names, centre, self.unit, np.concatenate([self.rows, more]))
+
+
+class WithPrior:
+    """Rows of measurements followed by those of a prior; a `Problem` of the descent.
+
+    What neither calibration can tell must stay unknown. Both see the same null direction, but each
+    as it is at its own linearisation; the small angle between the two would pass for knowledge.
+    Null directions of the measured rows that are parallel to one of the prior's are therefore taken
+    out of the prior's rows.
+    """
+
+    def __init__(self, rows: AnyRows, prior: Prior) -> None:
+        unknowns = rows.unknowns
+        table = unknowns.robot.parameters
+        places = np.array([table.index(name) for name in prior.names], dtype=np.int64)
+        B = np.zeros((len(prior.rows), len(table)))
+        B[:, places] = prior.rows
+        mean = unknowns.robot.values.copy()
+        mean[places] = prior.mean
+        self.measured = rows
+        self.parameters = rows.parameters
+        self.slope = B[:, unknowns.places] * unknowns.tolerance
+        self.centre = unknowns.deviation(mean[None])
+        # parameters that are not free any more contribute what they differ from the mean
+        self.constant = B @ (unknowns.values(self.centre)[0] - mean)
+        self.open = np.linalg.svd(self.slope, full_matrices=True)[2][len(B) :].T
+        self.added = len(B)
+
+    @property
+    def rows(self) -> IntArray:
+        """(t,) equations of the measurements, as the last fold counted them, and of the prior."""
+        return self.measured.rows + self.added
+
+    def fold(self, deviation: FloatArray, trials: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return factor and sum of squares of all rows, see `Problem.fold`."""
+        factor, cost = self.measured.fold(deviation, trials)
+        if not len(self.slope):
+            return factor, cost
+        slope = np.broadcast_to(self.slope, (len(trials), *self.slope.shape))
+        if self.open.shape[1]:
+            slope = np.stack([self._consistent(triangle) for triangle in factor[:, :-1, :-1]])
+        residual = np.matmul(slope, (deviation - self.centre)[..., None])[..., 0] + self.constant
+        rows = np.concatenate([slope, residual[..., None]], axis=2)
+        return engine.accumulate(factor, rows), cost + (residual**2).sum(axis=1)
+
+    def _consistent(self, triangle: FloatArray) -> FloatArray:
+        """The prior's rows without the null directions (p, d) of measured rows that it does not
+        know either.
+        """
+        if not np.isfinite(triangle).all():
+            return self.slope
+        _, s, vt = np.linalg.svd(triangle)
+        null = vt[s <= RANK_TOLERANCE * s[0]].T
+        outside = null - self.open @ (self.open.T @ null)
+        _, sine, combine = np.linalg.svd(outside, full_matrices=True)
+        sine = np.r_[sine, np.zeros(len(combine) - len(sine))]
+        common = null @ combine[sine < PARALLEL].T
+        return self.slope - (self.slope @ common) @ common.T
+
+
+def prior_from(earlier: Posterior) -> Prior:
+    """Return an earlier calibration as a prior: a full Gaussian over all directions that it knows.
+
+    Raises
+    ------
+    EstimationError
+        The earlier calibration gives no intervals.
+    """
+    if np.isnan(earlier.variance).any():
+        raise EstimationError(
+            "the earlier calibration gives no uncertainty (it did not converge, or too few degrees "
+            "of freedom tell its noise),"
+            " so it cannot be a prior; make it again until it converges, with the instrument's "
+            "sigma"
+        )
+    known = np.isfinite(earlier.variance)
+    rows = (
+        np.linalg.inv(earlier.directions)[known]
+        / np.sqrt(earlier.variance[known])[:, None]
+        / earlier.unit
+    )
+    return Prior(earlier.names, np.array(earlier.estimate), earlier.unit, rows)
+
+
+def limb_parameters(robot: Mechanism, limb: str) -> tuple[str, ...]:
+    """Return the free parameters of a limb, those whose names begin with its name and a point.
+
+    Raises
+    ------
+    EstimationError
+        No free parameter belongs to it; with the names that there are.
+    """
+    free = [p.name for p in robot.parameters.entries if p.free]
+    found = tuple(name for name in free if name.startswith(f"{limb}."))
+    if not found:
+        limbs = list(dict.fromkeys(name.split(".")[0] for name in free if "." in name))
+        raise EstimationError(
+            f"no free parameter of {robot.name} belongs to {limb!r}{nearest(limb, limbs)}; limbs "
+            "with free parameters are "
+            f"{', '.join(limbs)}"
+        )
+    return found

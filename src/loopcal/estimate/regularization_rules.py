@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rules that choose the ridge parameter or the truncation from the decomposition itself.
+
+Each rule is a small value, called with the decomposition, that minimises one criterion over a fixed
+grid, every trial on its own. With c_i = u_i'b, m equations and filter factors f_i:
+
+    GCV                 RSS / (m - sum f_i)^2            (generalised cross-validation)
+    MarginalLikelihood  sum_i log(1 + s_i^2 / lam) + c_i^2 / (1 + s_i^2 / lam)
+
+GCV needs no sigma; the marginal likelihood takes the rows as whitened by their true sigma. Golub,
+Heath, Wahba, "Generalized cross-validation as a method for choosing a good ridge parameter",
+Technometrics 21 (1979).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopcal.numerics.decomposition import Decomposition
+from loopcal.typing import FloatArray, IntArray
+
+PER_DECADE = 16
+"""Grid points per factor of ten; the criteria are flat to far less than this around their minimum.
+"""
+
+LOWEST, HIGHEST = 1e-12, 1e4
+"""Range of lam in units of the largest squared singular value: from no effect at all to hardly any
+data.
+"""
+
+
+@dataclass(frozen=True)
+class GCV:
+    """Ridge parameter that minimises generalised cross-validation."""
+
+    def __call__(self, decomposition: Decomposition) -> FloatArray:
+        """Return lam (t,)."""
+
+        def criterion(lam: FloatArray) -> FloatArray:
+            penalty = np.broadcast_to(lam[:, None], decomposition.singular_values.shape)
+            return _gcv(decomposition, penalty)
+
+        return _smallest(criterion, decomposition)
+
+
+@dataclass(frozen=True)
+class MarginalLikelihood:
+    """Ridge parameter under which the whitened data are most probable."""
+
+    def __call__(self, decomposition: Decomposition) -> FloatArray:
+        """Return lam (t,)."""
+        held = (
+            np.ones(1) if decomposition.flat is None else ~decomposition.flat
+        )  # flat directions tell nothing
+        square, projected = (
+            decomposition.singular_values**2 * held,
+            decomposition.projections**2 * held,
+        )
+
+        def criterion(lam: FloatArray) -> FloatArray:
+            variance = 1.0 + square / lam[:, None]
+            return (np.log(variance) + projected / variance).sum(axis=1)
+
+        return _smallest(criterion, decomposition)
+
+
+@dataclass(frozen=True)
+class TruncationGCV:
+    """Truncation k that minimises generalised cross-validation."""
+
+    def __call__(self, decomposition: Decomposition) -> IntArray:
+        """Return k (t,)."""
+        order = np.arange(decomposition.singular_values.shape[1])
+        used = decomposition.used
+        values = [
+            _gcv(decomposition, np.where((order < k) & used, 0.0, np.inf))
+            for k in range(len(order) + 1)
+        ]
+        return np.argmin(np.stack(values), axis=0)
+
+
+def _gcv(decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
+    """Generalised cross-validation (t,); infinite where no equation is left over."""
+    left = decomposition.rows - decomposition.filter_factors(penalty).sum(axis=1)
+    spare = left > 1e-6
+    return np.where(
+        spare, decomposition.remaining(penalty) / np.where(spare, left, 1.0) ** 2, np.inf
+    )
+
+
+def _smallest(
+    criterion: Callable[[FloatArray], FloatArray], decomposition: Decomposition
+) -> FloatArray:
+    """Minimise a criterion of lam (t,) over the grid, refined by the parabola through the best
+    three points.
+    """
+    reference = np.maximum(decomposition.singular_values[:, 0] ** 2, np.finfo(np.float64).tiny)
+    decades = np.log10(HIGHEST / LOWEST)
+    grid = np.linspace(np.log10(LOWEST), np.log10(HIGHEST), int(PER_DECADE * decades) + 1)
+    values = np.stack([criterion(reference * 10.0**g) for g in grid])
+    best = np.clip(np.argmin(values, axis=0), 1, len(grid) - 2)
+    trial = np.arange(values.shape[1])
+    low, middle, high = (values[best + shift, trial] for shift in (-1, 0, 1))
+    curvature = low - 2.0 * middle + high
+    with np.errstate(invalid="ignore"):
+        shift = np.where(
+            curvature > 0.0, 0.5 * (low - high) / np.where(curvature > 0.0, curvature, 1.0), 0.0
+        )
+    shift = np.clip(np.nan_to_num(shift), -1.0, 1.0)
+    return reference * 10.0 ** (grid[best] + shift * (grid[1] - grid[0]))

@@ -1,0 +1,314 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Three-angle descriptions of a rotation: the 24 Euler conventions, and tilt and torsion.
+
+Each comes as three functions: to a matrix, from a matrix, and `rates`, the matrix E with `omega = E
+d(angles)`. Order names follow scipy: lower case turns about fixed axes ("xyz": first about x, then
+y, then z of the base, `R = Rz Ry Rx`), upper case about the moving ones ("XYZ": `R = Rx Ry Rz`).
+Angles stand in the order of the letters.
+"""
+
+import numpy as np
+
+from loopcal.errors import DataError
+from loopcal.geometry.rotations import matrix
+from loopcal.typing import FloatArray
+
+_SEQUENCES = ("xyz", "yzx", "zxy", "xzy", "yxz", "zyx", "xyx", "xzx", "yxy", "yzy", "zxz", "zyz")
+EULER_ORDERS = _SEQUENCES + tuple(sequence.upper() for sequence in _SEQUENCES)
+
+# Below this cosine (or sine) of the middle angle [1], a few ulps, two axes are parallel and the
+# first angle is set to zero.
+_GIMBAL = 1e-15
+
+
+def wrap(angle: FloatArray | float) -> FloatArray:
+    """Angle moved by whole turns into (-pi, pi].
+
+    Parameters
+    ----------
+    angle : (...) [rad]
+
+    Returns
+    -------
+    wrapped : (...) [rad]
+    """
+    return np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
+
+
+def axis_rotation(angle: FloatArray | float, axis: int) -> FloatArray:
+    """Rotation about coordinate axis 0, 1 or 2.
+
+    Parameters
+    ----------
+    angle : (...) [rad]
+    axis : int
+
+    Returns
+    -------
+    rotation : (..., 3, 3)
+    """
+    c, s = np.cos(angle), np.sin(angle)
+    if axis == 0:
+        return matrix(((1.0, 0.0, 0.0), (0.0, c, -s), (0.0, s, c)))
+    if axis == 1:
+        return matrix(((c, 0.0, s), (0.0, 1.0, 0.0), (-s, 0.0, c)))
+    return matrix(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
+
+
+def _moving_axes(order: str) -> tuple[tuple[int, int, int], bool]:
+    """Axes as a moving sequence, and whether the angles have to be read backwards (fixed axes).
+
+    `Rz(c) Ry(b) Rx(a)` about fixed axes "xyz" is the same product as "ZYX" about moving ones.
+
+    Raises
+    ------
+    DataError
+        If the order is none of the 24.
+    """
+    if order not in EULER_ORDERS:
+        raise DataError(
+            f"the Euler order {order!r} is not one of the 24: use {', '.join(_SEQUENCES)} for "
+            "turns about fixed axes,"
+            " or the same in capitals for turns about the moving axes"
+        )
+    axes = tuple("xyz".index(letter) for letter in order.lower())
+    fixed = order.islower()
+    first, second, third = axes[::-1] if fixed else axes
+    return (first, second, third), fixed
+
+
+def euler_to_matrix(angles: FloatArray, order: str) -> FloatArray:
+    """Rotation of three Euler angles, e.g. `R = Rz(c) Ry(b) Rx(a)` for "xyz".
+
+    Parameters
+    ----------
+    angles : (..., 3) [rad]
+    order : str
+        One of `EULER_ORDERS`.
+
+    Returns
+    -------
+    rotation : (..., 3, 3)
+
+    Raises
+    ------
+    DataError
+        If the order is unknown.
+    """
+    axes, fixed = _moving_axes(order)
+    moving = angles[..., ::-1] if fixed else angles
+    first, second, third = (axis_rotation(moving[..., i], axis) for i, axis in enumerate(axes))
+    return first @ second @ third
+
+
+def matrix_to_euler(rotation: FloatArray, order: str) -> FloatArray:
+    """Euler angles of a rotation, the inverse of `euler_to_matrix`.
+
+    With `R = Ri(a1) Rj(a2) Rk(a3)` about moving axes, a1 and a2 come from arc tangents of entries
+    of R, and a3 from `Ri(a1)' R = Rj(a2) Rk(a3)`: so the angles give R back to rounding even where
+    the middle angle makes two axes parallel. There the first moving angle is zero.
+
+    Parameters
+    ----------
+    rotation : (..., 3, 3)
+    order : str
+        One of `EULER_ORDERS`.
+
+    Returns
+    -------
+    angles : (..., 3) [rad]
+        First and last in (-pi, pi]; the middle one in [-pi/2, pi/2] (three letters) or [0, pi]
+        (first letter repeated).
+
+    Raises
+    ------
+    DataError
+        If the order is unknown.
+    """
+    (i, j, last), fixed = _moving_axes(order)
+    k = 3 - i - j
+    sign = 1.0 if (j - i) % 3 == 1 else -1.0
+    if i == last:
+        sine, cosine, middle_cosine = (
+            rotation[..., j, i],
+            -sign * rotation[..., k, i],
+            rotation[..., i, i],
+        )
+        regular = np.hypot(sine, cosine)
+        second = np.arctan2(regular, middle_cosine)
+    else:
+        sine, cosine = -sign * rotation[..., j, k], rotation[..., k, k]
+        regular = np.hypot(sine, cosine)
+        second = np.arctan2(sign * rotation[..., i, k], regular)
+    first = np.where(regular > _GIMBAL, np.arctan2(sine, cosine), 0.0)
+    # Row j of Ri(a1)' R; the middle turn is about axis j and leaves this row to the last turn
+    # alone.
+    row = (
+        np.cos(first)[..., None] * rotation[..., j, :]
+        + (sign * np.sin(first))[..., None] * rotation[..., k, :]
+    )
+    third = np.arctan2(-sign * row[..., k] if i == last else sign * row[..., i], row[..., j])
+    return np.stack([third, second, first] if fixed else [first, second, third], axis=-1)
+
+
+def euler_rates(angles: FloatArray, order: str) -> FloatArray:
+    """Matrix E with `omega = E d(angles)`, omega in the axes the rotation maps to.
+
+    About moving axes the columns are `ei`, `Ri(a1) ej`, `Ri(a1) Rj(a2) ek`. Singular where two axes
+    are parallel.
+
+    Parameters
+    ----------
+    angles : (..., 3) [rad]
+    order : str
+        One of `EULER_ORDERS`.
+
+    Returns
+    -------
+    rates : (..., 3, 3)
+
+    Raises
+    ------
+    DataError
+        If the order is unknown.
+    """
+    (i, j, last), fixed = _moving_axes(order)
+    moving = angles[..., ::-1] if fixed else angles
+    turned = axis_rotation(moving[..., 0], i)
+    both = turned @ axis_rotation(moving[..., 1], j)
+    columns = [
+        np.broadcast_to(np.eye(3)[i], turned.shape[:-1]),
+        turned[..., :, j],
+        both[..., :, last],
+    ]
+    return np.stack(columns[::-1] if fixed else columns, axis=-1)
+
+
+def _nonzero(divisor: FloatArray) -> FloatArray:
+    """A divisor with exact zeros replaced, so that singular rows of a batch become huge and the
+    others stay right.
+    """
+    return np.where(divisor == 0.0, 1e-100, divisor)
+
+
+def tilt_torsion_to_matrix(
+    phi: FloatArray | float, theta: FloatArray | float, psi: FloatArray | float
+) -> FloatArray:
+    """Rotation of azimuth, tilt and torsion: `R = Rz(phi) Ry(theta) Rz(psi - phi)`.
+
+    The platform normal leans by theta towards the azimuth phi; psi turns about the normal.
+
+    Parameters
+    ----------
+    phi, theta, psi : (...) [rad]
+
+    Returns
+    -------
+    rotation : (..., 3, 3)
+
+    References
+    ----------
+    I. A. Bonev, J. Ryu, "A new approach to orientation workspace analysis of 6-DOF parallel
+    manipulators", DOI 10.1016/S0094-114X(00)00032-X.
+    """
+    return axis_rotation(phi, 2) @ axis_rotation(theta, 1) @ axis_rotation(psi - phi, 2)
+
+
+def matrix_to_tilt_torsion(rotation: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Azimuth, tilt and torsion of a rotation, the inverse of `tilt_torsion_to_matrix`.
+
+    At zero tilt phi is not defined and is given as zero; psi is defined there.
+
+    Parameters
+    ----------
+    rotation : (..., 3, 3)
+
+    Returns
+    -------
+    phi, theta, psi : (...) [rad]
+        phi and psi in (-pi, pi], theta in [0, pi].
+    """
+    angles = matrix_to_euler(rotation, "ZYZ")
+    phi, theta = angles[..., 0], angles[..., 1]
+    return phi, theta, wrap(phi + angles[..., 2])
+
+
+def euler_rates_inverse(angles: FloatArray, order: str) -> FloatArray:
+    """Matrix with `d(angles) = E^-1 omega`, the inverse of `euler_rates`; huge where two axes are
+    parallel.
+
+    The rows are cross products of the columns of E over its determinant, +-cos(a2) or +-sin(a2).
+
+    Parameters
+    ----------
+    angles : (..., 3) [rad]
+    order : str
+        One of `EULER_ORDERS`.
+
+    Returns
+    -------
+    inverse : (..., 3, 3)
+
+    Raises
+    ------
+    DataError
+        If the order is unknown.
+    """
+    rates = euler_rates(angles, order)
+    first, second, third = (rates[..., :, i] for i in range(3))
+    rows = np.stack(
+        [np.cross(second, third), np.cross(third, first), np.cross(first, second)], axis=-2
+    )
+    return rows / _nonzero(np.sum(rows[..., 0, :] * first, axis=-1))[..., None, None]
+
+
+def tilt_torsion_rates(
+    phi: FloatArray | float, theta: FloatArray | float, psi: FloatArray | float
+) -> FloatArray:
+    """Matrix E with `omega = E d(phi, theta, psi)`: columns `ez - R ez`, `Rz(phi) ey`, `R ez`.
+    Singular at zero tilt.
+
+    Parameters
+    ----------
+    phi, theta, psi : (...) [rad]
+        psi does not enter, since the torsion comes first; it is asked for so that all rates are
+        called alike.
+
+    Returns
+    -------
+    rates : (..., 3, 3)
+    """
+    cphi, sphi, ctheta, stheta = np.cos(phi), np.sin(phi), np.cos(theta), np.sin(theta)
+    nx, ny, nz = cphi * stheta, sphi * stheta, ctheta + 0.0 * psi
+    return matrix(((-nx, -sphi, nx), (-ny, cphi, ny), (1.0 - nz, 0.0, nz)))
+
+
+def tilt_torsion_rates_inverse(
+    phi: FloatArray | float, theta: FloatArray | float, psi: FloatArray | float
+) -> FloatArray:
+    """Matrix with `d(phi, theta, psi) = E^-1 omega`.
+
+    With the normal n and its derivative e in theta, which with `Rz(phi) ey` are three orthogonal
+    directions: `dphi = -e . omega / sin(theta)`, `dtheta = Rz(phi) ey . omega`, `dpsi = (n -
+    tan(theta/2) e) . omega`. The first row alone is huge at zero tilt.
+
+    Parameters
+    ----------
+    phi, theta, psi : (...) [rad]
+        psi does not enter, as in `tilt_torsion_rates`.
+
+    Returns
+    -------
+    inverse : (..., 3, 3)
+    """
+    cphi, sphi, ctheta, stheta = np.cos(phi), np.sin(phi), np.cos(theta), np.sin(theta)
+    half = np.tan(0.5 * theta) + 0.0 * psi
+    ex, ey, ez = cphi * ctheta, sphi * ctheta, -stheta
+    sine = _nonzero(stheta)
+    return matrix(
+        (
+            (-ex / sine, -ey / sine, -ez / sine),
+            (-sphi, cphi, 0.0),
+            (cphi * stheta - half * ex, sphi * stheta - half * ey, ctheta - half * ez),
+        )
+    )

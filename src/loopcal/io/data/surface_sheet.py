@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sheet and data file of points on planes and lines: here the readings are what is measured, and
+the gaps are zero.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from loopcal.io.core.csv_table import quoted
+from loopcal.io.data.measurement_writer import measurements_text
+from loopcal.io.data.pose_rows import dimension_of
+from loopcal.io.runs.plan_folder import DIGITS, VIA, unit_of
+from loopcal.mechanism.coordinates import POSITION
+from loopcal.units import Dimension
+
+if TYPE_CHECKING:
+    from loopcal.planning.surface_groups import SurfacePlan
+
+
+FREE = "free"
+"""Under hold: the foot of a group, which sets what the others are held to."""
+
+
+def surface_sheet_text(plan: SurfacePlan) -> str:
+    """Return the operator's sheet: each point with the coordinates to hold, how exactly, and the
+    nominal command.
+    """
+    robot = plan.robot
+    symbol, length = unit_of(robot, Dimension.LENGTH)
+    commanded = [unit_of(robot, dimension_of(name)) for name in robot.controlled]
+    reading = [unit_of(robot, actuator.dimension) for actuator in robot.actuators]
+    headers = [
+        "step",
+        "pose",
+        "group",
+        "role",
+        "hold",
+        f"tolerance [{symbol}]",
+        *(f"hold.{n} [{symbol}]" for n in POSITION),
+    ]
+    headers += [f"{name} [{s}]" for name, (s, _) in zip(robot.controlled, commanded, strict=True)]
+    headers += [f"{a.name} [{s}]" for a, (s, _) in zip(robot.actuators, reading, strict=True)]
+    lines = [
+        (
+            f"## Points of the tool of {robot.name}, in this order. p0 is free: go near to where "
+            "its "
+            "row says, stay there and"
+        ),
+        (
+            "## note where the measuring machine shows it. Every other point of its group is moved "
+            "until the coordinates under"
+        ),
+        (
+            "## hold agree with those noted of p0 within the tolerance; then the readings are "
+            "written "
+            "into the data file, those"
+        ),
+        (
+            "## of p0 into both of its rows alike, as it lies on the plane and on the line. "
+            "Numbers "
+            "are nominal, to go there by."
+        ),
+        ",".join(headers),
+    ]
+    factors = [factor for _, factor in (*commanded, *reading)]
+    u, k = plan.coordinates.shape[:2]
+    for g in range(u):
+        for i, role in enumerate(plan.roles(k)):
+            hold = plan.hold(g, i)
+            cells = [str(g * k + i + 1), plan.labels[g * k + i], f"group{g + 1}", role]
+            held, exactly = (
+                (" ".join(hold), f"{plan.sigma / length:.{DIGITS}g}") if i else (FREE, "")
+            )
+            cells += [held + (f" ({VIA} home)" if plan.via_home[g, i] else ""), exactly]
+            cells += [
+                f"{plan.held[g, 0, j] / length:.{DIGITS}g}" if n in hold else ""
+                for j, n in enumerate(POSITION)
+            ]
+            numbers = (*plan.coordinates[g, i], *plan.readings[g, i])
+            cells += [
+                f"{value / factor:.{DIGITS}g}"
+                for value, factor in zip(numbers, factors, strict=True)
+            ]
+            lines.append(",".join(quoted(cell) for cell in cells))
+    return "\n".join(lines) + "\n"
+
+
+def surface_data_text(plan: SurfacePlan) -> str:
+    """Return the data file to fill in: the gaps are zero, the readings empty."""
+    from loopcal.measure import Measurements, Observations
+
+    robot = plan.robot
+    observations = []
+    for sensor in plan.instrument().sensors:
+        assert sensor.rows is not None  # the plan spells them out
+        zero = np.zeros((len(sensor.rows), len(sensor.kind.columns)))
+        seen = Observations.from_sigma(
+            sensor.kind, sensor.rows, zero, sensor.noise.sigma, "", sensor.group
+        )
+        observations.append(seen)
+    flat = plan.readings.reshape(-1, len(robot.actuators))
+    text = measurements_text(
+        Measurements(robot.name, flat, tuple(observations), labels=plan.labels), robot
+    )
+    return _by_pose(plan, text)
+
+
+def _by_pose(plan: SurfacePlan, text: str) -> str:
+    """Put the rows in the order of the poses, and leave the cells of the readings empty."""
+    lines = text.splitlines()
+    first = next(i for i, line in enumerate(lines) if not line.startswith("#"))
+    names = {f"{a.name} [{unit_of(plan.robot, a.dimension)[0]}]" for a in plan.robot.actuators}
+    places = {i for i, name in enumerate(lines[first].split(",")) if name in names}
+    order = {label: i for i, label in enumerate(plan.labels)}
+    rows = sorted(
+        (line.split(",") for line in lines[first + 1 :]), key=lambda cells: order[cells[0]]
+    )
+    shown = (
+        ",".join("" if i in places else cell for i, cell in enumerate(cells)) for cells in rows
+    )
+    return "\n".join([*lines[: first + 1], *shown]) + "\n"

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a calibration leaves behind: its result as one document, and the run folder that keeps it.
+
+result.json    made_by    how (see `loopcal.io.runs.run_folder.MADE_BY`)
+               fit        `Identification.to_dict()`: parameters in the units of the robot's file, the rest in SI
+               start      `StartCheck.to_dict()`: the geometry of the robot file against the fit, on the fitted rows
+               split      share and labels of the poses that were held out; null where none were
+               validation `Validation.to_dict()` on those poses, SI; null where none were
+arrays.npz     `Identification.arrays()`, `initial`: the values before calibration of all parameters [SI], and the rows that
+               were fitted (see `loopcal.io.data.fitted_rows`)
+robot.yaml     the corrected robot file
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from loopcal.errors import DataError
+from loopcal.io.data.fitted_rows import fitted_rows, seen_before
+from loopcal.io.data.measurement_file import Paths, measurement_paths
+from loopcal.io.robot.robot_file import load_robot, robot_text, shipped_robots
+from loopcal.io.runs.run_folder import fitted_before, read_run_folder, write_run_folder
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from loopcal.estimate import Identification
+    from loopcal.apply import Validation
+    from loopcal.measure import Measurements
+    from loopcal.mechanism import Mechanism
+
+
+@dataclass(frozen=True)
+class CalibratedRun:
+    """A calibration read back: the corrected robot, and the one it started from."""
+
+    path: Path
+    result: dict[str, Any]
+    robot: Mechanism
+    before: Mechanism
+    local: Mapping[str, float] = field(default_factory=dict)
+    """Frames, targets and surfaces as the run found them: values by name, such as `tracker.x` [SI].
+    """
+    local_before: Mapping[str, float] = field(default_factory=dict)
+    """The same with the geometry before calibration, on the rows that were fitted."""
+    arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Arrays of the run, among them those of `loopcal.io.data.fitted_rows`."""
+
+
+def run_document(
+    fit: Identification, validation: Validation | None, origin: Mapping[str, Any], split: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Return the content of result.json; see the module."""
+    from loopcal.diagnose import start_check
+
+    shown = None if validation is None else validation.to_dict()
+    start = start_check(fit).to_dict()
+    return {"made_by": dict(origin), "fit": fit.to_dict(), "start": start, "split": split, "validation": shown}
+
+
+def save_run(
+    path: str | Path, fit: Identification, document: Mapping[str, Any], force: bool = False, fitted: Measurements | None = None
+) -> Path:
+    """Write the run folder of a calibration.
+
+    Parameters
+    ----------
+    path : str or Path
+        The folder to make.
+    fit : Identification
+        Of a robot that came from a file.
+    document : mapping
+        What `run_document` returned.
+    force : bool
+        Replace a run that is there.
+    fitted : Measurements, optional
+        What was fitted, to be known again.
+
+    Raises
+    ------
+    FileError
+        The folder is in use, or cannot be written.
+    MechanismError
+        The robot did not come from a file.
+    """
+    rows = {} if fitted is None else fitted_rows(fitted, fit.dropped)
+    arrays = {**fit.arrays(), "initial": fit.initial.values, **rows}
+    return write_run_folder(path, document, arrays, robot_text(fit.robot, fit.plus_minus), force)
+
+
+def load_run(path: str | Path) -> CalibratedRun:
+    """Read the run folder of a calibration.
+
+    Raises
+    ------
+    FileError
+        Not a run folder, damaged, or made by a newer loopcal.
+    """
+    run = read_run_folder(path)
+    robot = load_robot(run.robot_path)
+    initial = run.arrays.get("initial", robot.parameters.nominal)
+    names = [row["name"] for row in run.result.get("fit", {}).get("local") or ()]
+    local, start = (
+        dict(zip(names, found.tolist(), strict=True)) if found is not None and len(found) == len(names) else {}
+        for found in (run.arrays.get("local_estimate"), run.arrays.get("local_start"))
+    )
+    return CalibratedRun(run.path, run.result, robot, robot.with_values(initial), local, start, run.arrays)
+
+
+def load_calibrated(path: str | Path) -> CalibratedRun:
+    """Read a run folder, or a robot file (or the name of a shipped robot) as if a run had made it.
+
+    Raises
+    ------
+    FileError
+        Neither.
+    """
+    path = Path(path)
+    if path.is_dir() or (not path.exists() and str(path) not in shipped_robots()):
+        return load_run(path)
+    robot = load_robot(path)
+    return CalibratedRun(path, {}, robot, robot.nominal)
+
+
+def refuse_fitted_data(run: CalibratedRun, data: Paths, measured: Measurements) -> str:
+    """Refuse to validate a run with measured values that it was fitted to, as files or row by row.
+
+    Returns
+    -------
+    str
+        A note where fewer than half of the rows were fitted; else empty.
+
+    Raises
+    ------
+    DataError
+        A file is the same to the last byte, or half of the rows and more were fitted.
+    """
+    override = "--allow-fitted-data"
+    again = fitted_before(run.result, measurement_paths(data))
+    if again is not None:
+        raise DataError(
+            f"{again}: this run was fitted to these very measurements, which prove nothing about "
+            "unseen poses; "
+            f"give others, or use {override}"
+        )
+    return seen_before(run.arrays, measured, override)

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All rows of measurements at given poses and unknowns: what an estimator needs of them, and
+nothing of robots.
+
+    # U unknowns: frames, targets, surfaces
+    local = measurements.unknowns
+    # (U,), or start_values(measurements, T, local)
+    values = local.values()
+    # one `KindRows` for each kind
+    parts = evaluate_all(measurements, T, values[None], local)
+    # (t, M, p + U + 1): [machine | local | residual]
+    rows = whitened_rows(parts, D)
+
+With D = d twist / d parameter (t, n, 6, p) of the mechanism, a Gauss-Newton step (machine, local)
+solves `rows[..., :-1] step = -rows[..., -1]` in the least-squares sense. Both halves add: values of
+unknowns are plain numbers, frames too (see `loopcal.measure.kinds.parts`). Local unknowns without
+tolerance may be eliminated by projecting the rows onto the complement of their columns. Rows and
+components that are absent are zero in the same shape.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopcal.errors import DataError
+from loopcal.measure.measurements import Measurements
+from loopcal.measure.nuisance import LocalUnknowns
+from loopcal.measure.observations import Observations
+from loopcal.typing import FloatArray
+
+Ints = NDArray[np.intp]
+
+
+class KindRows(NamedTuple):
+    """Rows of one kind; l = 1 but where a row compares several poses.
+
+    Attributes
+    ----------
+    poses : (r, l) the poses each row saw.
+    residual : (t, r, m) predicted - measured [SI].
+    jacobian : (t, r, l, m, 6) by the platform twists.
+    own : (t, r, m, U) by all local unknowns of the measurements; zero where a row does not use one,
+        or it is fixed.
+    joints : (t, r, m, j) by the values of the joints `looks_at`, at the row's pose.
+    looks_at : names of these joints.
+    whitener : (r, m, m), zero where absent.
+    """
+
+    poses: Ints
+    residual: FloatArray
+    jacobian: FloatArray
+    own: FloatArray
+    joints: FloatArray
+    looks_at: tuple[str, ...]
+    whitener: FloatArray
+
+
+def evaluate_all(
+    measurements: Measurements,
+    T: FloatArray,
+    values: FloatArray,
+    local: LocalUnknowns | None = None,
+    joints: Mapping[str, FloatArray] | None = None,
+) -> tuple[KindRows, ...]:
+    """Evaluate every kind.
+
+    Parameters
+    ----------
+    measurements : Measurements
+    T : (t, n, 4, 4)
+        T_base_platform of each pose.
+    values : (t or 1, U)
+        Of the local unknowns.
+    local : LocalUnknowns, optional
+        Default: gathered from the measurements; gather them once where this is called often.
+    joints : name -> (t or 1, n), optional
+        Values of the joints that kinds look at, see `loopcal.measure.joint_observation`.
+
+    Returns
+    -------
+    parts : one `KindRows` for each kind, in order
+
+    Raises
+    ------
+    DataError
+        If a joint's values are missing.
+    """
+    gathered = measurements.unknowns if local is None else local
+    return tuple(
+        _kind_rows(rows, T, gathered.of(i, values), gathered.places[i], gathered, joints or {})
+        for i, rows in enumerate(measurements.observations)
+    )
+
+
+def whitened_rows(
+    parts: tuple[KindRows, ...], twists: FloatArray, joints: Mapping[str, FloatArray] | None = None
+) -> FloatArray:
+    """Whitened rows [machine | local | residual] of all kinds, one under the other.
+
+    Parameters
+    ----------
+    parts : from `evaluate_all`
+    twists : (t or 1, n, 6, p)
+        How the platform's twist depends on the machine's unknowns; p = 0 for local unknowns alone.
+    joints : name -> (t or 1, n, p), optional
+        How the joints' values depend on them; default: not at all.
+
+    Returns
+    -------
+    rows : (t, M, p + U + 1)
+    """
+    p = twists.shape[-1]
+    found = []
+    for part in parts:
+        t = np.broadcast_shapes(part.residual.shape[:1], twists.shape[:1])[0]
+        machine = (
+            np.sum(part.jacobian @ twists[:, part.poses], axis=2)
+            if p
+            else np.zeros((*part.residual.shape, 0))
+        )
+        for j, name in enumerate(part.looks_at):
+            if joints is not None and name in joints:
+                machine = (
+                    machine + part.joints[..., j, None] * joints[name][:, part.poses[:, 0], None, :]
+                )
+        blocks = (machine, part.own, part.residual[..., None])
+        raw = np.concatenate([np.broadcast_to(b, (t, *b.shape[1:])) for b in blocks], axis=-1)
+        white = part.whitener @ raw
+        found.append(white.reshape(t, -1, white.shape[-1]))
+    return np.concatenate(found, axis=1)
+
+
+def _kind_rows(
+    rows: Observations,
+    T: FloatArray,
+    values: FloatArray,
+    places: Ints,
+    local: LocalUnknowns,
+    joints: Mapping[str, FloatArray],
+) -> KindRows:
+    kind = rows.kind
+    for name in kind.looks_at:
+        if name not in joints:
+            raise DataError(
+                f"the kind {kind.name!r} needs the values of joint {name!r}; hand them over as "
+                "joints"
+            )
+    seen = (
+        np.stack([joints[name][:, rows.rows] for name in kind.looks_at], axis=-1)
+        if kind.looks_at
+        else None
+    )
+    found = rows.evaluate(T, values, seen)
+    t, r, m = found.residual.shape
+    jacobian = found.jacobian[:, :, None] if kind.links == 1 else found.jacobian
+    own = np.zeros((t, r, m, len(local)))
+    if found.own is not None:
+        free = local.table.free[places]
+        each = np.broadcast_to(found.own * free[:, None, :], (t, r, m, places.shape[1]))
+        np.put_along_axis(own, np.broadcast_to(places[:, None, :], each.shape), each, axis=-1)
+    moved = np.zeros((t, r, m, 0)) if found.joints is None else found.joints
+    return KindRows(
+        rows.rows.reshape(r, -1), found.residual, jacobian, own, moved, kind.looks_at, rows.whitener
+    )

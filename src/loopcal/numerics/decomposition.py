@@ -1,0 +1,383 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One triangular factor of any number of rows, and the one decomposition from which everything else
+is read.
+
+Rows [A | b] of a linear least-squares problem are folded, block by block, into the triangular
+factor of their QR decomposition (`loopcal.engine.accumulate`); the right-hand side rides along as
+the last column, so that the norm of what no solution explains is the last diagonal entry. Singular
+values, rank, solutions, filters and covariances come from the singular value decomposition of that
+factor. The product A'A is never formed: it would turn null directions of 1e-14 into 1e-7. Every
+array has a leading trial axis t. See docs/theory/estimation.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+RANK_TOLERANCE = 1e-11
+"""Singular values below this share of the largest count as zero.
+
+The matrix must be whitened and its columns scaled. Null directions of an exact model come out at
+1e-17 to 1e-13 by double rounding; the weakest genuine directions seen in complete error models of
+real machines are near 1e-9.
+"""
+
+NULL_COMPONENT = 1e-8
+"""A parameter has infinite variance when null directions carry more than this of its unit vector
+(sqrt of rounding).
+"""
+
+ROUNDING = 1e-12
+"""Share of the size of its terms below which a sum of a few products is rounding: some thousand
+units of the last place.
+"""
+
+
+def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:
+    """Return derivatives with zeros where they are rounding: at most ROUNDING of the size of the
+    terms they are sums of.
+
+    A column that rows see by rounding alone must be one that they do not see BEFORE columns are
+    brought to length one: among such columns a few units of the last place are a direction like any
+    other, and lead a step to the end of the world.
+
+    Parameters
+    ----------
+    values : any shape. size : of the terms, broadcast to it; with a size of zero, or not finite,
+        values stay.
+    """
+    return np.where(
+        (np.abs(values) <= ROUNDING * size) & (size > 0.0) & (size < np.inf), 0.0, values
+    )
+
+
+def empty_factor(trials: int, parameters: int) -> FloatArray:
+    """Return the factor of no rows at all, zeros (t, p + 1, p + 1), into which the engine folds
+    rows [A | b].
+    """
+    return np.zeros((trials, parameters + 1, parameters + 1))
+
+
+PER_TRIAL = ("singular_values", "directions", "projections", "outside", "rows", "dual", "flat")
+
+
+@dataclass(frozen=True)
+class Decomposition:
+    """Singular value decomposition A diag(scale) = U diag(s) V' of folded rows [A | b].
+
+    A deviation z has the coordinates y = V' (z / scale); in them the least-squares sum is sum (s_i
+    y_i - c_i)^2 plus what lies outside the range. A `penalty` (t, p) adds penalty_i y_i^2: zero for
+    plain least squares, infinite where a direction is not used at all. Its filter factors are f_i =
+    s_i^2 / (s_i^2 + penalty_i).
+
+    Where some columns are `flat`, never penalised, V holds two groups of columns: those of flat
+    parameters alone, and those of the others, each with the change of the flat ones that goes best
+    with it. U stays orthonormal and V'z of the second group depends on the penalised parameters
+    alone, so that all formulas stay as they are; V itself is oblique and its inverse is kept as
+    `dual`.
+
+    Attributes
+    ----------
+    singular_values : (t, p) s, descending.
+    directions : (t, p, p) V, column i belongs to s_i.
+    projections : (t, p) c = U'b.
+    outside : (t,) squared length of the part of b outside the range of A.
+    rows : (t,) number of equations folded (rows of weight zero not counted).
+    scale : (p,) by which the columns were multiplied.
+    tolerance : singular values below tolerance * s_1 count as zero.
+    dual : (t, p, p) inverse of V where V is oblique; None where it is V'.
+    flat : (t, p) directions of parameters that are never penalised; None where there are none.
+    """
+
+    singular_values: FloatArray
+    directions: FloatArray
+    projections: FloatArray
+    outside: FloatArray
+    rows: IntArray
+    scale: FloatArray
+    tolerance: float = RANK_TOLERANCE
+    dual: FloatArray | None = None
+    flat: BoolArray | None = None
+
+    @cached_property
+    def used(self) -> BoolArray:
+        """(t, p) which singular values count as nonzero."""
+        s = self.singular_values
+        return s > self.tolerance * s[:, :1]
+
+    @property
+    def rank(self) -> IntArray:
+        """(t,) number of singular values above the tolerance."""
+        return self.used.sum(axis=1)
+
+    @property
+    def unexplained(self) -> FloatArray:
+        """(t,) squared length of b outside what counts: where the rank is less than p, null
+        directions have a share of it.
+        """
+        return self.outside + np.where(self.used, 0.0, self.projections**2).sum(axis=1)
+
+    @property
+    def condition(self) -> FloatArray:
+        """(t,) largest singular value over the smallest one that counts; infinite for a matrix of
+        zeros.
+        """
+        s = self.singular_values
+        smallest = np.where(self.used, s, np.inf).min(axis=1, initial=np.inf)
+        with np.errstate(invalid="ignore"):
+            return np.where(np.isfinite(smallest), s.max(axis=1, initial=0.0) / smallest, np.inf)
+
+    @property
+    def gap(self) -> FloatArray:
+        """(t,) smallest singular value that counts over the largest that does not; infinite where
+        none was cut.
+        """
+        s = self.singular_values
+        kept = np.where(self.used, s, np.inf).min(axis=1, initial=np.inf)
+        cut = np.where(self.used, 0.0, s).max(axis=1, initial=0.0)
+        return np.divide(kept, cut, out=np.full(len(s), np.inf), where=cut > 0.0)
+
+    def coordinates(self, deviation: FloatArray) -> FloatArray:
+        """Return y = V' (z / scale), (t, p), of a deviation z (t, p)."""
+        scaled = deviation / self.scale
+        if self.dual is not None:
+            return np.matmul(self.dual, scaled[:, :, None])[:, :, 0]
+        return np.matmul(scaled[:, None, :], self.directions)[:, 0]
+
+    def deviation(self, coordinates: FloatArray) -> FloatArray:
+        """Return z = scale * V y, (t, p), of coordinates y (t, p)."""
+        return self.scale * np.matmul(self.directions, coordinates[:, :, None])[:, :, 0]
+
+    def filter_factors(self, penalty: FloatArray) -> FloatArray:
+        """Return f_i = s_i^2 / (s_i^2 + penalty_i), (t, p): the share of each least-squares
+        coordinate that is kept.
+        """
+        square = self.singular_values**2
+        total = square + penalty
+        return np.divide(square, total, out=np.zeros_like(total), where=total > 0.0)
+
+    def solution(self, penalty: FloatArray) -> FloatArray:
+        """Return the coordinates y_i = f_i c_i / s_i, (t, p), that minimise sum (s_i y_i - c_i)^2 +
+        penalty_i y_i^2.
+        """
+        s = self.singular_values
+        total = s**2 + penalty
+        return np.divide(s * self.projections, total, out=np.zeros_like(s), where=total > 0.0)
+
+    def remaining(self, penalty: FloatArray) -> FloatArray:
+        """Return the sum of squares (t,) that the filtered solution leaves: sum ((1 - f_i) c_i)^2 +
+        outside.
+        """
+        left = (1.0 - self.filter_factors(penalty)) * self.projections
+        return (left**2).sum(axis=1) + self.outside
+
+    def variances(self, penalty: FloatArray, noise: FloatArray | float = 1.0) -> FloatArray:
+        """Return the variance (t, p) of each coordinate: infinite where the direction is not used.
+
+        For noise variance sigma^2 of the rows and a prior of variance 1 / penalty_i it is noise
+        plus what the penalty holds back: f_i^2 sigma^2 / s_i^2 + (1 - f_i)^2 / penalty_i, with
+        sigma = 1 equal to 1 / (s_i^2 + penalty_i), and with no penalty equal to sigma^2 / s_i^2.
+        """
+        square = self.singular_values**2
+        sigma2 = np.broadcast_to(np.asarray(noise, dtype=np.float64), (len(square),))[:, None]
+        cut = np.isinf(penalty) | (square + penalty <= 0.0)
+        finite = np.where(cut, 1.0, penalty)
+        total = np.where(cut, 1.0, square + finite)
+        return np.where(cut, np.inf, (sigma2 * square + finite) / total**2)
+
+    def covariance(self, penalty: FloatArray, noise: FloatArray | float = 1.0) -> FloatArray:
+        """Return the covariance (t, p, p) of the deviation, in the units of the columns.
+
+        A parameter that has a part in a direction that is not used has infinite variance, and its
+        covariances with all others are not defined (nan): the one rule of the project for what the
+        data cannot tell.
+        """
+        variances = self.variances(penalty, noise)
+        infinite = np.isinf(variances)
+        spread = self.directions * np.sqrt(np.where(infinite, 0.0, variances))[:, None, :]
+        covariance = np.matmul(spread, spread.swapaxes(-1, -2)) * self.scale[:, None] * self.scale
+        if infinite.any():
+            unknown = self._touched(infinite)
+            covariance[unknown[:, :, None] | unknown[:, None, :]] = np.nan
+            trial, parameter = np.nonzero(unknown)
+            covariance[trial, parameter, parameter] = np.inf
+        return covariance
+
+    def standard_deviations(
+        self, penalty: FloatArray, noise: FloatArray | float = 1.0
+    ) -> FloatArray:
+        """Return the standard deviation (t, p) of each parameter by the rule of `covariance`,
+        without the matrix.
+        """
+        variances = self.variances(penalty, noise)
+        infinite = np.isinf(variances)
+        finite = np.where(infinite, 0.0, variances)
+        result = np.sqrt(np.matmul(self.directions**2, finite[:, :, None])[:, :, 0]) * self.scale
+        return np.where(self._touched(infinite), np.inf, result) if infinite.any() else result
+
+    def take(self, trials: IntArray) -> Decomposition:
+        """Return the decomposition of some trials only (the same object where these are all)."""
+        if len(trials) == len(self.outside):
+            return self
+        return replace(self, **{name: array[trials] for name, array in self._per_trial().items()})
+
+    def put(self, trials: IntArray, other: Decomposition) -> Decomposition:
+        """Return this decomposition with some trials taken from another one."""
+        if len(trials) == len(self.outside):
+            return other
+        merged = {name: array.copy() for name, array in self._per_trial().items()}
+        for name, array in merged.items():
+            array[trials] = getattr(other, name)
+        return replace(self, **merged)
+
+    def null_space(self, trial: int = 0) -> FloatArray:
+        """Return a basis (p, d) of the scaled deviations that change no row, for one trial;
+        orthonormal without `flat`.
+        """
+        return self.directions[trial][:, ~self.used[trial]]
+
+    def plain(self) -> Decomposition:
+        """Return the decomposition without flat columns, which alone has the singular values of A
+        (itself where it has).
+        """
+        if self.dual is None:
+            return replace(self, flat=None)
+        u, s, vt = np.linalg.svd(self.singular_values[:, :, None] * self.dual)
+        projections = np.matmul(self.projections[:, None, :], u)[:, 0]
+        directions = np.ascontiguousarray(vt.swapaxes(-1, -2))
+        return replace(
+            self,
+            singular_values=s,
+            directions=directions,
+            projections=projections,
+            dual=None,
+            flat=None,
+        )
+
+    def knowledge(
+        self, penalty: FloatArray, noise: float = 1.0, trial: int = 0
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return orthonormal directions (p, p) of z / scale, the variance (p,) of each, and which
+        the rows see, of one trial.
+
+        Where V is oblique these come from the singular values of diag(var)^(-1/2) V^-1.
+        """
+        variances = self.variances(penalty, noise)[trial]
+        if self.dual is None or np.isnan(variances).any():
+            return self.plain().directions[trial], variances, self.plain().used[trial]
+        dual = self.dual[trial]
+        root = np.where(np.isfinite(variances), 1.0 / np.sqrt(variances), 0.0)
+        _, s, vt = np.linalg.svd(root[:, None] * dual)
+        known = s > self.tolerance * s[0]
+        variance = np.where(known, 1.0 / np.where(known, s, 1.0) ** 2, np.inf)
+        effect = np.linalg.norm(self.singular_values[trial][:, None] * (dual @ vt.T), axis=0)
+        return vt.T, variance, effect > self.tolerance * self.singular_values[trial].max()
+
+    def divided(self, sigma: FloatArray) -> Decomposition:
+        """Return the decomposition of the rows divided by sigma (t,)."""
+        s, c, outside = (
+            self.singular_values / sigma[:, None],
+            self.projections / sigma[:, None],
+            self.outside / sigma**2,
+        )
+        return replace(self, singular_values=s, projections=c, outside=outside)
+
+    def _per_trial(self) -> dict[str, NDArray]:
+        """Arrays with the trial axis, by name."""
+        return {name: getattr(self, name) for name in PER_TRIAL if getattr(self, name) is not None}
+
+    def _touched(self, infinite: BoolArray) -> BoolArray:
+        """(t, p) which parameters have a part in the directions marked (t, p)."""
+        part = np.matmul(self.directions**2, infinite[:, :, None].astype(np.float64))[:, :, 0]
+        return part > NULL_COMPONENT**2
+
+
+def decompose(
+    factor: FloatArray,
+    rows: IntArray,
+    about: FloatArray | None = None,
+    scale: FloatArray | None = None,
+    tolerance: float = RANK_TOLERANCE,
+    flat: BoolArray | None = None,
+) -> Decomposition:
+    """Decompose a triangular factor of rows [A | b].
+
+    Parameters
+    ----------
+    factor : (t, p + 1, p + 1) upper triangular, as `engine.accumulate` folds it.
+    rows : (t,) number of equations that were folded.
+    about : (t, p), optional. With it the last column is read as a residual r at the deviation z =
+        `about`, and the problem becomes the one for the total deviation: |A z_new - b| with b = A z
+        - r.
+    scale : (p,), optional. Factors for the columns before the decomposition; the penalty then acts
+        on z / scale.
+    tolerance : relative rank tolerance.
+    flat : (p,), optional. Columns that no penalty may touch.
+    """
+    p = factor.shape[-1] - 1
+    triangle, last = factor[:, :p, :p], factor[:, :p, p]
+    if about is not None:
+        last = np.matmul(triangle, about[:, :, None])[:, :, 0] - last
+    if scale is not None:
+        triangle = triangle * scale
+    factors = np.ones(p) if scale is None else scale
+    outside = factor[:, p, p] ** 2
+    if flat is not None and flat.any() and not flat.all():
+        return _split(triangle, last, outside, rows, factors, tolerance, flat)
+    u, s, vt = np.linalg.svd(triangle)
+    projections = np.matmul(last[:, None, :], u)[:, 0]
+    # One memory layout, whichever trials are taken later: products round by the layout of their
+    # factors.
+    directions = np.ascontiguousarray(vt.swapaxes(-1, -2))
+    marked = np.ones(s.shape, dtype=bool) if flat is not None and flat.all() else None
+    return Decomposition(s, directions, projections, outside, rows, factors, tolerance, flat=marked)
+
+
+def _split(
+    triangle: FloatArray,
+    last: FloatArray,
+    outside: FloatArray,
+    rows: IntArray,
+    scale: FloatArray,
+    tolerance: float,
+    flat: BoolArray,
+) -> Decomposition:
+    """Decompose [F G] with flat columns F first: F = U1 S1 W', then what F cannot explain of G, (I
+    - U1 U1') G = U2 S2 V2'.
+
+    With T = S1^+ U1'G the columns of V are (W, 0) and (-W T V2, V2), and its inverse is [[W', T],
+    [0, V2']].
+    """
+    p, k = len(flat), int(flat.sum())
+    order = np.concatenate([np.flatnonzero(flat), np.flatnonzero(~flat)])
+    reduced: FloatArray = np.array(
+        np.linalg.qr(np.concatenate([triangle[:, :, order], last[:, :, None]], axis=2), mode="r")
+    )
+    u1, s1, w1t = np.linalg.svd(reduced[:, :k, :k])
+    top = np.linalg.norm(reduced[:, :, :p], axis=(1, 2))
+    used = s1 > tolerance * top[:, None]
+    first = np.matmul(u1.swapaxes(-1, -2), reduced[:, :k, k:])  # U1'G and U1'b
+    rest = np.concatenate([np.where(used[:, :, None], 0.0, first), reduced[:, k:, k:]], axis=1)
+    u2, s2, v2t = np.linalg.svd(rest[:, :, :-1], full_matrices=False)
+    second = np.matmul(rest[:, None, :, -1], u2)[:, 0]
+    outside = outside + np.maximum((rest[:, :, -1] ** 2).sum(axis=1) - (second**2).sum(axis=1), 0.0)
+    inverse = np.divide(1.0, s1, out=np.zeros_like(s1), where=used)
+    shift = inverse[:, :, None] * first[:, :, :-1]
+    dual, directions = np.zeros_like(triangle), np.zeros_like(triangle)
+    dual[:, :k, :k], dual[:, :k, k:], dual[:, k:, k:] = w1t, shift, v2t
+    w1, v2 = w1t.swapaxes(-1, -2), v2t.swapaxes(-1, -2)
+    directions[:, :k, :k], directions[:, :k, k:], directions[:, k:, k:] = w1, -w1 @ (shift @ v2), v2
+    s = np.concatenate([np.where(used, s1, 0.0), s2], axis=1)
+    c = np.concatenate([np.where(used, first[:, :, -1], 0.0), second], axis=1)
+    by_size, back = np.argsort(-s, axis=1, kind="stable"), np.argsort(order)
+    marked = by_size < k
+    dual = np.take_along_axis(dual[:, :, back], by_size[:, :, None], axis=1)
+    directions = np.take_along_axis(directions[:, back], by_size[:, None, :], axis=2)
+    s, c = np.take_along_axis(s, by_size, axis=1), np.take_along_axis(c, by_size, axis=1)
+    return Decomposition(s, directions, c, outside, rows, scale, tolerance, dual, marked)

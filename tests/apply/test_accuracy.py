@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Uncertainty of poses: the law of propagation, what is infinite and what is not, frames, maps, and
+Monte Carlo.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from loopcal import geometry, load_robot
+from loopcal.apply.accuracy import accuracy_map, pose_uncertainty
+from loopcal.apply.accuracy_simulation import monte_carlo
+from loopcal.diagnose.frame_motions import frame_motions
+from loopcal.errors import EstimationError
+from loopcal.estimate import MAP, LeastSquares, identify
+from loopcal.measure import sample_truth, simulate
+from loopcal.mechanism import forward, inverse
+from loopcal.mechanism.workspace import sample
+from tests.estimate.problems import five_dof, hexapod, hexapod_data, hexapod_poses, tracker
+
+WHERE = hexapod_poses(5, seed=11)
+
+
+@pytest.fixture(scope="module")
+def fit():
+    return identify(hexapod(), hexapod_data(), LeastSquares())
+
+
+@pytest.fixture(scope="module")
+def fit_5():
+    return identify(hexapod(), hexapod_data(instrument=five_dof()), LeastSquares())
+
+
+def slopes(function, at, steps):
+    """Central differences of poses, as twists (n, 6, p) in base axes at the platform's origin."""
+    columns = []
+    for i, h in enumerate(steps):
+        d = np.zeros(len(at))
+        d[i] = h
+        columns.append(geometry.difference(function(at + d), function(at - d)) / (2 * h))
+    return np.stack(columns, axis=-1)
+
+
+def test_a_posterior_holds_the_covariance_of_its_fit(fit):
+    known = fit.posterior
+    spread = known.unit[:, None] * known.directions * np.sqrt(known.variance)
+    np.testing.assert_allclose(
+        spread @ spread.T, fit.covariance, rtol=0, atol=1e-12 * fit.covariance.max()
+    )  # rounding
+
+
+def test_the_covariance_is_that_of_poses_by_finite_differences(fit):
+    q = inverse(fit.robot, WHERE).q
+    D = slopes(lambda e: forward(fit.robot.with_values(e), q).T, fit.estimate, np.full(42, 1e-6))
+    expected = D @ fit.covariance @ D.swapaxes(1, 2)
+    found = pose_uncertainty(fit, WHERE, point="platform").covariance
+    np.testing.assert_allclose(
+        found, expected, rtol=0, atol=1e-6 * np.abs(expected).max()
+    )  # differences of 1 um steps
+
+
+def test_noise_of_the_readings_is_added_where_actuators_have_a_sigma(fit):
+    sigma = np.array([1, 2, 3, 4, 5, 6]) * 1e-7
+    robot = fit.robot
+    actuators = tuple(replace(a, sigma=s) for a, s in zip(robot.actuators, sigma, strict=True))
+    noisy = replace(
+        fit.posterior, robot=replace(robot, assembly=replace(robot.assembly, actuators=actuators))
+    )
+    more = (
+        pose_uncertainty(noisy, WHERE, point="platform").covariance
+        - pose_uncertainty(fit, WHERE, point="platform").covariance
+    )
+    q = inverse(robot, WHERE[:1]).q
+    J = slopes(lambda x: forward(robot, x).T, q[0], np.full(6, 1e-6))[0]
+    np.testing.assert_allclose(
+        more[0], (J * sigma**2) @ J.T, rtol=0, atol=1e-6 * np.abs(more[0]).max()
+    )
+
+
+def test_at_the_tool_the_turn_of_the_platform_acts_on_an_arm(fit):
+    known, T_platform_tool = fit.posterior, np.eye(4)
+    T_platform_tool[:3, 3] = [0.0, 0.0, 0.3]
+    robot = replace(known.robot, assembly=replace(known.robot.assembly, tool=T_platform_tool))
+    here, there = (
+        pose_uncertainty(replace(known, robot=robot), WHERE, point=point)
+        for point in ("platform", "tool")
+    )
+    arm = WHERE[:, :3, 2] * 0.3
+    move = np.concatenate([-geometry.hat(arm), np.broadcast_to(np.eye(3), (5, 3, 3))], axis=2)
+    expected = move @ here.covariance @ move.swapaxes(1, 2)
+    np.testing.assert_allclose(
+        there.covariance[:, 3:, 3:], expected, rtol=0, atol=1e-10 * expected.max()
+    )
+    assert "tool point" in there.frame
+    assert "platform origin" in here.frame
+
+
+def test_lengths_of_errors_do_not_depend_on_the_axes(fit):
+    base, platform = (pose_uncertainty(fit, WHERE, frame) for frame in ("base", "platform"))
+    np.testing.assert_allclose(base.position, platform.position, rtol=1e-9)
+    np.testing.assert_allclose(base.orientation, platform.orientation, rtol=1e-9)
+    assert "platform axes" in platform.frame
+    assert np.array_equal(base.expanded, 2 * base.sd)
+
+
+def test_without_torsion_only_the_turn_about_the_normal_is_infinite(fit_5):
+    found = pose_uncertainty(fit_5, WHERE, "platform", gauge="infinite", point="platform")
+    assert np.array_equal(
+        np.isinf(found.sd), np.tile([False, False, True, False, False, False], (5, 1))
+    )
+    in_base = pose_uncertainty(fit_5, WHERE, "base", gauge="infinite", point="platform")
+    assert np.isinf(
+        in_base.sd[:, :3]
+    ).all()  # tilted poses: the normal has a part along each axis of the base
+    np.testing.assert_allclose(in_base.position, found.position, rtol=1e-9)
+
+
+def test_the_turn_about_the_normal_is_a_turn_of_the_platform_frame_and_left_out_by_name(fit_5):
+    found = pose_uncertainty(fit_5, WHERE)
+    assert np.isfinite(found.sd).all()
+    assert (
+        "the platform frame fitted to the parameters: 1 combination of them that only moves it"
+        in found.frame
+    )
+
+
+def base_motion_unknown(fit, extra=None):
+    """The fit's posterior, but nothing known of where the base is (nor of the parameter `extra`)."""
+    base = fit.estimate.reshape(6, 7)[:, :3]
+    known = np.zeros((42, 6))
+    for leg, b in enumerate(base):
+        known[7 * leg : 7 * leg + 3] = np.concatenate([-geometry.hat(b), np.eye(3)], axis=1)
+    if extra is not None:
+        known = np.column_stack([known, np.eye(42)[:, extra]])
+    q, _ = np.linalg.qr(known / fit.tolerance[:, None], mode="complete")
+    k = known.shape[1]
+    variance = np.r_[np.full(k, np.inf), np.full(42 - k, 1e-4)]
+    return replace(
+        fit.posterior, unit=fit.tolerance, directions=q, variance=variance, seen=np.arange(42) >= k
+    )
+
+
+def test_an_unknown_place_of_the_base_is_found_as_six_motions_of_the_base(fit):
+    if fit.names[:3] != ("leg1.base.x", "leg1.base.y", "leg1.base.z"):
+        pytest.fail("this test counts on the order of the hexapod's parameters")
+    known = base_motion_unknown(fit)
+    motions = frame_motions(known)
+    assert (motions.count, motions.frames) == (6, ("base",))
+    assert np.abs(motions.kept).max() < 1e-9
+    assert np.isfinite(pose_uncertainty(known, WHERE).sd).all()
+    assert np.isinf(pose_uncertainty(known, WHERE, gauge="infinite").sd).all()
+
+
+def test_what_is_no_motion_of_a_frame_stays_infinite(fit):
+    known = base_motion_unknown(fit, extra=fit.names.index("leg2.length"))
+    assert frame_motions(known).count == 6
+    assert np.isinf(pose_uncertainty(known, WHERE).sd).all()
+
+
+def test_a_frame_known_from_its_prior_alone_is_left_out_too(fit):
+    known = base_motion_unknown(fit)
+    with_prior = replace(known, variance=np.where(known.seen, known.variance, 1.0))
+    left_out, kept = (
+        pose_uncertainty(with_prior, WHERE, gauge=g) for g in ("left out", "infinite")
+    )
+    np.testing.assert_allclose(left_out.sd, pose_uncertainty(known, WHERE).sd, rtol=1e-9)
+    assert (kept.position > 5 * left_out.position).all()
+
+
+def test_poses_out_of_reach_have_no_uncertainty(fit):
+    far = WHERE[:2].copy()
+    far[1, 2, 3] = np.nan
+    found = pose_uncertainty(fit, far)
+    assert np.isfinite(found.sd[0]).all()
+    assert np.isnan(found.sd[1]).all()
+    assert np.isnan(found.T[1]).all()
+
+
+def test_options_that_do_not_exist_are_refused(fit):
+    with pytest.raises(
+        EstimationError, match="frame is 'world'; it must be one of 'base', 'platform'"
+    ):
+        pose_uncertainty(fit, WHERE, "world")  # pyright: ignore[reportArgumentType]
+
+
+def test_the_map_shows_extrapolation():
+    robot = load_robot("hexapod-42")
+    truth = robot.with_values(sample_truth(robot, 1, 5)[0])
+    everywhere = sample(robot, 30, 1).coordinates
+    middle = everywhere.mean(axis=0)
+    maps = []
+    for share in (1.0, 0.2):  # poses all over the workspace, and in the middle fifth of it
+        data = simulate(truth, middle + share * (everywhere - middle), tracker(), 1)
+        maps.append(
+            accuracy_map(identify(robot, data, LeastSquares()), data.readings, where=200, seed=2)
+        )
+    wide, narrow = maps
+    assert np.median(narrow.position_ratio) > 3
+    assert narrow.extrapolated.mean() > 0.9
+    assert np.median(wide.position_ratio) < 1
+    assert "poses are known less well than any measured one" in str(wide)
+    assert narrow.to_dict()["extrapolated"] == int(narrow.extrapolated.sum())
+
+
+def bounds(trials, numbers):
+    """Interval of sample sd / sd that all of `numbers` sample sds leave with a probability of at
+    most 1e-3 (Bonferroni).
+    """
+    tail = 1e-3 / (2 * numbers)
+    return np.sqrt(chi2.ppf([tail, 1 - tail], trials) / trials)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        ("hexapod-42", LeastSquares()),
+        ("3-prs", LeastSquares()),
+        ("3-prs", MAP()),
+        ("linear-delta", MAP()),
+    ],
+)
+def test_predicted_errors_of_pose_are_those_of_simulated_calibrations(name, method):
+    robot, trials = load_robot(name), 300
+    measured, judged = (sample(robot, n, seed).coordinates for n, seed in ((40, 1), (6, 9)))
+    found = monte_carlo(robot, measured, tracker(), judged, method, trials, seed=3)
+    ratio = found.ratio[np.isfinite(found.ratio)]
+    low, high = bounds(found.trials, len(ratio))
+    assert (found.trials, found.failed) == (trials, 0)
+    assert len(ratio) == (18 if name == "linear-delta" else 36)
+    # one trial's decomposition stands for all: 3 % for truths that differ by their tolerances
+    assert ratio.min() > 0.97 * low
+    assert ratio.max() < 1.03 * high
+    assert (ratio / 1.5).min() < 0.97 * low  # a prediction 50 % too large is found

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compensation: the identified machine goes where it should, as far as it has actuators for that,
+and says what stays.
+"""
+
+import numpy as np
+import pytest
+
+from loopcal import geometry, load_robot
+from loopcal.apply.compensation import Reach, compensate
+from loopcal.errors import DataError
+from loopcal.estimate import LeastSquares, identify
+from loopcal.mechanism import coordinates, forward, inverse
+from loopcal.mechanism.workspace import sample
+from tests.estimate.problems import hexapod, hexapod_data, hexapod_poses
+
+ROBOTS = ("hexapod-42", "3-prs", "linear-delta", "ru-pus-prs", "five-bar")
+
+
+def calibrated(name, seed=1):
+    """A robot with true errors of its tolerances, or of 0.1 mm and 0.1 mrad."""
+    robot = load_robot(name)
+    spread = np.nan_to_num(robot.parameters.tolerance, nan=1e-4)
+    return robot.with_values(
+        robot.values + spread * np.random.default_rng(seed).standard_normal(len(spread))
+    )
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_readings_take_the_controlled_coordinates_to_their_targets(name):
+    robot = calibrated(name)
+    targets = sample(robot, 20, 2).coordinates
+    found = compensate(robot, targets)
+    reached = forward(robot, found.readings).T
+    demanded = coordinates.demands(reached, targets, robot.controlled, robot.size)[0]
+    assert np.abs(demanded).max() < 1e-12  # [m], closure solved to rounding
+    assert found.good.all()
+    assert found.uncertainty is None
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_shifted_commands_lead_to_the_same_readings(name):
+    robot = calibrated(name)
+    targets = sample(robot, 20, 2).coordinates
+    best, found = compensate(robot, targets), compensate(robot, targets, "commands", steps=6)
+    assert found.commands is not None
+    np.testing.assert_allclose(
+        found.readings, best.readings, rtol=0, atol=1e-10
+    )  # [m, rad] six steps of a hundredth each
+    np.testing.assert_allclose(
+        inverse(robot.nominal, found.commands).q, best.readings, rtol=0, atol=1e-10
+    )
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_each_step_of_the_fixed_point_leaves_less_than_a_tenth(name):
+    robot = calibrated(name)
+    found = compensate(robot, sample(robot, 20, 2).coordinates, "commands", steps=3)
+    left = found.residual_position + robot.size * found.residual_orientation
+    assert left.shape == (4, 20)
+    assert (left[1:] < 0.1 * left[:-1] + 1e-12).all()  # [m]
+
+
+def test_a_machine_with_six_actuators_is_compensated_in_full():
+    robot, targets = calibrated("hexapod-42"), sample(load_robot("hexapod-42"), 10, 3).solution.T
+    found = compensate(robot, targets)
+    assert set(found.reach) == {Reach.REACHED}
+    assert np.linalg.norm(found.before[:, 3:], axis=1).min() > 1e-6
+    np.testing.assert_allclose(found.remaining, 0, atol=1e-12)
+
+
+def test_what_a_tripod_has_no_actuator_for_stays_and_no_reading_makes_it_smaller():
+    robot = calibrated("3-prs")
+    targets = sample(load_robot("3-prs"), 10, 3).solution.T
+    found = compensate(robot, targets)
+    assert set(found.reach) == {Reach.IN_PART}
+    assert found.sentences[0].startswith("z, phi, theta reached; no actuator removes 0.")
+
+    def distance(readings):
+        gap = geometry.difference(forward(robot, readings).T, targets)
+        return (gap[:, 3:] ** 2).sum(axis=1) + robot.size**2 * (gap[:, :3] ** 2).sum(axis=1)
+
+    here = distance(found.readings)
+    np.testing.assert_allclose(found.not_compensable, found.remaining)
+    for step in np.random.default_rng(0).standard_normal((20, 3)) * 2e-6:
+        assert (distance(found.readings + step) > here).all()
+
+
+def test_commands_do_not_fail_at_zero_tilt_where_the_azimuth_has_no_meaning():
+    found = compensate(
+        calibrated("3-prs"), [[0.7, 0.0, 0.0], [0.7, 2.0, 0.0], [0.7, -1.0, 1e-9]], "commands"
+    )
+    assert found.good.all()
+    assert found.residual_orientation[-1].max() < 1e-9  # [rad]
+
+
+def test_targets_out_of_reach_or_beyond_the_strokes_are_named():
+    robot = load_robot("hexapod-42")
+    targets = [
+        [0, 0, 0.2, 0, 0, 0],
+        [0, 0, 0.30, 0, 0, 0],
+        [0, 0, 5.0, 0, 0, 0],
+        [np.nan, 0, 0.2, 0, 0, 0],
+    ]
+    found = compensate(robot, targets, labels=("home", "high", "moon", "nowhere"))
+    assert found.labels[1] == "high"
+    assert found.reach[:2] == (Reach.REACHED, Reach.OUTSIDE)
+    assert found.good.tolist() == [True, False, False, False]
+    assert "stroke of q1" in found.sentences[1]
+    assert "cannot be reached" in found.sentences[3]
+
+
+def test_a_target_that_fails_does_not_disturb_the_others():
+    robot = calibrated("hexapod-42")
+    good = sample(robot, 4, 3).coordinates
+    alone = compensate(robot, good, "commands")
+    mixed = compensate(robot, np.vstack([good, np.full(6, np.nan)]), "commands")
+    np.testing.assert_allclose(mixed.readings[:4], alone.readings, rtol=0, atol=1e-12)
+    assert mixed.reach[4] is Reach.UNREACHABLE
+
+
+def test_an_identification_also_gives_the_uncertainty_of_each_target():
+    fit = identify(hexapod(), hexapod_data(), LeastSquares())
+    found = compensate(fit, hexapod_poses(4, seed=5))
+    assert found.uncertainty is not None
+    assert found.uncertainty.expanded.shape == (4, 6)
+    assert (found.uncertainty.position < 2e-6).all()  # [m], instrument 1 um
+    assert found.to_dict()["uncertainty"]["frame"].startswith("tool point, base axes")
+
+
+def test_bad_requests_are_refused():
+    robot = load_robot("3-prs")
+    with pytest.raises(DataError, match="mode is 'poses'; it must be 'readings' or 'commands'"):
+        compensate(robot, [[0.7, 0, 0]], "poses")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(DataError, match="0 steps of compensation were asked for"):
+        compensate(robot, [[0.7, 0, 0]], "commands", steps=0)
+    with pytest.raises(DataError, match="a target of shape"):
+        compensate(robot, [[0.7, 0.0]])

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Validation: the indices, the two errors told apart, and quality gates."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from loopcal.apply import validate
+from loopcal.diagnose import pose_errors
+from loopcal.diagnose.set_up_anew import set_up_anew
+from loopcal.errors import DataError
+from loopcal.estimate import identify
+from loopcal.io.core.json_text import to_json
+from loopcal.measure import Gaussian, Instrument, Pose, Sensor, simulate
+from tests import zoo
+from tests.estimate.problems import (
+    bed,
+    hexapod,
+    hexapod_data,
+    probed_heights,
+    tracker,
+    with_tolerance,
+)
+
+MM = 1e-3
+
+
+def tracker_in_frame() -> Instrument:
+    """Full poses in a frame that is not known."""
+    return Instrument(
+        (Sensor(Pose(unknown=("frame",)), Gaussian(np.array([5e-6] * 3 + [1e-6] * 3))),)
+    )
+
+
+@pytest.fixture(scope="module")
+def parts():
+    return hexapod_data(40).split(0.75, seed=1)
+
+
+@pytest.fixture(scope="module")
+def validation(parts):
+    return validate(identify(hexapod(), parts[0]), parts[1])
+
+
+def test_indices_are_the_formulas():
+    errors = pose_errors(np.array([[3.0, 0.0, -4.0]]) * MM, np.array([[2e-3, 0.0, 0.0]]))
+    assert errors.position[0] == pytest.approx(5 * MM)
+    assert errors.orientation[0] == pytest.approx(2e-3)
+    assert errors.integrated[0] == pytest.approx(5.002)  # mm + rad
+    assert errors.position_balance[0] == pytest.approx(7 * MM)
+    assert errors.orientation_balance[0] == pytest.approx(2e-3)
+
+
+def test_what_was_not_measured_has_no_index():
+    heights = pose_errors(
+        np.array([[np.nan, np.nan, 1.0], [np.nan, np.nan, np.nan]]) * MM, np.zeros((2, 0))
+    )
+    assert heights.position[0] == pytest.approx(MM)
+    assert np.isnan(heights.position[1])
+    assert np.isnan(heights.orientation).all()
+    assert np.isnan(heights.position_balance).all()
+    assert heights.statistics("position").count == 1
+    assert heights.statistics("orientation").count == 0
+
+
+def test_calibration_brings_held_out_poses_to_the_noise(validation):
+    assert len(validation.poses) == 10
+    assert validation.before.statistics("position").rms > 0.02 * MM
+    assert (
+        validation.after.statistics("position").rms < 4e-6
+    )  # [m] sqrt(3) um of noise and as much of the fit
+    assert validation.improvement() > 10.0
+
+
+def test_with_an_actuator_for_every_freedom_commanding_is_as_good_as_predicting(validation):
+    assert validation.not_compensable.position.max() < 1e-12
+    np.testing.assert_allclose(
+        validation.commanded_after.position, validation.after.position, rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        validation.commanded_before.position, validation.before.position, rtol=1e-12
+    )
+
+
+def test_what_has_no_actuator_stays_as_not_compensable():
+    robot = with_tolerance(zoo.three_prs(), 0.1 * MM)
+    rng = np.random.default_rng(0)
+    truth = robot.with_values(robot.values + rng.uniform(-0.05, 0.05, len(robot.values)) * MM)
+    poses = np.column_stack(
+        [rng.uniform(0.65, 0.75, 30), rng.uniform(-3, 3, 30), rng.uniform(0.1, 0.3, 30)]
+    )
+    data = simulate(truth, poses, tracker(), 0)
+    # perfect knowledge predicts the measured poses, and still cannot command x, y and torsion
+    perfect = validate(truth, data, before=robot)
+    assert perfect.after.statistics("position").rms < 2.5e-6  # [m] noise
+    left = perfect.not_compensable.statistics("position").rms
+    assert left > 5e-6
+    assert perfect.commanded_after.statistics("position").rms == pytest.approx(left, rel=0.3)
+    assert (
+        perfect.commanded_after.statistics("position").rms
+        < perfect.commanded_before.statistics("position").rms
+    )
+
+
+def test_gates_pass_and_fail_with_a_sentence(parts):
+    fit = identify(hexapod(), parts[0])
+    assert validate(fit, parts[1], limit_position=0.01 * MM, limit_angle=1e-4).passed
+    failed = validate(fit, parts[1], limit_position=1e-7, limit_angle=1e-4)
+    assert not failed.passed
+    assert "position error" in failed.reasons[0]
+    assert "exceeds the limit of 0.0001 mm" in failed.reasons[0]
+
+
+def test_a_gate_on_what_was_not_measured_is_not_met():
+    robot = zoo.delta()
+    found = validate(robot, probed_heights(robot, bed(8)), limit_angle=1e-3)
+    assert found.reasons == (
+        "the orientation limit cannot be checked: no row measures orientation",
+    )
+
+
+def test_rows_without_weight_are_left_out_and_no_row_is_refused(parts):
+    weight = np.ones(parts[1].n_poses)
+    weight[0] = 0.0
+    fewer = validate(hexapod(), parts[1].reweighted(weight))
+    assert len(fewer.poses) == parts[1].n_poses - 1
+    with pytest.raises(DataError, match="no row to validate"):
+        validate(hexapod(), parts[1].reweighted(0.0 * weight))
+
+
+def test_the_table_names_every_error_and_the_json_every_pose(validation):
+    text = str(validation)
+    assert all(
+        word in text
+        for word in ("predicted before", "commanded after", "not compensable", "mm+rad")
+    )
+    document = json.loads(to_json(validation.to_dict()))
+    assert document["passed"] is True
+    assert len(document["after"]["position"]["rows"]) == len(document["poses"])
+
+
+def test_a_geometry_that_went_astray_is_told_from_readings_that_no_geometry_reaches():
+    robot, data = hexapod(), hexapod_data(4)
+    legs = np.array([name.endswith("length") for name in robot.parameters.names])
+    astray = robot.with_values(np.where(legs, 0.2, 1.0) * robot.values)
+    with pytest.raises(
+        DataError,
+        match="cannot follow where the one before goes: with these readings that reaches 4 of 4",
+    ):
+        validate(astray, data, before=robot)
+    with pytest.raises(
+        DataError, match="reaches none of the 4 poses; check the readings and their units"
+    ):
+        validate(
+            robot, replace(data, readings=data.readings + np.array([10.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        )
+
+
+def sizes_if_moved(*moved, base=1.0, by=50.0, left=30):
+    """Sizes of errors that stay large while one of `moved` is kept."""
+    return lambda refit: (by if set(moved) - set(refit) else base, left)
+
+
+def test_of_several_kept_frames_the_moved_ones_are_named():
+    found = set_up_anew(("trk", "tool", "probe"), sizes_if_moved("trk", "probe"))
+    assert found is not None
+    assert found.names == ("trk", "probe")
+    assert found.times == pytest.approx(50.0)
+    assert found.sentence.endswith("use --refit trk --refit probe")
+    # a shift of the frame is a shift of the target: refitting either is enough, so that neither
+    # alone brings it back
+    either = set_up_anew(("trk", "tool"), lambda refit: (1.0 if refit else 50.0, 30))
+    assert either is not None
+    assert either.names == ("trk", "tool")
+
+
+def test_nothing_is_said_of_frames_where_errors_are_noise_alike_or_rows_are_few():
+    assert set_up_anew((), sizes_if_moved()) is None
+    assert set_up_anew(("trk",), sizes_if_moved("trk", by=2.5, base=0.5)) is None
+    assert set_up_anew(("trk",), sizes_if_moved("trk", by=50.0, base=20.0)) is None
+    assert set_up_anew(("trk",), sizes_if_moved("trk", left=7)) is None
+
+
+def test_what_is_not_known_of_the_geometry_before_is_noted_as_found_from_these_rows():
+    instrument = tracker_in_frame()
+    fit = identify(hexapod(), hexapod_data(20, 0, instrument))
+    more = hexapod_data(8, 1, instrument)
+    known = dict(fit.local.values)
+    assert any(
+        "which flatters them" in note for note in validate(fit.robot, more, known=known).notes
+    )
+    alike = validate(fit.robot, more, known=known, known_before=fit.local.starts)
+    assert not any("flatters" in note for note in alike.notes)
+    own = validate(fit, more)
+    np.testing.assert_allclose(alike.before.position, own.before.position, rtol=1e-9)

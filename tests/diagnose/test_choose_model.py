@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cross-validation over blocks, and the simplest set of parameters that is enough."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from loopcal.diagnose import choose_model, cross_validate, nested_sets
+from loopcal.diagnose.cross_validation import folds
+from loopcal.errors import DataError, EstimationError
+from loopcal.estimate import LeastSquares, identify
+from loopcal.io import load_robot
+from loopcal.measure import simulate
+from tests import zoo
+from tests.estimate.problems import UM, URAD, hexapod, hexapod_data, hexapod_poses, tracker
+
+
+def lengths_only(seed: int = 0):
+    """A hexapod whose legs alone are wrong."""
+    robot, truth = zoo.hexapod(), zoo.hexapod().values.copy()
+    places = [i for i, name in enumerate(robot.parameters.names) if name.endswith("length")]
+    truth[places] = zoo.hexapod_truth()[places]
+    return simulate(robot.with_values(truth), hexapod_poses(30, seed), tracker(), seed)
+
+
+def test_every_pose_is_held_out_once_and_blocks_are_kept_together():
+    data = replace(hexapod_data(30), block=np.arange(30) // 3)
+    parts = folds(data, 5, 1)
+    assert sorted(np.concatenate(parts)) == list(range(30))
+    assert {len(part) for part in parts} == {6}
+    for part in parts:
+        assert len(np.unique(data.block[part])) == 2
+    assert all(np.array_equal(a, b) for a, b in zip(parts, folds(data, 5, 1), strict=True))
+    with pytest.raises(DataError, match="11 folds of 10 blocks"):
+        folds(data, 11, 1)
+
+
+def test_unseen_poses_are_predicted_to_the_noise_and_worse_than_fitted_ones():
+    data = hexapod_data(40)
+    found = cross_validate(hexapod(), data, LeastSquares())
+    assert sorted(found.poses, key=int) == list(data.labels)
+    fit = identify(hexapod(), data, LeastSquares())
+    fitted = fit.chi_square / 240
+    assert fitted < 1.0 < found.score < 2.0  # 42 parameters from 192 equations add about a quarter
+    assert found.improvement() > 10.0
+    assert found.converged
+    assert (found.before_fold > 100.0).all()
+
+
+def test_a_machine_whose_lengths_alone_are_wrong_needs_no_other_parameters():
+    found = choose_model(hexapod(), lengths_only(), method=LeastSquares())
+    assert [c.name for c in found.candidates] == ["nothing", "lengths", "ideal"]
+    assert found.chosen.name == "lengths"
+    assert len(found.chosen.parameters) == 6
+    assert "a simpler model is enough: lengths (6 parameters)" in found.sentence
+    assert int(found.robot.parameters.free.sum()) == 6
+    assert "nothing" in str(found)
+
+
+def test_a_machine_with_all_errors_needs_all_parameters():
+    found = choose_model(hexapod(), hexapod_data(30))
+    assert found.chosen.name == "ideal"
+    assert "no simpler model is enough: all 42 parameters" in found.sentence
+
+
+def test_a_perfect_machine_seen_by_a_poor_instrument_is_left_alone():
+    data = simulate(zoo.hexapod(), hexapod_poses(30), tracker(100 * UM, 500 * URAD), 1)
+    found = choose_model(hexapod(), data, method=LeastSquares())
+    assert found.chosen.name == "nothing"
+    assert "calibration gains nothing" in found.sentence
+
+
+def test_sets_of_the_shipped_names():
+    robot = load_robot("3-prs")
+    assert list(nested_sets(robot)) == ["offsets", "lengths", "ideal", "complete"]
+    sets = nested_sets(robot)
+    assert sets["offsets"] == ("q1", "q2", "q3")
+    assert set(sets["lengths"]) == {"q1", "q2", "q3", "l1", "l2", "l3"}
+    assert len(sets["complete"]) == 33
+
+
+def test_sets_that_are_not_nested_are_refused():
+    with pytest.raises(EstimationError, match="'a' is not within 'b'"):
+        choose_model(
+            hexapod(), hexapod_data(30), {"a": ["leg1.length"], "b": ["leg2.length", "leg3.length"]}
+        )

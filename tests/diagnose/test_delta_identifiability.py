@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the probes of five real delta printers determine: rank and condition, intervals by stated
+sigmas, and chi-square.
+
+Conditions are of rows divided by one sigma and columns of 1 mm and 1 degree. The printers and what
+their firmware stored are described beside the records in LOOPCAL_DATA/delta_printers.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopcal.diagnose import identifiability
+from loopcal.diagnose.suggestions import remedies
+from loopcal.estimate import LeastSquares, identify
+from loopcal.io.formats import klipper
+from loopcal.io.formats.exchange import Imported, Reading
+from loopcal.io.formats.transfer import checked
+from loopcal.measure import Measurements, Observations
+from loopcal.mechanism import Mechanism
+from tests.cli.delta_printers import every_record
+from tests.io.formats.printers import printer_cfg
+
+SIX = ("radius", "tower1.angle", "tower2.angle", "tower1.stop", "tower2.stop", "tower3.stop")
+ARMS = ("arm1.length", "arm2.length", "arm3.length")
+WITH_DISTANCES = "RazorCopter/Klipper_FLSUN_Q5 printer [Post-Calibration].cfg"
+UNIT = "tolerances: {radius: {sd: 1}, angles: {sd: 1}, arms: {sd: 1}, stops: {sd: 1}}\n"
+
+Printer = tuple[Mechanism, Measurements]
+
+
+@pytest.fixture(scope="module")
+def printers(data_folder: Path, tmp_path_factory) -> dict[str, Printer]:
+    """Every printer with nine free parameters of tolerance 1 mm or 1 degree, and its probes."""
+    found = {}
+    for name, record in every_record(data_folder).items():
+        path = tmp_path_factory.mktemp("printer") / "printer.cfg"
+        path.write_text(printer_cfg(record), "utf-8")
+        read = klipper.read(path, Reading("printer"))
+        lines = [
+            line
+            for line in read.robot_text.splitlines(keepends=True)
+            if not line.startswith("fixed")
+        ]
+        assert read.measurements is not None
+        found[name] = checked(path, Imported("".join(lines) + UNIT)), read.measurements
+    assert len(found) == 5
+    return found
+
+
+def only(robot: Mechanism, *names: str) -> Mechanism:
+    """The robot with these parameters free."""
+    return replace(robot, parameters=robot.parameters.only(names))
+
+
+def with_sigmas(data: Measurements, height: float, distance: float) -> Measurements:
+    """The probes with other sigmas [m]."""
+    rows = [
+        Observations.from_sigma(
+            o.kind, o.rows, o.measured, height if o.kind.links == 1 else distance
+        )
+        for o in data.observations
+    ]
+    return replace(data, observations=tuple(rows))
+
+
+def heights(data: Measurements) -> Measurements:
+    """The heights alone."""
+    return replace(data, observations=tuple(o for o in data.observations if o.kind.links == 1))
+
+
+def test_six_parameters_are_well_conditioned_from_seven_heights(printers):
+    for name, (robot, data) in printers.items():
+        found = identifiability(only(robot, *SIX), heights(data))
+        assert found.rank == found.n_parameters == 6, name
+        assert 6.0 < found.condition < 8.0, name
+
+
+def test_one_arm_more_is_some_thirty_times_worse(printers):
+    """Seven numbers from seven heights can be computed, and mean little."""
+    first = []
+    for name, (robot, data) in printers.items():
+        found = [identifiability(only(robot, *SIX, arm), heights(data)) for arm in ARMS]
+        assert {one.rank for one in found} == {7}, name
+        assert all(140.0 < one.condition < 480.0 for one in found), name
+        first.append(found[0].condition)
+    assert 185.0 < min(first) < max(first) < 320.0
+
+
+def test_nine_parameters_from_heights_alone_lack_two_and_distances_are_what_tells_them(printers):
+    for name, (robot, data) in printers.items():
+        found = identifiability(robot, heights(data))
+        assert (found.rank, found.n_parameters, found.n_equations) == (7, 9, 7), name
+        assert found.gap > 1e10, name  # the two singular values that are cut are rounding
+        open_names = [set(combination.names) for combination in found.unidentifiable]
+        assert len(open_names) == 2
+        assert all(names & set(ARMS) for names in open_names), name
+        for remedy in remedies(found):
+            assert (
+                remedy.cures[0].words
+                == "distances between two poses (ball bar; callipers on a printed part)"
+            ), name
+
+
+def test_heights_with_twelve_distances_determine_all_nine(printers):
+    robot, data = printers[WITH_DISTANCES]
+    one = identifiability(robot, with_sigmas(data, 1e-3, 1e-3))
+    assert one.rank == 9
+    assert 44.0 < one.condition < 50.0
+    # a distance tells less than a height: what the figure is depends on their sigmas
+    firmware = identifiability(robot, with_sigmas(data, 1e-3 / np.sqrt(2 * 12 / 7), 1e-3))
+    assert 33.0 < firmware.condition < 38.0
+
+
+def test_probe_and_callipers_of_usual_sigmas_explain_the_residual_and_give_intervals(printers):
+    """With 0.05 mm for the probe and 0.3 mm for callipers on plastic; with 0.02 and 0.1 mm,
+    chi-square refuses.
+    """
+    robot, data = printers[WITH_DISTANCES]
+    small = identify(robot, with_sigmas(data, 0.02e-3, 0.1e-3), LeastSquares())
+    assert small.check.failed
+    assert small.check.sigma_scale > 2.5
+    fit = identify(robot, with_sigmas(data, 0.05e-3, 0.3e-3), LeastSquares())
+    assert fit.dof == pytest.approx(10.0)
+    assert not fit.check.failed
+    # chi-square of 10 degrees of freedom is between 3.25 and 20.5 in 95 % of data
+    assert 3.25 < fit.chi_square < 20.5
+    half = dict(zip(fit.names, 1.96 * fit.sd / 1e-3, strict=True))  # [mm]
+    assert all(1.5 < half[arm] < 3.0 for arm in ARMS)  # the arms are hardly known
+    assert all(half[f"tower{k}.stop"] < 0.5 for k in (1, 2, 3))
+    # the firmware's own optimum is 0.2 mm from what it stored: far inside these intervals
+    assert half["arm1.length"] > 5 * abs(217.6266 - 217.4260)
+
+
+def test_a_sigma_twice_as_large_makes_intervals_twice_as_wide_and_chi_square_a_quarter(printers):
+    name = next(n for n in printers if n.startswith("fzechert"))
+    robot, data = only(printers[name][0], *SIX), printers[name][1]
+    narrow, wide = (
+        identify(robot, with_sigmas(data, sigma, 1.0), LeastSquares())
+        for sigma in (0.01e-3, 0.02e-3)
+    )
+    assert not narrow.check.failed
+    np.testing.assert_allclose(wide.sd, 2 * narrow.sd, rtol=1e-6)
+    assert wide.chi_square == pytest.approx(narrow.chi_square / 4, rel=1e-6)

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters against a truth: what the data leave open is taken out, named, and does not count."""
+
+import json
+
+import numpy as np
+import pytest
+
+from loopcal.apply import validate
+from loopcal.diagnose import parameter_error
+from loopcal.errors import DataError, EstimationError
+from loopcal.estimate import LeastSquares, identify
+from loopcal.io.core.json_text import to_json
+from loopcal.measure import Instrument, Pose, Sensor, simulate
+from tests import zoo
+from tests.estimate.problems import UM, URAD, hexapod, hexapod_data, hexapod_poses, noise
+
+
+def in_unknown_frame(n: int = 30, seed: int = 0):
+    """Poses of the true hexapod in a frame that nobody knows."""
+    truth = zoo.hexapod().with_values(zoo.hexapod_truth())
+    kind = Pose(unknown=("frame",))
+    sensor = Sensor(kind, noise(*[0.1 * URAD] * 3, *[0.02 * UM] * 3))
+    placed = {"frame.x": 0.02, "frame.ry": 0.1}
+    return simulate(truth, hexapod_poses(n, seed), Instrument((sensor,)), seed, unknowns=placed)
+
+
+@pytest.fixture(scope="module")
+def fit():
+    return identify(hexapod(), in_unknown_frame(), LeastSquares())
+
+
+def test_what_an_unknown_frame_leaves_open_is_projected_out_and_named(fit):
+    found = parameter_error(fit, zoo.hexapod_truth())
+    assert len(found.dropped) == 6
+    assert np.abs(found.raw).max() > 0.01e-3  # [m] the base may sit anywhere within the errors
+    assert (
+        np.abs(found.error).max() < 0.001e-3
+    )  # [m] noise of 0.02 um and 0.1 urad, condition about 100
+    assert found.sentence.startswith(
+        "errors of 42 parameters in the 36 directions that the data determine; not compared"
+    )
+    assert all(combination.parts in found.sentence for combination in found.dropped)
+    np.testing.assert_allclose(
+        found.tolerances * fit.tolerance, found.error, rtol=1e-12, atol=1e-18
+    )
+    assert json.loads(to_json(found.to_dict()))["rms"] == pytest.approx(found.rms)
+
+
+def test_a_truth_moved_along_what_is_open_gives_the_same_error(fit):
+    known = fit.posterior
+    rng = np.random.default_rng(0)
+    open_ = known.directions[:, ~known.seen]
+    move = known.unit * (open_ @ rng.standard_normal(open_.shape[1]))
+    one, other = (parameter_error(fit, zoo.hexapod_truth() + step) for step in (0.0, move))
+    np.testing.assert_allclose(one.error, other.error, atol=1e-15)  # [m] double rounding
+    seen = known.unit * known.directions[:, known.seen][:, 0]
+    assert np.abs(parameter_error(fit, zoo.hexapod_truth() + seen).error - one.error).max() > 1e-6
+
+
+def test_where_all_is_determined_nothing_is_dropped():
+    fit = identify(hexapod(), hexapod_data(20), LeastSquares())
+    found = parameter_error(fit, zoo.hexapod_truth())
+    assert found.dropped == ()
+    np.testing.assert_array_equal(found.error, found.tolerances * fit.tolerance)
+    np.testing.assert_allclose(found.error, found.raw, rtol=1e-12)
+    assert "the data determine all of them" in found.sentence
+
+
+@pytest.mark.parametrize(
+    ("truth", "said"), [(np.zeros(41), r"shape \(41,\)"), (np.full(42, np.nan), "not finite")]
+)
+def test_a_truth_of_another_robot_is_refused(fit, truth, said):
+    with pytest.raises(
+        EstimationError, match=f"{said}.*give 42 values for all parameters of 'hexapod'"
+    ):
+        parameter_error(fit, truth)
+
+
+def test_validation_keeps_the_frame_of_the_fit_or_says_after_which_best_fit_it_compares(fit):
+    others = in_unknown_frame(8, seed=5)
+    kept = validate(fit, others)
+    assert kept.alignment == {"kept": ("frame",), "fitted": ()}
+    by_name = validate(fit.robot, others, before=fit.initial, known=fit.local.values)
+    np.testing.assert_allclose(by_name.after.position, kept.after.position, rtol=1e-9)
+    anew = validate(fit, others, refit=("fra*",))
+    assert anew.alignment == {"kept": (), "fitted": ("frame",)}
+    assert anew.notes[0].endswith("errors are those after the best fit of frame")
+    assert anew.after.statistics("position").rms <= kept.after.statistics("position").rms
+    assert json.loads(to_json(anew.to_dict()))["alignment"]["fitted"] == ["frame"]
+    with pytest.raises(DataError, match=r"is called 'tracker'; there are frame"):
+        validate(fit, others, refit=("tracker",))

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What can be known: ranks of the hexapod, null directions at rounding level, and combinations in
+words.
+"""
+
+import json
+
+import numpy as np
+import pytest
+
+from loopcal.diagnose import identifiability
+from loopcal.diagnose.observability import observability
+from loopcal.errors import EstimationError
+from loopcal.estimate.combinations import combinations
+from loopcal.estimate.scaling import unknowns
+from loopcal.io import load_robot
+from loopcal.io.core.json_text import to_json
+from loopcal.measure import Component, Inclination, Instrument, Pose, Position, Sensor, Separation
+from loopcal.numerics.decomposition import decompose
+from tests.estimate.problems import UM, five_dof, folded, hexapod, hexapod_data, noise, tracker
+
+FRAMES = {(): 42, ("frame",): 36, ("tool",): 36, ("frame", "tool"): 30}
+
+
+def positions() -> Instrument:
+    return Instrument((Sensor(Component(("x", "y", "z")), noise(UM, UM, UM)),))
+
+
+def poses(*unknown: str) -> Instrument:
+    return Instrument((Sensor(Pose(unknown=unknown), tracker().sensors[0].noise),))
+
+
+@pytest.mark.parametrize(("instrument", "rank"), [(None, 42), (five_dof(), 41), (positions(), 39)])
+def test_ranks_of_the_hexapod_are_those_of_the_measured_freedoms(instrument, rank):
+    found = identifiability(hexapod(), hexapod_data(60, instrument=instrument))
+    assert found.rank == rank
+    assert len(found.unidentifiable) == 42 - rank
+    assert found.n_parameters == 42
+    if rank < 42:
+        assert found.singular_values[rank] < 1e-13 * found.singular_values[0]
+        assert found.gap > 1e8
+        assert list(found.cut) == list(found.singular_values[rank:])
+
+
+@pytest.mark.parametrize(("unknown", "rank"), FRAMES.items())
+def test_each_unknown_frame_costs_six_and_its_combinations_are_called_motions_of_it(unknown, rank):
+    found = identifiability(hexapod(), hexapod_data(60, instrument=poses(*unknown)))
+    assert found.rank == rank
+    words = [c.meaning for c in found.unidentifiable]
+    assert sum("whole base" in w for w in words) == (6 if "frame" in unknown else 0)
+    assert sum("whole platform" in w for w in words) == (6 if "tool" in unknown else 0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "rank"),
+    [(Inclination(unknown=("gravity",)), 33), (Separation(), 33), (Position(), 39)],
+)
+def test_kinds_with_unknowns_and_kinds_that_link_poses_are_counted_too(kind, rank):
+    sigma = noise(*[5 * UM] * len(kind.noise_columns))
+    # a closed chain of neighbours and one of pairs further apart
+    far = (
+        None
+        if kind.links == 1
+        else np.array([(i, (i + k) % 60) for k in (1, 7, 19) for i in range(60)])
+    )
+    found = identifiability(
+        hexapod(), hexapod_data(60, instrument=Instrument((Sensor(kind, sigma, rows=far),)))
+    )
+    assert found.rank == rank
+
+
+def test_torsion_that_is_not_measured_leaves_the_turn_of_the_platform_open():
+    found = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
+    (turn,) = found.unidentifiable
+    moved = dict(zip(turn.names, turn.changes, strict=True))
+    assert all(".platform.x" in n or ".platform.y" in n for n in moved)
+    # a turn about z: dx = -w y, dy = w x at every joint
+    robot = hexapod()
+    values = dict(zip(robot.parameters.names, robot.values, strict=True))
+    w = [moved[f"leg{i}.platform.y"] / values[f"leg{i}.platform.x"] for i in range(1, 7)]
+    w += [-moved[f"leg{i}.platform.x"] / values[f"leg{i}.platform.y"] for i in range(1, 7)]
+    np.testing.assert_allclose(w, w[0], rtol=1e-6)
+    assert turn.meaning == "it is the whole platform turned about its z"
+
+
+def test_without_torsion_the_3_prs_knows_32_of_33_and_the_sentence_names_its_three_balls():
+    found = identifiability(load_robot("3-prs"), five_dof(), poses=36)
+    (turn,) = found.unidentifiable
+    assert (found.rank, found.n_parameters) == (32, 33)
+    assert turn.names == ("a1y", "a2y", "a3y")
+    np.testing.assert_allclose(turn.weights, 1 / np.sqrt(3), rtol=1e-6)
+    sentence = "together a1y, a2y and a3y, in equal parts, change nothing that was measured"
+    assert f"not identifiable: {sentence}: it is the whole platform turned about its z" in str(
+        found
+    )
+
+
+def test_without_torsion_the_tracker_knows_24_of_25():
+    found = identifiability(load_robot("ru-pus-prs"), five_dof(), poses=36)
+    (turn,) = found.unidentifiable
+    assert found.rank == 24
+    assert set(turn.names) == {"a1y", "a2x", "thU2z"}
+
+
+def test_each_parameter_is_judged_alone_and_with_its_partners():
+    found = identifiability(load_robot("3-prs"), five_dof(), poses=36)
+    verdict = {v.name: v for v in found.parameters}
+    assert str(verdict["a2y"]) == "only together with a1y and a3y"
+    assert {v.state for name, v in verdict.items() if name not in {"a1y", "a2y", "a3y"}} == {
+        "determined"
+    }
+    # two of three equal parts stay open to the prior: its share is at least the null vector's, 1 /
+    # sqrt 3
+    assert 1 / np.sqrt(3) <= verdict["a2y"].left < 0.6
+
+
+def test_directions_known_no_better_than_their_tolerance_are_named_the_weakest_first():
+    found = identifiability(load_robot("3-prs"), five_dof(), poses=36)
+    assert [c.singular_value for c in found.weak] == sorted(found.singular_values[: found.rank])[:5]
+    assert found.improved + (found.rank - found.improved) == found.rank
+    assert "hardly identifiable: together" in str(found)
+
+
+def test_indices_are_those_of_the_definitions():
+    A = np.random.default_rng(0).normal(size=(30, 5))
+    s = np.asarray(np.linalg.svd(A, compute_uv=False), dtype=float)
+    found = observability(s, 5, 30)
+    assert found.o1**10 * 30**5 == pytest.approx(np.linalg.det(A.T @ A), rel=1e-12)  # rounding
+    assert (found.o2, found.o3, found.o4) == pytest.approx(
+        (1 / np.linalg.cond(A), s[-1], s[-1] ** 2 / s[0])
+    )
+    assert found.o5 == pytest.approx(1 / sum(1 / s))
+    cut = observability(np.append(s, 1e-17), 5, 30)
+    assert (cut.o3, cut.left_out) == (found.o3, 1)
+    assert observability(np.zeros(3), 0, 4).o1 == 0.0
+    assert "rows divided by sigma, columns multiplied by tolerance" in str(found)
+
+
+def test_combinations_span_the_null_space_and_each_has_a_parameter_of_its_own():
+    free = unknowns(hexapod())
+    null = np.linalg.qr(np.random.default_rng(0).standard_normal((42, 4))).Q
+    found = combinations(free, null)
+    z = np.zeros((4, 42))
+    for row, combination in zip(z, found, strict=True):
+        for name, change in zip(combination.names, combination.changes, strict=True):
+            row[free.names.index(name)] = change
+    np.testing.assert_allclose(z @ null @ null.T, z, atol=1e-10)
+    assert np.linalg.matrix_rank(z) == 4
+
+
+def test_the_words_are_sentences_and_the_json_has_the_attributes():
+    found = identifiability(hexapod(), hexapod_data(6))
+    text = str(found)
+    assert "36 of 42 parameter combinations can be identified from 36 equations" in text
+    assert text.count("change nothing that was measured") == 6
+    document = json.loads(to_json(found.to_dict()))
+    assert document["rank"] == 36
+    assert len(document["singular_values"]) == 42
+    assert len(document["parameters"]) == 42
+    assert document["unidentifiable"][0]["sentence"] == str(found.unidentifiable[0])
+
+
+def test_what_it_reads_is_the_factor_of_a_fit_without_own_unknowns():
+    from loopcal.estimate.outlook import information
+    from loopcal.estimate.rows import rows_of
+
+    free, data = unknowns(hexapod()), hexapod_data(30)
+    z = free.deviation(hexapod().values[None])
+    expected = decompose(
+        rows_of(free, data).fold(z, np.arange(1))[0], np.full(1, 180)
+    ).singular_values
+    factor, reached = information(free, data)
+    np.testing.assert_allclose(
+        decompose(factor, np.full(1, 180)).singular_values, expected, rtol=1e-11
+    )  # [1] rounding
+    assert reached.all()
+
+
+def test_elimination_is_the_projection_onto_the_complement_even_of_columns_that_repeat():
+    from loopcal.estimate.outlook import without_own
+
+    rng = np.random.default_rng(1)
+    F, A = rng.normal(size=(20, 3)), rng.normal(size=(20, 4))
+    F = np.concatenate([F, F[:, :1] - 2 * F[:, 1:2]], axis=1)
+    factor = without_own(folded(np.concatenate([F, A, rng.normal(size=(20, 1))], axis=1)[None]), 4)
+    left = A - F @ (np.linalg.pinv(F) @ A)
+    R = factor[0, :4, :4]
+    np.testing.assert_allclose(R.T @ R, left.T @ left, atol=1e-12)  # [1] rounding
+
+
+def test_a_pose_out_of_reach_is_refused_with_its_name():
+    data = hexapod_data(6)
+    readings = data.readings.copy()
+    readings[2, 0] += 5.0
+    with pytest.raises(EstimationError, match=r"cannot reach 1 of 6 poses .* \(poses '3'\)"):
+        identifiability(hexapod(), type(data)(data.robot_name, readings, data.observations))

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of several kinds are compared in units of their sigma, and every number says from how many
+rows it is.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from loopcal.apply import validate
+from loopcal.diagnose.kind_errors import kind_errors
+from loopcal.io import load_robot
+from loopcal.measure import (
+    Component,
+    Instrument,
+    Measurements,
+    Observations,
+    Position,
+    Sensor,
+    simulate,
+)
+from loopcal.mechanism import forward
+from loopcal.mechanism.workspace import sample
+from tests.estimate.problems import UM, hexapod, hexapod_data, noise
+
+MM = 1e-3
+
+
+def rows(kind, count: int, sigma: float) -> Observations:
+    columns = len(kind.columns)
+    return Observations.from_sigma(
+        kind.mounted(np.eye(4)), np.arange(count), np.zeros((count, columns)), sigma
+    )
+
+
+def test_errors_are_divided_by_sigma_for_each_kind_and_summed_over_all():
+    heights, positions = rows(Component(("z",)), 4, 20 * UM), rows(Position(), 2, 300 * UM)
+    measured = positions.measured.copy()
+    measured[1, 2] = np.nan
+    positions = replace(positions, measured=measured)
+    before = [np.full((4, 1), 80 * UM), np.full((2, 3), 300 * UM)]
+    after = [np.full((4, 1), 20 * UM), np.full((2, 3), 600 * UM)]
+    one, two, every = kind_errors([heights, positions], before, after)
+    assert [(k.kind, k.count) for k in (one, two, every)] == [
+        ("component", 4),
+        ("position", 5),
+        ("all", 9),
+    ]
+    np.testing.assert_allclose(
+        [one.before, one.after, two.before, two.after], [4.0, 1.0, 1.0, 2.0], rtol=1e-12
+    )
+    assert every.before == pytest.approx(np.sqrt((4 * 16 + 5 * 1) / 9), rel=1e-12)
+    assert every.after == pytest.approx(np.sqrt((4 * 1 + 5 * 4) / 9), rel=1e-12)
+
+
+def test_a_fit_that_follows_the_better_instrument_is_not_called_larger_for_the_worse_one():
+    """Ten heights of 20 um ask for the new stops, thirty positions of 1 mm are 0.1 mm off them, a
+    tenth of their sigma.
+    """
+    new = load_robot("linear-delta")
+    stops = np.array([name.endswith("stop") for name in new.parameters.names])
+    old = new.with_values(new.values + 0.1 * MM * stops)
+    heights = Instrument((Sensor(Component(("z",)), noise(20 * UM)),))
+    readings = simulate(new, sample(new, 40, 3).coordinates, heights, 3).readings
+    z, xyz = forward(new, readings[:10]).T[:, 2, 3:], forward(old, readings[10:]).T[:, :3, 3]
+    heights = Observations.from_sigma(
+        Component(("z",)).mounted(new.tool), np.arange(10), z, 20 * UM
+    )
+    positions = Observations.from_sigma(Position().mounted(new.tool), np.arange(10, 40), xyz, MM)
+    found = validate(new, Measurements(new.name, readings, (heights, positions)), before=old)
+    assert found.improvement() == pytest.approx(
+        1 / np.sqrt(3.0), rel=1e-6
+    )  # as millimetres they grew
+    ((name, times),) = found.comparisons()
+    assert name == "error of all kinds, divided by sigma"
+    assert times == pytest.approx(np.sqrt(10 * 5.0**2 / (30 * 0.1**2)), rel=1e-6)
+    assert [k["kind"] for k in found.to_dict()["kinds"]] == ["component", "position", "all"]
+
+
+def test_every_error_says_of_how_many_rows_it_is_and_too_few_are_noted():
+    data = hexapod_data(12)
+    pose = data.observations[0]
+    measured = pose.measured.copy()
+    lengths = np.array([name in "xyz" for name in (column.name for column in pose.kind.columns)])
+    measured[np.ix_(np.arange(3, 12), lengths)] = (
+        np.nan
+    )  # position of three rows, orientation of eleven, and a row of nothing
+    measured[11] = np.nan
+    found = validate(hexapod(), replace(data, observations=(replace(pose, measured=measured),)))
+    counts = {(title, index): count for title, index, _, count, *_ in found.rows()}
+    assert len(found.poses) == 11
+    assert counts["predicted after", "position"] == 3
+    assert counts["predicted after", "orientation"] == 11
+    assert "only 3 rows measure position: too few to judge its errors by" in found.notes
+    assert not any("orientation:" in note for note in found.notes)
+    assert found.notes == () or not validate(hexapod(), data).notes

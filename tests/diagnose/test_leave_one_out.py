@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Leave-one-out of many filters from one linearisation against refits of the linear problem."""
+
+import numpy as np
+import pytest
+
+from loopcal.diagnose.leave_one_out_errors import leave_one_out, path_of_methods
+from loopcal.estimate import MAP, LeastSquares, Ridge, TruncatedSVD, identify
+from loopcal.estimate.rows import rows_of
+from loopcal.estimate.scaling import unknowns
+from tests.estimate.problems import hexapod, hexapod_data, tracker
+
+DATA = hexapod_data(14, instrument=tracker(20e-6, 100e-6))
+
+
+@pytest.mark.parametrize("method", [LeastSquares(), MAP(), Ridge(30.0)])
+def test_scores_are_those_of_refits_of_the_linear_problem(method):
+    found = leave_one_out(hexapod(), DATA, (method,))
+    rows = rows_of(unknowns(hexapod()), DATA)
+    A = np.concatenate(
+        [part.reshape(-1, 43) for kinds in rows.linearised(np.zeros((1, 42))) for _, part in kinds]
+    )
+    lam = {LeastSquares(): 0.0, MAP(): 1.0, Ridge(30.0): 30.0}[method]
+    total = 0.0
+    for j in range(14):
+        held, own = np.delete(A, np.s_[6 * j : 6 * j + 6], axis=0), A[6 * j : 6 * j + 6]
+        held = np.concatenate([held, np.sqrt(lam) * np.eye(42, 43)])
+        z = np.linalg.lstsq(held[:, :-1], -held[:, -1], rcond=None)[0]
+        total += ((own[:, :-1] @ z + own[:, -1]) ** 2).sum()
+    assert found.score[0] == pytest.approx(total / 84, rel=1e-8)
+
+
+def test_a_whole_path_is_scored_and_its_ends_are_known():
+    fit = identify(hexapod(), DATA)
+    methods = path_of_methods(1.0, 40, 42)
+    found = leave_one_out(fit.robot, DATA, methods)
+    assert len(found.score) == 40 + 43
+    assert found.dof[40] == 0.0
+    assert found.dof[-1] == pytest.approx(42.0)
+    np.testing.assert_allclose(found.estimate[40], fit.nominal, rtol=0, atol=1e-15)
+    whole = identify(hexapod(), DATA, LeastSquares())
+    assert (
+        np.abs((found.estimate[-1] - whole.estimate) / whole.sd).max() < 0.1
+    )  # one linearisation at another point
+    inside = found.score.min()
+    assert inside < min(found.score[0], found.score[39], found.score[40], found.score[-1])
+    assert isinstance(found.best, Ridge | TruncatedSVD)

@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blunders: losses, leverage, leave-one-block-out by the shortcut, and names at a stated level for
+the whole family.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import binom, chi2
+
+from loopcal.diagnose import find_outliers
+from loopcal.diagnose.examination import examine
+from loopcal.diagnose.influence import Influence, influence
+from loopcal.diagnose.outliers import _in_turn, _search, _sentence, _State
+from loopcal.errors import DataError, EstimationError
+from loopcal.estimate import MAP, Huber, LeastSquares, Tukey, identify
+from loopcal.estimate.losses import block_limit
+from loopcal.estimate.rows import rows_of
+from loopcal.estimate.scaling import unknowns
+from loopcal.io import load_robot
+from loopcal.measure import (
+    Component,
+    Instrument,
+    Measurements,
+    Position,
+    Sensor,
+    sample_truth,
+    simulate,
+    simulate_trials,
+)
+from loopcal.mechanism import Mechanism
+from loopcal.mechanism.workspace import sample
+from loopcal.numerics.decomposition import decompose
+from tests import zoo
+from tests.estimate.problems import UM, URAD, hexapod, hexapod_data, hexapod_poses, noise, tracker
+
+SIGMA = np.array([5 * URAD] * 3 + [UM] * 3)  # of `tracker`
+NAMED = ("4", "23", "11")
+
+
+def blundered(seed: int) -> tuple[Measurements, Measurements]:
+    """Forty poses, clean and with 5 % of the rows 20 sigma off in the norm of the row, and one row
+    of another run.
+    """
+    clean = hexapod_data(40, seed)
+    rows = clean.observations[0]
+    measured = np.array(rows.measured)
+    rng = np.random.default_rng(seed)
+    for pose in (3, 22):
+        step = rng.standard_normal(6)
+        measured[pose] += 20.0 * step / np.linalg.norm(step) * SIGMA
+    # the same machine without its errors of leg length
+    other = zoo.hexapod_truth()
+    lengths = [i for i, name in enumerate(zoo.hexapod().parameters.names) if "length" in name]
+    other[lengths] = zoo.hexapod().values[lengths]
+    measured[10] = (
+        simulate(zoo.hexapod().with_values(other), hexapod_poses(40, seed), tracker(), seed)
+        .observations[0]
+        .measured[10]
+    )
+    return clean, replace(clean, observations=(replace(rows, measured=measured),))
+
+
+def rms(fit) -> float:
+    return float(np.sqrt(np.mean((fit.estimate - zoo.hexapod_truth()) ** 2)))
+
+
+@pytest.mark.parametrize("loss", [Huber(), Tukey()])
+def test_a_robust_fit_of_blunders_is_nearly_as_good_as_the_fit_of_clean_data(loss):
+    clean, robust, plain = [], [], []
+    for seed in range(6):
+        good, bad = blundered(seed)
+        clean.append(rms(identify(hexapod(), good)))
+        fit = identify(hexapod(), bad, loss=loss)
+        robust.append(rms(fit))
+        plain.append(rms(identify(hexapod(), bad)))
+        assert all(fit.weight[int(name) - 1] < 0.5 for name in NAMED)
+    ratio = np.sqrt(np.mean(np.square(robust)) / np.mean(np.square(clean)))
+    assert ratio < 1.3
+    assert np.sqrt(np.mean(np.square(plain)) / np.mean(np.square(clean))) > 2.0
+
+
+@pytest.mark.parametrize("loss", [None, Huber(), Tukey()])
+@pytest.mark.parametrize("method", [LeastSquares(), None])
+def test_blunders_are_named_in_words_and_nothing_is_dropped(loss, method):
+    _, bad = blundered(0)
+    fit = identify(hexapod(), bad, method, loss=loss)
+    found = find_outliers(fit, bad)
+    assert set(found.names) == set(NAMED)
+    assert found.influence.leverage.sum() / 240 < 0.3
+    assert "3 of 40 blocks" in found.sentence
+    assert "does not fit the others" in str(found.outliers[0])
+    assert fit.check.degrees in {240 - 42, 240} or loss is not None
+    fitted = identify(hexapod(), bad, method, drop=found.names)
+    assert set(fitted.dropped) == set(NAMED)
+    assert any("left out as asked: poses" in note for note in fitted.notes)
+    assert find_outliers(fitted, bad).outliers == ()
+
+
+@pytest.mark.parametrize("method", [LeastSquares(), MAP()])
+def test_the_shortcut_is_the_residual_of_a_refit_without_the_block(method):
+    # one linearisation: with it the shortcut is exact
+    data, free = hexapod_data(12), unknowns(hexapod())
+    rows = rows_of(free, data)
+    member, z = np.arange(12) // 2, np.zeros((1, 42))  # two poses to a block
+
+    def fitted(weight):
+        kept = rows.weighted(weight)
+        factor, _ = kept.fold(z, np.arange(1))
+        d = decompose(factor, kept.rows, z)
+        penalty = method.penalty(d)
+        return d, penalty, d.deviation(d.solution(penalty))
+
+    d, penalty, at = fitted(np.ones(12))
+    found = influence(rows, member, d, penalty, np.ones(6), z, at)
+    A = np.concatenate([part.reshape(-1, 43) for kinds in rows.linearised(z) for _, part in kinds])
+    for j in range(6):
+        own = slice(12 * j, 12 * j + 12)
+        if method == LeastSquares():
+            held = np.delete(A, np.arange(12 * j, 12 * j + 12), axis=0)
+        else:
+            held = np.concatenate(
+                [np.delete(A, np.arange(12 * j, 12 * j + 12), axis=0), np.eye(42, 43)]
+            )
+        without = -np.linalg.lstsq(held[:, :-1], held[:, -1], rcond=None)[0]
+        residual = A[own, :-1] @ without + A[own, -1]
+        assert found.deleted[j] == pytest.approx(residual @ residual, rel=1e-7)
+        G = A[own, :-1] @ np.linalg.inv(held[:, :-1].T @ held[:, :-1]) @ A[own, :-1].T
+        expected = residual @ np.linalg.solve(np.eye(12) + G, residual)
+        assert found.distance[j] == pytest.approx(expected, rel=1e-6)
+        # the same from a fit in which the block has no weight
+        outside = (np.arange(6) != j).astype(float)
+        d_j, penalty_j, at_j = fitted(outside[member])
+        again = influence(rows, member, d_j, penalty_j, outside, z, at_j)
+        assert again.distance[j] == pytest.approx(expected, rel=1e-6)
+        assert again.leverage[j] == 0.0
+    if method == LeastSquares():
+        assert found.leverage.sum() == pytest.approx(42.0)
+
+
+def test_the_false_alarm_of_clean_data_is_that_of_the_family():
+    robot, t, alarms = hexapod(), 200, 0
+    measured = simulate_trials(robot, sample_truth(robot, t, 8), hexapod_poses(14), tracker(), 8)
+    for i in range(t):
+        data = measured.trial(i)
+        alarms += bool(find_outliers(identify(robot, data, LeastSquares()), data).outliers)
+    # 5 % of 200 is 10; outside the central 99.9 % of binomial(200, 0.05) the level is wrong
+    assert binom.ppf(0.0005, t, 0.05) <= alarms <= binom.ppf(0.9995, t, 0.05)
+
+
+def test_with_estimated_noise_the_scale_is_not_taken_from_the_blunders():
+    _, bad = blundered(1)
+    claimed = bad.observations[0]
+    sharp = replace(bad, observations=(replace(claimed, covariance=claimed.covariance / 9.0),))
+    fit = identify(hexapod(), sharp, loss=Huber(), noise="estimated")
+    found = find_outliers(fit, sharp)
+    assert found.scale == pytest.approx(3.0, rel=0.3)
+    assert set(found.names) == set(NAMED)
+
+
+def test_a_block_that_alone_determines_something_cannot_be_doubted():
+    data = hexapod_data(7)  # 42 equations, 42 parameters
+    found = find_outliers(identify(hexapod(), data, LeastSquares()), data)
+    assert found.blocks == 0
+    assert "no block of rows can be checked" in found.sentence
+
+
+def test_limits_of_blocks_are_as_rarely_exceeded_as_that_of_one_residual():
+    np.testing.assert_allclose(block_limit(1.345, np.array([1.0])), 1.345, rtol=1e-9)
+    np.testing.assert_allclose(
+        chi2.sf(block_limit(4.685, np.array([6.0])) ** 2, 6), chi2.sf(4.685**2, 1), rtol=1e-6
+    )
+    distance = np.array([0.0, 1.0, 1.345, 2.69, 10.0])
+    one = np.ones(5)
+    np.testing.assert_allclose(Huber().weight(distance, one), [1.0, 1.0, 1.0, 0.5, 0.1345])
+    np.testing.assert_allclose(Tukey().weight(distance, one)[[0, 4]], [1.0, 0.0])
+    assert (np.diff(Tukey().weight(distance, one)) < 0.0).all()
+
+
+def test_what_cannot_be_left_out_or_weighed_is_refused():
+    data = hexapod_data(20)
+    with pytest.raises(DataError, match="there is no pose '99' to leave out"):
+        identify(hexapod(), data, drop=("99",))
+    with pytest.raises(DataError, match="give a sequence of labels"):
+        identify(hexapod(), data, drop="12")
+    with pytest.raises(EstimationError, match="Huber loss with constant 0"):
+        Huber(0.0)
+    with pytest.raises(EstimationError, match="Tukey loss with constant"):
+        Tukey(-1.0)
+
+
+@pytest.mark.parametrize("frame", [(), ("frame",)])
+def test_the_distance_of_a_pose_set_aside_is_what_the_others_say_of_it_where_a_reading_is_missing(
+    frame,
+):
+    """Set aside, it stands where its own rows put it in the frame of the others, not where its
+    search began.
+    """
+    robot = load_robot("linear-delta")
+    truth = robot.with_values(sample_truth(robot, 1, 3)[0])
+    coordinates = sample(robot, 20, 3).coordinates
+    instrument = Instrument((Sensor(Position(unknown=frame), noise(*[10 * UM] * 3)),))
+    data = simulate(truth, coordinates, instrument, 3, reading_sigma=20 * UM)
+    assert data.reading_sigma is not None
+    readings, sigma, rows = data.readings.copy(), data.reading_sigma.copy(), data.observations[0]
+    readings[7, 0], sigma[7, 0] = np.nan, np.inf
+    measured = rows.measured.copy()
+    measured[7] += np.array([150 * UM, -150 * UM, 0.0])
+    data = replace(
+        data,
+        readings=readings,
+        reading_sigma=sigma,
+        observations=(replace(rows, measured=measured),),
+    )
+    fit = identify(robot, data, LeastSquares(), loss=Tukey())
+    assert fit.weight[7] < 0.5  # set aside in the first round
+    found = find_outliers(fit, data)
+    assert "8" in found.names
+    others = tuple(name for name in found.names if name != "8")
+    with_it, without = (
+        identify(robot, data, LeastSquares(), drop=names) for names in (others, found.names)
+    )
+    # what is not linear over 0.1 mm
+    assert found.influence.distance[7] == pytest.approx(
+        with_it.chi_square - without.chi_square, rel=1e-2
+    )
+
+
+def probed(
+    points: int, off: dict[int, float], sigma: float = 20 * UM
+) -> tuple[Mechanism, Measurements]:
+    """A delta printer's six parameters of geometry and heights (n,) at `points` of two rings, some
+    off by lengths [m].
+    """
+    robot = load_robot("linear-delta")
+    names = ("radius", "tower1.angle", "tower2.angle", "tower1.stop", "tower2.stop", "tower3.stop")
+    robot = replace(robot, parameters=robot.parameters.only(names))
+    turn = np.arange(points - 1) * 2.4  # [rad], so that no two points are opposite
+    ring = (
+        np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        * np.where(np.arange(points - 1) % 2, 0.05, 0.08)[:, None]
+    )
+    coordinates = np.zeros((points, 3))
+    coordinates[1:, :2], coordinates[:, 2] = ring, sample(robot, 20, 3).coordinates[:, 2].mean()
+    heights = Instrument((Sensor(Component(("z",)), noise(sigma)),))
+    data = simulate(robot, coordinates, heights, 5)
+    rows = data.observations[0]
+    measured = rows.measured.copy()
+    for place, length in off.items():
+        measured[place] += length
+    return robot, replace(data, observations=(replace(rows, measured=measured),))
+
+
+@pytest.mark.parametrize("wrong", range(7))
+def test_with_one_degree_of_freedom_a_disagreement_is_told_and_nobody_is_blamed(wrong):
+    """All seven residuals are multiples of one number, so any height can be the wrong one."""
+    robot, data = probed(7, {wrong: 1e-3})
+    fit = identify(robot, data, LeastSquares())
+    found = find_outliers(fit, data)
+    assert found.settled
+    assert found.blocks == 7
+    assert found.names == ()
+    assert fit.check.failed
+    (group,) = found.undecided
+    assert len(group.poses) == 7
+    assert group.times == pytest.approx(np.sqrt(fit.chi_square), rel=1e-3)  # not linear over 1 mm
+    assert "7 of 7 blocks of rows disagree, and which is wrong cannot be told" in found.sentence
+    assert "which one is wrong cannot be told" in " ".join(examine(fit, data).sentences)
+
+
+def test_with_one_degree_of_freedom_and_unknown_noise_nothing_is_said_to_fit():
+    robot, data = probed(7, {3: 1e-3})
+    found = find_outliers(identify(robot, data, LeastSquares(), noise="estimated"), data)
+    assert found.outliers == found.undecided == ()
+    assert "no block of rows can be checked: one degree of freedom" in found.sentence
+
+
+def test_with_degrees_of_freedom_to_spare_the_wrong_height_is_named():
+    robot, data = probed(12, {4: 1e-3})
+    found = find_outliers(identify(robot, data, LeastSquares()), data)
+    assert found.names == ("5",)
+    assert found.undecided == ()
+
+
+def test_two_wrong_heights_that_leave_nothing_to_check_the_others_are_not_named():
+    robot, data = probed(8, {0: 1e-3, 1: -1e-3})  # no single height explains both, and any two do
+    found = find_outliers(identify(robot, data, LeastSquares()), data)
+    assert found.names == ()
+    assert "cannot be told" in found.sentence
+
+
+def test_noise_that_is_spread_over_all_rows_is_no_all_clear():
+    robot, data = probed(40, {}, 38 * UM)
+    rows = data.observations[0]
+    data = replace(data, observations=(replace(rows, covariance=rows.covariance * (20 / 38) ** 2),))
+    fit = identify(robot, data, LeastSquares())
+    found = find_outliers(fit, data, level=1e-9)  # so that none is named though all are too large
+    assert fit.check.failed
+    assert found.outliers == found.undecided == ()
+    assert (
+        found.sentence
+        == "none of 40 blocks of rows stands out: what the noise does not explain is spread over "
+        "them"
+    )
+
+
+def test_a_search_that_comes_back_to_where_it_was_is_not_settled_and_says_who_was_doubted():
+    """Blocks 0 and 1 hide each other: each is doubted while the other is set aside."""
+
+    def ask(aside: np.ndarray) -> _State:
+        distance = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
+        distance[0 if aside[1] else 1] = 100.0
+        one = np.ones(6, dtype=np.int64)
+        return _State(aside, Influence(np.full(6, 0.1), one, distance, one, distance), 1.0, 4)
+
+    whole = ask(np.zeros(6, dtype=bool))
+    visited = _search(ask, whole, whole, 0.01, 3)
+    assert [np.flatnonzero(state.aside).tolist() for state in visited] == [[1], [0]]
+    (group,) = _in_turn(visited, np.zeros(6, dtype=bool))
+    assert np.flatnonzero(group).tolist() == [0, 1]
+    fit = identify(*probed(12, {}))
+    assert "did not settle: 2 of 6 are doubted in turn" in _sentence(fit, (), 2, False, 6, 0.05)

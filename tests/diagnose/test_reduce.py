@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The smallest set of parameters: what the papers drop is dropped, nothing measured is lost, and
+the file loads again.
+"""
+
+import json
+
+import numpy as np
+import pytest
+
+from loopcal.diagnose import identifiability
+from loopcal.diagnose.parameter_subset import reduce
+from loopcal.errors import MechanismError
+from loopcal.estimate.outlook import scene
+from loopcal.io import load_robot
+from loopcal.io.core.json_text import to_json
+from loopcal.io.robot.reduced_robot import reduced_robot_text
+from loopcal.io.robot.robot_file import shipped_robots
+from loopcal.measure import Instrument, Pose, Sensor
+from tests.estimate.problems import five_dof, hexapod, hexapod_data, tracker
+
+
+@pytest.fixture
+def with_line(tmp_path):
+    """A shipped robot with one more line in its file."""
+
+    def load(name: str, line: str):
+        path = tmp_path / "robot.yaml"
+        path.write_text(shipped_robots()[name].read_text("utf-8") + line + "\n", "utf-8")
+        return load_robot(path)
+
+    return load
+
+
+def called(*letters: str) -> set[str]:
+    """Names of all three chains, such as b1z for bz."""
+    return {f"{name[:-1]}{chain}{name[-1]}" for chain in "123" for name in letters}
+
+
+def test_fourteen_natural_parameters_a_chain_reduce_to_eleven_by_dropping_bz_thbz_and_thcy(
+    with_line,
+):
+    robot = with_line("3-prs", "parameters: fourteen")
+    found = identifiability(robot, tracker(), poses=36)
+    assert (found.rank, found.n_parameters) == (33, 42)
+    smaller = reduce(found)
+    assert {m.name for m in smaller.dropped} == called("bz", "thBz", "thCy")
+    assert smaller.kept == load_robot("3-prs").parameters.names
+    words = {m.name: str(m) for m in smaller.dropped}
+    assert words["b2z"] == "b2z: 1 mm of it counts as q2 +1 mm"
+    assert words["thB3z"] == "thB3z: nothing that was measured depends on it"
+    assert {v.name for v in found.parameters if v.state == "not at all"} == called("thBz", "thCy")
+
+
+def test_twenty_seven_parameters_of_the_tracker_reduce_to_26_by_merging_the_two_turns_about_the_post(
+    with_line,
+):
+    found = identifiability(
+        with_line("ru-pus-prs", "parameters: twenty-seven"), tracker(), poses=36
+    )
+    (merged,) = reduce(found).dropped
+    assert found.rank == 26
+    assert {merged.name, *merged.into} == {"thOz", "thU1z"}
+    assert str(merged).endswith("counts as thOz +1 deg")
+    (tied,) = found.unidentifiable
+    assert set(tied.names) == {"thOz", "thU1z"}
+    assert tied.meaning == "no pose depends on it"
+
+
+@pytest.mark.parametrize("unknown", [("frame",), ("tool",), ("frame", "tool")])
+def test_what_is_merged_moves_what_was_measured_as_its_replacement_does(unknown):
+    instrument = Instrument((Sensor(Pose(unknown=unknown), tracker().sensors[0].noise),))
+    found = identifiability(hexapod(), hexapod_data(60, instrument=instrument))
+    smaller = reduce(found)
+    free = found.unknowns
+    assert len(smaller.kept) == found.rank
+    s = np.linalg.svd(
+        found.factor[:, [free.names.index(n) for n in smaller.kept]], compute_uv=False
+    )
+    assert s[-1] > 1e-4 * s[0]
+    factor, _ = free.display()
+    for merged in smaller.dropped:
+        z = np.zeros(len(free))
+        place = free.names.index(merged.name)
+        z[place] = factor[place] / free.tolerance[place]
+        effect = found.factor @ z
+        for name, change in zip(merged.into, merged.changes, strict=True):
+            other = free.names.index(name)
+            z[other] -= change * factor[other] / free.tolerance[other]
+        assert np.linalg.norm(found.factor @ z) < 1e-5 * np.linalg.norm(
+            effect
+        )  # [1] parts below 1e-6 are left out
+
+
+def test_a_full_set_stays_whole_and_says_so():
+    smaller = reduce(identifiability(hexapod(), hexapod_data(60)))
+    assert smaller.dropped == ()
+    assert str(smaller) == "all 42 parameters can be told apart: none is left out"
+
+
+def test_the_written_file_loads_keeps_its_comments_and_loses_nothing(tmp_path):
+    robot = load_robot("3-prs")
+    found = identifiability(robot, five_dof(), poses=36)
+    smaller = reduce(found)
+    path = tmp_path / "smaller.yaml"
+    path.write_text(
+        reduced_robot_text(smaller.robot, {m.name: m.words() for m in smaller.dropped}), "utf-8"
+    )
+    again = load_robot(path)
+    assert again.parameters.free.sum() == 32
+    assert np.array_equal(again.parameters.free, smaller.robot.parameters.free)
+    assert "# of errors between 0.05 and 0.1 mm in size" in path.read_text("utf-8")
+    once_more = identifiability(again, five_dof(), poses=36)
+    assert once_more.rank == once_more.n_parameters == 32
+
+
+def test_a_list_that_is_there_grows_and_identified_values_stay(with_line):
+    robot = with_line("hexapod-42", "fixed: [leg1.length,\n  'leg2.base.?']\n# the end")
+    robot = robot.with_values(robot.values * (1 + 1e-4))
+    text = reduced_robot_text(robot, {"leg6.base.z": "1 mm of it counts as something"})
+    assert text.count("fixed:") == 1
+    assert '  - leg1.length\n  - "leg2.base.?"\n' in text
+    assert "# the end" in text
+    path = robot.record.path
+    path.write_text(text, "utf-8")
+    again = load_robot(path)
+    assert [n for n, free in zip(again.parameters.names, again.parameters.free, strict=True) if not free] == [
+        "leg1.length", "leg2.base.x", "leg2.base.y", "leg2.base.z", "leg6.base.z"]  # fmt: skip
+    np.testing.assert_allclose(again.values, robot.values, rtol=1e-15)
+
+
+def test_a_robot_without_a_file_cannot_be_shortened():
+    with pytest.raises(MechanismError, match="was not read from a robot file"):
+        reduced_robot_text(hexapod(), {})
+
+
+def test_the_json_says_the_same():
+    smaller = reduce(identifiability(load_robot("3-prs"), five_dof(), poses=36))
+    document = json.loads(to_json(smaller.to_dict()))
+    assert [m["name"] for m in document["dropped"]] == ["a2y"]
+    assert document["dropped"][0]["into"] == ["a1y", "a3y"]
+    assert len(document["kept"]) == 32
+
+
+def test_a_scene_marks_what_is_not_reached_and_leaves_no_number_that_is_none():
+    found = identifiability(hexapod(), hexapod_data(60))
+    at = scene(found.unknowns, np.array([np.zeros(6), 9.0 * np.eye(6)[0]]))
+    assert at.reached.tolist() == [True, False]
+    assert np.isfinite(at.twists).all()

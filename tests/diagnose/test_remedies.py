@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What further measurement would help: the ones that must, must; those that cannot, do not."""
+
+import pytest
+
+from loopcal.diagnose import identifiability
+from loopcal.diagnose.suggestions import remedies
+from loopcal.io import load_robot
+from loopcal.io.robot.robot_file import shipped_robots
+from loopcal.measure import KINDS, Instrument, Pose, Sensor
+from tests.estimate.problems import five_dof, hexapod, hexapod_data, tracker
+
+
+def test_torsion_is_what_the_3_prs_lacks():
+    (remedy,) = remedies(identifiability(load_robot("3-prs"), five_dof(), poses=36))
+    assert remedy.cures[0].words == "psi"
+    assert str(remedy).startswith(
+        "a1y, a2y and a3y: measuring psi as well would determine them (a1y to 0."
+    )
+    words = {cure.words for cure in remedy.cures}
+    assert "the pose" in words
+    # the length of the normal's path, heights and a point in the axis of the turn show nothing of
+    # it
+    assert not words & {
+        "z",
+        "x",
+        "y",
+        "theta",
+        "phi and theta",
+        "the position",
+        "the direction",
+        "the autocollimation",
+    }
+
+
+@pytest.mark.parametrize(("unknown", "datum"), [("frame", "the pose"), ("tool", "the pose")])
+def test_a_known_frame_is_what_an_unknown_one_lacks(unknown, datum):
+    instrument = Instrument((Sensor(Pose(unknown=(unknown,)), tracker().sensors[0].noise),))
+    found = remedies(identifiability(hexapod(), hexapod_data(60, instrument=instrument)))
+    assert len(found) == 6
+    for remedy in found:
+        words = {cure.words for cure in remedy.cures}
+        assert datum in words
+        assert "the pose (frame and tool unknown)" not in words
+
+
+def test_what_no_pose_depends_on_only_a_sensor_on_the_joint_could_tell(tmp_path):
+    path = tmp_path / "robot.yaml"
+    path.write_text(
+        shipped_robots()["3-prs"].read_text("utf-8") + "parameters: fourteen\n", "utf-8"
+    )
+    found = {
+        r.combination.names[0]: r
+        for r in remedies(identifiability(load_robot(path), tracker(), poses=36))
+    }
+    assert str(found["thB1z"]) == "thB1z: none of the known kinds of measurement would tell; fix it"
+    assert {cure.words for cure in found["thC1y"].cures} == {"the joint chain1.joint"}
+    assert "fix one of them" in str(found["b1z"])
+
+
+def test_nothing_is_proposed_where_nothing_is_open():
+    assert remedies(identifiability(hexapod(), hexapod_data(60))) == ()
+
+
+def test_every_cure_is_of_a_known_kind_and_leaves_less():
+    found = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
+    before = {v.name: v.left for v in found.parameters}
+    (remedy,) = remedies(found)
+    for cure in remedy.cures:
+        assert cure.kind in KINDS
+        assert cure.left < before[remedy.combination.names[0]]
+    assert remedy.to_dict()["sentence"] == str(remedy)
+
+
+def test_a_robot_without_a_workspace_is_looked_at_about_home():
+    found = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
+    assert not hexapod().assembly.workspace
+    assert "psi" in {cure.words for cure in remedies(found)[0].cures}
+
+
+TRANSLATIONAL = """\
+format: 1
+family: limbs
+name: tsai-3upu
+source: of the kind of Tsai 1996, dimensions ours
+units: {length: mm, angle: deg}
+controlled: [x, y, z]
+actuators:
+  q: {reads: length, stroke: [-150, 150], offset: 500, unknown: [offset], length: {sd: 0.1}}
+limbs:
+  - name: leg
+    chain:
+      - {joint: U, name: lower, at: [300, 0, 0], axes: [y, x], start: [-18, 0]}
+      - {joint: P, name: slide, axis: z, actuated: q, start: 500}
+      - {joint: U, name: upper, axes: [x, y], start: [0, 18]}
+    ending: rigid
+    attach: [145, 0, 0]
+    copies: {count: 3}
+    errors:
+      - {of: lower, shift: [x, y], tolerance: {sd: 0.1}}
+      - {of: platform, shift: [x, y, z], tolerance: {sd: 0.1}}
+home: {z: 475}
+workspace: {x: [-60, 60], y: [-60, 60], z: [420, 530]}
+"""
+
+
+def test_what_is_measured_in_full_already_is_no_remedy(tmp_path):
+    """Rounding in what a further instrument sees is no information: this platform never turns, and
+    full poses were measured.
+    """
+    path = tmp_path / "upu.yaml"
+    path.write_text(TRANSLATIONAL)
+    found = identifiability(load_robot(path), tracker(), poses=60)
+    assert found.rank < found.n_parameters
+    for remedy in remedies(found):
+        assert not {"psi", "theta", "phi and theta", "the pose"} & {
+            cure.words for cure in remedy.cures
+        }, str(remedy)

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a fit gained over its start, told apart from noise."""
+
+import numpy as np
+import pytest
+
+from loopcal.diagnose import Start, start_check
+from loopcal.estimate import Huber, Tukey, identify
+from loopcal.estimate.prior import Prior
+from loopcal.estimate.rows import rows_of
+from loopcal.estimate.scaling import unknowns
+from tests import zoo
+from tests.estimate.problems import hexapod, hexapod_data
+
+
+def test_a_start_at_the_truth_is_as_good_as_the_fit_within_the_noise() -> None:
+    truth = hexapod().with_values(zoo.hexapod_truth())
+    found = start_check(identify(truth, hexapod_data()))
+    assert found.verdict is Start.WITHIN_NOISE
+    assert found.p_value > 1e-3
+    # 180 equations, 42 parameters: the truth leaves 1 sigma, the fit sqrt(138 / 180) of it
+    assert found.before == pytest.approx(1.0, abs=0.2)
+    assert found.after == pytest.approx(np.sqrt(138 / 180), abs=0.2)
+
+
+@pytest.mark.parametrize("noise", ["given", "estimated"])
+def test_a_nominal_start_is_not_calibrated(noise) -> None:
+    found = start_check(identify(hexapod(), hexapod_data(), noise=noise))
+    assert found.verdict is Start.NOT_CALIBRATED
+    assert found.p_value < 1e-6
+    assert found.before > 10 * found.after
+
+
+def test_the_fit_itself_is_the_best_start() -> None:
+    first = identify(hexapod(), hexapod_data())
+    assert start_check(identify(first.robot, hexapod_data())).verdict is Start.BEST
+
+
+@pytest.mark.parametrize("loss", [Huber(), Tukey()])
+def test_a_loss_does_not_make_the_nominal_start_look_calibrated(loss) -> None:
+    """Reweighting begins at its own last estimate, which is not the start that was given."""
+    fit = identify(hexapod(), hexapod_data(), loss=loss)
+    assert start_check(fit).verdict is Start.NOT_CALIBRATED
+    assert len(fit.cost_history) == fit.iterations + 1
+    np.testing.assert_array_equal(
+        fit.estimate_history[0], hexapod().values[hexapod().parameters.free]
+    )
+    best = identify(fit.robot, hexapod_data(), loss=loss)
+    assert start_check(best).verdict is Start.BEST
+
+
+@pytest.mark.parametrize("loss", [Huber(), Tukey()])
+def test_with_a_loss_every_step_is_counted_and_the_history_is_one_way_from_the_start(loss) -> None:
+    """The first descent is not weighted yet, so that the way begins as that of a fit without a
+    loss.
+    """
+    plain, fit = identify(hexapod(), hexapod_data()), identify(hexapod(), hexapod_data(), loss=loss)
+    assert fit.iterations > plain.iterations
+    assert len(fit.cost_history) == len(fit.estimate_history) == fit.iterations + 1
+    np.testing.assert_array_equal(
+        fit.estimate_history[: plain.iterations + 1], plain.estimate_history
+    )
+    np.testing.assert_array_equal(fit.estimate_history[-1], fit.estimate)
+
+
+def test_with_a_loss_the_cost_of_the_start_is_weighted_as_that_of_the_fit_and_holds_the_prior() -> (
+    None
+):
+    robot, data = hexapod(), hexapod_data()
+    free = unknowns(robot)
+    spread = 0.1 * free.tolerance
+    prior = Prior(free.names, zoo.hexapod_truth(), free.tolerance, np.diag(1.0 / spread))
+    fit = identify(robot, data, prior=prior, loss=Huber())
+    assert fit.weight.min() < 0.99
+    start = free.deviation(robot.values[None])
+    rows = rows_of(free, data).weighted(fit.weight).fold(start, np.arange(1))[1][0]
+    held = (((robot.values[free.places] - prior.mean) / spread) ** 2).sum()
+    assert held > 100.0
+    assert fit.cost_history[0] == pytest.approx(rows + held, rel=1e-12)  # rounding of sums

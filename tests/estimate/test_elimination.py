@@ -1,0 +1,335 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nested elimination of own unknowns is the dense one over whole clusters, at a cost that grows
+with the number of groups.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import loopcal.estimate.rows as rows_module
+from loopcal.estimate import LeastSquares, identify
+from loopcal.estimate.elimination import OWN_RANK, Factors, eliminate
+from loopcal.estimate.nesting import Nesting, nest
+from loopcal.estimate.outlook import look, scene
+from loopcal.estimate.rows import rows_of
+from loopcal.estimate.scaling import unknowns
+from loopcal.measure import Gaussian, Instrument, Plane, Sensor, simulate
+from loopcal.numerics.decomposition import NULL_COMPONENT
+from tests import zoo
+from tests.estimate.problems import hexapod, hexapod_poses
+
+PROBE = Plane(
+    unknown=("surface", "targets"), targets=("probe",), places=np.array([[0.0, 0.0, 0.06]])
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Rows [F | A | r] of U unknowns, (N, U), (N, p + 1), and the set of unknowns (N,) that each
+    row may use.
+    """
+
+    free: np.ndarray
+    scopes: list[str]
+    sets: list[list[int]]
+    F: np.ndarray
+    right: np.ndarray
+    of: np.ndarray
+
+    @property
+    def nesting(self) -> Nesting:
+        pairs = [(i, x) for i, some in enumerate(self.sets) for x in some]
+        return nest(self.free, self.scopes, np.array(pairs, dtype=np.int64).reshape(-1, 2))
+
+
+def random_problem(rng, unseen):
+    """Up to three sessions of up to four groups, which share unknowns of the machine; `unseen`
+    directions over all of them.
+    """
+    scopes, sets = ["machine"] * int(rng.integers(0, 4)), []
+    shared = list(range(len(scopes)))
+    for _ in range(int(rng.integers(1, 4))):
+        day = list(range(len(scopes), len(scopes) + int(rng.integers(0, 4))))
+        scopes += ["session"] * len(day)
+        for _ in range(int(rng.integers(1, 5))):
+            group = list(range(len(scopes), len(scopes) + int(rng.integers(0, 4))))
+            scopes += ["group"] * len(group)
+            sets.append(shared + day + group)
+        sets.append(day)
+    U, p = len(scopes), int(rng.integers(0, 5))
+    free = rng.random(U) > 0.1
+    of = np.repeat(np.arange(len(sets)), rng.integers(1, 12, len(sets)))
+    F, hidden = np.zeros((len(of), U)), rng.normal(size=(U, unseen)) * (rng.random((U, 1)) > 0.3)
+    for i, some in enumerate(sets):
+        used = [x for x in some if free[x]]
+        rows = rng.normal(size=(int((of == i).sum()), len(used)))
+        if unseen and used:
+            rows = rows - rows @ hidden[used] @ np.linalg.pinv(hidden[used])
+        if used and rng.random() < 0.2:
+            rows[:, int(rng.integers(len(used)))] = 0.0
+        F[np.ix_(of == i, used)] = rows
+    return Problem(
+        free, scopes, sets, F * 10.0 ** rng.uniform(-3, 3, U), rng.normal(size=(len(of), p + 1)), of
+    )
+
+
+def folded(problem, nesting):
+    """The factors of a problem, its rows folded in two blocks; the rows without unknowns are left
+    out.
+    """
+    factors = Factors(nesting, 1, problem.right.shape[1] - 1)
+    for half in (slice(0, None, 2), slice(1, None, 2)):
+        F, right, of = problem.F[half], problem.right[half], problem.of[half]
+        for i in np.unique(of):
+            used = np.array([x for x in problem.sets[i] if problem.free[x]], dtype=np.int64)
+            if len(used):
+                node, some = nesting.node[used].max(), of == i
+                width, k = int(nesting.width[node]), int(some.sum())
+                rows = np.zeros((1, k, width + right.shape[1]))
+                rows[0][:, nesting.columns(np.array([node]), used[None])[0]] = F[np.ix_(some, used)]
+                rows[0, :, width:] = right[some]
+                factors.add(int(nesting.form[node]), rows, np.full(k, nesting.place[node]))
+    return factors
+
+
+def dense(problem, nesting):
+    """Best values, their variance, what is open, rank, and the rows left, by one pseudo-inverse for
+    each cluster.
+    """
+    U = len(problem.free)
+    best, variance, open_, rank = (
+        np.zeros((U, problem.right.shape[1])),
+        np.zeros(U),
+        np.zeros(U, dtype=bool),
+        0,
+    )
+    left = []
+    for c in range(int(nesting.cluster.max()) + 1):
+        inside = np.flatnonzero(nesting.cluster == c)
+        sets = [i for i, some in enumerate(problem.sets) if set(some) & set(inside.tolist())]
+        rows = np.isin(problem.of, sets)
+        F, right = problem.F[np.ix_(rows, inside)], problem.right[rows]
+        norm = np.linalg.norm(F, axis=0)
+        norm = np.where(norm > 0.0, norm, 1.0)
+        u, s, vt = np.linalg.svd(F / norm)
+        seen = int((s > OWN_RANK * s[0]).sum())
+        inverse = (vt[:seen].T / s[:seen]) @ u[:, :seen].T / norm[:, None]
+        best[inside], variance[inside] = -inverse @ right, (inverse**2).sum(axis=1)
+        open_[inside] = np.linalg.norm(vt[seen:], axis=0) > NULL_COMPONENT
+        left.append(right - u[:, :seen] @ (u[:, :seen].T @ right))
+        rank += seen
+    return best, variance, open_, rank, np.concatenate(left)
+
+
+@pytest.mark.parametrize("unseen", [0, 1, 2])
+def test_nested_elimination_is_the_dense_one_whatever_is_unseen(unseen):
+    deep = 0
+    for seed in range(60):
+        problem = random_problem(np.random.default_rng(seed), unseen)
+        if not problem.free.any():
+            continue
+        nesting = problem.nesting
+        best, variance, open_, rank, left = dense(problem, nesting)
+        found, rest = eliminate(folded(problem, nesting))
+        assert found.rank[0] == rank, seed
+        assert (found.open[0] == open_).all(), seed
+        # each unknown in the unit of its own column: 1e-9 is rounding times the worst condition of
+        # 60 problems
+        scale = np.maximum(np.linalg.norm(problem.F, axis=0), 1e-3)[:, None]
+        values = np.column_stack([found.slope[0], found.shift[0]])
+        assert_allclose(
+            values * scale,
+            best * scale,
+            rtol=0,
+            atol=1e-9 * max(1.0, np.abs(best * scale).max()),
+            err_msg=f"{seed}",
+        )
+        assert_allclose(found.variance()[0][~open_], variance[~open_], rtol=1e-8, err_msg=f"{seed}")
+        squares = (problem.right**2).sum()
+        assert_allclose(
+            rest[0].T @ rest[0], left.T @ left, rtol=0, atol=1e-10 * squares, err_msg=f"{seed}"
+        )
+        deep += len({form.outer for form in nesting.forms}) > 1
+    assert deep > 30, "too few of the problems are nested at all"
+
+
+def test_rows_in_units_of_their_standard_deviations_are_orthonormal():
+    problem = random_problem(np.random.default_rng(8), 0)
+    nesting = problem.nesting
+    found, _ = eliminate(folded(problem, nesting))
+    assert len(nesting.forms) > 2
+    assert not found.open.any()
+    whitened = np.zeros_like(problem.F)
+    for row, i in enumerate(problem.of):
+        used = [x for x in problem.sets[i] if problem.free[x]]
+        if used:
+            path, root, _ = found.at(np.array([nesting.node[used].max()]))
+            whitened[row, path[0]] = problem.F[row, path[0]] @ root[0]
+    free = problem.free
+    assert_allclose(
+        whitened[:, free].T @ whitened[:, free], np.eye(int(free.sum())), rtol=0, atol=1e-9
+    )
+
+
+def test_what_the_leaves_take_up_whole_is_not_taken_for_seen():
+    # ten groups with a height each and one offset that all of them share: only sums of the two are
+    # measured
+    rng, G = np.random.default_rng(0), 10
+    F = np.zeros((5 * G, G + 1))
+    F[np.arange(5 * G), np.repeat(np.arange(G), 5)] = F[:, G] = 1.0
+    sets = [[i, G] for i in range(G)]
+    problem = Problem(np.ones(G + 1, dtype=bool), ["group"] * G + ["machine"], sets, F, rng.normal(size=(5 * G, 3)),
+                      np.repeat(np.arange(G), 5))  # fmt: skip
+    found, rest = eliminate(folded(problem, problem.nesting))
+    assert found.rank[0] == G
+    assert found.open.all()
+    best, _, _, _, left = dense(problem, problem.nesting)
+    assert_allclose(found.shift[0], best[:, -1], rtol=0, atol=1e-12)
+    assert_allclose(
+        rest[0].T @ rest[0], left.T @ left, rtol=0, atol=1e-12 * np.abs(left.T @ left).max()
+    )
+
+
+def nested(scopes, sets):
+    return nest(
+        np.ones(len(scopes), dtype=bool),
+        scopes,
+        np.array([(i, x) for i, some in enumerate(sets) for x in some]),
+    )
+
+
+def test_groups_are_nested_in_their_session_and_sessions_in_what_they_share():
+    scopes = ["machine"] + 2 * (["session"] * 2 + ["group"] * 3)
+    sets = [
+        [0, 1 + 5 * day, 2 + 5 * day, 3 + 5 * day + group] for day in range(2) for group in range(3)
+    ]
+    found = nested(scopes, sets)
+    assert [(len(form), *form.path.shape[1:]) for form in found.forms] == [(1, 1), (2, 3), (6, 4)]
+    assert found.forms[2].path[4].tolist() == [9, 6, 7, 0]
+    assert (found.cluster == 0).all()
+    assert found.columns(found.node[[9]], np.array([[0, 6, 7, 9]])).tolist() == [[3, 1, 2, 0]]
+
+
+def test_many_targets_are_nested_in_the_frame_from_which_they_are_seen():
+    scopes = ["session"] * 6 + ["machine"] * 60
+    found = nested(scopes, [[*range(6), *range(6 + 3 * i, 9 + 3 * i)] for i in range(20)])
+    assert [form.path.shape for form in found.forms] == [(1, 6), (20, 9)]
+
+
+def test_unknowns_of_two_scopes_that_every_row_uses_are_one_node():
+    found = nested(["session"] * 6 + ["machine"] * 3, [list(range(9))])
+    assert [form.path.tolist() for form in found.forms] == [[list(range(9))]]
+
+
+def test_without_free_unknowns_there_is_nothing_to_nest():
+    found = nest(np.zeros(3, dtype=bool), ["group"] * 3, np.array([[0, 0], [0, 1], [0, 2]]))
+    assert found.forms == ()
+    eliminated, rest = eliminate(Factors(found, 2, 4))
+    assert eliminated.slope.shape == (2, 3, 4)
+    assert not rest.any()
+
+
+def probed(groups, per_group=6, seed=1):
+    """A hexapod that probes planes, in turn; all share the offset of one probe."""
+    n = groups * per_group
+    group = np.array([f"plate{i % groups}" for i in range(n)])
+    sensor = Sensor(PROBE, Gaussian(np.full(1, 5e-6)), group=group)
+    truth = zoo.hexapod().with_values(zoo.hexapod_truth())
+    return simulate(
+        truth,
+        hexapod_poses(n),
+        Instrument((sensor,)),
+        seed,
+        unknowns={"probe.x": 2e-3, "probe.z": 0.0615},
+    )
+
+
+def fold_of(data):
+    """Factor of one fold at the nominal machine, own unknowns from where they are stated, and
+    these.
+    """
+    free = unknowns(hexapod())
+    rows = rows_of(free, data)
+    assert rows.own is not None
+    rows.own.started[:] = True
+    return rows.fold(free.deviation(hexapod().values[None]), np.arange(1))[0][0], rows.own
+
+
+def test_planes_that_share_a_probe_cost_twice_as_much_where_there_are_twice_as_many(monkeypatch):
+    counted, add = {"rows": 0, "kept": 0, "widest": 0}, Factors.add
+
+    def counting(self, form, rows, places):
+        add(self, form, rows, places)
+        if self.parameters:
+            kept = sum(factor.size for factor in self.whole())
+            widest = max(counted["widest"], rows.shape[2])
+            counted.update(rows=counted["rows"] + rows.size, kept=kept, widest=widest)
+
+    monkeypatch.setattr(Factors, "add", counting)
+    found = []
+    for groups in (5, 10, 20):
+        counted.update(rows=0, kept=0, widest=0)
+        _, own = fold_of(probed(groups))
+        # three numbers of a plane, three of the probe, the machine, the residual; dense it were 3 *
+        # groups + 46
+        assert counted["widest"] == 3 + 3 + 42 + 1
+        assert int(own.nesting.width.max()) == 6
+        found.append((counted["rows"], counted["kept"]))
+    one, two, four = np.array(found)
+    assert (four - two == 2 * (two - one)).all()
+    assert (four <= 4 * one).all()
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_planes_and_the_probe_they_share_give_the_joint_solution(held):
+    data = probed(6, per_group=15)
+    free = unknowns(hexapod())
+    local = (
+        data.unknowns.with_prior("plate[0-3].*", 1e-3).with_prior("probe.x", 1e-4)
+        if held
+        else data.unknowns
+    )
+    local = local.fixed("plate5.plane.u")
+    rows = rows_of(free, data, local)
+    assert rows.own is not None
+    rows.own.started[:] = True
+    factor = rows.fold(free.deviation(hexapod().values[None]), np.arange(1))[0][0]
+    values, table = rows.own.values[0], local.table
+    F = look(scene(free, data.readings), data, local, values)[0]
+    F[:, : len(local)][:, ~table.free] = 0.0
+    priors = np.flatnonzero(table.free & ~np.isnan(table.tolerance))
+    weight = np.zeros((len(priors), F.shape[1]))
+    weight[np.arange(len(priors)), priors] = 1.0 / table.tolerance[priors]
+    weight[:, -1] = (values - table.nominal)[priors] / table.tolerance[priors]
+    F = np.concatenate([F, weight])
+    used, right = F[:, : len(local)][:, table.free], F[:, len(local) :]
+    q = np.linalg.svd(used / np.linalg.norm(used, axis=0), full_matrices=False)[0]
+    left = right - q @ (q.T @ right)
+    assert_allclose(
+        factor.T @ factor, left.T @ left, rtol=0, atol=1e-10 * np.abs(left.T @ left).max()
+    )
+    assert rows.rows[0] == len(F) - used.shape[1]
+    assert len(rows.own.nesting.forms) > 1
+
+
+def test_groups_whose_rows_come_in_several_blocks_are_folded_as_whole(monkeypatch):
+    data = probed(7)
+    whole = fold_of(data)[0]
+    monkeypatch.setattr(rows_module, "BLOCK", 5)
+    parts = fold_of(data)[0]
+    assert_allclose(
+        parts.T @ parts, whole.T @ whole, rtol=0, atol=1e-10 * np.abs(whole.T @ whole).max()
+    )
+
+
+def test_a_fit_with_planes_that_share_a_probe_finds_it():
+    data = probed(12, per_group=10)
+    fit = identify(hexapod(), data, LeastSquares())
+    assert fit.converged
+    assert fit.p_value > 1e-3
+    assert (
+        fit.rank == 30
+    )  # of 42, less the frames of the base and of the tool: the probe and the planes are free

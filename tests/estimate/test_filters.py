@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Methods as filter factors on one decomposition: identities to 1e-12, and rules that choose for
+themselves.
+"""
+
+import numpy as np
+import pytest
+
+from loopcal.errors import EstimationError
+from loopcal.estimate.penalties import MAP, LeastSquares, Ridge, TruncatedSVD
+from loopcal.estimate.regularization_rules import GCV, MarginalLikelihood, TruncationGCV
+from loopcal.numerics.decomposition import decompose
+from tests.estimate.problems import folded
+
+P, M, T = 6, 50, 4
+
+
+@pytest.fixture
+def rows() -> np.ndarray:
+    return np.random.default_rng(11).standard_normal((T, M, P + 1)) * np.array(
+        [3.0, 1.0, 0.3, 1.0, 0.1, 1.0, 1.0]
+    )
+
+
+def estimate(rows: np.ndarray, method) -> np.ndarray:
+    """Deviation (t, p) that the method finds for linear rows [A | b]."""
+    d = decompose(
+        folded(rows), np.full(len(rows), rows.shape[1]), scale=method.scale(P), flat=method.flat(P)
+    )
+    return d.deviation(d.solution(method.penalty(d)))
+
+
+def stacked(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Solve the least-squares problem with the penalty written as extra rows."""
+    return np.stack(
+        [
+            np.linalg.lstsq(
+                np.vstack([r[:, :P], np.diag(np.sqrt(weights))]),
+                np.append(r[:, P], np.zeros(P)),
+                rcond=None,
+            )[0]
+            for r in rows
+        ]
+    )
+
+
+def test_ridge_equals_the_penalty_written_as_extra_rows(rows):
+    np.testing.assert_allclose(
+        estimate(rows, Ridge(2.5)), stacked(rows, np.full(P, 2.5)), rtol=1e-12
+    )
+
+
+def test_one_lambda_per_parameter_equals_extra_rows_of_different_weight(rows):
+    lam = np.array([1.0, 0.1, 20.0, 3.0, 1e-3, 5.0])
+    np.testing.assert_allclose(estimate(rows, Ridge(tuple(lam))), stacked(rows, lam), rtol=1e-12)
+
+
+def test_a_parameter_with_lambda_zero_is_not_held_back(rows):
+    lam = np.array([1.0, 0.0, 20.0, 3.0, 0.0, 5.0])
+    method = Ridge(tuple(lam))
+    d = decompose(folded(rows), np.full(T, M), scale=method.scale(P), flat=method.flat(P))
+    penalty = method.penalty(d)
+    np.testing.assert_allclose(d.deviation(d.solution(penalty)), stacked(rows, lam), rtol=1e-12)
+    for r, c in zip(rows, d.covariance(penalty), strict=True):
+        np.testing.assert_allclose(
+            c @ (r[:, :P].T @ r[:, :P] + np.diag(lam)), np.eye(P), atol=1e-12
+        )
+    assert method.needs(P) == 2
+    # all alike: the plain method
+    assert np.array_equal(estimate(rows, Ridge((0.0,) * P)), estimate(rows, LeastSquares()))
+    plain = decompose(folded(rows), np.full(T, M))
+    np.testing.assert_allclose(
+        decompose(folded(rows), np.full(T, M), flat=method.flat(P)).plain().singular_values,
+        plain.singular_values,
+        rtol=1e-12,
+    )
+
+
+def test_an_unseen_parameter_with_lambda_zero_stays_unknown_and_leaves_the_others_alone(rows):
+    rows = rows.copy()
+    rows[:, :, 4] = rows[:, :, 1]
+    flat = np.array([False, True, False, False, True, False])
+    d = decompose(folded(rows), np.full(T, M), flat=flat)
+    assert d.flat is not None
+    penalty = np.where(d.flat, np.where(d.used, 0.0, np.inf), 1.0)
+    sd = d.standard_deviations(penalty)
+    assert np.isinf(sd[:, flat]).all()
+    assert np.isfinite(sd[:, ~flat]).all()
+    np.testing.assert_allclose(
+        d.deviation(d.solution(penalty)), stacked(rows, 1.0 - flat), rtol=1e-10
+    )
+    V, variance, seen = d.knowledge(penalty)
+    np.testing.assert_allclose(V.T @ V, np.eye(P), atol=1e-12)
+    assert np.isinf(variance).sum() == 1
+    assert seen.sum() == 5
+    known = np.isfinite(variance)
+    finite = (V[:, known] * variance[known]) @ V[:, known].T
+    np.testing.assert_allclose(np.diag(finite)[~flat], sd[0, ~flat] ** 2, rtol=1e-10)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7])
+def test_ridge_in_every_step_is_another_filter_that_tends_to_least_squares(rows, steps):
+    lam = 3.0
+    A, b = rows[0, :, :P], rows[0, :, P]
+    z = np.zeros(P)
+    for _ in range(steps):
+        z = z + np.linalg.solve(A.T @ A + lam * np.eye(P), A.T @ (b - A @ z))
+    d = decompose(folded(rows[:1]), np.array([M]))
+    f = 1.0 - (lam / (d.singular_values**2 + lam)) ** steps
+    np.testing.assert_allclose(
+        z, d.deviation(f * d.projections / d.singular_values)[0], rtol=1e-12, atol=1e-14
+    )
+
+
+def test_map_is_ridge_one_on_columns_scaled_by_their_spread(rows):
+    spread = np.array([0.5, 2.0, 1.0, 3.0, 0.1, 1.0])
+    scaled = rows.copy()
+    scaled[:, :, :P] *= spread
+    lam = tuple(1.0 / spread**2)
+    np.testing.assert_allclose(
+        spread * estimate(scaled, MAP()), estimate(rows, Ridge(lam)), rtol=1e-12
+    )
+
+
+def test_map_is_ridge_with_lambda_one(rows):
+    np.testing.assert_allclose(estimate(rows, MAP()), estimate(rows, Ridge(1.0)), rtol=1e-15)
+
+
+def test_truncation_at_full_rank_and_ridge_at_zero_are_least_squares(rows):
+    expected = estimate(rows, LeastSquares())
+    np.testing.assert_array_equal(estimate(rows, TruncatedSVD(P)), expected)
+    np.testing.assert_allclose(estimate(rows, Ridge(0.0)), expected, rtol=1e-15)
+
+
+def test_truncation_projects_the_least_squares_solution_onto_the_strongest_directions(rows):
+    d = decompose(folded(rows), np.full(T, M))
+    strongest = d.directions[:, :, :3]
+    expected = strongest @ (strongest.swapaxes(-1, -2) @ estimate(rows, LeastSquares())[:, :, None])
+    np.testing.assert_allclose(estimate(rows, TruncatedSVD(3)), expected[:, :, 0], rtol=1e-12)
+
+
+def test_filter_factors_are_the_formulas(rows):
+    d = decompose(folded(rows), np.full(T, M))
+    s2 = d.singular_values**2
+    np.testing.assert_allclose(d.filter_factors(Ridge(0.7).penalty(d)), s2 / (s2 + 0.7), rtol=1e-15)
+    np.testing.assert_array_equal(
+        d.filter_factors(TruncatedSVD(2).penalty(d)), np.arange(P) < np.array([2] * T)[:, None]
+    )
+    np.testing.assert_array_equal(d.filter_factors(LeastSquares().penalty(d)), np.ones((T, P)))
+
+
+def test_posterior_covariance_of_map_is_the_inverse_information(rows):
+    d = decompose(folded(rows), np.full(T, M))
+    covariance = d.covariance(MAP().penalty(d))
+    for r, c in zip(rows, covariance, strict=True):
+        np.testing.assert_allclose(c @ (r[:, :P].T @ r[:, :P] + np.eye(P)), np.eye(P), atol=1e-12)
+
+
+def test_eliminating_unknowns_by_projection_equals_solving_for_all_of_them_at_once(rows):
+    joint = estimate(rows, LeastSquares())[:, :4]
+    local, rest = rows[:, :, 4:P], np.concatenate([rows[:, :, :4], rows[:, :, P:]], axis=2)
+    q = np.linalg.qr(local).Q
+    projected = rest - q @ (q.swapaxes(-1, -2) @ rest)
+    d = decompose(folded(projected), np.full(T, M - 2))
+    np.testing.assert_allclose(d.deviation(d.solution(np.zeros((T, 4)))), joint, rtol=1e-12)
+
+
+def test_gcv_is_at_its_minimum(rows):
+    rows = rows.copy()
+    rows[:, :, P] += rows[:, :, :P] @ np.full(
+        P, 0.3
+    )  # something to find, so that the minimum is inside
+    d = decompose(folded(rows), np.full(T, M))
+
+    def criterion(lam):
+        penalty = np.broadcast_to(lam[:, None], (T, P))
+        return d.remaining(penalty) / (M - d.filter_factors(penalty).sum(axis=1)) ** 2
+
+    lam = GCV()(d)
+    for factor in (0.8, 1.25):
+        assert np.all(criterion(lam) <= criterion(lam * factor) * (1 + 1e-9))
+
+
+def test_marginal_likelihood_finds_the_prior_variance_that_made_the_data():
+    rng = np.random.default_rng(8)
+    a = rng.standard_normal((1, 4000, 400))
+    b = a @ (0.05 * rng.standard_normal((400, 1))) + rng.standard_normal((1, 4000, 1))
+    d = decompose(folded(np.concatenate([a, b], axis=2)), np.array([4000]))
+    # lam = 1 / 0.05^2 = 400; its standard error from 400 unknowns is about 400 sqrt(2 / 400) = 28
+    assert MarginalLikelihood()(d)[0] == pytest.approx(400.0, abs=4 * 28)
+
+
+def test_rules_choose_for_each_trial_on_its_own(rows):
+    together = estimate(rows, Ridge(GCV()))
+    alone = np.concatenate([estimate(rows[i : i + 1], Ridge(GCV())) for i in range(T)])
+    np.testing.assert_array_equal(together, alone)
+    assert estimate(rows, TruncatedSVD(TruncationGCV())).shape == (T, P)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Ridge(-1.0), "finite number >= 0"),
+        (lambda: Ridge((1.0, -1.0)), "finite number >= 0"),
+        (lambda: MAP(0.0), "finite factor above 0"),
+        (lambda: Ridge(float("nan")), "finite number >= 0"),
+        (lambda: TruncatedSVD(-1), "0 or more"),
+        (lambda: Ridge((1.0, 2.0)).scale(3), "2 values of lam for 3"),
+    ],
+)
+def test_impossible_settings_are_refused(make, words):
+    with pytest.raises(EstimationError, match=words):
+        make()

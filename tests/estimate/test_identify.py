@@ -1,0 +1,317 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identification: truth found, uncertainty stated, what cannot be known named, bad requests
+refused.
+"""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import loopcal.estimate.rows as rows_module
+from loopcal.errors import EstimationError
+from loopcal.estimate import (
+    MAP,
+    DescentStatus,
+    LeastSquares,
+    Ridge,
+    StepControl,
+    TruncatedSVD,
+    identify,
+    identify_trials,
+)
+from loopcal.io.core.json_text import to_json
+from loopcal.measure import sample_truth, simulate, simulate_trials
+from loopcal.mechanism import forward
+from tests import zoo
+from tests.estimate.problems import (
+    bed,
+    five_dof,
+    hexapod,
+    hexapod_data,
+    hexapod_poses,
+    probe,
+    probed_heights,
+    tracker,
+    with_tolerance,
+)
+
+MM = 1e-3
+
+
+@pytest.fixture(scope="module")
+def data():
+    return hexapod_data()
+
+
+@pytest.fixture(scope="module")
+def fit(data):
+    return identify(hexapod(), data, LeastSquares())
+
+
+def test_the_true_parameters_lie_within_their_uncertainty(fit):
+    pull = (fit.estimate - zoo.hexapod_truth()) / fit.sd
+    assert fit.converged
+    assert fit.rank == 42
+    assert np.abs(pull).max() < 4.5  # 42 correlated normal numbers
+    assert 0.5 < np.sqrt(np.mean(pull**2)) < 1.5
+    assert 1e-4 < fit.p_value < 1 - 1e-4
+    assert fit.dof == 30 * 6 - 42
+
+
+def test_the_corrected_robot_carries_the_estimate(fit):
+    assert np.array_equal(fit.robot.values, fit.estimate)
+    assert np.array_equal(fit.initial.values, zoo.hexapod().values)
+    assert np.array_equal(fit.plus_minus, fit.interval())
+
+
+def test_exact_poses_of_the_nategh_hexapod_are_recovered_quadratically():
+    # errors up to 5 mm; our bounds on medians and on the worst of 100 draws [mm]
+    robot, truth = zoo.nategh(), zoo.nategh_truth()
+    steps = []
+    for seed in range(100):
+        T = zoo.nategh_poses(np.random.default_rng(seed))
+        exact = simulate(robot.with_values(truth), T, tracker(1e-16, 5e-16), seed)
+        fit = identify(robot, exact, LeastSquares(), begin="closure")
+        assert fit.converged
+        errors = np.abs(fit.estimate_history - truth).max(axis=1) / MM
+        steps.append(errors[1:4])
+    assert (np.median(steps, axis=0) <= [0.6, 4e-4, 1e-9]).all()
+    assert (np.max(steps, axis=0) <= [2.0, 4e-3, 2e-8]).all()
+
+
+@pytest.mark.parametrize("method", [LeastSquares(), MAP()])
+def test_beginning_from_closure_leads_to_the_same_estimate(data, method):
+    a, b = identify(hexapod(), data, method), identify(hexapod(), data, method, begin="closure")
+    np.testing.assert_allclose(a.estimate, b.estimate, rtol=0, atol=1e-12)  # [m]
+    assert a.chi_square == pytest.approx(b.chi_square, rel=1e-9)
+
+
+def test_beginning_from_closure_changes_nothing_where_poses_are_not_measured_in_full():
+    heights = hexapod_data(60, instrument=probe())
+    a = identify(hexapod(), heights, MAP())
+    b = identify(hexapod(), heights, MAP(), begin="closure")
+    assert np.array_equal(a.estimate, b.estimate)
+    (note,) = set(b.notes) - set(a.notes)
+    assert note.startswith(
+        "begin closure was not used: it needs one kind that measures all poses in full"
+    )
+
+
+def test_that_uncertain_readings_cannot_begin_from_closure_is_noted(data):
+    few = replace(data.take(np.arange(10)), reading_sigma=2e-6)
+    fit = identify(hexapod(), few, MAP(), begin="closure")
+    assert (
+        "begin closure was not used: it needs exact readings; the fit began with the kinematics"
+        in fit.notes
+    )
+
+
+def test_leaving_poses_out_by_weight_equals_removing_them(data):
+    weight = np.ones(data.n_poses)
+    weight[[3, 17, 29]] = 0.0
+    by_weight = identify(hexapod(), data.reweighted(weight), LeastSquares())
+    removed = identify(hexapod(), data.take(weight > 0.0), LeastSquares())
+    np.testing.assert_allclose(by_weight.estimate, removed.estimate, rtol=0, atol=1e-12)  # [m]
+    np.testing.assert_allclose(by_weight.sd, removed.sd, rtol=1e-9)
+    assert by_weight.dof == removed.dof
+
+
+def test_the_order_of_poses_changes_rounding_only(data, fit):
+    order = np.random.default_rng(0).permutation(data.n_poses)
+    shuffled = identify(hexapod(), data.take(order), LeastSquares())
+    np.testing.assert_allclose(shuffled.estimate, fit.estimate, rtol=0, atol=1e-12)  # [m]
+
+
+def test_blocks_of_poses_change_rounding_only(data, fit, monkeypatch):
+    monkeypatch.setattr(rows_module, "BLOCK", 7)
+    blocked = identify(hexapod(), data, LeastSquares())
+    np.testing.assert_allclose(blocked.estimate, fit.estimate, rtol=0, atol=1e-12)  # [m]
+    np.testing.assert_allclose(blocked.residuals[0].raw, fit.residuals[0].raw, rtol=0, atol=1e-12)
+    assert blocked.residuals[0].poses == fit.residuals[0].poses
+
+
+@pytest.mark.parametrize(
+    ("method", "begin"), [(LeastSquares(), "kinematics"), (MAP(), "kinematics"), (MAP(), "closure")]
+)
+def test_stacked_trials_equal_single_ones_bit_for_bit(method, begin):
+    robot = hexapod()
+    trials = simulate_trials(robot, sample_truth(robot, 7, 1), hexapod_poses(15), tracker(), 2)
+    together = identify_trials(robot, trials, method, begin=begin)
+    assert together.converged.all()
+    for i in range(7):
+        alone = identify(robot, trials.trial(i), method, begin=begin)
+        assert np.array_equal(together.values[i], alone.robot.values)
+        assert together.iterations[i] == alone.iterations
+        np.testing.assert_allclose(together.standard_deviations()[i], alone.sd, rtol=1e-12)
+
+
+def test_a_trial_out_of_reach_is_marked_and_leaves_the_others_alone():
+    robot = hexapod()
+    truth = sample_truth(robot, 3, 1)
+    trials = simulate_trials(robot, truth, hexapod_poses(15), tracker(), 2)
+    start = np.repeat(robot.values[None], 3, axis=0)
+    start[1] += 1.0  # [m]
+    found = identify_trials(robot, trials, start=start)
+    assert found.status[1] == DescentStatus.BAD_START
+    assert found.converged[[0, 2]].all()
+    # the trials no longer share a start, so this also proves the path without sharing
+    np.testing.assert_allclose(
+        found.values[2], identify_trials(robot, trials).values[2], rtol=0, atol=1e-13
+    )
+
+
+def test_map_is_ridge_one_and_pulls_towards_nominal(data, fit):
+    posterior, ridge = identify(hexapod(), data, MAP()), identify(hexapod(), data, Ridge(1.0))
+    np.testing.assert_allclose(posterior.estimate, ridge.estimate, rtol=0, atol=1e-15)
+    assert (posterior.sd < fit.sd).all()
+    assert (posterior.sd < fit.tolerance).all()
+    assert posterior.check.degrees == 180
+
+
+def test_truncation_at_full_rank_is_least_squares(data, fit):
+    np.testing.assert_allclose(
+        identify(hexapod(), data, TruncatedSVD(42)).estimate, fit.estimate, rtol=0, atol=1e-15
+    )
+
+
+def test_fixed_parameters_stay_and_have_no_uncertainty(data):
+    robot = hexapod()
+    names = [n for n in robot.parameters.names if not n.startswith("leg4")]
+    some = replace(robot, parameters=robot.parameters.only(names))
+    fit = identify(some, data, LeastSquares())
+    held = [i for i, n in enumerate(robot.parameters.names) if n.startswith("leg4")]
+    assert len(fit.names) == 35
+    assert np.array_equal(fit.robot.values[held], robot.values[held])
+    assert np.isnan(fit.plus_minus[held]).all()
+    assert fit.p_value < 1e-6
+    assert "times what the stated noise explains" in fit.check.sentence
+
+
+def test_what_the_data_cannot_tell_is_named_has_infinite_uncertainty_and_stays_nearest_to_nominal():
+    robot, data = hexapod(), hexapod_data(30, instrument=five_dof())
+    fit = identify(robot, data, LeastSquares())
+    assert fit.rank == 41
+    (turn,) = fit.unidentifiable
+    assert {n for n, sd in zip(fit.names, fit.sd, strict=True) if np.isinf(sd)} == set(turn.names)
+    assert sum("not identifiable: together" in note for note in fit.notes) == 1
+    assert np.isnan(fit.covariance[np.isinf(fit.sd)][:, np.isfinite(fit.sd)]).all()
+    # walking along the combination changes no measured value, and only adds to the deviation
+    step = np.zeros(42)
+    step[[fit.names.index(n) for n in turn.names]] = turn.changes * 1e-6  # [m]
+    moved = forward(fit.robot.with_values(fit.robot.values + step), data.readings).T
+    still = forward(fit.robot, data.readings).T
+    kind = data.observations[0]
+    change = kind.evaluate(moved[None]).residual - kind.evaluate(still[None]).residual
+    assert np.abs(change).max() < 1e-9  # [m, rad] of second order in 1e-5 rad
+    assert np.abs((fit.estimate - fit.nominal) @ step) < 1e-6 * np.linalg.norm(
+        step
+    ) * np.linalg.norm(fit.estimate - fit.nominal)
+    assert identify(robot, data, MAP()).sd.max() < 0.035 * MM
+
+
+def test_missing_tolerances_are_assumed_aloud(data):
+    fit = identify(zoo.hexapod(), data, LeastSquares())
+    assert any("42 of 42 parameters have no tolerance" in note for note in fit.notes)
+    assert not any(
+        "no tolerance" in note for note in identify(hexapod(), data, LeastSquares()).notes
+    )
+
+
+def test_fewer_equations_than_parameters_are_refused_unless_asked_for_or_a_prior_fills_the_gap(
+    data,
+):
+    few = data.take(np.arange(5))
+    with pytest.raises(
+        EstimationError, match=r"30 equations from 5 poses cannot determine 42 .* at least 7 poses"
+    ):
+        identify(hexapod(), few, LeastSquares())
+    forced = identify(hexapod(), few, LeastSquares(), allow_fewer_equations=True)
+    assert forced.rank == 30
+    assert len(forced.unidentifiable) == 12
+    assert "no degree of freedom" in forced.check.sentence
+    assert np.isfinite(identify(hexapod(), few, MAP()).sd).all()
+
+
+def test_few_degrees_of_freedom_give_no_intervals_unless_sigma_is_given():
+    robot = with_tolerance(zoo.delta(), 1e-3)
+    six = [n for n in robot.parameters.names if "arm" not in n and "angle" not in n][:6]
+    some = replace(robot, parameters=robot.parameters.only(six))
+    data = probed_heights(robot, bed(len(six) + 1))
+    estimated, given = (
+        identify(some, data, LeastSquares(), noise="estimated"),
+        identify(some, data, LeastSquares()),
+    )
+    assert estimated.dof == 1
+    assert (
+        "one degree of freedom is too few for intervals unless the instrument's sigma is given"
+        in estimated.notes
+    )
+    assert np.isnan(estimated.sd).all()
+    assert np.isfinite(given.sd).all()
+
+
+def test_estimated_noise_scales_the_uncertainty(data):
+    quarter = hexapod_data(instrument=tracker(4e-6, 20e-6))
+    claimed = quarter.observations[0]
+    sharp = replace(quarter, observations=(replace(claimed, covariance=claimed.covariance / 16.0),))
+    fit = identify(hexapod(), sharp, LeastSquares(), noise="estimated")
+    assert fit.check.sigma_scale == pytest.approx(4.0, rel=0.25)  # 138 degrees of freedom: sd 6 %
+    np.testing.assert_allclose(
+        fit.sd,
+        identify(hexapod(), quarter, LeastSquares()).sd * fit.check.sigma_scale / 4.0,
+        rtol=1e-3,
+    )
+    assert np.isnan(fit.p_value)
+    assert "sigma too small" in identify(hexapod(), sharp, LeastSquares()).check.sentence
+
+
+def test_poses_out_of_reach_are_refused_by_name_and_ignored_without_weight(data):
+    readings = data.readings.copy()
+    readings[4] = -0.2  # [m]
+    broken = replace(data, readings=readings)
+    with pytest.raises(EstimationError, match=r"cannot reach 1 of 30 poses .*'5'"):
+        identify(hexapod(), broken, LeastSquares())
+    weight = np.ones(30)
+    weight[4] = 0.0
+    found = identify(hexapod(), broken.reweighted(weight), LeastSquares())
+    expected = identify(hexapod(), data.take(weight > 0), LeastSquares())
+    np.testing.assert_allclose(found.estimate, expected.estimate, rtol=0, atol=1e-12)
+
+
+def test_an_iteration_cut_short_says_so(data):
+    fit = identify(hexapod(), data, LeastSquares(), control=StepControl(iterations=0))
+    assert fit.status is DescentStatus.OUT_OF_ITERATIONS
+    assert "did not converge" in fit.notes[0]
+    assert "did not converge" in str(fit)
+
+
+def test_a_start_far_off_converges_to_the_same_answer(data, fit):
+    start = zoo.hexapod().values + np.random.default_rng(1).uniform(-5 * MM, 5 * MM, 42)
+    far = identify(hexapod(), data, LeastSquares(), start=start)
+    assert far.converged
+    np.testing.assert_allclose(
+        far.estimate, fit.estimate, rtol=0, atol=1e-9
+    )  # [m] 1e-3 of the smallest sd
+
+
+def test_rows_of_weight_zero_alone_and_no_free_parameter_are_refused(data):
+    with pytest.raises(EstimationError, match="every row is absent or has weight 0"):
+        identify(hexapod(), data.reweighted(np.zeros(30)), LeastSquares())
+    fixed = replace(hexapod(), parameters=hexapod().parameters.only([]))
+    with pytest.raises(EstimationError, match="no free parameter"):
+        identify(fixed, data, LeastSquares())
+    with pytest.raises(EstimationError, match="'given' or 'estimated'"):
+        identify(hexapod(), data, LeastSquares(), noise="guessed")  # pyright: ignore[reportArgumentType]
+
+
+def test_the_printed_table_and_the_json_name_every_parameter(fit):
+    text = str(fit)
+    assert all(name in text for name in fit.names)
+    assert "rank 42 of 42" in text
+    document = json.loads(to_json(fit.to_dict()))
+    assert [p["name"] for p in document["parameters"]] == list(fit.names)
+    assert document["parameters"][0]["unit"] == "mm"
+    assert document["status"] == "converged"
+    assert set(fit.arrays()) >= {"estimate", "covariance", "residual_0_pose"}

@@ -1,0 +1,488 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Uncertain readings and poses nobody measured: exact in the limit, equal to the dense problem,
+honest in its intervals.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.optimize import least_squares
+from scipy.stats import binom, chi2
+
+import loopcal.estimate.components as components_module
+import loopcal.estimate.latent as latent_module
+import loopcal.estimate.settle as settle_module
+from loopcal.apply import validate
+from loopcal.diagnose import cross_validate, examine, find_outliers, identifiability
+from loopcal.errors import DataError, EstimationError
+from loopcal.estimate import Huber, LeastSquares, Tukey, identify, identify_trials
+from loopcal.estimate.left_out import without_poses
+from loopcal.io import load_robot
+from loopcal.measure import (
+    Instrument,
+    JointSensor,
+    Measurements,
+    Pose,
+    Position,
+    Sensor,
+    Separation,
+    sample_truth,
+    simulate,
+    simulate_trials,
+)
+from loopcal.mechanism import forward, inverse
+from loopcal.mechanism.workspace import sample
+from tests.estimate.latent_problems import dense, measured_hexapod, only, seven_legs, ups_hexapod
+from tests.estimate.problems import UM, hexapod, hexapod_poses, noise, tracker
+
+TINY = 1e-11  # [m]: (TINY / sigma of the tracker)^2 = 1e-10 is what it may change
+
+
+def sigma_of(data):
+    """The sigma of the readings, a copy."""
+    assert data.reading_sigma is not None
+    return data.reading_sigma.copy()
+
+
+def latent_of(fit):
+    """What a fit found of its poses."""
+    assert fit.latent is not None
+    return fit.latent
+
+
+def largest_difference(a, b):
+    """Of two fits, in standard deviations of the second: estimates, and covariances."""
+    return np.abs((a.estimate - b.estimate) / b.sd).max(), np.abs(
+        (a.covariance - b.covariance) / np.outer(b.sd, b.sd)
+    ).max()
+
+
+def case(name):
+    """A robot and its measurements with exact readings."""
+    if name == "hexapod":
+        return hexapod(), measured_hexapod(12, None)
+    if name == "hexapod, frame unknown":
+        return hexapod(), measured_hexapod(
+            12, None, sensors=(Sensor(Pose(unknown=("frame",)), noise(*[5e-6] * 3, *[UM] * 3)),)
+        )
+    robot = load_robot("3-prs")
+    truth = robot.with_values(sample_truth(robot, 1, 1)[0])
+    passive = inverse(robot, sample(robot, 1, 0).coordinates).passive_names[0]
+    sensors = (
+        *tracker().sensors,
+        Sensor(JointSensor(joints=(passive, "q2"), measures="angle"), noise(5e-6, 5e-6)),
+    )
+    if robot.actuators[1].name != "q2" or "angle" not in robot.actuators[1].dimension.value:
+        sensors = (
+            *tracker().sensors,
+            Sensor(JointSensor(joints=(passive,), measures="angle"), noise(5e-6)),
+        )
+    return robot, simulate(truth, sample(robot, 20, 2).coordinates, Instrument(sensors), 0)
+
+
+@pytest.mark.parametrize(
+    "name", ["hexapod", "hexapod, frame unknown", "3-prs with a passive joint"]
+)
+def test_a_sigma_that_vanishes_gives_the_fit_of_exact_readings(name):
+    robot, data = case(name)
+    exact = identify(robot, data, LeastSquares(), rank_tolerance=1e-9)
+    for sigma in (TINY, np.where(np.arange(data.readings.shape[1]) == 1, 0.0, TINY)):
+        found = identify(
+            robot, replace(data, reading_sigma=sigma), LeastSquares(), rank_tolerance=1e-9
+        )
+        assert found.rank == exact.rank
+        assert found.dof == exact.dof
+        if np.isfinite(exact.sd).all():
+            assert max(largest_difference(found, exact)) < 1e-9
+        else:  # a frame is known only together with the machine: what is known is the same
+            known = exact.posterior.directions[:, exact.posterior.seen]
+            change = known.T @ ((found.estimate - exact.estimate) / exact.posterior.unit)
+            assert (
+                np.abs(change / np.sqrt(exact.posterior.variance[exact.posterior.seen])).max()
+                < 1e-9
+            )
+            assert_allclose(
+                found.singular_values[: found.rank], exact.singular_values[: found.rank], rtol=1e-9
+            )
+
+
+def test_readings_stated_as_exact_take_the_ordinary_path_to_the_last_bit():
+    data = measured_hexapod(10, None)
+    plain, stated = (
+        identify(hexapod(), d, LeastSquares()) for d in (data, replace(data, reading_sigma=0.0))
+    )
+    assert stated.latent is None
+    assert_array_equal(stated.estimate, plain.estimate)
+    assert_array_equal(stated.covariance, plain.covariance)
+
+
+def test_noise_missing_readings_and_linked_poses_equal_the_problem_with_every_reading_unknown():
+    robot = only(
+        hexapod(),
+        (
+            "leg1.base.x",
+            "leg2.base.z",
+            "leg3.platform.y",
+            "leg4.length",
+            "leg5.length",
+            "leg6.base.y",
+        ),
+    )
+    full = Sensor(Pose(), noise(*[5e-6] * 3, *[UM] * 3), rows=np.array([0, 1, 2]))
+    ball = Sensor(Separation(), noise(2 * UM), rows=np.array([[1, 3], [3, 4], [0, 5]]))
+    data = measured_hexapod(
+        6,
+        3 * UM,
+        sensors=(full, ball, Sensor(Position(), noise(UM, UM, UM), rows=np.array([3, 4, 5]))),
+    )
+    readings, sigma = data.readings.copy(), sigma_of(data)
+    readings[2, 4], sigma[2, 4] = np.nan, np.inf
+    sigma[5, 0] = 0.0
+    data = replace(data, readings=readings, reading_sigma=sigma)
+    expected, covariance = dense(robot, data, sigma_of(data))
+    found = identify(robot, data, LeastSquares())
+    assert found.converged
+    sd = np.sqrt(np.diag(covariance))
+    assert_allclose(found.estimate, expected, atol=1e-4 * sd.min(), rtol=0)  # [m], differences
+    stated = (
+        found.covariance / found.check.sigma_scale**2
+    )  # six of 42 wrong parameters are free: it is widened
+    assert_allclose(stated, covariance, atol=1e-4 * sd.max() ** 2, rtol=0)
+    assert latent_of(found).to_dict() == {
+        "exact": 1,
+        "uncertain": 34,
+        "not_taken": 1,
+        "open": [],
+        "calm": True,
+    }
+    assert {r.kind for r in found.residuals} == {"pose", "separation", "position", "readings"}
+    whitened = found.residuals[-1].whitened
+    assert whitened[2, 4] == 0.0
+    assert np.isnan(found.residuals[-1].raw[2, 4])
+    total = sum(float((r.whitened**2).sum()) for r in found.residuals)
+    assert total == pytest.approx(found.chi_square, rel=1e-6)
+
+
+@pytest.fixture(scope="module")
+def cable():
+    """A four-line robot, a true one, and positions in its workspace."""
+    robot = load_robot("cable-4")
+    return robot, robot.with_values(sample_truth(robot, 1, 3)[0]), sample(robot, 30, 5).coordinates
+
+
+def test_redundant_readings_equal_the_problem_with_every_position_unknown(cable):
+    robot, truth, positions = cable
+    data = simulate(
+        truth,
+        positions[:12],
+        Instrument((Sensor(Position(), noise(*[1e-3] * 3), rows=np.arange(8)),)),
+        1,
+    )
+    found = identify(robot, data, LeastSquares())
+    sigma = np.array([a.sigma for a in robot.actuators])
+    p, unit, names = len(found.names), robot.parameters.tolerance, robot.parameters.names
+    lengths = np.array([limb.length for limb in robot.assembly.limbs])
+    nominal = np.array([limb.links[-1].transform[:3, 3] for limb in robot.assembly.limbs])
+    radius = np.array([a.terms["gain"] for a in robot.actuators])
+
+    def rows(x):
+        change = dict(zip(names, unit * x[:p], strict=True))
+        anchors = nominal + [[change[f"{limb}.anchor.{axis}"] for axis in "xyz"] for limb in "ABCD"]
+        length = lengths + [change[f"{limb}.length"] for limb in "ABCD"]
+        spool = radius + [change[f"{a.name}.radius"] for a in robot.actuators]
+        at = x[p:].reshape(-1, 3)
+        q = (np.linalg.norm(at[:, None] - anchors, axis=2) - length) / spool
+        seen = (at[:8] - data.observations[0].measured) / 1e-3
+        return np.concatenate([seen.ravel(), ((q - data.readings) / sigma).ravel()])
+
+    start = np.concatenate([np.zeros(p), positions[:12].ravel()])
+    fit = least_squares(
+        rows, start, jac="3-point", x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
+    inverse_r = np.linalg.inv(np.linalg.qr(fit.jac)[1])
+    sd = np.linalg.norm(inverse_r, axis=1)[:p] * unit
+    assert_allclose(
+        found.estimate, robot.parameters.nominal + unit * fit.x[:p], atol=1e-3 * sd.min(), rtol=0
+    )
+    assert_allclose(
+        found.sd, sd, rtol=1e-4
+    )  # at two solutions that differ by the noise's curvature
+    assert_allclose(latent_of(found).poses[:, :3, 3], fit.x[p:].reshape(-1, 3), atol=1e-7)  # [m]
+
+
+def test_a_cable_robot_is_found_from_its_readings_alone_up_to_its_gauge(cable):
+    robot, truth, positions = cable
+    q = inverse(truth, positions).q
+    data = Measurements(robot.name, q, ())
+    fit = identify(robot, data, LeastSquares())
+    assert fit.converged
+    assert fit.rank == 13  # 20 parameters less six of the frame and one of scale
+    assert fit.chi_square < 1e-12
+    unseen = inverse(truth, sample(robot, 20, 9).coordinates).q
+    gap = forward(fit.robot, unseen).residual.max()
+    assert gap < 1e-9 * robot.size  # [m]: with the right geometry four lines meet in a point
+    assert forward(robot, unseen).residual.max() > 1e-3
+    found = identifiability(robot, data)
+    assert (found.rank, found.n_equations) == (13, 30)
+    checked = cross_validate(robot, data, LeastSquares(), count=3)
+    assert checked.poses == ()
+    assert checked.fold.max() < 1e-3 * checked.before_fold.min()
+
+
+def test_sensors_on_legs_tell_all_but_the_frames_with_exact_readings_and_with_noisy_ones():
+    """42 parameters less six of the platform's frame and three of where the base is: its turn the
+    joints' axes tell.
+    """
+    robot = ups_hexapod()
+    legs = tuple(f"leg{i}.universal{j}" for i in (1, 3, 5) for j in (1, 2))
+    sensors = Instrument((Sensor(JointSensor(joints=legs, measures="angle"), noise(*[1e-5] * 6)),))
+    for sigma in (None, 2 * UM):
+        found = identifiability(
+            robot, simulate(robot, hexapod_poses(30), sensors, 0, reading_sigma=sigma)
+        )
+        assert found.rank == 33
+        assert found.gap > 1e6
+
+
+def test_a_seventh_leg_tells_all_but_the_two_frames_from_readings_alone():
+    robot = seven_legs()
+    truth = robot.with_values(sample_truth(robot, 1, 0)[0])
+    data = Measurements(robot.name, inverse(truth, hexapod_poses(60)).q, ())
+    fit = identify(robot, data, LeastSquares())
+    assert fit.converged
+    assert fit.rank == 49 - 12
+    unseen = inverse(truth, hexapod_poses(20, 7)).q
+    assert forward(fit.robot, unseen).residual.max() < 1e-9 * robot.size  # [m]
+    assert forward(robot, unseen).residual.max() > 1e-5
+
+
+def coverage(robot, trials):
+    """How many of the trials have the truth inside the 95 % ellipsoid of their fit."""
+    fits = identify_trials(robot, trials, LeastSquares())
+    assert fits.converged.all()
+    places = fits.unknowns.places
+    covariance = fits.decomposition.covariance(fits.penalty) * np.outer(
+        fits.unknowns.tolerance, fits.unknowns.tolerance
+    )
+    error = fits.values[:, places] - trials.truth[:, places]
+    square = np.einsum("ti,tij,tj->t", error, np.linalg.inv(covariance), error)
+    return int((square <= chi2.ppf(0.95, len(places))).sum())
+
+
+def test_ellipsoids_cover_as_stated_with_noisy_readings_and_far_too_little_if_the_noise_is_ignored():
+    robot = load_robot("linear-delta")
+    n = 100
+    trials = simulate_trials(
+        robot, sample_truth(robot, n, 4), sample(robot, 12, 4).coordinates,
+        Instrument((Sensor(Position(), noise(10 * UM, 10 * UM, 10 * UM)),)), 4, reading_sigma=20 * UM,
+    )  # fmt: skip
+    inside = coverage(robot, trials)
+    assert binom.ppf(0.0005, n, 0.95) <= inside <= binom.ppf(0.9995, n, 0.95)
+    ignored = 0
+    for i in range(10):
+        data = replace(trials.trial(i), reading_sigma=0.0)
+        fit = identify(robot, data, LeastSquares())
+        error = fit.estimate - trials.truth[i, fit.unknowns.places]
+        stated = (
+            fit.covariance / fit.check.sigma_scale**2
+        )  # a residual that noise does not explain has widened it
+        ignored += bool(error @ np.linalg.solve(stated, error) <= chi2.ppf(0.95, len(error)))
+    assert ignored < binom.ppf(0.0005, 10, 0.95)
+
+
+def test_ellipsoids_cover_as_stated_with_redundant_readings_and_few_measured_poses(cable):
+    robot, _, positions = cable
+    n = 60
+    seen = Instrument((Sensor(Position(), noise(1e-4, 1e-4, 1e-4), rows=np.arange(8)),))
+    inside = coverage(robot, simulate_trials(robot, sample_truth(robot, n, 6), positions, seen, 6))
+    assert binom.ppf(0.0005, n, 0.95) <= inside <= binom.ppf(0.9995, n, 0.95)
+
+
+def test_recorded_readings_have_the_noise_stated_and_the_machine_stands_at_the_true_ones(cable):
+    robot, _, positions = cable
+    truth = sample_truth(robot, 40, 2)
+    seen = Instrument((Sensor(Position(), noise(UM, UM, UM)),))
+    trials = simulate_trials(robot, truth, positions, seen, 2)
+    assert trials.recorded is not None
+    sigma = np.array([a.sigma for a in robot.actuators])
+    assert_array_equal(trials.reading_sigma, np.tile(sigma, (30, 1)))  # as the robot states
+    true = np.stack(
+        [inverse(robot.with_values(v), T[:, :3, 3]).q for v, T in zip(truth, trials.T, strict=True)]
+    )
+    error = (trials.recorded - true) / sigma
+    m = error.size
+    assert chi2.ppf(1e-4, m) < (error**2).sum() < chi2.ppf(1 - 1e-4, m)
+    few = simulate_trials(robot, truth[:3], positions, seen, 2)
+    assert_array_equal(few.recorded, trials.recorded[:3])
+    exact = simulate_trials(
+        hexapod(),
+        hexapod().values[None],
+        hexapod_poses(3),
+        tracker(),
+        0,
+        reading_sigma=[0.0, np.inf, *[UM] * 4],
+    )
+    assert exact.recorded is not None
+    assert_array_equal(exact.recorded[0, :, 0], exact.readings[:, 0])
+    assert np.isnan(exact.recorded[0, :, 1]).all()
+
+
+def test_a_trial_is_the_same_alone_and_among_others():
+    robot = hexapod()
+    trials = simulate_trials(
+        robot, sample_truth(robot, 3, 0), hexapod_poses(10), tracker(), 0, reading_sigma=2 * UM
+    )
+    assert trials.recorded is not None
+    assert not np.array_equal(trials.recorded[0], trials.recorded[1])
+    together = identify_trials(robot, trials, LeastSquares())
+    for i in (0, 2):
+        alone = identify(robot, trials.trial(i), LeastSquares())
+        assert_allclose(
+            together.values[i, together.unknowns.places],
+            alone.estimate,
+            atol=1e-6 * alone.sd.min(),
+            rtol=0,
+        )
+
+
+def test_a_pose_whose_position_alone_is_known_adds_nothing_and_is_named():
+    data = measured_hexapod(12, 2 * UM)
+    known = identify(hexapod(), data.take(np.arange(11)), LeastSquares())
+    seen = replace(data.observations[0], measured=np.where(
+        (np.arange(12) == 11)[:, None] & (np.arange(6) < 3), np.nan, data.observations[0].measured))  # fmt: skip
+    unread = (np.arange(12) == 11)[:, None]
+    lost = replace(data, observations=(seen,), readings=np.where(unread, np.nan, data.readings),
+                   reading_sigma=np.where(unread, np.inf, sigma_of(data)))  # fmt: skip
+    found = identify(hexapod(), lost, LeastSquares())
+    assert (
+        max(largest_difference(found, known)) < 1e-6
+    )  # both fits end where steps are a millionth of the residual
+    assert found.dof == known.dof
+    assert latent_of(found).open.tolist() == [False] * 11 + [True]
+    assert any("not determined" in note and "pose 12" in note for note in found.notes)
+
+
+def test_a_reading_that_is_not_believed_is_found_from_the_pose():
+    data = measured_hexapod(12, 2 * UM)
+    sigma = sigma_of(data)
+    sigma[7, 3] = np.inf
+    for wrong in (5e-3, np.nan):
+        readings = data.readings.copy()
+        readings[7, 3] += wrong
+        found = identify(
+            hexapod(), replace(data, readings=readings, reading_sigma=sigma), LeastSquares()
+        )
+        assert latent_of(found).readings[7, 3] == pytest.approx(data.readings[7, 3], abs=20 * UM)
+        held = validate(found, replace(data, readings=readings, reading_sigma=sigma))
+        assert "8" not in held.poses
+        assert any("not taken" in note for note in held.notes)
+
+
+@pytest.fixture(scope="module")
+def wrong_reading():
+    """Measurements whose pose 5 has a reading off by 1 mm."""
+    data = measured_hexapod(16, 2 * UM)
+    readings = data.readings.copy()
+    readings[4, 1] += 1e-3
+    return replace(data, readings=readings)
+
+
+def test_a_wrong_reading_is_named_and_a_loss_or_its_absence_mends_the_fit(wrong_reading):
+    plain = identify(hexapod(), wrong_reading, LeastSquares())
+    assert find_outliers(plain, wrong_reading).names == ("5",)
+    dropped = identify(hexapod(), wrong_reading, LeastSquares(), drop=("5",))
+    without = identify(hexapod(), wrong_reading.take(np.arange(16) != 4), LeastSquares())
+    assert max(largest_difference(dropped, without)) < 1e-6
+    assert dropped.dof == without.dof
+    assert np.abs((plain.estimate - without.estimate) / without.sd).max() > 30.0
+    for loss, most in ((Huber(), 4.0), (Tukey(), 1.5)):
+        robust = identify(hexapod(), wrong_reading, LeastSquares(), loss=loss)
+        assert robust.weight[4] < 0.05
+        assert np.abs((robust.estimate - without.estimate) / without.sd).max() < most
+    assert examine(dropped, wrong_reading).outliers.outliers == ()
+
+
+def test_the_distance_of_a_pose_is_what_the_sum_of_squares_loses_without_it():
+    data = measured_hexapod(14, 2 * UM)
+    fit = identify(hexapod(), data, LeastSquares())
+    found = find_outliers(fit, data).influence
+    assert found.leverage.sum() == pytest.approx(42, abs=1e-6)
+    assert (
+        int(found.residuals.sum()) == 14 * 6
+    )  # six readings and six numbers of a pose, less its six freedoms
+    for i in (3, 11):
+        without = identify(hexapod(), data.take(np.arange(14) != i), LeastSquares())
+        assert fit.chi_square - without.chi_square == pytest.approx(
+            found.distance[i], rel=1e-3
+        )  # what is not linear
+
+
+def test_blocks_of_poses_change_nothing(monkeypatch):
+    sensors = (
+        Sensor(Pose(unknown=("frame",)), noise(*[5e-6] * 3, *[UM] * 3)),
+        Sensor(Separation(), noise(UM), np.array([[0, 7], [2, 3]])),
+    )
+    data = measured_hexapod(12, 2 * UM, sensors=sensors)
+    whole = identify(hexapod(), data, LeastSquares())
+    for module in (latent_module, settle_module):
+        monkeypatch.setattr(module, "BLOCK", 5)
+    parts = identify(hexapod(), data, LeastSquares())
+    assert parts.chi_square == pytest.approx(whole.chi_square, rel=1e-9)
+    assert_allclose(parts.singular_values[:36], whole.singular_values[:36], rtol=1e-9)
+    assert_allclose(latent_of(parts).readings, latent_of(whole).readings, atol=1e-9 * UM)
+
+
+def test_frames_and_noisy_readings_together_leave_what_a_known_frame_leaves_to_be_known():
+    sensor = Sensor(Pose(unknown=("frame",)), noise(*[5e-6] * 3, *[UM] * 3))
+    data = measured_hexapod(14, 2 * UM, sensors=(sensor,))
+    fit = identify(hexapod(), data, LeastSquares())
+    assert fit.converged
+    assert fit.rank == 36
+    assert fit.dof == 14 * 6 - 42
+    assert chi2.ppf(1e-4, fit.dof) < fit.chi_square < chi2.ppf(1 - 1e-4, fit.dof)
+
+
+def test_exact_readings_of_redundant_actuators_are_refused(cable):
+    robot, truth, positions = cable
+    data = replace(
+        simulate(truth, positions[:9], Instrument((Sensor(Position(), noise(UM, UM, UM)),)), 1),
+        reading_sigma=0.0,
+    )
+    with pytest.raises(DataError, match="no reading can be held exactly; state a sigma above 0"):
+        identify(robot, data, LeastSquares())
+
+
+def test_too_few_readings_and_chains_too_long_are_refused(cable, monkeypatch):
+    robot, truth, positions = cable
+    with pytest.raises(EstimationError, match="9 equations from 9 poses cannot determine 20"):
+        identify(
+            robot, Measurements(robot.name, inverse(truth, positions[:9]).q, ()), LeastSquares()
+        )
+    alone = replace(measured_hexapod(6, UM), observations=())
+    with pytest.raises(EstimationError, match="nothing is left"):
+        identify(hexapod(), alone, LeastSquares())
+    monkeypatch.setattr(components_module, "LARGEST", 30)
+    data = measured_hexapod(6, UM, sensors=(Sensor(Separation(), noise(UM)), *tracker().sensors))
+    with pytest.raises(EstimationError, match="link 6 poses"):
+        identify(hexapod(), data, LeastSquares())
+
+
+def test_a_pose_left_out_is_neither_undetermined_nor_without_readings():
+    data = measured_hexapod(12, 2 * UM)
+    fit = identify(hexapod(), data, drop=("3", "9"))
+    found, out = latent_of(fit), np.isin(np.arange(12), (2, 8))
+    assert not [note for note in fit.notes if "not determined" in note]
+    assert found.to_dict() == {
+        "exact": 0,
+        "uncertain": 60,
+        "not_taken": 0,
+        "open": [],
+        "calm": True,
+    }
+    assert_array_equal(np.isnan(found.poses).all(axis=(1, 2)), out)
+    assert_array_equal(np.isnan(found.readings).all(axis=1), out)
+    assert examine(fit, data).worth.calibrate
+    held = validate(fit, without_poses(data, ("3", "9")))
+    assert not [note for note in held.notes if "not taken" in note]

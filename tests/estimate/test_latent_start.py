@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses with missing readings: found from any full measurement, never by a long search."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import loopcal.mechanism.batch_kinematics as trials_module
+from loopcal.estimate import identify
+from loopcal.estimate.latent import LatentRows
+from loopcal.estimate.latent_doubts import latent_doubts
+from loopcal.estimate.measured_poses import measured_poses
+from loopcal.estimate.rows import rows_of
+from loopcal.estimate.scaling import unknowns
+from loopcal.estimate.settle import HALVINGS, STEPS, Poses
+from loopcal.estimate.standing import Standing
+from loopcal.io import load_robot
+from loopcal.measure import (
+    Component,
+    Distance,
+    Instrument,
+    Measurements,
+    Pose,
+    Position,
+    Sensor,
+    sample_truth,
+    simulate,
+)
+from loopcal.mechanism import forward, inverse
+from loopcal.mechanism.batch_kinematics import plainly_reached
+from loopcal.mechanism.workspace import sample
+from tests.estimate.problems import UM, noise
+
+
+def measured(name, sensors, n, seed, share=0.0, sigma=20 * UM):
+    """A robot, a true one, and measurements of n poses with this share of the readings not taken."""
+    robot = load_robot(name)
+    truth = robot.with_values(sample_truth(robot, 1, seed)[0])
+    data = simulate(
+        truth, sample(robot, n, seed).coordinates, Instrument(sensors), seed, reading_sigma=sigma
+    )
+    return (
+        robot,
+        truth,
+        without(data, np.random.default_rng(seed).random(data.readings.shape) < share),
+    )
+
+
+def without(data: Measurements, lost: np.ndarray) -> Measurements:
+    """The measurements with readings (n, a) not taken."""
+    assert data.reading_sigma is not None
+    return replace(
+        data,
+        readings=np.where(lost, np.nan, data.readings),
+        reading_sigma=np.where(lost, np.inf, data.reading_sigma),
+    )
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """How often poses are looked at, and how often one is followed along a path."""
+    count = {"looks": 0, "followed": 0}
+
+    def counting(owner, attribute, word):
+        original = getattr(owner, attribute)
+
+        def wrapped(*args, **named):
+            count[word] += 1
+            return original(*args, **named)
+
+        monkeypatch.setattr(owner, attribute, wrapped)
+
+    counting(Poses, "look", "looks")
+    counting(trials_module, "_followed", "followed")
+    return count
+
+
+ANCHORS = ((0.9, 0.1, 1.0), (-0.5, 0.8, 1.1), (-0.4, -0.9, 0.9))
+
+FULL = {
+    "a position of a delta robot": ("linear-delta", (Sensor(Position(), noise(UM, UM, UM)),)),
+    "two coordinates of a planar robot": (
+        "five-bar",
+        (Sensor(Component(("x", "y")), noise(UM, UM)),),
+    ),
+    "two coordinates from two instruments": (
+        "five-bar",
+        (Sensor(Component(("x",)), noise(UM)), Sensor(Component(("y",)), noise(50 * UM))),
+    ),
+    "three distances": (
+        "linear-delta",
+        tuple(
+            Sensor(Distance(anchor=np.array(a), anchor_name=f"wire{i}"), noise(UM))
+            for i, a in enumerate(ANCHORS)
+        ),
+    ),
+    "a position of a robot with three freedoms of six": (
+        "3-prs",
+        (Sensor(Position(), noise(UM, UM, UM)),),
+    ),
+    "a pose": ("hexapod-42", (Sensor(Pose(), noise(*[5 * UM] * 3, *[UM] * 3)),)),
+}
+
+
+@pytest.mark.parametrize("said", FULL)
+def test_rows_that_tell_all_freedoms_of_the_platform_give_its_pose(said):
+    robot, sensors = FULL[said]
+    robot = load_robot(robot)
+    found = inverse(robot, sample(robot, 6, 1).coordinates)
+    data = simulate(robot, found.T, Instrument(sensors), 0, reading_sigma=20 * UM)
+    rows = rows_of(unknowns(robot), data)
+    assert isinstance(rows, LatentRows)
+    T, known = measured_poses(robot, rows.sensed[:-1], np.zeros(6, dtype=int), np.arange(6))
+    assert known.all()
+    assert_allclose(
+        T[:, :3, 3], found.T[:, :3, 3], atol=2e-3, rtol=0
+    )  # [m] of noise and, for 3-prs, of its weak direction
+    fewer = tuple(replace(s, rows=np.array([0, 1, 3])) for s in sensors[:1])
+    rows = rows_of(
+        unknowns(robot),
+        simulate(robot, found.T, Instrument((*fewer, *sensors[1:])), 0, reading_sigma=20 * UM),
+    )
+    assert isinstance(rows, LatentRows)
+    _, known = measured_poses(robot, rows.sensed[:-1], np.zeros(6, dtype=int), np.arange(6))
+    assert known.tolist() == [True, True, False, True, False, False]
+
+
+PARTIAL = {
+    "linear-delta, positions": ("linear-delta", (Sensor(Position(), noise(*[10 * UM] * 3)),), 0.1),
+    "linear-delta, x and y": (
+        "linear-delta",
+        (Sensor(Component(("x", "y")), noise(*[10 * UM] * 2)),),
+        0.05,
+    ),
+    "3-rrr, x and y": ("3-rrr", (Sensor(Component(("x", "y")), noise(*[10 * UM] * 2)),), 0.05),
+}
+
+
+@pytest.mark.parametrize("said", PARTIAL)
+def test_missing_readings_are_found_in_few_looks_and_nothing_is_followed(said, counted):
+    name, sensors, share = PARTIAL[said]
+    for seed in range(3):
+        robot, _, data = measured(name, sensors, 30, seed, share)
+        counted.update(looks=0, followed=0)
+        fit = identify(robot, data)
+        assert fit.converged
+        assert fit.chi_square < 2.0 * fit.dof
+        assert (
+            counted["looks"] < 60
+        )  # some ten folds of two to four looks; 559 and more without a bound of the step
+        assert counted["followed"] == 0
+
+
+def test_a_missing_reading_is_that_of_the_branch_on_which_the_machine_is_built():
+    for seed in range(4):
+        robot, truth, data = measured(
+            "linear-delta", (Sensor(Position(), noise(*[10 * UM] * 3)),), 20, seed
+        )
+        lost = np.zeros(data.readings.shape, dtype=bool)
+        lost[7, 0] = True
+        fit = identify(robot, without(data, lost))
+        assert fit.latent is not None
+        true = inverse(truth, sample(robot, 20, seed).coordinates).q[7, 0]
+        assert fit.latent.readings[7, 0] == pytest.approx(
+            true, abs=2e-3
+        )  # [m]: errors of lengths; the other branch is 0.3 off
+        assert not any("branch" in note or "stroke" in note for note in fit.notes)
+
+
+def test_a_reading_found_outside_its_stroke_or_on_another_branch_is_told():
+    robot, _, data = measured("linear-delta", (Sensor(Position(), noise(*[10 * UM] * 3)),), 20, 0)
+    lost = np.zeros(data.readings.shape, dtype=bool)
+    lost[7, 0] = lost[9, 2] = True
+    fit = identify(robot, without(data, lost))
+    assert fit.latent is not None
+    assert latent_doubts(fit.robot, fit.latent) == []
+    found = fit.latent.readings.copy()
+    found[7, 0] += 0.1 if found[7, 0] < 0.3 else -0.1  # [m]: within the stroke of 0 to 0.4 m
+    found[9, 2] = -0.02
+    outside, beside = latent_doubts(fit.robot, replace(fit.latent, readings=found))
+    name = robot.actuators[2].name
+    assert outside.startswith(f"found outside the stroke: {name} at pose 10 (-20 mm); ")
+    assert f"{robot.actuators[0].name} at pose 8" in beside
+    assert (
+        latent_doubts(fit.robot, replace(fit.latent, readings=found, open=np.ones(20, dtype=bool)))
+        == []
+    )
+
+
+@pytest.mark.parametrize("name", ["linear-delta", "3-rrr", "hexapod-42"])
+def test_from_random_starts_the_search_is_bounded_and_never_ends_higher_than_it_began(
+    name, counted
+):
+    size = 6 if name == "hexapod-42" else 2
+    kind = Pose() if name == "hexapod-42" else Component(("x", "y"))
+    robot, _, data = measured(name, (Sensor(kind, noise(*[10 * UM] * size)),), 12, 5)
+    lost = np.zeros(data.readings.shape, dtype=bool)
+    lost[:, 0] = True
+    data = without(data, lost)
+    rows = rows_of(unknowns(robot), data)
+    assert isinstance(rows, LatentRows)
+    stroke = np.array([a.stroke for a in robot.actuators], dtype=float)
+    rng, z, trial = np.random.default_rng(3), np.zeros((1, rows.parameters)), np.arange(1)
+    for _ in range(4):
+        readings = data.readings.copy()
+        readings[:, 0] = stroke[0, 0] + (stroke[0, 1] - stroke[0, 0]) * rng.random(len(readings))
+        reached = plainly_reached(robot, robot.values[None], readings[None])[0]
+        readings = np.where(reached[:, None], readings, robot_home(robot))
+        begin = Standing(forward(robot, readings).state, readings[None])
+        first = rows.poses.look(z, trial, begin, None, own=False)
+        assert np.isfinite(first.cost).all()
+        counted.update(looks=0, followed=0)
+        here = rows.poses.settle(z, trial, begin)
+        assert counted["looks"] <= 1 + STEPS * (HALVINGS + 1)
+        assert counted["followed"] == 0
+        assert not here.failed.any()
+        assert here.cost[0] <= first.cost[0]
+
+
+def robot_home(robot):
+    """Readings (a,) of the home pose."""
+    return inverse(robot, robot.home[None]).q[0]

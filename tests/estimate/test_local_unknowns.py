@@ -1,0 +1,345 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Unknown frames, targets, surfaces, linked poses and joint sensors in the fit."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import loopcal as lc
+import loopcal.estimate.rows as rows_module
+from loopcal import geometry
+from loopcal.apply import validate
+from loopcal.cli import main
+from loopcal.diagnose import find_outliers
+from loopcal.estimate import MAP, LeastSquares, identify, identify_trials
+from loopcal.estimate.local import Own
+from loopcal.estimate.outlook import look, scene
+from loopcal.estimate.rows import rows_of
+from loopcal.estimate.scaling import unknowns
+from loopcal.measure import (
+    Gaussian,
+    Instrument,
+    JointSensor,
+    Pose,
+    Position,
+    Sensor,
+    Separation,
+    local_unknowns,
+    sample_truth,
+    simulate,
+    simulate_trials,
+)
+from loopcal.mechanism.workspace import sample
+from tests import zoo
+from tests.estimate.problems import hexapod, hexapod_data, hexapod_poses, tracker
+
+UM = 1e-6
+POINT = np.array([[0.03, -0.02, 0.05]])
+THREE = np.array([[0.1, 0.0, 0.02], [-0.06, 0.1, 0.03], [-0.05, -0.1, 0.01]])
+STATION = geometry.pose(np.eye(3), np.array([-2.5, -1.8, 0.1]))
+TRACKER = Position(targets=("a", "b", "c"), places=THREE, unknown=("frame", "targets"))
+TRUE = {
+    "frame.rx": 0.3, "frame.ry": -0.2, "frame.rz": 1.0, "frame.x": 0.4, "frame.y": -0.7, "anchor.x": 0.5, "anchor.y": -0.9,
+    "anchor.z": 0.1, "distance.offset": 1e-3, "separation.offset": 2e-3, "a.x": 0.11, "b.z": 0.04,
+}  # fmt: skip
+
+
+class Silent(Gaussian):
+    """Noise that is stated but does not come."""
+
+    def draw(self, generator, n):
+        return np.zeros((n, len(self.sd)))
+
+
+def seen_by(kind, noise: type[Gaussian] = Silent, sigma=UM):
+    return Sensor(kind, noise(np.full(len(kind.noise_columns), sigma)))
+
+
+def true_of(*kinds):
+    names = {parameter.name for kind in kinds for parameter in kind.unknowns}
+    return {name: value for name, value in TRUE.items() if name in names}
+
+
+def machine(name, n):
+    """A nominal robot, true values within its tolerances, and poses."""
+    if name == "hexapod":
+        return hexapod(), zoo.hexapod_truth(), hexapod_poses(n)
+    robot = lc.load_robot(name)
+    return robot, sample_truth(robot, 1, 3)[0], sample(robot, n, 5).coordinates
+
+
+def largest(errors, size):
+    """The largest error, lengths as a share of the robot's size."""
+    found = [
+        np.abs(values[np.isfinite(values)])
+        for values in (errors.position / size, errors.orientation)
+    ]
+    return float(np.concatenate(found).max())
+
+
+def mixed_data(seed=1, noise: type[Gaussian] = Gaussian):
+    """Poses in a known frame and targets in an unknown one."""
+    instrument = Instrument((seen_by(Pose(), noise), seen_by(TRACKER, noise)))
+    truth = hexapod().with_values(zoo.hexapod_truth())
+    return simulate(truth, hexapod_poses(30), instrument, seed, unknowns=true_of(TRACKER))
+
+
+def test_the_projected_solution_is_the_joint_one():
+    data, free = mixed_data(), unknowns(hexapod())
+    rows = rows_of(free, data)
+    assert rows.own is not None
+    z = free.deviation(hexapod().values[None])
+    factor, _ = rows.fold(z, np.arange(1))
+    projected = -np.linalg.solve(factor[0, :-1, :-1], factor[0, :-1, -1])
+    local = local_unknowns(data.observations, data.labels)
+    stacked = look(scene(free, data.readings), data, local, rows.own.values[0])[0]
+    scale = np.linalg.norm(stacked[:, :-1], axis=0)
+    joint = -np.linalg.lstsq(stacked[:, :-1] / scale, stacked[:, -1], rcond=None)[0] / scale
+    assert_allclose(projected, joint[len(local) :], rtol=0, atol=1e-12 * np.abs(projected).max())
+    done = rows.own.solved
+    assert done is not None
+    assert_allclose(
+        done.shift[0] + done.slope[0] @ projected, joint[: len(local)], rtol=0, atol=1e-11
+    )
+    assert rows.rows[0] == len(stacked) - len(local)
+
+
+def test_standard_deviations_are_those_of_the_joint_problem():
+    data = mixed_data()
+    fit = identify(hexapod(), data, LeastSquares())
+    free = unknowns(fit.robot)
+    at = scene(free, data.readings)
+    rows = look(at, data, local_unknowns(data.observations, data.labels), fit.local.estimate)[
+        0, :, :-1
+    ]
+    scale = np.linalg.norm(rows, axis=0)
+    sd = np.sqrt(np.diag(np.linalg.inv((rows / scale).T @ (rows / scale)))) / scale
+    assert_allclose(fit.local.sd, sd[: len(fit.local)], rtol=1e-3)
+    assert_allclose(fit.sd, sd[len(fit.local) :] * free.tolerance, rtol=1e-3)
+
+
+def test_a_fit_in_an_unknown_frame_is_that_in_the_known_frame_up_to_gauge():
+    truth = hexapod().with_values(zoo.hexapod_truth())
+    unknown = simulate(
+        truth, hexapod_poses(40), Instrument((seen_by(TRACKER),)), 1, unknowns=true_of(TRACKER)
+    )
+    first = identify(hexapod(), unknown, LeastSquares())
+    known = simulate(truth, hexapod_poses(40), Instrument((seen_by(Pose()),)), 1)
+    second = identify(hexapod(), known, LeastSquares())
+    assert (first.rank, second.rank) == (30, 42)
+    others = simulate(
+        truth,
+        hexapod_poses(12, seed=7),
+        Instrument((seen_by(TRACKER),)),
+        2,
+        unknowns=true_of(TRACKER),
+    )
+    assert largest(validate(first, others).after, 0.2) < 1e-9
+    assert largest(validate(second.robot, others).after, 0.2) < 1e-9
+    assert_allclose(second.estimate, truth.values, rtol=0, atol=1e-9 * 0.2)
+    assert all("frame" in c.meaning or "a, b and c" in c.meaning for c in first.unidentifiable)
+    assert np.isinf(first.local.sd).all()
+    assert validate(first, others).notes == ("frame, a, b and c: as the fit found it",)
+    assert "found anew" in validate(second.robot, others).notes[0]
+
+
+def test_intervals_of_machine_and_frame_hold_the_truth():
+    robot = lc.load_robot("linear-delta")
+    kind = Position(places=POINT, unknown=("frame", "targets"))
+    truths, fits = sample_truth(robot, 60, 11), []
+    inside = []
+    for i, truth in enumerate(truths):
+        instrument = Instrument((seen_by(kind, Gaussian, 20 * UM),))
+        data = simulate(
+            robot.with_values(truth),
+            sample(robot, 30, i).coordinates,
+            instrument,
+            i,
+            unknowns=true_of(kind),
+        )
+        fit = identify(robot, data, MAP())
+        fits.append(fit)
+        true = [
+            TRUE.get(name, nominal)
+            for name, nominal in zip(fit.local.names, fit.local.table.nominal, strict=True)
+        ]
+        off = np.concatenate(
+            [fit.estimate - truth[unknowns(robot).places], fit.local.estimate - np.array(true)]
+        )
+        sd = np.concatenate([fit.sd, fit.local.sd])
+        inside.append((np.abs(off) < 1.96 * sd)[np.isfinite(sd)])
+        # the delta does not turn: where the target sits and where the frame begins are one and the
+        # same
+        assert np.isinf(sd).sum() == 6
+        assert (
+            "not identifiable, whatever the robot: frame and target, or only together" in fit.notes
+        )
+    assert all(fit.converged for fit in fits)
+    # intervals of one fit are correlated: the band is that of as many draws as there are fits, at
+    # four standard deviations
+    assert np.mean(inside) == pytest.approx(0.95, abs=4 * np.sqrt(0.95 * 0.05 / len(fits)))
+
+
+@pytest.mark.parametrize("block", [16, 512])
+def test_rows_that_link_poses_and_joint_sensors_are_fitted_in_blocks_as_whole(monkeypatch, block):
+    monkeypatch.setattr(rows_module, "BLOCK", block)
+    robot, truth, poses = machine("3-prs", 40)
+    passive = lc.inverse(robot, poses[:1]).passive_names[0]
+    far = Sensor(
+        Separation(places=POINT),
+        Gaussian(np.full(1, UM)),
+        rows=np.stack([np.arange(20), np.arange(20, 40)], axis=1),
+    )
+    joint = seen_by(JointSensor(joints=(passive,), measures="angle", unknown=("offset",)), Gaussian)
+    instrument = Instrument((far, joint, seen_by(Pose(unknown=("frame",)), Gaussian)))
+    data = simulate(
+        robot.with_values(truth),
+        poses,
+        instrument,
+        2,
+        unknowns={**true_of(Pose(unknown=("frame",))), f"{passive}.joint": 0.01},
+    )
+    fit = identify(robot, data)
+    assert fit.converged
+    assert fit.p_value > 1e-4
+    assert fit.local.values[f"{passive}.joint"] == pytest.approx(
+        0.01, abs=5 * fit.local.sd[fit.local.names.index(f"{passive}.joint")]
+    )
+    assert (
+        len({tuple(poses) for poses in find_outliers(fit, data).poses}) == 20
+    )  # linked poses are one block
+
+
+def test_sessions_have_frames_of_their_own_and_are_eliminated_one_by_one():
+    truth = hexapod().with_values(zoo.hexapod_truth())
+    day = np.repeat([f"day{i}" for i in range(8)], 10)
+    kind = Pose(unknown=("frame",))
+    sensor = Sensor(kind, Gaussian(np.full(6, UM)), session=day)
+    moved = {f"day{i}.frame.{axis}": 0.1 * i for i in range(8) for axis in ("x", "rz")}
+    data = simulate(truth, hexapod_poses(80), Instrument((sensor,)), 1, unknowns=moved)
+    rows = rows_of(unknowns(hexapod()), data)
+    assert rows.own is not None
+    assert [len(columns) for columns in rows.own.clusters] == [6] * 8
+    fit = identify(hexapod(), data)
+    assert fit.converged
+    assert fit.p_value > 1e-4
+    assert fit.local.values["day3.frame.rz"] == pytest.approx(0.3, abs=1e-3)
+    assert fit.rank == 36
+
+
+@pytest.mark.slow
+def test_memory_stays_flat_in_the_number_of_sessions():
+    def peak(sessions):
+        day = np.repeat([f"day{i}" for i in range(sessions)], 8)
+        sensor = Sensor(Pose(unknown=("frame",)), Gaussian(np.full(6, UM)), session=day)
+        truth = hexapod().with_values(zoo.hexapod_truth())
+        data = simulate(truth, hexapod_poses(8 * sessions), Instrument((sensor,)), 1)
+        tracemalloc.start()
+        try:
+            assert identify(hexapod(), data, LeastSquares()).rank == 36
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    # one block of 512 poses either way; per session there is a factor of 49 columns and little else
+    assert peak(128) < 1.5 * peak(64) + 128 * 49**2 * 8
+
+
+def test_priors_and_fixed_unknowns_are_kept_to():
+    data = mixed_data()
+    local = local_unknowns(data.observations, data.labels)
+    true = local.values(true_of(TRACKER))
+    fixed = identify(hexapod(), data, local=local.starting_at(true).fixed("*"))
+    assert (fixed.local.estimate == true).all()
+    assert (fixed.local.sd == 0.0).all()
+    near = identify(hexapod(), data, local=local.starting_at(true).with_prior("*", 1e-9))
+    assert_allclose(near.estimate, fixed.estimate, rtol=0, atol=1e-8)
+    wide = identify(hexapod(), data, local=local.starting_at(true).with_prior("*", 10.0))
+    assert_allclose(wide.estimate, identify(hexapod(), data).estimate, rtol=0, atol=1e-9)
+    assert wide.check.degrees == identify(hexapod(), data).check.degrees + len(local)
+
+
+def test_noise_is_estimated_where_null_directions_hold_a_part_of_the_residual():
+    truth = hexapod().with_values(zoo.hexapod_truth())
+    data = simulate(
+        truth,
+        hexapod_poses(40),
+        Instrument((seen_by(TRACKER, Gaussian),)),
+        1,
+        unknowns=true_of(TRACKER),
+    )
+    fit = identify(hexapod(), data, noise="estimated")
+    assert fit.converged
+    # 315 degrees of freedom: sd of the ratio is 4 %
+    assert fit.check.sigma_scale == pytest.approx(1.0, abs=0.16)
+
+
+def test_trials_with_unknown_frames_are_identified_as_each_alone():
+    robot = hexapod()
+    instrument = Instrument((seen_by(TRACKER, Gaussian),))
+    truths = np.stack(
+        [zoo.hexapod_truth(), robot.values + 0.5 * (zoo.hexapod_truth() - robot.values)]
+    )
+    trials = simulate_trials(
+        robot, truths, hexapod_poses(30), instrument, 3, unknowns=true_of(TRACKER)
+    )
+    found = identify_trials(robot, trials, MAP())
+    for i in range(2):
+        alone = identify(robot, trials.trial(i), MAP())
+        assert found.converged[i]
+        assert_allclose(found.values[i], alone.robot.values, rtol=0, atol=1e-10)
+
+
+def test_starts_are_sought_once_for_all_trials_that_an_instrument_looks_at(monkeypatch):
+    sought = []
+    begin = Own.begin
+    monkeypatch.setattr(
+        Own, "begin", lambda own, trial, *rest: (sought.append(trial), begin(own, trial, *rest))
+    )
+    robot = lc.load_robot("linear-delta")
+    kind = Position(places=POINT, unknown=("frame",))
+    trials = simulate_trials(
+        robot, sample_truth(robot, 5, 1), sample(robot, 20, 1).coordinates, Instrument((seen_by(kind, Gaussian),)), 1,
+        unknowns=true_of(kind),
+    )  # fmt: skip
+    assert identify_trials(robot, trials, MAP()).converged.all()
+    assert sought == [0]
+
+
+def test_a_known_instrument_has_no_unknowns():
+    fit = identify(hexapod(), hexapod_data(20, instrument=tracker()))
+    assert len(fit.local) == 0
+    assert fit.to_dict()["local"] == []
+
+
+def test_the_command_line_calibrates_from_a_tracker_in_an_unknown_frame(tmp_path, capsys):
+    robot = lc.load_robot("hexapod-42")
+    truth = robot.with_values(sample_truth(robot, 1, 3)[0])
+    data = simulate(
+        truth,
+        sample(robot, 40, 5).coordinates,
+        Instrument((seen_by(TRACKER, Gaussian),)),
+        1,
+        unknowns=true_of(TRACKER),
+    )
+    path = tmp_path / "tracker.csv"
+    lc.save_measurements(data, path, robot)
+    assert (
+        main(
+            [
+                "calibrate",
+                "hexapod-42",
+                str(path),
+                "-o",
+                str(tmp_path / "run"),
+                "--hold-out",
+                "0.25",
+            ]
+        )
+        == 0
+    )
+    out, _ = capsys.readouterr()
+    assert "frame.rz" in out
+    assert "frame, a, b and c: as the fit found it" in out

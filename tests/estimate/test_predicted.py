@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Validation of poses by readings that are believed to different degrees: each counts as far as the
+data say.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from loopcal.apply import validate
+from loopcal.errors import DataError
+from loopcal.estimate.predicted import predicted
+from loopcal.io import load_robot
+from loopcal.measure import Instrument, Position, Sensor, simulate
+from loopcal.mechanism import forward, inverse
+from loopcal.mechanism.workspace import sample
+from tests.estimate.problems import MM, UM, noise
+
+
+@pytest.fixture(scope="module")
+def cable():
+    """A four-line robot, its true positions, and measurements of them; readings have the noise that
+    the robot states.
+    """
+    robot = load_robot("cable-4")
+    positions = sample(robot, 8, 1).coordinates
+    return (
+        robot,
+        positions,
+        simulate(robot, positions, Instrument((Sensor(Position(), noise(UM, UM, UM)),)), 1),
+    )
+
+
+def changed(data, sigma, off, pose=2, line=0):
+    """The measurements with one reading off [rad] and of another sigma [rad]."""
+    readings, stated = data.readings.copy(), data.reading_sigma.copy()
+    readings[pose, line] += off
+    stated[pose, line] = sigma
+    return replace(data, readings=readings, reading_sigma=stated)
+
+
+@pytest.mark.parametrize(("sigma", "off"), [(1e3, 50.0), (np.inf, 50.0), (np.inf, np.nan)])
+def test_a_line_that_is_hardly_believed_leaves_the_pose_to_the_other_three(cable, sigma, off):
+    robot, positions, data = cable
+    usual = validate(robot, data, before=robot)
+    found = validate(robot, changed(data, sigma, off), before=robot)
+    assert found.poses == usual.poses
+    assert found.failed == ()
+    assert found.notes == usual.notes
+    error = found.after.position
+    assert_allclose(
+        np.delete(error, 2), np.delete(usual.after.position, 2), atol=1e-6
+    )  # [m]: two ways to solve the same
+    assert error[2] < 10 * MM  # three lines; 50 rad of the fourth are metres
+    at, told = predicted(robot, changed(data, sigma, off))
+    assert told.all()
+    assert_allclose(at.T[2, :3, 3], positions[2], atol=10 * MM)
+    assert_allclose(
+        inverse(robot, at.T[2:3]).q[0, 1:], data.readings[2, 1:], atol=1e-4
+    )  # [rad]: three lines agree
+
+
+def test_a_pose_that_too_few_believed_lines_hold_is_left_out_and_named(cable):
+    robot, _, data = cable
+    two = changed(changed(data, np.inf, np.nan), np.inf, np.nan, line=2)
+    found = validate(robot, two, before=robot)
+    assert found.poses == ("1", "2", "4", "5", "6", "7", "8")
+    assert found.failed == ()
+    assert any("not taken or is not believed: 3" in note for note in found.notes)
+
+
+def test_equal_sigmas_predict_as_the_robot_does(cable):
+    robot, _, data = cable
+    found, _ = predicted(robot, data)
+    assert_allclose(found.T, forward(robot, data.readings).T, atol=0)
+    other, _ = predicted(
+        robot,
+        replace(data, reading_sigma=data.reading_sigma * np.array([1.0, 1.0, 1.0, 1.0 + 1e-6])),
+    )
+    assert_allclose(other.T, found.T, atol=1e-6)  # [m]: closure's curvature times noise
+
+
+@pytest.mark.parametrize("name", ["cable-4", "linear-delta"])
+def test_where_no_pose_has_its_readings_it_is_they_that_are_missed(name):
+    robot = load_robot(name)
+    data = simulate(
+        robot,
+        sample(robot, 3, 1).coordinates,
+        Instrument((Sensor(Position(), noise(UM, UM, UM)),)),
+        1,
+    )
+    none = replace(
+        data,
+        readings=np.full(data.readings.shape, np.nan),
+        reading_sigma=np.full(data.readings.shape, np.inf),
+    )
+    with pytest.raises(DataError, match="none of the 3 poses has all the readings"):
+        validate(robot, none)

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An earlier calibration as the prior of the next: nothing lost, nothing invented, and what moved
+is found.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from loopcal.errors import EstimationError
+from loopcal.estimate import LeastSquares, identify
+from loopcal.estimate.posteriors import posterior_from_arrays
+from loopcal.estimate.prior import limb_parameters, prior_from
+from loopcal.estimate.recalibration import recalibrate
+from loopcal.measure import simulate
+from loopcal.parameters import ParameterTable
+from tests import zoo
+from tests.estimate.problems import five_dof, hexapod, hexapod_data, hexapod_poses, tracker
+
+LEG3 = slice(14, 21)
+
+
+def both(a, b):
+    """Two sets of measurements as one."""
+    rows = replace(b.observations[0], rows=b.observations[0].rows + a.n_poses)
+    return replace(
+        a,
+        readings=np.vstack([a.readings, b.readings]),
+        observations=(*a.observations, rows),
+        block=np.arange(a.n_poses + b.n_poses),
+        labels=tuple(str(i) for i in range(a.n_poses + b.n_poses)),
+    )
+
+
+def test_first_one_then_the_other_is_both_together():
+    a, b = hexapod_data(20, seed=1), hexapod_data(15, seed=2)
+    first = identify(hexapod(), a, LeastSquares())
+    then = identify(hexapod(), b, prior=prior_from(first.posterior))
+    together = identify(hexapod(), both(a, b), LeastSquares())
+    # the first was linearised at its own estimate, which differs from the last by its sd: relative
+    # errors of 1e-4
+    np.testing.assert_allclose((then.estimate - together.estimate) / together.sd, 0, atol=1e-2)
+    np.testing.assert_allclose(then.sd, together.sd, rtol=1e-3)
+    assert then.chi_square + first.chi_square == pytest.approx(together.chi_square, rel=1e-3)
+    assert then.check.degrees + first.check.degrees == together.check.degrees
+
+
+def test_fewer_poses_than_parameters_are_enough_with_a_prior():
+    first = identify(hexapod(), hexapod_data(20, seed=1), LeastSquares())
+    fit = identify(hexapod(), hexapod_data(2, seed=2), prior=prior_from(first.posterior))
+    assert fit.converged
+    assert (fit.sd <= first.sd * (1 + 1e-6)).all()
+
+
+def test_freed_parameters_leave_the_marginal_distribution_of_the_others():
+    first = identify(hexapod(), hexapod_data(20, seed=1), LeastSquares())
+    names = limb_parameters(first.robot, "leg3")
+    B = prior_from(first.posterior).without(names).rows * first.tolerance
+    assert np.array_equal(B[:, LEG3], np.zeros_like(B[:, LEG3]))
+    others = np.delete(np.arange(42), LEG3)
+    scaled = first.covariance / first.tolerance[:, None] / first.tolerance
+    information = np.linalg.inv(scaled[np.ix_(others, others)])
+    np.testing.assert_allclose(
+        (B.T @ B)[np.ix_(others, others)],
+        information,
+        rtol=0,
+        atol=1e-6 * np.abs(information).max(),
+    )
+
+
+def test_what_was_unknown_stays_unknown_until_it_is_measured():
+    first = identify(hexapod(), hexapod_data(20, seed=1, instrument=five_dof()), LeastSquares())
+    prior = prior_from(first.posterior)
+    assert prior.rows.shape == (41, 42)
+    again = identify(hexapod(), hexapod_data(10, seed=2, instrument=five_dof()), prior=prior)
+    assert again.rank == 41  # although the null direction differs by 1e-4 between the two estimates
+    assert again.converged
+    assert len(again.unidentifiable) == 1
+    assert identify(hexapod(), hexapod_data(10, seed=2), prior=prior).rank == 42
+
+
+def test_a_run_keeps_the_posterior():
+    first = identify(hexapod(), hexapod_data(20, seed=1), LeastSquares())
+    back = posterior_from_arrays(first.robot, first.arrays())
+    assert np.array_equal(prior_from(back).rows, prior_from(first.posterior).rows)
+    assert back.names == first.names
+
+
+def repaired(shift, seed=2, n=12):
+    """Measurements of the true hexapod with other values in leg 3."""
+    truth = zoo.hexapod_truth().copy()
+    truth[LEG3] += shift
+    return simulate(
+        zoo.hexapod().with_values(truth), hexapod_poses(n, seed), tracker(), seed
+    ), truth
+
+
+def test_a_limb_that_moved_is_found_and_the_others_are_kept():
+    first = identify(hexapod(), hexapod_data(30, seed=1), LeastSquares())
+    data, truth = repaired([0, 0, 0, 0, 0, 0, 0.05e-3])
+    fit, change = recalibrate(hexapod(), data, first.posterior, "leg3")
+    assert change.moved
+    assert change.sentence.startswith(
+        "leg3 HAS moved since the earlier calibration: the change has chi-square"
+    )
+    assert "a change of leg3.length alone, by +0.0" in change.sentence
+    assert change.sentence in fit.notes
+    pull = (fit.estimate - truth) / fit.sd
+    assert np.abs(pull).max() < 4.5  # 42 correlated normal numbers
+    others = np.delete(np.arange(42), LEG3)
+    assert (fit.sd[others] <= first.sd[others] * (1 + 1e-6)).all()
+    assert (
+        identify(hexapod(), data, prior=prior_from(first.posterior)).p_value < 1e-6
+    )  # keeping all of it would be wrong
+
+
+@pytest.mark.slow
+def test_whether_a_limb_moved_is_judged_at_the_stated_level():
+    # chi-square of the change over 100 repetitions of both calibrations without any change: mean 7,
+    # sd of the mean sqrt(2 * 7 / 100) = 0.37; bounds at 4.5 sd. At 5 % level: binomial(100, 0.05),
+    # more than 15 has probability 4e-5
+    found = []
+    for seed in range(100):
+        first = identify(hexapod(), hexapod_data(15, seed=1000 + seed), LeastSquares())
+        found.append(recalibrate(hexapod(), repaired(0.0, seed)[0], first.posterior, "leg3")[1])
+    assert {c.degrees for c in found} == {7.0}
+    values = np.array([c.chi_square for c in found])
+    assert abs(values.mean() - 7) < 4.5 * 0.37
+    assert (values > chi2.ppf(0.95, 7)).sum() <= 15
+
+
+def test_without_a_limb_it_is_said_whether_the_machine_changed():
+    first = identify(hexapod(), hexapod_data(30, seed=1), LeastSquares())
+    _, same = recalibrate(hexapod(), hexapod_data(20, seed=2), first.posterior)
+    assert same.moved is False
+    assert same.degrees == 42
+    assert same.sentence.startswith("the machine has not moved beyond the noise")
+    _, other = recalibrate(hexapod(), repaired(0.02e-3)[0], first.posterior)
+    assert other.moved
+
+
+def test_a_posterior_of_another_robot_or_without_uncertainty_is_refused():
+    first = identify(hexapod(), hexapod_data(20, seed=1), LeastSquares())
+    entries = hexapod().parameters.entries
+    fixed = replace(
+        hexapod(), parameters=ParameterTable((replace(entries[0], free=False), *entries[1:]))
+    )
+    with pytest.raises(EstimationError, match=r"'leg1\.base\.x' is free in the earlier run alone"):
+        recalibrate(fixed, hexapod_data(20, seed=2), first.posterior)
+    with pytest.raises(EstimationError, match=r"belongs to 'leg33' \(did you mean 'leg3'"):
+        recalibrate(hexapod(), hexapod_data(20, seed=2), first.posterior, "leg33")
+    unsure = replace(first.posterior, variance=np.full(42, np.nan))
+    with pytest.raises(EstimationError, match="gives no uncertainty"):
+        prior_from(unsure)
+    with pytest.raises(EstimationError, match="this run holds no posterior"):
+        posterior_from_arrays(first.robot, {})

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames and offsets of sessions: drift, moved stations, priors, probes and tools; a wrong value
+that is fixed is found out.
+
+One frame alone can be wrong without a trace where the machine's own frame is free; each case here
+has what contradicts it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from numpy.testing import assert_allclose
+
+import loopcal as lc
+from loopcal import geometry
+from loopcal.estimate import LeastSquares, identify
+from loopcal.measure import (
+    Bearing,
+    Gaussian,
+    Instrument,
+    Measurements,
+    Plane,
+    Pose,
+    Position,
+    Sensor,
+    local_unknowns,
+    simulate,
+)
+from loopcal.measure.kinds import parts
+from loopcal.mechanism.workspace import sample
+from tests import zoo
+from tests.estimate.problems import hexapod, hexapod_poses
+
+UM, URAD = 1e-6, 1e-6
+SIGMA = 5 * UM
+POINT = np.array([[0.03, -0.02, 0.05]])
+UNLIKELY, USUAL = 1e-6, 1e-3
+"""p-values of a fit that is wrong, and of one that is right: one seed in a thousand would fail."""
+
+
+def sensor(kind, **labels):
+    sigma = [
+        SIGMA if column.dimension.value == "length" else 5 * URAD for column in kind.noise_columns
+    ]
+    return Sensor(kind, Gaussian(np.array(sigma)), **labels)
+
+
+def seen(poses, *sensors, true):
+    """What a true hexapod shows."""
+    return simulate(
+        zoo.hexapod().with_values(zoo.hexapod_truth()), poses, Instrument(sensors), 1, unknowns=true
+    )
+
+
+def fixed(data: Measurements, pattern: str, values: Mapping[str, float] | None = None):
+    """The unknowns of the data, some at these values and kept there."""
+    local = local_unknowns(data.observations, data.labels)
+    return local.starting_at(local.values(values)).fixed(pattern)
+
+
+def right(fit, true: Mapping[str, float]):
+    """A fit that explains the data, with these own unknowns within five standard deviations."""
+    assert fit.converged
+    assert fit.p_value > USUAL
+    for name, value in true.items():
+        i = fit.local.names.index(name)
+        assert np.isfinite(fit.local.sd[i])
+        assert abs(fit.local.estimate[i] - value) < 5 * fit.local.sd[i], name
+
+
+def wrong(fit):
+    """A fit whose residual says that something stated is not so."""
+    assert fit.p_value < UNLIKELY
+    assert fit.check.sentence in fit.notes
+    assert not fit.check.intervals or fit.check.sigma_scale > 1.0
+
+
+def test_a_base_that_drifts_is_re_measured_in_every_session():
+    day = np.repeat(["morning", "noon", "evening"], 20)
+    poses, kind = hexapod_poses(60), Pose(unknown=("frame",))
+    drift = {"noon.frame.x": 40 * UM, "evening.frame.x": 90 * UM, "evening.frame.ry": 100 * URAD}
+    data = seen(poses, sensor(kind, session=day), true=drift)
+    # the first session says where the base is, the others how far it has drifted since
+    first = {"morning.frame.x": 0.0, "morning.frame.ry": 0.0}
+    fit = identify(hexapod(), data, LeastSquares(), local=fixed(data, "morning.*", first))
+    assert fit.rank == 42
+    right(fit, drift)
+    free = identify(hexapod(), data, LeastSquares())
+    assert free.rank == 36
+    frames = [
+        parts.frame_at(
+            np.eye(4),
+            np.array([free.local.values[f"{s}.frame.{a}"] for a in parts.TURNS + parts.POSITION]),
+        )
+        for s in ("morning", "evening")
+    ]
+    # the gauge moves all frames alike: what lies between two of them is known; [rad, m] at 5 um in
+    # 20 poses, five times over
+    moved = geometry.log_so3(frames[1][:3, :3] @ frames[0][:3, :3].T)
+    assert_allclose(moved, [0.0, 100 * URAD, 0.0], atol=5 * 20 * URAD)
+    wrong(identify(hexapod(), data, LeastSquares(), local=fixed(data, "*")))
+
+
+def test_a_station_that_was_moved_is_found_anew_and_not_taken_for_the_same():
+    day = np.repeat(["left", "right"], 50)
+    station = geometry.pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
+    theodolite = Bearing(places=POINT, T_base_frame=station, unknown=("frame",))
+    poses = np.concatenate([hexapod_poses(50), hexapod_poses(50, 3)])
+    moved = {"right.frame.x": 1.4, "right.frame.y": -1.1, "right.frame.rz": 2.0}
+    known = Position(places=POINT)
+    data = seen(poses, sensor(theodolite, session=day), sensor(known), true=moved)
+    fit = identify(hexapod(), data, LeastSquares())
+    assert fit.rank == 39
+    right(fit, moved | {"left.frame.x": -1.5})
+    one = tuple(replace(o, session=np.full(len(o), "")) for o in data.observations)
+    wrong(identify(hexapod(), replace(data, observations=one), LeastSquares()))
+
+
+@cache
+def printed():
+    """A delta, whose base has no frame of its own to take up a wrong one, seen by a tracker."""
+    robot = lc.load_robot("linear-delta")
+    truth = robot.with_values(
+        robot.values
+        + np.where(robot.parameters.free, 0.5, 0.0) * np.nan_to_num(robot.parameters.tolerance)
+    )
+    data = simulate(
+        truth, sample(robot, 40, 5).coordinates, Instrument((sensor(Position(places=POINT, unknown=("frame",))),)), 1,
+        unknowns={"frame.x": 60 * UM},
+    )  # fmt: skip
+    return robot, truth, data
+
+
+def test_a_prior_on_a_frame_stands_between_a_free_and_a_fixed_one_and_is_weighed():
+    robot, truth, data = printed()
+    local = local_unknowns(data.observations, data.labels)
+    free, held, known = (
+        identify(robot, data, LeastSquares(), local=one)
+        for one in (
+            local,
+            local.with_prior("frame.*", 50 * UM),
+            fixed(data, "*", {"frame.x": 60 * UM}),
+        )
+    )
+    right(held, {"frame.x": 60 * UM})
+    assert np.isinf(free.sd).any()
+    assert np.isfinite(held.sd).all()
+    assert (known.sd <= held.sd * (1 + 1e-9)).all()
+    off = np.abs(held.estimate - truth.values[held.unknowns.places])
+    assert (off < 5 * held.sd).all()
+    # 60 um are thirty standard deviations of this one: a prior is a row like others, and its
+    # residual counts
+    wrong(identify(robot, data, LeastSquares(), local=local.with_prior("frame.*", 2 * UM)))
+
+
+def test_a_frame_fixed_where_it_is_not_is_found_out_where_the_machine_cannot_take_it_up():
+    robot, _, data = printed()
+    right(identify(robot, data, LeastSquares(), local=fixed(data, "*", {"frame.x": 60 * UM})), {})
+    wrong(identify(robot, data, LeastSquares(), local=fixed(data, "*")))
+
+
+def test_a_probe_s_offset_is_found_on_planes_and_a_wrong_one_is_found_out():
+    probe = Plane(
+        unknown=("surface", "targets"), targets=("probe",), places=np.array([[0.0, 0.0, 0.06]])
+    )
+    group = np.array([f"plate{i % 3}" for i in range(60)])
+    true = {"probe.x": 2e-3, "probe.y": -1e-3, "probe.z": 0.0615}
+    data = seen(hexapod_poses(60), sensor(Pose()), sensor(probe, group=group), true=true)
+    fit = identify(hexapod(), data, LeastSquares())
+    assert fit.rank == 42
+    right(fit, true)
+    wrong(
+        identify(
+            hexapod(),
+            data,
+            LeastSquares(),
+            local=fixed(data, "probe.*", true | {"probe.x": 2.2e-3}),
+        )
+    )
+
+
+def test_a_tool_s_offset_is_found_and_a_wrong_one_is_found_out():
+    true = {"tool.z": 0.12, "tool.rx": 0.01, "tool.y": 1e-3}
+    tool = Pose(
+        unknown=("tool",), T_platform_tool=geometry.pose(np.eye(3), np.array([0.0, 0.0, 0.1]))
+    )
+    balls = Position(targets=("a", "b", "c"), places=0.1 * np.eye(3))
+    data = seen(hexapod_poses(40), sensor(tool), sensor(balls), true=true)
+    fit = identify(hexapod(), data, LeastSquares())
+    assert fit.rank == 42
+    right(fit, true)
+    wrong(
+        identify(
+            hexapod(), data, LeastSquares(), local=fixed(data, "tool.*", true | {"tool.y": 1.1e-3})
+        )
+    )

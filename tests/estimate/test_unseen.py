@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Unknowns that rows see by rounding alone are not seen: nothing moves them, and they move nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+from scipy.stats import chi2
+
+from loopcal.estimate import identify
+from loopcal.estimate.components import project
+from loopcal.estimate.rows import Rows, rows_of
+from loopcal.estimate.scaling import unknowns
+from loopcal.estimate.settle import by_pose
+from loopcal.measure import (
+    Instrument,
+    Measurements,
+    Pose,
+    Sensor,
+    Separation,
+    simulate,
+    start_values,
+)
+from loopcal.numerics.decomposition import ROUNDING, without_rounding
+from tests import zoo
+from tests.estimate.problems import UM, URAD, hexapod, noise
+
+POSES = 40
+LINKS = np.array([[i, (i + k) % POSES] for k in (1, 7) for i in range(POSES)])
+
+
+def parallel(unknown: tuple[str, ...], truth: np.ndarray | None = None) -> Measurements:
+    """Poses of one orientation, measured in full and by distances between them, in which the place
+    of a target cancels.
+    """
+    robot = hexapod()
+    poses = np.tile(robot.home, (POSES, 1, 1))
+    poses[:, :3, 3] += np.random.default_rng(0).uniform(-0.03, 0.03, (POSES, 3))
+    distance = Sensor(Separation(unknown=unknown), noise(UM), LINKS)
+    instrument = Instrument((distance, Sensor(Pose(), noise(*[5 * URAD] * 3, *[UM] * 3))))
+    return simulate(
+        robot if truth is None else robot.with_values(truth), poses, instrument, 1, controller=robot
+    )
+
+
+def folded(data: Measurements) -> tuple[Rows, np.ndarray]:
+    """Rows at the nominal robot, and their factor."""
+    free = unknowns(hexapod())
+    rows = rows_of(free, data)
+    assert isinstance(rows, Rows)
+    return rows, rows.fold(np.zeros((1, len(free))), np.arange(1))[0][0]
+
+
+def test_a_target_that_cancels_stays_where_it_was_and_changes_nothing_of_the_machine():
+    (known, without), (rows, factor) = folded(parallel(())), folded(parallel(("targets",)))
+    assert rows.own is not None
+    assert int(rows.own.rank[0]) == 0
+    assert_array_equal(rows.own.values[0], 0.0)
+    assert rows.rows == known.rows
+    gram, expected = (
+        factor.T @ factor,
+        without.T @ without,
+    )  # of factors: the rows may have been reflected
+    np.testing.assert_allclose(gram, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_starts_are_not_sought_along_what_is_rounding():
+    data = parallel(("targets",))
+    T = np.tile(hexapod().home, (POSES, 1, 1))
+    T[:, :3, 3] += np.random.default_rng(0).uniform(-0.03, 0.03, (POSES, 3))
+    T[:, :3, :3] += np.random.default_rng(1).uniform(-2e-16, 2e-16, (POSES, 3, 3))
+    assert_array_equal(start_values(data, T), 0.0)
+
+
+@pytest.mark.parametrize("sigma", [None, UM])
+def test_a_fit_begins_where_a_target_is_not_seen_and_ends_where_it_is_hardly(sigma):
+    """The true machine turns by up to 0.2 mrad where it is told to keep its orientation: that sees
+    the target, at last.
+    """
+    truth = zoo.hexapod_truth()
+    data = parallel(("targets",), truth)
+    if sigma is not None:
+        draws = np.random.default_rng(2).standard_normal(data.readings.shape)
+        data = replace(data, readings=data.readings + sigma * draws, reading_sigma=sigma)
+    fit = identify(hexapod(), data)
+    assert fit.converged
+    assert fit.rank == 42
+    assert chi2.cdf(fit.chi_square, fit.dof) < 0.9999
+    assert np.abs((fit.estimate - truth) / fit.sd).max() < 4.5  # of 42: 3e-4
+    assert np.abs(fit.local.estimate / fit.local.sd).max() < 4.0
+
+
+def test_a_column_that_the_poses_take_up_whole_leaves_zeros():
+    rng = np.random.default_rng(0)
+    free = rng.standard_normal((1, 5, 12, 3)) * np.array([1.0, 1e3, 1e-3])
+    whole, other = free @ rng.standard_normal((3, 1)), rng.standard_normal((1, 5, 12, 2))
+    done = project(np.concatenate([free, 1e6 * whole, other], axis=-1), 3)
+    assert_array_equal(done.rest[..., 0], 0.0)
+    assert np.linalg.norm(done.rest[..., 1], axis=-1).min() > 1.0
+    assert_array_equal(done.rank, 3)
+
+
+def test_a_point_on_the_axis_of_a_pose_s_move_does_not_see_it():
+    rng = np.random.default_rng(3)
+    point, turn = rng.standard_normal((50, 3)), rng.standard_normal((50, 3))
+    move = np.concatenate([turn, -np.cross(turn, point)], axis=1)[None, :, :, None]
+    jacobian = np.zeros((1, 50, 3, 6))
+    jacobian[0, :, :, :3] = -np.cross(np.eye(3), -point[:, None, :]).swapaxes(1, 2)
+    jacobian[0, :, :, 3:] = np.eye(3)
+    assert np.any(jacobian @ move != 0.0)
+    assert_array_equal(by_pose(jacobian, move), 0.0)
+    shifted = move + 1e-9 * np.eye(6)[3, :, None]
+    np.testing.assert_allclose(
+        by_pose(jacobian, shifted)[0, :, 0, 0], 1e-9, rtol=1e-5
+    )  # 1e-15 of rounding in 1e-9
+
+
+def test_rounding_is_told_from_a_small_derivative_and_what_is_not_finite_stays():
+    size = np.array([1e6, 1e6, 0.0, 1.0, np.inf])
+    values = np.array([0.5e6 * ROUNDING, 2e6 * ROUNDING, 1e-300, np.nan, 1.0])
+    assert_array_equal(without_rounding(values, size), [0.0, *values[1:]])

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses that may be measured: every constraint is kept to, reaches to the boundary, and what was
+refused is counted.
+"""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from loopcal.errors import DataError, MechanismError
+from loopcal.io import load_robot
+from loopcal.io.robot.robot_file import robot_path
+from loopcal.mechanism.limits import within
+from loopcal.mechanism.singularities import singularity
+from loopcal.mechanism.workspace import ranges
+from loopcal.planning.candidates import candidates, listed_candidates
+from loopcal.planning.constraints import Constraints, Sight
+
+STATION = np.array([0.5, -0.3, 0.6])
+
+
+@pytest.fixture(scope="module")
+def strict():
+    """Candidates of a hexapod under every constraint at once."""
+    sight = Sight(STATION, np.array([0.0, 0.0, 2.0]), np.radians(60.0), 0.1, 2.0)
+    return candidates(
+        load_robot("hexapod-42"), Constraints(0.6, np.radians(12.0), sight), 100, seed=3
+    )
+
+
+def test_every_candidate_keeps_to_every_constraint_as_computed_anew(strict):
+    robot, T = strict.rules.robot, strict.solution.T
+    assert strict.solution.converged.all()
+    assert within(robot, robot.values[None], strict.solution.q[None], strict.solution.state)[
+        0
+    ].all()
+    near = singularity(robot, strict.coordinates)
+    assert (near.ratio >= 0.6).all()
+    assert (near.drive_ratio >= 0.6).all()
+    tilt = np.arccos(T[:, 2, 2])
+    assert tilt.max() <= np.radians(12.0) + 1e-9  # [rad], rounding of arccos near the bound
+    to_station = STATION - T[:, :3, 3]
+    cosine = np.einsum("ni,ni->n", T[:, :3, 2], to_station) / np.linalg.norm(to_station, axis=1)
+    assert cosine.min() >= np.cos(np.radians(60.0)) - 1e-9
+    assert np.linalg.norm(to_station, axis=1).min() >= 0.1
+
+
+def test_what_is_refused_is_counted_by_its_reason(strict):
+    assert set(strict.refused) >= {
+        "the tilt exceeds 12 deg",
+        "the target faces away from the instrument",
+    }
+    assert sum(strict.refused.values()) == strict.tried - len(strict)
+    assert f"{len(strict)} of {strict.tried} poses may be measured" in strict.sentence()
+
+
+@pytest.mark.parametrize("name", ["hexapod-42", "linear-delta"])
+def test_many_candidates_lie_at_the_boundary_of_the_workspace(name):
+    found = candidates(load_robot(name), None, 60, seed=1)
+    low, high = np.array(list(ranges(found.rules.robot).values())).T
+    at_end = np.isclose(found.coordinates, low, atol=1e-6) | np.isclose(
+        found.coordinates, high, atol=1e-6
+    )  # [m, rad]
+    edge = ~found.even
+    # of thirty that are drawn; corners drawn twice count once
+    assert 15 <= edge.sum() <= 30
+    # not all: what cannot be reached there was drawn back
+    assert at_end[edge].any(axis=1).mean() > 0.6
+    assert ((found.coordinates >= low - 1e-9) & (found.coordinates <= high + 1e-9)).all()
+
+
+def test_commanded_coordinates_have_few_digits(strict):
+    millimetres = strict.coordinates[:, :3] * 1e3
+    assert_allclose(millimetres, np.round(millimetres, 3), atol=1e-9)
+    degrees = np.degrees(strict.coordinates[:, 3:])
+    assert_allclose(degrees, np.round(degrees, 4), atol=1e-9)
+
+
+def test_a_workspace_that_the_constraints_leave_empty_is_refused_with_the_counts():
+    nobody_sees = Constraints(
+        sight=Sight(np.array([0.0, 0.0, -5.0]), np.array([0.0, 0.0, 1.0]), np.radians(20.0))
+    )
+    with pytest.raises(
+        MechanismError,
+        match=r"leave nothing of the workspace.*0 of \d+ poses.*faces away.*\(\d+\).*relax",
+    ):
+        candidates(load_robot("hexapod-42"), nobody_sees, 200)
+
+
+def test_home_that_breaks_a_constraint_is_refused_because_every_way_starts_there(tmp_path):
+    text = (
+        robot_path("hexapod-42")
+        .read_text("utf-8")
+        .replace("home: {z: 200}", "home: {z: 200, roll: 10}")
+    )
+    (tmp_path / "leaning.yaml").write_text(text)
+    with pytest.raises(
+        MechanismError, match=r"starts at the home.*tilt exceeds 5 deg.*choose another home"
+    ):
+        candidates(load_robot(tmp_path / "leaning.yaml"), Constraints(max_tilt=np.radians(5.0)), 50)
+
+
+def test_poses_of_a_user_are_judged_and_the_others_said():
+    robot = load_robot("hexapod-42")
+    poses = np.array([[0.0, 0.0, 0.2, 0.0, 0.0, 0.0], [0.0, 0.0, 0.9, 0.0, 0.0, 0.0]])
+    found = listed_candidates(robot, poses)
+    assert len(found) == 1
+    assert any("stroke" in reason for reason in found.refused)
+    with pytest.raises(MechanismError, match="none of the 1 poses given"):
+        listed_candidates(robot, poses[1:])
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Constraints(min_margin=1.5), "share of the median"),
+        (lambda: Constraints(max_tilt=-1.0), "angle above 0"),
+        (lambda: Sight(np.zeros(3), np.zeros(3)), "points somewhere"),
+        (lambda: Sight(np.array([np.nan, 0, 0]), np.ones(3)), "three finite numbers"),
+        (lambda: Sight(np.zeros(3), np.ones(3), cone=0.0), "at most 180 deg"),
+        (
+            lambda: Sight(np.zeros(3), np.ones(3), nearest=2.0, farthest=1.0),
+            "a smaller and a larger",
+        ),
+    ],
+)
+def test_numbers_that_cannot_be_are_refused(make, said):
+    with pytest.raises(DataError, match=said):
+        make()

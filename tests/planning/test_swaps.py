@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Formulas of exchange and their derivatives against making every design anew."""
+
+import numpy as np
+import pytest
+
+from loopcal.planning.barrier import derivatives
+from loopcal.planning.criteria import A, Criterion, D, I
+from loopcal.planning.design import Start, directions
+from loopcal.planning.scoring import Scoring, make_scoring
+from loopcal.planning.swaps import additions, see, swaps
+from tests.planning.polynomials import Array, random_rows
+
+CRITERIA = (D(), A(), I(np.random.default_rng(1).normal(size=(9, 4)), 3))
+CASES = [
+    (criterion, own, prior) for criterion in CRITERIA for own in (0, 2) for prior in (False, True)
+]
+NAMES = [
+    f"{criterion.name}-own{own}-{'prior' if prior else 'none'}" for criterion, own, prior in CASES
+]
+
+
+def ready(criterion: Criterion, own: int, prior: bool) -> tuple[Scoring, Array]:
+    """A random problem's scoring and rows."""
+    rows = random_rows(own=own)
+    start = Start.tolerances(4, own) if prior else Start.nothing(4, own)
+    scoring = make_scoring(rows, 0.5, criterion, start, directions(rows, start))
+    return scoring, scoring.ready(rows)
+
+
+@pytest.mark.parametrize(("criterion", "own", "prior"), CASES, ids=NAMES)
+def test_the_gain_of_every_swap_is_that_of_the_new_design(
+    criterion: Criterion, own: int, prior: bool
+) -> None:
+    scoring, X = ready(criterion, own, prior)
+    chosen = np.array([0, 3, 4, 7, 9])
+    R = scoring.factor(X[chosen])
+    seen = see(scoring, R, X)
+    for j, out in enumerate(chosen):
+        gains = swaps(seen, seen.Y[out], None if seen.V is None else seen.V[out])
+        designs = [np.concatenate([np.delete(chosen, j), [k]]) for k in range(len(X))]
+        anew = [scoring.score(scoring.factor(X[design])) - scoring.score(R) for design in designs]
+        np.testing.assert_allclose(
+            gains, anew, atol=1e-9
+        )  # in logs: rounding of well-conditioned 6 x 6 systems
+
+
+@pytest.mark.parametrize(("criterion", "own", "prior"), CASES, ids=NAMES)
+def test_the_gain_of_every_addition_is_that_of_the_new_design(
+    criterion: Criterion, own: int, prior: bool
+) -> None:
+    scoring, X = ready(criterion, own, prior)
+    R = scoring.factor(X[:4])
+    anew = [
+        scoring.score(scoring.factor(np.concatenate([X[:4], X[k : k + 1]]))) - scoring.score(R)
+        for k in range(len(X))
+    ]
+    np.testing.assert_allclose(additions(see(scoring, R, X)), anew, atol=1e-9)  # in logs, as above
+
+
+@pytest.mark.parametrize("criterion", CRITERIA, ids=lambda criterion: criterion.name)
+def test_a_swap_is_exact_where_the_design_without_the_unit_is_singular(
+    criterion: Criterion,
+) -> None:
+    scoring, X = ready(criterion, 0, False)
+    R = scoring.factor(X[:2])  # four equations for four unknowns
+    seen = see(scoring, R, X)
+    gains = swaps(seen, seen.Y[0], None if seen.V is None else seen.V[0])
+    anew = [scoring.score(scoring.factor(X[[k, 1]])) - scoring.score(R) for k in range(2, len(X))]
+    np.testing.assert_allclose(
+        gains[2:], anew, atol=1e-8
+    )  # in logs: rounding times the condition of two units, 10
+    assert gains[1] < -15.0  # the same unit twice leaves two directions open, to rounding
+
+
+@pytest.mark.parametrize(("criterion", "own", "prior"), CASES, ids=NAMES)
+def testderivatives_by_weights_agree_with_differences(
+    criterion: Criterion, own: int, prior: bool
+) -> None:
+    scoring, X = ready(criterion, own, prior)
+    w = np.random.default_rng(3).uniform(0.3, 0.8, len(X))
+
+    def score(weights: Array) -> float:
+        return scoring.score(scoring.factor(np.sqrt(weights)[:, None, None] * X))
+
+    slope, curve = derivatives(scoring, X, w)
+    h = 1e-4
+    steps = h * np.eye(len(w))
+    np.testing.assert_allclose(
+        slope, [(score(w + e) - score(w - e)) / (2 * h) for e in steps], atol=1e-6
+    )  # h^2
+    differences = [
+        (derivatives(scoring, X, w + e)[0] - derivatives(scoring, X, w - e)[0]) / (2 * h)
+        for e in steps
+    ]
+    np.testing.assert_allclose(
+        curve, np.array(differences), atol=1e-5
+    )  # h^2 times a third derivative of about 100
+    assert np.linalg.eigvalsh(curve)[-1] < 1e-9  # concave, to rounding
