@@ -54,19 +54,10 @@ class Finding:
         return CATALOG[self.code].word(self.data)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return code, severity, data and text, for JSON."""
+        """Return code, severity, data and text, for `loopcal.serialization.to_json`."""
         return {
             "code": self.code,
             "severity": self.severity.value,
-            "data": {name: _plain(value) for name, value in self.data.items()},
+            "data": dict(self.data),
             "text": str(self),
         }
-
-
-def _plain(value: Any) -> Any:
-    """Return a value for JSON: quantities as dictionaries, tuples as lists."""
-    if hasattr(value, "_asdict"):
-        return value._asdict()
-    if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
-    return value

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Turn results into JSON: one function for dataclasses, arrays, enums, findings and mappings.
+
+A class whose JSON is not simply its fields says so in one of two ways:
+
+* `JSON_FIELDS`, a class variable. A tuple names the attributes that are written, in order. A
+  mapping gives each key the path of an attribute, such as `{"rank": "spectrum.rank"}`.
+* a method `to_dict`, where a key has to be computed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from enum import Enum
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+INFINITE = "infinite: these data do not determine it"
+UNDEFINED = "undefined: there is nothing to compute it from"
+
+
+def to_json(value: Any, nulls: dict[str, str] | None = None, path: tuple[str, ...] = ()) -> Any:
+    """Return a value as dictionaries, lists, strings, numbers, booleans and None.
+
+    Parameters
+    ----------
+    value : dataclasses, findings, arrays, enums (written by their names in lower case), paths,
+        named tuples, and lists and mappings of these. A number that is not finite becomes None.
+    nulls : where given, receives the path of every such number, such as
+        `parameters/3/plus_minus`, and the reason: `INFINITE` or `UNDEFINED`.
+    path : keys that lead to `value`, for `nulls` and for the error.
+
+    Raises
+    ------
+    TypeError : a value of another type; the text names its path.
+
+    Examples
+    --------
+    >>> to_json({"sd": float("inf"), "names": ("a", "b")})
+    {'sd': None, 'names': ['a', 'b']}
+    """
+    if isinstance(value, Enum):
+        return value.name.lower()
+    if value is None or isinstance(value, bool | str):
+        return value
+    if isinstance(value, int):
+        return int(value)
+    if isinstance(value, float):
+        return _finite(float(value), nulls, path)
+    if (to_list := getattr(value, "tolist", None)) is not None:  # arrays and numbers of numpy
+        return to_json(to_list(), nulls, path)
+    if isinstance(value, Path):
+        return str(value)
+    content = _content(value)
+    if isinstance(content, Mapping):
+        return {_key(k): to_json(v, nulls, (*path, _key(k))) for k, v in content.items()}
+    if isinstance(content, list | tuple):
+        return [to_json(v, nulls, (*path, str(i))) for i, v in enumerate(content)]
+    raise TypeError(f"{'/'.join(path)}: {type(value).__name__} has no JSON form")
+
+
+def json_fields(value: Any) -> dict[str, Any]:
+    """Return the attributes of a dataclass that JSON shows, by key, as they are.
+
+    For methods `to_dict` that add keys to the fields: `{**json_fields(self), "rms": self.rms}`.
+    """
+    chosen = getattr(value, "JSON_FIELDS", None)
+    if chosen is None:
+        chosen = tuple(field.name for field in dataclasses.fields(value) if field.name[0] != "_")
+    if not isinstance(chosen, Mapping):
+        chosen = {name: name for name in chosen}
+    return {key: attrgetter(attribute)(value) for key, attribute in chosen.items()}
+
+
+def _content(value: Any) -> Any:
+    """Return the mapping or sequence behind a value; the value itself where there is none."""
+    if isinstance(value, type):
+        return value
+    if hasattr(value, "to_dict"):
+        return value.to_dict()
+    if dataclasses.is_dataclass(value):
+        return json_fields(value)
+    return value._asdict() if hasattr(value, "_asdict") else value
+
+
+def _finite(value: float, nulls: dict[str, str] | None, path: tuple[str, ...]) -> float | None:
+    """Return a finite number; None for any other, with the reason in `nulls`."""
+    if math.isfinite(value):
+        return value
+    if nulls is not None:
+        nulls["/".join(path)] = UNDEFINED if math.isnan(value) else INFINITE
+    return None
+
+
+def _key(key: Any) -> str:
+    """Return a key of a mapping as text; an enum by its name."""
+    return key.name.lower() if isinstance(key, Enum) else str(key)

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from enum import IntEnum
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from loopcal.findings import Finding, Quantity, Severity
+from loopcal.serialization import INFINITE, UNDEFINED, json_fields, to_json
+from loopcal.units import Dimension
+
+
+class Ending(IntEnum):
+    CONVERGED = 0
+
+
+@dataclass(frozen=True)
+class Inner:
+    rank: int = 3
+    sd: np.ndarray = field(default_factory=lambda: np.array([1.0, np.inf, np.nan]))
+    _cache: object = None
+
+
+@dataclass(frozen=True)
+class Chosen:
+    JSON_FIELDS: ClassVar = {"rank": "inner.rank", "status": "status"}
+    inner: Inner = field(default_factory=Inner)
+    status: Ending = Ending.CONVERGED
+
+
+@dataclass(frozen=True)
+class Own:
+    a: float = 1.0
+
+    def to_dict(self) -> dict[str, object]:
+        return {**json_fields(self), "twice": 2.0 * self.a}
+
+
+def test_dataclasses_arrays_enums_paths_and_mappings_become_json():
+    document = {
+        "inner": Inner(),
+        Dimension.LENGTH: (np.float64(0.5), np.int64(2), np.bool_(True)),
+        "where": Path("a/b"),
+        "nothing": None,
+    }
+    nulls: dict[str, str] = {}
+    written = to_json(document, nulls)
+    assert written == {
+        "inner": {"rank": 3, "sd": [1.0, None, None]},
+        "length": [0.5, 2, True],
+        "where": "a/b",
+        "nothing": None,
+    }
+    assert nulls == {"inner/sd/1": INFINITE, "inner/sd/2": UNDEFINED}
+    json.dumps(written, allow_nan=False)
+
+
+def test_a_class_chooses_its_keys_by_a_table_or_by_a_method():
+    assert to_json(Chosen()) == {"rank": 3, "status": "converged"}
+    assert to_json([Own(2.0)]) == [{"a": 2.0, "twice": 4.0}]
+
+
+def test_quantities_and_severities_of_findings_are_json():
+    assert to_json(Quantity(0.19, "mm")) == {"value": 0.19, "unit": "mm"}
+    assert to_json(Severity.WARNING) == "warning"
+    assert set(Finding.__dataclass_fields__) == {"code", "severity", "data"}
+
+
+def test_what_has_no_json_form_is_named_by_its_path():
+    with pytest.raises(TypeError, match="parts/1: complex"):
+        to_json({"parts": [1.0, 2.0 + 1.0j]})
