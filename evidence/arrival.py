@@ -15,7 +15,7 @@ from loopcal.diagnose.conventions import IMPLAUSIBLE, arrival
 from loopcal.errors import LoopcalError
 from loopcal.estimate.scaling import unknowns
 from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import shipped_robots
+from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import (
     KINDS,
     Component,
@@ -69,7 +69,7 @@ def cases(times: float) -> Iterator[tuple[Mechanism, Kind]]:
     """Robots with a workspace and kinds: the first and the last example of each, far off only the
     first.
     """
-    for name in EVERY_KIND if times > 3.0 else shipped_robots():
+    for name in EVERY_KIND if times > 3.0 else list_shipped_robots():
         robot = load_robot(name)
         every = [
             kind

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from loopcal.io.core import file_reference
-from loopcal.io.data.sensor_rows import SETTINGS
-from loopcal.io.data.sensor_settings import SYMBOLS, kind_settings
+from loopcal.io.data.kind_rows import SETTINGS
+from loopcal.io.data.kind_settings import SYMBOLS, list_kind_settings
 from loopcal.io.exports.profile import FROM, KEYS
 from loopcal.io.runs.run_folder import MADE_BY
 from loopcal.measure import KINDS, Column, Kind
@@ -105,7 +105,7 @@ def kinds() -> str:
             )
         settings = table(
             ("setting", "meaning"),
-            [(f"`{key}`", meanings.get(key, "")) for key in kind_settings(kind)],
+            [(f"`{key}`", meanings.get(key, "")) for key in list_kind_settings(kind)],
         )
         parts.append(
             f"### `kind: {name}`\n\n{file_reference.summary(kind)}\n\n{columns}\n{settings}"
@@ -143,7 +143,7 @@ def settings() -> str:
     return table(("setting", "meaning"), [(f"`{key}`", words) for key, words in SETTINGS.items()])
 
 
-def made_by() -> str:
+def collect_provenance() -> str:
     """Return the keys of `made_by`."""
     return table(("key", "meaning"), [(f"`{key}`", words) for key, words in MADE_BY.items()])
 
@@ -168,7 +168,7 @@ BLOCKS = {
     "families": families,
     "kinds": kinds,
     "settings": settings,
-    "made-by": made_by,
+    "made-by": collect_provenance,
 }
 OF_EXPORTS = {"profile": profile, "profile-columns": profile_columns} | {
     name: profile_example(f"{name}.yaml") for name in ("tracker-points", "six-dof", "cmm-spheres")

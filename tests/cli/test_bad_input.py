@@ -7,11 +7,11 @@ import pytest
 
 from loopcal.cli import main
 from loopcal.errors import MechanismError
-from loopcal.io.robot.robot_file import robot_path
+from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.measure import KINDS
 from loopcal.mechanism.records import AngleTolerance, LengthTolerance, Workspace, standard_deviation
 
-ROBOT = robot_path("hexapod-42").read_text()
+ROBOT = find_robot_file("hexapod-42").read_text()
 PROFILE = Path("examples/exports/cmm-spheres.yaml").read_text("utf-8")
 EXAMPLE = Path("examples/hexapod-42")
 HEADER = "pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm],z [mm]"

@@ -12,7 +12,7 @@ import pytest
 
 from loopcal.cli import main
 from loopcal.io import load_measurements, load_robot
-from loopcal.io.robot.robot_file import shipped_robots
+from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.io.runs.calibration_run import load_run
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
@@ -239,7 +239,7 @@ def test_joints_are_shown_where_they_stand_with_the_platform_at_home(run, name) 
                     assert found != pytest.approx(np.degrees(joint.start), abs=1e-5)
 
 
-@pytest.mark.parametrize("robot", sorted(shipped_robots()))
+@pytest.mark.parametrize("robot", sorted(list_shipped_robots()))
 def test_every_shipped_robot_expands_and_no_number_is_cut_short(run, robot) -> None:
     code, out, err = run(f"check {robot} --expand")
     assert (code, err) == (0, "")

@@ -5,7 +5,7 @@ import pytest
 
 from loopcal.cli import main
 from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import shipped_robots
+from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.mechanism import FAMILIES
 
 
@@ -14,7 +14,7 @@ def _folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.mark.parametrize("name", sorted({*FAMILIES, *shipped_robots()}))
+@pytest.mark.parametrize("name", sorted({*FAMILIES, *list_shipped_robots()}))
 def test_a_new_robot_of_every_family_closes_and_lists_its_keys(name) -> None:
     assert main(["new", name, "-o", "mine.yaml"]) == 0
     robot = load_robot("mine.yaml")

@@ -13,7 +13,7 @@ import pytest
 from loopcal.cli import main
 from loopcal.errors import FileError
 from loopcal.io.core.text_file import write_text
-from loopcal.io.robot.robot_file import robot_path
+from loopcal.io.robot.robot_file import find_robot_file
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 TARGETS = "pose,x [mm],y [mm],z [mm],roll [deg],pitch [deg],yaw [deg]\nhome,0,0,200,0,0,0\n"
@@ -25,7 +25,7 @@ def run(tmp_path, monkeypatch, capsys):
     standard error.
     """
     monkeypatch.chdir(tmp_path)
-    shutil.copy(robot_path("hexapod-42"), "robot.yaml")
+    shutil.copy(find_robot_file("hexapod-42"), "robot.yaml")
     shutil.copy(EXAMPLE / "measurements.csv", "data.csv")
     Path("pp.csv").write_text(TARGETS)
     Path("old.csv").write_text("mine\n")

@@ -18,7 +18,7 @@ from loopcal.diagnose.read_as import ReadAs
 from loopcal.errors import DataError, LoopcalError
 from loopcal.estimate.scaling import unknowns
 from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import shipped_robots
+from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import (
     KINDS,
     Bearing,
@@ -272,7 +272,7 @@ WITH_EVERY_KIND = ("3-prs",)
 
 def every_case(kinds):
     """Every shipped robot with the first kind, one of them with all."""
-    for name in shipped_robots():
+    for name in list_shipped_robots():
         if robot_of(name).assembly.workspace:
             for kind in kinds if name in WITH_EVERY_KIND else kinds[:1]:
                 yield name, kind

@@ -16,8 +16,8 @@ from loopcal.diagnose import identifiability
 from loopcal.diagnose.suggestions import remedies
 from loopcal.estimate import LeastSquares, identify
 from loopcal.io.formats import klipper
-from loopcal.io.formats.exchange import Imported, Reading
-from loopcal.io.formats.transfer import checked
+from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.program_format import Imported, ImportOptions
 from loopcal.measure import Measurements, Observations
 from loopcal.mechanism import Mechanism
 from tests.cli.delta_printers import every_record
@@ -38,14 +38,14 @@ def printers(data_folder: Path, tmp_path_factory) -> dict[str, Printer]:
     for name, record in every_record(data_folder).items():
         path = tmp_path_factory.mktemp("printer") / "printer.cfg"
         path.write_text(printer_cfg(record), "utf-8")
-        read = klipper.read(path, Reading("printer"))
+        read = klipper.read(path, ImportOptions("printer"))
         lines = [
             line
             for line in read.robot_text.splitlines(keepends=True)
             if not line.startswith("fixed")
         ]
         assert read.measurements is not None
-        found[name] = checked(path, Imported("".join(lines) + UNIT)), read.measurements
+        found[name] = build_imported_robot(path, Imported("".join(lines) + UNIT)), read.measurements
     assert len(found) == 5
     return found
 

@@ -14,8 +14,8 @@ from loopcal.errors import MechanismError
 from loopcal.estimate.outlook import scene
 from loopcal.io import load_robot
 from loopcal.io.core.json_text import to_json
-from loopcal.io.robot.reduced_robot import reduced_robot_text
-from loopcal.io.robot.robot_file import shipped_robots
+from loopcal.io.robot.reduced_robot import format_reduced_robot
+from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import Instrument, Pose, Sensor
 from tests.estimate.problems import five_dof, hexapod, hexapod_data, tracker
 
@@ -26,7 +26,7 @@ def with_line(tmp_path):
 
     def load(name: str, line: str):
         path = tmp_path / "robot.yaml"
-        path.write_text(shipped_robots()[name].read_text("utf-8") + line + "\n", "utf-8")
+        path.write_text(list_shipped_robots()[name].read_text("utf-8") + line + "\n", "utf-8")
         return load_robot(path)
 
     return load
@@ -104,7 +104,7 @@ def test_the_written_file_loads_keeps_its_comments_and_loses_nothing(tmp_path):
     smaller = reduce(found)
     path = tmp_path / "smaller.yaml"
     path.write_text(
-        reduced_robot_text(smaller.robot, {m.name: m.words() for m in smaller.dropped}), "utf-8"
+        format_reduced_robot(smaller.robot, {m.name: m.words() for m in smaller.dropped}), "utf-8"
     )
     again = load_robot(path)
     assert again.parameters.free.sum() == 32
@@ -117,7 +117,7 @@ def test_the_written_file_loads_keeps_its_comments_and_loses_nothing(tmp_path):
 def test_a_list_that_is_there_grows_and_identified_values_stay(with_line):
     robot = with_line("hexapod-42", "fixed: [leg1.length,\n  'leg2.base.?']\n# the end")
     robot = robot.with_values(robot.values * (1 + 1e-4))
-    text = reduced_robot_text(robot, {"leg6.base.z": "1 mm of it counts as something"})
+    text = format_reduced_robot(robot, {"leg6.base.z": "1 mm of it counts as something"})
     assert text.count("fixed:") == 1
     assert '  - leg1.length\n  - "leg2.base.?"\n' in text
     assert "# the end" in text
@@ -131,7 +131,7 @@ def test_a_list_that_is_there_grows_and_identified_values_stay(with_line):
 
 def test_a_robot_without_a_file_cannot_be_shortened():
     with pytest.raises(MechanismError, match="was not read from a robot file"):
-        reduced_robot_text(hexapod(), {})
+        format_reduced_robot(hexapod(), {})
 
 
 def test_the_json_says_the_same():

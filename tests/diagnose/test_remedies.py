@@ -6,7 +6,7 @@ import pytest
 from loopcal.diagnose import identifiability
 from loopcal.diagnose.suggestions import remedies
 from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import shipped_robots
+from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import KINDS, Instrument, Pose, Sensor
 from tests.estimate.problems import five_dof, hexapod, hexapod_data, tracker
 
@@ -47,7 +47,7 @@ def test_a_known_frame_is_what_an_unknown_one_lacks(unknown, datum):
 def test_what_no_pose_depends_on_only_a_sensor_on_the_joint_could_tell(tmp_path):
     path = tmp_path / "robot.yaml"
     path.write_text(
-        shipped_robots()["3-prs"].read_text("utf-8") + "parameters: fourteen\n", "utf-8"
+        list_shipped_robots()["3-prs"].read_text("utf-8") + "parameters: fourteen\n", "utf-8"
     )
     found = {
         r.combination.names[0]: r

@@ -21,7 +21,7 @@ from loopcal import apply, diagnose, estimate, geometry, measure, planning
 from loopcal.diagnose.conventions import arrival
 from loopcal.diagnose.suggestions import remedies
 from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import shipped_robots
+from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import KINDS, Gaussian, Instrument, Known, Sensor, local_unknowns
 from loopcal.mechanism import build, forward, inverse, sample
 from loopcal.mechanism.batch_kinematics import sensitivity
@@ -52,7 +52,7 @@ SIGMA = {Dimension.LENGTH: 5e-6, Dimension.ANGLE: 25e-6, Dimension.RATIO: 25e-6}
 
 def robot_names() -> list[str]:
     """Name every robot that comes with loopcal."""
-    return sorted(shipped_robots())
+    return sorted(list_shipped_robots())
 
 
 @cache

@@ -11,7 +11,7 @@ import pytest
 from loopcal.cli import main
 from loopcal.errors import FileError, LoopcalError
 from loopcal.io import load_measurements, load_robot
-from loopcal.io.exports import convert, read_profile
+from loopcal.io.exports import convert_export, read_profile
 
 BY_NAME = """format: 1
 delimiter: comma
@@ -44,7 +44,7 @@ READINGS = (
 def converted(folder, export: str, profile: str):
     (folder / "profile.yaml").write_text(profile, encoding="utf-8")
     (folder / "export.txt").write_text(export, encoding="utf-8")
-    return convert(folder / "export.txt", read_profile(folder / "profile.yaml"))
+    return convert_export(folder / "export.txt", read_profile(folder / "profile.yaml"))
 
 
 def table(text: str) -> list[str]:

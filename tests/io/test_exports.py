@@ -11,7 +11,7 @@ from loopcal import geometry
 from loopcal.cli import main
 from loopcal.errors import FileError
 from loopcal.io import load_measurements, load_robot
-from loopcal.io.exports import convert, read_profile
+from loopcal.io.exports import convert_export, read_profile
 from loopcal.measure import evaluate_all, start_values, whitened_rows
 from loopcal.mechanism import forward
 
@@ -58,7 +58,7 @@ def test_the_examples_are_imported_and_fit_the_robot_they_were_invented_for_with
 
 
 def test_the_digits_of_numbers_stay_as_they_are_and_what_is_missing_stays_empty() -> None:
-    text = convert(EXAMPLES / "cmm-spheres.csv", read_profile(EXAMPLES / "cmm-spheres.yaml")).text
+    text = convert_export(EXAMPLES / "cmm-spheres.csv", read_profile(EXAMPLES / "cmm-spheres.yaml")).text
     lines = [line for line in text.split("\n") if not line.startswith("#")]
     assert lines[0] == "pose,note diameter,x [mm],y [mm],z [mm]"
     assert lines[1] == '1,"25,0008",265.7983,-340.2645,354.4649'
@@ -82,7 +82,7 @@ def converted(folder, export: str | bytes = EXPORT, profile: str = PROFILE):
     (folder / "profile.yaml").write_text(profile, encoding="utf-8")
     raw = export if isinstance(export, bytes) else export.encode()
     (folder / "export.txt").write_bytes(raw)
-    return convert(folder / "export.txt", read_profile(folder / "profile.yaml"))
+    return convert_export(folder / "export.txt", read_profile(folder / "profile.yaml"))
 
 
 def rows_of(text: str) -> list[str]:

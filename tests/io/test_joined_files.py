@@ -8,7 +8,7 @@ import pytest
 
 from loopcal.errors import LoopcalError
 from loopcal.io import load_measurements, load_robot, save_measurements
-from loopcal.io.data.measurement_file import measurement_paths
+from loopcal.io.data.measurement_file import list_measurement_files
 from loopcal.measure import (
     Component,
     Gaussian,
@@ -82,7 +82,7 @@ def test_the_order_of_files_changes_nothing_but_the_order_of_poses(files, robot)
 def test_a_file_may_name_its_table_of_poses(files, robot) -> None:
     _, heights = files(poses=POSES, heights="# poses: poses.csv\n" + HEIGHTS)
     assert load_measurements(heights, robot).n_poses == 4
-    assert list(measurement_paths(heights)) == ["data", "poses"]
+    assert list(list_measurement_files(heights)) == ["data", "poses"]
 
 
 def test_a_table_of_commanded_poses_may_stand_apart_and_in_other_units(files, robot) -> None:

@@ -9,7 +9,7 @@ import pytest
 from loopcal.errors import DataError, LoopcalError
 from loopcal.io import load_measurements, load_robot, save_measurements
 from loopcal.io.core.numbers import exact, exactly
-from loopcal.io.data.measurement_writer import to_fill_in_text
+from loopcal.io.data.measurement_writer import format_data_sheet
 from loopcal.measure import (
     Component,
     Gaussian,
@@ -314,7 +314,7 @@ def test_a_quote_that_is_not_closed_is_refused_at_its_line(tmp_path, robot) -> N
 def test_a_file_to_fill_in_holds_the_poses_and_becomes_measurements(tmp_path, robot) -> None:
     readings = np.random.default_rng(4).uniform(-0.02, 0.02, (3, 6))
     tracker = Sensor(Position(), Gaussian(np.full(3, 5e-6)), session=np.array("monday"))
-    text = to_fill_in_text(robot, Instrument((tracker,)), readings, ("p1", "p2", "p3"))
+    text = format_data_sheet(robot, Instrument((tracker,)), readings, ("p1", "p2", "p3"))
     empty = load_measurements(write(tmp_path, text), robot)
     assert empty.n_rows == 0
     np.testing.assert_array_equal(empty.readings, readings)

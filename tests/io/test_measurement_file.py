@@ -8,9 +8,9 @@ import pytest
 
 from loopcal.errors import DataError, LoopcalError
 from loopcal.io import load_measurements, load_robot, save_measurements
+from loopcal.io.data.kind_settings import list_kind_settings
 from loopcal.io.data.measurement_file import load_poses
-from loopcal.io.data.measurement_writer import template_text
-from loopcal.io.data.sensor_settings import kind_settings
+from loopcal.io.data.measurement_writer import format_template
 from loopcal.measure import (
     KINDS,
     Component,
@@ -87,7 +87,7 @@ def test_measurements_of_every_kind_come_back_as_they_were_written(
     save_measurements(data, tmp_path / "data.csv", robot, "a test")
     loaded = load_measurements(tmp_path / "data.csv", robot, **ANY)
     assert_same(data, loaded)
-    for field in kind_settings(type(kind)):
+    for field in list_kind_settings(type(kind)):
         old, new = (getattr(d.observations[0].kind, field) for d in (data, loaded))
         same = (
             old == new
@@ -142,7 +142,7 @@ def test_a_template_lacks_only_the_rows(tmp_path, robot, poses, kind) -> None:
             ),
         )
     )
-    path.write_text(template_text(robot, instrument))
+    path.write_text(format_template(robot, instrument))
     with pytest.raises(LoopcalError, match="a header but no rows"):
         load_measurements(path, robot)
     save_measurements(measured_by(robot, poses, kind), tmp_path / "full.csv", robot)

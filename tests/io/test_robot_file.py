@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from loopcal.errors import FileError, LoopcalError, MechanismError
-from loopcal.io.robot.robot_file import load_robot, robot_path, save_robot, shipped_robots
+from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots, load_robot, save_robot
 from loopcal.mechanism import build
 
-HEXAPOD = robot_path("hexapod-42").read_text()
+HEXAPOD = find_robot_file("hexapod-42").read_text()
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def write(folder, text: str):
 
 
 def test_every_shipped_robot_loads_and_states_its_source() -> None:
-    robots = shipped_robots()
+    robots = list_shipped_robots()
     assert "hexapod-42" in robots
     for name in robots:
         loaded = load_robot(name)

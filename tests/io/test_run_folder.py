@@ -9,7 +9,12 @@ import pytest
 
 from loopcal.errors import FileError
 from loopcal.io.core.json_text import to_json
-from loopcal.io.runs.run_folder import MADE_BY, made_by, read_run_folder, write_run_folder
+from loopcal.io.runs.run_folder import (
+    MADE_BY,
+    collect_provenance,
+    read_run_folder,
+    write_run_folder,
+)
 from loopcal.units import Dimension
 
 
@@ -86,7 +91,7 @@ def test_json_has_null_and_a_reason_where_a_number_is_not_finite() -> None:
 def test_a_run_says_how_it_was_made(tmp_path) -> None:
     data = tmp_path / "data.csv"
     data.write_bytes(b"abc")
-    origin = made_by(["loopcal", "calibrate"], {"data": data}, {"split": 1})
+    origin = collect_provenance(["loopcal", "calibrate"], {"data": data}, {"split": 1})
     assert set(origin) == set(MADE_BY)
     assert origin["inputs"]["data"]["sha256"].startswith(
         "ba7816bf8f01cfea"

@@ -13,11 +13,11 @@ import pytest
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.io.robot.robot_file import load_robot, shipped_robots
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.mechanism import Mechanism, Solution, Status, forward, inverse
 
 Array = NDArray[np.float64]
-ROBOTS = tuple(shipped_robots())
+ROBOTS = tuple(list_shipped_robots())
 ROWS, BLOCK = 100_000, 5_000
 SHARE = 0.999  # of rows that must return to the mode they came from
 FAR = 20.0  # times the workspace: no machine reaches all of it

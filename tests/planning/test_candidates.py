@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from loopcal.errors import DataError, MechanismError
 from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import robot_path
+from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.mechanism.limits import within
 from loopcal.mechanism.singularities import singularity
 from loopcal.mechanism.workspace import ranges
@@ -89,7 +89,7 @@ def test_a_workspace_that_the_constraints_leave_empty_is_refused_with_the_counts
 
 def test_home_that_breaks_a_constraint_is_refused_because_every_way_starts_there(tmp_path):
     text = (
-        robot_path("hexapod-42")
+        find_robot_file("hexapod-42")
         .read_text("utf-8")
         .replace("home: {z: 200}", "home: {z: 200, roll: 10}")
     )

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.io import load_robot
-from loopcal.io.robot.robot_file import robot_path
+from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.mechanism import inverse
 from loopcal.mechanism.limits import within
 from loopcal.mechanism.singularities import along_path
@@ -27,7 +27,7 @@ def hexapod(tmp_path_factory):
     """
     path = tmp_path_factory.mktemp("robot") / "short.yaml"
     path.write_text(
-        robot_path("hexapod-42")
+        find_robot_file("hexapod-42")
         .read_text("utf-8")
         .replace("stroke: [-75, 75]", "stroke: [-20, 75]")
     )

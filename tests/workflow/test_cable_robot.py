@@ -22,8 +22,8 @@ from loopcal.diagnose.examination import examine
 from loopcal.diagnose.suggestions import remedies
 from loopcal.estimate import Identification, LeastSquares, identify
 from loopcal.io.formats import hangprinter
-from loopcal.io.formats.exchange import Imported, Reading
-from loopcal.io.formats.transfer import checked
+from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.program_format import Imported, ImportOptions
 from loopcal.measure import Measurements, Observations
 from loopcal.mechanism import Mechanism
 from tests.cable_robot import (
@@ -53,7 +53,7 @@ def imported(folder: Path, found: dict[str, Any], sigma: float) -> Imported:
     path = folder / "samples.json"
     path.write_text(samples_text(found), "utf-8")
     return hangprinter.read(
-        path, Reading("printer", sigma_line=sigma * 1e-3, sigma_position=sigma * 1e-3)
+        path, ImportOptions("printer", sigma_line=sigma * 1e-3, sigma_position=sigma * 1e-3)
     )
 
 
@@ -61,7 +61,7 @@ def machine(folder: Path, found: dict[str, Any], sigma: float) -> tuple[Mechanis
     """The robot and its measurements."""
     read = imported(folder, found, sigma)
     assert read.measurements is not None
-    return checked(folder / "samples.json", read), read.measurements
+    return build_imported_robot(folder / "samples.json", read), read.measurements
 
 
 def start_of(robot: Mechanism) -> np.ndarray:
@@ -368,7 +368,7 @@ def spools(
         "home:", "".join(shared) + "home:"
     )
     assert read.measurements is not None
-    return checked(folder / "samples.json", Imported(text)), read.measurements
+    return build_imported_robot(folder / "samples.json", Imported(text)), read.measurements
 
 
 def test_a_stretch_of_the_lines_by_their_forces_is_not_seen(samples, printer, answer):

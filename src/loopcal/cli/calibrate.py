@@ -97,10 +97,9 @@ def calibrate(
     """  # noqa: D301
     from loopcal.estimate.recalibration import recalibrate
     from loopcal.io import load_robot
-    from loopcal.io.core.outputs import refuse_run_folder
-    from loopcal.io.runs.calibration_run import run_document, save_run
+    from loopcal.io.runs.calibration_run import build_result_document, save_run
     from loopcal.io.runs.compensation_file import load_prior
-    from loopcal.io.runs.run_folder import made_by
+    from loopcal.io.runs.run_folder import collect_provenance, refuse_run_folder
 
     planned = _held_out(data, hold_out)
     _refuse_contradictions(
@@ -128,7 +127,7 @@ def calibrate(
         fit, fitted if unseen is None else unseen, limit_position, limit_angle
     )
     validation = None if unseen is None else errors
-    origin = made_by(sys.argv, inputs, {"hold_out": seed})
+    origin = collect_provenance(sys.argv, inputs, {"hold_out": seed})
     split = (
         None if unseen is None else {"hold_out": hold_out, "seed": seed, "held_out": unseen.labels}
     )
@@ -136,7 +135,7 @@ def calibrate(
     found = {name: _document(finding) for name, finding in findings.items() if finding is not None}
     reasons = _reasons(fit, validation, unjudged)
     document = (
-        run_document(fit, validation, origin, split)
+        build_result_document(fit, validation, origin, split)
         | found
         | {"passed": not reasons, "reasons": reasons}
     )
@@ -149,22 +148,22 @@ def calibrate(
 
 def _inputs(robot: str, data: Sequence[Path], prior: Path | None) -> dict[str, Path]:
     """Return the files that are read."""
-    from loopcal.io.data.measurement_file import measurement_paths
-    from loopcal.io.robot.robot_file import robot_path
+    from loopcal.io.data.measurement_file import list_measurement_files
+    from loopcal.io.robot.robot_file import find_robot_file
     from loopcal.io.runs.run_folder import RESULT
 
     return {
-        "robot": robot_path(robot),
-        **measurement_paths(data),
+        "robot": find_robot_file(robot),
+        **list_measurement_files(data),
         **({} if prior is None else {"prior": prior / RESULT}),
     }
 
 
 def _held_out(data: Sequence[Path], hold_out: float) -> tuple[str, ...]:
     """Return the poses that the data hold out themselves; refuse to draw others beside them."""
-    from loopcal.io.data.use_column import USE, held_out_poses
+    from loopcal.io.data.pose_use import USE, read_held_out_poses
 
-    planned = held_out_poses(data)
+    planned = read_held_out_poses(data)
     if planned and hold_out:
         raise DataError(
             f"the column {USE!r} of the data says which poses are held out ({len(planned)} of "

@@ -49,9 +49,9 @@ def check(robot: str, plot: Path | None, force: bool, expand: bool, as_json: boo
     """  # noqa: D301
     from loopcal.io import load_robot
     from loopcal.io.core.outputs import refuse_outputs
-    from loopcal.io.robot.robot_file import robot_path
+    from loopcal.io.robot.robot_file import find_robot_file
 
-    refuse_outputs((plot,), (robot_path(robot),), force)
+    refuse_outputs((plot,), (find_robot_file(robot),), force)
     machine = load_robot(robot)
     if plot is not None:
         from loopcal.report import save_picture

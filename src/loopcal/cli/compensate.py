@@ -65,7 +65,7 @@ def compensate(
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
     from loopcal.io.runs.compensation_file import (
-        compensation_text,
+        format_compensation,
         load_calibrated_or_posterior,
         load_targets,
     )
@@ -79,7 +79,7 @@ def compensate(
     found = compute(
         known, wanted, mode, None if controller is None else load_robot(controller), steps, labels
     )
-    text = compensation_text(found)
+    text = format_compensation(found)
     if output is not None:
         write_text(output, text)
     if as_json:

@@ -50,11 +50,11 @@ def export(
     """  # noqa: D301
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
-    from loopcal.io.formats.transfer import exported, format_of, load_source
+    from loopcal.io.formats.import_export import choose_format, export_robot, load_source
 
-    target = format_of(output, format_name)
+    target = choose_format(output, format_name)
     refuse_outputs((output,), (Path(source),), force)  # --into may be corrected in place
-    found = exported(load_source(source), target, into)
+    found = export_robot(load_source(source), target, into)
     write_text(output, found.text)
     if as_json:
         show.json_document({"output": output, "format": target.name, "notes": found.notes})

@@ -106,11 +106,11 @@ def identifiability(
     from loopcal.io import load_robot
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.data.measurement_file import load_poses
-    from loopcal.io.robot.robot_file import robot_path
+    from loopcal.io.robot.robot_file import find_robot_file
     from loopcal.measure import simulate
 
     _refuse(data, poses, seen_by | {"readings": sigma_reading}, reduced, output)
-    refuse_outputs((output,), (robot_path(robot), *data, poses), force)
+    refuse_outputs((output,), (find_robot_file(robot), *data, poses), force)
     machine, drawn = load_robot(robot), ""
     if data:
         measured = measurements(data, machine, **allowed)
@@ -246,7 +246,7 @@ def _print(found: Identifiability, cures: Sequence[Remedy]) -> None:
 def _write(output: Path, smaller: Reduction) -> None:
     """Write the robot file with the parameters fixed that are left out."""
     from loopcal.io.core.text_file import write_text
-    from loopcal.io.robot.reduced_robot import reduced_robot_text
+    from loopcal.io.robot.reduced_robot import format_reduced_robot
 
     words = {merged.name: merged.words(most=3) for merged in smaller.dropped}
-    write_text(output, reduced_robot_text(smaller.robot, words))
+    write_text(output, format_reduced_robot(smaller.robot, words))

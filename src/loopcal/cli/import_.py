@@ -16,7 +16,7 @@ from loopcal.units import Dimension, symbols
 
 if TYPE_CHECKING:
     from loopcal.estimate import Identification
-    from loopcal.io.formats.exchange import Format, Reading
+    from loopcal.io.formats.program_format import Format, ImportOptions
     from loopcal.mechanism import Mechanism
 
 FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "hangprinter")
@@ -130,12 +130,12 @@ def import_(
       loopcal import samples.json --format hangprinter -o robot.yaml --data samples.csv --sigma-line
       0.7mm loopcal import five-bar.urdf --closures five-bar-loops.yaml -o five-bar.yaml
     """  # noqa: D301
-    from loopcal.io.core.outputs import all_or_none, refuse_outputs
-    from loopcal.io.formats.transfer import format_of, save_imported
+    from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
+    from loopcal.io.formats.import_export import choose_format, save_imported
 
     if profile is not None:
         return _export(file, profile, output, force, as_json)
-    source = format_of(file, format_name)
+    source = choose_format(file, format_name)
     if source.read is None:
         raise DataError(
             f"loopcal writes the format {source.name}, but does not read it; known are "
@@ -150,7 +150,7 @@ def import_(
     refuse_outputs((output, data), (file, asked["closures"] or beside), force)
     refuse_outputs((output, data, corrected), (), force)  # FILE may be corrected in place
     found = source.read(file, _reading(source, output.stem, asked))
-    with all_or_none((output, data)):
+    with restore_on_failure((output, data)):
         robot = save_imported(file, found, output, data)
         if source.judged is not None and found.measurements is not None:
             found = replace(found, notes=(*found.notes, *source.judged(robot, found.measurements)))
@@ -182,7 +182,7 @@ def _export(file: Path, profile: Path, output: Path, force: bool, as_json: bool)
     """
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
-    from loopcal.io.exports import convert, read_profile
+    from loopcal.io.exports import convert_export, read_profile
 
     given = click.get_current_context().get_parameter_source
     for parameter in click.get_current_context().command.params:
@@ -197,7 +197,7 @@ def _export(file: Path, profile: Path, output: Path, force: bool, as_json: bool)
                 "leave it out"
             )
     refuse_outputs((output,), (file, profile), force)
-    found = convert(file, read_profile(profile))
+    found = convert_export(file, read_profile(profile))
     write_text(output, found.text)
     if as_json:
         misfits = [{"line": line, "reason": reason} for line, reason in found.misfits]
@@ -219,9 +219,9 @@ def _export(file: Path, profile: Path, output: Path, force: bool, as_json: bool)
     return 0
 
 
-def _reading(source: Format, name: str, asked: dict[str, Any]) -> Reading:
+def _reading(source: Format, name: str, asked: dict[str, Any]) -> ImportOptions:
     """What the options say; one that does not belong to the format is refused."""
-    from loopcal.io.formats.exchange import Reading
+    from loopcal.io.formats.program_format import ImportOptions
 
     given = {key: value for key, value in asked.items() if value is not None}
     for key in given:
@@ -229,7 +229,7 @@ def _reading(source: Format, name: str, asked: dict[str, Any]) -> Reading:
             raise DataError(
                 f"{ASKED[key]} does not belong to the format {source.name}; leave it out"
             )
-    return Reading(name, **given)
+    return ImportOptions(name, **given)
 
 
 def _corrected(
@@ -239,11 +239,11 @@ def _corrected(
     from loopcal.estimate import identify
     from loopcal.io import load_measurements
     from loopcal.io.core.text_file import write_text
-    from loopcal.io.formats.exchange import Source
-    from loopcal.io.formats.transfer import exported
+    from loopcal.io.formats.import_export import export_robot
+    from loopcal.io.formats.program_format import ExportSource
 
     fit = identify(robot, load_measurements(data, robot))
-    written = exported(Source(fit.robot), source, file)
+    written = export_robot(ExportSource(fit.robot), source, file)
     write_text(output, written.text)
     return fit, written.notes
 

@@ -57,11 +57,11 @@ def new(
     """  # noqa: D301
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
-    from loopcal.io.robot.new_robot import new_robot_text
+    from loopcal.io.robot.new_robot import format_new_robot
 
     seen_by = instrument(kind, components, orientation, sigma_position, sigma_angle)
     refuse_outputs((output, measurements), (), force)
-    robot_text = new_robot_text(family, output.stem)
+    robot_text = format_new_robot(family, output.stem)
     template = None if measurements is None else _template(robot_text, seen_by)
     write_text(output, robot_text)
     if measurements is not None and template is not None:
@@ -82,9 +82,9 @@ def new(
 def _template(robot_text: str, seen_by: Instrument) -> str:
     """Return a measurement file without rows for a robot that is not written yet."""
     from loopcal.io import load_robot
-    from loopcal.io.data.measurement_writer import template_text
+    from loopcal.io.data.measurement_writer import format_template
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.yaml"
         path.write_text(robot_text, encoding="utf-8")
-        return template_text(load_robot(path), seen_by)
+        return format_template(load_robot(path), seen_by)

@@ -94,11 +94,11 @@ def measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) -> Me
         See `loopcal.io.load_measurements`.
     """
     from loopcal.io import load_measurements
-    from loopcal.io.core.csv_table import stated_robot
+    from loopcal.io.core.csv_table import read_robot_name
 
     found = load_measurements(paths, robot, **allowed)
     for path in paths:
-        stated = stated_robot(path)
+        stated = read_robot_name(path)
         if stated is not None and stated != robot.name:
             click.echo(
                 f"loopcal: note: {path} is said to be of robot {stated!r}, but {robot.name!r} is "
@@ -211,7 +211,7 @@ def instrument(
     """
     import numpy as np
 
-    from loopcal.io.data.sensor_settings import kind_settings
+    from loopcal.io.data.kind_settings import list_kind_settings
     from loopcal.measure import KINDS, Gaussian, Instrument, Sensor
 
     kinds, made = kind.split(","), []
@@ -229,13 +229,13 @@ def instrument(
                 f"the kind {one!r} is named twice; name it once, and write the other into the file "
                 "by hand"
             )
-        known = kind_settings(KINDS[one])
+        known = list_kind_settings(KINDS[one])
         looking = KINDS[one](**{name: value for name, value in settings.items() if name in known})
         made.append(
             Sensor(looking, Gaussian(np.array([sigma[c.dimension] for c in looking.noise_columns])))
         )
     for name in settings:
-        if not any(name in kind_settings(KINDS[one]) for one in kinds):
+        if not any(name in list_kind_settings(KINDS[one]) for one in kinds):
             raise DataError(
                 f"--{name} does not belong to the kind {kind!r}; leave it out, or choose another "
                 "kind"

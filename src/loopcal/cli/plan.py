@@ -338,7 +338,7 @@ def _planned(
 def _known(measured: Sequence[Path], robot: Mechanism) -> tuple[Measurements, tuple[str, ...]]:
     """Return what earlier files measured of poses to fit, and the names of all their poses."""
     from loopcal.cli.options import measurements
-    from loopcal.io.data.use_column import held_out_poses
+    from loopcal.io.data.pose_use import read_held_out_poses
 
     found = measurements(measured, robot)
     if not found.n_rows:
@@ -346,7 +346,7 @@ def _known(measured: Sequence[Path], robot: Mechanism) -> tuple[Measurements, tu
             f"--measured {' '.join(map(str, measured))} holds no measured value; fill it in, or "
             "leave it out"
         )
-    held = held_out_poses(measured)
+    held = read_held_out_poses(measured)
     fitted = [i for i, label in enumerate(found.labels) if label not in set(held)]
     if not fitted:
         raise DataError(
@@ -359,21 +359,27 @@ def _inputs(
     robot: str, like: Path | None, allowed: Path | None, measured: tuple[Path, ...]
 ) -> dict[str, Path]:
     """Return the files that are read."""
-    from loopcal.io.robot.robot_file import robot_path
+    from loopcal.io.robot.robot_file import find_robot_file
 
-    files = {"robot": robot_path(robot), "like": like, "allowed": allowed}
+    files = {"robot": find_robot_file(robot), "like": like, "allowed": allowed}
     files |= {f"measured {i}": path for i, path in enumerate(measured, 1)}
     return {role: path for role, path in files.items() if path is not None}
 
 
 def _write(output: Path, made: Plan, inputs: Mapping[str, Path], force: bool) -> None:
     """Write the folder."""
-    from loopcal.io.runs.plan_folder import DATA, SHEET, data_text, sheet_text, write_plan_folder
-    from loopcal.io.runs.run_folder import made_by
+    from loopcal.io.runs.plan_folder import (
+        DATA,
+        SHEET,
+        format_plan_data,
+        format_sheet,
+        write_plan_folder,
+    )
+    from loopcal.io.runs.run_folder import collect_provenance
     from loopcal.report.draw_plan import draw_curve, draw_plan, save_figure
 
-    texts = {SHEET: sheet_text(made), DATA: data_text(made)}
-    document = made.to_dict() | {"made_by": made_by(sys.argv, inputs, {"plan": made.seed})}
+    texts = {SHEET: format_sheet(made), DATA: format_plan_data(made)}
+    document = made.to_dict() | {"made_by": collect_provenance(sys.argv, inputs, {"plan": made.seed})}
     pictures = {"plan.png": functools.partial(save_figure, figure=draw_plan(made))}
     if made.curve is not None:
         pictures["curve.png"] = functools.partial(

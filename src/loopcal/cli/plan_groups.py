@@ -70,9 +70,9 @@ def plan_groups(
     as_json: bool,
 ) -> None:
     """Plan groups, write the folder, and print."""
-    from loopcal.io.data.surface_sheet import surface_data_text, surface_sheet_text
     from loopcal.io.runs.plan_folder import DATA, SHEET, write_plan_folder
-    from loopcal.io.runs.run_folder import made_by
+    from loopcal.io.runs.run_folder import collect_provenance
+    from loopcal.io.runs.surface_sheet import format_surface_data, format_surface_sheet
     from loopcal.planning.surface_groups import plan_surfaces
 
     groups, points = (
@@ -81,10 +81,10 @@ def plan_groups(
     )
     show.progress("planning ...")
     made = plan_surfaces(robot, groups, points, sigma, constraints, seed)
-    document = made.to_dict() | {"made_by": made_by(sys.argv, inputs, {"plan": seed})}
+    document = made.to_dict() | {"made_by": collect_provenance(sys.argv, inputs, {"plan": seed})}
     write_plan_folder(
         output,
-        {SHEET: surface_sheet_text(made), DATA: surface_data_text(made)},
+        {SHEET: format_surface_sheet(made), DATA: format_surface_data(made)},
         document,
         {},
         force,

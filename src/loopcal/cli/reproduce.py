@@ -68,10 +68,10 @@ def reproduce(
         refuse_used_folder(output, force)
     found = chosen.run(seed, TRIALS if trials is None else trials, show.progress)
     if output is not None:
-        from loopcal.io.runs.run_folder import made_by
+        from loopcal.io.runs.run_folder import collect_provenance
         from loopcal.papers.writing import write_folder
 
-        write_folder(output, found, made_by(["loopcal", *sys.argv[1:]], {}, {"seed": seed}), force)
+        write_folder(output, found, collect_provenance(["loopcal", *sys.argv[1:]], {}, {"seed": seed}), force)
     if as_json:
         show.json_document(found.to_dict())
         return

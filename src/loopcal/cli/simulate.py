@@ -98,9 +98,9 @@ def simulate(
     from loopcal.io import load_robot, save_robot
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
-    from loopcal.io.robot.robot_file import robot_path
+    from loopcal.io.robot.robot_file import find_robot_file
 
-    refuse_outputs((output, truth), (robot_path(robot), poses, fill), force)
+    refuse_outputs((output, truth), (find_robot_file(robot), poses, fill), force)
     machine = load_robot(robot)
     if draw_errors:
         machine = machine.with_values(measure.sample_truth(machine, 1, seed)[0])
@@ -142,7 +142,7 @@ def _simulated(
     """Measure poses of a file, or drawn ones: what was measured, and the file that says so."""
     from loopcal import measure
     from loopcal.io.data.measurement_file import load_poses
-    from loopcal.io.data.measurement_writer import measurements_text
+    from loopcal.io.data.measurement_writer import format_measurements
 
     if poses is None:
         targets, words = drawn_poses(machine.nominal, draw, seed)
@@ -150,15 +150,15 @@ def _simulated(
         targets, words = load_poses(poses, machine), f"{poses.name}, seed {seed}"
     data = measure.simulate(machine, targets, seen_by, seed, reading_sigma=sigma_reading)
     measure.check_strokes(data, machine)
-    return data, measurements_text(data, machine, f"simulated by loopcal: {words}")
+    return data, format_measurements(data, machine, f"simulated by loopcal: {words}")
 
 
 def _filled(machine: Mechanism, sheet: Path, seed: int) -> tuple[Measurements, str]:
     """Fill in the data file of a plan: what was measured, and the file that says so."""
     from loopcal.io import load_measurements
     from loopcal.io.data.instrument_file import load_instrument, refuse_readings_to_measure
-    from loopcal.io.data.measurement_writer import measurements_text
-    from loopcal.io.data.use_column import use_of, with_use
+    from loopcal.io.data.measurement_writer import format_measurements
+    from loopcal.io.data.pose_use import insert_use_column, read_pose_use
     from loopcal.measure.sheet_simulation import fill_in
 
     given = click.get_current_context().get_parameter_source
@@ -181,6 +181,6 @@ def _filled(machine: Mechanism, sheet: Path, seed: int) -> tuple[Measurements, s
     data = fill_in(
         machine, load_measurements(sheet, machine), load_instrument(sheet, machine), seed
     )
-    text = measurements_text(data, machine, f"simulated by loopcal: {sheet.name}, seed {seed}")
-    use = use_of([sheet])
-    return data, with_use(text, use) if use else text
+    text = format_measurements(data, machine, f"simulated by loopcal: {sheet.name}, seed {seed}")
+    use = read_pose_use([sheet])
+    return data, insert_use_column(text, use) if use else text

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.io.core.json_text import to_json
-from loopcal.io.core.text_file import writing
+from loopcal.io.core.text_file import report_write_errors
 from loopcal.io.runs.run_folder import RESULT, refuse_used_folder
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def page(found: Reproduction, made_by: Mapping[str, Any]) -> str:
 
     Parameters
     ----------
-    found : what to tell. made_by : see `loopcal.io.runs.run_folder.made_by`.
+    found : what to tell. made_by : see `loopcal.io.runs.run_folder.collect_provenance`.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
@@ -93,7 +93,7 @@ def csv_text(table: Table) -> str:
 def _write(path: Path, files: Mapping[str, bytes]) -> None:
     """Write files by relative name into a new folder, which then takes the place of `path`."""
     temporary, old = (path.with_name(f".{path.name}.{os.getpid()}.{end}") for end in ("tmp", "old"))
-    with writing(path):
+    with report_write_errors(path):
         try:
             for name, content in files.items():
                 target = temporary / name

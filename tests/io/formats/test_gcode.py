@@ -12,8 +12,8 @@ import pytest
 from loopcal.errors import FileError
 from loopcal.io import load_robot, save_robot
 from loopcal.io.formats import FORMATS
-from loopcal.io.formats.exchange import Reading, Source
-from loopcal.io.formats.transfer import checked
+from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.program_format import ExportSource, ImportOptions
 from loopcal.mechanism import Mechanism
 
 REPRAP = """\
@@ -36,13 +36,13 @@ def imported(folder: Path, name: str, text: str) -> Mechanism:
     path.write_text(text)
     read = FORMATS[name].read
     assert read is not None
-    return checked(path, read(path, Reading("printer")))
+    return build_imported_robot(path, read(path, ImportOptions("printer")))
 
 
-def exported(robot: Mechanism, name: str, into: Path | None = None) -> str:
+def export_robot(robot: Mechanism, name: str, into: Path | None = None) -> str:
     write = FORMATS[name].write
     assert write is not None
-    return write(Source(robot), into).text
+    return write(ExportSource(robot), into).text
 
 
 def value(robot: Mechanism, name: str) -> float:
@@ -78,7 +78,7 @@ def test_marlin_stops_are_the_height_less_the_adjustments_and_the_probe(tmp_path
 @pytest.mark.parametrize(("name", "text"), [("reprap", REPRAP), ("marlin", MARLIN)])
 def test_a_file_whose_numbers_are_already_these_stays_byte_for_byte(tmp_path, name, text) -> None:
     robot = imported(tmp_path, name, text)
-    assert exported(robot, name, tmp_path / f"{name}.g") == text
+    assert export_robot(robot, name, tmp_path / f"{name}.g") == text
 
 
 @pytest.mark.parametrize(("name", "text"), [("reprap", REPRAP), ("marlin", MARLIN)])
@@ -88,7 +88,7 @@ def test_corrected_words_read_back_equal_and_nothing_else_changes(tmp_path, name
     shift[robot.parameters.index("tower3.angle")] = 0.0
     robot = robot.with_values(robot.values + shift)
     for into in (tmp_path / f"{name}.g", None):
-        written = exported(robot, name, into)
+        written = export_robot(robot, name, into)
         again = imported(tmp_path, name, written)
         # six decimals are written; two such numbers make a stop [mm, deg]
         np.testing.assert_allclose(again.values, robot.values, rtol=0, atol=9e-9)
@@ -108,7 +108,7 @@ def test_corrected_words_read_back_equal_and_nothing_else_changes(tmp_path, name
 
 def test_the_two_firmwares_say_the_same_printer_with_opposite_signs(tmp_path) -> None:
     robot = imported(tmp_path, "reprap", REPRAP)
-    marlin = exported(robot, "marlin")
+    marlin = export_robot(robot, "marlin")
     assert "M666 X0.000000 " not in marlin
     assert (
         "M666 X-0.800000 Y-0.100000 Z-0.000000" in marlin
@@ -126,7 +126,7 @@ def test_a_word_that_is_not_there_is_added_before_the_comment(tmp_path) -> None:
     moved = load_robot(tmp_path / "other.yaml")
     (tmp_path / "reprap.g").write_bytes(text.encode())
     assert (
-        exported(moved, "reprap", tmp_path / "reprap.g")
+        export_robot(moved, "reprap", tmp_path / "reprap.g")
         == "M665 L250 R130 H300 X0.057296 ; ours\r\n"
     )
 
@@ -204,7 +204,7 @@ def test_a_command_is_read_to_its_end_however_it_is_written(tmp_path, text) -> N
     )
     assert [value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx([269.1] * 3)
     assert value(robot, "radius") == pytest.approx(130.25)
-    assert exported(robot, "reprap", tmp_path / "reprap.g") == text
+    assert export_robot(robot, "reprap", tmp_path / "reprap.g") == text
 
 
 def test_words_are_corrected_and_added_where_they_belong_and_checksums_follow(tmp_path) -> None:
@@ -214,7 +214,7 @@ def test_words_are_corrected_and_added_where_they_belong_and_checksums_follow(tm
     shift = (
         shift + np.deg2rad(0.5) * np.eye(len(robot.values))[robot.parameters.index("tower1.angle")]
     )
-    written = exported(robot.with_values(robot.values + shift), "reprap", tmp_path / "reprap.g")
+    written = export_robot(robot.with_values(robot.values + shift), "reprap", tmp_path / "reprap.g")
     code = "N1 m665 L269 R131.000000 H300 X0.500000 M666 Y0.25"
     checksum = 0
     for byte in code.encode():

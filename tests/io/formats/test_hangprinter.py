@@ -15,16 +15,16 @@ from loopcal.errors import FileError
 from loopcal.io import load_measurements
 from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.formats import hangprinter
-from loopcal.io.formats.exchange import Reading
-from loopcal.io.formats.transfer import checked
+from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.program_format import ImportOptions
 from tests.cable_robot import NAMES, TRUTH, example, paid_out, samples_text
 
 
 def read(folder, found: dict, **reading: Any):
     path = folder / "samples.json"
     path.write_text(samples_text(found), "utf-8")
-    imported = hangprinter.read(path, Reading("printer", **reading))
-    return checked(path, imported), imported
+    imported = hangprinter.read(path, ImportOptions("printer", **reading))
+    return build_imported_robot(path, imported), imported
 
 
 def test_the_robot_has_four_anchors_lengths_one_spool_radius_and_four_buildups(tmp_path) -> None:
@@ -184,4 +184,4 @@ def test_what_is_no_file_of_samples_is_refused(tmp_path, text, sentence) -> None
     path = tmp_path / "samples.json"
     path.write_text(text)
     with pytest.raises(FileError, match=sentence):
-        hangprinter.read(path, Reading("printer"))
+        hangprinter.read(path, ImportOptions("printer"))

@@ -8,8 +8,8 @@ import pytest
 
 from loopcal.errors import FileError
 from loopcal.io.formats import klipper, printer_cfg
-from loopcal.io.formats.exchange import Reading, Source
-from loopcal.io.formats.transfer import checked
+from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.program_format import ExportSource, ImportOptions
 
 SHORT = """\
 [printer]
@@ -38,7 +38,7 @@ SAVED = """
 def read(folder, text: str):
     path = folder / "printer.cfg"
     path.write_text(text)
-    return checked(path, klipper.read(path, Reading("printer")))
+    return build_imported_robot(path, klipper.read(path, ImportOptions("printer")))
 
 
 def test_defaults_are_those_of_klipper_and_the_main_part_hides_the_saved_one(tmp_path) -> None:
@@ -57,7 +57,7 @@ def test_numbers_that_were_left_out_are_added_to_the_saved_block(tmp_path, text)
         robot.values
         + 1e-3 * np.arange(1, 11) * (np.array(robot.parameters.names) != "tower3.angle")
     )
-    written = klipper.write(Source(moved), tmp_path / "printer.cfg").text
+    written = klipper.write(ExportSource(moved), tmp_path / "printer.cfg").text
     again = read(tmp_path, written)
     np.testing.assert_allclose(
         again.values, moved.values, rtol=0, atol=1e-8
@@ -75,13 +75,13 @@ def test_an_arm_that_kept_its_length_is_written_where_its_default_moved(tmp_path
     robot = read(tmp_path, SHORT)
     values = robot.values.copy()
     values[robot.parameters.index("arm1.length")] += 1e-3
-    written = klipper.write(Source(robot.with_values(values)), tmp_path / "printer.cfg").text
+    written = klipper.write(ExportSource(robot.with_values(values)), tmp_path / "printer.cfg").text
     np.testing.assert_allclose(read(tmp_path, written).values, values, rtol=0, atol=1e-9)
 
 
 def test_without_a_file_a_block_to_paste_is_written(tmp_path) -> None:
     robot = read(tmp_path, SHORT)
-    block = klipper.write(Source(robot), None).text
+    block = klipper.write(ExportSource(robot), None).text
     assert block.startswith("#*# <------")
     assert all(line.startswith("#*#") for line in block.splitlines())
     pasted = (

@@ -13,8 +13,8 @@ from loopcal import geometry as rigid
 from loopcal.errors import DataError, FileError
 from loopcal.io import load_robot
 from loopcal.io.formats import linuxcnc
-from loopcal.io.formats.exchange import Reading, Source
-from loopcal.io.formats.transfer import checked
+from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.program_format import ExportSource, ImportOptions
 from loopcal.io.robot import robot_file
 from loopcal.mechanism import Mechanism, inverse
 
@@ -42,8 +42,8 @@ def hal(geometry: dict, lead: float = 0.0, lift: float = 0.0) -> str:
 def read(folder: Path, text: str, **options) -> Mechanism:
     path = folder / "hexapod.hal"
     path.write_text(text)
-    return checked(
-        path, linuxcnc.read(path, Reading("hexapod", **{"length_unit": "mm", **options}))
+    return build_imported_robot(
+        path, linuxcnc.read(path, ImportOptions("hexapod", **{"length_unit": "mm", **options}))
     )
 
 
@@ -91,7 +91,7 @@ def test_a_calibrated_hexapod_reads_back_equal_and_nothing_else_changes(tmp_path
     names = robot.parameters.names
     shift = 1e-4 * np.random.default_rng(1).uniform(-1, 1, len(names))
     moved = robot.with_values(robot.values + shift)
-    written = linuxcnc.write(Source(moved), tmp_path / "hexapod.hal")
+    written = linuxcnc.write(ExportSource(moved), tmp_path / "hexapod.hal")
     again = read(tmp_path, written.text)
     centres = [i for i, name in enumerate(names) if not name.endswith("length")]
     np.testing.assert_allclose(
@@ -116,9 +116,9 @@ def test_an_unchanged_hexapod_leaves_the_file_alone_and_lines_of_its_own_read_ba
 ) -> None:
     text = hal(geometry).rstrip("\n")
     robot = read(tmp_path, text)
-    assert linuxcnc.write(Source(robot), tmp_path / "hexapod.hal").text == text
+    assert linuxcnc.write(ExportSource(robot), tmp_path / "hexapod.hal").text == text
     np.testing.assert_array_equal(
-        read(tmp_path, linuxcnc.write(Source(robot), None).text).values, robot.values
+        read(tmp_path, linuxcnc.write(ExportSource(robot), None).text).values, robot.values
     )
 
 
@@ -129,12 +129,12 @@ def test_a_pin_that_was_left_at_zero_is_added(tmp_path, geometry) -> None:
     robot = read(tmp_path, text)
     values = robot.values.copy()
     values[robot.parameters.index("leg1.base.z")] = 2.5e-4
-    written = linuxcnc.write(Source(robot.with_values(values)), tmp_path / "hexapod.hal").text
+    written = linuxcnc.write(ExportSource(robot.with_values(values)), tmp_path / "hexapod.hal").text
     assert written == text + "setp genhexkins.base.0.z 0.25\n"
 
 
 def test_the_shipped_hexapod_says_that_its_lengths_have_no_pin() -> None:
-    found = linuxcnc.write(Source(load_robot("hexapod-42")), None)
+    found = linuxcnc.write(ExportSource(load_robot("hexapod-42")), None)
     assert "strut 0 is 233.238076 mm long at reading zero" in "\n".join(found.notes)
 
 
@@ -146,7 +146,7 @@ def test_screws_of_several_leads_are_refused(tmp_path, geometry) -> None:
         source.text.replace("  lead: [", "  lead: [5.0, 4, 4, 4, 4, 4]  # [")
     )
     with pytest.raises((DataError, FileError), match="screws of different lead"):
-        linuxcnc.write(Source(load_robot(tmp_path / "two.yaml")), None)
+        linuxcnc.write(ExportSource(load_robot(tmp_path / "two.yaml")), None)
 
 
 @pytest.mark.parametrize(

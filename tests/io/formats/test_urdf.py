@@ -11,8 +11,8 @@ import pytest
 
 from loopcal.errors import DataError, FileError, LoopcalError
 from loopcal.io.formats import urdf, urdf_limbs, urdf_loops, urdf_tree
-from loopcal.io.formats.exchange import Imported, Reading, Source
-from loopcal.io.formats.transfer import checked
+from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
 from loopcal.mechanism import Mechanism, forward, inverse
 
 FIVE_BAR, DELTA = "5bar_linkage", "robot_delta"
@@ -29,8 +29,8 @@ def files(data_folder) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def read(files) -> dict[str, tuple[Imported, Mechanism]]:
-    found = {name: urdf.read(path, Reading(name)) for name, path in files.items()}
-    return {name: (one, checked(files[name], one)) for name, one in found.items()}
+    found = {name: urdf.read(path, ImportOptions(name)) for name, path in files.items()}
+    return {name: (one, build_imported_robot(files[name], one)) for name, one in found.items()}
 
 
 @pytest.mark.parametrize("name", COUNTS)
@@ -73,13 +73,13 @@ def test_poses_are_those_of_the_tree_with_its_loops_closed(files, read, name) ->
 
 @pytest.mark.parametrize("name", COUNTS)
 def test_an_unchanged_robot_leaves_the_file_byte_for_byte(files, read, name) -> None:
-    assert urdf.write(Source(read[name][1]), files[name]).text.encode() == files[name].read_bytes()
+    assert urdf.write(ExportSource(read[name][1]), files[name]).text.encode() == files[name].read_bytes()
 
 
 @pytest.mark.parametrize("name", COUNTS)
 def test_only_attributes_of_origins_change(files, read, name) -> None:
     robot = moved(read[name][1])
-    before, after = files[name].read_text(), urdf.write(Source(robot), files[name]).text
+    before, after = files[name].read_text(), urdf.write(ExportSource(robot), files[name]).text
     changed = [
         (a, b) for a, b in zip(before.splitlines(), after.splitlines(), strict=True) if a != b
     ]
@@ -91,9 +91,9 @@ def test_only_attributes_of_origins_change(files, read, name) -> None:
 
 def test_corrected_origins_read_back_as_the_same_machine(tmp_path, files, read) -> None:
     robot = moved(read[FIVE_BAR][1])
-    (tmp_path / "robot.urdf").write_text(urdf.write(Source(robot), files[FIVE_BAR]).text)
+    (tmp_path / "robot.urdf").write_text(urdf.write(ExportSource(robot), files[FIVE_BAR]).text)
     (tmp_path / "robot.yaml").write_text(files[FIVE_BAR].with_name("robot.yaml").read_text())
-    again = checked(tmp_path / "robot.urdf", urdf.read(tmp_path / "robot.urdf", Reading("again")))
+    again = build_imported_robot(tmp_path / "robot.urdf", urdf.read(tmp_path / "robot.urdf", ImportOptions("again")))
     T = inverse(again, again.home[None]).T
     q = inverse(again, T).q + 0.05 * np.random.default_rng(2).uniform(-1, 1, (20, 2))
     one, other = forward(again, q), forward(robot, q)
@@ -110,12 +110,12 @@ def moved(robot: Mechanism) -> Mechanism:
 
 def test_a_limb_that_branches_is_refused_with_its_joints(files) -> None:
     with pytest.raises(FileError, match=r"joints .* meet in '.*', so a limb branches from a limb"):
-        urdf.read(files[DELTA], Reading("delta", platform="transmission_connecting_rod"))
+        urdf.read(files[DELTA], ImportOptions("delta", platform="transmission_connecting_rod"))
 
 
 def test_a_urdf_needs_a_file_to_be_corrected(read) -> None:
     with pytest.raises(DataError, match=r"name the one to correct, as --into robot.urdf"):
-        urdf.write(Source(read[FIVE_BAR][1]), None)
+        urdf.write(ExportSource(read[FIVE_BAR][1]), None)
 
 
 def test_another_machine_is_not_corrected(tmp_path, files, read) -> None:
@@ -123,7 +123,7 @@ def test_another_machine_is_not_corrected(tmp_path, files, read) -> None:
         files[FIVE_BAR].read_text().replace('xyz="0.1000', 'xyz="0.2000')
     )
     with pytest.raises(FileError, match="export into the URDF that it came from"):
-        urdf.write(Source(read[FIVE_BAR][1]), tmp_path / "other.urdf")
+        urdf.write(ExportSource(read[FIVE_BAR][1]), tmp_path / "other.urdf")
 
 
 JOINT = '<joint name="a" type="revolute"><origin xyz="0 0 1"/><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/></joint>'
@@ -167,7 +167,7 @@ JOINT = '<joint name="a" type="revolute"><origin xyz="0 0 1"/><parent link="base
 def test_bad_files_are_refused_in_one_sentence(tmp_path, text, sentence) -> None:
     (tmp_path / "a.urdf").write_text(text)
     with pytest.raises(FileError, match=sentence):
-        urdf.read(tmp_path / "a.urdf", Reading("a"))
+        urdf.read(tmp_path / "a.urdf", ImportOptions("a"))
 
 
 @pytest.mark.parametrize(
@@ -189,4 +189,4 @@ def test_bad_closures_are_refused_in_one_sentence(tmp_path, closures, sentence) 
     )
     (tmp_path / "a.yaml").write_text(closures)
     with pytest.raises(LoopcalError, match=sentence):
-        urdf.read(tmp_path / "a.urdf", Reading("a"))
+        urdf.read(tmp_path / "a.urdf", ImportOptions("a"))

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from loopcal import geometry
-from loopcal.io.robot.robot_file import load_robot, shipped_robots
+from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
 from loopcal.mechanism import Mechanism, coordinates, forward, inverse
 from loopcal.mechanism.batch_kinematics import forward_trials, readings_at, sensitivity
 from loopcal.units import Dimension
 from tests.jacobians import check_jacobian
 from tests.mechanism.families.ranks import coordinates as random_coordinates
 
-ROBOTS = tuple(shipped_robots())
+ROBOTS = tuple(list_shipped_robots())
 
 
 @cache

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from loopcal.errors import LoopcalError
-from loopcal.io.robot.robot_file import load_robot, robot_path, shipped_robots
+from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots, load_robot
 from loopcal.mechanism import Mechanism, inverse
 
-LIMBS = tuple(name for name in shipped_robots() if "family: limbs" in robot_path(name).read_text())
+LIMBS = tuple(name for name in list_shipped_robots() if "family: limbs" in find_robot_file(name).read_text())
 
 
 def changed(tmp_path: Path, name: str, *changes: tuple[str, str], more: str = "") -> Mechanism:
     """A shipped robot with pieces of its text replaced, and more of it."""
-    text = robot_path(name).read_text()
+    text = find_robot_file(name).read_text()
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)
@@ -138,7 +138,7 @@ def test_lengths_ranges_and_drives_that_cannot_be_are_told_in_a_sentence(
 
 
 def test_a_mistyped_drive_is_told_before_that_nothing_is_unknown(tmp_path: Path) -> None:
-    text = robot_path("rotary-delta").read_text().replace("actuated: q", "actuated: w")
+    text = find_robot_file("rotary-delta").read_text().replace("actuated: q", "actuated: w")
     start, end = text.index("    errors:"), text.index("home:")
     path = tmp_path / "silent.yaml"
     path.write_text(text[:start] + text[end:])
@@ -147,7 +147,7 @@ def test_a_mistyped_drive_is_told_before_that_nothing_is_unknown(tmp_path: Path)
 
 
 def test_a_file_without_limbs_is_told_so(tmp_path: Path) -> None:
-    text = robot_path("rotary-delta").read_text()
+    text = find_robot_file("rotary-delta").read_text()
     path = tmp_path / "none.yaml"
     path.write_text(text[: text.index("limbs:\n")] + "limbs: []\n" + text[text.index("home:") :])
     with pytest.raises(

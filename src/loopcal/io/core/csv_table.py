@@ -251,7 +251,7 @@ def sidecar(path: Path) -> Path:
     return path.with_suffix(".yaml")
 
 
-def stated_robot(path: str | Path) -> str | None:
+def read_robot_name(path: str | Path) -> str | None:
     """Return the robot that a measurement file says it belongs to, None where it says none; raises
     FileError.
     """

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from loopcal.errors import FileError
 from loopcal.io.core.text_file import target_of
-from loopcal.io.runs.run_folder import refuse_used_folder
 
 
 def refuse_outputs(
@@ -65,7 +64,7 @@ def refuse_outputs(
 
 
 @contextmanager
-def all_or_none(outputs: Sequence[Path | None]) -> Iterator[None]:
+def restore_on_failure(outputs: Sequence[Path | None]) -> Iterator[None]:
     """Put these files back as they were before the body, or take them away, where the body fails;
     None is passed over.
     """
@@ -82,23 +81,6 @@ def all_or_none(outputs: Sequence[Path | None]) -> Iterator[None]:
                 path.write_bytes(content)
             elif path.is_file():
                 target_of(path).unlink()
-
-
-def refuse_run_folder(folder: Path, inputs: Sequence[Path], force: bool) -> None:
-    """Refuse a run folder that would replace something it may not, or a file that is read.
-
-    Raises
-    ------
-    FileError
-        See `loopcal.io.runs.run_folder.refuse_used_folder`; or an input is in the folder.
-    """
-    refuse_used_folder(folder, force)
-    for path in inputs:
-        if path.exists() and path.resolve().is_relative_to(folder.resolve()):
-            raise FileError(
-                f"this folder would be replaced, but {path} in it is read; choose another name",
-                folder,
-            )
 
 
 def _same(one: Path, other: Path) -> bool:

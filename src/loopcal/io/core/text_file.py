@@ -132,7 +132,7 @@ def write_text(path: str | Path, text: str) -> None:
         The path is a folder or no file, its folder is missing, no permission, or the disk is full.
     """
     target = target_of(path)
-    with writing(path):
+    with report_write_errors(path):
         temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
         try:
             with temporary.open("w", encoding="utf-8", newline="\n") as stream:
@@ -145,7 +145,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 @contextmanager
-def writing(path: str | Path) -> Iterator[None]:
+def report_write_errors(path: str | Path) -> Iterator[None]:
     """Turn every failure of the file system while writing `path` into one sentence.
 
     Raises

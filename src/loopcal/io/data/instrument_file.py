@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from loopcal.errors import FileError
 from loopcal.io.core.csv_table import Table, read_table
-from loopcal.io.data.sensor_rows import Sensor as Found
-from loopcal.io.data.sensor_rows import read_sensors
+from loopcal.io.data.kind_rows import Sensor as Found
+from loopcal.io.data.kind_rows import read_sensors
 from loopcal.units import EXAMPLES
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 """Measurement files: CSV rows of readings (or commanded coordinates) and measured values, settings
 in front or beside.
 
-    # kind: pose                                       see `loopcal.io.data.sensor_settings`
+    # kind: pose                                       see `loopcal.io.data.kind_settings`
     # noise: {rx: 5 urad, ry: 5 urad, rz: 5 urad, x: 1 um, y: 1 um, z: 1 um}
     pose,q1 [mm],..,q6 [mm],rx [mrad],..,z [mm]
 
@@ -12,7 +12,7 @@ those of the kind, `sigma.<noise column>` where noise differs from row to row, `
 `[mm*mrad]`) where errors are correlated, `time` and `temperature` (see
 `loopcal.io.data.context_columns`), `note..` for remarks. Several kinds in one file stand under
 `kinds: {label: {kind: ..}}`, and a column `kind` holds the label. Settings: see
-`loopcal.io.data.sensor_rows.SETTINGS`.
+`loopcal.io.data.kind_rows.SETTINGS`.
 
 Several files are one set of measurements, joined by the names of poses: one without a kind only
 says where poses are, one without readings refers to poses of the others, and a pose in two files
@@ -29,15 +29,15 @@ from typing import TYPE_CHECKING
 from loopcal.errors import DataError, FileError
 from loopcal.io.core.csv_table import Table, read_table, require_columns
 from loopcal.io.data.context_columns import read_context
-from loopcal.io.data.known_unknowns import read_known
-from loopcal.io.data.pose_rows import dimension_of, read_pose_rows
-from loopcal.io.data.sensor_rows import (
+from loopcal.io.data.kind_rows import (
     Sensor,
     measures,
     read_observations,
     read_poses_only,
     read_sensors,
 )
+from loopcal.io.data.nuisance_settings import read_known
+from loopcal.io.data.pose_rows import dimension_of, read_pose_rows
 from loopcal.io.robot.robot_file import check_format
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def load_measurements(
     return data
 
 
-def measurement_paths(path: Paths) -> dict[str, Path]:
+def list_measurement_files(path: Paths) -> dict[str, Path]:
     """Return role -> file of all that `load_measurements` reads, those included that files name as
     `poses`.
 

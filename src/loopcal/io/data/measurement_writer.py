@@ -15,11 +15,11 @@ from loopcal.io.core.csv_table import quoted
 from loopcal.io.core.numbers import exactly, shortest
 from loopcal.io.core.text_file import write_text
 from loopcal.io.data.context_columns import context_header
-from loopcal.io.data.known_unknowns import known_text
+from loopcal.io.data.kind_rows import COVARIANCE, SIGMA
+from loopcal.io.data.kind_settings import SYMBOLS, quantity_text, write_sensor
 from loopcal.io.data.measurement_file import FORMAT
+from loopcal.io.data.nuisance_settings import known_text
 from loopcal.io.data.pose_rows import LINK, measured_name
-from loopcal.io.data.sensor_rows import COVARIANCE, SIGMA
-from loopcal.io.data.sensor_settings import SYMBOLS, quantity_text, write_sensor
 from loopcal.units import Dimension, unit
 
 if TYPE_CHECKING:
@@ -83,10 +83,10 @@ def save_measurements(
     DataError
         A name that a file cannot hold.
     """
-    write_text(path, measurements_text(data, robot, remark))
+    write_text(path, format_measurements(data, robot, remark))
 
 
-def measurements_text(data: Measurements, robot: Mechanism, remark: str = "") -> str:
+def format_measurements(data: Measurements, robot: Mechanism, remark: str = "") -> str:
     """Return the text of a measurement file; see `save_measurements`."""
     names = _kind_labels([rows.kind for rows in data.observations])
     parts = [_Part(name, rows, robot) for name, rows in zip(names, data.observations, strict=True)]
@@ -126,7 +126,7 @@ def measurements_text(data: Measurements, robot: Mechanism, remark: str = "") ->
     return "\n".join(lines) + "\n"
 
 
-def template_text(robot: Mechanism, instrument: Instrument) -> str:
+def format_template(robot: Mechanism, instrument: Instrument) -> str:
     """Return settings and header of a measurement file, to be filled in by hand.
 
     Parameters
@@ -145,7 +145,7 @@ def template_text(robot: Mechanism, instrument: Instrument) -> str:
     return "\n".join([*_settings(robot, sensors, ""), header, *ADDED, *compared]) + "\n"
 
 
-def to_fill_in_text(
+def format_data_sheet(
     robot: Mechanism, instrument: Instrument, readings: ArrayLike, labels: Sequence[str] = ()
 ) -> str:
     """Return a measurement file whose poses are stated and whose measured values are to be filled
@@ -182,7 +182,7 @@ def to_fill_in_text(
         for one, values in zip(looks, empty, strict=True)
         if one.rows is not None
     ]
-    return measurements_text(
+    return format_measurements(
         Measurements(robot.name, np.asarray(readings), tuple(rows), labels=tuple(labels)), robot
     )
 

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any
 from loopcal.errors import UnitError, nearest
 from loopcal.io.core.yaml_file import Location, YamlFile, read_yaml, refuse_unknown_keys
 from loopcal.io.data.context_columns import TEMPERATURE_UNITS, TIME, TIME_UNITS, is_context
-from loopcal.io.data.sensor_rows import COVARIANCE, SETTINGS, SIGMA
-from loopcal.io.data.sensor_settings import kind_settings, read_kind
-from loopcal.io.exports.cells import plain_number, with_point
+from loopcal.io.data.kind_rows import COVARIANCE, SETTINGS, SIGMA
+from loopcal.io.data.kind_settings import list_kind_settings, read_kind
+from loopcal.io.exports.export_cells import plain_number, with_point
 from loopcal.io.robot.robot_file import check_format
 from loopcal.units import Dimension, symbols, unit
 
@@ -181,7 +181,7 @@ def _kind(file: YamlFile) -> Kind:
         )
     kind = read_kind(file, settings, place)
     known = [key for key in SETTINGS if key != "kinds"]
-    refuse_unknown_keys(file, list(settings), [*known, *kind_settings(type(kind))], place)
+    refuse_unknown_keys(file, list(settings), [*known, *list_kind_settings(type(kind))], place)
     return kind
 
 

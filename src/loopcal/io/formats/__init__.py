@@ -8,8 +8,8 @@ line needs.
 
 from collections.abc import Mapping
 
-from loopcal.io.formats import hangprinter, klipper, linuxcnc, marlin, parameters, reprap, urdf
-from loopcal.io.formats.exchange import Format
+from loopcal.io.formats import hangprinter, klipper, linuxcnc, marlin, parameter_table, reprap, urdf
+from loopcal.io.formats.program_format import Format
 
 FORMATS: Mapping[str, Format] = {
     found.name: found
@@ -20,7 +20,7 @@ FORMATS: Mapping[str, Format] = {
         linuxcnc.FORMAT,
         urdf.FORMAT,
         hangprinter.FORMAT,
-        parameters.JSON,
-        parameters.CSV,
+        parameter_table.JSON,
+        parameter_table.CSV,
     )
 }

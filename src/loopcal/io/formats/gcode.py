@@ -20,8 +20,8 @@ from pathlib import Path
 
 from loopcal.errors import FileError
 from loopcal.io.core.text_file import read_text
-from loopcal.io.formats.delta import same, written
-from loopcal.io.formats.exchange import number
+from loopcal.io.formats.delta_geometry import same, written
+from loopcal.io.formats.program_format import number
 
 COMMAND = re.compile(r"\s*([GM]\d+)(?![\d.])")
 FRONT = re.compile(r"\s*(?:ECHO:)?\s*(?:N\s*\d+)?")

@@ -27,7 +27,7 @@ import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.io.core.text_file import read_text
-from loopcal.io.formats.exchange import Format, Imported, Reading
+from loopcal.io.formats.program_format import Format, Imported, ImportOptions
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements
@@ -121,7 +121,7 @@ class Samples:
         return tuple("ABCDEFGHIJKLMNOPQRSTUVWXYZ"[: len(self.radius)])
 
 
-def read(path: Path, reading: Reading) -> Imported:
+def read(path: Path, reading: ImportOptions) -> Imported:
     """Read robot and samples.
 
     Raises
@@ -227,7 +227,7 @@ def anchors_from_known(samples: Samples, path: Path) -> FloatArray:
     return np.array(anchors)
 
 
-def robot_text(samples: Samples, anchors: FloatArray, path: Path, reading: Reading) -> str:
+def robot_text(samples: Samples, anchors: FloatArray, path: Path, reading: ImportOptions) -> str:
     """The robot file, one limb a line; spools whose radii are equal share one parameter."""
     sigma = reading.sigma_line / MM
     lengths = np.linalg.norm(anchors, axis=1)
@@ -283,7 +283,7 @@ def _parameters(samples: Samples) -> Iterator[str]:
         yield PARAMETER.format(name=f"{name}.buildup", nominal=0, sd=0.3, maps=onto)
 
 
-def _measurements(samples: Samples, reading: Reading) -> Measurements:
+def _measurements(samples: Samples, reading: ImportOptions) -> Measurements:
     """All readings, and the known poses as positions of the platform; cells of NaN where none is
     known, to be filled in.
     """

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from loopcal.io.formats import printer_cfg
-from loopcal.io.formats.delta import (
+from loopcal.io.formats.delta_geometry import (
     NOMINAL_ANGLES,
     DeltaNumbers,
     Three,
@@ -29,16 +29,16 @@ from loopcal.io.formats.delta import (
     three,
     written,
 )
-from loopcal.io.formats.exchange import (
+from loopcal.io.formats.printer_cfg import PrinterConfig
+from loopcal.io.formats.program_format import (
     UNCHANGED,
     Exported,
+    ExportSource,
     Format,
     Imported,
-    Reading,
-    Source,
+    ImportOptions,
     byte_order_mark,
 )
-from loopcal.io.formats.printer_cfg import PrinterConfig
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements
@@ -60,7 +60,7 @@ class _Probes:
     distances: list[tuple[str, str, float]]
 
 
-def read(path: Path, reading: Reading) -> Imported:
+def read(path: Path, reading: ImportOptions) -> Imported:
     """Read geometry and measurements; FileError for what is missing or no number, or a printer that
     is no delta.
     """
@@ -127,7 +127,7 @@ def step_distance(cfg: PrinterConfig, section: str) -> float:
     return rotation / (micro * full * _gear_ratio(cfg, section))
 
 
-def write(source: Source, into: Path | None) -> Exported:
+def write(source: ExportSource, into: Path | None) -> Exported:
     """The corrected numbers in a printer.cfg whose other bytes stay; without one, a saved block to
     paste.
     """
@@ -193,7 +193,7 @@ def _probes(cfg: PrinterConfig) -> _Probes:
     return found
 
 
-def _measurements(probes: _Probes, steps: list[float], reading: Reading) -> Measurements:
+def _measurements(probes: _Probes, steps: list[float], reading: ImportOptions) -> Measurements:
     """Heights as the component z, distances as separations of two poses."""
     import numpy as np
 
@@ -250,7 +250,7 @@ def judged(robot: Mechanism, measured: Measurements) -> tuple[str, ...]:
     """Whether the stored geometry is the optimum of Klipper's own cost; nothing where the probes do
     not determine one.
     """
-    from loopcal.io.formats.stored_answer import stored_answer
+    from loopcal.diagnose.stored_geometry import stored_answer
 
     found = stored_answer(robot, measured)
     return () if found is None else (str(found),)

@@ -28,13 +28,13 @@ from pathlib import Path
 from loopcal.errors import DataError, FileError
 from loopcal.io.core.numbers import shortest
 from loopcal.io.core.text_file import read_text
-from loopcal.io.formats.exchange import (
+from loopcal.io.formats.program_format import (
     UNCHANGED,
     Exported,
+    ExportSource,
     Format,
     Imported,
-    Reading,
-    Source,
+    ImportOptions,
     byte_order_mark,
     number,
     record_of,
@@ -111,7 +111,7 @@ class _Hal:
         return x, y, z
 
 
-def read(path: Path, reading: Reading) -> Imported:
+def read(path: Path, reading: ImportOptions) -> Imported:
     """Read the pins; FileError for those that are missing or no number, or where no unit was
     stated.
     """
@@ -167,7 +167,7 @@ def read(path: Path, reading: Reading) -> Imported:
     return Imported(text, None, tuple(notes))
 
 
-def write(source: Source, into: Path | None) -> Exported:
+def write(source: ExportSource, into: Path | None) -> Exported:
     """The corrected pins in a HAL file whose other bytes stay, or `setp` lines of their own."""
     record: Gough = record_of(source, Gough, "linuxcnc", "a hexapod of the family gough")
     symbol = unit(source.robot.units[Dimension.LENGTH])
@@ -207,7 +207,7 @@ def write(source: Source, into: Path | None) -> Exported:
 
 
 def _pins(
-    source: Source, record: Gough, factor: float, lift: float, present: float | None
+    source: ExportSource, record: Gough, factor: float, lift: float, present: float | None
 ) -> Iterator[tuple[str, float]]:
     """Pin -> value in the file's unit; `present` is the lead there, whose sign is kept."""
     values = source.values()
@@ -236,7 +236,7 @@ def _pins(
                 yield f"genhexkins.{kind}.{n}.{axis}", value
 
 
-def _unsaid(source: Source, factor: float, symbol: str) -> Iterator[str]:
+def _unsaid(source: ExportSource, factor: float, symbol: str) -> Iterator[str]:
     """What has no pin: lengths at reading zero, and the other parameters of a complete model."""
     values = source.values()
     for n in range(6):

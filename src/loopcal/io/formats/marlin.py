@@ -16,7 +16,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from loopcal.io.formats import gcode
-from loopcal.io.formats.delta import (
+from loopcal.io.formats.delta_geometry import (
     NOMINAL_ANGLES,
     DeltaNumbers,
     numbers_of,
@@ -25,13 +25,13 @@ from loopcal.io.formats.delta import (
     three,
     written,
 )
-from loopcal.io.formats.exchange import (
+from loopcal.io.formats.program_format import (
     UNCHANGED,
     Exported,
+    ExportSource,
     Format,
     Imported,
-    Reading,
-    Source,
+    ImportOptions,
     byte_order_mark,
 )
 
@@ -40,7 +40,7 @@ REMARK = "; Delta geometry by loopcal, for Marlin without a bed probe: with one,
 OLD = "rod trims (M665 A, B, C) need Marlin 2.0.6 or later; older ones know one rod length only, and take B for a radius"
 
 
-def read(path: Path, reading: Reading) -> Imported:
+def read(path: Path, reading: ImportOptions) -> Imported:
     """Read M665 and M666 (and the probe's offset M851); FileError for what is missing, no number or
     contradictory.
     """
@@ -55,7 +55,7 @@ def read(path: Path, reading: Reading) -> Imported:
     )
 
 
-def write(source: Source, into: Path | None) -> Exported:
+def write(source: ExportSource, into: Path | None) -> Exported:
     """The corrected words in a file whose other bytes stay, or two lines of their own."""
     numbers = numbers_of(source, "marlin")
     file = None if into is None else gcode.read(into, one_in_a_line=True)

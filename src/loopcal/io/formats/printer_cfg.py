@@ -16,7 +16,7 @@ from pathlib import Path
 
 from loopcal.errors import FileError
 from loopcal.io.core.text_file import read_text
-from loopcal.io.formats.exchange import number
+from loopcal.io.formats.program_format import number
 
 MARK = "#*#"
 HEADER = "#*# <---------------------- SAVE_CONFIG ---------------------->"

@@ -15,7 +15,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from loopcal.io.formats import gcode
-from loopcal.io.formats.delta import (
+from loopcal.io.formats.delta_geometry import (
     NOMINAL_ANGLES,
     DeltaNumbers,
     Three,
@@ -25,13 +25,13 @@ from loopcal.io.formats.delta import (
     three,
     written,
 )
-from loopcal.io.formats.exchange import (
+from loopcal.io.formats.program_format import (
     UNCHANGED,
     Exported,
+    ExportSource,
     Format,
     Imported,
-    Reading,
-    Source,
+    ImportOptions,
     byte_order_mark,
 )
 
@@ -39,7 +39,7 @@ TOWERS = "XYZ"
 REMARK = "; Delta geometry by loopcal; L with three lengths needs RepRapFirmware 2.03 or later\n"
 
 
-def read(path: Path, reading: Reading) -> Imported:
+def read(path: Path, reading: ImportOptions) -> Imported:
     """Read M665 and M666; FileError for what is missing, no number, or not of three towers, and for
     a tilted bed.
     """
@@ -64,7 +64,7 @@ def read(path: Path, reading: Reading) -> Imported:
     )
 
 
-def write(source: Source, into: Path | None) -> Exported:
+def write(source: ExportSource, into: Path | None) -> Exported:
     """The corrected words in a file whose other bytes stay, or two lines of their own."""
     numbers = numbers_of(source, "reprap")
     height = sum(numbers.stops) / 3

@@ -21,13 +21,13 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import DataError, FileError
 from loopcal.io.formats import urdf_limbs, urdf_loops, urdf_tree
-from loopcal.io.formats.exchange import (
+from loopcal.io.formats.program_format import (
     UNCHANGED,
     Exported,
+    ExportSource,
     Format,
     Imported,
-    Reading,
-    Source,
+    ImportOptions,
     byte_order_mark,
     record_of,
 )
@@ -76,7 +76,7 @@ LIMB = """\
 """
 
 
-def read(path: Path, reading: Reading) -> Imported:
+def read(path: Path, reading: ImportOptions) -> Imported:
     """Read a URDF and its closures; FileError for what is broken, does not close, or branches."""
     urdf = urdf_tree.read(path)
     closures = reading.closures or path.with_suffix(".yaml")
@@ -111,7 +111,7 @@ def read(path: Path, reading: Reading) -> Imported:
     return Imported(text, None, tuple(_notes(loops, found, motion.shape[1], frame)))
 
 
-def write(source: Source, into: Path | None) -> Exported:
+def write(source: ExportSource, into: Path | None) -> Exported:
     """The URDF with corrected origins; DataError without one, FileError where its joints stand
     elsewhere.
     """

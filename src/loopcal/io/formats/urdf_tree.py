@@ -21,7 +21,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import FileError
 from loopcal.io.core.text_file import read_text
-from loopcal.io.formats.exchange import number
+from loopcal.io.formats.program_format import number
 from loopcal.typing import FloatArray
 
 KINDS = {"revolute": "R", "continuous": "R", "prismatic": "P", "fixed": ""}

@@ -12,7 +12,7 @@ import textwrap
 from loopcal.errors import MechanismError, nearest
 from loopcal.io.core import file_reference
 from loopcal.io.core.yaml_file import read_yaml
-from loopcal.io.robot.robot_file import shipped_robots
+from loopcal.io.robot.robot_file import list_shipped_robots
 
 EXAMPLES = {"gough": "hexapod-42", "limbs": "five-bar"}
 """The shipped robot that shows a family, where it is not called like the family."""
@@ -23,7 +23,7 @@ PLAIN = re.compile(r"(?!(?:true|false|null)$)[A-Za-z][\w.-]*$")
 """Names that YAML reads as text without quotes."""
 
 
-def new_robot_text(family: str, name: str) -> str:
+def format_new_robot(family: str, name: str) -> str:
     """Return the text of a robot file with a robot that closes, to put one's own numbers into.
 
     Parameters
@@ -40,7 +40,7 @@ def new_robot_text(family: str, name: str) -> str:
     """
     from loopcal.mechanism import FAMILIES
 
-    shipped = shipped_robots()
+    shipped = list_shipped_robots()
     example = EXAMPLES.get(family, family)
     if example not in shipped:
         known = [*FAMILIES, *(robot for robot in shipped if robot not in FAMILIES)]

@@ -24,7 +24,7 @@ PLAIN = re.compile(r"[A-Za-z][\w.-]*$")
 """Names that YAML reads as text without quotes."""
 
 
-def reduced_robot_text(robot: Mechanism, dropped: Mapping[str, str]) -> str:
+def format_reduced_robot(robot: Mechanism, dropped: Mapping[str, str]) -> str:
     """Return the text of a robot's file with further parameters fixed.
 
     Parameters

@@ -74,7 +74,7 @@ def load_robot(source: str | Path) -> Mechanism:
     """
     from loopcal.mechanism import FAMILIES, build
 
-    file = read_yaml(robot_path(source), WHAT)
+    file = read_yaml(find_robot_file(source), WHAT)
     check_format(file, FORMAT)
     units = read_units(file)
     family = _family(file, sorted(FAMILIES))
@@ -107,10 +107,10 @@ def save_robot(robot: Mechanism, path: str | Path, plus_minus: np.ndarray | None
     MechanismError
         The robot did not come from a file.
     """
-    write_text(path, robot_text(robot, plus_minus))
+    write_text(path, format_robot(robot, plus_minus))
 
 
-def robot_text(robot: Mechanism, plus_minus: np.ndarray | None = None) -> str:
+def format_robot(robot: Mechanism, plus_minus: np.ndarray | None = None) -> str:
     """Return the text that `save_robot` writes.
 
     Raises
@@ -127,7 +127,7 @@ def robot_text(robot: Mechanism, plus_minus: np.ndarray | None = None) -> str:
     return source.text + table_text(robot, plus_minus)
 
 
-def robot_path(source: str | Path) -> Path:
+def find_robot_file(source: str | Path) -> Path:
     """Return the file of a robot that is given as a file or by the name of a shipped one.
 
     Raises
@@ -138,7 +138,7 @@ def robot_path(source: str | Path) -> Path:
     path = Path(source)
     if path.exists():
         return path
-    shipped = shipped_robots()
+    shipped = list_shipped_robots()
     if str(source) in shipped:
         return shipped[str(source)]
     hint = nearest(str(source), shipped)
@@ -149,7 +149,7 @@ def robot_path(source: str | Path) -> Path:
     )
 
 
-def shipped_robots() -> dict[str, Path]:
+def list_shipped_robots() -> dict[str, Path]:
     """Return name -> file of the robots that come with loopcal."""
     folder = Path(str(resources.files("loopcal"))) / "robots"
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}

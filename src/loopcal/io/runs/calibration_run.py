@@ -7,7 +7,7 @@ result.json    made_by    how (see `loopcal.io.runs.run_folder.MADE_BY`)
                split      share and labels of the poses that were held out; null where none were
                validation `Validation.to_dict()` on those poses, SI; null where none were
 arrays.npz     `Identification.arrays()`, `initial`: the values before calibration of all parameters [SI], and the rows that
-               were fitted (see `loopcal.io.data.fitted_rows`)
+               were fitted (see `loopcal.apply.reused_rows`)
 robot.yaml     the corrected robot file
 """
 
@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import DataError
-from loopcal.io.data.fitted_rows import fitted_rows, seen_before
-from loopcal.io.data.measurement_file import Paths, measurement_paths
-from loopcal.io.robot.robot_file import load_robot, robot_text, shipped_robots
-from loopcal.io.runs.run_folder import fitted_before, read_run_folder, write_run_folder
+from loopcal.apply.reused_rows import fitted_rows, seen_before
+from loopcal.io.data.measurement_file import Paths, list_measurement_files
+from loopcal.io.robot.robot_file import load_robot, format_robot, list_shipped_robots
+from loopcal.io.runs.run_folder import find_fitted_file, read_run_folder, write_run_folder
 
 if TYPE_CHECKING:
     import numpy as np
@@ -47,10 +47,10 @@ class CalibratedRun:
     local_before: Mapping[str, float] = field(default_factory=dict)
     """The same with the geometry before calibration, on the rows that were fitted."""
     arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Arrays of the run, among them those of `loopcal.io.data.fitted_rows`."""
+    """Arrays of the run, among them those of `loopcal.apply.reused_rows`."""
 
 
-def run_document(
+def build_result_document(
     fit: Identification, validation: Validation | None, origin: Mapping[str, Any], split: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """Return the content of result.json; see the module."""
@@ -73,7 +73,7 @@ def save_run(
     fit : Identification
         Of a robot that came from a file.
     document : mapping
-        What `run_document` returned.
+        What `build_result_document` returned.
     force : bool
         Replace a run that is there.
     fitted : Measurements, optional
@@ -88,7 +88,7 @@ def save_run(
     """
     rows = {} if fitted is None else fitted_rows(fitted, fit.dropped)
     arrays = {**fit.arrays(), "initial": fit.initial.values, **rows}
-    return write_run_folder(path, document, arrays, robot_text(fit.robot, fit.plus_minus), force)
+    return write_run_folder(path, document, arrays, format_robot(fit.robot, fit.plus_minus), force)
 
 
 def load_run(path: str | Path) -> CalibratedRun:
@@ -119,7 +119,7 @@ def load_calibrated(path: str | Path) -> CalibratedRun:
         Neither.
     """
     path = Path(path)
-    if path.is_dir() or (not path.exists() and str(path) not in shipped_robots()):
+    if path.is_dir() or (not path.exists() and str(path) not in list_shipped_robots()):
         return load_run(path)
     robot = load_robot(path)
     return CalibratedRun(path, {}, robot, robot.nominal)
@@ -139,7 +139,7 @@ def refuse_fitted_data(run: CalibratedRun, data: Paths, measured: Measurements) 
         A file is the same to the last byte, or half of the rows and more were fitted.
     """
     override = "--allow-fitted-data"
-    again = fitted_before(run.result, measurement_paths(data))
+    again = find_fitted_file(run.result, list_measurement_files(data))
     if again is not None:
         raise DataError(
             f"{again}: this run was fitted to these very measurements, which prove nothing about "

@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING
 from loopcal.errors import DataError, nearest
 from loopcal.io.runs.calibration_run import load_calibrated
 from loopcal.io.core.csv_table import read_table, require_columns
-from loopcal.io.data.measurement_file import Paths, measurement_paths
+from loopcal.io.data.measurement_file import Paths, list_measurement_files
 from loopcal.io.core.numbers import shortest
 from loopcal.io.data.pose_rows import COMMANDED, dimension_of
 from loopcal.io.robot.robot_file import load_robot
-from loopcal.io.runs.run_folder import fitted_before, read_run_folder
+from loopcal.io.runs.run_folder import find_fitted_file, read_run_folder
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit, unit
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def load_prior(path: str | Path, data: Paths) -> Posterior:
     DataError
         The run was fitted to these very measurements, which would count twice.
     """
-    again = fitted_before(read_run_folder(path).result, measurement_paths(data))
+    again = find_fitted_file(read_run_folder(path).result, list_measurement_files(data))
     if again is not None:
         raise DataError(
             f"{again}: the earlier run was fitted to these very measurements, which would count "
@@ -116,7 +116,7 @@ def load_targets(path: str | Path, robot: Mechanism) -> tuple[np.ndarray, tuple[
     return np.column_stack(columns), labels
 
 
-def compensation_text(found: Compensation) -> str:
+def format_compensation(found: Compensation) -> str:
     """Return the result as CSV text, units in the header."""
     robot = found.robot
     if found.commands is None:

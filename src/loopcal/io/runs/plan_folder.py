@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING, Any
 from loopcal.errors import FileError
 from loopcal.io.core.csv_table import quoted
 from loopcal.io.core.json_text import to_json
-from loopcal.io.data.measurement_writer import to_fill_in_text
+from loopcal.io.data.measurement_writer import format_data_sheet
 from loopcal.io.core.numbers import exact
 from loopcal.io.data.pose_rows import dimension_of
-from loopcal.io.core.text_file import sha256, writing
-from loopcal.io.data.use_column import FIT, HELD_OUT, USE, with_use
+from loopcal.io.core.text_file import sha256, report_write_errors
+from loopcal.io.data.pose_use import FIT, HELD_OUT, USE, insert_use_column
 from loopcal.units import Dimension, unit
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ DIGITS = 12
 """Significant ones at most of a number: more than it was rounded to, less than a double has."""
 
 
-def sheet_text(plan: Plan) -> str:
+def format_sheet(plan: Plan) -> str:
     """Return the operator's sheet: steps in order, with home between two poses where the straight
     way is not allowed.
     """
@@ -75,15 +75,15 @@ def sheet_text(plan: Plan) -> str:
     return "\n".join(lines) + "\n"
 
 
-def data_text(plan: Plan) -> str:
+def format_plan_data(plan: Plan) -> str:
     """Return the data file to fill in."""
     sensors = plan.instrument.sensors
     looking = tuple(replace(s, rows=plan.units) if s.kind.links > 1 else s for s in sensors)
     factors = [unit_of(plan.robot, actuator.dimension)[1] for actuator in plan.robot.actuators]
     # the doubles that the texts of the sheet stand for, so that both files say the same digits
     readings = [[exact(_text(q, f), f) for q, f in zip(row, factors, strict=True)] for row in plan.readings.tolist()]
-    text = to_fill_in_text(plan.robot, replace(plan.instrument, sensors=looking), readings, plan.labels)
-    return with_use(text, {label: HELD_OUT if held else FIT for label, held in zip(plan.labels, plan.held_out, strict=True)})
+    text = format_data_sheet(plan.robot, replace(plan.instrument, sensors=looking), readings, plan.labels)
+    return insert_use_column(text, {label: HELD_OUT if held else FIT for label, held in zip(plan.labels, plan.held_out, strict=True)})
 
 
 def straight_in(robot: Mechanism) -> str:
@@ -170,7 +170,7 @@ def write_plan_folder(
     """
     refuse_plan_folder(path, force)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with writing(path):
+    with report_write_errors(path):
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             temporary.mkdir()

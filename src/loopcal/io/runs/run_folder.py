@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import FileError
 from loopcal.io.core.json_text import to_json
-from loopcal.io.core.text_file import read_text, sha256, writing
+from loopcal.io.core.text_file import read_text, sha256, report_write_errors
 
 if TYPE_CHECKING:
     import numpy as np
@@ -63,7 +63,7 @@ class RunFolder:
         return self.path / ROBOT
 
 
-def made_by(command: Sequence[str], inputs: Mapping[str, Path], seeds: Mapping[str, int]) -> dict[str, Any]:
+def collect_provenance(command: Sequence[str], inputs: Mapping[str, Path], seeds: Mapping[str, int]) -> dict[str, Any]:
     """Return where a result comes from, with the keys of MADE_BY.
 
     Parameters
@@ -88,7 +88,7 @@ def made_by(command: Sequence[str], inputs: Mapping[str, Path], seeds: Mapping[s
     return {"command": list(command), "versions": versions, "seeds": dict(seeds), "inputs": files}
 
 
-def fitted_before(result: Mapping[str, Any], inputs: Mapping[str, Path]) -> Path | None:
+def find_fitted_file(result: Mapping[str, Any], inputs: Mapping[str, Path]) -> Path | None:
     """Return the first file of measured values, by its role in `inputs`, that a run was made from;
     None where none is.
 
@@ -127,6 +127,23 @@ def refuse_used_folder(path: str | Path, force: bool) -> None:
         )
 
 
+def refuse_run_folder(folder: Path, inputs: Sequence[Path], force: bool) -> None:
+    """Refuse a run folder that would replace something it may not, or a file that is read.
+
+    Raises
+    ------
+    FileError
+        See `refuse_used_folder`; or an input is in the folder.
+    """
+    refuse_used_folder(folder, force)
+    for path in inputs:
+        if path.exists() and path.resolve().is_relative_to(folder.resolve()):
+            raise FileError(
+                f"this folder would be replaced, but {path} in it is read; choose another name",
+                folder,
+            )
+
+
 def write_run_folder(
     path: str | Path, result: Mapping[str, Any], arrays: Mapping[str, np.ndarray], robot_text: str, force: bool = False
 ) -> Path:
@@ -161,7 +178,7 @@ def write_run_folder(
     refuse_used_folder(path, force)
     text = to_json({"format": FORMAT, **result})
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with writing(path):
+    with report_write_errors(path):
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             temporary.mkdir()

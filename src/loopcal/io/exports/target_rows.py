@@ -14,9 +14,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from loopcal.io.data.context_columns import TIME
-from loopcal.io.data.sensor_rows import COVARIANCE, SIGMA
-from loopcal.io.exports.cells import plain_number
-from loopcal.io.exports.lines import Misfit
+from loopcal.io.data.kind_rows import COVARIANCE, SIGMA
+from loopcal.io.exports.export_cells import plain_number
+from loopcal.io.exports.export_lines import Misfit
 from loopcal.io.exports.profile import Profile
 
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import UnitError, nearest
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
-from loopcal.io.data.sensor_settings import SYMBOLS, quantity_text
+from loopcal.io.data.kind_settings import SYMBOLS, quantity_text
 from loopcal.units import Dimension, quantity
 
 if TYPE_CHECKING:

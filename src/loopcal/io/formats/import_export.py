@@ -12,7 +12,7 @@ from loopcal.errors import DataError, FileError, MechanismError
 from loopcal.io.core.text_file import write_text
 from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.formats import FORMATS
-from loopcal.io.formats.exchange import Exported, Format, Imported, Source
+from loopcal.io.formats.program_format import Exported, ExportSource, Format, Imported
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.io.runs.calibration_run import load_calibrated
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from loopcal.mechanism import Mechanism
 
 
-def format_of(path: Path, name: str | None) -> Format:
+def choose_format(path: Path, name: str | None) -> Format:
     """The format by name, or by the ending of a file.
 
     Raises
@@ -39,7 +39,7 @@ def format_of(path: Path, name: str | None) -> Format:
     )
 
 
-def checked(path: Path, imported: Imported) -> Mechanism:
+def build_imported_robot(path: Path, imported: Imported) -> Mechanism:
     """Build the robot that was read, before anything is written.
 
     Raises
@@ -66,7 +66,7 @@ def save_imported(path: Path, imported: Imported, output: Path, data: Path | Non
     FileError, MechanismError
         A file cannot be written, or the robot cannot be built.
     """
-    robot = checked(path, imported)
+    robot = build_imported_robot(path, imported)
     if data is not None:
         if imported.measurements is None:
             raise DataError(
@@ -78,7 +78,7 @@ def save_imported(path: Path, imported: Imported, output: Path, data: Path | Non
     return load_robot(output)
 
 
-def load_source(path: str | Path) -> Source:
+def load_source(path: str | Path) -> ExportSource:
     """What to export: a run folder, a robot file, or the name of a shipped robot.
 
     Raises
@@ -94,10 +94,10 @@ def load_source(path: str | Path) -> Source:
         for i, row in enumerate(rows)
         if row["plus_minus"] is None
     }
-    return Source(run.robot, {row["name"]: row["plus_minus"] for row in rows}, why)
+    return ExportSource(run.robot, {row["name"]: row["plus_minus"] for row in rows}, why)
 
 
-def exported(source: Source, target: Format, into: Path | None) -> Exported:
+def export_robot(source: ExportSource, target: Format, into: Path | None) -> Exported:
     """The text of a source in a format.
 
     Raises

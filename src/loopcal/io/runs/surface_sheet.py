@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from loopcal.io.core.csv_table import quoted
-from loopcal.io.data.measurement_writer import measurements_text
+from loopcal.io.data.measurement_writer import format_measurements
 from loopcal.io.data.pose_rows import dimension_of
 from loopcal.io.runs.plan_folder import DIGITS, VIA, unit_of
 from loopcal.mechanism.coordinates import POSITION
@@ -24,7 +24,7 @@ FREE = "free"
 """Under hold: the foot of a group, which sets what the others are held to."""
 
 
-def surface_sheet_text(plan: SurfacePlan) -> str:
+def format_surface_sheet(plan: SurfacePlan) -> str:
     """Return the operator's sheet: each point with the coordinates to hold, how exactly, and the
     nominal command.
     """
@@ -88,7 +88,7 @@ def surface_sheet_text(plan: SurfacePlan) -> str:
     return "\n".join(lines) + "\n"
 
 
-def surface_data_text(plan: SurfacePlan) -> str:
+def format_surface_data(plan: SurfacePlan) -> str:
     """Return the data file to fill in: the gaps are zero, the readings empty."""
     from loopcal.measure import Measurements, Observations
 
@@ -102,7 +102,7 @@ def surface_data_text(plan: SurfacePlan) -> str:
         )
         observations.append(seen)
     flat = plan.readings.reshape(-1, len(robot.actuators))
-    text = measurements_text(
+    text = format_measurements(
         Measurements(robot.name, flat, tuple(observations), labels=plan.labels), robot
     )
     return _by_pose(plan, text)

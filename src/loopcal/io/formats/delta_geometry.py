@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from loopcal.errors import FileError
-from loopcal.io.formats.exchange import Source, record_of
+from loopcal.io.formats.program_format import ExportSource, record_of
 from loopcal.mechanism.families.linear_delta import LinearDelta
 
 DECIMALS = 6
@@ -80,7 +80,7 @@ def robot_text(found: DeltaNumbers, name: str, path: Path, program: str, arms_kn
     )
 
 
-def numbers_of(source: Source, format_name: str) -> DeltaNumbers:
+def numbers_of(source: ExportSource, format_name: str) -> DeltaNumbers:
     """The numbers of a robot of the family linear-delta; DataError for another."""
     record_of(source, LinearDelta, format_name, "a robot of the family linear-delta")
     value = source.values()

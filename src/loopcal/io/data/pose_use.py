@@ -19,7 +19,7 @@ from loopcal.io.core.csv_table import quoted, read_table
 USE, FIT, HELD_OUT = "use", "fit", "held-out"
 
 
-def use_of(paths: Sequence[Path]) -> dict[str, str]:
+def read_pose_use(paths: Sequence[Path]) -> dict[str, str]:
     """Return pose -> fit or held-out, for the poses of which files say so, in the order of the
     files.
 
@@ -55,12 +55,12 @@ def use_of(paths: Sequence[Path]) -> dict[str, str]:
     return said
 
 
-def held_out_poses(paths: Sequence[Path]) -> tuple[str, ...]:
+def read_held_out_poses(paths: Sequence[Path]) -> tuple[str, ...]:
     """Return the names of the poses that files hold out; raises as `use_of`."""
-    return tuple(name for name, use in use_of(paths).items() if use == HELD_OUT)
+    return tuple(name for name, use in read_pose_use(paths).items() if use == HELD_OUT)
 
 
-def with_use(text: str, use: Mapping[str, str]) -> str:
+def insert_use_column(text: str, use: Mapping[str, str]) -> str:
     """Return the text of a measurement file with the column `use` behind the names of the poses."""
     lines, header = [], True
     for line in text.splitlines():

@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from loopcal.io.core.numbers import shortest
-from loopcal.io.formats.exchange import Exported, Format, Source
+from loopcal.io.formats.program_format import Exported, ExportSource, Format
 from loopcal.units import unit
 
 FORMAT = 1
 COLUMNS = ("name", "nominal", "value", "plus_minus", "unit", "free")
 
 
-def rows(source: Source) -> Iterator[dict[str, Any]]:
+def rows(source: ExportSource) -> Iterator[dict[str, Any]]:
     """One row for each parameter, numbers as text."""
     robot = source.robot
     for parameter, value in zip(robot.parameters.entries, robot.values.tolist(), strict=True):
@@ -39,7 +39,7 @@ def rows(source: Source) -> Iterator[dict[str, Any]]:
         }
 
 
-def to_csv(source: Source, into: Path | None) -> Exported:
+def to_csv(source: ExportSource, into: Path | None) -> Exported:
     """The table as CSV."""
     del into
     stream = io.StringIO()
@@ -49,7 +49,7 @@ def to_csv(source: Source, into: Path | None) -> Exported:
     return Exported(stream.getvalue(), _notes(source))
 
 
-def to_json(source: Source, into: Path | None) -> Exported:
+def to_json(source: ExportSource, into: Path | None) -> Exported:
     """The table as one JSON document."""
     del into
     found = [
@@ -63,7 +63,7 @@ def to_json(source: Source, into: Path | None) -> Exported:
     )
 
 
-def _notes(source: Source) -> tuple[str, ...]:
+def _notes(source: ExportSource) -> tuple[str, ...]:
     if source.plus_minus:
         return tuple(f"{name}: +/- is not given ({why})" for name, why in source.nulls.items())
     return ("intervals come from a run; export the run folder to have them",)

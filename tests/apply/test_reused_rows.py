@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from loopcal.apply.reused_rows import fitted_rows, seen_before
 from loopcal.errors import DataError
-from loopcal.io.data.fitted_rows import fitted_rows, seen_before
 from loopcal.measure import Measurements
 from tests.estimate.problems import hexapod_data
 

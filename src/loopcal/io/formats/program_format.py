@@ -33,7 +33,7 @@ DISTANCE_SIGMA = 0.1e-3
 
 
 @dataclass(frozen=True)
-class Reading:
+class ImportOptions:
     """How to read a file.
 
     Attributes
@@ -75,7 +75,7 @@ class Imported:
 
 
 @dataclass(frozen=True)
-class Source:
+class ExportSource:
     """What is exported: a robot, and where a run made it, half of the 95 % interval by parameter
     (unit of the file).
     """
@@ -107,7 +107,7 @@ class Format:
         taken for it.
     read : from a file. write : of a source, into the file given (all else in it stays as it is) or
         as a text of its own.
-    takes_file : whether `write` can correct a file. reads : options of `Reading` that `read` looks
+    takes_file : whether `write` can correct a file. reads : options of `ImportOptions` that `read` looks
         at.
     judged : sentences on what the other program stored, from the robot and the measurements that
         were read.
@@ -116,14 +116,14 @@ class Format:
     name: str
     what: str
     endings: tuple[str, ...] = ()
-    read: Callable[[Path, Reading], Imported] | None = None
-    write: Callable[[Source, Path | None], Exported] | None = None
+    read: Callable[[Path, ImportOptions], Imported] | None = None
+    write: Callable[[ExportSource, Path | None], Exported] | None = None
     takes_file: bool = True
     reads: tuple[str, ...] = ()
     judged: Callable[[Mechanism, Measurements], tuple[str, ...]] | None = None
 
 
-def record_of(source: Source, family: type, format_name: str, words: str) -> Any:
+def record_of(source: ExportSource, family: type, format_name: str, words: str) -> Any:
     """The family's record of a robot that came from a file; DataError where it is of another
     family.
     """

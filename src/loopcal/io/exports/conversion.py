@@ -18,13 +18,13 @@ from typing import Any
 
 from loopcal.errors import FileError
 from loopcal.io.core.csv_table import quoted
+from loopcal.io.data.kind_rows import COVARIANCE
 from loopcal.io.data.measurement_file import FORMAT
 from loopcal.io.data.pose_rows import LINK
-from loopcal.io.data.sensor_rows import COVARIANCE
-from loopcal.io.exports.cells import plain_number, with_point
-from loopcal.io.exports.lines import Line, Misfit, check_count, read_lines, unlike_most
+from loopcal.io.exports.export_cells import plain_number, with_point
+from loopcal.io.exports.export_lines import Line, Misfit, check_count, read_lines, unlike_most
 from loopcal.io.exports.profile import Profile, Source
-from loopcal.io.exports.rows import Rows, headers
+from loopcal.io.exports.target_rows import Rows, headers
 
 PLAIN = re.compile(r"(?!(?i:null|true|false|yes|no|on|off|y|n)$)[A-Za-z](?:[\w /.-]*[\w/.-])?")
 """Text that YAML reads as itself."""
@@ -58,7 +58,7 @@ class Converted:
     notes: tuple[str, ...] = ()
 
 
-def convert(path: str | Path, profile: Profile) -> Converted:
+def convert_export(path: str | Path, profile: Profile) -> Converted:
     """Read an export.
 
     Parameters

@@ -14,8 +14,8 @@ from loopcal.errors import DataError, UnitError, nearest
 from loopcal.io.core.csv_table import Table, meant, require_columns
 from loopcal.io.core.yaml_file import Location, refuse_unknown_keys
 from loopcal.io.data.context_columns import is_context
+from loopcal.io.data.kind_settings import list_kind_settings, read_kind, read_noise
 from loopcal.io.data.pose_rows import COMMANDED, OWN_COLUMNS, measured_name
-from loopcal.io.data.sensor_settings import kind_settings, read_kind, read_noise
 from loopcal.units import EXAMPLES, unit
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ def _sensors(table: Table, robot: Mechanism) -> tuple[Sensor, ...]:
     content, several = file.content, file.content.get("kinds")
     if several is None:
         kind = read_kind(file, content, ()).mounted(robot.tool)
-        refuse_unknown_keys(file, list(content), [*SETTINGS, *kind_settings(type(kind))])
+        refuse_unknown_keys(file, list(content), [*SETTINGS, *list_kind_settings(type(kind))])
         return (Sensor(kind, read_noise(file, content, kind, ()), np.arange(len(table.rows)), ()),)
     refuse_unknown_keys(
         file, list(content), [key for key in SETTINGS if key not in ("kind", "noise")]
@@ -177,7 +177,7 @@ def _sensors(table: Table, robot: Mechanism) -> tuple[Sensor, ...]:
         location = ("kinds", label)
         kind = read_kind(file, node, location).mounted(robot.tool)
         refuse_unknown_keys(
-            file, list(node), ["kind", "noise", *kind_settings(type(kind))], location
+            file, list(node), ["kind", "noise", *list_kind_settings(type(kind))], location
         )
         sensors.append(
             Sensor(

@@ -88,7 +88,7 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
         )
     kind = KINDS[name]
     settings = {}
-    for key, annotation in kind_settings(kind).items():
+    for key, annotation in list_kind_settings(kind).items():
         if key in node:
             settings[key] = _setting(file, node[key], annotation, (*location, key))
     try:
@@ -97,7 +97,7 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
         raise file.error(f"{error}", (*location, next(iter(settings), "kind"))) from None
 
 
-def kind_settings(kind: type[Kind]) -> dict[str, Any]:
+def list_kind_settings(kind: type[Kind]) -> dict[str, Any]:
     """Return name -> annotation of what can be set about a kind."""
     hints = typing.get_type_hints(kind)
     return {f.name: hints[f.name] for f in dataclasses.fields(typing.cast(Any, kind)) if f.init}
