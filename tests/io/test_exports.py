@@ -58,7 +58,9 @@ def test_the_examples_are_imported_and_fit_the_robot_they_were_invented_for_with
 
 
 def test_the_digits_of_numbers_stay_as_they_are_and_what_is_missing_stays_empty() -> None:
-    text = convert_export(EXAMPLES / "cmm-spheres.csv", read_profile(EXAMPLES / "cmm-spheres.yaml")).text
+    text = convert_export(
+        EXAMPLES / "cmm-spheres.csv", read_profile(EXAMPLES / "cmm-spheres.yaml")
+    ).text
     lines = [line for line in text.split("\n") if not line.startswith("#")]
     assert lines[0] == "pose,note diameter,x [mm],y [mm],z [mm]"
     assert lines[1] == '1,"25,0008",265.7983,-340.2645,354.4649'

@@ -379,7 +379,9 @@ def _write(output: Path, made: Plan, inputs: Mapping[str, Path], force: bool) ->
     from loopcal.report.draw_plan import draw_curve, draw_plan, save_figure
 
     texts = {SHEET: format_sheet(made), DATA: format_plan_data(made)}
-    document = made.to_dict() | {"made_by": collect_provenance(sys.argv, inputs, {"plan": made.seed})}
+    document = made.to_dict() | {
+        "made_by": collect_provenance(sys.argv, inputs, {"plan": made.seed})
+    }
     pictures = {"plan.png": functools.partial(save_figure, figure=draw_plan(made))}
     if made.curve is not None:
         pictures["curve.png"] = functools.partial(

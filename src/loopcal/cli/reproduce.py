@@ -71,7 +71,9 @@ def reproduce(
         from loopcal.io.runs.run_folder import collect_provenance
         from loopcal.papers.writing import write_folder
 
-        write_folder(output, found, collect_provenance(["loopcal", *sys.argv[1:]], {}, {"seed": seed}), force)
+        write_folder(
+            output, found, collect_provenance(["loopcal", *sys.argv[1:]], {}, {"seed": seed}), force
+        )
     if as_json:
         show.json_document(found.to_dict())
         return

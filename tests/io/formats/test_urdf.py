@@ -73,7 +73,10 @@ def test_poses_are_those_of_the_tree_with_its_loops_closed(files, read, name) ->
 
 @pytest.mark.parametrize("name", COUNTS)
 def test_an_unchanged_robot_leaves_the_file_byte_for_byte(files, read, name) -> None:
-    assert urdf.write(ExportSource(read[name][1]), files[name]).text.encode() == files[name].read_bytes()
+    assert (
+        urdf.write(ExportSource(read[name][1]), files[name]).text.encode()
+        == files[name].read_bytes()
+    )
 
 
 @pytest.mark.parametrize("name", COUNTS)
@@ -93,7 +96,9 @@ def test_corrected_origins_read_back_as_the_same_machine(tmp_path, files, read) 
     robot = moved(read[FIVE_BAR][1])
     (tmp_path / "robot.urdf").write_text(urdf.write(ExportSource(robot), files[FIVE_BAR]).text)
     (tmp_path / "robot.yaml").write_text(files[FIVE_BAR].with_name("robot.yaml").read_text())
-    again = build_imported_robot(tmp_path / "robot.urdf", urdf.read(tmp_path / "robot.urdf", ImportOptions("again")))
+    again = build_imported_robot(
+        tmp_path / "robot.urdf", urdf.read(tmp_path / "robot.urdf", ImportOptions("again"))
+    )
     T = inverse(again, again.home[None]).T
     q = inverse(again, T).q + 0.05 * np.random.default_rng(2).uniform(-1, 1, (20, 2))
     one, other = forward(again, q), forward(robot, q)

@@ -10,7 +10,9 @@ from loopcal.errors import LoopcalError
 from loopcal.io.robot.robot_file import find_robot_file, list_shipped_robots, load_robot
 from loopcal.mechanism import Mechanism, inverse
 
-LIMBS = tuple(name for name in list_shipped_robots() if "family: limbs" in find_robot_file(name).read_text())
+LIMBS = tuple(
+    name for name in list_shipped_robots() if "family: limbs" in find_robot_file(name).read_text()
+)
 
 
 def changed(tmp_path: Path, name: str, *changes: tuple[str, str], more: str = "") -> Mechanism:
