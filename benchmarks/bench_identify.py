@@ -14,8 +14,8 @@ from benchmarks.harness import Metric, measure_ratio, time_in_turns
 from loopcal.diagnose import leave_one_out
 from loopcal.diagnose.leave_one_out_errors import path_of_methods
 from loopcal.estimate import MAP, LeastSquares, identify, identify_trials
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.rows import rows_of
-from loopcal.estimate.scaling import unknowns
 from loopcal.io import load_robot
 from loopcal.measure import (
     Gaussian,
@@ -160,7 +160,7 @@ def bench_poses() -> list[Metric]:
 
 def _memory_of_folding(robot: Mechanism, data: Measurements) -> float:
     """Peak of what one folding of the rows allocates [bytes], its input not counted."""
-    free = unknowns(robot)
+    free = select_free_parameters(robot)
     rows = rows_of(free, data)
     z = free.deviation(robot.values[None])
     rows.fold(z, np.arange(1))
@@ -192,7 +192,10 @@ def bench_groups() -> Metric:
     one, each plane by itself.
     """
     robot = load_robot("hexapod-42")
-    free, group = unknowns(robot), np.array([f"plane{i % GROUPS}" for i in range(GROUPS * TOUCHES)])
+    free, group = (
+        select_free_parameters(robot),
+        np.array([f"plane{i % GROUPS}" for i in range(GROUPS * TOUCHES)]),
+    )
     z = free.deviation(robot.values[None])
 
     def folding(unknown: tuple[str, ...]) -> Callable[[], object]:

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.harness import Metric, measure_ratio, time_in_turns
+from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.outlook import scene
-from loopcal.estimate.scaling import Unknowns, unknowns
 from loopcal.io import load_robot
 from loopcal.mechanism import inverse
 from loopcal.mechanism.workspace import Sample, sample
@@ -30,9 +30,9 @@ POSES, SHARES = 100, (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
 @cache
-def _hexapod() -> tuple[Unknowns, Sample, Array, Array]:
+def _hexapod() -> tuple[FreeParameters, Sample, Array, Array]:
     """The shipped hexapod's unknowns, and the half ranges of its drawn positions about their means."""
-    free = unknowns(load_robot("hexapod-42"))
+    free = select_free_parameters(load_robot("hexapod-42"))
     drawn = sample(free.robot, 1000, 0)
     return free, drawn, drawn.coordinates.mean(axis=0), 0.5 * np.ptp(drawn.coordinates, axis=0)
 

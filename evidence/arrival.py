@@ -13,7 +13,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.diagnose.conventions import IMPLAUSIBLE, arrival
 from loopcal.errors import LoopcalError
-from loopcal.estimate.scaling import unknowns
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import (
@@ -51,7 +51,7 @@ def measured(robot: Mechanism, kind: Kind, times: float, seed: int) -> Measureme
     cannot.
     """
     noise = Gaussian(np.array([SIGMA.get(c.dimension, RATIO) for c in kind.noise_columns]))
-    free = unknowns(robot)
+    free = select_free_parameters(robot)
     truth = robot.values.copy()
     truth[free.places] += (
         times * free.tolerance * np.random.default_rng((SEED, seed)).standard_normal(len(free))

@@ -13,15 +13,15 @@ from loopcal.diagnose.model_choice import choose_model
 from loopcal.estimate import (
     GCV,
     MAP,
+    InflatedTolerances,
     LeastSquares,
     Ridge,
     TruncatedSVD,
     TruncationGCV,
-    Widened,
     identify,
     identify_trials,
 )
-from loopcal.estimate.penalties import Method
+from loopcal.estimate.methods.penalties import Method
 from loopcal.io import load_robot
 from loopcal.measure import (
     Component,
@@ -50,7 +50,7 @@ METHODS: dict[str, Method] = {
     "ridge, GCV": Ridge(GCV()),
     "truncated SVD, GCV": TruncatedSVD(TruncationGCV()),
     "MAP": MAP(),
-    "default": MAP(Widened()),
+    "default": MAP(InflatedTolerances()),
 }
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from evidence.known_truth import errors, instrument
-from loopcal.estimate import MAP, LeastSquares, Widened, identify, identify_trials
+from loopcal.estimate import MAP, InflatedTolerances, LeastSquares, identify, identify_trials
 from loopcal.io import load_robot
 from loopcal.measure import Measurements, sample_truth, simulate_trials
 from loopcal.mechanism import Mechanism, sample
@@ -45,7 +45,7 @@ def judge(name: str, factor: float, machines: int = MACHINES) -> dict[str, float
         for title, method in {
             "least squares": LeastSquares(),
             "MAP": MAP(),
-            "default": MAP(Widened()),
+            "default": MAP(InflatedTolerances()),
         }.items()
     }
     named = [_names_conflict(stated, trials.trial(i)) for i in range(machines)]

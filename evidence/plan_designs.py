@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.outlook import scene
-from loopcal.estimate.scaling import unknowns
 from loopcal.io import load_robot
 from loopcal.mechanism.workspace import sample
 from loopcal.planning.certified import certified_design
@@ -45,7 +45,7 @@ CASES = (
 
 def study(case: Case) -> list[object]:
     """One row: efficiencies against the bound, and what the certified design leaves open."""
-    free = unknowns(load_robot(case.robot))
+    free = select_free_parameters(load_robot(case.robot))
     twists = scene(free, sample(free.robot, CANDIDATES, 0).solution.q).twists[0]
     rows = (twists / SIGMA[:, None])[
         :, slice(0, 6) if case.measured == "full pose" else slice(3, 6)

@@ -16,7 +16,7 @@ from loopcal.diagnose.conventions import ALLOWED, BETTER, IMPLAUSIBLE, arrival, 
 from loopcal.diagnose.interpretations import hypotheses, readings_hypotheses
 from loopcal.diagnose.read_as import ReadAs
 from loopcal.errors import DataError, LoopcalError
-from loopcal.estimate.scaling import unknowns
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import (
@@ -56,7 +56,7 @@ def measured(name: str, kind: Kind, n: int = 10, times: float = 1.0, seed: int =
         robot_of(name),
         Gaussian(np.array([SIGMA[c.dimension] for c in kind.noise_columns])),
     )
-    free = unknowns(robot)
+    free = select_free_parameters(robot)
     truth = robot.values.copy()
     truth[free.places] += (
         times * free.tolerance * np.random.default_rng(seed).standard_normal(len(free))
@@ -311,7 +311,7 @@ def test_heights_that_should_be_zero_are_no_evidence_of_a_unit() -> None:
     robot = robot_of("linear-delta")
     flat = np.column_stack([np.random.default_rng(0).uniform(-0.05, 0.05, (20, 2)), np.zeros(20)])
     noise = Gaussian(np.array([1e-6]))
-    free = unknowns(robot)
+    free = select_free_parameters(robot)
     truth = robot.values.copy()
     truth[free.places] += (
         40.0 * free.tolerance * np.random.default_rng(1).standard_normal(len(free))

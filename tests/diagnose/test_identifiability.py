@@ -11,8 +11,8 @@ import pytest
 from loopcal.diagnose import identifiability
 from loopcal.diagnose.observability import observability
 from loopcal.errors import EstimationError
-from loopcal.estimate.combinations import combinations
-from loopcal.estimate.scaling import unknowns
+from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.inference.null_space import describe_null_space
 from loopcal.io import load_robot
 from loopcal.io.core.json_text import to_json
 from loopcal.measure import Component, Inclination, Instrument, Pose, Position, Sensor, Separation
@@ -137,9 +137,9 @@ def test_indices_are_those_of_the_definitions():
 
 
 def test_combinations_span_the_null_space_and_each_has_a_parameter_of_its_own():
-    free = unknowns(hexapod())
+    free = select_free_parameters(hexapod())
     null = np.linalg.qr(np.random.default_rng(0).standard_normal((42, 4))).Q
-    found = combinations(free, null)
+    found = describe_null_space(free, null)
     z = np.zeros((4, 42))
     for row, combination in zip(z, found, strict=True):
         for name, change in zip(combination.names, combination.changes, strict=True):
@@ -164,7 +164,7 @@ def test_what_it_reads_is_the_factor_of_a_fit_without_own_unknowns():
     from loopcal.estimate.outlook import information
     from loopcal.estimate.rows import rows_of
 
-    free, data = unknowns(hexapod()), hexapod_data(30)
+    free, data = select_free_parameters(hexapod()), hexapod_data(30)
     z = free.deviation(hexapod().values[None])
     expected = decompose(
         rows_of(free, data).fold(z, np.arange(1))[0], np.full(1, 180)

@@ -6,8 +6,8 @@ import pytest
 
 from loopcal.diagnose.leave_one_out_errors import leave_one_out, path_of_methods
 from loopcal.estimate import MAP, LeastSquares, Ridge, TruncatedSVD, identify
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.rows import rows_of
-from loopcal.estimate.scaling import unknowns
 from tests.estimate.problems import hexapod, hexapod_data, tracker
 
 DATA = hexapod_data(14, instrument=tracker(20e-6, 100e-6))
@@ -16,7 +16,7 @@ DATA = hexapod_data(14, instrument=tracker(20e-6, 100e-6))
 @pytest.mark.parametrize("method", [LeastSquares(), MAP(), Ridge(30.0)])
 def test_scores_are_those_of_refits_of_the_linear_problem(method):
     found = leave_one_out(hexapod(), DATA, (method,))
-    rows = rows_of(unknowns(hexapod()), DATA)
+    rows = rows_of(select_free_parameters(hexapod()), DATA)
     A = np.concatenate(
         [part.reshape(-1, 43) for kinds in rows.linearised(np.zeros((1, 42))) for _, part in kinds]
     )

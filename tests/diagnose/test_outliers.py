@@ -15,9 +15,9 @@ from loopcal.diagnose.influence import Influence, influence
 from loopcal.diagnose.outliers import _in_turn, _search, _sentence, _State
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import MAP, Huber, LeastSquares, Tukey, identify
-from loopcal.estimate.losses import block_limit
+from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.methods.losses import block_limit
 from loopcal.estimate.rows import rows_of
-from loopcal.estimate.scaling import unknowns
 from loopcal.io import load_robot
 from loopcal.measure import (
     Component,
@@ -101,7 +101,7 @@ def test_blunders_are_named_in_words_and_nothing_is_dropped(loss, method):
 @pytest.mark.parametrize("method", [LeastSquares(), MAP()])
 def test_the_shortcut_is_the_residual_of_a_refit_without_the_block(method):
     # one linearisation: with it the shortcut is exact
-    data, free = hexapod_data(12), unknowns(hexapod())
+    data, free = hexapod_data(12), select_free_parameters(hexapod())
     rows = rows_of(free, data)
     member, z = np.arange(12) // 2, np.zeros((1, 42))  # two poses to a block
 

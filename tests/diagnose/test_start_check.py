@@ -6,9 +6,9 @@ import pytest
 
 from loopcal.diagnose import Start, start_check
 from loopcal.estimate import Huber, Tukey, identify
-from loopcal.estimate.prior import Prior
+from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.inference.prior import Prior
 from loopcal.estimate.rows import rows_of
-from loopcal.estimate.scaling import unknowns
 from tests import zoo
 from tests.estimate.problems import hexapod, hexapod_data
 
@@ -67,7 +67,7 @@ def test_with_a_loss_the_cost_of_the_start_is_weighted_as_that_of_the_fit_and_ho
     None
 ):
     robot, data = hexapod(), hexapod_data()
-    free = unknowns(robot)
+    free = select_free_parameters(robot)
     spread = 0.1 * free.tolerance
     prior = Prior(free.names, zoo.hexapod_truth(), free.tolerance, np.diag(1.0 / spread))
     fit = identify(robot, data, prior=prior, loss=Huber())

@@ -11,7 +11,7 @@ from loopcal.diagnose.start_values import Start
 from loopcal.errors import EstimationError
 from loopcal.estimate import MAP, LeastSquares, identify
 from loopcal.estimate.descent import StepControl
-from loopcal.estimate.prior import prior_from
+from loopcal.estimate.inference.prior import prior_from
 from tests.estimate.problems import hexapod, hexapod_data
 
 ONE_STEP = StepControl(iterations=1)

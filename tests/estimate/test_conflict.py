@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from loopcal.errors import EstimationError
-from loopcal.estimate import MAP, LeastSquares, Widened, identify, identify_trials
-from loopcal.estimate.conflict import prior_statistic
+from loopcal.estimate import MAP, InflatedTolerances, LeastSquares, identify, identify_trials
+from loopcal.estimate.methods.prior_conflict import compute_prior_statistic
 from loopcal.measure import sample_truth, simulate_trials
 from loopcal.numerics.decomposition import decompose
 from loopcal.parameters import ParameterTable
@@ -42,7 +42,7 @@ def test_the_statistic_is_the_priors_part_of_the_sum_of_squares():
     w = np.linalg.eigvalsh(
         A.T @ A @ np.linalg.inv(np.eye(3) + A.T @ A)
     )  # z = A'(I + AA')^-1 b has these variances
-    statistic, degrees = prior_statistic(d)
+    statistic, degrees = compute_prior_statistic(d)
     assert degrees[0] == pytest.approx(w.sum() ** 2 / (w**2).sum(), rel=1e-12)
     assert statistic[0] == pytest.approx(z @ z * w.sum() / (w**2).sum(), rel=1e-12)
 
@@ -52,7 +52,7 @@ def test_well_seen_it_is_the_part_within_the_range_of_the_joint_form_of_data_and
     A = 1e4 * rng.standard_normal((9, 3))
     b = A @ rng.standard_normal(3) + rng.standard_normal(9)
     d = decompose(folded(np.column_stack([A, b])[None]), np.array([9]))
-    statistic, degrees = prior_statistic(d)
+    statistic, degrees = compute_prior_statistic(d)
     whole = b @ np.linalg.solve(np.eye(9) + A @ A.T, b)
     assert statistic[0] == pytest.approx(whole - d.outside[0], rel=1e-6)
     assert degrees[0] == pytest.approx(3.0)
@@ -154,4 +154,4 @@ def test_the_factor_by_rule_is_never_below_one():
     assert np.array_equal(
         identify_trials(wide, measured).values, identify_trials(wide, measured, MAP()).values
     )
-    assert MAP(Widened()) == MAP(Widened())
+    assert MAP(InflatedTolerances()) == MAP(InflatedTolerances())

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from loopcal.estimate.descent import DescentStatus, StepControl, descend
-from loopcal.estimate.penalties import MAP, LeastSquares, Ridge
+from loopcal.estimate.methods.penalties import MAP, LeastSquares, Ridge
 from tests.estimate.problems import folded
 
 

@@ -12,10 +12,10 @@ from numpy.testing import assert_allclose
 import loopcal.estimate.rows as rows_module
 from loopcal.estimate import LeastSquares, identify
 from loopcal.estimate.elimination import OWN_RANK, Factors, eliminate
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.nesting import Nesting, nest
 from loopcal.estimate.outlook import look, scene
 from loopcal.estimate.rows import rows_of
-from loopcal.estimate.scaling import unknowns
 from loopcal.measure import Gaussian, Instrument, Plane, Sensor, simulate
 from loopcal.numerics.decomposition import NULL_COMPONENT
 from tests import zoo
@@ -251,7 +251,7 @@ def fold_of(data):
     """Factor of one fold at the nominal machine, own unknowns from where they are stated, and
     these.
     """
-    free = unknowns(hexapod())
+    free = select_free_parameters(hexapod())
     rows = rows_of(free, data)
     assert rows.own is not None
     rows.own.started[:] = True
@@ -286,7 +286,7 @@ def test_planes_that_share_a_probe_cost_twice_as_much_where_there_are_twice_as_m
 @pytest.mark.parametrize("held", [False, True])
 def test_planes_and_the_probe_they_share_give_the_joint_solution(held):
     data = probed(6, per_group=15)
-    free = unknowns(hexapod())
+    free = select_free_parameters(hexapod())
     local = (
         data.unknowns.with_prior("plate[0-3].*", 1e-3).with_prior("probe.x", 1e-4)
         if held

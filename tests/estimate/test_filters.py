@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from loopcal.errors import EstimationError
-from loopcal.estimate.penalties import MAP, LeastSquares, Ridge, TruncatedSVD
-from loopcal.estimate.regularization_rules import GCV, MarginalLikelihood, TruncationGCV
+from loopcal.estimate.methods.penalties import MAP, LeastSquares, Ridge, TruncatedSVD
+from loopcal.estimate.methods.regularization_rules import GCV, MarginalLikelihood, TruncationGCV
 from loopcal.numerics.decomposition import decompose
 from tests.estimate.problems import folded
 

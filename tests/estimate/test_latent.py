@@ -18,7 +18,7 @@ from loopcal.apply import validate
 from loopcal.diagnose import cross_validate, examine, find_outliers, identifiability
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import Huber, LeastSquares, Tukey, identify, identify_trials
-from loopcal.estimate.left_out import without_poses
+from loopcal.estimate.excluded_poses import exclude_poses
 from loopcal.io import load_robot
 from loopcal.measure import (
     Instrument,
@@ -484,5 +484,5 @@ def test_a_pose_left_out_is_neither_undetermined_nor_without_readings():
     assert_array_equal(np.isnan(found.poses).all(axis=(1, 2)), out)
     assert_array_equal(np.isnan(found.readings).all(axis=1), out)
     assert examine(fit, data).worth.calibrate
-    held = validate(fit, without_poses(data, ("3", "9")))
+    held = validate(fit, exclude_poses(data, ("3", "9")))
     assert not [note for note in held.notes if "not taken" in note]

@@ -9,11 +9,11 @@ from numpy.testing import assert_allclose
 
 import loopcal.mechanism.batch_kinematics as trials_module
 from loopcal.estimate import identify
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.latent import LatentRows
 from loopcal.estimate.latent_doubts import latent_doubts
 from loopcal.estimate.measured_poses import measured_poses
 from loopcal.estimate.rows import rows_of
-from loopcal.estimate.scaling import unknowns
 from loopcal.estimate.settle import HALVINGS, STEPS, Poses
 from loopcal.estimate.standing import Standing
 from loopcal.io import load_robot
@@ -110,7 +110,7 @@ def test_rows_that_tell_all_freedoms_of_the_platform_give_its_pose(said):
     robot = load_robot(robot)
     found = inverse(robot, sample(robot, 6, 1).coordinates)
     data = simulate(robot, found.T, Instrument(sensors), 0, reading_sigma=20 * UM)
-    rows = rows_of(unknowns(robot), data)
+    rows = rows_of(select_free_parameters(robot), data)
     assert isinstance(rows, LatentRows)
     T, known = measured_poses(robot, rows.sensed[:-1], np.zeros(6, dtype=int), np.arange(6))
     assert known.all()
@@ -119,7 +119,7 @@ def test_rows_that_tell_all_freedoms_of_the_platform_give_its_pose(said):
     )  # [m] of noise and, for 3-prs, of its weak direction
     fewer = tuple(replace(s, rows=np.array([0, 1, 3])) for s in sensors[:1])
     rows = rows_of(
-        unknowns(robot),
+        select_free_parameters(robot),
         simulate(robot, found.T, Instrument((*fewer, *sensors[1:])), 0, reading_sigma=20 * UM),
     )
     assert isinstance(rows, LatentRows)
@@ -199,7 +199,7 @@ def test_from_random_starts_the_search_is_bounded_and_never_ends_higher_than_it_
     lost = np.zeros(data.readings.shape, dtype=bool)
     lost[:, 0] = True
     data = without(data, lost)
-    rows = rows_of(unknowns(robot), data)
+    rows = rows_of(select_free_parameters(robot), data)
     assert isinstance(rows, LatentRows)
     stroke = np.array([a.stroke for a in robot.actuators], dtype=float)
     rng, z, trial = np.random.default_rng(3), np.zeros((1, rows.parameters)), np.arange(1)

@@ -14,10 +14,10 @@ from loopcal.apply import validate
 from loopcal.cli import main
 from loopcal.diagnose import find_outliers
 from loopcal.estimate import MAP, LeastSquares, identify, identify_trials
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.local import Own
 from loopcal.estimate.outlook import look, scene
 from loopcal.estimate.rows import rows_of
-from loopcal.estimate.scaling import unknowns
 from loopcal.measure import (
     Gaussian,
     Instrument,
@@ -87,7 +87,7 @@ def mixed_data(seed=1, noise: type[Gaussian] = Gaussian):
 
 
 def test_the_projected_solution_is_the_joint_one():
-    data, free = mixed_data(), unknowns(hexapod())
+    data, free = mixed_data(), select_free_parameters(hexapod())
     rows = rows_of(free, data)
     assert rows.own is not None
     z = free.deviation(hexapod().values[None])
@@ -109,7 +109,7 @@ def test_the_projected_solution_is_the_joint_one():
 def test_standard_deviations_are_those_of_the_joint_problem():
     data = mixed_data()
     fit = identify(hexapod(), data, LeastSquares())
-    free = unknowns(fit.robot)
+    free = select_free_parameters(fit.robot)
     at = scene(free, data.readings)
     rows = look(at, data, local_unknowns(data.observations, data.labels), fit.local.estimate)[
         0, :, :-1
@@ -166,7 +166,10 @@ def test_intervals_of_machine_and_frame_hold_the_truth():
             for name, nominal in zip(fit.local.names, fit.local.table.nominal, strict=True)
         ]
         off = np.concatenate(
-            [fit.estimate - truth[unknowns(robot).places], fit.local.estimate - np.array(true)]
+            [
+                fit.estimate - truth[select_free_parameters(robot).places],
+                fit.local.estimate - np.array(true),
+            ]
         )
         sd = np.concatenate([fit.sd, fit.local.sd])
         inside.append((np.abs(off) < 1.96 * sd)[np.isfinite(sd)])
@@ -219,7 +222,7 @@ def test_sessions_have_frames_of_their_own_and_are_eliminated_one_by_one():
     sensor = Sensor(kind, Gaussian(np.full(6, UM)), session=day)
     moved = {f"day{i}.frame.{axis}": 0.1 * i for i in range(8) for axis in ("x", "rz")}
     data = simulate(truth, hexapod_poses(80), Instrument((sensor,)), 1, unknowns=moved)
-    rows = rows_of(unknowns(hexapod()), data)
+    rows = rows_of(select_free_parameters(hexapod()), data)
     assert rows.own is not None
     assert [len(columns) for columns in rows.own.clusters] == [6] * 8
     fit = identify(hexapod(), data)

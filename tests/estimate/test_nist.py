@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from loopcal.estimate.descent import DescentStatus, StepControl, descend
-from loopcal.estimate.penalties import LeastSquares
+from loopcal.estimate.methods.penalties import LeastSquares
 from tests.estimate.nist import MODELS, Certified, matching_digits, read, residual_and_jacobian
 from tests.estimate.problems import folded
 

@@ -11,8 +11,8 @@ from scipy.stats import chi2
 
 from loopcal.errors import EstimationError
 from loopcal.estimate import LeastSquares, identify
-from loopcal.estimate.posteriors import posterior_from_arrays
-from loopcal.estimate.prior import limb_parameters, prior_from
+from loopcal.estimate.inference.posterior import posterior_from_arrays
+from loopcal.estimate.inference.prior import limb_parameters, prior_from
 from loopcal.estimate.recalibration import recalibrate
 from loopcal.measure import simulate
 from loopcal.parameters import ParameterTable

@@ -10,8 +10,8 @@ from scipy.stats import chi2
 
 from loopcal.estimate import identify
 from loopcal.estimate.components import project
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.rows import Rows, rows_of
-from loopcal.estimate.scaling import unknowns
 from loopcal.estimate.settle import by_pose
 from loopcal.measure import (
     Instrument,
@@ -46,7 +46,7 @@ def parallel(unknown: tuple[str, ...], truth: np.ndarray | None = None) -> Measu
 
 def folded(data: Measurements) -> tuple[Rows, np.ndarray]:
     """Rows at the nominal robot, and their factor."""
-    free = unknowns(hexapod())
+    free = select_free_parameters(hexapod())
     rows = rows_of(free, data)
     assert isinstance(rows, Rows)
     return rows, rows.fold(np.zeros((1, len(free))), np.arange(1))[0][0]

@@ -314,12 +314,12 @@ def method(name: str, value: Any = None) -> Any:
     """Make a method by its name: ls, map, map-widened, ridge, ridge-gcv, ridge-likelihood, tsvd,
     tsvd-gcv.
     """
-    from loopcal.estimate.conflict import Widened
+    from loopcal.estimate.methods.prior_conflict import InflatedTolerances
 
     makers = {
         "ls": estimate.LeastSquares,
         "map": lambda: estimate.MAP() if value is None else estimate.MAP(value),
-        "map-widened": lambda: estimate.MAP(Widened()),
+        "map-widened": lambda: estimate.MAP(InflatedTolerances()),
         "ridge": lambda: estimate.Ridge(value),
         "ridge-gcv": lambda: estimate.Ridge(estimate.GCV()),
         "ridge-likelihood": lambda: estimate.Ridge(estimate.MarginalLikelihood()),

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from loopcal.errors import EstimationError
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.outlook import scene
-from loopcal.estimate.scaling import unknowns
 from loopcal.io import load_robot
 from loopcal.mechanism import inverse
 from loopcal.mechanism.workspace import sample
@@ -97,7 +97,7 @@ def test_units_that_cannot_be_moved_apart_are_refused() -> None:
 
 
 def test_poses_of_a_hexapod_move_to_where_its_parameters_show() -> None:
-    free = unknowns(load_robot("hexapod-42"))
+    free = select_free_parameters(load_robot("hexapod-42"))
     drawn = sample(free.robot, 200, 0).coordinates
     middle, half = drawn.mean(axis=0), 0.5 * np.ptp(drawn, axis=0)
 

@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose
 
 import loopcal as lc
 from loopcal.errors import EstimationError
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.outlook import scene
-from loopcal.estimate.scaling import unknowns
 from loopcal.io import load_robot
 from loopcal.measure import KINDS
 from loopcal.mechanism.workspace import sample
@@ -51,7 +51,9 @@ def test_of_many_listed_poses_errors_are_predicted_all_over_the_list():
     listed = sample(robot, 260, seed=3).coordinates
     listed = listed[np.lexsort(listed.T[::-1])]
     made = problem(robot, looking("position"), poses=listed)
-    twists = scene(unknowns(robot), lc.inverse(robot, listed[200:]).q).twists[0, :, 3:]
+    twists = scene(select_free_parameters(robot), lc.inverse(robot, listed[200:]).q).twists[
+        0, :, 3:
+    ]
     # the instrument tells all nine parameters: nothing is projected out of what is predicted
     found = [
         np.abs(made.wanted.shifts - one).max(axis=(1, 2)).min() < 1e-9 for one in twists

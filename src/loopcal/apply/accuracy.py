@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from loopcal import geometry
 from loopcal.diagnose.frame_motions import NOTHING, FrameMotions, frame_motions, weights
 from loopcal.errors import EstimationError
-from loopcal.estimate.posteriors import Posterior
+from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.mechanism import Mechanism, Solution, forward, inverse
 from loopcal.mechanism.batch_kinematics import sensitivity

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 from loopcal import geometry
 from loopcal.apply.accuracy import PoseUncertainty, pose_uncertainty
 from loopcal.estimate.identification import identify_trials
-from loopcal.estimate.penalties import LeastSquares, Method
-from loopcal.estimate.posteriors import posterior
+from loopcal.estimate.inference.posterior import compute_posterior
+from loopcal.estimate.methods.penalties import LeastSquares, Method
 from loopcal.measure import Instrument, sample_truth, simulate_trials
 from loopcal.mechanism import Mechanism, Status, forward, inverse
 from loopcal.mechanism.batch_kinematics import forward_trials
@@ -82,7 +82,7 @@ def monte_carlo(
     free, first = fits.unknowns, int(np.flatnonzero(good)[0])
     one = np.array([first])
     identified = robot.with_values(fits.values[first])
-    known = posterior(
+    known = compute_posterior(
         identified, free.places, free.tolerance, fits.decomposition.take(one), fits.penalty[one]
     )
     predicted = pose_uncertainty(

@@ -22,7 +22,7 @@ from loopcal import geometry
 from loopcal.apply.accuracy import PoseUncertainty, pose_uncertainty
 from loopcal.diagnose.frame_motions import weights
 from loopcal.errors import DataError
-from loopcal.estimate.posteriors import Posterior
+from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.mechanism import Mechanism, Solution, forward, inverse
 from loopcal.mechanism import coordinates as controlled

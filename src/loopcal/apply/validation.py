@@ -22,7 +22,7 @@ from loopcal.diagnose.kind_errors import KindErrors, few, kind_errors
 from loopcal.diagnose.pose_error_figures import INDICES, PoseErrors, pose_errors
 from loopcal.diagnose.set_up_anew import set_up_anew
 from loopcal.errors import DataError, nearest
-from loopcal.estimate.combinations import listed
+from loopcal.estimate.inference.null_space import listed
 from loopcal.estimate.predicted import predicted, untold
 from loopcal.estimate.result import Identification
 from loopcal.measure import (

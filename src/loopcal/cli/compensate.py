@@ -60,7 +60,7 @@ def compensate(
       loopcal compensate run targets.csv --mode commands -o commands.csv
     """  # noqa: D301
     from loopcal.apply.compensation import compensate as compute
-    from loopcal.estimate.posteriors import Posterior
+    from loopcal.estimate.inference.posterior import Posterior
     from loopcal.io import load_robot
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text

@@ -15,8 +15,8 @@ from loopcal.errors import DataError
 if TYPE_CHECKING:
     from loopcal.diagnose.model_choice import ModelChoice
     from loopcal.estimate import Identification
-    from loopcal.estimate.losses import Loss
-    from loopcal.estimate.penalties import Method
+    from loopcal.estimate.methods.losses import Loss
+    from loopcal.estimate.methods.penalties import Method
     from loopcal.measure import Measurements
     from loopcal.mechanism import Mechanism
 
@@ -68,9 +68,9 @@ class Fitting:
         hold_out : share of the poses that is drawn by `seed`. planned : names that the data hold
             out themselves, in its place.
         """
-        from loopcal.estimate.left_out import without_poses
+        from loopcal.estimate.excluded_poses import exclude_poses
 
-        kept = without_poses(data, self.drop)
+        kept = exclude_poses(data, self.drop)
         judge = [label in planned for label in kept.labels]
         if all(judge):
             raise DataError(

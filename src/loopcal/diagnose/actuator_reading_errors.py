@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.estimate.left_out import without_poses
+from loopcal.estimate.excluded_poses import exclude_poses
 from loopcal.estimate.result import Identification
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
@@ -63,7 +63,7 @@ def reading_errors(fit: Identification, data: Measurements) -> tuple[ReadingErro
     """
     if fit.latent is None:
         return None
-    recorded, found = without_poses(data, fit.dropped).readings, fit.latent.readings
+    recorded, found = exclude_poses(data, fit.dropped).readings, fit.latent.readings
     believed = (
         np.isfinite(fit.latent.sigma)
         & (fit.latent.sigma > 0.0)

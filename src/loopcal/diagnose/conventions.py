@@ -26,8 +26,8 @@ from loopcal.diagnose.interpretations import Hypothesis, hypotheses, readings_hy
 from loopcal.diagnose.read_as import MOST_LEFT_OUT, ReadAs, begun, quick_misfit, refined
 from loopcal.diagnose.stated_unknowns import Contradiction, contradicted
 from loopcal.errors import DataError
-from loopcal.estimate.combinations import listed
-from loopcal.estimate.scaling import Unknowns, unknowns
+from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
+from loopcal.estimate.inference.null_space import listed
 from loopcal.measure import Measurements, check_actuators, check_moved
 from loopcal.measure.data_checks import stays
 from loopcal.mechanism import Mechanism, forward
@@ -140,7 +140,7 @@ def arrival(robot: Mechanism, data: Measurements, parts: Sequence[str] = ()) -> 
         Readings of another number of actuators.
     """
     check_actuators(data, robot)
-    free, believed = unknowns(robot), _believed(data)
+    free, believed = select_free_parameters(robot), _believed(data)
     if believed is None:
         return Arrival(float("nan"))
     uncertain = data.reading_sigma is not None and bool(
@@ -255,7 +255,7 @@ def _shared(data: Measurements) -> bool:
 
 
 def _best(
-    free: Unknowns, stated: ReadAs, misfit: float, parts: Sequence[str]
+    free: FreeParameters, stated: ReadAs, misfit: float, parts: Sequence[str]
 ) -> tuple[ReadAs | None, list[Hypothesis]]:
     """The way that fits far better than what is stated, if there is one, and others that fit as
     well.
@@ -278,7 +278,7 @@ def _best(
 
 
 def _tried(
-    free: Unknowns, stated: ReadAs, misfit: float, parts: Sequence[str]
+    free: FreeParameters, stated: ReadAs, misfit: float, parts: Sequence[str]
 ) -> list[tuple[Hypothesis, float]]:
     """Hypotheses that promise to fit far better with their misfits, to first order, blunders left
     out.
@@ -299,7 +299,7 @@ def _tried(
 
 
 def _readings_tried(
-    free: Unknowns, data: Measurements, misfit: float, parts: Sequence[str]
+    free: FreeParameters, data: Measurements, misfit: float, parts: Sequence[str]
 ) -> list[tuple[Hypothesis, float]]:
     """Hypotheses about the readings, as `_tried` gives them."""
     robot, poses = free.robot, _few(data)
@@ -343,7 +343,7 @@ def _promising(found: list[tuple[Hypothesis, float]], misfit: float) -> list[str
 
 
 def _misfits(
-    free: Unknowns, data: Measurements, ways: tuple[Hypothesis, ...], *, quick: bool = False
+    free: FreeParameters, data: Measurements, ways: tuple[Hypothesis, ...], *, quick: bool = False
 ) -> list[tuple[Hypothesis, float]]:
     """Misfits of ways to read the values, all at once; where one cannot be evaluated, each half for
     itself.
@@ -362,7 +362,7 @@ def _misfits(
     return list(zip(ways, values.tolist(), strict=True))
 
 
-def _tells(free: Unknowns, stated: ReadAs, way: Hypothesis, found: float) -> bool:
+def _tells(free: FreeParameters, stated: ReadAs, way: Hypothesis, found: float) -> bool:
     """Whether values that shrink fit far better than a constant in their place would: zeros fit
     every unit.
     """

@@ -14,11 +14,11 @@ import numpy as np
 from loopcal.apply.validation import validate
 from loopcal.diagnose.pose_error_figures import INDICES, PoseErrors
 from loopcal.errors import DataError
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
-from loopcal.estimate.losses import Loss
-from loopcal.estimate.penalties import Method
+from loopcal.estimate.methods.losses import Loss
+from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.rows import rows_of
-from loopcal.estimate.scaling import unknowns
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray, IntArray
@@ -145,7 +145,7 @@ def cross_validate(
 
 def _mean_square(robot: Mechanism, data: Measurements) -> float:
     """Mean square of the whitened residuals of a robot; infinite where it cannot reach a pose."""
-    rows = rows_of(unknowns(robot), data)
+    rows = rows_of(select_free_parameters(robot), data)
     values = rows.unknowns.deviation(robot.values[None])
     total = 0.0
     for sensed, found in zip(rows.sensed, rows.residuals(values), strict=True):

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal import geometry
-from loopcal.estimate.posteriors import Posterior
+from loopcal.estimate.inference.posterior import Posterior
 from loopcal.mechanism import Mechanism, Status
 from loopcal.mechanism.batch_kinematics import forward_trials, readings_at, sensitivity
 from loopcal.typing import BoolArray, FloatArray

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import EstimationError
-from loopcal.estimate.combinations import Combination
+from loopcal.estimate.inference.null_space import Combination
 from loopcal.estimate.result import Identification
 from loopcal.typing import FloatArray
 

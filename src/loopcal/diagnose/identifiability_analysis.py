@@ -13,9 +13,15 @@ import numpy as np
 from loopcal.diagnose.meaning import with_meaning
 from loopcal.diagnose.observability import SCALING, Observability, observability
 from loopcal.errors import EstimationError
-from loopcal.estimate.combinations import Combination, combination, combinations, listed, sparse
+from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
+from loopcal.estimate.inference.null_space import (
+    Combination,
+    describe_direction,
+    describe_null_space,
+    listed,
+    sparsify_basis,
+)
 from loopcal.estimate.outlook import equations, information
-from loopcal.estimate.scaling import Unknowns, unknowns
 from loopcal.measure import Instrument, Measurements, check_actuators, simulate
 from loopcal.mechanism import Mechanism
 from loopcal.mechanism.workspace import sample
@@ -102,7 +108,7 @@ class Identifiability:
     indices: Observability
     parameters: tuple[Verdict, ...]
     notes: tuple[str, ...]
-    unknowns: Unknowns
+    unknowns: FreeParameters
     factor: FloatArray
 
     def __str__(self) -> str:
@@ -204,7 +210,7 @@ def identifiability(
             robot, sample(robot, poses, seed).coordinates, data, seed=0, controller=robot
         )
     check_actuators(data, robot)
-    free = unknowns(robot)
+    free = select_free_parameters(robot)
     count = equations(robot, data)
     if not len(free) or not count:
         what = (
@@ -221,7 +227,9 @@ def identifiability(
     )
 
 
-def summary(free: Unknowns, decomposition: Decomposition, factor: FloatArray) -> Identifiability:
+def summary(
+    free: FreeParameters, decomposition: Decomposition, factor: FloatArray
+) -> Identifiability:
     """Return what a decomposition (t = 1), of a factor (p, p), says about identifiability."""
     s, V = decomposition.singular_values[0], decomposition.directions[0]
     rank, equations = int(decomposition.rank[0]), int(decomposition.rows[0])
@@ -238,8 +246,8 @@ def summary(free: Unknowns, decomposition: Decomposition, factor: FloatArray) ->
         singular_values=s,
         tolerance=decomposition.tolerance,
         improved=improved,
-        unidentifiable=with_meaning(free, combinations(free, null), sparse(null)),
-        weak=tuple(combination(free, V[:, i], float(s[i])) for i in weakest),
+        unidentifiable=with_meaning(free, describe_null_space(free, null), sparsify_basis(null)),
+        weak=tuple(describe_direction(free, V[:, i], float(s[i])) for i in weakest),
         indices=observability(s, rank, equations),
         parameters=_verdicts(free, null, V, s),
         notes=() if note is None else (note,),
@@ -262,7 +270,7 @@ def _unreached(data: Measurements, reached: BoolArray) -> str:
 
 
 def _verdicts(
-    free: Unknowns, null: FloatArray, V: FloatArray, s: FloatArray
+    free: FreeParameters, null: FloatArray, V: FloatArray, s: FloatArray
 ) -> tuple[Verdict, ...]:
     """Judge each parameter by the projector onto the null space: whom it shares null directions
     with.

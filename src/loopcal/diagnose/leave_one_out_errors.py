@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.errors import EstimationError
-from loopcal.estimate.penalties import Method, Ridge, TruncatedSVD, adapted
+from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.estimate.methods.penalties import Method, Ridge, TruncatedSVD, adapt_method
 from loopcal.estimate.rows import rows_of
-from loopcal.estimate.scaling import unknowns
 from loopcal.estimate.sensed import linked
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
@@ -61,7 +61,7 @@ def leave_one_out(robot: Mechanism, data: Measurements, methods: tuple[Method, .
     EstimationError
         The kinds have unknowns of their own.
     """
-    free = unknowns(robot)
+    free = select_free_parameters(robot)
     rows = rows_of(free, data)
     if rows.own is not None:
         raise EstimationError(
@@ -71,7 +71,9 @@ def leave_one_out(robot: Mechanism, data: Measurements, methods: tuple[Method, .
     z = free.deviation(robot.values[None])
     factor, _ = rows.fold(z, np.arange(1))
     d = decompose(factor, rows.rows, z)
-    used = tuple(adapted(method, np.zeros(len(free), dtype=bool), "given") for method in methods)
+    used = tuple(
+        adapt_method(method, np.zeros(len(free), dtype=bool), "given") for method in methods
+    )
     penalty = np.concatenate([method.penalty(d) for method in used])
     weight, y = _solutions(d, penalty)
     member = np.unique(linked(data), return_inverse=True)[1]

@@ -16,9 +16,9 @@ from dataclasses import replace
 import numpy as np
 
 from loopcal import geometry
-from loopcal.estimate.combinations import Combination
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.inference.null_space import Combination
 from loopcal.estimate.outlook import Scene, scene
-from loopcal.estimate.scaling import Unknowns
 from loopcal.mechanism import Mechanism
 from loopcal.mechanism.batch_kinematics import readings_at
 from loopcal.typing import FloatArray
@@ -39,7 +39,7 @@ ALIKE = 1e-6
 """Relative difference of motions that are called the same."""
 
 
-def probed(free: Unknowns, joints: Iterable[str] = ()) -> Scene:
+def probed(free: FreeParameters, joints: Iterable[str] = ()) -> Scene:
     """Poses about home, reached for certain by no more than chance: readings spread evenly, those
     out of reach left out.
     """
@@ -59,7 +59,7 @@ def _spread_readings(robot: Mechanism) -> FloatArray:
 
 
 def with_meaning(
-    free: Unknowns, found: tuple[Combination, ...], directions: FloatArray
+    free: FreeParameters, found: tuple[Combination, ...], directions: FloatArray
 ) -> tuple[Combination, ...]:
     """Add to combinations, given as directions (d, p) in tolerances, what the robot does with them."""
     if not found:

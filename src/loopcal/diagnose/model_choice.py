@@ -16,8 +16,8 @@ from typing import Any, Literal
 
 from loopcal.diagnose.cross_validation import CrossValidation, cross_validate
 from loopcal.errors import EstimationError
-from loopcal.estimate.losses import Loss
-from loopcal.estimate.penalties import Method
+from loopcal.estimate.methods.losses import Loss
+from loopcal.estimate.methods.penalties import Method
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.units import Dimension

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from loopcal.diagnose.influence import Influence, influence
-from loopcal.estimate.combinations import listed
-from loopcal.estimate.left_out import without_poses
+from loopcal.estimate.excluded_poses import exclude_poses
+from loopcal.estimate.inference.null_space import listed
 from loopcal.estimate.result import Identification
 from loopcal.estimate.robust_descent import scale_of
 from loopcal.estimate.rows import AnyRows, rows_of
@@ -178,7 +178,7 @@ def find_outliers(fit: Identification, data: Measurements, level: float = 0.05) 
     fit : the identification, with or without a loss. data : the measurements it was made from.
     level : probability of naming any block where none is wrong.
     """
-    data = without_poses(with_stated_sigma(fit.robot, data), fit.dropped)
+    data = exclude_poses(with_stated_sigma(fit.robot, data), fit.dropped)
     rows = rows_of(fit.unknowns, data)
     numbers, member = np.unique(linked(data), return_inverse=True)
     labels = tuple(tuple(np.array(data.labels)[member == i].tolist()) for i in range(len(numbers)))

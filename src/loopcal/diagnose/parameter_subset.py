@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopcal.diagnose.identifiability_analysis import Identifiability
-from loopcal.estimate.combinations import NEGLIGIBLE, SHOWN, listed
-from loopcal.estimate.scaling import Unknowns
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.inference.null_space import NEGLIGIBLE, SHOWN, listed
 from loopcal.mechanism import Mechanism
 from loopcal.mechanism.assembly import Linear
 from loopcal.typing import FloatArray
@@ -137,7 +137,7 @@ def reduce(found: Identifiability) -> Reduction:
     return Reduction(names, dropped, float(s[0] / s[-1]) if len(s) else 1.0, robot)
 
 
-def _left_out(free: Unknowns, null: FloatArray) -> np.ndarray:
+def _left_out(free: FreeParameters, null: FloatArray) -> np.ndarray:
     """Places (d,) of the parameters to leave out, in the order of the robot's file."""
     from scipy.linalg import qr
 
@@ -148,7 +148,7 @@ def _left_out(free: Unknowns, null: FloatArray) -> np.ndarray:
     return np.sort(np.asarray(order)[:d])
 
 
-def _weights(free: Unknowns) -> FloatArray:
+def _weights(free: FreeParameters) -> FloatArray:
     """How readily each parameter (p,) is left out."""
     set_by_controller: set[str] = set()
     for link in free.robot.assembly.maps:
@@ -162,7 +162,7 @@ def _weights(free: Unknowns) -> FloatArray:
     return np.asarray(np.array(kinds) * (1.0 + FIRST * np.arange(len(free))), dtype=np.float64)
 
 
-def _merged(free: Unknowns, place: int, direction: FloatArray, kept: np.ndarray) -> Merged:
+def _merged(free: FreeParameters, place: int, direction: FloatArray, kept: np.ndarray) -> Merged:
     """What takes the place of a parameter whose null direction (p,) is one at its own place and
     zero at the others left out.
     """

@@ -16,9 +16,9 @@ import numpy as np
 from loopcal import engine
 from loopcal.diagnose.interpretations import Hypothesis
 from loopcal.errors import DataError
+from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.local import Own
 from loopcal.estimate.rows import Rows, rows_of
-from loopcal.estimate.scaling import Unknowns
 from loopcal.estimate.sensed import Residuals, Sensed
 from loopcal.measure import LocalUnknowns, Measurements
 from loopcal.measure.initial_values import starts_of
@@ -62,7 +62,7 @@ ROUNDS = 3
 """
 
 
-def quick_misfit(free: Unknowns, data: Measurements) -> float:
+def quick_misfit(free: FreeParameters, data: Measurements) -> float:
     """The misfit of measurements as written, unknown frames sought from their nominal values only:
     an upper bound.
 
@@ -101,7 +101,7 @@ class ReadAs:
 
     def __init__(
         self,
-        free: Unknowns,
+        free: FreeParameters,
         data: Measurements,
         ways: tuple[Hypothesis, ...] = (),
         hypothesis: Hypothesis | None = None,
@@ -244,7 +244,7 @@ class ReadAs:
 
 
 def begun(
-    free: Unknowns, data: Measurements, readings: FloatArray, solved: np.ndarray
+    free: FreeParameters, data: Measurements, readings: FloatArray, solved: np.ndarray
 ) -> tuple[FloatArray, FloatArray]:
     """Frames (h, U) for h sets of readings (h, n, a) of the same measured values, and what they
     leave.
@@ -272,7 +272,7 @@ def begun(
     return begin, np.median(every, axis=1) if every.shape[1] else np.zeros(h)
 
 
-def _reached(free: Unknowns, data: Measurements, *, follow: bool) -> tuple[np.ndarray, int]:
+def _reached(free: FreeParameters, data: Measurements, *, follow: bool) -> tuple[np.ndarray, int]:
     """Which poses (n,) the robot reaches with the readings, and how many were tried.
 
     Few poses that are not reached at once are followed along a path before all of them are: failing

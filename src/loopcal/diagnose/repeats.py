@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.estimate.left_out import without_poses
+from loopcal.estimate.excluded_poses import exclude_poses
+from loopcal.estimate.inference.residual_test import DOUBT
 from loopcal.estimate.result import Identification
 from loopcal.estimate.rows import rows_of
-from loopcal.estimate.statistics import DOUBT
 from loopcal.measure import Measurements, with_stated_sigma
 from loopcal.typing import FloatArray, IntArray
 
@@ -75,7 +75,7 @@ def lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
             "readings are uncertain, so poses of equal readings differ, and repeats are no pure "
             "error"
         )
-    data = without_poses(data, fit.dropped)
+    data = exclude_poses(data, fit.dropped)
     member, times = repeated(data.readings)
     pure, degrees = _pure_error(fit, data, member)
     left = float(fit.cost_history[-1]) - pure

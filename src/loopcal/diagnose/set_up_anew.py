@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from loopcal.estimate.combinations import listed
+from loopcal.estimate.inference.null_space import listed
 
 SMALLER = 3.0
 """Times by which errors shrink when something is found anew, from which it is said to have been set

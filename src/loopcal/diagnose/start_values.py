@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from loopcal.estimate.inference.residual_test import DOUBT, FEWEST_DEGREES
 from loopcal.estimate.result import Identification
-from loopcal.estimate.statistics import DOUBT, FEWEST_DEGREES
 
 NOTHING = 1e-3
 """Share of the start's chi-square below which a gain is none: other rounding, the last digits of a

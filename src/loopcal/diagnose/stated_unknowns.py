@@ -12,8 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from loopcal.diagnose.read_as import ReadAs, refined
-from loopcal.estimate.combinations import listed
-from loopcal.estimate.scaling import Unknowns
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.inference.null_space import listed
 from loopcal.parameters import Parameter
 from loopcal.units import DISPLAY_UNITS, unit
 
@@ -43,7 +43,7 @@ class Contradiction:
 
 
 def contradicted(
-    free: Unknowns, stated: ReadAs, misfit: float, better: float
+    free: FreeParameters, stated: ReadAs, misfit: float, better: float
 ) -> Contradiction | None:
     """Find stated unknowns without which measurements fit far better.
 
@@ -90,7 +90,7 @@ def _fewest(one: tuple[tuple[str, ...], tuple[ReadAs, float]]) -> tuple[int, flo
     return len(one[0]), one[1][1]
 
 
-def _freed(free: Unknowns, stated: ReadAs, names: tuple[str, ...]) -> tuple[ReadAs, float]:
+def _freed(free: FreeParameters, stated: ReadAs, names: tuple[str, ...]) -> tuple[ReadAs, float]:
     """The measurements with some unknowns left to the data, and their misfit, blunders left out."""
     known = tuple(one for one in stated.whole.known if one.name not in names)
     way = ReadAs(free, replace(stated.whole, known=known))
@@ -99,7 +99,7 @@ def _freed(free: Unknowns, stated: ReadAs, names: tuple[str, ...]) -> tuple[Read
     return way, min(way.misfit(), refined(way))
 
 
-def _shown(free: Unknowns, entry: Parameter, value: float) -> str:
+def _shown(free: FreeParameters, entry: Parameter, value: float) -> str:
     """Where the data put an unknown and what was stated of it, in the unit of the robot's file."""
     symbol = free.robot.units.get(entry.dimension, DISPLAY_UNITS[entry.dimension].symbol)
     factor = unit(symbol).factor_to_si

@@ -17,9 +17,9 @@ import numpy as np
 from loopcal.diagnose.identifiability_analysis import Identifiability, identifiability
 from loopcal.diagnose.meaning import probed
 from loopcal.errors import DataError, MechanismError
-from loopcal.estimate.combinations import Combination, listed, sparse
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.inference.null_space import Combination, listed, sparsify_basis
 from loopcal.estimate.outlook import Scene, alone, scene
-from loopcal.estimate.scaling import Unknowns
 from loopcal.measure import (
     KINDS,
     Component,
@@ -123,7 +123,7 @@ def remedies(
     if not found.unidentifiable:
         return ()
     free = found.unknowns
-    B = sparse(found.null_space())
+    B = sparsify_basis(found.null_space())
     B = B / np.linalg.norm(B, axis=1, keepdims=True)
     leading = [free.names.index(c.names[0]) for c in found.unidentifiable]
     cures: list[list[Cure]] = [[] for _ in leading]
@@ -168,7 +168,7 @@ def open_words(robot: Mechanism, data: Measurements) -> str:
     return f" ({'; '.join(str(remedy.combination) for remedy in found)}; {advice})"
 
 
-def _scene(free: Unknowns, joints: list[str]) -> Scene:
+def _scene(free: FreeParameters, joints: list[str]) -> Scene:
     """Poses drawn from the workspace, or about home where none is stated."""
     try:
         q = sample(free.robot, POSES, seed=0).solution.q

@@ -19,7 +19,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.estimate.descent import Descent, DescentStatus, StepControl, descend
 from loopcal.estimate.latent import LatentRows
-from loopcal.estimate.penalties import Method
+from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.rows import AnyRows, Rows
 from loopcal.typing import FloatArray
 

@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 
 from loopcal.errors import EstimationError
-from loopcal.estimate.penalties import Method
+from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.steps import Step, penalised, propose
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, decompose
 from loopcal.typing import BoolArray, FloatArray, IntArray

@@ -14,32 +14,32 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import EstimationError
-from loopcal.estimate.astray import astray
-from loopcal.estimate.checks import check_count, check_rows, check_settings, check_start
 from loopcal.estimate.closure import descend_from_closure, not_used
-from loopcal.estimate.combinations import combinations
-from loopcal.estimate.conflict import prior_conflict
 from loopcal.estimate.descent import Descent, DescentStatus, StepControl, descend
+from loopcal.estimate.divergence import find_diverged
+from loopcal.estimate.excluded_poses import exclude_poses
+from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
+from loopcal.estimate.inference.null_space import describe_null_space
+from loopcal.estimate.inference.posterior import compute_posterior
+from loopcal.estimate.inference.prior import Prior
+from loopcal.estimate.inference.residual_test import ResidualTest, run_residual_test
+from loopcal.estimate.input_checks import check_count, check_rows, check_settings, check_start
 from loopcal.estimate.latent import LatentRows
 from loopcal.estimate.latent_doubts import latent_doubts, uneven
 from loopcal.estimate.latent_estimate import latent_estimate
-from loopcal.estimate.left_out import without_poses
 from loopcal.estimate.local_estimate import (
     LocalEstimate,
     local_estimate,
     nothing_local,
     with_followers,
 )
-from loopcal.estimate.losses import Loss
-from loopcal.estimate.penalties import MAP, LeastSquares, Method, adapted
-from loopcal.estimate.posteriors import posterior
-from loopcal.estimate.prior import Prior
+from loopcal.estimate.methods.losses import Loss
+from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method, adapt_method
+from loopcal.estimate.methods.prior_conflict import assess_prior_conflict
 from loopcal.estimate.result import Identification, KindResiduals
 from loopcal.estimate.robust_descent import descend_robustly
 from loopcal.estimate.rows import AnyRows, rows_of, rows_of_trials
-from loopcal.estimate.scaling import Unknowns, unknowns
 from loopcal.estimate.sensed import Residuals, linked
-from loopcal.estimate.statistics import ResidualCheck, residual_check
 from loopcal.measure import LocalUnknowns, Measurements, Trials, with_stated_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition
@@ -67,17 +67,17 @@ def identify(
     drop: Sequence[str] = (),
     local: LocalUnknowns | None = None,
 ) -> Identification:
-    """Identify the free parameters of a robot; the theory is in `loopcal.estimate.penalties`.
+    """Identify the free parameters of a robot; the theory is in `loopcal.estimate.methods.penalties`.
 
     Parameters
     ----------
     robot : its values are the start, its table says what is nominal, free and tolerated. data : the
         measurements; where a reading has a sigma, given or stated by the robot, its pose is an
         unknown, too (docs/theory/latent.md).
-    method : default `MAP(Widened())`: stated tolerances are a prior, widened where the data
+    method : default `MAP(InflatedTolerances())`: stated tolerances are a prior, widened where the data
         contradict them; with `prior` least squares.
     noise : "given": the sigmas of the data are true; "estimated": true up to one common factor.
-    prior : what an earlier calibration knows, as further rows; see `loopcal.estimate.prior`.
+    prior : what an earlier calibration knows, as further rows; see `loopcal.estimate.inference.prior`.
     start : (parameters of the robot,) [SI] values to begin with instead of the robot's.
     begin : "closure": where all poses are measured in full, first linearise closure there (for
         starts far off).
@@ -99,11 +99,11 @@ def identify(
         the start.
     """
     check_settings(method, rank_tolerance, noise)
-    free = unknowns(robot)
-    method = adapted(
+    free = select_free_parameters(robot)
+    method = adapt_method(
         LeastSquares() if method is None and prior is not None else method, free.assumed, noise
     )
-    rows = rows_of(free, data := without_poses(with_stated_sigma(robot, data), drop), local)
+    rows = rows_of(free, data := exclude_poses(with_stated_sigma(robot, data), drop), local)
     check_rows(rows, data, robot)
     check_count(rows, data, method, allow_fewer_equations or prior is not None)
     z = free.deviation((robot if start is None else robot.with_values(start)).values[None])
@@ -118,7 +118,7 @@ def identify(
     fit, weight, weighed = _weighed(rows, data, z, loss, noise, run, prior)
     if fit.status[0] == DescentStatus.BAD_START:
         check_start(rows, data, z, fit.cost)
-    check = residual_check(
+    check = run_residual_test(
         fit.decomposition,
         fit.penalty,
         noise,
@@ -210,7 +210,7 @@ class IdentifiedTrials:
     status: IntArray
     iterations: IntArray
     cost: FloatArray
-    unknowns: Unknowns
+    unknowns: FreeParameters
     decomposition: Decomposition
     penalty: FloatArray
 
@@ -244,12 +244,12 @@ def identify_trials(
     start : (t | 1, parameters of the robot) [SI], default the robot's values. The others: as for
         `identify`.
     """
-    free = unknowns(robot)
+    free = select_free_parameters(robot)
     rows = rows_of_trials(free, trials)
     values = np.atleast_2d(robot.values if start is None else np.asarray(start, dtype=np.float64))
     z = np.broadcast_to(free.deviation(values), (len(trials), len(free)))
     fit = _descended(
-        rows, z, adapted(method, free.assumed, "given"), control, rank_tolerance, begin
+        rows, z, adapt_method(method, free.assumed, "given"), control, rank_tolerance, begin
     )
     return IdentifiedTrials(
         free.values(fit.deviation),
@@ -287,10 +287,10 @@ def _descended(
 
 def _identification(
     robot: Mechanism,
-    free: Unknowns,
+    free: FreeParameters,
     method: Method,
     fit: Descent,
-    check: ResidualCheck,
+    check: ResidualTest,
     residuals: tuple[KindResiduals, ...],
     rows: AnyRows,
 ) -> Identification:
@@ -304,7 +304,7 @@ def _identification(
     conflict = None
     if isinstance(method, MAP):
         sigma = float(method.sigma(d)[0])
-        conflict = prior_conflict(free, d, penalty, sigma, fit.deviation[0])
+        conflict = assess_prior_conflict(free, d, penalty, sigma, fit.deviation[0])
         if (
             check.intervals and check.noise == "estimated"
         ):  # the penalty holds its variance: divided by it, all is as stated
@@ -313,12 +313,12 @@ def _identification(
     values = free.values(fit.deviation)[0]
     status = DescentStatus(int(fit.status[0]))
     local = _local(rows, robot, fit.deviation, d, penalty, variance)
-    open_ = with_followers(combinations(free, plain.null_space()), plain.null_space(), local)
+    open_ = with_followers(describe_null_space(free, plain.null_space()), plain.null_space(), local)
     converged = status is DescentStatus.CONVERGED
     notes = [
         *([] if converged else [status.sentence]),
         check.sentence,
-        *astray(free, fit.deviation[0], method, converged),
+        *find_diverged(free, fit.deviation[0], method, converged),
     ]
     if converged and conflict is not None and conflict.conflict:
         notes.append(conflict.sentence)
@@ -333,7 +333,7 @@ def _identification(
         unknowns=free,
         estimate=values[free.places],
         covariance=covariance,
-        posterior=posterior(
+        posterior=compute_posterior(
             robot.with_values(values), free.places, free.tolerance, d, penalty, variance
         ),
         rank=int(plain.rank[0]),

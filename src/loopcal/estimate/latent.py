@@ -21,10 +21,10 @@ import numpy as np
 from loopcal import engine
 from loopcal.estimate.components import components_of
 from loopcal.estimate.elimination import Factors
+from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.latent_start import start_of
 from loopcal.estimate.local import Own
 from loopcal.estimate.moves import evaluated
-from loopcal.estimate.scaling import Unknowns
 from loopcal.estimate.sensed import BLOCK, Residuals, Sensed
 from loopcal.estimate.settle import Poses, Settled
 from loopcal.estimate.standing import ByPose, ByReadings, Chart, Standing
@@ -91,7 +91,7 @@ class LatentRows:
 
     def __init__(
         self,
-        unknowns: Unknowns,
+        unknowns: FreeParameters,
         sensed: tuple[Sensed, ...],
         trials: int,
         chart: Chart,
@@ -306,7 +306,7 @@ class LatentRows:
 
 
 def latent_rows(
-    unknowns: Unknowns,
+    unknowns: FreeParameters,
     recorded: FloatArray,
     sigma: FloatArray,
     sensed: tuple[Sensed, ...],

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.estimate.combinations import Combination, listed, sparse
+from loopcal.estimate.inference.null_space import Combination, listed, sparsify_basis
 from loopcal.estimate.local import Own
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition
@@ -182,7 +182,7 @@ def with_followers(
     """
     if not len(local) or not found:
         return found
-    changed = np.abs(sparse(null) @ local.slope.T)
+    changed = np.abs(sparsify_basis(null) @ local.slope.T)
     limit = MOVES * np.abs(local.slope).max(axis=1, initial=0.0)
     told = []
     for one, moved in zip(found, changed > limit, strict=True):

@@ -18,8 +18,8 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.estimate.elimination import OWN_RANK
+from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.rows import rows_of
-from loopcal.estimate.scaling import Unknowns, unknowns
 from loopcal.measure import (
     LocalUnknowns,
     Measurements,
@@ -52,7 +52,7 @@ class Scene:
     joints : name -> (1, n) [SI]. slopes : name -> (1, n, p), of the joints asked for.
     """
 
-    free: Unknowns
+    free: FreeParameters
     readings: FloatArray
     reached: BoolArray
     T: FloatArray
@@ -61,7 +61,7 @@ class Scene:
     slopes: Mapping[str, FloatArray]
 
 
-def scene(free: Unknowns, readings: FloatArray, joints: Iterable[str] = ()) -> Scene:
+def scene(free: FreeParameters, readings: FloatArray, joints: Iterable[str] = ()) -> Scene:
     """Solve and linearise a robot at readings (n, a), at its present values."""
     robot, values, names = free.robot, free.robot.values[None], tuple(joints)
     state = forward_trials(robot, values, readings[None])
@@ -110,7 +110,7 @@ def without_own(factor: FloatArray, own: int) -> FloatArray:
     return engine.accumulate(factor[:, own:, own:], free[None])
 
 
-def information(free: Unknowns, data: Measurements) -> tuple[FloatArray, BoolArray]:
+def information(free: FreeParameters, data: Measurements) -> tuple[FloatArray, BoolArray]:
     """Fold all rows of measurements at the robot's present values.
 
     Parameters
@@ -147,7 +147,7 @@ def information(free: Unknowns, data: Measurements) -> tuple[FloatArray, BoolArr
     return without_own(engine.accumulate(factor, _prior_rows(local, len(free))), own), reached
 
 
-def _uncertain(free: Unknowns, data: Measurements) -> tuple[FloatArray, BoolArray]:
+def _uncertain(free: FreeParameters, data: Measurements) -> tuple[FloatArray, BoolArray]:
     """The same where poses are unknowns, too: at those that fit the robot's present values best."""
     rows, z = rows_of(free, data), free.deviation(free.robot.values[None])
     factor, _ = rows.fold(z, np.arange(1))
@@ -162,7 +162,7 @@ def equations(robot: Mechanism, data: Measurements) -> int:
     """
     if believed_sigma(robot, data.reading_sigma, data.n_poses) is None:
         return data.n_rows
-    return int(rows_of(unknowns(robot), data).equations[0])
+    return int(rows_of(select_free_parameters(robot), data).equations[0])
 
 
 def alone(at: Scene, measured: Measurements) -> FloatArray:
@@ -175,7 +175,7 @@ def alone(at: Scene, measured: Measurements) -> FloatArray:
     return without_own(engine.accumulate(factor, _prior_rows(local, len(at.free))), len(local))
 
 
-def _own_values(free: Unknowns, data: Measurements, local: LocalUnknowns) -> FloatArray:
+def _own_values(free: FreeParameters, data: Measurements, local: LocalUnknowns) -> FloatArray:
     """Values (U,) of the own unknowns that fit the measurements at the robot's present poses."""
     at = [
         scene(

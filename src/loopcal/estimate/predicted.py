@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopcal.estimate.combinations import listed
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.inference.null_space import listed
 from loopcal.estimate.latent import latent_rows
-from loopcal.estimate.scaling import Unknowns
 from loopcal.measure import Measurements, with_stated_sigma
 from loopcal.mechanism import Mechanism, Solution, forward
 from loopcal.mechanism.kinematics import solution_of
@@ -62,7 +62,7 @@ def _fitted(robot: Mechanism, data: Measurements) -> tuple[Solution, np.ndarray]
     """
     assert data.reading_sigma is not None
     nothing = np.zeros(0)
-    fixed = Unknowns(robot, nothing.astype(np.int64), nothing, nothing, nothing.astype(bool))
+    fixed = FreeParameters(robot, nothing.astype(np.int64), nothing, nothing, nothing.astype(bool))
     rows = latent_rows(fixed, data.readings[None], data.reading_sigma, (), 1, lambda member: None)
     one = np.arange(1)
     here = rows.poses.settle(np.zeros((1, 0)), one, rows.memory.take(one))

@@ -17,13 +17,13 @@ from typing import Any, Literal
 import numpy as np
 
 from loopcal.errors import EstimationError
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
-from loopcal.estimate.penalties import LeastSquares
-from loopcal.estimate.posteriors import Posterior
-from loopcal.estimate.prior import Prior, limb_parameters, prior_from
+from loopcal.estimate.inference.posterior import Posterior
+from loopcal.estimate.inference.prior import Prior, limb_parameters, prior_from
+from loopcal.estimate.inference.residual_test import DOUBT
+from loopcal.estimate.methods.penalties import LeastSquares
 from loopcal.estimate.result import Identification
-from loopcal.estimate.scaling import unknowns
-from loopcal.estimate.statistics import DOUBT
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
@@ -158,14 +158,14 @@ def _used(robot: Mechanism, prior: Prior, limb: str | None, names: tuple[str, ..
     """Return the prior of the fit: all of it, or with a freed limb back at its tolerances."""
     if limb is None:
         return prior
-    free = unknowns(robot)
+    free = select_free_parameters(robot)
     places = [free.names.index(name) for name in names]
     return prior.without(names).toleranced(names, free.nominal[places], free.tolerance[places])
 
 
 def _check_names(robot: Mechanism, prior: Prior) -> None:
     """Refuse a prior of another robot."""
-    free = unknowns(robot).names
+    free = select_free_parameters(robot).names
     for name in (*prior.names, *free):
         if name not in prior.names or name not in free:
             where = "the earlier run" if name in prior.names else "the robot file"

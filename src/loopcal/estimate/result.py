@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.estimate.combinations import Combination
-from loopcal.estimate.conflict import PriorConflict
 from loopcal.estimate.descent import DescentStatus
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.inference.null_space import Combination
+from loopcal.estimate.inference.posterior import Posterior
+from loopcal.estimate.inference.residual_test import LEVEL, ResidualTest, coverage_factor
 from loopcal.estimate.latent_estimate import LatentEstimate
 from loopcal.estimate.local_estimate import LocalEstimate
-from loopcal.estimate.penalties import Method
-from loopcal.estimate.posteriors import Posterior
-from loopcal.estimate.scaling import Unknowns
-from loopcal.estimate.statistics import LEVEL, ResidualCheck, coverage_factor
+from loopcal.estimate.methods.penalties import Method
+from loopcal.estimate.methods.prior_conflict import PriorConflict
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
 
@@ -78,7 +78,7 @@ class Identification:
     robot: Mechanism
     initial: Mechanism
     method: Method
-    unknowns: Unknowns
+    unknowns: FreeParameters
     estimate: FloatArray
     covariance: FloatArray
     posterior: Posterior
@@ -87,7 +87,7 @@ class Identification:
     singular_values: FloatArray
     rank_tolerance: float
     unidentifiable: tuple[Combination, ...]
-    check: ResidualCheck
+    check: ResidualTest
     conflict: PriorConflict | None
     residuals: tuple[KindResiduals, ...]
     status: DescentStatus
@@ -147,7 +147,7 @@ class Identification:
 
     @property
     def chi_square(self) -> float:
-        """Whitened sum of squares, see `ResidualCheck`."""
+        """Whitened sum of squares, see `ResidualTest`."""
         return self.check.chi_square
 
     @property

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopcal.estimate.descent import Descent, DescentStatus
-from loopcal.estimate.losses import Huber, Loss, Tukey
-from loopcal.estimate.prior import Prior
+from loopcal.estimate.inference.prior import Prior
+from loopcal.estimate.methods.losses import Huber, Loss, Tukey
 from loopcal.estimate.rows import AnyRows
 from loopcal.typing import FloatArray, IntArray
 

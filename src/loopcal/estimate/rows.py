@@ -6,7 +6,7 @@ For a row with residual r = predicted - measured, whitener W and kind's derivati
 platform's twist, and the error model D = d twist / d parameter, the row is [W G D diag(tolerance) |
 W r]; a row that compares poses has the sum over its poses, one that looks at joints their
 derivatives in addition. Blocks of poses are folded into one triangular factor by the engine, so the
-memory of a fit is its parameters squared plus one block. Unknowns that measurements bring with them
+memory of a fit is its parameters squared plus one block. FreeParameters that measurements bring with them
 are eliminated, see `loopcal.estimate.local`. The rows are a `Problem` of the descent: t machines
 that share readings and kinds, each with its own measured values.
 """
@@ -20,10 +20,10 @@ import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.estimate.elimination import Factors
+from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.latent import LatentRows, latent_rows
 from loopcal.estimate.local import Own, Part, fold_parts, spread_columns
 from loopcal.estimate.moves import Last, Moves, evaluated, machine_columns
-from loopcal.estimate.scaling import Unknowns
 from loopcal.estimate.sensed import BLOCK, Block, Residuals, Sensed, blocks_of
 from loopcal.measure import (
     LocalUnknowns,
@@ -66,7 +66,7 @@ class Rows:
 
     def __init__(
         self,
-        unknowns: Unknowns,
+        unknowns: FreeParameters,
         readings: FloatArray,
         sensed: tuple[Sensed, ...],
         trials: int,
@@ -434,7 +434,9 @@ class Rows:
             yield Part(form, which, nodes, part.reshape(a, len(which) * m, -1))
 
 
-def rows_of(unknowns: Unknowns, data: Measurements, local: LocalUnknowns | None = None) -> AnyRows:
+def rows_of(
+    unknowns: FreeParameters, data: Measurements, local: LocalUnknowns | None = None
+) -> AnyRows:
     """Return the rows of one machine's measurements; `local` are the unknowns that these bring,
     default as stated.
 
@@ -448,7 +450,7 @@ def rows_of(unknowns: Unknowns, data: Measurements, local: LocalUnknowns | None 
     return _rows(unknowns, data.readings[None], data.reading_sigma, sensed, 1, own, lambda _: data)
 
 
-def rows_of_trials(unknowns: Unknowns, trials: Trials) -> AnyRows:
+def rows_of_trials(unknowns: FreeParameters, trials: Trials) -> AnyRows:
     """Return the rows of t simulated machines."""
     sensors = trials.instrument.sensors
     first = trials.trial(0)
@@ -473,7 +475,7 @@ def rows_of_trials(unknowns: Unknowns, trials: Trials) -> AnyRows:
 
 
 def _rows(
-    unknowns: Unknowns,
+    unknowns: FreeParameters,
     recorded: FloatArray,
     sigma: FloatArray | None,
     sensed: tuple[Sensed, ...],

@@ -28,9 +28,9 @@ from loopcal.estimate.components import (
     side_by_side,
 )
 from loopcal.estimate.elimination import Factors
+from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.local import CLOSE, NOTHING, Own, spread_columns
 from loopcal.estimate.moves import evaluated, machine_columns, mapped
-from loopcal.estimate.scaling import Unknowns
 from loopcal.estimate.sensed import BLOCK, Block, Sensed
 from loopcal.estimate.standing import Chart, FreeMoves, Standing
 from loopcal.measure import Evaluation, joints_looked_at
@@ -118,7 +118,7 @@ class Poses:
 
     def __init__(
         self,
-        unknowns: Unknowns,
+        unknowns: FreeParameters,
         sensed: tuple[Sensed, ...],
         chart: Chart,
         member: IntArray,

@@ -22,8 +22,8 @@ import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.errors import EstimationError
+from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.moves import Moves, mapped
-from loopcal.estimate.scaling import Unknowns
 from loopcal.measure import joint_values
 from loopcal.mechanism import Mechanism, Status
 from loopcal.mechanism.assembly import Actuator
@@ -120,7 +120,9 @@ class ByReadings:
     unknowns : the free parameters. scale : (n, a) [SI]. joints : names that kinds look at.
     """
 
-    def __init__(self, unknowns: Unknowns, scale: FloatArray, joints: tuple[str, ...]) -> None:
+    def __init__(
+        self, unknowns: FreeParameters, scale: FloatArray, joints: tuple[str, ...]
+    ) -> None:
         self.unknowns, self.scale, self.joints = unknowns, scale, joints
         self.freedoms = scale.shape[1]
         self.longest = LONGEST * np.array(
@@ -183,7 +185,7 @@ class ByPose:
         An actuator drives several limbs, so that the pose does not give its reading.
     """
 
-    def __init__(self, unknowns: Unknowns, joints: tuple[str, ...]) -> None:
+    def __init__(self, unknowns: FreeParameters, joints: tuple[str, ...]) -> None:
         robot = unknowns.robot
         drives = np.concatenate([g.actuator[g.actuator >= 0] for g in robot.program.groups])
         if len(drives) != len(robot.actuators):
@@ -257,13 +259,13 @@ def _share(step: FloatArray, longest: FloatArray) -> FloatArray:
     return 1.0 / np.maximum(np.abs(step) / longest, 1.0).max(axis=2, initial=1.0)
 
 
-def _free(unknowns: Unknowns, by_parameter: FloatArray) -> FloatArray:
+def _free(unknowns: FreeParameters, by_parameter: FloatArray) -> FloatArray:
     """Columns of the free parameters in units of their tolerance."""
     return by_parameter[..., unknowns.places] * unknowns.tolerance
 
 
 def _safe(
-    unknowns: Unknowns,
+    unknowns: FreeParameters,
     joints: tuple[str, ...],
     here: Standing,
     needed: np.ndarray,

@@ -17,7 +17,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.errors import EstimationError
-from loopcal.estimate.scaling import Unknowns, unknowns
+from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.measure import Measurements, Observations
 from loopcal.mechanism import Mechanism, Status
 from loopcal.mechanism.batch_kinematics import forward_trials
@@ -55,7 +55,7 @@ def identify_per_leg(robot: Mechanism, data: Measurements, steps: int = 3) -> Pe
     EstimationError
         Not full poses, a free parameter that moves no leg or several, or a pose out of reach.
     """
-    free = unknowns(robot)
+    free = select_free_parameters(robot)
     observations = _full_poses(data)
     q = data.readings[None, observations.rows]
     values = robot.values[None].copy()
@@ -76,7 +76,7 @@ def identify_per_leg(robot: Mechanism, data: Measurements, steps: int = 3) -> Pe
 
 def _step(
     robot: Mechanism,
-    free: Unknowns,
+    free: FreeParameters,
     values: FloatArray,
     q: FloatArray,
     state: engine.State,

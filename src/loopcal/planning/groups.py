@@ -29,7 +29,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import EstimationError
-from loopcal.estimate.scaling import Unknowns, unknowns
+from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.mechanism import Mechanism, Status
 from loopcal.mechanism.batch_kinematics import (
     inverse_trials,
@@ -57,7 +57,7 @@ NEARER, ROUNDS = 0.85, 12
 """Groups out of reach are drawn anew in a workspace this much narrower, so many times."""
 
 SURFACE = 5
-"""Unknowns of a group's surfaces: two turns, a height, two shifts."""
+"""FreeParameters of a group's surfaces: two turns, a height, two shifts."""
 
 DEGENERATE = 1e-10
 """Share of a column of the surfaces' unknowns, after those before it, below which the points do not
@@ -117,9 +117,9 @@ class PlaneAndLine:
             )
 
     @cached_property
-    def unknowns(self) -> Unknowns:
+    def select_free_parameters(self) -> FreeParameters:
         """The machine's, p of them."""
-        return unknowns(self.robot)
+        return select_free_parameters(self.robot)
 
     @cached_property
     def turning(self) -> tuple[str, ...]:

@@ -22,9 +22,9 @@ import numpy as np
 from loopcal import engine
 from loopcal.apply.accuracy import transport
 from loopcal.diagnose.frame_motions import frame_motions
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.outlook import look, scene, without_own
-from loopcal.estimate.posteriors import Posterior
-from loopcal.estimate.scaling import Unknowns
 from loopcal.measure import (
     Instrument,
     LocalUnknowns,
@@ -62,7 +62,7 @@ class UnitRows:
 
 
 def considered(
-    free: Unknowns, instrument: Instrument, readings: FloatArray, rng: np.random.Generator
+    free: FreeParameters, instrument: Instrument, readings: FloatArray, rng: np.random.Generator
 ) -> UnitRows:
     """Return the rows of all units that a plan may choose from, at readings (n, a) of the
     candidates' poses.
@@ -88,7 +88,7 @@ def considered(
 
 
 def unit_rows(
-    free: Unknowns, instrument: Instrument, readings: FloatArray, members: IntArray
+    free: FreeParameters, instrument: Instrument, readings: FloatArray, members: IntArray
 ) -> UnitRows:
     """Return the rows of units at readings (n, a) of the candidates' poses; members (N, k) as of
     `units_of`.
@@ -105,7 +105,7 @@ def unit_rows(
     return UnitRows(np.concatenate(parts), members, local.table.names, prior)
 
 
-def start_of(free: Unknowns, rows: UnitRows, measured: FloatArray | None = None) -> Start:
+def start_of(free: FreeParameters, rows: UnitRows, measured: FloatArray | None = None) -> Start:
     """Return what is known before: stated tolerances, what is stated of the instrument, and a
     factor of rows measured.
 
@@ -121,7 +121,9 @@ def start_of(free: Unknowns, rows: UnitRows, measured: FloatArray | None = None)
     return start.plus(np.concatenate([np.zeros((len(measured), o)), measured], axis=1))
 
 
-def knowable(free: Unknowns, rows: UnitRows, measured: FloatArray | None = None) -> Decomposition:
+def knowable(
+    free: FreeParameters, rows: UnitRows, measured: FloatArray | None = None
+) -> Decomposition:
     """Return the decomposition of all that could be measured, without tolerances, own unknowns
     eliminated.
     """
@@ -172,7 +174,7 @@ class Predicted:
         return np.concatenate([self.size * self.orientation, self.position])
 
 
-def predicted(free: Unknowns, solution: Solution, seen: Decomposition) -> Predicted:
+def predicted(free: FreeParameters, solution: Solution, seen: Decomposition) -> Predicted:
     """Return how poses of a solution depend on the parameters.
 
     Parameters
@@ -203,7 +205,7 @@ def _looking(mounted: Instrument, members: IntArray) -> list[tuple]:
 
 
 def _block(
-    free: Unknowns, mounted: Instrument, readings: FloatArray, members: IntArray
+    free: FreeParameters, mounted: Instrument, readings: FloatArray, members: IntArray
 ) -> FloatArray:
     """Return the rows (b, r, o + p) of some units."""
     poses, places = np.unique(members, return_inverse=True)

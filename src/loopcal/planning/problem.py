@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 
 from loopcal.errors import DataError, EstimationError
+from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.outlook import equations, information
-from loopcal.estimate.scaling import Unknowns, unknowns
 from loopcal.measure import Instrument, Measurements, check_actuators
 from loopcal.mechanism import Mechanism, Solution, inverse
 from loopcal.mechanism.workspace import sample
@@ -81,7 +81,7 @@ class Problem:
         their own unknowns need. taken : names of poses that were measured already.
     """
 
-    free: Unknowns
+    free: FreeParameters
     instrument: Instrument
     candidates: Candidates
     units: UnitRows
@@ -217,7 +217,7 @@ def problem(
     MechanismError, DataError
         See `candidates`, `considered`.
     """
-    free = unknowns(robot)
+    free = select_free_parameters(robot)
     if not len(free):
         raise EstimationError(
             f"there is nothing to plan for: {robot.name} has no free parameter; free one in its "
@@ -259,7 +259,7 @@ def problem(
     )
 
 
-def _known(free: Unknowns, measured: Measurements) -> tuple[FloatArray, int]:
+def _known(free: FreeParameters, measured: Measurements) -> tuple[FloatArray, int]:
     """Return the factor (p, p) of measurements made already, and how many equations they leave for
     the robot.
     """

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from loopcal.apply.compensation import Compensation
-    from loopcal.estimate.posteriors import Posterior
+    from loopcal.estimate.inference.posterior import Posterior
     from loopcal.mechanism import Mechanism
 
 NAMES = ("rx", "ry", "rz", "x", "y", "z")
@@ -45,7 +45,7 @@ def load_posterior(path: str | Path) -> Posterior:
     EstimationError
         It does not hold this knowledge, or its robot file was changed.
     """
-    from loopcal.estimate.posteriors import posterior_from_arrays
+    from loopcal.estimate.inference.posterior import posterior_from_arrays
 
     run = read_run_folder(path)
     return posterior_from_arrays(load_robot(run.robot_path), run.arrays)

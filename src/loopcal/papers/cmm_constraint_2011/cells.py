@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.estimate.penalties import MAP, LeastSquares, Method
+from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method
 from loopcal.papers.cmm_constraint_2011.published import MM, published
 from loopcal.papers.cmm_constraint_2011.steps import PaperRows, Weights, identify_from_rows
 from loopcal.papers.cmm_constraint_2011.study import MEASURES, Study, true_machines

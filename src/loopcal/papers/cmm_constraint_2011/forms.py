@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.estimate import identify
+from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.outlook import information
-from loopcal.estimate.scaling import unknowns
 from loopcal.measure import Line, Measurements, Observations, Plane
 from loopcal.mechanism.coordinates import POSITION
 from loopcal.papers.cmm_constraint_2011.cells import METHODS
@@ -91,7 +91,9 @@ def compare_forms(study: Study, seed: int) -> Forms:
     for noise in NOISES:
         truth = true_machines(study.robot, ERRORS, 1, seed)
         q = study.layout.held(truth, noise, seed)
-        problem = PaperRows(study.layout, q, unknowns(study.robot).tolerance[0], noise)
+        problem = PaperRows(
+            study.layout, q, select_free_parameters(study.robot).tolerance[0], noise
+        )
         for name, method in METHODS.items():
             paper = problem.values(identify_from_rows(problem, method, 1e-6).deviation)[0]
             data = measurements(study.layout, q[0], noise)
@@ -107,7 +109,7 @@ def covariance_difference(layout: Layout, noise: float) -> float:
     """
     robot = layout.robot
     q = layout.held(robot.parameters.nominal[None], 0.0, 0)
-    free = unknowns(robot)
+    free = select_free_parameters(robot)
     factor = information(free, measurements(layout, q[0], noise))[0]
     s, vt = _seen(PaperRows(layout, q, free.tolerance[0], noise))
     ratio = np.linalg.svd(factor[0, : len(free), : len(free)] @ (vt.T / s), compute_uv=False)

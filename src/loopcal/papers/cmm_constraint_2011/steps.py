@@ -27,7 +27,7 @@ import numpy as np
 
 from loopcal.engine import State
 from loopcal.estimate.descent import Descent, StepControl, descend
-from loopcal.estimate.penalties import Method
+from loopcal.estimate.methods.penalties import Method
 from loopcal.measure import stream
 from loopcal.mechanism import Mechanism, Status
 from loopcal.mechanism.batch_kinematics import (

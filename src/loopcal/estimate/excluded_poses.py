@@ -13,7 +13,7 @@ from loopcal.measure import Measurements
 from loopcal.measure.measurements import weighted_sigma
 
 
-def without_poses(data: Measurements, drop: Sequence[str]) -> Measurements:
+def exclude_poses(data: Measurements, drop: Sequence[str]) -> Measurements:
     """Return the measurements with weight 0 for every row that sees one of these poses, and their
     readings not believed.
 

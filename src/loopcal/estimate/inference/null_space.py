@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from loopcal.estimate.scaling import Unknowns
+from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.typing import FloatArray
 
 NEGLIGIBLE = 1e-6
@@ -104,13 +104,17 @@ def listed(words: list[str] | tuple[str, ...], most: int = SHOWN) -> str:
     return f"{', '.join(words[:-1])} and {words[-1]}" if len(words) > 1 else "".join(words)
 
 
-def combinations(unknowns: Unknowns, null_space: FloatArray) -> tuple[Combination, ...]:
+def describe_null_space(
+    unknowns: FreeParameters, null_space: FloatArray
+) -> tuple[Combination, ...]:
     """Return the combinations that span a null space (p, d) of deviations in tolerances."""
-    return tuple(combination(unknowns, direction) for direction in sparse(null_space))
+    return tuple(
+        describe_direction(unknowns, direction) for direction in sparsify_basis(null_space)
+    )
 
 
-def combination(
-    unknowns: Unknowns, direction: FloatArray, singular_value: float = 0.0
+def describe_direction(
+    unknowns: FreeParameters, direction: FloatArray, singular_value: float = 0.0
 ) -> Combination:
     """Return one direction (p,) of deviations in tolerances by names; small parts are left out."""
     factor, symbols = unknowns.display()
@@ -129,7 +133,7 @@ def combination(
     )
 
 
-def sparse(null_space: FloatArray) -> FloatArray:
+def sparsify_basis(null_space: FloatArray) -> FloatArray:
     """Return a basis (d, p) of the same space in which each vector has a parameter of its own."""
     d = null_space.shape[1]
     if d == 0:

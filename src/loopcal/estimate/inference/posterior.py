@@ -57,7 +57,7 @@ class Posterior:
         return {PREFIX + name: np.asarray(getattr(self, name)) for name in STORED}
 
 
-def posterior(
+def compute_posterior(
     robot: Mechanism,
     places: IntArray,
     tolerance: FloatArray,

@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.estimate.regularization_rules import MarginalLikelihood
-from loopcal.estimate.scaling import Unknowns
-from loopcal.estimate.statistics import DOUBT
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.inference.residual_test import DOUBT
+from loopcal.estimate.methods.regularization_rules import MarginalLikelihood
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import FloatArray
 
@@ -35,7 +35,7 @@ SHOWN = 3
 
 
 @dataclass(frozen=True)
-class Widened:
+class InflatedTolerances:
     """Factor (t,) on all tolerances: 1, or where data contradict them beyond doubt, that of largest
     marginal likelihood.
 
@@ -46,8 +46,8 @@ class Widened:
 
     def __call__(self, decomposition: Decomposition) -> FloatArray:
         """Return the factor (t,)."""
-        shown = decomposition.divided(shown_noise(decomposition))
-        statistic, degrees = prior_statistic(shown)
+        shown = decomposition.divided(estimate_excess_noise(decomposition))
+        statistic, degrees = compute_prior_statistic(shown)
         doubted = _tail(degrees, statistic) < DOUBT
         spread = np.ones_like(statistic)
         if doubted.any():
@@ -83,8 +83,8 @@ class PriorConflict:
         return {**vars(self), "farthest": [list(pair) for pair in self.farthest]}
 
 
-def prior_conflict(
-    free: Unknowns,
+def assess_prior_conflict(
+    free: FreeParameters,
     decomposition: Decomposition,
     penalty: FloatArray,
     sigma: float,
@@ -99,7 +99,8 @@ def prior_conflict(
     """
     scaled = decomposition.divided(np.full(1, sigma))
     statistic, degrees = (
-        float(value[0]) for value in prior_statistic(scaled.divided(shown_noise(scaled)))
+        float(value[0])
+        for value in compute_prior_statistic(scaled.divided(estimate_excess_noise(scaled)))
     )
     held = np.isfinite(penalty[0]) & (penalty[0] > 0.0)
     spread = float(sigma / np.sqrt(penalty[0][held][0])) if held.any() else np.nan
@@ -120,7 +121,7 @@ def prior_conflict(
     )
 
 
-def prior_statistic(decomposition: Decomposition) -> tuple[FloatArray, FloatArray]:
+def compute_prior_statistic(decomposition: Decomposition) -> tuple[FloatArray, FloatArray]:
     """Return Q (t,), scaled to a chi-square, and its degrees of freedom (t,), over the directions
     that a prior holds.
     """
@@ -134,7 +135,7 @@ def prior_statistic(decomposition: Decomposition) -> tuple[FloatArray, FloatArra
     return np.where(there, value * first / safe, 0.0), np.where(there, first**2 / safe, 0.0)
 
 
-def shown_noise(decomposition: Decomposition) -> FloatArray:
+def estimate_excess_noise(decomposition: Decomposition) -> FloatArray:
     """Return the factor (t,) on sigma that the part outside the range shows, 1 unless that is
     beyond doubt above 1.
     """

@@ -28,7 +28,7 @@ ASTRAY = "no interval is given and nothing is said of the noise: what is left is
 
 
 @dataclass(frozen=True)
-class ResidualCheck:
+class ResidualTest:
     """The residual against its degrees of freedom.
 
     Attributes
@@ -60,13 +60,13 @@ class ResidualCheck:
         return self.noise == "given" and self.p_value < DOUBT
 
 
-def residual_check(
+def run_residual_test(
     decomposition: Decomposition,
     penalty: FloatArray,
     noise: str,
     robust: bool = False,
     converged: bool = True,
-) -> ResidualCheck:
+) -> ResidualTest:
     """Check the residual of a fit (t = 1).
 
     chi_square = |W r|^2 + sum penalty_i y_i^2 over the directions used, with one degree of freedom
@@ -90,17 +90,17 @@ def residual_check(
     degrees = m - float((used & (penalty == 0.0)).sum())
     dof = m - float(decomposition.filter_factors(penalty).sum())
     if not converged:
-        return ResidualCheck(chi_square, degrees, np.nan, dof, noise, 1.0, False, ASTRAY)
+        return ResidualTest(chi_square, degrees, np.nan, dof, noise, 1.0, False, ASTRAY)
     if noise == "estimated":
         enough = dof >= FEWEST_DEGREES
         scale = float(np.sqrt(left / dof)) if dof > 0 else np.nan
-        return ResidualCheck(
+        return ResidualTest(
             chi_square, degrees, np.nan, dof, noise, scale, enough, _estimated(dof, scale, enough)
         )
     from scipy.special import chdtrc
 
     if robust:
-        return ResidualCheck(
+        return ResidualTest(
             chi_square,
             degrees,
             np.nan,
@@ -112,12 +112,12 @@ def residual_check(
         )
     p_value = float(chdtrc(degrees, chi_square)) if degrees > 0 else np.nan
     scale = max(1.0, float(np.sqrt(chi_square / degrees))) if p_value < DOUBT else 1.0
-    return ResidualCheck(
+    return ResidualTest(
         chi_square, degrees, p_value, dof, noise, scale, True, _given(chi_square, degrees, p_value)
     )
 
 
-def coverage_factor(check: ResidualCheck, level: float = LEVEL) -> float:
+def coverage_factor(check: ResidualTest, level: float = LEVEL) -> float:
     """Return by how many standard deviations an interval of this coverage extends to each side."""
     from scipy.special import ndtri, stdtrit
 

@@ -10,7 +10,7 @@ penalty_i):
     TruncatedSVD(k)  penalty 0 up to k, infinite beyond it
     Ridge(lam)       penalty lam everywhere, or one lam per parameter, zero for those that are not held back
     MAP()            penalty 1: the tolerances are the standard deviations of a Gaussian prior; none where none is stated
-    MAP(Widened())   the default: the same, with all tolerances widened where the data contradict them
+    MAP(InflatedTolerances())   the default: the same, with all tolerances widened where the data contradict them
 
 What is penalised is the total deviation from nominal in units of tolerance, never the step, so the
 answer does not depend on the number of iterations. A new method is one more class here. See
@@ -26,14 +26,14 @@ from typing import Literal, Protocol
 import numpy as np
 
 from loopcal.errors import EstimationError
-from loopcal.estimate.conflict import Widened
-from loopcal.estimate.statistics import FEWEST_DEGREES
+from loopcal.estimate.inference.residual_test import FEWEST_DEGREES
+from loopcal.estimate.methods.prior_conflict import InflatedTolerances
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 Rule = Callable[[Decomposition], FloatArray | IntArray]
 """Chooses one number per trial, (t,), from a decomposition; see
-`loopcal.estimate.regularization_rules`.
+`loopcal.estimate.methods.regularization_rules`.
 """
 
 
@@ -204,7 +204,7 @@ class MAP:
 
     Parameters
     ----------
-    spread : factor on all tolerances, or a rule that chooses it, such as `Widened()`.
+    spread : factor on all tolerances, or a rule that chooses it, such as `InflatedTolerances()`.
     free : (p,) parameters that are not held back; `identify` puts in those without a stated
         tolerance.
     noise : "given": the rows are divided by their true sigma; "estimated": true up to one factor,
@@ -264,7 +264,7 @@ def _held(decomposition: Decomposition, lam: FloatArray) -> FloatArray:
     return held if decomposition.flat is None else np.where(decomposition.flat, free, held)
 
 
-def adapted(
+def adapt_method(
     method: Method | None, assumed: BoolArray, noise: Literal["given", "estimated"]
 ) -> Method:
     """Return the method for a robot and its data: the default where there is none, and what MAP
@@ -274,7 +274,7 @@ def adapted(
     ----------
     assumed : (p,) free parameters whose tolerance is not stated. noise : see `identify`.
     """
-    method = MAP(Widened()) if method is None else method
+    method = MAP(InflatedTolerances()) if method is None else method
     if not isinstance(method, MAP):
         return method
     free = method.free or (tuple(assumed.tolist()) if assumed.any() else ())

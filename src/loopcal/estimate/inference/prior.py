@@ -19,7 +19,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.errors import EstimationError, nearest
-from loopcal.estimate.posteriors import Posterior
+from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.rows import AnyRows
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import RANK_TOLERANCE

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopcal.estimate.combinations import listed
-from loopcal.estimate.penalties import MAP, Method
-from loopcal.estimate.scaling import Unknowns
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.inference.null_space import listed
+from loopcal.estimate.methods.penalties import MAP, Method
 from loopcal.typing import FloatArray
 
 FAR = 10.0
@@ -18,7 +18,9 @@ noise never does that.
 """
 
 
-def astray(free: Unknowns, deviation: FloatArray, method: Method, converged: bool) -> list[str]:
+def find_diverged(
+    free: FreeParameters, deviation: FloatArray, method: Method, converged: bool
+) -> list[str]:
     """Say which estimates left their stated tolerances by far, and what to do; nothing where
     tolerances are a prior.
 

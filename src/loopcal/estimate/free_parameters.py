@@ -24,7 +24,7 @@ this ratio.
 
 
 @dataclass(frozen=True, eq=False)
-class Unknowns:
+class FreeParameters:
     """The free parameters of a robot as the estimators see them: e = nominal + tolerance * z.
 
     Attributes
@@ -96,7 +96,7 @@ class Unknowns:
         )
 
 
-def unknowns(robot: Mechanism) -> Unknowns:
+def select_free_parameters(robot: Mechanism) -> FreeParameters:
     """Return the free parameters of a robot with the unit of each."""
     table = robot.parameters
     places = np.flatnonzero(table.free)
@@ -104,4 +104,4 @@ def unknowns(robot: Mechanism) -> Unknowns:
     assumed = np.isnan(table.tolerance[places])
     fallback = np.array([default.get(table.dimensions[i], DEFAULT) for i in places])
     tolerance = np.where(assumed, fallback, table.tolerance[places])
-    return Unknowns(robot, places, table.nominal[places], tolerance, assumed)
+    return FreeParameters(robot, places, table.nominal[places], tolerance, assumed)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from loopcal.errors import EstimationError
-from loopcal.estimate.penalties import Method
+from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.rows import AnyRows
 from loopcal.measure import Measurements, check_actuators
 from loopcal.mechanism import Mechanism
