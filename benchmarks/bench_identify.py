@@ -11,8 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.harness import Metric, measure_ratio, time_in_turns
-from loopcal.diagnose import leave_one_out
-from loopcal.diagnose.leave_one_out_errors import path_of_methods
+from loopcal.diagnose import build_regularization_path, score_leave_one_out
 from loopcal.estimate import MAP, LeastSquares, identify, identify_trials
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.rows import rows_of
@@ -94,10 +93,10 @@ def bench_filters() -> Metric:
     robot = load_robot("hexapod-42")
     data = _measured(robot, 50)
     fit = identify(robot, data, LeastSquares())
-    methods = path_of_methods(1.0, 40, 42)
+    methods = build_regularization_path(1.0, 40, 42)
     return measure_ratio(
         "identify.paths_of_one_fit",
-        lambda: leave_one_out(fit.robot, data, methods),
+        lambda: score_leave_one_out(fit.robot, data, methods),
         lambda: identify(robot, data, LeastSquares()),
         repeats=15,
         limit=5.0,

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from loopcal import geometry
-from loopcal.diagnose.conventions import IMPLAUSIBLE, arrival
+from loopcal.diagnose import IMPLAUSIBLE, compare_conventions
 from loopcal.errors import LoopcalError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.io import load_robot
@@ -92,7 +92,7 @@ def false_alarms(times: float) -> list:
     for seed, (robot, kind) in enumerate(cases(times)):
         data = measured(robot, kind, times, seed)
         if data is not None:
-            found = arrival(robot, data)
+            found = compare_conventions(robot, data)
             misfits.append(found.misfit)
             refused += found.refused
     said = np.array(misfits)[~np.isnan(misfits)]
@@ -190,7 +190,7 @@ def detected() -> list[list]:
     rows = []
     for name, kind, change, change_readings, words in tried:
         every = [(robot, slipped(robot, kind, change, change_readings)) for robot in machines]
-        found = [arrival(robot, data) for robot, data in every if data is not None]
+        found = [compare_conventions(robot, data) for robot, data in every if data is not None]
         named = sum(any(words in one for one in (f.other or "", *f.alike)) for f in found)
         rows.append(
             [name, len(found), sum(f.doubtful for f in found), sum(f.refused for f in found), named]

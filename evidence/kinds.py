@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.apply import validate
-from loopcal.diagnose.frame_motions import frame_motions
-from loopcal.diagnose.pose_error_figures import PoseErrors
+from loopcal.diagnose import PoseErrors, find_frame_motions
 from loopcal.errors import LoopcalError
 from loopcal.estimate import MAP, Identification, LeastSquares, identify, identify_trials
 from loopcal.estimate.identification import IdentifiedTrials
@@ -226,7 +225,7 @@ def recover(case: Case, seed: int = SEED) -> Recovery:
     except LoopcalError as error:
         return Recovery(0, len(robot.parameters), np.nan, np.nan, np.nan, np.nan, (), 0, str(error))
     checked = validate(fit, others)
-    motions = frame_motions(fit.posterior)
+    motions = find_frame_motions(fit.posterior)
     left = len(fit.names) - fit.rank - motions.count
     return Recovery(
         rank=fit.rank,

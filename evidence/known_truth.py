@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.diagnose.model_choice import choose_model
+from loopcal.diagnose import choose_model
 from loopcal.estimate import (
     GCV,
     MAP,

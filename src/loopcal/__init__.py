@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from loopcal.apply import compensate as compensate
     from loopcal.apply import pose_uncertainty as pose_uncertainty
     from loopcal.apply import validate as validate
-    from loopcal.diagnose import check_arrival as check_arrival
+    from loopcal.diagnose import check_conventions as check_conventions
+    from loopcal.diagnose import compare_with_truth as compare_with_truth
     from loopcal.diagnose import identifiability as identifiability
-    from loopcal.diagnose import parameter_error as parameter_error
     from loopcal.errors import LoopcalError as LoopcalError
     from loopcal.estimate import MAP as MAP
     from loopcal.estimate import Huber as Huber
@@ -74,7 +74,7 @@ _WHERE = {
             "pose_uncertainty",
             "validate",
         ),
-        "loopcal.diagnose": ("check_arrival", "identifiability", "parameter_error"),
+        "loopcal.diagnose": ("check_conventions", "compare_with_truth", "identifiability"),
         "loopcal.errors": ("LoopcalError",),
         "loopcal.estimate": (
             "Huber",

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from loopcal import geometry, load_robot
 from loopcal.apply.accuracy import accuracy_map, pose_uncertainty
 from loopcal.apply.accuracy_simulation import monte_carlo
-from loopcal.diagnose.frame_motions import frame_motions
+from loopcal.diagnose import find_frame_motions
 from loopcal.errors import EstimationError
 from loopcal.estimate import MAP, LeastSquares, identify
 from loopcal.measure import sample_truth, simulate
@@ -146,7 +146,7 @@ def test_an_unknown_place_of_the_base_is_found_as_six_motions_of_the_base(fit):
     if fit.names[:3] != ("leg1.base.x", "leg1.base.y", "leg1.base.z"):
         pytest.fail("this test counts on the order of the hexapod's parameters")
     known = base_motion_unknown(fit)
-    motions = frame_motions(known)
+    motions = find_frame_motions(known)
     assert (motions.count, motions.frames) == (6, ("base",))
     assert np.abs(motions.kept).max() < 1e-9
     assert np.isfinite(pose_uncertainty(known, WHERE).sd).all()
@@ -155,7 +155,7 @@ def test_an_unknown_place_of_the_base_is_found_as_six_motions_of_the_base(fit):
 
 def test_what_is_no_motion_of_a_frame_stays_infinite(fit):
     known = base_motion_unknown(fit, extra=fit.names.index("leg2.length"))
-    assert frame_motions(known).count == 6
+    assert find_frame_motions(known).count == 6
     assert np.isinf(pose_uncertainty(known, WHERE).sd).all()
 
 

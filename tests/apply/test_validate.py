@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from loopcal.apply import validate
-from loopcal.diagnose import pose_errors
-from loopcal.diagnose.set_up_anew import set_up_anew
+from loopcal.diagnose import compute_pose_errors, find_moved_setups
 from loopcal.errors import DataError
 from loopcal.estimate import identify
 from loopcal.io.core.json_text import to_json
@@ -45,7 +44,7 @@ def validation(parts):
 
 
 def test_indices_are_the_formulas():
-    errors = pose_errors(np.array([[3.0, 0.0, -4.0]]) * MM, np.array([[2e-3, 0.0, 0.0]]))
+    errors = compute_pose_errors(np.array([[3.0, 0.0, -4.0]]) * MM, np.array([[2e-3, 0.0, 0.0]]))
     assert errors.position[0] == pytest.approx(5 * MM)
     assert errors.orientation[0] == pytest.approx(2e-3)
     assert errors.integrated[0] == pytest.approx(5.002)  # mm + rad
@@ -54,7 +53,7 @@ def test_indices_are_the_formulas():
 
 
 def test_what_was_not_measured_has_no_index():
-    heights = pose_errors(
+    heights = compute_pose_errors(
         np.array([[np.nan, np.nan, 1.0], [np.nan, np.nan, np.nan]]) * MM, np.zeros((2, 0))
     )
     assert heights.position[0] == pytest.approx(MM)
@@ -164,23 +163,23 @@ def sizes_if_moved(*moved, base=1.0, by=50.0, left=30):
 
 
 def test_of_several_kept_frames_the_moved_ones_are_named():
-    found = set_up_anew(("trk", "tool", "probe"), sizes_if_moved("trk", "probe"))
+    found = find_moved_setups(("trk", "tool", "probe"), sizes_if_moved("trk", "probe"))
     assert found is not None
     assert found.names == ("trk", "probe")
     assert found.times == pytest.approx(50.0)
     assert found.sentence.endswith("use --refit trk --refit probe")
     # a shift of the frame is a shift of the target: refitting either is enough, so that neither
     # alone brings it back
-    either = set_up_anew(("trk", "tool"), lambda refit: (1.0 if refit else 50.0, 30))
+    either = find_moved_setups(("trk", "tool"), lambda refit: (1.0 if refit else 50.0, 30))
     assert either is not None
     assert either.names == ("trk", "tool")
 
 
 def test_nothing_is_said_of_frames_where_errors_are_noise_alike_or_rows_are_few():
-    assert set_up_anew((), sizes_if_moved()) is None
-    assert set_up_anew(("trk",), sizes_if_moved("trk", by=2.5, base=0.5)) is None
-    assert set_up_anew(("trk",), sizes_if_moved("trk", by=50.0, base=20.0)) is None
-    assert set_up_anew(("trk",), sizes_if_moved("trk", left=7)) is None
+    assert find_moved_setups((), sizes_if_moved()) is None
+    assert find_moved_setups(("trk",), sizes_if_moved("trk", by=2.5, base=0.5)) is None
+    assert find_moved_setups(("trk",), sizes_if_moved("trk", by=50.0, base=20.0)) is None
+    assert find_moved_setups(("trk",), sizes_if_moved("trk", left=7)) is None
 
 
 def test_what_is_not_known_of_the_geometry_before_is_noted_as_found_from_these_rows():

@@ -12,9 +12,15 @@ import numpy as np
 import pytest
 
 from loopcal import geometry
-from loopcal.diagnose.conventions import ALLOWED, BETTER, IMPLAUSIBLE, arrival, check_arrival
-from loopcal.diagnose.interpretations import hypotheses, readings_hypotheses
-from loopcal.diagnose.read_as import ReadAs
+from loopcal.diagnose.conventions import (
+    ALLOWED,
+    BETTER,
+    IMPLAUSIBLE,
+    check_conventions,
+    compare_conventions,
+)
+from loopcal.diagnose.interpretations import list_interpretations, list_reading_interpretations
+from loopcal.diagnose.read_as import InterpretedData
 from loopcal.errors import DataError, LoopcalError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.io import load_robot
@@ -186,7 +192,7 @@ SLIPS = {
 def test_a_slip_is_refused_with_what_fits_instead(slip) -> None:
     name, kind, change, words = SLIPS[slip]
     data = changed(measured(name, kind), change)
-    found = arrival(robot_of(name), data)
+    found = compare_conventions(robot_of(name), data)
     assert found.refused, found
     named = (found.other or "", *found.alike)
     assert any(words in one for one in named), named
@@ -214,7 +220,7 @@ READINGS = {
 def test_a_slip_of_the_readings_is_refused_with_what_fits_instead(slip) -> None:
     name, change, words = READINGS[slip]
     data = measured(name, Position())
-    found = arrival(robot_of(name), replace(data, readings=change(data.readings)))
+    found = compare_conventions(robot_of(name), replace(data, readings=change(data.readings)))
     assert words in (found.other or ""), found
 
 
@@ -243,7 +249,7 @@ def test_a_slip_is_seen_through_blunders() -> None:
         measured("hexapod-42", Position(unknown=("frame",)), n=20), scaled(slice(None), 0.1)
     )
     bad = changed(data, lambda values: values.__setitem__((slice(3, 5), 0), values[3:5, 0] + 0.01))
-    found = arrival(robot_of("hexapod-42"), bad)
+    found = compare_conventions(robot_of("hexapod-42"), bad)
     assert "lengths 10 times larger" in (found.other or ""), found
 
 
@@ -251,20 +257,20 @@ def test_a_unit_is_named_where_a_constant_in_its_place_leaves_no_frame_to_be_fou
     data = changed(
         measured("linear-delta", Position(unknown=("frame",)), n=20), scaled(slice(None), 1e3)
     )
-    found = arrival(robot_of("linear-delta"), data)
+    found = compare_conventions(robot_of("linear-delta"), data)
     assert "lengths 1000 times smaller" in (found.other or ""), found
 
 
 def test_blunders_alone_are_left_to_their_own_check() -> None:
     data = measured("hexapod-42", Position(unknown=("frame",)), n=20)
     bad = changed(data, lambda values: values.__setitem__((slice(3, 5), 0), values[3:5, 0] + 0.1))
-    found = arrival(robot_of("hexapod-42"), bad)
+    found = compare_conventions(robot_of("hexapod-42"), bad)
     assert not found.refused
     assert found.misfit < IMPLAUSIBLE  # without the two rows all is well
     assert found.sentence.startswith(
         "2 of 20 rows that were compared do not fit the others by far (poses 4 and 5); check"
     )
-    assert arrival(robot_of("hexapod-42"), data).sentence == ""
+    assert compare_conventions(robot_of("hexapod-42"), data).sentence == ""
 
 
 WITH_EVERY_KIND = ("3-prs",)
@@ -290,7 +296,7 @@ def test_true_data_of_robots_three_times_beyond_their_tolerances_pass() -> None:
         except LoopcalError:
             continue  # this kind has nothing to look at on this robot, or the robot cannot follow
         count += 1
-        assert not arrival(robot_of(name), data).doubtful, (name, kind.name)
+        assert not compare_conventions(robot_of(name), data).doubtful, (name, kind.name)
     assert count >= len(KINDS) + 6
 
 
@@ -298,7 +304,7 @@ def test_true_data_of_robots_three_times_beyond_their_tolerances_pass() -> None:
 def test_true_data_of_a_robot_far_off_its_tolerances_are_not_refused(name) -> None:
     """Forty tolerances off: implausible, all others are tried, and none fits far better."""
     data = measured(name, Position(), times=40.0)
-    found = arrival(robot_of(name), data)
+    found = compare_conventions(robot_of(name), data)
     assert found.doubtful
     assert not found.refused
     assert "no other unit, order, sign or column explains it; check the noise" in found.sentence
@@ -323,7 +329,7 @@ def test_heights_that_should_be_zero_are_no_evidence_of_a_unit() -> None:
         0,
         controller=robot,
     )
-    found = arrival(robot, data)
+    found = compare_conventions(robot, data)
     assert found.doubtful
     assert not found.refused, found
 
@@ -338,15 +344,15 @@ def test_data_of_nothing_are_noted_after_few_readings_were_judged(monkeypatch) -
     )  # [m], as far as the machine moves
     data = changed(data, lambda values: values.__iadd__(noise))
     poses: list[int] = []
-    whole = ReadAs.misfits
+    whole = InterpretedData.misfits
 
-    def counted(self: ReadAs):
+    def counted(self: InterpretedData):
         if not self.quick:
             poses.append(self.data.n_poses)
         return whole(self)
 
-    monkeypatch.setattr(ReadAs, "misfits", counted)
-    found = arrival(robot_of("linear-delta"), data)
+    monkeypatch.setattr(InterpretedData, "misfits", counted)
+    found = compare_conventions(robot_of("linear-delta"), data)
     assert found.misfit > 100.0
     assert not found.refused
     assert (
@@ -358,7 +364,7 @@ def test_too_few_rows_say_nothing() -> None:
     data = changed(
         measured("hexapod-42", Position(unknown=("frame",)), n=4), scaled([0, 1, 2], 1e3)
     )
-    found = arrival(robot_of("hexapod-42"), data)
+    found = compare_conventions(robot_of("hexapod-42"), data)
     assert np.isnan(found.misfit)
     assert not found.refused
 
@@ -372,7 +378,7 @@ def test_of_two_joined_instruments_the_one_in_the_wrong_unit_is_named() -> None:
     data = simulate(robot, at, Instrument(sensors), 0)
     tracker, level = data.observations
     level = replace(level, measured=level.measured * np.pi / 180.0)
-    found = arrival(robot, replace(data, observations=(tracker, level)))
+    found = compare_conventions(robot, replace(data, observations=(tracker, level)))
     assert found.other == "angles of kind 'inclination' 57.3 times larger (rad written as deg)"
 
 
@@ -381,12 +387,16 @@ def test_of_two_files_of_one_kind_the_one_that_is_written_otherwise_is_named() -
     rows = data.observations[0]
     parts = rows.take(np.arange(8)), rows.take(np.arange(8, 16))
     inches = replace(parts[1], measured=parts[1].measured / 25.4)
-    found = arrival(robot, replace(data, observations=(parts[0], inches)), ("a.csv", "b.csv"))
+    found = compare_conventions(
+        robot, replace(data, observations=(parts[0], inches)), ("a.csv", "b.csv")
+    )
     assert found.other == "lengths of b.csv 25.4 times larger (inches written as mm)"
     readings = np.concatenate([data.readings[:8], 0.1 * data.readings[8:]])
-    found = arrival(robot, replace(data, observations=parts, readings=readings), ("a.csv", "b.csv"))
+    found = compare_conventions(
+        robot, replace(data, observations=parts, readings=readings), ("a.csv", "b.csv")
+    )
     assert found.other == "readings of b.csv 10 times larger (cm written as mm)"
-    unnamed = readings_hypotheses(
+    unnamed = list_reading_interpretations(
         replace(data, observations=parts), ("q1", "q2", "q3"), (Dimension.LENGTH,) * 3
     )
     assert "readings of part 2 of the data 10 times larger (cm written as mm)" in {
@@ -411,16 +421,16 @@ def test_what_is_absent_fixed_or_unread_neither_hides_a_slip_nor_looks_like_one(
         (robot, changed(wrong, lambda values: values.__setitem__(holes, np.nan)), True),
         (robot, replace(data, readings=readings, reading_sigma=sigma), False),
     ):
-        found = arrival(machine, some)
+        found = compare_conventions(machine, some)
         assert found.refused == slip
         assert ("lengths 1000 times smaller" in (found.other or "")) == slip
     for nothing in (data.reweighted(np.zeros(10)), replace(data, observations=())):
-        assert np.isnan(arrival(robot, nothing).misfit)
+        assert np.isnan(compare_conventions(robot, nothing).misfit)
 
 
 def test_large_data_are_judged_by_runs_of_neighbours_and_rows_one_off_are_seen_in_them() -> None:
     data = measured("linear-delta", Position(), n=200)
-    found = arrival(
+    found = compare_conventions(
         robot_of("linear-delta"), replace(data, readings=np.roll(data.readings, 1, axis=0))
     )
     assert found.other == "every row belonging to the readings of the row below"
@@ -429,7 +439,9 @@ def test_large_data_are_judged_by_runs_of_neighbours_and_rows_one_off_are_seen_i
 @pytest.mark.slow
 def test_readings_that_the_robot_cannot_reach_are_explained() -> None:
     data = measured("linear-delta", Position(), n=4)
-    found = arrival(robot_of("linear-delta"), replace(data, readings=data.readings * 1e3))
+    found = compare_conventions(
+        robot_of("linear-delta"), replace(data, readings=data.readings * 1e3)
+    )
     assert (
         "the robot reaches only 0 of 4 poses that were tried with these readings; with readings "
         "1000 times" in found.sentence
@@ -451,12 +463,12 @@ def test_the_published_table_names_its_own_euler_order() -> None:
     values = printed.measured_poses.values / TO_PRINTED
     sigma = printed.measured_poses.unit * np.array([MM] * 3 + [1.0] * 3) / np.sqrt(12.0)
     right = measurements(study, values, sigma)
-    assert not arrival(robot, right).refused
+    assert not compare_conventions(robot, right).refused
     kind = Pose(form_name(printed.order)).mounted(robot.tool)
     rows = Observations.from_sigma(
         kind, np.arange(len(values)), np.roll(values, 3, axis=1), np.roll(sigma, 3, axis=1)
     )
-    found = arrival(robot, replace(right, observations=(rows,)))
+    found = compare_conventions(robot, replace(right, observations=(rows,)))
     assert found.other == f"rotations read as {form_name(ORDER)}"
     assert found.misfit > 100.0 * found.other_misfit
 
@@ -467,8 +479,8 @@ def test_the_message_names_the_override_and_the_override_works() -> None:
     with pytest.raises(
         DataError, match=r"correct the unit in the header, or use --allow-implausible$"
     ):
-        check_arrival(robot, data, overrides=("--allow-still", "--allow-implausible"))
-    assert np.isnan(check_arrival(robot, data, allow_implausible=True).misfit)
+        check_conventions(robot, data, overrides=("--allow-still", "--allow-implausible"))
+    assert np.isnan(check_conventions(robot, data, allow_implausible=True).misfit)
     still = changed(
         measured("hexapod-42", Position()),
         lambda values: values.__setitem__(slice(1, None), values[0]),
@@ -478,7 +490,7 @@ def test_the_message_names_the_override_and_the_override_works() -> None:
         match=r"never moves: its readings stay within 0 mm, but the robot moves it by "
         r".*allow_still=True",
     ):
-        check_arrival(robot, still)
+        check_conventions(robot, still)
 
 
 def test_every_hypothesis_is_another_reading_in_the_same_shape() -> None:
@@ -489,7 +501,7 @@ def test_every_hypothesis_is_another_reading_in_the_same_shape() -> None:
                 data = measured("hexapod-42", kind, n=5)
             except LoopcalError:
                 continue
-            for way in hypotheses(data):
+            for way in list_interpretations(data):
                 rows = way.applied(data).observations[0]
                 assert rows.measured.shape == data.observations[0].measured.shape
                 assert not np.allclose(
@@ -500,5 +512,5 @@ def test_every_hypothesis_is_another_reading_in_the_same_shape() -> None:
     assert seen == set(KINDS)
     names, lengths = ("q1", "q2", "q3"), (Dimension.LENGTH,) * 3
     data = measured("linear-delta", Position(), n=5)
-    ways = [way.words for way in readings_hypotheses(data, names, lengths)]
+    ways = [way.words for way in list_reading_interpretations(data, names, lengths)]
     assert len(set(ways)) == len(ways) == 6 + 1 + 3 + 3 + 1 + 2  # units, signs, pairs, order, rows

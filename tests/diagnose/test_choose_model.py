@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.diagnose import choose_model, cross_validate, nested_sets
-from loopcal.diagnose.cross_validation import folds
+from loopcal.diagnose import choose_model, cross_validate, nest_parameter_sets
+from loopcal.diagnose.cross_validation import draw_folds
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import LeastSquares, identify
 from loopcal.io import load_robot
@@ -26,14 +26,14 @@ def lengths_only(seed: int = 0):
 
 def test_every_pose_is_held_out_once_and_blocks_are_kept_together():
     data = replace(hexapod_data(30), block=np.arange(30) // 3)
-    parts = folds(data, 5, 1)
+    parts = draw_folds(data, 5, 1)
     assert sorted(np.concatenate(parts)) == list(range(30))
     assert {len(part) for part in parts} == {6}
     for part in parts:
         assert len(np.unique(data.block[part])) == 2
-    assert all(np.array_equal(a, b) for a, b in zip(parts, folds(data, 5, 1), strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(parts, draw_folds(data, 5, 1), strict=True))
     with pytest.raises(DataError, match="11 folds of 10 blocks"):
-        folds(data, 11, 1)
+        draw_folds(data, 11, 1)
 
 
 def test_unseen_poses_are_predicted_to_the_noise_and_worse_than_fitted_ones():
@@ -73,8 +73,8 @@ def test_a_perfect_machine_seen_by_a_poor_instrument_is_left_alone():
 
 def test_sets_of_the_shipped_names():
     robot = load_robot("3-prs")
-    assert list(nested_sets(robot)) == ["offsets", "lengths", "ideal", "complete"]
-    sets = nested_sets(robot)
+    assert list(nest_parameter_sets(robot)) == ["offsets", "lengths", "ideal", "complete"]
+    sets = nest_parameter_sets(robot)
     assert sets["offsets"] == ("q1", "q2", "q3")
     assert set(sets["lengths"]) == {"q1", "q2", "q3", "l1", "l2", "l3"}
     assert len(sets["complete"]) == 33

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from loopcal.apply import validate
-from loopcal.diagnose import parameter_error
+from loopcal.diagnose import compare_with_truth
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import LeastSquares, identify
 from loopcal.io.core.json_text import to_json
@@ -31,7 +31,7 @@ def fit():
 
 
 def test_what_an_unknown_frame_leaves_open_is_projected_out_and_named(fit):
-    found = parameter_error(fit, zoo.hexapod_truth())
+    found = compare_with_truth(fit, zoo.hexapod_truth())
     assert len(found.dropped) == 6
     assert np.abs(found.raw).max() > 0.01e-3  # [m] the base may sit anywhere within the errors
     assert (
@@ -52,15 +52,17 @@ def test_a_truth_moved_along_what_is_open_gives_the_same_error(fit):
     rng = np.random.default_rng(0)
     open_ = known.directions[:, ~known.seen]
     move = known.unit * (open_ @ rng.standard_normal(open_.shape[1]))
-    one, other = (parameter_error(fit, zoo.hexapod_truth() + step) for step in (0.0, move))
+    one, other = (compare_with_truth(fit, zoo.hexapod_truth() + step) for step in (0.0, move))
     np.testing.assert_allclose(one.error, other.error, atol=1e-15)  # [m] double rounding
     seen = known.unit * known.directions[:, known.seen][:, 0]
-    assert np.abs(parameter_error(fit, zoo.hexapod_truth() + seen).error - one.error).max() > 1e-6
+    assert (
+        np.abs(compare_with_truth(fit, zoo.hexapod_truth() + seen).error - one.error).max() > 1e-6
+    )
 
 
 def test_where_all_is_determined_nothing_is_dropped():
     fit = identify(hexapod(), hexapod_data(20), LeastSquares())
-    found = parameter_error(fit, zoo.hexapod_truth())
+    found = compare_with_truth(fit, zoo.hexapod_truth())
     assert found.dropped == ()
     np.testing.assert_array_equal(found.error, found.tolerances * fit.tolerance)
     np.testing.assert_allclose(found.error, found.raw, rtol=1e-12)
@@ -74,7 +76,7 @@ def test_a_truth_of_another_robot_is_refused(fit, truth, said):
     with pytest.raises(
         EstimationError, match=f"{said}.*give 42 values for all parameters of 'hexapod'"
     ):
-        parameter_error(fit, truth)
+        compare_with_truth(fit, truth)
 
 
 def test_validation_keeps_the_frame_of_the_fit_or_says_after_which_best_fit_it_compares(fit):

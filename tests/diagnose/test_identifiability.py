@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from loopcal.diagnose import identifiability
-from loopcal.diagnose.observability import observability
+from loopcal.diagnose.observability import compute_observability
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.inference.null_space import describe_null_space
@@ -124,15 +124,15 @@ def test_directions_known_no_better_than_their_tolerance_are_named_the_weakest_f
 def test_indices_are_those_of_the_definitions():
     A = np.random.default_rng(0).normal(size=(30, 5))
     s = np.asarray(np.linalg.svd(A, compute_uv=False), dtype=float)
-    found = observability(s, 5, 30)
+    found = compute_observability(s, 5, 30)
     assert found.o1**10 * 30**5 == pytest.approx(np.linalg.det(A.T @ A), rel=1e-12)  # rounding
     assert (found.o2, found.o3, found.o4) == pytest.approx(
         (1 / np.linalg.cond(A), s[-1], s[-1] ** 2 / s[0])
     )
     assert found.o5 == pytest.approx(1 / sum(1 / s))
-    cut = observability(np.append(s, 1e-17), 5, 30)
+    cut = compute_observability(np.append(s, 1e-17), 5, 30)
     assert (cut.o3, cut.left_out) == (found.o3, 1)
-    assert observability(np.zeros(3), 0, 4).o1 == 0.0
+    assert compute_observability(np.zeros(3), 0, 4).o1 == 0.0
     assert "rows divided by sigma, columns multiplied by tolerance" in str(found)
 
 

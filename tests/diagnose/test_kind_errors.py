@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from loopcal.apply import validate
-from loopcal.diagnose.kind_errors import kind_errors
+from loopcal.diagnose import compute_kind_errors
 from loopcal.io import load_robot
 from loopcal.measure import (
     Component,
@@ -41,7 +41,7 @@ def test_errors_are_divided_by_sigma_for_each_kind_and_summed_over_all():
     positions = replace(positions, measured=measured)
     before = [np.full((4, 1), 80 * UM), np.full((2, 3), 300 * UM)]
     after = [np.full((4, 1), 20 * UM), np.full((2, 3), 600 * UM)]
-    one, two, every = kind_errors([heights, positions], before, after)
+    one, two, every = compute_kind_errors([heights, positions], before, after)
     assert [(k.kind, k.count) for k in (one, two, every)] == [
         ("component", 4),
         ("position", 5),

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from loopcal.diagnose.leave_one_out_errors import leave_one_out, path_of_methods
+from loopcal.diagnose.leave_one_out_errors import build_regularization_path, score_leave_one_out
 from loopcal.estimate import MAP, LeastSquares, Ridge, TruncatedSVD, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.rows import rows_of
@@ -15,7 +15,7 @@ DATA = hexapod_data(14, instrument=tracker(20e-6, 100e-6))
 
 @pytest.mark.parametrize("method", [LeastSquares(), MAP(), Ridge(30.0)])
 def test_scores_are_those_of_refits_of_the_linear_problem(method):
-    found = leave_one_out(hexapod(), DATA, (method,))
+    found = score_leave_one_out(hexapod(), DATA, (method,))
     rows = rows_of(select_free_parameters(hexapod()), DATA)
     A = np.concatenate(
         [part.reshape(-1, 43) for kinds in rows.linearised(np.zeros((1, 42))) for _, part in kinds]
@@ -32,8 +32,8 @@ def test_scores_are_those_of_refits_of_the_linear_problem(method):
 
 def test_a_whole_path_is_scored_and_its_ends_are_known():
     fit = identify(hexapod(), DATA)
-    methods = path_of_methods(1.0, 40, 42)
-    found = leave_one_out(fit.robot, DATA, methods)
+    methods = build_regularization_path(1.0, 40, 42)
+    found = score_leave_one_out(fit.robot, DATA, methods)
     assert len(found.score) == 40 + 43
     assert found.dof[40] == 0.0
     assert found.dof[-1] == pytest.approx(42.0)

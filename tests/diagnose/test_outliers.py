@@ -10,8 +10,8 @@ import pytest
 from scipy.stats import binom, chi2
 
 from loopcal.diagnose import find_outliers
-from loopcal.diagnose.examination import examine
-from loopcal.diagnose.influence import Influence, influence
+from loopcal.diagnose.examination import examine_fit
+from loopcal.diagnose.influence import Influence, compute_influence
 from loopcal.diagnose.outliers import _in_turn, _search, _sentence, _State
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import MAP, Huber, LeastSquares, Tukey, identify
@@ -113,7 +113,7 @@ def test_the_shortcut_is_the_residual_of_a_refit_without_the_block(method):
         return d, penalty, d.deviation(d.solution(penalty))
 
     d, penalty, at = fitted(np.ones(12))
-    found = influence(rows, member, d, penalty, np.ones(6), z, at)
+    found = compute_influence(rows, member, d, penalty, np.ones(6), z, at)
     A = np.concatenate([part.reshape(-1, 43) for kinds in rows.linearised(z) for _, part in kinds])
     for j in range(6):
         own = slice(12 * j, 12 * j + 12)
@@ -132,7 +132,7 @@ def test_the_shortcut_is_the_residual_of_a_refit_without_the_block(method):
         # the same from a fit in which the block has no weight
         outside = (np.arange(6) != j).astype(float)
         d_j, penalty_j, at_j = fitted(outside[member])
-        again = influence(rows, member, d_j, penalty_j, outside, z, at_j)
+        again = compute_influence(rows, member, d_j, penalty_j, outside, z, at_j)
         assert again.distance[j] == pytest.approx(expected, rel=1e-6)
         assert again.leverage[j] == 0.0
     if method == LeastSquares():
@@ -266,7 +266,7 @@ def test_with_one_degree_of_freedom_a_disagreement_is_told_and_nobody_is_blamed(
     assert len(group.poses) == 7
     assert group.times == pytest.approx(np.sqrt(fit.chi_square), rel=1e-3)  # not linear over 1 mm
     assert "7 of 7 blocks of rows disagree, and which is wrong cannot be told" in found.sentence
-    assert "which one is wrong cannot be told" in " ".join(examine(fit, data).sentences)
+    assert "which one is wrong cannot be told" in " ".join(examine_fit(fit, data).sentences)
 
 
 def test_with_one_degree_of_freedom_and_unknown_noise_nothing_is_said_to_fit():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from loopcal.diagnose import identifiability
-from loopcal.diagnose.parameter_subset import reduce
+from loopcal.diagnose.parameter_subset import choose_identifiable_subset
 from loopcal.errors import MechanismError
 from loopcal.estimate.outlook import scene
 from loopcal.io import load_robot
@@ -43,7 +43,7 @@ def test_fourteen_natural_parameters_a_chain_reduce_to_eleven_by_dropping_bz_thb
     robot = with_line("3-prs", "parameters: fourteen")
     found = identifiability(robot, tracker(), poses=36)
     assert (found.rank, found.n_parameters) == (33, 42)
-    smaller = reduce(found)
+    smaller = choose_identifiable_subset(found)
     assert {m.name for m in smaller.dropped} == called("bz", "thBz", "thCy")
     assert smaller.kept == load_robot("3-prs").parameters.names
     words = {m.name: str(m) for m in smaller.dropped}
@@ -58,7 +58,7 @@ def test_twenty_seven_parameters_of_the_tracker_reduce_to_26_by_merging_the_two_
     found = identifiability(
         with_line("ru-pus-prs", "parameters: twenty-seven"), tracker(), poses=36
     )
-    (merged,) = reduce(found).dropped
+    (merged,) = choose_identifiable_subset(found).dropped
     assert found.rank == 26
     assert {merged.name, *merged.into} == {"thOz", "thU1z"}
     assert str(merged).endswith("counts as thOz +1 deg")
@@ -71,7 +71,7 @@ def test_twenty_seven_parameters_of_the_tracker_reduce_to_26_by_merging_the_two_
 def test_what_is_merged_moves_what_was_measured_as_its_replacement_does(unknown):
     instrument = Instrument((Sensor(Pose(unknown=unknown), tracker().sensors[0].noise),))
     found = identifiability(hexapod(), hexapod_data(60, instrument=instrument))
-    smaller = reduce(found)
+    smaller = choose_identifiable_subset(found)
     free = found.unknowns
     assert len(smaller.kept) == found.rank
     s = np.linalg.svd(
@@ -93,7 +93,7 @@ def test_what_is_merged_moves_what_was_measured_as_its_replacement_does(unknown)
 
 
 def test_a_full_set_stays_whole_and_says_so():
-    smaller = reduce(identifiability(hexapod(), hexapod_data(60)))
+    smaller = choose_identifiable_subset(identifiability(hexapod(), hexapod_data(60)))
     assert smaller.dropped == ()
     assert str(smaller) == "all 42 parameters can be told apart: none is left out"
 
@@ -101,7 +101,7 @@ def test_a_full_set_stays_whole_and_says_so():
 def test_the_written_file_loads_keeps_its_comments_and_loses_nothing(tmp_path):
     robot = load_robot("3-prs")
     found = identifiability(robot, five_dof(), poses=36)
-    smaller = reduce(found)
+    smaller = choose_identifiable_subset(found)
     path = tmp_path / "smaller.yaml"
     path.write_text(
         format_reduced_robot(smaller.robot, {m.name: m.words() for m in smaller.dropped}), "utf-8"
@@ -135,7 +135,7 @@ def test_a_robot_without_a_file_cannot_be_shortened():
 
 
 def test_the_json_says_the_same():
-    smaller = reduce(identifiability(load_robot("3-prs"), five_dof(), poses=36))
+    smaller = choose_identifiable_subset(identifiability(load_robot("3-prs"), five_dof(), poses=36))
     document = json.loads(to_json(smaller.to_dict()))
     assert [m["name"] for m in document["dropped"]] == ["a2y"]
     assert document["dropped"][0]["into"] == ["a1y", "a3y"]

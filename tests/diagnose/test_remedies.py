@@ -4,7 +4,7 @@
 import pytest
 
 from loopcal.diagnose import identifiability
-from loopcal.diagnose.suggestions import remedies
+from loopcal.diagnose.suggestions import suggest_measurements
 from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import KINDS, Instrument, Pose, Sensor
@@ -12,7 +12,7 @@ from tests.estimate.problems import five_dof, hexapod, hexapod_data, tracker
 
 
 def test_torsion_is_what_the_3_prs_lacks():
-    (remedy,) = remedies(identifiability(load_robot("3-prs"), five_dof(), poses=36))
+    (remedy,) = suggest_measurements(identifiability(load_robot("3-prs"), five_dof(), poses=36))
     assert remedy.cures[0].words == "psi"
     assert str(remedy).startswith(
         "a1y, a2y and a3y: measuring psi as well would determine them (a1y to 0."
@@ -36,7 +36,9 @@ def test_torsion_is_what_the_3_prs_lacks():
 @pytest.mark.parametrize(("unknown", "datum"), [("frame", "the pose"), ("tool", "the pose")])
 def test_a_known_frame_is_what_an_unknown_one_lacks(unknown, datum):
     instrument = Instrument((Sensor(Pose(unknown=(unknown,)), tracker().sensors[0].noise),))
-    found = remedies(identifiability(hexapod(), hexapod_data(60, instrument=instrument)))
+    found = suggest_measurements(
+        identifiability(hexapod(), hexapod_data(60, instrument=instrument))
+    )
     assert len(found) == 6
     for remedy in found:
         words = {cure.words for cure in remedy.cures}
@@ -51,7 +53,7 @@ def test_what_no_pose_depends_on_only_a_sensor_on_the_joint_could_tell(tmp_path)
     )
     found = {
         r.combination.names[0]: r
-        for r in remedies(identifiability(load_robot(path), tracker(), poses=36))
+        for r in suggest_measurements(identifiability(load_robot(path), tracker(), poses=36))
     }
     assert str(found["thB1z"]) == "thB1z: none of the known kinds of measurement would tell; fix it"
     assert {cure.words for cure in found["thC1y"].cures} == {"the joint chain1.joint"}
@@ -59,13 +61,13 @@ def test_what_no_pose_depends_on_only_a_sensor_on_the_joint_could_tell(tmp_path)
 
 
 def test_nothing_is_proposed_where_nothing_is_open():
-    assert remedies(identifiability(hexapod(), hexapod_data(60))) == ()
+    assert suggest_measurements(identifiability(hexapod(), hexapod_data(60))) == ()
 
 
 def test_every_cure_is_of_a_known_kind_and_leaves_less():
     found = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
     before = {v.name: v.left for v in found.parameters}
-    (remedy,) = remedies(found)
+    (remedy,) = suggest_measurements(found)
     for cure in remedy.cures:
         assert cure.kind in KINDS
         assert cure.left < before[remedy.combination.names[0]]
@@ -75,7 +77,7 @@ def test_every_cure_is_of_a_known_kind_and_leaves_less():
 def test_a_robot_without_a_workspace_is_looked_at_about_home():
     found = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
     assert not hexapod().assembly.workspace
-    assert "psi" in {cure.words for cure in remedies(found)[0].cures}
+    assert "psi" in {cure.words for cure in suggest_measurements(found)[0].cures}
 
 
 TRANSLATIONAL = """\
@@ -112,7 +114,7 @@ def test_what_is_measured_in_full_already_is_no_remedy(tmp_path):
     path.write_text(TRANSLATIONAL)
     found = identifiability(load_robot(path), tracker(), poses=60)
     assert found.rank < found.n_parameters
-    for remedy in remedies(found):
+    for remedy in suggest_measurements(found):
         assert not {"psi", "theta", "phi and theta", "the pose"} & {
             cure.words for cure in remedy.cures
         }, str(remedy)

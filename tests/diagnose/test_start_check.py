@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from loopcal.diagnose import Start, start_check
+from loopcal.diagnose import StartVerdict, check_start_values
 from loopcal.estimate import Huber, Tukey, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.inference.prior import Prior
@@ -15,8 +15,8 @@ from tests.estimate.problems import hexapod, hexapod_data
 
 def test_a_start_at_the_truth_is_as_good_as_the_fit_within_the_noise() -> None:
     truth = hexapod().with_values(zoo.hexapod_truth())
-    found = start_check(identify(truth, hexapod_data()))
-    assert found.verdict is Start.WITHIN_NOISE
+    found = check_start_values(identify(truth, hexapod_data()))
+    assert found.verdict is StartVerdict.WITHIN_NOISE
     assert found.p_value > 1e-3
     # 180 equations, 42 parameters: the truth leaves 1 sigma, the fit sqrt(138 / 180) of it
     assert found.before == pytest.approx(1.0, abs=0.2)
@@ -25,28 +25,28 @@ def test_a_start_at_the_truth_is_as_good_as_the_fit_within_the_noise() -> None:
 
 @pytest.mark.parametrize("noise", ["given", "estimated"])
 def test_a_nominal_start_is_not_calibrated(noise) -> None:
-    found = start_check(identify(hexapod(), hexapod_data(), noise=noise))
-    assert found.verdict is Start.NOT_CALIBRATED
+    found = check_start_values(identify(hexapod(), hexapod_data(), noise=noise))
+    assert found.verdict is StartVerdict.NOT_CALIBRATED
     assert found.p_value < 1e-6
     assert found.before > 10 * found.after
 
 
 def test_the_fit_itself_is_the_best_start() -> None:
     first = identify(hexapod(), hexapod_data())
-    assert start_check(identify(first.robot, hexapod_data())).verdict is Start.BEST
+    assert check_start_values(identify(first.robot, hexapod_data())).verdict is StartVerdict.BEST
 
 
 @pytest.mark.parametrize("loss", [Huber(), Tukey()])
 def test_a_loss_does_not_make_the_nominal_start_look_calibrated(loss) -> None:
     """Reweighting begins at its own last estimate, which is not the start that was given."""
     fit = identify(hexapod(), hexapod_data(), loss=loss)
-    assert start_check(fit).verdict is Start.NOT_CALIBRATED
+    assert check_start_values(fit).verdict is StartVerdict.NOT_CALIBRATED
     assert len(fit.cost_history) == fit.iterations + 1
     np.testing.assert_array_equal(
         fit.estimate_history[0], hexapod().values[hexapod().parameters.free]
     )
     best = identify(fit.robot, hexapod_data(), loss=loss)
-    assert start_check(best).verdict is Start.BEST
+    assert check_start_values(best).verdict is StartVerdict.BEST
 
 
 @pytest.mark.parametrize("loss", [Huber(), Tukey()])

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.diagnose import start_check
-from loopcal.diagnose.start_values import Start
+from loopcal.diagnose import StartVerdict, check_start_values
 from loopcal.errors import EstimationError
 from loopcal.estimate import MAP, LeastSquares, identify
 from loopcal.estimate.descent import StepControl
@@ -35,8 +34,8 @@ def test_a_fit_that_did_not_converge_says_nothing_of_the_noise_and_gives_no_inte
         assert "sigma is too large" not in notes
         assert "stated noise explains" not in notes
         assert ("--method map" in notes) == (method == LeastSquares())
-        assert start_check(fit).verdict is Start.OPEN
-        assert "did not converge" in start_check(fit).sentence
+        assert check_start_values(fit).verdict is StartVerdict.OPEN
+        assert "did not converge" in check_start_values(fit).sentence
 
 
 def test_a_fit_that_did_not_converge_cannot_be_a_prior():

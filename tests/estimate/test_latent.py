@@ -15,7 +15,7 @@ import loopcal.estimate.components as components_module
 import loopcal.estimate.latent as latent_module
 import loopcal.estimate.settle as settle_module
 from loopcal.apply import validate
-from loopcal.diagnose import cross_validate, examine, find_outliers, identifiability
+from loopcal.diagnose import cross_validate, examine_fit, find_outliers, identifiability
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import Huber, LeastSquares, Tukey, identify, identify_trials
 from loopcal.estimate.excluded_poses import exclude_poses
@@ -401,7 +401,7 @@ def test_a_wrong_reading_is_named_and_a_loss_or_its_absence_mends_the_fit(wrong_
         robust = identify(hexapod(), wrong_reading, LeastSquares(), loss=loss)
         assert robust.weight[4] < 0.05
         assert np.abs((robust.estimate - without.estimate) / without.sd).max() < most
-    assert examine(dropped, wrong_reading).outliers.outliers == ()
+    assert examine_fit(dropped, wrong_reading).outliers.outliers == ()
 
 
 def test_the_distance_of_a_pose_is_what_the_sum_of_squares_loses_without_it():
@@ -483,6 +483,6 @@ def test_a_pose_left_out_is_neither_undetermined_nor_without_readings():
     }
     assert_array_equal(np.isnan(found.poses).all(axis=(1, 2)), out)
     assert_array_equal(np.isnan(found.readings).all(axis=1), out)
-    assert examine(fit, data).worth.calibrate
+    assert examine_fit(fit, data).worth.calibrate
     held = validate(fit, exclude_poses(data, ("3", "9")))
     assert not [note for note in held.notes if "not taken" in note]

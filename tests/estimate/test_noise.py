@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.diagnose import correlated_groups, lack_of_fit, worth
+from loopcal.diagnose import check_lack_of_fit, estimate_calibration_gain, find_correlated_groups
 from loopcal.estimate import LeastSquares, Tukey, identify
 from loopcal.measure import simulate
 from tests import zoo
@@ -30,7 +30,7 @@ def repeats(seed: int, times: int = 3, instrument=None, poses: int = 12):
 
 def test_pure_error_is_the_spread_within_the_groups():
     data = repeats(0)
-    found = lack_of_fit(identify(hexapod(), data, LeastSquares()), data)
+    found = check_lack_of_fit(identify(hexapod(), data, LeastSquares()), data)
     sigma = np.array([5 * URAD] * 3 + [UM] * 3)
     groups = (data.observations[0].measured / sigma).reshape(12, 3, 6)
     expected = ((groups - groups.mean(axis=1, keepdims=True)) ** 2).sum()
@@ -49,7 +49,7 @@ def test_a_right_model_is_hardly_ever_blamed_and_the_true_sigma_does_not_matter(
         data = repeats(seed)
         claimed = data.observations[0]
         wrong = replace(data, observations=(replace(claimed, covariance=claimed.covariance / 9.0),))
-        found = lack_of_fit(identify(hexapod(), wrong, LeastSquares()), wrong)
+        found = check_lack_of_fit(identify(hexapod(), wrong, LeastSquares()), wrong)
         assert found.sigma_scale == pytest.approx(3.0, rel=0.3)
         blamed += not found.explained
     assert blamed <= 4  # P(binomial(60, 0.01) > 4) = 3e-4
@@ -61,7 +61,7 @@ def test_something_else_than_geometry_is_told_from_noise():
     warm = np.array(rows.measured)
     warm[:, 5] += 5 * UM * np.sin(300.0 * data.readings[:, 0])  # the same in all repeats of a pose
     bent = replace(data, observations=(replace(rows, measured=warm),))
-    found = lack_of_fit(identify(hexapod(), bent, LeastSquares()), bent)
+    found = check_lack_of_fit(identify(hexapod(), bent, LeastSquares()), bent)
     assert found.explained is False
     assert "something else than the geometry" in found.sentence
     assert found.sigma_scale == pytest.approx(1.0, abs=0.2)
@@ -69,11 +69,11 @@ def test_something_else_than_geometry_is_told_from_noise():
 
 def test_without_repeats_or_with_a_loss_nothing_is_claimed():
     data = hexapod_data(20)
-    found = lack_of_fit(identify(hexapod(), data), data)
+    found = check_lack_of_fit(identify(hexapod(), data), data)
     assert found.explained is None
     assert "no pose was measured twice" in found.sentence
     again = repeats(2)
-    assert lack_of_fit(identify(hexapod(), again, loss=Tukey()), again).explained is None
+    assert check_lack_of_fit(identify(hexapod(), again, loss=Tukey()), again).explained is None
 
 
 def test_correlated_parameters_are_grouped_in_words():
@@ -84,7 +84,7 @@ def test_correlated_parameters_are_grouped_in_words():
     )
     truth = zoo.hexapod().with_values(zoo.hexapod_truth())
     fit = identify(hexapod(), simulate(truth, flat, tracker(), 0), LeastSquares())
-    groups = correlated_groups(fit)
+    groups = find_correlated_groups(fit)
     assert groups
     assert abs(groups[0].correlation) > 0.9
     assert set(groups[0].pair) <= set(groups[0].names)
@@ -94,27 +94,27 @@ def test_correlated_parameters_are_grouped_in_words():
     assert groups[0].correlation == pytest.approx(rho[a, b])
     names = [name for group in groups for name in group.names]
     assert len(names) == len(set(names))
-    assert correlated_groups(fit, strong=1.0) == ()
+    assert find_correlated_groups(fit, strong=1.0) == ()
 
 
 def test_an_instrument_coarser_than_the_tolerances_is_advised_against():
     good, poor = hexapod_data(20), hexapod_data(20, instrument=tracker(2 * MM, 10e-3))
-    fine = worth(identify(hexapod(), good), good)
+    fine = estimate_calibration_gain(identify(hexapod(), good), good)
     assert fine.calibrate
     assert fine.position_after < 0.1 * fine.position_before
     for method in (None, LeastSquares()):
-        useless = worth(identify(hexapod(), poor, method), poor)
+        useless = estimate_calibration_gain(identify(hexapod(), poor, method), poor)
         assert useless.calibrate is False
         assert useless.sentence.startswith("do not calibrate with this instrument")
     assert (
-        worth(identify(hexapod(), poor, LeastSquares()), poor).position_after
+        estimate_calibration_gain(identify(hexapod(), poor, LeastSquares()), poor).position_after
         > 3 * fine.position_before
     )
 
 
 def test_what_tolerances_allow_before_is_what_drawn_machines_do():
     data, robot = hexapod_data(20), hexapod()
-    expected = worth(identify(robot, data), data)
+    expected = estimate_calibration_gain(identify(robot, data), data)
     from loopcal.mechanism import forward
 
     rng, square = np.random.default_rng(0), []
@@ -127,5 +127,7 @@ def test_what_tolerances_allow_before_is_what_drawn_machines_do():
 
 def test_without_tolerances_no_gain_is_predicted():
     data = hexapod_data(20)
-    assert worth(identify(zoo.hexapod(), data), data).calibrate is None
-    assert worth(identify(with_tolerance(zoo.hexapod(), 1e-4), data), data).calibrate
+    assert estimate_calibration_gain(identify(zoo.hexapod(), data), data).calibrate is None
+    assert estimate_calibration_gain(
+        identify(with_tolerance(zoo.hexapod(), 1e-4), data), data
+    ).calibrate

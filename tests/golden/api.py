@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loopcal import apply, diagnose, estimate, geometry, measure, planning
-from loopcal.diagnose.conventions import arrival
-from loopcal.diagnose.suggestions import remedies
+from loopcal.diagnose import compare_conventions, suggest_measurements
 from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import KINDS, Gaussian, Instrument, Known, Sensor, local_unknowns
@@ -442,7 +441,7 @@ def report_trials(machine: Robot, trials: Data, how: Any) -> Report:
 
 def report_leave_one_out(machine: Robot, data: Data, methods: Sequence[Any]) -> Report:
     """Score methods by leaving out blocks, from one linearisation."""
-    found = diagnose.leave_one_out(machine, data, tuple(methods))
+    found = diagnose.score_leave_one_out(machine, data, tuple(methods))
     return {"score": found.score, "dof": found.dof, "best": list(methods).index(found.best)}
 
 
@@ -511,7 +510,7 @@ def report_identifiability(machine: Robot, data: Data, cures: bool = False) -> R
         "left": [v.left for v in found.parameters],
     }
     if cures:
-        told = remedies(found)
+        told = suggest_measurements(found)
         result["cures"] = [[c.words for c in r.cures] for r in told]
         result["cures_left"] = {str(i): [c.left for c in r.cures] for i, r in enumerate(told)}
     return result
@@ -648,8 +647,8 @@ def report_examination(found: Fit, data: Data) -> Report:
     """Report lack of fit, groups that correlate, worth of the calibration, and the start compared
     with the fit.
     """
-    seen = diagnose.examine(found, data)
-    lack, worth, start = seen.lack_of_fit, seen.worth, diagnose.start_check(found)
+    seen = diagnose.examine_fit(found, data)
+    lack, worth, start = seen.lack_of_fit, seen.worth, diagnose.check_start_values(found)
     return {
         "groups": lack.groups,
         "pure": lack.pure,
@@ -674,7 +673,7 @@ def report_examination(found: Fit, data: Data) -> Report:
 
 def report_arrival(machine: Robot, data: Data) -> Report:
     """Report whether stated conventions fit: as numbers and as whether another one was found."""
-    found = arrival(machine, data)
+    found = compare_conventions(machine, data)
     return {
         "misfit": found.misfit,
         "doubtful": bool(found.doubtful),
@@ -686,7 +685,7 @@ def report_arrival(machine: Robot, data: Data) -> Report:
 
 def report_parameter_error(found: Fit, truth: Array) -> Report:
     """Report errors of parameters with and without what the data leave open."""
-    off = diagnose.parameter_error(found, truth)
+    off = diagnose.compare_with_truth(found, truth)
     return {
         "names": list(off.names),
         "raw": off.raw,

@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loopcal.diagnose import identifiability
-from loopcal.diagnose.actuator_reading_errors import reading_errors
-from loopcal.diagnose.examination import examine
-from loopcal.diagnose.suggestions import remedies
+from loopcal.diagnose import (
+    compute_reading_errors,
+    examine_fit,
+    identifiability,
+    suggest_measurements,
+)
 from loopcal.estimate import Identification, LeastSquares, identify
 from loopcal.io.formats import hangprinter
 from loopcal.io.formats.import_export import build_imported_robot
@@ -156,7 +158,7 @@ def test_the_residual_is_a_third_of_a_millimetre_and_fits_the_stated_sigmas(fit,
     assert rms.max() < 0.35  # [mm]
     (readings,) = (part for part in fit.residuals if part.kind == "readings")
     assert readings.raw.shape == (44, 4)
-    errors = reading_errors(fit, printer[1])
+    errors = compute_reading_errors(fit, printer[1])
     assert errors is not None
     assert [error.name for error in errors] == ["a", "b", "c", "d"]
     for i, error in enumerate(errors):
@@ -173,16 +175,16 @@ def test_errors_of_readings_leave_out_dropped_poses_and_are_none_where_readings_
     printer, fit
 ):
     robot, data = printer
-    errors = reading_errors(identify(robot, data, LeastSquares(), drop=["sample19"]), data)
+    errors = compute_reading_errors(identify(robot, data, LeastSquares(), drop=["sample19"]), data)
     assert errors is not None
     assert {error.count for error in errors} == {43}
     assert "sample19" not in {error.pose for error in errors}
-    assert reading_errors(replace(fit, latent=None), data) is None
+    assert compute_reading_errors(replace(fit, latent=None), data) is None
 
 
 def test_no_row_is_doubted_and_a_wrong_motor_angle_is(printer, fit):
     robot, data = printer
-    examined = examine(fit, data).outliers
+    examined = examine_fit(fit, data).outliers
     assert examined.outliers == ()
     single = np.flatnonzero(examined.influence.degrees == 1)  # poses nobody measured
     farthest = single[np.argsort(-examined.influence.distance[single])][:3]
@@ -193,7 +195,7 @@ def test_no_row_is_doubted_and_a_wrong_motor_angle_is(printer, fit):
     readings = data.readings.copy()
     readings[24, 0] += np.radians(300.0)  # 15 mm of line A, at a pose nobody measured
     wrong = replace(data, readings=readings)
-    named = examine(identify(robot, wrong, LeastSquares()), wrong).outliers.outliers
+    named = examine_fit(identify(robot, wrong, LeastSquares()), wrong).outliers.outliers
     assert named[0].poses == ("sample25",)
     assert named[0].degrees == 1  # four lines, three freedoms
 
@@ -209,10 +211,13 @@ def test_rows_of_a_file_in_which_nothing_was_measured_are_no_degrees_of_freedom(
     )
     same = identify(robot, padded, LeastSquares())
     np.testing.assert_allclose(same.estimate, fit.estimate, rtol=0, atol=1e-9)  # [m]
-    ours, theirs = (examine(fit, data).outliers.influence, examine(same, padded).outliers.influence)
+    ours, theirs = (
+        examine_fit(fit, data).outliers.influence,
+        examine_fit(same, padded).outliers.influence,
+    )
     np.testing.assert_array_equal(theirs.degrees, ours.degrees)
     np.testing.assert_allclose(theirs.distance, ours.distance, rtol=1e-6, atol=1e-9)
-    estimated = examine(identify(robot, padded, noise="estimated"), padded).outliers
+    estimated = examine_fit(identify(robot, padded, noise="estimated"), padded).outliers
     assert estimated.outliers == ()
     assert 0.7 < estimated.scale < 1.3
 
@@ -406,7 +411,7 @@ def test_without_a_known_pose_seven_directions_are_the_frame_and_the_scale(print
     origin = data.take(np.concatenate([[0], np.arange(9, 44)]))
     found = identifiability(fit.robot, replace(origin, observations=(seen.take([0]),)))
     assert found.rank == 17
-    told = {r.combination.names[0]: r.cures[0].words for r in remedies(found)}
+    told = {r.combination.names[0]: r.cures[0].words for r in suggest_measurements(found)}
     assert len(told) == 4
     assert told["spool.radius"].startswith("distances between two poses")
 

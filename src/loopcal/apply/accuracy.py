@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal import geometry
-from loopcal.diagnose.frame_motions import NOTHING, FrameMotions, frame_motions, weights
+from loopcal.diagnose import NO_MOTION, FrameMotions, find_frame_motions, twist_weights
 from loopcal.errors import EstimationError
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
@@ -128,7 +128,7 @@ def pose_uncertainty(
     known = fit.posterior if isinstance(fit, Identification) else fit
     robot = known.robot
     found = poses if isinstance(poses, Solution) else inverse(robot, poses)
-    motions = frame_motions(known)
+    motions = find_frame_motions(known)
     roots = _roots(known, motions, gauge)
     parts = []
     for first in range(0, len(found.q), BLOCK):
@@ -170,8 +170,8 @@ def _covariance(
     root = np.concatenate(spread, axis=2)
     covariance = root @ root.swapaxes(1, 2)
     if open_.shape[1]:
-        weight = weights(robot)
-        limit = NOTHING * np.linalg.norm(D * weight[:, None], axis=(1, 2))
+        weight = twist_weights(robot)
+        limit = NO_MOTION * np.linalg.norm(D * weight[:, None], axis=(1, 2))
         moved = np.linalg.norm(D @ open_, axis=2) * weight > limit[:, None]
         covariance[moved[:, :, None] | moved[:, None, :]] = np.nan
         pose, component = np.nonzero(moved)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from loopcal import geometry
 from loopcal.apply.accuracy import PoseUncertainty, pose_uncertainty
-from loopcal.diagnose.frame_motions import weights
+from loopcal.diagnose import twist_weights
 from loopcal.errors import DataError
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
@@ -234,7 +234,7 @@ def _judged(
     robot: Mechanism, believed: Solution, best: Solution, settled: _Settled, fixed: FloatArray
 ) -> tuple[tuple[Reach, ...], tuple[str, ...]]:
     """Say what becomes of each target; `fixed` (n, 6) is what no reading can remove."""
-    final, gap = settled.final, settled.gaps * weights(robot) / robot.size
+    final, gap = settled.final, settled.gaps * twist_weights(robot) / robot.size
     allowed, why = within(robot, robot.values[None], final.q[None], final.state)
     first, last = np.linalg.norm(gap[0], axis=1), np.linalg.norm(gap[-1], axis=1)
     loose = last > np.maximum(SHRUNK * first, NOTHING)

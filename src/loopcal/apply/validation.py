@@ -12,32 +12,35 @@ model as it did at the measured readings. What no actuator can reach is shown as
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
 
-from loopcal.diagnose.kind_errors import KindErrors, few, kind_errors
-from loopcal.diagnose.pose_error_figures import INDICES, PoseErrors, pose_errors
-from loopcal.diagnose.set_up_anew import set_up_anew
+from loopcal.diagnose import (
+    INDICES,
+    KindErrors,
+    PoseErrors,
+    PosePredictions,
+    compare_predictions,
+    compute_kind_errors,
+    compute_row_errors,
+    find_moved_setups,
+    predict_poses,
+)
 from loopcal.errors import DataError, nearest
 from loopcal.estimate.inference.null_space import listed
-from loopcal.estimate.predicted import predicted, untold
+from loopcal.estimate.predicted import untold
 from loopcal.estimate.result import Identification
-from loopcal.measure import (
-    LocalUnknowns,
-    Measurements,
-    Observations,
-    check_actuators,
-    joint_values,
-    joints_looked_at,
-    start_values,
-)
-from loopcal.mechanism import Mechanism, Solution, inverse
-from loopcal.parameters import ParameterTable
-from loopcal.typing import FloatArray
+from loopcal.measure import Measurements, check_actuators
+from loopcal.mechanism import Mechanism, Solution
 from loopcal.units import DISPLAY_UNITS, Dimension, unit
+
+FEW = 5
+"""Rows below which an error is said to be judged by too few: at 4 the rms of noise alone varies by
+a third.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,141 +211,37 @@ def validate(
     robot = fit.robot if isinstance(fit, Identification) else fit
     old = before or (fit.initial if isinstance(fit, Identification) else fit.nominal)
     check_actuators(data, robot)
-    rows = [
-        some
-        for o in data.observations
-        if len(some := o.take((o.weight > 0.0) & o.present.any(axis=1)))
-    ]
-    if not rows:
-        raise DataError("there is no row to validate with: every row is absent or has weight 0")
-    (believed, _), (found, told) = predicted(old, data), predicted(robot, data)
-    reached = inverse(robot, believed.T)
-    ok = believed.converged & found.converged & reached.converged & told
-    if not ok.any():
-        raise DataError(_unreached(robot, told, believed.converged, found.converged))
-    rows = [o.take(ok[o.rows].reshape(len(o), -1).all(axis=1)) for o in rows]
-    seen, units = replace(data, observations=tuple(rows)), _units(robot)
     starts, kept = _known(fit, before, (known_before, known), refit, data)
-    first, last = _view(old, seen, believed, ok, starts), _view(robot, seen, found, ok, kept)
+    compared = compare_predictions(old, robot, data, starts, kept)
+    first, last, rows = compared.before, compared.after, list(compared.data.observations)
+    poses, ok, told, units = compared.rows, compared.usable, compared.predictable, _units(robot)
     was, now, missed = (
         first.residuals(rows),
         last.residuals(rows),
-        first.differences(rows, _view(old, seen, reached, ok, None)),
+        first.differences(rows, compared.reached),
     )
-    after, poses = _errors(rows, now), _labels(rows, data)
+    after = compute_row_errors(rows, now)
     return Validation(
         poses=poses,
-        before=_errors(rows, was),
+        before=compute_row_errors(rows, was),
         after=after,
-        commanded_before=_errors(rows, [-r for r in was]),
-        commanded_after=_errors(rows, [m - r for m, r in zip(missed, now, strict=True)]),
-        not_compensable=_errors(rows, missed),
+        commanded_before=compute_row_errors(rows, [-r for r in was]),
+        commanded_after=compute_row_errors(rows, [m - r for m, r in zip(missed, now, strict=True)]),
+        not_compensable=compute_row_errors(rows, missed),
         failed=tuple(data.labels[i] for i in np.flatnonzero(~ok & told)),
         limit_position=limit_position,
         limit_angle=limit_angle,
         reasons=_gates(after, poses, limit_position, limit_angle, units),
         units=units,
         notes=(
-            *few(after),
+            *_few(after),
             *_notes(first, last),
-            *_anew(robot, seen, found, ok, kept),
+            *_anew(robot, compared.data, compared.solution, ok, kept),
             *untold(data, told),
         ),
         alignment=_alignment(last),
-        kinds=kind_errors(rows, was, now),
+        kinds=compute_kind_errors(rows, was, now),
     )
-
-
-def _unreached(robot: Mechanism, told: np.ndarray, before: np.ndarray, after: np.ndarray) -> str:
-    """Say why no pose is left: readings not there, or not reached by the geometry before, or a
-    calibration gone astray.
-    """
-    n, some = len(told), int(before.sum())
-    if not told.any():
-        return (
-            f"none of the {n} poses has all the readings from which {robot.name} can be predicted: "
-            "give readings, and a finite"
-            " sigma to those that are to be believed"
-        )
-    if not some:
-        return f"{robot.name} reaches none of the {n} poses; check the readings and their units"
-    return (
-        f"the calibrated geometry of {robot.name} cannot follow where the one before goes: with "
-        "these readings that reaches"
-        f" {some} of {n} poses, the calibrated one {int(after.sum())}, and none of them the same; "
-        "do not use this calibration,"
-        " and check what is stated of frames and noise"
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _View:
-    """Poses (1, n, 4, 4) of a robot, its joints, and the values (1, U) of what the measurements
-    bring with them.
-    """
-
-    T: FloatArray
-    joints: Mapping[str, FloatArray]
-    local: LocalUnknowns
-    values: FloatArray
-    carried: tuple[str, ...]
-
-    def residuals(self, rows: list[Observations]) -> list[FloatArray]:
-        """Prediction errors (r, m) of every kind."""
-        return [
-            o.evaluate(self.T, self.own(i, o), self.seen(o)).residual[0] for i, o in enumerate(rows)
-        ]
-
-    def differences(self, rows: list[Observations], other: _View) -> list[FloatArray]:
-        """What every kind would see (r, m) of another view's poses, less what it would see of
-        these.
-        """
-        found = []
-        for i, o in enumerate(rows):
-            own = self.own(i, o)
-            wanted = o.kind.measure(
-                self.T[:, o.rows], np.zeros((1, *o.present.shape)), own, self.seen(o)
-            )
-            found.append(
-                o.kind.evaluate(other.T[:, o.rows], wanted, own, other.seen(o)).residual[0]
-            )
-        return found
-
-    def own(self, i: int, o: Observations) -> FloatArray | None:
-        """Unknowns (1, r, u) of a kind's rows."""
-        return self.local.of(i, self.values) if o.kind.unknowns else None
-
-    def seen(self, o: Observations) -> FloatArray | None:
-        """Joints (1, r, j) that a kind looks at."""
-        names = o.kind.looks_at
-        return (
-            np.stack([self.joints[name][:, o.rows] for name in names], axis=-1) if names else None
-        )
-
-
-def _view(
-    robot: Mechanism,
-    data: Measurements,
-    found: Solution,
-    ok: np.ndarray,
-    known: Mapping[str, float] | None,
-) -> _View:
-    """Look at solved poses; unknowns of the measurements are as known or fit these poses best
-    (None: nominal).
-    """
-    T = np.where(ok[:, None, None], found.T, np.eye(4))
-    names = joints_looked_at(o.kind for o in data.observations)
-    joints = joint_values(robot, names, found.q[None], found.state)
-    local = data.unknowns
-    values, carried = local.values(), ()
-    if known is not None and len(local):
-        carried = tuple(name for name in local.table.names if name in known)
-        entries = tuple(
-            p if p.name not in carried else replace(p, nominal=known[p.name], free=False)
-            for p in local.table.entries
-        )
-        values = start_values(data, T, replace(local, table=ParameterTable(entries)), joints)
-    return _View(T[None], joints, local, values[None], carried)
 
 
 def _known(
@@ -383,12 +282,12 @@ def _kept(known: Mapping[str, float], refit: Sequence[str], data: Measurements) 
     }
 
 
-def _alignment(view: _View) -> dict[str, tuple[str, ...]]:
+def _alignment(view: PosePredictions) -> dict[str, tuple[str, ...]]:
     """Frames, targets and surfaces by where their values come from: kept as known, or fitted to
     these rows.
     """
-    names = view.local.table.names
-    there = [name in view.carried for name in names]
+    names = view.setup.table.names
+    there = [name in view.kept for name in names]
     return {
         word: tuple(
             dict.fromkeys(
@@ -399,7 +298,7 @@ def _alignment(view: _View) -> dict[str, tuple[str, ...]]:
     }
 
 
-def _notes(first: _View, last: _View) -> tuple[str, ...]:
+def _notes(first: PosePredictions, last: PosePredictions) -> tuple[str, ...]:
     """Say where the unknowns of the measurements come from, and after which best fit errors are
     compared.
     """
@@ -432,7 +331,7 @@ def _anew(
 
     def sizes(refit: tuple[str, ...]) -> tuple[float, int]:
         try:
-            view = _view(
+            view = predict_poses(
                 robot,
                 data,
                 found,
@@ -453,24 +352,21 @@ def _anew(
         return float(np.sqrt(total / max(left, 1))), left
 
     names = dict.fromkeys(owner[p.name] for p in table.entries if p.free and p.name in kept)
-    moved = set_up_anew(tuple(names), sizes)
+    moved = find_moved_setups(tuple(names), sizes)
     return () if moved is None else (moved.sentence,)
 
 
-def _errors(rows: list[Observations], residuals: list[FloatArray]) -> PoseErrors:
-    """Indices of all kinds' rows, one after the other."""
-    parts = []
-    for o, residual in zip(rows, residuals, strict=True):
-        shown = np.where(o.present, residual, np.nan)
-        length = np.array([column.dimension is Dimension.LENGTH for column in o.kind.noise_columns])
-        angle = np.array([column.dimension is Dimension.ANGLE for column in o.kind.noise_columns])
-        parts.append(pose_errors(shown[:, length], shown[:, angle]))
-    return PoseErrors(*(np.concatenate([getattr(p, index) for p in parts]) for index in INDICES))
-
-
-def _labels(rows: list[Observations], data: Measurements) -> tuple[str, ...]:
+def _few(after: PoseErrors) -> tuple[str, ...]:
+    """Say which errors too few rows measure to judge them by."""
+    counts = {index: after.statistics(index).count for index in ("position", "orientation")}
+    rows = {
+        index: f"only {n} row{' measures' if n == 1 else 's measure'} {index}"
+        for index, n in counts.items()
+    }
     return tuple(
-        "/".join(data.labels[i] for i in seen) for o in rows for seen in o.rows.reshape(len(o), -1)
+        f"{rows[index]}: too few to judge its errors by"
+        for index, n in counts.items()
+        if 0 < n < FEW
     )
 
 

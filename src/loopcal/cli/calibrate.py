@@ -27,7 +27,7 @@ from loopcal.errors import DataError
 
 if TYPE_CHECKING:
     from loopcal.apply import Validation
-    from loopcal.diagnose.examination import Examination
+    from loopcal.diagnose import FitExamination
     from loopcal.estimate import Identification
     from loopcal.measure import Measurements
 
@@ -213,11 +213,11 @@ def _judged(
         return None, str(error)
 
 
-def _examined(fit: Identification, fitted: Measurements) -> Examination | None:
+def _examined(fit: Identification, fitted: Measurements) -> FitExamination | None:
     """Examine a fit that converged."""
-    from loopcal.diagnose.examination import examine
+    from loopcal.diagnose import examine_fit
 
-    return examine(fit, fitted) if fit.converged else None
+    return examine_fit(fit, fitted) if fit.converged else None
 
 
 def _document(finding: Any) -> Any:
@@ -227,15 +227,13 @@ def _document(finding: Any) -> Any:
 
 def _findings(fit: Identification, fitted: Measurements) -> dict[str, Any]:
     """What else is known of a fit; None where there is nothing to say."""
-    from loopcal.diagnose import identifiability
-    from loopcal.diagnose.actuator_reading_errors import reading_errors
-    from loopcal.diagnose.suggestions import remedies
+    from loopcal.diagnose import compute_reading_errors, identifiability, suggest_measurements
 
     open_ = fit.converged and fit.unidentifiable
     return {
         "examination": _examined(fit, fitted),
-        "remedies": remedies(identifiability(fit.robot, fitted)) if open_ else None,
-        "reading_errors": reading_errors(fit, fitted),
+        "remedies": suggest_measurements(identifiability(fit.robot, fitted)) if open_ else None,
+        "reading_errors": compute_reading_errors(fit, fitted),
     }
 
 
@@ -249,7 +247,7 @@ def _print(
     """Print what was found, and how well it does on unseen poses, or without any on the fitted
     ones.
     """
-    from loopcal.diagnose import start_check
+    from loopcal.diagnose import check_start_values
 
     found = fit.to_dict()
     show.parameters(f"{fit.robot.name}: {len(fit.names)} parameters", found["parameters"])
@@ -264,8 +262,8 @@ def _print(
         f"{fit.check.degrees:.4g} degree{'' if round(fit.check.degrees) == 1 else 's'} of freedom"
     )
     show.say(f"chi-square {fit.chi_square:.5g} with {degrees}")
-    show.say(f"note: {start_check(fit).sentence}")
-    examined: Examination | None = findings["examination"]
+    show.say(f"note: {check_start_values(fit).sentence}")
+    examined: FitExamination | None = findings["examination"]
     advised = [f"to determine {cure}" for cure in findings["remedies"] or ()]
     for note in (*fit.notes, *advised, *(() if examined is None else examined.sentences)):
         show.say(f"note: {note}")

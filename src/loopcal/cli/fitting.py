@@ -13,7 +13,7 @@ import click
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
-    from loopcal.diagnose.model_choice import ModelChoice
+    from loopcal.diagnose import ModelChoice
     from loopcal.estimate import Identification
     from loopcal.estimate.methods.losses import Loss
     from loopcal.estimate.methods.penalties import Method
@@ -84,8 +84,7 @@ class Fitting:
         self, robot: Mechanism, data: Measurements
     ) -> tuple[Identification, ModelChoice | None]:
         """Identify, after choosing the set of parameters where asked."""
-        from loopcal.diagnose import choose_model
-        from loopcal.diagnose.suggestions import open_words
+        from loopcal.diagnose import choose_model, describe_missing_equations
         from loopcal.estimate import identify
         from loopcal.estimate.outlook import equations
 
@@ -107,7 +106,7 @@ class Fitting:
             raise DataError(
                 f"{count} equations cannot determine {free} parameters; measure more poses, fix "
                 "parameters, or let the "
-                f"stated tolerances decide what is open with --method map{open_words(chosen, data)}"
+                f"stated tolerances decide what is open with --method map{describe_missing_equations(chosen, data)}"
             )
         drop = tuple(label for label in self.drop if label in data.labels)
         return identify(chosen, data, method, noise=self.noise, loss=loss, drop=drop), choice

@@ -29,9 +29,7 @@ from loopcal.cli.options import (
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
-    from loopcal.diagnose import Identifiability
-    from loopcal.diagnose.parameter_subset import Reduction
-    from loopcal.diagnose.suggestions import Remedy
+    from loopcal.diagnose import Identifiability, IdentifiableSubset, MeasurementSuggestion
     from loopcal.measure import Instrument
 
 FRAMES = {"base": ("frame",), "tool": ("tool", "targets")}
@@ -100,9 +98,8 @@ def identifiability(
       loopcal identifiability hexapod-42 --poses poses.csv --kind component --components x,y,z
       --sigma-position 5um
     """  # noqa: D301
+    from loopcal.diagnose import choose_identifiable_subset, suggest_measurements
     from loopcal.diagnose import identifiability as identifiable
-    from loopcal.diagnose.parameter_subset import reduce
-    from loopcal.diagnose.suggestions import remedies
     from loopcal.io import load_robot
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.data.measurement_file import load_poses
@@ -130,7 +127,10 @@ def identifiability(
             reading_sigma=sigma_of_readings(sigma_reading, machine),
         )
     found = identifiable(machine, measured)
-    cures, smaller = remedies(found), reduce(found) if reduced else None
+    cures, smaller = (
+        suggest_measurements(found),
+        choose_identifiable_subset(found) if reduced else None,
+    )
     if smaller is not None and output is not None:
         _write(output, smaller)
     if as_json:
@@ -223,16 +223,16 @@ def _unknown(frames: str, kind: object) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _print(found: Identifiability, cures: Sequence[Remedy]) -> None:
+def _print(found: Identifiability, cures: Sequence[MeasurementSuggestion]) -> None:
     """Print sentences, then what is said of each parameter, then the indices."""
-    from loopcal.diagnose.suggestions import ASSUMED
+    from loopcal.diagnose import ASSUMED_FRAMES
 
     for sentence in found.sentences():
         show.say(sentence)
     for cure in cures:
         show.say(f"to determine {cure}")
     if cures:
-        show.say(f"note: {ASSUMED}")
+        show.say(f"note: {ASSUMED_FRAMES}")
     verdicts = [
         (v.name, "yes" if v.state == "determined" else str(v), f"{v.left:.2f}")
         for v in found.parameters
@@ -243,7 +243,7 @@ def _print(found: Identifiability, cures: Sequence[Remedy]) -> None:
     show.table("Observability", ("index", "what", "value"), indices, text_columns=2)
 
 
-def _write(output: Path, smaller: Reduction) -> None:
+def _write(output: Path, smaller: IdentifiableSubset) -> None:
     """Write the robot file with the parameters fixed that are left out."""
     from loopcal.io.core.text_file import write_text
     from loopcal.io.robot.reduced_robot import format_reduced_robot

@@ -14,7 +14,7 @@ from loopcal.units import DISPLAY_UNITS, Dimension, Unit, unit
 
 if TYPE_CHECKING:
     from loopcal.apply import Validation
-    from loopcal.diagnose.actuator_reading_errors import ReadingError
+    from loopcal.diagnose import ReadingError
     from loopcal.mechanism import Mechanism
 
 ROUNDING = 1e-12

@@ -54,7 +54,9 @@ class ReadingError:
         return {**vars(self), **words}
 
 
-def reading_errors(fit: Identification, data: Measurements) -> tuple[ReadingError, ...] | None:
+def compute_reading_errors(
+    fit: Identification, data: Measurements
+) -> tuple[ReadingError, ...] | None:
     """Compare recorded readings with those found; None where readings were taken for exact.
 
     Parameters

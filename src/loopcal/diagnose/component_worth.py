@@ -30,7 +30,7 @@ POSES = 200
 
 
 @dataclass(frozen=True)
-class Worth:
+class CalibrationGain:
     """Expected errors of the platform at the measured poses.
 
     Attributes
@@ -54,7 +54,7 @@ class Worth:
         return dict(vars(self))
 
 
-def worth(fit: Identification, data: Measurements) -> Worth:
+def estimate_calibration_gain(fit: Identification, data: Measurements) -> CalibrationGain:
     """Compare what calibration is expected to leave with what the tolerances allow.
 
     Parameters
@@ -80,7 +80,7 @@ def worth(fit: Identification, data: Measurements) -> Worth:
     before, after = _errors(D * free.tolerance), _errors(D @ spread)
     better = [b > GAIN * a for b, a in zip(before, after, strict=True) if b > 0.0]
     calibrate = any(better)
-    return Worth(
+    return CalibrationGain(
         before[1],
         after[1],
         before[0],
@@ -90,10 +90,12 @@ def worth(fit: Identification, data: Measurements) -> Worth:
     )
 
 
-def _open(why: str) -> Worth:
+def _open(why: str) -> CalibrationGain:
     """Return that nothing can be said."""
     nan = float("nan")
-    return Worth(nan, nan, nan, nan, None, f"what calibration gains cannot be predicted: {why}")
+    return CalibrationGain(
+        nan, nan, nan, nan, None, f"what calibration gains cannot be predicted: {why}"
+    )
 
 
 def _spread(fit: Identification) -> FloatArray:

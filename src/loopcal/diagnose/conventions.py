@@ -22,8 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.diagnose.interpretations import Hypothesis, hypotheses, readings_hypotheses
-from loopcal.diagnose.read_as import MOST_LEFT_OUT, ReadAs, begun, quick_misfit, refined
+from loopcal.diagnose.interpretations import (
+    Interpretation,
+    list_interpretations,
+    list_reading_interpretations,
+)
+from loopcal.diagnose.read_as import MOST_LEFT_OUT, InterpretedData, begun, quick_misfit, refined
 from loopcal.diagnose.stated_unknowns import Contradiction, contradicted
 from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
@@ -84,7 +88,7 @@ tolerances show the same, and it is noted."""
 
 
 @dataclass(frozen=True, eq=False)
-class Arrival:
+class ConventionCheck:
     """The stated conventions of measurements against the robot, and the best other ones.
 
     Attributes
@@ -120,7 +124,9 @@ class Arrival:
         return {**vars(self), "alike": list(self.alike), "refused": self.refused}
 
 
-def arrival(robot: Mechanism, data: Measurements, parts: Sequence[str] = ()) -> Arrival:
+def compare_conventions(
+    robot: Mechanism, data: Measurements, parts: Sequence[str] = ()
+) -> ConventionCheck:
     """Compare measurements with a robot under the stated conventions and, where these are
     implausible, under others.
 
@@ -132,7 +138,7 @@ def arrival(robot: Mechanism, data: Measurements, parts: Sequence[str] = ()) -> 
 
     Returns
     -------
-    Arrival
+    ConventionCheck
 
     Raises
     ------
@@ -142,22 +148,22 @@ def arrival(robot: Mechanism, data: Measurements, parts: Sequence[str] = ()) -> 
     check_actuators(data, robot)
     free, believed = select_free_parameters(robot), _believed(data)
     if believed is None:
-        return Arrival(float("nan"))
+        return ConventionCheck(float("nan"))
     uncertain = data.reading_sigma is not None and bool(
         np.any(np.isfinite(data.reading_sigma) & (data.reading_sigma > 0.0))
     )
     data = believed
     misfit = quick_misfit(free, data)
     if misfit <= IMPLAUSIBLE:
-        return Arrival(misfit)
-    stated = ReadAs(free, _thinned(data))
+        return ConventionCheck(misfit)
+    stated = InterpretedData(free, _thinned(data))
     misfit = stated.misfit()
     if not misfit > IMPLAUSIBLE:
-        return Arrival(misfit)
+        return ConventionCheck(misfit)
     stated.leave_out()
     misfit = min(misfit, stated.misfit(), refined(stated))
     if not misfit > IMPLAUSIBLE:
-        return Arrival(misfit, sentence=_set_aside(stated))
+        return ConventionCheck(misfit, sentence=_set_aside(stated))
     against = contradicted(free, stated, misfit, BETTER)
     if against is not None and against.misfit <= ALLOWED:
         return _contradiction(misfit, against)
@@ -165,14 +171,14 @@ def arrival(robot: Mechanism, data: Measurements, parts: Sequence[str] = ()) -> 
     if best is None and against is not None:
         return _contradiction(misfit, against)
     if best is None:
-        return Arrival(misfit, sentence="" if uncertain else _unexplained(stated, misfit))
+        return ConventionCheck(misfit, sentence="" if uncertain else _unexplained(stated, misfit))
     words = tuple(h.words for h in alike)
     sentence = _evidence(stated, misfit, best, words)
     assert best.hypothesis is not None
-    return Arrival(misfit, best.hypothesis.words, best.found, words, sentence)
+    return ConventionCheck(misfit, best.hypothesis.words, best.found, words, sentence)
 
 
-def check_arrival(
+def check_conventions(
     robot: Mechanism,
     data: Measurements,
     *,
@@ -180,7 +186,7 @@ def check_arrival(
     allow_implausible: bool = False,
     overrides: tuple[str, str] = ("allow_still=True", "allow_implausible=True"),
     parts: Sequence[str] = (),
-) -> Arrival:
+) -> ConventionCheck:
     """Refuse a target that no pose moves, and measurements of which there is clear evidence that
     they mean something else.
 
@@ -196,7 +202,7 @@ def check_arrival(
 
     Returns
     -------
-    Arrival
+    ConventionCheck
         Its sentence is worth a note where it is not empty: the data fit badly, but no other way to
         read them fits better.
 
@@ -210,8 +216,8 @@ def check_arrival(
         if found.converged.any():
             check_moved(data.take(found.converged), found.T[found.converged], override=overrides[0])
     if allow_implausible:
-        return Arrival(float("nan"))
-    told = arrival(robot, data, parts)
+        return ConventionCheck(float("nan"))
+    told = compare_conventions(robot, data, parts)
     if told.refused:
         raise DataError(f"{told.sentence}, or use {overrides[1]}")
     return told
@@ -255,8 +261,8 @@ def _shared(data: Measurements) -> bool:
 
 
 def _best(
-    free: FreeParameters, stated: ReadAs, misfit: float, parts: Sequence[str]
-) -> tuple[ReadAs | None, list[Hypothesis]]:
+    free: FreeParameters, stated: InterpretedData, misfit: float, parts: Sequence[str]
+) -> tuple[InterpretedData | None, list[Interpretation]]:
     """The way that fits far better than what is stated, if there is one, and others that fit as
     well.
     """
@@ -270,7 +276,7 @@ def _best(
         return None, []
     smallest = min(found for found, _ in ranked)
     near = [way for found, way in ranked if found <= max(EQUALLY * smallest, 1.0)]
-    best = ReadAs(free, near[0].applied(stated.whole), hypothesis=near[0])
+    best = InterpretedData(free, near[0].applied(stated.whole), hypothesis=near[0])
     best.misfits()
     best.leave_out()
     best.found = min(best.misfit(), refined(best))
@@ -278,20 +284,22 @@ def _best(
 
 
 def _tried(
-    free: FreeParameters, stated: ReadAs, misfit: float, parts: Sequence[str]
-) -> list[tuple[Hypothesis, float]]:
+    free: FreeParameters, stated: InterpretedData, misfit: float, parts: Sequence[str]
+) -> list[tuple[Interpretation, float]]:
     """Hypotheses that promise to fit far better with their misfits, to first order, blunders left
     out.
 
     All are compared by few rows first. The readings are read otherwise only where no other way to
     read the measured values is allowed: each needs its own poses.
     """
-    found: list[tuple[Hypothesis, float]] = []
+    found: list[tuple[Interpretation, float]] = []
     if stated.enough:
         data = stated.data
         few = data.take(_few(data))
-        chosen = _promising(_misfits(free, few, tuple(hypotheses(few, parts)), quick=True), misfit)
-        ways = {way.words: way for way in hypotheses(data, parts)}
+        chosen = _promising(
+            _misfits(free, few, tuple(list_interpretations(few, parts)), quick=True), misfit
+        )
+        ways = {way.words: way for way in list_interpretations(data, parts)}
         found = _misfits(free, data, tuple(ways[words] for words in chosen if words in ways))
     if not any(value <= ALLOWED for _, value in found):
         found += _readings_tried(free, stated.whole, misfit, parts)
@@ -300,14 +308,14 @@ def _tried(
 
 def _readings_tried(
     free: FreeParameters, data: Measurements, misfit: float, parts: Sequence[str]
-) -> list[tuple[Hypothesis, float]]:
+) -> list[tuple[Interpretation, float]]:
     """Hypotheses about the readings, as `_tried` gives them."""
     robot, poses = free.robot, _few(data)
     named, dimensions = (
         tuple(a.name for a in robot.actuators),
         tuple(a.dimension for a in robot.actuators),
     )
-    ways = tuple(readings_hypotheses(data, named, dimensions, parts))
+    ways = tuple(list_reading_interpretations(data, named, dimensions, parts))
     every = np.stack([way.values[poses] for way in ways])
     solved = plainly_reached(
         robot, robot.values[None], every.reshape(1, -1, every.shape[-1])
@@ -316,9 +324,9 @@ def _readings_tried(
     begin, left = begun(free, data.take(poses), every[near], solved[near])
     order = np.argsort(left)[:NEAREST] if len(data.unknowns) else np.arange(len(near))
 
-    def judged(way: Hypothesis, begin: FloatArray | None = None) -> float:
+    def judged(way: Interpretation, begin: FloatArray | None = None) -> float:
         read, quick = way.applied(data), begin is not None
-        one = ReadAs(
+        one = InterpretedData(
             free, read.take(poses) if quick else read, hypothesis=way, quick=quick, begin=begin
         )
         one.misfits()
@@ -330,7 +338,7 @@ def _readings_tried(
     return [(way, judged(way)) for way, _ in found if way.words in chosen]
 
 
-def _promising(found: list[tuple[Hypothesis, float]], misfit: float) -> list[str]:
+def _promising(found: list[tuple[Interpretation, float]], misfit: float) -> list[str]:
     """Words of the best hypotheses, in the order given, that may fit far better than what is
     stated.
     """
@@ -343,14 +351,18 @@ def _promising(found: list[tuple[Hypothesis, float]], misfit: float) -> list[str
 
 
 def _misfits(
-    free: FreeParameters, data: Measurements, ways: tuple[Hypothesis, ...], *, quick: bool = False
-) -> list[tuple[Hypothesis, float]]:
+    free: FreeParameters,
+    data: Measurements,
+    ways: tuple[Interpretation, ...],
+    *,
+    quick: bool = False,
+) -> list[tuple[Interpretation, float]]:
     """Misfits of ways to read the values, all at once; where one cannot be evaluated, each half for
     itself.
     """
     if not ways:
         return []
-    together = ReadAs(free, data, ways, quick=quick)
+    together = InterpretedData(free, data, ways, quick=quick)
     values = together.misfits()
     if together.failed and len(ways) > 1:
         middle = len(ways) // 2
@@ -362,7 +374,9 @@ def _misfits(
     return list(zip(ways, values.tolist(), strict=True))
 
 
-def _tells(free: FreeParameters, stated: ReadAs, way: Hypothesis, found: float) -> bool:
+def _tells(
+    free: FreeParameters, stated: InterpretedData, way: Interpretation, found: float
+) -> bool:
     """Whether values that shrink fit far better than a constant in their place would: zeros fit
     every unit.
     """
@@ -372,13 +386,15 @@ def _tells(free: FreeParameters, stated: ReadAs, way: Hypothesis, found: float) 
         stated.whole.readings if way.kind is None else stated.whole.observations[way.kind].measured
     )
     still = np.where(way.values != written, np.nanmedian(way.values, axis=0), way.values)
-    control = ReadAs(free, replace(way, values=still).applied(stated.whole), hypothesis=way)
+    control = InterpretedData(
+        free, replace(way, values=still).applied(stated.whole), hypothesis=way
+    )
     control.misfits()
     control.leave_out()
     return not control.misfit() < BETTER * found
 
 
-def _contradiction(misfit: float, against: Contradiction) -> Arrival:
+def _contradiction(misfit: float, against: Contradiction) -> ConventionCheck:
     """Stated unknowns without which the data fit: refused where they contradict the data grossly,
     else noted.
     """
@@ -389,10 +405,14 @@ def _contradiction(misfit: float, against: Contradiction) -> Arrival:
         f"{_much(against.misfit)};"
         " correct or remove the statement"
     )
-    return Arrival(misfit, against.words if misfit > GROSS else None, against.misfit, (), sentence)
+    return ConventionCheck(
+        misfit, against.words if misfit > GROSS else None, against.misfit, (), sentence
+    )
 
 
-def _evidence(stated: ReadAs, misfit: float, best: ReadAs, alike: tuple[str, ...]) -> str:
+def _evidence(
+    stated: InterpretedData, misfit: float, best: InterpretedData, alike: tuple[str, ...]
+) -> str:
     """The sentence that refuses."""
     way = best.hypothesis
     assert way is not None
@@ -412,7 +432,7 @@ def _much(misfit: float) -> str:
     )
 
 
-def _set_aside(stated: ReadAs) -> str:
+def _set_aside(stated: InterpretedData) -> str:
     """Which rows do not fit the others, which do fit; they stay in the data."""
     poses = tuple(dict.fromkeys(stated.left_out))
     rows = sum(len(o) for o in stated.data.observations)
@@ -423,7 +443,7 @@ def _set_aside(stated: ReadAs) -> str:
     )
 
 
-def _unexplained(stated: ReadAs, misfit: float) -> str:
+def _unexplained(stated: InterpretedData, misfit: float) -> str:
     """The sentence that only notes."""
     return (
         f"the data do not fit {stated.free.robot.name!r}: {_left(stated, misfit)}, and no other "
@@ -433,13 +453,13 @@ def _unexplained(stated: ReadAs, misfit: float) -> str:
     )
 
 
-def _left(stated: ReadAs, misfit: float) -> str:
+def _left(stated: InterpretedData, misfit: float) -> str:
     if not stated.enough:
         return f"the robot reaches only {stated.reached} of {stated.poses} poses that were tried with these readings"
     return f"{_size(stated)} (rms) is left, {misfit:.2g} times what tolerances and noise allow"
 
 
-def _size(way: ReadAs) -> str:
+def _size(way: InterpretedData) -> str:
     """Root mean squares of the first way's residuals by dimension, in units of the robot's file,
     blunders left out.
     """

@@ -52,7 +52,9 @@ def correlation(fit: Identification) -> FloatArray:
     return np.where(known[:, None] & known, fit.covariance, np.nan) * scale[:, None] * scale
 
 
-def correlated_groups(fit: Identification, strong: float = STRONG) -> tuple[CorrelatedGroup, ...]:
+def find_correlated_groups(
+    fit: Identification, strong: float = STRONG
+) -> tuple[CorrelatedGroup, ...]:
     """Return the groups, largest correlation first."""
     rho = correlation(fit)
     linked = np.where(np.isnan(rho), 0.0, np.abs(rho)) > strong

@@ -5,14 +5,17 @@ seen it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
-from loopcal.apply.validation import validate
-from loopcal.diagnose.pose_error_figures import INDICES, PoseErrors
+from loopcal.diagnose.prediction_errors import (
+    PoseErrors,
+    compare_predictions,
+    compute_row_errors,
+    join_errors,
+)
 from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
@@ -73,7 +76,7 @@ class CrossValidation:
         }
 
 
-def folds(data: Measurements, count: int, seed: int) -> tuple[IntArray, ...]:
+def draw_folds(data: Measurements, count: int, seed: int) -> tuple[IntArray, ...]:
     """Return the poses held out in each of `count` folds: whole blocks drawn at random, folds of
     nearly equal size.
 
@@ -117,7 +120,7 @@ def cross_validate(
     """
     labels: list[str] = []
     before, after, scores, plain, converged = [], [], [], [], True
-    for held in folds(data, count, seed):
+    for held in draw_folds(data, count, seed):
         unseen = data.take(held)
         fitted = robot
         if robot.parameters.free.any():
@@ -132,14 +135,20 @@ def cross_validate(
         if (
             unseen.n_rows
         ):  # else readings alone, of redundant actuators: there is a score, but no measured error
-            found = validate(fitted, unseen, before=robot)
-            labels += found.poses
-            before.append(found.before)
-            after.append(found.after)
+            compared = compare_predictions(robot, fitted, unseen)
+            rows = compared.data.observations
+            labels += compared.rows
+            before.append(compute_row_errors(rows, compared.before.residuals(rows)))
+            after.append(compute_row_errors(rows, compared.after.residuals(rows)))
         scores.append(_mean_square(fitted, unseen))
         plain.append(_mean_square(robot, unseen))
     return CrossValidation(
-        tuple(labels), _joined(before), _joined(after), np.array(scores), np.array(plain), converged
+        tuple(labels),
+        join_errors(before),
+        join_errors(after),
+        np.array(scores),
+        np.array(plain),
+        converged,
     )
 
 
@@ -152,12 +161,3 @@ def _mean_square(robot: Mechanism, data: Measurements) -> float:
         present = np.einsum("rii->ri", sensed.whitener[0]) != 0.0
         total += float(np.where(present, found.whitened[0] ** 2, 0.0).sum())
     return total / int(rows.rows[0]) if np.isfinite(total) and rows.rows[0] else np.inf
-
-
-def _joined(parts: Sequence[PoseErrors]) -> PoseErrors:
-    return PoseErrors(
-        *(
-            np.concatenate([np.zeros(0), *(getattr(part, index) for part in parts)])
-            for index in INDICES
-        )
-    )

@@ -8,10 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from loopcal.diagnose.component_worth import Worth, worth
-from loopcal.diagnose.correlation import CorrelatedGroup, correlated_groups
+from loopcal.diagnose.component_worth import CalibrationGain, estimate_calibration_gain
+from loopcal.diagnose.correlation import CorrelatedGroup, find_correlated_groups
 from loopcal.diagnose.outliers import OutlierCheck, find_outliers
-from loopcal.diagnose.repeats import LackOfFit, lack_of_fit
+from loopcal.diagnose.repeats import LackOfFit, check_lack_of_fit
 from loopcal.estimate.result import Identification
 from loopcal.measure import Measurements
 
@@ -20,13 +20,13 @@ SHOWN = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Examination:
+class FitExamination:
     """What a fit's own data say about it."""
 
     outliers: OutlierCheck
     lack_of_fit: LackOfFit
     correlated: tuple[CorrelatedGroup, ...]
-    worth: Worth
+    worth: CalibrationGain
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -52,15 +52,18 @@ class Examination:
         }
 
 
-def examine(fit: Identification, data: Measurements) -> Examination:
+def examine_fit(fit: Identification, data: Measurements) -> FitExamination:
     """Examine a fit.
 
     Parameters
     ----------
     fit : an identification. data : the measurements it was made from.
     """
-    return Examination(
-        find_outliers(fit, data), lack_of_fit(fit, data), correlated_groups(fit), worth(fit, data)
+    return FitExamination(
+        find_outliers(fit, data),
+        check_lack_of_fit(fit, data),
+        find_correlated_groups(fit),
+        estimate_calibration_gain(fit, data),
     )
 
 

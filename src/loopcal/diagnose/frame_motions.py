@@ -28,7 +28,7 @@ directions in question.
 SPREAD_LENGTH, SPREAD_ANGLE = 0.05, 0.1
 """How far readings go to each side of home, in the robot's size and in radians."""
 
-NOTHING = 1e-8
+NO_MOTION = 1e-8
 """Motion below this share of what all parameters together do is none: the square root of double
 rounding.
 """
@@ -51,13 +51,13 @@ class FrameMotions:
     count: int
 
 
-def frame_motions(known: Posterior) -> FrameMotions:
+def find_frame_motions(known: Posterior) -> FrameMotions:
     """Take the motions of frames out of the directions that the rows of a fit do not determine."""
     null = known.directions[:, ~known.seen]
     if null.shape[1] == 0:
         return FrameMotions(null, (), 0)
     D, base, platform = _motions(known)
-    limit = NOTHING * float(np.linalg.norm(D))
+    limit = NO_MOTION * float(np.linalg.norm(D))
     moved = D @ null
     _, s, vt = np.linalg.svd(
         _outside(np.concatenate([base, platform], axis=1), moved), full_matrices=False
@@ -80,7 +80,7 @@ def _without(gauge: FloatArray, infinite: BoolArray) -> FloatArray:
     """
     d = len(gauge)
     u, s, vt = np.linalg.svd(gauge[infinite], full_matrices=True)
-    rank = int((s > NOTHING).sum())
+    rank = int((s > NO_MOTION).sum())
     first, second = gauge @ vt[:rank].T, gauge @ vt[rank:].T
     one = np.eye(d)
     one[:, infinite] -= (first / s[:rank]) @ u[:, :rank].T
@@ -88,7 +88,7 @@ def _without(gauge: FloatArray, infinite: BoolArray) -> FloatArray:
     return one - basis @ (basis.T @ one)
 
 
-def weights(robot: Mechanism) -> FloatArray:
+def twist_weights(robot: Mechanism) -> FloatArray:
     """(6,) factors that make rotations [rad] comparable with displacements [m]: the robot's size,
     and one.
     """
@@ -117,7 +117,7 @@ def _motions(known: Posterior) -> tuple[FloatArray, FloatArray, FloatArray]:
         [np.concatenate([turn, zero], 2), np.concatenate([-geometry.hat(t), turn], 2)], axis=1
     )
     platform = np.concatenate([np.concatenate([R, zero], 2), np.concatenate([zero, R], 2)], axis=1)
-    weight = weights(robot)[:, None]
+    weight = twist_weights(robot)[:, None]
     of_parameters = (D[good][:, :, known.places] * known.unit) * weight
     flat = (of_parameters, base * weight, platform * weight)
     return tuple(a.reshape(-1, a.shape[-1]) for a in flat)  # pyright: ignore[reportReturnType]
@@ -126,7 +126,7 @@ def _motions(known: Posterior) -> tuple[FloatArray, FloatArray, FloatArray]:
 def _outside(frames: FloatArray, moved: FloatArray) -> FloatArray:
     """What no motion of the frames explains of some motions."""
     u, s, _ = np.linalg.svd(frames, full_matrices=False)
-    basis = u[:, s > NOTHING * s[0]]
+    basis = u[:, s > NO_MOTION * s[0]]
     return moved - basis @ (basis.T @ moved)
 
 

@@ -26,7 +26,7 @@ from loopcal.typing import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class ParameterError:
+class TruthComparison:
     """Errors of the free parameters of a fit; arrays (p,) in the order of `names`.
 
     Attributes
@@ -78,7 +78,7 @@ class ParameterError:
         }
 
 
-def parameter_error(fit: Identification, truth: ArrayLike) -> ParameterError:
+def compare_with_truth(fit: Identification, truth: ArrayLike) -> TruthComparison:
     """Compare the parameters of a fit with true ones, after what its data leave open is projected
     out.
 
@@ -90,7 +90,7 @@ def parameter_error(fit: Identification, truth: ArrayLike) -> ParameterError:
 
     Returns
     -------
-    ParameterError
+    TruthComparison
 
     Raises
     ------
@@ -113,4 +113,4 @@ def parameter_error(fit: Identification, truth: ArrayLike) -> ParameterError:
     open_ = (known.unit / fit.tolerance)[:, None] * known.directions[:, ~known.seen]
     basis = np.linalg.qr(open_)[0]
     z = z - basis @ (basis.T @ z)
-    return ParameterError(fit.names, raw, z * fit.tolerance, z, fit.unidentifiable)
+    return TruthComparison(fit.names, raw, z * fit.tolerance, z, fit.unidentifiable)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.diagnose.meaning import with_meaning
-from loopcal.diagnose.observability import SCALING, Observability, observability
+from loopcal.diagnose.observability import SCALING, Observability, compute_observability
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.inference.null_space import (
@@ -222,12 +222,12 @@ def identifiability(
     factor, reached = information(free, data)
     if not reached.all():
         raise EstimationError(_unreached(data, reached))
-    return summary(
+    return summarize_identifiability(
         free, decompose(factor, np.full(1, count), tolerance=rank_tolerance), factor[0, :-1, :-1]
     )
 
 
-def summary(
+def summarize_identifiability(
     free: FreeParameters, decomposition: Decomposition, factor: FloatArray
 ) -> Identifiability:
     """Return what a decomposition (t = 1), of a factor (p, p), says about identifiability."""
@@ -248,7 +248,7 @@ def summary(
         improved=improved,
         unidentifiable=with_meaning(free, describe_null_space(free, null), sparsify_basis(null)),
         weak=tuple(describe_direction(free, V[:, i], float(s[i])) for i in weakest),
-        indices=observability(s, rank, equations),
+        indices=compute_observability(s, rank, equations),
         parameters=_verdicts(free, null, V, s),
         notes=() if note is None else (note,),
         unknowns=free,

@@ -55,7 +55,7 @@ class Influence:
     deleted: FloatArray
 
 
-def influence(
+def compute_influence(
     rows: AnyRows,
     member: IntArray,
     decomposition: Decomposition,

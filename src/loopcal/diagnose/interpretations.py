@@ -57,7 +57,7 @@ UNIT_CURE = "correct the unit in the header"
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
+class Interpretation:
     """One other way to read measurements.
 
     Attributes
@@ -111,7 +111,7 @@ class _Turned(NamedTuple):
         return changed
 
 
-def hypotheses(data: Measurements, parts: Sequence[str] = ()) -> Iterator[Hypothesis]:
+def list_interpretations(data: Measurements, parts: Sequence[str] = ()) -> Iterator[Interpretation]:
     """All other ways to read measurements, the likelier slip of each family first.
 
     A way that a kind itself doubts (a negative distance, tilts no direction has), or that changes
@@ -136,15 +136,15 @@ def hypotheses(data: Measurements, parts: Sequence[str] = ()) -> Iterator[Hypoth
             meant = np.isfinite(values) | np.isnan(rows.measured)
             same = np.allclose(values, rows.measured, rtol=1e-12, atol=0.0, equal_nan=True)
             if meant.all() and not same and not rows.kind.doubts(values):
-                yield Hypothesis(words.format(of=of), cure, i, values, shrinks)
+                yield Interpretation(words.format(of=of), cure, i, values, shrinks)
 
 
-def readings_hypotheses(
+def list_reading_interpretations(
     data: Measurements,
     names: tuple[str, ...],
     dimensions: tuple[Dimension, ...],
     parts: Sequence[str] = (),
-) -> Iterator[Hypothesis]:
+) -> Iterator[Interpretation]:
     """All other ways to read the readings of actuators with these names and dimensions; see
     `hypotheses`.
     """
@@ -153,7 +153,7 @@ def readings_hypotheses(
         for dimension in dict.fromkeys(dimensions):
             chosen = poses[:, None] & np.array([d is dimension for d in dimensions])
             for factor, words in FACTORS.get(dimension, ()):
-                yield Hypothesis(
+                yield Interpretation(
                     f"readings{of} {words}",
                     UNIT_CURE,
                     None,
@@ -162,22 +162,22 @@ def readings_hypotheses(
                 )
     cure = "turn the sign of these readings, or the direction of the actuator in the robot file"
     if len(names) > 1:
-        yield Hypothesis("all readings of the other sign (drop for rise)", cure, None, -q)
+        yield Interpretation("all readings of the other sign (drop for rise)", cure, None, -q)
     for j, name in enumerate(names):
         sign = np.where(np.arange(len(names)) == j, -1.0, 1.0)
-        yield Hypothesis(f"readings of {name} of the other sign", cure, None, sign * q)
+        yield Interpretation(f"readings of {name} of the other sign", cure, None, sign * q)
     for a, b in combinations(range(len(names)), 2):
         swapped = _swapped(q, [a], [b])
-        yield Hypothesis(
+        yield Interpretation(
             f"readings of {names[a]} and {names[b]} swapped", "swap their headers", None, swapped
         )
     if len(names) > 2:
-        yield Hypothesis(
+        yield Interpretation(
             "readings in the opposite order", "turn the order of their headers", None, q[:, ::-1]
         )
     for shift, which in ((1, "above"), (-1, "below")):
         words = f"every row belonging to the readings of the row {which}"
-        yield Hypothesis(
+        yield Interpretation(
             words, "move the columns of the readings by one row", None, np.roll(q, shift, axis=0)
         )
 

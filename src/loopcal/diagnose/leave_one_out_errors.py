@@ -47,7 +47,9 @@ class LeaveOneOut:
         return self.methods[int(np.argmin(self.score))]
 
 
-def leave_one_out(robot: Mechanism, data: Measurements, methods: tuple[Method, ...]) -> LeaveOneOut:
+def score_leave_one_out(
+    robot: Mechanism, data: Measurements, methods: tuple[Method, ...]
+) -> LeaveOneOut:
     """Score methods that keep the columns as they are: ridge with one lam, truncation, least
     squares, MAP.
 
@@ -96,7 +98,7 @@ def leave_one_out(robot: Mechanism, data: Measurements, methods: tuple[Method, .
     return LeaveOneOut(tuple(methods), total / int(rows.rows[0]), dof, estimate)
 
 
-def path_of_methods(data_scale: float, count: int, parameters: int) -> tuple[Method, ...]:
+def build_regularization_path(data_scale: float, count: int, parameters: int) -> tuple[Method, ...]:
     """Return `count` ridges, lam from 1e-8 to 1e4 of `data_scale`, and every truncation from 0 to
     all parameters.
     """

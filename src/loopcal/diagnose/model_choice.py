@@ -84,7 +84,7 @@ class ModelChoice:
         }
 
 
-def nested_sets(robot: Mechanism) -> dict[str, tuple[str, ...]]:
+def nest_parameter_sets(robot: Mechanism) -> dict[str, tuple[str, ...]]:
     """Return sets of a robot's free parameters, each within the next: offsets, with lengths, ideal
     joints, complete.
 
@@ -142,7 +142,7 @@ def choose_model(
         NOTHING: (),
         **{
             name: tuple(names)
-            for name, names in (nested_sets(robot) if nested is None else nested).items()
+            for name, names in (nest_parameter_sets(robot) if nested is None else nested).items()
         },
     }
     named = list(sets.items())

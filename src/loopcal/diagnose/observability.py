@@ -60,7 +60,7 @@ class Observability:
         return asdict(self)
 
 
-def observability(singular_values: FloatArray, rank: int, equations: int) -> Observability:
+def compute_observability(singular_values: FloatArray, rank: int, equations: int) -> Observability:
     """Return the indices of singular values (p,), descending, of whitened and tolerance-scaled
     rows.
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.diagnose.influence import Influence, influence
+from loopcal.diagnose.influence import Influence, compute_influence
 from loopcal.estimate.excluded_poses import exclude_poses
 from loopcal.estimate.inference.null_space import listed
 from loopcal.estimate.result import Identification
@@ -234,7 +234,7 @@ def _ask(
     )
     penalty = np.array(method.penalty(d), dtype=np.float64)
     at = d.deviation(d.solution(penalty))
-    found = influence(rows, member, d, penalty, weight, z, at)
+    found = compute_influence(rows, member, d, penalty, weight, z, at)
     there = (found.degrees > 0) & ~aside
     scale = 1.0
     if fit.noise == "estimated":

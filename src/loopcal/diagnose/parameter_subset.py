@@ -36,7 +36,7 @@ every machine.
 
 
 @dataclass(frozen=True, eq=False)
-class Merged:
+class MergedParameter:
     """A parameter that is left out.
 
     Attributes
@@ -75,7 +75,7 @@ class Merged:
 
 
 @dataclass(frozen=True, eq=False)
-class Reduction:
+class IdentifiableSubset:
     """A set of parameters that says as much as all.
 
     Attributes
@@ -87,7 +87,7 @@ class Reduction:
     """
 
     kept: tuple[str, ...]
-    dropped: tuple[Merged, ...]
+    dropped: tuple[MergedParameter, ...]
     condition: float
     robot: Mechanism
 
@@ -113,7 +113,7 @@ class Reduction:
         }
 
 
-def reduce(found: Identifiability) -> Reduction:
+def choose_identifiable_subset(found: Identifiability) -> IdentifiableSubset:
     """Choose a minimal set of parameters for what measurements determine.
 
     Parameters
@@ -122,7 +122,7 @@ def reduce(found: Identifiability) -> Reduction:
 
     Returns
     -------
-    Reduction; with as many parameters as `found.rank`. The same result for the same input, whatever
+    IdentifiableSubset; with as many parameters as `found.rank`. The same result for the same input, whatever
     the machine.
     """
     free, null = found.unknowns, found.null_space()
@@ -134,7 +134,7 @@ def reduce(found: Identifiability) -> Reduction:
     s = np.linalg.svd(found.factor[:, kept], compute_uv=False)
     names = tuple(free.names[i] for i in kept)
     robot = replace(free.robot, parameters=free.robot.parameters.only(names))
-    return Reduction(names, dropped, float(s[0] / s[-1]) if len(s) else 1.0, robot)
+    return IdentifiableSubset(names, dropped, float(s[0] / s[-1]) if len(s) else 1.0, robot)
 
 
 def _left_out(free: FreeParameters, null: FloatArray) -> np.ndarray:
@@ -162,7 +162,9 @@ def _weights(free: FreeParameters) -> FloatArray:
     return np.asarray(np.array(kinds) * (1.0 + FIRST * np.arange(len(free))), dtype=np.float64)
 
 
-def _merged(free: FreeParameters, place: int, direction: FloatArray, kept: np.ndarray) -> Merged:
+def _merged(
+    free: FreeParameters, place: int, direction: FloatArray, kept: np.ndarray
+) -> MergedParameter:
     """What takes the place of a parameter whose null direction (p,) is one at its own place and
     zero at the others left out.
     """
@@ -178,6 +180,6 @@ def _merged(free: FreeParameters, place: int, direction: FloatArray, kept: np.nd
         / free.tolerance[place]
     )
     names = tuple(free.names[i] for i in chosen)
-    return Merged(
+    return MergedParameter(
         free.names[place], symbols[place], names, changes, tuple(symbols[i] for i in chosen)
     )

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from loopcal import engine
-from loopcal.diagnose.interpretations import Hypothesis
+from loopcal.diagnose.interpretations import Interpretation
 from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.local import Own
@@ -85,7 +85,7 @@ def quick_misfit(free: FreeParameters, data: Measurements) -> float:
     return float(found[0])
 
 
-class ReadAs:
+class InterpretedData:
     """Measurements read in one way, or in t ways that share readings: their rows at the robot's own
     values.
 
@@ -103,8 +103,8 @@ class ReadAs:
         self,
         free: FreeParameters,
         data: Measurements,
-        ways: tuple[Hypothesis, ...] = (),
-        hypothesis: Hypothesis | None = None,
+        ways: tuple[Interpretation, ...] = (),
+        hypothesis: Interpretation | None = None,
         quick: bool = False,
         begin: FloatArray | None = None,
     ) -> None:
@@ -191,7 +191,7 @@ class ReadAs:
                     sd[chosen] = np.sqrt(1.0 + (A**2).sum(axis=-1))
         return found
 
-    def _sensed(self, ways: tuple[Hypothesis, ...]) -> tuple[Sensed, ...]:
+    def _sensed(self, ways: tuple[Interpretation, ...]) -> tuple[Sensed, ...]:
         """Rows of every kind; a row that another way of reading leaves without some of its
         residuals is absent there.
         """
@@ -313,7 +313,7 @@ def _row_rms(whitened: FloatArray, sd: FloatArray) -> FloatArray:
     return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 
-def refined(way: ReadAs) -> float:
+def refined(way: InterpretedData) -> float:
     """The misfit of the first way after Gauss-Newton steps within the tolerances; infinite where it
     cannot be found.
     """

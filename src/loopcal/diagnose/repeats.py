@@ -63,7 +63,7 @@ class LackOfFit:
         return dict(vars(self))
 
 
-def lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
+def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
     """Test the fit against the pure error of repeats.
 
     Parameters

@@ -30,7 +30,7 @@ FEWEST = 8
 
 
 @dataclass(frozen=True)
-class SetUpAnew:
+class MovedSetups:
     """Frames, targets and surfaces that stand elsewhere than the fit found them.
 
     Attributes
@@ -54,9 +54,9 @@ class SetUpAnew:
         )
 
 
-def set_up_anew(
+def find_moved_setups(
     names: Sequence[str], sizes: Callable[[tuple[str, ...]], tuple[float, int]]
-) -> SetUpAnew | None:
+) -> MovedSetups | None:
     """Find what was set up anew, if anything was.
 
     Parameters
@@ -68,7 +68,7 @@ def set_up_anew(
 
     Returns
     -------
-    SetUpAnew or None
+    MovedSetups or None
     """
     every = tuple(names)
     if not every:
@@ -82,4 +82,4 @@ def set_up_anew(
         if every[1:]
         else every
     )
-    return SetUpAnew(tuple(moved) or every, kept / free)
+    return MovedSetups(tuple(moved) or every, kept / free)

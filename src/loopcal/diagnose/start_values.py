@@ -25,7 +25,7 @@ file.
 """
 
 
-class Start(Enum):
+class StartVerdict(Enum):
     """What is known of the geometry from which a fit started."""
 
     BEST = "best"
@@ -47,7 +47,7 @@ class StartCheck:
     sentence : what this means.
     """
 
-    verdict: Start
+    verdict: StartVerdict
     before: float
     after: float
     p_value: float
@@ -58,7 +58,7 @@ class StartCheck:
         return {**vars(self), "verdict": self.verdict.value}
 
 
-def start_check(fit: Identification) -> StartCheck:
+def check_start_values(fit: Identification) -> StartCheck:
     """Compare the geometry from which a fit started with the fit, on the fitted measurements.
 
     Parameters
@@ -74,11 +74,11 @@ def start_check(fit: Identification) -> StartCheck:
     before, after = np.sqrt(first / rows), np.sqrt(last / rows)
     if not fit.converged:
         sentence = "the robot file's geometry cannot be compared with a best fit: the iteration did not converge"
-        return StartCheck(Start.OPEN, before, after, float("nan"), sentence)
+        return StartCheck(StartVerdict.OPEN, before, after, float("nan"), sentence)
     gain = max(first - last, 0.0)
     if gain <= NOTHING * first:
         return StartCheck(
-            Start.BEST,
+            StartVerdict.BEST,
             before,
             after,
             1.0,
@@ -92,15 +92,15 @@ def start_check(fit: Identification) -> StartCheck:
     )
     if p_value < DOUBT:
         sentence = f"the robot file's geometry is NOT calibrated to these rows: {ratio}, which noise does not explain"
-        return StartCheck(Start.NOT_CALIBRATED, before, after, p_value, sentence)
+        return StartCheck(StartVerdict.NOT_CALIBRATED, before, after, p_value, sentence)
     if fit.dof < FEWEST_DEGREES and not _trusted(fit):
         sentence = f"the robot file's geometry: {ratio}; whether noise explains that can only be said with its true sigma"
-        return StartCheck(Start.OPEN, before, after, p_value, sentence)
+        return StartCheck(StartVerdict.OPEN, before, after, p_value, sentence)
     if fit.check.failed:
         sentence = f"the robot file's geometry: {ratio}; neither fits the stated noise, so which is better cannot be said"
-        return StartCheck(Start.OPEN, before, after, p_value, sentence)
+        return StartCheck(StartVerdict.OPEN, before, after, p_value, sentence)
     sentence = f"the robot file's geometry is as good as the fit within the noise ({ratio})"
-    return StartCheck(Start.WITHIN_NOISE, before, after, p_value, sentence)
+    return StartCheck(StartVerdict.WITHIN_NOISE, before, after, p_value, sentence)
 
 
 def _trusted(fit: Identification) -> bool:

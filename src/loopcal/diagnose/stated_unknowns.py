@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from loopcal.diagnose.read_as import ReadAs, refined
+from loopcal.diagnose.read_as import InterpretedData, refined
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import listed
 from loopcal.parameters import Parameter
@@ -31,7 +31,7 @@ class Contradiction:
     names : of the unknowns. shown : for each, where the data put it and what was stated.
     """
 
-    freed: ReadAs
+    freed: InterpretedData
     misfit: float
     names: tuple[str, ...]
     shown: tuple[str, ...]
@@ -43,7 +43,7 @@ class Contradiction:
 
 
 def contradicted(
-    free: FreeParameters, stated: ReadAs, misfit: float, better: float
+    free: FreeParameters, stated: InterpretedData, misfit: float, better: float
 ) -> Contradiction | None:
     """Find stated unknowns without which measurements fit far better.
 
@@ -85,15 +85,17 @@ def contradicted(
     return Contradiction(meant, best[1], chosen, tuple(shown))
 
 
-def _fewest(one: tuple[tuple[str, ...], tuple[ReadAs, float]]) -> tuple[int, float]:
+def _fewest(one: tuple[tuple[str, ...], tuple[InterpretedData, float]]) -> tuple[int, float]:
     """Fewest unknowns first, then what fits best."""
     return len(one[0]), one[1][1]
 
 
-def _freed(free: FreeParameters, stated: ReadAs, names: tuple[str, ...]) -> tuple[ReadAs, float]:
+def _freed(
+    free: FreeParameters, stated: InterpretedData, names: tuple[str, ...]
+) -> tuple[InterpretedData, float]:
     """The measurements with some unknowns left to the data, and their misfit, blunders left out."""
     known = tuple(one for one in stated.whole.known if one.name not in names)
-    way = ReadAs(free, replace(stated.whole, known=known))
+    way = InterpretedData(free, replace(stated.whole, known=known))
     way.misfits()
     way.leave_out()
     return way, min(way.misfit(), refined(way))

@@ -56,7 +56,7 @@ TILT = "tilt-torsion"
 SINGLE = (("x",), ("y",), ("z",), ("psi",), ("theta",), ("phi", "theta"))
 """Coordinates to measure one by one, the simplest remedies."""
 
-ASSUMED = "frames of further measurements are known in the base (a datum on it), unless they are said to be unknown"
+ASSUMED_FRAMES = "frames of further measurements are known in the base (a datum on it), unless they are said to be unknown"
 """What a remedy takes for granted."""
 
 SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5, Dimension.RATIO: 5e-5}
@@ -64,7 +64,7 @@ SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5, Dimension.RATIO: 5e-5}
 
 
 @dataclass(frozen=True)
-class Cure:
+class FurtherMeasurement:
     """A further measurement that determines a combination.
 
     Attributes
@@ -80,11 +80,11 @@ class Cure:
 
 
 @dataclass(frozen=True, eq=False)
-class Remedy:
+class MeasurementSuggestion:
     """A combination that stays open, and what would determine it: simplest first."""
 
     combination: Combination
-    cures: tuple[Cure, ...]
+    cures: tuple[FurtherMeasurement, ...]
 
     def __str__(self) -> str:
         names, one = listed(self.combination.names), len(self.combination.names) == 1
@@ -105,9 +105,9 @@ class Remedy:
         return {"names": list(self.combination.names), "cures": cures, "sentence": str(self)}
 
 
-def remedies(
+def suggest_measurements(
     found: Identifiability, sigma: dict[Dimension, float] | None = None
-) -> tuple[Remedy, ...]:
+) -> tuple[MeasurementSuggestion, ...]:
     """Try every known kind at poses of the workspace, one after the other, on the combinations that
     stay open.
 
@@ -126,7 +126,7 @@ def remedies(
     B = sparsify_basis(found.null_space())
     B = B / np.linalg.norm(B, axis=1, keepdims=True)
     leading = [free.names.index(c.names[0]) for c in found.unidentifiable]
-    cures: list[list[Cure]] = [[] for _ in leading]
+    cures: list[list[FurtherMeasurement]] = [[] for _ in leading]
     # what a kind sees must stand out from the rounding of what is measured already, not only from
     # its own
     floor, present = float(np.linalg.norm(found.factor, ord=2)), _left(found.factor)
@@ -141,12 +141,12 @@ def remedies(
         if determined.any():
             left = _left(np.concatenate([found.factor, X]))
             for i in np.flatnonzero(determined & (left[leading] < HELP * present[leading])):
-                cures[i].append(Cure(words, kind.name, float(left[leading[i]])))
+                cures[i].append(FurtherMeasurement(words, kind.name, float(left[leading[i]])))
     pairs = zip(found.unidentifiable, cures, strict=True)
-    return tuple(Remedy(combination, tuple(some)) for combination, some in pairs)
+    return tuple(MeasurementSuggestion(combination, tuple(some)) for combination, some in pairs)
 
 
-def open_words(robot: Mechanism, data: Measurements) -> str:
+def describe_missing_equations(robot: Mechanism, data: Measurements) -> str:
     """What too few equations leave open and what would determine it, for a refusal; empty where
     that is too much to say.
 
@@ -156,7 +156,7 @@ def open_words(robot: Mechanism, data: Measurements) -> str:
     """
     if int(robot.parameters.free.sum()) - data.n_rows > FEW:
         return ""
-    found = remedies(identifiability(robot, data))
+    found = suggest_measurements(identifiability(robot, data))
     if not 0 < len(found) <= FEW:
         return ""
     common = [

@@ -21,7 +21,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.apply.accuracy import transport
-from loopcal.diagnose.frame_motions import frame_motions
+from loopcal.diagnose import find_frame_motions
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.outlook import look, scene, without_own
@@ -185,7 +185,9 @@ def predicted(free: FreeParameters, solution: Solution, seen: Decomposition) -> 
     moves = transport(free.robot, at.T[0], "base", "tool") @ at.twists[0]
     used, V = seen.used[0], seen.directions[0]
     variance = np.where(used, 1.0, np.where(free.assumed.any(), np.inf, 1.0))
-    motions = frame_motions(Posterior(free.robot, free.places, free.tolerance, V, variance, used))
+    motions = find_frame_motions(
+        Posterior(free.robot, free.places, free.tolerance, V, variance, used)
+    )
     # P takes motions of frames out of a deviation, and leaves the rest as it is
     P = V[:, used] @ V[:, used].T + motions.kept @ V[:, ~used].T
     kept = moves[at.reached] @ P

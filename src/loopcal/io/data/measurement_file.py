@@ -86,7 +86,7 @@ def load_measurements(
         Readings outside the stroke, duplicates, noise that is no covariance, conventions that
         cannot be; with the file.
     """
-    from loopcal.diagnose.conventions import check_arrival
+    from loopcal.diagnose import check_conventions
     from loopcal.measure import check_duplicates, check_strokes
 
     tables = _tables(path)
@@ -97,7 +97,7 @@ def load_measurements(
         overrides = ("--allow-still", "--allow-implausible")
         allow = {"allow_still": allow_still, "allow_implausible": allow_implausible}
         parts = [next(iter(rows), "").rpartition(":")[0] for rows in places]
-        told = check_arrival(robot, data, **allow, overrides=overrides, parts=parts)
+        told = check_conventions(robot, data, **allow, overrides=overrides, parts=parts)
         if told.sentence:
             logging.getLogger(__name__).warning("%s: %s", files, told.sentence)
     except DataError as error:

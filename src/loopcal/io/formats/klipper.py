@@ -250,7 +250,7 @@ def judged(robot: Mechanism, measured: Measurements) -> tuple[str, ...]:
     """Whether the stored geometry is the optimum of Klipper's own cost; nothing where the probes do
     not determine one.
     """
-    from loopcal.diagnose.stored_geometry import stored_answer
+    from loopcal.diagnose import stored_answer
 
     found = stored_answer(robot, measured)
     return () if found is None else (str(found),)

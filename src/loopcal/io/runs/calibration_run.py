@@ -54,10 +54,10 @@ def build_result_document(
     fit: Identification, validation: Validation | None, origin: Mapping[str, Any], split: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """Return the content of result.json; see the module."""
-    from loopcal.diagnose import start_check
+    from loopcal.diagnose import check_start_values
 
     shown = None if validation is None else validation.to_dict()
-    start = start_check(fit).to_dict()
+    start = check_start_values(fit).to_dict()
     return {"made_by": dict(origin), "fit": fit.to_dict(), "start": start, "split": split, "validation": shown}
 
 

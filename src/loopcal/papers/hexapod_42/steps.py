@@ -26,7 +26,7 @@ from functools import cached_property
 import numpy as np
 
 from loopcal import geometry
-from loopcal.diagnose import pose_errors
+from loopcal.diagnose import compute_pose_errors
 from loopcal.geometry import Orientation, orientation
 from loopcal.measure import Measurements, Observations, Pose, stream
 from loopcal.mechanism import Mechanism, Solution, forward, inverse
@@ -162,7 +162,9 @@ def integrated(errors: FloatArray) -> FloatArray:
     """Largest dQint (k,) [mm + rad] over the poses of errors (k, n, 6) [m, rad]: equations (15) to
     (17).
     """
-    return np.array([pose_errors(e[:, :3], e[:, 3:]).statistics("integrated").max for e in errors])
+    return np.array(
+        [compute_pose_errors(e[:, :3], e[:, 3:]).statistics("integrated").max for e in errors]
+    )
 
 
 def transforms(poses: FloatArray, order: str) -> FloatArray:
