@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+# size: a list of cases, to be read as one
 """The registry of golden cases: small calibrations with fixed seeds, each a function that returns
 plain results.
 
@@ -98,7 +99,10 @@ def calibration(name: str, how: str) -> dict[str, Any]:
     """Calibrate a robot from 24 full poses."""
     data = measured(name, 24)
     options = {"rank_tolerance": 3e-4} if (name, how) == SECOND_ORDER else {}
-    found = fitted(name, data, api.method(how), allow_fewer_equations=True, **options)
+    identify = api.polished if name == "hexapod-nategh-agheli" else api.fit
+    found = api.report_fit(
+        identify(api.robot(name), data, api.method(how), allow_fewer_equations=True, **options)
+    )
     return {"data": api.report_data(data) if how == "map" else {}, **found}
 
 
@@ -112,7 +116,7 @@ for _name in api.robot_names():
 # ------------------------------------------------------------------------------------
 
 
-LEAN = ("length", "base.z")
+LEAN = ("length",)
 """Parameters that least squares finds where a kind tells so little that all 42 would be
 ill-conditioned.
 """
@@ -132,8 +136,10 @@ def one_kind(kind: Any, n: int = 30, machine: Any = None, lean: bool = False) ->
     )
     return {
         "data": api.report_data(data)["measured"],
-        "ls": api.report_fit(api.fit(less, data, api.method("ls"), allow_fewer_equations=True)),
-        "map": api.report_fit(api.fit(robot, data, api.method("map"))),
+        "ls": api.report_fit(
+            api.polished(less, data, api.method("ls"), allow_fewer_equations=True)
+        ),
+        "map": api.report_fit(api.polished(robot, data, api.method("map"))),
     }
 
 
@@ -156,14 +162,28 @@ def looking_at_joints(name: str) -> dict[str, Any]:
     return one_kind(api.joint_example(name, robot), 10, robot)
 
 
-NEARER = {
+INSTEAD = {
+    "component": api.kind(
+        "component", ("x", "y", "z", "phi", "theta"), "tilt-torsion", unknown=("frame",)
+    ),
+    "distance": api.kind(
+        "distance", anchor=np.array([0.5, -0.4, 0.6]), unknown=("anchor",), anchor_name="wire1"
+    ),
     "sphere": api.kind(
-        "sphere", unknown=("surface",), through=np.array([0.25, -0.15, 0.35]), surface="ball"
-    )
+        "sphere", unknown=("surface",), through=np.array([0.1, -0.08, 0.3]), surface="ball"
+    ),
+    "inclination": api.kind("inclination", unknown=("gravity",), sensor="level"),
 }
-"""Instead of an example that is so far away that its unknowns are ill-conditioned."""
+"""Of examples that are so far away, or leave so much open, that the start of their unknowns depends
+on rounding.
+"""
 
 LITTLE = (
+    "line",
+    "plane",
+    "bearing",
+    "direction",
+    "autocollimation",
     "bearing/theodolite",
     "bearing/camera",
     "distance",
@@ -184,7 +204,7 @@ FORMS = {
     "bearing/theodolite": api.kind("bearing", places=POINT, T_base_frame=STATION),
     "bearing/camera": api.kind(
         "bearing",
-        T_base_frame=api.transform((0.1, -0.1, -2.5)),
+        T_base_frame=api.transform((0.1, -0.1, -0.8)),
         form="camera",
         unknown=("frame",),
         frame="camera",
@@ -197,7 +217,7 @@ for _name in api.kind_names():
     if _name in JOINTS:
         add(f"kinds/{_name}", looking_at_joints, _name)
     else:
-        _kind = NEARER.get(_name) or api.most_unknown_example(_name)
+        _kind = INSTEAD.get(_name) or api.most_unknown_example(_name)
         add(f"kinds/{_name}", one_kind, _kind, MORE_ROWS.get(_name, 30), lean=_name in LITTLE)
 for _name, _kind in FORMS.items():
     _poses = 48 if _name.split("/")[0] in ("component", "distance", "sphere") else 20
@@ -228,7 +248,7 @@ PARTS = {
         frame="laser",
     ),
     "position": api.kind("position", places=POINT, unknown=("frame",), frame="cmm"),
-    "inclination": api.kind("inclination", unknown=("gravity", "mounting"), sensor="level"),
+    "inclination": api.kind("inclination", unknown=("gravity",), sensor="level"),
     "bearing": api.kind(
         "bearing", places=POINT, T_base_frame=STATION, unknown=("frame",), frame="station"
     ),
@@ -385,10 +405,15 @@ add("trials/hexapod-42/unknown-frame", trials, HEXAPOD, "map", None, ("position"
 
 def left_out() -> dict[str, Any]:
     """Score methods by leave-one-out."""
-    methods = [
-        api.method(*one)
-        for one in (("ls",), ("map",), ("ridge", 1e-2), ("ridge", 10.0), ("tsvd", 10), ("tsvd", 30))
-    ]
+    wanted = (
+        ("ls", None),
+        ("map", None),
+        ("ridge", 1e-2),
+        ("ridge", 10.0),
+        ("tsvd", 10),
+        ("tsvd", 30),
+    )
+    methods = [api.method(name, value) for name, value in wanted]
     return api.report_leave_one_out(api.robot(HEXAPOD), measured(HEXAPOD, 24), methods)
 
 
@@ -558,14 +583,17 @@ def again(change: float, limb: str | None) -> dict[str, Any]:
 
 
 add("recalibration/unchanged", again, 0.0, None)
-add("recalibration/longer-leg", again, 300 * UM, None, slow=True)
+add("recalibration/longer-leg", again, 300 * UM, None)
 add("recalibration/freed-limb", again, 300 * UM, "leg3")
 
 
 def earlier_as_prior(how: str) -> dict[str, Any]:
     """Use an earlier fit as prior knowledge of one with too few equations."""
     few = measured(HEXAPOD, 4, seed=6)
-    return fitted(HEXAPOD, few, api.method(how), prior=api.prior_of(usual_fit("ls")))
+    found = api.polished(
+        api.robot(HEXAPOD), few, api.method(how), prior=api.prior_of(usual_fit("ls"))
+    )
+    return api.report_fit(found)
 
 
 add("recalibration/prior-from-earlier", earlier_as_prior, "ls")
@@ -592,7 +620,6 @@ for _criterion in ("D", "I"):
         _criterion,
         hold_out=3,
         candidates=60,
-        slow=True,
     )
     add(
         f"plans/3-prs/pose/{_criterion}",
@@ -603,19 +630,8 @@ for _criterion in ("D", "I"):
         _criterion,
         hold_out=3,
         candidates=60,
-        slow=True,
     )
-add(
-    "plans/linear-delta/position/I",
-    plan,
-    DELTA,
-    "position",
-    12,
-    "I",
-    hold_out=3,
-    candidates=60,
-    slow=True,
-)
+add("plans/linear-delta/position/I", plan, DELTA, "position", 12, "I", hold_out=3, candidates=60)
 add(
     "plans/hexapod-42/pose/position",
     plan,
@@ -625,7 +641,6 @@ add(
     "I",
     target="position",
     candidates=50,
-    slow=True,
 )
 
 
@@ -635,7 +650,7 @@ def plan_further() -> dict[str, Any]:
     return plan(HEXAPOD, "pose", 6, "I", candidates=50, hold_out=0, measured=before)
 
 
-add("plans/hexapod-42/beyond-measured", plan_further, slow=True)
+add("plans/hexapod-42/beyond-measured", plan_further)
 
 
 def fedorov(name: str, kind: str, n: int, criterion: str) -> dict[str, Any]:
@@ -655,8 +670,8 @@ def exchange(criterion: str, axes: tuple[str, ...]) -> dict[str, Any]:
     )
 
 
-add("plans/coordinate-exchange/D", exchange, "D", ("x", "y", "z"), slow=True)
-add("plans/coordinate-exchange/A", exchange, "A", ("z",), slow=True)
+add("plans/coordinate-exchange/D", exchange, "D", ("x", "y", "z"))
+add("plans/coordinate-exchange/A", exchange, "A", ("z",))
 
 
 add(
@@ -672,12 +687,12 @@ add(
 add("papers/hexapod-42/exact", api.report_hexapod_42, None, 3)
 add("papers/hexapod-42/presumed-noise", api.report_hexapod_42, (1e-6, 1e-9), 3)
 add("papers/hexapod-42/stated-noise", api.report_hexapod_42, (1e-3, 1e-6), 2)
-add("papers/hexapod-42/table-4", api.report_hexapod_42_table_4, slow=True)
+add("papers/hexapod-42/table-4", api.report_hexapod_42_table_4)
 add("papers/hexapod-42/methods", api.report_hexapod_42_methods, 3)
 for _name in ("RU-PUS-PRS", "3-PRS"):
     for _five in (False, True):
         add(f"papers/tsvd-2016/{_name}/{5 if _five else 6}-dof", api.report_tsvd_2016, _name, _five)
-add("papers/cmm-constraint-2011/cell", api.report_cmm_constraint_2011, 8, 8, 1, 3, slow=True)
+add("papers/cmm-constraint-2011/cell", api.report_cmm_constraint_2011, 8, 8, 1, 3)
 add("papers/cmm-constraint-2011/surfaces", api.report_cmm_constraint_2011_surfaces, 8, 8, 1e-5)
 
 
@@ -695,8 +710,8 @@ def validation(name: str, how: str, *kinds: str) -> dict[str, Any]:
 
 for _name in (HEXAPOD, TRIPOD, DELTA, "ru-pus-prs", "five-bar"):
     add(f"validation/{_name}", validation, _name, "map", "pose")
-add("validation/hexapod-42/targets", validation, HEXAPOD, "map", "targets")
-add("validation/hexapod-42/three-kinds", validation, HEXAPOD, "map", "pose", "tilt", "position")
+add("validation/hexapod-42/targets", validation, HEXAPOD, "map", "pose", "targets")
+add("validation/hexapod-42/three-kinds", validation, HEXAPOD, "map", "pose", "tilt", "wire")
 
 
 def accuracy(name: str, how: str, frame: str) -> dict[str, Any]:
@@ -786,7 +801,6 @@ add(
     lambda: api.report_model_choice(
         api.robot(DELTA), measured(DELTA, 20, api.sensor(PARTS["position"])), api.method("map"), 3
     ),
-    slow=True,
 )
 
 
@@ -820,4 +834,4 @@ def arrival(slip: str) -> dict[str, Any]:
 
 
 for _slip in ("none", "unit", "sign", "order", "row"):
-    add(f"arrival/{_slip}", arrival, _slip, slow=_slip in ("unit", "sign", "order"))
+    add(f"arrival/{_slip}", arrival, _slip)

@@ -117,7 +117,7 @@ class PlaneAndLine:
             )
 
     @cached_property
-    def select_free_parameters(self) -> FreeParameters:
+    def free_parameters(self) -> FreeParameters:
         """The machine's, p of them."""
         return select_free_parameters(self.robot)
 
@@ -270,7 +270,7 @@ class PlaneAndLine:
         """Poses (n, 4, 4), slopes (n, 3, p) of the tool's origin in tolerances, and which rows of x
         (n, c) are reached.
         """
-        robot, free = self.robot, self.unknowns
+        robot, free = self.robot, self.free_parameters
         values = robot.values[None]
         state = inverse_trials(robot, values, x[None])
         q = readings_at(robot, values, state)
