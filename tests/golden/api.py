@@ -48,7 +48,7 @@ SIGMA = {Dimension.LENGTH: 5e-6, Dimension.ANGLE: 25e-6, Dimension.RATIO: 25e-6}
 
 
 # --- robots and kinematics
-# -------------------------------------------------------------------------------------------
+# ---
 
 
 def robot_names() -> list[str]:
@@ -158,7 +158,7 @@ def _pose(machine: Robot, T: Array) -> Array:
 
 
 # --- measurements
-# ----------------------------------------------------------------------------------------------------
+# ---
 
 
 def kind_names() -> list[str]:
@@ -292,7 +292,7 @@ def report_data(data: Data) -> Report:
 
 
 # --- fits
-# ------------------------------------------------------------------------------------------------------------
+# ---
 
 
 def method(name: str, value: Any = None) -> Any:
@@ -487,7 +487,7 @@ def report_recalibration(
 
 
 # --- what can be known, how well, and what is wrong
-# ------------------------------------------------------------------
+# ---
 
 
 def report_identifiability(machine: Robot, data: Data, cures: bool = False) -> Report:
@@ -690,7 +690,7 @@ def report_parameter_error(found: Fit, truth: Array) -> Report:
 
 
 # --- plans
-# -----------------------------------------------------------------------------------------------------------
+# ---
 
 
 def report_plan(
@@ -740,7 +740,7 @@ def report_coordinate_exchange(
     planned = PlaneAndLine(machine, points, 1e-3, axes)
     first = planned.random(groups, 1)
     wanted = {"D": D(), "A": A()}[criterion]
-    start = Start.nothing(len(planned.unknowns))
+    start = Start.nothing(len(planned.free_parameters))
     found = coordinate_exchange(
         planned.evaluate, first, planned.levels(), wanted, start, sweeps=sweeps
     )
@@ -767,7 +767,7 @@ def report_surface_plan(machine: Robot, groups: int, points: int) -> Report:
 
 
 # --- papers
-# ----------------------------------------------------------------------------------------------------------
+# ---
 
 
 def report_hexapod_42(noise: tuple[float, float] | None, iterations: int) -> Report:

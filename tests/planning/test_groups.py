@@ -72,7 +72,7 @@ def test_slopes_are_those_of_the_forward_kinematics(robot) -> None:
             forward(robot.with_values(robot.values + s * step), q.q, q).T[:, :3, 3]
             for s in (1.0, -1.0)
         ]
-        by_hand = (ends[0] - ends[1]) / 2e-6 * planned.unknowns.tolerance[place]
+        by_hand = (ends[0] - ends[1]) / 2e-6 * planned.free_parameters.tolerance[place]
         np.testing.assert_allclose(
             J[:, :, place], by_hand, atol=1e-11
         )  # [m per tolerance], central differences of 1e-3

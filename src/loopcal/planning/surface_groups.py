@@ -192,7 +192,7 @@ def plan_surfaces(
     if groups < 1:
         raise EstimationError(f"{groups} groups were asked for; ask for 1 or more")
     drawn, many = _drawn(planned, judged, groups, np.random.default_rng(seed))
-    start = Start.nothing(len(planned.unknowns))
+    start = Start.nothing(len(planned.free_parameters))
     rank = len(directions(many, start))
     if groups * (planned.points - SPENT) < rank:
         raise EstimationError(
@@ -235,7 +235,7 @@ def _drawn(
     EstimationError
         Hardly any group keeps to the constraints.
     """
-    enough = max(groups, -(-len(planned.unknowns) // (planned.points - SPENT)))
+    enough = max(groups, -(-len(planned.free_parameters) // (planned.points - SPENT)))
     design: list[FloatArray] = []
     rows: list[FloatArray] = []
     tried = 0

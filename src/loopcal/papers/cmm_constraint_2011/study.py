@@ -153,7 +153,7 @@ def plan(
         first,
         planned.levels(),
         D(),
-        Start.nothing(len(planned.unknowns)),
+        Start.nothing(len(planned.free_parameters)),
         sweeps=sweeps,
     )
     return Study(robot, planned, first, found, seed)

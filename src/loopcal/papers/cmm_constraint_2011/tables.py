@@ -78,7 +78,7 @@ def ranks(study: Study, seed: int) -> tuple[tuple[int, int, int, int, FloatArray
     found = []
     for groups, points in RANKS:
         planned = PlaneAndLine(study.robot, points, MM, AXES)
-        rows = planned.rows(planned.random(groups, seed)).reshape(-1, len(planned.unknowns))
+        rows = planned.rows(planned.random(groups, seed)).reshape(-1, len(planned.free_parameters))
         s = np.linalg.svd(rows, compute_uv=False)
         found.append((groups, points, len(rows), int((s > 1e-10 * s[0]).sum()), s))
     return tuple(found)
