@@ -15,8 +15,7 @@ from benchmarks.harness import Metric, measure_ratio, time_in_turns
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.outlook import scene
 from loopcal.io import load_robot
-from loopcal.mechanism import inverse
-from loopcal.mechanism.workspace import Sample, sample
+from loopcal.mechanism import WorkspaceSample, inverse, sample_workspace
 from loopcal.planning.certified import certified_design
 from loopcal.planning.coordinate import coordinate_exchange
 from loopcal.planning.criteria import D
@@ -30,10 +29,10 @@ POSES, SHARES = 100, (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
 @cache
-def _hexapod() -> tuple[FreeParameters, Sample, Array, Array]:
+def _hexapod() -> tuple[FreeParameters, WorkspaceSample, Array, Array]:
     """The shipped hexapod's unknowns, and the half ranges of its drawn positions about their means."""
     free = select_free_parameters(load_robot("hexapod-42"))
-    drawn = sample(free.robot, 1000, 0)
+    drawn = sample_workspace(free.robot, 1000, 0)
     return free, drawn, drawn.coordinates.mean(axis=0), 0.5 * np.ptp(drawn.coordinates, axis=0)
 
 

@@ -7,10 +7,15 @@ import numpy as np
 
 from benchmarks.harness import Metric, measure_ratio, time_in_turns
 from loopcal.io import load_robot
-from loopcal.mechanism import Assembly, build, forward
-from loopcal.mechanism.batch_kinematics import forward_trials, sensitivity
+from loopcal.mechanism import (
+    Assembly,
+    Mechanism,
+    build,
+    differentiate_pose,
+    forward,
+    forward_trials,
+)
 from loopcal.mechanism.families.gough import Gough
-from loopcal.mechanism.model import Mechanism
 
 POSES = 10_000
 
@@ -46,7 +51,7 @@ def bench_sensitivity() -> Metric:
     A, b = rng.normal(size=(POSES, 6, 6)), rng.normal(size=(POSES, 6, 1))
     return measure_ratio(
         "sensitivity.ups_hexapod",
-        lambda: sensitivity(robot, values, q, state),
+        lambda: differentiate_pose(robot, values, q, state),
         lambda: np.linalg.solve(A, b),
         limit=80.0,
     )

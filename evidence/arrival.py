@@ -28,7 +28,7 @@ from loopcal.measure import (
     Sensor,
     simulate,
 )
-from loopcal.mechanism import Mechanism, sample
+from loopcal.mechanism import Mechanism, sample_workspace
 from loopcal.units import Dimension
 
 SEED, POSES = 3, 20
@@ -57,7 +57,7 @@ def measured(robot: Mechanism, kind: Kind, times: float, seed: int) -> Measureme
         times * free.tolerance * np.random.default_rng((SEED, seed)).standard_normal(len(free))
     )
     try:
-        at = sample(robot, POSES, SEED + seed).coordinates
+        at = sample_workspace(robot, POSES, SEED + seed).coordinates
         return simulate(
             robot.with_values(truth), at, Instrument((Sensor(kind, noise),)), seed, controller=robot
         )

@@ -26,8 +26,7 @@ from loopcal.measure import (
     sample_truth,
     simulate_trials,
 )
-from loopcal.mechanism import Mechanism, sample
-from loopcal.mechanism.batch_kinematics import forward_trials, sensitivity
+from loopcal.mechanism import Mechanism, differentiate_pose, forward_trials, sample_workspace
 
 Array = NDArray[np.float64]
 
@@ -103,8 +102,8 @@ def fits(case: Case, count: int) -> Iterator[Outcome]:
     """Simulate and identify `count` machines drawn from the tolerances, some at a time."""
     robot = load_robot(case.robot)
     coordinates, elsewhere = (
-        sample(robot, case.poses, SEED).coordinates,
-        sample(robot, 10, SEED + 1).solution.q,
+        sample_workspace(robot, case.poses, SEED).coordinates,
+        sample_workspace(robot, 10, SEED + 1).solution.q,
     )
     for first in range(0, count, TOGETHER):
         seed = SEED + first
@@ -148,8 +147,8 @@ def _spread(
         forward_trials(robot, values, q[None]),
         forward_trials(robot, truth[good], q[None]),
     )
-    error = geometry.difference(predicted.T, true.T)
-    D = sensitivity(robot, values, q[None], predicted).parameters[..., robot.parameters.free]
+    error = geometry.pose_difference(predicted.T, true.T)
+    D = differentiate_pose(robot, values, q[None], predicted).parameters[..., robot.parameters.free]
     C = found.decomposition.take(np.flatnonzero(good)).covariance(found.penalty[good], 1.0)
     tolerance = found.unknowns.tolerance
     C = C * tolerance[:, None] * tolerance

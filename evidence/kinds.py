@@ -38,7 +38,7 @@ from loopcal.measure import (
     simulate_trials,
 )
 from loopcal.measure.closed_form import hand_eye, kabsch
-from loopcal.mechanism import Mechanism, build, forward, inverse, sample
+from loopcal.mechanism import Mechanism, build, forward, inverse, sample_workspace
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.typing import IntArray
 from loopcal.units import Dimension
@@ -145,7 +145,7 @@ def _robot(name: str, chains: bool) -> Mechanism:
 @cache
 def _commanded(name: str, seed: int) -> Array:
     """Coordinates (n, c) all over the workspace, those held out last."""
-    return sample(_robot(name, False), POSES + HELD_OUT, seed).coordinates
+    return sample_workspace(_robot(name, False), POSES + HELD_OUT, seed).coordinates
 
 
 def _passive(robot: Mechanism) -> tuple[str, ...]:
@@ -253,7 +253,7 @@ def pose_error(
         return float(np.abs((turned @ T)[:, :3, 3] - true[:, :3, 3]).max() / found.size)
     base, tool = (None if name in frames else np.eye(4) for name in ("base", "platform"))
     F, X = hand_eye(T, true, base, tool) if frames else (np.eye(4), np.eye(4))
-    off = geometry.difference(geometry.inverse(F) @ T @ X, true)
+    off = geometry.pose_difference(geometry.invert_pose(F) @ T @ X, true)
     return float(np.abs(off / np.array([1.0] * 3 + [found.size] * 3)).max())
 
 

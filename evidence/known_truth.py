@@ -33,8 +33,7 @@ from loopcal.measure import (
     sample_truth,
     simulate_trials,
 )
-from loopcal.mechanism import Mechanism, sample
-from loopcal.mechanism.batch_kinematics import forward_trials
+from loopcal.mechanism import Mechanism, forward_trials, sample_workspace
 
 Array = NDArray[np.float64]
 
@@ -64,7 +63,7 @@ def instrument(robot: Mechanism, length: float, angle: float) -> Instrument:
 def errors(robot: Mechanism, values: Array, truth: Array, q: Array) -> Array:
     """Root mean square position error (t,) [m] of poses predicted at unseen readings q (n, a)."""
     predicted, true = forward_trials(robot, values, q[None]), forward_trials(robot, truth, q[None])
-    gap = geometry.difference(predicted.T, true.T)[..., 3:]
+    gap = geometry.pose_difference(predicted.T, true.T)[..., 3:]
     return np.sqrt((gap**2).sum(axis=2).mean(axis=1))
 
 
@@ -72,8 +71,8 @@ def cell(name: str, noise: tuple[float, float], machines: int = MACHINES) -> dic
     """Error (t,) [m] before and after each method, for machines drawn from the tolerances."""
     robot = load_robot(name)
     coordinates, q = (
-        sample(robot, POSES, SEED).coordinates,
-        sample(robot, UNSEEN, SEED + 1).solution.q,
+        sample_workspace(robot, POSES, SEED).coordinates,
+        sample_workspace(robot, UNSEEN, SEED + 1).solution.q,
     )
     truth = sample_truth(robot, machines, SEED)
     trials = simulate_trials(robot, truth, coordinates, instrument(robot, *noise), SEED)

@@ -11,7 +11,7 @@ from evidence.known_truth import errors, instrument
 from loopcal.estimate import MAP, InflatedTolerances, LeastSquares, identify, identify_trials
 from loopcal.io import load_robot
 from loopcal.measure import Measurements, sample_truth, simulate_trials
-from loopcal.mechanism import Mechanism, sample
+from loopcal.mechanism import Mechanism, sample_workspace
 from loopcal.parameters import ParameterTable
 
 SEED, MACHINES, POSES, UNSEEN = 9, 60, 25, 60
@@ -33,8 +33,8 @@ def judge(name: str, factor: float, machines: int = MACHINES) -> dict[str, float
     robot = load_robot(name)
     stated = narrowed(robot, factor)
     coordinates, q = (
-        sample(robot, POSES, SEED).coordinates,
-        sample(robot, UNSEEN, SEED + 1).solution.q,
+        sample_workspace(robot, POSES, SEED).coordinates,
+        sample_workspace(robot, UNSEEN, SEED + 1).solution.q,
     )
     truth = sample_truth(robot, machines, SEED)
     trials = simulate_trials(robot, truth, coordinates, instrument(robot, *NOISE), SEED)

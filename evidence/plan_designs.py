@@ -12,7 +12,7 @@ import numpy as np
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.outlook import scene
 from loopcal.io import load_robot
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import sample_workspace
 from loopcal.planning.certified import certified_design
 from loopcal.planning.criteria import Criterion, D, I, evaluate
 from loopcal.planning.design import Start, design_factor
@@ -46,7 +46,7 @@ CASES = (
 def study(case: Case) -> list[object]:
     """One row: efficiencies against the bound, and what the certified design leaves open."""
     free = select_free_parameters(load_robot(case.robot))
-    twists = scene(free, sample(free.robot, CANDIDATES, 0).solution.q).twists[0]
+    twists = scene(free, sample_workspace(free.robot, CANDIDATES, 0).solution.q).twists[0]
     rows = (twists / SIGMA[:, None])[
         :, slice(0, 6) if case.measured == "full pose" else slice(3, 6)
     ]

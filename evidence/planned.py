@@ -27,8 +27,7 @@ from loopcal.measure import (
     sample_truth,
     simulate_trials,
 )
-from loopcal.mechanism import Mechanism, sample
-from loopcal.mechanism.batch_kinematics import forward_trials
+from loopcal.mechanism import Mechanism, forward_trials, sample_workspace
 from loopcal.planning.information import unit_rows
 from loopcal.planning.pose_planning import planned
 from loopcal.planning.problem import Problem, Target, problem
@@ -128,7 +127,10 @@ def prepare(
     """Draw machines and poses, and make the planning problem ready for a multiple of the noise."""
     robot = load_robot(case.robot)
     made = problem(robot, instrument(case, louder), count=candidates, seed=SEED)
-    pool, judged = sample(robot, seeds * most, SEED + 1), sample(robot, UNSEEN, SEED + 2)
+    pool, judged = (
+        sample_workspace(robot, seeds * most, SEED + 1),
+        sample_workspace(robot, UNSEEN, SEED + 2),
+    )
     rows = unit_rows(made.free, made.instrument, pool.solution.q, np.arange(seeds * most)[:, None])
     truth, q = sample_truth(robot, seeds * machines, SEED), judged.solution.q
     tool = forward_trials(robot, truth, q[None]).T @ robot.tool
@@ -219,7 +221,7 @@ def calibrated(
     robot = study.robot
     fit = identify_trials(robot, simulate_trials(robot, truth, poses, study.made.instrument, seed))
     assert fit.converged.all(), "machines within their tolerances are always found"
-    gap = geometry.difference(
+    gap = geometry.pose_difference(
         forward_trials(robot, fit.values, study.unseen[None]).T @ robot.tool, tool
     )
     squares = (gap**2).reshape(*gap.shape[:2], 2, 3).sum(axis=3).mean(axis=1)

@@ -104,7 +104,7 @@ AT_FULL_SIZE = (
 def draw_poses(rng: np.random.Generator, n: int) -> Array:
     """Poses (n, 4, 4) within a decimetre and a quarter of a radian of one 0.8 m above the base."""
     x = rng.uniform(-1, 1, (n, 6)) * [0.1, 0.1, 0.1, 0.25, 0.25, 0.25] + [0, 0, 0.8, 0, 0, 0]
-    return geometry.pose(geometry.euler_to_matrix(x[:, 3:], "xyz"), x[:, :3])
+    return geometry.make_pose(geometry.euler_to_matrix(x[:, 3:], "xyz"), x[:, :3])
 
 
 def truth_of(local: LocalUnknowns, rng: np.random.Generator) -> Array:
@@ -188,7 +188,7 @@ def start(name: str, seed: int) -> Start | None:
         data, local, truth = measured_at(KINDS[name], T, rng)
     except DataError:
         return None
-    believed = geometry.exp_update(T, rng.normal(size=(POSES, 6)) * OFF)
+    believed = geometry.apply_twist(T, rng.normal(size=(POSES, 6)) * OFF)
     found = start_values(data, believed, local)
     left, best = (
         float(np.linalg.norm(residuals(data, believed, local, values))) for values in (found, truth)

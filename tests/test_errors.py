@@ -6,7 +6,7 @@ import inspect
 import pytest
 
 from loopcal import errors
-from loopcal.errors import FileError, LoopcalError, nearest
+from loopcal.errors import FileError, LoopcalError, suggest_names
 
 
 def test_every_error_of_the_tree_is_a_loopcal_error() -> None:
@@ -27,5 +27,5 @@ def test_a_file_error_names_path_and_line(line: int | None, text: str) -> None:
 
 
 def test_nearest_names_close_names_only() -> None:
-    assert nearest("lenght", ["length", "angle"]) == " (did you mean 'length'?)"
-    assert nearest("zzz", ["length", "angle"]) == ""
+    assert suggest_names("lenght", ["length", "angle"]) == " (did you mean 'length'?)"
+    assert suggest_names("zzz", ["length", "angle"]) == ""

@@ -51,8 +51,8 @@ def test_a_name_used_twice_is_refused():
 
 
 def test_only_frees_the_chosen_and_fixes_the_rest():
-    chosen = TABLE.only(["tower1.angle"])
+    chosen = TABLE.with_free(["tower1.angle"])
     assert_array_equal(chosen.free, [False, False, True])
     assert_array_equal(TABLE.free, [True, True, False])
     with pytest.raises(MechanismError, match="no parameter is called"):
-        TABLE.only(["leg2.length"])
+        TABLE.with_free(["leg2.length"])

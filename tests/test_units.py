@@ -6,7 +6,7 @@ import math
 import pytest
 
 from loopcal.errors import UnitError
-from loopcal.units import Dimension, quantity, symbols, unit
+from loopcal.units import Dimension, find_unit, list_symbols, parse_quantity
 
 
 @pytest.mark.parametrize(
@@ -24,7 +24,7 @@ from loopcal.units import Dimension, quantity, symbols, unit
     ],
 )
 def test_a_quantity_is_its_number_times_the_factor_of_its_unit(text: str, value: float) -> None:
-    assert quantity(text) == pytest.approx(value, rel=4e-16)  # one rounding of the product
+    assert parse_quantity(text) == pytest.approx(value, rel=4e-16)  # one rounding of the product
 
 
 @pytest.mark.parametrize(
@@ -41,11 +41,11 @@ def test_a_quantity_is_its_number_times_the_factor_of_its_unit(text: str, value:
 )
 def test_a_bad_quantity_is_refused_with_what_is_allowed(text: str, message: str) -> None:
     with pytest.raises(UnitError, match=message):
-        quantity(text, Dimension.LENGTH)
+        parse_quantity(text, Dimension.LENGTH)
 
 
 def test_every_unit_is_found_by_its_symbol() -> None:
     for dimension in Dimension:
-        for symbol in symbols(dimension):
-            assert unit(symbol, dimension).dimension is dimension
-            assert str(unit(symbol)) == symbol
+        for symbol in list_symbols(dimension):
+            assert find_unit(symbol, dimension).dimension is dimension
+            assert str(find_unit(symbol)) == symbol

@@ -14,20 +14,21 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.mechanism import (
+    AXES,
     Actuator,
     Address,
     Assembly,
     Joint,
     Limb,
-    Linear,
+    LinearMap,
     Link,
     Mechanism,
+    PoseRecord,
+    Workspace,
     build,
 )
-from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.families.gough import Gough
 from loopcal.mechanism.families.linear_delta import LinearDelta
-from loopcal.mechanism.records import Pose, Workspace
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 
@@ -163,7 +164,7 @@ def gough(
         platform=tuple(tuple(p) for p in platform.tolist()),
         lengths=tuple(np.broadcast_to(lengths, 6).tolist()),
         stroke=stroke,
-        home=Pose(z=z),
+        home=PoseRecord(z=z),
     )
     return build(record.expand(), record=record)
 
@@ -175,7 +176,9 @@ def gough_values(base: Array, platform: Array, lengths: Array) -> Array:
 
 def poses_of(coordinates: Array) -> Array:
     """Poses (n, 4, 4) of x, y, z, roll, pitch, yaw (n, 6) [m, rad]."""
-    return geometry.pose(geometry.euler_to_matrix(coordinates[:, 3:], "xyz"), coordinates[:, :3])
+    return geometry.make_pose(
+        geometry.euler_to_matrix(coordinates[:, 3:], "xyz"), coordinates[:, :3]
+    )
 
 
 # --- deltas and planar machines: platforms with fewer than six freedoms
@@ -193,7 +196,7 @@ def delta(readings: str = "drop") -> Mechanism:
         stops=(0.3, 0.301, 0.2985),
         readings="drop" if readings == "drop" else "height",
         stroke=(-0.1, 0.4),
-        home=Pose(z=0.1),
+        home=PoseRecord(z=0.1),
         workspace=Workspace(x=(-0.08, 0.08), y=(-0.08, 0.08), z=(0.0, 0.2)),
     )
     return build(record.expand(), record=record)
@@ -297,7 +300,7 @@ def three_prs() -> Mechanism:
             name = f"{owner}.{element}.{axis}"
             dimension = Dimension.ANGLE if axis in AXES[:3] else Dimension.LENGTH
             parameters.append(Parameter(name, dimension, 0.0))
-            maps.append(Linear(name, Address(owner, element, axis)))
+            maps.append(LinearMap(name, Address(owner, element, axis)))
     return build(
         Assembly(
             name="3-PRS",
@@ -328,7 +331,7 @@ def menagerie() -> Mechanism:
 def menagerie_assembly(seed: int = 7) -> Assembly:
     """Axes and offsets are random about the legs of a hexapod, so that nothing is zero by symmetry."""
     rng = np.random.default_rng(seed)
-    home = geometry.pose(
+    home = geometry.make_pose(
         geometry.exp_so3(np.array([0.05, -0.08, 0.1])), np.array([0.01, -0.02, 0.25])
     )
     kinds = [
@@ -372,20 +375,20 @@ def random_limb(
 
     `driven` is the joint that `motor` drives; -1 for the rod of a `distance` ending.
     """
-    attachment = geometry.pose(geometry.exp_so3(rng.normal(size=3)), corner)
+    attachment = geometry.make_pose(geometry.exp_so3(rng.normal(size=3)), corner)
     end = home @ attachment
     rod = ending == "distance"
     leg, frames = end[:3, 3] - foot, []
     for j, kind in enumerate(kinds):
         along = float(j + 0.3 * rng.uniform()) / (len(kinds) + int(rod))
         point = foot + along * leg + 0.01 * rng.normal(size=3)
-        frames.append(geometry.pose(_frame(rng, leg, kind), point))
+        frames.append(geometry.make_pose(_frame(rng, leg, kind), point))
     tip = end
     if rod and kinds == "H":  # a crank whose arm lies across the leg, far from its dead points
         arm = geometry.hat(frames[0][:3, 2]) @ leg
-        tip = geometry.pose(geometry.exp_so3(rng.normal(size=3)), foot + leg * 0.2 + arm * 0.4)
+        tip = geometry.make_pose(geometry.exp_so3(rng.normal(size=3)), foot + leg * 0.2 + arm * 0.4)
     elif rod:
-        tip = geometry.pose(
+        tip = geometry.make_pose(
             geometry.exp_so3(rng.normal(size=3)), foot + leg * (0.7 if kinds else 0.0)
         )
     start = rng.uniform(0.02, 0.06, len(kinds)) * np.where([k == "P" for k in kinds], 1.0, 8.0)
@@ -401,7 +404,7 @@ def random_limb(
     )
     before, links = np.eye(4), []
     for j, frame in enumerate([*frames, tip]):
-        links.append(Link(f"link{j}", geometry.inverse(before) @ frame))
+        links.append(Link(f"link{j}", geometry.invert_pose(before) @ frame))
         if j < len(kinds):
             before = frame @ _motion(joints[j])
     length = float(np.linalg.norm(end[:3, 3] - tip[:3, 3])) if rod else 0.0
@@ -458,7 +461,7 @@ def assembled(
         name_of = f"{address.owner}.{address.element}.{address.axis}"
         nominal = 1.0 if address.axis == "gain" else 0.0
         parameters.append(Parameter(name_of, _dimension(address, turns), nominal))
-        maps.append(Linear(name_of, address))
+        maps.append(LinearMap(name_of, address))
     return Assembly(
         name, limbs, actuators, freedoms, controlled, home, tuple(parameters), tuple(maps)
     )
@@ -484,7 +487,7 @@ def _dimension(address: Address, turns: set[str]) -> Dimension:
 
 def place(point: Iterable[float], turn: Iterable[float] = (0.0, 0.0, 0.0)) -> Array:
     """Pose (4, 4) from a position [m] and a rotation vector [rad]."""
-    return geometry.pose(
+    return geometry.make_pose(
         geometry.exp_so3(np.array(list(turn), dtype=float)), np.array(list(point), dtype=float)
     )
 

@@ -18,8 +18,7 @@ from loopcal.io.data.kind_settings import SYMBOLS, list_kind_settings
 from loopcal.io.exports.profile import FROM, KEYS
 from loopcal.io.runs.run_folder import MADE_BY
 from loopcal.measure import KINDS, Column, Kind
-from loopcal.mechanism import FAMILIES
-from loopcal.mechanism.records import Robot
+from loopcal.mechanism import FAMILIES, RobotRecord
 from loopcal.units import Dimension
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
@@ -59,7 +58,7 @@ def record_table(record: type, without: Iterable[str] = ()) -> str:
 
 def common() -> str:
     """Return what every robot file may say."""
-    parts = [record_table(Robot)]
+    parts = [record_table(RobotRecord)]
     parts += [_nested(record) for record in common_records()]
     return "\n".join(parts)
 
@@ -75,7 +74,7 @@ def common_records() -> tuple[type, ...]:
 
 def families() -> str:
     """Return the keys of every family, beside the common ones."""
-    shared = [key.name for key in file_reference.keys(Robot)]
+    shared = [key.name for key in file_reference.keys(RobotRecord)]
     parts = []
     for name, family in FAMILIES.items():
         own = [record for record in file_reference.nested(family) if record not in common_records()]

@@ -50,12 +50,12 @@ if TYPE_CHECKING:
     from loopcal.mechanism import Mechanism as Mechanism
     from loopcal.mechanism import Solution as Solution
     from loopcal.mechanism import Status as Status
-    from loopcal.mechanism import along_path as along_path
-    from loopcal.mechanism import assembly_modes as assembly_modes
+    from loopcal.mechanism import find_assembly_modes as find_assembly_modes
+    from loopcal.mechanism import find_working_modes as find_working_modes
     from loopcal.mechanism import forward as forward
     from loopcal.mechanism import inverse as inverse
-    from loopcal.mechanism import sample as sample
-    from loopcal.mechanism import working_modes as working_modes
+    from loopcal.mechanism import sample_workspace as sample_workspace
+    from loopcal.mechanism import trace_singularity as trace_singularity
     from loopcal.planning import Constraints as Constraints
     from loopcal.planning import Plan as Plan
     from loopcal.planning import Sight as Sight
@@ -108,12 +108,12 @@ _WHERE = {
             "Mechanism",
             "Solution",
             "Status",
-            "along_path",
-            "assembly_modes",
+            "trace_singularity",
+            "find_assembly_modes",
             "forward",
             "inverse",
-            "sample",
-            "working_modes",
+            "sample_workspace",
+            "find_working_modes",
         ),
         "loopcal.planning": ("Constraints", "Plan", "Sight", "plan", "plan_surfaces"),
     }.items()

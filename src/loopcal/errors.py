@@ -62,7 +62,7 @@ class FileError(LoopcalError):
         return f"{place}: {self.sentence}"
 
 
-def nearest(name: str, allowed: Iterable[str], n: int = 3) -> str:
+def suggest_names(name: str, allowed: Iterable[str], n: int = 3) -> str:
     """Return ` (did you mean 'a' or 'b'?)` with the allowed names closest to `name`, or nothing
     where none is close.
     """

@@ -95,7 +95,7 @@ class ParameterTable:
             f"no parameter is called {name!r}; the nearest names are {', '.join(near)}"
         )
 
-    def only(self, names: Iterable[str]) -> ParameterTable:
+    def with_free(self, names: Iterable[str]) -> ParameterTable:
         """The same table with just these parameters free."""
         chosen = {self.names[self.index(name)] for name in names}
         return ParameterTable(tuple(replace(p, free=p.name in chosen) for p in self.entries))

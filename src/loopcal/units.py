@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Annotated
 
-from loopcal.errors import UnitError, nearest
+from loopcal.errors import UnitError, suggest_names
 
 
 class Dimension(Enum):
@@ -84,7 +84,7 @@ EXAMPLES: Mapping[Dimension, str] = {
 }
 
 
-def symbols(dimension: Dimension | None = None) -> tuple[str, ...]:
+def list_symbols(dimension: Dimension | None = None) -> tuple[str, ...]:
     """Return the allowed unit symbols, of one dimension or of all."""
     return tuple(s for s, u in UNITS.items() if dimension is None or u.dimension is dimension)
 
@@ -92,7 +92,7 @@ def symbols(dimension: Dimension | None = None) -> tuple[str, ...]:
 ARTICLES = {Dimension.LENGTH: "a length", Dimension.ANGLE: "an angle", Dimension.RATIO: "a ratio"}
 
 
-def unit(symbol: str, dimension: Dimension | None = None) -> Unit:
+def find_unit(symbol: str, dimension: Dimension | None = None) -> Unit:
     """Return the unit with this symbol.
 
     Parameters
@@ -108,10 +108,10 @@ def unit(symbol: str, dimension: Dimension | None = None) -> Unit:
         Unknown symbol, or a unit of another dimension; the text lists the allowed ones.
     """
     found = UNITS.get(symbol)
-    allowed = symbols(dimension)
+    allowed = list_symbols(dimension)
     if found is None:
         raise UnitError(
-            f"unknown unit {symbol!r}{nearest(symbol, allowed)}; allowed are {', '.join(allowed)}"
+            f"unknown unit {symbol!r}{suggest_names(symbol, allowed)}; allowed are {', '.join(allowed)}"
         )
     if dimension is not None and found.dimension is not dimension:
         raise UnitError(
@@ -122,7 +122,7 @@ def unit(symbol: str, dimension: Dimension | None = None) -> Unit:
     return found
 
 
-def quantity(text: str, dimension: Dimension | None = None) -> float:
+def parse_quantity(text: str, dimension: Dimension | None = None) -> float:
     """Return the SI value of a number with its unit, such as `0.02mm` or `5 urad`.
 
     Raises
@@ -144,10 +144,10 @@ def quantity(text: str, dimension: Dimension | None = None) -> float:
         )
     if not symbol:
         raise UnitError(
-            f"{text!r} has no unit; add one of {', '.join(symbols(dimension))}, for example "
+            f"{text!r} has no unit; add one of {', '.join(list_symbols(dimension))}, for example "
             f"{example}"
         )
-    return value * unit(symbol, dimension).factor_to_si
+    return value * find_unit(symbol, dimension).factor_to_si
 
 
 def _is_number(text: str) -> bool:

@@ -16,8 +16,7 @@ from loopcal.diagnose import find_frame_motions
 from loopcal.errors import EstimationError
 from loopcal.estimate import MAP, LeastSquares, identify
 from loopcal.measure import sample_truth, simulate
-from loopcal.mechanism import forward, inverse
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import forward, inverse, sample_workspace
 from tests.estimate.problems import five_dof, hexapod, hexapod_data, hexapod_poses, tracker
 
 WHERE = hexapod_poses(5, seed=11)
@@ -39,7 +38,7 @@ def slopes(function, at, steps):
     for i, h in enumerate(steps):
         d = np.zeros(len(at))
         d[i] = h
-        columns.append(geometry.difference(function(at + d), function(at - d)) / (2 * h))
+        columns.append(geometry.pose_difference(function(at + d), function(at - d)) / (2 * h))
     return np.stack(columns, axis=-1)
 
 
@@ -188,7 +187,7 @@ def test_options_that_do_not_exist_are_refused(fit):
 def test_the_map_shows_extrapolation():
     robot = load_robot("hexapod-42")
     truth = robot.with_values(sample_truth(robot, 1, 5)[0])
-    everywhere = sample(robot, 30, 1).coordinates
+    everywhere = sample_workspace(robot, 30, 1).coordinates
     middle = everywhere.mean(axis=0)
     maps = []
     for share in (1.0, 0.2):  # poses all over the workspace, and in the middle fifth of it
@@ -224,7 +223,9 @@ def bounds(trials, numbers):
 )
 def test_predicted_errors_of_pose_are_those_of_simulated_calibrations(name, method):
     robot, trials = load_robot(name), 300
-    measured, judged = (sample(robot, n, seed).coordinates for n, seed in ((40, 1), (6, 9)))
+    measured, judged = (
+        sample_workspace(robot, n, seed).coordinates for n, seed in ((40, 1), (6, 9))
+    )
     found = monte_carlo(robot, measured, tracker(), judged, method, trials, seed=3)
     ratio = found.ratio[np.isfinite(found.ratio)]
     low, high = bounds(found.trials, len(ratio))

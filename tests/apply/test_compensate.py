@@ -10,8 +10,7 @@ from loopcal import geometry, load_robot
 from loopcal.apply.compensation import Reach, compensate
 from loopcal.errors import DataError
 from loopcal.estimate import LeastSquares, identify
-from loopcal.mechanism import coordinates, forward, inverse
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import compare_coordinates, forward, inverse, sample_workspace
 from tests.estimate.problems import hexapod, hexapod_data, hexapod_poses
 
 ROBOTS = ("hexapod-42", "3-prs", "linear-delta", "ru-pus-prs", "five-bar")
@@ -29,10 +28,10 @@ def calibrated(name, seed=1):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_readings_take_the_controlled_coordinates_to_their_targets(name):
     robot = calibrated(name)
-    targets = sample(robot, 20, 2).coordinates
+    targets = sample_workspace(robot, 20, 2).coordinates
     found = compensate(robot, targets)
     reached = forward(robot, found.readings).T
-    demanded = coordinates.demands(reached, targets, robot.controlled, robot.size)[0]
+    demanded = compare_coordinates(reached, targets, robot.controlled, robot.size)[0]
     assert np.abs(demanded).max() < 1e-12  # [m], closure solved to rounding
     assert found.good.all()
     assert found.uncertainty is None
@@ -41,7 +40,7 @@ def test_readings_take_the_controlled_coordinates_to_their_targets(name):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_shifted_commands_lead_to_the_same_readings(name):
     robot = calibrated(name)
-    targets = sample(robot, 20, 2).coordinates
+    targets = sample_workspace(robot, 20, 2).coordinates
     best, found = compensate(robot, targets), compensate(robot, targets, "commands", steps=6)
     assert found.commands is not None
     np.testing.assert_allclose(
@@ -55,14 +54,17 @@ def test_shifted_commands_lead_to_the_same_readings(name):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_each_step_of_the_fixed_point_leaves_less_than_a_tenth(name):
     robot = calibrated(name)
-    found = compensate(robot, sample(robot, 20, 2).coordinates, "commands", steps=3)
+    found = compensate(robot, sample_workspace(robot, 20, 2).coordinates, "commands", steps=3)
     left = found.residual_position + robot.size * found.residual_orientation
     assert left.shape == (4, 20)
     assert (left[1:] < 0.1 * left[:-1] + 1e-12).all()  # [m]
 
 
 def test_a_machine_with_six_actuators_is_compensated_in_full():
-    robot, targets = calibrated("hexapod-42"), sample(load_robot("hexapod-42"), 10, 3).solution.T
+    robot, targets = (
+        calibrated("hexapod-42"),
+        sample_workspace(load_robot("hexapod-42"), 10, 3).solution.T,
+    )
     found = compensate(robot, targets)
     assert set(found.reach) == {Reach.REACHED}
     assert np.linalg.norm(found.before[:, 3:], axis=1).min() > 1e-6
@@ -71,13 +73,13 @@ def test_a_machine_with_six_actuators_is_compensated_in_full():
 
 def test_what_a_tripod_has_no_actuator_for_stays_and_no_reading_makes_it_smaller():
     robot = calibrated("3-prs")
-    targets = sample(load_robot("3-prs"), 10, 3).solution.T
+    targets = sample_workspace(load_robot("3-prs"), 10, 3).solution.T
     found = compensate(robot, targets)
     assert set(found.reach) == {Reach.IN_PART}
     assert found.sentences[0].startswith("z, phi, theta reached; no actuator removes 0.")
 
     def distance(readings):
-        gap = geometry.difference(forward(robot, readings).T, targets)
+        gap = geometry.pose_difference(forward(robot, readings).T, targets)
         return (gap[:, 3:] ** 2).sum(axis=1) + robot.size**2 * (gap[:, :3] ** 2).sum(axis=1)
 
     here = distance(found.readings)
@@ -112,7 +114,7 @@ def test_targets_out_of_reach_or_beyond_the_strokes_are_named():
 
 def test_a_target_that_fails_does_not_disturb_the_others():
     robot = calibrated("hexapod-42")
-    good = sample(robot, 4, 3).coordinates
+    good = sample_workspace(robot, 4, 3).coordinates
     alone = compensate(robot, good, "commands")
     mixed = compensate(robot, np.vstack([good, np.full(6, np.nan)]), "commands")
     np.testing.assert_allclose(mixed.readings[:4], alone.readings, rtol=0, atol=1e-12)

@@ -10,7 +10,7 @@ from loopcal.cli import main
 from loopcal.errors import DataError
 from loopcal.io import load_measurements, load_robot, save_measurements
 from loopcal.measure import Gaussian, Instrument, Pose, Sensor, simulate
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import sample_workspace
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def saved(path, kind, n=9, seed=0, change=None, unknowns=None):
         robot.values + 0.03e-3 * np.random.default_rng(0).standard_normal(len(robot.values))
     )
     instrument = Instrument((Sensor(kind, Gaussian(np.array([5e-6] * 3 + [1e-6] * 3))),))
-    poses = sample(robot, n, seed + 1).coordinates
+    poses = sample_workspace(robot, n, seed + 1).coordinates
     save_measurements(
         simulate(truth, poses, instrument, seed, controller=robot, unknowns=unknowns), path, robot
     )

@@ -9,7 +9,7 @@ from loopcal.cli import main
 from loopcal.errors import MechanismError
 from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.measure import KINDS
-from loopcal.mechanism.records import AngleTolerance, LengthTolerance, Workspace, standard_deviation
+from loopcal.mechanism import AngleTolerance, LengthTolerance, Workspace, standard_deviation
 
 ROBOT = find_robot_file("hexapod-42").read_text()
 PROFILE = Path("examples/exports/cmm-spheres.yaml").read_text("utf-8")

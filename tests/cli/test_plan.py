@@ -12,8 +12,7 @@ import pytest
 from loopcal.cli import main
 from loopcal.io import load_measurements, load_robot
 from loopcal.measure import sample_truth
-from loopcal.mechanism import forward, inverse
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import forward, inverse, sample_workspace
 
 SMALL = ["--poses", "8", "--hold-out", "3", "--candidates", "24", "--kind", "position"]
 
@@ -132,7 +131,7 @@ def test_planes_and_lines_are_planned_held_filled_in_and_calibrated(here, capsys
     assert run("calibrate hexapod-nategh-agheli filled.csv -o run") == 0
     # of these data nine motions of frames are unknown, but none of them changes a distance between
     # places of the tool
-    q = sample(robot, 20, seed=4).solution.q
+    q = sample_workspace(robot, 20, seed=4).solution.q
     places = [forward(one, q).T[:, :3, 3] for one in (truth, robot, load_robot("run/robot.yaml"))]
     true, before, after = (np.linalg.norm(x[:, None] - x[None], axis=2) for x in places)
     assert np.abs(before - true).max() > 1e-4  # [m]

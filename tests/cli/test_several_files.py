@@ -23,7 +23,7 @@ from loopcal.measure import (
     sample_truth,
     simulate,
 )
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import sample_workspace
 
 SD = "tracker.x: {start: 0 mm, sd: 1 mm}"
 
@@ -32,7 +32,7 @@ SD = "tracker.x: {start: 0 mm, sd: 1 mm}"
 def data() -> Measurements:
     """A tracker whose frame is unknown, set up on two days, and an inclinometer, at 20 poses."""
     robot = load_robot("hexapod-42")
-    poses = sample(robot, 20, 3).coordinates
+    poses = sample_workspace(robot, 20, 3).coordinates
     days = np.array(["monday"] * 11 + ["tuesday"] * 9)
     tracker = Sensor(
         Pose(unknown=("frame",), frame="tracker"),

@@ -41,7 +41,7 @@ from loopcal.measure import (
     Sensor,
     simulate,
 )
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import sample_workspace
 from loopcal.parameters import ParameterTable
 from loopcal.units import Dimension
 
@@ -67,7 +67,7 @@ def measured(name: str, kind: Kind, n: int = 10, times: float = 1.0, seed: int =
     truth[free.places] += (
         times * free.tolerance * np.random.default_rng(seed).standard_normal(len(free))
     )
-    targets = sample(robot, n, 1).coordinates
+    targets = sample_workspace(robot, n, 1).coordinates
     return simulate(
         robot.with_values(truth),
         targets,
@@ -119,7 +119,7 @@ def scalar_last(values):
     values[:, :4] = values[:, [1, 2, 3, 0]]
 
 
-STATION = geometry.pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
+STATION = geometry.make_pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
 XYZ = Pose("euler-xyz")
 SLIPS = {
     "milliradians written as radians": (
@@ -370,7 +370,7 @@ def test_too_few_rows_say_nothing() -> None:
 
 
 def test_of_two_joined_instruments_the_one_in_the_wrong_unit_is_named() -> None:
-    robot, at = robot_of("hexapod-42"), sample(robot_of("hexapod-42"), 10, 1).coordinates
+    robot, at = robot_of("hexapod-42"), sample_workspace(robot_of("hexapod-42"), 10, 1).coordinates
     sensors = (
         Sensor(Position(), Gaussian(np.full(3, 1e-5))),
         Sensor(Inclination(), Gaussian(np.full(2, 5e-5))),

@@ -52,7 +52,7 @@ def printers(data_folder: Path, tmp_path_factory) -> dict[str, Printer]:
 
 def only(robot: Mechanism, *names: str) -> Mechanism:
     """The robot with these parameters free."""
-    return replace(robot, parameters=robot.parameters.only(names))
+    return replace(robot, parameters=robot.parameters.with_free(names))
 
 
 def with_sigmas(data: Measurements, height: float, distance: float) -> Measurements:

@@ -20,8 +20,7 @@ from loopcal.measure import (
     Sensor,
     simulate,
 )
-from loopcal.mechanism import forward
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import forward, sample_workspace
 from tests.estimate.problems import UM, hexapod, hexapod_data, noise
 
 MM = 1e-3
@@ -62,7 +61,7 @@ def test_a_fit_that_follows_the_better_instrument_is_not_called_larger_for_the_w
     stops = np.array([name.endswith("stop") for name in new.parameters.names])
     old = new.with_values(new.values + 0.1 * MM * stops)
     heights = Instrument((Sensor(Component(("z",)), noise(20 * UM)),))
-    readings = simulate(new, sample(new, 40, 3).coordinates, heights, 3).readings
+    readings = simulate(new, sample_workspace(new, 40, 3).coordinates, heights, 3).readings
     z, xyz = forward(new, readings[:10]).T[:, 2, 3:], forward(old, readings[10:]).T[:, :3, 3]
     heights = Observations.from_sigma(
         Component(("z",)).mounted(new.tool), np.arange(10), z, 20 * UM

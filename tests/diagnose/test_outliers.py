@@ -29,8 +29,7 @@ from loopcal.measure import (
     simulate,
     simulate_trials,
 )
-from loopcal.mechanism import Mechanism
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import Mechanism, sample_workspace
 from loopcal.numerics.decomposition import decompose
 from tests import zoo
 from tests.estimate.problems import UM, URAD, hexapod, hexapod_data, hexapod_poses, noise, tracker
@@ -199,7 +198,7 @@ def test_the_distance_of_a_pose_set_aside_is_what_the_others_say_of_it_where_a_r
     """
     robot = load_robot("linear-delta")
     truth = robot.with_values(sample_truth(robot, 1, 3)[0])
-    coordinates = sample(robot, 20, 3).coordinates
+    coordinates = sample_workspace(robot, 20, 3).coordinates
     instrument = Instrument((Sensor(Position(unknown=frame), noise(*[10 * UM] * 3)),))
     data = simulate(truth, coordinates, instrument, 3, reading_sigma=20 * UM)
     assert data.reading_sigma is not None
@@ -235,14 +234,17 @@ def probed(
     """
     robot = load_robot("linear-delta")
     names = ("radius", "tower1.angle", "tower2.angle", "tower1.stop", "tower2.stop", "tower3.stop")
-    robot = replace(robot, parameters=robot.parameters.only(names))
+    robot = replace(robot, parameters=robot.parameters.with_free(names))
     turn = np.arange(points - 1) * 2.4  # [rad], so that no two points are opposite
     ring = (
         np.stack([np.cos(turn), np.sin(turn)], axis=1)
         * np.where(np.arange(points - 1) % 2, 0.05, 0.08)[:, None]
     )
     coordinates = np.zeros((points, 3))
-    coordinates[1:, :2], coordinates[:, 2] = ring, sample(robot, 20, 3).coordinates[:, 2].mean()
+    coordinates[1:, :2], coordinates[:, 2] = (
+        ring,
+        sample_workspace(robot, 20, 3).coordinates[:, 2].mean(),
+    )
     heights = Instrument((Sensor(Component(("z",)), noise(sigma)),))
     data = simulate(robot, coordinates, heights, 5)
     rows = data.observations[0]

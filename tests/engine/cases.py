@@ -77,7 +77,7 @@ def unit_of_displacements(program: Program) -> Array:
 def unknowns(program: Program, state: State, free: bool = False) -> Array:
     """Joints that closure determines (t, n, u): group by group, limb by limb."""
     parts = [
-        joints[..., group.unknown(free)].reshape(*state.T.shape[:2], -1)
+        joints[..., group.unknown_joints(free)].reshape(*state.T.shape[:2], -1)
         for group, joints in zip(program.groups, state.joints, strict=True)
     ]
     return np.concatenate(parts, axis=-1)
@@ -87,7 +87,7 @@ def motion(program: Program, state: State, of: State, free: bool = False) -> Arr
     """Change (t, n, m + u) of the platform (as a twist, its freedoms only) and of the unknown
     joints since `of`.
     """
-    twist = geometry.difference(state.T, np.broadcast_to(of.T, state.T.shape))[
+    twist = geometry.pose_difference(state.T, np.broadcast_to(of.T, state.T.shape))[
         ..., list(program.freedoms)
     ]
     return np.concatenate(
@@ -101,7 +101,7 @@ def pose_demand(
     """The task of reaching poses (N, 4, 4), all six freedoms."""
 
     def task(T: Array, rows: NDArray[np.int64]) -> tuple[Array, Array]:
-        gap = geometry.difference(T, target[rows])
+        gap = geometry.pose_difference(T, target[rows])
         columns = np.zeros((len(rows), 6, 6))
         columns[:, :3, :3] = geometry.left_jacobian_inverse_so3(gap[:, :3])
         columns[:, 3:, 3:] = np.eye(3)
@@ -192,7 +192,7 @@ def open_by(program: Program, state: State, e: Array) -> Array:
     return out
 
 
-# --- what the blocks of `linearise` say, solved row by row
+# --- what the blocks of `linearize` say, solved row by row
 # -----------------------------------------------------------
 
 

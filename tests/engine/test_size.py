@@ -7,13 +7,13 @@ import ast
 from pathlib import Path
 
 
-def test_the_engine_has_at_most_five_files_and_600_lines(root: Path):
+def test_the_engine_has_at_most_five_files_and_800_lines(root: Path):
     files = sorted((root / "src" / "loopcal" / "engine").glob("*.py"))
     assert len(files) <= 5
-    assert sum(len(file.read_text("utf-8").splitlines()) for file in files) <= 600
+    assert sum(len(file.read_text("utf-8").splitlines()) for file in files) <= 800
 
 
-def test_the_engine_imports_numpy_and_nothing_of_loopcal(root: Path):
+def test_the_engine_imports_numpy_and_the_array_types_only(root: Path):
     found = set()
     for file in (root / "src" / "loopcal" / "engine").glob("*.py"):
         for node in ast.walk(ast.parse(file.read_text("utf-8"))):
@@ -27,4 +27,5 @@ def test_the_engine_imports_numpy_and_nothing_of_loopcal(root: Path):
         "collections.abc",
         "dataclasses",
         "typing",
+        "loopcal.typing",
     }

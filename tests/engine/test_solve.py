@@ -16,7 +16,7 @@ from tests import zoo
 from tests.engine.cases import case, driven, open_by, pose_demand, unit_of_displacements
 
 CLOSED = 1e-13  # of the robot's size: a hundred roundings of a coordinate
-FIELDS = ("T", "status", "residual", "iterations", "orientation")
+FIELDS = ("T", "status", "residual", "iterations", "closure_sign")
 
 
 def assert_same(a, b):
@@ -55,7 +55,7 @@ def test_the_platform_moves_in_its_freedoms_only(engine, some):
     state = engine.solve(some.program, some.e, some.q, some.home)
     others = [i for i in range(6) if i not in some.program.freedoms]
     assert_allclose(
-        geometry.difference(state.T, np.broadcast_to(some.home.T, state.T.shape))[..., others],
+        geometry.pose_difference(state.T, np.broadcast_to(some.home.T, state.T.shape))[..., others],
         0.0,
         atol=1e-16,
     )
@@ -189,7 +189,7 @@ def test_a_singular_start_is_not_an_exception(engine):
 
 
 def test_too_few_steps_are_said(engine, some):
-    state = engine.solve(some.program, some.e, some.q, some.home, most=1)
+    state = engine.solve(some.program, some.e, some.q, some.home, max_iterations=1)
     assert_array_equal(state.status, EXHAUSTED)
     assert_array_equal(state.iterations, 1)
 
@@ -211,7 +211,7 @@ def test_orientation_changes_sign_with_the_mirrored_mode(engine):
     above = engine.solve(some.program, some.e, some.q, replace(some.home, T=T))
     below = engine.solve(some.program, some.e, some.q, some.home)
     assert_array_equal(above.status, engine.CONVERGED)
-    assert_array_equal(above.orientation, -below.orientation)
+    assert_array_equal(above.closure_sign, -below.closure_sign)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -10,11 +10,9 @@ from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from loopcal.measure import Instrument, Measurements, Pose, Sensor, simulate
-from loopcal.mechanism import Mechanism, build
-from loopcal.mechanism.assembly import Linear
-from loopcal.mechanism.batch_kinematics import forward_trials
+from loopcal.mechanism import LinearMap, Mechanism, build, forward_trials
+from loopcal.mechanism import PoseRecord as HomePose
 from loopcal.mechanism.families.gough import Gough
-from loopcal.mechanism.records import Pose as HomePose
 from loopcal.parameters import ParameterTable
 from tests import zoo
 from tests.estimate.problems import UM, hexapod_poses, noise, with_tolerance
@@ -44,7 +42,7 @@ def seven_legs(sigma: float = 2 * UM) -> Mechanism:
             address=replace(m.address, owner="leg7"),
         )
         for m in assembly.maps
-        if isinstance(m, Linear) and m.parameter.startswith("leg6.")
+        if isinstance(m, LinearMap) and m.parameter.startswith("leg6.")
     )
     actuators = tuple(
         replace(a, sigma=sigma)

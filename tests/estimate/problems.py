@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from loopcal.engine import accumulate
+from loopcal.engine import fold
 from loopcal.measure import (
     Component,
     Gaussian,
@@ -26,7 +26,7 @@ MM, UM, URAD = 1e-3, 1e-6, 1e-6
 
 def folded(rows: np.ndarray) -> np.ndarray:
     """Triangular factor (t, p + 1, p + 1) of rows [A | b] (t, m, p + 1)."""
-    return accumulate(empty_factor(len(rows), rows.shape[-1] - 1), rows)
+    return fold(empty_factor(len(rows), rows.shape[-1] - 1), rows)
 
 
 def noise(*sigma: float) -> Gaussian:

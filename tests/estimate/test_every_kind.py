@@ -50,7 +50,7 @@ from loopcal.measure import (
     simulate,
     simulate_trials,
 )
-from loopcal.mechanism import inverse, sample
+from loopcal.mechanism import inverse, sample_workspace
 
 EXACT = 1e-9
 """[share of the robot's size, rad]: ranks are decided at 1e-11, and 1e-13 of rounding comes back
@@ -103,7 +103,10 @@ def test_a_machine_is_recovered_from_noise_free_rows_of_one_kind_up_to_its_gauge
 def test_what_a_kind_cannot_show_of_a_delta_is_said(case):
     robot = machine(case)
     data = simulate(
-        robot, sample(robot, POSES, SEED).coordinates, instrument(case.kind, POSES, Silent), SEED
+        robot,
+        sample_workspace(robot, POSES, SEED).coordinates,
+        instrument(case.kind, POSES, Silent),
+        SEED,
     )
     fit = identify(robot, data, LeastSquares(), allow_fewer_equations=True)
     assert fit.rank == 0
@@ -135,7 +138,7 @@ def test_intervals_of_noise_stated_half_as_large_as_it_is_fail():
     assert found.directions.mean() < 0.95 - band(60)
 
 
-STATION = geometry.pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
+STATION = geometry.make_pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
 POINT = np.array([[0.03, -0.02, 0.05]])
 FIVE = (
     Position(places=POINT, unknown=("frame",)),
@@ -160,7 +163,9 @@ def judged(kinds):
     looking = Instrument(
         tuple(Sensor(kind, Gaussian(np.full(len(kind.noise_columns), 5e-6))) for kind in kinds)
     )
-    trials = simulate_trials(robot, truth, sample(robot, 40, SEED).coordinates, looking, SEED)
+    trials = simulate_trials(
+        robot, truth, sample_workspace(robot, 40, SEED).coordinates, looking, SEED
+    )
     found = identify_trials(robot, trials, MAP())
     assert found.converged.all()
     free = found.unknowns
@@ -192,7 +197,10 @@ FRAMED = (
 def test_a_frame_anywhere_gives_the_machine_of_the_known_frame_up_to_its_gauge(kind):
     robot = load_robot("hexapod-42")
     truth = robot.with_values(sample_truth(robot, 1, SEED)[0])
-    poses, elsewhere = sample(robot, 50, SEED).coordinates, sample(robot, 15, SEED + 1).solution.q
+    poses, elsewhere = (
+        sample_workspace(robot, 50, SEED).coordinates,
+        sample_workspace(robot, 15, SEED + 1).solution.q,
+    )
     known = identify(
         robot, simulate(truth, poses, instrument(Pose(), 50, Silent), SEED), LeastSquares()
     )
@@ -249,7 +257,7 @@ def test_joints_locked_at_constants_nobody_knows_recover_a_tripod_up_to_its_fram
     robot, rng = load_robot("3-prs"), np.random.default_rng(SEED)
     truth = robot.with_values(sample_truth(robot, 1, SEED)[0])
     joints = inverse(truth, np.array([[0.7, 0.0, 0.1]])).passive_names
-    usual = inverse(truth, sample(robot, 60, SEED).coordinates).passive
+    usual = inverse(truth, sample_workspace(robot, 60, SEED).coordinates).passive
     sensors, coordinates, constants = [], [], {}
     for i, joint in enumerate(joints):
         for k, constant in enumerate(np.quantile(usual[:, i], [0.3, 0.5, 0.7])):
@@ -274,7 +282,9 @@ def test_joints_locked_at_constants_nobody_knows_recover_a_tripod_up_to_its_fram
     assert fit.rank == 21
     assert along_gauge(fit, data, truth.values) < EXACT
     assert (
-        pose_error(fit.robot, truth, sample(robot, 15, SEED).solution.q, ("base", "platform"))
+        pose_error(
+            fit.robot, truth, sample_workspace(robot, 15, SEED).solution.q, ("base", "platform")
+        )
         < EXACT
     )
     assert fit.local.values.keys() == constants.keys()

@@ -179,7 +179,7 @@ def test_truncation_at_full_rank_is_least_squares(data, fit):
 def test_fixed_parameters_stay_and_have_no_uncertainty(data):
     robot = hexapod()
     names = [n for n in robot.parameters.names if not n.startswith("leg4")]
-    some = replace(robot, parameters=robot.parameters.only(names))
+    some = replace(robot, parameters=robot.parameters.with_free(names))
     fit = identify(some, data, LeastSquares())
     held = [i for i, n in enumerate(robot.parameters.names) if n.startswith("leg4")]
     assert len(fit.names) == 35
@@ -237,7 +237,7 @@ def test_fewer_equations_than_parameters_are_refused_unless_asked_for_or_a_prior
 def test_few_degrees_of_freedom_give_no_intervals_unless_sigma_is_given():
     robot = with_tolerance(zoo.delta(), 1e-3)
     six = [n for n in robot.parameters.names if "arm" not in n and "angle" not in n][:6]
-    some = replace(robot, parameters=robot.parameters.only(six))
+    some = replace(robot, parameters=robot.parameters.with_free(six))
     data = probed_heights(robot, bed(len(six) + 1))
     estimated, given = (
         identify(some, data, LeastSquares(), noise="estimated"),
@@ -299,7 +299,7 @@ def test_a_start_far_off_converges_to_the_same_answer(data, fit):
 def test_rows_of_weight_zero_alone_and_no_free_parameter_are_refused(data):
     with pytest.raises(EstimationError, match="every row is absent or has weight 0"):
         identify(hexapod(), data.reweighted(np.zeros(30)), LeastSquares())
-    fixed = replace(hexapod(), parameters=hexapod().parameters.only([]))
+    fixed = replace(hexapod(), parameters=hexapod().parameters.with_free([]))
     with pytest.raises(EstimationError, match="no free parameter"):
         identify(fixed, data, LeastSquares())
     with pytest.raises(EstimationError, match="'given' or 'estimated'"):

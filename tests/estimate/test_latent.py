@@ -32,8 +32,7 @@ from loopcal.measure import (
     simulate,
     simulate_trials,
 )
-from loopcal.mechanism import forward, inverse
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import forward, inverse, sample_workspace
 from tests.estimate.latent_problems import dense, measured_hexapod, only, seven_legs, ups_hexapod
 from tests.estimate.problems import UM, hexapod, hexapod_poses, noise, tracker
 
@@ -69,7 +68,7 @@ def case(name):
         )
     robot = load_robot("3-prs")
     truth = robot.with_values(sample_truth(robot, 1, 1)[0])
-    passive = inverse(robot, sample(robot, 1, 0).coordinates).passive_names[0]
+    passive = inverse(robot, sample_workspace(robot, 1, 0).coordinates).passive_names[0]
     sensors = (
         *tracker().sensors,
         Sensor(JointSensor(joints=(passive, "q2"), measures="angle"), noise(5e-6, 5e-6)),
@@ -79,7 +78,9 @@ def case(name):
             *tracker().sensors,
             Sensor(JointSensor(joints=(passive,), measures="angle"), noise(5e-6)),
         )
-    return robot, simulate(truth, sample(robot, 20, 2).coordinates, Instrument(sensors), 0)
+    return robot, simulate(
+        truth, sample_workspace(robot, 20, 2).coordinates, Instrument(sensors), 0
+    )
 
 
 @pytest.mark.parametrize(
@@ -169,7 +170,11 @@ def test_noise_missing_readings_and_linked_poses_equal_the_problem_with_every_re
 def cable():
     """A four-line robot, a true one, and positions in its workspace."""
     robot = load_robot("cable-4")
-    return robot, robot.with_values(sample_truth(robot, 1, 3)[0]), sample(robot, 30, 5).coordinates
+    return (
+        robot,
+        robot.with_values(sample_truth(robot, 1, 3)[0]),
+        sample_workspace(robot, 30, 5).coordinates,
+    )
 
 
 def test_redundant_readings_equal_the_problem_with_every_position_unknown(cable):
@@ -220,7 +225,7 @@ def test_a_cable_robot_is_found_from_its_readings_alone_up_to_its_gauge(cable):
     assert fit.converged
     assert fit.rank == 13  # 20 parameters less six of the frame and one of scale
     assert fit.chi_square < 1e-12
-    unseen = inverse(truth, sample(robot, 20, 9).coordinates).q
+    unseen = inverse(truth, sample_workspace(robot, 20, 9).coordinates).q
     gap = forward(fit.robot, unseen).residual.max()
     assert gap < 1e-9 * robot.size  # [m]: with the right geometry four lines meet in a point
     assert forward(robot, unseen).residual.max() > 1e-3
@@ -275,7 +280,7 @@ def test_ellipsoids_cover_as_stated_with_noisy_readings_and_far_too_little_if_th
     robot = load_robot("linear-delta")
     n = 100
     trials = simulate_trials(
-        robot, sample_truth(robot, n, 4), sample(robot, 12, 4).coordinates,
+        robot, sample_truth(robot, n, 4), sample_workspace(robot, 12, 4).coordinates,
         Instrument((Sensor(Position(), noise(10 * UM, 10 * UM, 10 * UM)),)), 4, reading_sigma=20 * UM,
     )  # fmt: skip
     inside = coverage(robot, trials)

@@ -28,9 +28,7 @@ from loopcal.measure import (
     sample_truth,
     simulate,
 )
-from loopcal.mechanism import forward, inverse
-from loopcal.mechanism.batch_kinematics import plainly_reached
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import find_directly_reachable, forward, inverse, sample_workspace
 from tests.estimate.problems import UM, noise
 
 
@@ -39,7 +37,11 @@ def measured(name, sensors, n, seed, share=0.0, sigma=20 * UM):
     robot = load_robot(name)
     truth = robot.with_values(sample_truth(robot, 1, seed)[0])
     data = simulate(
-        truth, sample(robot, n, seed).coordinates, Instrument(sensors), seed, reading_sigma=sigma
+        truth,
+        sample_workspace(robot, n, seed).coordinates,
+        Instrument(sensors),
+        seed,
+        reading_sigma=sigma,
     )
     return (
         robot,
@@ -108,7 +110,7 @@ FULL = {
 def test_rows_that_tell_all_freedoms_of_the_platform_give_its_pose(said):
     robot, sensors = FULL[said]
     robot = load_robot(robot)
-    found = inverse(robot, sample(robot, 6, 1).coordinates)
+    found = inverse(robot, sample_workspace(robot, 6, 1).coordinates)
     data = simulate(robot, found.T, Instrument(sensors), 0, reading_sigma=20 * UM)
     rows = rows_of(select_free_parameters(robot), data)
     assert isinstance(rows, LatentRows)
@@ -162,7 +164,7 @@ def test_a_missing_reading_is_that_of_the_branch_on_which_the_machine_is_built()
         lost[7, 0] = True
         fit = identify(robot, without(data, lost))
         assert fit.latent is not None
-        true = inverse(truth, sample(robot, 20, seed).coordinates).q[7, 0]
+        true = inverse(truth, sample_workspace(robot, 20, seed).coordinates).q[7, 0]
         assert fit.latent.readings[7, 0] == pytest.approx(
             true, abs=2e-3
         )  # [m]: errors of lengths; the other branch is 0.3 off
@@ -206,7 +208,7 @@ def test_from_random_starts_the_search_is_bounded_and_never_ends_higher_than_it_
     for _ in range(4):
         readings = data.readings.copy()
         readings[:, 0] = stroke[0, 0] + (stroke[0, 1] - stroke[0, 0]) * rng.random(len(readings))
-        reached = plainly_reached(robot, robot.values[None], readings[None])[0]
+        reached = find_directly_reachable(robot, robot.values[None], readings[None])[0]
         readings = np.where(reached[:, None], readings, robot_home(robot))
         begin = Standing(forward(robot, readings).state, readings[None])
         first = rows.poses.look(z, trial, begin, None, own=False)

@@ -31,14 +31,14 @@ from loopcal.measure import (
     simulate,
     simulate_trials,
 )
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import sample_workspace
 from tests import zoo
 from tests.estimate.problems import hexapod, hexapod_data, hexapod_poses, tracker
 
 UM = 1e-6
 POINT = np.array([[0.03, -0.02, 0.05]])
 THREE = np.array([[0.1, 0.0, 0.02], [-0.06, 0.1, 0.03], [-0.05, -0.1, 0.01]])
-STATION = geometry.pose(np.eye(3), np.array([-2.5, -1.8, 0.1]))
+STATION = geometry.make_pose(np.eye(3), np.array([-2.5, -1.8, 0.1]))
 TRACKER = Position(targets=("a", "b", "c"), places=THREE, unknown=("frame", "targets"))
 TRUE = {
     "frame.rx": 0.3, "frame.ry": -0.2, "frame.rz": 1.0, "frame.x": 0.4, "frame.y": -0.7, "anchor.x": 0.5, "anchor.y": -0.9,
@@ -67,7 +67,7 @@ def machine(name, n):
     if name == "hexapod":
         return hexapod(), zoo.hexapod_truth(), hexapod_poses(n)
     robot = lc.load_robot(name)
-    return robot, sample_truth(robot, 1, 3)[0], sample(robot, n, 5).coordinates
+    return robot, sample_truth(robot, 1, 3)[0], sample_workspace(robot, n, 5).coordinates
 
 
 def largest(errors, size):
@@ -154,7 +154,7 @@ def test_intervals_of_machine_and_frame_hold_the_truth():
         instrument = Instrument((seen_by(kind, Gaussian, 20 * UM),))
         data = simulate(
             robot.with_values(truth),
-            sample(robot, 30, i).coordinates,
+            sample_workspace(robot, 30, i).coordinates,
             instrument,
             i,
             unknowns=true_of(kind),
@@ -304,7 +304,7 @@ def test_starts_are_sought_once_for_all_trials_that_an_instrument_looks_at(monke
     robot = lc.load_robot("linear-delta")
     kind = Position(places=POINT, unknown=("frame",))
     trials = simulate_trials(
-        robot, sample_truth(robot, 5, 1), sample(robot, 20, 1).coordinates, Instrument((seen_by(kind, Gaussian),)), 1,
+        robot, sample_truth(robot, 5, 1), sample_workspace(robot, 20, 1).coordinates, Instrument((seen_by(kind, Gaussian),)), 1,
         unknowns=true_of(kind),
     )  # fmt: skip
     assert identify_trials(robot, trials, MAP()).converged.all()
@@ -322,7 +322,7 @@ def test_the_command_line_calibrates_from_a_tracker_in_an_unknown_frame(tmp_path
     truth = robot.with_values(sample_truth(robot, 1, 3)[0])
     data = simulate(
         truth,
-        sample(robot, 40, 5).coordinates,
+        sample_workspace(robot, 40, 5).coordinates,
         Instrument((seen_by(TRACKER, Gaussian),)),
         1,
         unknowns=true_of(TRACKER),

@@ -14,8 +14,7 @@ from loopcal.errors import DataError
 from loopcal.estimate.predicted import predicted
 from loopcal.io import load_robot
 from loopcal.measure import Instrument, Position, Sensor, simulate
-from loopcal.mechanism import forward, inverse
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import forward, inverse, sample_workspace
 from tests.estimate.problems import MM, UM, noise
 
 
@@ -25,7 +24,7 @@ def cable():
     the robot states.
     """
     robot = load_robot("cable-4")
-    positions = sample(robot, 8, 1).coordinates
+    positions = sample_workspace(robot, 8, 1).coordinates
     return (
         robot,
         positions,
@@ -87,7 +86,7 @@ def test_where_no_pose_has_its_readings_it_is_they_that_are_missed(name):
     robot = load_robot(name)
     data = simulate(
         robot,
-        sample(robot, 3, 1).coordinates,
+        sample_workspace(robot, 3, 1).coordinates,
         Instrument((Sensor(Position(), noise(UM, UM, UM)),)),
         1,
     )

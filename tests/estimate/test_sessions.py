@@ -29,7 +29,7 @@ from loopcal.measure import (
     simulate,
 )
 from loopcal.measure.kinds import parts
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import sample_workspace
 from tests import zoo
 from tests.estimate.problems import hexapod, hexapod_poses
 
@@ -105,7 +105,7 @@ def test_a_base_that_drifts_is_re_measured_in_every_session():
 
 def test_a_station_that_was_moved_is_found_anew_and_not_taken_for_the_same():
     day = np.repeat(["left", "right"], 50)
-    station = geometry.pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
+    station = geometry.make_pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
     theodolite = Bearing(places=POINT, T_base_frame=station, unknown=("frame",))
     poses = np.concatenate([hexapod_poses(50), hexapod_poses(50, 3)])
     moved = {"right.frame.x": 1.4, "right.frame.y": -1.1, "right.frame.rz": 2.0}
@@ -127,7 +127,7 @@ def printed():
         + np.where(robot.parameters.free, 0.5, 0.0) * np.nan_to_num(robot.parameters.tolerance)
     )
     data = simulate(
-        truth, sample(robot, 40, 5).coordinates, Instrument((sensor(Position(places=POINT, unknown=("frame",))),)), 1,
+        truth, sample_workspace(robot, 40, 5).coordinates, Instrument((sensor(Position(places=POINT, unknown=("frame",))),)), 1,
         unknowns={"frame.x": 60 * UM},
     )  # fmt: skip
     return robot, truth, data
@@ -184,7 +184,7 @@ def test_a_probe_s_offset_is_found_on_planes_and_a_wrong_one_is_found_out():
 def test_a_tool_s_offset_is_found_and_a_wrong_one_is_found_out():
     true = {"tool.z": 0.12, "tool.rx": 0.01, "tool.y": 1e-3}
     tool = Pose(
-        unknown=("tool",), T_platform_tool=geometry.pose(np.eye(3), np.array([0.0, 0.0, 0.1]))
+        unknown=("tool",), T_platform_tool=geometry.make_pose(np.eye(3), np.array([0.0, 0.0, 0.1]))
     )
     balls = Position(targets=("a", "b", "c"), places=0.1 * np.eye(3))
     data = seen(hexapod_poses(40), sensor(tool), sensor(balls), true=true)

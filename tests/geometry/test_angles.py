@@ -38,7 +38,7 @@ def test_regular_angles_come_back_as_they_were(order, first, third, middle):
     angles = np.array([first, second, third])
     back = geometry.matrix_to_euler(geometry.euler_to_matrix(angles, order), order)
     assert_allclose(
-        geometry.wrap(back - angles), np.zeros(3), atol=1e-13
+        geometry.wrap_angle(back - angles), np.zeros(3), atol=1e-13
     )  # [rad], ulps over sin(0.05 pi)
 
 
@@ -79,7 +79,7 @@ def test_an_unknown_order_is_refused_with_the_allowed_ones():
 def test_tilt_and_torsion_comes_back(phi, theta, psi):
     back = geometry.matrix_to_tilt_torsion(geometry.tilt_torsion_to_matrix(phi, theta, psi))
     assert_allclose(
-        geometry.wrap(np.array(back) - [phi, theta, psi]), np.zeros(3), atol=5e-12
+        geometry.wrap_angle(np.array(back) - [phi, theta, psi]), np.zeros(3), atol=5e-12
     )  # [rad], ulps / sin
 
 
@@ -93,7 +93,9 @@ def test_torsion_and_tilt_stay_exact_as_the_tilt_vanishes(phi, theta, psi):
 
 def test_at_zero_tilt_the_azimuth_is_zero_and_the_torsion_the_turn_about_the_normal():
     assert_allclose(
-        geometry.matrix_to_tilt_torsion(geometry.axis_rotation(0.3, 2)), (0.0, 0.0, 0.3), atol=1e-16
+        geometry.matrix_to_tilt_torsion(geometry.rotation_about_axis(0.3, 2)),
+        (0.0, 0.0, 0.3),
+        atol=1e-16,
     )
 
 
@@ -127,7 +129,7 @@ def test_tilt_torsion_rates_are_the_derivative_and_their_inverse_its_inverse(the
 
 @given(st.floats(-50.0, 50.0))
 def test_wrapped_angles_are_the_same_turn_within_half_a_turn(x):
-    wrapped = geometry.wrap(x)
+    wrapped = geometry.wrap_angle(x)
     assert -np.pi < wrapped <= np.pi
     assert_allclose(
         [np.cos(wrapped), np.sin(wrapped)], [np.cos(x), np.sin(x)], atol=1e-13
@@ -135,4 +137,4 @@ def test_wrapped_angles_are_the_same_turn_within_half_a_turn(x):
 
 
 def test_half_a_turn_wraps_to_plus_pi():
-    assert geometry.wrap(np.array([np.pi, -np.pi])).tolist() == [np.pi, np.pi]
+    assert geometry.wrap_angle(np.array([np.pi, -np.pi])).tolist() == [np.pi, np.pi]

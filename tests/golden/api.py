@@ -24,8 +24,7 @@ from loopcal.diagnose import compare_conventions, suggest_measurements
 from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import KINDS, Gaussian, Instrument, Known, Sensor, local_unknowns
-from loopcal.mechanism import build, forward, inverse, sample
-from loopcal.mechanism.batch_kinematics import sensitivity
+from loopcal.mechanism import build, differentiate_pose, forward, inverse, sample_workspace
 from loopcal.parameters import ParameterTable
 from loopcal.planning.coordinate import coordinate_exchange
 from loopcal.planning.criteria import A, D
@@ -102,7 +101,7 @@ def wrong_by(machine: Robot, values: Array, endings: Sequence[str]) -> Array:
 
 def poses(machine: Robot, n: int, seed: int) -> Array:
     """Draw controlled coordinates (n, c) from the workspace."""
-    return sample(machine, n, seed).coordinates
+    return sample_workspace(machine, n, seed).coordinates
 
 
 def passive_names(machine: Robot) -> tuple[str, ...]:
@@ -117,7 +116,7 @@ def actuator_names(machine: Robot) -> tuple[str, ...]:
 
 def transform(point: Sequence[float], turn: Sequence[float] = (0.0, 0.0, 0.0)) -> Array:
     """Return a transform (4, 4) of a point [m] and a rotation vector [rad]."""
-    return geometry.pose(geometry.exp_so3(np.array(turn)), np.array(point))
+    return geometry.make_pose(geometry.exp_so3(np.array(turn)), np.array(point))
 
 
 def report_kinematics(machine: Robot, values: Array, coordinates: Array) -> Report:
@@ -125,7 +124,7 @@ def report_kinematics(machine: Robot, values: Array, coordinates: Array) -> Repo
     true = machine.with_values(values)
     back = inverse(true, coordinates)
     front = forward(true, inverse(machine, coordinates).q)
-    found = sensitivity(true, true.values[None], front.q[None], front.state)
+    found = differentiate_pose(true, true.values[None], front.q[None], front.state)
     rows = np.array([1.0] * 3 + [1.0 / machine.size] * 3)[:, None]
     lengths = np.array([_size(machine, d) for d in machine.parameters.dimensions])
     strokes = np.array([_size(machine, a.dimension) for a in machine.actuators])

@@ -39,7 +39,7 @@ def test_missing_components_equal_leaving_them_out_of_the_covariance(there, seed
     C = covariances(1, 3, seed)
     measured = np.where(there, np.random.default_rng(seed).normal(size=3), np.nan)[None]
     data = Observations(POINT, np.array([0]), measured, C)
-    T = geometry.exp_update(np.eye(4), np.random.default_rng(seed).normal(size=6))[None, None]
+    T = geometry.apply_twist(np.eye(4), np.random.default_rng(seed).normal(size=6))[None, None]
     result = data.evaluate(T)
     white, slopes = (
         data.whitener[0] @ result.residual[0, 0],

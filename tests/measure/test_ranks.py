@@ -29,11 +29,11 @@ from loopcal.measure import (
     simulate_trials,
     whitened_rows,
 )
-from loopcal.mechanism.batch_kinematics import forward_trials, sensitivity
+from loopcal.mechanism import differentiate_pose, forward_trials
 from tests import zoo
 
 FIVE = ("x", "y", "z", "phi", "theta")
-STATION = geometry.pose(np.eye(3), np.array([-2.5, -1.8, 0.1]))
+STATION = geometry.make_pose(np.eye(3), np.array([-2.5, -1.8, 0.1]))
 FAR = np.array([0.7, -0.4, 0.1])
 POINT = np.array([[0.03, -0.02, 0.05]])
 BOTH = ("frame", "tool")
@@ -101,7 +101,7 @@ def singular_values(robot, poses, instrument):
     trials = simulate_trials(robot, robot.values, poses, instrument, seed=1, controller=robot)
     data = trials.trial(0)
     state = forward_trials(robot, robot.values[None], data.readings[None])
-    D = sensitivity(robot, robot.values[None], data.readings[None], state).parameters
+    D = differentiate_pose(robot, robot.values[None], data.readings[None], state).parameters
     rows = whitened_rows(evaluate_all(data, state.T, trials.local.values()[None], trials.local), D)[
         0
     ]
@@ -162,7 +162,7 @@ def test_planes_and_perpendicular_lines_touched_at_poses_on_them_tell_33(robot):
             noise = Gaussian(np.full(len(made.noise_columns), 1e-5))
             seen.append(Sensor(made, noise, rows=np.arange(first, first + 30)))
             first += 30
-    poses = geometry.pose(turns, np.concatenate(points) - (turns @ POINT[0]))
+    poses = geometry.make_pose(turns, np.concatenate(points) - (turns @ POINT[0]))
     check_rank(singular_values(robot, poses, Instrument(tuple(seen))), 33)
 
 

@@ -12,14 +12,16 @@ from loopcal.errors import DataError
 from loopcal.estimate import LeastSquares, identify
 from loopcal.io import load_robot
 from loopcal.measure import Gaussian, Instrument, Measurements, Position, Sensor, simulate
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import sample_workspace
 
 
 def data_of(name, n=20, sigma=None):
     """A robot, and measured positions of it."""
     robot = load_robot(name)
     seen = Instrument((Sensor(Position(), Gaussian(np.full(3, 1e-5))),))
-    return robot, simulate(robot, sample(robot, n, 1).coordinates, seen, 0, reading_sigma=sigma)
+    return robot, simulate(
+        robot, sample_workspace(robot, n, 1).coordinates, seen, 0, reading_sigma=sigma
+    )
 
 
 @pytest.mark.parametrize("given", ["5 um", 1j, np.array([1j]), [[1.0], "a"]])

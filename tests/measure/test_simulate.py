@@ -83,7 +83,7 @@ def test_a_true_machine_is_seen_where_its_own_geometry_puts_it(robot, truth):
     trials = simulate_trials(robot, truth.values, COMMANDED, TRACKER, seed=1)
     white = (trials.trial(0).observations[0].whitener @ _residual(trials)[..., None])[..., 0]
     assert np.abs(white).max() < 5.0
-    moved = geometry.difference(trials.T[0], COMMANDED)
+    moved = geometry.pose_difference(trials.T[0], COMMANDED)
     assert np.abs(moved[:, 3:]).max() > 20 * SIGMA[-1]
     # The rods of the true machine are as long as its readings say.
     assert_allclose(inverse(truth, trials.T[0]).q, trials.readings, atol=1e-12)

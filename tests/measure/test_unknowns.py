@@ -84,7 +84,7 @@ def test_one_name_stated_in_two_ways_is_refused():
     turned = Direction(
         unknown=("frame",),
         frame="tracker",
-        T_base_frame=geometry.pose(geometry.axis_rotation(0.1, 0), np.zeros(3)),
+        T_base_frame=geometry.make_pose(geometry.rotation_about_axis(0.1, 0), np.zeros(3)),
     )
     with pytest.raises(
         DataError, match=r"counts the unknowns of 'tracker' from another orientation"
@@ -115,7 +115,7 @@ def test_priors_fixed_values_and_values_by_name():
 
 def test_all_rows_stand_in_one_matrix_with_every_unknown_in_its_column():
     rng = np.random.default_rng(3)
-    T = geometry.exp_update(np.eye(4), rng.uniform(-0.3, 0.3, (2, 4, 6)))
+    T = geometry.apply_twist(np.eye(4), rng.uniform(-0.3, 0.3, (2, 4, 6)))
     parts = (
         rows(TRACKER, session=np.array(["a", "a", "b", "b"])),
         rows(Separation(places=np.ones((1, 3)))),
@@ -127,7 +127,7 @@ def test_all_rows_stand_in_one_matrix_with_every_unknown_in_its_column():
     D = rng.normal(size=(1, 4, 6, 5))
 
     def white(machine, step):
-        moved = geometry.exp_update(T, (D @ machine)[..., :])
+        moved = geometry.apply_twist(T, (D @ machine)[..., :])
         return whitened_rows(evaluate_all(data, moved, (values + step)[None], local), D)
 
     found = white(np.zeros(5), np.zeros(len(local)))

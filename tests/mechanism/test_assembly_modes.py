@@ -9,10 +9,17 @@ from numpy.testing import assert_allclose
 
 from loopcal.errors import DataError, MechanismError
 from loopcal.io import load_robot
-from loopcal.mechanism import build, coordinates, forward, inverse, states
+from loopcal.mechanism import (
+    PoseRecord,
+    build,
+    driven_values,
+    find_assembly_modes,
+    find_working_modes,
+    forward,
+    inverse,
+    read_coordinates,
+)
 from loopcal.mechanism.families.gough import Gough
-from loopcal.mechanism.modes import assembly_modes, working_modes
-from loopcal.mechanism.records import Pose
 from tests import zoo
 
 # P. Dietmaier, "The Stewart-Gough platform of general geometry can have 40 real postures" (1998,
@@ -38,7 +45,7 @@ DIETMAIER_LENGTHS = (1.0, 0.645275, 1.086284, 1.503439, 1.281933, 0.771071)
 
 
 def dietmaier():
-    home = Pose(z=0.8, roll=0.3, pitch=0.2, yaw=0.5)
+    home = PoseRecord(z=0.8, roll=0.3, pitch=0.2, yaw=0.5)
     record = Gough(
         "dietmaier",
         base=DIETMAIER_BASE,
@@ -52,13 +59,13 @@ def dietmaier():
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_dietmaiers_hexapod_has_forty_modes(seed):
-    found = assembly_modes(dietmaier(), np.zeros(6), seed=seed)
+    found = find_assembly_modes(dietmaier(), np.zeros(6), seed=seed)
     assert len(found) == 40
     assert found.solution.residual.max() < 1e-12  # of legs of length 1
     for T in found.solution.T:  # closure once more, plainly
         legs = np.array(DIETMAIER_PLATFORM) @ T[:3, :3].T + T[:3, 3] - DIETMAIER_BASE
         assert_allclose(np.linalg.norm(legs, axis=1), DIETMAIER_LENGTHS, atol=1e-13)
-    assert found.quiet >= 8192
+    assert found.starts_since_new >= 8192
     assert str(found).startswith("40 modes found from ")
 
 
@@ -75,7 +82,7 @@ def test_hexapods_with_plane_base_and_platform_have_as_many_modes_above_as_below
 ):
     machine = robot()
     at = inverse(machine, np.array(coordinates))
-    found = assembly_modes(machine, at.q[0])
+    found = find_assembly_modes(machine, at.q[0])
     assert (len(found), int((found.solution.T[:, 2, 3] > 0).sum())) == (modes, above)
     assert (
         np.abs(found.solution.T - at.T).max(axis=(1, 2)).min() < 1e-9
@@ -88,7 +95,7 @@ def test_hexapods_with_plane_base_and_platform_have_as_many_modes_above_as_below
 def test_known_machines_have_as_many_assembly_modes_as_spheres_or_circles_meet(name, modes):
     robot = load_robot(name)
     at = inverse(robot, robot.home[None])
-    assert len(assembly_modes(robot, at.q[0], quiet=4096)) == modes
+    assert len(find_assembly_modes(robot, at.q[0], patience=4096)) == modes
 
 
 @pytest.mark.parametrize(
@@ -97,43 +104,43 @@ def test_known_machines_have_as_many_assembly_modes_as_spheres_or_circles_meet(n
 def test_each_limb_with_one_drive_doubles_the_working_modes(name, modes):
     robot = load_robot(name)
     target = inverse(robot, robot.home[None])
-    home = working_modes(robot, np.array([target_of(robot)]))
+    home = find_working_modes(robot, np.array([target_of(robot)]))
     assert len(home) == modes
     assert np.abs(home.solution.q - target.q).max(axis=1).min() < 1e-9  # [rad, m]
 
 
 def target_of(robot):
-    return coordinates.read(robot.home, robot.controlled)
+    return read_coordinates(robot.home, robot.controlled)
 
 
 def test_start_chooses_the_mode():
     robot = load_robot("five-bar")
-    modes = working_modes(robot, target_of(robot))
+    modes = find_working_modes(robot, target_of(robot))
     for row in range(len(modes)):
         one = modes.solution.take(np.array([row]))
         near = inverse(robot, target_of(robot) + np.array([0.005, -0.005]), start=one)
         assert np.abs(near.q - one.q).max() < 0.1
     q = modes.solution.q[0]
-    both = assembly_modes(robot, q)
+    both = find_assembly_modes(robot, q)
     for row in range(len(both)):
         one = both.solution.take(np.array([row]))
         assert_allclose(forward(robot, q[None], start=one).T, one.T, atol=1e-12)
 
 
 def test_readings_that_allow_no_pose_have_no_modes():
-    found = assembly_modes(load_robot("linear-delta"), [5.0, -5.0, 0.0], quiet=2048)
+    found = find_assembly_modes(load_robot("linear-delta"), [5.0, -5.0, 0.0], patience=2048)
     assert len(found) == 0
     assert "0 modes" in str(found)
 
 
 def test_a_platform_that_is_free_to_move_is_said():
     with pytest.raises(MechanismError, match="new ones keep coming"):
-        assembly_modes(dietmaier(), np.zeros(6), quiet=4096, most=2048)
+        find_assembly_modes(dietmaier(), np.zeros(6), patience=4096, max_starts=2048)
 
 
 def test_a_wrong_number_of_readings_is_refused():
     with pytest.raises(DataError, match="3 readings were given"):
-        assembly_modes(zoo.hexapod(), np.zeros(3))
+        find_assembly_modes(zoo.hexapod(), np.zeros(3))
 
 
 @pytest.mark.parametrize("stroke", [None, (5.0, 11.0)])
@@ -142,7 +149,7 @@ def test_working_modes_have_readings_within_a_turn_and_start_with_the_one_at_hom
     robot = build(
         replace(assembly, actuators=tuple(replace(a, stroke=stroke) for a in assembly.actuators))
     )
-    found = working_modes(robot, target_of(robot))
+    found = find_working_modes(robot, target_of(robot))
     low, high = stroke or (-np.pi, np.pi)
     home = inverse(robot, robot.home[None]).q[0]
     middle = (low + high) / 2
@@ -155,5 +162,5 @@ def test_working_modes_have_readings_within_a_turn_and_start_with_the_one_at_hom
         assert_allclose(q[0], home, atol=1e-9)
     for row in range(4):  # readings, joints and pose belong together
         one = found.solution.take(np.array([row]))
-        assert_allclose(states.actuated(robot.program, one.state)[0], one.q, atol=1e-12)
+        assert_allclose(driven_values(robot.program, one.state)[0], one.q, atol=1e-12)
         assert_allclose(forward(robot, one.q, start=one).T, one.T, atol=1e-12)

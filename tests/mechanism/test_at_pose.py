@@ -7,9 +7,18 @@ import numpy as np
 from numpy.testing import assert_allclose
 
 from loopcal import geometry
-from loopcal.mechanism import Joint, Limb, Link, Status, build, forward, inverse
-from loopcal.mechanism.passive_joints import passive_sensitivity
-from loopcal.mechanism.pose_driven import moves_at_pose, solve_at_pose
+from loopcal.mechanism import (
+    Joint,
+    Limb,
+    Link,
+    Status,
+    build,
+    differentiate_at_pose,
+    differentiate_passive_joints,
+    forward,
+    inverse,
+    solve_at_pose,
+)
 from tests import zoo
 from tests.jacobians import check_jacobian
 
@@ -52,7 +61,7 @@ def test_every_limb_closes_at_the_pose_given():
 def test_readings_and_passive_joints_follow_pose_and_parameters_as_differences_say():
     robot = planar_with_four_arms()
     values, T, state, q = standing(robot)
-    found = moves_at_pose(robot, values, q, state)
+    found = differentiate_at_pose(robot, values, q, state)
     p, freedoms = values.shape[1], robot.program.freedoms
     moved = np.zeros((3, 6))
     moved[range(3), list(freedoms)] = 1.0
@@ -61,7 +70,7 @@ def test_readings_and_passive_joints_follow_pose_and_parameters_as_differences_s
         at = np.concatenate(
             [
                 np.tile(T, (p, 1, 1, 1)),
-                geometry.exp_update(np.tile(T, (3, 1, 1, 1)), x[0] * moved[:, None]),
+                geometry.apply_twist(np.tile(T, (3, 1, 1, 1)), x[0] * moved[:, None]),
             ]
         )
         every = np.concatenate([values + x[0] * np.eye(p), np.tile(values, (3, 1))])
@@ -84,8 +93,8 @@ def test_readings_and_passive_joints_follow_pose_and_parameters_as_differences_s
 def test_along_consistent_readings_pose_and_readings_say_the_same():
     robot = planar_with_four_arms()
     values, _, state, q = standing(robot)
-    found = moves_at_pose(robot, values, q, state)
-    by_reading = passive_sensitivity(robot, values, q, state)
+    found = differentiate_at_pose(robot, values, q, state)
+    by_reading = differentiate_passive_joints(robot, values, q, state)
     turned = (
         by_reading.readings[0, 0] @ found.readings[1][0, 0]
     )  # passive by readings, readings by pose

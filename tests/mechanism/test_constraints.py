@@ -9,9 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.errors import MechanismError
-from loopcal.geometry import inverse as back
-from loopcal.mechanism import Joint, Limb, Link, build, forward, inverse
-from loopcal.mechanism.modes import assembly_modes
+from loopcal.geometry import invert_pose as back
+from loopcal.mechanism import Joint, Limb, Link, build, find_assembly_modes, forward, inverse
 from tests import zoo
 
 HOME = zoo.place((0.01, -0.02, 0.25), (0.05, -0.08, 0.1))
@@ -109,7 +108,7 @@ def test_the_order_of_limbs_that_differ_in_rank_changes_nothing():
             (limb, j)
             for g in robot.program.groups
             for limb in g.limbs
-            for j, h in enumerate(g.held)
+            for j, h in enumerate(g.locked)
             if h
         ]
         (limb, joint), (note,) = held[0], robot.notes
@@ -173,11 +172,11 @@ def test_a_planar_machine_with_all_six_freedoms_is_solved_like_one_with_three_an
     # the determinant of closure that is not square has no sign: it once told rows apart at random
     assert again.converged.all()
     assert_allclose(again.T, found.T, atol=1e-11)
-    assert (again.state.orientation == 0).all()
-    assert (whole.home_state.orientation == 0).all()
-    modes = [assembly_modes(robot, found.q[0], quiet=2048) for robot in (whole, flat)]
+    assert (again.state.closure_sign == 0).all()
+    assert (whole.home_state.closure_sign == 0).all()
+    modes = [find_assembly_modes(robot, found.q[0], patience=2048) for robot in (whole, flat)]
     assert_allclose(modes[0].solution.T, modes[1].solution.T, atol=1e-9)
-    assert (modes[0].solution.state.orientation == 0).all()
+    assert (modes[0].solution.state.closure_sign == 0).all()
 
 
 def test_equations_that_repeat_others_are_told_where_no_choice_of_freedoms_leaves_them_out():

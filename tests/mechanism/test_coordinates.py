@@ -9,7 +9,12 @@ from numpy.testing import assert_allclose
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
-from loopcal.mechanism import coordinates
+from loopcal.mechanism import (
+    check_coordinates,
+    compare_coordinates,
+    pose_from_coordinates,
+    read_coordinates,
+)
 from tests.jacobians import check_jacobian
 
 SETS = [
@@ -25,7 +30,7 @@ SIZE = 0.3
 def poses(n, tilt=1.2, seed=3):
     rng = np.random.default_rng(seed)
     angles = rng.uniform([-3.0, 0.05, -3.0], [3.0, tilt, 3.0], (n, 3))
-    return geometry.pose(geometry.tilt_torsion_to_matrix(*angles.T), rng.normal(size=(n, 3)))
+    return geometry.make_pose(geometry.tilt_torsion_to_matrix(*angles.T), rng.normal(size=(n, 3)))
 
 
 @pytest.mark.parametrize("names", SETS)
@@ -35,28 +40,28 @@ def test_coordinates_are_read_back_as_they_were_set(names, part):
     high = {"theta": 3.0, "pitch": 1.5}
     ends = np.array([(low.get(n, -1.0), high.get(n, 3.1 if n in low else 1.0)) for n in names])
     values = ends[:, 0] + np.array(part[: len(names)]) * (ends[:, 1] - ends[:, 0])
-    T = coordinates.pose(values, names, np.eye(4))
+    T = pose_from_coordinates(values, names, np.eye(4))
     # phi and roll lose what the sine of the tilt and the cosine of the pitch take
-    assert_allclose(coordinates.read(T, names), values, atol=1e-12)
+    assert_allclose(read_coordinates(T, names), values, atol=1e-12)
 
 
 def test_coordinates_not_named_stay_as_they_are():
-    base = geometry.pose(np.eye(3), np.array([1.0, 2.0, 3.0]))
-    T = coordinates.pose(np.array([[0.5, 0.2]]), ("z", "yaw"), base)
+    base = geometry.make_pose(np.eye(3), np.array([1.0, 2.0, 3.0]))
+    T = pose_from_coordinates(np.array([[0.5, 0.2]]), ("z", "yaw"), base)
     assert_allclose(T[0, :3, 3], [1.0, 2.0, 0.5])
-    assert_allclose(T[0, :3, :3], geometry.axis_rotation(0.2, 2))
+    assert_allclose(T[0, :3, :3], geometry.rotation_about_axis(0.2, 2))
 
 
 @pytest.mark.parametrize("names", [*SETS, ("roll",), ("psi",)])
 @pytest.mark.parametrize("off", [0.0, 0.3])
 def test_slopes_of_every_coordinate_agree_with_differences(names, off):
     T = poses(5)
-    target = coordinates.read(T, names) + off
-    _, columns = coordinates.demands(T, target, names, SIZE)
+    target = read_coordinates(T, names) + off
+    _, columns = compare_coordinates(T, target, names, SIZE)
 
     def moved(x):
-        return coordinates.demands(
-            geometry.exp_update(T, np.broadcast_to(x, (5, 6))), target, names, SIZE
+        return compare_coordinates(
+            geometry.apply_twist(T, np.broadcast_to(x, (5, 6))), target, names, SIZE
         )[0]
 
     check_jacobian(moved, columns, np.zeros(6), scale=0.05)
@@ -65,22 +70,22 @@ def test_slopes_of_every_coordinate_agree_with_differences(names, off):
 @pytest.mark.parametrize("names", [("x", "y", "z", "phi", "theta", "psi"), ("z", "phi", "theta")])
 @pytest.mark.parametrize("phi", [0.0, 2.0])
 def test_slopes_are_regular_at_zero_tilt(names, phi):
-    T = geometry.pose(geometry.tilt_torsion_to_matrix(phi, 0.0, 0.4), np.ones(3))[None]
+    T = geometry.make_pose(geometry.tilt_torsion_to_matrix(phi, 0.0, 0.4), np.ones(3))[None]
     values = {"x": 1.0, "y": 1.0, "z": 1.0, "phi": phi, "theta": 0.0, "psi": 0.4}
     target = np.array([[values[n] for n in names]])
-    residual, columns = coordinates.demands(T, target, names, SIZE)
+    residual, columns = compare_coordinates(T, target, names, SIZE)
     assert_allclose(residual, 0.0, atol=1e-15)
     assert np.linalg.matrix_rank(columns[0]) == len(names)
 
     def moved(x):
-        return coordinates.demands(geometry.exp_update(T, x[None]), target, names, SIZE)[0]
+        return compare_coordinates(geometry.apply_twist(T, x[None]), target, names, SIZE)[0]
 
     check_jacobian(moved, columns, np.zeros(6), scale=0.05)
 
 
 def test_angles_asked_for_are_compared_the_short_way_round():
-    T = coordinates.pose(np.array([[np.pi - 0.01]]), ("yaw",), np.eye(4))
-    residual, _ = coordinates.demands(T, np.array([[-np.pi + 0.01]]), ("yaw",), SIZE)
+    T = pose_from_coordinates(np.array([[np.pi - 0.01]]), ("yaw",), np.eye(4))
+    residual, _ = compare_coordinates(T, np.array([[-np.pi + 0.01]]), ("yaw",), SIZE)
     assert_allclose(residual, -0.02 * SIZE)
 
 
@@ -95,4 +100,4 @@ def test_angles_asked_for_are_compared_the_short_way_round():
 )
 def test_impossible_sets_of_coordinates_are_one_clear_sentence(names, sentence):
     with pytest.raises(MechanismError, match=sentence):
-        coordinates.check_names(names)
+        check_coordinates(names)

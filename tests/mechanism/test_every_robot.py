@@ -60,7 +60,7 @@ def rows_inside(machine: Mechanism, seed: int) -> Iterator[Solution]:
 def returned(there: Solution, back: Solution) -> NDArray[np.bool_]:
     """Rows that came back to where they were."""
     # [rad, m] Newton stops below 1e-13 of the size; the rest is the condition of the mechanism
-    return back.converged & (np.abs(geometry.difference(back.T, there.T)).max(axis=1) < 1e-8)
+    return back.converged & (np.abs(geometry.pose_difference(back.T, there.T)).max(axis=1) < 1e-8)
 
 
 @pytest.mark.slow

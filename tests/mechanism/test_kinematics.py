@@ -11,8 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import engine, geometry
 from loopcal.errors import DataError
-from loopcal.mechanism import Status, build, forward, inverse
-from loopcal.mechanism.batch_kinematics import forward_trials
+from loopcal.mechanism import Status, build, forward, forward_trials, inverse
 from tests import zoo
 from tests.engine.cases import driven, spread
 
@@ -45,7 +44,7 @@ def sampled(name, n, seed=7):
 def gap_of(robot, T, reference):
     """Distance of poses as a fraction of the robot's size, a rotation vector counting as such (n,)."""
     return np.linalg.norm(
-        geometry.difference(T, reference) / np.array([1.0] * 3 + [robot.size] * 3), axis=1
+        geometry.pose_difference(T, reference) / np.array([1.0] * 3 + [robot.size] * 3), axis=1
     )
 
 
@@ -54,7 +53,7 @@ def condition(robot, state):
     per size (n,).
     """
     e, _ = robot.slots(robot.values[None])
-    blocks = engine.linearise(robot.program, e, driven(robot.program, state), state)
+    blocks = engine.linearize(robot.program, e, driven(robot.program, state), state)
     A = spread(robot.program, blocks.closure)[0][0]
     return np.linalg.cond(
         A / np.array([robot.size if f < 3 else 1.0 for f in robot.program.freedoms])
@@ -165,7 +164,7 @@ def inverse_from(robot, sol, T):
     """The solution with its platform put elsewhere and the orientation of the mirrored mode."""
     from dataclasses import replace
 
-    state = replace(sol.state, T=T[None], orientation=-sol.state.orientation)
+    state = replace(sol.state, T=T[None], closure_sign=-sol.state.closure_sign)
     return replace(sol, T=T, state=state)
 
 
@@ -201,7 +200,7 @@ def test_forward_after_inverse_is_the_identity(name):
     @given(st.lists(coordinate, min_size=len(low), max_size=len(low)))
     def holds(part):
         sol = inverse(robot, low + np.array(part) * (high - low))
-        assert_allclose(geometry.difference(forward(robot, sol.q).T, sol.T), 0.0, atol=1e-12)
+        assert_allclose(geometry.pose_difference(forward(robot, sol.q).T, sol.T), 0.0, atol=1e-12)
 
     holds()
 
@@ -222,7 +221,7 @@ def test_units_scale_out(s):
 @settings(max_examples=20)
 @given(st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6))
 def test_readings_do_not_depend_on_where_the_base_stands(twist):
-    G = geometry.exp_update(np.eye(4), np.array(twist))
+    G = geometry.apply_twist(np.eye(4), np.array(twist))
     here, there = zoo.hexapod(), build(zoo.relocated(zoo.hexapod().assembly, G))
     _, sol, _ = sampled("hexapod", 5)
     assert_allclose(inverse(there, G @ sol.T).q, sol.q, atol=1e-14)

@@ -6,15 +6,15 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.errors import MechanismError
-from loopcal.mechanism import Actuator
-from loopcal.mechanism.transmission import (
+from loopcal.mechanism import (
     TERMS,
-    frequency,
-    joint_values,
+    Actuator,
+    harmonic_frequencies,
+    joint_slopes,
+    joints_from_readings,
     nominal_terms,
-    readings_of,
-    slope,
-    term_columns,
+    readings_from_joints,
+    term_derivatives,
 )
 from loopcal.units import Dimension
 from tests import zoo
@@ -79,17 +79,17 @@ READINGS = np.random.default_rng(4).uniform(-0.1, 0.1, (1, 6, 3))
 
 
 def test_transmission_has_the_slopes_it_says():
-    tau, w = nominal_terms(ACTUATORS)[None], frequency(ACTUATORS)
+    tau, w = nominal_terms(ACTUATORS)[None], harmonic_frequencies(ACTUATORS)
     check_jacobian(
-        lambda x: joint_values(READINGS + x[0], tau, w), slope(READINGS, tau, w)[..., None], np.zeros(1), scale=0.0005,
-        automatic=lambda x: joint_values(READINGS + x[0], tau, w),
+        lambda x: joints_from_readings(READINGS + x[0], tau, w), joint_slopes(READINGS, tau, w)[..., None], np.zeros(1), scale=0.0005,
+        automatic=lambda x: joints_from_readings(READINGS + x[0], tau, w),
     )  # fmt: skip
     for i in range(len(TERMS)):
         unit = np.zeros_like(tau)
         unit[..., i] = 1.0
-        column = term_columns(READINGS, w)[i]
+        column = term_derivatives(READINGS, w)[i]
         check_jacobian(
-            lambda x, u=unit: joint_values(READINGS, tau + x[0] * u, w),
+            lambda x, u=unit: joints_from_readings(READINGS, tau + x[0] * u, w),
             column[..., None],
             np.zeros(1),
             scale=1.0,
@@ -99,14 +99,17 @@ def test_transmission_has_the_slopes_it_says():
 
 
 def test_transmission_is_inverted_to_rounding():
-    tau, w = nominal_terms(ACTUATORS)[None], frequency(ACTUATORS)
+    tau, w = nominal_terms(ACTUATORS)[None], harmonic_frequencies(ACTUATORS)
     assert_allclose(
-        readings_of(joint_values(READINGS, tau, w), tau, w), READINGS, rtol=0, atol=1e-16 / 0.9 * 10
+        readings_from_joints(joints_from_readings(READINGS, tau, w), tau, w),
+        READINGS,
+        rtol=0,
+        atol=1e-16 / 0.9 * 10,
     )
 
 
 def test_an_actuator_without_period_has_no_harmonics():
-    columns = term_columns(READINGS, frequency(ACTUATORS))
+    columns = term_derivatives(READINGS, harmonic_frequencies(ACTUATORS))
     for term, column in zip(TERMS, columns, strict=True):
         if term.startswith(("sin", "cos")):
             assert_array_equal(column[..., 1], 0.0)

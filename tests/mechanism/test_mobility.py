@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from loopcal.errors import MechanismError
-from loopcal.mechanism import Actuator, Address, Joint, Limb, Linear, Link, build
+from loopcal.mechanism import Actuator, Address, Joint, Limb, LinearMap, Link, build
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 from tests import zoo
@@ -148,7 +148,7 @@ def test_a_parameter_mapped_onto_nothing_is_refused():
         Address("q1", "transmission", "tooth"),
         Address("leg9", "base", "x"),
     ):
-        wrong = replace(HEXAPOD, parameters=(parameter,), maps=(Linear("a", address),))
+        wrong = replace(HEXAPOD, parameters=(parameter,), maps=(LinearMap("a", address),))
         with pytest.raises(
             MechanismError, match=f"mapped onto {address}, which this mechanism does not have"
         ):

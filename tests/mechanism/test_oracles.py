@@ -11,9 +11,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import geometry
-from loopcal.mechanism import Status, build, forward, inverse
+from loopcal.mechanism import PoseRecord, Status, build, forward, inverse
 from loopcal.mechanism.families.linear_delta import LinearDelta
-from loopcal.mechanism.records import Pose
 from tests import zoo
 
 
@@ -56,11 +55,11 @@ def test_forward_kinematics_of_genhexkins_lengths_find_its_poses(hexapod):
     robot, poses, lengths, found = hexapod
     sol = forward(robot, inverse(robot, poses).q)
     assert_array_equal(sol.status, Status.CONVERGED)
-    assert_allclose(geometry.difference(sol.T, poses), 0.0, atol=1e-10)
+    assert_allclose(geometry.pose_difference(sol.T, poses), 0.0, atol=1e-10)
     theirs = forward(robot, lengths)
     assert_array_equal(theirs.status, Status.CONVERGED)
     assert_allclose(
-        geometry.difference(theirs.T, found), 0.0, atol=1e-7
+        geometry.pose_difference(theirs.T, found), 0.0, atol=1e-7
     )  # its own iteration stops there
 
 
@@ -69,7 +68,7 @@ def test_lineardeltakins_gives_the_same_carriages_and_poses(oracles):
     # 330 degrees
     record = LinearDelta(
         name="lineardeltakins", radius=130.25, angles=tuple(np.deg2rad((90.0, 210.0, 330.0)).tolist()), arms=269.0,
-        stops=-float(np.sqrt(269.0**2 - 130.25**2)), readings="height", home=Pose(z=50.0),
+        stops=-float(np.sqrt(269.0**2 - 130.25**2)), readings="height", home=PoseRecord(z=50.0),
     )  # fmt: skip
     robot, path = build(record.expand()), oracles / "lineardeltakins_default_200poses.csv"
     points, carriages, found = (

@@ -5,12 +5,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from loopcal.mechanism import build, forward
-from loopcal.mechanism.batch_kinematics import forward_trials
+from loopcal.mechanism import (
+    PoseRecord,
+    build,
+    differentiate_passive_joints,
+    forward,
+    forward_trials,
+    make_solution,
+)
 from loopcal.mechanism.families.gough import Gough
-from loopcal.mechanism.kinematics import solution_of
-from loopcal.mechanism.passive_joints import passive_sensitivity
-from loopcal.mechanism.records import Pose
 from loopcal.units import Dimension
 from tests import zoo
 from tests.jacobians import check_jacobian
@@ -23,7 +26,7 @@ def ups():
         base=tuple(map(tuple, (zoo.HEXAPOD_BASE * zoo.MM).tolist())),
         platform=tuple(map(tuple, (zoo.HEXAPOD_PLATFORM * zoo.MM).tolist())),
         lengths=zoo.HEXAPOD_LENGTH * zoo.MM,
-        home=Pose(z=0.2),
+        home=PoseRecord(z=0.2),
         legs="ups",
         error_model="complete",
     )
@@ -35,7 +38,7 @@ def test_passive_joints_follow_parameters_and_readings_as_differences_say(name):
     robot, sol, _ = sampled(name, 1)
     values, q = robot.values[None], sol.q[None]
     state = forward_trials(robot, values, q, start=sol.state)
-    found = passive_sensitivity(robot, values, q, state)
+    found = differentiate_passive_joints(robot, values, q, state)
     assert found.names == sol.passive_names
     dimensions = [*robot.parameters.dimensions, *(a.dimension for a in robot.actuators)]
     unit = np.array([robot.size if d is Dimension.LENGTH else 1.0 for d in dimensions])
@@ -78,18 +81,18 @@ def test_blocks_of_rows_change_nothing():
     q = np.random.default_rng(0).uniform(-0.01, 0.01, (1, 700, 6))
     values = robot.values[None]
     state = forward_trials(robot, values, q)
-    whole = passive_sensitivity(robot, values, q, state)
+    whole = differentiate_passive_joints(robot, values, q, state)
     single = forward(robot, q[0, 600:601])
-    alone = passive_sensitivity(robot, values, q[:, 600:601], single.state)
+    alone = differentiate_passive_joints(robot, values, q[:, 600:601], single.state)
     # numpy's matmul rounds a batch by its size; a turn per metre is about 10
     np.testing.assert_allclose(whole.parameters[:, 600:601], alone.parameters, rtol=0, atol=1e-11)
-    assert solution_of(robot, state, q[0]).passive_names == whole.names
+    assert make_solution(robot, state, q[0]).passive_names == whole.names
 
 
 def test_failed_rows_hold_no_numbers():
     robot, q = ups(), np.zeros((1, 2, 6))
     q[0, 1, 2] = np.nan
-    found = passive_sensitivity(
+    found = differentiate_passive_joints(
         robot, robot.values[None], q, forward_trials(robot, robot.values[None], q)
     )
     assert np.isfinite(found.parameters[0, 0]).all()
@@ -101,4 +104,4 @@ def test_a_driven_slide_does_not_make_the_joint_below_it_a_spinning_one():
     # were held
     robot = ups()
     assert robot.notes == ()
-    assert_array_equal([g.held for g in robot.program.groups], [(False, False, False)])
+    assert_array_equal([g.locked for g in robot.program.groups], [(False, False, False)])

@@ -5,14 +5,14 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import geometry
-from loopcal.mechanism import Status, coordinates, inverse
+from loopcal.mechanism import Status, inverse, read_coordinates
 from tests import zoo
 from tests.mechanism.test_kinematics import sampled
 
 
 def cost(robot, T, target):
     """|log(R R*')|^2 size^2 + |t - t*|^2 (n,) [m^2]."""
-    gap = geometry.difference(T, target) * np.array([robot.size] * 3 + [1.0] * 3)
+    gap = geometry.pose_difference(T, target) * np.array([robot.size] * 3 + [1.0] * 3)
     return (gap**2).sum(axis=1)
 
 
@@ -21,14 +21,14 @@ def targets(n=20):
     rng = np.random.default_rng(5)
     values = rng.uniform([0.66, -np.pi, 0.1], [0.74, np.pi, 0.5], (n, 3))
     T = inverse(zoo.three_prs(), values).T
-    return geometry.exp_update(T, rng.uniform(-1, 1, (n, 6)) * np.array([0.05] * 3 + [0.02] * 3))
+    return geometry.apply_twist(T, rng.uniform(-1, 1, (n, 6)) * np.array([0.05] * 3 + [0.02] * 3))
 
 
 def test_the_nearest_pose_of_a_3_prs_has_no_slope_left():
     robot, target = zoo.three_prs(), targets()
     sol = inverse(robot, target)
     assert_array_equal(sol.status, Status.CONVERGED)
-    found = coordinates.read(sol.T, robot.controlled)
+    found = read_coordinates(sol.T, robot.controlled)
     best, h = cost(robot, sol.T, target), 1e-5
     for i in range(3):
         ahead, behind = (
@@ -42,7 +42,7 @@ def test_the_nearest_pose_of_a_3_prs_has_no_slope_left():
 def test_a_reachable_pose_is_its_own_nearest():
     robot, sol, _ = sampled("three_prs", 20)
     back = inverse(robot, sol.T)
-    assert_allclose(geometry.difference(back.T, sol.T), 0.0, atol=1e-11)
+    assert_allclose(geometry.pose_difference(back.T, sol.T), 0.0, atol=1e-11)
     assert_allclose(back.q, sol.q, atol=1e-11)
 
 
@@ -57,4 +57,6 @@ def test_a_machine_with_fewer_freedoms_ignores_what_it_has_not():
 
 def test_a_hexapod_reaches_the_pose_itself():
     _, sol, _ = sampled("hexapod", 20)
-    assert_allclose(geometry.difference(inverse(zoo.hexapod(), sol.T).T, sol.T), 0.0, atol=1e-15)
+    assert_allclose(
+        geometry.pose_difference(inverse(zoo.hexapod(), sol.T).T, sol.T), 0.0, atol=1e-15
+    )

@@ -95,7 +95,9 @@ def test_a_3_prs_meets_its_closed_form_with_the_parasitic_motion():
         c = N + zoo.PRS_A * R @ out - zoo.PRS_B * out
         carriage = c[:, 2] - np.sqrt(zoo.PRS_L**2 - c[:, 0] ** 2 - c[:, 1] ** 2)
         assert_allclose(sol.q[:, i], carriage, atol=1e-13)
-    assert_allclose(geometry.difference(forward(zoo.three_prs(), sol.q).T, sol.T), 0.0, atol=1e-12)
+    assert_allclose(
+        geometry.pose_difference(forward(zoo.three_prs(), sol.q).T, sol.T), 0.0, atol=1e-12
+    )
 
 
 def test_passive_joints_of_a_3_prs_are_its_rods_swings():

@@ -11,8 +11,16 @@ from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
 from loopcal.io import load_robot
-from loopcal.mechanism import Actuator, Link, Status, build, forward, inverse
-from loopcal.mechanism.batch_kinematics import forward_trials, sensitivity
+from loopcal.mechanism import (
+    Actuator,
+    Link,
+    Status,
+    build,
+    differentiate_pose,
+    forward,
+    forward_trials,
+    inverse,
+)
 from loopcal.units import Dimension
 from tests import zoo
 from tests.jacobians import check_jacobian
@@ -90,7 +98,7 @@ def test_consistent_readings_leave_nothing_open():
     assert sol.residual.max() <= 1e-12
 
 
-def test_poses_follow_readings_as_linearised():
+def test_poses_follow_readings_as_linearized():
     robot = cable_robot((1e-3, 5e-3, 2e-4, 2e-3))
     q = inverse(robot, np.array([robot.home[:3, 3]]) + 0.05).q
     values = robot.values[None]
@@ -100,7 +108,7 @@ def test_poses_follow_readings_as_linearised():
 
     def slopes(readings):
         state = forward_trials(robot, values, readings[None, None])
-        return sensitivity(robot, values, readings[None, None], state).readings[0, 0, 3:]
+        return differentiate_pose(robot, values, readings[None, None], state).readings[0, 0, 3:]
 
     check_jacobian(
         position,

@@ -10,8 +10,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import geometry
-from loopcal.mechanism import Address, Linear, build
-from loopcal.mechanism.batch_kinematics import forward_trials, sensitivity
+from loopcal.mechanism import Address, LinearMap, build, differentiate_pose, forward_trials
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 from tests import zoo
@@ -53,7 +52,7 @@ def test_sensitivity_of_the_families_agrees_with_differences_and_jax(name, legs,
     robot, sol, _ = sampled(name, 4)
     values, q = noisy(robot), sol.q[None]
     state = forward_trials(robot, values, q)
-    found = sensitivity(robot, values, q, state)
+    found = differentiate_pose(robot, values, q, state)
     free = list(robot.program.freedoms)
 
     both = np.concatenate([found.parameters[0], found.readings[0]], axis=-1)
@@ -67,7 +66,7 @@ def test_sensitivity_of_the_families_agrees_with_differences_and_jax(name, legs,
 
     def solved(x):  # one trial a parameter or reading
         v, r = values + x[0] * moved[:, : values.size], q + x[0] * moved[:, None, values.size :]
-        return geometry.difference(forward_trials(robot, v, r, start=state).T, state.T)
+        return geometry.pose_difference(forward_trials(robot, v, r, start=state).T, state.T)
 
     check_jacobian(
         solved, (both * scale).transpose(2, 0, 1)[..., None], np.zeros(1), scale=0.1,
@@ -91,14 +90,14 @@ def test_sensitivity_of_any_mechanism_agrees_with_differences(name):
     robot, sol, _ = sampled(name, 1)
     values, q = robot.values[None], sol.q[None]
     state = forward_trials(robot, values, q, start=sol.state)
-    found = sensitivity(robot, values, q, state)
+    found = differentiate_pose(robot, values, q, state)
     unit = np.array(
         [robot.size if d is Dimension.LENGTH else 1.0 for d in robot.parameters.dimensions]
     )
 
     def solved(x):  # one trial a parameter
         moved = forward_trials(robot, values + x[0] * np.diag(unit), q, start=state)
-        return geometry.difference(moved.T, np.broadcast_to(state.T, moved.T.shape))
+        return geometry.pose_difference(moved.T, np.broadcast_to(state.T, moved.T.shape))
 
     check_jacobian(
         solved, (found.parameters[0] * unit).transpose(2, 0, 1)[..., None], np.zeros(1), scale=0.1,
@@ -111,12 +110,12 @@ def test_transmission_terms_enter_the_pose_with_their_slopes():
     _, sol, _ = sampled("hexapod", 3)
     values, q = noisy(robot, 1e-4), sol.q[None]
     state = forward_trials(robot, values, q)
-    found = sensitivity(robot, values, q, state)
+    found = differentiate_pose(robot, values, q, state)
     both = np.concatenate([found.parameters[0][..., 42:], found.readings[0]], axis=-1)
 
     def solved(x):
         v = np.concatenate([values[0, :42], x[:-6]])[None]
-        return geometry.difference(
+        return geometry.pose_difference(
             forward_trials(robot, v, q + x[-6:], start=state).T[0], state.T[0]
         )
 
@@ -141,7 +140,7 @@ def with_harmonics(robot):
         for term in terms:
             dimension = Dimension.RATIO if term == "gain" else Dimension.LENGTH
             extra.append(Parameter(f"{name}.{term}", dimension, float(term == "gain")))
-            maps.append(Linear(f"{name}.{term}", Address(name, "transmission", term)))
+            maps.append(LinearMap(f"{name}.{term}", Address(name, "transmission", term)))
     actuators = tuple(
         replace(a, period=0.005) if a.name in ("q1", "q2") else a for a in assembly.actuators
     )
@@ -159,10 +158,10 @@ def test_trials_agree_with_single_calls_up_to_the_rounding_of_numpy_matmul():
     robot, sol, _ = sampled("three_prs", 6)
     values, q = noisy(robot, 1e-4, t=7), sol.q[None]
     state = forward_trials(robot, values, q)
-    together = sensitivity(robot, values, q, state)
+    together = differentiate_pose(robot, values, q, state)
     for i in range(7):
         one = forward_trials(robot, values[i : i + 1], q)
-        alone = sensitivity(robot, values[i : i + 1], q, one)
+        alone = differentiate_pose(robot, values[i : i + 1], q, one)
         # the product with de/dp is one matmul a trial, whose order of summation BLAS chooses
         assert_allclose(together.parameters[i], alone.parameters[0], rtol=1e-12, atol=1e-13)
         assert_array_equal(together.readings[i], alone.readings[0])
@@ -172,7 +171,7 @@ def test_failed_rows_hold_no_numbers_and_do_not_stop_the_others():
     robot, q = zoo.hexapod(), np.zeros((1, 3, 6))
     q[0, 1, 2] = np.nan
     values = robot.values[None]
-    found = sensitivity(robot, values, q, forward_trials(robot, values, q))
+    found = differentiate_pose(robot, values, q, forward_trials(robot, values, q))
     assert np.isnan(found.parameters[0, 1]).all()
     assert np.isfinite(found.parameters[0, [0, 2]]).all()
 
@@ -187,7 +186,7 @@ def scaled_matrix(name, n=40):
     """
     robot, sol, _ = sampled(name, n)
     state = forward_trials(robot, noisy(robot, 1e-4), sol.q[None], start=sol.state)
-    D = sensitivity(robot, noisy(robot, 1e-4), sol.q[None], state).parameters[0]
+    D = differentiate_pose(robot, noisy(robot, 1e-4), sol.q[None], state).parameters[0]
     T, eye, zero = state.T[0], np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3, 3))
     base = np.concatenate(
         [

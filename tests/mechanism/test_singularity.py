@@ -7,15 +7,19 @@ from numpy.testing import assert_allclose
 
 from loopcal.errors import DataError
 from loopcal.io import load_robot
-from loopcal.mechanism import inverse
-from loopcal.mechanism.singularities import along_path, singularity, typical
+from loopcal.mechanism import (
+    analyze_singularity,
+    compute_median_margins,
+    inverse,
+    trace_singularity,
+)
 from tests import zoo
 
 
 def test_the_margin_of_a_hexapod_is_that_of_its_plucker_lines():
     robot, T = zoo.hexapod(), zoo.nategh_poses(np.random.default_rng(0), 5)
     T[:, 2, 3] -= 0.6
-    found = singularity(robot, T)
+    found = analyze_singularity(robot, T)
     p = np.einsum("nij,kj->nki", T[:, :3, :3], zoo.HEXAPOD_PLATFORM * zoo.MM)
     u = p + T[:, None, :3, 3] - zoo.HEXAPOD_BASE * zoo.MM
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
@@ -24,8 +28,8 @@ def test_the_margin_of_a_hexapod_is_that_of_its_plucker_lines():
         found.margin, np.linalg.svd(lines, compute_uv=False)[:, -1], atol=1e-14
     )  # [m/m] rounding
     assert (
-        found.orientation
-        == np.sign(np.linalg.det(lines)) * found.orientation[0] * np.sign(np.linalg.det(lines))[0]
+        found.closure_sign
+        == np.sign(np.linalg.det(lines)) * found.closure_sign[0] * np.sign(np.linalg.det(lines))[0]
     ).all()
     assert_allclose(
         found.drive_margin, 1.0, atol=1e-14
@@ -34,12 +38,12 @@ def test_the_margin_of_a_hexapod_is_that_of_its_plucker_lines():
 
 def test_a_hexapod_turned_by_a_right_angle_can_turn_freely():
     # Fichter's singularity: a symmetric platform turned by 90 degrees about its normal
-    found = singularity(
+    found = analyze_singularity(
         zoo.hexapod(),
         np.array([[0.0, 0.0, 0.2, 0.0, 0.0, np.pi / 2], [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]]),
     )
     assert found.margin[0] < 1e-9  # [m/m] six printed digits of the centres
-    assert found.near.tolist() == [True, False]
+    assert found.is_near.tolist() == [True, False]
     assert "turn about z" in found.motion(0)
     assert "smallest singular value of closure" in found.explain(0)
 
@@ -48,20 +52,20 @@ def test_a_path_through_a_singularity_warns_once_near_it_and_where_the_sign_chan
     robot = load_robot("hexapod-42")
     path = np.zeros((41, 6))
     path[:, 2], path[:, 5] = 0.2, np.linspace(0.0, 2.0, 41)
-    found = along_path(robot, coordinates=path)
+    found = trace_singularity(robot, coordinates=path)
     assert len(found.warnings) == 2
     (first, near), (changed, sign) = found.warnings
     assert path[first, 5] < np.pi / 2 < path[changed, 5] < path[changed - 1, 5] + 0.06
     assert near.startswith(f"steps {first} to ")
     assert "changes its sign" in sign
-    assert not along_path(robot, coordinates=path[:20]).warnings
+    assert not trace_singularity(robot, coordinates=path[:20]).warnings
 
 
 def test_a_path_that_cannot_go_on_says_where():
     robot = zoo.delta()
     path = np.zeros((12, 3))
     path[:, 2], path[:, 0] = 0.1, np.linspace(0.0, 0.6, 12)
-    found = along_path(robot, coordinates=path, medians=typical(robot))
+    found = trace_singularity(robot, coordinates=path, medians=compute_median_margins(robot))
     lost = int(np.flatnonzero(np.isnan(found.margin))[0])
     assert (lost, True) in [
         (step, text.startswith("not reached from here")) for step, text in found.warnings
@@ -71,32 +75,32 @@ def test_a_path_that_cannot_go_on_says_where():
 def test_readings_and_coordinates_of_one_path_agree():
     robot = zoo.planar_rrr()
     path = np.linspace(0.0, 1.0, 10)[:, None] * np.array([0.02, 0.01, 0.1])
-    there = along_path(robot, coordinates=path, medians=(1.0, 1.0))
-    again = along_path(robot, readings=there.solution.q, medians=(1.0, 1.0))
+    there = trace_singularity(robot, coordinates=path, medians=(1.0, 1.0))
+    again = trace_singularity(robot, readings=there.solution.q, medians=(1.0, 1.0))
     assert_allclose(again.margin, there.margin, atol=1e-11)  # [m/m] rounding through Newton
-    assert (again.orientation == there.orientation).all()
+    assert (again.closure_sign == there.closure_sign).all()
 
 
 def test_an_outstretched_crank_moves_nothing():
     # crank of 0.2 m and rod of 0.3 m in one line: the drive's row of closure vanishes
     robot = load_robot("five-bar")
     reach = 0.4999 * np.array([np.cos(1.0), np.sin(1.0)]) + [-0.075, 0.0]
-    found = singularity(robot, inverse(robot, reach[None]))
+    found = analyze_singularity(robot, inverse(robot, reach[None]))
     assert found.drive_margin[0] < 0.05 * found.drive_median
     assert "left hardly moves it" in found.explain(0)
 
 
 def test_without_a_workspace_home_is_the_measure():
     robot = zoo.planar_rrr()
-    assert typical(robot)[0] == pytest.approx(
-        singularity(robot, robot.home[None], (1.0, 1.0)).margin[0], abs=1e-12
+    assert compute_median_margins(robot)[0] == pytest.approx(
+        analyze_singularity(robot, robot.home[None], (1.0, 1.0)).margin[0], abs=1e-12
     )
 
 
 def test_redundant_drives_have_a_margin_and_no_sign():
-    found = singularity(load_robot("cable-4"), load_robot("cable-4").home[None])
+    found = analyze_singularity(load_robot("cable-4"), load_robot("cable-4").home[None])
     assert found.margin[0] > 0.5
-    assert found.orientation[0] == 0
+    assert found.closure_sign[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -104,4 +108,4 @@ def test_redundant_drives_have_a_margin_and_no_sign():
 )
 def test_a_path_is_readings_or_coordinates(given):
     with pytest.raises(DataError, match="one of the two"):
-        along_path(zoo.hexapod(), **given)
+        trace_singularity(zoo.hexapod(), **given)

@@ -11,33 +11,38 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.errors import MechanismError
 from loopcal.io import load_robot
-from loopcal.mechanism import build, forward
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import build, forward, sample_workspace
 from tests import zoo
 
 
 def test_positions_are_inside_ranges_and_strokes_and_forward_leads_back():
     robot = load_robot("hexapod-42")
-    found = sample(robot, 300, seed=1)
+    found = sample_workspace(robot, 300, seed=1)
     low, high = np.array([robot.assembly.workspace[name] for name in robot.controlled]).T
     assert ((found.coordinates >= low) & (found.coordinates <= high)).all()
     assert np.abs(found.solution.q).max() <= 0.075
     assert_allclose(
         forward(robot, found.solution.q).T, found.solution.T, atol=1e-12
     )  # [1, m]: rounding over Newton
-    assert 0.95 < found.share < 1.0
-    assert all(name.startswith("stroke of q") for name in found.lost)
+    assert 0.95 < found.reachable_share < 1.0
+    assert all(name.startswith("stroke of q") for name in found.rejected)
 
 
 def test_a_seed_gives_the_same_positions_and_another_one_others():
     robot = zoo.delta()
-    assert_array_equal(sample(robot, 50, seed=3).coordinates, sample(robot, 50, seed=3).coordinates)
-    assert (sample(robot, 50, seed=3).coordinates != sample(robot, 50, seed=4).coordinates).all()
+    assert_array_equal(
+        sample_workspace(robot, 50, seed=3).coordinates,
+        sample_workspace(robot, 50, seed=3).coordinates,
+    )
+    assert (
+        sample_workspace(robot, 50, seed=3).coordinates
+        != sample_workspace(robot, 50, seed=4).coordinates
+    ).all()
 
 
 def test_tilt_is_even_over_the_cap():
     robot = load_robot("3-prs")
-    found = sample(robot, 4000, seed=0)
+    found = sample_workspace(robot, 4000, seed=0)
     theta = found.coordinates[:, robot.controlled.index("theta")]
     low, high = robot.assembly.workspace["theta"]
     share = (np.cos(low) - np.cos(theta)) / (np.cos(low) - np.cos(high))
@@ -52,17 +57,17 @@ def test_an_empty_workspace_is_said_with_its_reason():
     with pytest.raises(
         MechanismError, match=r"workspace is empty: 0 of .* because the loops cannot be closed"
     ):
-        sample(robot, 10)
+        sample_workspace(robot, 10)
     robot = with_workspace(
         {"x": (-0.08, 0.08), "y": (-0.08, 0.08), "z": (0.0, 0.2)}, stroke=(0.9, 1.0)
     )
     with pytest.raises(MechanismError, match="because stroke of q1 is exceeded"):
-        sample(robot, 10)
+        sample_workspace(robot, 10)
 
 
 def test_a_range_that_is_missing_is_named():
     with pytest.raises(MechanismError, match="states no workspace for y"):
-        sample(with_workspace({"x": (-0.1, 0.1), "z": (0.0, 0.1)}), 10)
+        sample_workspace(with_workspace({"x": (-0.1, 0.1), "z": (0.0, 0.1)}), 10)
 
 
 def with_workspace(ranges, stroke=None):

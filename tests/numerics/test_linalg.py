@@ -4,14 +4,14 @@
 import numpy as np
 import pytest
 
-from loopcal.engine import accumulate
+from loopcal.engine import fold
 from loopcal.numerics.decomposition import decompose, empty_factor
 
 P, M, T = 7, 40, 3
 
 
 def folded(rows: np.ndarray) -> np.ndarray:
-    return accumulate(empty_factor(len(rows), P), rows)
+    return fold(empty_factor(len(rows), P), rows)
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_folding_in_blocks_of_any_size_gives_the_same_triangle_up_to_signs(rows)
     for cuts in ([1, 3, 20], [10], list(range(1, M))):
         factor = empty_factor(T, P)
         for block in np.split(rows, cuts, axis=1):
-            factor = accumulate(factor, block)
+            factor = fold(factor, block)
         np.testing.assert_allclose(np.abs(factor), whole, rtol=0, atol=1e-12 * whole.max())
 
 

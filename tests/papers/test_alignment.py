@@ -34,7 +34,7 @@ def test_frames_that_are_open_are_found_and_nothing_is_left(base, tool):
 
 def test_what_is_left_is_a_minimum_of_the_stated_sum():
     noise = RNG.normal(size=(12, 6)) * [1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4]
-    reference = geometry.exp_update(BASE @ T @ TOOL, noise)
+    reference = geometry.apply_twist(BASE @ T @ TOOL, noise)
     weight = np.array([0.2, 0.2, 0.2, 1.0, 1.0, 1.0])
 
     def total(found):
@@ -44,12 +44,12 @@ def test_what_is_left_is_a_minimum_of_the_stated_sum():
     least = total(found)
     assert least < np.sum((weight * noise) ** 2)
     for step in np.concatenate([np.eye(6), -np.eye(6)]) * 1e-5:
-        assert total(replace(found, T_base=geometry.exp_update(found.T_base, step))) > least
-        assert total(replace(found, T_tool=geometry.exp_update(found.T_tool, step))) > least
+        assert total(replace(found, T_base=geometry.apply_twist(found.T_base, step))) > least
+        assert total(replace(found, T_tool=geometry.apply_twist(found.T_tool, step))) > least
 
 
 def test_an_error_that_is_no_gauge_stays():
-    reference = BASE @ geometry.exp_update(
+    reference = BASE @ geometry.apply_twist(
         T, np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 1e-3], (12, 1)) * (np.arange(12.0) % 2)[:, None]
     )
     left = align(T, reference, base=True, tool=False, size=0.2).errors(T, reference)

@@ -16,8 +16,7 @@ from scipy.stats import beta
 
 from loopcal import geometry
 from loopcal.estimate import LeastSquares
-from loopcal.mechanism import forward
-from loopcal.mechanism.batch_kinematics import forward_trials
+from loopcal.mechanism import forward, forward_trials
 from loopcal.papers import PAPERS
 from loopcal.papers.cmm_constraint_2011.cells import BEFORE, LS, PRIOR, cell, grid
 from loopcal.papers.cmm_constraint_2011.compare import told
@@ -152,10 +151,12 @@ def test_alignment_takes_out_motions_of_the_base_and_turns_of_the_platform_and_n
     study,
 ) -> None:
     true = study.unseen.solution.T[None]
-    base = geometry.pose(geometry.exp_so3(np.array([0.1, -0.2, 0.3])), np.array([0.3, 0.1, -0.2]))
-    turn = geometry.pose(geometry.exp_so3(np.array([0.2, 0.1, -0.1])), np.zeros(3))
+    base = geometry.make_pose(
+        geometry.exp_so3(np.array([0.1, -0.2, 0.3])), np.array([0.3, 0.1, -0.2])
+    )
+    turn = geometry.make_pose(geometry.exp_so3(np.array([0.2, 0.1, -0.1])), np.zeros(3))
     np.testing.assert_allclose(best_fit(base @ true @ turn, true), true, atol=1e-12)
-    shifted = true @ geometry.pose(np.eye(3), np.array([1e-3, 0.0, 0.0]))
+    shifted = true @ geometry.make_pose(np.eye(3), np.array([1e-3, 0.0, 0.0]))
     assert (
         np.abs(best_fit(shifted, true)[..., :3, 3] - true[..., :3, 3]).max() > 1e-5
     )  # [m] that is no motion of the base

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from loopcal.measure import Noise, Uniform
-from loopcal.mechanism.batch_kinematics import forward_trials
+from loopcal.mechanism import forward_trials
 from loopcal.papers import PAPERS
 from loopcal.papers.tsvd_2016.cases import LS, PRIOR, RANKED, RE, TSVD, WHITENED, spacing
 from loopcal.papers.tsvd_2016.compare import compute

@@ -10,9 +10,7 @@ from numpy.testing import assert_allclose
 from loopcal.errors import DataError, MechanismError
 from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import find_robot_file
-from loopcal.mechanism.limits import within
-from loopcal.mechanism.singularities import singularity
-from loopcal.mechanism.workspace import ranges
+from loopcal.mechanism import analyze_singularity, check_limits, workspace_ranges
 from loopcal.planning.candidates import candidates, listed_candidates
 from loopcal.planning.constraints import Constraints, Sight
 
@@ -31,10 +29,10 @@ def strict():
 def test_every_candidate_keeps_to_every_constraint_as_computed_anew(strict):
     robot, T = strict.rules.robot, strict.solution.T
     assert strict.solution.converged.all()
-    assert within(robot, robot.values[None], strict.solution.q[None], strict.solution.state)[
+    assert check_limits(robot, robot.values[None], strict.solution.q[None], strict.solution.state)[
         0
     ].all()
-    near = singularity(robot, strict.coordinates)
+    near = analyze_singularity(robot, strict.coordinates)
     assert (near.ratio >= 0.6).all()
     assert (near.drive_ratio >= 0.6).all()
     tilt = np.arccos(T[:, 2, 2])
@@ -57,7 +55,7 @@ def test_what_is_refused_is_counted_by_its_reason(strict):
 @pytest.mark.parametrize("name", ["hexapod-42", "linear-delta"])
 def test_many_candidates_lie_at_the_boundary_of_the_workspace(name):
     found = candidates(load_robot(name), None, 60, seed=1)
-    low, high = np.array(list(ranges(found.rules.robot).values())).T
+    low, high = np.array(list(workspace_ranges(found.rules.robot).values())).T
     at_end = np.isclose(found.coordinates, low, atol=1e-6) | np.isclose(
         found.coordinates, high, atol=1e-6
     )  # [m, rad]

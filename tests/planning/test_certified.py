@@ -12,7 +12,7 @@ import pytest
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.outlook import scene
 from loopcal.io import load_robot
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import sample_workspace
 from loopcal.planning.certified import certified_design
 from loopcal.planning.criteria import A, D, I, efficiency, evaluate
 from loopcal.planning.design import Start, design_factor
@@ -25,7 +25,7 @@ SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)  # [rad, m]
 def pose_rows(robot: str, count: int, components: slice = slice(0, 6)) -> Array:
     """Whitened rows (count, r, p) of poses drawn from a shipped robot's workspace."""
     free = select_free_parameters(load_robot(robot))
-    twists = scene(free, sample(free.robot, count, 0).solution.q).twists[0]
+    twists = scene(free, sample_workspace(free.robot, count, 0).solution.q).twists[0]
     return (twists / SIGMA[:, None])[:, components]
 
 

@@ -8,8 +8,7 @@ from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.outlook import scene
 from loopcal.io import load_robot
-from loopcal.mechanism import inverse
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import inverse, sample_workspace
 from loopcal.planning.coordinate import coordinate_exchange
 from loopcal.planning.criteria import A, Criterion, D, evaluate
 from loopcal.planning.design import Start, design_factor
@@ -98,7 +97,7 @@ def test_units_that_cannot_be_moved_apart_are_refused() -> None:
 
 def test_poses_of_a_hexapod_move_to_where_its_parameters_show() -> None:
     free = select_free_parameters(load_robot("hexapod-42"))
-    drawn = sample(free.robot, 200, 0).coordinates
+    drawn = sample_workspace(free.robot, 200, 0).coordinates
     middle, half = drawn.mean(axis=0), 0.5 * np.ptp(drawn, axis=0)
 
     def rows_of(_: Places, x: Array) -> Array:

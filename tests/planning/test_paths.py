@@ -11,9 +11,7 @@ from numpy.testing import assert_allclose
 
 from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import find_robot_file
-from loopcal.mechanism import inverse
-from loopcal.mechanism.limits import within
-from loopcal.mechanism.singularities import along_path
+from loopcal.mechanism import check_limits, inverse, trace_singularity
 from loopcal.planning.candidates import candidates, home_coordinates
 from loopcal.planning.constraints import Constraints, rules
 from loopcal.planning.order import shortest, visiting_order
@@ -41,10 +39,12 @@ def _fine(found, start, end, steps):
     robot = found.rules.robot
     share = np.linspace(0.0, 1.0, steps)
     x = between(robot, np.repeat(start[None], steps, 0), np.repeat(end[None], steps, 0), share)
-    path = along_path(robot, coordinates=x, medians=found.rules.medians)
-    inside = within(robot, robot.values[None], path.solution.q[None], path.solution.state)[0][0]
+    path = trace_singularity(robot, coordinates=x, medians=found.rules.medians)
+    inside = check_limits(robot, robot.values[None], path.solution.q[None], path.solution.state)[0][
+        0
+    ]
     margin = np.fmin(path.ratio, path.drive_ratio)
-    return inside, margin, path.orientation
+    return inside, margin, path.closure_sign
 
 
 def test_ways_that_are_allowed_break_nothing_at_five_times_as_many_places(hexapod):
@@ -142,7 +142,7 @@ def test_a_way_ends_with_the_readings_of_its_end(hexapod):
     x = hexapod.coordinates[:5]
     home = np.broadcast_to(home_coordinates(robot), x.shape)
     assert follow(hexapod.rules, home, x).allowed.all()
-    last = along_path(
+    last = trace_singularity(
         robot,
         coordinates=between(
             robot, home[:1].repeat(20, 0), x[:1].repeat(20, 0), np.linspace(0, 1, 20)

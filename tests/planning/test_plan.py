@@ -16,7 +16,7 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.outlook import information
 from loopcal.io import load_robot
 from loopcal.measure import KINDS, sample_truth
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import sample_workspace
 from loopcal.planning.certified import certified_design
 from loopcal.planning.compared import MOST, units_of
 from loopcal.planning.criteria import D
@@ -59,13 +59,13 @@ def found(tracker):
 def test_rows_of_units_are_those_that_identification_folds(name, kind, settings):
     robot = load_robot(name)
     free, seen_by = select_free_parameters(robot), looking(kind, **settings)
-    q = sample(robot, 30, seed=2).solution.q
+    q = sample_workspace(robot, 30, seed=2).solution.q
     members = units_of(len(q), seen_by, np.random.default_rng(0))
     if members.shape[1] > 1:  # as a sensor looks that is told nothing: each with the next
         members = np.stack([np.arange(30), (np.arange(30) + 1) % 30], axis=1)
     units = unit_rows(free, seen_by, q, members)
     data = lc.simulate(
-        robot, sample(robot, 30, seed=2).coordinates, seen_by, seed=0, controller=robot
+        robot, sample_workspace(robot, 30, seed=2).coordinates, seen_by, seed=0, controller=robot
     )
     rows = np.concatenate(
         [units.rows.reshape(-1, units.rows.shape[2]), np.eye(units.rows.shape[2])[len(units.own) :]]
@@ -237,7 +237,7 @@ def test_no_choice_of_pairs_beats_what_is_said_of_pairs_not_even_all_pairs_of_fe
 
 def test_of_many_poses_the_pairs_considered_are_different_and_tell_more_than_as_many_drawn():
     robot, seen_by = load_robot("linear-delta"), looking("separation")
-    free, q = select_free_parameters(robot), sample(robot, 400, seed=2).solution.q
+    free, q = select_free_parameters(robot), sample_workspace(robot, 400, seed=2).solution.q
     mounted = seen_by.mounted(robot)
     ours = considered(free, mounted, q, np.random.default_rng(3))
     drawn = unit_rows(
@@ -283,7 +283,7 @@ def test_an_unknown_frame_changes_nothing_of_what_is_expected_before():
 
 def test_stated_tolerances_are_the_only_prior():
     free = select_free_parameters(load_robot("hexapod-42"))
-    q = sample(free.robot, 4, seed=1).solution.q
+    q = sample_workspace(free.robot, 4, seed=1).solution.q
     units = unit_rows(free, looking("pose"), q, np.arange(4)[:, None])
     assert len(start_of(free, units).rows) >= 42
     assert not free.assumed.any()

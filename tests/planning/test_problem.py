@@ -13,7 +13,7 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.outlook import scene
 from loopcal.io import load_robot
 from loopcal.measure import KINDS
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import sample_workspace
 from loopcal.planning.needed import poses_needed
 from loopcal.planning.pose_planning import planned, planned_for
 from loopcal.planning.problem import problem
@@ -48,7 +48,7 @@ def test_where_errors_are_predicted_depends_neither_on_the_line_of_sight_nor_on_
 
 def test_of_many_listed_poses_errors_are_predicted_all_over_the_list():
     robot = load_robot("linear-delta")
-    listed = sample(robot, 260, seed=3).coordinates
+    listed = sample_workspace(robot, 260, seed=3).coordinates
     listed = listed[np.lexsort(listed.T[::-1])]
     made = problem(robot, looking("position"), poses=listed)
     twists = scene(select_free_parameters(robot), lc.inverse(robot, listed[200:]).q).twists[
@@ -76,7 +76,10 @@ def test_an_instrument_that_tells_nothing_is_refused(kind):
 def test_equations_of_earlier_measurements_pay_for_their_own_set_up_first():
     robot = load_robot("linear-delta")
     before = lc.simulate(
-        robot, sample(robot, 5, seed=3).coordinates, looking("position", unknown=("frame",)), seed=1
+        robot,
+        sample_workspace(robot, 5, seed=3).coordinates,
+        looking("position", unknown=("frame",)),
+        seed=1,
     )
     assert problem(robot, looking("position"), measured=before, count=20).equations == 15 - 6
 
@@ -103,7 +106,9 @@ def test_what_is_guaranteed_is_rounded_down():
 
 def test_poses_get_names_that_were_not_measured_yet():
     robot = load_robot("linear-delta")
-    before = lc.simulate(robot, sample(robot, 12, seed=3).coordinates, looking("position"), seed=1)
+    before = lc.simulate(
+        robot, sample_workspace(robot, 12, seed=3).coordinates, looking("position"), seed=1
+    )
     found = planned(
         problem(robot, looking("position"), measured=before, count=20, taken=("14", "p3")),
         3,

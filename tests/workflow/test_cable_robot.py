@@ -140,7 +140,9 @@ def test_published_anchors_agree_one_by_one_and_not_together(fit, printer):
     values[3:16:4] = np.linalg.norm(PUBLISHED, axis=1) * 1e-3
     free = [name for name in NAMES if "anchor" not in name]
     moved = robot.with_values(values)
-    held = identify(replace(moved, parameters=moved.parameters.only(free)), data, LeastSquares())
+    held = identify(
+        replace(moved, parameters=moved.parameters.with_free(free)), data, LeastSquares()
+    )
     assert len(held.names) == 9
     assert held.chi_square - fit.chi_square == pytest.approx(64.0, rel=0.05)
     # each alone says little of those that the data tell to 2 cm only, and more of x and y of the

@@ -16,9 +16,8 @@ import pytest
 from loopcal.apply import validate
 from loopcal.estimate import identify
 from loopcal.measure import Component, Measurements, Observations
-from loopcal.mechanism import Mechanism, build
+from loopcal.mechanism import Mechanism, PoseRecord, build
 from loopcal.mechanism.families.linear_delta import LinearDelta
-from loopcal.mechanism.records import Pose
 
 MM, DEG = 1e-3, np.pi / 180.0
 PROBE = 0.02 * MM  # a usual probe's repeatability
@@ -46,10 +45,10 @@ def printer(record: dict, stop: float = 0.0) -> Mechanism:
         angles=tuple(a * DEG for a in stored["angles"]),
         arms=tuple(a * MM for a in stored["arms"]),
         stops=tuple(e * MM + stop for e in stored["endstops"]),
-        home=Pose(z=0.05),
+        home=PoseRecord(z=0.05),
     )
     robot = build(family.expand(), record=family)
-    return replace(robot, parameters=robot.parameters.only(FITTED))
+    return replace(robot, parameters=robot.parameters.with_free(FITTED))
 
 
 def heights(record: dict) -> Measurements:

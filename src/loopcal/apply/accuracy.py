@@ -22,9 +22,14 @@ from loopcal.diagnose import NO_MOTION, FrameMotions, find_frame_motions, twist_
 from loopcal.errors import EstimationError
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
-from loopcal.mechanism import Mechanism, Solution, forward, inverse
-from loopcal.mechanism.batch_kinematics import sensitivity
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import (
+    Mechanism,
+    Solution,
+    differentiate_pose,
+    forward,
+    inverse,
+    sample_workspace,
+)
 from loopcal.typing import BoolArray, FloatArray
 
 COVERAGE = 2.0
@@ -160,7 +165,7 @@ def _covariance(
     for.
     """
     robot = known.robot
-    S = sensitivity(robot, robot.values[None], found.q[None], found.state)
+    S = differentiate_pose(robot, robot.values[None], found.q[None], found.state)
     D = H @ (S.parameters[0][:, :, known.places] * known.unit)
     finite, open_ = roots
     spread = [D @ finite]
@@ -299,7 +304,7 @@ def accuracy_map(
     """
     robot = (fit.posterior if isinstance(fit, Identification) else fit).robot
     coordinates = (
-        sample(robot, where, seed).coordinates
+        sample_workspace(robot, where, seed).coordinates
         if isinstance(where, int)
         else np.asarray(where, dtype=np.float64)
     )

@@ -20,8 +20,7 @@ from loopcal.estimate.identification import identify_trials
 from loopcal.estimate.inference.posterior import compute_posterior
 from loopcal.estimate.methods.penalties import LeastSquares, Method
 from loopcal.measure import Instrument, sample_truth, simulate_trials
-from loopcal.mechanism import Mechanism, Status, forward, inverse
-from loopcal.mechanism.batch_kinematics import forward_trials
+from loopcal.mechanism import Mechanism, Status, forward, forward_trials, inverse
 from loopcal.typing import FloatArray
 
 
@@ -78,7 +77,7 @@ def monte_carlo(
     ]
     closed = [(state.status == Status.CONVERGED).all(axis=1) for state in states]
     good = good & closed[0] & closed[1]
-    errors = geometry.difference(states[0].T[good], states[1].T[good])
+    errors = geometry.pose_difference(states[0].T[good], states[1].T[good])
     free, first = fits.unknowns, int(np.flatnonzero(good)[0])
     one = np.array([first])
     identified = robot.with_values(fits.values[first])

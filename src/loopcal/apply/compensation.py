@@ -24,11 +24,9 @@ from loopcal.diagnose import twist_weights
 from loopcal.errors import DataError
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
-from loopcal.mechanism import Mechanism, Solution, forward, inverse
-from loopcal.mechanism import coordinates as controlled
-from loopcal.mechanism.limits import within
+from loopcal.mechanism import Mechanism, Solution, check_limits, forward, inverse, read_coordinates
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import DISPLAY_UNITS, Dimension, unit
+from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 Mode = Literal["readings", "commands"]
 
@@ -156,11 +154,11 @@ def compensate(
     believed = inverse(old, targets)
     wanted = np.reshape(targets, (-1, 4, 4)) if np.shape(targets)[-2:] == (4, 4) else believed.T
     best = inverse(robot, targets)
-    before = geometry.difference(forward(robot, believed.q, _begin(robot, best)).T, wanted)
+    before = geometry.pose_difference(forward(robot, believed.q, _begin(robot, best)).T, wanted)
     exact = _Settled(best, None, np.zeros((1, len(wanted), 6)))
     settled = exact if mode == "readings" else _shifted(robot, old, believed, best, steps)
     final = settled.final
-    fixed = geometry.difference(best.T, wanted)
+    fixed = geometry.pose_difference(best.T, wanted)
     position, angle = (
         np.linalg.norm(settled.gaps[..., part], axis=2) for part in (slice(3, 6), slice(3))
     )
@@ -175,7 +173,7 @@ def compensate(
         wanted=wanted,
         reached=final.T,
         before=before,
-        remaining=geometry.difference(final.T, wanted),
+        remaining=geometry.pose_difference(final.T, wanted),
         not_compensable=fixed,
         residual_position=position,
         residual_orientation=angle,
@@ -218,15 +216,15 @@ def _shifted(
     singular.
     """
     start = _begin(robot, best)
-    commands = controlled.read(believed.T, controller.controlled)
+    commands = read_coordinates(believed.T, controller.controlled)
     final = forward(robot, believed.q, start)
-    gaps = [geometry.difference(final.T, best.T)]
+    gaps = [geometry.pose_difference(final.T, best.T)]
     for _ in range(steps):
-        moved = geometry.exp_update(believed.T, -gaps[-1])
-        commands = controlled.read(moved, controller.controlled)
+        moved = geometry.apply_twist(believed.T, -gaps[-1])
+        commands = read_coordinates(moved, controller.controlled)
         believed = inverse(controller, commands, believed if believed.converged.all() else None)
         final = forward(robot, believed.q, start)
-        gaps.append(geometry.difference(final.T, best.T))
+        gaps.append(geometry.pose_difference(final.T, best.T))
     return _Settled(final, commands, np.stack(gaps))
 
 
@@ -235,7 +233,7 @@ def _judged(
 ) -> tuple[tuple[Reach, ...], tuple[str, ...]]:
     """Say what becomes of each target; `fixed` (n, 6) is what no reading can remove."""
     final, gap = settled.final, settled.gaps * twist_weights(robot) / robot.size
-    allowed, why = within(robot, robot.values[None], final.q[None], final.state)
+    allowed, why = check_limits(robot, robot.values[None], final.q[None], final.state)
     first, last = np.linalg.norm(gap[0], axis=1), np.linalg.norm(gap[-1], axis=1)
     loose = last > np.maximum(SHRUNK * first, NOTHING)
     position, angle = np.linalg.norm(fixed[:, 3:], axis=1), np.linalg.norm(fixed[:, :3], axis=1)
@@ -272,6 +270,6 @@ def _shown(robot: Mechanism, position: float, angle: float) -> str:
     """Length and angle in the units of the robot's file."""
     parts = []
     for value, dimension in ((position, Dimension.LENGTH), (angle, Dimension.ANGLE)):
-        shown = unit(robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol))
+        shown = find_unit(robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol))
         parts.append(f"{value / shown.factor_to_si:.3g} {shown}")
     return " and ".join(parts)

@@ -29,13 +29,13 @@ from loopcal.diagnose import (
     find_moved_setups,
     predict_poses,
 )
-from loopcal.errors import DataError, nearest
+from loopcal.errors import DataError, suggest_names
 from loopcal.estimate.inference.null_space import listed
 from loopcal.estimate.predicted import untold
 from loopcal.estimate.result import Identification
 from loopcal.measure import Measurements, check_actuators
 from loopcal.mechanism import Mechanism, Solution
-from loopcal.units import DISPLAY_UNITS, Dimension, unit
+from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 FEW = 5
 """Rows below which an error is said to be judged by too few: at 4 the rms of noise alone varies by
@@ -115,7 +115,7 @@ class Validation:
         """Return a table: error, index, unit, number of rows that have it, and max, rms, mean, sd
         in that unit.
         """
-        length, angle = (unit(symbol) for symbol in self.units)
+        length, angle = (find_unit(symbol) for symbol in self.units)
         scale = {
             "position": (length.factor_to_si, length.symbol),
             "position_balance": (length.factor_to_si, length.symbol),
@@ -272,7 +272,7 @@ def _kept(known: Mapping[str, float], refit: Sequence[str], data: Measurements) 
         if not any(fnmatchcase(name, pattern) for name in there):
             raise DataError(
                 "no frame, target or surface of these measurements is called "
-                f"{pattern!r}{nearest(pattern, there)}; there are"
+                f"{pattern!r}{suggest_names(pattern, there)}; there are"
                 f" {', '.join(sorted(there)) or 'none'}"
             )
     return {
@@ -393,7 +393,7 @@ def _gates(
         if not np.isfinite(values).any():
             reasons.append(f"the {name} limit cannot be checked: no row measures {name}")
             continue
-        worst, factor = int(np.nanargmax(values)), unit(symbol).factor_to_si
+        worst, factor = int(np.nanargmax(values)), find_unit(symbol).factor_to_si
         if values[worst] > limit:
             reasons.append(
                 f"{name} error {values[worst] / factor:.4g} {symbol} at pose {poses[worst]} "

@@ -147,13 +147,12 @@ def _print(robot: Mechanism) -> None:
 
 def _home(robot: Mechanism) -> tuple[list[float], list[str]]:
     """Return the readings (a,) [SI] of the home pose, and which strokes and limits they exceed."""
-    from loopcal.mechanism import inverse
-    from loopcal.mechanism.limits import limits
+    from loopcal.mechanism import evaluate_limits, inverse
 
     found = inverse(robot, robot.home[None])
     exceeded = [
         limit.name
-        for limit in limits(robot, robot.values[None], found.q[None], found.state)
+        for limit in evaluate_limits(robot, robot.values[None], found.q[None], found.state)
         if limit.margin[0, 0] < -SLACK
     ]
     return found.q[0].tolist(), exceeded

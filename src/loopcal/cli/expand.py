@@ -15,8 +15,7 @@ from loopcal.units import Dimension, Unit
 if TYPE_CHECKING:
     import numpy as np
 
-    from loopcal.mechanism import Mechanism
-    from loopcal.mechanism.assembly import Address, Limb
+    from loopcal.mechanism import Address, Limb, Mechanism
 
 Units = Mapping[Dimension, Unit]
 JOINTS = {"R": ("turns about z", Dimension.ANGLE), "P": ("slides along z", Dimension.LENGTH)}

@@ -12,7 +12,7 @@ import click
 from loopcal.cli import show
 from loopcal.cli.options import FILE, Quantity, json_option
 from loopcal.errors import DataError
-from loopcal.units import Dimension, symbols
+from loopcal.units import Dimension, list_symbols
 
 if TYPE_CHECKING:
     from loopcal.estimate import Identification
@@ -85,7 +85,7 @@ ASKED = {
 @click.option(
     "--unit",
     "length_unit",
-    type=click.Choice(symbols(Dimension.LENGTH)),
+    type=click.Choice(list_symbols(Dimension.LENGTH)),
     help="Of lengths (linuxcnc).",
 )
 @click.option(

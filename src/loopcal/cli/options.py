@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from loopcal.errors import DataError, UnitError, nearest
-from loopcal.units import Dimension, quantity
+from loopcal.errors import DataError, UnitError, suggest_names
+from loopcal.units import Dimension, parse_quantity
 
 if TYPE_CHECKING:
     import numpy as np
@@ -43,7 +43,7 @@ class Quantity(click.ParamType):
         if isinstance(value, float):
             return value
         try:
-            return quantity(value, self.dimension)
+            return parse_quantity(value, self.dimension)
         except UnitError as error:
             self.fail(str(error), param, ctx)
 
@@ -124,10 +124,10 @@ def drawn_poses(robot: Mechanism, count: int, seed: int) -> tuple[np.ndarray, st
     MechanismError
         The robot states no workspace, or cannot reach it.
     """
-    from loopcal.mechanism.workspace import sample
+    from loopcal.mechanism import sample_workspace
 
     words = f"{count} poses drawn from the workspace of {robot.name}, seed {seed}"
-    return sample(robot, count, seed).coordinates, words
+    return sample_workspace(robot, count, seed).coordinates, words
 
 
 def instrument_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -179,12 +179,12 @@ def sigma_of_readings(text: str | None, robot: Mechanism) -> np.ndarray | None:
         if equals and name not in found:
             known = ", ".join(found)
             raise DataError(
-                f"--sigma-reading names {name!r}{nearest(name, found)}; actuators of {robot.name} "
+                f"--sigma-reading names {name!r}{suggest_names(name, found)}; actuators of {robot.name} "
                 f"are {known}"
             )
         for each in (name,) if equals else tuple(found):
             try:
-                found[each] = quantity(number, dimensions[each])
+                found[each] = parse_quantity(number, dimensions[each])
             except UnitError as error:
                 raise DataError(f"--sigma-reading {number!r} for {each}: {error}") from None
             if not 0.0 <= found[each] < np.inf:
@@ -221,7 +221,7 @@ def instrument(
     for i, one in enumerate(kinds):
         if one not in KINDS:
             raise DataError(
-                f"{one!r} is not a kind of measurement{nearest(one, KINDS)}; known are "
+                f"{one!r} is not a kind of measurement{suggest_names(one, KINDS)}; known are "
                 f"{', '.join(KINDS)}"
             )
         if one in kinds[:i]:

@@ -19,7 +19,7 @@ from loopcal.cli import show
 from loopcal.cli.identifiability import assumed_instrument
 from loopcal.cli.options import FILE, Quantity, instrument_options, json_option, robot_argument
 from loopcal.errors import DataError, UnitError
-from loopcal.units import Dimension, quantity
+from loopcal.units import Dimension, parse_quantity
 
 if TYPE_CHECKING:
     from loopcal.measure import Instrument, Measurements
@@ -42,9 +42,9 @@ class Goal(click.ParamType):
         if isinstance(value, tuple):
             return value
         with suppress(UnitError):
-            return quantity(value, Dimension.ANGLE), "orientation"
+            return parse_quantity(value, Dimension.ANGLE), "orientation"
         try:
-            return quantity(value, Dimension.LENGTH), "position"
+            return parse_quantity(value, Dimension.LENGTH), "position"
         except UnitError as error:
             self.fail(f"{error}; or give an angle, such as 10urad", param, ctx)
 
@@ -396,7 +396,9 @@ def _three(text: str, option: str, dimension: Dimension | None) -> Any:
 
     parts = text.split(",")
     try:
-        found = [float(part) if dimension is None else quantity(part, dimension) for part in parts]
+        found = [
+            float(part) if dimension is None else parse_quantity(part, dimension) for part in parts
+        ]
     except (UnitError, ValueError) as error:
         found, why = [], f" ({error})"
     else:

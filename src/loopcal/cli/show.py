@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from loopcal.units import DISPLAY_UNITS, Dimension, Unit, unit
+from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
 
 if TYPE_CHECKING:
     from loopcal.apply import Validation
@@ -73,7 +73,7 @@ def units_of(robot: Mechanism) -> dict[Dimension, Unit]:
     """Return the units in which a robot's numbers are shown: those of its file."""
     return {
         **DISPLAY_UNITS,
-        **{dimension: unit(symbol) for dimension, symbol in robot.units.items()},
+        **{dimension: find_unit(symbol) for dimension, symbol in robot.units.items()},
     }
 
 

@@ -18,8 +18,7 @@ import numpy as np
 from loopcal.estimate.excluded_poses import exclude_poses
 from loopcal.estimate.result import Identification
 from loopcal.measure import Measurements
-from loopcal.mechanism import Mechanism
-from loopcal.mechanism.transmission import joint_values
+from loopcal.mechanism import Mechanism, joints_from_readings
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
@@ -98,7 +97,7 @@ def compute_reading_errors(
 def _joints(robot: Mechanism, readings: FloatArray) -> FloatArray:
     """Values of the driven joints (n, a) at these readings."""
     _, tau = robot.slots(robot.values[None])
-    return joint_values(readings[None], tau, robot.slots.frequency)[0]
+    return joints_from_readings(readings[None], tau, robot.slots.frequency)[0]
 
 
 def _driven(robot: Mechanism) -> dict[str, Dimension]:

@@ -17,10 +17,9 @@ import numpy as np
 
 from loopcal.estimate.result import Identification
 from loopcal.measure import Measurements
-from loopcal.mechanism import Status
-from loopcal.mechanism.batch_kinematics import forward_trials, sensitivity
+from loopcal.mechanism import Status, differentiate_pose, forward_trials
 from loopcal.typing import FloatArray
-from loopcal.units import DISPLAY_UNITS, Dimension, unit
+from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 GAIN = 1.1
 """Times by which an expected error must become smaller to be called better."""
@@ -73,7 +72,7 @@ def estimate_calibration_gain(fit: Identification, data: Measurements) -> Calibr
     readings, values = known[None, chosen], fit.robot.values[None]
     state = forward_trials(fit.robot, values, readings)
     ok = np.asarray(state.status == Status.CONVERGED)[0]
-    D = sensitivity(fit.robot, values, readings, state).parameters[0, ok][..., free.places]
+    D = differentiate_pose(fit.robot, values, readings, state).parameters[0, ok][..., free.places]
     spread = _spread(fit)
     if not ok.any() or np.isnan(spread).any():
         return _open("no interval can be given")
@@ -127,7 +126,7 @@ def _sentence(
         ("orientation", Dimension.ANGLE, before[0], after[0]),
     ):
         symbol = fit.robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol)
-        factor = unit(symbol).factor_to_si
+        factor = find_unit(symbol).factor_to_si
         if b > 0.0:
             shown.append(
                 f"{name} {b / factor:.3g} {symbol} by tolerances, {a / factor:.3g} {symbol} after"

@@ -34,10 +34,9 @@ from loopcal.estimate.free_parameters import FreeParameters, select_free_paramet
 from loopcal.estimate.inference.null_space import listed
 from loopcal.measure import Measurements, check_actuators, check_moved
 from loopcal.measure.data_checks import stays
-from loopcal.mechanism import Mechanism, forward
-from loopcal.mechanism.batch_kinematics import plainly_reached
+from loopcal.mechanism import Mechanism, find_directly_reachable, forward
 from loopcal.typing import FloatArray, IntArray
-from loopcal.units import DISPLAY_UNITS, Dimension, unit
+from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 IMPLAUSIBLE = 10.0
 """Misfit from which conventions are doubted. Tolerances exceeded three times and a noise stated
@@ -317,7 +316,7 @@ def _readings_tried(
     )
     ways = tuple(list_reading_interpretations(data, named, dimensions, parts))
     every = np.stack([way.values[poses] for way in ways])
-    solved = plainly_reached(
+    solved = find_directly_reachable(
         robot, robot.values[None], every.reshape(1, -1, every.shape[-1])
     ).reshape(every.shape[:2])
     near = np.flatnonzero(solved.mean(axis=1) >= 1.0 - MOST_LEFT_OUT)
@@ -474,5 +473,5 @@ def _size(way: InterpretedData) -> str:
         value = np.concatenate(parts)
         if len(value):
             symbol = way.free.robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol)
-            shown.append(f"{np.sqrt(value.mean()) / unit(symbol).factor_to_si:.3g} {symbol}")
+            shown.append(f"{np.sqrt(value.mean()) / find_unit(symbol).factor_to_si:.3g} {symbol}")
     return listed(shown)

@@ -15,8 +15,13 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.estimate.inference.posterior import Posterior
-from loopcal.mechanism import Mechanism, Status
-from loopcal.mechanism.batch_kinematics import forward_trials, readings_at, sensitivity
+from loopcal.mechanism import (
+    Mechanism,
+    Status,
+    compute_readings,
+    differentiate_pose,
+    forward_trials,
+)
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
@@ -101,7 +106,7 @@ def _motions(known: Posterior) -> tuple[FloatArray, FloatArray, FloatArray]:
     """
     robot = known.robot
     rng = np.random.default_rng(0)
-    home = readings_at(robot, robot.values[None], robot.home_state)[0, 0]
+    home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
     spread = [
         SPREAD_LENGTH * robot.size if a.dimension is Dimension.LENGTH else SPREAD_ANGLE
         for a in robot.actuators
@@ -109,7 +114,7 @@ def _motions(known: Posterior) -> tuple[FloatArray, FloatArray, FloatArray]:
     q = home + rng.uniform(-1.0, 1.0, (PROBES, len(home))) * spread
     state = forward_trials(robot, robot.values[None], q[None])
     good = state.status[0] == Status.CONVERGED
-    D = sensitivity(robot, robot.values[None], q[None], state).parameters[0]
+    D = differentiate_pose(robot, robot.values[None], q[None], state).parameters[0]
     good &= np.isfinite(D).all(axis=(1, 2))
     R, t = state.T[0, good, :3, :3], state.T[0, good, :3, 3]
     zero, turn = np.zeros_like(R), np.broadcast_to(np.eye(3), R.shape)

@@ -23,8 +23,7 @@ from loopcal.estimate.inference.null_space import (
 )
 from loopcal.estimate.outlook import equations, information
 from loopcal.measure import Instrument, Measurements, check_actuators, simulate
-from loopcal.mechanism import Mechanism
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import Mechanism, sample_workspace
 from loopcal.numerics.decomposition import NULL_COMPONENT, RANK_TOLERANCE, Decomposition, decompose
 from loopcal.typing import BoolArray, FloatArray
 
@@ -207,7 +206,7 @@ def identifiability(
     """
     if isinstance(data, Instrument):
         data = simulate(
-            robot, sample(robot, poses, seed).coordinates, data, seed=0, controller=robot
+            robot, sample_workspace(robot, poses, seed).coordinates, data, seed=0, controller=robot
         )
     check_actuators(data, robot)
     free = select_free_parameters(robot)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from loopcal import geometry
-from loopcal.geometry.orientation_forms import Orientation, orientation
+from loopcal.geometry.orientation_forms import OrientationForm, parse_orientation
 from loopcal.measure.kinds import Bearing, Component, Kind, Pose
 from loopcal.measure.measurements import Measurements
 from loopcal.typing import BoolArray, FloatArray
@@ -93,7 +93,7 @@ class Interpretation:
 class _Turned(NamedTuple):
     """Where a kind's columns hold a whole orientation and a position."""
 
-    form: Orientation
+    form: OrientationForm
     angles: list[int]
     position: list[int]
 
@@ -252,7 +252,7 @@ def _rotations(kind: Kind, values: FloatArray) -> Iterator[tuple[str, str, Float
         ]
         for name in names:
             if name != at.form.name:
-                rotation = orientation(name).to_matrix(values[:, at.angles])
+                rotation = parse_orientation(name).to_matrix(values[:, at.angles])
                 yield (
                     f"rotations{{of}} read as {name}",
                     f"write 'orientation: {name}'",

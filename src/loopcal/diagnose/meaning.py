@@ -19,8 +19,7 @@ from loopcal import geometry
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import Combination
 from loopcal.estimate.outlook import Scene, scene
-from loopcal.mechanism import Mechanism
-from loopcal.mechanism.batch_kinematics import readings_at
+from loopcal.mechanism import Mechanism, compute_readings
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
@@ -50,7 +49,7 @@ def probed(free: FreeParameters, joints: Iterable[str] = ()) -> Scene:
 
 def _spread_readings(robot: Mechanism) -> FloatArray:
     """Readings (PROBES, a) about those of home."""
-    home = readings_at(robot, robot.values[None], robot.home_state)[0, 0]
+    home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
     spread = [
         SPREAD_LENGTH * robot.size if a.dimension is Dimension.LENGTH else SPREAD_ANGLE
         for a in robot.actuators

@@ -172,7 +172,7 @@ def choose_model(
 
 
 def _only(robot: Mechanism, names: Sequence[str]) -> Mechanism:
-    return replace(robot, parameters=robot.parameters.only(names))
+    return replace(robot, parameters=robot.parameters.with_free(names))
 
 
 def _sentence(candidates: tuple[Candidate, ...], chosen: Candidate, best: Candidate) -> str:

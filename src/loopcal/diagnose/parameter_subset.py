@@ -19,8 +19,7 @@ import numpy as np
 from loopcal.diagnose.identifiability_analysis import Identifiability
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import NEGLIGIBLE, SHOWN, listed
-from loopcal.mechanism import Mechanism
-from loopcal.mechanism.assembly import Linear
+from loopcal.mechanism import LinearMap, Mechanism
 from loopcal.typing import FloatArray
 
 SET, SIZED = 0.1, 0.3
@@ -133,7 +132,7 @@ def choose_identifiable_subset(found: Identifiability) -> IdentifiableSubset:
     dropped = tuple(_merged(free, int(place), B[:, i], kept) for i, place in enumerate(places))
     s = np.linalg.svd(found.factor[:, kept], compute_uv=False)
     names = tuple(free.names[i] for i in kept)
-    robot = replace(free.robot, parameters=free.robot.parameters.only(names))
+    robot = replace(free.robot, parameters=free.robot.parameters.with_free(names))
     return IdentifiableSubset(names, dropped, float(s[0] / s[-1]) if len(s) else 1.0, robot)
 
 
@@ -152,9 +151,11 @@ def _weights(free: FreeParameters) -> FloatArray:
     """How readily each parameter (p,) is left out."""
     set_by_controller: set[str] = set()
     for link in free.robot.assembly.maps:
-        moves = (link.address,) if isinstance(link, Linear) else link.outputs
+        moves = (link.address,) if isinstance(link, LinearMap) else link.outputs
         if any(address.element == "transmission" for address in moves):
-            set_by_controller.update((link.parameter,) if isinstance(link, Linear) else link.inputs)
+            set_by_controller.update(
+                (link.parameter,) if isinstance(link, LinearMap) else link.inputs
+            )
     kinds = [
         SET if p.name in set_by_controller else SIZED if p.nominal != 0.0 else 1.0
         for p in free.parameters

@@ -22,8 +22,7 @@ from loopcal.estimate.rows import Rows, rows_of
 from loopcal.estimate.sensed import Residuals, Sensed
 from loopcal.measure import LocalUnknowns, Measurements
 from loopcal.measure.initial_values import starts_of
-from loopcal.mechanism import forward
-from loopcal.mechanism.batch_kinematics import forward_trials, plainly_reached
+from loopcal.mechanism import find_directly_reachable, forward, forward_trials
 from loopcal.typing import FloatArray
 
 FEWEST = 8
@@ -69,7 +68,7 @@ def quick_misfit(free: FreeParameters, data: Measurements) -> float:
     It costs one step of a fit. Infinite where a pose is out of reach; NaN where too few rows are
     left.
     """
-    if not plainly_reached(free.robot, free.robot.values[None], data.readings[None]).all():
+    if not find_directly_reachable(free.robot, free.robot.values[None], data.readings[None]).all():
         return np.inf
     rows = rows_of(free, data, data.unknowns)
     if rows.own is not None:
@@ -279,7 +278,7 @@ def _reached(free: FreeParameters, data: Measurements, *, follow: bool) -> tuple
     takes longest.
     """
     robot, q = free.robot, data.readings
-    solved = plainly_reached(robot, robot.values[None], q[None])[0]
+    solved = find_directly_reachable(robot, robot.values[None], q[None])[0]
     if not follow or solved.sum() >= (1.0 - MOST_LEFT_OUT) * len(q):
         return solved, len(q)
     hard = np.flatnonzero(~solved)
@@ -296,7 +295,7 @@ def _cost(factor: FloatArray, moved: FloatArray) -> FloatArray:
     """Smallest |R z + r|^2 + |moved + z|^2 (t,) of factors (t, p + 1, p + 1)."""
     t, p = moved.shape
     prior = np.concatenate([np.broadcast_to(np.eye(p), (t, p, p)), moved[..., None]], axis=-1)
-    return engine.accumulate(factor, prior)[:, -1, -1] ** 2 if p else factor[:, -1, -1] ** 2
+    return engine.fold(factor, prior)[:, -1, -1] ** 2 if p else factor[:, -1, -1] ** 2
 
 
 def _rms(cost: FloatArray, rows: np.ndarray) -> FloatArray:
@@ -330,7 +329,7 @@ def refined(way: InterpretedData) -> float:
             best = min(best, now)
             break
         best = now
-        whole = engine.accumulate(factor, np.concatenate([np.eye(p), moved.T], axis=1)[None])[0]
+        whole = engine.fold(factor, np.concatenate([np.eye(p), moved.T], axis=1)[None])[0]
         moved = moved - np.linalg.solve(whole[:p, :p], whole[:p, p])[None]
         if np.abs(moved).max() > LARGEST:
             break

@@ -15,7 +15,7 @@ from loopcal.diagnose.read_as import InterpretedData, refined
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import listed
 from loopcal.parameters import Parameter
-from loopcal.units import DISPLAY_UNITS, unit
+from loopcal.units import DISPLAY_UNITS, find_unit
 
 MOST_ALONE = 12
 """Stated unknowns up to which each is freed alone, to see which of them it is."""
@@ -104,7 +104,7 @@ def _freed(
 def _shown(free: FreeParameters, entry: Parameter, value: float) -> str:
     """Where the data put an unknown and what was stated of it, in the unit of the robot's file."""
     symbol = free.robot.units.get(entry.dimension, DISPLAY_UNITS[entry.dimension].symbol)
-    factor = unit(symbol).factor_to_si
+    factor = find_unit(symbol).factor_to_si
     known = (
         "fixed"
         if not entry.free or entry.tolerance is None

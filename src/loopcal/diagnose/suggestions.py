@@ -30,8 +30,7 @@ from loopcal.measure import (
     Observations,
     Sensor,
 )
-from loopcal.mechanism import Mechanism
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import Mechanism, sample_workspace
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
@@ -171,7 +170,7 @@ def describe_missing_equations(robot: Mechanism, data: Measurements) -> str:
 def _scene(free: FreeParameters, joints: list[str]) -> Scene:
     """Poses drawn from the workspace, or about home where none is stated."""
     try:
-        q = sample(free.robot, POSES, seed=0).solution.q
+        q = sample_workspace(free.robot, POSES, seed=0).solution.q
     except MechanismError:
         return probed(free, joints)
     return scene(free, q, joints)

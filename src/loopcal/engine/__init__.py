@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Closed loops in flat arrays: solve, linearise, accumulate. Imports numpy and nothing of loopcal.
+"""Closed loops in flat arrays: solve, linearize, fold. Imports numpy and nothing of loopcal.
 
 Nothing outside this package may know how these three work: another engine is accepted by passing
 tests/engine.
 """
 
-from loopcal.engine.householder import accumulate
+from loopcal.engine.householder import fold
 from loopcal.engine.program import (
     CONVERGED,
     LENGTH,
     PITCH,
     Block,
-    Blocks,
+    ClosureBlocks,
     Group,
     Program,
     Slot,
     State,
 )
-from loopcal.engine.solve import linearise, merged, solve
+from loopcal.engine.solve import insert_driven_values, linearize, solve
 from loopcal.typing import FloatArray
 
 # fmt: off
@@ -26,14 +26,14 @@ __all__ = [
     "LENGTH",
     "PITCH",
     "Block",
-    "Blocks",
+    "ClosureBlocks",
     "FloatArray",
     "Group",
     "Program",
     "Slot",
     "State",
-    "accumulate",
-    "linearise",
-    "merged",
+    "fold",
+    "linearize",
+    "insert_driven_values",
     "solve",
 ]

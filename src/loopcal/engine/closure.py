@@ -17,7 +17,7 @@ from loopcal.typing import FloatArray
 
 
 @dataclass(frozen=True)
-class Geometry:
+class PlacedLinks:
     """Displaced links of a group, (.., k, t): placed = nominal . translation(d) . rotation(exp(w)).
 
     `frame` is a link's nominal rotation, `turn` the displaced one, `spread` what a unit change of w
@@ -33,7 +33,7 @@ class Geometry:
     length: FloatArray
     turns: tuple[bool, ...]
 
-    def rows(self, trial: np.ndarray) -> Geometry:
+    def rows(self, trial: np.ndarray) -> PlacedLinks:
         """The geometry of each row's trial; a single trial broadcasts over all rows."""
         if self.length.shape[1] == 1:
             return self
@@ -41,10 +41,10 @@ class Geometry:
             a[..., trial]
             for a in (self.frame, self.turn, self.spread, self.shift, self.pitch, self.length)
         ]
-        return Geometry(*values, turns=self.turns)
+        return PlacedLinks(*values, turns=self.turns)
 
 
-def geometry(group: Group, e: FloatArray) -> Geometry:
+def place_links(group: Group, e: FloatArray) -> PlacedLinks:
     """Place the links of a group for displacements e (t, n_displacements) [m, rad]."""
     t, k, links = len(e), len(group.limbs), len(group.joints) + 2
     own = e[:, group.columns].reshape(t, k, len(group.slots)).transpose(2, 1, 0)
@@ -68,7 +68,7 @@ def geometry(group: Group, e: FloatArray) -> Geometry:
         turn[j] = matmul(frame[j], rotation(move[j, :3]))
         spread[j] = matmul(frame[j], left_jacobian(move[j, :3]))
     plain = np.all(group.links[:, :, :3, :3] == np.eye(3), axis=(0, 2, 3))
-    return Geometry(
+    return PlacedLinks(
         frame,
         turn,
         spread,
@@ -85,7 +85,7 @@ class Chain:
     """
 
     def __init__(
-        self, group: Group, g: Geometry, T: FloatArray, theta: FloatArray, size: float
+        self, group: Group, g: PlacedLinks, T: FloatArray, theta: FloatArray, size: float
     ) -> None:
         self.group, self.g, self.theta, self.size = group, g, theta, size
         self.last = len(group.joints) + 1

@@ -14,7 +14,7 @@ import numpy as np
 from loopcal.typing import FloatArray
 
 
-def triangularise(matrix: FloatArray, columns: int) -> tuple[FloatArray, FloatArray]:
+def triangularize(matrix: FloatArray, columns: int) -> tuple[FloatArray, FloatArray]:
     """Q' matrix (r, c, batch) with its first columns upper triangular, and the determinant +-1 of
     Q' (batch,).
     """
@@ -48,7 +48,7 @@ def back_substitute(upper: FloatArray, right: FloatArray) -> FloatArray:
     return x
 
 
-def accumulate(factor: FloatArray, rows: FloatArray) -> FloatArray:
+def fold(factor: FloatArray, rows: FloatArray) -> FloatArray:
     """Fold whitened rows (t | 1, m, p) into upper triangular factors (t, p, p): R'R = factor'factor
     + rows'rows.
 

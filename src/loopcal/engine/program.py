@@ -39,7 +39,7 @@ class Group:
     limbs : (k,) positions of these limbs in the mechanism. joints : one letter a joint, R or P.
     actuator : (J + 1, k) column of q that drives the joint, -1 where it is passive; the last row
         belongs to the rod.
-    held : (J,) joints that keep their start value: those that only spin a limb about itself.
+    locked : (J,) joints that keep their start value: those that only spin a limb about itself.
     ending : rigid, ball or distance. rows : which of its rows count (positions in a twist); (0,)
         for distance.
     links : (k, J + 2, 4, 4) nominal link transforms, the attachment last [m].
@@ -51,7 +51,7 @@ class Group:
     limbs: tuple[int, ...]
     joints: str
     actuator: IntArray
-    held: tuple[bool, ...]
+    locked: tuple[bool, ...]
     ending: str
     rows: tuple[int, ...]
     links: FloatArray
@@ -60,10 +60,10 @@ class Group:
     slots: tuple[Slot, ...]
     columns: slice
 
-    def unknown(self, free: bool) -> list[int]:
+    def unknown_joints(self, free: bool) -> list[int]:
         """Joints that closure determines: the passive ones and, if `free`, the actuated ones too."""
         driven = self.actuator[:, 0] >= 0
-        passive = [j for j in range(len(self.joints)) if not driven[j] and not self.held[j]]
+        passive = [j for j in range(len(self.joints)) if not driven[j] and not self.locked[j]]
         return sorted(passive + [j for j in range(len(driven)) if free and driven[j]])
 
 
@@ -95,7 +95,7 @@ class State:
     status : (t, n) CONVERGED; STALLED: no closure near here; EXHAUSTED: out of iterations;
         NOT_FINITE or singular.
     residual : (t, n) norm of the closure residual [m]. iterations : (t, n) Newton steps taken.
-    orientation : (t, n) sign of the determinant of the closure Jacobian; it changes only through a
+    closure_sign : (t, n) sign of the determinant of the closure Jacobian; it changes only through a
         singularity.
     """
 
@@ -104,7 +104,7 @@ class State:
     status: NDArray[np.int8]
     residual: FloatArray
     iterations: IntArray
-    orientation: NDArray[np.int8]
+    closure_sign: NDArray[np.int8]
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Blocks:
+class ClosureBlocks:
     """Closure linearised, by group: the rows left (U is empty), the rows that give the eliminated
     joints, and these joints.
     """

@@ -4,7 +4,7 @@ its own.
 
 A step is a Householder reduction of each limb (its own joints) and one of the platform. A row is
 converged once a step below 1e-7 of the robot's size has been applied (the next would be below
-rounding) and what can still be reduced of its residual is at most 1e-13 of the size; from then on
+rounding) and what can still be reduced of its residual is at max_iterations 1e-13 of the size; from then on
 it is frozen. See docs/theory/engine.md.
 """
 
@@ -14,15 +14,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from loopcal.engine.closure import Chain, Geometry, geometry, matmul, rotation
-from loopcal.engine.householder import back_substitute, triangularise
+from loopcal.engine.closure import Chain, PlacedLinks, matmul, place_links, rotation
+from loopcal.engine.householder import back_substitute, triangularize
 from loopcal.engine.program import (
     CONVERGED,
     EXHAUSTED,
     NOT_FINITE,
     STALLED,
     Block,
-    Blocks,
+    ClosureBlocks,
     Group,
     Program,
     State,
@@ -49,7 +49,7 @@ def solve(
     start: State,
     task: Task | None = None,
     free: bool = False,
-    most: int = 60,
+    max_iterations: int = 60,
 ) -> State:
     """Find the pose and joints that close every loop.
 
@@ -57,14 +57,14 @@ def solve(
         with `free` they are
     unknowns and q only a first guess. start : where to begin, (t | 1, n | 1) rows. task : demands
         on the pose, as many as
-    freed actuators leave open. most : Newton steps allowed. Rows that fail are marked in `status`,
+    freed actuators leave open. max_iterations : Newton steps allowed. Rows that fail are marked in `status`,
         never raised.
     """
     t = max(len(e), len(q), len(start.T))
     n = max(q.shape[1], start.T.shape[1])
-    places = [geometry(g, e) for g in program.groups]
+    places = [place_links(g, e) for g in program.groups]
     joints = [
-        merged(g, np.broadcast_to(a, (t, n, *a.shape[2:])), q)
+        insert_driven_values(g, np.broadcast_to(a, (t, n, *a.shape[2:])), q)
         for g, a in zip(program.groups, start.joints, strict=True)
     ]
     T = np.broadcast_to(start.T, (t, n, 4, 4))[:, :, :3]
@@ -75,14 +75,14 @@ def solve(
     for first in range(0, t * n, ROWS):
         rows = np.arange(first, min(first + ROWS, t * n))
         work = _Rows(program, [g.rows(rows // n) for g in places], task, free, rows)
-        parts.append(_newton(work, begin[:, rows], most))
+        parts.append(_newton(work, begin[:, rows], max_iterations))
     points, status, steps = (np.concatenate(p, axis=-1) for p in zip(*parts, strict=True))
     return _Rows(program, places, task, free, np.arange(t * n)).state(points, status, steps, (t, n))
 
 
-def linearise(
+def linearize(
     program: Program, e: FloatArray, q: FloatArray, state: State, free: bool = False
-) -> Blocks:
+) -> ClosureBlocks:
     """Closure linearised at a state (t, n), its passive joints (and, if `free`, the actuated ones)
     eliminated.
 
@@ -92,24 +92,24 @@ def linearise(
     T, trial = state.T.reshape(-1, 4, 4)[:, :3].transpose(1, 2, 0), np.arange(t * n) // n
     low, top, eliminated = [], [], []
     for group, joints in zip(program.groups, state.joints, strict=True):
-        values = joints if free else merged(group, joints, q)
+        values = joints if free else insert_driven_values(group, joints, q)
         theta = values.reshape(t * n, len(group.limbs), -1).transpose(2, 1, 0)
         with np.errstate(all="ignore"):
-            chain = Chain(group, geometry(group, e).rows(trial), T, theta, program.size)
-            unknown = group.unknown(free)
+            chain = Chain(group, place_links(group, e).rows(trial), T, theta, program.size)
+            unknown = group.unknown_joints(free)
             columns = [chain.joint(j) for j in unknown] + [
                 chain.freedom(f) for f in program.freedoms
             ]
             columns += [chain.slot(s) for s in group.slots] + [
                 chain.joint(j) for j in range(chain.last)
             ]
-            block, _ = triangularise(chain.matrix(columns), len(unknown))
+            block, _ = triangularize(chain.matrix(columns), len(unknown))
         block = block.transpose(3, 2, 0, 1).reshape(t, n, len(group.limbs), *block.shape[:2])
         u, m, s = len(unknown), len(program.freedoms), len(group.slots)
         top.append(Block(*np.split(block[..., :u, :], [u, u + m, u + m + s], axis=-1)))
         low.append(Block(*np.split(block[..., u:, :], [u, u + m, u + m + s], axis=-1)))
         eliminated.append(tuple(unknown))
-    return Blocks(tuple(low), tuple(top), tuple(eliminated))
+    return ClosureBlocks(tuple(low), tuple(top), tuple(eliminated))
 
 
 class _Rows:
@@ -120,7 +120,7 @@ class _Rows:
     def __init__(
         self,
         program: Program,
-        places: list[Geometry],
+        places: list[PlacedLinks],
         task: Task | None,
         free: bool,
         rows: np.ndarray,
@@ -132,7 +132,7 @@ class _Rows:
             free,
             rows,
         )
-        self.unknown = [g.unknown(free) for g in program.groups]
+        self.unknown = [g.unknown_joints(free) for g in program.groups]
         self.shapes = [(len(g.joints) + 1, len(g.limbs)) for g in program.groups]
         self.ends = np.cumsum([12, *(a * k for a, k in self.shapes)])
 
@@ -168,7 +168,7 @@ class _Rows:
             if redundant:
                 j = int(np.flatnonzero(group.actuator[:, 0] >= 0)[0])
                 columns.append(chain.joint(j) * np.array(p.sigma)[group.actuator[j], None])
-            block, turn = triangularise(chain.matrix([*columns, chain.residual()]), u)
+            block, turn = triangularize(chain.matrix([*columns, chain.residual()]), u)
             if u:
                 diagonal = np.diagonal(block[:u, :u])
                 sign = sign * np.prod(turn * np.prod(np.sign(diagonal), axis=-1), axis=0)
@@ -194,7 +194,7 @@ class _Rows:
             return np.concatenate(
                 [coordinates, 0 * last[self.ends[-1] : -5], [norm, norm, 0 * norm], last[-2:]]
             )
-        low, turn = triangularise(low, m)
+        low, turn = triangularize(low, m)
         sign = sign * turn * np.prod(np.sign(np.diagonal(low[:m, :m])), axis=-1)
         y = back_substitute(low[:m, :m], -low[:m, m:])[:, 0]
         inner = inner + np.add.reduce(low[:m, m] ** 2, axis=0)
@@ -261,7 +261,7 @@ class _Rows:
 
 
 def _newton(
-    work: _Rows, coordinates: FloatArray, most: int
+    work: _Rows, coordinates: FloatArray, max_iterations: int
 ) -> tuple[FloatArray, np.ndarray, np.ndarray]:
     """Iterate one chunk; returns its points, status and iteration counts."""
     size, N = work.program.size, coordinates.shape[1]
@@ -270,7 +270,7 @@ def _newton(
     with np.errstate(all="ignore"):
         point = work.at(coordinates)
         done = point.copy()
-        for _ in range(most):
+        for _ in range(max_iterations):
             reducible, length, pivot = point[-4], point[-3], point[-1]
             settled = (reducible <= RESIDUAL * size) & ((applied <= STEP * size) | (calm > 2))
             broken = ~(np.isfinite(reducible) & np.isfinite(length) & (pivot > SINGULAR))
@@ -306,7 +306,7 @@ def _newton(
     return done, status, steps
 
 
-def merged(group: Group, joints: FloatArray, q: FloatArray) -> FloatArray:
+def insert_driven_values(group: Group, joints: FloatArray, q: FloatArray) -> FloatArray:
     """Joint values (t, n, k, J + 1) of a group with the actuated ones set to q."""
     shape = (max(len(joints), len(q)), max(joints.shape[1], q.shape[1]), *joints.shape[2:])
     out = np.array(np.broadcast_to(joints, shape))

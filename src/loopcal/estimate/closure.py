@@ -64,7 +64,7 @@ def locate(rows: Rows) -> FloatArray | None:
     measured in full.
     """
     robot = rows.unknowns.robot
-    passive = any(group.unknown(False) for group in robot.program.groups)
+    passive = any(group.unknown_joints(False) for group in robot.program.groups)
     if passive or len(robot.program.freedoms) < 6 or len(rows.sensed) != 1 or rows.own is not None:
         return None
     (sensed,) = rows.sensed
@@ -83,7 +83,7 @@ def locate(rows: Rows) -> FloatArray | None:
         step: FloatArray = -np.linalg.solve(seen.jacobian, seen.residual[..., None])[..., 0].astype(
             np.float64
         )
-        T = geometry.exp_update(T, step)
+        T = geometry.apply_twist(T, step)
         if np.abs(step[..., :3]).max() < 1e-14 and np.abs(step[..., 3:]).max() < 1e-14 * robot.size:
             break
     return T if np.isfinite(T).all() else None

@@ -219,7 +219,7 @@ def eliminate(factors: Factors) -> tuple[Eliminated, FloatArray]:
         one, left = _eliminated(whole[i], norm[:, form.own], form)
         solved.append(one)
         if form.outer < 0:
-            rest = engine.accumulate(rest, left.reshape(len(left), -1, left.shape[-1]))
+            rest = engine.fold(rest, left.reshape(len(left), -1, left.shape[-1]))
         else:
             places = np.repeat(form.around, left.shape[2])
             whole[form.outer] = folded(

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from loopcal.errors import DataError, nearest
+from loopcal.errors import DataError, suggest_names
 from loopcal.measure import Measurements
 from loopcal.measure.measurements import weighted_sigma
 
@@ -33,7 +33,7 @@ def exclude_poses(data: Measurements, drop: Sequence[str]) -> Measurements:
     for label in drop:
         if label not in data.labels:
             raise DataError(
-                f"there is no pose {label!r} to leave out{nearest(label, data.labels)}; give "
+                f"there is no pose {label!r} to leave out{suggest_names(label, data.labels)}; give "
                 "labels of the data"
             )
     kept = np.array([label not in drop for label in data.labels])

@@ -15,7 +15,7 @@ import numpy as np
 from loopcal.mechanism import Mechanism
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
-from loopcal.units import DISPLAY_UNITS, Dimension, unit
+from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 DEFAULT = 1e-3
 """Tolerance where none is stated: this share of the robot's size for lengths, this many radians,
@@ -72,7 +72,7 @@ class FreeParameters:
             self.robot.units.get(q.dimension, DISPLAY_UNITS[q.dimension].symbol)
             for q in self.parameters
         ]
-        return np.array([unit(symbol).factor_to_si for symbol in symbols]), tuple(symbols)
+        return np.array([find_unit(symbol).factor_to_si for symbol in symbols]), tuple(symbols)
 
     def note(self) -> str | None:
         """Return the sentence that says which tolerances were assumed; None where all are stated."""
@@ -88,7 +88,7 @@ class FreeParameters:
             ]
             if chosen:
                 symbol = self.robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol)
-                value = self.tolerance[chosen[0]] / unit(symbol).factor_to_si
+                value = self.tolerance[chosen[0]] / find_unit(symbol).factor_to_si
                 shown.append(f"{value:.4g} {symbol} for {dimension.value}s")
         return (
             f"{count} of {len(self)} parameters have no tolerance; assumed: {', '.join(shown)}"

@@ -162,7 +162,7 @@ class LatentRows:
         for group, done in self.poses.projected(here, z, trials):
             rest = done.rest.reshape(len(trials), -1, done.rest.shape[-1])
             if folding is None or group.form < 0:
-                factor = engine.accumulate(factor, rest)
+                factor = engine.fold(factor, rest)
             else:
                 folding.add(
                     group.form,
@@ -171,7 +171,7 @@ class LatentRows:
                 )
         cost = (factor[:, :, -1] ** 2).sum(axis=1)
         if self.own is not None and folding is not None and here.values is not None:
-            factor = engine.accumulate(factor, self.own.finish(folding, here.values))
+            factor = engine.fold(factor, self.own.finish(folding, here.values))
             cost = np.where(here.failed, np.inf, (factor[:, :, -1] ** 2).sum(axis=1))
             self.own.keep(trials, z, here.values, cost)
         self.memory.keep(trials, here, np.where(here.failed, np.inf, cost))

@@ -13,9 +13,9 @@ import numpy as np
 
 from loopcal.estimate.latent import LatentRows
 from loopcal.estimate.latent_estimate import LatentEstimate
-from loopcal.geometry import wrap
+from loopcal.geometry import wrap_angle
 from loopcal.mechanism import Mechanism, inverse
-from loopcal.units import DISPLAY_UNITS, Dimension, unit
+from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 APART = 1e-6
 """Difference of readings, as a share of the robot's size or in radians, above which they are two
@@ -94,7 +94,7 @@ def _other_branch(robot: Mechanism, latent: LatentEstimate, poses: np.ndarray) -
         home = inverse(robot, latent.poses[poses])
         gap = latent.readings[poses] - home.q
         turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
-        gap = np.abs(np.where(turning, wrap(gap), gap)) / np.where(turning, 1.0, robot.size)
+        gap = np.abs(np.where(turning, wrap_angle(gap), gap)) / np.where(turning, 1.0, robot.size)
         other[poses] = home.converged[:, None] & (gap > APART)
     return other
 
@@ -104,7 +104,9 @@ def _named(robot: Mechanism, latent: LatentEstimate, chosen: np.ndarray) -> str:
     words = []
     for pose, column in np.argwhere(chosen)[:SHOWN]:
         actuator = robot.actuators[column]
-        shown = unit(robot.units.get(actuator.dimension, DISPLAY_UNITS[actuator.dimension].symbol))
+        shown = find_unit(
+            robot.units.get(actuator.dimension, DISPLAY_UNITS[actuator.dimension].symbol)
+        )
         value = latent.readings[pose, column] / shown.factor_to_si
         words.append(f"{actuator.name} at pose {latent.labels[pose]} ({value:.6g} {shown.symbol})")
     more = int(chosen.sum()) - len(words)

@@ -15,8 +15,7 @@ from loopcal.estimate.measured_poses import measured_poses, squares_at
 from loopcal.estimate.moves import mapped
 from loopcal.estimate.sensed import Sensed
 from loopcal.estimate.standing import Standing, stroke_of
-from loopcal.mechanism import Mechanism, Status, inverse
-from loopcal.mechanism.batch_kinematics import forward_trials, readings_at
+from loopcal.mechanism import Mechanism, Status, compute_readings, forward_trials, inverse
 from loopcal.typing import FloatArray, IntArray
 
 TRIED = 9
@@ -35,7 +34,7 @@ def start_of(
     sensed : what was measured.
     """
     missing = np.isnan(recorded) | np.isinf(sigma)
-    q = _nearest(recorded, readings_at(robot, robot.values[None], robot.home_state)[0, 0])
+    q = _nearest(recorded, compute_readings(robot, robot.values[None], robot.home_state)[0, 0])
     shape = (len(q), q.shape[1])
     state = mapped(
         lambda array: np.broadcast_to(array, (*shape, *array.shape[2:])), robot.home_state
@@ -85,7 +84,7 @@ def _tried(
     pose's, home's, across the stroke; where all were said (k,), if not believed, at these.
     """
     trial, pose = where
-    home = readings_at(robot, robot.values[None], robot.home_state)[0, 0]
+    home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
     width = np.array([stroke_of(robot, a) for a in robot.actuators])
     low = np.array(
         [

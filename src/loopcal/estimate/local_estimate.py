@@ -22,7 +22,7 @@ from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.parameters import Parameter, ParameterTable
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import DISPLAY_UNITS, unit
+from loopcal.units import DISPLAY_UNITS, find_unit
 
 MOVES = 1e-7
 """Share of all that the machine does to an unknown below which a direction does not move it:
@@ -200,4 +200,4 @@ def with_followers(
 
 def _shown(robot: Mechanism, entry: Parameter) -> tuple[float, str]:
     symbol = robot.units.get(entry.dimension, DISPLAY_UNITS[entry.dimension].symbol)
-    return unit(symbol).factor_to_si, symbol
+    return find_unit(symbol).factor_to_si, symbol

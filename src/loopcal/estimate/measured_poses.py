@@ -15,9 +15,13 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.estimate.sensed import Sensed
-from loopcal.mechanism import Mechanism, Status, coordinates
-from loopcal.mechanism.batch_kinematics import inverse_trials
-from loopcal.mechanism.projection import pose_slopes
+from loopcal.mechanism import (
+    Mechanism,
+    Status,
+    differentiate_by_coordinates,
+    inverse_trials,
+    read_coordinates,
+)
 from loopcal.typing import FloatArray, IntArray
 
 STEPS = 30
@@ -62,9 +66,9 @@ def measured_poses(
             slope = np.diag([1.0 / robot.size] * 3 + [1.0] * 3)[:, robot.program.freedoms]
         else:
             state = inverse_trials(
-                robot, robot.values[None], coordinates.read(T[None], robot.controlled), state
+                robot, robot.values[None], read_coordinates(T[None], robot.controlled), state
             )
-            slope = pose_slopes(robot, robot.values[None], state)[0]
+            slope = differentiate_by_coordinates(robot, robot.values[None], state)[0]
         step, full = _step(by_twist @ slope, residual)
         length = np.linalg.norm(step, axis=1)
         step *= np.minimum(1.0, LONGEST * robot.size / np.maximum(length, LONGEST * robot.size))[
@@ -74,7 +78,7 @@ def measured_poses(
             np.ones(len(pose), dtype=bool) if state is None else state.status[0] == Status.CONVERGED
         )
         at = T if state is None else np.where(closed[:, None, None], state.T[0], T)
-        T = geometry.exp_update(at, np.matmul(slope, step[..., None])[..., 0])
+        T = geometry.apply_twist(at, np.matmul(slope, step[..., None])[..., 0])
         known = full & closed & (length < REST * robot.size)
         if (known | ~full).all():
             break

@@ -97,7 +97,7 @@ class Last:
             return state
         change = (deviation - self.deviation[trials]).astype(np.float32)
         twist = np.matmul(self.moves[trials], change[:, None, :, None])[..., 0]
-        return dataclasses.replace(state, T=geometry.exp_update(state.T, twist.astype(np.float64)))
+        return dataclasses.replace(state, T=geometry.apply_twist(state.T, twist.astype(np.float64)))
 
     def put(
         self,

@@ -30,9 +30,13 @@ from loopcal.measure import (
     start_values,
     whitened_rows,
 )
-from loopcal.mechanism import Mechanism, Status
-from loopcal.mechanism.batch_kinematics import forward_trials, sensitivity
-from loopcal.mechanism.passive_joints import passive_sensitivity
+from loopcal.mechanism import (
+    Mechanism,
+    Status,
+    differentiate_passive_joints,
+    differentiate_pose,
+    forward_trials,
+)
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.typing import BoolArray, FloatArray
 
@@ -66,7 +70,7 @@ def scene(free: FreeParameters, readings: FloatArray, joints: Iterable[str] = ()
     robot, values, names = free.robot, free.robot.values[None], tuple(joints)
     state = forward_trials(robot, values, readings[None])
     D = (
-        sensitivity(robot, values, readings[None], state).parameters[..., free.places]
+        differentiate_pose(robot, values, readings[None], state).parameters[..., free.places]
         * free.tolerance
     )
     reached = (state.status == Status.CONVERGED) & np.isfinite(D).all(axis=(2, 3))
@@ -78,7 +82,7 @@ def scene(free: FreeParameters, readings: FloatArray, joints: Iterable[str] = ()
     ]
     at = joint_values(robot, names, readings[None], state)
     if passive:
-        moved = passive_sensitivity(robot, values, readings[None], state)
+        moved = differentiate_passive_joints(robot, values, readings[None], state)
         scaled = np.nan_to_num(moved.parameters[..., free.places] * free.tolerance)
         slopes = {name: scaled[:, :, moved.names.index(name)] for name in passive}
     return Scene(free, readings, np.asarray(reached[0]), T, D, at, slopes)
@@ -107,7 +111,7 @@ def without_own(factor: FloatArray, own: int) -> FloatArray:
     norm = np.linalg.norm(top, axis=0)
     u, s, _ = np.linalg.svd(top / np.where(norm > 0.0, norm, 1.0))
     free = (u.T @ factor[0, :own, own:])[s <= OWN_RANK * s[0]]
-    return engine.accumulate(factor[:, own:, own:], free[None])
+    return engine.fold(factor[:, own:, own:], free[None])
 
 
 def information(free: FreeParameters, data: Measurements) -> tuple[FloatArray, BoolArray]:
@@ -143,8 +147,8 @@ def information(free: FreeParameters, data: Measurements) -> tuple[FloatArray, B
             reached[poses[needed & ~at.reached]] = False
             some = Measurements(data.robot_name, at.readings, (part,))
             used = replace(local, places=(local.places[i][chosen],))
-            factor = engine.accumulate(factor, look(at, some, used, values))
-    return without_own(engine.accumulate(factor, _prior_rows(local, len(free))), own), reached
+            factor = engine.fold(factor, look(at, some, used, values))
+    return without_own(engine.fold(factor, _prior_rows(local, len(free))), own), reached
 
 
 def _uncertain(free: FreeParameters, data: Measurements) -> tuple[FloatArray, BoolArray]:
@@ -171,8 +175,8 @@ def alone(at: Scene, measured: Measurements) -> FloatArray:
     """
     local = measured.unknowns
     rows = look(at, measured, local, local.values())
-    factor = engine.accumulate(empty_factor(1, len(local) + len(at.free)), rows)
-    return without_own(engine.accumulate(factor, _prior_rows(local, len(at.free))), len(local))
+    factor = engine.fold(empty_factor(1, len(local) + len(at.free)), rows)
+    return without_own(engine.fold(factor, _prior_rows(local, len(at.free))), len(local))
 
 
 def _own_values(free: FreeParameters, data: Measurements, local: LocalUnknowns) -> FloatArray:

@@ -14,8 +14,7 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import listed
 from loopcal.estimate.latent import latent_rows
 from loopcal.measure import Measurements, with_stated_sigma
-from loopcal.mechanism import Mechanism, Solution, forward
-from loopcal.mechanism.kinematics import solution_of
+from loopcal.mechanism import Mechanism, Solution, forward, make_solution
 
 SAME = 1e-9
 """Relative difference of sigma ratios below which a pose's readings are weighted as the robot
@@ -66,4 +65,4 @@ def _fitted(robot: Mechanism, data: Measurements) -> tuple[Solution, np.ndarray]
     rows = latent_rows(fixed, data.readings[None], data.reading_sigma, (), 1, lambda member: None)
     one = np.arange(1)
     here = rows.poses.settle(np.zeros((1, 0)), one, rows.memory.take(one))
-    return solution_of(robot, here.standing.state, here.standing.q[0]), ~here.open[0].any(axis=1)
+    return make_solution(robot, here.standing.state, here.standing.q[0]), ~here.open[0].any(axis=1)

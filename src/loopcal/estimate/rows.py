@@ -36,11 +36,13 @@ from loopcal.measure import (
 )
 from loopcal.measure.simulation import rows_of as sensor_rows
 from loopcal.measure.whitening import whitener
-from loopcal.mechanism import Status
-from loopcal.mechanism.batch_kinematics import forward_trials
-from loopcal.mechanism.passive_joints import passive_sensitivity
-from loopcal.mechanism.sensitivity import sensitivity
-from loopcal.mechanism.transmission import joint_values as driven_values
+from loopcal.mechanism import (
+    Status,
+    differentiate_passive_joints,
+    differentiate_pose,
+    forward_trials,
+    joints_from_readings,
+)
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.typing import FloatArray, IntArray
 
@@ -140,13 +142,13 @@ class Rows:
             ]
             plain = [part.rows for part in parts if part.form < 0]
             if plain:
-                factor = engine.accumulate(
+                factor = engine.fold(
                     factor, plain[0] if len(plain) == 1 else np.concatenate(plain, axis=1)
                 )
             fold_parts(folding, parts)
             lost |= found.failed
         if self.own is not None and folding is not None and values is not None:
-            factor = engine.accumulate(factor, self.own.finish(folding, values))
+            factor = engine.fold(factor, self.own.finish(folding, values))
             self.own.keep(
                 trials, z, values, np.where(lost, np.inf, (factor[:, :, -1] ** 2).sum(axis=1))
             )
@@ -280,7 +282,7 @@ class Rows:
             return self._closure(block, values, trials)
         begin = self.last and self.last.take(trials[: len(values)], deviation)
         state = forward_trials(robot, values, block.readings, begin)
-        D, T = sensitivity(robot, values, block.readings, state).parameters, state.T
+        D, T = differentiate_pose(robot, values, block.readings, state).parameters, state.T
         ok = _solved(state) & np.isfinite(D).all(axis=(2, 3))
         failed = np.zeros(len(values), dtype=bool)
         if not ok.all():
@@ -301,7 +303,7 @@ class Rows:
         ]
         slopes = {}
         if passive:
-            moved = passive_sensitivity(robot, values, block.readings, state)
+            moved = differentiate_passive_joints(robot, values, block.readings, state)
             every = self._scaled(np.where(ok[..., None, None], moved.parameters, 0.0))
             slopes = {name: every[:, :, moved.names.index(name)] for name in passive}
         return Moves(T, ok, failed, D, joints=self._joints(block, state, ok), slopes=slopes)
@@ -374,13 +376,13 @@ class Rows:
         every = np.broadcast_to(self.located, (self.counted.size, *self.located.shape[1:]))
         T = every[trials[:, None], block.poses]
         e, tau = robot.slots(values)
-        joints = driven_values(block.readings, tau, robot.slots.frequency)
+        joints = joints_from_readings(block.readings, tau, robot.slots.frequency)
         state = engine.solve(
-            robot.program, e, joints, dataclasses.replace(robot.home_state, T=T), most=1
+            robot.program, e, joints, dataclasses.replace(robot.home_state, T=T), max_iterations=1
         )
-        step = geometry.difference(state.T, T)
+        step = geometry.pose_difference(state.T, T)
         here = dataclasses.replace(state, T=T, status=np.zeros_like(state.status))
-        D = sensitivity(robot, values, block.readings, here).parameters
+        D = differentiate_pose(robot, values, block.readings, here).parameters
         ok = np.asarray(np.isfinite(step).all(axis=2) & np.isfinite(D).all(axis=(2, 3)))
         step, D = np.where(ok[..., None], step, 0.0), np.where(ok[..., None, None], D, 0.0)
         return Moves(T, ok, np.any(~ok & block.needed, axis=1), self._scaled(D), step)

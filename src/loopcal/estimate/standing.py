@@ -25,12 +25,16 @@ from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.moves import Moves, mapped
 from loopcal.measure import joint_values
-from loopcal.mechanism import Mechanism, Status
-from loopcal.mechanism.assembly import Actuator
-from loopcal.mechanism.batch_kinematics import forward_trials
-from loopcal.mechanism.passive_joints import passive_sensitivity
-from loopcal.mechanism.pose_driven import moves_at_pose, solve_at_pose
-from loopcal.mechanism.sensitivity import sensitivity
+from loopcal.mechanism import (
+    Actuator,
+    Mechanism,
+    Status,
+    differentiate_at_pose,
+    differentiate_passive_joints,
+    differentiate_pose,
+    forward_trials,
+    solve_at_pose,
+)
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -152,7 +156,7 @@ class ByReadings:
     ) -> FreeMoves:
         """By the implicit function theorem."""
         robot, state, scale = self.unknowns.robot, here.state, self.scale[poses]
-        found = sensitivity(robot, values, here.q, state)
+        found = differentiate_pose(robot, values, here.q, state)
         D, Y = _free(self.unknowns, found.parameters), found.readings * scale[:, None, :]
         names = [actuator.name for actuator in robot.actuators]
         turns = {
@@ -163,7 +167,7 @@ class ByReadings:
         slopes = {}
         passive = [name for name in self.joints if name not in turns]
         if passive:
-            moved = passive_sensitivity(robot, values, here.q, state)
+            moved = differentiate_passive_joints(robot, values, here.q, state)
             places = [moved.names.index(name) for name in passive]
             slopes = {
                 n: _free(self.unknowns, moved.parameters[:, :, i])
@@ -221,7 +225,7 @@ class ByPose:
         """Poses moved."""
         twist = np.zeros((*u.shape[:2], 6))
         twist[..., self.places] = u * self.scale
-        return replace(here, state=replace(here.state, T=geometry.exp_update(here.state.T, twist)))
+        return replace(here, state=replace(here.state, T=geometry.apply_twist(here.state.T, twist)))
 
     def linearised(
         self, values: FloatArray, here: Standing, poses: IntArray, needed: np.ndarray
@@ -231,7 +235,7 @@ class ByPose:
         D = np.zeros((*shape, 6, len(self.unknowns)))
         Y = np.zeros((*shape, 6, self.freedoms))
         Y[..., self.places, range(self.freedoms)] = self.scale
-        found = moves_at_pose(robot, values, here.q, here.state)
+        found = differentiate_at_pose(robot, values, here.q, here.state)
         slopes, turns = {}, {}
         parts = (
             ([a.name for a in robot.actuators], found.readings),

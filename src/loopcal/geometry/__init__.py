@@ -2,25 +2,25 @@
 """Rotations, poses and twists, batched over any leading axes; numpy only."""
 
 from loopcal.geometry.euler_angles import EULER_ORDERS as EULER_ORDERS
-from loopcal.geometry.euler_angles import axis_rotation as axis_rotation
 from loopcal.geometry.euler_angles import euler_rates as euler_rates
 from loopcal.geometry.euler_angles import euler_rates_inverse as euler_rates_inverse
 from loopcal.geometry.euler_angles import euler_to_matrix as euler_to_matrix
 from loopcal.geometry.euler_angles import matrix_to_euler as matrix_to_euler
 from loopcal.geometry.euler_angles import matrix_to_tilt_torsion as matrix_to_tilt_torsion
+from loopcal.geometry.euler_angles import rotation_about_axis as rotation_about_axis
 from loopcal.geometry.euler_angles import tilt_torsion_rates as tilt_torsion_rates
 from loopcal.geometry.euler_angles import tilt_torsion_rates_inverse as tilt_torsion_rates_inverse
 from loopcal.geometry.euler_angles import tilt_torsion_to_matrix as tilt_torsion_to_matrix
-from loopcal.geometry.euler_angles import wrap as wrap
-from loopcal.geometry.orientation_forms import Orientation as Orientation
-from loopcal.geometry.orientation_forms import orientation as orientation
-from loopcal.geometry.rigid_transforms import adjoint as adjoint
-from loopcal.geometry.rigid_transforms import compose as compose
-from loopcal.geometry.rigid_transforms import difference as difference
-from loopcal.geometry.rigid_transforms import exp_update as exp_update
-from loopcal.geometry.rigid_transforms import inverse as inverse
-from loopcal.geometry.rigid_transforms import pose as pose
-from loopcal.geometry.rigid_transforms import transport as transport
+from loopcal.geometry.euler_angles import wrap_angle as wrap_angle
+from loopcal.geometry.orientation_forms import OrientationForm as OrientationForm
+from loopcal.geometry.orientation_forms import parse_orientation as parse_orientation
+from loopcal.geometry.rigid_transforms import adjoint_matrix as adjoint_matrix
+from loopcal.geometry.rigid_transforms import apply_twist as apply_twist
+from loopcal.geometry.rigid_transforms import compose_poses as compose_poses
+from loopcal.geometry.rigid_transforms import invert_pose as invert_pose
+from loopcal.geometry.rigid_transforms import make_pose as make_pose
+from loopcal.geometry.rigid_transforms import pose_difference as pose_difference
+from loopcal.geometry.rigid_transforms import transport_matrix as transport_matrix
 from loopcal.geometry.rotations import exp_so3 as exp_so3
 from loopcal.geometry.rotations import hat as hat
 from loopcal.geometry.rotations import left_jacobian_inverse_so3 as left_jacobian_inverse_so3

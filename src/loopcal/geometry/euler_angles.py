@@ -10,7 +10,7 @@ Angles stand in the order of the letters.
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.geometry.rotations import matrix
+from loopcal.geometry.rotations import stack_matrix
 from loopcal.typing import FloatArray
 
 _SEQUENCES = ("xyz", "yzx", "zxy", "xzy", "yxz", "zyx", "xyx", "xzx", "yxy", "yzy", "zxz", "zyz")
@@ -21,7 +21,7 @@ EULER_ORDERS = _SEQUENCES + tuple(sequence.upper() for sequence in _SEQUENCES)
 _GIMBAL = 1e-15
 
 
-def wrap(angle: FloatArray | float) -> FloatArray:
+def wrap_angle(angle: FloatArray | float) -> FloatArray:
     """Angle moved by whole turns into (-pi, pi].
 
     Parameters
@@ -35,7 +35,7 @@ def wrap(angle: FloatArray | float) -> FloatArray:
     return np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
 
 
-def axis_rotation(angle: FloatArray | float, axis: int) -> FloatArray:
+def rotation_about_axis(angle: FloatArray | float, axis: int) -> FloatArray:
     """Rotation about coordinate axis 0, 1 or 2.
 
     Parameters
@@ -49,10 +49,10 @@ def axis_rotation(angle: FloatArray | float, axis: int) -> FloatArray:
     """
     c, s = np.cos(angle), np.sin(angle)
     if axis == 0:
-        return matrix(((1.0, 0.0, 0.0), (0.0, c, -s), (0.0, s, c)))
+        return stack_matrix(((1.0, 0.0, 0.0), (0.0, c, -s), (0.0, s, c)))
     if axis == 1:
-        return matrix(((c, 0.0, s), (0.0, 1.0, 0.0), (-s, 0.0, c)))
-    return matrix(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
+        return stack_matrix(((c, 0.0, s), (0.0, 1.0, 0.0), (-s, 0.0, c)))
+    return stack_matrix(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
 
 
 def _moving_axes(order: str) -> tuple[tuple[int, int, int], bool]:
@@ -97,7 +97,9 @@ def euler_to_matrix(angles: FloatArray, order: str) -> FloatArray:
     """
     axes, fixed = _moving_axes(order)
     moving = angles[..., ::-1] if fixed else angles
-    first, second, third = (axis_rotation(moving[..., i], axis) for i, axis in enumerate(axes))
+    first, second, third = (
+        rotation_about_axis(moving[..., i], axis) for i, axis in enumerate(axes)
+    )
     return first @ second @ third
 
 
@@ -174,8 +176,8 @@ def euler_rates(angles: FloatArray, order: str) -> FloatArray:
     """
     (i, j, last), fixed = _moving_axes(order)
     moving = angles[..., ::-1] if fixed else angles
-    turned = axis_rotation(moving[..., 0], i)
-    both = turned @ axis_rotation(moving[..., 1], j)
+    turned = rotation_about_axis(moving[..., 0], i)
+    both = turned @ rotation_about_axis(moving[..., 1], j)
     columns = [
         np.broadcast_to(np.eye(3)[i], turned.shape[:-1]),
         turned[..., :, j],
@@ -211,7 +213,11 @@ def tilt_torsion_to_matrix(
     I. A. Bonev, J. Ryu, "A new approach to orientation workspace analysis of 6-DOF parallel
     manipulators", DOI 10.1016/S0094-114X(00)00032-X.
     """
-    return axis_rotation(phi, 2) @ axis_rotation(theta, 1) @ axis_rotation(psi - phi, 2)
+    return (
+        rotation_about_axis(phi, 2)
+        @ rotation_about_axis(theta, 1)
+        @ rotation_about_axis(psi - phi, 2)
+    )
 
 
 def matrix_to_tilt_torsion(rotation: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -230,7 +236,7 @@ def matrix_to_tilt_torsion(rotation: FloatArray) -> tuple[FloatArray, FloatArray
     """
     angles = matrix_to_euler(rotation, "ZYZ")
     phi, theta = angles[..., 0], angles[..., 1]
-    return phi, theta, wrap(phi + angles[..., 2])
+    return phi, theta, wrap_angle(phi + angles[..., 2])
 
 
 def euler_rates_inverse(angles: FloatArray, order: str) -> FloatArray:
@@ -280,7 +286,7 @@ def tilt_torsion_rates(
     """
     cphi, sphi, ctheta, stheta = np.cos(phi), np.sin(phi), np.cos(theta), np.sin(theta)
     nx, ny, nz = cphi * stheta, sphi * stheta, ctheta + 0.0 * psi
-    return matrix(((-nx, -sphi, nx), (-ny, cphi, ny), (1.0 - nz, 0.0, nz)))
+    return stack_matrix(((-nx, -sphi, nx), (-ny, cphi, ny), (1.0 - nz, 0.0, nz)))
 
 
 def tilt_torsion_rates_inverse(
@@ -305,7 +311,7 @@ def tilt_torsion_rates_inverse(
     half = np.tan(0.5 * theta) + 0.0 * psi
     ex, ey, ez = cphi * ctheta, sphi * ctheta, -stheta
     sine = _nonzero(stheta)
-    return matrix(
+    return stack_matrix(
         (
             (-ex / sine, -ey / sine, -ez / sine),
             (-sphi, cphi, 0.0),

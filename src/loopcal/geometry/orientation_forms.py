@@ -20,7 +20,7 @@ from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
 
-class Orientation(ABC):
+class OrientationForm(ABC):
     """One way to write a rotation.
 
     Attributes
@@ -69,7 +69,7 @@ class Orientation(ABC):
 
 
 @dataclass(frozen=True)
-class RotationVector(Orientation):
+class RotationVector(OrientationForm):
     """`R = exp(r)`, columns rx ry rz."""
 
     _name = "rotation-vector"
@@ -84,7 +84,7 @@ class RotationVector(Orientation):
 
 
 @dataclass(frozen=True)
-class Quaternion(Orientation):
+class Quaternion(OrientationForm):
     """Scalar first, columns qw qx qy qz, of any length."""
 
     _name = "quaternion"
@@ -101,7 +101,7 @@ class Quaternion(Orientation):
 
 
 @dataclass(frozen=True)
-class TiltTorsion(Orientation):
+class TiltTorsion(OrientationForm):
     """`R = Rz(phi) Ry(theta) Rz(psi - phi)`, columns phi theta psi."""
 
     _name = "tilt-torsion"
@@ -127,7 +127,7 @@ class TiltTorsion(Orientation):
 
 
 @dataclass(frozen=True)
-class Euler(Orientation):
+class Euler(OrientationForm):
     """Three turns a, b, c about the axes named by the order, see `geometry.euler_to_matrix`.
 
     Parameters
@@ -167,12 +167,12 @@ class Euler(Orientation):
         return geometry.euler_rates_inverse(values, self.order)
 
 
-_SIMPLE: dict[str, Orientation] = {
+_SIMPLE: dict[str, OrientationForm] = {
     form.name: form for form in (RotationVector(), Quaternion(), TiltTorsion())
 }
 
 
-def orientation(name: str) -> Orientation:
+def parse_orientation(name: str) -> OrientationForm:
     """Form of orientation by its name in files.
 
     Parameters

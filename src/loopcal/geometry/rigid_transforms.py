@@ -8,11 +8,11 @@ belongs to the other, spatial, convention and is kept for files and programs tha
 
 import numpy as np
 
-from loopcal.geometry.rotations import exp_so3, hat, log_so3, matrix
+from loopcal.geometry.rotations import exp_so3, hat, log_so3, stack_matrix
 from loopcal.typing import FloatArray
 
 
-def pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+def make_pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
     """Homogeneous matrix `T = [R t; 0 1]`.
 
     Parameters
@@ -29,10 +29,10 @@ def pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
         (rotation[..., i, 0], rotation[..., i, 1], rotation[..., i, 2], translation[..., i])
         for i in range(3)
     )
-    return matrix((*rows, (0.0, 0.0, 0.0, 1.0)))
+    return stack_matrix((*rows, (0.0, 0.0, 0.0, 1.0)))
 
 
-def compose(*poses: FloatArray) -> FloatArray:
+def compose_poses(*poses: FloatArray) -> FloatArray:
     """Product of poses from left to right: `T_a_c = compose(T_a_b, T_b_c)`.
 
     Parameters
@@ -49,7 +49,7 @@ def compose(*poses: FloatArray) -> FloatArray:
     return product
 
 
-def inverse(T: FloatArray) -> FloatArray:
+def invert_pose(T: FloatArray) -> FloatArray:
     """Inverse pose `[R' -R't; 0 1]`: `inverse(T_a_b) = T_b_a`.
 
     Parameters
@@ -61,10 +61,10 @@ def inverse(T: FloatArray) -> FloatArray:
     T_inverse : (..., 4, 4)
     """
     rotation = np.swapaxes(T[..., :3, :3], -1, -2)
-    return pose(rotation, -(rotation @ T[..., :3, 3:])[..., 0])
+    return make_pose(rotation, -(rotation @ T[..., :3, 3:])[..., 0])
 
 
-def exp_update(T: FloatArray, twist: FloatArray) -> FloatArray:
+def apply_twist(T: FloatArray, twist: FloatArray) -> FloatArray:
     """Move poses by twists: `R <- exp(omega) R`, `t <- t + v`.
 
     Parameters
@@ -77,10 +77,10 @@ def exp_update(T: FloatArray, twist: FloatArray) -> FloatArray:
     -------
     T_updated : (..., 4, 4)
     """
-    return pose(exp_so3(twist[..., :3]) @ T[..., :3, :3], T[..., :3, 3] + twist[..., 3:])
+    return make_pose(exp_so3(twist[..., :3]) @ T[..., :3, :3], T[..., :3, 3] + twist[..., 3:])
 
 
-def difference(T_a: FloatArray, T_b: FloatArray) -> FloatArray:
+def pose_difference(T_a: FloatArray, T_b: FloatArray) -> FloatArray:
     """Twist that takes b to a: `(log(R_a R_b'), t_a - t_b)`, so that `exp_update(T_b,
     difference(T_a, T_b)) = T_a`.
 
@@ -97,7 +97,7 @@ def difference(T_a: FloatArray, T_b: FloatArray) -> FloatArray:
     return np.concatenate([rotation, T_a[..., :3, 3] - T_b[..., :3, 3]], axis=-1)
 
 
-def adjoint(T: FloatArray) -> FloatArray:
+def adjoint_matrix(T: FloatArray) -> FloatArray:
     """Map of SPATIAL twists between frames: `V_a = adjoint(T_a_b) V_b`, `[[R, 0], [hat(t) R, R]]`.
 
     In a spatial twist the translation part is the velocity of the body's point that is just then at
@@ -117,7 +117,7 @@ def adjoint(T: FloatArray) -> FloatArray:
     return _blocks(rotation, hat(T[..., :3, 3]) @ rotation, rotation)
 
 
-def transport(arm: FloatArray, rotation: FloatArray | None = None) -> FloatArray:
+def transport_matrix(arm: FloatArray, rotation: FloatArray | None = None) -> FloatArray:
     """Map of platform twists to another point of the platform, written in other axes.
 
     `omega' = Q omega`, `v' = Q (v + omega x arm)`: a 6x6 matrix `[[Q, 0], [-Q hat(arm), Q]]`.

@@ -14,7 +14,7 @@ from loopcal.typing import FloatArray
 _TINY = 1e-200
 
 
-def matrix(rows: tuple[tuple[FloatArray | float, ...], ...]) -> FloatArray:
+def stack_matrix(rows: tuple[tuple[FloatArray | float, ...], ...]) -> FloatArray:
     """Stack entries of equal shape (...) row by row into matrices.
 
     Parameters
@@ -42,7 +42,7 @@ def hat(vector: FloatArray) -> FloatArray:
     skew : (..., 3, 3), same unit
     """
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-    return matrix(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+    return stack_matrix(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
 
 
 def _polynomial(vector: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
@@ -53,7 +53,7 @@ def _polynomial(vector: FloatArray, first: FloatArray, second: FloatArray) -> Fl
     xy, xz, yz = second * x * y, second * x * z, second * y * z
     xx, yy, zz = second * x * x, second * y * y, second * z * z
     ax, ay, az = first * x, first * y, first * z
-    return matrix(
+    return stack_matrix(
         (
             (1.0 - yy - zz, xy - az, xz + ay),
             (xy + az, 1.0 - xx - zz, yz - ax),
@@ -159,7 +159,7 @@ def quaternion_to_matrix(quaternion: FloatArray) -> FloatArray:
     """
     scale = np.sqrt(2.0 / np.sum(quaternion * quaternion, axis=-1))
     w, x, y, z = (scale * quaternion[..., i] for i in range(4))
-    return matrix(
+    return stack_matrix(
         (
             (1.0 - y * y - z * z, x * y - w * z, x * z + w * y),
             (x * y + w * z, 1.0 - x * x - z * z, y * z - w * x),

@@ -54,7 +54,7 @@ def kabsch(points: FloatArray, seen: FloatArray) -> FloatArray:
     """
     middle, centre = points.mean(axis=0), seen.mean(axis=0)
     R = nearest_rotation((seen - centre).T @ (points - middle))
-    return geometry.pose(R, centre - R @ middle)
+    return geometry.make_pose(R, centre - R @ middle)
 
 
 def rotations(H: FloatArray, g: FloatArray, best: int = 3) -> FloatArray:
@@ -150,7 +150,7 @@ def hand_eye(
     found = linear(np.concatenate(columns, axis=-1).reshape(known.size, -1), known.ravel())
     t_F = found[:3] if frame is None else frame[:3, 3]
     t_X = found[-3:] if tool is None else tool[:3, 3]
-    return geometry.pose(R_F, t_F), geometry.pose(R_X, t_X)
+    return geometry.make_pose(R_F, t_F), geometry.make_pose(R_X, t_X)
 
 
 def frame_and_points(
@@ -179,7 +179,7 @@ def frame_and_points(
     M_out, b_out = M - Q @ (Q.T @ M), b - Q @ (Q.T @ b)
     R = rotations(M_out.T @ M_out, M_out.T @ b_out)
     rest = linear(C, (M @ R.reshape(-1, 9).T) - b[:, None]).T
-    return geometry.pose(R, rest[:, w:]), rest[:, :w]
+    return geometry.make_pose(R, rest[:, w:]), rest[:, :w]
 
 
 def resection(rays: FloatArray, points: FloatArray) -> FloatArray:
@@ -199,7 +199,7 @@ def resection(rays: FloatArray, points: FloatArray) -> FloatArray:
     ahead = np.einsum("ri,kij,rj->kr", rays, A, points - middle) - np.einsum("ri,ki->kr", rays, s)
     order = np.argsort(-np.mean(ahead > 0.0, axis=1), kind="stable")
     R = np.swapaxes(A, -1, -2)
-    return geometry.pose(R, (R @ s[..., None])[..., 0] + middle)[order]
+    return geometry.make_pose(R, (R @ s[..., None])[..., 0] + middle)[order]
 
 
 def trilateration(

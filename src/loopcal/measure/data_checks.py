@@ -15,7 +15,7 @@ from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
 from loopcal.mechanism import Mechanism
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import DISPLAY_UNITS, unit
+from loopcal.units import DISPLAY_UNITS, find_unit
 
 STILL, PLANNED = 10.0, 100.0
 """Standard deviations of the noise within which readings stay that never move, and beyond which a
@@ -67,7 +67,7 @@ def check_strokes(
     if len(outside):
         pose, column = (int(i) for i in outside[0])
         actuator = robot.actuators[column]
-        shown = unit(robot.units[actuator.dimension])
+        shown = find_unit(robot.units[actuator.dimension])
         value, least, most = (
             f"{number / shown.factor_to_si:.7g}"
             for number in (measurements.readings[pose, column], *strokes[column])

@@ -4,7 +4,7 @@
 from collections.abc import Iterable
 
 from loopcal.engine import State
-from loopcal.errors import DataError, nearest
+from loopcal.errors import DataError, suggest_names
 from loopcal.measure.kinds import Kind
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
@@ -48,7 +48,7 @@ def joint_values(
         else:
             known = [*actuators, *passive]
             raise DataError(
-                f"{robot.name!r} has no joint {name!r}{nearest(name, known)}; those a sensor can "
+                f"{robot.name!r} has no joint {name!r}{suggest_names(name, known)}; those a sensor can "
                 f"look at are {', '.join(known)}"
             )
     return found

@@ -15,7 +15,7 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.errors import DataError, nearest
+from loopcal.errors import DataError, suggest_names
 from loopcal.measure.kinds import Kind
 from loopcal.parameters import Parameter, ParameterTable
 from loopcal.typing import FloatArray
@@ -159,7 +159,7 @@ class LocalUnknowns:
             known = ", ".join(self.table.names[:12]) or "none"
             raise DataError(
                 "no unknown of these measurements is called "
-                f"{name!r}{nearest(name, self.table.names)}; there are {known}"
+                f"{name!r}{suggest_names(name, self.table.names)}; there are {known}"
             )
         return self.table.index(name)
 

@@ -18,7 +18,7 @@ from loopcal.measure.kinds.kind import Column, Evaluation, Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
-from loopcal.units import DISPLAY_UNITS, Dimension, unit
+from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 BEYOND = 1e6
 """Sigma of a reading, in sizes of the robot or radians, that says no more than infinity does."""
@@ -132,7 +132,7 @@ def _check_sigma(robot: Mechanism, sigma: FloatArray) -> None:
         if np.any(wrong):
             pose, column = (int(i) for i in np.argwhere(wrong)[0])
             actuator = robot.actuators[column]
-            shown = unit(
+            shown = find_unit(
                 robot.units.get(actuator.dimension, DISPLAY_UNITS[actuator.dimension].symbol)
             )
             value = f"{sigma[pose, column] / shown.factor_to_si:.6g} {shown.symbol}"

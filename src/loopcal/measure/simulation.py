@@ -25,9 +25,7 @@ from loopcal.measure.noise import stream
 from loopcal.measure.nuisance import LocalUnknowns, local_unknowns
 from loopcal.measure.observations import Observations
 from loopcal.measure.readings import believed_sigma
-from loopcal.mechanism import Mechanism, Status
-from loopcal.mechanism.batch_kinematics import forward_trials
-from loopcal.mechanism.pose_driven import solve_at_pose
+from loopcal.mechanism import Mechanism, Status, forward_trials, solve_at_pose
 from loopcal.typing import BoolArray, FloatArray
 
 Ints = NDArray[np.intp]

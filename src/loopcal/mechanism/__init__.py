@@ -1,27 +1,83 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mechanisms: robot records and families, their compilation for the engine, inverse and forward
-kinematics.
+"""Mechanisms: robot records and families, compilation for the engine, kinematics and sensitivities.
+
+Other packages import from here; the modules inside may be rearranged.
 """
 
 from loopcal.mechanism.assembly import AXES as AXES
 from loopcal.mechanism.assembly import Actuator as Actuator
 from loopcal.mechanism.assembly import Address as Address
 from loopcal.mechanism.assembly import Assembly as Assembly
+from loopcal.mechanism.assembly import Cone as Cone
 from loopcal.mechanism.assembly import Joint as Joint
 from loopcal.mechanism.assembly import Limb as Limb
-from loopcal.mechanism.assembly import Linear as Linear
+from loopcal.mechanism.assembly import LinearMap as LinearMap
 from loopcal.mechanism.assembly import Link as Link
+from loopcal.mechanism.assembly import SharedMap as SharedMap
+from loopcal.mechanism.batch_kinematics import compute_closure_sign as compute_closure_sign
+from loopcal.mechanism.batch_kinematics import compute_readings as compute_readings
+from loopcal.mechanism.batch_kinematics import find_directly_reachable as find_directly_reachable
+from loopcal.mechanism.batch_kinematics import forward_trials as forward_trials
+from loopcal.mechanism.batch_kinematics import inverse_trials as inverse_trials
 from loopcal.mechanism.compilation import build as build
+from loopcal.mechanism.coordinates import POSITION as POSITION
+from loopcal.mechanism.coordinates import TILT as TILT
+from loopcal.mechanism.coordinates import check_coordinates as check_coordinates
+from loopcal.mechanism.coordinates import compare_coordinates as compare_coordinates
+from loopcal.mechanism.coordinates import pose_from_coordinates as pose_from_coordinates
+from loopcal.mechanism.coordinates import read_coordinates as read_coordinates
 from loopcal.mechanism.families import FAMILIES as FAMILIES
+from loopcal.mechanism.frames import compute_limb_frames as compute_limb_frames
 from loopcal.mechanism.kinematics import Solution as Solution
 from loopcal.mechanism.kinematics import forward as forward
 from loopcal.mechanism.kinematics import inverse as inverse
+from loopcal.mechanism.kinematics import make_solution as make_solution
+from loopcal.mechanism.limits import Limit as Limit
+from loopcal.mechanism.limits import check_limits as check_limits
+from loopcal.mechanism.limits import evaluate_limits as evaluate_limits
 from loopcal.mechanism.model import Mechanism as Mechanism
 from loopcal.mechanism.model import Status as Status
-from loopcal.mechanism.modes import assembly_modes as assembly_modes
-from loopcal.mechanism.modes import working_modes as working_modes
-from loopcal.mechanism.records import Robot as Robot
+from loopcal.mechanism.modes import Modes as Modes
+from loopcal.mechanism.modes import find_assembly_modes as find_assembly_modes
+from loopcal.mechanism.modes import find_working_modes as find_working_modes
+from loopcal.mechanism.passive_joints import PassiveSensitivity as PassiveSensitivity
+from loopcal.mechanism.passive_joints import (
+    differentiate_passive_joints as differentiate_passive_joints,
+)
+from loopcal.mechanism.pose_driven import PoseDrivenSensitivity as PoseDrivenSensitivity
+from loopcal.mechanism.pose_driven import differentiate_at_pose as differentiate_at_pose
+from loopcal.mechanism.pose_driven import solve_at_pose as solve_at_pose
+from loopcal.mechanism.projection import (
+    differentiate_by_coordinates as differentiate_by_coordinates,
+)
+from loopcal.mechanism.records import AngleTolerance as AngleTolerance
+from loopcal.mechanism.records import LengthTolerance as LengthTolerance
+from loopcal.mechanism.records import Point as Point
+from loopcal.mechanism.records import PoseRecord as PoseRecord
+from loopcal.mechanism.records import RatioTolerance as RatioTolerance
+from loopcal.mechanism.records import RobotRecord as RobotRecord
+from loopcal.mechanism.records import Workspace as Workspace
+from loopcal.mechanism.records import match_parameter_names as match_parameter_names
+from loopcal.mechanism.records import standard_deviation as standard_deviation
+from loopcal.mechanism.sensitivity import PoseSensitivity as PoseSensitivity
+from loopcal.mechanism.sensitivity import differentiate_pose as differentiate_pose
+from loopcal.mechanism.singularities import NEAR_SHARE as NEAR_SHARE
 from loopcal.mechanism.singularities import Singularity as Singularity
-from loopcal.mechanism.singularities import along_path as along_path
-from loopcal.mechanism.singularities import singularity as singularity
-from loopcal.mechanism.workspace import sample as sample
+from loopcal.mechanism.singularities import analyze_singularity as analyze_singularity
+from loopcal.mechanism.singularities import compute_median_margins as compute_median_margins
+from loopcal.mechanism.singularities import trace_singularity as trace_singularity
+from loopcal.mechanism.states import driven_values as driven_values
+from loopcal.mechanism.states import select_poses as select_poses
+from loopcal.mechanism.transmission import TERMS as TERMS
+from loopcal.mechanism.transmission import harmonic_frequencies as harmonic_frequencies
+from loopcal.mechanism.transmission import joint_slopes as joint_slopes
+from loopcal.mechanism.transmission import joints_from_readings as joints_from_readings
+from loopcal.mechanism.transmission import nominal_terms as nominal_terms
+from loopcal.mechanism.transmission import readings_from_joints as readings_from_joints
+from loopcal.mechanism.transmission import term_derivatives as term_derivatives
+from loopcal.mechanism.workspace import MIN_DRAWS as MIN_DRAWS
+from loopcal.mechanism.workspace import MIN_REACHABLE_SHARE as MIN_REACHABLE_SHARE
+from loopcal.mechanism.workspace import WorkspaceSample as WorkspaceSample
+from loopcal.mechanism.workspace import draw_coordinates as draw_coordinates
+from loopcal.mechanism.workspace import sample_workspace as sample_workspace
+from loopcal.mechanism.workspace import workspace_ranges as workspace_ranges

@@ -112,7 +112,7 @@ class Address:
 
 
 @dataclass(frozen=True)
-class Linear:
+class LinearMap:
     """Map of one parameter onto one address: displacement += coefficient * (value - nominal)."""
 
     parameter: str
@@ -120,7 +120,7 @@ class Linear:
     coefficient: float = 1.0
 
 
-class Shared(Protocol):
+class SharedMap(Protocol):
     """Map of several parameters onto several addresses by a smooth function (delta radius, tower
     angle).
     """
@@ -188,8 +188,8 @@ class Assembly:
     controlled: tuple[str, ...]
     home: FloatArray
     parameters: tuple[Parameter, ...]
-    maps: tuple[Linear, ...]
-    shared: tuple[Shared, ...] = ()
+    maps: tuple[LinearMap, ...]
+    shared: tuple[SharedMap, ...] = ()
     tool: FloatArray = field(default_factory=lambda: np.eye(4))
     workspace: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     source: str = ""

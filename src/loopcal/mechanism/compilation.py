@@ -14,12 +14,13 @@ import numpy as np
 from loopcal import engine
 from loopcal.engine import Group, Program, Slot, State
 from loopcal.errors import MechanismError
-from loopcal.mechanism import coordinates, mobility
+from loopcal.mechanism import mobility
 from loopcal.mechanism.assembly import AXES, Address, Assembly, Limb
-from loopcal.mechanism.batch_kinematics import inverse_trials, orientation_at
+from loopcal.mechanism.batch_kinematics import compute_closure_sign, inverse_trials
+from loopcal.mechanism.coordinates import COORDINATES, check_coordinates, read_coordinates
 from loopcal.mechanism.model import Mechanism, SlotMap
-from loopcal.mechanism.redundant_actuation import shared_drives
-from loopcal.mechanism.transmission import TERMS, frequency, nominal_terms
+from loopcal.mechanism.redundant_actuation import count_shared_drives
+from loopcal.mechanism.transmission import TERMS, harmonic_frequencies, nominal_terms
 from loopcal.parameters import ParameterTable
 from loopcal.units import Dimension
 
@@ -62,7 +63,7 @@ def build(
     freedoms = tuple(AXES.index(f) for f in AXES if f in assembly.freedoms)
     size = characteristic_length(assembly)
     loose, _, count = _groups(assembly, wanted, {})
-    held = mobility.spinning(
+    held = mobility.find_idle_joints(
         Program(loose, freedoms, size, count, len(assembly.actuators)), _guess(assembly, loose)
     )
     _check_drives(assembly, held)
@@ -79,7 +80,7 @@ def build(
     robot = Mechanism(
         assembly, table, table.nominal, program, slots, size, guess, units, notes, record
     )
-    return mobility.checked(replace(robot, home_state=_home(robot)))
+    return mobility.check_mobility(replace(robot, home_state=_home(robot)))
 
 
 def characteristic_length(assembly: Assembly) -> float:
@@ -173,9 +174,9 @@ def _check_freedoms(assembly: Assembly) -> None:
     if not assembly.controlled:
         raise MechanismError(
             f"{assembly.name} names no controlled coordinate; state one for each freedom, of "
-            f"{', '.join(coordinates.NAMES)}"
+            f"{', '.join(COORDINATES)}"
         )
-    coordinates.check_names(assembly.controlled)
+    check_coordinates(assembly.controlled)
 
 
 def _check_ranges(assembly: Assembly) -> None:
@@ -329,7 +330,7 @@ def _weights(
     if len(assembly.actuators) <= len(freedoms):
         return None
     for group in groups:
-        rows = len(group.rows) - len(group.unknown(False))
+        rows = len(group.rows) - len(group.unknown_joints(False))
         driven = int((group.actuator[:, 0] >= 0).sum())
         if rows != driven or driven != 1:
             limb = assembly.limbs[group.limbs[0]].name
@@ -377,7 +378,7 @@ def _slot_map(
         (s, tuple(table.index(name) for name in s.inputs), tuple(place(a) for a in s.outputs))
         for s in assembly.shared
     )
-    terms, w = nominal_terms(assembly.actuators), frequency(assembly.actuators)
+    terms, w = nominal_terms(assembly.actuators), harmonic_frequencies(assembly.actuators)
     return SlotMap(matrix, shared, table.nominal, count, terms, w)
 
 
@@ -405,12 +406,12 @@ def _home(robot: Mechanism) -> State:
     loops cannot close.
     """
     values = robot.values[None]
-    target = coordinates.read(robot.assembly.home[None, None], robot.controlled)
+    target = read_coordinates(robot.assembly.home[None, None], robot.controlled)
     program = robot.program
     movable = len(program.freedoms) - sum(
-        len(g.limbs) * (len(g.rows) - len(g.unknown(True))) for g in program.groups
+        len(g.limbs) * (len(g.rows) - len(g.unknown_joints(True))) for g in program.groups
     )
-    movable -= shared_drives(program)
+    movable -= count_shared_drives(program)
     if len(robot.controlled) < movable:
         raise MechanismError(
             f"{robot.name} can be moved in {movable} freedoms or more, but {len(robot.controlled)} "
@@ -420,11 +421,11 @@ def _home(robot: Mechanism) -> State:
         )
     state = inverse_trials(robot, values, target)
     if state.status[0, 0] != engine.CONVERGED:
-        if not shared_drives(program):
-            mobility.refuse_uncommandable(robot, robot.home_state)
+        if not count_shared_drives(program):
+            mobility.refuse_uncontrolled(robot, robot.home_state)
         raise MechanismError(
             f"{robot.name} cannot close at its home pose: the loops stay "
             f"{state.residual[0, 0] * 1e3:.3g} mm open; "
             "check the joint centres, lengths and home"
         )
-    return replace(state, orientation=orientation_at(robot, values, state))
+    return replace(state, closure_sign=compute_closure_sign(robot, values, state))

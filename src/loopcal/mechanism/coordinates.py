@@ -18,14 +18,16 @@ from loopcal.typing import FloatArray
 POSITION = ("x", "y", "z")
 TILT = ("phi", "theta", "psi")
 EULER = ("roll", "pitch", "yaw")
-NAMES = (*POSITION, *EULER, *TILT)
+COORDINATES = (*POSITION, *EULER, *TILT)
 
 
-def check_names(names: tuple[str, ...]) -> None:
+def check_coordinates(names: tuple[str, ...]) -> None:
     """Refuse unknown, repeated or mixed coordinates; raises MechanismError."""
-    wrong = [n for n in names if n not in NAMES]
+    wrong = [n for n in names if n not in COORDINATES]
     if wrong:
-        raise MechanismError(f"{wrong[0]!r} is not a coordinate; allowed are {', '.join(NAMES)}")
+        raise MechanismError(
+            f"{wrong[0]!r} is not a coordinate; allowed are {', '.join(COORDINATES)}"
+        )
     if len(set(names)) < len(names):
         raise MechanismError(f"a coordinate is named twice in {', '.join(names)}; name each once")
     if set(names) & set(TILT) and set(names) & set(EULER):
@@ -37,7 +39,7 @@ def check_names(names: tuple[str, ...]) -> None:
         raise MechanismError("phi and theta are the direction of one normal; name both or neither")
 
 
-def read(T: FloatArray, names: tuple[str, ...]) -> FloatArray:
+def read_coordinates(T: FloatArray, names: tuple[str, ...]) -> FloatArray:
     """Values of these coordinates (.., c) at poses T (.., 4, 4) [m, rad]."""
     found = {name: T[..., i, 3] for i, name in enumerate(POSITION)}
     if set(names) & set(TILT):
@@ -48,7 +50,9 @@ def read(T: FloatArray, names: tuple[str, ...]) -> FloatArray:
     return np.stack([found[name] for name in names], axis=-1)
 
 
-def pose(values: FloatArray, names: tuple[str, ...], base: FloatArray) -> FloatArray:
+def pose_from_coordinates(
+    values: FloatArray, names: tuple[str, ...], base: FloatArray
+) -> FloatArray:
     """Poses (.., 4, 4) with these coordinates; the coordinates not named stay as in `base` (4, 4)."""
     T = np.array(np.broadcast_to(base, (*values.shape[:-1], 4, 4)))
     given = {name: values[..., i] for i, name in enumerate(names)}
@@ -64,7 +68,7 @@ def pose(values: FloatArray, names: tuple[str, ...], base: FloatArray) -> FloatA
     return T
 
 
-def demands(
+def compare_coordinates(
     T: FloatArray, target: FloatArray, names: tuple[str, ...], size: float
 ) -> tuple[FloatArray, FloatArray]:
     """How far poses are from the coordinates asked for, and the slopes of that in the twist.
@@ -93,7 +97,7 @@ def demands(
     if "psi" in wanted:
         place, angle, row = names.index("psi"), *_torsion(rotation)
         residual[:, place], columns[:, place, :3] = (
-            size * geometry.wrap(angle - wanted["psi"]),
+            size * geometry.wrap_angle(angle - wanted["psi"]),
             size * row,
         )
     if set(EULER) & set(names):
@@ -103,7 +107,7 @@ def demands(
             if name in wanted:
                 place = names.index(name)
                 residual[:, place], columns[:, place, :3] = (
-                    size * geometry.wrap(angles[:, i] - wanted[name]),
+                    size * geometry.wrap_angle(angles[:, i] - wanted[name]),
                     size * rates[:, i],
                 )
     return residual, columns

@@ -14,7 +14,9 @@ from loopcal.mechanism.model import Mechanism
 from loopcal.typing import FloatArray
 
 
-def limb_frames(robot: Mechanism, values: FloatArray, state: State) -> tuple[FloatArray, ...]:
+def compute_limb_frames(
+    robot: Mechanism, values: FloatArray, state: State
+) -> tuple[FloatArray, ...]:
     """Frames along each limb, in the mechanism's order of limbs.
 
     Parameters
@@ -44,7 +46,7 @@ def _walk(group: Group, k: int, own: FloatArray, joints: FloatArray, T: FloatArr
             pitch[:, slot.element] += value
         elif slot.axis != ROD:
             move[:, slot.element, slot.axis] += value
-    placed = group.links[k] @ geometry.pose(geometry.exp_so3(move[..., :3]), move[..., 3:])
+    placed = group.links[k] @ geometry.make_pose(geometry.exp_so3(move[..., :3]), move[..., 3:])
     frames = [np.broadcast_to(placed[:, None, 0], T.shape)]
     for j, letter in enumerate(group.joints):
         value = joints[..., j]
@@ -54,7 +56,9 @@ def _walk(group: Group, k: int, own: FloatArray, joints: FloatArray, T: FloatArr
         along = np.stack([np.zeros_like(value), np.zeros_like(value), np.ones_like(value)], axis=-1)
         frames.append(
             frames[-1]
-            @ geometry.pose(geometry.exp_so3(turn[..., None] * along), shift[..., None] * along)
+            @ geometry.make_pose(
+                geometry.exp_so3(turn[..., None] * along), shift[..., None] * along
+            )
             @ placed[:, None, j + 1]
         )
     return np.stack([*frames, T @ placed[:, None, -1]], axis=2)

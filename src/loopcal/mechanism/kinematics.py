@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from loopcal.engine import State
 from loopcal.errors import DataError
-from loopcal.mechanism import states
-from loopcal.mechanism.batch_kinematics import forward_trials, inverse_trials, readings_at
+from loopcal.mechanism.batch_kinematics import compute_readings, forward_trials, inverse_trials
 from loopcal.mechanism.model import Mechanism, Status
-from loopcal.mechanism.projection import nearest_reachable
+from loopcal.mechanism.projection import find_nearest_reachable
+from loopcal.mechanism.states import select_poses
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 APART = 1e-9
@@ -63,7 +63,7 @@ class Solution:
             name: getattr(self, name)[rows]
             for name in ("T", "q", "passive", "status", "residual", "iterations")
         }
-        return replace(self, **cut, state=states.take(self.state, rows))
+        return replace(self, **cut, state=select_poses(self.state, rows))
 
     def explain(self, row: int) -> str:
         """What became of a row, in a sentence."""
@@ -104,7 +104,7 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
     state = forward_trials(
         robot, robot.values[None], readings[None], None if start is None else start.state
     )
-    return solution_of(robot, state, readings[:, : len(robot.actuators)])
+    return make_solution(robot, state, readings[:, : len(robot.actuators)])
 
 
 def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) -> Solution:
@@ -133,7 +133,7 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
     if wanted.ndim >= 2 and wanted.shape[-2:] == (4, 4):
         T = wanted.reshape(-1, 4, 4)
         _check_poses(T)
-        state = nearest_reachable(robot, values, T[None], begin)
+        state = find_nearest_reachable(robot, values, T[None], begin)
     elif wanted.ndim in (1, 2) and wanted.shape[-1] == c:
         state = inverse_trials(robot, values, np.atleast_2d(wanted)[None], begin)
     else:
@@ -142,7 +142,7 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
             "coordinates "
             f"({', '.join(robot.controlled)})"
         )
-    return solution_of(robot, state, readings_at(robot, values, state)[0])
+    return make_solution(robot, state, compute_readings(robot, values, state)[0])
 
 
 def _check_poses(T: FloatArray) -> None:
@@ -167,7 +167,7 @@ def _check_poses(T: FloatArray) -> None:
         )
 
 
-def solution_of(robot: Mechanism, state: State, q: FloatArray) -> Solution:
+def make_solution(robot: Mechanism, state: State, q: FloatArray) -> Solution:
     """The solution of a state (1, n) and its readings (n, a)."""
     names, columns = [], []
     for group, joints in zip(robot.program.groups, state.joints, strict=True):

@@ -37,7 +37,7 @@ class LimbMap:
     readings: Columns
 
 
-def limb_maps(
+def build_limb_maps(
     program: Program, matrix: FloatArray, touches: BoolArray
 ) -> tuple[tuple[LimbMap, ...], ...]:
     """The limb maps of each group, from the linear map (s, p) and which parameters may move which

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal.engine import State
-from loopcal.mechanism.frames import limb_frames
+from loopcal.mechanism.frames import compute_limb_frames
 from loopcal.mechanism.model import Mechanism
 from loopcal.typing import BoolArray, FloatArray
 
@@ -34,7 +34,9 @@ class Limit:
         return np.minimum(self.value - self.low, self.high - self.value)
 
 
-def limits(robot: Mechanism, values: FloatArray, q: FloatArray, state: State) -> tuple[Limit, ...]:
+def evaluate_limits(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+) -> tuple[Limit, ...]:
     """Everything that limits the machine, at readings q (t | 1, n, a) and their states (t, n)."""
     found = [
         Limit(f"stroke of {a.name}", *a.stroke, np.broadcast_to(q[..., i], state.status.shape))
@@ -54,14 +56,14 @@ def limits(robot: Mechanism, values: FloatArray, q: FloatArray, state: State) ->
     return tuple(found)
 
 
-def within(
+def check_limits(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> tuple[BoolArray, NDArray[np.object_]]:
     """Which rows are allowed (t, n), and what forbids the others in words (t, n), '' where nothing
     does.
     """
     allowed, why = np.ones(state.status.shape, bool), np.full(state.status.shape, "", dtype=object)
-    for limit in limits(robot, values, q, state):
+    for limit in evaluate_limits(robot, values, q, state):
         # a bound itself is allowed, up to the rounding of its own number
         outside = ~(limit.margin >= -1e-12 * max(abs(limit.low), abs(limit.high)))
         first = outside & allowed
@@ -77,7 +79,9 @@ def within(
 def _cones(robot: Mechanism, values: FloatArray, state: State) -> list[Limit]:
     """Angles between rods and the axes of their cones."""
     found = []
-    for limb, frames in zip(robot.assembly.limbs, limb_frames(robot, values, state), strict=True):
+    for limb, frames in zip(
+        robot.assembly.limbs, compute_limb_frames(robot, values, state), strict=True
+    ):
         rod = frames[:, :, -1, :3, 3] - frames[:, :, -2, :3, 3]
         rod = rod / np.linalg.norm(rod, axis=-1, keepdims=True)
         for cone in limb.cones:

@@ -9,10 +9,11 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.errors import MechanismError
-from loopcal.mechanism import coordinates, states
 from loopcal.mechanism.assembly import AXES
+from loopcal.mechanism.coordinates import COORDINATES, compare_coordinates, read_coordinates
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.sensitivity import platform_rows
+from loopcal.mechanism.sensitivity import stack_platform_rows
+from loopcal.mechanism.states import driven_values
 from loopcal.typing import FloatArray
 
 RANK = 1e-9
@@ -20,7 +21,7 @@ RANK = 1e-9
 rounding below 1e-13.
 """
 
-WORDS = {
+MOTIONS = {
     "rx": "turn about x",
     "ry": "turn about y",
     "rz": "turn about z",
@@ -30,14 +31,14 @@ WORDS = {
 }
 
 
-def checked(robot: Mechanism) -> Mechanism:
+def check_mobility(robot: Mechanism) -> Mechanism:
     """The robot, or MechanismError naming the freedoms that are too many or too few at home."""
     program, home = robot.program, robot.home_state
     e = robot.slots(robot.values[None])[0]
-    q = states.actuated(program, home)
-    blocks = engine.linearise(program, e, q, home)
+    q = driven_values(program, home)
+    blocks = engine.linearize(program, e, q, home)
     scale = np.array([1 / robot.size if f < 3 else 1.0 for f in program.freedoms])
-    A = platform_rows(blocks)[0, 0] * scale
+    A = stack_platform_rows(blocks)[0, 0] * scale
     _, s, V = np.linalg.svd(A, full_matrices=True)
     m = len(program.freedoms)
     rank = int((s > RANK * max(s[0], 1e-300)).sum()) if len(s) else 0
@@ -94,7 +95,7 @@ def _repeated(freedoms: tuple[int, ...], count: int, moves: FloatArray) -> str:
     )
 
 
-def _drives(robot: Mechanism, blocks: engine.Blocks) -> FloatArray:
+def _drives(robot: Mechanism, blocks: engine.ClosureBlocks) -> FloatArray:
     """Closure rows of the home position against the actuated joints (c, a)."""
     parts = []
     for group, block in zip(robot.program.groups, blocks.closure, strict=True):
@@ -111,29 +112,29 @@ def _commandable(robot: Mechanism, movable: int, D: FloatArray) -> Mechanism:
     """Refuse controlled coordinates that the machine has no way of choosing; D (m, a): freedoms per
     actuated joint.
     """
-    target = coordinates.read(robot.home[None], robot.controlled)
-    _, columns = coordinates.demands(robot.home[None], target, robot.controlled, robot.size)
+    target = read_coordinates(robot.home[None], robot.controlled)
+    _, columns = compare_coordinates(robot.home[None], target, robot.controlled, robot.size)
     s = np.linalg.svd(columns[0][:, list(robot.program.freedoms)] @ D, compute_uv=False)
     if (s > RANK * s.max(initial=1e-300)).sum() < movable:
         raise MechanismError(
             f"{robot.name}: the coordinates {', '.join(robot.controlled)} cannot all be chosen "
             "freely at home; "
             f"name {movable} that the actuators move independently, of "
-            f"{', '.join(coordinates.NAMES)}"
+            f"{', '.join(COORDINATES)}"
         )
     return robot
 
 
-def refuse_uncommandable(robot: Mechanism, state: engine.State) -> None:
+def refuse_uncontrolled(robot: Mechanism, state: engine.State) -> None:
     """Refuse coordinates that do not determine the platform where its limbs let it move, judged at
     a state (1, 1).
     """
     program = robot.program
-    e, q = robot.slots(robot.values[None])[0], states.actuated(program, state)
-    rows = platform_rows(engine.linearise(program, e, q, state, free=True))[0, 0]
+    e, q = robot.slots(robot.values[None])[0], driven_values(program, state)
+    rows = stack_platform_rows(engine.linearize(program, e, q, state, free=True))[0, 0]
     T = state.T[0]
-    _, columns = coordinates.demands(
-        T, coordinates.read(T, robot.controlled), robot.controlled, robot.size
+    _, columns = compare_coordinates(
+        T, read_coordinates(T, robot.controlled), robot.controlled, robot.size
     )
     scale = np.array([1 / robot.size if f < 3 else 1.0 for f in program.freedoms])
     s = np.linalg.svd(
@@ -144,11 +145,11 @@ def refuse_uncommandable(robot: Mechanism, state: engine.State) -> None:
             f"{robot.name}: the coordinates {', '.join(robot.controlled)} cannot all be chosen "
             "freely at home; "
             f"name {len(robot.controlled)} that the actuators move independently, of "
-            f"{', '.join(coordinates.NAMES)}"
+            f"{', '.join(COORDINATES)}"
         )
 
 
-def spinning(program: engine.Program, guess: engine.State) -> dict[int, tuple[int, ...]]:
+def find_idle_joints(program: engine.Program, guess: engine.State) -> dict[int, tuple[int, ...]]:
     """One joint of a limb for each way it can move while tip and platform stand still (the spin of
     an S-P-S leg).
 
@@ -168,8 +169,8 @@ def spinning(program: engine.Program, guess: engine.State) -> dict[int, tuple[in
     )
     # driven joints as shaken too: a slide at zero would take a leg's lower joint for one that only
     # spins it
-    e, q = np.zeros((1, program.n_displacements)), states.actuated(program, shaken)
-    blocks = engine.linearise(program, e, q, shaken)
+    e, q = np.zeros((1, program.n_displacements)), driven_values(program, shaken)
+    blocks = engine.linearize(program, e, q, shaken)
     held = {}
     for group, block, joints in zip(program.groups, blocks.passive, blocks.joints, strict=True):
         for k, limb in enumerate(group.limbs):
@@ -201,4 +202,4 @@ def _motion(freedoms: tuple[int, ...], direction: FloatArray) -> str:
         for i in np.argsort(-np.abs(direction))
         if abs(direction[i]) > 0.3 * np.abs(direction).max()
     ]
-    return " with ".join(WORDS[AXES[freedoms[i]]] for i in order)
+    return " with ".join(MOTIONS[AXES[freedoms[i]]] for i in order)

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 
 from loopcal.engine import Program, State
 from loopcal.errors import MechanismError
-from loopcal.mechanism.assembly import Actuator, Assembly, Shared
-from loopcal.mechanism.limb_maps import LimbMap, limb_maps
+from loopcal.mechanism.assembly import Actuator, Assembly, SharedMap
+from loopcal.mechanism.limb_maps import LimbMap, build_limb_maps
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
@@ -62,7 +62,7 @@ class SlotMap:
     """
 
     matrix: FloatArray
-    shared: tuple[tuple[Shared, tuple[int, ...], tuple[int, ...]], ...]
+    shared: tuple[tuple[SharedMap, tuple[int, ...], tuple[int, ...]], ...]
     nominal: FloatArray
     n_displacements: int
     terms: FloatArray
@@ -171,7 +171,7 @@ class Mechanism:
     @cached_property
     def limb_maps(self) -> tuple[tuple[LimbMap, ...], ...]:
         """What stands in the equations of each limb, group by group."""
-        return limb_maps(self.program, self.slots.matrix, self.slots.touches)
+        return build_limb_maps(self.program, self.slots.matrix, self.slots.touches)
 
     @property
     def nominal(self) -> Mechanism:

@@ -19,11 +19,15 @@ from numpy.typing import ArrayLike
 from loopcal import engine, geometry
 from loopcal.engine import State
 from loopcal.errors import DataError, MechanismError
-from loopcal.mechanism import states
-from loopcal.mechanism.batch_kinematics import inverse_trials, orientation_at, readings_at
-from loopcal.mechanism.kinematics import Solution, solution_of
+from loopcal.mechanism.batch_kinematics import (
+    compute_closure_sign,
+    compute_readings,
+    inverse_trials,
+)
+from loopcal.mechanism.kinematics import Solution, make_solution
 from loopcal.mechanism.model import Mechanism, Status
-from loopcal.mechanism.transmission import joint_values
+from loopcal.mechanism.states import driven_values, join_states, select_poses
+from loopcal.mechanism.transmission import joints_from_readings
 from loopcal.typing import FloatArray, IntArray
 
 BATCH = 2048
@@ -53,7 +57,7 @@ class Modes:
     solution: Solution
     hits: IntArray
     starts: int
-    quiet: int
+    starts_since_new: int
 
     def __len__(self) -> int:
         return len(self.hits)
@@ -61,11 +65,15 @@ class Modes:
     def __str__(self) -> str:
         found = f"{len(self)} modes found" if len(self) != 1 else "1 mode found"
         rarest = f"; the rarest was reached {self.hits.min()} times" if len(self) else ""
-        return f"{found} from {self.starts} random starts, the last {self.quiet} without a new one{rarest}"
+        return f"{found} from {self.starts} random starts, the last {self.starts_since_new} without a new one{rarest}"
 
 
-def assembly_modes(
-    robot: Mechanism, q: ArrayLike, quiet: int = 4 * BATCH, most: int = 200_000, seed: int = 0
+def find_assembly_modes(
+    robot: Mechanism,
+    q: ArrayLike,
+    patience: int = 4 * BATCH,
+    max_starts: int = 200_000,
+    seed: int = 0,
 ) -> Modes:
     """All poses of the platform that readings q (a,) allow [m or rad].
 
@@ -88,7 +96,7 @@ def assembly_modes(
     DataError
         q has another number of readings than the robot has actuators.
     MechanismError
-        `most` starts were not enough for a quiet end.
+        `max_starts` starts were not enough for a quiet end.
     """
     readings = np.asarray(q, dtype=float).reshape(-1)
     if len(readings) != len(robot.actuators):
@@ -98,11 +106,11 @@ def assembly_modes(
         )
     values = robot.values[None]
     e, tau = robot.slots(values)
-    driven = joint_values(readings[None, None], tau, robot.slots.frequency)
+    driven = joints_from_readings(readings[None, None], tau, robot.slots.frequency)
 
     def solved(start: State) -> State:
         state = engine.solve(robot.program, e, driven, start)
-        return replace(state, orientation=orientation_at(robot, values, state))
+        return replace(state, closure_sign=compute_closure_sign(robot, values, state))
 
     def key(state: State) -> FloatArray:
         return np.concatenate(
@@ -110,7 +118,9 @@ def assembly_modes(
         )
 
     def far(state: State) -> FloatArray:
-        distance = geometry.difference(state.T[0], np.broadcast_to(robot.home, state.T[0].shape))
+        distance = geometry.pose_difference(
+            state.T[0], np.broadcast_to(robot.home, state.T[0].shape)
+        )
         return distance * np.repeat([robot.size, 1.0], 3)
 
     return _search(
@@ -119,14 +129,18 @@ def assembly_modes(
         key,
         far,
         lambda state: np.tile(readings, (state.T.shape[1], 1)),
-        quiet,
-        most,
+        patience,
+        max_starts,
         seed,
     )
 
 
-def working_modes(
-    robot: Mechanism, target: ArrayLike, quiet: int = 4 * BATCH, most: int = 200_000, seed: int = 0
+def find_working_modes(
+    robot: Mechanism,
+    target: ArrayLike,
+    patience: int = 4 * BATCH,
+    max_starts: int = 200_000,
+    seed: int = 0,
 ) -> Modes:
     """All readings that lead to controlled coordinates (c,) [m, rad], whatever strokes and limits
     say.
@@ -154,13 +168,15 @@ def working_modes(
         return _unwound(robot, inverse_trials(robot, values, target, replace(start, T=T)))
 
     turning = [a.dimension.value == "angle" for a in robot.actuators]
-    home = readings_at(robot, values, robot.home_state)[0]
+    home = compute_readings(robot, values, robot.home_state)[0]
 
     def far(state: State) -> FloatArray:
-        return (readings_at(robot, values, state)[0] - home) * np.where(turning, robot.size, 1.0)
+        return (compute_readings(robot, values, state)[0] - home) * np.where(
+            turning, robot.size, 1.0
+        )
 
     def key(state: State) -> FloatArray:
-        q = readings_at(robot, values, state)[0]
+        q = compute_readings(robot, values, state)[0]
         turns = np.concatenate([np.cos(q[:, turning]), np.sin(q[:, turning])], axis=1)
         pose = np.concatenate(
             [state.T[0, :, :3, 3] / robot.size, state.T[0, :, :3, :3].reshape(-1, 9)], axis=1
@@ -172,9 +188,9 @@ def working_modes(
         solved,
         key,
         far,
-        lambda state: readings_at(robot, values, state)[0],
-        quiet,
-        most,
+        lambda state: compute_readings(robot, values, state)[0],
+        patience,
+        max_starts,
         seed,
     )
 
@@ -190,8 +206,8 @@ def _unwound(robot: Mechanism, state: State) -> State:
         ]
     )
     _, tau = robot.slots(robot.values[None])
-    centre = joint_values(middle[None, None], tau, robot.slots.frequency)[0, 0]
-    turns = np.round((states.actuated(robot.program, state) - centre) / (2 * np.pi))
+    centre = joints_from_readings(middle[None, None], tau, robot.slots.frequency)[0, 0]
+    turns = np.round((driven_values(robot.program, state) - centre) / (2 * np.pi))
     for group in robot.program.groups:  # a slide or a screw is elsewhere after a turn
         for j, columns in enumerate(group.actuator):
             if columns[0] >= 0 and (group.joints[j : j + 1] != "R" or group.pitch[:, j].any()):
@@ -212,29 +228,29 @@ def _search(
     key: Callable[[State], FloatArray],
     far: Callable[[State], FloatArray],
     readings: Callable[[State], FloatArray],
-    quiet: int,
-    most: int,
+    patience: int,
+    max_starts: int,
     seed: int,
 ) -> Modes:
-    """Solve batches of random starts until `quiet` of them have found nothing new."""
+    """Solve batches of random starts until `patience` of them have found nothing new."""
     rng, tried, last = np.random.default_rng(seed), 0, 0
-    found, hits = states.take(robot.home_state, np.arange(0)), np.zeros(0, np.int64)
-    while tried - last < quiet:
-        if tried >= most:
+    found, hits = select_poses(robot.home_state, np.arange(0)), np.zeros(0, np.int64)
+    while tried - last < patience:
+        if tried >= max_starts:
             raise MechanismError(
                 f"{robot.name}: {len(hits)} modes after {tried} random starts, and new ones keep "
                 "coming; allow more starts, "
                 "or the readings leave the platform free to move"
             )
         new = solved(_starts(robot, rng, BATCH))
-        new = states.take(new, new.status[0] == Status.CONVERGED)
+        new = select_poses(new, new.status[0] == Status.CONVERGED)
         before = len(hits)
         found, hits = _merged(found, hits, new, key)
         tried += BATCH
         last = tried if len(hits) > before else last
     order = np.argsort(np.linalg.norm(far(found), axis=1))
-    found = states.take(found, order)
-    return Modes(solution_of(robot, found, readings(found)), hits[order], tried, tried - last)
+    found = select_poses(found, order)
+    return Modes(make_solution(robot, found, readings(found)), hits[order], tried, tried - last)
 
 
 def _merged(
@@ -255,7 +271,7 @@ def _merged(
         alone = alone[~same]
     if not first:
         return found, hits
-    return states.joined(found, states.take(new, np.array(first))), np.concatenate(
+    return join_states(found, select_poses(new, np.array(first))), np.concatenate(
         [hits, np.array(counts, np.int64)]
     )
 
@@ -284,7 +300,7 @@ def _starts(robot: Mechanism, rng: np.random.Generator, n: int) -> State:
     for group, home in zip(robot.program.groups, robot.home_state.joints, strict=True):
         values = np.array(np.broadcast_to(home, (1, n, *home.shape[2:])))
         for j, letter in enumerate(group.joints):
-            if letter == "R" and not group.held[j]:
+            if letter == "R" and not group.locked[j]:
                 values[..., j] = rng.uniform(-np.pi, np.pi, values.shape[:-1])
             elif letter == "P":
                 values[..., j] += size * rng.normal(size=values.shape[:-1])
@@ -292,5 +308,10 @@ def _starts(robot: Mechanism, rng: np.random.Generator, n: int) -> State:
     zero = np.zeros((1, n))
     none = zero.astype(np.int8)
     return State(
-        geometry.pose(R, position)[None], tuple(joints), none, zero, zero.astype(np.int64), none
+        geometry.make_pose(R, position)[None],
+        tuple(joints),
+        none,
+        zero,
+        zero.astype(np.int64),
+        none,
     )

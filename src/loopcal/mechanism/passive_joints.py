@@ -14,7 +14,12 @@ import numpy as np
 
 from loopcal.engine import State
 from loopcal.mechanism.model import Mechanism, Status
-from loopcal.mechanism.sensitivity import Linearised, row_blocks, some, some_rows
+from loopcal.mechanism.sensitivity import (
+    LinearizedLimbs,
+    select_block,
+    select_state_block,
+    split_rows,
+)
 from loopcal.typing import FloatArray
 
 
@@ -34,7 +39,7 @@ class PassiveSensitivity:
     readings: FloatArray
 
 
-def passive_sensitivity(
+def differentiate_passive_joints(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> PassiveSensitivity:
     """Derivative of every passive joint in every parameter and reading.
@@ -58,8 +63,13 @@ def passive_sensitivity(
     t, n = state.T.shape[:2]
     parameters = np.zeros((t, n, len(passive), len(robot.parameters)))
     readings = np.zeros((t, n, len(passive), len(robot.actuators)))
-    for rows in row_blocks(t, n):
-        work = Linearised(robot, some(values, rows[:1]), some(q, rows), some_rows(state, rows))
+    for rows in split_rows(t, n):
+        work = LinearizedLimbs(
+            robot,
+            select_block(values, rows[:1]),
+            select_block(q, rows),
+            select_state_block(state, rows),
+        )
         by_parameter, by_reading = work.platform()
         found = work.limbs(work.blocks.passive)
         for group, block, joints in zip(
@@ -72,17 +82,19 @@ def passive_sensitivity(
                 moved, driven = np.matmul(A, by_parameter), np.matmul(A, by_reading)
                 moved[..., columns] += of_parameters
                 driven[..., drives] += of_drives
-                both = back_substituted(block.U[:, :, k], np.concatenate([moved, driven], axis=-1))
+                both = solve_passive_motion(
+                    block.U[:, :, k], np.concatenate([moved, driven], axis=-1)
+                )
                 at = [place[limb, j] for j in joints]
                 parameters[rows][:, :, at], readings[rows][:, :, at] = np.split(
                     both, [moved.shape[-1]], axis=-1
                 )
     lost = (state.status != Status.CONVERGED) & (state.status != Status.OTHER_MODE)
     parameters[lost], readings[lost] = np.nan, np.nan
-    return PassiveSensitivity(passive_names(robot), parameters, readings)
+    return PassiveSensitivity(name_passive_joints(robot), parameters, readings)
 
 
-def passive_names(robot: Mechanism) -> tuple[str, ...]:
+def name_passive_joints(robot: Mechanism) -> tuple[str, ...]:
     """Names `limb.joint` of all passive joints, limb by limb."""
     return tuple(
         f"{limb.name}.{joint.name}"
@@ -92,7 +104,7 @@ def passive_names(robot: Mechanism) -> tuple[str, ...]:
     )
 
 
-def back_substituted(U: FloatArray, right: FloatArray) -> FloatArray:
+def solve_passive_motion(U: FloatArray, right: FloatArray) -> FloatArray:
     """-U^-1 right for upper triangular U (t, n, u, u) and right (t, n, u, c); a zero pivot gives
     infinities or NaN.
     """

@@ -17,16 +17,21 @@ import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.engine import State
-from loopcal.mechanism import states
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.passive_joints import back_substituted, passive_names
-from loopcal.mechanism.sensitivity import Linearised, row_blocks, some, some_rows
-from loopcal.mechanism.transmission import readings_of
+from loopcal.mechanism.passive_joints import name_passive_joints, solve_passive_motion
+from loopcal.mechanism.sensitivity import (
+    LinearizedLimbs,
+    select_block,
+    select_state_block,
+    split_rows,
+)
+from loopcal.mechanism.states import driven_values
+from loopcal.mechanism.transmission import readings_from_joints
 from loopcal.typing import FloatArray
 
 
 @dataclass(frozen=True)
-class AtPose:
+class PoseDrivenSensitivity:
     """Derivatives by parameters (.., p) with the pose held, and by the platform's freedoms (.., m).
 
     Attributes
@@ -58,26 +63,35 @@ def solve_at_pose(
         whole = np.zeros((len(here), 4, 4))
         whole[:, :3], whole[:, 3, 3] = here, 1.0
         scale = np.array([size] * 3 + [1.0] * 3)
-        gap = geometry.difference(whole, target[rows]) * scale
+        gap = geometry.pose_difference(whole, target[rows]) * scale
         return gap[:, freedoms], np.broadcast_to(
             np.diag(scale)[freedoms], (len(here), len(freedoms), 6)
         )
 
-    guess = states.actuated(robot.program, begin)
+    guess = driven_values(robot.program, begin)
     state = engine.solve(robot.program, e, guess, replace(begin, T=T), task, free=True)
-    return state, readings_of(states.actuated(robot.program, state), tau, robot.slots.frequency)
+    return state, readings_from_joints(
+        driven_values(robot.program, state), tau, robot.slots.frequency
+    )
 
 
-def moves_at_pose(robot: Mechanism, values: FloatArray, q: FloatArray, state: State) -> AtPose:
+def differentiate_at_pose(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+) -> PoseDrivenSensitivity:
     """Linearise the limbs at states (t, n) of redundant actuators, their readings q (t | 1, n, a)
     closing every limb.
     """
     t, n = state.T.shape[:2]
-    names = passive_names(robot)
+    names = name_passive_joints(robot)
     a, p, m = len(robot.actuators), len(robot.parameters), len(robot.freedoms)
     readings, passive = np.zeros((t, n, a, p + m)), np.zeros((t, n, len(names), p + m))
-    for rows in row_blocks(t, n):
-        work = Linearised(robot, some(values, rows[:1]), some(q, rows), some_rows(state, rows))
+    for rows in split_rows(t, n):
+        work = LinearizedLimbs(
+            robot,
+            select_block(values, rows[:1]),
+            select_block(q, rows),
+            select_state_block(state, rows),
+        )
         for A, columns, of_parameters, drives, of_drives in work.limbs(work.blocks.closure):
             both = np.concatenate([np.zeros((*A.shape[:2], p)), A[:, :, 0]], axis=-1)
             both[..., :p][..., columns] += of_parameters[:, :, 0]
@@ -85,13 +99,13 @@ def moves_at_pose(robot: Mechanism, values: FloatArray, q: FloatArray, state: St
                 readings[rows][:, :, drives] = -(both / of_drives[:, :, 0])[:, :, None]
         for places, part in _passive(robot, work, names, readings[rows]):
             passive[rows][:, :, places] = part
-    return AtPose(
+    return PoseDrivenSensitivity(
         names, (readings[..., :p], readings[..., p:]), (passive[..., :p], passive[..., p:])
     )
 
 
 def _passive(
-    robot: Mechanism, work: Linearised, names: tuple[str, ...], readings: FloatArray
+    robot: Mechanism, work: LinearizedLimbs, names: tuple[str, ...], readings: FloatArray
 ) -> Iterator[tuple[list[int], FloatArray]]:
     """Places of each limb's passive joints and how they move, (t, n, j, p + m): U dtheta = -(A y +
     E de + Q dq).
@@ -111,4 +125,4 @@ def _passive(
             places = [
                 names.index(f"{limbs[limb].name}.{limbs[limb].joints[j].name}") for j in joints
             ]
-            yield places, back_substituted(block.U[:, :, k], moved)
+            yield places, solve_passive_motion(block.U[:, :, k], moved)

@@ -12,52 +12,55 @@ import numpy as np
 
 from loopcal import engine, geometry
 from loopcal.engine import State
-from loopcal.mechanism import coordinates
-from loopcal.mechanism.batch_kinematics import inverse_trials, platform_rows
+from loopcal.mechanism.batch_kinematics import inverse_trials, stack_platform_rows
+from loopcal.mechanism.coordinates import compare_coordinates, read_coordinates
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.redundant_actuation import reading_slopes, shared_drives
+from loopcal.mechanism.redundant_actuation import (
+    count_shared_drives,
+    differentiate_through_readings,
+)
 from loopcal.typing import FloatArray
 
 STEPS = 12
 
 
-def nearest_reachable(
+def find_nearest_reachable(
     robot: Mechanism, values: FloatArray, T: FloatArray, start: State | None = None
 ) -> State:
     """States (t, n) whose platform is nearest to T (t | 1, n, 4, 4), actuators free."""
-    target = coordinates.read(T, robot.controlled)
+    target = read_coordinates(T, robot.controlled)
     state = inverse_trials(robot, values, target, start)
     if len(robot.controlled) == 6 or set(robot.controlled) == set(robot.freedoms):
         return state
     for _ in range(STEPS):
-        gap = geometry.difference(state.T, np.broadcast_to(T, state.T.shape))
-        slope = pose_slopes(robot, values, state)
+        gap = geometry.pose_difference(state.T, np.broadcast_to(T, state.T.shape))
+        slope = differentiate_by_coordinates(robot, values, state)
         weight = np.array([robot.size] * 3 + [1.0] * 3)
         step = _least_squares(slope * weight[:, None], -gap * weight)
         step = np.where(np.isfinite(step), step, 0.0)
-        moved = geometry.exp_update(state.T, np.matmul(slope, step[..., None])[..., 0])
-        state = inverse_trials(robot, values, coordinates.read(moved, robot.controlled), state)
+        moved = geometry.apply_twist(state.T, np.matmul(slope, step[..., None])[..., 0])
+        state = inverse_trials(robot, values, read_coordinates(moved, robot.controlled), state)
         if np.abs(step).max(initial=0.0) < 1e-12 * robot.size:
             break
     return state
 
 
-def pose_slopes(robot: Mechanism, values: FloatArray, state: State) -> FloatArray:
+def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: State) -> FloatArray:
     """d twist / d demand (t, n, 6, c) with the actuators free, demands as `coordinates.demands`
     counts them [1/m, 1].
     """
-    if shared_drives(robot.program):
-        return reading_slopes(robot, values, state)
+    if count_shared_drives(robot.program):
+        return differentiate_through_readings(robot, values, state)
     e, _ = robot.slots(values)
     names, freedoms = robot.controlled, list(robot.program.freedoms)
     t, n = state.T.shape[:2]
-    rows = platform_rows(
-        engine.linearise(
+    rows = stack_platform_rows(
+        engine.linearize(
             robot.program, e, np.zeros((1, n, robot.program.n_joints)), state, free=True
         )
     )
     flat = state.T.reshape(-1, 4, 4)
-    _, columns = coordinates.demands(flat, coordinates.read(flat, names), names, robot.size)
+    _, columns = compare_coordinates(flat, read_coordinates(flat, names), names, robot.size)
     columns = columns.reshape(t, n, len(names), 6)[..., freedoms]
     both = np.concatenate([rows, columns], axis=2)
     right = np.zeros((*both.shape[:3], len(names)))

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from loopcal import geometry
-from loopcal.errors import MechanismError, nearest
+from loopcal.errors import MechanismError, suggest_names
 from loopcal.mechanism.assembly import Assembly
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Length, Ratio
@@ -24,7 +24,7 @@ Point = tuple[Length, Length, Length]
 
 
 @dataclass(frozen=True)
-class Pose:
+class PoseRecord:
     """Position and orientation R = Rz(yaw) Ry(pitch) Rx(roll), or tilt-and-torsion phi, theta, psi
     in its place.
     """
@@ -40,7 +40,7 @@ class Pose:
     def matrix(self) -> FloatArray:
         """(4, 4) homogeneous matrix."""
         R = geometry.euler_to_matrix(np.array([self.roll, self.pitch, self.yaw]), "xyz")
-        return geometry.pose(R, np.array([self.x, self.y, self.z]))
+        return geometry.make_pose(R, np.array([self.x, self.y, self.z]))
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Workspace:
 
 
 @dataclass(frozen=True)
-class Robot:
+class RobotRecord:
     """What every robot file may say, whatever its family. A family adds its own fields and
     `expand`.
 
@@ -150,8 +150,8 @@ class Robot:
 
     name: str
     source: str = ""
-    home: Pose = field(default_factory=Pose)
-    tool: Pose = field(default_factory=Pose)
+    home: PoseRecord = field(default_factory=PoseRecord)
+    tool: PoseRecord = field(default_factory=PoseRecord)
     workspace: Workspace = field(default_factory=Workspace)
     fixed: tuple[str, ...] = ()
 
@@ -170,28 +170,28 @@ class Robot:
         """
         expanded = self.expand()
         names = [parameter.name for parameter in expanded.parameters]
-        held = {name for pattern in self.fixed for name in called(pattern, names)}
+        held = {name for pattern in self.fixed for name in match_parameter_names(pattern, names)}
         parameters = tuple(
             replace(p, free=False) if p.name in held else p for p in expanded.parameters
         )
         return replace(expanded, parameters=parameters)
 
 
-def called(pattern: str, names: Sequence[str]) -> list[str]:
+def match_parameter_names(pattern: str, names: Sequence[str]) -> list[str]:
     """The parameters that a name or pattern calls; raises MechanismError where there is none."""
     found = fnmatch.filter(names, pattern)
     if not found:
-        hint = nearest(pattern, names) or f"; its parameters are {', '.join(names)}"
+        hint = suggest_names(pattern, names) or f"; its parameters are {', '.join(names)}"
         raise MechanismError(f"{pattern!r} fixes no parameter of this robot{hint}; correct it")
     return found
 
 
 def translation(point: tuple[float, float, float]) -> FloatArray:
     """(4, 4) pure translation [m]."""
-    return geometry.pose(np.eye(3), np.array(point, dtype=float))
+    return geometry.make_pose(np.eye(3), np.array(point, dtype=float))
 
 
-def per_leg(value: float | tuple[float, ...], count: int, name: str) -> tuple[float, ...]:
+def values_per_leg(value: float | tuple[float, ...], count: int, name: str) -> tuple[float, ...]:
     """One value for all legs, or one each; raises MechanismError for another count."""
     values = (value,) * count if isinstance(value, (int, float)) else tuple(value)
     if len(values) != count:

@@ -16,10 +16,15 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.engine import Program, State
-from loopcal.mechanism import coordinates, states
+from loopcal.mechanism.coordinates import (
+    compare_coordinates,
+    pose_from_coordinates,
+    read_coordinates,
+)
 from loopcal.mechanism.model import Mechanism, Status
-from loopcal.mechanism.sensitivity import sensitivity
-from loopcal.mechanism.transmission import joint_values, readings_of
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.states import driven_values, replace_rows, select_rows
+from loopcal.mechanism.transmission import joints_from_readings, readings_from_joints
 from loopcal.typing import FloatArray
 
 STEPS = 20
@@ -33,7 +38,7 @@ to 1e-13 of it.
 ANGLES = {"rx": "roll", "ry": "pitch", "rz": "yaw"}
 
 
-def shared_drives(program: Program) -> int:
+def count_shared_drives(program: Program) -> int:
     """How many driven joints there are beyond one for each actuator."""
     return (
         sum(int((columns >= 0).sum()) for group in program.groups for columns in group.actuator)
@@ -41,7 +46,7 @@ def shared_drives(program: Program) -> int:
     )
 
 
-def inverse_coupled(
+def inverse_with_shared_drives(
     robot: Mechanism, values: FloatArray, target: FloatArray, begin: State
 ) -> State:
     """States (t, n) at controlled coordinates (t | 1, n, c); rows that are not reached are marked.
@@ -52,16 +57,16 @@ def inverse_coupled(
     trial, pose = (a.ravel() for a in np.indices((t, n)))
     asked = np.broadcast_to(target, (t, n, target.shape[2])).reshape(t * n, -1)
     own = np.broadcast_to(values, (t, values.shape[1]))[trial]
-    state = _as_commanded(robot, own, asked, states.pick(begin, (t, n), trial, pose))
+    state = _as_commanded(robot, own, asked, select_rows(begin, (t, n), trial, pose))
     q = _readings(robot, own, state)
     alive, zero = np.flatnonzero(state.status[:, 0] == Status.CONVERGED), np.zeros(t * n, int)
     for _ in range(STEPS):
         if not len(alive):
             break
         here = _forward(
-            robot, own[alive], q[alive], states.pick(state, (t * n, 1), alive, zero[alive])
+            robot, own[alive], q[alive], select_rows(state, (t * n, 1), alive, zero[alive])
         )
-        state = states.put(state, alive, zero[alive], here)
+        state = replace_rows(state, alive, zero[alive], here)
         gap, step = _newton(robot, own[alive], q[alive], asked[alive], here)
         going = (here.status[:, 0] == Status.CONVERGED) & (
             np.abs(gap).max(axis=1) > CLOSE * robot.size
@@ -79,19 +84,21 @@ def _as_commanded(robot: Mechanism, values: FloatArray, asked: FloatArray, begin
     """
     e, _ = robot.slots(values)
     names = tuple(ANGLES.get(freedom, freedom) for freedom in robot.freedoms)
-    T = coordinates.pose(asked, robot.controlled, robot.home)
-    whole = coordinates.read(T, names)
+    T = pose_from_coordinates(asked, robot.controlled, robot.home)
+    whole = read_coordinates(T, names)
 
     def task(at: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
-        return coordinates.demands(at, whole[rows], names, robot.size)
+        return compare_coordinates(at, whole[rows], names, robot.size)
 
-    guess = states.actuated(robot.program, begin)
+    guess = driven_values(robot.program, begin)
     return engine.solve(robot.program, e, guess, replace(begin, T=T[:, None]), task, free=True)
 
 
 def _forward(robot: Mechanism, values: FloatArray, q: FloatArray, start: State) -> State:
     e, tau = robot.slots(values)
-    return engine.solve(robot.program, e, joint_values(q, tau, robot.slots.frequency), start)
+    return engine.solve(
+        robot.program, e, joints_from_readings(q, tau, robot.slots.frequency), start
+    )
 
 
 def _newton(
@@ -100,33 +107,35 @@ def _newton(
     """How far rows are from what is asked (rows, c) [m], and the step of the readings that would
     undo it (rows, a).
     """
-    gap, columns = coordinates.demands(state.T[:, 0], asked, robot.controlled, robot.size)
-    D = sensitivity(robot, values, q, state).readings[:, 0]
+    gap, columns = compare_coordinates(state.T[:, 0], asked, robot.controlled, robot.size)
+    D = differentiate_pose(robot, values, q, state).readings[:, 0]
     slope = np.nan_to_num(np.matmul(columns, D))
     return gap, np.matmul(np.linalg.pinv(slope), gap[..., None])[..., 0]
 
 
-def reading_slopes(robot: Mechanism, values: FloatArray, state: State) -> FloatArray:
+def differentiate_through_readings(
+    robot: Mechanism, values: FloatArray, state: State
+) -> FloatArray:
     """d twist / d demand (t, n, 6, c) through the readings, demands as `coordinates.demands` counts
     them [1/m, 1].
     """
     t, n = state.T.shape[:2]
     flat, names = state.T.reshape(-1, 4, 4), robot.controlled
-    _, columns = coordinates.demands(flat, coordinates.read(flat, names), names, robot.size)
-    D = sensitivity(robot, values, _readings(robot, values, state), state).readings
+    _, columns = compare_coordinates(flat, read_coordinates(flat, names), names, robot.size)
+    D = differentiate_pose(robot, values, _readings(robot, values, state), state).readings
     slope = np.matmul(columns.reshape(t, n, len(names), 6), D)
     return np.matmul(D, np.linalg.pinv(np.nan_to_num(slope)))
 
 
 def _readings(robot: Mechanism, values: FloatArray, state: State) -> FloatArray:
     _, tau = robot.slots(values)
-    return readings_of(states.actuated(robot.program, state), tau, robot.slots.frequency)
+    return readings_from_joints(driven_values(robot.program, state), tau, robot.slots.frequency)
 
 
 def _reshaped(state: State, t: int, n: int) -> State:
     """Rows (t n, 1) as (t, n)."""
     arrays = {
         name: getattr(state, name).reshape(t, n, *getattr(state, name).shape[2:])
-        for name in ("T", "status", "residual", "iterations", "orientation")
+        for name in ("T", "status", "residual", "iterations", "closure_sign")
     }
     return State(**arrays, joints=tuple(j.reshape(t, n, *j.shape[2:]) for j in state.joints))

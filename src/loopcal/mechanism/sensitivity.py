@@ -19,7 +19,7 @@ from loopcal import engine
 from loopcal.engine import Block, State
 from loopcal.mechanism.limb_maps import Columns, LimbMap
 from loopcal.mechanism.model import Mechanism, Status
-from loopcal.mechanism.transmission import joint_values, slope, term_columns
+from loopcal.mechanism.transmission import joint_slopes, joints_from_readings, term_derivatives
 from loopcal.typing import FloatArray
 
 ROWS = 512
@@ -27,7 +27,7 @@ ROWS = 512
 
 
 @dataclass(frozen=True)
-class Sensitivity:
+class PoseSensitivity:
     """How the platform moves with parameters and readings.
 
     Attributes
@@ -41,7 +41,9 @@ class Sensitivity:
     readings: FloatArray
 
 
-def sensitivity(robot: Mechanism, values: FloatArray, q: FloatArray, state: State) -> Sensitivity:
+def differentiate_pose(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+) -> PoseSensitivity:
     """Derivative of the platform's pose by the implicit function theorem, D = -A^-1 [E de/dp + Q
     dq/dp].
 
@@ -55,11 +57,16 @@ def sensitivity(robot: Mechanism, values: FloatArray, q: FloatArray, state: Stat
     """
     t, n = state.T.shape[:2]
     freedoms = list(robot.program.freedoms)
-    out = Sensitivity(
+    out = PoseSensitivity(
         np.zeros((t, n, 6, len(robot.parameters))), np.zeros((t, n, 6, len(robot.actuators)))
     )
-    for rows in row_blocks(t, n):
-        work = Linearised(robot, some(values, rows[:1]), some(q, rows), some_rows(state, rows))
+    for rows in split_rows(t, n):
+        work = LinearizedLimbs(
+            robot,
+            select_block(values, rows[:1]),
+            select_block(q, rows),
+            select_state_block(state, rows),
+        )
         by_parameter, by_reading = work.platform()
         if len(freedoms) == 6:
             out.parameters[rows], out.readings[rows] = by_parameter, by_reading
@@ -73,7 +80,7 @@ def sensitivity(robot: Mechanism, values: FloatArray, q: FloatArray, state: Stat
     return out
 
 
-def row_blocks(t: int, n: int) -> Iterator[tuple[slice, slice]]:
+def split_rows(t: int, n: int) -> Iterator[tuple[slice, slice]]:
     """Slices of trials and poses that cover (t, n) by at most ROWS rows each."""
     poses = min(n, ROWS)
     trials = max(1, ROWS // max(poses, 1))
@@ -82,7 +89,7 @@ def row_blocks(t: int, n: int) -> Iterator[tuple[slice, slice]]:
             yield slice(i, min(i + trials, t)), slice(j, min(j + poses, n))
 
 
-def some(array: FloatArray, rows: tuple[slice, ...]) -> FloatArray:
+def select_block(array: FloatArray, rows: tuple[slice, ...]) -> FloatArray:
     """A block of rows of an array whose leading axes may be 1 and then broadcast."""
     return array[
         tuple(
@@ -91,26 +98,26 @@ def some(array: FloatArray, rows: tuple[slice, ...]) -> FloatArray:
     ]
 
 
-def some_rows(state: State, rows: tuple[slice, slice]) -> State:
+def select_state_block(state: State, rows: tuple[slice, slice]) -> State:
     """A block of rows of a state (t, n)."""
     cut = {f.name: getattr(state, f.name)[rows] for f in fields(State) if f.name != "joints"}
     return replace(state, **cut, joints=tuple(j[rows] for j in state.joints))
 
 
-class Linearised:
+class LinearizedLimbs:
     """Closure of some rows, with the parameters and readings that each limb's equations hold."""
 
     def __init__(self, robot: Mechanism, values: FloatArray, q: FloatArray, state: State) -> None:
         slots, self.robot, self.shape = robot.slots, robot, state.T.shape[:2]
         e, tau = slots(values)
-        self.blocks = engine.linearise(
-            robot.program, e, joint_values(q, tau, slots.frequency), state
+        self.blocks = engine.linearize(
+            robot.program, e, joints_from_readings(q, tau, slots.frequency), state
         )
         J = slots.jacobian(values)
         self.of_slots = J[:, : slots.n_displacements]
         self.of_terms = J[:, slots.n_displacements :].reshape(len(J), *slots.terms.shape, -1)
-        self.terms = term_columns(q, slots.frequency)
-        self.slope = slope(q, tau, slots.frequency)
+        self.terms = term_derivatives(q, slots.frequency)
+        self.slope = joint_slopes(q, tau, slots.frequency)
 
     def limbs(
         self, parts: tuple[Block, ...]
@@ -132,7 +139,9 @@ class Linearised:
     def platform(self) -> tuple[FloatArray, FloatArray]:
         """d platform freedoms / d parameters (t, n, m, p), and / d readings (t, n, m, a)."""
         program = self.robot.program
-        inverse = _pseudo_inverse(platform_rows(self.blocks), _row_weights(program, self.blocks))
+        inverse = _pseudo_inverse(
+            stack_platform_rows(self.blocks), _row_weights(program, self.blocks)
+        )
         m = len(program.freedoms)
         by_parameter = np.zeros((*self.shape, m, len(self.robot.parameters)))
         by_reading = np.zeros((*self.shape, m, program.n_joints))
@@ -171,14 +180,14 @@ class Linearised:
         )
 
 
-def platform_rows(blocks: engine.Blocks) -> FloatArray:
+def stack_platform_rows(blocks: engine.ClosureBlocks) -> FloatArray:
     """All closure rows against the platform's freedoms, (t, n, c, m)."""
     return np.concatenate(
         [b.A.reshape(*b.A.shape[:2], -1, b.A.shape[-1]) for b in blocks.closure], axis=2
     )
 
 
-def _row_weights(program: engine.Program, blocks: engine.Blocks) -> FloatArray | None:
+def _row_weights(program: engine.Program, blocks: engine.ClosureBlocks) -> FloatArray | None:
     """One over the standard deviation that a redundant actuator gives each row, (t, n, c); None
     without redundancy.
     """

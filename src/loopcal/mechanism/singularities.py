@@ -20,20 +20,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loopcal import engine
-from loopcal.engine import Blocks, Program, State
+from loopcal.engine import ClosureBlocks, Program, State
 from loopcal.errors import DataError
-from loopcal.mechanism import states
 from loopcal.mechanism.assembly import AXES
-from loopcal.mechanism.batch_kinematics import orientation_at
-from loopcal.mechanism.kinematics import Solution, forward, inverse, solution_of
-from loopcal.mechanism.mobility import WORDS
+from loopcal.mechanism.batch_kinematics import compute_closure_sign
+from loopcal.mechanism.kinematics import Solution, forward, inverse, make_solution
+from loopcal.mechanism.mobility import MOTIONS
 from loopcal.mechanism.model import Mechanism, Status
-from loopcal.mechanism.sensitivity import platform_rows
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism.sensitivity import stack_platform_rows
+from loopcal.mechanism.states import driven_values, join_states
+from loopcal.mechanism.workspace import sample_workspace
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
-NEAR = 0.1
+NEAR_SHARE = 0.1
 """Share of the workspace's median margin below which a pose counts as near a singularity: a rule of
 thumb.
 """
@@ -47,7 +47,7 @@ class Singularity:
 
     Attributes
     ----------
-    orientation : (n,) sign of the determinant of A; it changes only through a singularity. 0 where
+    closure_sign : (n,) sign of the determinant of A; it changes only through a singularity. 0 where
         A is not square.
     margin : (n,) smallest singular value of A [m/m]; NaN where the pose was not reached.
     direction : (n, m) how the platform moves most freely: unit vector over its freedoms, turns
@@ -60,7 +60,7 @@ class Singularity:
     warnings : along a path, (step, sentence) in its order.
     """
 
-    orientation: NDArray[np.int8]
+    closure_sign: NDArray[np.int8]
     margin: FloatArray
     direction: FloatArray
     drive_margin: FloatArray
@@ -83,9 +83,9 @@ class Singularity:
         return self.drive_margin / self.drive_median
 
     @property
-    def near(self) -> BoolArray:
-        """(n,) True where a margin is below NEAR of its median, or the pose was not reached."""
-        return ~((self.ratio >= NEAR) & (self.drive_ratio >= NEAR))
+    def is_near(self) -> BoolArray:
+        """(n,) True where a margin is below NEAR_SHARE of its median, or the pose was not reached."""
+        return ~((self.ratio >= NEAR_SHARE) & (self.drive_ratio >= NEAR_SHARE))
 
     def motion(self, row: int) -> str:
         """How the platform moves most freely at a row, largest component first."""
@@ -95,7 +95,7 @@ class Singularity:
             for i in np.argsort(-np.abs(direction))
             if abs(direction[i]) > 0.3 * np.abs(direction).max()
         ]
-        return " with ".join(WORDS[self.freedoms[i]] for i in order)
+        return " with ".join(MOTIONS[self.freedoms[i]] for i in order)
 
     def explain(self, row: int) -> str:
         """A row in a sentence."""
@@ -106,7 +106,7 @@ class Singularity:
             f"{self.ratio[row]:.2g} of the median; "
             f"the platform moves most freely as a {self.motion(row)}"
         )
-        if self.drive_ratio[row] >= NEAR:
+        if self.drive_ratio[row] >= NEAR_SHARE:
             return loose
         return (
             f"{loose}; {self.actuators[self.drive[row]]} hardly moves it "
@@ -114,7 +114,7 @@ class Singularity:
         )
 
 
-def singularity(
+def analyze_singularity(
     robot: Mechanism, poses: ArrayLike | Solution, medians: tuple[float, float] | None = None
 ) -> Singularity:
     """How far poses are from a singularity.
@@ -127,21 +127,21 @@ def singularity(
     solution = poses if isinstance(poses, Solution) else inverse(robot, poses)
     margin, direction, drive_margin, drive = _margins(robot, solution.state)
     closed = (solution.status == Status.CONVERGED) | (solution.status == Status.OTHER_MODE)
-    sign = orientation_at(robot, robot.values[None], solution.state)[0]
+    sign = compute_closure_sign(robot, robot.values[None], solution.state)[0]
     return Singularity(
         np.where(closed, sign, 0).astype(np.int8),
         np.where(closed, margin, np.nan),
         direction,
         np.where(closed, drive_margin, np.nan),
         drive,
-        *(typical(robot) if medians is None else medians),
+        *(compute_median_margins(robot) if medians is None else medians),
         tuple(AXES[f] for f in robot.program.freedoms),
         tuple(a.name for a in robot.actuators),
         solution,
     )
 
 
-def along_path(
+def trace_singularity(
     robot: Mechanism,
     *,
     readings: ArrayLike | None = None,
@@ -174,14 +174,14 @@ def along_path(
         found = step(robot, point[None], start=last)
         parts.append(found)
         last = found if found.status[0] in (Status.CONVERGED, Status.OTHER_MODE) else last
-    whole = solution_of(
-        robot, states.joined(*(p.state for p in parts)), np.concatenate([p.q for p in parts])
+    whole = make_solution(
+        robot, join_states(*(p.state for p in parts)), np.concatenate([p.q for p in parts])
     )
-    result = singularity(robot, whole, medians)
+    result = analyze_singularity(robot, whole, medians)
     return replace(result, warnings=tuple(_path_warnings(result)))
 
 
-def typical(robot: Mechanism) -> tuple[float, float]:
+def compute_median_margins(robot: Mechanism) -> tuple[float, float]:
     """Median margin and drive margin over the workspace; those of home where no workspace is
     stated.
     """
@@ -190,7 +190,7 @@ def typical(robot: Mechanism) -> tuple[float, float]:
         *robot.assembly.workspace,
         *(["phi"] if "theta" in robot.assembly.workspace else []),
     }:
-        state = sample(robot, POSES).solution.state
+        state = sample_workspace(robot, POSES).solution.state
     margin, _, drive_margin, _ = _margins(robot, state)
     return float(np.median(margin)), float(np.median(drive_margin))
 
@@ -201,8 +201,10 @@ def _margins(robot: Mechanism, state: State) -> tuple[FloatArray, FloatArray, Fl
     """
     program, size = robot.program, robot.size
     e, _ = robot.slots(robot.values[None])
-    blocks = engine.linearise(program, e, states.actuated(program, state), state)
-    A = platform_rows(blocks)[0] * np.array([1 / size if f < 3 else 1.0 for f in program.freedoms])
+    blocks = engine.linearize(program, e, driven_values(program, state), state)
+    A = stack_platform_rows(blocks)[0] * np.array(
+        [1 / size if f < 3 else 1.0 for f in program.freedoms]
+    )
     Q = _drives(program, blocks) * np.array(
         [1 / size if a.dimension is Dimension.ANGLE else 1.0 for a in robot.actuators]
     )
@@ -214,7 +216,7 @@ def _margins(robot: Mechanism, state: State) -> tuple[FloatArray, FloatArray, Fl
     return margin, V[:, -1], drive_margin, np.abs(W[:, -1]).argmax(axis=1)
 
 
-def _drives(program: Program, blocks: Blocks) -> FloatArray:
+def _drives(program: Program, blocks: ClosureBlocks) -> FloatArray:
     """Closure rows against the actuated joints (n, c, a) [m/m or m/rad]."""
     parts = []
     for group, block in zip(program.groups, blocks.closure, strict=True):
@@ -232,7 +234,7 @@ def _path_warnings(path: Singularity) -> Iterator[tuple[int, str]]:
     of the path.
     """
     closed = np.isfinite(path.margin)
-    sign = path.orientation.astype(int)
+    sign = path.closure_sign.astype(int)
     for i in range(len(sign)):
         before = sign[:i][closed[:i]][-1:]
         if closed[i] and before.size and sign[i] * before[0] < 0:
@@ -246,7 +248,7 @@ def _path_warnings(path: Singularity) -> Iterator[tuple[int, str]]:
             )
         if not closed[i] and (i == 0 or closed[i - 1]):
             yield i, f"not reached from here: {path.solution.explain(i)}"
-        near = path.near & closed
+        near = path.is_near & closed
         if near[i] and not (i and near[i - 1]):
             beyond = np.flatnonzero(~near[i:])
             stretch = np.arange(i, i + int(beyond[0]) if beyond.size else len(sign))

@@ -25,22 +25,22 @@ def _each(make: Callable[..., np.ndarray], *states: State) -> State:
     return State(**found)
 
 
-def pick(state: State, shape: tuple[int, int], trial: np.ndarray, pose: np.ndarray) -> State:
+def select_rows(state: State, shape: tuple[int, int], trial: np.ndarray, pose: np.ndarray) -> State:
     """Rows (trial, pose) of a state that broadcasts to `shape` = (t, n), as (rows, 1)."""
     return _each(lambda a: np.broadcast_to(a, (*shape, *a.shape[2:]))[trial, pose][:, None], state)
 
 
-def take(state: State, rows: np.ndarray) -> State:
+def select_poses(state: State, rows: np.ndarray) -> State:
     """Poses `rows` (positions or a mask) of a state (t, n), every trial."""
     return _each(lambda a: a[:, rows], state)
 
 
-def joined(*parts: State) -> State:
+def join_states(*parts: State) -> State:
     """States (t, n_i) one after the other, (t, sum n_i)."""
     return _each(lambda *arrays: np.concatenate(arrays, axis=1), *parts)
 
 
-def put(state: State, trial: np.ndarray, pose: np.ndarray, new: State) -> State:
+def replace_rows(state: State, trial: np.ndarray, pose: np.ndarray, new: State) -> State:
     """A copy of a state (t, n) whose rows (trial, pose) are those of `new` (rows, 1)."""
 
     def replaced(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -51,7 +51,7 @@ def put(state: State, trial: np.ndarray, pose: np.ndarray, new: State) -> State:
     return _each(replaced, state, new)
 
 
-def actuated(program: Program, state: State) -> FloatArray:
+def driven_values(program: Program, state: State) -> FloatArray:
     """Values of the actuated joints (t, n, a) [m or rad]."""
     out = np.zeros((*state.T.shape[:2], program.n_joints))
     for group, joints in zip(program.groups, state.joints, strict=True):

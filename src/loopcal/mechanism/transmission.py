@@ -50,14 +50,14 @@ def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
     return np.array(rows, dtype=float).reshape(-1, len(TERMS))
 
 
-def frequency(actuators: Sequence[Actuator]) -> FloatArray:
+def harmonic_frequencies(actuators: Sequence[Actuator]) -> FloatArray:
     """Angular frequency of the harmonics (a,) [rad per unit of reading], 0 where there are none."""
     return np.array([2 * np.pi / a.period if a.period else 0.0 for a in actuators])
 
 
-def term_columns(q: FloatArray, w: FloatArray) -> list[FloatArray]:
+def term_derivatives(q: FloatArray, w: FloatArray) -> list[FloatArray]:
     """Derivative of the joint values in each term, eight arrays (t | 1, n, a)."""
-    r, approach = split(q, len(w))
+    r, approach = split_readings(q, len(w))
     # with w = 0 the cosines would repeat the offset
     on = (w != 0).astype(float)
     turn = w * r
@@ -65,18 +65,18 @@ def term_columns(q: FloatArray, w: FloatArray) -> list[FloatArray]:
     return [np.ones_like(r), r, r * r, *waves, 0.5 * approach]
 
 
-def joint_values(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+def joints_from_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
     """Joint values (t, n, a) of readings q under terms tau (t | 1, a, 8)."""
-    columns = term_columns(q, w)
+    columns = term_derivatives(q, w)
     return sum(
         (columns[i] * tau[:, None, :, i] for i in range(1, len(TERMS))),
         start=columns[0] * tau[:, None, :, 0],
     )
 
 
-def slope(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+def joint_slopes(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
     """d joint / d reading (t, n, a)."""
-    r, _ = split(q, len(w))
+    r, _ = split_readings(q, len(w))
     turn = w * r
     _, gain, curve, sin1, cos1, sin2, cos2, _ = np.moveaxis(tau[:, None], -1, 0)
     first = w * (sin1 * np.cos(turn) - cos1 * np.sin(turn))
@@ -84,7 +84,7 @@ def slope(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
     return gain + 2 * curve * r + first + second
 
 
-def readings_of(joints: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
+def readings_from_joints(joints: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
     """Readings (t, n, a) that give these joint values, approach not counted: the linear part, then
     Newton on the rest.
     """
@@ -92,13 +92,13 @@ def readings_of(joints: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArra
     if not tau[..., 2:7].any():
         return readings
     for _ in range(20):
-        step = (joint_values(readings, tau, w) - joints) / slope(readings, tau, w)
+        step = (joints_from_readings(readings, tau, w) - joints) / joint_slopes(readings, tau, w)
         readings = readings - step
         if np.abs(step).max(initial=0.0) <= 1e-15 * np.abs(readings).max(initial=1.0):
             break
     return readings
 
 
-def split(q: FloatArray, a: int) -> tuple[FloatArray, FloatArray]:
+def split_readings(q: FloatArray, a: int) -> tuple[FloatArray, FloatArray]:
     """Readings and directions of approach (zero where none were given)."""
     return q[..., :a], q[..., a:] if q.shape[-1] == 2 * a else np.zeros_like(q[..., :a])

@@ -12,36 +12,38 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.errors import MechanismError
-from loopcal.mechanism.batch_kinematics import orientation_at
+from loopcal.mechanism.batch_kinematics import compute_closure_sign
 from loopcal.mechanism.kinematics import Solution, inverse
-from loopcal.mechanism.limits import limits
+from loopcal.mechanism.limits import evaluate_limits
 from loopcal.mechanism.model import Mechanism
 from loopcal.typing import BoolArray, FloatArray
 
-DRAWS, FEWEST = 2000, 1e-3
+MIN_DRAWS, MIN_REACHABLE_SHARE = 2000, 1e-3
 """Positions drawn before a workspace is called empty, and the share of them that must be reachable.
 """
 
 
 @dataclass(frozen=True)
-class Sample:
+class WorkspaceSample:
     """Positions drawn at random from a workspace.
 
     Attributes
     ----------
     coordinates : (n, c) controlled coordinates [m, rad]. solution : their readings and poses, n
         rows.
-    share : share of the stated ranges that the machine reaches. lost : what stops it elsewhere, in
+    reachable_share : share of the stated ranges that the machine reaches. rejected : what stops it elsewhere, in
         words, with the count.
     """
 
     coordinates: FloatArray
     solution: Solution
-    share: float
-    lost: Mapping[str, int]
+    reachable_share: float
+    rejected: Mapping[str, int]
 
 
-def sample(robot: Mechanism, n: int, seed: int | np.random.Generator = 0) -> Sample:
+def sample_workspace(
+    robot: Mechanism, n: int, seed: int | np.random.Generator = 0
+) -> WorkspaceSample:
     """Draw n positions evenly from the ranges of `workspace`, those out of reach drawn anew.
 
     Coordinates are uniform in their ranges; phi and theta are uniform over the area of the sphere
@@ -63,24 +65,24 @@ def sample(robot: Mechanism, n: int, seed: int | np.random.Generator = 0) -> Sam
         can be reached.
     """
     rng = np.random.default_rng(seed)
-    wanted = ranges(robot)
+    wanted = workspace_ranges(robot)
     lost: Counter[str] = Counter()
     parts: list[FloatArray] = []
     kept = tried = 0
     while kept < n or not tried:
-        coordinates = drawn(rng, robot.controlled, wanted, max(n, DRAWS // 8))
+        coordinates = draw_coordinates(rng, robot.controlled, wanted, max(n, MIN_DRAWS // 8))
         good = _reached(robot, coordinates, lost)
         parts.append(coordinates[good])
         kept, tried = kept + int(good.sum()), tried + len(coordinates)
-        if tried >= DRAWS and kept < FEWEST * tried:
+        if tried >= MIN_DRAWS and kept < MIN_REACHABLE_SHARE * tried:
             raise MechanismError(_empty(robot, kept, tried, lost))
     coordinates = np.concatenate(parts)[:n]
-    return Sample(
+    return WorkspaceSample(
         coordinates, inverse(robot, coordinates), kept / tried, dict((+lost).most_common())
     )
 
 
-def ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
+def workspace_ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
     """Range of every controlled coordinate [m, rad]; phi runs all the way round where it is not
     stated.
 
@@ -102,7 +104,7 @@ def ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
     return {name: stated[name] for name in robot.controlled}
 
 
-def drawn(
+def draw_coordinates(
     rng: np.random.Generator,
     names: tuple[str, ...],
     within: Mapping[str, tuple[float, float]],
@@ -127,13 +129,13 @@ def _reached(robot: Mechanism, coordinates: FloatArray, lost: Counter[str]) -> B
     values, found = robot.values[None], inverse(robot, coordinates)
     good = np.array(found.converged)
     lost["the loops cannot be closed"] += int((~good).sum())
-    for limit in limits(robot, values, found.q[None], found.state):
+    for limit in evaluate_limits(robot, values, found.q[None], found.state):
         outside = good & ~(limit.margin[0] >= 0)
         lost[f"{limit.name} is exceeded"] += int(outside.sum())
         good &= ~outside
     beyond = good & (
-        orientation_at(robot, values, found.state)[0]
-        != orientation_at(robot, values, robot.home_state)[0, 0]
+        compute_closure_sign(robot, values, found.state)[0]
+        != compute_closure_sign(robot, values, robot.home_state)[0, 0]
     )
     lost["a singularity lies between it and home"] += int(beyond.sum())
     return good & ~beyond

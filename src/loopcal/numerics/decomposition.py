@@ -3,7 +3,7 @@
 is read.
 
 Rows [A | b] of a linear least-squares problem are folded, block by block, into the triangular
-factor of their QR decomposition (`loopcal.engine.accumulate`); the right-hand side rides along as
+factor of their QR decomposition (`loopcal.engine.fold`); the right-hand side rides along as
 the last column, so that the norm of what no solution explains is the last diagonal entry. Singular
 values, rank, solutions, filters and covariances come from the singular value decomposition of that
 factor. The product A'A is never formed: it would turn null directions of 1e-14 into 1e-7. Every
@@ -310,7 +310,7 @@ def decompose(
 
     Parameters
     ----------
-    factor : (t, p + 1, p + 1) upper triangular, as `engine.accumulate` folds it.
+    factor : (t, p + 1, p + 1) upper triangular, as `engine.fold` folds it.
     rows : (t,) number of equations that were folded.
     about : (t, p), optional. With it the last column is read as a residual r at the deviation z =
         `about`, and the problem becomes the one for the total deviation: |A z_new - b| with b = A z

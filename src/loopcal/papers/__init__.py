@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from loopcal.errors import DataError, nearest
+from loopcal.errors import DataError, suggest_names
 
 if TYPE_CHECKING:
     from loopcal.papers.reproduction import Reproduction
@@ -99,7 +99,7 @@ def paper(name: str) -> Paper:
     """
     if name not in PAPERS:
         raise DataError(
-            f"{name!r} is not a paper that can be repeated{nearest(name, PAPERS)}; known are "
+            f"{name!r} is not a paper that can be repeated{suggest_names(name, PAPERS)}; known are "
             f"{', '.join(PAPERS)}"
         )
     return PAPERS[name]

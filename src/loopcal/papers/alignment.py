@@ -38,7 +38,7 @@ class Alignment:
 
     def errors(self, T: FloatArray, reference: FloatArray) -> FloatArray:
         """Twists (n, 6) from reference poses to aligned ones [rad, m], rotation first."""
-        return geometry.difference(self(T), reference)
+        return geometry.pose_difference(self(T), reference)
 
 
 SENTENCES = {
@@ -89,7 +89,7 @@ def align(
         return Alignment(one, one, SENTENCES[base, tool])
     # base T tool = reference, so base seen = reference tool^-1
     found = hand_eye(reference, T, None if base else one, None if tool else one)
-    frames = np.stack([found[0] if base else one, geometry.inverse(found[1]) if tool else one])
+    frames = np.stack([found[0] if base else one, geometry.invert_pose(found[1]) if tool else one])
     open_ = np.repeat([base, tool], 6)
     weight = np.array([size, size, size, 1.0, 1.0, 1.0])
     for _ in range(20):
@@ -97,7 +97,7 @@ def align(
         J = (weight[:, None] * slopes[..., open_]).reshape(-1, int(open_.sum()))
         step = np.zeros(12)
         step[open_] = -linear(J, (weight * error).ravel())
-        frames = geometry.exp_update(frames, step.reshape(2, 6))
+        frames = geometry.apply_twist(frames, step.reshape(2, 6))
         if np.abs(step).max() < 1e-14:
             break
     return Alignment(frames[0], frames[1], SENTENCES[base, tool])
@@ -130,10 +130,10 @@ def _slopes(
     """
     base, tool = frames
     moved = base @ T @ tool
-    error = geometry.difference(moved, reference)
+    error = geometry.pose_difference(moved, reference)
     inverse = geometry.left_jacobian_inverse_so3(error[:, :3])
-    front = geometry.transport(moved[:, :3, 3] - base[:3, 3])
+    front = geometry.transport_matrix(moved[:, :3, 3] - base[:3, 3])
     R = base[:3, :3] @ T[:, :3, :3]
-    back = geometry.transport(np.zeros(3), R)
+    back = geometry.transport_matrix(np.zeros(3), R)
     both = np.concatenate([front, back], axis=-1)
     return error, np.concatenate([inverse @ both[:, :3], both[:, 3:]], axis=1)

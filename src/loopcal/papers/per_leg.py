@@ -19,9 +19,7 @@ from loopcal import engine
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.measure import Measurements, Observations
-from loopcal.mechanism import Mechanism, Status
-from loopcal.mechanism.batch_kinematics import forward_trials
-from loopcal.mechanism.transmission import joint_values
+from loopcal.mechanism import Mechanism, Status, forward_trials, joints_from_readings
 from loopcal.numerics.decomposition import RANK_TOLERANCE, decompose, empty_factor
 from loopcal.typing import FloatArray
 
@@ -86,7 +84,9 @@ def _step(
     e, tau = robot.slots(values)
     n_e = robot.slots.n_displacements
     J = robot.slots.jacobian(values)[0][:, free.places]
-    blocks = engine.linearise(robot.program, e, joint_values(q, tau, robot.slots.frequency), state)
+    blocks = engine.linearize(
+        robot.program, e, joints_from_readings(q, tau, robot.slots.frequency), state
+    )
     change, conditions, owners = np.zeros(len(free)), [], np.zeros(len(free), dtype=int)
     for group, block in zip(robot.program.groups, blocks.closure, strict=True):
         k, s = block.E.shape[2], block.E.shape[-1]
@@ -100,7 +100,7 @@ def _step(
             rows = np.concatenate([(E @ own[:, mine]), right[..., None]], axis=-1).reshape(
                 1, -1, len(mine) + 1
             )
-            factor = engine.accumulate(empty_factor(1, len(mine)), rows)
+            factor = engine.fold(empty_factor(1, len(mine)), rows)
             d = decompose(factor, np.array([rows.shape[1]]), tolerance=RANK_TOLERANCE)
             change[mine] = d.deviation(d.solution(np.where(d.used, 0.0, np.inf)))[0]
             conditions.append(float(d.condition[0]))

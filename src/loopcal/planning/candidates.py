@@ -18,13 +18,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.errors import MechanismError
-from loopcal.mechanism import Mechanism, Solution, inverse
-from loopcal.mechanism.coordinates import POSITION, read
-from loopcal.mechanism.workspace import DRAWS, FEWEST, drawn, ranges
+from loopcal.mechanism import (
+    MIN_DRAWS,
+    MIN_REACHABLE_SHARE,
+    POSITION,
+    Mechanism,
+    Solution,
+    draw_coordinates,
+    inverse,
+    read_coordinates,
+    workspace_ranges,
+)
 from loopcal.planning.constraints import Constraints, Rules, Verdicts, refusals, rules
 from loopcal.planning.paths import between, distance, follow
 from loopcal.typing import FloatArray
-from loopcal.units import Dimension, unit
+from loopcal.units import Dimension, find_unit
 
 HALVINGS = 12
 """Bisections of the line to the middle: the boundary is met to 1/4096 of it."""
@@ -82,7 +90,7 @@ def candidates(
         breaks one.
     """
     rng = np.random.default_rng(seed)
-    judged_by, wanted = _at_home(robot, constraints), ranges(robot)
+    judged_by, wanted = _at_home(robot, constraints), workspace_ranges(robot)
     refused: Counter[str] = Counter()
     inside, tried = _inside(judged_by, rng, wanted, count - count // 2, refused)
     edge = _boundary(judged_by, rng, wanted, count // 2, inside)
@@ -129,7 +137,7 @@ def rounded(
     steps = []
     for name in robot.controlled:
         dimension = Dimension.LENGTH if name in POSITION else Dimension.ANGLE
-        shown = unit(robot.units[dimension])
+        shown = find_unit(robot.units[dimension])
         whole = (robot.size if name in POSITION else 1.0) / shown.factor_to_si
         steps.append(10.0 ** (np.floor(np.log10(whole)) - DIGITS) * shown.factor_to_si)
     counts = coordinates / np.array(steps)
@@ -143,7 +151,7 @@ def rounded(
 
 def home_coordinates(robot: Mechanism) -> FloatArray:
     """Controlled coordinates (c,) of home [m, rad]."""
-    return read(robot.home, robot.controlled)
+    return read_coordinates(robot.home, robot.controlled)
 
 
 def _at_home(robot: Mechanism, constraints: Constraints | None) -> Rules:
@@ -171,7 +179,7 @@ def _inside(
     while kept < count:
         poses = rounded(
             robot,
-            drawn(
+            draw_coordinates(
                 rng,
                 robot.controlled,
                 wanted,
@@ -182,7 +190,7 @@ def _inside(
         refused.update(verdict.counts())
         parts.append(poses[verdict.allowed])
         kept, tried = kept + len(parts[-1]), tried + len(poses)
-        if tried >= DRAWS and kept < FEWEST * tried:
+        if tried >= MIN_DRAWS and kept < MIN_REACHABLE_SHARE * tried:
             raise MechanismError(
                 f"the constraints leave nothing of the workspace of {robot.name}: {kept} of "
                 f"{tried} poses drawn from it are "
@@ -202,7 +210,7 @@ def _boundary(
     robot, names = judged_by.robot, judged_by.robot.controlled
     low, high = np.array([wanted[name] for name in names]).T
     full = np.isclose(high - low, 2.0 * np.pi)
-    poses = drawn(rng, names, wanted, count)
+    poses = draw_coordinates(rng, names, wanted, count)
     end = rng.random((count, len(names))) < 0.5
     put = (rng.random((count, len(names))) < ON_BOUNDARY) & ~full
     # one coordinate at least is at an end, unless none has one

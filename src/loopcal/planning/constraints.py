@@ -16,10 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal.errors import DataError
-from loopcal.mechanism import Mechanism, Solution
-from loopcal.mechanism.batch_kinematics import orientation_at
-from loopcal.mechanism.limits import limits
-from loopcal.mechanism.singularities import NEAR, singularity, typical
+from loopcal.mechanism import (
+    NEAR_SHARE,
+    Mechanism,
+    Solution,
+    analyze_singularity,
+    compute_closure_sign,
+    compute_median_margins,
+    evaluate_limits,
+)
 from loopcal.typing import BoolArray, FloatArray
 
 ROUNDING = 1e-12
@@ -108,7 +113,7 @@ class Constraints:
         A number that cannot be.
     """
 
-    min_margin: float = NEAR
+    min_margin: float = NEAR_SHARE
     max_tilt: float | None = None
     sight: Sight | None = None
 
@@ -155,13 +160,13 @@ class Rules:
     def _broken(self, found: Solution, at_pose: bool) -> Iterator[tuple[str, BoolArray]]:
         """Yield each constraint in words, and where it is not met (n,)."""
         robot, asked = self.robot, self.constraints
-        for limit in limits(robot, robot.values[None], found.q[None], found.state):
+        for limit in evaluate_limits(robot, robot.values[None], found.q[None], found.state):
             yield (
                 f"{limit.name} is exceeded",
                 ~(limit.margin[0] >= -ROUNDING * max(abs(limit.low), abs(limit.high))),
             )
-        near = singularity(robot, found, self.medians)
-        yield "a singularity lies between it and home", near.orientation != self.side
+        near = analyze_singularity(robot, found, self.medians)
+        yield "a singularity lies between it and home", near.closure_sign != self.side
         yield (
             f"a singularity is near (margin below {asked.min_margin:g} of the median)",
             ~((near.ratio >= asked.min_margin) & (near.drive_ratio >= asked.min_margin)),
@@ -193,8 +198,8 @@ class Verdicts:
 
 def rules(robot: Mechanism, constraints: Constraints) -> Rules:
     """Return what poses of a robot are judged by."""
-    side = int(orientation_at(robot, robot.values[None], robot.home_state)[0, 0])
-    return Rules(robot, constraints, typical(robot), side)
+    side = int(compute_closure_sign(robot, robot.values[None], robot.home_state)[0, 0])
+    return Rules(robot, constraints, compute_median_margins(robot), side)
 
 
 def refusals(counts: dict[str, int], most: int = 3) -> str:

@@ -30,16 +30,18 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
-from loopcal.mechanism import Mechanism, Status
-from loopcal.mechanism.batch_kinematics import (
+from loopcal.mechanism import (
+    POSITION,
+    Mechanism,
+    Status,
+    compute_closure_sign,
+    compute_readings,
+    differentiate_pose,
+    evaluate_limits,
     inverse_trials,
-    orientation_at,
-    readings_at,
-    sensitivity,
+    pose_from_coordinates,
+    workspace_ranges,
 )
-from loopcal.mechanism.coordinates import POSITION, pose
-from loopcal.mechanism.limits import limits
-from loopcal.mechanism.workspace import ranges
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 AXIS = 3
@@ -142,7 +144,9 @@ class PlaneAndLine:
     @cached_property
     def _home(self) -> int:
         """Orientation at home: another one lies beyond a singularity."""
-        return int(orientation_at(self.robot, self.robot.values[None], self.robot.home_state)[0, 0])
+        return int(
+            compute_closure_sign(self.robot, self.robot.values[None], self.robot.home_state)[0, 0]
+        )
 
     def levels(self, fractions: Sequence[float] = LEVELS) -> tuple[FloatArray, ...]:
         """Values to try, coordinate by coordinate."""
@@ -197,7 +201,7 @@ class PlaneAndLine:
         for j in (1, 2):
             place[each, 2:, (axis + j) % 3] = rest[:, :, j - 1]
         turn[:, 2:] = rest[:, :, 2:]
-        wide = ranges(self.robot)
+        wide = workspace_ranges(self.robot)
         low, high = np.array([wide[name] for name in (*POSITION, *self.turning)]).T
         given = 0.5 * (high + low) + 0.5 * (high - low) * np.concatenate([place, turn], axis=2)
         order = [(*POSITION, *self.turning).index(name) for name in self.robot.controlled]
@@ -262,7 +266,7 @@ class PlaneAndLine:
         if not tool.any():
             return x
         moved = x.copy()
-        offset = pose(x, names, self.robot.home)[..., :3, :3] @ tool
+        offset = pose_from_coordinates(x, names, self.robot.home)[..., :3, :3] @ tool
         moved[..., [names.index(name) for name in POSITION]] -= offset
         return moved
 
@@ -273,11 +277,14 @@ class PlaneAndLine:
         robot, free = self.robot, self.free_parameters
         values = robot.values[None]
         state = inverse_trials(robot, values, x[None])
-        q = readings_at(robot, values, state)
-        reached = (state.status == Status.CONVERGED) & (state.orientation == self._home)
-        for limit in limits(robot, values, q, state):
+        q = compute_readings(robot, values, state)
+        reached = (state.status == Status.CONVERGED) & (state.closure_sign == self._home)
+        for limit in evaluate_limits(robot, values, q, state):
             reached = reached & (limit.margin >= 0.0)
-        D = sensitivity(robot, values, q, state).parameters[0][..., free.places] * free.tolerance
+        D = (
+            differentiate_pose(robot, values, q, state).parameters[0][..., free.places]
+            * free.tolerance
+        )
         reached = reached[0] & np.isfinite(D).all(axis=(1, 2))
         T = np.where(reached[:, None, None], state.T[0], np.eye(4))
         D = np.where(reached[:, None, None], D, 0.0)

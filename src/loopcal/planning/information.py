@@ -131,14 +131,10 @@ def knowable(
     factor = empty_factor(1, o + p)
     good = rows.rows[allowed(rows.rows)]
     flat = np.concatenate([good.reshape(-1, o + p), rows.prior])
-    factor = engine.accumulate(
-        factor, np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)[None]
-    )
+    factor = engine.fold(factor, np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)[None])
     factor = without_own(factor, o)
     if measured is not None:
-        factor = engine.accumulate(
-            factor, np.concatenate([measured, np.zeros((p, 1))], axis=1)[None]
-        )
+        factor = engine.fold(factor, np.concatenate([measured, np.zeros((p, 1))], axis=1)[None])
     return decompose(factor, np.full(1, len(flat)))
 
 

@@ -20,7 +20,7 @@ from loopcal.planning.curve import Curve, design_curve, enough
 from loopcal.planning.design import allowed
 from loopcal.planning.problem import Accuracy, Problem, Target
 from loopcal.typing import FloatArray, IntArray
-from loopcal.units import DISPLAY_UNITS, Dimension, unit
+from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 SIZES = 6
 """Numbers of poses on a curve."""
@@ -184,7 +184,7 @@ def counted(together: int) -> str:
 def in_unit(robot: Mechanism, value: float, dimension: Dimension) -> str:
     """Return a number with the unit of the robot's file."""
     symbol = robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol)
-    return f"{value / unit(symbol).factor_to_si:.3g} {symbol}"
+    return f"{value / find_unit(symbol).factor_to_si:.3g} {symbol}"
 
 
 def in_words(robot: Mechanism, errors: Accuracy) -> str:

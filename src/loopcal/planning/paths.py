@@ -12,8 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from loopcal import geometry
-from loopcal.mechanism import Mechanism, inverse
-from loopcal.mechanism.coordinates import POSITION, TILT
+from loopcal.mechanism import POSITION, TILT, Mechanism, inverse
 from loopcal.planning.constraints import Rules, Verdicts
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
@@ -37,7 +36,7 @@ def between(
     names, s = robot.controlled, np.asarray(share, dtype=float)
     angular = np.array([name not in POSITION for name in names])
     step = end - start
-    step = np.where(angular, geometry.wrap(step), step)
+    step = np.where(angular, geometry.wrap_angle(step), step)
     found = start + (s[..., None] if s.ndim else s) * step
     if "phi" in names:
         places = [names.index(name) for name in TILT[:2]]
@@ -52,7 +51,7 @@ def distance(robot: Mechanism, start: FloatArray, end: FloatArray) -> FloatArray
     """
     names = robot.controlled
     scale = np.array([1.0 if name in POSITION else robot.size for name in names])
-    step = np.where(scale == 1.0, end - start, geometry.wrap(end - start)) * scale
+    step = np.where(scale == 1.0, end - start, geometry.wrap_angle(end - start)) * scale
     if "phi" in names:
         places = [names.index(name) for name in TILT[:2]]
         tilted = robot.size * (_tilt(end, places) - _tilt(start, places))

@@ -26,7 +26,7 @@ from loopcal.planning.order import Visit, visiting_order
 from loopcal.planning.problem import Accuracy, Problem, Target, problem
 from loopcal.planning.result import Plan
 from loopcal.typing import FloatArray, IntArray
-from loopcal.units import Dimension, unit
+from loopcal.units import Dimension, find_unit
 
 SHAKES = 10
 """Times that a design is shaken out of local optima: more gain some tenths of a per cent."""
@@ -248,7 +248,7 @@ def _typed(robot: Mechanism, readings: FloatArray) -> FloatArray:
     instrument tells apart.
     """
     factors = np.array(
-        [unit(robot.units[actuator.dimension]).factor_to_si for actuator in robot.actuators]
+        [find_unit(robot.units[actuator.dimension]).factor_to_si for actuator in robot.actuators]
     )
     scale = np.array(
         [

@@ -16,8 +16,7 @@ from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.outlook import equations, information
 from loopcal.measure import Instrument, Measurements, check_actuators
-from loopcal.mechanism import Mechanism, Solution, inverse
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import Mechanism, Solution, inverse, sample_workspace
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.planning.candidates import Candidates, candidates, listed_candidates
 from loopcal.planning.constraints import Constraints
@@ -290,7 +289,7 @@ def _to_predict(found: Candidates, poses: FloatArray | None, seed: int) -> Solut
     robot = found.rules.robot
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
     if poses is None:
-        return sample(robot, PREDICTED, rng).solution
+        return sample_workspace(robot, PREDICTED, rng).solution
     listed = np.unique(poses, axis=0)
     solution = inverse(robot, listed)
     bare = replace(found.rules, constraints=Constraints(min_margin=0.0))

@@ -17,8 +17,7 @@ from loopcal.errors import EstimationError
 from loopcal.measure import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.line import Line
 from loopcal.measure.kinds.plane import Plane
-from loopcal.mechanism import Mechanism, inverse
-from loopcal.mechanism.coordinates import POSITION
+from loopcal.mechanism import POSITION, Mechanism, inverse
 from loopcal.planning.candidates import home_coordinates
 from loopcal.planning.constraints import Constraints, Rules, refusals, rules
 from loopcal.planning.coordinate import coordinate_exchange

@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.errors import FileError
-from loopcal.mechanism import Mechanism, Solution
-from loopcal.mechanism.frames import limb_frames
+from loopcal.mechanism import Mechanism, Solution, compute_limb_frames
 from loopcal.typing import FloatArray
-from loopcal.units import Dimension, unit
+from loopcal.units import Dimension, find_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,10 +53,12 @@ def draw(robot: Mechanism, solution: Solution | None = None, row: int = 0) -> Fi
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     state = robot.home_state if solution is None else solution.take(np.array([row])).state
-    length = unit(robot.units[Dimension.LENGTH])
+    length = find_unit(robot.units[Dimension.LENGTH])
     strokes = list(
         _strokes(
-            robot, [f[0, 0] for f in limb_frames(robot, robot.values[None], state)], state.T[0, 0]
+            robot,
+            [f[0, 0] for f in compute_limb_frames(robot, robot.values[None], state)],
+            state.T[0, 0],
         )
     )
     strokes = [Stroke(s.points / length.factor_to_si, s.style) for s in strokes]

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.mechanism import Mechanism
-from loopcal.mechanism.coordinates import POSITION
+from loopcal.mechanism import POSITION, Mechanism
 from loopcal.planning.candidates import home_coordinates
 from loopcal.planning.needed import DIMENSION, PoseCurve
 from loopcal.planning.result import Plan
 from loopcal.report.draw import COLOURS, DPI
-from loopcal.units import Dimension, Unit, unit
+from loopcal.units import Dimension, Unit, find_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,7 +76,7 @@ def draw_curve(robot: Mechanism, curve: PoseCurve) -> Figure:
     from matplotlib.ticker import NullFormatter, ScalarFormatter
 
     dimension = DIMENSION[curve.target]
-    shown = unit(robot.units[dimension])
+    shown = find_unit(robot.units[dimension])
     figure = Figure(figsize=(6.4, 4.4), layout="constrained")
     axes: Any = figure.add_subplot(1, 1, 1)
     axes.plot(
@@ -130,7 +129,7 @@ def save_figure(path: Path, figure: Figure) -> None:
 
 
 def _unit(robot: Mechanism, name: str) -> Unit:
-    return unit(robot.units[Dimension.LENGTH if name in POSITION else Dimension.ANGLE])
+    return find_unit(robot.units[Dimension.LENGTH if name in POSITION else Dimension.ANGLE])
 
 
 def _label(robot: Mechanism, name: str) -> str:

@@ -65,7 +65,7 @@ def test_strut_lengths_are_those_of_linuxcnc(
     )
     angles = np.radians(np.stack([table[f"{axis}_deg"] for axis in "abc"], axis=1))
     position = np.stack([table[axis] for axis in "xyz"], axis=1) * 1e-3
-    found = inverse(robot, rigid.pose(rigid.euler_to_matrix(angles, "xyz"), position))
+    found = inverse(robot, rigid.make_pose(rigid.euler_to_matrix(angles, "xyz"), position))
     assert found.converged.all()
     expected = np.stack([table[f"L{n}"] for n in range(6)], axis=1) * 1e-3
     off = np.abs(found.q - expected)

@@ -119,7 +119,7 @@ def test_a_row_that_compares_a_pose_with_itself():
 @pytest.mark.parametrize("kind", EXAMPLES)
 def test_a_covariance_that_is_not_positive_definite_and_rows_that_repeat(kind):
     kind = kind.mounted(np.eye(4))
-    T = geometry.exp_update(np.eye(4), np.random.default_rng(0).uniform(-0.4, 0.4, (1, 3, 6)))
+    T = geometry.apply_twist(np.eye(4), np.random.default_rng(0).uniform(-0.4, 0.4, (1, 3, 6)))
     rows = np.array([0, 1, 1]) if kind.links == 1 else np.array([[0, 1], [1, 2], [1, 2]])
     m = len(kind.noise_columns)
     measured = kind.measure(T[:, rows], np.zeros((1, 3, m)))[0]

@@ -17,15 +17,17 @@ FIVE = Component(("x", "y", "z", "phi", "theta"), "tilt-torsion", T_platform_too
 
 
 def poses_of(phi, theta, psi):
-    return geometry.pose(
+    return geometry.make_pose(
         geometry.tilt_torsion_to_matrix(*np.broadcast_arrays(phi, theta, psi)), np.zeros(3)
     )[None]
 
 
 def test_a_probed_height_is_z_of_the_tool_alone():
-    T_platform_tool = geometry.pose(np.eye(3), np.array([0.0, 0.1, -0.2]))
+    T_platform_tool = geometry.make_pose(np.eye(3), np.array([0.0, 0.1, -0.2]))
     height = Component(T_platform_tool=T_platform_tool)
-    T = geometry.pose(geometry.axis_rotation(0.5, 0), np.array([1.0, 2.0, 3.0]))[None, None]
+    T = geometry.make_pose(geometry.rotation_about_axis(0.5, 0), np.array([1.0, 2.0, 3.0]))[
+        None, None
+    ]
     residual, jacobian, own, _ = height.evaluate(T, np.array([[[3.0]]]))
     assert own is None
     assert_allclose(residual, 0.1 * np.sin(0.5) - 0.2 * np.cos(0.5), atol=1e-15)
@@ -34,7 +36,7 @@ def test_a_probed_height_is_z_of_the_tool_alone():
 
 def test_angle_differences_wrap_across_half_a_turn():
     kind = Component(("a", "c"), "euler-xyz", T_platform_tool=np.eye(4))
-    T = geometry.pose(
+    T = geometry.make_pose(
         geometry.euler_to_matrix(np.array([np.pi - 1e-3, 0.2, -np.pi + 2e-3]), "xyz"), np.zeros(3)
     )[None, None]
     residual = kind.evaluate(T, np.array([[[-np.pi + 1e-3, np.pi - 2e-3]]])).residual
@@ -55,7 +57,7 @@ def test_near_zero_tilt_the_normal_stands_in_for_phi_and_theta(theta):
     assert_allclose(FIVE.evaluate(T, measured).residual, -noise, atol=1e-15)
 
     def residual(x):
-        return FIVE.evaluate(geometry.exp_update(T, x), measured).residual
+        return FIVE.evaluate(geometry.apply_twist(T, x), measured).residual
 
     result = FIVE.evaluate(T, measured)
     # jax cannot pass the angles of zero tilt themselves, which the normal replaces: 0 times their
@@ -85,9 +87,9 @@ def test_a_covariance_of_rotation_is_mapped_to_the_angles_as_by_drawing():
     kind = Component(("z", "a", "b", "c"), "euler-xyz", T_platform_tool=np.eye(4))
     A = rng.normal(size=(6, 6))
     C = 1e-8 * (A @ A.T + np.eye(6))
-    T = geometry.exp_update(np.eye(4), np.array([0.4, 0.8, -0.3, 0.0, 0.0, 0.0]))[None, None]
+    T = geometry.apply_twist(np.eye(4), np.array([0.4, 0.8, -0.3, 0.0, 0.0, 0.0]))[None, None]
     exact = kind.measure(T, np.zeros((1, 1, 4)))
-    drawn = geometry.exp_update(T, rng.multivariate_normal(np.zeros(6), C, size=(1, 20000)))
+    drawn = geometry.apply_twist(T, rng.multivariate_normal(np.zeros(6), C, size=(1, 20000)))
     scatter = np.cov((kind.measure(drawn, np.zeros((1, 1, 4))) - exact)[0].T)
     mapped = kind.covariance_of_rotation(exact[0], C[None])[0]
     # relative 5 %: four sigma of a variance from 20000 draws is 4 sqrt(2 / 20000) = 4 %
@@ -98,7 +100,7 @@ def test_a_covariance_of_rotation_is_mapped_to_the_angles_as_by_drawing():
 
 def test_all_six_components_carry_the_information_of_the_full_pose():
     C = np.diag([1e-10, 2e-10, 3e-10, 1e-12, 2e-12, 3e-12])
-    T = geometry.exp_update(np.eye(4), np.array([0.4, 0.6, -0.3, 0.1, 0.2, 0.3]))[None, None]
+    T = geometry.apply_twist(np.eye(4), np.array([0.4, 0.6, -0.3, 0.1, 0.2, 0.3]))[None, None]
     kinds = (
         Pose(T_platform_tool=np.eye(4)),
         Component(("a", "b", "c", "x", "y", "z"), "euler-ZYX", T_platform_tool=np.eye(4)),

@@ -21,15 +21,15 @@ INSTANCES = [
 EXAMPLES = [pytest.param(kind, id=name) for name, kind in INSTANCES]
 WITH_UNKNOWNS = [pytest.param(kind, id=name) for name, kind in INSTANCES if kind.unknowns]
 WITH_JOINTS = [pytest.param(kind, id=name) for name, kind in INSTANCES if kind.looks_at]
-T_BASE_FRAME = geometry.exp_update(np.eye(4), np.array([0.5, 0.1, -0.9, 1.1, -0.7, 0.3]))
-T_PLATFORM_TOOL = geometry.exp_update(np.eye(4), np.array([0.3, -0.5, 0.2, 0.02, -0.05, 0.11]))
+T_BASE_FRAME = geometry.apply_twist(np.eye(4), np.array([0.5, 0.1, -0.9, 1.1, -0.7, 0.3]))
+T_PLATFORM_TOOL = geometry.apply_twist(np.eye(4), np.array([0.3, -0.5, 0.2, 0.02, -0.05, 0.11]))
 every_kind = pytest.mark.parametrize("kind", EXAMPLES)
 
 
 def platform_poses(kind, t, r, seed=0, spread=0.4):
     """Random platform poses (t, r, 4, 4), with an axis of links where the kind has them."""
     shape = (t, r, 6) if kind.links == 1 else (t, r, kind.links, 6)
-    return geometry.exp_update(
+    return geometry.apply_twist(
         np.eye(4), np.random.default_rng(seed).uniform(-spread, spread, shape)
     )
 
@@ -138,7 +138,7 @@ def check_derivatives(kind, error, *, with_jax):
 
     def residual(x):
         moved = (
-            geometry.exp_update(T, x[:n].reshape(shape)) if n else T
+            geometry.apply_twist(T, x[:n].reshape(shape)) if n else T
         )  # the same small motion in every row and trial
         return kind.evaluate(
             moved, measured, None if values is None else values + x[n:], joints

@@ -17,8 +17,7 @@ from loopcal.measure import (
     simulate,
     whitened_rows,
 )
-from loopcal.mechanism import inverse
-from loopcal.mechanism.batch_kinematics import forward_trials
+from loopcal.mechanism import forward_trials, inverse
 from tests import zoo
 
 COMMANDED = np.random.default_rng(2).uniform([0.65, -np.pi, 0.05], [0.75, np.pi, 0.2], (8, 3))

@@ -11,7 +11,7 @@ from loopcal.measure import Observations, Pose
 
 
 def test_the_residual_is_the_logarithm_of_predicted_times_measured_transposed_and_predicted_minus_measured():
-    T = geometry.exp_update(np.eye(4), np.array([0.2, 0.0, 0.0, 1.0, 2.0, 3.0]))[None, None]
+    T = geometry.apply_twist(np.eye(4), np.array([0.2, 0.0, 0.0, 1.0, 2.0, 3.0]))[None, None]
     measured = np.array([[[0.1, 0.0, 0.0, 1.0, 2.0, 2.5]]])
     residual = Pose(T_platform_tool=np.eye(4)).evaluate(T, measured).residual
     assert_allclose(residual[0, 0], [0.1, 0.0, 0.0, 0.0, 0.0, 0.5], atol=1e-15)
@@ -19,8 +19,8 @@ def test_the_residual_is_the_logarithm_of_predicted_times_measured_transposed_an
 
 def test_all_forms_of_orientation_give_the_same_residual_in_every_frame():
     rng = np.random.default_rng(2)
-    T, T_measured = geometry.exp_update(np.eye(4), rng.uniform(-1, 1, (2, 1, 30, 6)))
-    T_base_frame = geometry.exp_update(np.eye(4), rng.normal(size=6))
+    T, T_measured = geometry.apply_twist(np.eye(4), rng.uniform(-1, 1, (2, 1, 30, 6)))
+    T_base_frame = geometry.apply_twist(np.eye(4), rng.normal(size=6))
     reference = Pose(T_platform_tool=np.eye(4))
     seen = np.concatenate(
         [geometry.log_so3(T_measured[..., :3, :3]), T_measured[..., :3, 3]], axis=-1
@@ -40,7 +40,7 @@ def test_all_forms_of_orientation_give_the_same_residual_in_every_frame():
 
 def test_the_length_and_sign_of_a_quaternion_do_not_matter():
     kind = Pose("quaternion", T_platform_tool=np.eye(4))
-    T = geometry.exp_update(np.eye(4), np.full(6, 0.2))[None, None]
+    T = geometry.apply_twist(np.eye(4), np.full(6, 0.2))[None, None]
     measured = kind.measure(T, np.zeros((1, 1, 6)))
     measured[..., :4] *= -1.0005
     assert_allclose(kind.evaluate(T, measured).residual, 0.0, atol=1e-15)
@@ -88,7 +88,7 @@ def test_noise_of_angles_that_are_nearly_the_same_turn_is_a_rotation_error(form,
     # before, a tilt of 1e-9 made one rotation a thousand million times as certain as stated, and a
     # tilt of zero was refused
     kind = Pose(form, T_platform_tool=np.eye(4))
-    T = geometry.exp_update(np.eye(4), np.array([0.6 * tilt, -0.8 * tilt, 0.0, 0.0, 0.0, 0.1]))[
+    T = geometry.apply_twist(np.eye(4), np.array([0.6 * tilt, -0.8 * tilt, 0.0, 0.0, 0.0, 0.1]))[
         None, None
     ]
     T = np.broadcast_to(T, (1, 200, 4, 4))

@@ -8,12 +8,17 @@ from numpy.typing import NDArray
 
 from loopcal import engine, geometry
 from loopcal.engine import State
-from loopcal.mechanism import Mechanism, build, states
-from loopcal.mechanism.batch_kinematics import readings_at
+from loopcal.mechanism import (
+    Mechanism,
+    Point,
+    PoseRecord,
+    build,
+    compute_readings,
+    joints_from_readings,
+    select_poses,
+)
 from loopcal.mechanism.families.limb_records import JointRecord, LimbRecord, Prismatic, Revolute
 from loopcal.mechanism.families.limbs import Limbs
-from loopcal.mechanism.records import Point, Pose
-from loopcal.mechanism.transmission import joint_values
 from loopcal.units import Dimension
 
 Array = NDArray[np.float64]
@@ -60,17 +65,20 @@ def wander(machine: Mechanism, n: int, seed: int) -> tuple[State, Array]:
     rng = np.random.default_rng(seed)
     width = [0.3 if a.dimension is Dimension.ANGLE else 0.06 for a in machine.actuators]
     q = (
-        readings_at(machine, machine.values[None], machine.home_state)
+        compute_readings(machine, machine.values[None], machine.home_state)
         + rng.uniform(-1, 1, (1, n, len(width))) * width
     )
     e, tau = machine.slots(machine.values[None])
     state = engine.solve(
-        machine.program, e, joint_values(q, tau, machine.slots.frequency), machine.home_state
+        machine.program,
+        e,
+        joints_from_readings(q, tau, machine.slots.frequency),
+        machine.home_state,
     )
     # random machines have small workspaces: rows that do not close, or closed elsewhere, are left
     # out
-    good = (state.status[0] == 0) & (state.orientation[0] == machine.home_state.orientation[0, 0])
-    return states.take(state, good), q[:, good]
+    good = (state.status[0] == 0) & (state.closure_sign[0] == machine.home_state.closure_sign[0, 0])
+    return select_poses(state, good), q[:, good]
 
 
 def _limb(rng: np.random.Generator, name: str, ending: str, taken: int) -> LimbRecord:
@@ -107,22 +115,22 @@ def _limb(rng: np.random.Generator, name: str, ending: str, taken: int) -> LimbR
     return LimbRecord(name, "ball" if ending == "ball" else "rigid", _pose(T), tuple(chain), tip)
 
 
-def _joint(kind: str, place: Pose, axis: Array, drive: str | None) -> JointRecord:
+def _joint(kind: str, place: PoseRecord, axis: Array, drive: str | None) -> JointRecord:
     if kind == "R":
         return Revolute("R", at=place, axis=_point(axis), actuated=drive)
     return Prismatic("P", at=place, axis=_point(axis), actuated=drive)
 
 
-def _place(rng: np.random.Generator) -> Pose:
+def _place(rng: np.random.Generator) -> PoseRecord:
     x, y, z = (float(v) for v in rng.uniform(-0.4, 0.4, 3))
     roll, pitch, yaw = (float(v) for v in rng.uniform(-1.0, 1.0, 3))
-    return Pose(x, y, z, roll, pitch, yaw)
+    return PoseRecord(x, y, z, roll, pitch, yaw)
 
 
-def _pose(T: Array) -> Pose:
+def _pose(T: Array) -> PoseRecord:
     x, y, z = (float(v) for v in T[:3, 3])
     roll, pitch, yaw = (float(v) for v in geometry.matrix_to_euler(T[:3, :3], "xyz"))
-    return Pose(x, y, z, roll, pitch, yaw)
+    return PoseRecord(x, y, z, roll, pitch, yaw)
 
 
 def _point(values: Array | tuple[float, ...]) -> Point:

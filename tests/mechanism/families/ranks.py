@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import geometry
-from loopcal.mechanism import Mechanism, Solution, inverse
-from loopcal.mechanism.batch_kinematics import sensitivity
+from loopcal.mechanism import Mechanism, Solution, differentiate_pose, inverse
 from loopcal.units import Dimension
 
 Array = NDArray[np.float64]
@@ -36,7 +35,9 @@ def scaled_sensitivity(robot: Mechanism, solution: Solution) -> Array:
     """(n, 6, p) platform twist per parameter, all lengths [m / m]."""
     return scaled(
         robot,
-        sensitivity(robot, robot.values[None], solution.q[None], solution.state).parameters[0],
+        differentiate_pose(robot, robot.values[None], solution.q[None], solution.state).parameters[
+            0
+        ],
     )
 
 

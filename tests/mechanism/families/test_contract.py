@@ -11,8 +11,16 @@ import pytest
 
 from loopcal import geometry
 from loopcal.io.robot.robot_file import list_shipped_robots, load_robot
-from loopcal.mechanism import Mechanism, coordinates, forward, inverse
-from loopcal.mechanism.batch_kinematics import forward_trials, readings_at, sensitivity
+from loopcal.mechanism import (
+    Mechanism,
+    compare_coordinates,
+    compute_readings,
+    differentiate_pose,
+    forward,
+    forward_trials,
+    inverse,
+    read_coordinates,
+)
 from loopcal.units import Dimension
 from tests.jacobians import check_jacobian
 from tests.mechanism.families.ranks import coordinates as random_coordinates
@@ -30,7 +38,7 @@ def test_it_closes_at_home_where_its_file_says(name: str) -> None:
     machine = robot(name)
     assert machine.home_state.residual.max() <= 1e-12 * machine.size
     home = machine.assembly.home
-    read = [coordinates.read(T, machine.controlled) for T in (machine.home, home)]
+    read = [read_coordinates(T, machine.controlled) for T in (machine.home, home)]
     tilt = geometry.log_so3(machine.home[:3, :3] @ home[:3, :3].T)
     if "phi" in machine.controlled and abs(tilt).max() < 1e-12:  # phi is anything at zero tilt
         read = [np.delete(r, machine.controlled.index("phi")) for r in read]
@@ -58,7 +66,7 @@ def test_forward_undoes_inverse_in_the_workspace(name: str) -> None:
     assert good.mean() >= 0.999
     # [m, rad] Newton stops below 1e-13 of the size; the rest is the condition of the mechanism
     np.testing.assert_allclose(back.T[good], there.T[good], atol=1e-9)
-    residual = coordinates.demands(back.T[good], wanted[good], machine.controlled, machine.size)[0]
+    residual = compare_coordinates(back.T[good], wanted[good], machine.controlled, machine.size)[0]
     np.testing.assert_allclose(residual, 0.0, atol=1e-9 * machine.size)
 
 
@@ -79,15 +87,15 @@ def test_its_sensitivities_are_the_derivatives_of_its_forward_kinematics(name: s
     machine = robot(name)
     there = inverse(machine, random_coordinates(machine, 3, seed=13))
     assert there.converged.all()
-    q, values = readings_at(machine, machine.values[None], there.state), machine.values
+    q, values = compute_readings(machine, machine.values[None], there.state), machine.values
     state = forward_trials(machine, values[None], q)
-    known = sensitivity(machine, values[None], q, state)
+    known = differentiate_pose(machine, values[None], q, state)
 
     def by_value(x: np.ndarray) -> np.ndarray:
-        return geometry.difference(forward_trials(machine, x[None], q, state).T[0], state.T[0])
+        return geometry.pose_difference(forward_trials(machine, x[None], q, state).T[0], state.T[0])
 
     def by_reading(x: np.ndarray) -> np.ndarray:
-        return geometry.difference(
+        return geometry.pose_difference(
             forward_trials(machine, values[None], q + x, state).T[0], state.T[0]
         )
 

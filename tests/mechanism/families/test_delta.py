@@ -11,8 +11,15 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.io.robot.robot_file import load_robot
-from loopcal.mechanism import Mechanism, build, forward, inverse
-from loopcal.mechanism.batch_kinematics import sensitivity
+from loopcal.mechanism import (
+    Mechanism,
+    PoseRecord,
+    Workspace,
+    build,
+    differentiate_pose,
+    forward,
+    inverse,
+)
 from loopcal.mechanism.families.limb_records import (
     Copies,
     LengthDrive,
@@ -24,7 +31,6 @@ from loopcal.mechanism.families.limb_records import (
 )
 from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.families.linear_delta import LinearDelta
-from loopcal.mechanism.records import Pose, Workspace
 from tests.mechanism.families.ranks import coordinates
 
 Array = NDArray[np.float64]
@@ -48,7 +54,7 @@ def uneven() -> Mechanism:
 def slopes(machine: Mechanism, q: Array) -> tuple[Array, Array]:
     """d position (n, 3, p) and (n, 3, a)."""
     solution = forward(machine, q)
-    found = sensitivity(machine, machine.values[None], q[None], solution.state)
+    found = differentiate_pose(machine, machine.values[None], q[None], solution.state)
     return found.parameters[0, :, 3:], found.readings[0, :, 3:]
 
 
@@ -67,7 +73,7 @@ def exact() -> tuple[Mechanism, Mechanism]:
         angles=angles,
         arms=ARM,
         stops=STOP,
-        home=Pose(z=0.12),
+        home=PoseRecord(z=0.12),
         workspace=PLACE,
     )
     limbs = tuple(
@@ -99,7 +105,7 @@ def exact() -> tuple[Mechanism, Mechanism]:
         },
         limbs=limbs,
         parameters=(NamedLength(name="radius", length=TIP + RADIUS, maps=radius),),
-        home=Pose(z=0.12),
+        home=PoseRecord(z=0.12),
         workspace=PLACE,
     )
     return build(three.expand()), build(six.expand())

@@ -14,12 +14,19 @@ from numpy.typing import NDArray
 
 from loopcal import geometry as rigid
 from loopcal.errors import MechanismError
-from loopcal.mechanism import Mechanism, build, forward, inverse
-from loopcal.mechanism.batch_kinematics import sensitivity
+from loopcal.mechanism import (
+    LengthTolerance,
+    Mechanism,
+    PoseRecord,
+    Workspace,
+    build,
+    check_limits,
+    differentiate_pose,
+    forward,
+    inverse,
+)
 from loopcal.mechanism.families.gough import Gough, GoughCones
 from loopcal.mechanism.families.ups import Screw
-from loopcal.mechanism.limits import within
-from loopcal.mechanism.records import LengthTolerance, Pose, Workspace
 from tests import zoo
 from tests.mechanism.families.ranks import (
     perturbed,
@@ -43,7 +50,7 @@ ROD = Gough(
     base=points(zoo.HEXAPOD_BASE * zoo.MM),
     platform=points(zoo.HEXAPOD_PLATFORM * zoo.MM),
     lengths=zoo.HEXAPOD_LENGTH * zoo.MM,
-    home=Pose(z=0.2),
+    home=PoseRecord(z=0.2),
     workspace=Workspace(
         x=(-0.04, 0.04),
         y=(-0.04, 0.04),
@@ -79,7 +86,9 @@ def test_columns_are_those_of_the_leg_equation(record: Gough) -> None:
     """u . dt + (R p x u) . omega = dl + u . db - u . R dp, six legs: D = J^-1 G."""
     machine = moved(robot(record))
     solution = solved(machine)
-    D = sensitivity(machine, machine.values[None], solution.q[None], solution.state).parameters[0]
+    D = differentiate_pose(
+        machine, machine.values[None], solution.q[None], solution.state
+    ).parameters[0]
     value = machine.values.reshape(6, 7)
     for T, found in zip(solution.T, D, strict=True):
         N, R = T[:3, 3], T[:3, :3]
@@ -106,7 +115,7 @@ def test_rods_and_chains_agree_in_names_pose_residual_and_sensitivities() -> Non
     np.testing.assert_allclose(back.T, there.T, rtol=0, atol=1e-12)  # [m, 1]
     assert max(there.residual.max(), back.residual.max()) < 1e-12  # [m]
     D = [
-        sensitivity(machine, machine.values[None], one.q[None], found.state)
+        differentiate_pose(machine, machine.values[None], one.q[None], found.state)
         for machine, found in ((rod, there), (chain, back))
     ]
     size = np.abs(D[0].parameters).max()  # [rad/m] about 10
@@ -228,7 +237,9 @@ def genhexkins(data_folder: Path) -> tuple[dict[str, Array], Array, Array]:
     geometry = json.loads((folder / "genhexkins_geometry.json").read_text())
     rows = np.genfromtxt(folder / "genhexkins_screwlead4_200poses.csv", delimiter=",", names=True)
     angles = np.radians(np.stack([rows[c] for c in ("a_deg", "b_deg", "c_deg")], axis=1))
-    T = rigid.pose(rigid.euler_to_matrix(angles, "xyz"), np.stack([rows[c] for c in "xyz"], axis=1))
+    T = rigid.make_pose(
+        rigid.euler_to_matrix(angles, "xyz"), np.stack([rows[c] for c in "xyz"], axis=1)
+    )
     struts = np.stack([rows[f"L{leg}"] for leg in range(6)], axis=1)
     return (
         {
@@ -274,7 +285,7 @@ def screw_hexapod(geometry: dict[str, Array], fold: NDArray[np.bool_], home: Arr
         platform=points(geometry["platform"]),
         legs="ups",
         screw=Screw(tuple(LEAD * sign), *axes),
-        home=Pose(x, y, z, roll, pitch, yaw),
+        home=PoseRecord(x, y, z, roll, pitch, yaw),
     )
     return build(record.expand())
 
@@ -291,9 +302,9 @@ def test_the_screw_gives_all_strut_lengths_and_poses_of_genhexkins(
         # walk there in twenty steps: a screw that overtakes half a turn on the way stands a turn
         # further
         start = None
-        twist = rigid.difference(T[rows], T[rows[:1]] + 0 * T[rows])
+        twist = rigid.pose_difference(T[rows], T[rows[:1]] + 0 * T[rows])
         for part in np.linspace(0.05, 1.0, 20):
-            pose = rigid.exp_update(T[rows[:1]] + 0 * T[rows], part * twist)
+            pose = rigid.apply_twist(T[rows[:1]] + 0 * T[rows], part * twist)
             start = inverse(machine, pose, start)
         assert start is not None
         assert start.converged.all()
@@ -344,7 +355,7 @@ def machine_points(listed: tuple[tuple[float, float, float], ...]) -> Array:
 def test_a_leg_that_leans_too_far_from_its_direction_at_home_is_told() -> None:
     machine = robot(replace(ROD, cones=GoughCones(base=0.1, platform=0.3)))
     q = inverse(machine, np.array([[0.0, 0, 0.2, 0, 0, 0], [0.1, 0, 0.2, 0, 0, 0]]))
-    allowed, why = within(machine, machine.values[None], q.q[None], q.state)
+    allowed, why = check_limits(machine, machine.values[None], q.q[None], q.state)
     assert allowed.tolist() == [[True, False]]
     assert why[0, 1].startswith("lean of leg1 at its tip is")
     with pytest.raises(MechanismError, match="cones with legs: ups"):

@@ -12,8 +12,16 @@ import pytest
 
 from loopcal.errors import LoopcalError, MechanismError
 from loopcal.io.robot.robot_file import load_robot
-from loopcal.mechanism import Mechanism, build, forward, inverse
-from loopcal.mechanism.batch_kinematics import sensitivity
+from loopcal.mechanism import (
+    LengthTolerance,
+    Mechanism,
+    PoseRecord,
+    build,
+    check_limits,
+    differentiate_pose,
+    forward,
+    inverse,
+)
 from loopcal.mechanism.families.limb_records import (
     AngleDrive,
     Copies,
@@ -32,8 +40,6 @@ from loopcal.mechanism.families.limb_records import (
 )
 from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.families.three_prs import ThreePrs
-from loopcal.mechanism.limits import within
-from loopcal.mechanism.records import LengthTolerance, Pose
 from tests.mechanism.families.random_limbs import built, expected_rank, random_mechanism, wander
 from tests.mechanism.families.ranks import rank, scaled, solved
 
@@ -63,7 +69,9 @@ limbs:
 home: {z: 700}
 workspace: {z: [650, 750], phi: [-180, 180], theta: [1, 35]}
 """
-TWIN = ThreePrs(name="3-prs", platform_radius=0.2, base_radius=0.35, rod=0.5, home=Pose(z=0.7))
+TWIN = ThreePrs(
+    name="3-prs", platform_radius=0.2, base_radius=0.35, rod=0.5, home=PoseRecord(z=0.7)
+)
 NAMES = {
     "guide.x": "b{}x", "guide.y": "b{}y", "guide.rx": "thB{}x", "guide.ry": "thB{}y", "hinge.rx": "thC{}x",
     "hinge.rz": "thC{}z", "tip.z": "l{}", "platform.x": "a{}x", "platform.y": "a{}y", "platform.z": "a{}z",
@@ -75,10 +83,12 @@ def test_a_tripod_in_thirty_lines_is_the_3_prs(tmp_path: Path) -> None:
     path.write_text(TRIPOD)
     written, twin = load_robot(path), build(TWIN.expand())
     solution = solved(written)
-    D = sensitivity(written, written.values[None], solution.q[None], solution.state).parameters[0]
+    D = differentiate_pose(
+        written, written.values[None], solution.q[None], solution.state
+    ).parameters[0]
     other = inverse(twin, np.stack([solution.T[:, 2, 3], *_tilt(solution.T)], axis=1))
     np.testing.assert_allclose(other.T, solution.T, atol=1e-12)  # [m, 1]
-    E = sensitivity(twin, twin.values[None], other.q[None], other.state).parameters[0]
+    E = differentiate_pose(twin, twin.values[None], other.q[None], other.state).parameters[0]
     assert len(written.parameters) == len(twin.parameters) == 33
     for i, parameter in enumerate(written.parameters.entries):
         start, _, rest = parameter.name.partition(".")
@@ -123,7 +133,7 @@ def test_the_complete_model_of_a_random_mechanism_has_the_rank_of_the_counting_r
     record, machine = random_mechanism(seed, limbs), random_robot(limbs, seed)
     state, q = wander(machine, 400, seed)
     assert state.T.shape[1] >= 40  # six rows each, for at most 142 parameters
-    D = sensitivity(machine, machine.values[None], q, state).parameters[0, :150]
+    D = differentiate_pose(machine, machine.values[None], q, state).parameters[0, :150]
     assert rank(scaled(machine, D), tolerance=1e-10) == expected_rank(record)
     offsets = len(machine.actuators)
     free = sum(
@@ -159,7 +169,7 @@ SLIDER = Limbs(  # two rods from driven slides to a point in the plane
             errors=(Shifts("rod", ("length",)),),
         ),
     ),
-    home=Pose(x=-0.05, y=-0.05),
+    home=PoseRecord(x=-0.05, y=-0.05),
 )
 
 
@@ -216,9 +226,9 @@ def test_a_named_parameter_moves_all_that_it_is_mapped_onto() -> None:
         inverse(machine.with_values(values), xy).q, inverse(build(wider.expand()), xy).q, atol=1e-12
     )
     solution = inverse(machine, xy)
-    D = sensitivity(machine, machine.values[None], solution.q[None], solution.state).parameters[
-        0, :, 3:5
-    ]
+    D = differentiate_pose(
+        machine, machine.values[None], solution.q[None], solution.state
+    ).parameters[0, :, 3:5]
     # the whole machine turned by da moves the point by da z x (x, y)
     expected = np.stack([-xy[:, 1], xy[:, 0]], axis=1)
     np.testing.assert_allclose(
@@ -241,7 +251,7 @@ def test_joints_made_of_others_move_like_them() -> None:
         limbs=(limb,),
         freedoms=("x", "y", "z"),
         controlled=("x", "y", "z"),
-        home=Pose(z=0.4),
+        home=PoseRecord(z=0.4),
     )
     machine = build(record.expand())
     xyz = np.array([[-0.02, -0.08, 0.3], [0.06, -0.01, 0.5]])
@@ -260,7 +270,7 @@ def test_limits_and_cones_of_a_file_are_told() -> None:
     # the first slide goes up with y, as long as its rod lies across; the rods lean more where the
     # point comes near them
     solution = inverse(machine, np.array([[-0.05, -0.05], [-0.05, 0.1], [0.02, -0.05]]))
-    allowed, why = within(machine, machine.values[None], solution.q[None], solution.state)
+    allowed, why = check_limits(machine, machine.values[None], solution.q[None], solution.state)
     assert allowed.tolist() == [[True, False, False]]
     assert why[0, 1].startswith("rod1.P1 is 0.457071, allowed are -1 to 0.45")
     assert why[0, 2].startswith("lean of rod1 at its tip is 0.97")

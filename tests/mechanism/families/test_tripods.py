@@ -13,13 +13,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from loopcal.engine.closure import geometry
+from loopcal.engine.closure import place_links
 from loopcal.errors import MechanismError
-from loopcal.mechanism import Mechanism, build
-from loopcal.mechanism.batch_kinematics import sensitivity
+from loopcal.mechanism import Mechanism, PoseRecord, Workspace, build, differentiate_pose
 from loopcal.mechanism.families.ru_pus_prs import LEFT_OUT, RuPusPrs
 from loopcal.mechanism.families.three_prs import ThreePrs
-from loopcal.mechanism.records import Pose, Workspace
 from tests.mechanism.families.ranks import (
     measured,
     null_vector,
@@ -39,7 +37,7 @@ THREE_PRS = ThreePrs(
     platform_radius=0.2,
     base_radius=0.35,
     rod=0.5,
-    home=Pose(z=0.7),
+    home=PoseRecord(z=0.7),
     workspace=Workspace(z=(0.65, 0.75), **TILTS),
 )
 RU_PUS_PRS = RuPusPrs(
@@ -48,7 +46,7 @@ RU_PUS_PRS = RuPusPrs(
     base_radius=0.4,
     rod=0.5,
     post=0.6,
-    home=Pose(z=0.6),
+    home=PoseRecord(z=0.6),
     workspace=Workspace(**TILTS),
 )
 KINDS = ("full", "5-dof", "positions", "orientation")
@@ -177,7 +175,9 @@ def test_columns_are_those_of_the_error_model_written_out(case: str) -> None:
     record, rows = CASES[case]
     machine = robot(record)
     solution = solved(machine)
-    D = sensitivity(machine, machine.values[None], solution.q[None], solution.state).parameters[0]
+    D = differentiate_pose(
+        machine, machine.values[None], solution.q[None], solution.state
+    ).parameters[0]
     expected = np.stack(
         [
             by_hand(rows(T[:3, 3], T[:3, :3], q), machine.parameters.names)
@@ -283,7 +283,9 @@ def test_columns_at_moved_parameters_are_those_of_the_closure_written_out(
     record, rows = CASES[case]
     machine = perturbed(robot(record), size, seed=11)
     solution = solved(machine, 40)
-    D = sensitivity(machine, machine.values[None], solution.q[None], solution.state).parameters[0]
+    D = differentiate_pose(
+        machine, machine.values[None], solution.q[None], solution.state
+    ).parameters[0]
     kind, names = rows.__name__.removesuffix("_rows"), machine.parameters.names
     found = [
         by_closure(kind, names, machine.values, T, q)
@@ -398,7 +400,7 @@ def test_a_tilted_guide_does_not_turn_the_joint_on_the_carriage() -> None:
     values[machine.parameters.index("thB1y")] = -0.1
     e, _ = machine.slots(values[None])
     group = machine.program.groups[0]
-    g = geometry(group, e)
+    g = place_links(group, e)
     np.testing.assert_allclose(g.turn[0][..., 0, 0] @ g.turn[1][..., 0, 0] @ EZ, EY, atol=1e-15)
 
 

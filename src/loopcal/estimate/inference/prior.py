@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopcal import engine
-from loopcal.errors import EstimationError, nearest
+from loopcal.errors import EstimationError, suggest_names
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.rows import AnyRows
 from loopcal.mechanism import Mechanism
@@ -115,7 +115,7 @@ class WithPrior:
             slope = np.stack([self._consistent(triangle) for triangle in factor[:, :-1, :-1]])
         residual = np.matmul(slope, (deviation - self.centre)[..., None])[..., 0] + self.constant
         rows = np.concatenate([slope, residual[..., None]], axis=2)
-        return engine.accumulate(factor, rows), cost + (residual**2).sum(axis=1)
+        return engine.fold(factor, rows), cost + (residual**2).sum(axis=1)
 
     def _consistent(self, triangle: FloatArray) -> FloatArray:
         """The prior's rows without the null directions (p, d) of measured rows that it does not
@@ -169,7 +169,7 @@ def limb_parameters(robot: Mechanism, limb: str) -> tuple[str, ...]:
     if not found:
         limbs = list(dict.fromkeys(name.split(".")[0] for name in free if "." in name))
         raise EstimationError(
-            f"no free parameter of {robot.name} belongs to {limb!r}{nearest(limb, limbs)}; limbs "
+            f"no free parameter of {robot.name} belongs to {limb!r}{suggest_names(limb, limbs)}; limbs "
             "with free parameters are "
             f"{', '.join(limbs)}"
         )

@@ -20,11 +20,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from loopcal.errors import FileError, UnitError, nearest
+from loopcal.errors import FileError, UnitError, suggest_names
 from loopcal.io.core.numbers import exact
 from loopcal.io.core.text_file import read_text
 from loopcal.io.core.yaml_file import YamlFile, parse_yaml, read_yaml
-from loopcal.units import Dimension, unit
+from loopcal.units import Dimension, find_unit
 
 if TYPE_CHECKING:
     import numpy as np
@@ -126,7 +126,7 @@ class Table:
                 f"column {name!r} has no unit; write it in brackets, for example {example}"
             )
         try:
-            return unit(symbol, dimension).factor_to_si
+            return find_unit(symbol, dimension).factor_to_si
         except UnitError as error:
             raise self.header_error(f"column {name!r}: {error}") from None
 
@@ -235,7 +235,7 @@ def require_columns(table: Table, needed: Sequence[str], why: str) -> None:
     for name in needed:
         if name not in table.units:
             hints = [meant(other, symbol, [name]) for other, symbol in table.units.items()]
-            hint = next(filter(None, hints), nearest(name, table.names))
+            hint = next(filter(None, hints), suggest_names(name, table.names))
             raise table.header_error(
                 f"there is no column {name!r}{hint}, which {why}; add it with its unit"
             )

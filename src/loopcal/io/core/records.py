@@ -17,9 +17,9 @@ import typing
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
-from loopcal.errors import FileError, nearest
+from loopcal.errors import FileError, suggest_names
 from loopcal.io.core.yaml_file import Location, YamlFile, has_child, refuse_unknown_keys, words
-from loopcal.units import Dimension, Unit, symbols, unit
+from loopcal.units import Dimension, Unit, find_unit, list_symbols
 
 T = TypeVar("T")
 Units = Mapping[Dimension, Unit]
@@ -79,19 +79,19 @@ def read_units(file: YamlFile) -> dict[Dimension, Unit]:
         )
     names = [d.value for d in (Dimension.LENGTH, Dimension.ANGLE)]
     refuse_unknown_keys(file, list(found), names, ("units",))
-    units = {Dimension.RATIO: unit("1")}
+    units = {Dimension.RATIO: find_unit("1")}
     for name in names:
         dimension = Dimension(name)
         if name not in found:
             raise file.error(f"'units' states no unit of {name}; {example}", ("units",))
         symbol = found[name]
-        if not isinstance(symbol, str) or symbol not in symbols(dimension):
-            hint = nearest(str(symbol), symbols(dimension))
-            allowed = ", ".join(symbols(dimension))
+        if not isinstance(symbol, str) or symbol not in list_symbols(dimension):
+            hint = suggest_names(str(symbol), list_symbols(dimension))
+            allowed = ", ".join(list_symbols(dimension))
             raise file.error(
                 f"{symbol!r} is not a unit of {name}{hint}; allowed are {allowed}", ("units", name)
             )
-        units[dimension] = unit(symbol, dimension)
+        units[dimension] = find_unit(symbol, dimension)
     return units
 
 
@@ -278,7 +278,7 @@ def _sentence(finding: Any, location: Location, node: Any, needed: int) -> str:
             f"{name} is {_shape(node)} where 'key: value' lines are needed; write it as a mapping"
         )
     if kind == "literal_error":
-        hint = nearest(
+        hint = suggest_names(
             str(node), [p.strip("' ") for p in context["expected"].replace(" or ", ",").split(",")]
         )
         return f"{name} is {node!r}{hint}; allowed: {context['expected'].replace(' or ', ', ')}"

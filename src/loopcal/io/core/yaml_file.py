@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from loopcal.errors import FileError, nearest
+from loopcal.errors import FileError, suggest_names
 from loopcal.io.core.text_file import read_text
 
 Location = tuple[str | int, ...]
@@ -142,7 +142,7 @@ def refuse_unknown_keys(
     """
     for key in keys:
         if key not in allowed:
-            hint = nearest(key, allowed) or f"; allowed are {', '.join(sorted(allowed))}"
+            hint = suggest_names(key, allowed) or f"; allowed are {', '.join(sorted(allowed))}"
             raise file.error(
                 f"unknown key {key!r}{_inside(location)}{hint}; correct or remove it",
                 (*location, key),

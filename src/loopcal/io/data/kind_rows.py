@@ -10,13 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from loopcal.errors import DataError, UnitError, nearest
+from loopcal.errors import DataError, UnitError, suggest_names
 from loopcal.io.core.csv_table import Table, meant, require_columns
 from loopcal.io.core.yaml_file import Location, refuse_unknown_keys
 from loopcal.io.data.context_columns import is_context
 from loopcal.io.data.kind_settings import list_kind_settings, read_kind, read_noise
 from loopcal.io.data.pose_rows import COMMANDED, OWN_COLUMNS, measured_name
-from loopcal.units import EXAMPLES, unit
+from loopcal.units import EXAMPLES, find_unit
 
 if TYPE_CHECKING:
     import numpy as np
@@ -211,7 +211,9 @@ def _refuse_unknown_columns(table: Table, robot: Mechanism, sensors: tuple[Senso
     )
     for name in table.names:
         if name not in known and not is_context(name) and not name.startswith("note"):
-            hint = meant(name, table.units[name], {*known, *OWN_COLUMNS}) or nearest(name, known)
+            hint = meant(name, table.units[name], {*known, *OWN_COLUMNS}) or suggest_names(
+                name, known
+            )
             hint = hint or f"; columns of this file can be {', '.join(sorted(known))}"
             raise table.header_error(
                 f"column {name!r} is unknown{hint}; correct it, or call it 'note {name}' to ignore "
@@ -333,7 +335,7 @@ def _products(table: Table, name: str, left: Column, right: Column) -> np.ndarra
     factor = 1.0
     for symbol, column in zip(symbols, (left, right), strict=True):
         try:
-            factor *= unit(symbol.strip(), column.dimension).factor_to_si
+            factor *= find_unit(symbol.strip(), column.dimension).factor_to_si
         except UnitError as error:
             raise table.header_error(f"column {name!r}: {error}") from None
     return (

@@ -23,10 +23,10 @@ from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
-from loopcal.errors import DataError, UnitError, nearest
+from loopcal.errors import DataError, UnitError, suggest_names
 from loopcal.io.core.numbers import shortest
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys, words
-from loopcal.units import EXAMPLES, Dimension, quantity
+from loopcal.units import EXAMPLES, Dimension, parse_quantity
 
 if TYPE_CHECKING:
     import numpy as np
@@ -82,7 +82,7 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
             location,
         )
     if name not in KINDS:
-        hint = nearest(str(name), KINDS)
+        hint = suggest_names(str(name), KINDS)
         raise file.error(
             f"{name!r} is not a kind of measurement{hint}; known are {known}", (*location, "kind")
         )
@@ -243,7 +243,7 @@ def _pose(file: YamlFile, node: Any, location: Location) -> np.ndarray:
         for key, d in POSE_KEYS.items()
     }
     angles = np.array([found[key] for key in ("roll", "pitch", "yaw")])
-    return geometry.pose(
+    return geometry.make_pose(
         geometry.euler_to_matrix(angles, "xyz"), np.array([found[key] for key in ("x", "y", "z")])
     )
 
@@ -263,7 +263,7 @@ def _pose_text(T: np.ndarray) -> str:
 def _quantity(file: YamlFile, node: Any, dimension: Dimension, location: Location) -> float:
     """Return the SI value of a number with its unit."""
     try:
-        return quantity(str(node), dimension)
+        return parse_quantity(str(node), dimension)
     except UnitError as error:
         raise file.error(f"{words(location)!r}: {error}", location) from None
 

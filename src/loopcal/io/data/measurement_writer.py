@@ -20,7 +20,7 @@ from loopcal.io.data.kind_settings import SYMBOLS, quantity_text, write_sensor
 from loopcal.io.data.measurement_file import FORMAT
 from loopcal.io.data.nuisance_settings import known_text
 from loopcal.io.data.pose_rows import LINK, measured_name
-from loopcal.units import Dimension, unit
+from loopcal.units import Dimension, find_unit
 
 if TYPE_CHECKING:
     import numpy as np
@@ -393,7 +393,7 @@ def _headers(names: Sequence[str], columns: Sequence[Column]) -> Mapping[str, st
 
 def _unit(robot: Mechanism, dimension: Dimension) -> tuple[str, float]:
     """Return symbol and factor of the robot's unit."""
-    found = unit(robot.units[dimension])
+    found = find_unit(robot.units[dimension])
     return found.symbol, found.factor_to_si
 
 

@@ -20,10 +20,10 @@ from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
-from loopcal.errors import UnitError, nearest
+from loopcal.errors import UnitError, suggest_names
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
 from loopcal.io.data.kind_settings import SYMBOLS, quantity_text
-from loopcal.units import Dimension, quantity
+from loopcal.units import Dimension, parse_quantity
 
 if TYPE_CHECKING:
     from loopcal.measure import Known, Observations
@@ -106,7 +106,7 @@ def _meant(file: YamlFile, entries: Sequence[Parameter], pattern: str) -> list[P
     meant = meant or [entry for entry in entries if fnmatchcase(entry.name, f"*.{pattern}")]
     if not meant:
         shown = ", ".join(names[:12]) or "none; say which are, as 'unknown: [frame]' of the kind"
-        hint = nearest(pattern, names)
+        hint = suggest_names(pattern, names)
         raise file.error(
             f"no unknown of this file is called {pattern!r}{hint}; there are {shown}",
             (KEY, pattern),
@@ -153,6 +153,6 @@ def _known(file: YamlFile, node: Any, meant: Sequence[Parameter], place: Locatio
 def _number(file: YamlFile, text: Any, dimension: Dimension, place: Location) -> float:
     """Return the SI value of a number with its unit."""
     try:
-        return quantity(str(text), dimension)
+        return parse_quantity(str(text), dimension)
     except UnitError as error:
         raise file.error(f"{place[-1]!r}: {error}", place) from None

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from loopcal.errors import DataError, nearest
+from loopcal.errors import DataError, suggest_names
 from loopcal.io.core.csv_table import Table, require_columns
 from loopcal.io.data.reading_noise import read_reading_sigma, says_noise
 from loopcal.io.robot.robot_file import load_robot
@@ -206,7 +206,7 @@ def _members(table: Table, row: int, cell: str, place: dict[str, int]) -> tuple[
     found = []
     for name in (part.strip() for part in cell.split(LINK)):
         if name not in place:
-            hint = nearest(name, place)
+            hint = suggest_names(name, place)
             raise table.row_error(
                 row, f"there is no pose {name!r}{hint}; give it a row with its readings"
             )

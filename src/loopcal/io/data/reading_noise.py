@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from loopcal.errors import UnitError
 from loopcal.io.core.yaml_file import Location, refuse_unknown_keys
-from loopcal.units import Dimension, quantity
+from loopcal.units import Dimension, parse_quantity
 
 if TYPE_CHECKING:
     import numpy as np
@@ -99,7 +99,7 @@ def _stated(table: Table, robot: Mechanism) -> dict[str, float]:
 def _number(table: Table, text: object, dimension: Dimension, place: Location) -> float:
     """Return a standard deviation [SI]."""
     try:
-        value = quantity(str(text), dimension)
+        value = parse_quantity(str(text), dimension)
     except UnitError as error:
         raise table.settings.error(f"{'.'.join(map(str, place))!r}: {error}", place) from None
     if not 0.0 <= value < math.inf:

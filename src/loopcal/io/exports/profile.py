@@ -17,14 +17,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from loopcal.errors import UnitError, nearest
+from loopcal.errors import UnitError, suggest_names
 from loopcal.io.core.yaml_file import Location, YamlFile, read_yaml, refuse_unknown_keys
 from loopcal.io.data.context_columns import TEMPERATURE_UNITS, TIME, TIME_UNITS, is_context
 from loopcal.io.data.kind_rows import COVARIANCE, SETTINGS, SIGMA
 from loopcal.io.data.kind_settings import list_kind_settings, read_kind
 from loopcal.io.exports.export_cells import plain_number, with_point
 from loopcal.io.robot.robot_file import check_format
-from loopcal.units import Dimension, symbols, unit
+from loopcal.units import Dimension, find_unit, list_symbols
 
 if TYPE_CHECKING:
     from loopcal.measure import Column, Kind
@@ -233,7 +233,7 @@ def _check_name(file: YamlFile, kind: Kind, name: str, known: list[str], noise: 
     of_noise = name.startswith((SIGMA, COVARIANCE))
     allowed, plain = (noise, name.replace(MEASURED, "")) if of_noise else (known, name)
     if plain not in allowed and not is_context(name) and not name.startswith("note"):
-        hint = nearest(name, allowed) or f"; there are {', '.join(allowed)}"
+        hint = suggest_names(name, allowed) or f"; there are {', '.join(allowed)}"
         raise file.error(
             f"{name!r} is no column of a measurement file of the kind {kind.name!r}{hint}",
             ("columns", name),
@@ -336,15 +336,15 @@ def _check_unit(
         )
     for part, dimension in zip(parts, needed, strict=True):
         try:
-            unit(part, dimension)
+            find_unit(part, dimension)
         except UnitError:
             of = (
                 f"unit of {name!r}"
-                if part in symbols()
-                else f"unit{nearest(part, symbols(dimension))}"
+                if part in list_symbols()
+                else f"unit{suggest_names(part, list_symbols(dimension))}"
             )
             raise file.error(
-                f"{part!r} is no {of}; write one of {', '.join(symbols(dimension))}", place
+                f"{part!r} is no {of}; write one of {', '.join(list_symbols(dimension))}", place
             ) from None
 
 
@@ -353,7 +353,7 @@ def _check_header(file: YamlFile, header: str, symbol: str, place: Location) -> 
     found = STATED.search(header)
     behind = symbol if found is None else found["unit"]
     stated = ALIASES.get(behind, behind)
-    if stated != symbol and stated in {*symbols(), *TIME_UNITS, *TEMPERATURE_UNITS} - {"1"}:
+    if stated != symbol and stated in {*list_symbols(), *TIME_UNITS, *TEMPERATURE_UNITS} - {"1"}:
         sentence = f"the export heads this column {header!r}, but the unit here is {symbol!r}"
         raise file.error(
             f"{sentence}; write the unit {stated}, or name the column by its place", place

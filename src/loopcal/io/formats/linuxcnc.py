@@ -40,7 +40,7 @@ from loopcal.io.formats.program_format import (
     record_of,
 )
 from loopcal.mechanism.families.gough import Gough
-from loopcal.units import Dimension, unit
+from loopcal.units import Dimension, find_unit
 
 SETP = re.compile(r"\s*setp\s+(genhexkins\.[\w.-]+)(\s*=\s*|\s+)([^\s#]+)")
 LEAD, OFFSETS = "genhexkins.screw-lead", ("genhexkins.spindle-offset", "genhexkins.tool-offset")
@@ -121,7 +121,7 @@ def read(path: Path, reading: ImportOptions) -> Imported:
             "a HAL file states no unit of length; say the machine's, as --unit mm or --unit in",
             path,
         )
-    symbol = unit(reading.length_unit, Dimension.LENGTH)
+    symbol = find_unit(reading.length_unit, Dimension.LENGTH)
     lift, lead = sum(hal.number(name, 0.0) for name in OFFSETS), hal.number(LEAD, 0.0)
     centres = {
         kind: [_lifted(hal.point(kind, n), lift) for n in range(6)] for kind in ("base", "platform")
@@ -170,7 +170,7 @@ def read(path: Path, reading: ImportOptions) -> Imported:
 def write(source: ExportSource, into: Path | None) -> Exported:
     """The corrected pins in a HAL file whose other bytes stay, or `setp` lines of their own."""
     record: Gough = record_of(source, Gough, "linuxcnc", "a hexapod of the family gough")
-    symbol = unit(source.robot.units[Dimension.LENGTH])
+    symbol = find_unit(source.robot.units[Dimension.LENGTH])
     hal = _Hal(Path("hexapod.hal"), (), {}) if into is None else _read(into)
     lift = sum(hal.number(name, 0.0) for name in OFFSETS)
     lead = hal.number(LEAD) if LEAD in hal.pins else None

@@ -17,7 +17,7 @@ from typing import Any
 
 from loopcal.io.core.numbers import shortest
 from loopcal.io.formats.program_format import Exported, ExportSource, Format
-from loopcal.units import unit
+from loopcal.units import find_unit
 
 FORMAT = 1
 COLUMNS = ("name", "nominal", "value", "plus_minus", "unit", "free")
@@ -27,7 +27,7 @@ def rows(source: ExportSource) -> Iterator[dict[str, Any]]:
     """One row for each parameter, numbers as text."""
     robot = source.robot
     for parameter, value in zip(robot.parameters.entries, robot.values.tolist(), strict=True):
-        shown = unit(robot.units[parameter.dimension])
+        shown = find_unit(robot.units[parameter.dimension])
         half = source.plus_minus.get(parameter.name)
         yield {
             "name": parameter.name,

@@ -90,7 +90,7 @@ def read(path: Path, reading: ImportOptions) -> Imported:
     platform, frame = _platform(urdf, loops, reading.platform)
     found = urdf_limbs.cut(loops, platform)
     loops = found.loops
-    T_body_frame = geometry.inverse(urdf.in_body(platform)) @ urdf.in_body(frame)
+    T_body_frame = geometry.invert_pose(urdf.in_body(platform)) @ urdf.in_body(frame)
     motion = loops.motions()
     turns = any(name.startswith("r") for name in found.freedoms)
     home = loops.places[platform] @ T_body_frame
@@ -134,7 +134,7 @@ def write(source: ExportSource, into: Path | None) -> Exported:
             continue
         found = urdf.joints[name]
         turn = zero if found.kind == "R" else 0.0
-        moved = found.origin @ geometry.pose(
+        moved = found.origin @ geometry.make_pose(
             geometry.exp_so3(turn * found.axis), shift + (zero - turn) * found.axis
         )
         urdf = urdf.with_origin(name, moved, turned=turn != 0.0)
@@ -240,10 +240,10 @@ def _limb(loops: Loops, limb: tuple[Edge, ...], T_body_frame: FloatArray, turns:
         if forward:
             name = f"tip, name: {json.dumps(edge.name)}" if ends else json.dumps(edge.name)
             errors.append(f"      - {{of: {name}, shift: [{', '.join(_across(axis))}]}}")
-        pending = geometry.inverse(edge.T_other if forward else edge.T_one)
+        pending = geometry.invert_pose(edge.T_other if forward else edge.T_one)
         body = other_end(edge, body)
     last = path[-1]
-    attach: FloatArray = geometry.inverse(pending @ T_body_frame)
+    attach: FloatArray = geometry.invert_pose(pending @ T_body_frame)
     if last.pin:
         # the far end of the pin, a joint of its own in the URDF
         errors.append(

@@ -61,8 +61,8 @@ class Edge:
     def moved(self, value: float) -> FloatArray:
         """(4, 4) T_one_body of the other body's joint frame."""
         if self.kind == "P":
-            return self.T_one @ geometry.pose(np.eye(3), value * self.axis)
-        return self.T_one @ geometry.pose(geometry.exp_so3(value * self.axis), np.zeros(3))
+            return self.T_one @ geometry.make_pose(np.eye(3), value * self.axis)
+        return self.T_one @ geometry.make_pose(geometry.exp_so3(value * self.axis), np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ class Loops:
     def pin_value(self, pin: Edge) -> float:
         """The angle of a pin at home [rad]."""
         T = self.places
-        between = geometry.inverse(T[pin.one] @ pin.T_one) @ T[pin.other] @ pin.T_other
+        between = geometry.invert_pose(T[pin.one] @ pin.T_one) @ T[pin.other] @ pin.T_other
         return float(geometry.log_so3(between[:3, :3]) @ pin.axis)
 
 

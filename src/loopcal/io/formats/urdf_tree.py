@@ -56,7 +56,7 @@ class UrdfJoint:
             R = geometry.exp_so3(value * self.axis)
         elif self.kind == "P":
             t = value * self.axis
-        return self.origin @ geometry.pose(R, t)
+        return self.origin @ geometry.make_pose(R, t)
 
 
 @dataclass(frozen=True)
@@ -230,7 +230,7 @@ def _joint(read_so_far: _Open, raw: bytes, path: Path) -> UrdfJoint:
     if start >= 0:
         end = raw.index(b">", start) + 1
     length = float(np.linalg.norm(axis)) or 1.0
-    origin = geometry.pose(geometry.euler_to_matrix(rpy, "xyz"), xyz)
+    origin = geometry.make_pose(geometry.euler_to_matrix(rpy, "xyz"), xyz)
     return UrdfJoint(
         name,
         kind,

@@ -9,10 +9,10 @@ import json
 import math
 from typing import TYPE_CHECKING
 
-from loopcal.errors import UnitError, nearest
+from loopcal.errors import UnitError, suggest_names
 from loopcal.io.core.numbers import shortest
 from loopcal.io.core.yaml_file import YamlFile, refuse_unknown_keys
-from loopcal.units import unit
+from loopcal.units import find_unit
 
 if TYPE_CHECKING:
     import numpy as np
@@ -48,7 +48,7 @@ def table_text(robot: Mechanism, plus_minus: np.ndarray | None = None) -> str:
     for i, parameter in enumerate(robot.parameters.entries):
         if parameter.free or robot.values[i] != parameter.nominal:
             deviation = math.nan if plus_minus is None else float(plus_minus[i])
-            shown = unit(robot.units[parameter.dimension])
+            shown = find_unit(robot.units[parameter.dimension])
             rows.append(
                 _row_text(
                     parameter.name,
@@ -85,7 +85,7 @@ def table_values(file: YamlFile, robot: Mechanism) -> np.ndarray:
             raise file.error(f"this row has no {key!r}, which is needed; write it as {_ROW}", place)
         name, value, symbol = row["name"], row["value"], row["unit"]
         if name not in robot.parameters.names:
-            hint = nearest(str(name), robot.parameters.names)
+            hint = suggest_names(str(name), robot.parameters.names)
             raise file.error(
                 f"{name!r} is not a parameter of this robot{hint}; correct its name", place
             )
@@ -100,7 +100,7 @@ def table_values(file: YamlFile, robot: Mechanism) -> np.ndarray:
             )
         index = robot.parameters.index(name)
         try:
-            factor = unit(str(symbol), robot.parameters.dimensions[index]).factor_to_si
+            factor = find_unit(str(symbol), robot.parameters.dimensions[index]).factor_to_si
         except UnitError as error:
             raise file.error(f"the unit of {name!r}: {error}", place) from None
         values[index] = value * factor

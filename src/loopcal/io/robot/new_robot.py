@@ -9,7 +9,7 @@ import json
 import re
 import textwrap
 
-from loopcal.errors import MechanismError, nearest
+from loopcal.errors import MechanismError, suggest_names
 from loopcal.io.core import file_reference
 from loopcal.io.core.yaml_file import read_yaml
 from loopcal.io.robot.robot_file import list_shipped_robots
@@ -44,7 +44,7 @@ def format_new_robot(family: str, name: str) -> str:
     example = EXAMPLES.get(family, family)
     if example not in shipped:
         known = [*FAMILIES, *(robot for robot in shipped if robot not in FAMILIES)]
-        hint = nearest(family, known)
+        hint = suggest_names(family, known)
         raise MechanismError(
             f"{family!r} is neither a family nor a shipped robot{hint}; known are "
             f"{', '.join(known)}"

@@ -21,7 +21,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from loopcal.errors import FileError, LoopcalError, MechanismError, nearest
+from loopcal.errors import FileError, LoopcalError, MechanismError, suggest_names
 from loopcal.io.core.records import read_record, read_units
 from loopcal.io.core.text_file import write_text
 from loopcal.io.core.yaml_file import YamlFile, read_yaml
@@ -30,7 +30,7 @@ from loopcal.io.robot.identified_table import TABLE, nominal_text, table_text, t
 if TYPE_CHECKING:
     import numpy as np
 
-    from loopcal.mechanism import Assembly, Mechanism, Robot
+    from loopcal.mechanism import Assembly, Mechanism, RobotRecord
 
 FORMAT = 1
 HEADER = ("format", "units", "family", TABLE)
@@ -141,7 +141,7 @@ def find_robot_file(source: str | Path) -> Path:
     shipped = list_shipped_robots()
     if str(source) in shipped:
         return shipped[str(source)]
-    hint = nearest(str(source), shipped)
+    hint = suggest_names(str(source), shipped)
     names = ", ".join(shipped) or "none"
     raise FileError(
         f"there is no such robot file{hint}; name a file, or one of the shipped robots: {names}",
@@ -187,23 +187,23 @@ def _family(file: YamlFile, known: Sequence[str]) -> str:
             f"this file names no family; write 'family:' and one of {', '.join(known)}"
         )
     if found not in known:
-        hint = nearest(str(found), known)
+        hint = suggest_names(str(found), known)
         raise file.error(
             f"{found!r} is not a family of robots{hint}; known are {', '.join(known)}", ("family",)
         )
     return str(found)
 
 
-def _assembly(record: Robot, file: YamlFile) -> Assembly:
+def _assembly(record: RobotRecord, file: YamlFile) -> Assembly:
     """Return what a record expands to; a name under `fixed` that calls no parameter is refused at
     its line.
     """
-    from loopcal.mechanism.records import called
+    from loopcal.mechanism import match_parameter_names
 
     names = [parameter.name for parameter in record.expand().parameters] if record.fixed else []
     for i, pattern in enumerate(record.fixed):
         try:
-            called(pattern, names)
+            match_parameter_names(pattern, names)
         except MechanismError as error:
             raise file.error(str(error), ("fixed", i)) from None
     return record.assembly()

@@ -14,7 +14,7 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from loopcal.errors import DataError, nearest
+from loopcal.errors import (DataError, suggest_names)
 from loopcal.io.runs.calibration_run import load_calibrated
 from loopcal.io.core.csv_table import read_table, require_columns
 from loopcal.io.data.measurement_file import Paths, list_measurement_files
@@ -22,7 +22,7 @@ from loopcal.io.core.numbers import shortest
 from loopcal.io.data.pose_rows import COMMANDED, dimension_of
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.io.runs.run_folder import find_fitted_file, read_run_folder
-from loopcal.units import DISPLAY_UNITS, Dimension, Unit, unit
+from loopcal.units import (DISPLAY_UNITS, Dimension, Unit, find_unit)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -102,7 +102,7 @@ def load_targets(path: str | Path, robot: Mechanism) -> tuple[np.ndarray, tuple[
     for name in table.names:
         if name not in known and not name.startswith("note"):
             raise table.header_error(
-                f"column {name!r} is unknown{nearest(name, known)}; columns of targets are "
+                f"column {name!r} is unknown{suggest_names(name, known)}; columns of targets are "
                 f"{', '.join(known)}; call it "
                 f"'note {name}' to ignore it"
             )
@@ -144,7 +144,7 @@ def format_compensation(found: Compensation) -> str:
 
 def _unit(robot: Mechanism, dimension: Dimension) -> Unit:
     """Return the unit in which the robot's file has this dimension."""
-    return unit(robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol))
+    return find_unit(robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol))
 
 
 def _number(value: float) -> str:

@@ -28,7 +28,7 @@ from loopcal.io.core.numbers import exact
 from loopcal.io.data.pose_rows import dimension_of
 from loopcal.io.core.text_file import sha256, report_write_errors
 from loopcal.io.data.pose_use import FIT, HELD_OUT, USE, insert_use_column
-from loopcal.units import Dimension, unit
+from loopcal.units import (Dimension, find_unit)
 
 if TYPE_CHECKING:
     from loopcal.planning.result import Plan
@@ -191,5 +191,5 @@ def write_plan_folder(
 
 def unit_of(robot: Mechanism, dimension: Dimension) -> tuple[str, float]:
     """Return symbol and factor of the robot's unit."""
-    found = unit(robot.units[dimension])
+    found = find_unit(robot.units[dimension])
     return found.symbol, found.factor_to_si

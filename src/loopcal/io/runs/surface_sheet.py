@@ -13,7 +13,7 @@ from loopcal.io.core.csv_table import quoted
 from loopcal.io.data.measurement_writer import format_measurements
 from loopcal.io.data.pose_rows import dimension_of
 from loopcal.io.runs.plan_folder import DIGITS, VIA, unit_of
-from loopcal.mechanism.coordinates import POSITION
+from loopcal.mechanism import POSITION
 from loopcal.units import Dimension
 
 if TYPE_CHECKING:

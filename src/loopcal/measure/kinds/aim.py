@@ -97,7 +97,7 @@ class AimKind(Kind):
     ) -> Evaluation:
         d, rows = self.direction(T, values)
         predicted, slopes = self.predict(d)
-        return self.split(geometry.wrap(predicted - measured), slopes @ rows)
+        return self.split(geometry.wrap_angle(predicted - measured), slopes @ rows)
 
     def measure(
         self,

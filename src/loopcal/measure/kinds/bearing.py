@@ -54,8 +54,8 @@ class Bearing(TargetKind):
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
         """A theodolite, a camera at an unknown station, and two targets."""
-        station = geometry.pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
-        behind = geometry.pose(np.eye(3), np.array([0.1, -0.1, -2.5]))
+        station = geometry.make_pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
+        behind = geometry.make_pose(np.eye(3), np.array([0.1, -0.1, -2.5]))
         pair = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02]])
         return (
             cls(T_base_frame=station),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.geometry.orientation_forms import Orientation, orientation
+from loopcal.geometry.orientation_forms import OrientationForm, parse_orientation
 from loopcal.measure.closed_form import kabsch
 from loopcal.measure.kinds import parts
 from loopcal.measure.kinds.kind import Bools, Column, Evaluation
@@ -64,7 +64,7 @@ class Component(ToolKind):
     components: tuple[str, ...] = ("z",)
     orientation: str | None = None
 
-    form: Orientation | None = field(init=False, repr=False)
+    form: OrientationForm | None = field(init=False, repr=False)
     _places_among: NDArray[np.intp] = field(init=False, repr=False)
 
     name: ClassVar[str] = "component"
@@ -72,7 +72,7 @@ class Component(ToolKind):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "components", tuple(self.components))
-        form = None if self.orientation is None else orientation(self.orientation)
+        form = None if self.orientation is None else parse_orientation(self.orientation)
         if form is not None and not form.angles:
             raise DataError(
                 f"components of a {form.name} cannot be measured one by one: declare tilt-torsion "
@@ -158,7 +158,7 @@ class Component(ToolKind):
         difference = predicted - np.where(np.isnan(measured), predicted, measured)
         residual = difference
         if self.form is not None:
-            residual = np.where(self._places_among < 3, geometry.wrap(difference), difference)
+            residual = np.where(self._places_among < 3, geometry.wrap_angle(difference), difference)
         moved = self.transport(T, values)
         rows = slopes @ moved
         if not self._has_normal:
@@ -220,7 +220,7 @@ class Component(ToolKind):
         angles = np.stack([self._value(values, name) for name in self._angle_names], axis=-1)
         position = np.zeros((*values.shape[:-1], 3))
         rotation = np.broadcast_to(np.eye(3), (*values.shape[:-1], 3, 3))
-        seen = geometry.pose(
+        seen = geometry.make_pose(
             rotation if self.form is None else self.form.to_matrix(angles), position
         )
         rows = self._slopes(angles)

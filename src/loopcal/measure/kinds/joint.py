@@ -96,7 +96,7 @@ class JointSensor(Kind):
     ) -> Evaluation:
         residual = self.predict(joints, values) - measured
         if self.dimension is Dimension.ANGLE:
-            residual = geometry.wrap(residual)
+            residual = geometry.wrap_angle(residual)
         m = len(self.joints)
         still = np.zeros((*residual.shape, 6))
         slope = np.broadcast_to(np.eye(m), (*residual.shape, m))

@@ -48,7 +48,7 @@ def frame_at(stated: FloatArray, values: FloatArray | None) -> FloatArray:
     """The frame (.., 4, 4) at values (.., 6), or as stated."""
     if values is None:
         return stated
-    return geometry.pose(geometry.exp_so3(values[..., :3]) @ stated[:3, :3], values[..., 3:])
+    return geometry.make_pose(geometry.exp_so3(values[..., :3]) @ stated[:3, :3], values[..., 3:])
 
 
 def frame_values(stated: FloatArray, T: FloatArray) -> FloatArray:

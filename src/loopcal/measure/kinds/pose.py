@@ -7,7 +7,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from loopcal import geometry
-from loopcal.geometry.orientation_forms import Orientation, orientation
+from loopcal.geometry.orientation_forms import OrientationForm, parse_orientation
 from loopcal.measure.closed_form import hand_eye
 from loopcal.measure.kinds import parts
 from loopcal.measure.kinds.component import FLAT
@@ -44,13 +44,13 @@ class Pose(ToolKind):
     """
 
     orientation: str = "rotation-vector"
-    form: Orientation = field(init=False, repr=False)
+    form: OrientationForm = field(init=False, repr=False)
 
     name: ClassVar[str] = "pose"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "form", orientation(self.orientation))
+        object.__setattr__(self, "form", parse_orientation(self.orientation))
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
@@ -157,7 +157,7 @@ class Pose(ToolKind):
         whole = ~np.any(np.isnan(measured), axis=-1)
         if not self.unknown or np.count_nonzero(whole) < 3:
             return super().starts(T, measured)
-        seen = geometry.pose(self.form.to_matrix(measured[whole, :-3]), measured[whole, -3:])
+        seen = geometry.make_pose(self.form.to_matrix(measured[whole, :-3]), measured[whole, -3:])
         frame, tool = hand_eye(
             T[whole],
             seen,

@@ -195,7 +195,7 @@ class TargetKind(Kind):
     ) -> Evaluation:
         predicted, rows = self._predicted(T, values)
         residual = predicted - measured
-        return self.split(geometry.wrap(residual) if self.wraps else residual, rows)
+        return self.split(geometry.wrap_angle(residual) if self.wraps else residual, rows)
 
     def measure(
         self,

@@ -92,7 +92,7 @@ class ToolKind(Kind):
         of the unknowns.
         """
         frame, tool = self._places(self.values(values))
-        return geometry.inverse(frame) @ (T @ tool)
+        return geometry.invert_pose(frame) @ (T @ tool)
 
     def transport(self, T: FloatArray, values: FloatArray | None = None) -> FloatArray:
         """Map (.., 6, 6 + u) to the tool's twist in axes of the frame, from platform twist and
@@ -102,15 +102,15 @@ class ToolKind(Kind):
         frame, tool = self._places(values)
         Q = np.swapaxes(frame[..., :3, :3], -1, -2)
         arm = (T[..., :3, :3] @ tool[..., :3, 3:])[..., 0]
-        blocks = {"twist": geometry.transport(arm, Q)}
+        blocks = {"twist": geometry.transport_matrix(arm, Q)}
         own = self.part(values, "frame")
         if own is not None:
             # what moves the frame moves the tool the other way, seen from it
             lever = arm + T[..., :3, 3] - frame[..., :3, 3]
-            blocks["frame"] = -geometry.transport(lever, Q) @ parts.frame_slope(own)
+            blocks["frame"] = -geometry.transport_matrix(lever, Q) @ parts.frame_slope(own)
         own = self.part(values, "tool")
         if own is not None:
-            blocks["tool"] = geometry.transport(
+            blocks["tool"] = geometry.transport_matrix(
                 np.zeros(3), Q @ T[..., :3, :3]
             ) @ parts.frame_slope(own)
         return self.columns_of(blocks, (*T.shape[:-2], 6))
@@ -121,7 +121,9 @@ class ToolKind(Kind):
         """
         if "frame" not in self.unknown:
             return self.nominal[None]
-        frames = geometry.pose(OCTAHEDRAL @ self.T_base_frame[:3, :3], self.T_base_frame[:3, 3])
+        frames = geometry.make_pose(
+            OCTAHEDRAL @ self.T_base_frame[:3, :3], self.T_base_frame[:3, 3]
+        )
         return stacked(self, {"frame": parts.frame_values(self.T_base_frame, frames)}, len(frames))
 
     def _places(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:

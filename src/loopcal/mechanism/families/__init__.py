@@ -12,9 +12,9 @@ from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.families.linear_delta import LinearDelta
 from loopcal.mechanism.families.ru_pus_prs import RuPusPrs
 from loopcal.mechanism.families.three_prs import ThreePrs
-from loopcal.mechanism.records import Robot
+from loopcal.mechanism.records import RobotRecord
 
-FAMILIES: Mapping[str, type[Robot]] = {
+FAMILIES: Mapping[str, type[RobotRecord]] = {
     "3-prs": ThreePrs,
     "gough": Gough,
     "limbs": Limbs,

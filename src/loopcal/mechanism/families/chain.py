@@ -16,7 +16,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
-from loopcal.mechanism.assembly import AXES, Address, Cone, Joint, Limb, Linear, Link
+from loopcal.mechanism.assembly import AXES, Address, Cone, Joint, Limb, LinearMap, Link
 from loopcal.typing import FloatArray
 
 EX, EY, EZ = np.eye(3)
@@ -139,7 +139,7 @@ def axis_frame(axis: FloatArray, name: str) -> FloatArray:
 
 def moved(
     parameter: str, limb: Placed, element: str, axis: str, coefficient: float = 1.0
-) -> tuple[Linear, ...]:
+) -> tuple[LinearMap, ...]:
     """Maps of a parameter that moves an element along, or turns it about, an axis of the frame
     carried there.
 
@@ -153,7 +153,7 @@ def moved(
 
 def towards(
     parameter: str, limb: Placed, element: str, turns: bool, direction: FloatArray
-) -> tuple[Linear, ...]:
+) -> tuple[LinearMap, ...]:
     """Maps of a parameter that turns an element about (or moves it along) `direction`, in the frame
     carried there.
     """
@@ -161,13 +161,13 @@ def towards(
     axes = AXES[:3] if turns else AXES[3:]
     # what is below rounding of a direction is no component
     return tuple(
-        Linear(parameter, Address(limb.name, element, axis), float(part))
+        LinearMap(parameter, Address(limb.name, element, axis), float(part))
         for axis, part in zip(axes, own, strict=True)
         if abs(part) > 1e-12 * np.abs(own).max()
     )
 
 
-def tilted(parameter: str, limb: Placed, element: str, axis: str) -> tuple[Linear, ...]:
+def tilted(parameter: str, limb: Placed, element: str, axis: str) -> tuple[LinearMap, ...]:
     """Maps of a parameter that turns the axis of a sliding joint and leaves what slides on it
     unturned.
 
@@ -195,7 +195,7 @@ def tilted(parameter: str, limb: Placed, element: str, axis: str) -> tuple[Linea
 
 def at(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> FloatArray:
     """(4, 4) translation [m]."""
-    return geometry.pose(np.eye(3), np.array([x, y, z]))
+    return geometry.make_pose(np.eye(3), np.array([x, y, z]))
 
 
 def turn_about(axis: str, angle: float) -> FloatArray:
@@ -204,4 +204,4 @@ def turn_about(axis: str, angle: float) -> FloatArray:
 
 
 def _turned(R: FloatArray) -> FloatArray:
-    return geometry.pose(R, np.zeros(3))
+    return geometry.make_pose(R, np.zeros(3))

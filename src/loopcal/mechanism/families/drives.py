@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from loopcal.errors import MechanismError
-from loopcal.mechanism.assembly import Actuator, Address, Linear
+from loopcal.mechanism.assembly import Actuator, Address, LinearMap
 from loopcal.mechanism.families.errors import Errors, quantity
 from loopcal.mechanism.families.limb_records import AngleDrive, Drive, LengthDrive, SpoolDrive
 from loopcal.mechanism.records import (
@@ -71,7 +71,7 @@ def drive_errors(name: str, drive: Drive, turns: bool) -> Errors:
             dimension,
             nominal,
             sd,
-            Linear(full, Address(name, "transmission", axis), coefficient),
+            LinearMap(full, Address(name, "transmission", axis), coefficient),
         )
     return found
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal.mechanism.assembly import AXES, Address, Linear
+from loopcal.mechanism.assembly import AXES, Address, LinearMap
 from loopcal.mechanism.families.chain import Placed, moved
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
@@ -31,7 +31,7 @@ class Errors:
     """Parameters with their maps; `+` joins two."""
 
     parameters: tuple[Parameter, ...] = ()
-    maps: tuple[Linear, ...] = ()
+    maps: tuple[LinearMap, ...] = ()
 
     def __add__(self, other: Errors) -> Errors:
         return Errors(self.parameters + other.parameters, self.maps + other.maps)
@@ -92,7 +92,7 @@ def quantity(
     dimension: Dimension,
     nominal: float,
     tolerance: float | None,
-    *maps: Linear,
+    *maps: LinearMap,
     free: bool = True,
 ) -> Errors:
     """One named parameter."""
@@ -119,7 +119,7 @@ def rod_length(limb: Placed, tolerance: float | None) -> Errors:
     """The length of a `distance` ending's rod at reading zero, `limb.length`."""
     name = f"{limb.name}.length"
     address = Address(limb.name, "rod", "length")
-    return quantity(name, Dimension.LENGTH, limb.limb.length, tolerance, Linear(name, address))
+    return quantity(name, Dimension.LENGTH, limb.limb.length, tolerance, LinearMap(name, address))
 
 
 def offset(
@@ -131,7 +131,7 @@ def offset(
         dimension,
         nominal,
         tolerance,
-        Linear(name, Address(actuator, "transmission", "offset")),
+        LinearMap(name, Address(actuator, "transmission", "offset")),
     )
 
 
@@ -165,11 +165,11 @@ def _displacement(limb: Placed, element: str, axis: str, spread: Spread) -> Erro
     name = f"{limb.name}.{element}.{axis}"
     dimension = Dimension.ANGLE if axis in AXES[:3] else Dimension.LENGTH
     return quantity(
-        name, dimension, 0.0, spread.of(axis), Linear(name, Address(limb.name, element, axis))
+        name, dimension, 0.0, spread.of(axis), LinearMap(name, Address(limb.name, element, axis))
     )
 
 
-def _in_frame_before(name: str, limb: Placed, element: str, axis: str) -> tuple[Linear, ...]:
+def _in_frame_before(name: str, limb: Placed, element: str, axis: str) -> tuple[LinearMap, ...]:
     """Maps of a move along an axis of the frame before the placement."""
     turn = limb.places[element][:3, :3]
     parts = turn.T @ [float(a == axis) for a in "xyz"]

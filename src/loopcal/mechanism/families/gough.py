@@ -23,9 +23,9 @@ from loopcal.mechanism.records import (
     AngleTolerance,
     LengthTolerance,
     Point,
-    Robot,
-    per_leg,
+    RobotRecord,
     standard_deviation,
+    values_per_leg,
 )
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length
@@ -53,7 +53,7 @@ class GoughCones:
 
 
 @dataclass(frozen=True)
-class Gough(Robot):
+class Gough(RobotRecord):
     """A hexapod's file.
 
     Attributes
@@ -86,7 +86,7 @@ class Gough(Robot):
         form cannot carry.
         """
         self._check()
-        lengths = per_leg(self.lengths, 6, "lengths")
+        lengths = values_per_leg(self.lengths, 6, "lengths")
         screws = self.screw.legs() if self.screw else (None,) * 6
         legs, actuators, errors = [], [], Errors()
         for i, length in enumerate(lengths):

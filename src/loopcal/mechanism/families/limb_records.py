@@ -20,7 +20,7 @@ from loopcal.mechanism.records import (
     AngleTolerance,
     LengthTolerance,
     Point,
-    Pose,
+    PoseRecord,
     RatioTolerance,
     translation,
 )
@@ -28,7 +28,7 @@ from loopcal.typing import FloatArray
 from loopcal.units import Angle, Length, Ratio
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"] | tuple[Ratio, Ratio, Ratio]
-Place = Point | Pose
+Place = Point | PoseRecord
 ORIGIN: Point = (0.0, 0.0, 0.0)
 Moving = Literal["x", "y", "z", "length"]
 Turning = Literal["rx", "ry", "rz"]
@@ -43,7 +43,7 @@ def direction(axis: Axis) -> FloatArray:
 
 def place_matrix(place: Place) -> FloatArray:
     """A placement as (4, 4)."""
-    return place.matrix if isinstance(place, Pose) else translation(place)
+    return place.matrix if isinstance(place, PoseRecord) else translation(place)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopcal.errors import MechanismError
-from loopcal.mechanism.assembly import AXES, Address, Assembly, Cone, Linear
+from loopcal.mechanism.assembly import AXES, Address, Assembly, Cone, LinearMap
 from loopcal.mechanism.families.chain import (
     EX,
     EY,
@@ -51,12 +51,12 @@ from loopcal.mechanism.families.limb_records import (
     refuse_branch,
 )
 from loopcal.mechanism.families.map_units import check_units, dimension_of, engine_axis
-from loopcal.mechanism.records import Robot, standard_deviation
+from loopcal.mechanism.records import RobotRecord, standard_deviation
 from loopcal.units import Dimension
 
 
 @dataclass(frozen=True)
-class Limbs(LimbsFile, Robot):
+class Limbs(LimbsFile, RobotRecord):
     """The file of a mechanism of any limbs.
 
     Attributes
@@ -266,7 +266,9 @@ def _shifts(limb: Placed, entry: Shifts) -> Errors:
             _check_rod(limb, entry)
             name = label if entry.name else f"{limb.name}.length"
             address = Address(limb.name, "rod", "length")
-            found += quantity(name, Dimension.LENGTH, limb.limb.length, sd, Linear(name, address))
+            found += quantity(
+                name, Dimension.LENGTH, limb.limb.length, sd, LinearMap(name, address)
+            )
             continue
         element = _element(limb, entry.of)
         place, name = limb.places[element], f"{label}.{axis}"
@@ -324,12 +326,12 @@ def _onto(
     entry: Onto,
     members: dict[str, tuple[_Member, ...]],
     drives: Mapping[str, tuple[Drive, bool]],
-) -> Iterator[Linear]:
+) -> Iterator[LinearMap]:
     """One entry of a parameter's maps, for every copy that it means."""
     name, (axis, coefficient) = named.name, engine_axis(named.name, entry)
     if entry.limb in drives:
         check_units(named, entry, drives[entry.limb])
-        yield Linear(name, Address(entry.limb, entry.element, axis), coefficient)
+        yield LinearMap(name, Address(entry.limb, entry.element, axis), coefficient)
         return
     found = members.get(entry.limb) or tuple(
         m for ms in members.values() for m in ms if m.placed.name == entry.limb
@@ -347,7 +349,7 @@ def _onto(
                 name, one.placed, _element(one.placed, entry.element), axis, coefficient
             )
         else:
-            yield Linear(name, Address(one.placed.name, entry.element, axis), coefficient)
+            yield LinearMap(name, Address(one.placed.name, entry.element, axis), coefficient)
 
 
 def _plain(vector: np.ndarray) -> tuple[float, float, float]:

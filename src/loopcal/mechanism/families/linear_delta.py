@@ -17,14 +17,14 @@ from typing import Literal
 import numpy as np
 
 from loopcal.errors import MechanismError
-from loopcal.mechanism.assembly import Actuator, Address, Assembly, Joint, Limb, Linear, Link
+from loopcal.mechanism.assembly import Actuator, Address, Assembly, Joint, Limb, LinearMap, Link
 from loopcal.mechanism.records import (
     AngleTolerance,
     LengthTolerance,
-    Robot,
-    per_leg,
+    RobotRecord,
     standard_deviation,
     translation,
+    values_per_leg,
 )
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
@@ -74,7 +74,7 @@ class TowerMap:
 
 
 @dataclass(frozen=True)
-class LinearDelta(Robot):
+class LinearDelta(RobotRecord):
     """A linear delta's file.
 
     Attributes
@@ -98,7 +98,7 @@ class LinearDelta(Robot):
 
     def expand(self) -> Assembly:
         """Three limbs: a driven carriage on a tower, then a rod; the platform keeps x, y and z."""
-        arms, stops = per_leg(self.arms, 3, "arms"), per_leg(self.stops, 3, "stops")
+        arms, stops = values_per_leg(self.arms, 3, "arms"), values_per_leg(self.stops, 3, "stops")
         if len(self.angles) != 3:
             raise MechanismError(
                 f"{self.name} has {len(self.angles)} tower angles; a linear delta has three"
@@ -133,7 +133,7 @@ class LinearDelta(Robot):
                 Parameter(f"arm{k}.length", Dimension.LENGTH, arm, sd["arms"]),
                 Parameter(f"tower{k}.stop", Dimension.LENGTH, stop, sd["stops"]),
             ]
-            maps.append(Linear(f"arm{k}.length", Address(limb, "rod", "length")))
+            maps.append(LinearMap(f"arm{k}.length", Address(limb, "rod", "length")))
             shared.append(
                 TowerMap(
                     ("radius", f"tower{k}.angle", f"arm{k}.length", f"tower{k}.stop"),

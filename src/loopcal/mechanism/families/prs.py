@@ -17,7 +17,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
-from loopcal.mechanism.assembly import Address, Linear
+from loopcal.mechanism.assembly import Address, LinearMap
 from loopcal.mechanism.families.chain import EX, EY, EZ, Placed, Step, at, moved, placed, tilted
 from loopcal.mechanism.families.errors import Errors, quantity
 from loopcal.mechanism.records import AngleTolerance, LengthTolerance, standard_deviation
@@ -61,7 +61,7 @@ class Frames:
 
     def gap(self, name: str) -> FloatArray:
         """From the foot of the guide to the ball at home (3,), in the chain frame [m]."""
-        gap = (geometry.inverse(self.base) @ self.home @ self.platform)[:3, 3]
+        gap = (geometry.invert_pose(self.base) @ self.home @ self.platform)[:3, 3]
         if not np.hypot(gap[0], gap[1]) < self.length:
             raise MechanismError(
                 f"the rod of {name} is {self.length * 1e3:g} mm long, but its ball is "
@@ -88,7 +88,9 @@ def prs_limb(name: str, motor: str, frames: Frames, axis: str, axes: bool) -> Pl
     end = at(0.0, 0.0, frames.length)
     if not axes:
         return placed(name, steps, end, "ball", frames.platform)
-    upright = geometry.pose(geometry.exp_so3(-lean * turn), np.array([0.0, 0.0, frames.length]))
+    upright = geometry.make_pose(
+        geometry.exp_so3(-lean * turn), np.array([0.0, 0.0, frames.length])
+    )
     return placed(name, (*steps, *_ball(upright, frames)), np.eye(4), "rigid", frames.platform)
 
 
@@ -112,7 +114,7 @@ def pus_limb(name: str, motor: str, frames: Frames, axes: bool) -> Placed:
 def _ball(place: FloatArray, frames: Frames) -> tuple[Step, ...]:
     """Three axes through the ball's centre, at zero in the home pose."""
     relative = frames.base[:3, :3].T @ frames.home[:3, :3] @ frames.platform[:3, :3]
-    place = place @ geometry.pose(relative, np.zeros(3))
+    place = place @ geometry.make_pose(relative, np.zeros(3))
     return tuple(
         Step(f"ball{i + 1}", "R", place if i == 0 else np.eye(4), axis)
         for i, axis in enumerate((EZ, EY, EX))
@@ -147,12 +149,12 @@ def drive_and_rod(
     """q., the carriage's place at reading zero, and l., the rod's length."""
     q, rod = f"q{number}", f"l{number}"
     rods = (
-        (Linear(rod, Address(limb.name, "rod", "length")),)
+        (LinearMap(rod, Address(limb.name, "rod", "length")),)
         if limb.limb.ending == "distance"
         else moved(rod, limb, "tip", "z")
     )
     return quantity(
-        q, Dimension.LENGTH, 0.0, tolerance, Linear(q, Address(motor, "transmission", "offset"))
+        q, Dimension.LENGTH, 0.0, tolerance, LinearMap(q, Address(motor, "transmission", "offset"))
     ) + quantity(rod, Dimension.LENGTH, frames.length, tolerance, *rods)
 
 

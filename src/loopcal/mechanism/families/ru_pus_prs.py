@@ -36,7 +36,7 @@ from loopcal.mechanism.families.prs import (
     prs_limb,
     pus_limb,
 )
-from loopcal.mechanism.records import Robot
+from loopcal.mechanism.records import RobotRecord
 from loopcal.units import Dimension, Length
 
 POST_ANGLES = (
@@ -56,7 +56,7 @@ LEFT_OUT = ("thOz", "thU1z")
 
 
 @dataclass(frozen=True)
-class RuPusPrs(Robot):
+class RuPusPrs(RobotRecord):
     """An RU-PUS-PRS tracker's file.
 
     Attributes

@@ -31,12 +31,12 @@ from loopcal.mechanism.families.prs import (
     joint_angles,
     prs_limb,
 )
-from loopcal.mechanism.records import Robot
+from loopcal.mechanism.records import RobotRecord
 from loopcal.units import Dimension, Length
 
 
 @dataclass(frozen=True)
-class ThreePrs(Robot):
+class ThreePrs(RobotRecord):
     """A 3-PRS tripod's file.
 
     Attributes

@@ -21,7 +21,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.mechanism.families.chain import EX, EY, EZ, Placed, Step, at, placed
-from loopcal.mechanism.records import per_leg
+from loopcal.mechanism.records import values_per_leg
 from loopcal.typing import FloatArray
 from loopcal.units import Length, Ratio
 
@@ -60,7 +60,7 @@ class Screw:
                 f"the screw names {len(self.base_axes)} base_axes and {len(self.platform_axes)} "
                 "platform_axes; name six of each"
             )
-        leads = per_leg(self.lead, 6, "the screw's lead")
+        leads = values_per_leg(self.lead, 6, "the screw's lead")
         return tuple(
             ScrewLeg(*one) for one in zip(leads, self.base_axes, self.platform_axes, strict=True)
         )
@@ -89,7 +89,7 @@ def ups_leg(
     )
     if not axes:
         return placed(name, steps, np.eye(4), "ball", at(*top))
-    turned = geometry.pose(home[:3, :3], np.zeros(3))
+    turned = geometry.make_pose(home[:3, :3], np.zeros(3))
     ball = tuple(
         Step(f"ball{i + 1}", "R", turned if i == 0 else np.eye(4), axis)
         for i, axis in enumerate((EZ, EY, EX))
@@ -118,7 +118,7 @@ def screw_leg(
     low, high = _across(s, lower), _across(s, upper)
     turned = float(np.arctan2(np.cross(low, high) @ s, low @ high))
     # at zero the spindle stands turned back by the angle that it has at home
-    back = geometry.pose(geometry.exp_so3(-turned * s), np.zeros(3))
+    back = geometry.make_pose(geometry.exp_so3(-turned * s), np.zeros(3))
     steps = (
         Step("universal1", "R", at(*b), lower),
         Step("universal2", "R", np.eye(4), np.cross(s, low)),
@@ -127,7 +127,7 @@ def screw_leg(
         Step("universal3", "R", back, np.cross(s, high)),
         Step("universal4", "R", np.eye(4), upper),
     )
-    return placed(name, steps, geometry.pose(home[:3, :3], np.zeros(3)), "rigid", at(*top))
+    return placed(name, steps, geometry.make_pose(home[:3, :3], np.zeros(3)), "rigid", at(*top))
 
 
 def _along(

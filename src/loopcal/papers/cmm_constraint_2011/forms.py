@@ -17,7 +17,7 @@ from loopcal.estimate import identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.outlook import information
 from loopcal.measure import Line, Measurements, Observations, Plane
-from loopcal.mechanism.coordinates import POSITION
+from loopcal.mechanism import POSITION
 from loopcal.papers.cmm_constraint_2011.cells import METHODS
 from loopcal.papers.cmm_constraint_2011.published import MM
 from loopcal.papers.cmm_constraint_2011.steps import Layout, PaperRows, identify_from_rows

@@ -29,14 +29,15 @@ from loopcal.engine import State
 from loopcal.estimate.descent import Descent, StepControl, descend
 from loopcal.estimate.methods.penalties import Method
 from loopcal.measure import stream
-from loopcal.mechanism import Mechanism, Status
-from loopcal.mechanism.batch_kinematics import (
+from loopcal.mechanism import (
+    POSITION,
+    Mechanism,
+    Status,
+    compute_readings,
+    differentiate_pose,
     forward_trials,
     inverse_trials,
-    readings_at,
-    sensitivity,
 )
-from loopcal.mechanism.coordinates import POSITION
 from loopcal.typing import FloatArray, IntArray
 
 Weights = Literal["printed", "distance", "single", "full"]
@@ -102,7 +103,9 @@ class Layout:
         )
         target = np.repeat(self.flat[None], len(truth), axis=0)
         target[:, :, [self.robot.controlled.index(name) for name in POSITION]] += sigma * noise
-        return readings_at(self.robot, truth, inverse_trials(self.robot, truth, target, self.state))
+        return compute_readings(
+            self.robot, truth, inverse_trials(self.robot, truth, target, self.state)
+        )
 
     def sloped(
         self, values: FloatArray, q: FloatArray
@@ -111,7 +114,7 @@ class Layout:
         them (t,).
         """
         state = forward_trials(self.robot, values, q, self.state)
-        D = sensitivity(self.robot, values, q, state).parameters[:, :, 3:]
+        D = differentiate_pose(self.robot, values, q, state).parameters[:, :, 3:]
         shape = (len(values), self.groups, -1, 3)
         reached = np.all(state.status == Status.CONVERGED, axis=1) & np.isfinite(D).all(
             axis=(1, 2, 3)

@@ -15,8 +15,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.measure import stream
-from loopcal.mechanism import Mechanism, Solution, sample
-from loopcal.mechanism.batch_kinematics import forward_trials
+from loopcal.mechanism import Mechanism, Solution, forward_trials, sample_workspace
 from loopcal.papers.cmm_constraint_2011.gauge import without_gauge
 from loopcal.papers.cmm_constraint_2011.published import MM
 from loopcal.papers.cmm_constraint_2011.steps import Layout
@@ -83,7 +82,7 @@ class Unseen:
 
         In one of FRAMES.
         """
-        return geometry.difference(
+        return geometry.pose_difference(
             self.placed(np.broadcast_to(self.poses(values), true.shape), true, frame), true
         )
 
@@ -94,7 +93,9 @@ class Unseen:
         T = np.broadcast_to(self.poses(values), true.shape)
         found = {}
         for frame in FRAMES:
-            squares = np.mean(geometry.difference(self.placed(T, true, frame), true) ** 2, axis=1)
+            squares = np.mean(
+                geometry.pose_difference(self.placed(T, true, frame), true) ** 2, axis=1
+            )
             found[frame] = [
                 np.sqrt(squares[:, 3:].sum(axis=1)) / MM,
                 np.rad2deg(np.sqrt(squares[:, :3].sum(axis=1))),
@@ -130,7 +131,7 @@ class Study:
     @cached_property
     def unseen(self) -> Unseen:
         """Drawn by another seed than the points."""
-        return Unseen(self.robot, sample(self.robot, UNSEEN, self.seed + 1).solution)
+        return Unseen(self.robot, sample_workspace(self.robot, UNSEEN, self.seed + 1).solution)
 
 
 def machine() -> Mechanism:
@@ -195,7 +196,7 @@ def best_fit(T: FloatArray, others: FloatArray) -> FloatArray:
     Q = nearest_rotations(np.swapaxes(y - centre, 1, 2) @ (x - middle))
     R = Q[:, None] @ T[..., :3, :3]
     turn = nearest_rotations(np.sum(np.swapaxes(R, 2, 3) @ others[..., :3, :3], axis=1))
-    return geometry.pose(R @ turn[:, None], (x - middle) @ np.swapaxes(Q, 1, 2) + centre)
+    return geometry.make_pose(R @ turn[:, None], (x - middle) @ np.swapaxes(Q, 1, 2) + centre)
 
 
 def nearest_rotations(M: FloatArray) -> FloatArray:

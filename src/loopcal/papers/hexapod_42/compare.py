@@ -188,7 +188,7 @@ def symmetric(robot: Mechanism, printed: Published) -> FloatArray:
     table = printed.nominal.values.copy()
     base, top = slice(0, 3), slice(4, 7)
     for leg, (source, angle) in enumerate(((0, 0), (1, 0), (0, 120), (1, 120), (0, 240), (1, 240))):
-        turn = geometry.axis_rotation(np.deg2rad(angle), 2)
+        turn = geometry.rotation_about_axis(np.deg2rad(angle), 2)
         for part in (base, top):
             table[leg, part] = turn @ printed.nominal.values[source, part]
     place = PARAMETERS.index("length")

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.mechanism import Mechanism, Solution
-from loopcal.mechanism.batch_kinematics import sensitivity
+from loopcal.mechanism import Mechanism, Solution, differentiate_pose
 from loopcal.papers.hexapod_42.published import LEGS
 from loopcal.typing import FloatArray
 
@@ -37,7 +36,7 @@ class LegForm:
     @classmethod
     def at(cls, machine: Mechanism, at: Solution) -> LegForm:
         """Linearise a machine at poses."""
-        found = sensitivity(machine, machine.values[None], at.q[None], at.state)
+        found = differentiate_pose(machine, machine.values[None], at.q[None], at.state)
         names = machine.parameters.names
         own = tuple(np.flatnonzero([name.startswith(f"{leg}.") for name in names]) for leg in LEGS)
         S, D = found.readings[0], found.parameters[0]

@@ -27,7 +27,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.diagnose import compute_pose_errors
-from loopcal.geometry import Orientation, orientation
+from loopcal.geometry import OrientationForm, parse_orientation
 from loopcal.measure import Measurements, Observations, Pose, stream
 from loopcal.mechanism import Mechanism, Solution, forward, inverse
 from loopcal.papers.hexapod_42.leg_form import LegForm
@@ -169,7 +169,7 @@ def integrated(errors: FloatArray) -> FloatArray:
 
 def transforms(poses: FloatArray, order: str) -> FloatArray:
     """(n, 4, 4) of poses (n, 6) [m, rad]."""
-    return geometry.pose(form(order).to_matrix(poses[:, 3:]), poses[:, :3])
+    return geometry.make_pose(form(order).to_matrix(poses[:, 3:]), poses[:, :3])
 
 
 def coordinates(T: FloatArray, order: str) -> FloatArray:
@@ -180,12 +180,12 @@ def coordinates(T: FloatArray, order: str) -> FloatArray:
 def difference(first: FloatArray, second: FloatArray) -> FloatArray:
     """Differences (n, 6) of coordinates, angles wrapped."""
     change = first - second
-    return np.concatenate([change[:, :3], geometry.wrap(change[:, 3:])], axis=1)
+    return np.concatenate([change[:, :3], geometry.wrap_angle(change[:, 3:])], axis=1)
 
 
-def form(order: str) -> Orientation:
+def form(order: str) -> OrientationForm:
     """Euler angles of this order."""
-    return orientation(form_name(order))
+    return parse_orientation(form_name(order))
 
 
 def form_name(order: str) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from loopcal.errors import EstimationError
 from loopcal.estimate import MAP, LeastSquares, identify_trials
 from loopcal.measure import Instrument, Pose, Sensor, Trials, Uniform, simulate_trials, stream
-from loopcal.mechanism.batch_kinematics import forward_trials
+from loopcal.mechanism import forward_trials
 from loopcal.papers.hexapod_42.published import MM, Published
 from loopcal.papers.hexapod_42.steps import (
     Study,

@@ -62,13 +62,13 @@ def orders(
     for order in (name for name in geometry.EULER_ORDERS if name.islower()):
         for angles in permutations(range(3)):
             wanted, seen = (
-                geometry.pose(
+                geometry.make_pose(
                     geometry.euler_to_matrix(poses[:, 3:][:, angles], order), poses[:, :3]
                 )
                 for poses in (nominal, measured)
             )
             commanded = inverse(robot, wanted)
-            difference = geometry.difference(forward(truth, commanded.q, commanded).T, seen)
+            difference = geometry.pose_difference(forward(truth, commanded.q, commanded).T, seen)
             sizes = (
                 float(np.sqrt(np.mean(part**2)))
                 for part in (difference[:, 3:] / MM, difference[:, :3])

@@ -6,7 +6,7 @@
  3 measured poses                                     `measured_poses`                | study.py
  4 measured data: true machine, with noise            `simulate_trials`               /
  5 error transfer matrix T_j of pose j                `sensitivity`, in rows of x, y, z, phi, theta (, psi)
- 6 identification matrix H, all T_j in one column     `accumulate`: one triangular factor
+ 6 identification matrix H, all T_j in one column     `fold`: one triangular factor
  7 de from H de = D, by LS, RE or TSVD                `decompose`, with the filter factors below
  8 e + de; again from step 5 unless |de| is small     `iterate`
  9 save e
@@ -24,8 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal import engine
-from loopcal.mechanism import Mechanism, Status
-from loopcal.mechanism.batch_kinematics import forward_trials, sensitivity
+from loopcal.mechanism import Mechanism, Status, differentiate_pose, forward_trials
 from loopcal.numerics.decomposition import Decomposition, decompose, empty_factor
 from loopcal.papers.tsvd_2016.published import MM
 from loopcal.papers.tsvd_2016.study import Study
@@ -133,7 +132,7 @@ def linearised(
     reached = (state.status == Status.CONVERGED).all(axis=1)
     T = np.where(reached[:, None, None, None], state.T, np.eye(4))
     D = np.where(
-        reached[:, None, None, None], sensitivity(robot, at, readings, state).parameters, 0.0
+        reached[:, None, None, None], differentiate_pose(robot, at, readings, state).parameters, 0.0
     ) * units(robot)
     if shared:
         T, reached = (
@@ -145,7 +144,7 @@ def linearised(
     H = np.matmul(seen.jacobian * raw[:, None], D)
     rows = np.concatenate([H, -(seen.residual * raw)[..., None]], axis=-1)
     rows = rows.reshape(len(values), -1, rows.shape[-1])
-    factor = engine.accumulate(empty_factor(len(rows), rows.shape[-1] - 1), rows)
+    factor = engine.fold(empty_factor(len(rows), rows.shape[-1] - 1), rows)
     return decompose(factor, np.full(len(values), rows.shape[1]), tolerance=0.0), reached
 
 

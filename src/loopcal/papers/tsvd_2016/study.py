@@ -26,8 +26,7 @@ from loopcal.measure import (
     simulate_trials,
     stream,
 )
-from loopcal.mechanism import Mechanism, Solution, inverse
-from loopcal.mechanism.batch_kinematics import forward_trials
+from loopcal.mechanism import Mechanism, Solution, forward_trials, inverse
 from loopcal.papers.tsvd_2016.published import MM, published
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
@@ -148,7 +147,7 @@ class Study:
         position = np.sum((T[..., :3, 3] - true[..., :3, 3]) ** 2, axis=-1) / MM**2
         first, second = (geometry.matrix_to_tilt_torsion(x[..., :3, :3]) for x in (T, true))
         angles = sum(
-            np.rad2deg(geometry.wrap(a - b)) ** 2
+            np.rad2deg(geometry.wrap_angle(a - b)) ** 2
             for a, b in zip(first[:2], second[:2], strict=True)
         )
         normal = np.rad2deg(1.0) ** 2 * np.sum((T[..., :3, 2] - true[..., :3, 2]) ** 2, axis=-1)
@@ -219,7 +218,7 @@ def true_values(robot: Mechanism, trials: int, seed: int) -> FloatArray:
 
 
 def _coordinates(robot: Mechanism, phi: FloatArray, theta: FloatArray, z: FloatArray) -> FloatArray:
-    given = {"phi": geometry.wrap(np.deg2rad(phi)), "theta": np.deg2rad(theta), "z": z}
+    given = {"phi": geometry.wrap_angle(np.deg2rad(phi)), "theta": np.deg2rad(theta), "z": z}
     return np.column_stack([given[name] for name in robot.controlled])
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`accumulate` folds rows into a triangular factor as one QR of all of them would."""
+"""`fold` folds rows into a triangular factor as one QR of all of them would."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def rows():
 def test_blocks_of_rows_give_the_factor_of_all_rows(engine, rows):
     factor = np.zeros((3, 7, 7))
     for part in np.split(rows, [11, 12, 30], axis=1):
-        factor = engine.accumulate(factor, part)
+        factor = engine.fold(factor, part)
     assert_array_equal(factor, np.triu(factor))
     scale = np.linalg.norm(rows, axis=1, keepdims=True)
     whole = np.linalg.qr(rows, mode="r")
@@ -31,8 +31,8 @@ def test_blocks_of_rows_give_the_factor_of_all_rows(engine, rows):
 def test_absent_rows_are_rows_of_zeros(engine, rows):
     kept = rows.copy()
     kept[:, 5:9] = 0.0
-    a = engine.accumulate(np.zeros((3, 7, 7)), kept)
-    b = engine.accumulate(np.zeros((3, 7, 7)), np.delete(rows, np.s_[5:9], axis=1))
+    a = engine.fold(np.zeros((3, 7, 7)), kept)
+    b = engine.fold(np.zeros((3, 7, 7)), np.delete(rows, np.s_[5:9], axis=1))
     scale = np.linalg.norm(rows, axis=1, keepdims=True)
     assert_allclose(np.abs(a / scale), np.abs(b / scale), atol=1e-14)
 
@@ -40,20 +40,18 @@ def test_absent_rows_are_rows_of_zeros(engine, rows):
 def test_null_directions_stay_at_rounding_and_not_at_its_root(engine, rows):
     rows[..., 6] = rows[..., 5] * 2 - rows[..., 4]
     scaled = rows / np.linalg.norm(rows, axis=1, keepdims=True)
-    factor = engine.accumulate(
-        engine.accumulate(np.zeros((3, 7, 7)), scaled[:, :20]), scaled[:, 20:]
-    )
+    factor = engine.fold(engine.fold(np.zeros((3, 7, 7)), scaled[:, :20]), scaled[:, 20:])
     s = np.linalg.svd(factor, compute_uv=False)
     assert (s[:, -1] <= 1e-14 * s[:, 0]).all()
 
 
 def test_trials_do_not_depend_on_each_other_bit_for_bit(engine, rows):
-    together = engine.accumulate(np.zeros((3, 7, 7)), rows)
+    together = engine.fold(np.zeros((3, 7, 7)), rows)
     for i in range(3):
-        assert_array_equal(together[i], engine.accumulate(np.zeros((1, 7, 7)), rows[i : i + 1])[0])
+        assert_array_equal(together[i], engine.fold(np.zeros((1, 7, 7)), rows[i : i + 1])[0])
 
 
 def test_trials_may_share_rows(engine, rows):
-    shared = engine.accumulate(np.zeros((2, 7, 7)), rows[:1])
+    shared = engine.fold(np.zeros((2, 7, 7)), rows[:1])
     assert_array_equal(shared[0], shared[1])
     assert_allclose(gram(shared[0]), gram(rows[0]), rtol=1e-12)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The columns of `linearise` against the solver itself (central differences) and against jax on a
+"""The columns of `linearize` against the solver itself (central differences) and against jax on a
 plainly written closure.
 """
 
@@ -40,7 +40,7 @@ def independent_slopes(some, state, row, free=False):
     n_unknown = m + unknowns(p, state, free).shape[-1]
     for group, joints in zip(p.groups, state.joints, strict=True):
         columns = np.arange(p.n_displacements)[group.columns].reshape(len(group.limbs), -1)
-        unknown = group.unknown(free)
+        unknown = group.unknown_joints(free)
         for k in range(len(group.limbs)):
             J = limb_slopes(p, group, k, state.T[0, row], joints[0, row, k], some.e[0])
             f, g = np.zeros((len(J), n_unknown)), np.zeros((len(J), p.n_displacements + p.n_joints))
@@ -105,12 +105,12 @@ def compiled(letters, ending, chosen, slots, size):
 @pytest.mark.parametrize(
     "robot", ["menagerie", "three_prs", "hexapod", "delta", "five_bar", "planar_rrr"]
 )
-def test_every_displacement_and_joint_moves_the_mechanism_as_linearised(engine, robot):
+def test_every_displacement_and_joint_moves_the_mechanism_as_linearized(engine, robot):
     some = case(getattr(zoo, robot)(), n=2)
     p = some.program
     state = engine.solve(p, some.e, some.q, some.home)
     assert_array_equal(state.status, engine.CONVERGED)
-    analytic = slopes(p, engine.linearise(p, some.e, some.q, state))[0]
+    analytic = slopes(p, engine.linearize(p, some.e, some.q, state))[0]
     s, a = p.n_displacements, p.n_joints
     turning = [
         g.actuator[j, k]
@@ -140,12 +140,12 @@ def test_every_displacement_and_joint_moves_the_mechanism_as_linearised(engine, 
 
 
 @pytest.mark.parametrize("robot", ["menagerie", "hexapod"])
-def test_free_actuators_follow_the_platform_as_linearised(engine, robot):
+def test_free_actuators_follow_the_platform_as_linearized(engine, robot):
     some = case(getattr(zoo, robot)(), n=2)
     p = some.program
     state = engine.solve(p, some.e, some.q, some.home)
     s, m = p.n_displacements, 6
-    analytic = slopes(p, engine.linearise(p, some.e, some.q, state, free=True), free=True)[0][
+    analytic = slopes(p, engine.linearize(p, some.e, some.q, state, free=True), free=True)[0][
         :, m:, m:
     ]
     unit = unit_of_displacements(p)
@@ -176,10 +176,10 @@ def assert_close_columns(found, reference, unit):
 def test_the_blocks_of_a_trial_do_not_depend_on_the_others_bit_for_bit(engine):
     some = case(zoo.menagerie(), t=3)
     state = engine.solve(some.program, some.e, some.q, some.home)
-    together = engine.linearise(some.program, some.e, some.q, state)
+    together = engine.linearize(some.program, some.e, some.q, state)
     for i in range(3):
         e, q = some.e[i : i + 1], some.q[i : i + 1]
-        alone = engine.linearise(some.program, e, q, engine.solve(some.program, e, q, some.home))
+        alone = engine.linearize(some.program, e, q, engine.solve(some.program, e, q, some.home))
         for kind in ("closure", "passive"):
             for mine, other in zip(getattr(together, kind), getattr(alone, kind), strict=True):
                 for name in ("U", "A", "E", "Q"):
@@ -191,8 +191,8 @@ def test_rows_that_failed_do_not_stop_the_others(engine):
     q = np.array(some.q)
     q[0, 2] = np.nan
     state = engine.solve(some.program, some.e, q, some.home)
-    blocks = engine.linearise(some.program, some.e, q, state)
-    clean = engine.linearise(
+    blocks = engine.linearize(some.program, some.e, q, state)
+    clean = engine.linearize(
         some.program, some.e, some.q, engine.solve(some.program, some.e, some.q, some.home)
     )
     for mine, other in zip(blocks.closure, clean.closure, strict=True):
