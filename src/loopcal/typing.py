@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Array types, defined once."""
+"""Array types and the progress callback, defined once."""
 
 from __future__ import annotations
+
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,3 +16,19 @@ IntArray = NDArray[np.int64]
 
 BoolArray = NDArray[np.bool_]
 """Yes or no, element by element."""
+
+
+class Progress(Protocol):
+    """A callback to which long work reports how far it is.
+
+    The library never prints. A caller passes a function; work of known length calls it after each
+    step, and a view (the command line, a notebook) draws it.
+    """
+
+    def __call__(self, done: int, total: int, what: str, /) -> None:
+        """Receive one report: `done` of `total` steps of `what` (a short noun phrase) are done."""
+        ...
+
+
+def report_no_progress(_done: int, _total: int, _what: str, /) -> None:
+    """Do nothing: the default callback of long work."""

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from loopcal import geometry, load_robot
 from loopcal.apply.accuracy import accuracy_map, pose_uncertainty
-from loopcal.apply.accuracy_simulation import monte_carlo
+from loopcal.apply.accuracy_simulation import simulate_accuracy
 from loopcal.diagnose import find_frame_motions
 from loopcal.errors import EstimationError
 from loopcal.estimate import MAP, LeastSquares, identify
@@ -119,10 +119,9 @@ def test_without_torsion_only_the_turn_about_the_normal_is_infinite(fit_5):
 def test_the_turn_about_the_normal_is_a_turn_of_the_platform_frame_and_left_out_by_name(fit_5):
     found = pose_uncertainty(fit_5, WHERE)
     assert np.isfinite(found.sd).all()
-    assert (
-        "the platform frame fitted to the parameters: 1 combination of them that only moves it"
-        in found.frame
-    )
+    assert found.reference.code == "accuracy.frame"
+    assert found.reference.data["frames"] == ("platform",)
+    assert found.reference.data["count"] == 1
 
 
 def base_motion_unknown(fit, extra=None):
@@ -199,7 +198,7 @@ def test_the_map_shows_extrapolation():
     assert np.median(narrow.position_ratio) > 3
     assert narrow.extrapolated.mean() > 0.9
     assert np.median(wide.position_ratio) < 1
-    assert "poses are known less well than any measured one" in str(wide)
+    assert f"{int(wide.extrapolated.sum())} of 200 poses" in str(wide)
     assert narrow.to_dict()["extrapolated"] == int(narrow.extrapolated.sum())
 
 
@@ -223,10 +222,8 @@ def bounds(trials, numbers):
 )
 def test_predicted_errors_of_pose_are_those_of_simulated_calibrations(name, method):
     robot, trials = load_robot(name), 300
-    measured, judged = (
-        sample_workspace(robot, n, seed).coordinates for n, seed in ((40, 1), (6, 9))
-    )
-    found = monte_carlo(robot, measured, tracker(), judged, method, trials, seed=3)
+    measured, judged = (sample(robot, n, seed).coordinates for n, seed in ((40, 1), (6, 9)))
+    found = simulate_accuracy(robot, measured, tracker(), judged, method, trials, seed=3)
     ratio = found.ratio[np.isfinite(found.ratio)]
     low, high = bounds(found.trials, len(ratio))
     assert (found.trials, found.failed) == (trials, 0)

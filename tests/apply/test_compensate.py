@@ -33,7 +33,7 @@ def test_readings_take_the_controlled_coordinates_to_their_targets(name):
     reached = forward(robot, found.readings).T
     demanded = compare_coordinates(reached, targets, robot.controlled, robot.size)[0]
     assert np.abs(demanded).max() < 1e-12  # [m], closure solved to rounding
-    assert found.good.all()
+    assert found.usable.all()
     assert found.uncertainty is None
 
 
@@ -76,7 +76,9 @@ def test_what_a_tripod_has_no_actuator_for_stays_and_no_reading_makes_it_smaller
     targets = sample_workspace(load_robot("3-prs"), 10, 3).solution.T
     found = compensate(robot, targets)
     assert set(found.reach) == {Reach.IN_PART}
-    assert found.sentences[0].startswith("z, phi, theta reached; no actuator removes 0.")
+    assert found.findings[0].code == "compensation.reached-in-part"
+    assert found.findings[0].data["names"] == ("z", "phi", "theta")
+    assert 0.0 < found.findings[0].data["position"].value < 1.0  # [mm]
 
     def distance(readings):
         gap = geometry.pose_difference(forward(robot, readings).T, targets)
@@ -92,7 +94,7 @@ def test_commands_do_not_fail_at_zero_tilt_where_the_azimuth_has_no_meaning():
     found = compensate(
         calibrated("3-prs"), [[0.7, 0.0, 0.0], [0.7, 2.0, 0.0], [0.7, -1.0, 1e-9]], "commands"
     )
-    assert found.good.all()
+    assert found.usable.all()
     assert found.residual_orientation[-1].max() < 1e-9  # [rad]
 
 
@@ -107,9 +109,9 @@ def test_targets_out_of_reach_or_beyond_the_strokes_are_named():
     found = compensate(robot, targets, labels=("home", "high", "moon", "nowhere"))
     assert found.labels[1] == "high"
     assert found.reach[:2] == (Reach.REACHED, Reach.OUTSIDE)
-    assert found.good.tolist() == [True, False, False, False]
-    assert "stroke of q1" in found.sentences[1]
-    assert "cannot be reached" in found.sentences[3]
+    assert found.usable.tolist() == [True, False, False, False]
+    assert "stroke of q1" in found.findings[1].data["limit"]
+    assert found.findings[3].code == "compensation.unreachable"
 
 
 def test_a_target_that_fails_does_not_disturb_the_others():
@@ -134,7 +136,7 @@ def test_bad_requests_are_refused():
     robot = load_robot("3-prs")
     with pytest.raises(DataError, match="mode is 'poses'; it must be 'readings' or 'commands'"):
         compensate(robot, [[0.7, 0, 0]], "poses")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(DataError, match="0 steps of compensation were asked for"):
+    with pytest.raises(DataError, match="steps is 0; it must be 1 or more"):
         compensate(robot, [[0.7, 0, 0]], "commands", steps=0)
     with pytest.raises(DataError, match="a target of shape"):
         compensate(robot, [[0.7, 0.0]])

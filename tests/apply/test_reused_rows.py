@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.apply.reused_rows import fitted_rows, seen_before
+from loopcal.apply.reused_rows import collect_fitted_rows, find_reused_rows
 from loopcal.errors import DataError
+from loopcal.findings import Severity
 from loopcal.measure import Measurements
 from tests.estimate.problems import hexapod_data
 
 FITTED = hexapod_data(20)
-STORED = fitted_rows(FITTED)
+STORED = collect_fitted_rows(FITTED)
 OTHER = hexapod_data(20, 1)
 
 
@@ -33,17 +34,15 @@ def joined(*parts: Measurements) -> Measurements:
     return Measurements(parts[0].robot_name, readings, (one,))
 
 
-def test_a_part_of_the_fitted_rows_is_refused_in_another_order_and_after_rounding() -> None:
+def test_a_part_of_the_collect_fitted_rows_is_refused_in_another_order_and_after_rounding() -> None:
     some = FITTED.take(np.array([7, 3, 11, 0]))
     rows = some.observations[0]
     again = replace(some, observations=(replace(rows, measured=rows.measured * (1.0 + 1e-12)),))
     for data in (some, again):
-        with pytest.raises(
-            DataError,
-            match=r"^4 of 4 rows are rows that this run was fitted to .*; give others, or use "
-            r"--flag$",
-        ):
-            seen_before(STORED, data, "--flag")
+        with pytest.raises(DataError) as refused:
+            find_reused_rows(STORED, data)
+        assert refused.value.code == "validation.rows-reused"
+        assert refused.value.args[0].data["count"] == refused.value.args[0].data["total"] == 4
 
 
 def test_repeats_and_other_rows_are_unseen() -> None:
@@ -53,27 +52,32 @@ def test_repeats_and_other_rows_are_unseen() -> None:
         0.1 * sigma * np.random.default_rng(0).standard_normal(rows.measured.shape)
     )  # a tenth of what a repeat has
     assert (
-        seen_before(
+        find_reused_rows(
             STORED, replace(FITTED, observations=(replace(rows, measured=rows.measured + noise),))
         )
-        == ""
+        is None
     )
-    assert seen_before(STORED, OTHER) == ""
-    assert seen_before({}, FITTED) == ""
+    assert find_reused_rows(STORED, OTHER) is None
+    assert find_reused_rows({}, FITTED) is None
 
 
-def test_few_fitted_rows_among_unseen_ones_are_named() -> None:
-    found = seen_before(STORED, joined(FITTED.take(np.arange(3)), OTHER))
-    assert found.startswith(
-        "3 of 23 rows are rows that this run was fitted to (poses 1, 2, 3), which prove nothing"
-    )
+def test_few_collect_fitted_rows_among_unseen_ones_are_named() -> None:
+    found = find_reused_rows(STORED, joined(FITTED.take(np.arange(3)), OTHER))
+    assert found is not None
+    assert found.severity is Severity.WARNING
+    assert found.data == {"count": 3, "total": 23, "poses": ("1", "2", "3")}
 
 
 def test_poses_that_were_left_out_of_the_fit_are_unseen() -> None:
-    assert seen_before(fitted_rows(FITTED, ("1", "2")), FITTED.take(np.arange(2))) == ""
+    assert (
+        find_reused_rows(collect_fitted_rows(FITTED, ("1", "2")), FITTED.take(np.arange(2))) is None
+    )
     weight = np.ones(20)
     weight[:2] = 0.0
-    assert seen_before(fitted_rows(FITTED.reweighted(weight)), FITTED.take(np.arange(2))) == ""
+    assert (
+        find_reused_rows(collect_fitted_rows(FITTED.reweighted(weight)), FITTED.take(np.arange(2)))
+        is None
+    )
 
 
 def test_absent_values_agree_with_absent_ones_only() -> None:
@@ -81,6 +85,6 @@ def test_absent_values_agree_with_absent_ones_only() -> None:
     holes = np.array(rows.measured)
     holes[:, 0] = np.nan
     content = {"fitted_0_pose": np.concatenate([FITTED.readings, holes], axis=1)}
-    assert seen_before(content, FITTED) == ""
+    assert find_reused_rows(content, FITTED) is None
     with pytest.raises(DataError, match="20 of 20"):
-        seen_before(content | STORED, FITTED)
+        find_reused_rows(content | STORED, FITTED)

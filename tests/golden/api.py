@@ -587,7 +587,7 @@ def report_monte_carlo(
     machine: Robot, coordinates: Array, sensors: Iterable[Any], where: Array, trials: int
 ) -> Report:
     """Compare predicted with observed uncertainties over a few drawn machines."""
-    found = apply.monte_carlo(
+    found = apply.simulate_accuracy(
         machine, coordinates, Instrument(tuple(sensors)), where, trials=trials
     )
     return {

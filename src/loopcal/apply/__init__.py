@@ -5,9 +5,12 @@ from loopcal.apply.accuracy import AccuracyMap as AccuracyMap
 from loopcal.apply.accuracy import PoseUncertainty as PoseUncertainty
 from loopcal.apply.accuracy import accuracy_map as accuracy_map
 from loopcal.apply.accuracy import pose_uncertainty as pose_uncertainty
-from loopcal.apply.accuracy_simulation import MonteCarlo as MonteCarlo
-from loopcal.apply.accuracy_simulation import monte_carlo as monte_carlo
+from loopcal.apply.accuracy_simulation import AccuracySimulation as AccuracySimulation
+from loopcal.apply.accuracy_simulation import simulate_accuracy as simulate_accuracy
 from loopcal.apply.compensation import Compensation as Compensation
 from loopcal.apply.compensation import compensate as compensate
+from loopcal.apply.noise_floor import NoiseFloor as NoiseFloor
+from loopcal.apply.reused_rows import collect_fitted_rows as collect_fitted_rows
+from loopcal.apply.reused_rows import find_reused_rows as find_reused_rows
 from loopcal.apply.validation import Validation as Validation
 from loopcal.apply.validation import validate as validate

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well the poses of a calibrated machine are known, anywhere in its workspace.
+"""Uncertainty of the poses of a calibrated machine, anywhere in its workspace.
 
     covariance = D C D' + J_q S_q J_q'        expanded uncertainty U = k sqrt(diag), k = 2
 
-with the error model D = d twist / d parameter, the covariance C of the parameters and the variances
-S_q of the readings where the actuators have a sigma. A direction of which nothing is known makes
-those components infinite that it moves, and no others. Directions that only move a frame as a whole
-are left out, and the result says so. JCGM 100; derivation: docs/theory/uncertainty.md.
+with the error model D = d twist / d parameter, the covariance C of the parameters, and the
+variances S_q of the readings where the actuators have a sigma. A direction that the data do not determine
+makes those components infinite that it moves, and no others. Directions that only move a frame as a
+whole are excluded, and the result says so. JCGM 100; derivation: docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
@@ -22,14 +22,10 @@ from loopcal.diagnose import NO_MOTION, FrameMotions, find_frame_motions, twist_
 from loopcal.errors import EstimationError
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
-from loopcal.mechanism import (
-    Mechanism,
-    Solution,
-    differentiate_pose,
-    forward,
-    inverse,
-    sample_workspace,
-)
+from loopcal.findings import Finding, report_finding
+from loopcal.mechanism import Mechanism, Solution, forward, inverse
+from loopcal.mechanism.batch_kinematics import sensitivity
+from loopcal.mechanism.workspace import sample
 from loopcal.typing import BoolArray, FloatArray
 
 COVERAGE = 2.0
@@ -37,7 +33,7 @@ COVERAGE = 2.0
 
 COMPONENTS = ("rx", "ry", "rz", "x", "y", "z")
 BLOCK = 1024
-"""Poses whose sensitivities are held at once."""
+"""Poses whose sensitivities are in memory at once."""
 
 Axes = Literal["base", "platform"]
 Gauge = Literal["left out", "infinite"]
@@ -46,20 +42,37 @@ Point = Literal["tool", "platform"]
 
 @dataclass(frozen=True, eq=False)
 class PoseUncertainty:
-    """Uncertainty of n poses; components are COMPONENTS, a small rotation and the displacement of
-    the point.
+    """Uncertainty of n poses.
+
+    The components are those of `COMPONENTS`: a small rotation, then the displacement of the point.
 
     Attributes
     ----------
-    T : (n, 4, 4) platform poses of the calibrated robot; NaN where it does not reach.
-    covariance : (n, 6, 6) [rad, m]; infinite on the diagonal (and NaN beside it) where nothing is
-        known.
-    frame : in words: the axes, the point, and what was left out.
+    T : (n, 4, 4) platform poses of the calibrated robot; NaN where a pose is unreachable.
+    covariance : (n, 6, 6) [rad, m]; infinite on the diagonal (and NaN beside it) where the data do
+        not determine a component.
+    reference : point, axes and frame to which the numbers refer, as a finding `accuracy.frame`.
     """
 
     T: FloatArray
     covariance: FloatArray
-    frame: str
+    reference: Finding
+
+    @property
+    def frame(self) -> str:
+        """Point, axes and frame in words."""
+        return str(self.reference)
+
+    def __repr__(self) -> str:
+        """Return the largest uncertainties and the frame."""
+        position, angle = (
+            float(np.nanmax(values)) if np.isfinite(values).any() else float("nan")
+            for values in (self.position, self.orientation)
+        )
+        return (
+            f"PoseUncertainty of {len(self.T)} poses: at most {1e3 * position:.3g} mm and "
+            f"{1e3 * angle:.3g} mrad (rms); {self.frame}"
+        )
 
     @property
     def sd(self) -> FloatArray:
@@ -68,17 +81,17 @@ class PoseUncertainty:
 
     @property
     def expanded(self) -> FloatArray:
-        """(n, 6) U = 2 sd of each component alone, about 95 % [rad, m]."""
+        """(n, 6) expanded uncertainty U = 2 sd of each component, about 95 % [rad, m]."""
         return COVERAGE * self.sd
 
     @property
     def position(self) -> FloatArray:
-        """(n,) root mean square of the distance by which the point is off [m]."""
+        """(n,) root mean square of the displacement of the point [m]."""
         return np.sqrt((self.sd[:, 3:] ** 2).sum(axis=1))
 
     @property
     def orientation(self) -> FloatArray:
-        """(n,) root mean square of the angle by which the platform is turned [rad]."""
+        """(n,) root mean square of the rotation of the platform [rad]."""
         return np.sqrt((self.sd[:, :3] ** 2).sum(axis=1))
 
     def to_dict(self) -> dict[str, Any]:
@@ -100,21 +113,21 @@ def pose_uncertainty(
     gauge: Gauge = "left out",
     point: Point = "tool",
 ) -> PoseUncertainty:
-    """Return how well poses of the calibrated robot are known.
+    """Compute the uncertainty of poses of the calibrated robot.
 
     Parameters
     ----------
     fit : the identification, or the posterior of a run folder.
     poses : (n, 4, 4) T_base_platform, (n, c) controlled coordinates [m, rad], or a solution of the
         calibrated robot.
-    frame : axes in which components are given. gauge : "left out" leaves out those directions
-        without data that move the base or platform frame as a whole (the frame then is the one that
-        the estimate defines); "infinite" does not.
-    point : whose displacement it is, the tool's or the platform's origin.
+    frame : axes of the components. gauge : "left out" excludes undetermined directions that move
+        the base or platform frame as a whole (the frame is then the one that the estimate
+        defines); "infinite" includes them.
+    point : the point whose displacement is meant: that of the tool, or the platform's origin.
 
     Returns
     -------
-    PoseUncertainty; NaN where a pose is out of reach or no interval can be given.
+    PoseUncertainty; NaN where a pose is unreachable or no interval can be given.
 
     Raises
     ------
@@ -132,61 +145,65 @@ def pose_uncertainty(
             )
     known = fit.posterior if isinstance(fit, Identification) else fit
     robot = known.robot
-    found = poses if isinstance(poses, Solution) else inverse(robot, poses)
+    solution = poses if isinstance(poses, Solution) else inverse(robot, poses)
     motions = find_frame_motions(known)
-    roots = _roots(known, motions, gauge)
-    parts = []
-    for first in range(0, len(found.q), BLOCK):
-        rows = np.arange(first, min(first + BLOCK, len(found.q)))
-        parts.append(
-            _covariance(
-                known, found.take(rows), roots, transport(robot, found.T[rows], frame, point)
-            )
-        )
-    T = np.where(found.converged[:, None, None], found.T, np.nan)
-    return PoseUncertainty(T, np.concatenate(parts), _frame_words(motions, frame, gauge, point))
+    roots = _covariance_roots(known, motions, gauge)
+    blocks = []
+    for first in range(0, len(solution.q), BLOCK):
+        rows = np.arange(first, min(first + BLOCK, len(solution.q)))
+        H = transport(robot, solution.T[rows], frame, point)
+        blocks.append(_covariance(known, solution.take(rows), roots, H))
+    T = np.where(solution.converged[:, None, None], solution.T, np.nan)
+    excluded = motions.count if gauge == "left out" else 0
+    reference = report_finding(
+        "accuracy.frame", point=point, axes=frame, count=excluded, frames=tuple(motions.frames)
+    )
+    return PoseUncertainty(T, np.concatenate(blocks), reference)
 
 
-def _roots(known: Posterior, motions: FrameMotions, gauge: Gauge) -> tuple[FloatArray, FloatArray]:
-    """Directions times their standard deviations (p, r), and those of infinite variance (p, o),
-    both in tolerances.
+def _covariance_roots(
+    known: Posterior, motions: FrameMotions, gauge: Gauge
+) -> tuple[FloatArray, FloatArray]:
+    """Return directions times their standard deviations (p, r), and those of infinite variance
+    (p, o), both in tolerances.
     """
     directions = known.directions.copy()
     if gauge == "left out":
         directions[:, ~known.seen] = motions.kept
-    open_ = np.isinf(known.variance)
-    return directions[:, ~open_] * np.sqrt(known.variance[~open_]), directions[:, open_]
+    infinite = np.isinf(known.variance)
+    return directions[:, ~infinite] * np.sqrt(known.variance[~infinite]), directions[:, infinite]
 
 
 def _covariance(
-    known: Posterior, found: Solution, roots: tuple[FloatArray, FloatArray], H: FloatArray
+    known: Posterior, solution: Solution, roots: tuple[FloatArray, FloatArray], H: FloatArray
 ) -> FloatArray:
-    """Covariance (n, 6, 6) of some poses; H (n, 6, 6) takes base twists to the point and axes asked
-    for.
+    """Return the covariance (n, 6, 6) of poses.
+
+    H (n, 6, 6) takes twists in base axes to the wanted point and axes.
     """
     robot = known.robot
-    S = differentiate_pose(robot, robot.values[None], found.q[None], found.state)
+    S = sensitivity(robot, robot.values[None], solution.q[None], solution.state)
     D = H @ (S.parameters[0][:, :, known.places] * known.unit)
-    finite, open_ = roots
-    spread = [D @ finite]
+    finite, infinite = roots
+    factors = [D @ finite]
     sigma = np.array([a.sigma or 0.0 for a in robot.actuators])
     if sigma.any():
-        spread.append(H @ (S.readings[0] * sigma))
-    root = np.concatenate(spread, axis=2)
+        factors.append(H @ (S.readings[0] * sigma))
+    root = np.concatenate(factors, axis=2)
     covariance = root @ root.swapaxes(1, 2)
-    if open_.shape[1]:
+    if infinite.shape[1]:
         weight = twist_weights(robot)
         limit = NO_MOTION * np.linalg.norm(D * weight[:, None], axis=(1, 2))
-        moved = np.linalg.norm(D @ open_, axis=2) * weight > limit[:, None]
+        moved = np.linalg.norm(D @ infinite, axis=2) * weight > limit[:, None]
         covariance[moved[:, :, None] | moved[:, None, :]] = np.nan
         pose, component = np.nonzero(moved)
         covariance[pose, component, component] = np.inf
-    covariance[~found.converged] = np.nan
+    covariance[~solution.converged] = np.nan
     return covariance
 
 
 def transport(robot: Mechanism, T: FloatArray, frame: Axes, point: Point) -> FloatArray:
-    """(n, 6, 6) from twists of the platform's origin in base axes to those of the point in the
+    """Return (n, 6, 6) from twists of the platform origin in base axes to those of a point in other
     axes.
     """
     R = T[:, :3, :3]
@@ -201,30 +218,14 @@ def transport(robot: Mechanism, T: FloatArray, frame: Axes, point: Point) -> Flo
     return H
 
 
-def _frame_words(motions: FrameMotions, frame: Axes, gauge: Gauge, point: Point) -> str:
-    """Name axes, point and frame."""
-    text = f"{'tool point' if point == 'tool' else 'platform origin'}, {frame} axes"
-    if not motions.count or gauge == "infinite":
-        return f"{text}, in the base frame of the robot file"
-    several = motions.count > 1
-    which = " and the ".join(motions.frames)
-    one = len(motions.frames) == 1
-    return (
-        f"{text}; the {which} frame{'' if one else 's'} fitted to the parameters: {motions.count}"
-        f" combination{'s' if several else ''} of them that only {'move' if several else 'moves'} "
-        f"{'it' if one else 'these'}"
-        f" cannot be known from these data and {'are' if several else 'is'} left out"
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class AccuracyMap:
-    """Uncertainty over the workspace, beside that at the measured poses.
+    """Uncertainty over the workspace, and at the measured poses.
 
     Attributes
     ----------
     coordinates : (n, c) controlled coordinates [m, rad]; `names` names them.
-    uncertainty : of these n poses. measured : of the poses that were measured.
+    uncertainty : of these n poses. measured : of the measured poses.
     """
 
     names: tuple[str, ...]
@@ -234,42 +235,45 @@ class AccuracyMap:
 
     @property
     def position_ratio(self) -> FloatArray:
-        """(n,) position uncertainty over the largest at any measured pose: above 1 is
-        extrapolation.
+        """(n,) position uncertainty divided by the largest at the measured poses.
+
+        Above 1 the map extrapolates.
         """
         return _ratio(self.uncertainty.position, self.measured.position)
 
     @property
     def orientation_ratio(self) -> FloatArray:
-        """(n,) orientation uncertainty over the largest at any measured pose: above 1 is
-        extrapolation.
-        """
+        """(n,) orientation uncertainty divided by the largest at the measured poses."""
         return _ratio(self.uncertainty.orientation, self.measured.orientation)
 
     @property
     def extrapolated(self) -> BoolArray:
-        """(n,) poses less well known than every measured one."""
+        """(n,) poses that are less certain than every measured pose."""
         return (self.position_ratio > 1.0) | (self.orientation_ratio > 1.0)
 
     def __str__(self) -> str:
-        found = self.uncertainty
-        lines = [f"pose uncertainty (rms) at {len(self.coordinates)} poses: {found.frame}"]
+        """Return medians and maxima, and how many poses are extrapolated."""
+        n = len(self.coordinates)
+        lines = [f"Pose uncertainty (rms) at {n} poses: {self.uncertainty.frame}"]
         for name, factor, symbol in (("position", 1e3, "mm"), ("orientation", 1e3, "mrad")):
-            here, there = factor * getattr(found, name), factor * getattr(self.measured, name)
+            values, measured = (
+                factor * getattr(u, name) for u in (self.uncertainty, self.measured)
+            )
+            ratio = getattr(self, f"{name}_ratio")
             lines.append(
-                f"{name:<12} median {np.nanmedian(here):.3g}, largest {np.nanmax(here):.3g} "
-                f"{symbol}; at measured poses largest"
-                f" {np.nanmax(there):.3g} {symbol}; ratio up to "
-                f"{np.nanmax(getattr(self, name + '_ratio')):.3g}"
+                f"{name:<12} median {np.nanmedian(values):.3g} {symbol}, largest "
+                f"{np.nanmax(values):.3g} {symbol}; largest at measured poses "
+                f"{np.nanmax(measured):.3g} {symbol} (ratio up to {np.nanmax(ratio):.3g})"
             )
         lines.append(
-            f"{int(self.extrapolated.sum())} of {len(self.coordinates)} poses are known less well "
-            "than any measured one"
+            f"{int(self.extrapolated.sum())} of {n} poses are less certain than every measured pose"
         )
         return "\n".join(lines)
 
+    __repr__ = __str__
+
     def to_dict(self) -> dict[str, Any]:
-        """Return all by name for JSON, SI."""
+        """Return the map by name for JSON, SI."""
         return {
             "names": list(self.names),
             "coordinates": self.coordinates,
@@ -287,13 +291,13 @@ def accuracy_map(
     seed: int = 0,
     frame: Axes = "base",
 ) -> AccuracyMap:
-    """Return the uncertainty of poses over the workspace, with the extrapolation visible.
+    """Compute the uncertainty of poses over the workspace, and compare it with the measured poses.
 
     Parameters
     ----------
     fit : the identification, or the posterior of a run folder.
     measured : (m, a) readings of the measured poses, as in `Measurements.readings` [m, rad].
-    where : (n, c) controlled coordinates, a grid for instance, or the number of poses to draw from
+    where : (n, c) controlled coordinates, for instance a grid, or the number of poses to draw from
         the robot's workspace.
     seed : of that draw. frame : axes of the components.
 
@@ -303,11 +307,10 @@ def accuracy_map(
         Poses are to be drawn, and the robot states no workspace.
     """
     robot = (fit.posterior if isinstance(fit, Identification) else fit).robot
-    coordinates = (
-        sample_workspace(robot, where, seed).coordinates
-        if isinstance(where, int)
-        else np.asarray(where, dtype=np.float64)
-    )
+    if isinstance(where, int):
+        coordinates = sample(robot, where, seed).coordinates
+    else:
+        coordinates = np.asarray(where, dtype=np.float64)
     return AccuracyMap(
         names=robot.controlled,
         coordinates=coordinates,
@@ -316,8 +319,8 @@ def accuracy_map(
     )
 
 
-def _ratio(here: FloatArray, there: FloatArray) -> FloatArray:
-    """Over the largest that is there; one where both are infinite or both zero."""
-    most = float(np.nanmax(there))
+def _ratio(values: FloatArray, reference: FloatArray) -> FloatArray:
+    """Return values over the largest reference; 1 where both are infinite or both are zero."""
+    largest = float(np.nanmax(reference))
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(here == most, 1.0, here / most)
+        return np.where(values == largest, 1.0, values / largest)

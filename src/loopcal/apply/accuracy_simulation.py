@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is the linear prediction of pose errors right? Many simulated calibrations, each with its own
-truth and noise.
+"""Check the linear prediction of pose errors by many simulated calibrations.
 
-Predicted are standard deviations from D C D' of one fit; observed is the root mean square of the
-errors of pose (identified against true machine, the same readings) over all trials. JCGM 101; see
-docs/theory/uncertainty.md.
+Every trial has its own true machine and its own noise. Predicted are the standard deviations from
+D C D' of one fit. Observed is the root mean square, over all trials, of the pose error between the
+identified and the true machine at the same readings. JCGM 101; see docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ from loopcal.typing import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class MonteCarlo:
+class AccuracySimulation:
     """Predicted and observed errors of n poses.
 
     Attributes
     ----------
-    predicted : of the first trial's fit: platform origin, base axes, no direction left out.
-    observed : (n, 6) root mean square error [rad, m]. trials : how many fits converged. failed :
-        how many did not.
+    predicted : of the fit of the first trial: platform origin, base axes, no direction excluded.
+    observed : (n, 6) root mean square error [rad, m].
+    trials, failed : number of fits that converged, and that did not.
     """
 
     predicted: PoseUncertainty
@@ -42,13 +41,13 @@ class MonteCarlo:
 
     @property
     def ratio(self) -> FloatArray:
-        """(n, 6) observed over predicted; NaN where nothing is predicted or nothing moves."""
+        """(n, 6) observed over predicted; NaN where the prediction is infinite or zero."""
         sd = self.predicted.sd
-        there = np.isfinite(sd) & (sd > 0.0)
-        return np.divide(self.observed, sd, out=np.full(sd.shape, np.nan), where=there)
+        valid = np.isfinite(sd) & (sd > 0.0)
+        return np.divide(self.observed, sd, out=np.full(sd.shape, np.nan), where=valid)
 
 
-def monte_carlo(
+def simulate_accuracy(
     robot: Mechanism,
     commanded: ArrayLike,
     instrument: Instrument,
@@ -56,36 +55,35 @@ def monte_carlo(
     method: Method | None = None,
     trials: int = 2000,
     seed: int = 0,
-) -> MonteCarlo:
-    """Compare predicted with observed errors of pose.
+) -> AccuracySimulation:
+    """Compare predicted with observed errors of poses.
 
     Parameters
     ----------
-    robot : its tolerances are those of the true errors, drawn anew in each trial.
-    commanded : poses that are measured, (m, 4, 4) or (m, c). instrument : with what.
-    where : poses that are judged, (n, 4, 4) or (n, c); the nominal robot's readings there.
-    method : default least squares. trials, seed : how many, and of which random streams.
+    robot : its tolerances are those of the true errors, which each trial draws anew.
+    commanded : measured poses, (m, 4, 4) or (m, c). instrument : with what they are measured.
+    where : compared poses, (n, 4, 4) or (n, c), at the readings of the nominal robot.
+    method : default least squares. trials : their number. seed : of all random streams.
     """
     truth = sample_truth(robot, trials, seed)
     measured = simulate_trials(robot, truth, commanded, instrument, seed)
     fits = identify_trials(robot, measured, method or LeastSquares())
-    good = fits.converged
-    judged = inverse(robot.nominal, where)
+    compared = inverse(robot.nominal, where)
     states = [
-        forward_trials(robot, values, judged.q[None], judged.state)
+        forward_trials(robot, values, compared.q[None], compared.state)
         for values in (fits.values, truth)
     ]
     closed = [(state.status == Status.CONVERGED).all(axis=1) for state in states]
-    good = good & closed[0] & closed[1]
-    errors = geometry.pose_difference(states[0].T[good], states[1].T[good])
-    free, first = fits.unknowns, int(np.flatnonzero(good)[0])
-    one = np.array([first])
+    valid = fits.converged & closed[0] & closed[1]
+    errors = geometry.difference(states[0].T[valid], states[1].T[valid])
+    free, first = fits.unknowns, int(np.flatnonzero(valid)[0])
+    trial = np.array([first])
     identified = robot.with_values(fits.values[first])
     known = compute_posterior(
-        identified, free.places, free.tolerance, fits.decomposition.take(one), fits.penalty[one]
+        identified, free.places, free.tolerance, fits.decomposition.take(trial), fits.penalty[trial]
     )
     predicted = pose_uncertainty(
-        known, forward(identified, judged.q), gauge="infinite", point="platform"
+        known, forward(identified, compared.q), gauge="infinite", point="platform"
     )
     observed = np.sqrt((errors**2).mean(axis=0))
-    return MonteCarlo(predicted, observed, int(good.sum()), int((~good).sum()))
+    return AccuracySimulation(predicted, observed, int(valid.sum()), int((~valid).sum()))

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Use a calibration: readings that take the real machine to its targets, or shifted commands for a
-closed controller.
+"""Compensation: actuator readings, or shifted commands, that take the machine to its targets.
 
     readings   q = IK(x; e_hat)
     commands   x_cmd <- x_cmd - (FK(IK(x_cmd; controller); e_hat) - x), a few fixed-point steps
 
-A machine with fewer actuators than six also errs where nothing can push it: that part stays, and
-each target says how much. See docs/theory/accuracy.md.
+A machine with fewer than six actuators also errs in directions that no actuator can correct. That
+part remains, and the result states it for each target. See docs/theory/accuracy.md.
 """
 
 from __future__ import annotations
@@ -24,52 +23,68 @@ from loopcal.diagnose import twist_weights
 from loopcal.errors import DataError
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
-from loopcal.mechanism import Mechanism, Solution, check_limits, forward, inverse, read_coordinates
+from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.mechanism import Mechanism, Solution, forward, inverse
+from loopcal.mechanism import coordinates as controlled
+from loopcal.mechanism.limits import within
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 Mode = Literal["readings", "commands"]
 
-NOTHING = 1e-9
-"""Error below this share of the robot's size (or in radians) is rounding."""
+SHOWN = 5
+"""Targets out of reach that the text lists."""
 
-SHRUNK = 0.1
-"""Share of its first value to which the fixed point must have brought the distance; it usually
-falls a hundredfold a step.
+ROUNDING = 1e-9
+"""An error below this share of the robot's size (or this many radians) is rounding."""
+
+REDUCED = 0.1
+"""Share of its first value below which the fixed-point iteration must bring the distance to the
+best pose. It usually falls a hundredfold in each step.
 """
 
 
 class Reach(Enum):
-    """What becomes of a target."""
+    """Whether the machine reaches a target."""
 
     REACHED = "reached"
     IN_PART = "reached in part"
     OUTSIDE = "outside the limits"
     UNREACHABLE = "unreachable"
-    NOT_SETTLED = "not settled"
+    NOT_CONVERGED = "not converged"
+
+
+CODES = {
+    "compensation.reached": Reach.REACHED,
+    "compensation.reached-in-part": Reach.IN_PART,
+    "compensation.outside-limits": Reach.OUTSIDE,
+    "compensation.unreachable": Reach.UNREACHABLE,
+    "compensation.not-converged": Reach.NOT_CONVERGED,
+}
+"""Code of the finding of a target -> its state."""
 
 
 @dataclass(frozen=True, eq=False)
 class Compensation:
-    """What to tell the machine for n targets, and where it goes then. Errors are twists (n, 6),
-    rotation first [rad, m].
+    """Readings or commands for n targets, and the poses they lead to.
+
+    Errors are twists (n, 6), rotation first [rad, m].
 
     Attributes
     ----------
     mode : "readings" or "commands". labels : (n,) names of the targets.
     robot, controller : the identified geometry, and that of the controller.
-    readings : (n, a) of the actuators at the targets [m, rad]. commands : (n, c) coordinates to
-        command [m, rad]; None where readings are set.
-    wanted, reached : (n, 4, 4) platform poses. reached is where the identified robot goes.
-    before : (n, 6) error of the machine if it is commanded to the target by its controller as it
-        is.
+    readings : (n, a) of the actuators at the targets [m, rad].
+    commands : (n, c) coordinates to command [m, rad]; None where readings are set.
+    wanted, reached : (n, 4, 4) platform poses; `reached` is that of the identified robot.
+    before : (n, 6) error of the machine when its controller commands the target unchanged.
     remaining : (n, 6) error after compensation. not_compensable : (n, 6) the part of it that no
         reading can remove.
     residual_position, residual_orientation : (steps + 1, n) [m], [rad] distance from the best
         reachable pose before the first and after each fixed-point step; zeros (1, n) where readings
         are set.
-    uncertainty : of the poses reached; None where only a robot was given.
-    reach : (n,) Reach. sentences : (n,).
+    uncertainty : of the reached poses; None where only a robot was given.
+    findings : (n,) one for each target: reached, or why not.
     """
 
     mode: Mode
@@ -86,17 +101,32 @@ class Compensation:
     residual_position: FloatArray
     residual_orientation: FloatArray
     uncertainty: PoseUncertainty | None
-    reach: tuple[Reach, ...]
-    sentences: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
     @property
-    def good(self) -> BoolArray:
-        """(n,) targets that the machine can be sent to."""
+    def reach(self) -> tuple[Reach, ...]:
+        """(n,) whether each target is reached."""
+        return tuple(CODES[finding.code] for finding in self.findings)
+
+    @property
+    def usable(self) -> BoolArray:
+        """(n,) targets to which the machine can be sent."""
         return np.array([r in (Reach.REACHED, Reach.IN_PART) for r in self.reach])
+
+    def __str__(self) -> str:
+        """Return how many targets are reached, and the findings of those that are not."""
+        n, reached = len(self.labels), int(self.usable.sum())
+        lines = [f"{self.robot.name}: {reached} of {n} targets reached ({self.mode})"]
+        missed = [i for i in range(len(self.labels)) if not self.usable[i]]
+        lines += [f"target {self.labels[i]!r} {self.findings[i]}" for i in missed[:SHOWN]]
+        if len(missed) > SHOWN:
+            lines.append(f"and {len(missed) - SHOWN} more")
+        return "\n".join(lines)
+
+    __repr__ = __str__
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result by name for JSON, SI."""
-        found = self.uncertainty
         return {
             "robot": self.robot.name,
             "mode": self.mode,
@@ -110,9 +140,10 @@ class Compensation:
             "not_compensable": self.not_compensable,
             "residual_position": self.residual_position,
             "residual_orientation": self.residual_orientation,
-            "uncertainty": None if found is None else found.to_dict(),
+            "uncertainty": None if self.uncertainty is None else self.uncertainty.to_dict(),
             "reach": [r.value for r in self.reach],
-            "sentences": list(self.sentences),
+            "sentences": [str(finding) for finding in self.findings],
+            "findings": [finding.to_dict() for finding in self.findings],
         }
 
 
@@ -124,15 +155,15 @@ def compensate(
     steps: int = 3,
     labels: tuple[str, ...] = (),
 ) -> Compensation:
-    """Return readings or shifted commands for targets.
+    """Compute readings or shifted commands for targets.
 
     Parameters
     ----------
     fit : the identification, the posterior of a run folder (both give uncertainties), or a
         calibrated robot.
-    targets : (n, 4, 4) T_base_platform or (n, c) controlled coordinates [m, rad]. A target in
-        coordinates asks, for what cannot be controlled, for the pose that the controller's geometry
-        has there.
+    targets : (n, 4, 4) T_base_platform or (n, c) controlled coordinates [m, rad]. For freedoms that
+        a target in coordinates does not state, the wanted pose is that of the controller's
+        geometry.
     mode : "readings" to set the actuators, "commands" for a controller whose geometry cannot be
         changed.
     controller : that geometry; default: the nominal robot. steps : fixed-point steps of "commands".
@@ -140,136 +171,137 @@ def compensate(
 
     Returns
     -------
-    Compensation; a target that cannot be reached is said in `reach` and `sentences`, not raised.
+    Compensation. A target that cannot be reached is not an error: see `reach` and `findings`.
 
     Raises
     ------
     DataError
         Unknown mode, no step, targets of another shape.
     """
-    _check(mode, steps)
+    _check_settings(mode, steps)
     known = fit.posterior if isinstance(fit, Identification) else fit
     robot = known if isinstance(known, Mechanism) else known.robot
     old = controller or robot.nominal
-    believed = inverse(old, targets)
-    wanted = np.reshape(targets, (-1, 4, 4)) if np.shape(targets)[-2:] == (4, 4) else believed.T
+    uncorrected = inverse(old, targets)
+    is_pose = np.shape(targets)[-2:] == (4, 4)
+    wanted = np.reshape(targets, (-1, 4, 4)) if is_pose else uncorrected.T
     best = inverse(robot, targets)
-    before = geometry.pose_difference(forward(robot, believed.q, _begin(robot, best)).T, wanted)
-    exact = _Settled(best, None, np.zeros((1, len(wanted), 6)))
-    settled = exact if mode == "readings" else _shifted(robot, old, believed, best, steps)
-    final = settled.final
-    fixed = geometry.pose_difference(best.T, wanted)
-    position, angle = (
-        np.linalg.norm(settled.gaps[..., part], axis=2) for part in (slice(3, 6), slice(3))
-    )
-    reach, sentences = _judged(robot, believed, best, settled, fixed)
+    start = _forward_start(robot, best)
+    before = geometry.difference(forward(robot, uncorrected.q, start).T, wanted)
+    if mode == "readings":
+        result = _Iteration(best, None, np.zeros((1, len(wanted), 6)))
+    else:
+        result = _shift_commands(robot, old, uncorrected, best, steps)
+    final = result.final
+    not_compensable = geometry.difference(best.T, wanted)
     return Compensation(
         mode=mode,
         labels=tuple(labels) or tuple(str(i + 1) for i in range(len(wanted))),
         robot=robot,
         controller=old,
         readings=final.q,
-        commands=settled.commands,
+        commands=result.commands,
         wanted=wanted,
         reached=final.T,
         before=before,
-        remaining=geometry.pose_difference(final.T, wanted),
-        not_compensable=fixed,
-        residual_position=position,
-        residual_orientation=angle,
+        remaining=geometry.difference(final.T, wanted),
+        not_compensable=not_compensable,
+        residual_position=np.linalg.norm(result.distances[..., 3:], axis=2),
+        residual_orientation=np.linalg.norm(result.distances[..., :3], axis=2),
         uncertainty=None if isinstance(known, Mechanism) else pose_uncertainty(known, final),
-        reach=reach,
-        sentences=sentences,
+        findings=_report_targets(robot, uncorrected, best, result, not_compensable),
     )
 
 
-def _check(mode: str, steps: int) -> None:
-    """Refuse what `compensate` cannot do; raises DataError."""
+def _check_settings(mode: str, steps: int) -> None:
+    """Raise DataError for an unknown mode or no step."""
     if mode not in get_args(Mode):
         raise DataError(f"mode is {mode!r}; it must be 'readings' or 'commands'")
     if steps < 1:
-        raise DataError(
-            f"{steps} steps of compensation were asked for; give 1 or more, 3 are usually enough"
-        )
+        raise DataError(f"steps is {steps}; it must be 1 or more, and 3 are usually enough")
 
 
 @dataclass(frozen=True, eq=False)
-class _Settled:
-    """Where the machine goes: its solution, what is commanded (n, c), and the gaps (steps + 1, n,
-    6) on the way.
+class _Iteration:
+    """Outcome of the fixed-point iteration.
+
+    Attributes
+    ----------
+    final : where the machine goes. commands : (n, c) [m, rad], or None.
+    distances : (steps + 1, n, 6) twists from the best poses, before the first and after each step.
     """
 
     final: Solution
     commands: FloatArray | None
-    gaps: FloatArray
+    distances: FloatArray
 
 
-def _begin(robot: Mechanism, best: Solution) -> Solution | None:
-    """Start of forward solutions: the best poses where all are closed, else home."""
+def _forward_start(robot: Mechanism, best: Solution) -> Solution | None:
+    """Return the start of forward solutions: the best poses where all converged, else home."""
     return best if best.converged.all() and robot.program.sigma is None else None
 
 
-def _shifted(
-    robot: Mechanism, controller: Mechanism, believed: Solution, best: Solution, steps: int
-) -> _Settled:
-    """Shift commands until the machine goes to the best poses; the shift is a twist, so no angle is
-    singular.
+def _shift_commands(
+    robot: Mechanism, controller: Mechanism, uncorrected: Solution, best: Solution, steps: int
+) -> _Iteration:
+    """Shift commands until the machine goes to the best poses.
+
+    The shift is a twist, so no choice of angles is singular.
     """
-    start = _begin(robot, best)
-    commands = read_coordinates(believed.T, controller.controlled)
-    final = forward(robot, believed.q, start)
-    gaps = [geometry.pose_difference(final.T, best.T)]
+    start = _forward_start(robot, best)
+    solution = uncorrected
+    commands = controlled.read(solution.T, controller.controlled)
+    final = forward(robot, solution.q, start)
+    distances = [geometry.difference(final.T, best.T)]
     for _ in range(steps):
-        moved = geometry.apply_twist(believed.T, -gaps[-1])
-        commands = read_coordinates(moved, controller.controlled)
-        believed = inverse(controller, commands, believed if believed.converged.all() else None)
-        final = forward(robot, believed.q, start)
-        gaps.append(geometry.pose_difference(final.T, best.T))
-    return _Settled(final, commands, np.stack(gaps))
+        moved = geometry.exp_update(solution.T, -distances[-1])
+        commands = controlled.read(moved, controller.controlled)
+        solution = inverse(controller, commands, solution if solution.converged.all() else None)
+        final = forward(robot, solution.q, start)
+        distances.append(geometry.difference(final.T, best.T))
+    return _Iteration(final, commands, np.stack(distances))
 
 
-def _judged(
-    robot: Mechanism, believed: Solution, best: Solution, settled: _Settled, fixed: FloatArray
-) -> tuple[tuple[Reach, ...], tuple[str, ...]]:
-    """Say what becomes of each target; `fixed` (n, 6) is what no reading can remove."""
-    final, gap = settled.final, settled.gaps * twist_weights(robot) / robot.size
-    allowed, why = check_limits(robot, robot.values[None], final.q[None], final.state)
-    first, last = np.linalg.norm(gap[0], axis=1), np.linalg.norm(gap[-1], axis=1)
-    loose = last > np.maximum(SHRUNK * first, NOTHING)
-    position, angle = np.linalg.norm(fixed[:, 3:], axis=1), np.linalg.norm(fixed[:, :3], axis=1)
-    names = ", ".join(robot.controlled)
-    found = []
-    for i in range(len(fixed)):
-        lost = next((s for s in (best, believed, final) if not s.converged[i]), None)
-        if lost is not None:
-            whose = "the controller's geometry: " if lost is believed else ""
-            found.append(
-                (
-                    Reach.UNREACHABLE,
-                    f"cannot be reached: {whose}{lost.explain(i).split(': ', 1)[1]}",
-                )
-            )
+def _report_targets(
+    robot: Mechanism,
+    uncorrected: Solution,
+    best: Solution,
+    result: _Iteration,
+    not_compensable: FloatArray,
+) -> tuple[Finding, ...]:
+    """Return one finding for each target."""
+    final, distance = result.final, result.distances * twist_weights(robot) / robot.size
+    allowed, why = within(robot, robot.values[None], final.q[None], final.state)
+    first, last = np.linalg.norm(distance[0], axis=1), np.linalg.norm(distance[-1], axis=1)
+    is_loose = last > np.maximum(REDUCED * first, ROUNDING)
+    position = np.linalg.norm(not_compensable[:, 3:], axis=1)
+    angle = np.linalg.norm(not_compensable[:, :3], axis=1)
+    findings = []
+    for i in range(len(not_compensable)):
+        failed = next((s for s in (best, uncorrected, final) if not s.converged[i]), None)
+        if failed is not None:
+            whose = "the controller's geometry: " if failed is uncorrected else ""
+            reason = whose + failed.explain(i).split(": ", 1)[1]
+            findings.append(report_finding("compensation.unreachable", reason=reason))
         elif not allowed[0, i]:
-            found.append((Reach.OUTSIDE, f"outside the machine's limits: {why[0, i]}"))
-        elif loose[i]:
-            found.append(
-                (
-                    Reach.NOT_SETTLED,
-                    "the shifted commands have not settled; allow more steps, or set readings",
+            findings.append(report_finding("compensation.outside-limits", limit=str(why[0, i])))
+        elif is_loose[i]:
+            findings.append(report_finding("compensation.not-converged"))
+        elif position[i] > ROUNDING * robot.size or angle[i] > ROUNDING:
+            findings.append(
+                report_finding(
+                    "compensation.reached-in-part",
+                    names=tuple(robot.controlled),
+                    position=_quantity(robot, float(position[i]), Dimension.LENGTH),
+                    orientation=_quantity(robot, float(angle[i]), Dimension.ANGLE),
                 )
             )
-        elif position[i] > NOTHING * robot.size or angle[i] > NOTHING:
-            left = _shown(robot, position[i], angle[i])
-            found.append((Reach.IN_PART, f"{names} reached; no actuator removes {left}"))
         else:
-            found.append((Reach.REACHED, "reached in full"))
-    return tuple(reach for reach, _ in found), tuple(sentence for _, sentence in found)
+            findings.append(report_finding("compensation.reached"))
+    return tuple(findings)
 
 
-def _shown(robot: Mechanism, position: float, angle: float) -> str:
-    """Length and angle in the units of the robot's file."""
-    parts = []
-    for value, dimension in ((position, Dimension.LENGTH), (angle, Dimension.ANGLE)):
-        shown = find_unit(robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol))
-        parts.append(f"{value / shown.factor_to_si:.3g} {shown}")
-    return " and ".join(parts)
+def _quantity(robot: Mechanism, value: float, dimension: Dimension) -> Quantity:
+    """Return an SI value in the unit of the robot's file."""
+    shown = unit(robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol))
+    return Quantity(value / shown.factor_to_si, shown.symbol)

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prove a calibration on poses it has not seen, before and after, with two errors told apart.
+"""Validation: errors on measured poses before and after calibration, best on held-out poses.
 
-Prediction error: what the model predicts at the readings that were measured, against what was
-measured. Commanded error: where the machine goes when it is told to reach a pose with this
-geometry, against that pose. The poses asked for are those that the geometry before calibration
-believes in at the measured readings, so before calibration the machine's answer was measured. After
-calibration the readings change, by little; the machine is then taken to differ from the identified
-model as it did at the measured readings. What no actuator can reach is shown as not compensable.
+Two errors are distinguished. The prediction error is what the model predicts at the measured
+readings, minus what was measured. The commanded error is the pose of the machine, commanded with
+this geometry, minus the commanded pose. The commanded poses are those that the geometry before
+calibration predicts at the measured readings, so the machine's answer before calibration was
+measured. After calibration the readings change slightly; the machine is assumed to differ from the
+identified model as it does at the measured readings. The part of the commanded error that no
+actuator can remove is reported as not compensable.
 """
 
 from __future__ import annotations
@@ -18,51 +19,49 @@ from typing import Any
 
 import numpy as np
 
+from loopcal.apply.noise_floor import NoiseFloor, compute_noise_floor
+from loopcal.apply.validation_findings import (
+    QUANTITIES,
+    check_limits,
+    group_setup,
+    owner_of,
+    report_few_rows,
+    report_left_out,
+    report_moved_setup,
+    report_setup,
+)
 from loopcal.diagnose import (
-    INDICES,
     KindErrors,
     PoseErrors,
-    PosePredictions,
     compare_predictions,
     compute_kind_errors,
     compute_row_errors,
-    find_moved_setups,
-    predict_poses,
 )
-from loopcal.errors import DataError, suggest_names
-from loopcal.estimate.inference.null_space import listed
-from loopcal.estimate.predicted import untold
+from loopcal.errors import DataError, nearest
 from loopcal.estimate.result import Identification
+from loopcal.findings import Finding, Severity
 from loopcal.measure import Measurements, check_actuators
-from loopcal.mechanism import Mechanism, Solution
-from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
-
-FEW = 5
-"""Rows below which an error is said to be judged by too few: at 4 the rms of noise alone varies by
-a third.
-"""
+from loopcal.mechanism import Mechanism
+from loopcal.units import DISPLAY_UNITS, Dimension, unit
 
 
 @dataclass(frozen=True, eq=False)
 class Validation:
-    """Errors on measured poses before and after calibration; rows are the r rows of all kinds.
+    """Errors on measured poses before and after calibration, over the r rows of all kinds.
 
     Attributes
     ----------
     poses : (r,) labels.
-    before, after : prediction error at equal readings.
-    commanded_before, commanded_after : pose error of the machine after commanding.
-    not_compensable : the part of `commanded_after` for which the machine has no actuator.
-    failed : labels of poses that one of the two geometries cannot reach; they are left out of all
-        statistics.
-    limit_position, limit_angle : quality gates [m], [rad] on the largest prediction error after;
-        None for no gate.
-    reasons : a sentence for each gate that is not met.
-    units : display symbols of length and angle.
-    notes : where unknown frames, targets and surfaces come from: from the fit, or found anew from
-        these rows.
-    alignment : the same by name: `kept` as the fit found them, `fitted` to these very rows, after
-        which errors are compared.
+    before, after : prediction errors. commanded_before, commanded_after : pose errors of the
+        commanded machine. not_compensable : the part of `commanded_after` that no actuator removes.
+    noise_floor : the error that the measurement noise alone causes.
+    unreachable : labels of poses that one of the two geometries cannot reach; no statistic contains
+        them.
+    limit_position, limit_angle : limits [m], [rad] on the largest prediction error after
+        calibration; None for no limit.
+    units : symbols of the units in which length and angle are shown.
+    findings : limits that are exceeded (failures), and notes.
+    alignment : names of frames, targets and surfaces: `kept` from the fit, `fitted` to these rows.
     kinds : prediction errors divided by sigma, of each kind and, last, of all.
     """
 
@@ -72,71 +71,57 @@ class Validation:
     commanded_before: PoseErrors
     commanded_after: PoseErrors
     not_compensable: PoseErrors
-    failed: tuple[str, ...]
+    noise_floor: NoiseFloor
+    unreachable: tuple[str, ...]
     limit_position: float | None
     limit_angle: float | None
-    reasons: tuple[str, ...]
     units: tuple[str, str]
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     alignment: Mapping[str, tuple[str, ...]] = field(
         default_factory=lambda: {"kept": (), "fitted": ()}
     )
     kinds: tuple[KindErrors, ...] = ()
 
     @property
+    def failures(self) -> tuple[Finding, ...]:
+        """Findings of limits that are exceeded or cannot be checked."""
+        return tuple(f for f in self.findings if f.severity is Severity.FAILURE)
+
+    @property
     def passed(self) -> bool:
-        """Whether every quality gate is met."""
-        return not self.reasons
+        """Whether every limit is kept."""
+        return not self.failures
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """What the rows measure: position, orientation, or both."""
+        return tuple(q for q in QUANTITIES if self.after.statistics(q).count)
+
+    @property
+    def has_several_kinds(self) -> bool:
+        """Whether several kinds of measurement are mixed; then only errors divided by sigma can be
+        compared.
+        """
+        return len(self.kinds) > 2
+
+    @property
+    def n_judged(self) -> int:
+        """Largest number of rows that measure one quantity."""
+        return max((self.after.statistics(q).count for q in self.quantities), default=0)
 
     def improvement(self, index: str = "position", statistic: str = "rms") -> float:
         """Return how many times smaller a statistic of the prediction error became."""
         after = getattr(self.after.statistics(index), statistic)
         return getattr(self.before.statistics(index), statistic) / after if after > 0.0 else np.inf
 
-    @property
-    def several_kinds(self) -> bool:
-        """Whether rows of several kinds are mixed; then only errors divided by sigma can be
-        compared.
-        """
-        return len(self.kinds) > 2
+    def improvements(self) -> dict[str, float]:
+        """Return how many times smaller (rms) the error of each quantity became.
 
-    def comparisons(self) -> tuple[tuple[str, float], ...]:
-        """Return what is compared before and after calibration (rms), and how many times smaller it
-        became.
+        The key is "weighted", the error of all kinds divided by sigma, where kinds are mixed.
         """
-        if self.several_kinds:
-            return (("error of all kinds, divided by sigma", self.kinds[-1].improvement),)
-        measured = [
-            index for index in ("position", "orientation") if self.after.statistics(index).count
-        ]
-        return tuple((f"{index} error", self.improvement(index)) for index in measured)
-
-    def rows(self) -> list[tuple[str, str, str, int, float, float, float, float]]:
-        """Return a table: error, index, unit, number of rows that have it, and max, rms, mean, sd
-        in that unit.
-        """
-        length, angle = (find_unit(symbol) for symbol in self.units)
-        scale = {
-            "position": (length.factor_to_si, length.symbol),
-            "position_balance": (length.factor_to_si, length.symbol),
-            "orientation": (angle.factor_to_si, angle.symbol),
-            "orientation_balance": (angle.factor_to_si, angle.symbol),
-            "integrated": (1.0, "mm+rad"),
-        }
-        table = []
-        for title, errors in self.errors().items():
-            for index in INDICES:
-                found = errors.statistics(index)
-                if found.count:
-                    factor, symbol = scale[index]
-                    four = (
-                        found.max / factor,
-                        found.rms / factor,
-                        found.mean / factor,
-                        found.sd / factor,
-                    )
-                    table.append((title, index, symbol, found.count, *four))
-        return table
+        if self.has_several_kinds:
+            return {"weighted": self.kinds[-1].improvement}
+        return {quantity: self.improvement(quantity) for quantity in self.quantities}
 
     def errors(self) -> dict[str, PoseErrors]:
         """Return the errors by name."""
@@ -148,32 +133,42 @@ class Validation:
             "not compensable": self.not_compensable,
         }
 
+    def unit_of(self, quantity: str) -> str:
+        """Return the symbol of the unit in which position or orientation is shown."""
+        return self.units[QUANTITIES.index(quantity)]
+
     def __str__(self) -> str:
-        head = f"{'error':<17} {'index':<20} {'n':>5} {'max':>11} {'rms':>11} {'mean':>11} {'sd':>11} unit"
-        lines = [f"{len(self.poses)} rows", head]
-        for title, index, symbol, count, *four in self.rows():
+        """Return one line for each quantity, and the findings."""
+        lines = [f"Validation on {len(self.poses)} rows (rms):"]
+        for quantity in self.quantities:
+            shown = unit(self.unit_of(quantity))
+            values = [
+                self.before.statistics(quantity).rms,
+                self.after.statistics(quantity).rms,
+                getattr(self.noise_floor, quantity),
+            ]
+            before, after, floor = (f"{value / shown.factor_to_si:.3g}" for value in values)
             lines.append(
-                f"{title:<17} {index:<20} {count:>5} "
-                + " ".join(f"{x:>11.4g}" for x in four)
-                + f" {symbol}"
+                f"  {quantity}: {before} {shown} before, {after} {shown} after calibration "
+                f"(noise floor {floor} {shown})"
             )
-        if self.failed:
-            lines.append(f"left out, out of reach: poses {', '.join(self.failed)}")
-        return "\n".join([*lines, *(f"note: {note}" for note in self.notes), *self.reasons])
+        return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self.findings)])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result by attribute name for JSON, SI (integrated: mm + rad)."""
+        """Return the result by name for JSON, SI."""
         named = ("before", "after", "commanded_before", "commanded_after", "not_compensable")
         return {
             "poses": list(self.poses),
             **{name: getattr(self, name).to_dict() for name in named},
-            "failed": list(self.failed),
+            "noise_floor": vars(self.noise_floor),
+            "failed": list(self.unreachable),
             "limit_position": self.limit_position,
             "limit_angle": self.limit_angle,
             "passed": self.passed,
-            "reasons": list(self.reasons),
-            "notes": list(self.notes),
-            "alignment": {name: list(parts) for name, parts in self.alignment.items()},
+            "reasons": [str(finding) for finding in self.failures],
+            "notes": [str(f) for f in self.findings if f.severity is not Severity.FAILURE],
+            "findings": [finding.to_dict() for finding in self.findings],
+            "alignment": {name: list(names) for name, names in self.alignment.items()},
             "kinds": [vars(kind) for kind in self.kinds],
         }
 
@@ -188,216 +183,104 @@ def validate(
     refit: Sequence[str] = (),
     known_before: Mapping[str, float] | None = None,
 ) -> Validation:
-    """Compare a calibrated robot with measurements, best with ones it was not fitted to.
+    """Compare a calibrated robot with measurements, best with some that were not fitted.
 
     Parameters
     ----------
-    fit : the identification, or a calibrated robot. data : measurements held out.
-    limit_position, limit_angle : quality gates [m], [rad].
-    before : the geometry to compare with, and that of the controller; default: what `fit` started
-        from (for a robot: its nominal values).
-    known : values [SI] by name of frames, targets and surfaces that a fit found; they are kept.
-        Default: those of `fit`.
-    refit : names of some of them, such as `tracker*`, that were set up anew, to be found from these
-        rows.
-    known_before : the same for the geometry before, to compare like with like; default: the values
-        with which `fit` began.
+    fit : the identification, or a calibrated robot. data : the held-out measurements.
+    limit_position, limit_angle : largest allowed prediction errors [m], [rad].
+    before : the geometry to compare with, which is also that of the controller; default: the one
+        that `fit` started from (of a robot: its nominal values).
+    known : values [SI] by name of frames, targets and surfaces to keep; default: those of `fit`.
+    refit : names of some of them, such as `tracker*`, to fit to these rows instead.
+    known_before : the same for the geometry before calibration; default: the values with which
+        `fit` began.
 
     Raises
     ------
     DataError
-        Data of another robot, without rows, or with every pose out of reach.
+        The data belong to another robot, contain no row, or every pose is unreachable.
     """
     robot = fit.robot if isinstance(fit, Identification) else fit
     old = before or (fit.initial if isinstance(fit, Identification) else fit.nominal)
     check_actuators(data, robot)
-    starts, kept = _known(fit, before, (known_before, known), refit, data)
-    compared = compare_predictions(old, robot, data, starts, kept)
-    first, last, rows = compared.before, compared.after, list(compared.data.observations)
-    poses, ok, told, units = compared.rows, compared.usable, compared.predictable, _units(robot)
-    was, now, missed = (
-        first.residuals(rows),
-        last.residuals(rows),
-        first.differences(rows, compared.reached),
-    )
-    after = compute_row_errors(rows, now)
+    kept_before, kept = _kept_setup(fit, before, (known_before, known), refit, data)
+    compared = compare_predictions(old, robot, data, kept_before, kept)
+    rows = compared.data.observations
+    errors_before = compared.before.residuals(rows)
+    errors_after = compared.after.residuals(rows)
+    missed = compared.before.differences(rows, compared.reached)
+    after, usable = compute_row_errors(rows, errors_after), compared.usable
+    limits = {"position": limit_position, "orientation": limit_angle}
+    units = _display_units(robot)
+    left_out = ~usable & compared.predictable
     return Validation(
-        poses=poses,
-        before=compute_row_errors(rows, was),
+        poses=compared.rows,
+        before=compute_row_errors(rows, errors_before),
         after=after,
-        commanded_before=compute_row_errors(rows, [-r for r in was]),
-        commanded_after=compute_row_errors(rows, [m - r for m, r in zip(missed, now, strict=True)]),
+        commanded_before=compute_row_errors(rows, [-r for r in errors_before]),
+        commanded_after=compute_row_errors(
+            rows, [m - r for m, r in zip(missed, errors_after, strict=True)]
+        ),
         not_compensable=compute_row_errors(rows, missed),
-        failed=tuple(data.labels[i] for i in np.flatnonzero(~ok & told)),
+        noise_floor=compute_noise_floor(rows),
+        unreachable=tuple(data.labels[i] for i in np.flatnonzero(left_out)),
         limit_position=limit_position,
         limit_angle=limit_angle,
-        reasons=_gates(after, poses, limit_position, limit_angle, units),
         units=units,
-        notes=(
-            *_few(after),
-            *_notes(first, last),
-            *_anew(robot, compared.data, compared.solution, ok, kept),
-            *untold(data, told),
+        findings=(
+            *check_limits(after, compared.rows, limits, units),
+            *report_moved_setup(robot, compared, kept),
+            *report_left_out(data, usable, compared.predictable),
+            *report_few_rows(after),
+            *report_setup(compared.before, compared.after),
         ),
-        alignment=_alignment(last),
-        kinds=compute_kind_errors(rows, was, now),
+        alignment=group_setup(compared.after),
+        kinds=compute_kind_errors(rows, errors_before, errors_after),
     )
 
 
-def _known(
+def _kept_setup(
     fit: Identification | Mechanism,
     before: Mechanism | None,
     known: tuple[Mapping[str, float] | None, Mapping[str, float] | None],
     refit: Sequence[str],
     data: Measurements,
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """What is known of frames, targets and surfaces for the geometry before, and for the calibrated
-    one.
-    """
-    own = fit.local if isinstance(fit, Identification) else None
-    then, now = known
-    kept = (own.values if own else {}) if now is None else now
-    starts = (
-        (own.starts if own and before is None and now is None else {}) if then is None else then
-    )
-    return _kept(starts, refit, data), _kept(kept, refit, data)
+    """Return the setup parameters [SI] to keep for the geometry before, and for the calibrated one.
 
-
-def _kept(known: Mapping[str, float], refit: Sequence[str], data: Measurements) -> dict[str, float]:
-    """What is known, without the frames, targets and surfaces to be found anew; DataError for a
-    name that is not there.
+    Raises
+    ------
+    DataError : a name in `refit` belongs to nothing in the data.
     """
-    there = {name.rsplit(".", 1)[0] for name in data.unknowns.table.names}
+    local = fit.local if isinstance(fit, Identification) else None
+    known_before, known_after = known
+    if known_before is None:
+        is_own = local is not None and before is None and known_after is None
+        known_before = local.starts if is_own and local is not None else {}
+    if known_after is None:
+        known_after = {} if local is None else local.values
+    owners = {owner_of(name) for name in data.unknowns.table.names}
     for pattern in refit:
-        if not any(fnmatchcase(name, pattern) for name in there):
+        if not any(fnmatchcase(owner, pattern) for owner in owners):
+            listed = ", ".join(sorted(owners)) or "none"
             raise DataError(
-                "no frame, target or surface of these measurements is called "
-                f"{pattern!r}{suggest_names(pattern, there)}; there are"
-                f" {', '.join(sorted(there)) or 'none'}"
+                f"no frame, target or surface of these data is called {pattern!r}"
+                f"{nearest(pattern, owners)}; the data have: {listed}"
             )
-    return {
-        n: v
-        for n, v in known.items()
-        if not any(fnmatchcase(n.rsplit(".", 1)[0], pattern) for pattern in refit)
-    }
-
-
-def _alignment(view: PosePredictions) -> dict[str, tuple[str, ...]]:
-    """Frames, targets and surfaces by where their values come from: kept as known, or fitted to
-    these rows.
-    """
-    names = view.setup.table.names
-    there = [name in view.kept for name in names]
-    return {
-        word: tuple(
-            dict.fromkeys(
-                n.rsplit(".", 1)[0] for n, c in zip(names, there, strict=True) if c is carried
-            )
-        )
-        for word, carried in (("kept", True), ("fitted", False))
-    }
-
-
-def _notes(first: PosePredictions, last: PosePredictions) -> tuple[str, ...]:
-    """Say where the unknowns of the measurements come from, and after which best fit errors are
-    compared.
-    """
-    found, notes = _alignment(last), []
-    if found["kept"]:
-        notes.append(f"{listed(found['kept'])}: as the fit found it")
-    unlike = [name for name in found["kept"] if name in _alignment(first)["fitted"]]
-    if unlike:
-        names = listed(unlike)
-        notes.append(
-            f"errors before calibration are those after the best fit of {names} to these rows, "
-            "which flatters them"
-        )
-    if found["fitted"]:
-        names = listed(found["fitted"])
-        notes.append(
-            f"{names}: found anew from these rows, which flatters: errors are those after the best "
-            f"fit of {names}"
-        )
-    return tuple(notes)
-
-
-def _anew(
-    robot: Mechanism, data: Measurements, found: Solution, ok: np.ndarray, kept: Mapping[str, float]
-) -> tuple[str, ...]:
-    """Say which of the frames, targets and surfaces that are kept seem to have been set up anew."""
-    table = data.unknowns.table
-    owner = {p.name: p.name.rsplit(".", 1)[0] for p in table.entries}
-    rows = list(data.observations)
-
-    def sizes(refit: tuple[str, ...]) -> tuple[float, int]:
-        try:
-            view = predict_poses(
-                robot,
-                data,
-                found,
-                ok,
-                {name: v for name, v in kept.items() if owner.get(name) not in refit},
-            )
-        except DataError:  # too few rows to find it from
-            return float("nan"), 0
-        errors = [
-            np.where(o.present, r, 0.0) for o, r in zip(rows, view.residuals(rows), strict=True)
-        ]
-        total = sum(
-            float(((o.whitener @ e[..., None]) ** 2).sum())
-            for o, e in zip(rows, errors, strict=True)
-        )
-        free = sum(p.free and owner[p.name] in refit for p in table.entries)
-        left = sum(o.n_residuals for o in rows) - free
-        return float(np.sqrt(total / max(left, 1))), left
-
-    names = dict.fromkeys(owner[p.name] for p in table.entries if p.free and p.name in kept)
-    moved = find_moved_setups(tuple(names), sizes)
-    return () if moved is None else (moved.sentence,)
-
-
-def _few(after: PoseErrors) -> tuple[str, ...]:
-    """Say which errors too few rows measure to judge them by."""
-    counts = {index: after.statistics(index).count for index in ("position", "orientation")}
-    rows = {
-        index: f"only {n} row{' measures' if n == 1 else 's measure'} {index}"
-        for index, n in counts.items()
-    }
-    return tuple(
-        f"{rows[index]}: too few to judge its errors by"
-        for index, n in counts.items()
-        if 0 < n < FEW
+    before_, after = (
+        {
+            name: value
+            for name, value in values.items()
+            if not any(fnmatchcase(owner_of(name), pattern) for pattern in refit)
+        }
+        for values in (known_before, known_after)
     )
+    return before_, after
 
 
-def _units(robot: Mechanism) -> tuple[str, str]:
+def _display_units(robot: Mechanism) -> tuple[str, str]:
     length, angle = (
         robot.units.get(d, DISPLAY_UNITS[d].symbol) for d in (Dimension.LENGTH, Dimension.ANGLE)
     )
     return length, angle
-
-
-def _gates(
-    after: PoseErrors,
-    poses: tuple[str, ...],
-    position: float | None,
-    angle: float | None,
-    units: tuple[str, str],
-) -> tuple[str, ...]:
-    """Sentences for the gates that are not met; a gate on what was not measured is not met."""
-    reasons = []
-    for name, limit, symbol in (("position", position, units[0]), ("orientation", angle, units[1])):
-        if limit is None:
-            continue
-        values = getattr(after, name)
-        if not np.isfinite(values).any():
-            reasons.append(f"the {name} limit cannot be checked: no row measures {name}")
-            continue
-        worst, factor = int(np.nanargmax(values)), find_unit(symbol).factor_to_si
-        if values[worst] > limit:
-            reasons.append(
-                f"{name} error {values[worst] / factor:.4g} {symbol} at pose {poses[worst]} "
-                "exceeds the limit of"
-                f" {limit / factor:.4g} {symbol}"
-            )
-    return tuple(reasons)

@@ -290,10 +290,9 @@ def _reasons(fit: Identification, validation: Validation | None, unjudged: str) 
     reasons += [unjudged] if unjudged else []
     if validation is None:
         return reasons
-    for name, smaller in validation.comparisons():
+    for name, smaller in validation.improvements().items():
         if (times := 1.0 / smaller if smaller > 0.0 else float("inf")) > GREW:
             reasons.append(
-                f"{name.replace('error', 'errors')} on unseen poses are {times:.3g} times LARGER "
-                "after calibration (rms)"
+                f"{name} on unseen poses are {times:.3g} times LARGER after calibration (rms)"
             )
-    return [*reasons, *validation.reasons]
+    return [*reasons, *map(str, validation.failures)]

@@ -90,9 +90,9 @@ def compensate(
         _print(found)
         show.say(f"\nwritten to {output}")
     return show.gates(
-        f"target {label!r} {found.sentences[i]}"
+        f"target {label!r} {str(found.findings[i])}"
         for i, label in enumerate(labels)
-        if not found.good[i]
+        if not found.usable[i]
     )
 
 

@@ -376,7 +376,7 @@ def _write(output: Path, made: Plan, inputs: Mapping[str, Path], force: bool) ->
         write_plan_folder,
     )
     from loopcal.io.runs.run_folder import collect_provenance
-    from loopcal.report.draw_plan import draw_curve, draw_plan, save_figure
+    from loopcal.report.plan_drawing import draw_curve, draw_plan, save_figure
 
     texts = {SHEET: format_sheet(made), DATA: format_plan_data(made)}
     document = made.to_dict() | {

@@ -152,7 +152,7 @@ def validation(found: Validation, poses: str, before: bool = True) -> None:
     Errors after commanding are left out where they are those of the prediction because nothing is
     out of the actuators' reach.
     """
-    rows = found.rows()
+    rows = _error_rows(found)
     same = all(max(four) < ROUNDING for title, _, _, _, *four in rows if title == "not compensable")
     if same:
         rows = [row for row in rows if row[0].startswith("predicted")]
@@ -162,19 +162,31 @@ def validation(found: Validation, poses: str, before: bool = True) -> None:
              for title, index, symbol, count, *four in rows]  # fmt: skip
     headers = ("error", "of", "rows", "max", "rms", "mean", "sd", "unit")
     table(f"Errors on {len(found.poses)} {poses} rows", headers, cells, text_columns=2)
-    if found.several_kinds:
+    if found.has_several_kinds:
         _kinds(found, before)
     if same and before:
         say(
             "poses after commanding have these same errors: what was measured can be corrected by "
             "the actuators in full"
         )
-    for name, times in found.comparisons() if before else ():
+    for name, times in found.improvements().items() if before else ():
         say(f"{name} (rms): {_compared(times)}")
-    if found.failed:
-        say(f"left out, out of reach: poses {', '.join(found.failed)}")
-    for note in found.notes:
-        say(f"note: {note}")
+    if found.unreachable:
+        say(f"left out, out of reach: poses {', '.join(found.unreachable)}")
+    for finding in found.findings:
+        if finding not in found.failures:
+            say(f"note: {finding}")
+
+
+def _error_rows(found: Validation) -> list[tuple[str, str, str, int, float, float, float, float]]:
+    """Return error, quantity, unit, count, and max, rms, mean, sd in that unit."""
+    rows = []
+    for title, errors in found.errors().items():
+        for quantity in found.quantities:
+            s, shown = errors.statistics(quantity), unit(found.unit_of(quantity))
+            four = (x / shown.factor_to_si for x in (s.max, s.rms, s.mean, s.sd))
+            rows.append((title, quantity, shown.symbol, s.count, *four))
+    return rows
 
 
 def _kinds(found: Validation, before: bool) -> None:

@@ -59,11 +59,11 @@ def validate(
       loopcal validate robot.yaml measurements.csv --limit-position 0.1mm
     """  # noqa: D301
     from loopcal.apply import validate as compare
-    from loopcal.io.runs.calibration_run import load_calibrated, refuse_fitted_data
+    from loopcal.io.runs.calibration_run import load_calibrated, check_reused_data
 
     calibrated = load_calibrated(run)
     measured = measurements(data, calibrated.robot, **allowed)
-    if not allow_fitted_data and (again := refuse_fitted_data(calibrated, data, measured)):
+    if not allow_fitted_data and (again := check_reused_data(calibrated, data, measured)):
         click.echo(f"loopcal: note: {again}", err=True)
     known = {"known": calibrated.local, "known_before": calibrated.local_before, "refit": refit}
     found = compare(
@@ -74,4 +74,4 @@ def validate(
     else:
         changed = bool((calibrated.robot.values != calibrated.before.values).any())
         show.validation(found, "measured", before=changed)
-    return show.gates(found.reasons)
+    return show.gates(map(str, found.failures))

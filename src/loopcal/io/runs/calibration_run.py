@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import DataError
-from loopcal.apply.reused_rows import fitted_rows, seen_before
+from loopcal.findings import Finding, report_finding
+from loopcal.apply.reused_rows import collect_fitted_rows, find_reused_rows
 from loopcal.io.data.measurement_file import Paths, list_measurement_files
 from loopcal.io.robot.robot_file import load_robot, format_robot, list_shipped_robots
 from loopcal.io.runs.run_folder import find_fitted_file, read_run_folder, write_run_folder
@@ -86,7 +87,7 @@ def save_run(
     MechanismError
         The robot did not come from a file.
     """
-    rows = {} if fitted is None else fitted_rows(fitted, fit.dropped)
+    rows = {} if fitted is None else collect_fitted_rows(fitted, fit.dropped)
     arrays = {**fit.arrays(), "initial": fit.initial.values, **rows}
     return write_run_folder(path, document, arrays, format_robot(fit.robot, fit.plus_minus), force)
 
@@ -125,25 +126,20 @@ def load_calibrated(path: str | Path) -> CalibratedRun:
     return CalibratedRun(path, {}, robot, robot.nominal)
 
 
-def refuse_fitted_data(run: CalibratedRun, data: Paths, measured: Measurements) -> str:
-    """Refuse to validate a run with measured values that it was fitted to, as files or row by row.
+def check_reused_data(run: CalibratedRun, data: Paths, measured: Measurements) -> Finding | None:
+    """Refuse to validate a run with measurements that it was fitted to, as files or row by row.
 
     Returns
     -------
-    str
-        A note where fewer than half of the rows were fitted; else empty.
+    Finding or None
+        A warning where fewer than half of the rows were fitted.
 
     Raises
     ------
     DataError
-        A file is the same to the last byte, or half of the rows and more were fitted.
+        A file is the same to the last byte, or half of the rows or more were fitted.
     """
-    override = "--allow-fitted-data"
-    again = find_fitted_file(run.result, list_measurement_files(data))
-    if again is not None:
-        raise DataError(
-            f"{again}: this run was fitted to these very measurements, which prove nothing about "
-            "unseen poses; "
-            f"give others, or use {override}"
-        )
-    return seen_before(run.arrays, measured, override)
+    reused = find_fitted_file(run.result, list_measurement_files(data))
+    if reused is not None:
+        raise DataError(report_finding("validation.file-reused", file=str(reused)))
+    return find_reused_rows(run.arrays, measured)

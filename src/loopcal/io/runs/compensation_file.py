@@ -135,10 +135,10 @@ def format_compensation(found: Compensation) -> str:
     header += [f"note {title} {name} [{symbol}]" for title, _ in notes for name, symbol in zip(NAMES, shown, strict=True)]
     write([*header, "note status"])
     for i, label in enumerate(found.labels):
-        cells = [shortest(float(v), u.factor_to_si) if found.good[i] else "" for v, (_, u) in zip(values[i], told, strict=True)]
+        cells = [shortest(float(v), u.factor_to_si) if found.usable[i] else "" for v, (_, u) in zip(values[i], told, strict=True)]
         for _, errors in notes:
             cells += [_number(float(v) / u.factor_to_si) for v, u in zip(errors[i], shown, strict=True)]
-        write([label, *cells, found.sentences[i]])
+        write([label, *cells, str(found.findings[i])])
     return text.getvalue()
 
 

@@ -14,8 +14,8 @@ from loopcal.mechanism import POSITION, Mechanism
 from loopcal.planning.candidates import home_coordinates
 from loopcal.planning.needed import DIMENSION, PoseCurve
 from loopcal.planning.result import Plan
-from loopcal.report.draw import COLOURS, DPI
-from loopcal.units import Dimension, Unit, find_unit
+from loopcal.report.robot_drawing import COLOURS, DPI
+from loopcal.units import Dimension, Unit, unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

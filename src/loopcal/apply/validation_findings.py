@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Findings of a validation: limits, setup parameters that moved, and poses that were left out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from loopcal.diagnose import (
+    PoseErrors,
+    PosePredictions,
+    PredictionComparison,
+    find_moved_setups,
+    predict_poses,
+)
+from loopcal.errors import DataError
+from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.measure import Measurements
+from loopcal.mechanism import Mechanism
+from loopcal.typing import BoolArray
+from loopcal.units import unit
+
+QUANTITIES = ("position", "orientation")
+"""Indices of errors that every validation shows."""
+
+FEW_ROWS = 5
+"""Number of rows below which an error cannot be judged.
+
+At 4 rows the rms of noise alone varies by a third.
+"""
+
+
+def owner_of(name: str) -> str:
+    """Return the frame, target or surface of a setup parameter: `tracker` of `tracker.x`."""
+    return name.rsplit(".", 1)[0]
+
+
+def group_setup(prediction: PosePredictions) -> dict[str, tuple[str, ...]]:
+    """Return the frames, targets and surfaces that are kept, and those fitted to the rows."""
+    kept = dict.fromkeys(owner_of(n) for n in prediction.setup.table.names if n in prediction.kept)
+    fitted = dict.fromkeys(
+        owner_of(n) for n in prediction.setup.table.names if n not in prediction.kept
+    )
+    return {"kept": tuple(kept), "fitted": tuple(fitted)}
+
+
+def report_setup(first: PosePredictions, last: PosePredictions) -> list[Finding]:
+    """Report where the setup parameters come from."""
+    before, after = group_setup(first), group_setup(last)
+    only_after = tuple(name for name in after["kept"] if name in before["fitted"])
+    codes = {
+        "validation.setup-kept": after["kept"],
+        "validation.setup-fitted-before": only_after,
+        "validation.setup-fitted": after["fitted"],
+    }
+    return [report_finding(code, names=names) for code, names in codes.items() if names]
+
+
+def report_few_rows(after: PoseErrors) -> list[Finding]:
+    """Report quantities that too few rows measure."""
+    counts = {quantity: after.statistics(quantity).count for quantity in QUANTITIES}
+    return [
+        report_finding("validation.few-rows", quantity=quantity, count=count)
+        for quantity, count in counts.items()
+        if 0 < count < FEW_ROWS
+    ]
+
+
+def report_left_out(data: Measurements, valid: BoolArray, determined: BoolArray) -> list[Finding]:
+    """Report poses with rows that no statistic contains."""
+    has_rows = np.zeros(data.n_poses, dtype=bool)
+    for o in data.observations:
+        has_rows[o.rows[o.weight > 0.0]] = True
+    cases = {
+        "validation.unreachable-poses": ~valid & determined,
+        "validation.missing-readings": has_rows & ~determined,
+    }
+    named = {code: [data.labels[i] for i in np.flatnonzero(out)] for code, out in cases.items()}
+    return [
+        report_finding(code, names=tuple(f"pose {name}" for name in names))
+        for code, names in named.items()
+        if names
+    ]
+
+
+def report_moved_setup(
+    robot: Mechanism, compared: PredictionComparison, kept: Mapping[str, float]
+) -> list[Finding]:
+    """Report kept frames, targets and surfaces that were apparently moved after the fit."""
+    data = compared.data
+    table, rows = data.unknowns.table, data.observations
+    owner = {p.name: owner_of(p.name) for p in table.entries}
+
+    def measure_errors(refit: tuple[str, ...]) -> tuple[float, int]:
+        """Return the whitened rms error with these fitted again, and the equations left over."""
+        values = {name: v for name, v in kept.items() if owner.get(name) not in refit}
+        try:
+            prediction = predict_poses(robot, data, compared.solution, compared.usable, values)
+        except DataError:  # too few rows to fit it
+            return float("nan"), 0
+        total = 0.0
+        for o, residual in zip(rows, prediction.residuals(rows), strict=True):
+            present = np.where(o.present, residual, 0.0)
+            total += float(((o.whitener @ present[..., None]) ** 2).sum())
+        fitted = sum(p.free and owner[p.name] in refit for p in table.entries)
+        left = sum(o.n_residuals for o in rows) - fitted
+        return float(np.sqrt(total / max(left, 1))), left
+
+    names = dict.fromkeys(owner[p.name] for p in table.entries if p.free and p.name in kept)
+    moved = find_moved_setups(tuple(names), measure_errors)
+    if moved is None:
+        return []
+    return [report_finding("validation.setup-moved", names=moved.names, times=moved.times)]
+
+
+def check_limits(
+    after: PoseErrors,
+    poses: tuple[str, ...],
+    limits: Mapping[str, float | None],
+    units: tuple[str, str],
+) -> list[Finding]:
+    """Report limits that the largest error exceeds, and limits on what no row measures."""
+    findings = []
+    for (quantity, limit), symbol in zip(limits.items(), units, strict=True):
+        if limit is None:
+            continue
+        values = getattr(after, quantity)
+        if not np.isfinite(values).any():
+            findings.append(report_finding("gates.limit-not-measured", quantity=quantity))
+            continue
+        worst, factor = int(np.nanargmax(values)), unit(symbol).factor_to_si
+        if values[worst] > limit:
+            findings.append(
+                report_finding(
+                    "gates.limit-exceeded",
+                    quantity=quantity,
+                    pose=poses[worst],
+                    error=Quantity(float(values[worst]) / factor, symbol),
+                    limit=Quantity(limit / factor, symbol),
+                )
+            )
+    return findings

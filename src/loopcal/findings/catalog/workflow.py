@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The calibration workflow: what decides the verdict beside the gates, and the next step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from loopcal.findings.finding import Severity
+from loopcal.findings.wording import Entry, fill_template
+
+
+def _word_frame_freedoms(data: Mapping[str, Any]) -> str:
+    moves = "moves" if data["count"] == 1 else "move"
+    frames = "frame" if len(data["frames"]) == 1 else "frames"
+    return fill_template(
+        "{count:count parameter combination} only "
+        f"{moves} the {{frames:list}} {frames} as a whole. This is harmless: the accuracy relative "
+        "to the fitted frames does not depend on it.",
+        **data,
+    )
+
+
+def _word_undetermined(data: Mapping[str, Any]) -> str:
+    keep = "It keeps its" if data["count"] == 1 else "They keep their"
+    return fill_template(
+        "These data cannot determine {count:count parameter combination} that "
+        f"{'changes' if data['count'] == 1 else 'change'} poses (of {{names:list}}). {keep} "
+        "prior value, so other poses may be less accurate.",
+        **data,
+    )
+
+
+ENTRIES = (
+    Entry(
+        "workflow.no-held-out-poses",
+        Severity.WARNING,
+        "No poses were held out, so the accuracy at other poses is not known.",
+        "A calibration was made without validation.",
+        "Hold out a share of the poses, for example a quarter, or validate with other "
+        "measurements.",
+    ),
+    Entry(
+        "workflow.few-held-out-poses",
+        Severity.WARNING,
+        "{count:count held-out row} cannot support a verdict; at least {needed} are needed.",
+        "Fewer rows were held out than an error statistic needs.",
+        "Hold out more poses, or validate with other measurements.",
+    ),
+    Entry(
+        "workflow.undetermined-combinations",
+        Severity.WARNING,
+        _word_undetermined,
+        "The data leave parameter combinations open that move the platform relative to the base.",
+        "Follow the suggested measurements, or fix one parameter of each combination.",
+    ),
+    Entry(
+        "workflow.frame-freedoms",
+        Severity.INFO,
+        _word_frame_freedoms,
+        "The only open parameter combinations are rigid motions of the base or platform frame.",
+    ),
+    Entry(
+        "workflow.robot-of-other-name",
+        Severity.INFO,
+        "{file} names the robot {stated!r}, but {used!r} is calibrated.",
+        "The measurement file names another robot.",
+        "Check that the file belongs to this robot.",
+    ),
+    Entry(
+        "workflow.next-use-result",
+        Severity.SUGGESTION,
+        "Use the calibrated geometry, and validate it with new measurements from time to time.",
+        "The verdict is calibrated.",
+    ),
+    Entry(
+        "workflow.next-resolve-warnings",
+        Severity.SUGGESTION,
+        "Resolve the warnings or accept them, then validate with measurements that were not "
+        "fitted.",
+        "The verdict is calibrated with reservations.",
+    ),
+    Entry(
+        "workflow.next-hold-out",
+        Severity.SUGGESTION,
+        "Repeat the calibration with a quarter of the poses held out, or validate the result with "
+        "other measurements.",
+        "The verdict is undecided.",
+    ),
+    Entry(
+        "workflow.next-check-outliers",
+        Severity.SUGGESTION,
+        "Check the measurement of {poses:list}. Correct it, exclude it, or fit with a robust loss.",
+        "The verdict is not calibrated, and outliers were found.",
+    ),
+    Entry(
+        "workflow.next-check-noise",
+        Severity.SUGGESTION,
+        "Check the stated sigma and the frames. If they are right, free more parameters or "
+        "estimate the noise from the residuals.",
+        "The verdict is not calibrated because of the residuals, and no outlier was found.",
+    ),
+    Entry(
+        "workflow.next-check-data",
+        Severity.SUGGESTION,
+        "Check units, frames and joint readings of the data; then look at the identifiability of "
+        "the parameters.",
+        "The verdict is not calibrated because the fit did not converge or diverged.",
+    ),
+    Entry(
+        "workflow.next-measure-more",
+        Severity.SUGGESTION,
+        "Measure more poses, free fewer parameters, or use a better instrument.",
+        "The verdict is not calibrated because errors grew or exceed a limit.",
+    ),
+)

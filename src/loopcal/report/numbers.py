@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers for people: digits that the uncertainty leaves, and the units of a robot's file."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from loopcal.units import DISPLAY_UNITS, Dimension, Unit, unit
+
+if TYPE_CHECKING:
+    from loopcal.mechanism import Mechanism
+
+ROUNDING = 1e-12
+"""A number smaller than this, in whatever unit is shown, is rounding and printed as 0."""
+
+INSIGNIFICANT = 0.01
+"""Share of its uncertainty below which a value is printed as 0."""
+
+ABSENT = "-"
+"""Stands for a number that does not exist."""
+
+
+def units_of(robot: Mechanism) -> dict[Dimension, Unit]:
+    """Return the units in which the numbers of a robot are shown: those of its file."""
+    stated = {dimension: unit(symbol) for dimension, symbol in robot.units.items()}
+    return {**DISPLAY_UNITS, **stated}
+
+
+def format_number(value: float, digits: int = 6) -> str:
+    """Return a number with `digits` significant digits; a dash where it is not finite."""
+    if not math.isfinite(value):
+        return ABSENT
+    return f"{0.0 if abs(value) < ROUNDING else value:.{digits}g}"
+
+
+def format_with_uncertainty(value: float, uncertainty: float, digits: int = 9) -> str:
+    """Return a value to the third significant digit of its uncertainty.
+
+    A value below a hundredth of its uncertainty is 0. Without a finite uncertainty above 0 the
+    value has `digits` significant digits.
+    """
+    if not math.isfinite(value) or not math.isfinite(uncertainty) or uncertainty <= 0.0:
+        return format_number(value, digits)
+    if abs(value) < INSIGNIFICANT * uncertainty:
+        value = 0.0
+    return f"{value:.{_decimals(uncertainty)}f}"
+
+
+def format_uncertainty(uncertainty: float) -> str:
+    """Return an uncertainty with three significant digits, or a word where it has no number."""
+    if math.isnan(uncertainty):
+        return "not given"
+    if math.isinf(uncertainty):
+        return "unknown"
+    return f"{uncertainty:.{_decimals(uncertainty)}f}" if uncertainty > 0.0 else "0"
+
+
+def _decimals(uncertainty: float) -> int:
+    """Return the decimals that show three significant digits, at most 12."""
+    rounded = float(f"{uncertainty:.2e}")  # 9.996 shows as 10.0, which has one decimal less
+    return min(max(2 - math.floor(math.log10(rounded)), 0), 12)

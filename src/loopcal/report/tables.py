@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One description of a table, rendered as text, CSV and HTML."""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+GAP = 2
+"""Blanks between two columns of text."""
+
+NARROWEST = 12
+"""Characters that a column of words keeps when a table is narrowed."""
+
+RULE = "─"
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a table.
+
+    Parameters
+    ----------
+    title : its heading. unit : symbol of the unit of its numbers, empty where there is none or
+        where another column states it.
+    align : "left" for words, "right" for numbers. wraps : whether cells of words may be broken
+        where the table is wider than the page; numbers are never broken.
+    """
+
+    title: str
+    unit: str = ""
+    align: Literal["left", "right"] = "right"
+    wraps: bool = False
+
+    @property
+    def heading(self) -> str:
+        """Title and unit, such as `before [mm]`."""
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+
+def word_column(title: str, wraps: bool = False) -> Column:
+    """Return a column of words, on the left."""
+    return Column(title, align="left", wraps=wraps)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns, rows of formatted cells, and a caption."""
+
+    caption: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            assert len(row) == len(self.columns), f"{self.caption}: {row}"
+
+    def to_text(self, width: int | None = None) -> str:
+        """Return the table as lines of text without trailing blanks.
+
+        Parameters
+        ----------
+        width : characters of a line. Columns that wrap are narrowed to keep to it; where that is
+            not enough the table is wider. Default: no limit.
+        """
+        headings = [column.heading for column in self.columns]
+        cells = [headings, *self.rows]
+        widths = [max(len(row[i]) for row in cells) for i in range(len(headings))]
+        widths = self._narrowed(widths, width)
+        lines = [self.caption] if self.caption else []
+        lines += self._lines(headings, widths)
+        lines.append(RULE * (sum(widths) + GAP * (len(widths) - 1)))
+        for row in self.rows:
+            lines += self._lines(row, widths)
+        return "\n".join(line.rstrip() for line in lines)
+
+    def to_csv(self) -> str:
+        """Return the headings and rows as CSV text."""
+        stream = io.StringIO()
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow([column.heading for column in self.columns])
+        writer.writerows(self.rows)
+        return stream.getvalue()
+
+    def to_html(self) -> str:
+        """Return a `<table>` element; classes `words` and `numbers` mark the alignment."""
+        classes = ["words" if column.align == "left" else "numbers" for column in self.columns]
+
+        def row(tag: str, cells: Sequence[str]) -> str:
+            marked = zip(classes, cells, strict=True)
+            inner = "".join(f'<{tag} class="{c}">{html.escape(x)}</{tag}>' for c, x in marked)
+            return f"<tr>{inner}</tr>"
+
+        caption = f"<caption>{html.escape(self.caption)}</caption>" if self.caption else ""
+        head = row("th", [column.heading for column in self.columns])
+        body = "\n".join(row("td", cells) for cells in self.rows)
+        return f"<table>{caption}\n<thead>{head}</thead>\n<tbody>\n{body}\n</tbody>\n</table>"
+
+    def _narrowed(self, widths: list[int], width: int | None) -> list[int]:
+        """Return the widths with wrapping columns narrowed, the widest first."""
+        widths = list(widths)
+        wrapping = [i for i, column in enumerate(self.columns) if column.wraps]
+        while width is not None and sum(widths) + GAP * (len(widths) - 1) > width:
+            widest = max(wrapping, key=lambda i: widths[i], default=None)
+            if widest is None or widths[widest] <= NARROWEST:
+                break
+            widths[widest] -= 1
+        return widths
+
+    def _lines(self, cells: Sequence[str], widths: Sequence[int]) -> list[str]:
+        """Return the lines of one row."""
+        broken = [
+            textwrap.wrap(cell, width, break_long_words=False) or [""]
+            if len(cell) > width
+            else cell.split("\n")
+            for cell, width in zip(cells, widths, strict=True)
+        ]
+        height = max(len(lines) for lines in broken)
+        padded = [lines + [""] * (height - len(lines)) for lines in broken]
+        return [(" " * GAP).join(self._aligned(row, widths)) for row in zip(*padded, strict=True)]
+
+    def _aligned(self, cells: Sequence[str], widths: Sequence[int]) -> list[str]:
+        """Return cells padded to the widths of their columns."""
+        return [
+            cell.ljust(width) if column.align == "left" else cell.rjust(width)
+            for cell, width, column in zip(cells, widths, self.columns, strict=True)
+        ]
