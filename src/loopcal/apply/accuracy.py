@@ -23,9 +23,14 @@ from loopcal.errors import EstimationError
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
-from loopcal.mechanism import Mechanism, Solution, forward, inverse
-from loopcal.mechanism.batch_kinematics import sensitivity
-from loopcal.mechanism.workspace import sample
+from loopcal.mechanism import (
+    Mechanism,
+    Solution,
+    differentiate_pose,
+    forward,
+    inverse,
+    sample_workspace,
+)
 from loopcal.typing import BoolArray, FloatArray
 
 COVERAGE = 2.0
@@ -182,7 +187,7 @@ def _covariance(
     H (n, 6, 6) takes twists in base axes to the wanted point and axes.
     """
     robot = known.robot
-    S = sensitivity(robot, robot.values[None], solution.q[None], solution.state)
+    S = differentiate_pose(robot, robot.values[None], solution.q[None], solution.state)
     D = H @ (S.parameters[0][:, :, known.places] * known.unit)
     finite, infinite = roots
     factors = [D @ finite]
@@ -308,7 +313,7 @@ def accuracy_map(
     """
     robot = (fit.posterior if isinstance(fit, Identification) else fit).robot
     if isinstance(where, int):
-        coordinates = sample(robot, where, seed).coordinates
+        coordinates = sample_workspace(robot, where, seed).coordinates
     else:
         coordinates = np.asarray(where, dtype=np.float64)
     return AccuracyMap(

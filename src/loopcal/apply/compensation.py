@@ -24,9 +24,7 @@ from loopcal.errors import DataError
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, report_finding
-from loopcal.mechanism import Mechanism, Solution, forward, inverse
-from loopcal.mechanism import coordinates as controlled
-from loopcal.mechanism.limits import within
+from loopcal.mechanism import Mechanism, Solution, check_limits, forward, inverse, read_coordinates
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
@@ -187,13 +185,13 @@ def compensate(
     wanted = np.reshape(targets, (-1, 4, 4)) if is_pose else uncorrected.T
     best = inverse(robot, targets)
     start = _forward_start(robot, best)
-    before = geometry.difference(forward(robot, uncorrected.q, start).T, wanted)
+    before = geometry.pose_difference(forward(robot, uncorrected.q, start).T, wanted)
     if mode == "readings":
         result = _Iteration(best, None, np.zeros((1, len(wanted), 6)))
     else:
         result = _shift_commands(robot, old, uncorrected, best, steps)
     final = result.final
-    not_compensable = geometry.difference(best.T, wanted)
+    not_compensable = geometry.pose_difference(best.T, wanted)
     return Compensation(
         mode=mode,
         labels=tuple(labels) or tuple(str(i + 1) for i in range(len(wanted))),
@@ -204,7 +202,7 @@ def compensate(
         wanted=wanted,
         reached=final.T,
         before=before,
-        remaining=geometry.difference(final.T, wanted),
+        remaining=geometry.pose_difference(final.T, wanted),
         not_compensable=not_compensable,
         residual_position=np.linalg.norm(result.distances[..., 3:], axis=2),
         residual_orientation=np.linalg.norm(result.distances[..., :3], axis=2),
@@ -250,15 +248,15 @@ def _shift_commands(
     """
     start = _forward_start(robot, best)
     solution = uncorrected
-    commands = controlled.read(solution.T, controller.controlled)
+    commands = read_coordinates(solution.T, controller.controlled)
     final = forward(robot, solution.q, start)
-    distances = [geometry.difference(final.T, best.T)]
+    distances = [geometry.pose_difference(final.T, best.T)]
     for _ in range(steps):
-        moved = geometry.exp_update(solution.T, -distances[-1])
-        commands = controlled.read(moved, controller.controlled)
+        moved = geometry.apply_twist(solution.T, -distances[-1])
+        commands = read_coordinates(moved, controller.controlled)
         solution = inverse(controller, commands, solution if solution.converged.all() else None)
         final = forward(robot, solution.q, start)
-        distances.append(geometry.difference(final.T, best.T))
+        distances.append(geometry.pose_difference(final.T, best.T))
     return _Iteration(final, commands, np.stack(distances))
 
 
@@ -271,7 +269,7 @@ def _report_targets(
 ) -> tuple[Finding, ...]:
     """Return one finding for each target."""
     final, distance = result.final, result.distances * twist_weights(robot) / robot.size
-    allowed, why = within(robot, robot.values[None], final.q[None], final.state)
+    allowed, why = check_limits(robot, robot.values[None], final.q[None], final.state)
     first, last = np.linalg.norm(distance[0], axis=1), np.linalg.norm(distance[-1], axis=1)
     is_loose = last > np.maximum(REDUCED * first, ROUNDING)
     position = np.linalg.norm(not_compensable[:, 3:], axis=1)
@@ -303,5 +301,5 @@ def _report_targets(
 
 def _quantity(robot: Mechanism, value: float, dimension: Dimension) -> Quantity:
     """Return an SI value in the unit of the robot's file."""
-    shown = unit(robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol))
+    shown = find_unit(robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol))
     return Quantity(value / shown.factor_to_si, shown.symbol)

@@ -37,12 +37,12 @@ from loopcal.diagnose import (
     compute_kind_errors,
     compute_row_errors,
 )
-from loopcal.errors import DataError, nearest
+from loopcal.errors import DataError, suggest_names
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity
 from loopcal.measure import Measurements, check_actuators
 from loopcal.mechanism import Mechanism
-from loopcal.units import DISPLAY_UNITS, Dimension, unit
+from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ class Validation:
         """Return one line for each quantity, and the findings."""
         lines = [f"Validation on {len(self.poses)} rows (rms):"]
         for quantity in self.quantities:
-            shown = unit(self.unit_of(quantity))
+            shown = find_unit(self.unit_of(quantity))
             values = [
                 self.before.statistics(quantity).rms,
                 self.after.statistics(quantity).rms,
@@ -266,7 +266,7 @@ def _kept_setup(
             listed = ", ".join(sorted(owners)) or "none"
             raise DataError(
                 f"no frame, target or surface of these data is called {pattern!r}"
-                f"{nearest(pattern, owners)}; the data have: {listed}"
+                f"{suggest_names(pattern, owners)}; the data have: {listed}"
             )
     before_, after = (
         {

@@ -19,7 +19,7 @@ from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.typing import BoolArray
-from loopcal.units import unit
+from loopcal.units import find_unit
 
 QUANTITIES = ("position", "orientation")
 """Indices of errors that every validation shows."""
@@ -129,7 +129,7 @@ def check_limits(
         if not np.isfinite(values).any():
             findings.append(report_finding("gates.limit-not-measured", quantity=quantity))
             continue
-        worst, factor = int(np.nanargmax(values)), unit(symbol).factor_to_si
+        worst, factor = int(np.nanargmax(values)), find_unit(symbol).factor_to_si
         if values[worst] > limit:
             findings.append(
                 report_finding(

@@ -183,7 +183,7 @@ def _error_rows(found: Validation) -> list[tuple[str, str, str, int, float, floa
     rows = []
     for title, errors in found.errors().items():
         for quantity in found.quantities:
-            s, shown = errors.statistics(quantity), unit(found.unit_of(quantity))
+            s, shown = errors.statistics(quantity), find_unit(found.unit_of(quantity))
             four = (x / shown.factor_to_si for x in (s.max, s.rms, s.mean, s.sd))
             rows.append((title, quantity, shown.symbol, s.count, *four))
     return rows

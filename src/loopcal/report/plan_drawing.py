@@ -15,7 +15,7 @@ from loopcal.planning.candidates import home_coordinates
 from loopcal.planning.needed import DIMENSION, PoseCurve
 from loopcal.planning.result import Plan
 from loopcal.report.robot_drawing import COLOURS, DPI
-from loopcal.units import Dimension, Unit, unit
+from loopcal.units import Dimension, Unit, find_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
