@@ -59,7 +59,7 @@ def validate(
       loopcal validate robot.yaml measurements.csv --limit-position 0.1mm
     """  # noqa: D301
     from loopcal.apply import validate as compare
-    from loopcal.io.runs.calibration_run import load_calibrated, check_reused_data
+    from loopcal.io.runs.calibration_run import check_reused_data, load_calibrated
 
     calibrated = load_calibrated(run)
     measured = measurements(data, calibrated.robot, **allowed)
