@@ -222,7 +222,9 @@ def bounds(trials, numbers):
 )
 def test_predicted_errors_of_pose_are_those_of_simulated_calibrations(name, method):
     robot, trials = load_robot(name), 300
-    measured, judged = (sample_workspace(robot, n, seed).coordinates for n, seed in ((40, 1), (6, 9)))
+    measured, judged = (
+        sample_workspace(robot, n, seed).coordinates for n, seed in ((40, 1), (6, 9))
+    )
     found = simulate_accuracy(robot, measured, tracker(), judged, method, trials, seed=3)
     ratio = found.ratio[np.isfinite(found.ratio)]
     low, high = bounds(found.trials, len(ratio))
