@@ -32,7 +32,7 @@ from loopcal.measure import (
     Measurements,
     Sensor,
     Trials,
-    local_unknowns,
+    collect_nuisance_parameters,
     sample_truth,
     simulate,
     simulate_trials,
@@ -155,7 +155,7 @@ def _passive(robot: Mechanism) -> tuple[str, ...]:
 
 def machine(case: Case) -> Mechanism:
     """The nominal robot; a hexapod whose joints are looked at has legs with joints."""
-    return _robot(case.robot, bool(case.kind.looks_at))
+    return _robot(case.robot, bool(case.kind.sensed_joints))
 
 
 def instrument(kind: Kind, poses: int, noise: type[Gaussian]) -> Instrument:
@@ -165,11 +165,11 @@ def instrument(kind: Kind, poses: int, noise: type[Gaussian]) -> Instrument:
     every = np.arange(poses)
     rows = (
         np.concatenate([np.stack([every, np.roll(every, -k)], axis=1) for k in PAIRS])
-        if kind.links == 2
+        if kind.poses_per_row == 2
         else every
     )
     sigma = np.array([SIGMA[column.dimension] for column in kind.noise_columns])
-    grouped = any(p.scope == "group" for p in kind.unknowns)
+    grouped = any(p.scope == "group" for p in kind.nuisance_parameters)
     group = np.array([f"g{i % GROUPS}" for i in range(len(rows))]) if grouped else np.array("")
     return Instrument((Sensor(kind, noise(sigma), rows=rows, group=group),))
 
@@ -178,8 +178,8 @@ def own_truth(
     robot: Mechanism, looking: Instrument, poses: int, rng: np.random.Generator
 ) -> dict[str, float]:
     """True values of the unknowns of an instrument, drawn evenly about the stated ones."""
-    sensors = [sensor.looking(poses) for sensor in looking.mounted(robot).sensors]
-    table = local_unknowns(sensors, tuple(map(str, range(poses)))).table  # type: ignore[arg-type]
+    sensors = [sensor.assign_rows(poses) for sensor in looking.with_tool(robot).sensors]
+    table = collect_nuisance_parameters(sensors, tuple(map(str, range(poses)))).table  # type: ignore[arg-type]
     reach = np.array([REACH[p.dimension] for p in table.entries])
     drawn = rng.uniform(-reach, reach)
     drawn = np.where(
@@ -219,7 +219,7 @@ def recover(case: Case, seed: int = SEED) -> Recovery:
     looking = instrument(case.kind, POSES + HELD_OUT, Silent)
     own = own_truth(robot, looking, POSES + HELD_OUT, rng)
     try:
-        data = simulate(truth, _commanded(case.robot, seed), looking, seed, unknowns=own)
+        data = simulate(truth, _commanded(case.robot, seed), looking, seed, nuisance_values=own)
         some, others = data.take(np.arange(POSES)), data.take(np.arange(POSES, POSES + HELD_OUT))
         fit = identify(robot, some, LeastSquares(), allow_fewer_equations=True)
     except LoopcalError as error:
@@ -316,7 +316,7 @@ def cover(
     looking = instrument(case.kind, POSES, noise)
     own = own_truth(robot, looking, POSES, rng)
     truth = sample_truth(robot, fits, seed)
-    trials = simulate_trials(robot, truth, coordinates, looking, seed, unknowns=own)
+    trials = simulate_trials(robot, truth, coordinates, looking, seed, nuisance_values=own)
     found = identify_trials(robot, trials, MAP())
     good = np.flatnonzero(found.converged)
     free, d, penalty = found.unknowns, found.decomposition.take(good), found.penalty[good]

@@ -25,17 +25,17 @@ from loopcal.measure import (
     Inclination,
     Kind,
     Line,
-    LocalUnknowns,
     Measurements,
+    NuisanceParameters,
     Observations,
     Plane,
     Pose,
     Position,
     Separation,
     Sphere,
+    collect_nuisance_parameters,
     evaluate_all,
-    local_unknowns,
-    start_values,
+    guess_nuisance_values,
     whitened_rows,
 )
 
@@ -107,7 +107,7 @@ def draw_poses(rng: np.random.Generator, n: int) -> Array:
     return geometry.make_pose(geometry.euler_to_matrix(x[:, 3:], "xyz"), x[:, :3])
 
 
-def truth_of(local: LocalUnknowns, rng: np.random.Generator) -> Array:
+def truth_of(local: NuisanceParameters, rng: np.random.Generator) -> Array:
     """Values anywhere: rotations over the whole group, frames up to metres off, targets and
     surfaces by centimetres.
     """
@@ -133,25 +133,25 @@ def truth_of(local: LocalUnknowns, rng: np.random.Generator) -> Array:
 
 def measured_at(
     kind: Kind, T: Array, rng: np.random.Generator
-) -> tuple[Measurements, LocalUnknowns, Array]:
+) -> tuple[Measurements, NuisanceParameters, Array]:
     """Noise-free rows at random true values, and these values."""
     n, m = len(T), len(kind.noise_columns)
     poses_seen = (
         np.arange(n)
-        if kind.links == 1
+        if kind.poses_per_row == 1
         else np.stack([np.arange(n), (np.arange(n) + 1) % n], axis=1)
     )
     empty = Observations.from_sigma(
         kind, poses_seen, np.full((n, len(kind.columns)), np.nan), SIGMA
     )
     data = Measurements("toy", np.zeros((n, 1)), (empty,))
-    local = local_unknowns(data.observations, data.labels)
+    local = collect_nuisance_parameters(data.observations, data.labels)
     truth = truth_of(local, rng)
-    seen = kind.measure(T[None, poses_seen], np.zeros((1, n, m)), local.of(0, truth[None]))
+    seen = kind.measure(T[None, poses_seen], np.zeros((1, n, m)), local.select(0, truth[None]))
     return replace(data, observations=(replace(empty, measured=seen[0]),)), local, truth
 
 
-def residuals(data: Measurements, T: Array, local: LocalUnknowns, values: Array) -> Array:
+def residuals(data: Measurements, T: Array, local: NuisanceParameters, values: Array) -> Array:
     """Whitened residuals of all rows at poses T (n, 4, 4)."""
     return whitened_rows(
         evaluate_all(data, T[None], values[None], local), np.zeros((1, len(T), 6, 0))
@@ -189,7 +189,7 @@ def start(name: str, seed: int) -> Start | None:
     except DataError:
         return None
     believed = geometry.apply_twist(T, rng.normal(size=(POSES, 6)) * OFF)
-    found = start_values(data, believed, local)
+    found = guess_nuisance_values(data, believed, local)
     left, best = (
         float(np.linalg.norm(residuals(data, believed, local, values))) for values in (found, truth)
     )

@@ -97,7 +97,7 @@ def kinds() -> str:
         rows = dict.fromkeys(_example(one) for one in kind.examples())
         columns = table(("settings", "columns", "noise is stated for"), rows)
         meanings = file_reference.meanings_of(kind)
-        if possible := getattr(kind, "possible", ()):
+        if possible := getattr(kind, "allowed_unknown", ()):
             meanings["unknown"] = (
                 f"Which of {', '.join(f'`{p}`' for p in possible)} are unknown, and identified "
                 "with the robot"

@@ -75,7 +75,9 @@ def test_poses_that_were_left_out_of_the_fit_are_unseen() -> None:
     weight = np.ones(20)
     weight[:2] = 0.0
     assert (
-        find_reused_rows(collect_fitted_rows(FITTED.reweighted(weight)), FITTED.take(np.arange(2)))
+        find_reused_rows(
+            collect_fitted_rows(FITTED.with_weights(weight)), FITTED.take(np.arange(2))
+        )
         is None
     )
 

@@ -126,10 +126,10 @@ def test_a_gate_on_what_was_not_measured_is_not_met():
 def test_rows_without_weight_are_left_out_and_no_row_is_refused(parts):
     weight = np.ones(parts[1].n_poses)
     weight[0] = 0.0
-    fewer = validate(hexapod(), parts[1].reweighted(weight))
+    fewer = validate(hexapod(), parts[1].with_weights(weight))
     assert len(fewer.poses) == parts[1].n_poses - 1
     with pytest.raises(DataError, match="no row to validate"):
-        validate(hexapod(), parts[1].reweighted(0.0 * weight))
+        validate(hexapod(), parts[1].with_weights(0.0 * weight))
 
 
 def test_the_table_names_every_error_and_the_json_every_pose(validation):

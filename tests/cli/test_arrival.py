@@ -34,7 +34,9 @@ def saved(path, kind, n=9, seed=0, change=None, unknowns=None):
     instrument = Instrument((Sensor(kind, Gaussian(np.array([5e-6] * 3 + [1e-6] * 3))),))
     poses = sample_workspace(robot, n, seed + 1).coordinates
     save_measurements(
-        simulate(truth, poses, instrument, seed, controller=robot, unknowns=unknowns), path, robot
+        simulate(truth, poses, instrument, seed, controller=robot, nuisance_values=unknowns),
+        path,
+        robot,
     )
     if change is not None:
         path.write_text(change(path.read_text()))

@@ -16,10 +16,10 @@ from loopcal.measure import (
     Gaussian,
     Inclination,
     Instrument,
-    Known,
     Measurements,
     Pose,
     Sensor,
+    StatedValue,
     sample_truth,
     simulate,
 )
@@ -155,8 +155,11 @@ def test_a_prior_of_a_file_reaches_the_fit_and_its_held_out_part(folder, capsys)
 
 def test_what_is_known_survives_splits_and_the_file(data, tmp_path) -> None:
     robot = load_robot("hexapod-42")
-    known = replace(data, known=(Known("monday.tracker.x", 1e-3), Known("tuesday.tracker.rz")))
+    known = replace(
+        data,
+        stated_values=(StatedValue("monday.tracker.x", 1e-3), StatedValue("tuesday.tracker.rz")),
+    )
     fit, held_out = known.split(0.5, seed=2)
-    assert fit.known == held_out.known == known.known
+    assert fit.stated_values == held_out.stated_values == known.stated_values
     save_measurements(known.take(np.arange(11)), tmp_path / "monday.csv", robot)
     assert '# unknowns: {"monday.tracker.x": {sd: 1 mm}}' in (tmp_path / "monday.csv").read_text()

@@ -424,7 +424,7 @@ def test_what_is_absent_fixed_or_unread_neither_hides_a_slip_nor_looks_like_one(
         found = compare_conventions(machine, some)
         assert found.refused == slip
         assert ("lengths 1000 times smaller" in (found.other or "")) == slip
-    for nothing in (data.reweighted(np.zeros(10)), replace(data, observations=())):
+    for nothing in (data.with_weights(np.zeros(10)), replace(data, observations=())):
         assert np.isnan(compare_conventions(robot, nothing).misfit)
 
 
@@ -464,7 +464,7 @@ def test_the_published_table_names_its_own_euler_order() -> None:
     sigma = printed.measured_poses.unit * np.array([MM] * 3 + [1.0] * 3) / np.sqrt(12.0)
     right = measurements(study, values, sigma)
     assert not compare_conventions(robot, right).refused
-    kind = Pose(form_name(printed.order)).mounted(robot.tool)
+    kind = Pose(form_name(printed.order)).with_tool(robot.tool)
     rows = Observations.from_sigma(
         kind, np.arange(len(values)), np.roll(values, 3, axis=1), np.roll(sigma, 3, axis=1)
     )

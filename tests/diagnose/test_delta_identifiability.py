@@ -59,7 +59,7 @@ def with_sigmas(data: Measurements, height: float, distance: float) -> Measureme
     """The probes with other sigmas [m]."""
     rows = [
         Observations.from_sigma(
-            o.kind, o.rows, o.measured, height if o.kind.links == 1 else distance
+            o.kind, o.rows, o.measured, height if o.kind.poses_per_row == 1 else distance
         )
         for o in data.observations
     ]
@@ -68,7 +68,9 @@ def with_sigmas(data: Measurements, height: float, distance: float) -> Measureme
 
 def heights(data: Measurements) -> Measurements:
     """The heights alone."""
-    return replace(data, observations=tuple(o for o in data.observations if o.kind.links == 1))
+    return replace(
+        data, observations=tuple(o for o in data.observations if o.kind.poses_per_row == 1)
+    )
 
 
 def test_six_parameters_are_well_conditioned_from_seven_heights(printers):

@@ -22,7 +22,9 @@ def in_unknown_frame(n: int = 30, seed: int = 0):
     kind = Pose(unknown=("frame",))
     sensor = Sensor(kind, noise(*[0.1 * URAD] * 3, *[0.02 * UM] * 3))
     placed = {"frame.x": 0.02, "frame.ry": 0.1}
-    return simulate(truth, hexapod_poses(n, seed), Instrument((sensor,)), seed, unknowns=placed)
+    return simulate(
+        truth, hexapod_poses(n, seed), Instrument((sensor,)), seed, nuisance_values=placed
+    )
 
 
 @pytest.fixture(scope="module")

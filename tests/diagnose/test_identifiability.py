@@ -60,7 +60,7 @@ def test_kinds_with_unknowns_and_kinds_that_link_poses_are_counted_too(kind, ran
     # a closed chain of neighbours and one of pairs further apart
     far = (
         None
-        if kind.links == 1
+        if kind.poses_per_row == 1
         else np.array([(i, (i + k) % 60) for k in (1, 7, 19) for i in range(60)])
     )
     found = identifiability(

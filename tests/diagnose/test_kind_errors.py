@@ -64,9 +64,9 @@ def test_a_fit_that_follows_the_better_instrument_is_not_called_larger_for_the_w
     readings = simulate(new, sample_workspace(new, 40, 3).coordinates, heights, 3).readings
     z, xyz = forward(new, readings[:10]).T[:, 2, 3:], forward(old, readings[10:]).T[:, :3, 3]
     heights = Observations.from_sigma(
-        Component(("z",)).mounted(new.tool), np.arange(10), z, 20 * UM
+        Component(("z",)).with_tool(new.tool), np.arange(10), z, 20 * UM
     )
-    positions = Observations.from_sigma(Position().mounted(new.tool), np.arange(10, 40), xyz, MM)
+    positions = Observations.from_sigma(Position().with_tool(new.tool), np.arange(10, 40), xyz, MM)
     found = validate(new, Measurements(new.name, readings, (heights, positions)), before=old)
     assert found.improvement() == pytest.approx(
         1 / np.sqrt(3.0), rel=1e-6

@@ -81,7 +81,7 @@ def probed_heights(
     [m].
     """
     readings = inverse(truth.nominal, grid).q
-    kind = Component(("z",)).mounted(truth.tool)
+    kind = Component(("z",)).with_tool(truth.tool)
     drawn = sigma * np.random.default_rng(seed).standard_normal((1, len(grid), 1))
     seen = kind.measure(forward(truth, readings).T[None], drawn)[0]
     rows = Observations.from_sigma(kind, np.arange(len(grid)), seen, sigma)

@@ -243,7 +243,7 @@ def probed(groups, per_group=6, seed=1):
         hexapod_poses(n),
         Instrument((sensor,)),
         seed,
-        unknowns={"probe.x": 2e-3, "probe.z": 0.0615},
+        nuisance_values={"probe.x": 2e-3, "probe.z": 0.0615},
     )
 
 
@@ -288,11 +288,11 @@ def test_planes_and_the_probe_they_share_give_the_joint_solution(held):
     data = probed(6, per_group=15)
     free = select_free_parameters(hexapod())
     local = (
-        data.unknowns.with_prior("plate[0-3].*", 1e-3).with_prior("probe.x", 1e-4)
+        data.nuisance_parameters.with_prior("plate[0-3].*", 1e-3).with_prior("probe.x", 1e-4)
         if held
-        else data.unknowns
+        else data.nuisance_parameters
     )
-    local = local.fixed("plate5.plane.u")
+    local = local.with_fixed("plate5.plane.u")
     rows = rows_of(free, data, local)
     assert rows.own is not None
     rows.own.started[:] = True

@@ -218,7 +218,7 @@ def test_a_frame_anywhere_gives_the_machine_of_the_known_frame_up_to_its_gauge(k
                 strict=True,
             )
         )
-        data = simulate(truth, poses, instrument(kind, 50, Silent), SEED, unknowns=true)
+        data = simulate(truth, poses, instrument(kind, 50, Silent), SEED, nuisance_values=true)
         fit = identify(robot, data, LeastSquares())
         assert fit.converged
         assert pose_error(fit.robot, known.robot, elsewhere, ("base", "platform")) < EXACT, seed
@@ -274,7 +274,7 @@ def test_joints_locked_at_constants_nobody_knows_recover_a_tripod_up_to_its_fram
         Instrument(tuple(sensors)),
         SEED,
         controller=truth,
-        unknowns=constants,
+        nuisance_values=constants,
     )
     # [rad]: a lock without play shows zeros, which is all that is measured
     assert max(np.abs(o.measured).max() for o in data.observations) < 1e-12

@@ -111,7 +111,7 @@ def test_that_uncertain_readings_cannot_begin_from_closure_is_noted(data):
 def test_leaving_poses_out_by_weight_equals_removing_them(data):
     weight = np.ones(data.n_poses)
     weight[[3, 17, 29]] = 0.0
-    by_weight = identify(hexapod(), data.reweighted(weight), LeastSquares())
+    by_weight = identify(hexapod(), data.with_weights(weight), LeastSquares())
     removed = identify(hexapod(), data.take(weight > 0.0), LeastSquares())
     np.testing.assert_allclose(by_weight.estimate, removed.estimate, rtol=0, atol=1e-12)  # [m]
     np.testing.assert_allclose(by_weight.sd, removed.sd, rtol=1e-9)
@@ -275,7 +275,7 @@ def test_poses_out_of_reach_are_refused_by_name_and_ignored_without_weight(data)
         identify(hexapod(), broken, LeastSquares())
     weight = np.ones(30)
     weight[4] = 0.0
-    found = identify(hexapod(), broken.reweighted(weight), LeastSquares())
+    found = identify(hexapod(), broken.with_weights(weight), LeastSquares())
     expected = identify(hexapod(), data.take(weight > 0), LeastSquares())
     np.testing.assert_allclose(found.estimate, expected.estimate, rtol=0, atol=1e-12)
 
@@ -298,7 +298,7 @@ def test_a_start_far_off_converges_to_the_same_answer(data, fit):
 
 def test_rows_of_weight_zero_alone_and_no_free_parameter_are_refused(data):
     with pytest.raises(EstimationError, match="every row is absent or has weight 0"):
-        identify(hexapod(), data.reweighted(np.zeros(30)), LeastSquares())
+        identify(hexapod(), data.with_weights(np.zeros(30)), LeastSquares())
     fixed = replace(hexapod(), parameters=hexapod().parameters.with_free([]))
     with pytest.raises(EstimationError, match="no free parameter"):
         identify(fixed, data, LeastSquares())

@@ -26,7 +26,7 @@ from loopcal.measure import (
     Position,
     Sensor,
     Separation,
-    local_unknowns,
+    collect_nuisance_parameters,
     sample_truth,
     simulate,
     simulate_trials,
@@ -58,7 +58,7 @@ def seen_by(kind, noise: type[Gaussian] = Silent, sigma=UM):
 
 
 def true_of(*kinds):
-    names = {parameter.name for kind in kinds for parameter in kind.unknowns}
+    names = {parameter.name for kind in kinds for parameter in kind.nuisance_parameters}
     return {name: value for name, value in TRUE.items() if name in names}
 
 
@@ -83,7 +83,7 @@ def mixed_data(seed=1, noise: type[Gaussian] = Gaussian):
     """Poses in a known frame and targets in an unknown one."""
     instrument = Instrument((seen_by(Pose(), noise), seen_by(TRACKER, noise)))
     truth = hexapod().with_values(zoo.hexapod_truth())
-    return simulate(truth, hexapod_poses(30), instrument, seed, unknowns=true_of(TRACKER))
+    return simulate(truth, hexapod_poses(30), instrument, seed, nuisance_values=true_of(TRACKER))
 
 
 def test_the_projected_solution_is_the_joint_one():
@@ -93,7 +93,7 @@ def test_the_projected_solution_is_the_joint_one():
     z = free.deviation(hexapod().values[None])
     factor, _ = rows.fold(z, np.arange(1))
     projected = -np.linalg.solve(factor[0, :-1, :-1], factor[0, :-1, -1])
-    local = local_unknowns(data.observations, data.labels)
+    local = collect_nuisance_parameters(data.observations, data.labels)
     stacked = look(scene(free, data.readings), data, local, rows.own.values[0])[0]
     scale = np.linalg.norm(stacked[:, :-1], axis=0)
     joint = -np.linalg.lstsq(stacked[:, :-1] / scale, stacked[:, -1], rcond=None)[0] / scale
@@ -111,9 +111,9 @@ def test_standard_deviations_are_those_of_the_joint_problem():
     fit = identify(hexapod(), data, LeastSquares())
     free = select_free_parameters(fit.robot)
     at = scene(free, data.readings)
-    rows = look(at, data, local_unknowns(data.observations, data.labels), fit.local.estimate)[
-        0, :, :-1
-    ]
+    rows = look(
+        at, data, collect_nuisance_parameters(data.observations, data.labels), fit.local.estimate
+    )[0, :, :-1]
     scale = np.linalg.norm(rows, axis=0)
     sd = np.sqrt(np.diag(np.linalg.inv((rows / scale).T @ (rows / scale)))) / scale
     assert_allclose(fit.local.sd, sd[: len(fit.local)], rtol=1e-3)
@@ -123,7 +123,11 @@ def test_standard_deviations_are_those_of_the_joint_problem():
 def test_a_fit_in_an_unknown_frame_is_that_in_the_known_frame_up_to_gauge():
     truth = hexapod().with_values(zoo.hexapod_truth())
     unknown = simulate(
-        truth, hexapod_poses(40), Instrument((seen_by(TRACKER),)), 1, unknowns=true_of(TRACKER)
+        truth,
+        hexapod_poses(40),
+        Instrument((seen_by(TRACKER),)),
+        1,
+        nuisance_values=true_of(TRACKER),
     )
     first = identify(hexapod(), unknown, LeastSquares())
     known = simulate(truth, hexapod_poses(40), Instrument((seen_by(Pose()),)), 1)
@@ -134,7 +138,7 @@ def test_a_fit_in_an_unknown_frame_is_that_in_the_known_frame_up_to_gauge():
         hexapod_poses(12, seed=7),
         Instrument((seen_by(TRACKER),)),
         2,
-        unknowns=true_of(TRACKER),
+        nuisance_values=true_of(TRACKER),
     )
     assert largest(validate(first, others).after, 0.2) < 1e-9
     assert largest(validate(second.robot, others).after, 0.2) < 1e-9
@@ -157,7 +161,7 @@ def test_intervals_of_machine_and_frame_hold_the_truth():
             sample_workspace(robot, 30, i).coordinates,
             instrument,
             i,
-            unknowns=true_of(kind),
+            nuisance_values=true_of(kind),
         )
         fit = identify(robot, data, MAP())
         fits.append(fit)
@@ -202,7 +206,7 @@ def test_rows_that_link_poses_and_joint_sensors_are_fitted_in_blocks_as_whole(mo
         poses,
         instrument,
         2,
-        unknowns={**true_of(Pose(unknown=("frame",))), f"{passive}.joint": 0.01},
+        nuisance_values={**true_of(Pose(unknown=("frame",))), f"{passive}.joint": 0.01},
     )
     fit = identify(robot, data)
     assert fit.converged
@@ -221,7 +225,7 @@ def test_sessions_have_frames_of_their_own_and_are_eliminated_one_by_one():
     kind = Pose(unknown=("frame",))
     sensor = Sensor(kind, Gaussian(np.full(6, UM)), session=day)
     moved = {f"day{i}.frame.{axis}": 0.1 * i for i in range(8) for axis in ("x", "rz")}
-    data = simulate(truth, hexapod_poses(80), Instrument((sensor,)), 1, unknowns=moved)
+    data = simulate(truth, hexapod_poses(80), Instrument((sensor,)), 1, nuisance_values=moved)
     rows = rows_of(select_free_parameters(hexapod()), data)
     assert rows.own is not None
     assert [len(columns) for columns in rows.own.clusters] == [6] * 8
@@ -252,14 +256,14 @@ def test_memory_stays_flat_in_the_number_of_sessions():
 
 def test_priors_and_fixed_unknowns_are_kept_to():
     data = mixed_data()
-    local = local_unknowns(data.observations, data.labels)
+    local = collect_nuisance_parameters(data.observations, data.labels)
     true = local.values(true_of(TRACKER))
-    fixed = identify(hexapod(), data, local=local.starting_at(true).fixed("*"))
+    fixed = identify(hexapod(), data, local=local.with_nominal(true).with_fixed("*"))
     assert (fixed.local.estimate == true).all()
     assert (fixed.local.sd == 0.0).all()
-    near = identify(hexapod(), data, local=local.starting_at(true).with_prior("*", 1e-9))
+    near = identify(hexapod(), data, local=local.with_nominal(true).with_prior("*", 1e-9))
     assert_allclose(near.estimate, fixed.estimate, rtol=0, atol=1e-8)
-    wide = identify(hexapod(), data, local=local.starting_at(true).with_prior("*", 10.0))
+    wide = identify(hexapod(), data, local=local.with_nominal(true).with_prior("*", 10.0))
     assert_allclose(wide.estimate, identify(hexapod(), data).estimate, rtol=0, atol=1e-9)
     assert wide.check.degrees == identify(hexapod(), data).check.degrees + len(local)
 
@@ -271,7 +275,7 @@ def test_noise_is_estimated_where_null_directions_hold_a_part_of_the_residual():
         hexapod_poses(40),
         Instrument((seen_by(TRACKER, Gaussian),)),
         1,
-        unknowns=true_of(TRACKER),
+        nuisance_values=true_of(TRACKER),
     )
     fit = identify(hexapod(), data, noise="estimated")
     assert fit.converged
@@ -286,7 +290,7 @@ def test_trials_with_unknown_frames_are_identified_as_each_alone():
         [zoo.hexapod_truth(), robot.values + 0.5 * (zoo.hexapod_truth() - robot.values)]
     )
     trials = simulate_trials(
-        robot, truths, hexapod_poses(30), instrument, 3, unknowns=true_of(TRACKER)
+        robot, truths, hexapod_poses(30), instrument, 3, nuisance_values=true_of(TRACKER)
     )
     found = identify_trials(robot, trials, MAP())
     for i in range(2):
@@ -305,7 +309,7 @@ def test_starts_are_sought_once_for_all_trials_that_an_instrument_looks_at(monke
     kind = Position(places=POINT, unknown=("frame",))
     trials = simulate_trials(
         robot, sample_truth(robot, 5, 1), sample_workspace(robot, 20, 1).coordinates, Instrument((seen_by(kind, Gaussian),)), 1,
-        unknowns=true_of(kind),
+        nuisance_values=true_of(kind),
     )  # fmt: skip
     assert identify_trials(robot, trials, MAP()).converged.all()
     assert sought == [0]
@@ -325,7 +329,7 @@ def test_the_command_line_calibrates_from_a_tracker_in_an_unknown_frame(tmp_path
         sample_workspace(robot, 40, 5).coordinates,
         Instrument((seen_by(TRACKER, Gaussian),)),
         1,
-        unknowns=true_of(TRACKER),
+        nuisance_values=true_of(TRACKER),
     )
     path = tmp_path / "tracker.csv"
     lc.save_measurements(data, path, robot)

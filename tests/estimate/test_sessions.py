@@ -25,7 +25,7 @@ from loopcal.measure import (
     Pose,
     Position,
     Sensor,
-    local_unknowns,
+    collect_nuisance_parameters,
     simulate,
 )
 from loopcal.measure.kinds import parts
@@ -50,14 +50,18 @@ def sensor(kind, **labels):
 def seen(poses, *sensors, true):
     """What a true hexapod shows."""
     return simulate(
-        zoo.hexapod().with_values(zoo.hexapod_truth()), poses, Instrument(sensors), 1, unknowns=true
+        zoo.hexapod().with_values(zoo.hexapod_truth()),
+        poses,
+        Instrument(sensors),
+        1,
+        nuisance_values=true,
     )
 
 
 def fixed(data: Measurements, pattern: str, values: Mapping[str, float] | None = None):
     """The unknowns of the data, some at these values and kept there."""
-    local = local_unknowns(data.observations, data.labels)
-    return local.starting_at(local.values(values)).fixed(pattern)
+    local = collect_nuisance_parameters(data.observations, data.labels)
+    return local.with_nominal(local.values(values)).with_fixed(pattern)
 
 
 def right(fit, true: Mapping[str, float]):
@@ -128,14 +132,14 @@ def printed():
     )
     data = simulate(
         truth, sample_workspace(robot, 40, 5).coordinates, Instrument((sensor(Position(places=POINT, unknown=("frame",))),)), 1,
-        unknowns={"frame.x": 60 * UM},
+        nuisance_values={"frame.x": 60 * UM},
     )  # fmt: skip
     return robot, truth, data
 
 
 def test_a_prior_on_a_frame_stands_between_a_free_and_a_fixed_one_and_is_weighed():
     robot, truth, data = printed()
-    local = local_unknowns(data.observations, data.labels)
+    local = collect_nuisance_parameters(data.observations, data.labels)
     free, held, known = (
         identify(robot, data, LeastSquares(), local=one)
         for one in (

@@ -19,8 +19,8 @@ from loopcal.measure import (
     Pose,
     Sensor,
     Separation,
+    guess_nuisance_values,
     simulate,
-    start_values,
 )
 from loopcal.numerics.decomposition import ROUNDING, without_rounding
 from tests import zoo
@@ -70,7 +70,7 @@ def test_starts_are_not_sought_along_what_is_rounding():
     T = np.tile(hexapod().home, (POSES, 1, 1))
     T[:, :3, 3] += np.random.default_rng(0).uniform(-0.03, 0.03, (POSES, 3))
     T[:, :3, :3] += np.random.default_rng(1).uniform(-2e-16, 2e-16, (POSES, 3, 3))
-    assert_array_equal(start_values(data, T), 0.0)
+    assert_array_equal(guess_nuisance_values(data, T), 0.0)
 
 
 @pytest.mark.parametrize("sigma", [None, UM])

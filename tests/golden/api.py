@@ -23,7 +23,14 @@ from loopcal import apply, diagnose, estimate, geometry, measure, planning
 from loopcal.diagnose import compare_conventions, suggest_measurements
 from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.measure import KINDS, Gaussian, Instrument, Known, Sensor, local_unknowns
+from loopcal.measure import (
+    KINDS,
+    Gaussian,
+    Instrument,
+    Sensor,
+    StatedValue,
+    collect_nuisance_parameters,
+)
 from loopcal.mechanism import build, differentiate_pose, forward, inverse, sample_workspace
 from loopcal.parameters import ParameterTable
 from loopcal.planning.coordinate import coordinate_exchange
@@ -203,10 +210,10 @@ def sensor_of_pairs(made: Any, n: int, steps: Sequence[int] = (1, 7, 19), groups
     every = np.arange(n)
     rows = (
         np.concatenate([np.stack([every, np.roll(every, -k)], axis=1) for k in steps])
-        if made.links == 2
+        if made.poses_per_row == 2
         else every
     )
-    grouped = any(p.scope == "group" for p in made.unknowns)
+    grouped = any(p.scope == "group" for p in made.nuisance_parameters)
     group = np.array([f"g{i % groups}" for i in range(len(rows))]) if grouped else np.array("")
     return sensor(made, rows=rows, group=group)
 
@@ -224,7 +231,7 @@ def simulated(
     looking = Instrument(tuple(sensors))
     true = machine.with_values(values)
     return measure.simulate(
-        true, coordinates, looking, seed, unknowns=unknowns, reading_sigma=reading_sigma
+        true, coordinates, looking, seed, nuisance_values=unknowns, reading_sigma=reading_sigma
     )
 
 
@@ -243,8 +250,8 @@ def one_trial(trials: Data, i: int) -> Data:
 def own_truth(machine: Robot, sensors: Iterable[Any], n: int, seed: int) -> dict[str, float]:
     """Draw true values of what the sensors do not know, within 20 mm and 0.3 rad of what is stated."""
     reach = {Dimension.LENGTH: 0.02, Dimension.ANGLE: 0.3}
-    seeing = [s.looking(n) for s in Instrument(tuple(sensors)).mounted(machine).sensors]
-    table = local_unknowns(seeing, tuple(map(str, range(n)))).table  # pyright: ignore[reportArgumentType]
+    seeing = [s.assign_rows(n) for s in Instrument(tuple(sensors)).with_tool(machine).sensors]
+    table = collect_nuisance_parameters(seeing, tuple(map(str, range(n)))).table  # pyright: ignore[reportArgumentType]
     span = np.array([reach[p.dimension] for p in table.entries])
     drawn = np.random.default_rng(seed).uniform(-span, span)
     drawn = np.where([name.endswith("offset") for name in table.names], np.abs(drawn), drawn)
@@ -281,7 +288,10 @@ def with_readings(data: Data, readings: Array, sigma: Array | None) -> Data:
 
 def with_known(data: Data, known: Mapping[str, tuple[float, float | None]]) -> Data:
     """State priors of unknowns: name -> (standard deviation, value); a deviation of 0 fixes it."""
-    return replace(data, known=tuple(Known(name, sd, value) for name, (sd, value) in known.items()))
+    return replace(
+        data,
+        stated_values=tuple(StatedValue(name, sd, value) for name, (sd, value) in known.items()),
+    )
 
 
 def report_data(data: Data) -> Report:
@@ -454,13 +464,13 @@ def report_per_leg(machine: Robot, data: Data, steps: int) -> Report:
 
 def fix_unknowns(data: Data, pattern: str, values: Mapping[str, float] | None = None) -> Any:
     """Return the unknowns of the data, some kept at their values."""
-    local = local_unknowns(data.observations, data.labels)
-    return local.starting_at(local.values(values)).fixed(pattern)
+    local = collect_nuisance_parameters(data.observations, data.labels)
+    return local.with_nominal(local.values(values)).with_fixed(pattern)
 
 
 def hold_unknowns(data: Data, pattern: str, sd: float) -> Any:
     """Return the unknowns of the data, some with a prior of this standard deviation."""
-    return local_unknowns(data.observations, data.labels).with_prior(pattern, sd)
+    return collect_nuisance_parameters(data.observations, data.labels).with_prior(pattern, sd)
 
 
 def prior_of(earlier: Fit) -> Any:

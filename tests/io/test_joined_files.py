@@ -252,5 +252,8 @@ def test_a_setting_names_the_session_of_a_whole_file(files, robot) -> None:
     )
     data = load_measurements(files(poses=POSES, mo=monday, tu=tuesday), robot)
     assert [set(rows.session.tolist()) for rows in data.observations] == [{"monday"}, {"tuesday"}]
-    assert {name.split(".")[0] for name in data.unknowns.table.names} == {"monday", "tuesday"}
+    assert {name.split(".")[0] for name in data.nuisance_parameters.table.names} == {
+        "monday",
+        "tuesday",
+    }
     assert isinstance(data.observations[0], Observations)

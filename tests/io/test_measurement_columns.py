@@ -14,11 +14,11 @@ from loopcal.measure import (
     Component,
     Gaussian,
     Instrument,
-    Known,
     Measurements,
     Observations,
     Position,
     Sensor,
+    StatedValue,
 )
 
 LABELS = ("a", "b,1", 'say "c"', "#d", "λ")
@@ -53,10 +53,10 @@ def write(folder, text: str):
 def random_measurements(robot, seed: int) -> Measurements:
     """Everything a file can hold, in numbers that use all bits of a double."""
     draw = np.random.default_rng(seed)
-    tracker = Position(targets=("ball",), unknown=("frame", "targets"), frame="tracker").mounted(
+    tracker = Position(targets=("ball",), unknown=("frame", "targets"), frame="tracker").with_tool(
         robot.tool
     )
-    height = Component(("z",)).mounted(robot.tool)
+    height = Component(("z",)).with_tool(robot.tool)
     days = np.array(["monday", "monday", "tuesday", "day, 3", ""])
     first = Observations.from_sigma(
         tracker, np.arange(5), draw.normal(size=(5, 3)), 5e-6, session=days
@@ -75,12 +75,17 @@ def random_measurements(robot, seed: int) -> Measurements:
     sigma[1, 3] = sigma[2, 5] = sigma[2, 3] = np.inf
     readings[1, 3] = np.nan
     known = (
-        Known("monday.tracker.x", 1e-3 / 3, 0.1 + 0.2),
-        Known("tuesday.tracker.rz"),
-        Known("ball.y", 0.0, 1 / 7),
+        StatedValue("monday.tracker.x", 1e-3 / 3, 0.1 + 0.2),
+        StatedValue("tuesday.tracker.rz"),
+        StatedValue("ball.y", 0.0, 1 / 7),
     )
     return Measurements(
-        robot.name, readings, (first, second), labels=LABELS, reading_sigma=sigma, known=known
+        robot.name,
+        readings,
+        (first, second),
+        labels=LABELS,
+        reading_sigma=sigma,
+        stated_values=known,
     )
 
 
@@ -92,7 +97,7 @@ def test_every_column_comes_back_to_the_last_bit(tmp_path, robot, seed) -> None:
         tmp_path / "data.csv", robot, allow_still=True, allow_implausible=True
     )  # numbers drawn at random
     assert again.labels == data.labels
-    assert again.known == data.known
+    assert again.stated_values == data.stated_values
     np.testing.assert_array_equal(again.readings, data.readings)
     assert again.reading_sigma is not None
     np.testing.assert_array_equal(again.reading_sigma, data.reading_sigma)
@@ -119,7 +124,7 @@ def test_any_double_is_written_so_that_it_is_read_as_itself(factor) -> None:
 
 def test_known_unknowns_are_patterns_with_units_and_stay_with_every_part(tmp_path, robot) -> None:
     data = load_measurements(write(tmp_path, TEXT), robot)
-    table = data.take([0, 1]).unknowns.table
+    table = data.take([0, 1]).nuisance_parameters.table
     entry = {e.name: e for e in table.entries}
     assert (entry["monday.tracker.x"].nominal, entry["monday.tracker.x"].tolerance) == (
         0.012,
@@ -129,7 +134,9 @@ def test_known_unknowns_are_patterns_with_units_and_stay_with_every_part(tmp_pat
     assert entry["monday.tracker.y"].tolerance is None
     assert not entry["monday.ball.x"].free
     assert "tuesday.tracker.rx" not in entry
-    assert {e.name: e for e in data.unknowns.table.entries}["tuesday.tracker.rz"].tolerance == 0.002
+    assert {e.name: e for e in data.nuisance_parameters.table.entries}[
+        "tuesday.tracker.rz"
+    ].tolerance == 0.002
 
 
 KNOWN_CASES = {

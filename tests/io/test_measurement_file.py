@@ -67,15 +67,15 @@ def measured_by(robot, poses, kind) -> Measurements:
     once.
     """
     generator = np.random.default_rng(11)
-    links = np.arange(len(poses) - kind.links + 1)[:, None] + np.arange(kind.links)
+    links = np.arange(len(poses) - kind.poses_per_row + 1)[:, None] + np.arange(kind.poses_per_row)
     values = generator.uniform(0.1, 0.2, (len(links), len(kind.columns)))
     for names in (("qw", "qx", "qy", "qz"), ("i", "j", "k")):
         places = [i for i, column in enumerate(kind.columns) if column.name in names]
         if places:
             values[:, places] /= np.linalg.norm(values[:, places], axis=1, keepdims=True)
-    seen = links if kind.links > 1 else links[:, 0]
+    seen = links if kind.poses_per_row > 1 else links[:, 0]
     sigma = np.linspace(1e-6, 2e-6, len(kind.noise_columns))
-    rows = Observations.from_sigma(kind.mounted(robot.tool), seen, values, sigma)
+    rows = Observations.from_sigma(kind.with_tool(robot.tool), seen, values, sigma)
     return Measurements(robot.name, inverse(robot, poses).q, (rows,))
 
 
@@ -138,7 +138,8 @@ def test_a_template_lacks_only_the_rows(tmp_path, robot, poses, kind) -> None:
     instrument = Instrument(
         (
             Sensor(
-                kind.mounted(robot.tool), Gaussian(np.linspace(1e-6, 2e-6, len(kind.noise_columns)))
+                kind.with_tool(robot.tool),
+                Gaussian(np.linspace(1e-6, 2e-6, len(kind.noise_columns))),
             ),
         )
     )
@@ -150,7 +151,7 @@ def test_a_template_lacks_only_the_rows(tmp_path, robot, poses, kind) -> None:
     head = template[: template.index("\n# Below come the rows") + 1]
     assert full.startswith(head)
     assert "session, group" in template[len(head) :]
-    assert full.count("\n") == head.count("\n") + 6 + (5 if kind.links > 1 else 0)
+    assert full.count("\n") == head.count("\n") + 6 + (5 if kind.poses_per_row > 1 else 0)
     (tmp_path / "filled.csv").write_text(template + full[len(head) :])
     assert_same(
         *(load_measurements(tmp_path / name, robot, **ANY) for name in ("full.csv", "filled.csv"))

@@ -42,7 +42,7 @@ def exact(layout: Layout) -> np.ndarray:
 
 
 def test_a_plane_and_a_line_that_name_the_same_surface_share_its_direction(layout) -> None:
-    local = measurements(layout, exact(layout)[0], NOISE).unknowns
+    local = measurements(layout, exact(layout)[0], NOISE).nuisance_parameters
     names = {
         f"plane{g + 1}.held_z.{part}"
         for g in range(GROUPS)
@@ -56,7 +56,9 @@ def test_the_shared_surface_survives_a_measurement_file(layout, tmp_path) -> Non
     data = measurements(layout, exact(layout)[0], NOISE)
     lc.save_measurements(data, tmp_path / "points.csv", layout.robot)
     read = lc.load_measurements(tmp_path / "points.csv", layout.robot)
-    assert sorted(read.unknowns.table.names) == sorted(data.unknowns.table.names)
+    assert sorted(read.nuisance_parameters.table.names) == sorted(
+        data.nuisance_parameters.table.names
+    )
 
 
 @pytest.mark.slow

@@ -97,12 +97,12 @@ def test_taking_what_is_not_there_is_refused(poses):
 
 
 def test_weights_of_poses_reach_their_rows_in_the_same_shape():
-    data = heights(4, rows=[0, 1, 1, 3]).reweighted([1.0, 0.0, 1.0, 0.25])
+    data = heights(4, rows=[0, 1, 1, 3]).with_weights([1.0, 0.0, 1.0, 0.25])
     assert data.observations[0].weight.tolist() == [1.0, 0.0, 0.0, 0.25]
     assert data.observations[0].whitener.shape == (4, 1, 1)
     assert data.n_rows == 2
     with pytest.raises(DataError, match=r"weight of the poses has shape \(3,\)"):
-        heights(4).reweighted([1.0, 1.0, 1.0])
+        heights(4).with_weights([1.0, 1.0, 1.0])
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_the_sigma_of_readings_follows_their_poses():
     assert of_readings(data.take([2, 0])).tolist() == [[3e-6, 3e-6], [1e-6, np.inf]]
     fit, held = data.split(0.6, seed=1)
     assert len(of_readings(fit)) + len(of_readings(held)) == 3
-    weighted = data.reweighted([4.0, 1.0, 0.0])
+    weighted = data.with_weights([4.0, 1.0, 0.0])
     assert of_readings(weighted).tolist() == [[5e-7, np.inf], [0.0, 2e-6], [np.inf, np.inf]]
     assert of_readings(_data_with_sigma(1e-6, np.ones((3, 2)))).shape == (3, 2)
 

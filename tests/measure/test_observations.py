@@ -64,7 +64,7 @@ def test_what_is_written_in_a_covariance_beside_a_missing_component_does_not_mat
 def test_a_weight_multiplies_the_square_and_zero_makes_a_row_absent_in_the_same_shape():
     C = covariances(3, 3)
     one = Observations(POINT, np.arange(3), np.zeros((3, 3)), C)
-    weighed = one.reweighted([1.0, 0.25, 0.0])
+    weighed = one.with_weights([1.0, 0.25, 0.0])
     assert_allclose(
         weighed.whitener, one.whitener * np.array([1.0, 0.5, 0.0])[:, None, None], rtol=1e-15
     )

@@ -87,7 +87,7 @@ CASES = {
 def sensors(kind):
     """The kind looking at all poses; a ball-bar at many pairs of them."""
     rows = None
-    if kind.links == 2:
+    if kind.poses_per_row == 2:
         rows = np.concatenate([np.stack([ALL, np.roll(ALL, -k)], axis=-1) for k in (1, 7, 19)])
     dimensions = [column.dimension.value for column in kind.noise_columns]
     sigma = np.array([1e-5 if d == "length" else 5e-5 for d in dimensions])

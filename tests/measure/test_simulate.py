@@ -23,11 +23,11 @@ from loopcal.measure import (
     check_actuators,
     check_duplicates,
     check_strokes,
-    readings_from_commanded,
+    make_random_stream,
     sample_truth,
     simulate,
     simulate_trials,
-    stream,
+    solve_commanded_readings,
 )
 from loopcal.mechanism import inverse
 from loopcal.parameters import ParameterTable
@@ -61,7 +61,7 @@ def truth(robot):
 
 def test_commanded_poses_become_the_readings_of_the_controllers_geometry(robot, truth):
     assert_allclose(
-        readings_from_commanded(robot, COMMANDED), inverse(robot, COMMANDED).q, atol=0.0
+        solve_commanded_readings(robot, COMMANDED), inverse(robot, COMMANDED).q, atol=0.0
     )
     assert_allclose(
         simulate(truth, COMMANDED, TRACKER, seed=1).readings, inverse(robot, COMMANDED).q, atol=0.0
@@ -125,11 +125,11 @@ def test_true_values_have_the_tolerances_as_standard_deviations(robot):
 
 def test_noise_has_the_spread_it_states():
     for noise in (Gaussian(SIGMA), Uniform(SIGMA)):
-        drawn = noise.draw(stream(1, 0), 20000)
+        drawn = noise.draw(make_random_stream(1, 0), 20000)
         # 1 / sqrt(40000) = 0.5 % for the normal one, less for the uniform one; six columns within
         # five of those
         assert_allclose(drawn.std(axis=0), noise.sigma, rtol=0.025)
-    assert np.all(np.abs(Uniform(SIGMA).draw(stream(1, 0), 20000)) <= SIGMA)
+    assert np.all(np.abs(Uniform(SIGMA).draw(make_random_stream(1, 0), 20000)) <= SIGMA)
 
 
 @pytest.mark.parametrize("sigma", [[0.0], [-1.0], [np.nan]])
@@ -152,7 +152,7 @@ def test_a_pose_the_controller_cannot_reach_is_named(robot):
         simulate(robot, far, TRACKER, seed=1)
     labels = tuple("abcdefghijklmnopqrst"[: len(far)])
     with pytest.raises(DataError, match="pose 'c'"):
-        readings_from_commanded(robot, far, labels)
+        solve_commanded_readings(robot, far, labels)
 
 
 def test_a_machine_that_cannot_follow_is_absent_from_its_trial_only(robot):
@@ -205,19 +205,19 @@ def test_true_values_of_unknowns_are_seen_and_unknown_names_are_refused(robot):
     tracker = Position(targets=("ball",), unknown=("frame", "targets"), frame="tracker")
     instrument = Instrument((Sensor(tracker, Gaussian(np.full(3, 1e-9))),))
     at = {"tracker.x": 1.0, "tracker.rz": np.pi / 2, "ball.z": 0.1}
-    data = simulate(robot, COMMANDED, instrument, seed=1, unknowns=at)
+    data = simulate(robot, COMMANDED, instrument, seed=1, nuisance_values=at)
     point = (COMMANDED @ [0.0, 0.0, 0.1, 1.0])[:, :3]
     seen = np.stack(
         [point[:, 1], 1.0 - point[:, 0], point[:, 2]], axis=1
     )  # turned by a quarter about z, one metre off
     assert_allclose(data.observations[0].measured, seen, atol=1e-8)
-    trials = simulate_trials(robot, robot.values, COMMANDED, instrument, seed=1, unknowns=at)
+    trials = simulate_trials(robot, robot.values, COMMANDED, instrument, seed=1, nuisance_values=at)
     assert trials.local.values()[trials.local.table.index("tracker.x")] == 1.0
     with pytest.raises(
         DataError,
         match=r"no unknown of these measurements is called 'traker\.x'.*did you mean 'tracker\.x'",
     ):
-        simulate(robot, COMMANDED, instrument, seed=1, unknowns={"traker.x": 1.0})
+        simulate(robot, COMMANDED, instrument, seed=1, nuisance_values={"traker.x": 1.0})
 
 
 def test_rows_may_see_some_poses_compare_two_and_stand_in_sessions(robot):

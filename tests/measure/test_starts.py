@@ -26,8 +26,8 @@ from loopcal.measure import (
     Measurements,
     Observations,
     Position,
-    local_unknowns,
-    start_values,
+    collect_nuisance_parameters,
+    guess_nuisance_values,
 )
 from loopcal.measure.closed_form import OCTAHEDRAL, trilateration
 
@@ -47,7 +47,7 @@ def test_every_unknown_is_found_without_a_guess(name):
             data, local, _ = measured_at(KINDS[name], T, rng)
         except DataError:  # a truth that cannot be measured, such as a sensor upside down
             continue
-        found = start_values(data, T, local)
+        found = guess_nuisance_values(data, T, local)
         # [sigma] noise-free rows with sigma 1e-5 m or rad: 1e-8 m
         assert_allclose(residuals(data, T, local, found), 0.0, atol=1e-3, err_msg=f"seed {seed}")
 
@@ -87,9 +87,11 @@ def test_kinds_that_share_a_frame_start_it_together():
         data,
         observations=(Observations.from_sigma(axis, np.arange(N), seen, 1e-5), *data.observations),
     )
-    local = local_unknowns(both.observations, both.labels)
+    local = collect_nuisance_parameters(both.observations, both.labels)
     assert len(local) == 9
-    assert_allclose(residuals(both, T, local, start_values(both, T, local)), 0.0, atol=1e-3)
+    assert_allclose(
+        residuals(both, T, local, guess_nuisance_values(both, T, local)), 0.0, atol=1e-3
+    )
 
 
 def test_sessions_are_started_one_by_one():
@@ -105,21 +107,23 @@ def test_sessions_are_started_one_by_one():
         kind, np.arange(N), measured, 1e-5, session=np.repeat(["mon", "tue"], 15)
     )
     data = Measurements("toy", np.zeros((N, 1)), (rows,))
-    local = local_unknowns(data.observations, data.labels)
+    local = collect_nuisance_parameters(data.observations, data.labels)
     assert len(local) == 2 * 15
-    assert_allclose(residuals(data, T, local, start_values(data, T, local)), 0.0, atol=1e-3)
+    assert_allclose(
+        residuals(data, T, local, guess_nuisance_values(data, T, local)), 0.0, atol=1e-3
+    )
 
 
 def test_fixed_values_stay_and_priors_pull():
     rng = np.random.default_rng(2)
     T = poses(rng)
     data, local, truth = measured_at(KINDS["a frame"], T, rng)
-    held = local.starting_at(truth + np.array([0.0, 0.0, 0.0, 1e-3, 0.0, 0.0]))
-    found = start_values(data, T, held.fixed("frame.x"))
+    held = local.with_nominal(truth + np.array([0.0, 0.0, 0.0, 1e-3, 0.0, 0.0]))
+    found = guess_nuisance_values(data, T, held.with_fixed("frame.x"))
     assert found[3] == truth[3] + 1e-3
-    loose = start_values(data, T, held.with_prior("*", 1.0))
+    loose = guess_nuisance_values(data, T, held.with_prior("*", 1.0))
     assert_allclose(loose, truth, atol=1e-8)
-    tight = start_values(data, T, held.with_prior("*", 1e-9))
+    tight = guess_nuisance_values(data, T, held.with_prior("*", 1e-9))
     assert_allclose(tight[3], truth[3] + 1e-3, atol=1e-5)
 
 
@@ -131,12 +135,12 @@ def test_points_in_one_plane_need_a_word_on_the_side():
     with pytest.raises(
         DataError, match=r"'anchor' were all measured in one plane, so it can be on either side"
     ):
-        start_values(data, T, local)
+        guess_nuisance_values(data, T, local)
     side = np.array([0.0, 0.0, 0.8 + np.sign(truth[2] - 0.8)])
     rows = replace(
         data.observations[0], kind=Distance(places=NOWHERE, unknown=("anchor",), anchor=side)
     )
-    found = start_values(replace(data, observations=(rows,)), T)
+    found = guess_nuisance_values(replace(data, observations=(rows,)), T)
     assert_allclose(found, truth, atol=1e-7)
 
 
@@ -148,7 +152,7 @@ def test_points_on_a_line_leave_a_turn_open_and_are_refused():
     with pytest.raises(
         DataError, match=r"the 30 positions lie on a line, about which the frame 'frame' could turn"
     ):
-        start_values(data, T, local)
+        guess_nuisance_values(data, T, local)
 
 
 def test_the_24_rotations_of_a_cube_leave_none_out():

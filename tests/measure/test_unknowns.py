@@ -15,8 +15,8 @@ from loopcal.measure import (
     Plane,
     Position,
     Separation,
+    collect_nuisance_parameters,
     evaluate_all,
-    local_unknowns,
     whitened_rows,
 )
 
@@ -31,7 +31,7 @@ LEVEL = ("0", "1", "2", "3")
 def rows(kind, count=4, **labels):
     seen = (
         np.arange(count)
-        if kind.links == 1
+        if kind.poses_per_row == 1
         else np.stack([np.arange(count), np.roll(np.arange(count), 1)], axis=1)
     )
     measured = np.ones((count, len(kind.columns)))
@@ -41,7 +41,7 @@ def rows(kind, count=4, **labels):
 
 
 def test_kinds_that_name_the_same_frame_share_its_unknowns():
-    local = local_unknowns([rows(TRACKER), rows(AXIS)], LEVEL)
+    local = collect_nuisance_parameters([rows(TRACKER), rows(AXIS)], LEVEL)
     turns = ["tracker.rx", "tracker.ry", "tracker.rz"]
     assert list(local.table.names) == [
         *turns,
@@ -52,16 +52,16 @@ def test_kinds_that_name_the_same_frame_share_its_unknowns():
         "ball.y",
         "ball.z",
     ]
-    assert np.array_equal(local.places[1], np.tile([0, 1, 2], (4, 1)))
+    assert np.array_equal(local.indices[1], np.tile([0, 1, 2], (4, 1)))
 
 
 def test_every_session_and_every_group_has_its_own():
     sessions = np.array(["mon", "mon", "tue", "tue"])
-    local = local_unknowns([rows(TRACKER, session=sessions)], LEVEL)
+    local = collect_nuisance_parameters([rows(TRACKER, session=sessions)], LEVEL)
     assert len(local) == 18
     assert local.table.names[0] == "mon.tracker.rx"
-    assert np.array_equal(local.places[0][:, 0], [0, 0, 9, 9])
-    groups = local_unknowns([rows(BED, group=np.array(["a", "b", "a", "b"]))], LEVEL)
+    assert np.array_equal(local.indices[0][:, 0], [0, 0, 9, 9])
+    groups = collect_nuisance_parameters([rows(BED, group=np.array(["a", "b", "a", "b"]))], LEVEL)
     assert groups.table.names == (
         "a.bed.u",
         "a.bed.v",
@@ -70,8 +70,8 @@ def test_every_session_and_every_group_has_its_own():
         "b.bed.v",
         "b.bed.height",
     )
-    assert np.array_equal(groups.places[0][:, 2], [2, 5, 2, 5])
-    both = local_unknowns(
+    assert np.array_equal(groups.indices[0][:, 2], [2, 5, 2, 5])
+    both = collect_nuisance_parameters(
         [rows(BED, session=sessions, group=np.array(["a", "b", "a", "b"]))], LEVEL
     )
     assert "mon.a.bed.u" in both.table.names
@@ -80,7 +80,7 @@ def test_every_session_and_every_group_has_its_own():
 def test_one_name_stated_in_two_ways_is_refused():
     elsewhere = Position(targets=("ball",), places=np.ones((1, 3)), unknown=("targets",))
     with pytest.raises(DataError, match=r"states the unknown 'ball.x' as 1 .*another one as 0"):
-        local_unknowns([rows(TRACKER), rows(elsewhere)], LEVEL)
+        collect_nuisance_parameters([rows(TRACKER), rows(elsewhere)], LEVEL)
     turned = Direction(
         unknown=("frame",),
         frame="tracker",
@@ -89,26 +89,30 @@ def test_one_name_stated_in_two_ways_is_refused():
     with pytest.raises(
         DataError, match=r"counts the unknowns of 'tracker' from another orientation"
     ):
-        local_unknowns([rows(TRACKER), rows(turned)], LEVEL)
+        collect_nuisance_parameters([rows(TRACKER), rows(turned)], LEVEL)
     clash = Position(targets=("frame",), places=np.zeros((1, 3)), unknown=("frame", "targets"))
     with pytest.raises(DataError, match=r"calls two unknowns 'frame\.x'"):
-        local_unknowns([rows(clash)], LEVEL)
+        collect_nuisance_parameters([rows(clash)], LEVEL)
 
 
 def test_priors_fixed_values_and_values_by_name():
-    local = local_unknowns([rows(TRACKER)], LEVEL).with_prior("tracker.r?", 1e-3).fixed("ball.*")
+    local = (
+        collect_nuisance_parameters([rows(TRACKER)], LEVEL)
+        .with_prior("tracker.r?", 1e-3)
+        .with_fixed("ball.*")
+    )
     assert_allclose(local.table.tolerance[:3], 1e-3)
     assert np.isnan(local.table.tolerance[3:]).all()
     assert local.table.free.tolist() == [True] * 6 + [False] * 3
     assert local.values({"tracker.y": 2.0})[4] == 2.0
     assert local.matching({"tracker.y": 2.0, "other.x": 1.0})[4] == 2.0
-    assert local.starting_at(np.arange(9.0)).table.nominal[8] == 8.0
+    assert local.with_nominal(np.arange(9.0)).table.nominal[8] == 8.0
     with pytest.raises(
         DataError, match=r"no unknown of these measurements is called 'traker.x'.*tracker.x"
     ):
         local.values({"traker.x": 1.0})
     with pytest.raises(DataError, match="no unknown of these measurements is called"):
-        local.fixed("camera.*")
+        local.with_fixed("camera.*")
     with pytest.raises(DataError, match="give a number above 0, or fix"):
         local.with_prior("ball.*", 0.0)
 
@@ -122,7 +126,7 @@ def test_all_rows_stand_in_one_matrix_with_every_unknown_in_its_column():
         rows(AXIS),
     )
     data = Measurements("toy", np.zeros((4, 1)), parts)
-    local = local_unknowns(parts, data.labels).fixed("a.ball.x")
+    local = collect_nuisance_parameters(parts, data.labels).with_fixed("a.ball.x")
     values = local.values() + rng.uniform(-0.1, 0.1, len(local))
     D = rng.normal(size=(1, 4, 6, 5))
 
@@ -147,13 +151,13 @@ def test_all_rows_stand_in_one_matrix_with_every_unknown_in_its_column():
 def test_rows_of_weight_zero_and_absent_components_are_zero_in_the_same_shape():
     measured = np.ones((4, 3))
     measured[1, 2] = np.nan
-    part = Observations.from_sigma(TRACKER, np.arange(4), measured, 1e-3).reweighted(
+    part = Observations.from_sigma(TRACKER, np.arange(4), measured, 1e-3).with_weights(
         [1.0, 1.0, 0.0, 1.0]
     )
     data = Measurements("toy", np.zeros((4, 1)), (part,))
     T = np.broadcast_to(np.eye(4), (1, 4, 4, 4))
     found = whitened_rows(
-        evaluate_all(data, T, local_unknowns([part], data.labels).values()[None]),
+        evaluate_all(data, T, collect_nuisance_parameters([part], data.labels).values()[None]),
         np.zeros((1, 4, 6, 2)),
     )
     empty = ~found[0].any(axis=1)

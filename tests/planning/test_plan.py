@@ -238,7 +238,7 @@ def test_no_choice_of_pairs_beats_what_is_said_of_pairs_not_even_all_pairs_of_fe
 def test_of_many_poses_the_pairs_considered_are_different_and_tell_more_than_as_many_drawn():
     robot, seen_by = load_robot("linear-delta"), looking("separation")
     free, q = select_free_parameters(robot), sample_workspace(robot, 400, seed=2).solution.q
-    mounted = seen_by.mounted(robot)
+    mounted = seen_by.with_tool(robot)
     ours = considered(free, mounted, q, np.random.default_rng(3))
     drawn = unit_rows(
         free, mounted, q, units_of(len(q), mounted, np.random.default_rng(3), len(ours.members))

@@ -57,7 +57,7 @@ def heights(record: dict) -> Measurements:
     step = np.array(record["geometry_stored_in_config"]["stepdist"]) * MM
     readings = np.array([row["stable_steps"] for row in rows]) * step
     z = np.array([[row["z_mm"] * MM] for row in rows])
-    kind = Component(("z",)).mounted(np.eye(4))
+    kind = Component(("z",)).with_tool(np.eye(4))
     return Measurements(
         "printer", readings, (Observations.from_sigma(kind, np.arange(len(rows)), z, PROBE),)
     )

@@ -260,7 +260,7 @@ def _kept_setup(
         known_before = local.starts if is_own and local is not None else {}
     if known_after is None:
         known_after = {} if local is None else local.values
-    owners = {owner_of(name) for name in data.unknowns.table.names}
+    owners = {owner_of(name) for name in data.nuisance_parameters.table.names}
     for pattern in refit:
         if not any(fnmatchcase(owner, pattern) for owner in owners):
             listed = ", ".join(sorted(owners)) or "none"

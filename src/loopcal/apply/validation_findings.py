@@ -89,7 +89,7 @@ def report_moved_setup(
 ) -> list[Finding]:
     """Report kept frames, targets and surfaces that were apparently moved after the fit."""
     data = compared.data
-    table, rows = data.unknowns.table, data.observations
+    table, rows = data.nuisance_parameters.table, data.observations
     owner = {p.name: owner_of(p.name) for p in table.entries}
 
     def measure_errors(refit: tuple[str, ...]) -> tuple[float, int]:

@@ -207,7 +207,7 @@ def assumed_instrument(
 
 def _unknown(frames: str, kind: object) -> tuple[str, ...]:
     """Return what a kind calls the frames that are unknown."""
-    possible: tuple[str, ...] = getattr(kind, "possible", ())
+    possible: tuple[str, ...] = getattr(kind, "allowed_unknown", ())
     found = []
     for name in frames.split(","):
         if name not in FRAMES:

@@ -159,7 +159,7 @@ def _filled(machine: Mechanism, sheet: Path, seed: int) -> tuple[Measurements, s
     from loopcal.io.data.instrument_file import load_instrument, refuse_readings_to_measure
     from loopcal.io.data.measurement_writer import format_measurements
     from loopcal.io.data.pose_use import insert_use_column, read_pose_use
-    from loopcal.measure.sheet_simulation import fill_in
+    from loopcal.measure.sheet_simulation import replace_measured_values
 
     given = click.get_current_context().get_parameter_source
     for name in (
@@ -178,7 +178,7 @@ def _filled(machine: Mechanism, sheet: Path, seed: int) -> tuple[Measurements, s
                 f"--{name.replace('_', '-')}, or --fill"
             )
     refuse_readings_to_measure(sheet, machine)
-    data = fill_in(
+    data = replace_measured_values(
         machine, load_measurements(sheet, machine), load_instrument(sheet, machine), seed
     )
     text = format_measurements(data, machine, f"simulated by loopcal: {sheet.name}, seed {seed}")

@@ -32,7 +32,7 @@ from loopcal.diagnose.stated_unknowns import Contradiction, contradicted
 from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.inference.null_space import listed
-from loopcal.measure import Measurements, check_actuators, check_moved
+from loopcal.measure import Measurements, check_actuators, check_targets_move
 from loopcal.measure.data_checks import stays
 from loopcal.mechanism import Mechanism, find_directly_reachable, forward
 from loopcal.typing import FloatArray, IntArray
@@ -213,7 +213,9 @@ def check_conventions(
     if not allow_still and stays(data):
         found = forward(robot, data.readings)
         if found.converged.any():
-            check_moved(data.take(found.converged), found.T[found.converged], override=overrides[0])
+            check_targets_move(
+                data.take(found.converged), found.T[found.converged], override=overrides[0]
+            )
     if allow_implausible:
         return ConventionCheck(float("nan"))
     told = compare_conventions(robot, data, parts)
@@ -256,7 +258,7 @@ def _few(data: Measurements) -> IntArray:
 
 
 def _shared(data: Measurements) -> bool:
-    return any(o.kind.links > 1 or bool((o.group != "").any()) for o in data.observations)
+    return any(o.kind.poses_per_row > 1 or bool((o.group != "").any()) for o in data.observations)
 
 
 def _best(
@@ -321,7 +323,7 @@ def _readings_tried(
     ).reshape(every.shape[:2])
     near = np.flatnonzero(solved.mean(axis=1) >= 1.0 - MOST_LEFT_OUT)
     begin, left = begun(free, data.take(poses), every[near], solved[near])
-    order = np.argsort(left)[:NEAREST] if len(data.unknowns) else np.arange(len(near))
+    order = np.argsort(left)[:NEAREST] if len(data.nuisance_parameters) else np.arange(len(near))
 
     def judged(way: Interpretation, begin: FloatArray | None = None) -> float:
         read, quick = way.applied(data), begin is not None

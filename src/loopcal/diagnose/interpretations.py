@@ -135,7 +135,7 @@ def list_interpretations(data: Measurements, parts: Sequence[str] = ()) -> Itera
         for words, cure, values, shrinks in _of_kind(rows.kind, rows.measured):
             meant = np.isfinite(values) | np.isnan(rows.measured)
             same = np.allclose(values, rows.measured, rtol=1e-12, atol=0.0, equal_nan=True)
-            if meant.all() and not same and not rows.kind.doubts(values):
+            if meant.all() and not same and not rows.kind.find_invalid_rows(values):
                 yield Interpretation(words.format(of=of), cure, i, values, shrinks)
 
 
@@ -209,7 +209,7 @@ def _of_kind(kind: Kind, values: FloatArray) -> Iterator[tuple[str, str, FloatAr
 
 
 def _units(kind: Kind, values: FloatArray) -> Iterator[tuple[str, str, FloatArray, bool]]:
-    if not kind.follows and not kind.looks_at:
+    if not kind.changes_with_pose and not kind.sensed_joints:
         return  # gaps to a touched surface are 0, whatever the unit
     for dimension, called in ((Dimension.LENGTH, "lengths"), (Dimension.ANGLE, "angles")):
         chosen = np.array([column.dimension is dimension for column in kind.columns])
@@ -304,7 +304,7 @@ def _signs(kind: Kind, values: FloatArray) -> Iterator[tuple[str, str, FloatArra
 
 def _swaps(kind: Kind, values: FloatArray) -> Iterator[tuple[str, str, FloatArray, bool]]:
     alike, dimension = _alike(kind), {c.name.rsplit(".", 1)[-1]: c.dimension for c in kind.columns}
-    if len(kind.sights) == 1 and kind.looks_at:
+    if len(kind.target_columns) == 1 and kind.sensed_joints:
         dimension = {c.name: c.dimension for c in kind.columns}
     for a, b in combinations(alike, 2):
         if dimension[a] is dimension[b]:
@@ -314,7 +314,7 @@ def _swaps(kind: Kind, values: FloatArray) -> Iterator[tuple[str, str, FloatArra
                 _swapped(values, alike[a], alike[b]),
                 False,
             )
-    for (a, first), (b, second) in combinations(kind.sights.items(), 2):
+    for (a, first), (b, second) in combinations(kind.target_columns.items(), 2):
         yield (
             f"targets {a!r} and {b!r}{{of}} swapped",
             "swap their headers",
@@ -326,8 +326,8 @@ def _swaps(kind: Kind, values: FloatArray) -> Iterator[tuple[str, str, FloatArra
 def _alike(kind: Kind) -> dict[str, list[int]]:
     """Columns of the same meaning in all sights, by name: x of every target."""
     found: dict[str, list[int]] = {}
-    single = len(kind.sights) == 1
-    for places in kind.sights.values():
+    single = len(kind.target_columns) == 1
+    for places in kind.target_columns.values():
         for place in places:
             name = kind.columns[place].name
             found.setdefault(name if single else name.rsplit(".", 1)[-1], []).append(place)

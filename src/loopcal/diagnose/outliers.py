@@ -27,7 +27,7 @@ from loopcal.estimate.result import Identification
 from loopcal.estimate.robust_descent import scale_of
 from loopcal.estimate.rows import AnyRows, rows_of
 from loopcal.estimate.sensed import linked
-from loopcal.measure import Measurements, with_stated_sigma
+from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.numerics.decomposition import Decomposition, decompose
 from loopcal.typing import BoolArray, FloatArray
 
@@ -178,7 +178,7 @@ def find_outliers(fit: Identification, data: Measurements, level: float = 0.05) 
     fit : the identification, with or without a loss. data : the measurements it was made from.
     level : probability of naming any block where none is wrong.
     """
-    data = exclude_poses(with_stated_sigma(fit.robot, data), fit.dropped)
+    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.dropped)
     rows = rows_of(fit.unknowns, data)
     numbers, member = np.unique(linked(data), return_inverse=True)
     labels = tuple(tuple(np.array(data.labels)[member == i].tolist()) for i in range(len(numbers)))

@@ -29,12 +29,12 @@ import numpy as np
 from loopcal.errors import DataError
 from loopcal.estimate.predicted import predicted
 from loopcal.measure import (
-    LocalUnknowns,
     Measurements,
+    NuisanceParameters,
     Observations,
-    joint_values,
-    joints_looked_at,
-    start_values,
+    guess_nuisance_values,
+    list_sensed_joints,
+    select_joint_values,
 )
 from loopcal.mechanism import Mechanism, Solution, inverse
 from loopcal.parameters import ParameterTable
@@ -124,7 +124,7 @@ class PosePredictions:
 
     T: FloatArray
     joints: Mapping[str, FloatArray]
-    setup: LocalUnknowns
+    setup: NuisanceParameters
     values: FloatArray
     kept: tuple[str, ...]
 
@@ -150,11 +150,11 @@ class PosePredictions:
 
     def _setup_of(self, i: int, o: Observations) -> FloatArray | None:
         """Setup parameters (1, r, u) of the rows of a kind."""
-        return self.setup.of(i, self.values) if o.kind.unknowns else None
+        return self.setup.select(i, self.values) if o.kind.nuisance_parameters else None
 
     def _joints_of(self, o: Observations) -> FloatArray | None:
         """Joint values (1, r, j) that a kind measures."""
-        names = o.kind.looks_at
+        names = o.kind.sensed_joints
         if not names:
             return None
         return np.stack([self.joints[name][:, o.rows] for name in names], axis=-1)
@@ -248,9 +248,9 @@ def predict_poses(
     setup : values [SI] by name that are kept; None takes the nominal values of all and fits none.
     """
     T = np.where(usable[:, None, None], solution.T, np.eye(4))
-    names = joints_looked_at(o.kind for o in data.observations)
-    joints = joint_values(robot, names, solution.q[None], solution.state)
-    unknowns = data.unknowns
+    names = list_sensed_joints(o.kind for o in data.observations)
+    joints = select_joint_values(robot, names, solution.q[None], solution.state)
+    unknowns = data.nuisance_parameters
     values, kept = unknowns.values(), ()
     if setup is not None and len(unknowns):
         kept = tuple(name for name in unknowns.table.names if name in setup)
@@ -258,7 +258,9 @@ def predict_poses(
             p if p.name not in kept else replace(p, nominal=setup[p.name], free=False)
             for p in unknowns.table.entries
         )
-        values = start_values(data, T, replace(unknowns, table=ParameterTable(entries)), joints)
+        values = guess_nuisance_values(
+            data, T, replace(unknowns, table=ParameterTable(entries)), joints
+        )
     return PosePredictions(T[None], joints, unknowns, values[None], kept)
 
 

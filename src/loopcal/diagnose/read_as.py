@@ -20,8 +20,8 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.local import Own
 from loopcal.estimate.rows import Rows, rows_of
 from loopcal.estimate.sensed import Residuals, Sensed
-from loopcal.measure import LocalUnknowns, Measurements
-from loopcal.measure.initial_values import starts_of
+from loopcal.measure import Measurements, NuisanceParameters
+from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.mechanism import find_directly_reachable, forward, forward_trials
 from loopcal.typing import FloatArray
 
@@ -70,7 +70,7 @@ def quick_misfit(free: FreeParameters, data: Measurements) -> float:
     """
     if not find_directly_reachable(free.robot, free.robot.values[None], data.readings[None]).all():
         return np.inf
-    rows = rows_of(free, data, data.unknowns)
+    rows = rows_of(free, data, data.nuisance_parameters)
     if rows.own is not None:
         rows.own.started[:] = True
     z = free.deviation(free.robot.values[None])
@@ -116,7 +116,7 @@ class InterpretedData:
         self.data = data if solved.all() or not self.enough else data.take(solved)
         self.t = max(len(ways), 1)
         self.seen = [i for i, o in enumerate(self.data.observations) if len(o)]
-        self.local = self.data.unknowns
+        self.local = self.data.nuisance_parameters
         self.sensed = self._sensed(ways)
         self.z = np.repeat(free.deviation(free.robot.values[None]), self.t, axis=0)
         self.begin = begin
@@ -200,9 +200,9 @@ class InterpretedData:
             measured = (
                 np.stack([way.measured(self.data)[i] for way in ways]) if ways else o.measured[None]
             )
-            same = (o.kind.present(measured) == o.present).all(axis=-1)
+            same = (o.kind.detect_present(measured) == o.present).all(axis=-1)
             white = o.whitener * same[..., None, None]
-            made.append(Sensed(o.kind, o.rows, measured, white, self.local.places[i]))
+            made.append(Sensed(o.kind, o.rows, measured, white, self.local.indices[i]))
         return tuple(made)
 
     def _start(self) -> None:
@@ -217,12 +217,14 @@ class InterpretedData:
         for i, s in zip(self.seen, self.sensed, strict=True):
             measured[i] = np.broadcast_to(s.measured, measured[i].shape)
             if self.t == 1:
-                observations[i] = observations[i].reweighted(
+                observations[i] = observations[i].with_weights(
                     np.any(s.whitener[0] != 0.0, axis=(1, 2)) * observations[i].weight
                 )
         most, steps = (CANDIDATES, STEPS) if self.quick else (None, LONGEST)
         data = replace(self.data, observations=tuple(observations))
-        self.begin = starts_of(data, measured, T, self.local, most=most, steps=steps)
+        self.begin = guess_nuisance_values_batch(
+            data, measured, T, self.local, most=most, steps=steps
+        )
         self._put(self.rows)
 
     def _put(self, rows: Rows) -> None:
@@ -231,7 +233,7 @@ class InterpretedData:
 
     def _rows(self, sensed: tuple[Sensed, ...]) -> Rows:
         places = tuple(s.places for s in sensed)
-        local = LocalUnknowns(self.local.table, places)
+        local = NuisanceParameters(self.local.table, places)
         own = (
             Own(local, sensed, self.t, len(self.free), lambda _: self.data) if len(local) else None
         )
@@ -257,14 +259,14 @@ def begun(
     begin : (h, U)
     left : (h,) median over rows of the size of whitened residuals [1], the robot as it is.
     """
-    robot, local, h = free.robot, data.unknowns, len(readings)
+    robot, local, h = free.robot, data.nuisance_parameters, len(readings)
     T = np.broadcast_to(robot.home_state.T.reshape(-1, 4, 4)[0], (*solved.shape, 4, 4)).copy()
     T[solved] = forward_trials(robot, robot.values[None], readings[solved][None]).T[0]
     measured = [np.broadcast_to(o.measured, (h, *o.measured.shape)) for o in data.observations]
-    begin = starts_of(data, measured, T, local, most=CANDIDATES, steps=STEPS)
+    begin = guess_nuisance_values_batch(data, measured, T, local, most=CANDIDATES, steps=STEPS)
     sizes = [np.zeros((h, 0))]
-    for o, places in zip(data.observations, local.places, strict=True):
-        if len(o) and not o.kind.looks_at:
+    for o, places in zip(data.observations, local.indices, strict=True):
+        if len(o) and not o.kind.sensed_joints:
             seen = o.kind.evaluate(T[:, o.rows], o.measured[None], begin[:, places]).residual
             sizes.append(np.linalg.norm(np.matmul(o.whitener, seen[..., None])[..., 0], axis=-1))
     every = np.concatenate(sizes, axis=1)

@@ -22,7 +22,7 @@ from loopcal.estimate.excluded_poses import exclude_poses
 from loopcal.estimate.inference.residual_test import DOUBT
 from loopcal.estimate.result import Identification
 from loopcal.estimate.rows import rows_of
-from loopcal.measure import Measurements, with_stated_sigma
+from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.typing import FloatArray, IntArray
 
 SAME = 1e-9
@@ -70,7 +70,7 @@ def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
     ----------
     fit : an identification without a loss. data : the measurements it was made from.
     """
-    if with_stated_sigma(fit.robot, data).reading_sigma is not None:
+    if fill_in_reading_sigma(fit.robot, data).reading_sigma is not None:
         return _open(
             "readings are uncertain, so poses of equal readings differ, and repeats are no pure "
             "error"

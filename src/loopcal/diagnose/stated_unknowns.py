@@ -59,7 +59,7 @@ def contradicted(
         Of the unknowns that alone explain it, or else of all that are stated.
     """
     there = set(stated.local.table.names)
-    names = tuple(known.name for known in stated.whole.known if known.name in there)
+    names = tuple(known.name for known in stated.whole.stated_values if known.name in there)
     if not names or not stated.enough:
         return None
     every, found = _freed(free, stated, names)
@@ -94,8 +94,8 @@ def _freed(
     free: FreeParameters, stated: InterpretedData, names: tuple[str, ...]
 ) -> tuple[InterpretedData, float]:
     """The measurements with some unknowns left to the data, and their misfit, blunders left out."""
-    known = tuple(one for one in stated.whole.known if one.name not in names)
-    way = InterpretedData(free, replace(stated.whole, known=known))
+    known = tuple(one for one in stated.whole.stated_values if one.name not in names)
+    way = InterpretedData(free, replace(stated.whole, stated_values=known))
     way.misfits()
     way.leave_out()
     return way, min(way.misfit(), refined(way))

@@ -90,11 +90,11 @@ def _weighed(measured: Measurements) -> Measurements:
     """The same rows with the firmware's weights as sigmas."""
     from loopcal.measure import Observations
 
-    count = {o.kind.links: len(o) for o in measured.observations}
+    count = {o.kind.poses_per_row: len(o) for o in measured.observations}
     w = 2.0 * count[2] / count[1] if count.get(1) and count.get(2) else 1.0
     sigma = {1: MM / np.sqrt(w), 2: MM}
     weighed = [
-        Observations.from_sigma(o.kind, o.rows, o.measured, sigma[o.kind.links])
+        Observations.from_sigma(o.kind, o.rows, o.measured, sigma[o.kind.poses_per_row])
         for o in measured.observations
     ]
     return replace(measured, observations=tuple(weighed))

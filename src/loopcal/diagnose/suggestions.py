@@ -192,10 +192,10 @@ def _candidates(robot: Mechanism, passive: list[tuple[str, str]]) -> Iterator[tu
     """
     # examples of Component and JointSensor are of one robot; both are made for this one
     known = [kind for kind in KINDS.values() if not issubclass(kind, (Component, JointSensor))]
-    yield from _examples([kind for kind in known if kind.links > 1])
+    yield from _examples([kind for kind in known if kind.poses_per_row > 1])
     for names in SINGLE:
         yield " and ".join(names), Component(names, None if names[0] in "xyz" else TILT)
-    yield from _examples([kind for kind in known if kind.links == 1])
+    yield from _examples([kind for kind in known if kind.poses_per_row == 1])
     for name, measures in passive:
         yield f"the joint {name}", JointSensor(joints=(name,), measures=measures)
 
@@ -212,9 +212,9 @@ def _examples(kinds: Iterable[type[Kind]]) -> Iterator[tuple[str, Kind]]:
 
 def _words(kind: Kind) -> str:
     """A kind with what is unknown of it."""
-    targets, unknown = getattr(kind, "targets", ()), list(kind.parts)
-    if kind.said and not unknown:
-        return kind.said
+    targets, unknown = getattr(kind, "targets", ()), list(kind.setup_items)
+    if kind.description and not unknown:
+        return kind.description
     words = f"the {kind.name}" + (f" of {len(targets)} targets" if len(targets) > 1 else "")
     return f"{words} ({listed(unknown)} unknown)" if unknown else words
 
@@ -223,12 +223,12 @@ def _seen(at: Scene, kind: Kind, sigma: dict[Dimension, float]) -> Measurements:
     """What an instrument of this kind reads at the scene, without noise."""
     robot = at.free.robot
     noise = Gaussian(np.array([sigma[column.dimension] for column in kind.noise_columns]))
-    sensor = Sensor(kind.mounted(robot.tool), noise).looking(len(at.readings))
+    sensor = Sensor(kind.with_tool(robot.tool), noise).assign_rows(len(at.readings))
     rows, mounted = sensor.rows, sensor.kind
     assert rows is not None
     joints = (
-        np.stack([at.joints[name][:, rows] for name in kind.looks_at], axis=-1)
-        if kind.looks_at
+        np.stack([at.joints[name][:, rows] for name in kind.sensed_joints], axis=-1)
+        if kind.sensed_joints
         else None
     )
     zero = np.zeros((1, len(rows), len(kind.noise_columns)))

@@ -72,7 +72,7 @@ def locate(rows: Rows) -> FloatArray | None:
     full = (
         m == 6
         and not rows.joints
-        and sensed.kind.links == 1
+        and sensed.kind.poses_per_row == 1
         and (np.einsum("trii->tri", sensed.whitener) != 0.0).all()
     )
     if not full or not np.array_equal(sensed.poses, np.arange(len(rows.readings))):

@@ -10,7 +10,7 @@ import numpy as np
 
 from loopcal.errors import DataError, suggest_names
 from loopcal.measure import Measurements
-from loopcal.measure.measurements import weighted_sigma
+from loopcal.measure.measurements import weight_reading_sigma
 
 
 def exclude_poses(data: Measurements, drop: Sequence[str]) -> Measurements:
@@ -38,11 +38,11 @@ def exclude_poses(data: Measurements, drop: Sequence[str]) -> Measurements:
             )
     kept = np.array([label not in drop for label in data.labels])
     observations = tuple(
-        o.reweighted(o.weight * kept[o.rows].reshape(len(o), -1).all(axis=1))
+        o.with_weights(o.weight * kept[o.rows].reshape(len(o), -1).all(axis=1))
         for o in data.observations
     )
     return replace(
         data,
         observations=observations,
-        reading_sigma=weighted_sigma(data.reading_sigma, kept.astype(np.float64)),
+        reading_sigma=weight_reading_sigma(data.reading_sigma, kept.astype(np.float64)),
     )

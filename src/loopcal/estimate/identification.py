@@ -40,7 +40,7 @@ from loopcal.estimate.result import Identification, KindResiduals
 from loopcal.estimate.robust_descent import descend_robustly
 from loopcal.estimate.rows import AnyRows, rows_of, rows_of_trials
 from loopcal.estimate.sensed import Residuals, linked
-from loopcal.measure import LocalUnknowns, Measurements, Trials, with_stated_sigma
+from loopcal.measure import Measurements, NuisanceParameters, Trials, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition
 from loopcal.typing import FloatArray, IntArray
@@ -65,7 +65,7 @@ def identify(
     allow_fewer_equations: bool = False,
     loss: Loss | None = None,
     drop: Sequence[str] = (),
-    local: LocalUnknowns | None = None,
+    local: NuisanceParameters | None = None,
 ) -> Identification:
     """Identify the free parameters of a robot; the theory is in `loopcal.estimate.methods.penalties`.
 
@@ -86,7 +86,7 @@ def identify(
         equations.
     loss : `Huber()` or `Tukey()`: blocks of rows far from the fit count less. drop : labels of
         poses to leave out.
-    local : unknowns of the instruments with priors or fixed, see `loopcal.measure.local_unknowns`;
+    local : unknowns of the instruments with priors or fixed, see `loopcal.measure.collect_nuisance_parameters`;
         default all free.
 
     Returns
@@ -103,7 +103,7 @@ def identify(
     method = adapt_method(
         LeastSquares() if method is None and prior is not None else method, free.assumed, noise
     )
-    rows = rows_of(free, data := exclude_poses(with_stated_sigma(robot, data), drop), local)
+    rows = rows_of(free, data := exclude_poses(fill_in_reading_sigma(robot, data), drop), local)
     check_rows(rows, data, robot)
     check_count(rows, data, method, allow_fewer_equations or prior is not None)
     z = free.deviation((robot if start is None else robot.with_values(start)).values[None])

@@ -28,7 +28,7 @@ from loopcal.estimate.moves import evaluated
 from loopcal.estimate.sensed import BLOCK, Residuals, Sensed
 from loopcal.estimate.settle import Poses, Settled
 from loopcal.estimate.standing import ByPose, ByReadings, Chart, Standing
-from loopcal.measure import joints_looked_at, readings_kind
+from loopcal.measure import list_sensed_joints, make_readings_kind
 from loopcal.mechanism import Status
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.typing import FloatArray, IntArray
@@ -328,9 +328,9 @@ def latent_rows(
     weight[0, :, range(sigma.shape[1]), range(sigma.shape[1])] = np.where(
         believed, 1.0 / np.where(believed, sigma, 1.0), 0.0
     ).T
-    readings = Sensed(readings_kind(robot), np.arange(n), recorded, weight)
+    readings = Sensed(make_readings_kind(robot), np.arange(n), recorded, weight)
     every = (*sensed, readings)
-    names = joints_looked_at(s.kind for s in every)
+    names = list_sensed_joints(s.kind for s in every)
     unseen = np.array(
         [UNSEEN * (robot.size if a.dimension is Dimension.LENGTH else 1.0) for a in robot.actuators]
     )

@@ -22,7 +22,7 @@ import numpy as np
 from loopcal.estimate.elimination import Eliminated, Factors, eliminate
 from loopcal.estimate.nesting import nest
 from loopcal.estimate.sensed import Sensed
-from loopcal.measure import LocalUnknowns, Measurements, Observations, start_values
+from loopcal.measure import Measurements, NuisanceParameters, Observations, guess_nuisance_values
 from loopcal.parameters import ParameterTable
 from loopcal.typing import FloatArray, IntArray
 
@@ -56,7 +56,7 @@ class Own:
 
     def __init__(
         self,
-        local: LocalUnknowns,
+        local: NuisanceParameters,
         sensed: tuple[Sensed, ...],
         trials: int,
         parameters: int,
@@ -131,7 +131,7 @@ class Own:
         """
         values, data = self.local.values(), self.data(trial)
         clusters = [
-            self.nesting.cluster[places].max(axis=1, initial=-1) for places in self.local.places
+            self.nesting.cluster[places].max(axis=1, initial=-1) for places in self.local.indices
         ]
         for c in range(len(self.clusters)):
             some = [
@@ -141,11 +141,11 @@ class Own:
             ]
             used = np.unique(np.concatenate([places.ravel() for _, places in some]))
             entries = tuple(self.local.table.entries[i] for i in used)
-            local = LocalUnknowns(
+            local = NuisanceParameters(
                 ParameterTable(entries), tuple(np.searchsorted(used, places) for _, places in some)
             )
             part = replace(data, observations=tuple(rows for rows, _ in some))
-            values[used] = start_values(part, T, local, joints)
+            values[used] = guess_nuisance_values(part, T, local, joints)
         self.values[trial], self.started[trial] = values, True
         self.start = values.copy()
 
@@ -157,7 +157,7 @@ class Own:
         self, data: Measurements, clusters: list[IntArray]
     ) -> list[tuple[Observations, IntArray, IntArray]]:
         """Kinds with rows, which unknowns each uses, and the cluster of each row."""
-        every = zip(data.observations, self.local.places, clusters, strict=True)
+        every = zip(data.observations, self.local.indices, clusters, strict=True)
         return [(o, places, of) for o, places, of in every if len(o) and places.shape[1]]
 
     def predicted(self, trials: IntArray, deviation: FloatArray) -> FloatArray:

@@ -102,7 +102,10 @@ def _usable(sensed: Sequence[Sensed], pose: IntArray) -> list[tuple[Sensed, IntA
     usable = [
         s
         for s in sensed
-        if not s.places.shape[1] and s.kind.links == 1 and not s.kind.looks_at and len(s.poses)
+        if not s.places.shape[1]
+        and s.kind.poses_per_row == 1
+        and not s.kind.sensed_joints
+        and len(s.poses)
     ]
     return [(s, _rows_of(s, pose)) for s in usable]
 

@@ -40,15 +40,16 @@ def machine_columns(
 ) -> FloatArray:
     """Whitened derivatives (a, r, m, p) of a kind's rows by the machine's deviations."""
     D = moves.D
-    if sensed.kind.links > 1:
+    if sensed.kind.poses_per_row > 1:
         parts = (
-            found.jacobian[:, :, i] @ D[:, sensed.poses[:, i]] for i in range(sensed.kind.links)
+            found.jacobian[:, :, i] @ D[:, sensed.poses[:, i]]
+            for i in range(sensed.kind.poses_per_row)
         )
         return np.matmul(white, sum(parts, start=np.zeros(1)))
     if not np.array_equal(sensed.poses, np.arange(D.shape[1])):
         D = D[:, sensed.poses]
     columns = np.matmul(np.matmul(white, found.jacobian), D)
-    for j, name in enumerate(sensed.kind.looks_at):
+    for j, name in enumerate(sensed.kind.sensed_joints):
         if name in moves.slopes and found.joints is not None:
             slope = moves.slopes[name][:, sensed.poses, None, :]
             columns = columns + np.matmul(white, found.joints[..., j, None] * slope)
@@ -67,7 +68,7 @@ def evaluated(
         T = T[:, sensed.poses]
     T = np.broadcast_to(T, (len(trials), *T.shape[1:]))
     own = values[:, sensed.places] if values is not None and sensed.places.shape[1] else None
-    names = sensed.kind.looks_at
+    names = sensed.kind.sensed_joints
     joints = None
     if names:
         seen = np.stack([moves.joints[name][:, sensed.poses] for name in names], axis=-1)

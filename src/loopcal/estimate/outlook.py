@@ -21,13 +21,13 @@ from loopcal.estimate.elimination import OWN_RANK
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.rows import rows_of
 from loopcal.measure import (
-    LocalUnknowns,
     Measurements,
-    believed_sigma,
+    NuisanceParameters,
     evaluate_all,
-    joint_values,
-    joints_looked_at,
-    start_values,
+    guess_nuisance_values,
+    list_sensed_joints,
+    resolve_reading_sigma,
+    select_joint_values,
     whitened_rows,
 )
 from loopcal.mechanism import (
@@ -80,7 +80,7 @@ def scene(free: FreeParameters, readings: FloatArray, joints: Iterable[str] = ()
     passive = [
         name for name in names if name not in {actuator.name for actuator in robot.actuators}
     ]
-    at = joint_values(robot, names, readings[None], state)
+    at = select_joint_values(robot, names, readings[None], state)
     if passive:
         moved = differentiate_passive_joints(robot, values, readings[None], state)
         scaled = np.nan_to_num(moved.parameters[..., free.places] * free.tolerance)
@@ -88,7 +88,9 @@ def scene(free: FreeParameters, readings: FloatArray, joints: Iterable[str] = ()
     return Scene(free, readings, np.asarray(reached[0]), T, D, at, slopes)
 
 
-def look(at: Scene, measured: Measurements, local: LocalUnknowns, values: FloatArray) -> FloatArray:
+def look(
+    at: Scene, measured: Measurements, local: NuisanceParameters, values: FloatArray
+) -> FloatArray:
     """Whitened rows (1, M, U + p + 1), [own | machine | residual], of measurements at a scene;
     values (U,) of the own.
     """
@@ -127,15 +129,15 @@ def information(free: FreeParameters, data: Measurements) -> tuple[FloatArray, B
     factor : (1, p + 1, p + 1) of rows [A | r] with own unknowns eliminated. reached : (n,) poses
         that close or are not needed; where one is False its rows are missing.
     """
-    if believed_sigma(free.robot, data.reading_sigma, data.n_poses) is not None:
+    if resolve_reading_sigma(free.robot, data.reading_sigma, data.n_poses) is not None:
         return _uncertain(free, data)
-    local = data.unknowns
+    local = data.nuisance_parameters
     own = len(local)
     factor = empty_factor(1, own + len(free))
     values = _own_values(free, data, local) if own else np.zeros(0)
     reached = np.ones(data.n_poses, dtype=bool)
     for i, kind_rows in enumerate(data.observations):
-        names = joints_looked_at([kind_rows.kind])
+        names = list_sensed_joints([kind_rows.kind])
         for first in range(0, len(kind_rows), BLOCK):
             chosen = np.arange(first, min(first + BLOCK, len(kind_rows)))
             poses, rows = np.unique(kind_rows.rows[chosen], return_inverse=True)
@@ -146,7 +148,7 @@ def information(free: FreeParameters, data: Measurements) -> tuple[FloatArray, B
             needed[part.rows[np.any(part.whitener != 0.0, axis=(1, 2))].ravel()] = True
             reached[poses[needed & ~at.reached]] = False
             some = Measurements(data.robot_name, at.readings, (part,))
-            used = replace(local, places=(local.places[i][chosen],))
+            used = replace(local, indices=(local.indices[i][chosen],))
             factor = engine.fold(factor, look(at, some, used, values))
     return without_own(engine.fold(factor, _prior_rows(local, len(free))), own), reached
 
@@ -164,7 +166,7 @@ def equations(robot: Mechanism, data: Measurements) -> int:
     """How many equations measurements give: their rows; where readings are uncertain, less what the
     poses take of them.
     """
-    if believed_sigma(robot, data.reading_sigma, data.n_poses) is None:
+    if resolve_reading_sigma(robot, data.reading_sigma, data.n_poses) is None:
         return data.n_rows
     return int(rows_of(select_free_parameters(robot), data).equations[0])
 
@@ -173,19 +175,19 @@ def alone(at: Scene, measured: Measurements) -> FloatArray:
     """Factor (1, p + 1, p + 1) of one instrument's rows at a scene, its own unknowns eliminated at
     their stated values.
     """
-    local = measured.unknowns
+    local = measured.nuisance_parameters
     rows = look(at, measured, local, local.values())
     factor = engine.fold(empty_factor(1, len(local) + len(at.free)), rows)
     return without_own(engine.fold(factor, _prior_rows(local, len(at.free))), len(local))
 
 
-def _own_values(free: FreeParameters, data: Measurements, local: LocalUnknowns) -> FloatArray:
+def _own_values(free: FreeParameters, data: Measurements, local: NuisanceParameters) -> FloatArray:
     """Values (U,) of the own unknowns that fit the measurements at the robot's present poses."""
     at = [
         scene(
             free,
             data.readings[first : first + BLOCK],
-            joints_looked_at(o.kind for o in data.observations),
+            list_sensed_joints(o.kind for o in data.observations),
         )
         for first in range(0, data.n_poses, BLOCK)
     ]
@@ -193,10 +195,10 @@ def _own_values(free: FreeParameters, data: Measurements, local: LocalUnknowns) 
     joints = {
         name: np.concatenate([part.joints[name] for part in at], axis=1) for name in at[0].joints
     }
-    return start_values(data, T, local, joints)
+    return guess_nuisance_values(data, T, local, joints)
 
 
-def _prior_rows(local: LocalUnknowns, p: int) -> FloatArray:
+def _prior_rows(local: NuisanceParameters, p: int) -> FloatArray:
     """Rows (1, U, U + p + 1) of the own unknowns that have a tolerance; zero for the others."""
     known = local.table.free & ~np.isnan(local.table.tolerance)
     weight = np.where(known, 1.0 / np.where(known, local.table.tolerance, 1.0), 0.0)

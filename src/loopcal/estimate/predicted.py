@@ -13,7 +13,7 @@ import numpy as np
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import listed
 from loopcal.estimate.latent import latent_rows
-from loopcal.measure import Measurements, with_stated_sigma
+from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism, Solution, forward, make_solution
 
 SAME = 1e-9
@@ -39,7 +39,7 @@ def predicted(robot: Mechanism, data: Measurements) -> tuple[Solution, np.ndarra
     ratio = sigma / np.array(robot.program.sigma)
     if np.isfinite(ratio).all() and np.ptp(ratio, axis=1).max() <= SAME * ratio.min():
         return forward(robot, data.readings), np.ones(data.n_poses, dtype=bool)
-    return _fitted(robot, with_stated_sigma(robot, data))
+    return _fitted(robot, fill_in_reading_sigma(robot, data))
 
 
 def untold(data: Measurements, told: np.ndarray) -> tuple[str, ...]:

@@ -26,13 +26,13 @@ from loopcal.estimate.local import Own, Part, fold_parts, spread_columns
 from loopcal.estimate.moves import Last, Moves, evaluated, machine_columns
 from loopcal.estimate.sensed import BLOCK, Block, Residuals, Sensed, blocks_of
 from loopcal.measure import (
-    LocalUnknowns,
     Measurements,
+    NuisanceParameters,
     Trials,
-    believed_sigma,
-    joint_values,
-    joints_looked_at,
-    local_unknowns,
+    collect_nuisance_parameters,
+    list_sensed_joints,
+    resolve_reading_sigma,
+    select_joint_values,
 )
 from loopcal.measure.simulation import rows_of as sensor_rows
 from loopcal.measure.whitening import whitener
@@ -81,7 +81,7 @@ class Rows:
         self.located = located
         self.own = own
         self.parameters = len(unknowns)
-        self.joints = joints_looked_at(s.kind for s in sensed)
+        self.joints = list_sensed_joints(s.kind for s in sensed)
         present = [np.einsum("trii->tri", s.whitener) != 0.0 for s in sensed]
         counted = sum((p.sum(axis=(1, 2)) for p in present), start=np.zeros(1, dtype=np.int64))
         self.counted: IntArray = np.broadcast_to(counted, (trials,)).astype(np.int64)
@@ -322,7 +322,7 @@ class Rows:
 
     def _joints(self, block: Block, state: engine.State, ok: np.ndarray) -> dict[str, FloatArray]:
         """Values (a, n) of the joints that kinds look at; zero where a pose failed."""
-        found = joint_values(self.unknowns.robot, self.joints, block.readings, state)
+        found = select_joint_values(self.unknowns.robot, self.joints, block.readings, state)
         return {name: np.where(ok, value, 0.0) for name, value in found.items()}
 
     def _settled(self, looks: list[Moves], z: FloatArray, trials: IntArray) -> FloatArray:
@@ -423,8 +423,10 @@ class Rows:
             return
         own = (
             None
-            if found.own is None
-            else np.matmul(white, np.broadcast_to(found.own, (a, r, m, found.own.shape[-1])))
+            if found.nuisance is None
+            else np.matmul(
+                white, np.broadcast_to(found.nuisance, (a, r, m, found.nuisance.shape[-1]))
+            )
         )
         for form, which, nodes, columns in self.own.members(sensed):
             part = rows[:, which]
@@ -437,15 +439,17 @@ class Rows:
 
 
 def rows_of(
-    unknowns: FreeParameters, data: Measurements, local: LocalUnknowns | None = None
+    unknowns: FreeParameters, data: Measurements, local: NuisanceParameters | None = None
 ) -> AnyRows:
     """Return the rows of one machine's measurements; `local` are the unknowns that these bring,
     default as stated.
 
     Where readings have a sigma above 0, the poses are unknowns, too.
     """
-    own = data.unknowns if local is None else local
-    pairs = [(o, places) for o, places in zip(data.observations, own.places, strict=True) if len(o)]
+    own = data.nuisance_parameters if local is None else local
+    pairs = [
+        (o, places) for o, places in zip(data.observations, own.indices, strict=True) if len(o)
+    ]
     sensed = tuple(
         Sensed(o.kind, o.rows, o.measured[None], o.whitener[None], places) for o, places in pairs
     )
@@ -456,12 +460,12 @@ def rows_of_trials(unknowns: FreeParameters, trials: Trials) -> AnyRows:
     """Return the rows of t simulated machines."""
     sensors = trials.instrument.sensors
     first = trials.trial(0)
-    local = local_unknowns(first.observations, first.labels)
+    local = collect_nuisance_parameters(first.observations, first.labels)
     sensed = []
-    for sensor, measured, places in zip(sensors, trials.measured, local.places, strict=True):
+    for sensor, measured, places in zip(sensors, trials.measured, local.indices, strict=True):
         kind = sensor.kind
-        present = kind.present(measured)
-        N = kind.noise_map(measured)
+        present = kind.detect_present(measured)
+        N = kind.linearize_noise(measured)
         covariance = (N * np.asarray(sensor.noise.sigma) ** 2) @ np.swapaxes(N, -1, -2)
         t, r, m = present.shape
         flat = whitener(
@@ -482,7 +486,7 @@ def _rows(
     sigma: FloatArray | None,
     sensed: tuple[Sensed, ...],
     trials: int,
-    local: LocalUnknowns,
+    local: NuisanceParameters,
     data: Callable[[int], Measurements],
 ) -> AnyRows:
     """Rows at readings (t | 1, n, a), the poses unknown where a reading is not exact."""
@@ -490,7 +494,7 @@ def _rows(
     def own(together: IntArray | None) -> Own | None:
         return Own(local, sensed, trials, len(unknowns), data, together) if len(local) else None
 
-    believed = believed_sigma(unknowns.robot, sigma, recorded.shape[1])
+    believed = resolve_reading_sigma(unknowns.robot, sigma, recorded.shape[1])
     if believed is None:
         return Rows(unknowns, recorded[0], sensed, trials, own=own(None))
     return latent_rows(unknowns, recorded, believed, sensed, trials, own)

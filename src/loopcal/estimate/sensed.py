@@ -71,7 +71,7 @@ class Sensed:
     @property
     def per_pose(self) -> IntArray:
         """(r, links) poses of each row, whatever their number."""
-        return self.poses.reshape(len(self.poses), self.kind.links)
+        return self.poses.reshape(len(self.poses), self.kind.poses_per_row)
 
 
 class Residuals(NamedTuple):
@@ -102,7 +102,7 @@ def linked(data: Measurements) -> IntArray:
     from scipy.sparse.csgraph import connected_components
 
     numbers, member = np.unique(data.block, return_inverse=True)
-    pairs = [o.rows for o in data.observations if o.kind.links > 1 and len(o)]
+    pairs = [o.rows for o in data.observations if o.kind.poses_per_row > 1 and len(o)]
     if not pairs:
         return member
     ends = member[

@@ -33,7 +33,7 @@ from loopcal.estimate.local import CLOSE, NOTHING, Own, spread_columns
 from loopcal.estimate.moves import evaluated, machine_columns, mapped
 from loopcal.estimate.sensed import BLOCK, Block, Sensed
 from loopcal.estimate.standing import Chart, FreeMoves, Standing
-from loopcal.measure import Evaluation, joints_looked_at
+from loopcal.measure import Evaluation, list_sensed_joints
 from loopcal.numerics.decomposition import without_rounding
 from loopcal.typing import FloatArray, IntArray
 
@@ -133,7 +133,7 @@ class Poses:
             own,
         )
         self.components = int(member.max()) + 1
-        self.joints = joints_looked_at(s.kind for s in sensed)
+        self.joints = list_sensed_joints(s.kind for s in sensed)
         self.blocks = component_blocks(sensed[-1].measured[0], sensed, member, needed, BLOCK)
         nodes, forms = self._nodes()
         self.groups = [groups_of(block, member, nodes, forms) for block in self.blocks]
@@ -370,8 +370,10 @@ class Poses:
             a, r, m = seen.residual.shape
             by_own = (
                 None
-                if seen.own is None
-                else np.matmul(white, np.broadcast_to(seen.own, (a, r, m, seen.own.shape[-1])))
+                if seen.nuisance is None
+                else np.matmul(
+                    white, np.broadcast_to(seen.nuisance, (a, r, m, seen.nuisance.shape[-1]))
+                )
             )
             by_machine = (
                 machine_columns(s, seen, white, moves) if machine else np.zeros((a, r, m, 0))
@@ -418,17 +420,17 @@ def _free_columns(
     """Whitened derivatives (a, r, links, m, k) of a kind's rows by the free numbers of the poses
     they saw.
     """
-    if sensed.kind.links > 1:
-        every = range(sensed.kind.links)
+    if sensed.kind.poses_per_row > 1:
+        every = range(sensed.kind.poses_per_row)
         parts = [
             np.matmul(white, by_pose(seen.jacobian[:, :, i], moves.Y[:, sensed.poses[:, i]]))
             for i in every
         ]
         return np.stack(parts, axis=2)
     columns = by_pose(seen.jacobian, moves.Y[:, sensed.poses])
-    if seen.joints is not None and sensed.kind.looks_at:
+    if seen.joints is not None and sensed.kind.sensed_joints:
         turns = np.stack(
-            [moves.turns[name][:, sensed.poses] for name in sensed.kind.looks_at], axis=2
+            [moves.turns[name][:, sensed.poses] for name in sensed.kind.sensed_joints], axis=2
         )
         columns = columns + np.matmul(seen.joints, turns)
     return np.matmul(white, columns)[:, :, None]

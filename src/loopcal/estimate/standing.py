@@ -24,7 +24,7 @@ from loopcal import engine, geometry
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.moves import Moves, mapped
-from loopcal.measure import joint_values
+from loopcal.measure import select_joint_values
 from loopcal.mechanism import (
     Actuator,
     Mechanism,
@@ -284,7 +284,7 @@ def _safe(
     ok = np.asarray(here.state.status == Status.CONVERGED)
     for one in finite:
         ok = ok & one
-    values = joint_values(unknowns.robot, joints, here.q, here.state)
+    values = select_joint_values(unknowns.robot, joints, here.q, here.state)
 
     def where(array: np.ndarray) -> FloatArray:
         return (

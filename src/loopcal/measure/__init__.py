@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measurements: kinds, instruments, observations, their unknowns, and their simulation."""
 
-from loopcal.measure.commanded_poses import readings_from_commanded as readings_from_commanded
+from loopcal.measure.commanded_poses import solve_commanded_readings as solve_commanded_readings
 from loopcal.measure.data_checks import check_actuators as check_actuators
 from loopcal.measure.data_checks import check_duplicates as check_duplicates
-from loopcal.measure.data_checks import check_moved as check_moved
 from loopcal.measure.data_checks import check_strokes as check_strokes
+from loopcal.measure.data_checks import check_targets_move as check_targets_move
 from loopcal.measure.evaluation import KindRows as KindRows
 from loopcal.measure.evaluation import evaluate_all as evaluate_all
 from loopcal.measure.evaluation import whitened_rows as whitened_rows
-from loopcal.measure.initial_values import start_values as start_values
+from loopcal.measure.initial_values import guess_nuisance_values as guess_nuisance_values
 from loopcal.measure.instrument import Instrument as Instrument
 from loopcal.measure.instrument import Sensor as Sensor
-from loopcal.measure.joint_observation import joint_values as joint_values
-from loopcal.measure.joint_observation import joints_looked_at as joints_looked_at
+from loopcal.measure.joint_observation import list_sensed_joints as list_sensed_joints
+from loopcal.measure.joint_observation import select_joint_values as select_joint_values
 from loopcal.measure.kinds import KINDS as KINDS
 from loopcal.measure.kinds import Autocollimation as Autocollimation
 from loopcal.measure.kinds import Bearing as Bearing
@@ -36,15 +36,15 @@ from loopcal.measure.measurements import Measurements as Measurements
 from loopcal.measure.noise import Gaussian as Gaussian
 from loopcal.measure.noise import Noise as Noise
 from loopcal.measure.noise import Uniform as Uniform
-from loopcal.measure.noise import stream as stream
-from loopcal.measure.nuisance import Known as Known
-from loopcal.measure.nuisance import LocalUnknowns as LocalUnknowns
-from loopcal.measure.nuisance import local_unknowns as local_unknowns
+from loopcal.measure.noise import make_random_stream as make_random_stream
+from loopcal.measure.nuisance import NuisanceParameters as NuisanceParameters
+from loopcal.measure.nuisance import StatedValue as StatedValue
+from loopcal.measure.nuisance import collect_nuisance_parameters as collect_nuisance_parameters
 from loopcal.measure.observations import Observations as Observations
 from loopcal.measure.readings import Readings as Readings
-from loopcal.measure.readings import believed_sigma as believed_sigma
-from loopcal.measure.readings import readings_kind as readings_kind
-from loopcal.measure.readings import with_stated_sigma as with_stated_sigma
+from loopcal.measure.readings import fill_in_reading_sigma as fill_in_reading_sigma
+from loopcal.measure.readings import make_readings_kind as make_readings_kind
+from loopcal.measure.readings import resolve_reading_sigma as resolve_reading_sigma
 from loopcal.measure.simulation import Trials as Trials
 from loopcal.measure.simulation import sample_truth as sample_truth
 from loopcal.measure.simulation import simulate as simulate

@@ -9,7 +9,7 @@ from loopcal.mechanism import Mechanism, Solution, inverse
 from loopcal.typing import FloatArray
 
 
-def readings_from_commanded(
+def solve_commanded_readings(
     controller: Mechanism, commanded: ArrayLike, labels: tuple[str, ...] = ()
 ) -> FloatArray:
     """Actuator readings with which a controller answers commanded poses.
@@ -31,13 +31,13 @@ def readings_from_commanded(
     DataError
         If the controller's geometry does not reach a pose.
     """
-    return solve_commanded(controller, commanded, labels).q
+    return solve_commanded_poses(controller, commanded, labels).q
 
 
-def solve_commanded(
+def solve_commanded_poses(
     controller: Mechanism, commanded: ArrayLike, labels: tuple[str, ...] = ()
 ) -> Solution:
-    """`readings_from_commanded`, with the poses and passive joints that belong to the readings.
+    """`solve_commanded_readings`, with the poses and passive joints that belong to the readings.
 
     Raises
     ------

@@ -160,7 +160,7 @@ def _same(one: Kind, other: Kind) -> bool:
     )
 
 
-def check_moved(
+def check_targets_move(
     measurements: Measurements, T: FloatArray, *, allow: bool = False, override: str = ""
 ) -> None:
     """Refuse a target that no pose moves: its readings stay within the noise, though the robot
@@ -208,7 +208,7 @@ def check_moved(
 
 
 def stays(measurements: Measurements) -> bool:
-    """Whether any target's readings stay within the noise, so that `check_moved` has something to
+    """Whether any target's readings stay within the noise, so that `check_targets_move` has something to
     look at.
     """
     return any(True for _ in _stays(measurements))
@@ -230,12 +230,17 @@ class _Still(NamedTuple):
 def _stays(measurements: Measurements) -> Iterator[_Still]:
     for rows in measurements.observations:
         kind = rows.kind
-        if not kind.follows or kind.links > 1 or kind.looks_at or len(rows) < 3:
+        if (
+            not kind.changes_with_pose
+            or kind.poses_per_row > 1
+            or kind.sensed_joints
+            or len(rows) < 3
+        ):
             continue
         sigma = np.sqrt(np.einsum("rii->ri", rows.covariance)).max(axis=0)
         each = sigma if len(sigma) == len(kind.columns) else np.full(len(kind.columns), sigma.max())
         for session in np.unique(rows.session):
-            for target, columns in kind.sights.items():
+            for target, columns in kind.target_columns.items():
                 places = list(columns)
                 here = (rows.session == session) & ~np.any(
                     np.isnan(rows.measured[:, places]), axis=1

@@ -3,8 +3,8 @@
 nothing of robots.
 
     # U unknowns: frames, targets, surfaces
-    local = measurements.unknowns
-    # (U,), or start_values(measurements, T, local)
+    local = measurements.nuisance_parameters
+    # (U,), or guess_nuisance_values(measurements, T, local)
     values = local.values()
     # one `KindRows` for each kind
     parts = evaluate_all(measurements, T, values[None], local)
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from loopcal.errors import DataError
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.nuisance import LocalUnknowns
+from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations
 from loopcal.typing import FloatArray
 
@@ -43,8 +43,8 @@ class KindRows(NamedTuple):
     jacobian : (t, r, l, m, 6) by the platform twists.
     own : (t, r, m, U) by all local unknowns of the measurements; zero where a row does not use one,
         or it is fixed.
-    joints : (t, r, m, j) by the values of the joints `looks_at`, at the row's pose.
-    looks_at : names of these joints.
+    joints : (t, r, m, j) by the values of the joints `sensed_joints`, at the row's pose.
+    sensed_joints : names of these joints.
     whitener : (r, m, m), zero where absent.
     """
 
@@ -53,7 +53,7 @@ class KindRows(NamedTuple):
     jacobian: FloatArray
     own: FloatArray
     joints: FloatArray
-    looks_at: tuple[str, ...]
+    sensed_joints: tuple[str, ...]
     whitener: FloatArray
 
 
@@ -61,7 +61,7 @@ def evaluate_all(
     measurements: Measurements,
     T: FloatArray,
     values: FloatArray,
-    local: LocalUnknowns | None = None,
+    local: NuisanceParameters | None = None,
     joints: Mapping[str, FloatArray] | None = None,
 ) -> tuple[KindRows, ...]:
     """Evaluate every kind.
@@ -73,7 +73,7 @@ def evaluate_all(
         T_base_platform of each pose.
     values : (t or 1, U)
         Of the local unknowns.
-    local : LocalUnknowns, optional
+    local : NuisanceParameters, optional
         Default: gathered from the measurements; gather them once where this is called often.
     joints : name -> (t or 1, n), optional
         Values of the joints that kinds look at, see `loopcal.measure.joint_observation`.
@@ -87,9 +87,9 @@ def evaluate_all(
     DataError
         If a joint's values are missing.
     """
-    gathered = measurements.unknowns if local is None else local
+    gathered = measurements.nuisance_parameters if local is None else local
     return tuple(
-        _kind_rows(rows, T, gathered.of(i, values), gathered.places[i], gathered, joints or {})
+        _kind_rows(rows, T, gathered.select(i, values), gathered.indices[i], gathered, joints or {})
         for i, rows in enumerate(measurements.observations)
     )
 
@@ -120,7 +120,7 @@ def whitened_rows(
             if p
             else np.zeros((*part.residual.shape, 0))
         )
-        for j, name in enumerate(part.looks_at):
+        for j, name in enumerate(part.sensed_joints):
             if joints is not None and name in joints:
                 machine = (
                     machine + part.joints[..., j, None] * joints[name][:, part.poses[:, 0], None, :]
@@ -137,30 +137,36 @@ def _kind_rows(
     T: FloatArray,
     values: FloatArray,
     places: Ints,
-    local: LocalUnknowns,
+    local: NuisanceParameters,
     joints: Mapping[str, FloatArray],
 ) -> KindRows:
     kind = rows.kind
-    for name in kind.looks_at:
+    for name in kind.sensed_joints:
         if name not in joints:
             raise DataError(
                 f"the kind {kind.name!r} needs the values of joint {name!r}; hand them over as "
                 "joints"
             )
     seen = (
-        np.stack([joints[name][:, rows.rows] for name in kind.looks_at], axis=-1)
-        if kind.looks_at
+        np.stack([joints[name][:, rows.rows] for name in kind.sensed_joints], axis=-1)
+        if kind.sensed_joints
         else None
     )
     found = rows.evaluate(T, values, seen)
     t, r, m = found.residual.shape
-    jacobian = found.jacobian[:, :, None] if kind.links == 1 else found.jacobian
+    jacobian = found.jacobian[:, :, None] if kind.poses_per_row == 1 else found.jacobian
     own = np.zeros((t, r, m, len(local)))
-    if found.own is not None:
+    if found.nuisance is not None:
         free = local.table.free[places]
-        each = np.broadcast_to(found.own * free[:, None, :], (t, r, m, places.shape[1]))
+        each = np.broadcast_to(found.nuisance * free[:, None, :], (t, r, m, places.shape[1]))
         np.put_along_axis(own, np.broadcast_to(places[:, None, :], each.shape), each, axis=-1)
     moved = np.zeros((t, r, m, 0)) if found.joints is None else found.joints
     return KindRows(
-        rows.rows.reshape(r, -1), found.residual, jacobian, own, moved, kind.looks_at, rows.whitener
+        rows.rows.reshape(r, -1),
+        found.residual,
+        jacobian,
+        own,
+        moved,
+        kind.sensed_joints,
+        rows.whitener,
     )

@@ -2,7 +2,7 @@
 """Starts for unknown frames, targets, points and surfaces: from the data and the poses of the
 nominal robot alone.
 
-Each kind offers candidates in closed form (`Kind.starts`) for the rows that share its unknowns.
+Each kind offers candidates in closed form (`Kind.guess_values`) for the rows that share its unknowns.
 Every candidate is improved by damped Gauss-Newton on the kind's own rows at fixed poses, the best
 one is kept, and a last descent runs over all rows together. Unknowns with a prior, and fixed ones,
 keep their nominal value to begin with.
@@ -17,7 +17,7 @@ from loopcal.errors import DataError
 from loopcal.measure.evaluation import evaluate_all, whitened_rows
 from loopcal.measure.kinds import Kind
 from loopcal.measure.measurements import Measurements
-from loopcal.measure.nuisance import LocalUnknowns
+from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations
 from loopcal.typing import FloatArray
 
@@ -27,10 +27,10 @@ STEPS = 60
 """Steps of damped Gauss-Newton [1]; candidates in the right basin need fewer than ten."""
 
 
-def start_values(
+def guess_nuisance_values(
     measurements: Measurements,
     T: FloatArray,
-    local: LocalUnknowns | None = None,
+    local: NuisanceParameters | None = None,
     joints: Mapping[str, FloatArray] | None = None,
 ) -> FloatArray:
     """Values of the local unknowns that fit the measurements at given poses.
@@ -40,7 +40,7 @@ def start_values(
     measurements : Measurements
     T : (n, 4, 4)
         T_base_platform of each pose, usually of the nominal robot at the readings.
-    local : LocalUnknowns, optional
+    local : NuisanceParameters, optional
         With priors and fixed values, if any; default: as the kinds state them.
     joints : name -> (1, n), optional
         Values of joints that kinds look at.
@@ -54,20 +54,20 @@ def start_values(
     DataError
         If poses are too few or too much alike to tell where something is.
     """
-    gathered = measurements.unknowns if local is None else local
+    gathered = measurements.nuisance_parameters if local is None else local
     if not gathered.table.free.any():
         return gathered.values()
-    values = starts_of(
+    values = guess_nuisance_values_batch(
         measurements, [o.measured[None] for o in measurements.observations], T[None], gathered
     )[0]
     return _descended(measurements, T, gathered, values, joints)
 
 
-def starts_of(
+def guess_nuisance_values_batch(
     measurements: Measurements,
     measured: Sequence[FloatArray],
     T: FloatArray,
-    local: LocalUnknowns,
+    local: NuisanceParameters,
     *,
     most: int | None = None,
     steps: int = STEPS,
@@ -79,7 +79,7 @@ def starts_of(
     measurements : whose rows these are.
     measured : (t, r, c) of each kind.
     T : (t | 1, n, 4, 4) T_base_platform.
-    local : see `start_values`.
+    local : see `guess_nuisance_values`.
     most : candidates of each set that are improved, the best ones as they are offered; default all.
     steps : of the descent.
 
@@ -90,14 +90,14 @@ def starts_of(
     Raises
     ------
     DataError
-        See `start_values`; of several sets, one without candidates keeps the nominal values.
+        See `guess_nuisance_values`; of several sets, one without candidates keeps the nominal values.
     """
     known = ~(local.table.free & np.isnan(local.table.tolerance))
     values = np.tile(local.values(), (max((len(m) for m in measured), default=1), 1))
     for i, rows in enumerate(measurements.observations):
-        if not rows.kind.unknowns or rows.kind.looks_at:
+        if not rows.kind.nuisance_parameters or rows.kind.sensed_joints:
             continue
-        for members, places in _sharing(local.places[i]):
+        for members, places in _sharing(local.indices[i]):
             if not known[places].all():
                 counted = members[rows.weight[members] > 0.0]
                 if len(counted):
@@ -143,7 +143,7 @@ def _best(
             poses[of if len(poses) > 1 else [0]], measured[of if t > 1 else [0]], x[:, None, :]
         )
         c, r, m = len(x), *found.residual.shape[1:]
-        own = np.zeros((1, 1, 1, x.shape[1])) if found.own is None else found.own
+        own = np.zeros((1, 1, 1, x.shape[1])) if found.nuisance is None else found.nuisance
         J = rows.whitener @ np.broadcast_to(own, (c, r, m, x.shape[1]))
         e = (rows.whitener @ np.broadcast_to(found.residual, (c, r, m))[..., None])[..., 0]
         return e.reshape(c, -1), np.where(known, 0.0, J).reshape(c, r * m, -1)
@@ -162,12 +162,12 @@ def _candidates(kind: Kind, poses: FloatArray, measured: FloatArray) -> FloatArr
     each = []
     for j, one in enumerate(measured):
         try:
-            offered = kind.starts(poses[j if len(poses) > 1 else 0], one)
+            offered = kind.guess_values(poses[j if len(poses) > 1 else 0], one)
         except DataError:
             if len(measured) == 1:
                 raise
-            offered = kind.nominal[None]
-        each.append(np.concatenate([offered, kind.nominal[None]]))
+            offered = kind.nominal_values[None]
+        each.append(np.concatenate([offered, kind.nominal_values[None]]))
     k = max(len(one) for one in each)
     return np.stack(
         [np.concatenate([one, np.repeat(one[-1:], k - len(one), axis=0)]) for one in each]
@@ -177,7 +177,7 @@ def _candidates(kind: Kind, poses: FloatArray, measured: FloatArray) -> FloatArr
 def _descended(
     measurements: Measurements,
     T: FloatArray,
-    local: LocalUnknowns,
+    local: NuisanceParameters,
     values: FloatArray,
     joints: Mapping[str, FloatArray] | None,
 ) -> FloatArray:

@@ -25,7 +25,7 @@ class Sensor:
     ----------
     kind : Kind
     noise : Noise
-    rows : (r,) or (r, links) int, optional
+    rows : (r,) or (r, l) int, optional
         Poses of each row. Default: every pose once; where rows link poses, each with the next and
         the last with the first.
     session, group : text or (r,) text, optional
@@ -51,7 +51,7 @@ class Sensor:
                 f"one for each of {names}"
             )
 
-    def looking(self, n_poses: int) -> Self:
+    def assign_rows(self, n_poses: int) -> Self:
         """The sensor with its rows, sessions and groups spelt out for n poses; DataError where a
         pose is not there.
         """
@@ -69,7 +69,7 @@ class Sensor:
     def _rows(self, n: int) -> Ints:
         if self.rows is not None:
             return indices(self.rows, self.kind)
-        if self.kind.links == 1:
+        if self.kind.poses_per_row == 1:
             return np.arange(n)
         if n < 2:
             raise DataError(
@@ -100,6 +100,8 @@ class Instrument:
         if not self.sensors:
             raise DataError("an instrument needs at least one sensor: a kind and its noise")
 
-    def mounted(self, robot: Mechanism) -> Self:
+    def with_tool(self, robot: Mechanism) -> Self:
         """The instrument with the robot's tool, wherever a kind states none of its own."""
-        return type(self)(tuple(replace(s, kind=s.kind.mounted(robot.tool)) for s in self.sensors))
+        return type(self)(
+            tuple(replace(s, kind=s.kind.with_tool(robot.tool)) for s in self.sensors)
+        )

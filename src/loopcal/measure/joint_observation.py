@@ -10,12 +10,12 @@ from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
 
 
-def joints_looked_at(kinds: Iterable[Kind]) -> tuple[str, ...]:
+def list_sensed_joints(kinds: Iterable[Kind]) -> tuple[str, ...]:
     """Names of all joints that kinds look at, each once."""
-    return tuple(dict.fromkeys(name for kind in kinds for name in kind.looks_at))
+    return tuple(dict.fromkeys(name for kind in kinds for name in kind.sensed_joints))
 
 
-def joint_values(
+def select_joint_values(
     robot: Mechanism, names: Iterable[str], readings: FloatArray, state: State
 ) -> dict[str, FloatArray]:
     """Values of joints.

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from loopcal.errors import DataError
 from loopcal.measure.arrays import stored
-from loopcal.measure.nuisance import Known, LocalUnknowns, local_unknowns
+from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
 from loopcal.typing import FloatArray
 
@@ -37,7 +37,7 @@ class Measurements:
         Standard deviation of each reading: 0 is exact, infinite was not taken or is not believed. A
         reading may be NaN exactly where this is infinite. Default None: exact, but where the robot
         states the sigma of its actuators.
-    known : tuple of Known, optional
+    stated_values : tuple of StatedValue, optional
         Priors and fixed values of unknowns that the observations bring with them. Default: all are
         left to the data.
 
@@ -54,7 +54,7 @@ class Measurements:
     block: Ints = field(default_factory=lambda: np.empty(0, dtype=np.intp))
     labels: tuple[str, ...] = ()
     reading_sigma: FloatArray | None = None
-    known: tuple[Known, ...] = ()
+    stated_values: tuple[StatedValue, ...] = ()
 
     def __post_init__(self) -> None:
         readings = _readings(self.readings, self.reading_sigma is not None)
@@ -97,9 +97,9 @@ class Measurements:
         return sum(rows.n_residuals for rows in self.observations)
 
     @property
-    def unknowns(self) -> LocalUnknowns:
+    def nuisance_parameters(self) -> NuisanceParameters:
         """The unknowns that the observations bring with them, with what is known of them."""
-        return local_unknowns(self.observations, self.labels, self.known)
+        return collect_nuisance_parameters(self.observations, self.labels, self.stated_values)
 
     @property
     def context(self) -> Mapping[str, FloatArray]:
@@ -110,7 +110,9 @@ class Measurements:
         for name in dict.fromkeys(name for rows in self.observations for name in rows.context):
             total, count = np.zeros(self.n_poses), np.zeros(self.n_poses)
             for rows in (rows for rows in self.observations if name in rows.context):
-                values = np.broadcast_to(rows.context[name][:, None], (len(rows), rows.kind.links))
+                values = np.broadcast_to(
+                    rows.context[name][:, None], (len(rows), rows.kind.poses_per_row)
+                )
                 there = ~np.isnan(values)
                 np.add.at(total, rows.rows.reshape(values.shape)[there], values[there])
                 np.add.at(count, rows.rows.reshape(values.shape)[there], 1.0)
@@ -192,12 +194,12 @@ class Measurements:
         fit = np.isin(member, order[: int(np.argmin(missed)) + 1])
         return self.take(fit), self.take(~fit)
 
-    def reweighted(self, weight: ArrayLike) -> Self:
+    def with_weights(self, weight: ArrayLike) -> Self:
         """The same measurements with one weight (n,) for each pose; a row that links poses takes
         their product.
 
         Readings that have a sigma are weighted like the rows of their pose: sigma / sqrt(weight).
-        For a weight of each row use `Observations.reweighted`.
+        For a weight of each row use `Observations.with_weights`.
 
         Raises
         ------
@@ -206,11 +208,11 @@ class Measurements:
         """
         given = stored(weight, "the weight of the poses", (self.n_poses,))
         parts = tuple(
-            rows.reweighted(given[rows.rows].reshape(len(rows), -1).prod(axis=1))
+            rows.with_weights(given[rows.rows].reshape(len(rows), -1).prod(axis=1))
             for rows in self.observations
         )
         return replace(
-            self, observations=parts, reading_sigma=weighted_sigma(self.reading_sigma, given)
+            self, observations=parts, reading_sigma=weight_reading_sigma(self.reading_sigma, given)
         )
 
 
@@ -226,7 +228,7 @@ def _readings(readings: ArrayLike, uncertain: bool) -> FloatArray:
         raise
 
 
-def weighted_sigma(sigma: FloatArray | None, weight: FloatArray) -> FloatArray | None:
+def weight_reading_sigma(sigma: FloatArray | None, weight: FloatArray) -> FloatArray | None:
     """Standard deviations (n, a) of readings whose squares count by a weight (n,): infinite for 0;
     exact ones stay exact.
     """
@@ -237,7 +239,7 @@ def weighted_sigma(sigma: FloatArray | None, weight: FloatArray) -> FloatArray |
     return np.where(sigma == 0.0, 0.0, apart)
 
 
-def spread_sigma(sigma: ArrayLike, readings: FloatArray) -> FloatArray:
+def broadcast_reading_sigma(sigma: ArrayLike, readings: FloatArray) -> FloatArray:
     """Standard deviations (n, a) of readings (n, a) from what spreads to them; DataError where that
     does not fit.
     """
@@ -261,7 +263,7 @@ def spread_sigma(sigma: ArrayLike, readings: FloatArray) -> FloatArray:
 
 def _reading_sigma(sigma: ArrayLike, readings: FloatArray, labels: tuple[str, ...]) -> FloatArray:
     """Checked, read-only standard deviations (n, a) of the readings."""
-    spread = spread_sigma(sigma, readings)
+    spread = broadcast_reading_sigma(sigma, readings)
     for wrong, what in (
         (
             ~(spread >= 0.0),

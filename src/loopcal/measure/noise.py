@@ -74,7 +74,7 @@ class Uniform(Noise):
         return generator.uniform(-1.0, 1.0, (n, len(self.limit))) * self.limit
 
 
-def stream(seed: int, trial: int, purpose: int = 0) -> np.random.Generator:
+def make_random_stream(seed: int, trial: int, purpose: int = 0) -> np.random.Generator:
     """Generator of one trial of a study; depends on nothing but these three numbers.
 
     Parameters

@@ -49,7 +49,7 @@ class Labelled(Protocol):
 
 
 @dataclass(frozen=True)
-class Known:
+class StatedValue:
     """What is known beforehand of one unknown that measurements bring with them.
 
     Parameters
@@ -90,7 +90,7 @@ class Known:
 
 
 @dataclass(frozen=True, eq=False)
-class LocalUnknowns:
+class NuisanceParameters:
     """All unknowns that measurements bring with them.
 
     Attributes
@@ -98,19 +98,19 @@ class LocalUnknowns:
     table : ParameterTable
         The U unknowns. A tolerance is a prior; None leaves the unknown to the data alone; fixed
         ones keep their value.
-    places : tuple of (r, u) int
+    indices : tuple of (r, u) int
         For each kind of the measurements, which unknowns its rows use.
     """
 
     table: ParameterTable
-    places: tuple[Ints, ...]
+    indices: tuple[Ints, ...]
 
     def __len__(self) -> int:
         return len(self.table)
 
-    def of(self, kind: int, values: FloatArray) -> FloatArray:
+    def select(self, kind: int, values: FloatArray) -> FloatArray:
         """Values (t, r, u) for the rows of one kind, from those of all unknowns (t, U)."""
-        return values[:, self.places[kind]]
+        return values[:, self.indices[kind]]
 
     def values(self, known: Mapping[str, float] | None = None) -> FloatArray:
         """Values (U,): nominal, or as known by name; DataError for a name that is not there."""
@@ -134,11 +134,11 @@ class LocalUnknowns:
             )
         return self._changed(pattern, tolerance=sd)
 
-    def fixed(self, pattern: str) -> Self:
+    def with_fixed(self, pattern: str) -> Self:
         """The same, with unknowns such as `tracker.r?` kept at their nominal values."""
         return self._changed(pattern, free=False)
 
-    def starting_at(self, values: FloatArray) -> Self:
+    def with_nominal(self, values: FloatArray) -> Self:
         """The same, with other nominal values (U,)."""
         pairs = zip(self.table.entries, np.asarray(values).tolist(), strict=True)
         return replace(
@@ -164,21 +164,21 @@ class LocalUnknowns:
         return self.table.index(name)
 
 
-def local_unknowns(
-    observations: Iterable[Labelled], labels: tuple[str, ...], known: Iterable[Known] = ()
-) -> LocalUnknowns:
+def collect_nuisance_parameters(
+    observations: Iterable[Labelled], labels: tuple[str, ...], known: Iterable[StatedValue] = ()
+) -> NuisanceParameters:
     """Gather the unknowns of measurements.
 
     Parameters
     ----------
     observations : of `Measurements`, or anything with kind, rows, session and group.
     labels : names of the poses.
-    known : what is known of some of them, usually `Measurements.known`; of names that do not occur
+    known : what is known of some of them, usually `Measurements.stated_values`; of names that do not occur
         nothing is said.
 
     Returns
     -------
-    LocalUnknowns
+    NuisanceParameters
 
     Raises
     ------
@@ -191,8 +191,11 @@ def local_unknowns(
     for rows in observations:
         kind = rows.kind
         _agree(references, kind)
-        owners = {scope: _owners(rows, scope, labels) for scope in {p.scope for p in kind.unknowns}}
-        twice = [p.name for p in kind.unknowns]
+        owners = {
+            scope: _owners(rows, scope, labels)
+            for scope in {p.scope for p in kind.nuisance_parameters}
+        }
+        twice = [p.name for p in kind.nuisance_parameters]
         if len(set(twice)) < len(twice):
             again = next(name for name in twice if twice.count(name) > 1)
             raise DataError(
@@ -208,13 +211,13 @@ def local_unknowns(
         used = {key: [order[name] for name in names] for key, names in own.items()}
         places.append(
             np.array([used[key] for key in keys], dtype=np.intp).reshape(
-                len(rows.rows), len(kind.unknowns)
+                len(rows.rows), len(kind.nuisance_parameters)
             )
         )
     for said in known:
         if said.name in entries:
             entries[said.name] = said.applied(entries[said.name])
-    return LocalUnknowns(ParameterTable(tuple(entries.values())), tuple(places))
+    return NuisanceParameters(ParameterTable(tuple(entries.values())), tuple(places))
 
 
 def _owners(rows: Labelled, scope: str, labels: tuple[str, ...]) -> list[str]:
@@ -233,7 +236,8 @@ def _owners(rows: Labelled, scope: str, labels: tuple[str, ...]) -> list[str]:
 def _entered_all(entries: dict[str, Parameter], kind: Kind, owner: Mapping[str, str]) -> list[str]:
     """Enter all unknowns of a kind for the owners of each scope; their full names."""
     return [
-        _entered(entries, parameter, owner[parameter.scope], kind) for parameter in kind.unknowns
+        _entered(entries, parameter, owner[parameter.scope], kind)
+        for parameter in kind.nuisance_parameters
     ]
 
 

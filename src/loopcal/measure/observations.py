@@ -27,13 +27,13 @@ class Observations:
     Parameters
     ----------
     kind : Kind
-        Mounted on the robot's tool, see `Kind.mounted`.
+        Mounted on the robot's tool, see `Kind.with_tool`.
     rows : (r,) int
-        Index of the pose each row saw ((r, links) for kinds that compare several poses).
+        Index of the pose each row saw ((r, l) for kinds that compare several poses).
     measured : (r, c) [SI]
         NaN where not measured.
     covariance : (r, m, m) or (m, m) [SI]
-        Of the residuals, see `from_sigma` and `Kind.noise_map`; entries of absent components are
+        Of the residuals, see `from_sigma` and `Kind.linearize_noise`; entries of absent components are
         not looked at.
     weight : (r,), optional
         Factor of the squared whitened residual; 0 makes a row absent. Default 1.
@@ -72,8 +72,10 @@ class Observations:
 
     def __post_init__(self) -> None:
         kind = self.kind
-        if not kind.is_mounted:
-            raise DataError(f"the kind {kind.name!r} has no tool yet; use kind.mounted(robot.tool)")
+        if not kind.has_tool:
+            raise DataError(
+                f"the kind {kind.name!r} has no tool yet; use kind.with_tool(robot.tool)"
+            )
         rows = indices(self.rows, kind)
         c, m, r = len(kind.columns), len(kind.noise_columns), len(rows)
         measured = stored(
@@ -90,9 +92,9 @@ class Observations:
                 f"the weight of row {i + 1} is {weight[i]:.6g}; use 0 to leave a row out, or a "
                 "positive number"
             )
-        for i, doubt in kind.doubts(measured):
+        for i, doubt in kind.find_invalid_rows(measured):
             raise DataError(f"row {i + 1} of kind {kind.name!r} {doubt}")
-        present = kind.present(measured)
+        present = kind.detect_present(measured)
         covariance = _spread(
             self.covariance, (r, m, m), "covariance", f"({r}, {m}, {m}) or ({m}, {m})"
         )
@@ -150,7 +152,7 @@ class Observations:
         sd = _spread(sigma, shape, "sigma", f"one number, or one for each of {names}")
         if values.ndim != 2 or values.shape[1] != len(kind.columns):
             raise _wrong_columns(kind, values.shape)
-        N = kind.noise_map(values)
+        N = kind.linearize_noise(values)
         covariance = (N * (sd * sd)[:, None, :]) @ np.swapaxes(N, -1, -2)
         return cls(
             kind,
@@ -201,18 +203,18 @@ class Observations:
             context={name: values[chosen] for name, values in self.context.items()},
         )
 
-    def reweighted(self, weight: ArrayLike) -> Self:
+    def with_weights(self, weight: ArrayLike) -> Self:
         """The same rows with other weights (r,)."""
         return replace(self, weight=np.asarray(weight, dtype=float))
 
 
 def indices(rows: ArrayLike, kind: Kind) -> Ints:
-    """Checked copy of the pose indices (r,) or (r, links)."""
+    """Checked copy of the pose indices (r,) or (r, l)."""
     given = np.array(rows)
-    wanted = 1 if kind.links == 1 else 2
+    wanted = 1 if kind.poses_per_row == 1 else 2
     whole = np.issubdtype(given.dtype, np.integer) or given.size == 0
-    if given.ndim != wanted or (wanted == 2 and given.shape[1] != kind.links) or not whole:
-        shape = "(r,)" if wanted == 1 else f"(r, {kind.links})"
+    if given.ndim != wanted or (wanted == 2 and given.shape[1] != kind.poses_per_row) or not whole:
+        shape = "(r,)" if wanted == 1 else f"(r, {kind.poses_per_row})"
         raise DataError(
             f"rows of kind {kind.name!r} have shape {given.shape} and type {given.dtype}; give "
             "whole numbers of shape"

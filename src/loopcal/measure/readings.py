@@ -34,7 +34,7 @@ class Readings(Kind):
     """
 
     name: ClassVar[str] = "readings"
-    said: ClassVar[str] = "the readings of the actuators"
+    description: ClassVar[str] = "the readings of the actuators"
     actuators: Mapping[str, Dimension]
 
     @classmethod
@@ -48,7 +48,7 @@ class Readings(Kind):
         return tuple(Column(name, dimension) for name, dimension in self.actuators.items())
 
     @property
-    def looks_at(self) -> tuple[str, ...]:
+    def sensed_joints(self) -> tuple[str, ...]:
         """The actuators."""
         return tuple(self.actuators)
 
@@ -71,12 +71,12 @@ class Readings(Kind):
         return noise if joints is None else joints + noise
 
 
-def readings_kind(robot: Mechanism) -> Readings:
+def make_readings_kind(robot: Mechanism) -> Readings:
     """The kind of a robot's readings."""
     return Readings({actuator.name: actuator.dimension for actuator in robot.actuators})
 
 
-def believed_sigma(robot: Mechanism, given: FloatArray | None, n: int) -> FloatArray | None:
+def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) -> FloatArray | None:
     """Standard deviations (n, a) [SI] of readings: those given, else those that the robot states;
     None where all are exact.
 
@@ -141,11 +141,11 @@ def _check_sigma(robot: Mechanism, sigma: FloatArray) -> None:
             )
 
 
-def with_stated_sigma(robot: Mechanism, data: Measurements) -> Measurements:
+def fill_in_reading_sigma(robot: Mechanism, data: Measurements) -> Measurements:
     """Measurements that say themselves how far their readings are believed; the same object where
     all are exact.
     """
-    sigma = believed_sigma(robot, data.reading_sigma, data.n_poses)
+    sigma = resolve_reading_sigma(robot, data.reading_sigma, data.n_poses)
     return (
         data if sigma is None or sigma is data.reading_sigma else replace(data, reading_sigma=sigma)
     )

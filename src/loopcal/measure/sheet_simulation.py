@@ -12,7 +12,7 @@ from loopcal.measure.simulation import simulate
 from loopcal.mechanism import Mechanism, forward
 
 
-def fill_in(
+def replace_measured_values(
     robot: Mechanism, data: Measurements, instrument: Instrument, seed: int
 ) -> Measurements:
     """Return measurements with simulated values in place of theirs, at their readings.

@@ -16,15 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from loopcal.engine import State
 from loopcal.errors import DataError
-from loopcal.measure.commanded_poses import solve_commanded
+from loopcal.measure.commanded_poses import solve_commanded_poses
 from loopcal.measure.instrument import Instrument, Sensor
-from loopcal.measure.joint_observation import joint_values, joints_looked_at
+from loopcal.measure.joint_observation import list_sensed_joints, select_joint_values
 from loopcal.measure.kinds import Kind
-from loopcal.measure.measurements import Measurements, spread_sigma
-from loopcal.measure.noise import stream
-from loopcal.measure.nuisance import LocalUnknowns, local_unknowns
+from loopcal.measure.measurements import Measurements, broadcast_reading_sigma
+from loopcal.measure.noise import make_random_stream
+from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
-from loopcal.measure.readings import believed_sigma
+from loopcal.measure.readings import resolve_reading_sigma
 from loopcal.mechanism import Mechanism, Status, forward_trials, solve_at_pose
 from loopcal.typing import BoolArray, FloatArray
 
@@ -54,7 +54,7 @@ class Trials:
         True T_base_platform.
     reached : (t, n) bool
         Poses to which the true machine could follow.
-    local : LocalUnknowns
+    local : NuisanceParameters
         Of the kinds, their true values as nominal ones.
     recorded : (t, n, a) [SI], optional
         What the readings were recorded as, with their noise; None where they are the controller's.
@@ -69,7 +69,7 @@ class Trials:
     truth: FloatArray
     T: FloatArray
     reached: Bools
-    local: LocalUnknowns
+    local: NuisanceParameters
     recorded: FloatArray | None = None
     reading_sigma: FloatArray | None = None
 
@@ -107,7 +107,10 @@ def sample_truth(robot: Mechanism, n_trials: int, seed: int) -> FloatArray:
     """
     table = robot.parameters
     spread = np.where(table.free, np.nan_to_num(table.tolerance, nan=0.0), 0.0)
-    draws = [stream(seed, trial, TRUTH).standard_normal(len(table)) for trial in range(n_trials)]
+    draws = [
+        make_random_stream(seed, trial, TRUTH).standard_normal(len(table))
+        for trial in range(n_trials)
+    ]
     return table.nominal + spread * np.array(draws).reshape(n_trials, len(table))
 
 
@@ -118,7 +121,7 @@ def simulate_trials(
     instrument: Instrument,
     seed: int,
     controller: Mechanism | None = None,
-    unknowns: Mapping[str, float] | None = None,
+    nuisance_values: Mapping[str, float] | None = None,
     reading_sigma: ArrayLike | None = None,
 ) -> Trials:
     """Measure the same commanded poses on t machines.
@@ -136,7 +139,7 @@ def simulate_trials(
         Trial i draws the same noise however many trials there are.
     controller : Mechanism, optional
         The geometry that turns poses into readings; default: the robot at its nominal values.
-    unknowns : name -> value [SI], optional
+    nuisance_values : name -> value [SI], optional
         True values of unknowns of the kinds, such as `tracker.x`; default: nominal.
     reading_sigma : number, (a,) or (n, a) [SI], optional
         Standard deviation of the recorded readings: normal noise on the true ones, at which the
@@ -153,12 +156,14 @@ def simulate_trials(
         If the controller cannot reach a pose, or an unknown is not there.
     """
     values = np.atleast_2d(np.asarray(truth, dtype=float))
-    commanded = solve_commanded(robot.nominal if controller is None else controller, poses)
+    commanded = solve_commanded_poses(robot.nominal if controller is None else controller, poses)
     readings, n = commanded.q, len(commanded.q)
-    mounted = Instrument(tuple(sensor.looking(n) for sensor in instrument.mounted(robot).sensors))
+    mounted = Instrument(
+        tuple(sensor.assign_rows(n) for sensor in instrument.with_tool(robot).sensors)
+    )
     seeing = [_Seeing(s.kind, rows_of(s), s.session, s.group) for s in mounted.sensors]
-    local = local_unknowns(seeing, tuple(str(i + 1) for i in range(n)))
-    local = local.starting_at(local.values(unknowns))
+    local = collect_nuisance_parameters(seeing, tuple(str(i + 1) for i in range(n)))
+    local = local.with_nominal(local.values(nuisance_values))
     # Starting at the commanded pose keeps the true machine in the assembly mode of its controller.
     state = forward_trials(robot, values, readings[None], commanded.state)
     T = np.broadcast_to(state.T, (len(values), *state.T.shape[1:]))
@@ -169,8 +174,12 @@ def simulate_trials(
     true = (
         readings[None] if robot.program.sigma is None else _closing(robot, values, readings, state)
     )
-    joints = joint_values(robot, joints_looked_at(s.kind for s in mounted.sensors), true, state)
-    noise = [_drawn(mounted, stream(seed, trial, NOISE)) for trial in range(len(values))]
+    joints = select_joint_values(
+        robot, list_sensed_joints(s.kind for s in mounted.sensors), true, state
+    )
+    noise = [
+        _drawn(mounted, make_random_stream(seed, trial, NOISE)) for trial in range(len(values))
+    ]
     measured = tuple(
         _seen(k, one, T, reached, joints, noise, local) for k, one in enumerate(seeing)
     )
@@ -186,7 +195,7 @@ def simulate(
     instrument: Instrument,
     seed: int,
     controller: Mechanism | None = None,
-    unknowns: Mapping[str, float] | None = None,
+    nuisance_values: Mapping[str, float] | None = None,
     reading_sigma: ArrayLike | None = None,
 ) -> Measurements:
     """Measure commanded poses on one machine.
@@ -202,7 +211,7 @@ def simulate(
         The result is that of trial 0 of `simulate_trials`.
     controller : Mechanism, optional
         The geometry that turns poses into readings; default: the robot at its nominal values.
-    unknowns : name -> value [SI], optional
+    nuisance_values : name -> value [SI], optional
         True values of unknowns of the kinds; default: nominal.
     reading_sigma : optional
         As for `simulate_trials`.
@@ -217,7 +226,14 @@ def simulate(
         If the controller cannot reach a pose, or the true machine cannot follow the readings.
     """
     trials = simulate_trials(
-        robot, robot.values[None], poses, instrument, seed, controller, unknowns, reading_sigma
+        robot,
+        robot.values[None],
+        poses,
+        instrument,
+        seed,
+        controller,
+        nuisance_values,
+        reading_sigma,
     )
     lost = np.flatnonzero(~trials.reached[0])
     if len(lost):
@@ -246,17 +262,17 @@ def _seen(
     reached: Bools,
     joints: Mapping[str, FloatArray],
     noise: list[list[FloatArray]],
-    local: LocalUnknowns,
+    local: NuisanceParameters,
 ) -> FloatArray:
     """Columns (t, r, c) of sensor k at true poses; NaN where these could not be reached."""
     kind, rows = one.kind, one.rows
     safe = np.where(reached[..., None, None], T, np.eye(4))
     at = (
-        np.stack([joints[name][:, rows] for name in kind.looks_at], axis=-1)
-        if kind.looks_at
+        np.stack([joints[name][:, rows] for name in kind.sensed_joints], axis=-1)
+        if kind.sensed_joints
         else None
     )
-    own = local.of(k, local.table.nominal[None]) if kind.unknowns else None
+    own = local.select(k, local.table.nominal[None]) if kind.nuisance_parameters else None
     seen = kind.measure(safe[:, rows], np.stack([drawn[k] for drawn in noise]), own, at)
     there = np.asarray(np.all(reached[:, rows].reshape(len(reached), len(rows), -1), axis=-1))
     return np.where(there[..., None], seen, np.nan)
@@ -278,21 +294,24 @@ def _recorded(
     """Recorded readings (t, n, a) of true ones (t | 1, n, a), and their sigma (n, a); None, None
     where all are exact.
     """
-    given = None if sigma is None else spread_sigma(sigma, true[0])
-    stated = believed_sigma(robot, given, true.shape[1])
+    given = None if sigma is None else broadcast_reading_sigma(sigma, true[0])
+    stated = resolve_reading_sigma(robot, given, true.shape[1])
     if stated is None:
         return None, given
     draws = np.stack(
-        [stream(seed, trial, READING).standard_normal(stated.shape) for trial in range(trials)]
+        [
+            make_random_stream(seed, trial, READING).standard_normal(stated.shape)
+            for trial in range(trials)
+        ]
     )
     taken = np.isfinite(stated)
     return np.where(taken, true + np.where(taken, stated, 0.0) * draws, np.nan), stated
 
 
 def rows_of(sensor: Sensor) -> Ints:
-    """Rows of a sensor whose rows are spelt out, see `Sensor.looking`."""
+    """Rows of a sensor whose rows are spelt out, see `Sensor.assign_rows`."""
     if sensor.rows is None:
-        raise DataError("the rows of the sensor are not spelt out; use sensor.looking(n_poses)")
+        raise DataError("the rows of the sensor are not spelt out; use sensor.assign_rows(n_poses)")
     return sensor.rows
 
 

@@ -34,7 +34,7 @@ def poses_in_unit(instrument: Instrument) -> int:
     """Return how many poses are measured together; raises DataError for kinds that compare
     different numbers.
     """
-    links = sorted({sensor.kind.links for sensor in instrument.sensors} - {1})
+    links = sorted({sensor.kind.poses_per_row for sensor in instrument.sensors} - {1})
     if len(links) > 1:
         raise DataError(
             f"kinds that compare {links[0]} and {links[1]} poses cannot be planned together; plan "

@@ -27,11 +27,11 @@ from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.outlook import look, scene, without_own
 from loopcal.measure import (
     Instrument,
-    LocalUnknowns,
     Measurements,
+    NuisanceParameters,
     Observations,
-    joints_looked_at,
-    local_unknowns,
+    collect_nuisance_parameters,
+    list_sensed_joints,
 )
 from loopcal.mechanism import Solution
 from loopcal.numerics.decomposition import Decomposition, decompose, empty_factor
@@ -93,7 +93,7 @@ def unit_rows(
     """Return the rows of units at readings (n, a) of the candidates' poses; members (N, k) as of
     `units_of`.
     """
-    mounted = instrument.mounted(free.robot)
+    mounted = instrument.with_tool(free.robot)
     local = _local(mounted, members[:1])
     parts = [
         _block(free, mounted, readings, members[i : i + BLOCK])
@@ -190,16 +190,18 @@ def predicted(free: FreeParameters, solution: Solution, seen: Decomposition) -> 
     return Predicted(kept[:, :3], kept[:, 3:], free.robot.size, motions.frames)
 
 
-def _local(mounted: Instrument, members: IntArray) -> LocalUnknowns:
+def _local(mounted: Instrument, members: IntArray) -> NuisanceParameters:
     """Return the unknowns that the instrument brings with it."""
     looking = _looking(mounted, members)
-    seen = tuple(replace(sensor, rows=rows).looking(members.max() + 1) for sensor, rows in looking)
-    return local_unknowns(seen, tuple(str(i) for i in range(int(members.max()) + 1)))  # pyright: ignore[reportArgumentType]
+    seen = tuple(
+        replace(sensor, rows=rows).assign_rows(members.max() + 1) for sensor, rows in looking
+    )
+    return collect_nuisance_parameters(seen, tuple(str(i) for i in range(int(members.max()) + 1)))  # pyright: ignore[reportArgumentType]
 
 
 def _looking(mounted: Instrument, members: IntArray) -> list[tuple]:
     """Return each sensor with the poses of its rows, unit by unit."""
-    return [(s, members.ravel() if s.kind.links == 1 else members) for s in mounted.sensors]
+    return [(s, members.ravel() if s.kind.poses_per_row == 1 else members) for s in mounted.sensors]
 
 
 def _block(
@@ -208,22 +210,22 @@ def _block(
     """Return the rows (b, r, o + p) of some units."""
     poses, places = np.unique(members, return_inverse=True)
     places = places.reshape(members.shape)
-    at = scene(free, readings[poses], joints_looked_at(sensor.kind for sensor in mounted.sensors))
+    at = scene(free, readings[poses], list_sensed_joints(sensor.kind for sensor in mounted.sensors))
     local = _local(mounted, places)
     parts, useless = [], np.zeros(len(members), dtype=bool)
     for i, (sensor, rows) in enumerate(_looking(mounted, places)):
         kind = sensor.kind
-        own = local.of(i, local.table.nominal[None]) if kind.unknowns else None
+        own = local.select(i, local.table.nominal[None]) if kind.nuisance_parameters else None
         joints = (
-            np.stack([at.joints[name][:, rows] for name in kind.looks_at], axis=-1)
-            if kind.looks_at
+            np.stack([at.joints[name][:, rows] for name in kind.sensed_joints], axis=-1)
+            if kind.sensed_joints
             else None
         )
         measured = kind.measure(
             at.T[:, rows], np.zeros((1, len(rows), len(kind.noise_columns))), own, joints
         )[0]
         # what cannot be measured there, such as the distance of a point from itself
-        doubted = [row for row, _ in kind.doubts(measured)]
+        doubted = [row for row, _ in kind.find_invalid_rows(measured)]
         useless[[row * len(members) // len(rows) for row in doubted]] = True
         measured = np.where(np.isin(np.arange(len(rows)), doubted)[:, None], np.nan, measured)
         parts.append(Observations.from_sigma(kind, rows, measured, sensor.noise.sigma, "", ""))

@@ -239,7 +239,7 @@ def problem(
         if poses is None
         else listed_candidates(robot, poses, constraints)
     )
-    mounted = instrument.mounted(robot)
+    mounted = instrument.with_tool(robot)
     units = considered(free, mounted, found.solution.q, rng)
     told = knowable(free, units)
     if not told.singular_values.max(initial=0.0) > NOTHING:
@@ -277,7 +277,7 @@ def _known(free: FreeParameters, measured: Measurements) -> tuple[FloatArray, in
             "there; correct the readings, "
             "or plan with the calibrated robot file"
         )
-    table = measured.unknowns.table
+    table = measured.nuisance_parameters.table
     own = int((table.free & np.isnan(table.tolerance)).sum())
     return factor[0, :-1, :-1], max(equations(robot, measured) - own, 0)
 

@@ -112,7 +112,7 @@ class SurfacePlan:
                 sensors.append(
                     Sensor(kind, Gaussian(np.full(m, self.sigma)), rows=points.ravel(), group=names)
                 )
-        return Instrument(tuple(sensors)).mounted(self.robot)
+        return Instrument(tuple(sensors)).with_tool(self.robot)
 
     def __str__(self) -> str:
         u, k = self.coordinates.shape[:2]

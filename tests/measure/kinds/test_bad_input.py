@@ -26,7 +26,7 @@ from loopcal.measure import (
     Separation,
     Sphere,
     check_duplicates,
-    check_moved,
+    check_targets_move,
     simulate,
 )
 from tests import zoo
@@ -104,7 +104,7 @@ def test_rows_that_no_instrument_shows(kind, row, sentence):
     good = {"distance": [1.0], "separation": [1.0], "direction": [0.0, 0.0, 1.0]}.get(
         kind.name, [0.0, 0.0]
     )
-    poses = np.arange(2) if kind.links == 1 else np.array([[0, 1], [1, 0]])
+    poses = np.arange(2) if kind.poses_per_row == 1 else np.array([[0, 1], [1, 0]])
     with pytest.raises(DataError, match=sentence):
         Observations.from_sigma(kind, poses, [good, row], 1e-4)
 
@@ -118,9 +118,9 @@ def test_a_row_that_compares_a_pose_with_itself():
 
 @pytest.mark.parametrize("kind", EXAMPLES)
 def test_a_covariance_that_is_not_positive_definite_and_rows_that_repeat(kind):
-    kind = kind.mounted(np.eye(4))
+    kind = kind.with_tool(np.eye(4))
     T = geometry.apply_twist(np.eye(4), np.random.default_rng(0).uniform(-0.4, 0.4, (1, 3, 6)))
-    rows = np.array([0, 1, 1]) if kind.links == 1 else np.array([[0, 1], [1, 2], [1, 2]])
+    rows = np.array([0, 1, 1]) if kind.poses_per_row == 1 else np.array([[0, 1], [1, 2], [1, 2]])
     m = len(kind.noise_columns)
     measured = kind.measure(T[:, rows], np.zeros((1, 3, m)))[0]
     with pytest.raises(DataError, match="the covariance of row 1"):
@@ -139,7 +139,7 @@ def test_a_covariance_that_is_not_positive_definite_and_rows_that_repeat(kind):
 def test_names_may_hold_anything(name):
     kind = Position(targets=(name, "b"), places=np.zeros((2, 3)), unknown=("targets",))
     assert kind.columns[0].name == f"{name}.x"
-    assert kind.unknowns[0].name == f"{name}.x"
+    assert kind.nuisance_parameters[0].name == f"{name}.x"
 
 
 def test_a_target_that_no_pose_moves_is_named():
@@ -148,7 +148,7 @@ def test_a_target_that_no_pose_moves_is_named():
     noise = 1e-5 * np.random.default_rng(1).normal(size=(1, 8, 6))
     measured = kind.measure(T[None], noise)[0]
     readings = np.arange(8.0)[:, None]
-    check_moved(
+    check_targets_move(
         Measurements(
             "toy", readings, (Observations.from_sigma(kind, np.arange(8), measured, 1e-5),)
         ),
@@ -162,21 +162,21 @@ def test_a_target_that_no_pose_moves_is_named():
         DataError,
         match=r"'b' of kind 'position' never moves: its readings stay within .*use --allow-still",
     ):
-        check_moved(data, T, override="--allow-still")
-    check_moved(data, T, allow=True)
+        check_targets_move(data, T, override="--allow-still")
+    check_targets_move(data, T, allow=True)
 
 
 FOLLOWING = [
     kind
     for cls in KINDS.values()
     for kind in cls.examples()[:1]
-    if kind.follows and kind.links == 1
+    if kind.changes_with_pose and kind.poses_per_row == 1
 ]
 
 
 @pytest.mark.parametrize("kind", FOLLOWING, ids=lambda kind: kind.name)
 def test_readings_that_never_move_are_refused_in_every_kind_that_follows_the_robot(kind):
-    kind = kind.mounted(np.eye(4))
+    kind = kind.with_tool(np.eye(4))
     T = zoo.poses_of(
         np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)) + np.array([0, 0, 0, 0.1, 0.1, 0.0])
     )
@@ -189,11 +189,11 @@ def test_readings_that_never_move_are_refused_in_every_kind_that_follows_the_rob
     good, bad = (
         Observations.from_sigma(kind, np.arange(8), values, 1e-6) for values in (true, still)
     )
-    check_moved(Measurements("toy", readings, (good,)), T)
+    check_targets_move(Measurements("toy", readings, (good,)), T)
     with pytest.raises(
         DataError, match=f"of kind '{kind.name}' never moves: its readings stay within"
     ):
-        check_moved(Measurements("toy", readings, (bad,)), T)
+        check_targets_move(Measurements("toy", readings, (bad,)), T)
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
@@ -232,12 +232,12 @@ def test_poses_in_one_plane_are_told_what_they_leave_open_or_refused_in_a_senten
 def test_touched_surfaces_and_joints_may_stay_where_they_are(kind):
     T = zoo.poses_of(np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)))
     rows = Observations.from_sigma(kind, np.arange(8), np.zeros((8, len(kind.columns))), 1e-5)
-    check_moved(Measurements("toy", np.arange(8.0)[:, None], (rows,)), T)
+    check_targets_move(Measurements("toy", np.arange(8.0)[:, None], (rows,)), T)
 
 
 def test_a_sensor_that_is_to_look_at_poses_that_are_not_there():
     kind = Separation(places=POINT)
     with pytest.raises(DataError, match="is to see poses up to 7 of 0 to 3"):
-        Sensor(kind, Gaussian(np.ones(1)), rows=np.array([[0, 7]])).looking(4)
+        Sensor(kind, Gaussian(np.ones(1)), rows=np.array([[0, 7]])).assign_rows(4)
     with pytest.raises(DataError, match="compares poses, but there is 1; give at least 2"):
-        Sensor(kind, Gaussian(np.ones(1))).looking(1)
+        Sensor(kind, Gaussian(np.ones(1))).assign_rows(1)

@@ -19,8 +19,10 @@ INSTANCES = [
     (f"{name}-{i}", kind) for name, cls in KINDS.items() for i, kind in enumerate(cls.examples())
 ]
 EXAMPLES = [pytest.param(kind, id=name) for name, kind in INSTANCES]
-WITH_UNKNOWNS = [pytest.param(kind, id=name) for name, kind in INSTANCES if kind.unknowns]
-WITH_JOINTS = [pytest.param(kind, id=name) for name, kind in INSTANCES if kind.looks_at]
+WITH_UNKNOWNS = [
+    pytest.param(kind, id=name) for name, kind in INSTANCES if kind.nuisance_parameters
+]
+WITH_JOINTS = [pytest.param(kind, id=name) for name, kind in INSTANCES if kind.sensed_joints]
 T_BASE_FRAME = geometry.apply_twist(np.eye(4), np.array([0.5, 0.1, -0.9, 1.1, -0.7, 0.3]))
 T_PLATFORM_TOOL = geometry.apply_twist(np.eye(4), np.array([0.3, -0.5, 0.2, 0.02, -0.05, 0.11]))
 every_kind = pytest.mark.parametrize("kind", EXAMPLES)
@@ -28,7 +30,7 @@ every_kind = pytest.mark.parametrize("kind", EXAMPLES)
 
 def platform_poses(kind, t, r, seed=0, spread=0.4):
     """Random platform poses (t, r, 4, 4), with an axis of links where the kind has them."""
-    shape = (t, r, 6) if kind.links == 1 else (t, r, kind.links, 6)
+    shape = (t, r, 6) if kind.poses_per_row == 1 else (t, r, kind.poses_per_row, 6)
     return geometry.apply_twist(
         np.eye(4), np.random.default_rng(seed).uniform(-spread, spread, shape)
     )
@@ -39,23 +41,23 @@ def placed(kind):
     stated = getattr(kind, "T_base_frame", None)
     if stated is not None and np.array_equal(stated, np.eye(4)):
         kind = dataclasses.replace(kind, T_base_frame=T_BASE_FRAME)
-    return kind.mounted(T_PLATFORM_TOOL)
+    return kind.with_tool(T_PLATFORM_TOOL)
 
 
 def own_unknowns(kind, seed=2):
     """Values of the kind's unknowns (1, 1, u) off their nominal ones, None where it has none."""
-    if not kind.unknowns:
+    if not kind.nuisance_parameters:
         return None
-    return kind.nominal[None, None] + np.random.default_rng(seed).uniform(
-        -0.2, 0.2, (1, 1, len(kind.unknowns))
+    return kind.nominal_values[None, None] + np.random.default_rng(seed).uniform(
+        -0.2, 0.2, (1, 1, len(kind.nuisance_parameters))
     )
 
 
 def joints_of(kind, T, seed=3):
     """Values of the joints that the kind looks at (t, r, j), None where it looks at none."""
-    if not kind.looks_at:
+    if not kind.sensed_joints:
         return None
-    return np.random.default_rng(seed).uniform(-0.5, 0.5, (*T.shape[:2], len(kind.looks_at)))
+    return np.random.default_rng(seed).uniform(-0.5, 0.5, (*T.shape[:2], len(kind.sensed_joints)))
 
 
 def measured_near(kind, T, size, seed=1):
@@ -76,7 +78,7 @@ def test_a_kind_is_registered_under_its_name_and_says_what_its_columns_measure(k
     assert KINDS[kind.name] is type(kind)
     assert len({c.name for c in kind.columns}) == len(kind.columns) > 0
     assert all(isinstance(c.dimension, Dimension) for c in (*kind.columns, *kind.noise_columns))
-    assert all(p.scope in ("machine", "session", "group", "pose") for p in kind.unknowns)
+    assert all(p.scope in ("machine", "session", "group", "pose") for p in kind.nuisance_parameters)
 
 
 @every_kind
@@ -84,15 +86,15 @@ def test_shapes_follow_trials_and_rows(kind):
     kind = placed(kind)
     T = platform_poses(kind, 3, 5)
     measured, _ = measured_near(kind, T, 1e-3)
-    m, links = len(kind.noise_columns), () if kind.links == 1 else (kind.links,)
+    m, links = len(kind.noise_columns), () if kind.poses_per_row == 1 else (kind.poses_per_row,)
     assert measured.shape == (3, 5, len(kind.columns))
-    assert kind.present(measured).shape == (3, 5, m)
-    assert kind.noise_map(measured).shape == (3, 5, m, m)
+    assert kind.detect_present(measured).shape == (3, 5, m)
+    assert kind.linearize_noise(measured).shape == (3, 5, m, m)
     for rows in (measured, measured[:1]):
         result = evaluated(kind, T, rows)
         assert result.residual.shape == (3, 5, m)
         assert result.jacobian.shape == (3, 5, *links, m, 6)
-        assert (result.own is None) == (not kind.unknowns)
+        assert (result.nuisance is None) == (not kind.nuisance_parameters)
 
 
 @every_kind
@@ -112,7 +114,7 @@ def test_the_residual_of_a_noisy_reading_is_the_mapped_noise_with_the_sign_turne
     T = platform_poses(kind, 2, 50)
     measured, noise = measured_near(kind, T, 1e-6)
     residual = evaluated(kind, T, measured).residual
-    expected = -(kind.noise_map(measured) @ noise[..., None])[..., 0]
+    expected = -(kind.linearize_noise(measured) @ noise[..., None])[..., 0]
     assert_allclose(
         residual, expected, atol=1e-11
     )  # [m, rad], the square of the noise times the bend of the angles
@@ -127,14 +129,14 @@ def check_derivatives(kind, error, *, with_jax):
     found = kind.evaluate(T, measured, values, joints)
     parts = (
         [found.jacobian]
-        if kind.links == 1
-        else [found.jacobian[:, :, link] for link in range(kind.links)]
+        if kind.poses_per_row == 1
+        else [found.jacobian[:, :, link] for link in range(kind.poses_per_row)]
     )
-    if kind.looks_at:  # differences of nothing prove nothing
+    if kind.sensed_joints:  # differences of nothing prove nothing
         assert not found.jacobian.any()
         parts = []
     n = 6 * len(parts)
-    shape = (6,) if kind.links == 1 else (kind.links, 6)
+    shape = (6,) if kind.poses_per_row == 1 else (kind.poses_per_row, 6)
 
     def residual(x):
         moved = (
@@ -144,8 +146,8 @@ def check_derivatives(kind, error, *, with_jax):
             moved, measured, None if values is None else values + x[n:], joints
         ).residual
 
-    if found.own is not None:
-        parts.append(found.own)
+    if found.nuisance is not None:
+        parts.append(found.nuisance)
     if parts:
         jacobian = np.concatenate(parts, axis=-1)
         reason = "[rad] per 0.05 rad, rounding of angles near small tilt"
@@ -184,7 +186,7 @@ def test_the_jacobian_by_the_joints_agrees_with_differences(kind):
     def residual(x):
         return kind.evaluate(T, measured, own_unknowns(kind), joints + x).residual
 
-    check_jacobian(residual, found, np.zeros(len(kind.looks_at)), scale=0.05, atol=1e-13)
+    check_jacobian(residual, found, np.zeros(len(kind.sensed_joints)), scale=0.05, atol=1e-13)
     with pytest.raises(DataError, match="needs the values of"):
         kind.evaluate(T, measured, own_unknowns(kind))
 
@@ -194,7 +196,9 @@ def test_unknowns_may_differ_from_row_to_row_and_from_trial_to_trial(kind):
     kind = placed(kind)
     T = platform_poses(kind, 2, 3)
     joints = joints_of(kind, T)
-    values = kind.nominal + np.random.default_rng(8).uniform(-0.1, 0.1, (2, 3, len(kind.unknowns)))
+    values = kind.nominal_values + np.random.default_rng(8).uniform(
+        -0.1, 0.1, (2, 3, len(kind.nuisance_parameters))
+    )
     measured = kind.measure(T, np.zeros((2, 3, len(kind.noise_columns))), values, joints)
     together = kind.evaluate(T, measured, own_unknowns(kind), joints)
     assert_allclose(kind.evaluate(T, measured, values, joints).residual, 0.0, atol=1e-13)
@@ -218,12 +222,12 @@ def test_components_not_measured_are_zero_and_leave_the_others_as_they_were(kind
     for column in range(len(kind.columns)):
         holed = measured.copy()
         holed[:, ::2, column] = np.nan
-        present = kind.present(holed)
+        present = kind.detect_present(holed)
         part = evaluated(kind, T, holed)
         assert not present[:, ::2].all()
         assert present[:, 1::2].all()
         assert_allclose(part.residual[~present], 0.0, atol=0.0)
-        absent = ~present[..., None] if kind.links == 1 else ~present[..., None, :, None]
+        absent = ~present[..., None] if kind.poses_per_row == 1 else ~present[..., None, :, None]
         assert_allclose(part.jacobian[np.broadcast_to(absent, part.jacobian.shape)], 0.0, atol=0.0)
         assert_allclose(part.residual[:, 1::2], whole.residual[:, 1::2], atol=0.0)
         assert np.isfinite(part.residual).all()
@@ -250,19 +254,19 @@ def test_rows_do_not_depend_on_their_batch(kind):
 
 @every_kind
 def test_a_kind_that_needs_a_tool_says_so_and_keeps_its_own(kind):
-    if kind.is_mounted:
-        assert kind.mounted(T_PLATFORM_TOOL) is kind
+    if kind.has_tool:
+        assert kind.with_tool(T_PLATFORM_TOOL) is kind
         return
-    with pytest.raises(DataError, match=r"use kind\.mounted\(robot\.tool\)"):
+    with pytest.raises(DataError, match=r"use kind\.with_tool\(robot\.tool\)"):
         Observations(
             kind, np.array([0]), np.zeros((1, len(kind.columns))), np.eye(len(kind.noise_columns))
         )
-    once = kind.mounted(T_PLATFORM_TOOL)
-    assert once.is_mounted
-    assert once.mounted(np.eye(4)) is once
+    once = kind.with_tool(T_PLATFORM_TOOL)
+    assert once.has_tool
+    assert once.with_tool(np.eye(4)) is once
 
 
 @every_kind
 def test_nothing_the_kind_stores_can_be_changed(kind):
-    for value in vars(kind.mounted(T_PLATFORM_TOOL)).values():
+    for value in vars(kind.with_tool(T_PLATFORM_TOOL)).values():
         assert not isinstance(value, np.ndarray) or not value.flags.writeable

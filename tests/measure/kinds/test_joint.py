@@ -13,7 +13,7 @@ from loopcal.measure import (
     Locked,
     Sensor,
     evaluate_all,
-    joint_values,
+    select_joint_values,
     simulate,
     whitened_rows,
 )
@@ -36,7 +36,7 @@ def robot():
 def test_a_sensor_on_a_passive_joint_shows_its_value_and_the_offset(robot):
     kind = JointSensor(joints=("limb2.pin", "limb1.pin"), measures="angle", unknown=("offset",))
     data = simulate(
-        robot, COMMANDED, Instrument((sensor(kind),)), 1, unknowns={"limb1.pin.joint": 0.1}
+        robot, COMMANDED, Instrument((sensor(kind),)), 1, nuisance_values={"limb1.pin.joint": 0.1}
     )
     solution = inverse(robot, COMMANDED)
     expected = [solution.passive[:, solution.passive_names.index(name)] for name in kind.joints]
@@ -58,7 +58,7 @@ def test_a_lock_holds_at_a_constant_of_its_group(robot):
         COMMANDED,
         Instrument((sensor(kind, group=groups),)),
         1,
-        unknowns={"a.q1.locked": 0.2},
+        nuisance_values={"a.q1.locked": 0.2},
     )
     slip = data.readings[:, 0] - np.repeat([0.2, 0.0], 4)
     assert_allclose(data.observations[0].measured[:, 0], slip, atol=1e-8)
@@ -68,14 +68,14 @@ def test_rows_of_joints_follow_the_joints(robot):
     kind = JointSensor(joints=("limb1.pin", "q2"), measures="angle")
     data = simulate(robot, COMMANDED, Instrument((sensor(kind),)), 1)
     state = forward_trials(robot, robot.values[None], data.readings[None])
-    values = joint_values(robot, kind.looks_at, data.readings[None], state)
-    slopes = {name: np.random.default_rng(5).normal(size=(1, 8, 4)) for name in kind.looks_at}
+    values = select_joint_values(robot, kind.sensed_joints, data.readings[None], state)
+    slopes = {name: np.random.default_rng(5).normal(size=(1, 8, 4)) for name in kind.sensed_joints}
     parts = evaluate_all(data, state.T, np.zeros((1, 0)), joints=values)
     rows = whitened_rows(parts, np.ones((1, 8, 6, 4)), slopes)
     assert rows.shape == (1, 16, 5)
     assert_allclose(
         rows[0, :, :4] * TINY,
-        np.stack([slopes[n][0] for n in kind.looks_at], axis=1).reshape(16, 4),
+        np.stack([slopes[n][0] for n in kind.sensed_joints], axis=1).reshape(16, 4),
         rtol=1e-12,
     )
     with pytest.raises(DataError, match=r"needs the values of joint 'limb1\.pin'"):

@@ -48,7 +48,11 @@ def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
     poses = table.text("pose") if "pose" in table.units else tuple(map(str, range(len(table.rows))))
     apart = len({frozenset(poses[row] for row in sensor.rows) for sensor in found}) > 1
     for sensor in found:
-        own = [parameter.name for parameter in sensor.kind.unknowns if parameter.scope == "group"]
+        own = [
+            parameter.name
+            for parameter in sensor.kind.nuisance_parameters
+            if parameter.scope == "group"
+        ]
         if own and (apart or len({groups[row] for row in sensor.rows}) > 1):
             surfaces = sensor.kind.name in ("plane", "line")
             remedy = (

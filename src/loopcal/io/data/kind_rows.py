@@ -118,7 +118,7 @@ def read_observations(
     chosen = _seen(table, sensor, members)
     measured, covariance = _values(table, robot, chosen)
     seen = np.array([members[row] for row in chosen.rows], dtype=np.intp).reshape(
-        -1, chosen.kind.links
+        -1, chosen.kind.poses_per_row
     )
     beside = {}
     for name in dict.fromkeys([*context, *of_poses]):
@@ -133,7 +133,7 @@ def read_observations(
     try:
         found = Observations(
             chosen.kind,
-            seen[:, 0] if chosen.kind.links == 1 else seen,
+            seen[:, 0] if chosen.kind.poses_per_row == 1 else seen,
             measured,
             covariance,
             session=_texts(table, "session", chosen.rows),
@@ -152,7 +152,7 @@ def _sensors(table: Table, robot: Mechanism) -> tuple[Sensor, ...]:
     file = table.settings
     content, several = file.content, file.content.get("kinds")
     if several is None:
-        kind = read_kind(file, content, ()).mounted(robot.tool)
+        kind = read_kind(file, content, ()).with_tool(robot.tool)
         refuse_unknown_keys(file, list(content), [*SETTINGS, *list_kind_settings(type(kind))])
         return (Sensor(kind, read_noise(file, content, kind, ()), np.arange(len(table.rows)), ()),)
     refuse_unknown_keys(
@@ -175,7 +175,7 @@ def _sensors(table: Table, robot: Mechanism) -> tuple[Sensor, ...]:
             )
     for label, node in several.items():
         location = ("kinds", label)
-        kind = read_kind(file, node, location).mounted(robot.tool)
+        kind = read_kind(file, node, location).with_tool(robot.tool)
         refuse_unknown_keys(
             file, list(node), ["kind", "noise", *list_kind_settings(type(kind))], location
         )
@@ -225,7 +225,7 @@ def _seen(table: Table, sensor: Sensor, members: Sequence[tuple[int, ...]]) -> S
     """Return the sensor with those of its rows that measure: for a kind that compares poses, not
     those that name one.
     """
-    links = sensor.kind.links
+    links = sensor.kind.poses_per_row
     if links > 1 and "kind" not in table.units:
         sensor = replace(sensor, rows=sensor.rows[[len(members[row]) > 1 for row in sensor.rows]])
     for row in sensor.rows:
@@ -246,7 +246,7 @@ def _values(table: Table, robot: Mechanism, sensor: Sensor) -> tuple[np.ndarray,
     measured = np.column_stack(
         [table.numbers(name, dimension) for name, dimension in columns.items()]
     )[rows]
-    for i, doubt in kind.doubts(measured):
+    for i, doubt in kind.find_invalid_rows(measured):
         raise table.row_error(int(rows[i]), f"this row {doubt}")
     # where the noise columns are the measured ones, what was not measured needs no sigma
     absent = (
@@ -267,7 +267,7 @@ def _values(table: Table, robot: Mechanism, sensor: Sensor) -> tuple[np.ndarray,
                 covariance[:, a, b] = covariance[:, b, a] = _products(table, name, left, right)[
                     rows
                 ]
-    N = kind.noise_map(measured)
+    N = kind.linearize_noise(measured)
     return measured, N @ covariance @ np.swapaxes(N, -1, -2)
 
 

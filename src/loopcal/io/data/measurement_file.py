@@ -236,7 +236,10 @@ def _context_of_poses(
     found: dict[str, np.ndarray] = {}
     for table, own, seen, context in zip(tables, sensors, members, beside, strict=True):
         measuring = {
-            int(row) for sensor in own for row in sensor.rows if len(seen[row]) == sensor.kind.links
+            int(row)
+            for sensor in own
+            for row in sensor.rows
+            if len(seen[row]) == sensor.kind.poses_per_row
         }
         for name, values in context.items():
             for row, poses in enumerate(seen):

@@ -92,10 +92,15 @@ def format_measurements(data: Measurements, robot: Mechanism, remark: str = "") 
     parts = [_Part(name, rows, robot) for name, rows in zip(names, data.observations, strict=True)]
     _refuse_names(data)
     readings = _Readings(data, robot)
-    told = {int(pose[0]) for part in parts if part.rows.kind.links == 1 for pose, _ in part.cells()}
+    told = {
+        int(pose[0])
+        for part in parts
+        if part.rows.kind.poses_per_row == 1
+        for pose, _ in part.cells()
+    }
     untold = [pose for pose in range(data.n_poses) if pose not in told]
     lines = _settings(robot, [(part.label, part.rows.kind, part.common) for part in parts], remark)
-    known = known_text(data.known, data.unknowns.table.entries)
+    known = known_text(data.stated_values, data.nuisance_parameters.table.entries)
     lines += [
         f"# {key}: {text}"
         for key, text in (("unknowns", known), ("reading_noise", readings.common))
@@ -139,7 +144,10 @@ def format_template(robot: Mechanism, instrument: Instrument) -> str:
     sensors = _stated(instrument)
     units = {a.name: _unit(robot, a.dimension)[0] for a in robot.actuators}
     compared = [
-        line.format(label) for label, kind, _ in sensors if kind.links > 1 for line in COMPARED
+        line.format(label)
+        for label, kind, _ in sensors
+        if kind.poses_per_row > 1
+        for line in COMPARED
     ]
     header = ",".join(_template_columns(robot, sensors, units))
     return "\n".join([*_settings(robot, sensors, ""), header, *ADDED, *compared]) + "\n"
@@ -171,8 +179,8 @@ def format_data_sheet(
 
     from loopcal.measure import Measurements, Observations
 
-    mounted = instrument.mounted(robot)
-    looks = [sensor.looking(len(np.asarray(readings))) for sensor in mounted.sensors]
+    mounted = instrument.with_tool(robot)
+    looks = [sensor.assign_rows(len(np.asarray(readings))) for sensor in mounted.sensors]
     empty = [
         np.full((len(one.rows if one.rows is not None else ()), len(one.kind.columns)), np.nan)
         for one in looks
@@ -310,7 +318,7 @@ class _Part:
         self.label, self.rows = label, rows
         self.names = [measured_name(column.name, robot) for column in rows.kind.columns]
         self.noise = [measured_name(column.name, robot) for column in rows.kind.noise_columns]
-        N = rows.kind.noise_map(rows.measured)
+        N = rows.kind.linearize_noise(rows.measured)
         half = np.linalg.solve(N, rows.covariance)
         self.covariance = np.linalg.solve(N, np.swapaxes(half, -1, -2))
         self.sigma = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))

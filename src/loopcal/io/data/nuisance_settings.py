@@ -26,7 +26,7 @@ from loopcal.io.data.kind_settings import SYMBOLS, quantity_text
 from loopcal.units import Dimension, parse_quantity
 
 if TYPE_CHECKING:
-    from loopcal.measure import Known, Observations
+    from loopcal.measure import Observations, StatedValue
     from loopcal.parameters import Parameter
 
 KEY, FIXED = "unknowns", "fixed"
@@ -34,7 +34,7 @@ KEY, FIXED = "unknowns", "fixed"
 
 def read_known(
     files: Sequence[tuple[YamlFile, Sequence[Observations]]], labels: tuple[str, ...]
-) -> tuple[Known, ...]:
+) -> tuple[StatedValue, ...]:
     """Return what files say of the unknowns of their own rows.
 
     Parameters
@@ -49,9 +49,9 @@ def read_known(
     DataError
         Two kinds of a file state one unknown differently.
     """
-    from loopcal.measure import local_unknowns
+    from loopcal.measure import collect_nuisance_parameters
 
-    found: dict[str, tuple[Known, YamlFile, Location]] = {}
+    found: dict[str, tuple[StatedValue, YamlFile, Location]] = {}
     for file, observations in files:
         stated = file.content.get(KEY, {})
         if not isinstance(stated, dict):
@@ -59,8 +59,8 @@ def read_known(
                 f"{KEY!r} must name unknowns, as {KEY}: {{tracker.x: {{sd: 1 mm}}}}; correct it",
                 (KEY,),
             )
-        own: dict[str, tuple[Known, YamlFile, Location]] = {}
-        entries = local_unknowns(observations, labels).table.entries if stated else ()
+        own: dict[str, tuple[StatedValue, YamlFile, Location]] = {}
+        entries = collect_nuisance_parameters(observations, labels).table.entries if stated else ()
         for pattern, node in stated.items():
             place = (KEY, pattern)
             own |= {
@@ -79,7 +79,7 @@ def read_known(
     return tuple(known for known, _, _ in found.values())
 
 
-def known_text(known: Sequence[Known], entries: Sequence[Parameter]) -> str:
+def known_text(known: Sequence[StatedValue], entries: Sequence[Parameter]) -> str:
     """Return the setting as text that `read_known` reads; names that are not among the entries are
     left out.
     """
@@ -114,12 +114,14 @@ def _meant(file: YamlFile, entries: Sequence[Parameter], pattern: str) -> list[P
     return meant
 
 
-def _known(file: YamlFile, node: Any, meant: Sequence[Parameter], place: Location) -> list[Known]:
+def _known(
+    file: YamlFile, node: Any, meant: Sequence[Parameter], place: Location
+) -> list[StatedValue]:
     """Return what a statement says of each unknown that it means."""
-    from loopcal.measure import Known
+    from loopcal.measure import StatedValue
 
     if node == FIXED:
-        return [Known(entry.name) for entry in meant]
+        return [StatedValue(entry.name) for entry in meant]
     example = f"write '{FIXED}', {{sd: 1 mm}}, {{start: 12 mm, sd: 1 mm}} or {{start: 12 mm, {FIXED}: true}}"
     if not isinstance(node, dict):
         raise file.error(f"this says {node!r} of an unknown; {example}", place)
@@ -146,7 +148,8 @@ def _known(file: YamlFile, node: Any, meant: Sequence[Parameter], place: Locatio
             (*place, "sd"),
         )
     return [
-        Known(entry.name, 0.0 if fixed else values["sd"], values.get("start")) for entry in meant
+        StatedValue(entry.name, 0.0 if fixed else values["sd"], values.get("start"))
+        for entry in meant
     ]
 
 

@@ -268,12 +268,12 @@ def _from_commanded(
     """
     import numpy as np
 
-    from loopcal.measure import readings_from_commanded
+    from loopcal.measure import solve_commanded_readings
 
     readings = np.full((len(rows), len(robot.actuators)), np.nan)
     try:
         if first:
-            readings[list(first)] = readings_from_commanded(
+            readings[list(first)] = solve_commanded_readings(
                 controller, rows[list(first)], tuple(first.values())
             )
     except DataError as error:

@@ -290,7 +290,7 @@ def _measurements(samples: Samples, reading: ImportOptions) -> Measurements:
     from loopcal.measure import Measurements, Observations
     from loopcal.measure.kinds.position import Position
 
-    kind = Position().mounted(np.eye(4))
+    kind = Position().with_tool(np.eye(4))
     known = (
         samples.known * MM
         if len(samples.known)

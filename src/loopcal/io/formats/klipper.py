@@ -205,12 +205,12 @@ def _measurements(probes: _Probes, steps: list[float], reading: ImportOptions) -
     readings = np.array([probes.positions[label] for label in labels]) * np.array(steps) * 1e-3
     observations = []
     if probes.heights:
-        kind = Component(components=("z",)).mounted(np.eye(4))
+        kind = Component(components=("z",)).with_tool(np.eye(4))
         rows = [labels.index(label) for label, _ in probes.heights]
         measured = np.array([[value * 1e-3] for _, value in probes.heights])
         observations.append(Observations.from_sigma(kind, rows, measured, reading.sigma_height))
     if probes.distances:
-        kind = Separation().mounted(np.eye(4))
+        kind = Separation().with_tool(np.eye(4))
         pairs = [(labels.index(one), labels.index(two)) for one, two, _ in probes.distances]
         measured = np.array([[value * 1e-3] for *_, value in probes.distances])
         observations.append(Observations.from_sigma(kind, pairs, measured, reading.sigma_distance))

@@ -78,7 +78,7 @@ def format_sheet(plan: Plan) -> str:
 def format_plan_data(plan: Plan) -> str:
     """Return the data file to fill in."""
     sensors = plan.instrument.sensors
-    looking = tuple(replace(s, rows=plan.units) if s.kind.links > 1 else s for s in sensors)
+    looking = tuple(replace(s, rows=plan.units) if s.kind.poses_per_row > 1 else s for s in sensors)
     factors = [unit_of(plan.robot, actuator.dimension)[1] for actuator in plan.robot.actuators]
     # the doubles that the texts of the sheet stand for, so that both files say the same digits
     readings = [[exact(_text(q, f), f) for q, f in zip(row, factors, strict=True)] for row in plan.readings.tolist()]

@@ -32,13 +32,13 @@ class AimKind(Kind):
     Parameters
     ----------
     unknown : tuple of str
-        Which of `possible`, (orientation, direction), are unknown; three and two numbers, one value
+        Which of `allowed_unknown`, (orientation, direction), are unknown; three and two numbers, one value
         for a session.
     """
 
     unknown: tuple[str, ...] = ()
 
-    possible: ClassVar[tuple[str, str]] = ("frame", "axis")
+    allowed_unknown: ClassVar[tuple[str, str]] = ("frame", "axis")
     inward: ClassVar[bool] = False
 
     @property
@@ -47,12 +47,12 @@ class AimKind(Kind):
         """Name and rotation (3, 3) of the orientation, name and unit vector (3,) of the direction."""
 
     @property
-    def parts(self) -> Mapping[str, tuple[Parameter, ...]]:
+    def setup_items(self) -> Mapping[str, tuple[Parameter, ...]]:
         """Turns of the orientation and of the direction, as far as they are unknown."""
         turned, _, pointed, _ = self.stated
         both = {
-            self.possible[0]: parts.turn_part(turned),
-            self.possible[1]: parts.direction_part(pointed),
+            self.allowed_unknown[0]: parts.turn_part(turned),
+            self.allowed_unknown[1]: parts.direction_part(pointed),
         }
         return {name: both[name] for name in self.unknown}
 
@@ -60,13 +60,13 @@ class AimKind(Kind):
     def references(self) -> Mapping[str, FloatArray]:
         """The stated orientation and direction."""
         turned, S, pointed, a = self.stated
-        both = {self.possible[0]: (turned, S), self.possible[1]: (pointed, a)}
+        both = {self.allowed_unknown[0]: (turned, S), self.allowed_unknown[1]: (pointed, a)}
         return dict(both[name] for name in self.unknown)
 
     def direction(self, T: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The direction d (.., 3) and its derivative (.., 3, 6 + u)."""
         _, S, _, a = self.stated
-        turn, point = (self.part(values, name) for name in self.possible)
+        turn, point = (self.item_values(values, name) for name in self.allowed_unknown)
         R = T[..., :3, :3]
         Q = np.swapaxes(R, -1, -2) if self.inward else R
         if turn is not None:
@@ -78,9 +78,11 @@ class AimKind(Kind):
         by_omega = St @ by_omega
         blocks = {"twist": np.concatenate([by_omega, np.zeros_like(by_omega)], axis=-1)}
         if turn is not None:
-            blocks[self.possible[0]] = St @ geometry.hat(seen) @ geometry.left_jacobian_so3(turn)
+            blocks[self.allowed_unknown[0]] = (
+                St @ geometry.hat(seen) @ geometry.left_jacobian_so3(turn)
+            )
         if point is not None:
-            blocks[self.possible[1]] = St @ Q @ parts.direction_slope(self.stated[3], point)
+            blocks[self.allowed_unknown[1]] = St @ Q @ parts.direction_slope(self.stated[3], point)
         d = (St @ seen[..., None])[..., 0]
         return d, self.columns_of(blocks, d.shape)
 
@@ -109,11 +111,11 @@ class AimKind(Kind):
         """Columns (t, r, c) with noise added."""
         return self.predict(self.direction(T, self.values(unknowns))[0])[0] + noise
 
-    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Orientation and direction in closed form, from the whole group of rotations."""
         whole = ~np.any(np.isnan(measured), axis=-1)
         if not self.unknown or np.count_nonzero(whole) < 3:
-            return self.nominal[None]
+            return self.nominal_values[None]
         _, S, _, a = self.stated
         Q = T[whole, :3, :3]
         if self.inward:
@@ -128,14 +130,14 @@ class AimKind(Kind):
 
     def _found(self, Q: FloatArray, S: FloatArray, a: FloatArray, seen: FloatArray) -> FloatArray:
         """Candidates (k, u) from directions seen (r, 3)."""
-        turned, pointed = (name in self.unknown for name in self.possible)
+        turned, pointed = (name in self.unknown for name in self.allowed_unknown)
         if turned:
             turns, points = directions(seen, Q, None if pointed else a)
         else:
             mean = np.einsum("rji,jk,rk->i", Q, S, seen)
             turns, points = S[None], (mean / np.linalg.norm(mean))[None]
         found = {
-            self.possible[0]: parts.turn_values(S, turns),
-            self.possible[1]: parts.direction_values(a, points),
+            self.allowed_unknown[0]: parts.turn_values(S, turns),
+            self.allowed_unknown[1]: parts.direction_values(a, points),
         }
         return stacked(self, found, len(turns))

@@ -51,14 +51,14 @@ class Autocollimation(AimKind):
     frame: str = "frame"
 
     name: ClassVar[str] = "autocollimation"
-    possible: ClassVar[tuple[str, str]] = ("frame", "mirror")
+    allowed_unknown: ClassVar[tuple[str, str]] = ("frame", "mirror")
 
     def __post_init__(self) -> None:
         object.__setattr__(
             self, "normal", stored_direction(self.normal, "the normal of the mirror")
         )
         object.__setattr__(self, "T_base_frame", stored_pose(self.T_base_frame, "T_base_frame"))
-        object.__setattr__(self, "unknown", chosen(self.unknown, self.possible, self.name))
+        object.__setattr__(self, "unknown", chosen(self.unknown, self.allowed_unknown, self.name))
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
@@ -92,7 +92,7 @@ class Autocollimation(AimKind):
         d = np.stack([x, y, np.ones_like(x)], axis=-1)
         return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
-    def doubts(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
+    def find_invalid_rows(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
         """Rows whose mirror is turned away."""
         with np.errstate(invalid="ignore"):
             away = np.argwhere(np.abs(measured) >= np.pi / 2)

@@ -101,10 +101,10 @@ class Bearing(TargetKind):
             [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1
         )
 
-    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """The station by resection, targets where they are stated."""
         _, _, points, seen = points_of(self, T, measured)
         if "frame" not in self.unknown or len(seen) < 4:
-            return self.nominal[None]
+            return self.nominal_values[None]
         frames = resection(self.rays(seen), points)
         return stacked(self, {"frame": parts.frame_values(self.T_base_frame, frames)}, len(frames))

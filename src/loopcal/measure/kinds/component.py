@@ -126,7 +126,7 @@ class Component(ToolKind):
             for name in self.components
         )
 
-    def doubts(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
+    def find_invalid_rows(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
         """Rows whose Euler angles are at the point where the first and the last turn are one."""
         if self.form is None or "b" not in self.components:
             return ()
@@ -146,7 +146,7 @@ class Component(ToolKind):
         )
 
     @property
-    def neutral(self) -> FloatArray:
+    def placeholder(self) -> FloatArray:
         """NaN, which each component sorts out for itself."""
         return np.full(len(self.components), np.nan)
 
@@ -188,7 +188,7 @@ class Component(ToolKind):
         noisy = np.where(flat[..., None] & (places == theta), tilt[..., None], noisy)
         return np.where(flat[..., None] & (places == phi), azimuth[..., None], noisy)
 
-    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """The frame from positions, where all three are measured; else in 24 orientations."""
         whole = ~np.any(np.isnan(measured), axis=-1)
         if (
@@ -196,7 +196,7 @@ class Component(ToolKind):
             or not set(POSITION) <= set(self.components)
             or np.count_nonzero(whole) < 3
         ):
-            return super().starts(T, measured)
+            return super().guess_values(T, measured)
         point = (T @ self._tool())[whole, :3, 3]
         seen = measured[whole][:, [self.components.index(name) for name in POSITION]]
         return parts.frame_values(self.T_base_frame, kabsch(seen, point))[None]

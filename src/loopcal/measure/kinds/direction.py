@@ -56,7 +56,7 @@ class Direction(AimKind):
     def __post_init__(self) -> None:
         object.__setattr__(self, "axis", stored_direction(self.axis, "the axis"))
         object.__setattr__(self, "T_base_frame", stored_pose(self.T_base_frame, "T_base_frame"))
-        object.__setattr__(self, "unknown", chosen(self.unknown, self.possible, self.name))
+        object.__setattr__(self, "unknown", chosen(self.unknown, self.allowed_unknown, self.name))
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
@@ -87,15 +87,15 @@ class Direction(AimKind):
         return self.frame, self.T_base_frame[:3, :3], self.axis_name, self.axis
 
     @property
-    def neutral(self) -> FloatArray:
+    def placeholder(self) -> FloatArray:
         """A direction that stands where none was measured."""
         return np.array([0.0, 0.0, 1.0])
 
-    def present(self, measured: FloatArray) -> Bools:
+    def detect_present(self, measured: FloatArray) -> Bools:
         """Both residuals, or none where a component is missing."""
         return np.repeat(~np.any(np.isnan(measured), axis=-1, keepdims=True), 2, axis=-1)
 
-    def doubts(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
+    def find_invalid_rows(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
         """Rows with a part of a direction, or one that is not of length one."""
         length = np.linalg.norm(measured, axis=-1)
         missing = np.isnan(measured)
@@ -123,7 +123,7 @@ class Direction(AimKind):
         # a row with a missing component has no direction at all
         d, rows = self.direction(T, values)
         length = np.sqrt(np.sum(measured * measured, axis=-1, keepdims=True))
-        m = np.where(length > 0.5, measured / np.where(length > 0.5, length, 1.0), self.neutral)
+        m = np.where(length > 0.5, measured / np.where(length > 0.5, length, 1.0), self.placeholder)
         Bt = np.swapaxes(parts.across(m), -1, -2)
         facing = 1.0 + np.sum(m * d, axis=-1, keepdims=True)
         half = 2.0 / np.where(facing > 1e-9, facing, 1e-9)

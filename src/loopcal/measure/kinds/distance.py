@@ -45,7 +45,7 @@ class Distance(TargetKind):
 
     name: ClassVar[str] = "distance"
     per_target: ClassVar[tuple[Column, ...]] = (Column("distance", Dimension.LENGTH),)
-    possible: ClassVar[tuple[str, ...]] = ("anchor", "targets", "offset")
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("anchor", "targets", "offset")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,7 +62,7 @@ class Distance(TargetKind):
             cls(targets=("a", "b"), places=pair, anchor=far, unknown=("targets", "anchor")),
         )
 
-    def own_part(self, name: str) -> tuple[Parameter, ...]:
+    def own_item(self, name: str) -> tuple[Parameter, ...]:
         """Three unknowns of the fixed point, one of the offset."""
         return (
             parts.point_part(self.anchor_name, self.anchor)
@@ -74,7 +74,7 @@ class Distance(TargetKind):
         self, x: FloatArray, values: FloatArray
     ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
         """Distances (.., k, 1) and unit vectors."""
-        own = self.part(values, "anchor")
+        own = self.item_values(values, "anchor")
         offset, blocks = offset_of(self, values)
         reach = x - (self.anchor if own is None else own[..., None, :])
         length, unit = length_of(reach)
@@ -83,11 +83,11 @@ class Distance(TargetKind):
             blocks["anchor"] = -unit
         return length + offset, unit, blocks
 
-    def doubts(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
+    def find_invalid_rows(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
         """Rows with a distance that is none."""
         return not_above_zero(measured)
 
-    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """The fixed point by trilateration, targets where they are stated.
 
         Raises
@@ -98,7 +98,7 @@ class Distance(TargetKind):
         """
         _, _, points, seen = points_of(self, T, measured)
         if "anchor" not in self.unknown or len(seen) < 4:
-            return self.nominal[None]
+            return self.nominal_values[None]
         inside = (points - self.T_base_frame[:3, 3]) @ self.T_base_frame[:3, :3]
         with_offset = "offset" in self.unknown
         found = [

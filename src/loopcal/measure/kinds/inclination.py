@@ -44,7 +44,7 @@ class Inclination(AimKind):
     sensor: str = "inclinometer"
 
     name: ClassVar[str] = "inclination"
-    possible: ClassVar[tuple[str, str]] = ("mounting", "gravity")
+    allowed_unknown: ClassVar[tuple[str, str]] = ("mounting", "gravity")
     inward: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -52,7 +52,7 @@ class Inclination(AimKind):
         object.__setattr__(
             self, "T_platform_sensor", stored_pose(self.T_platform_sensor, "T_platform_sensor")
         )
-        object.__setattr__(self, "unknown", chosen(self.unknown, self.possible, self.name))
+        object.__setattr__(self, "unknown", chosen(self.unknown, self.allowed_unknown, self.name))
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
@@ -99,7 +99,7 @@ class Inclination(AimKind):
             else (upright,)
         )
 
-    def doubts(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
+    def find_invalid_rows(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
         """Rows whose two tilts no direction can have."""
         with np.errstate(invalid="ignore"):
             wrong = np.flatnonzero(

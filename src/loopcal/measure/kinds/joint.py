@@ -48,7 +48,7 @@ class JointSensor(Kind):
 
     name: ClassVar[str] = "joint"
     scope: ClassVar[str] = "session"
-    follows: ClassVar[bool] = False
+    changes_with_pose: ClassVar[bool] = False
     sign: ClassVar[float] = 1.0
 
     def __post_init__(self) -> None:
@@ -78,12 +78,12 @@ class JointSensor(Kind):
         return tuple(Column(name, self.dimension) for name in self.joints)
 
     @property
-    def looks_at(self) -> tuple[str, ...]:
+    def sensed_joints(self) -> tuple[str, ...]:
         """The joints."""
         return self.joints
 
     @property
-    def parts(self) -> Mapping[str, tuple[Parameter, ...]]:
+    def setup_items(self) -> Mapping[str, tuple[Parameter, ...]]:
         """An offset for each joint."""
         made = tuple(
             Parameter(f"{joint}.{self.name}", self.dimension, 0.0, scope=self.scope)
@@ -104,12 +104,12 @@ class JointSensor(Kind):
 
     def predict(self, joints: FloatArray, values: FloatArray) -> FloatArray:
         """What the sensors show (t, r, m)."""
-        own = self.part(values, "offset")
+        own = self.item_values(values, "offset")
         return joints if own is None else joints + self.sign * own
 
-    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Nothing is known from poses alone; offsets start at zero and enter linearly."""
-        return self.nominal[None]
+        return self.nominal_values[None]
 
     def measure(
         self,

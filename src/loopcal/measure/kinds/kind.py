@@ -6,7 +6,7 @@ documentation and the contract tests follow from what this class asks for. A kin
 robots: it is given platform poses.
 
 Shapes: t trials, r rows, c columns as written in files, m residuals (often c), u unknowns of the
-kind, j joints it looks at. A kind with `links` > 1 compares several poses in one row and has an
+kind, j joints it looks at. A kind with `poses_per_row` > 1 compares several poses in one row and has an
 axis l for them: T (t, r, l, 4, 4), jacobian (t, r, l, m, 6). Values of unknowns are plain numbers
 that add up; how a frame or a direction is written in them, see `loopcal.measure.kinds.parts`.
 """
@@ -45,7 +45,7 @@ class Evaluation(NamedTuple):
     jacobian : (t, r, m, 6)
         By the platform twist (omega, v) in base axes; with an axis of links before m where there
         are several.
-    own : (t, r, m, u) or None
+    nuisance : (t, r, m, u) or None
         By the kind's own unknowns, None where it has none.
     joints : (t, r, m, j) or None
         By the values of the joints it looks at, None where it looks at poses only.
@@ -53,7 +53,7 @@ class Evaluation(NamedTuple):
 
     residual: FloatArray
     jacobian: FloatArray
-    own: FloatArray | None = None
+    nuisance: FloatArray | None = None
     joints: FloatArray | None = None
 
 
@@ -64,20 +64,20 @@ class Kind(ABC):
     ----------
     name : str
         As files and `KINDS` call it.
-    links : int
+    poses_per_row : int
         How many poses one row compares.
-    follows : bool
+    changes_with_pose : bool
         Whether columns that stay the same while the robot moves are a mistake; touched surfaces and
         locks stay at 0.
-    said : str
+    description : str
         What is measured, for sentences that advise it with nothing unknown; "the" and the name
         where empty.
     """
 
     name: ClassVar[str]
-    links: ClassVar[int] = 1
-    follows: ClassVar[bool] = True
-    said: ClassVar[str] = ""
+    poses_per_row: ClassVar[int] = 1
+    changes_with_pose: ClassVar[bool] = True
+    description: ClassVar[str] = ""
 
     @property
     @abstractmethod
@@ -90,17 +90,17 @@ class Kind(ABC):
         return self.columns
 
     @property
-    def parts(self) -> Mapping[str, tuple[Parameter, ...]]:
+    def setup_items(self) -> Mapping[str, tuple[Parameter, ...]]:
         """The unknowns by what they describe (a frame, a target, a surface), in order."""
         return {}
 
     @property
-    def unknowns(self) -> tuple[Parameter, ...]:
+    def nuisance_parameters(self) -> tuple[Parameter, ...]:
         """The u unknowns the kind brings with it, each with the scope that shares one value of it."""
-        return tuple(parameter for part in self.parts.values() for parameter in part)
+        return tuple(parameter for part in self.setup_items.values() for parameter in part)
 
     @property
-    def sights(self) -> Mapping[str, tuple[int, ...]]:
+    def target_columns(self) -> Mapping[str, tuple[int, ...]]:
         """What is looked at, by name, with the places of its columns."""
         return {self.name: tuple(range(len(self.columns)))}
 
@@ -112,7 +112,7 @@ class Kind(ABC):
         return {}
 
     @property
-    def looks_at(self) -> tuple[str, ...]:
+    def sensed_joints(self) -> tuple[str, ...]:
         """Names of the j joints, driven or passive, whose values the residual depends on."""
         return ()
 
@@ -123,7 +123,7 @@ class Kind(ABC):
         use them.
         """
 
-    def mounted(self, T_platform_tool: FloatArray) -> Self:
+    def with_tool(self, T_platform_tool: FloatArray) -> Self:
         """The kind for a robot with this tool (4, 4); the same object where the tool does not
         matter or is stated.
         """
@@ -131,17 +131,17 @@ class Kind(ABC):
         return self
 
     @property
-    def is_mounted(self) -> bool:
+    def has_tool(self) -> bool:
         """Whether the kind knows all it needs to be evaluated."""
         return True
 
-    def present(self, measured: FloatArray) -> Bools:
+    def detect_present(self, measured: FloatArray) -> Bools:
         """Which residuals (..., m) can be formed from columns (..., c); NaN stands for what was not
         measured.
         """
         return ~np.isnan(measured)
 
-    def doubts(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
+    def find_invalid_rows(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
         """Rows (index, sentence) of columns (r, c) that cannot mean what they say."""
         del measured
         return ()
@@ -164,7 +164,7 @@ class Kind(ABC):
         unknowns : (t or 1, r or 1, u), optional
             Values of the kind's unknowns that hold for each row; default: nominal.
         joints : (t, r, j), optional
-            Values of the joints in `looks_at`.
+            Values of the joints in `sensed_joints`.
 
         Returns
         -------
@@ -175,26 +175,26 @@ class Kind(ABC):
         DataError
             If the kind looks at joints and none are given.
         """
-        if self.looks_at and joints is None:
+        if self.sensed_joints and joints is None:
             raise DataError(
-                f"the kind {self.name!r} needs the values of {', '.join(self.looks_at)}; hand them "
+                f"the kind {self.name!r} needs the values of {', '.join(self.sensed_joints)}; hand them "
                 "over as joints"
             )
-        filled = np.where(np.isnan(measured), self.neutral, measured)
+        filled = np.where(np.isnan(measured), self.placeholder, measured)
         values = self.values(unknowns)
         if len(values) > len(T):
             T = np.broadcast_to(T, (len(values), *T.shape[1:]))
         result = self._seen(
             self._evaluate(T, filled, values, np.empty((1, 1, 0)) if joints is None else joints)
         )
-        present = self.present(measured)
+        present = self.detect_present(measured)
         if np.all(present):
             return result
         here = present[..., None]
-        links = present[..., None, :, None] if self.links > 1 else here
+        links = present[..., None, :, None] if self.poses_per_row > 1 else here
         own, moved = (
             None if part is None else np.where(here, part, 0.0)
-            for part in (result.own, result.joints)
+            for part in (result.nuisance, result.joints)
         )
         return Evaluation(
             np.where(present, result.residual, 0.0),
@@ -211,14 +211,14 @@ class Kind(ABC):
         radian there: the limit lies so far below all that counts that any length of machines would
         do.
         """
-        if found.own is None:
+        if found.nuisance is None:
             return found
         by_move = np.linalg.norm(found.jacobian, axis=-1)
-        by_move = by_move.sum(axis=-2) if self.links > 1 else by_move
-        return found._replace(own=without_rounding(found.own, by_move[..., None]))
+        by_move = by_move.sum(axis=-2) if self.poses_per_row > 1 else by_move
+        return found._replace(nuisance=without_rounding(found.nuisance, by_move[..., None]))
 
     @property
-    def neutral(self) -> FloatArray:
+    def placeholder(self) -> FloatArray:
         """Columns (c,) that stand where nothing was measured, so that nothing becomes NaN."""
         return np.zeros(len(self.columns))
 
@@ -230,7 +230,7 @@ class Kind(ABC):
         nothing was measured.
         """
 
-    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Candidates (k, u) for the unknowns of rows that share them, from poses T (r, 4, 4) and
         columns (r, c) alone.
 
@@ -238,7 +238,7 @@ class Kind(ABC):
         compares them.
         """
         del T, measured
-        return self.nominal[None]
+        return self.nominal_values[None]
 
     @abstractmethod
     def measure(
@@ -263,10 +263,10 @@ class Kind(ABC):
         Returns
         -------
         measured : (t, r, c) [SI]
-            With `evaluate(T, measured).residual = -noise_map(measured) noise` to first order.
+            With `evaluate(T, measured).residual = -linearize_noise(measured) noise` to first order.
         """
 
-    def noise_map(self, measured: FloatArray) -> FloatArray:
+    def linearize_noise(self, measured: FloatArray) -> FloatArray:
         """Matrix (..., m, m) by which errors of the noise columns enter the residuals (up to sign)."""
         m = len(self.noise_columns)
         return np.broadcast_to(np.eye(m), (*measured.shape[:-1], m, m))
@@ -275,18 +275,18 @@ class Kind(ABC):
     # ------------------------------------------------------------------------------------
 
     @property
-    def nominal(self) -> FloatArray:
+    def nominal_values(self) -> FloatArray:
         """Nominal values (u,) of the unknowns."""
-        return np.array([parameter.nominal for parameter in self.unknowns])
+        return np.array([parameter.nominal for parameter in self.nuisance_parameters])
 
     def values(self, unknowns: FloatArray | None) -> FloatArray:
         """The values given, or the nominal ones (1, 1, u)."""
-        return self.nominal[None, None] if unknowns is None else unknowns
+        return self.nominal_values[None, None] if unknowns is None else unknowns
 
-    def part(self, values: FloatArray, name: str) -> FloatArray | None:
+    def item_values(self, values: FloatArray, name: str) -> FloatArray | None:
         """Values (.., w) of one part, None where it is known."""
         first = 0
-        for part, parameters in self.parts.items():
+        for part, parameters in self.setup_items.items():
             if part == name:
                 return values[..., first : first + len(parameters)]
             first += len(parameters)
@@ -306,7 +306,7 @@ class Kind(ABC):
         -------
         rows : (*shape, 6 + u)
         """
-        widths = {"twist": 6} | {name: len(part) for name, part in self.parts.items()}
+        widths = {"twist": 6} | {name: len(part) for name, part in self.setup_items.items()}
         return np.concatenate(
             [
                 np.broadcast_to(blocks.get(name, np.zeros(w)), (*shape, w))
@@ -319,7 +319,7 @@ class Kind(ABC):
         """The evaluation of residuals (t, r, m) whose derivatives (t, r, m, 6 + u) stand side by
         side.
         """
-        return Evaluation(residual, rows[..., :6], rows[..., 6:] if self.parts else None)
+        return Evaluation(residual, rows[..., :6], rows[..., 6:] if self.setup_items else None)
 
 
 def chosen(unknown: tuple[str, ...], possible: tuple[str, ...], kind: str) -> tuple[str, ...]:

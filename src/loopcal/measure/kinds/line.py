@@ -45,7 +45,7 @@ class Line(SurfaceKind):
         """A known line, and an unknown one."""
         return (cls(), cls(unknown=("surface",), along=np.array([0.6, 0.0, 0.8]), surface="ruler"))
 
-    def own_part(self, name: str) -> tuple[Parameter, ...]:
+    def own_item(self, name: str) -> tuple[Parameter, ...]:
         """Two turns and two shifts."""
         shifts = tuple(
             Parameter(f"{self.surface}.{axis}", Dimension.LENGTH, 0.0, scope="group")
@@ -57,7 +57,7 @@ class Line(SurfaceKind):
         self, x: FloatArray, values: FloatArray
     ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
         """Distances (.., k, 2) across the line."""
-        own = self.part(values, "surface")
+        own = self.item_values(values, "surface")
         B, lever = parts.across(self.along), x - self.through
         if own is None:
             return lever @ B, B.T, {}
@@ -69,11 +69,11 @@ class Line(SurfaceKind):
         gaps = (rows @ lever[..., None])[..., 0] - own[..., None, 2:]
         return gaps, rows, {"surface": np.concatenate([turning, shifts], axis=-1)}
 
-    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """The line of largest scatter through the points."""
         x, gaps = self.touched(T, measured)
         if "surface" not in self.unknown or len(x) < 2:
-            return self.nominal[None]
+            return self.nominal_values[None]
         middle = x.mean(axis=0)
         direction = np.linalg.svd(x - middle, full_matrices=False)[2][0]
         turns = parts.direction_values(

@@ -47,7 +47,7 @@ class Plane(SurfaceKind):
             ),
         )
 
-    def own_part(self, name: str) -> tuple[Parameter, ...]:
+    def own_item(self, name: str) -> tuple[Parameter, ...]:
         """Two turns and a height."""
         height = Parameter(f"{self.surface}.height", Dimension.LENGTH, 0.0, scope="group")
         return (*parts.direction_part(self.surface, "group"), height)
@@ -56,7 +56,7 @@ class Plane(SurfaceKind):
         self, x: FloatArray, values: FloatArray
     ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
         """Heights (.., k, 1) above the plane."""
-        own = self.part(values, "surface")
+        own = self.item_values(values, "surface")
         lever = x - self.through
         if own is None:
             return lever @ self.along[:, None], self.along[None], {}
@@ -71,13 +71,13 @@ class Plane(SurfaceKind):
             {"surface": np.concatenate([turning, -np.ones_like(turning[..., :1])], axis=-1)},
         )
 
-    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """The plane through the points: with least scatter across, or by the gaps where they
         differ.
         """
         x, gaps = self.touched(T, measured)
         if "surface" not in self.unknown or len(x) < 3:
-            return self.nominal[None]
+            return self.nominal_values[None]
         middle = x.mean(axis=0)
         normals = [np.linalg.svd(x - middle, full_matrices=False)[2][2]]
         sloped = linear(x - middle, gaps[:, 0] - gaps.mean())

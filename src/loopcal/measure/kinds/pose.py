@@ -81,14 +81,14 @@ class Pose(ToolKind):
             + position_columns()
         )
 
-    def present(self, measured: FloatArray) -> Bools:
+    def detect_present(self, measured: FloatArray) -> Bools:
         """Orientation is there as a whole or not at all, x y z each for itself."""
         whole = ~np.any(np.isnan(measured[..., :-3]), axis=-1, keepdims=True)
         return np.concatenate(
             [np.repeat(whole, 3, axis=-1), ~np.isnan(measured[..., -3:])], axis=-1
         )
 
-    def doubts(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
+    def find_invalid_rows(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
         """Rows with a part of an orientation, or with a quaternion that is not of length one."""
         turned = measured[..., :-3]
         missing = np.isnan(turned)
@@ -118,7 +118,7 @@ class Pose(ToolKind):
         return tuple(found)
 
     @property
-    def neutral(self) -> FloatArray:
+    def placeholder(self) -> FloatArray:
         """The identity for an orientation that was not measured."""
         return np.array([1.0, *[0.0] * 6] if self.orientation == "quaternion" else [0.0] * 6)
 
@@ -152,11 +152,11 @@ class Pose(ToolKind):
             )
         return np.concatenate([turned, seen[..., :3, 3] + noise[..., 3:]], axis=-1)
 
-    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Frame and tool in closed form, from rows that are complete."""
         whole = ~np.any(np.isnan(measured), axis=-1)
         if not self.unknown or np.count_nonzero(whole) < 3:
-            return super().starts(T, measured)
+            return super().guess_values(T, measured)
         seen = geometry.make_pose(self.form.to_matrix(measured[whole, :-3]), measured[whole, -3:])
         frame, tool = hand_eye(
             T[whole],
@@ -170,7 +170,7 @@ class Pose(ToolKind):
         }
         return stacked(self, found, 1)
 
-    def noise_map(self, measured: FloatArray) -> FloatArray:
+    def linearize_noise(self, measured: FloatArray) -> FloatArray:
         """Matrix (..., 6, 6): E of the angles (or the identity, see the class) for the rotation,
         the identity for x y z.
         """
@@ -184,7 +184,9 @@ class Pose(ToolKind):
     def _filled(self, measured: FloatArray) -> FloatArray:
         """Orientation columns, with the identity where any of them was not measured."""
         turned = measured[..., :-3]
-        return np.where(np.any(np.isnan(turned), axis=-1, keepdims=True), self.neutral[:-3], turned)
+        return np.where(
+            np.any(np.isnan(turned), axis=-1, keepdims=True), self.placeholder[:-3], turned
+        )
 
 
 def _degenerate(rates: FloatArray) -> Bools:

@@ -48,7 +48,7 @@ class Position(TargetKind):
         """The points themselves."""
         return x, np.eye(3), {}
 
-    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Frame and targets in closed form.
 
         Raises
@@ -58,7 +58,7 @@ class Position(TargetKind):
         """
         moving, origin, points, seen = points_of(self, T, measured)
         if not self.unknown or len(seen) < 3:
-            return self.nominal[None]
+            return self.nominal_values[None]
         extent = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
         if "frame" in self.unknown and extent[1] <= FLAT * extent[0]:
             raise DataError(

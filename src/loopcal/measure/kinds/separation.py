@@ -30,21 +30,23 @@ class Separation(TargetKind):
     """
 
     name: ClassVar[str] = "separation"
-    links: ClassVar[int] = 2
-    said: ClassVar[str] = "distances between two poses (ball bar; callipers on a printed part)"
+    poses_per_row: ClassVar[int] = 2
+    description: ClassVar[str] = (
+        "distances between two poses (ball bar; callipers on a printed part)"
+    )
     per_target: ClassVar[tuple[Column, ...]] = (Column("separation", Dimension.LENGTH),)
-    possible: ClassVar[tuple[str, ...]] = ("targets", "offset")
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("targets", "offset")
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
         """The tool's point, and an unknown point with unknown zero."""
         return (cls(), cls(targets=("nozzle",), unknown=("targets", "offset")))
 
-    def own_part(self, name: str) -> tuple[Parameter, ...]:
+    def own_item(self, name: str) -> tuple[Parameter, ...]:
         """One unknown: the offset."""
         return self.offset_part()
 
-    def doubts(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
+    def find_invalid_rows(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
         """Rows with a distance that is none."""
         return not_above_zero(measured)
 
@@ -65,7 +67,7 @@ class Separation(TargetKind):
         each = unit[..., None, :, :, :] @ rows * np.array([-1.0, 1.0])[:, None, None, None]
         own = np.sum(each, axis=-4) + self.columns_of(blocks, predicted.shape)
         jacobian = each[..., 0, :6]
-        if not self.parts:
+        if not self.setup_items:
             return predicted[..., 0], jacobian, None
         return predicted[..., 0], jacobian, own[..., 0, 6:]
 

@@ -54,7 +54,7 @@ class Sphere(SurfaceKind):
         far = np.array([1.5, -0.8, 1.1])
         return (cls(through=far), cls(unknown=("surface",), through=far, surface="ball"))
 
-    def own_part(self, name: str) -> tuple[Parameter, ...]:
+    def own_item(self, name: str) -> tuple[Parameter, ...]:
         """Centre and radius."""
         radius = Parameter(f"{self.surface}.radius", Dimension.LENGTH, self.radius, scope="group")
         return (*parts.point_part(self.surface, self.through, "group"), radius)
@@ -63,7 +63,7 @@ class Sphere(SurfaceKind):
         self, x: FloatArray, values: FloatArray
     ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
         """Distances (.., k, 1) from the sphere."""
-        own = self.part(values, "surface")
+        own = self.item_values(values, "surface")
         if own is None:
             length, unit = length_of(x - self.through)
             return length - self.radius, unit[..., None, :], {}
@@ -72,13 +72,13 @@ class Sphere(SurfaceKind):
         blocks = {"surface": -np.concatenate([unit, np.ones_like(unit[..., :1])], axis=-1)}
         return length - own[..., None, 3:], unit, blocks
 
-    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Centre and radius by trilateration: distances from the centre are gaps and a common
         offset, the radius.
         """
         x, gaps = self.touched(T, measured)
         if "surface" not in self.unknown or len(x) < 4:
-            return self.nominal[None]
+            return self.nominal_values[None]
         centres, offsets = trilateration(x, gaps[:, 0], with_offset=True)
         return stacked(
             self, {"surface": np.concatenate([centres, -offsets[:, None]], axis=-1)}, len(centres)

@@ -45,8 +45,8 @@ class SurfaceKind(TargetKind):
     along: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     surface: str = "surface"
 
-    possible: ClassVar[tuple[str, ...]] = ("surface", "targets")
-    follows: ClassVar[bool] = False
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("surface", "targets")
+    changes_with_pose: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -35,7 +35,7 @@ class TargetKind(Kind):
     T_base_frame : (4, 4), optional
         Frame of the instrument in the base; default: the base itself.
     unknown : tuple of str
-        Which of `possible` are unknown; each has one value for a session (surfaces: for a group of
+        Which of `allowed_unknown` are unknown; each has one value for a session (surfaces: for a group of
         rows).
     frame : str
         Name of the frame; kinds that name the same one share its unknowns.
@@ -52,7 +52,7 @@ class TargetKind(Kind):
     unknown: tuple[str, ...] = ()
     frame: str = "frame"
 
-    possible: ClassVar[tuple[str, ...]] = ("frame", "targets")
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "targets")
     per_target: ClassVar[tuple[Column, ...]]
     wraps: ClassVar[bool] = False
 
@@ -69,18 +69,18 @@ class TargetKind(Kind):
             )
             object.__setattr__(self, "places", places)
         object.__setattr__(self, "T_base_frame", stored_pose(self.T_base_frame, "T_base_frame"))
-        object.__setattr__(self, "unknown", chosen(self.unknown, self.possible, self.name))
+        object.__setattr__(self, "unknown", chosen(self.unknown, self.allowed_unknown, self.name))
 
-    def mounted(self, T_platform_tool: FloatArray) -> Self:
+    def with_tool(self, T_platform_tool: FloatArray) -> Self:
         """The kind with its targets at the tool's origin, unless their places are stated."""
-        if self.is_mounted:
+        if self.has_tool:
             return self
         return replace(
             self, places=np.repeat(T_platform_tool[None, :3, 3], len(self.targets), axis=0)
         )
 
     @property
-    def is_mounted(self) -> bool:
+    def has_tool(self) -> bool:
         """Whether the places of the targets are known, or what they are counted from."""
         return self.places is not None
 
@@ -96,7 +96,7 @@ class TargetKind(Kind):
         )
 
     @property
-    def parts(self) -> Mapping[str, tuple[Parameter, ...]]:
+    def setup_items(self) -> Mapping[str, tuple[Parameter, ...]]:
         """Frame, targets, and what the kind adds, as far as they are unknown."""
         places = np.zeros((len(self.targets), 3)) if self.places is None else self.places
         found: dict[str, tuple[Parameter, ...]] = {}
@@ -109,16 +109,16 @@ class TargetKind(Kind):
                     p for target, place in named for p in parts.point_part(target, place)
                 )
             else:
-                found[name] = self.own_part(name)
+                found[name] = self.own_item(name)
         return found
 
     @property
-    def sights(self) -> Mapping[str, tuple[int, ...]]:
+    def target_columns(self) -> Mapping[str, tuple[int, ...]]:
         """The targets."""
         g = len(self.per_target)
         return {target: tuple(range(i * g, (i + 1) * g)) for i, target in enumerate(self.targets)}
 
-    def own_part(self, name: str) -> tuple[Parameter, ...]:
+    def own_item(self, name: str) -> tuple[Parameter, ...]:
         """Parameters of a part that only this kind has."""
         raise NotImplementedError(name)
 
@@ -131,7 +131,7 @@ class TargetKind(Kind):
         """Targets x (.., k, 3) in the frame, and their derivative (.., k, 3, 6 + u), at poses T
         (.., 4, 4).
         """
-        own = self.part(values, "frame")
+        own = self.item_values(values, "frame")
         frame = parts.frame_at(self.T_base_frame, own)
         R, Q = T[..., None, :3, :3], np.swapaxes(frame[..., None, :3, :3], -1, -2)
         arm = (R @ self.places_at(values)[..., None])[..., 0]
@@ -152,7 +152,7 @@ class TargetKind(Kind):
 
     def places_at(self, values: FloatArray) -> FloatArray:
         """Targets (.., k, 3) on the platform."""
-        own = self.part(values, "targets")
+        own = self.item_values(values, "targets")
         if own is not None:
             return own.reshape(*own.shape[:-1], len(self.targets), 3)
         return self.placed()
@@ -161,7 +161,7 @@ class TargetKind(Kind):
         """Stated places (k, 3); DataError before the kind is mounted."""
         if self.places is None:
             raise DataError(
-                f"the kind {self.name!r} does not know its targets: use kind.mounted(robot.tool), "
+                f"the kind {self.name!r} does not know its targets: use kind.with_tool(robot.tool), "
                 "or state their places"
             )
         return self.places
@@ -214,7 +214,7 @@ class TargetKind(Kind):
 
 def offset_of(kind: Kind, values: FloatArray) -> tuple[FloatArray, dict[str, FloatArray]]:
     """The offset (.., 1, 1) of all readings, zero where known, and its derivative as a part."""
-    own = kind.part(values, "offset")
+    own = kind.item_values(values, "offset")
     if own is None:
         return np.zeros((1, 1)), {}
     return own[..., None, :], {"offset": np.ones((1, 1, 1))}

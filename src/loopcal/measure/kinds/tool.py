@@ -35,7 +35,7 @@ class ToolKind(Kind):
         Instrument frame in the base; default: the base itself. Where unknown, the value it is
         counted from.
     T_platform_tool : (4, 4), optional
-        Tool on the platform; default: the robot's own, filled in by `mounted`.
+        Tool on the platform; default: the robot's own, filled in by `with_tool`.
     unknown : tuple of str
         Which of "frame" and "tool" are unknown, six numbers each, one value for a session.
     frame : str
@@ -52,27 +52,27 @@ class ToolKind(Kind):
     unknown: tuple[str, ...] = ()
     frame: str = "frame"
 
-    possible: ClassVar[tuple[str, ...]] = ("frame", "tool")
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "tool")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_base_frame", stored_pose(self.T_base_frame, "T_base_frame"))
-        object.__setattr__(self, "unknown", chosen(self.unknown, self.possible, self.name))
+        object.__setattr__(self, "unknown", chosen(self.unknown, self.allowed_unknown, self.name))
         if self.T_platform_tool is not None:
             object.__setattr__(
                 self, "T_platform_tool", stored_pose(self.T_platform_tool, "T_platform_tool")
             )
 
-    def mounted(self, T_platform_tool: FloatArray) -> Self:
+    def with_tool(self, T_platform_tool: FloatArray) -> Self:
         """The kind with this tool (4, 4), unless it has one of its own."""
-        return self if self.is_mounted else replace(self, T_platform_tool=T_platform_tool)
+        return self if self.has_tool else replace(self, T_platform_tool=T_platform_tool)
 
     @property
-    def is_mounted(self) -> bool:
+    def has_tool(self) -> bool:
         """Whether the tool is known, or what its unknowns are counted from."""
         return self.T_platform_tool is not None
 
     @property
-    def parts(self) -> Mapping[str, tuple[Parameter, ...]]:
+    def setup_items(self) -> Mapping[str, tuple[Parameter, ...]]:
         """Six unknowns for each of frame and tool, as far as they are unknown."""
         tool = np.eye(4) if self.T_platform_tool is None else self.T_platform_tool
         stated = {"frame": (self.frame, self.T_base_frame), "tool": ("tool", tool)}
@@ -103,24 +103,24 @@ class ToolKind(Kind):
         Q = np.swapaxes(frame[..., :3, :3], -1, -2)
         arm = (T[..., :3, :3] @ tool[..., :3, 3:])[..., 0]
         blocks = {"twist": geometry.transport_matrix(arm, Q)}
-        own = self.part(values, "frame")
+        own = self.item_values(values, "frame")
         if own is not None:
             # what moves the frame moves the tool the other way, seen from it
             lever = arm + T[..., :3, 3] - frame[..., :3, 3]
             blocks["frame"] = -geometry.transport_matrix(lever, Q) @ parts.frame_slope(own)
-        own = self.part(values, "tool")
+        own = self.item_values(values, "tool")
         if own is not None:
             blocks["tool"] = geometry.transport_matrix(
                 np.zeros(3), Q @ T[..., :3, :3]
             ) @ parts.frame_slope(own)
         return self.columns_of(blocks, (*T.shape[:-2], 6))
 
-    def starts(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """The frame in 24 orientations, spread evenly over all, with the frame's origin where it is
         stated.
         """
         if "frame" not in self.unknown:
-            return self.nominal[None]
+            return self.nominal_values[None]
         frames = geometry.make_pose(
             OCTAHEDRAL @ self.T_base_frame[:3, :3], self.T_base_frame[:3, 3]
         )
@@ -128,13 +128,13 @@ class ToolKind(Kind):
 
     def _places(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Frame and tool (.., 4, 4)."""
-        frame = parts.frame_at(self.T_base_frame, self.part(values, "frame"))
-        return frame, parts.frame_at(self._tool(), self.part(values, "tool"))
+        frame = parts.frame_at(self.T_base_frame, self.item_values(values, "frame"))
+        return frame, parts.frame_at(self._tool(), self.item_values(values, "tool"))
 
     def _tool(self) -> FloatArray:
         if self.T_platform_tool is None:
             raise DataError(
-                f"the kind {self.name!r} does not know its tool: use kind.mounted(robot.tool),"
+                f"the kind {self.name!r} does not know its tool: use kind.with_tool(robot.tool),"
                 " or state T_platform_tool (np.eye(4) for the platform itself)"
             )
         return self.T_platform_tool
@@ -143,7 +143,7 @@ class ToolKind(Kind):
 def stacked(kind: Kind, found: Mapping[str, FloatArray], count: int) -> FloatArray:
     """Candidates (count, u) from values (count, w) or (w,) of some parts; the others stay nominal."""
     columns = []
-    for name, parameters in kind.parts.items():
+    for name, parameters in kind.setup_items.items():
         nominal = np.array([p.nominal for p in parameters])
         columns.append(np.broadcast_to(found.get(name, nominal), (count, len(parameters))))
     return np.concatenate(columns, axis=-1)

@@ -69,7 +69,7 @@ def measurements(layout: Layout, q: FloatArray, sigma: float) -> Measurements:
             "through": layout.robot.home[:3, 3],
         }
         plane, line = (
-            kind(along=np.eye(3)[along], **stated).mounted(layout.robot.tool)
+            kind(along=np.eye(3)[along], **stated).with_tool(layout.robot.tool)
             for kind in (Plane, Line)
         )
         points, groups = (

@@ -28,7 +28,7 @@ import numpy as np
 from loopcal.engine import State
 from loopcal.estimate.descent import Descent, StepControl, descend
 from loopcal.estimate.methods.penalties import Method
-from loopcal.measure import stream
+from loopcal.measure import make_random_stream
 from loopcal.mechanism import (
     POSITION,
     Mechanism,
@@ -99,7 +99,10 @@ class Layout:
         are.
         """
         noise = np.stack(
-            [stream(seed, trial).standard_normal((self.points, 3)) for trial in range(len(truth))]
+            [
+                make_random_stream(seed, trial).standard_normal((self.points, 3))
+                for trial in range(len(truth))
+            ]
         )
         target = np.repeat(self.flat[None], len(truth), axis=0)
         target[:, :, [self.robot.controlled.index(name) for name in POSITION]] += sigma * noise

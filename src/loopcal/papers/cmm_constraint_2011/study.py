@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from loopcal import geometry
-from loopcal.measure import stream
+from loopcal.measure import make_random_stream
 from loopcal.mechanism import Mechanism, Solution, forward_trials, sample_workspace
 from loopcal.papers.cmm_constraint_2011.gauge import without_gauge
 from loopcal.papers.cmm_constraint_2011.published import MM
@@ -177,7 +177,7 @@ def true_machines(
     """
     drawn = np.stack(
         [
-            stream(seed, trial, TRUTH).standard_normal(len(robot.parameters))
+            make_random_stream(seed, trial, TRUTH).standard_normal(len(robot.parameters))
             for trial in range(trials)
         ]
     )

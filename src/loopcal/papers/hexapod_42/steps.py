@@ -28,7 +28,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.diagnose import compute_pose_errors
 from loopcal.geometry import OrientationForm, parse_orientation
-from loopcal.measure import Measurements, Observations, Pose, stream
+from loopcal.measure import Measurements, Observations, Pose, make_random_stream
 from loopcal.mechanism import Mechanism, Solution, forward, inverse
 from loopcal.papers.hexapod_42.leg_form import LegForm
 from loopcal.papers.per_leg import identify_per_leg
@@ -109,7 +109,7 @@ def measured_poses(
     actual = actual_poses(study)
     if noise is None:
         return actual
-    drawn = stream(seed, trial).uniform(-1.0, 1.0, actual.shape)
+    drawn = make_random_stream(seed, trial).uniform(-1.0, 1.0, actual.shape)
     return actual + np.roll(drawn, 3, axis=1) * noise  # a kind has its angles first
 
 
@@ -151,7 +151,7 @@ def measurements(
     """Measured poses (n, 6) [m, rad] as measurements, with a sigma of one unless sigmas (n, 6) [m,
     rad] are given.
     """
-    kind = Pose(form_name(study.order)).mounted(study.robot.tool)
+    kind = Pose(form_name(study.order)).with_tool(study.robot.tool)
     sd = sigma if isinstance(sigma, float) else np.roll(sigma, 3, axis=1)
     rows = Observations.from_sigma(kind, np.arange(len(measured)), np.roll(measured, 3, axis=1), sd)
     labels = tuple(f"A{i + 1}" for i in range(len(measured)))

@@ -11,7 +11,15 @@ import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.estimate import MAP, LeastSquares, identify_trials
-from loopcal.measure import Instrument, Pose, Sensor, Trials, Uniform, simulate_trials, stream
+from loopcal.measure import (
+    Instrument,
+    Pose,
+    Sensor,
+    Trials,
+    Uniform,
+    make_random_stream,
+    simulate_trials,
+)
 from loopcal.mechanism import forward_trials
 from loopcal.papers.hexapod_42.published import MM, Published
 from loopcal.papers.hexapod_42.steps import (
@@ -263,7 +271,7 @@ def simulated(study: Study, seed: int, trials: int) -> Trials:
 def drawn(name: str, n: int, seed: int) -> FloatArray:
     """(n, 6) poses [m, rad] drawn uniformly in one of RANGES."""
     low, high = (np.array(end) * np.array([MM] * 3 + [np.pi / 180.0] * 3) for end in RANGES[name])
-    return stream(seed, n, DRAWN_POSES).uniform(low, high, (n, 6))
+    return make_random_stream(seed, n, DRAWN_POSES).uniform(low, high, (n, 6))
 
 
 def _per_leg(study: Study, made: Trials) -> FloatArray:

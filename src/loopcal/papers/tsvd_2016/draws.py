@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.estimate import GCV, MAP, LeastSquares, Ridge, identify_trials
-from loopcal.measure import stream
+from loopcal.measure import make_random_stream
 from loopcal.papers.printed import Cell, Table
 from loopcal.papers.tsvd_2016.steps import iterate, ridge, truncated
 from loopcal.papers.tsvd_2016.study import MEASURES, Study, machine, study, true_values
@@ -288,7 +288,7 @@ def _lost(errors: FloatArray) -> FloatArray:
 def _resampled(values: FloatArray) -> FloatArray:
     """(RESAMPLES, t, ..) machines drawn with replacement, always the same ones."""
     t = len(values)
-    return values[stream(0, 0, RESAMPLING).integers(0, t, (RESAMPLES, t))]
+    return values[make_random_stream(0, 0, RESAMPLING).integers(0, t, (RESAMPLES, t))]
 
 
 def _interval(medians: FloatArray) -> FloatArray:

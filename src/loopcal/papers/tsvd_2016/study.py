@@ -23,8 +23,8 @@ from loopcal.measure import (
     Sensor,
     Trials,
     Uniform,
+    make_random_stream,
     simulate_trials,
-    stream,
 )
 from loopcal.mechanism import Mechanism, Solution, forward_trials, inverse
 from loopcal.papers.tsvd_2016.published import MM, published
@@ -211,7 +211,7 @@ def true_values(robot: Mechanism, trials: int, seed: int) -> FloatArray:
     ).T
     values = []
     for trial in range(trials):
-        drawn = stream(seed, trial, ERRORS)
+        drawn = make_random_stream(seed, trial, ERRORS)
         size, sign = drawn.uniform(low, high), drawn.choice([-1.0, 1.0], len(table))
         values.append(table.nominal + sign * size)
     return np.array(values)
