@@ -61,6 +61,10 @@ if TYPE_CHECKING:
     from loopcal.planning import Sight as Sight
     from loopcal.planning import plan as plan
     from loopcal.planning import plan_surfaces as plan_surfaces
+    from loopcal.workflow import CalibrationOptions as CalibrationOptions
+    from loopcal.workflow import CalibrationReport as CalibrationReport
+    from loopcal.workflow import Verdict as Verdict
+    from loopcal.workflow import calibrate as calibrate
 
 __version__ = "0.1.0.dev0"
 
@@ -116,6 +120,7 @@ _WHERE = {
             "find_working_modes",
         ),
         "loopcal.planning": ("Constraints", "Plan", "Sight", "plan", "plan_surfaces"),
+        "loopcal.workflow": ("CalibrationOptions", "CalibrationReport", "Verdict", "calibrate"),
     }.items()
     for name in names
 }

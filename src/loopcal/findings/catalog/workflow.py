@@ -31,7 +31,56 @@ def _word_undetermined(data: Mapping[str, Any]) -> str:
     )
 
 
+def _word_too_few_equations(data: Mapping[str, Any]) -> str:
+    template = (
+        "{equations} equations cannot determine {parameters} parameters: measure more poses, fix "
+        "parameters, or choose a method with the tolerances as prior (MAP)."
+    )
+    suggestions = str(data["suggestions"]).lstrip("; ")
+    return fill_template(template, **data) + (f" {suggestions}" if suggestions else "")
+
+
 ENTRIES = (
+    Entry("workflow.note", Severity.INFO, "{text}", "A remark that has no code yet."),
+    Entry(
+        "workflow.limit-needs-held-out-poses",
+        Severity.REFUSAL,
+        "A limit is checked on held-out poses, and none are held out: hold out a share of the "
+        "poses, such as 0.25.",
+        "A limit is stated without held-out poses.",
+        "Hold out a share of the poses.",
+    ),
+    Entry(
+        "workflow.free-limb-needs-prior",
+        Severity.REFUSAL,
+        "{limb} can only be freed with an earlier calibration that knows the other limbs: give it "
+        "as the prior.",
+        "A limb is to be freed without a prior.",
+        "Give the earlier calibration.",
+    ),
+    Entry(
+        "workflow.option-excludes-prior",
+        Severity.REFUSAL,
+        "{option} does not go with an earlier calibration as the prior, which is combined with the "
+        "data by least squares: remove one of the two.",
+        "A method, loss or choice of parameters is stated beside a prior.",
+        "Remove the option or the prior.",
+    ),
+    Entry(
+        "workflow.too-few-equations",
+        Severity.REFUSAL,
+        _word_too_few_equations,
+        "The data give fewer equations than there are free parameters, and no method was chosen.",
+        "Measure more poses, fix parameters, or use a method with a prior (MAP).",
+    ),
+    Entry(
+        "workflow.no-parameter-chosen",
+        Severity.REFUSAL,
+        "No set of free parameters predicts held-out poses better than the robot as it is: keep "
+        "its geometry, or calibrate all parameters without choosing.",
+        "The choice of parameters finds that calibration gains nothing.",
+        "Keep the geometry, or measure with a better instrument.",
+    ),
     Entry(
         "workflow.no-held-out-poses",
         Severity.WARNING,

@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibrate a robot from measurements: split, choose the model, fit, validate, examine, judge."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from loopcal.apply import Validation, validate
+from loopcal.apply.validation_findings import FEW_ROWS
+from loopcal.diagnose import (
+    MeasurementSuggestion,
+    ModelChoice,
+    check_start_values,
+    choose_model,
+    compute_reading_errors,
+    describe_missing_equations,
+    examine_fit,
+    find_frame_motions,
+    identifiability,
+    suggest_measurements,
+)
+from loopcal.errors import DataError
+from loopcal.estimate import Change, Identification, recalibrate
+from loopcal.estimate.excluded_poses import exclude_poses
+from loopcal.estimate.outlook import equations
+from loopcal.findings import Finding, Severity, report_finding
+from loopcal.findings.importance import sort_by_importance
+from loopcal.measure import Measurements
+from loopcal.mechanism import Mechanism
+from loopcal.typing import Progress, report_no_progress
+from loopcal.workflow.calibration_options import CalibrationOptions
+from loopcal.workflow.calibration_report import CalibrationReport, describe_provenance
+from loopcal.workflow.data_split import split_data
+from loopcal.workflow.fit_adapter import findings_of, fit_robot
+
+GREW = 1.1
+"""Factor by which an error on held-out poses must grow to be a failure; less is their noise."""
+
+STEPS = 5
+"""Steps that the progress callback counts: model, fit, validation, examination, suggestions."""
+
+
+def calibrate(
+    robot: Mechanism,
+    data: Measurements,
+    options: CalibrationOptions | None = None,
+    progress: Progress = report_no_progress,
+) -> CalibrationReport:
+    """Identify the free parameters of a robot, validate the result and judge it.
+
+    Parameters
+    ----------
+    robot : the nominal robot, or the geometry to start from. data : the measurements.
+    options : see `CalibrationOptions`; the default fits all poses and holds none out.
+    progress : receives the steps that are done.
+
+    Returns
+    -------
+    CalibrationReport. A calibration that is not good enough is not an error: see its `verdict`.
+
+    Raises
+    ------
+    DataError, EstimationError
+        The data belong to another robot, contain too few values, or the options contradict them.
+
+    Examples
+    --------
+    >>> import loopcal as lc
+    >>> robot = lc.load_robot("hexapod-42")
+    >>> data = lc.load_measurements("examples/hexapod-42/measurements.csv", robot)
+    >>> report = lc.calibrate(robot, data, lc.CalibrationOptions(hold_out=0.25))
+    >>> report.verdict
+    <Verdict.CALIBRATED: 'calibrated'>
+    """
+    options = CalibrationOptions() if options is None else options
+    _check_arguments(robot, data, options)
+    kept = exclude_poses(data, options.fit.excluded_poses)
+    split = split_data(kept, options.hold_out, options.seed, options.held_out)
+    fitted = split.fitted
+    if not fitted.n_rows:
+        raise DataError("the data hold no measured value; fill in what the instrument showed")
+    count = _StepCounter(progress)
+    result = _fit(robot, fitted, options, count)
+    fit = result.fit
+    held_out = split.held_out
+    errors, impossible = _validate(fit, fitted if held_out is None else held_out, options)
+    count("examining the residuals")
+    examination = examine_fit(fit, fitted) if fit.converged else None
+    count("looking for further measurements")
+    suggestions = _suggest(fit, fitted)
+    start = check_start_values(fit)
+    findings = [
+        *_report_fit(fit),
+        *impossible,
+        *_report_validation(errors, held_out is not None),
+        *_report_freedoms(fit),
+        *findings_of(start, examination, result.choice),
+    ]
+    count("done")
+    return CalibrationReport(
+        options=options,
+        split=split,
+        identification=fit,
+        start=start,
+        validation=None if held_out is None else errors,
+        fitted_errors=errors if held_out is None else None,
+        findings=sort_by_importance(findings),
+        examination=examination,
+        suggestions=suggestions,
+        reading_errors=compute_reading_errors(fit, fitted),
+        model_choice=result.choice,
+        change=result.change,
+        provenance=describe_provenance(options),
+    )
+
+
+def _check_arguments(robot: Any, data: Any, options: Any) -> None:
+    """Refuse arguments of another type, with what to pass instead."""
+    wanted = (
+        ("robot", robot, Mechanism, "a robot, as from load_robot('robot.yaml')"),
+        ("data", data, Measurements, "measurements, as from load_measurements('data.csv', robot)"),
+        ("options", options, CalibrationOptions, "CalibrationOptions(hold_out=0.25), or nothing"),
+    )
+    for name, value, kind, advice in wanted:
+        if not isinstance(value, kind):
+            raise DataError(f"{name} is a {type(value).__name__}; pass {advice}")
+
+
+class _StepCounter:
+    """Reports the steps of a calibration to the callback, one after the other."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._done = 0
+
+    def __call__(self, what: str) -> None:
+        self._progress(self._done, STEPS, what)
+        self._done += 1
+
+
+@dataclass(frozen=True, eq=False)
+class _FitResult:
+    """A fit, with the choice of its parameters and the comparison with an earlier calibration."""
+
+    fit: Identification
+    choice: ModelChoice | None = None
+    change: Change | None = None
+
+
+def _fit(
+    robot: Mechanism, data: Measurements, options: CalibrationOptions, count: Callable[[str], None]
+) -> _FitResult:
+    """Identify from the tolerances, or again with an earlier calibration as the prior."""
+    excluded = tuple(p for p in options.fit.excluded_poses if p in data.labels)
+    fit_options = replace(options.fit, excluded_poses=excluded)
+    count("choosing the parameters" if options.choose_model else "preparing")
+    if options.prior is not None:
+        count("fitting")
+        fit, change = recalibrate(robot, data, options.prior, options.free_limb, fit_options.noise)
+        return _FitResult(fit, change=change)
+    choice = None
+    if options.choose_model:
+        choice = choose_model(
+            robot, data, method=fit_options.method, noise=fit_options.noise, loss=fit_options.loss
+        )
+        if not choice.chosen.parameters:
+            raise DataError(report_finding("workflow.no-parameter-chosen"))
+    chosen = robot if choice is None else choice.robot
+    free, available = int(chosen.parameters.free.sum()), equations(chosen, data)
+    if fit_options.method is None and available < free:
+        raise DataError(
+            report_finding(
+                "workflow.too-few-equations",
+                equations=available,
+                parameters=free,
+                suggestions=describe_missing_equations(chosen, data),
+            )
+        )
+    count(f"fitting {free} parameters")
+    return _FitResult(fit_robot(chosen, data, fit_options), choice=choice)
+
+
+def _validate(
+    fit: Identification, data: Measurements, options: CalibrationOptions
+) -> tuple[Validation | None, list[Finding]]:
+    """Return errors on poses, or why there are none: a wrong geometry may reach no pose."""
+    try:
+        return validate(fit, data, options.limit_position, options.limit_angle), []
+    except DataError as error:
+        return None, [report_finding("gates.poses-unreachable", reason=str(error))]
+
+
+def _suggest(fit: Identification, data: Measurements) -> tuple[MeasurementSuggestion, ...] | None:
+    """Return further measurements that determine open combinations; None where none is open."""
+    if not fit.converged or not fit.unidentifiable:
+        return None
+    return suggest_measurements(identifiability(fit.robot, data))
+
+
+def _report_fit(fit: Identification) -> list[Finding]:
+    """Return the findings of the fit; a contradiction with the noise is a failure."""
+    findings = findings_of(fit)
+    codes = {f.code for f in findings}
+    if not fit.converged and not any(code.startswith("fit.") for code in codes):
+        findings.append(report_finding("gates.not-converged", status=fit.status.name.lower()))
+    if fit.check.failed and "noise.residuals-too-large" not in codes:
+        ratio = float(np.sqrt(fit.check.chi_square / fit.check.degrees))
+        findings.append(report_finding("gates.residuals-exceed-noise", ratio=ratio))
+    return [
+        replace(f, severity=Severity.FAILURE) if f.code == "noise.residuals-too-large" else f
+        for f in findings
+    ]
+
+
+def _report_validation(errors: Validation | None, is_held_out: bool) -> list[Finding]:
+    """Return the findings of the validation, and whether it supports a verdict."""
+    if not is_held_out:
+        return [report_finding("workflow.no-held-out-poses")]
+    if errors is None:
+        return []
+    findings = list(errors.findings)
+    if errors.n_judged < FEW_ROWS:
+        findings.append(
+            report_finding("workflow.few-held-out-poses", count=errors.n_judged, needed=FEW_ROWS)
+        )
+    for quantity, smaller in errors.improvements().items():
+        larger = 1.0 / smaller if smaller > 0.0 else float("inf")
+        if larger > GREW:
+            findings.append(report_finding("gates.errors-grew", quantity=quantity, times=larger))
+    return findings
+
+
+def _report_freedoms(fit: Identification) -> list[Finding]:
+    """Return whether open combinations only move frames, or change poses."""
+    if not fit.converged or not fit.unidentifiable:
+        return []
+    motions = find_frame_motions(fit.posterior)
+    count = len(fit.names) - fit.rank
+    findings = []
+    if motions.count:
+        findings.append(
+            report_finding(
+                "workflow.frame-freedoms", count=motions.count, frames=tuple(motions.frames)
+            )
+        )
+    if count > motions.count:
+        names = dict.fromkeys(name for c in fit.unidentifiable for name in c.names)
+        findings.append(
+            report_finding(
+                "workflow.undetermined-combinations",
+                count=count - motions.count,
+                names=tuple(names),
+            )
+        )
+    return findings

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The options of a calibration, as one value."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from loopcal.errors import DataError
+from loopcal.estimate import Posterior
+from loopcal.findings import report_finding
+from loopcal.workflow.fit_adapter import FitOptions
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """Options of `calibrate`. Every field has a default.
+
+    Parameters
+    ----------
+    fit : how parameters are estimated, and which poses are excluded.
+    hold_out : share of the poses to keep out of the fit for validation, from 0 to below 1. The
+        sets are those of `data.split(1 - hold_out, seed)`.
+    held_out : labels of the poses to keep out, instead of a share.
+    seed : of the random choice of held-out poses.
+    limit_position, limit_angle : largest allowed errors [m], [rad] on held-out poses.
+    choose_model : free only as many parameters as held-out predictions justify.
+    prior : the posterior of an earlier calibration of this machine; its knowledge is kept.
+    free_limb : with `prior`: a limb that was repaired, which starts again from its tolerances.
+
+    Raises
+    ------
+    DataError : a value that is not allowed, or options that contradict each other.
+    """
+
+    fit: FitOptions = field(default_factory=FitOptions)
+    hold_out: float = 0.0
+    held_out: Sequence[str] = ()
+    seed: int = 1
+    limit_position: float | None = None
+    limit_angle: float | None = None
+    choose_model: bool = False
+    prior: Posterior | None = None
+    free_limb: str | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.hold_out < 1.0:
+            raise DataError(
+                f"hold_out is {self.hold_out}; it is a share of the poses, from 0 to below 1"
+            )
+        if isinstance(self.held_out, str):
+            raise DataError(
+                f"held_out is the text {self.held_out!r}; give a sequence of labels, such as "
+                f"[{self.held_out!r}]"
+            )
+        object.__setattr__(self, "held_out", tuple(self.held_out))
+        if self.hold_out and self.held_out:
+            raise DataError(
+                f"hold_out is {self.hold_out} and held_out names {len(self.held_out)} poses; give "
+                "one of the two"
+            )
+        has_limit = self.limit_position is not None or self.limit_angle is not None
+        if has_limit and not self.hold_out and not self.held_out:
+            raise DataError(report_finding("workflow.limit-needs-held-out-poses"))
+        if self.free_limb is not None and self.prior is None:
+            raise DataError(report_finding("workflow.free-limb-needs-prior", limb=self.free_limb))
+        if self.prior is not None:
+            self._check_prior()
+
+    def _check_prior(self) -> None:
+        """Refuse options that do not go with an earlier calibration."""
+        chosen = {
+            "method": self.fit.method is not None,
+            "loss": self.fit.loss is not None,
+            "choose_model": self.choose_model,
+        }
+        for option, is_chosen in chosen.items():
+            if is_chosen:
+                raise DataError(report_finding("workflow.option-excludes-prior", option=option))

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The result of a calibration: everything that text, JSON and run folder show."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import version
+from typing import Any
+
+from loopcal.apply import Validation
+from loopcal.diagnose import (
+    FitExamination,
+    MeasurementSuggestion,
+    ModelChoice,
+    ReadingError,
+    StartCheck,
+)
+from loopcal.estimate import Change, Identification
+from loopcal.findings import Finding, Severity
+from loopcal.mechanism import Mechanism
+from loopcal.workflow.calibration_options import CalibrationOptions
+from loopcal.workflow.data_split import DataSplit
+from loopcal.workflow.verdict import Verdict, choose_next_step, decide_verdict
+
+TOP = 3
+"""Findings that a summary shows."""
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a result comes from, as far as it is known without files.
+
+    Attributes
+    ----------
+    versions : of loopcal, numpy, scipy and python. seeds : by name. options : the options in words.
+    """
+
+    versions: Mapping[str, str]
+    seeds: Mapping[str, int]
+    options: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the attributes by name for JSON."""
+        return {"versions": dict(self.versions), "seeds": dict(self.seeds), "options": self.options}
+
+
+def describe_provenance(options: CalibrationOptions) -> Provenance:
+    """Return the versions in use, the seeds and the options."""
+    versions = {name: version(name) for name in ("loopcal", "numpy", "scipy")}
+    versions["python"] = platform.python_version()
+    return Provenance(versions, {"hold_out": options.seed}, repr(options))
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationReport:
+    """The result of `calibrate`.
+
+    Attributes
+    ----------
+    options : as given. split : which poses were fitted, and which were held out.
+    identification : the fit. start : the geometry before calibration against the fit.
+    validation : errors on held-out poses; None without held-out poses, or where they could not be
+        predicted.
+    fitted_errors : errors on the fitted poses where no pose was held out; they are optimistic.
+    findings : everything noticed, the most important first.
+    examination : outliers, lack of fit, correlations and expected gain; None where the fit did not
+        converge.
+    suggestions : further measurements that determine open parameter combinations.
+    reading_errors : recorded actuator readings against the estimated ones; None for exact readings.
+    model_choice : the comparison of parameter sets, where it was asked for.
+    change : whether the machine changed since the earlier calibration that is the prior.
+    provenance : versions, seeds and options.
+    """
+
+    options: CalibrationOptions
+    split: DataSplit
+    identification: Identification
+    start: StartCheck
+    validation: Validation | None
+    fitted_errors: Validation | None
+    findings: tuple[Finding, ...]
+    examination: FitExamination | None
+    suggestions: tuple[MeasurementSuggestion, ...] | None
+    reading_errors: tuple[ReadingError, ...] | None
+    model_choice: ModelChoice | None
+    change: Change | None
+    provenance: Provenance
+
+    @property
+    def robot(self) -> Mechanism:
+        """The calibrated robot."""
+        return self.identification.robot
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether the geometry can be used; the rules are those of `decide_verdict`."""
+        return decide_verdict(self.findings)
+
+    @property
+    def exit_code(self) -> int:
+        """2 where a quality gate is not met, else 0."""
+        return self.verdict.exit_code
+
+    @property
+    def failures(self) -> tuple[Finding, ...]:
+        """Findings of quality gates that are not met."""
+        return tuple(f for f in self.findings if f.severity is Severity.FAILURE)
+
+    @property
+    def top_findings(self) -> tuple[Finding, ...]:
+        """The two or three most important findings; all failures among them."""
+        return self.findings[: max(TOP, len(self.failures))]
+
+    @cached_property
+    def next_step(self) -> Finding:
+        """The step that helps most now."""
+        outliers = () if self.examination is None else self.examination.outliers.names
+        return choose_next_step(self.verdict, self.findings, outliers)
+
+    @property
+    def headline(self) -> str:
+        """The verdict in one sentence."""
+        fit = self.identification
+        fitted = self.split.fitted.n_poses - len(fit.dropped)
+        verdict = self.verdict.value
+        return (
+            f"{verdict[0].upper()}{verdict[1:]}: {self.robot.name}, {len(fit.names)} parameters "
+            f"from {fitted} poses."
+        )
+
+    def __str__(self) -> str:
+        """Return verdict, errors, the most important findings and the next step."""
+        errors = self.validation or self.fitted_errors
+        lines = [self.headline]
+        if errors is not None:
+            lines += str(errors).splitlines()[: 1 + len(errors.quantities)]
+        lines += [f"{finding.severity.value}: {finding}" for finding in self.top_findings]
+        return "\n".join([*lines, f"Next: {self.next_step}"])
+
+    __repr__ = __str__
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result by name for JSON, SI."""
+        optional = {
+            "change": self.change,
+            "model_choice": self.model_choice,
+            "examination": self.examination,
+            "remedies": self.suggestions,
+            "reading_errors": self.reading_errors,
+        }
+        return {
+            "verdict": self.verdict,
+            "findings": self.findings,
+            "next_step": self.next_step,
+            "passed": not self.failures,
+            "reasons": [str(finding) for finding in self.failures],
+            "fit": self.identification,
+            "start": self.start,
+            "split": self.split,
+            "validation": self.validation,
+            **{name: part for name, part in optional.items() if part is not None},
+            "options": self.provenance.options,
+        }

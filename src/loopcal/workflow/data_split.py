@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measurements divided into those to fit and those held out for validation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from loopcal.errors import DataError, suggest_names
+from loopcal.measure import Measurements
+
+
+@dataclass(frozen=True, eq=False)
+class DataSplit:
+    """The two sets of a calibration.
+
+    Attributes
+    ----------
+    fitted : measurements to fit. held_out : measurements for validation; None where there are none.
+    share : the share that was asked for; 0 where poses were named, or none were held out.
+    seed : of the random choice.
+    """
+
+    fitted: Measurements
+    held_out: Measurements | None
+    share: float
+    seed: int
+
+    def to_dict(self) -> dict[str, object] | None:
+        """Return share, seed and labels of the held-out poses for JSON; None without any."""
+        if self.held_out is None:
+            return None
+        labels = list(self.held_out.labels)
+        return {"hold_out": self.share, "seed": self.seed, "held_out": labels}
+
+
+def split_data(
+    data: Measurements, hold_out: float = 0.0, seed: int = 1, held_out: Sequence[str] = ()
+) -> DataSplit:
+    """Divide measurements into a set to fit and a set for validation.
+
+    Parameters
+    ----------
+    hold_out : share of the poses to hold out; the sets are those of `data.split(1 - hold_out,
+        seed)`, drawn by whole blocks. 0 holds nothing out.
+    held_out : labels of the poses to hold out, instead of a share.
+
+    Raises
+    ------
+    DataError
+        A label that the data do not have, or no pose is left to fit.
+    """
+    if held_out:
+        for label in held_out:
+            if label not in data.labels:
+                raise DataError(
+                    f"held_out names the pose {label!r}, which the data do not have"
+                    f"{suggest_names(label, data.labels)}"
+                )
+        names = set(held_out)
+        is_held_out = [label in names for label in data.labels]
+        if all(is_held_out):
+            raise DataError("all poses of the data are held out; leave some to fit")
+        fitted = data.take([not held for held in is_held_out])
+        return DataSplit(fitted, data.take(is_held_out), 0.0, seed)
+    if not hold_out:
+        return DataSplit(data, None, 0.0, seed)
+    fitted, validation = data.split(1.0 - hold_out, seed)
+    return DataSplit(fitted, validation, hold_out, seed)

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Temporary: options and findings of a fit, until the fit itself has them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from loopcal.estimate import Identification, identify
+from loopcal.findings import Finding, report_finding
+from loopcal.measure import Measurements
+from loopcal.mechanism import Mechanism
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Options of a fit."""
+
+    method: Any = None
+    loss: Any = None
+    noise: Literal["given", "estimated"] = "given"
+    excluded_poses: tuple[str, ...] = ()
+
+
+def fit_robot(robot: Mechanism, data: Measurements, options: FitOptions) -> Identification:
+    """Identify with options."""
+    return identify(
+        robot,
+        data,
+        options.method,
+        noise=options.noise,
+        loss=options.loss,
+        drop=tuple(options.excluded_poses),
+    )
+
+
+def findings_of(*sources: Any) -> list[Finding]:
+    """Return the findings of results, some of which still have sentences."""
+    result: list[Finding] = []
+    for source in sources:
+        if source is None:
+            continue
+        notes = getattr(source, "findings", None)
+        if notes is None:
+            notes = getattr(source, "notes", None) or getattr(source, "sentences", None)
+        if notes is None:
+            notes = (getattr(source, "finding", None) or source.sentence,)
+        result += [
+            note if isinstance(note, Finding) else report_finding("workflow.note", text=str(note))
+            for note in notes
+        ]
+    return result

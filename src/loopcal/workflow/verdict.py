@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The verdict of a calibration, and the next step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from enum import Enum
+
+from loopcal.findings import Finding, Severity, report_finding
+
+TOO_LITTLE_VALIDATION = ("workflow.no-held-out-poses", "workflow.few-held-out-poses")
+"""Findings that leave the verdict open."""
+
+
+class Verdict(Enum):
+    """Whether the calibrated geometry can be used; the value is how people read it."""
+
+    CALIBRATED = "calibrated"
+    RESERVATIONS = "calibrated with reservations"
+    NOT_CALIBRATED = "not calibrated"
+    UNDECIDED = "undecided"
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code of a command with this verdict: 2 where a quality gate is not met, else 0."""
+        return 2 if self is Verdict.NOT_CALIBRATED else 0
+
+
+def decide_verdict(findings: Iterable[Finding]) -> Verdict:
+    """Return the verdict that findings lead to.
+
+    1. Not calibrated: any failure. Failures are a fit that did not converge, a geometry that
+       reaches no held-out pose, residuals that contradict the stated noise, errors on held-out
+       poses that grew by more than 10 %, and a limit that is exceeded.
+    2. Undecided: no pose was held out, or too few to judge an error.
+    3. Calibrated with reservations: any warning, such as outliers, a prior that the data
+       contradict, or undetermined parameter combinations that change poses.
+    4. Calibrated: everything else.
+
+    The first rule that applies decides.
+    """
+    findings = tuple(findings)
+    if any(finding.severity is Severity.FAILURE for finding in findings):
+        return Verdict.NOT_CALIBRATED
+    if any(finding.code in TOO_LITTLE_VALIDATION for finding in findings):
+        return Verdict.UNDECIDED
+    if any(finding.severity is Severity.WARNING for finding in findings):
+        return Verdict.RESERVATIONS
+    return Verdict.CALIBRATED
+
+
+def choose_next_step(
+    verdict: Verdict, findings: Sequence[Finding], outliers: Sequence[str]
+) -> Finding:
+    """Return the step that helps most now, as a suggestion.
+
+    Parameters
+    ----------
+    findings : of the calibration. outliers : labels of poses that do not fit the others.
+    """
+    if verdict is Verdict.CALIBRATED:
+        return report_finding("workflow.next-use-result")
+    if verdict is Verdict.UNDECIDED:
+        return report_finding("workflow.next-hold-out")
+    if outliers:
+        return report_finding(
+            "workflow.next-check-outliers", poses=tuple(f"pose {label}" for label in outliers)
+        )
+    if verdict is Verdict.RESERVATIONS:
+        return report_finding("workflow.next-resolve-warnings")
+    failed = {f.code for f in findings if f.severity is Severity.FAILURE}
+    if any(code.startswith("fit.") for code in failed) or "gates.poses-unreachable" in failed:
+        return report_finding("workflow.next-check-data")
+    if any(code.startswith("noise.") for code in failed):
+        return report_finding("workflow.next-check-noise")
+    return report_finding("workflow.next-measure-more")
