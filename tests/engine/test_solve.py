@@ -3,6 +3,7 @@
 beside it.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -237,3 +238,17 @@ def test_slots_of_the_menagerie_cover_every_place_of_a_limb():
         == program.n_displacements
         == len(zoo.menagerie().parameters) - 12
     )
+
+
+def test_four_threads_obtain_the_same_bits(engine, some):
+    def run(_: int) -> tuple[np.ndarray, ...]:
+        state = engine.solve(some.program, some.e, some.q, some.home)
+        blocks = engine.linearize(some.program, some.e, some.q, state)
+        arrays = [a for b in (*blocks.closure, *blocks.passive) for a in (b.U, b.A, b.E, b.Q)]
+        return state.T, *state.joints, state.residual, state.status, *arrays
+
+    alone = run(0)
+    with ThreadPoolExecutor(4) as pool:
+        for together in pool.map(run, range(8)):
+            for a, b in zip(alone, together, strict=True):
+                assert_array_equal(a, b)

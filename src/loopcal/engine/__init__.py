@@ -1,39 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Closed loops in flat arrays: solve, linearize, fold. Imports numpy and nothing of loopcal.
+"""The engine: solve closed loops, linearize them, fold rows into a factor. NumPy arrays only.
 
-Nothing outside this package may know how these three work: another engine is accepted by passing
-tests/engine.
+Nothing outside this package depends on how these three functions work: another engine is accepted
+when it passes tests/engine. All functions are pure; threads may call them at the same time.
 """
 
-from loopcal.engine.householder import fold
-from loopcal.engine.program import (
-    CONVERGED,
-    LENGTH,
-    PITCH,
-    Block,
-    ClosureBlocks,
-    Group,
-    Program,
-    Slot,
-    State,
-)
-from loopcal.engine.solve import insert_driven_values, linearize, solve
-from loopcal.typing import FloatArray
-
-# fmt: off
-__all__ = [
-    "CONVERGED",
-    "LENGTH",
-    "PITCH",
-    "Block",
-    "ClosureBlocks",
-    "FloatArray",
-    "Group",
-    "Program",
-    "Slot",
-    "State",
-    "fold",
-    "linearize",
-    "insert_driven_values",
-    "solve",
-]
+from loopcal.engine.closure import linearize as linearize
+from loopcal.engine.householder import fold as fold
+from loopcal.engine.newton import solve as solve
+from loopcal.engine.program import CONVERGED as CONVERGED
+from loopcal.engine.program import LENGTH as LENGTH
+from loopcal.engine.program import PITCH as PITCH
+from loopcal.engine.program import Block as Block
+from loopcal.engine.program import ClosureBlocks as ClosureBlocks
+from loopcal.engine.program import Group as Group
+from loopcal.engine.program import Program as Program
+from loopcal.engine.program import Slot as Slot
+from loopcal.engine.program import State as State

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small dense matrices by the thousand: Householder triangularisation with the batch as the
-contiguous axis.
+"""Householder triangularization of thousands of small matrices, the batch as contiguous axis.
 
-Shapes are (rows, columns, batch). Only element-wise operations are used, so the result of one
-matrix never depends on its neighbours, bit for bit, and a singular one yields infinities without
-stopping the others. See docs/theory/engine.md.
+Shapes are (rows, columns, batch). All operations are element-wise, so that the result of one
+matrix never depends on its neighbors, bit for bit; a singular matrix gives infinities and does not
+stop the others. Derivation: docs/theory/engine.md.
 """
 
 from __future__ import annotations
@@ -15,8 +14,9 @@ from loopcal.typing import FloatArray
 
 
 def triangularize(matrix: FloatArray, columns: int) -> tuple[FloatArray, FloatArray]:
-    """Q' matrix (r, c, batch) with its first columns upper triangular, and the determinant +-1 of
-    Q' (batch,).
+    """Return Q' matrix (r, c, batch), upper triangular in its first columns, and det Q' (batch,).
+
+    The determinant is +1 or -1.
     """
     m = matrix.copy()
     sign = np.ones(m.shape[2:])
@@ -25,7 +25,7 @@ def triangularize(matrix: FloatArray, columns: int) -> tuple[FloatArray, FloatAr
         norm = np.sqrt(np.add.reduce(v * v, axis=0))
         alpha = -np.copysign(norm, v[0])
         v[0] -= alpha
-        # v'v = 2 norm (norm + |v0|); a zero column keeps beta = 0 and is left alone
+        # v'v = 2 norm (norm + |v0|); a zero column keeps beta = 0 and stays as it is
         vv = -alpha * v[0]
         beta = np.divide(1.0, vv, out=np.zeros_like(vv), where=vv > 0)
         right = m[j:, j + 1 :]
@@ -37,25 +37,24 @@ def triangularize(matrix: FloatArray, columns: int) -> tuple[FloatArray, FloatAr
 
 
 def back_substitute(upper: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve upper x = right for (u, u, batch) and (u, c, batch); a zero pivot yields infinities or
-    NaN.
+    """Solve upper x = right for (u, u, batch) and (u, c, batch).
+
+    A pivot of zero gives infinities or NaN.
     """
     x = np.empty_like(right)
     for i in range(len(upper) - 1, -1, -1):
-        x[i] = (right[i] - np.add.reduce(upper[i, i + 1 :, None] * x[i + 1 :], axis=0)) / upper[
-            i, i
-        ]
+        known = np.add.reduce(upper[i, i + 1 :, None] * x[i + 1 :], axis=0)
+        x[i] = (right[i] - known) / upper[i, i]
     return x
 
 
 def fold(factor: FloatArray, rows: FloatArray) -> FloatArray:
-    """Fold whitened rows (t | 1, m, p) into upper triangular factors (t, p, p): R'R = factor'factor
-    + rows'rows.
+    """Return the triangular factor R with R'R = factor'factor + rows'rows.
 
-    By QR of the stack, neither product is formed; the signs of R's rows are arbitrary and a row of
-    zeros is absent.
+    The stack of both is triangularized by QR; neither product is formed. The signs of the rows of R
+    are arbitrary. A row of zeros changes nothing.
+
+    factor : (t, p, p) upper triangular. rows : (t | 1, m, p), whitened.
     """
-    stacked = np.concatenate(
-        [factor, np.broadcast_to(rows, (factor.shape[0], *rows.shape[1:]))], axis=1
-    )
-    return np.asarray(np.linalg.qr(stacked, mode="r"))
+    shared = np.broadcast_to(rows, (factor.shape[0], *rows.shape[1:]))
+    return np.asarray(np.linalg.qr(np.concatenate([factor, shared], axis=1), mode="r"))

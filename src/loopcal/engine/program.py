@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the engine is told of a mechanism: its structure, apart from every number that is estimated.
+"""The input and output of the engine: the structure of a mechanism, apart from its parameters.
 
-A limb is a chain from the base to a tip (link 0, joint 0, link 1, ..., link J) and one ending that
+A limb is a chain from the base to a tip (link 0, joint 0, link 1, ..., link J) and an ending that
 ties the tip to an attachment frame on the platform: `rigid` (6 rows: rotation times the size,
-position), `ball` (3: position) or `distance` (1: |attachment - tip| - length). A joint moves along
-or about the z axis of the frame it stands in: `R` turns by theta and advances by pitch * theta, `P`
-advances by theta. Limbs of one structure form a group and are evaluated together. The rod of a
-`distance` ending counts as joint J, whose value is added to the rod's length.
+position), `ball` (3 rows: position) or `distance` (1 row: |attachment - tip| - length). A joint
+moves along or about the z axis of the link frame before it: `R` turns by theta and advances by
+pitch * theta, `P` advances by theta. Limbs of one structure form a group and are evaluated
+together. The rod of a `distance` ending counts as joint J, whose value is added to its length.
 """
 
 from __future__ import annotations
@@ -18,14 +18,18 @@ from numpy.typing import NDArray
 
 from loopcal.typing import FloatArray, IntArray
 
-PITCH, LENGTH, CONVERGED, STALLED, EXHAUSTED, NOT_FINITE = 6, 7, 0, 1, 2, 3
+PITCH, LENGTH = 6, 7
+"""Values of `Slot.axis` beside the axes 0..5 of a twist."""
+CONVERGED, STALLED, EXHAUSTED, NOT_FINITE = 0, 1, 2, 3
+"""Values of `State.status`."""
 
 
 @dataclass(frozen=True)
 class Slot:
-    """A displacement that parameters can move, in every limb of a group: `element` counts the links
-    0..J and J + 1 for the attachment; `axis` is 0..5 for (rx, ry, rz, x, y, z) in that link's
-    frame, PITCH of joint `element`, LENGTH of the rod.
+    """A displacement that parameters can move, in every limb of a group.
+
+    element : the links 0..J, J + 1 for the attachment. axis : 0..5 for (rx, ry, rz, x, y, z) in
+    that link's frame, PITCH of joint `element`, or LENGTH of the rod.
     """
 
     element: int
@@ -34,18 +38,16 @@ class Slot:
 
 @dataclass(frozen=True)
 class Group:
-    """Limbs of one structure: k of them, with J joints each.
+    """Limbs of one structure: k limbs with J joints each.
 
     limbs : (k,) positions of these limbs in the mechanism. joints : one letter a joint, R or P.
-    actuator : (J + 1, k) column of q that drives the joint, -1 where it is passive; the last row
-        belongs to the rod.
-    locked : (J,) joints that keep their start value: those that only spin a limb about itself.
-    ending : rigid, ball or distance. rows : which of its rows count (positions in a twist); (0,)
-        for distance.
+    actuator : (J + 1, k) column of q that drives the joint, -1 if passive; last row: the rod.
+    locked : (J,) joints that keep their start value, because they only spin a limb about itself.
+    ending : rigid, ball or distance. rows : those of its rows that count, as positions in a twist;
+        (0,) for distance.
     links : (k, J + 2, 4, 4) nominal link transforms, the attachment last [m].
-    pitch : (k, J) nominal advance per turn angle [m/rad]. length : (k,) nominal length of the rod
-        [m].
-    slots : displacements present; columns : their place in e, limb by limb.
+    pitch : (k, J) nominal advance per turn angle [m/rad]. length : (k,) nominal rod length [m].
+    slots : displacements of each limb. columns : their place in e, limb by limb.
     """
 
     limbs: tuple[int, ...]
@@ -61,21 +63,30 @@ class Group:
     columns: slice
 
     def unknown_joints(self, free: bool) -> list[int]:
-        """Joints that closure determines: the passive ones and, if `free`, the actuated ones too."""
+        """Return the joints that closure determines: passive ones, and if `free` actuated ones."""
         driven = self.actuator[:, 0] >= 0
         passive = [j for j in range(len(self.joints)) if not driven[j] and not self.locked[j]]
         return sorted(passive + [j for j in range(len(driven)) if free and driven[j]])
 
+    def insert_driven(self, joints: FloatArray, q: FloatArray) -> FloatArray:
+        """Return joint values (t, n, k, J + 1) with the actuated ones set to q (t, n, n_joints)."""
+        shape = (max(len(joints), len(q)), max(joints.shape[1], q.shape[1]), *joints.shape[2:])
+        out = np.array(np.broadcast_to(joints, shape))
+        for j, columns in enumerate(self.actuator):
+            if columns[0] >= 0:
+                out[..., j] = q[:, :, columns]
+        return out
+
 
 @dataclass(frozen=True)
 class Program:
-    """A mechanism as the engine sees it.
+    """A mechanism in the form that the engine computes with.
 
     groups : the limbs. freedoms : positions in a twist of the platform's m freedoms.
-    size : characteristic length [m]; angles times size compare with lengths.
+    size : characteristic length [m]; an angle times the size compares with a length.
     n_displacements, n_joints : lengths of e and of q.
-    sigma : (n_joints,) standard deviations of q that weigh redundant actuators, None where there is
-        no redundancy.
+    sigma : (n_joints,) standard deviations of q that weigh redundant actuators; None without
+        redundancy.
     """
 
     groups: tuple[Group, ...]
@@ -88,15 +99,15 @@ class Program:
 
 @dataclass(frozen=True)
 class State:
-    """Where the mechanism stands, for t trials and n poses.
+    """Positions of a mechanism for t trials and n poses.
 
-    T : (t, n, 4, 4) platform in base [m]. joints : one (t, n, k, J + 1) array a group: all joint
-        values [m, rad].
+    T : (t, n, 4, 4) platform in base [m]. joints : for each group all joint values
+        (t, n, k, J + 1) [m, rad].
     status : (t, n) CONVERGED; STALLED: no closure near here; EXHAUSTED: out of iterations;
-        NOT_FINITE or singular.
-    residual : (t, n) norm of the closure residual [m]. iterations : (t, n) Newton steps taken.
-    closure_sign : (t, n) sign of the determinant of the closure Jacobian; it changes only through a
-        singularity.
+        NOT_FINITE: not finite, or singular.
+    residual : (t, n) norm of the closure residual [m]. iterations : (t, n) Newton steps.
+    closure_sign : (t, n) sign of the determinant of the closure Jacobian; along a continuous
+        motion it changes only at a singularity.
     """
 
     T: FloatArray
@@ -109,11 +120,10 @@ class State:
 
 @dataclass(frozen=True)
 class Block:
-    """Linearised closure of a group in its c' rows: U dtheta + A y + E de + Q dq, shapes (t, n, k,
-    c', columns).
+    """Linearized closure of a group, c' rows of each limb: U dtheta + A y + E de + Q dq.
 
-    theta: the eliminated joints (U is triangular); y: the platform's freedoms in base axes; e, q:
-    all of a limb's own.
+    Shapes (t, n, k, c', columns). theta : the eliminated joints, with U triangular. y : the
+    platform's freedoms in base axes. e, q : all displacements and joints of the limb itself.
     """
 
     U: FloatArray
@@ -124,8 +134,10 @@ class Block:
 
 @dataclass(frozen=True)
 class ClosureBlocks:
-    """Closure linearised, by group: the rows left (U is empty), the rows that give the eliminated
-    joints, and these joints.
+    """Linearized closure of all groups, the joints of each limb eliminated.
+
+    closure : the rows without joints (U is empty). passive : the rows that determine the
+    eliminated joints. joints : these joints, group by group.
     """
 
     closure: tuple[Block, ...]

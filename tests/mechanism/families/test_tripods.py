@@ -401,7 +401,9 @@ def test_a_tilted_guide_does_not_turn_the_joint_on_the_carriage() -> None:
     e, _ = machine.slots(values[None])
     group = machine.program.groups[0]
     g = place_links(group, e)
-    np.testing.assert_allclose(g.turn[0][..., 0, 0] @ g.turn[1][..., 0, 0] @ EZ, EY, atol=1e-15)
+    np.testing.assert_allclose(
+        g.rotation[0][..., 0, 0] @ g.rotation[1][..., 0, 0] @ EZ, EY, atol=1e-15
+    )
 
 
 def test_twenty_seven_parameters_of_the_tracker_have_rank_26_because_pivot_and_first_axis_turn_alike() -> (

@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Solve closure for the platform pose and the free joints: Newton with step control, row by row.
+
+A step is a Householder reduction of each limb (its own joints) and one of the platform. A row has
+converged when a step below 1e-7 of the robot's size has been applied (the next one would be below
+rounding) and the reducible part of its residual is at most 1e-13 of the size; it then stays as it
+is. Derivation: docs/theory/engine.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from loopcal.engine.closure import Chain, PlacedLinks, exponential, matmul, place_links
+from loopcal.engine.householder import back_substitute, triangularize
+from loopcal.engine.program import CONVERGED, EXHAUSTED, NOT_FINITE, STALLED, Group, Program, State
+from loopcal.typing import FloatArray
+
+CHUNK = 2048
+"""Rows solved together: few enough for the cache, many enough that Python's share is small."""
+RESIDUAL, STEP = 1e-13, 1e-7
+"""Residual and last step of a converged row, relative to the robot's size."""
+SINGULAR = 1e-11
+"""Smallest pivot of a limb's joints, relative to its largest, below which a limb is singular."""
+
+Task = Callable[[FloatArray, np.ndarray], tuple[FloatArray, FloatArray]]
+"""Conditions on the pose: T (N, 3, 4), rows (N,) -> residual (N, c) [m], its slopes (N, c, 6)."""
+
+
+class Iterate(NamedTuple):
+    """A Newton iterate of N rows.
+
+    coordinates : (12 + joint values, N) platform rotation and position (3, 4), then all joints.
+    step : (6 + unknown joints, N) Newton step from there: twist, then unknown joints.
+    residual : (N,) norm of the closure residual [m]. reducible : (N,) the part of it that a further
+        step can remove [m]. length : (N,) length of the step [m], angles times the robot's size.
+    sign : (N,) sign of the determinant. pivot : (N,) smallest relative pivot of the limbs.
+    """
+
+    coordinates: FloatArray
+    step: FloatArray
+    residual: FloatArray
+    reducible: FloatArray
+    length: FloatArray
+    sign: FloatArray
+    pivot: FloatArray
+
+    def select(self, keep: np.ndarray) -> Iterate:
+        """Return these rows."""
+        return Iterate(*(a[..., keep] for a in self))
+
+    def replace_where(self, better: np.ndarray, trial: Iterate) -> Iterate:
+        """Return the rows of `trial` where it is better, the others as they are."""
+        if better.all():
+            return trial
+        return Iterate(*(np.where(better, b, a) for a, b in zip(self, trial, strict=True)))
+
+
+class Solved(NamedTuple):
+    """The last iterates of N rows with their status and their numbers of steps."""
+
+    coordinates: FloatArray
+    residual: FloatArray
+    sign: FloatArray
+    status: np.ndarray
+    steps: np.ndarray
+
+
+def solve(
+    program: Program,
+    e: FloatArray,
+    q: FloatArray,
+    start: State,
+    task: Task | None = None,
+    free: bool = False,
+    max_iterations: int = 60,
+) -> State:
+    """Find the pose and the joints that close every loop.
+
+    e : (t | 1, n_displacements) [m, rad].
+    q : (t | 1, n, n_joints) actuated joint values [m, rad]; with `free` only their first guess.
+    start : first guess, (t | 1, n | 1) rows.
+    task : conditions on the pose, as many as the freed actuators leave open.
+    free : solve for the actuated joints too.
+
+    Rows that fail are marked in `status`; nothing is raised.
+    """
+    t, n = max(len(e), len(q), len(start.T)), max(q.shape[1], start.T.shape[1])
+    links = [place_links(g, e) for g in program.groups]
+    unknown = [g.unknown_joints(free) for g in program.groups]
+    redundant = program.sigma is not None and not free
+    joints = [
+        g.insert_driven(np.broadcast_to(a, (t, n, *a.shape[2:])), q).swapaxes(2, 3)
+        for g, a in zip(program.groups, start.joints, strict=True)
+    ]
+    T = np.broadcast_to(start.T, (t, n, 4, 4))[:, :, :3]
+    begin = np.concatenate([a.reshape(t * n, -1) for a in (T, *joints)], axis=1).T
+    parts = []
+    for first in range(0, t * n, CHUNK):
+        rows = np.arange(first, min(first + CHUNK, t * n))
+        placed = [p.select(rows // n) for p in links]
+        equations = _Equations(program, unknown, redundant, placed, task, rows)
+        parts.append(_iterate(equations, begin[:, rows], max_iterations))
+    whole = Solved(*(np.concatenate(arrays, axis=-1) for arrays in zip(*parts, strict=True)))
+    return _pack(program, whole, (t, n))
+
+
+def _iterate(equations: _Equations, coordinates: FloatArray, max_iterations: int) -> Solved:
+    """Iterate one chunk until every row has converged or failed."""
+    size, N = equations.program.size, coordinates.shape[1]
+    may_stay_open = equations.program.sigma is not None
+    status, steps, alive = np.full(N, EXHAUSTED, np.int8), np.zeros(N, np.int64), np.arange(N)
+    # share of the full step, length of the last applied step, steps in a row at rounding level
+    share, applied, at_rounding = np.ones(N), np.full(N, np.inf), np.zeros(N)
+    with np.errstate(all="ignore"):
+        now = equations.evaluate(coordinates)
+        done = Solved(now.coordinates.copy(), now.residual.copy(), now.sign.copy(), status, steps)
+        for _ in range(max_iterations):
+            settled = (now.reducible <= RESIDUAL * size) & (
+                (applied <= STEP * size) | (at_rounding > 2)
+            )
+            finite = np.isfinite(now.reducible) & np.isfinite(now.length)
+            broken = ~(finite & (now.pivot > SINGULAR))
+            end = settled | broken | (share < 1e-5)
+            if end.any():
+                closed = settled & ((now.residual <= 1e4 * RESIDUAL * size) | may_stay_open)
+                reason = np.where(broken, NOT_FINITE, np.where(closed, CONVERGED, STALLED))
+                status[alive[end]] = reason[end]
+                _store(done, alive[end], now.select(end))
+                keep = ~end
+                equations, now, alive = equations.select(keep), now.select(keep), alive[keep]
+                share, applied, at_rounding = share[keep], applied[keep], at_rounding[keep]
+                if not len(alive):
+                    return done
+            fraction = share * np.minimum(1.0, 0.5 * size / np.maximum(now.length, 1e-300))
+            length = fraction * now.length
+            tiny = bool((length <= STEP * size).all())
+            trial = equations.evaluate(equations.move(now, fraction), now if tiny else None)
+            low = trial.reducible <= RESIDUAL * size
+            better = low | (trial.residual <= (1 - 1e-4 * fraction) * now.residual)
+            better |= trial.reducible <= 0.5 * now.reducible
+            applied = np.where(better, length, applied)
+            at_rounding = np.where(better & low, at_rounding + 1, 0)
+            share = np.where(better, np.minimum(1.0, 4 * share), 0.25 * share)
+            steps[alive] += 1
+            now = now.replace_where(better, trial)
+        _store(done, alive, now)
+    return done
+
+
+def _store(done: Solved, rows: np.ndarray, last: Iterate) -> None:
+    """Write the last iterates of these rows into a result under construction."""
+    done.coordinates[:, rows] = last.coordinates
+    done.residual[rows], done.sign[rows] = last.residual, last.sign
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """The closure equations of N rows as a function of their coordinates.
+
+    unknown : joints that closure determines, group by group. redundant : whether the residual is
+        weighted by the standard deviations of redundant actuators. rows : (N,) numbers for `task`.
+    """
+
+    program: Program
+    unknown: list[list[int]]
+    redundant: bool
+    links: list[PlacedLinks]
+    task: Task | None
+    rows: np.ndarray
+
+    def select(self, keep: np.ndarray) -> _Equations:
+        """Return the equations of these rows."""
+        return replace(self, links=[p.select(keep) for p in self.links], rows=self.rows[keep])
+
+    def evaluate(self, coordinates: FloatArray, previous: Iterate | None = None) -> Iterate:
+        """Return the Newton step at these coordinates and its measures.
+
+        previous : an iterate that is a rounding error away; its step is not computed anew where all
+        rows close.
+        """
+        program, m, N = self.program, len(self.program.freedoms), coordinates.shape[1]
+        T, limbs = coordinates[:12].reshape(3, 4, N), _split_joints(program, coordinates)
+        parts = zip(*(self._eliminate(i, T, theta) for i, theta in enumerate(limbs)), strict=True)
+        tops, lows, signs, pivots = (list(part) for part in parts)
+        if self.task is not None:
+            residual, slopes = self.task(T.transpose(2, 0, 1), self.rows)
+            demand = [slopes[..., list(program.freedoms)], residual[..., None]]
+            lows.append(np.concatenate(demand, axis=2).transpose(1, 2, 0))
+        missing = max(0, m - sum(map(len, lows)))
+        low = np.concatenate([*lows, np.zeros((missing, m + 1, N))])
+        inner = sum((np.add.reduce(top[:, -1] ** 2, axis=(0, 1)) for top in tops), np.zeros(N))
+        norm = np.sqrt(inner + np.add.reduce(low[:, m] ** 2, axis=0))
+        if previous is not None and (norm <= RESIDUAL * program.size).all():
+            zero = 0 * norm
+            return Iterate(
+                coordinates, 0 * previous.step, norm, norm, zero, previous.sign, previous.pivot
+            )
+        low, reflected = triangularize(low, m)
+        signs += [reflected, np.prod(np.sign(np.diagonal(low[:m, :m])), axis=-1)]
+        y = back_substitute(low[:m, :m], -low[:m, m:])[:, 0]
+        reducible = np.sqrt(inner + np.add.reduce(low[:m, m] ** 2, axis=0))
+        twist = np.zeros((6, N))
+        twist[list(program.freedoms)] = y
+        turns = []
+        for top in tops:
+            u = len(top)
+            rest = top[:, -1] + np.add.reduce(top[:, u : u + m] * y[:, None], axis=1)
+            turns.append(back_substitute(top[:, :u], -rest[:, None])[:, 0])
+        step = np.concatenate([twist, *(turn.reshape(-1, N) for turn in turns)])
+        length, sign, pivot = (
+            self._length(twist, turns),
+            np.prod(signs, axis=0),
+            np.min(pivots, axis=0),
+        )
+        return Iterate(coordinates, step, norm, reducible, length, sign, pivot)
+
+    def _eliminate(
+        self, i: int, T: FloatArray, theta: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Eliminate the joints of the limbs in group i.
+
+        Returns the rows (u, columns, k, N) that determine these joints, the rows (.., m + 1, N)
+        without them, and the sign of the determinant and the smallest relative pivot (N,).
+        """
+        program, group, unknown = self.program, self.program.groups[i], self.unknown[i]
+        chain, u, m = Chain(group, self.links[i], T, theta, program.size), len(unknown), 0
+        columns = [chain.rows_of_joint(j) for j in unknown]
+        columns += [chain.rows_of_freedom(f) for f in program.freedoms]
+        if self.redundant:
+            j = int(np.flatnonzero(group.actuator[:, 0] >= 0)[0])
+            sigma = np.array(program.sigma)[group.actuator[j], None]
+            columns.append(chain.rows_of_joint(j) * sigma)
+        rows, reflected = triangularize(chain.stack(*columns, chain.residual()), u)
+        sign = pivot = np.ones(T.shape[-1])
+        if u:
+            diagonal = np.diagonal(rows[:u, :u])
+            sign = np.prod(reflected * np.prod(np.sign(diagonal), axis=-1), axis=0)
+            largest = np.maximum(np.abs(diagonal).max(axis=-1), 1e-300)
+            pivot = (np.abs(diagonal).min(axis=-1) / largest).min(axis=0)
+        low = rows[u:, u:].transpose(2, 0, 1, 3).reshape(-1, rows.shape[1] - u, T.shape[-1])
+        if self.redundant:
+            # each row in standard deviations of the actuator that drives its limb
+            m = len(program.freedoms)
+            low = np.delete(low / np.abs(low[:, m, None]), m, axis=1)
+        return rows[:u], low, sign, pivot
+
+    def _length(self, twist: FloatArray, turns: list[FloatArray]) -> FloatArray:
+        """Return the length of a step [m]: its largest part, an angle times the robot's size."""
+        size = self.program.size
+        length = np.maximum(np.abs(twist[:3]).max(axis=0) * size, np.abs(twist[3:]).max(axis=0))
+        for group, unknown, turn in zip(self.program.groups, self.unknown, turns, strict=True):
+            for j, part in zip(unknown, turn, strict=True):
+                unit = size if group.joints[j : j + 1] == "R" else 1.0
+                length = np.maximum(length, np.abs(part).max(axis=0) * unit)
+        return length
+
+    def move(self, now: Iterate, fraction: FloatArray) -> FloatArray:
+        """Return the coordinates a fraction (N,) of its step beyond an iterate."""
+        out, N = now.coordinates.copy(), len(fraction)
+        twist, T, new = fraction * now.step[:6], now.coordinates[:12], out[:12].reshape(3, 4, N)
+        new[:, :3] = matmul(exponential(twist[:3]), T.reshape(3, 4, N)[:, :3])
+        new[:, 3] += twist[3:]
+        first = 6
+        for theta, unknown in zip(_split_joints(self.program, out), self.unknown, strict=True):
+            last = first + len(unknown) * theta.shape[1]
+            part = now.step[first:last].reshape(len(unknown), theta.shape[1], N)
+            theta[unknown] += fraction * part
+            first = last
+        return out
+
+
+def _split_joints(program: Program, coordinates: FloatArray) -> list[FloatArray]:
+    """Return the joint values (J + 1, k, N) of each group as views into coordinates."""
+    out, first = [], 12
+    for shape in map(_joint_shape, program.groups):
+        last = first + shape[0] * shape[1]
+        out.append(coordinates[first:last].reshape(*shape, coordinates.shape[1]))
+        first = last
+    return out
+
+
+def _joint_shape(group: Group) -> tuple[int, int]:
+    """Return the numbers of joints of a limb, its rod counted, and of limbs."""
+    return len(group.joints) + 1, len(group.limbs)
+
+
+def _pack(program: Program, solved: Solved, shape: tuple[int, int]) -> State:
+    """Return solved rows as a state with the axes (t, n)."""
+    T = np.zeros((solved.coordinates.shape[1], 4, 4))
+    T[:, :3], T[:, 3, 3] = solved.coordinates[:12].T.reshape(-1, 3, 4), 1.0
+    joints = tuple(
+        values.transpose(2, 1, 0).reshape(*shape, *_joint_shape(group)[::-1])
+        for group, values in zip(
+            program.groups, _split_joints(program, solved.coordinates), strict=True
+        )
+    )
+    return State(
+        T.reshape(*shape, 4, 4),
+        joints,
+        solved.status.reshape(shape),
+        solved.residual.reshape(shape),
+        solved.steps.reshape(shape),
+        np.sign(np.nan_to_num(solved.sign)).astype(np.int8).reshape(shape),
+    )
