@@ -456,7 +456,7 @@ def report_leave_one_out(machine: Robot, data: Data, methods: Sequence[Any]) -> 
 
 def report_per_leg(machine: Robot, data: Data, steps: int) -> Report:
     """Identify leg by leg."""
-    from loopcal.papers.per_leg import identify_per_leg
+    from loopcal.papers.hexapod_42.leg_form import identify_per_leg
 
     found = identify_per_leg(machine, data, steps)
     return {"values": found.robot.values, "conditions": found.conditions}
@@ -784,12 +784,12 @@ def report_hexapod_42(noise: tuple[float, float] | None, iterations: int) -> Rep
     poses.
     """
     from loopcal.papers.hexapod_42 import steps
-    from loopcal.papers.hexapod_42.study_noise import limits_si
+    from loopcal.papers.hexapod_42.noise_study import to_si
 
     study, _ = _hexapod_42()
-    measured = steps.measured_poses(study, None if noise is None else limits_si(noise), 0)
+    measured = steps.draw_measured_poses(study, None if noise is None else to_si(noise), 0)
     found = steps.iterate(study, measured, iterations)
-    off = found.parameter_errors(study.truth)
+    off = found.compute_parameter_errors(study.truth)
     return {
         "commanded": study.commanded.q,
         "actual": measured,
@@ -804,16 +804,18 @@ def report_hexapod_42(noise: tuple[float, float] | None, iterations: int) -> Rep
 
 def report_hexapod_42_table_4() -> Report:
     """Ask which Euler order and which odd row explain the printed poses."""
-    from loopcal.papers.hexapod_42 import study_table_4
+    from loopcal.papers.hexapod_42 import table_4_study
 
     study, printed = _hexapod_42()
     measured = printed.measured_poses.values / np.array([1e3] * 3 + [1.0] * 3)
-    orders = study_table_4.orders(study.robot, study.truth, study.poses[2:], measured[2:])
-    odd = study_table_4.outliers(study, printed, measured)
+    orders = table_4_study.rank_euler_orders(
+        study.robot, study.truth, study.poses[2:], measured[2:]
+    )
+    odd = table_4_study.search_outliers(study, printed, measured)
     return {
         "order": orders[0].formula,
         "position": [o.position for o in orders[:6]],
-        "named": list(odd.named),
+        "named": list(odd.labels),
         "first": [o.chi_square for o in odd.first],
         "last": [o.chi_square for o in odd.last],
     }
@@ -823,11 +825,11 @@ def report_hexapod_42_methods(trials: int) -> Report:
     """Compare methods on the stated noise, but least squares over all legs: ten narrow poses hardly
     determine it.
     """
-    from loopcal.papers.hexapod_42 import study_noise
+    from loopcal.papers.hexapod_42 import noise_study
 
     found = [
         m
-        for m in study_noise.methods(_hexapod_42()[0], 0, trials)
+        for m in noise_study.compare_methods(_hexapod_42()[0], 0, trials)
         if not m.method.startswith("all legs")
     ]
     return {
@@ -837,13 +839,17 @@ def report_hexapod_42_methods(trials: int) -> Report:
 
 
 def _hexapod_42() -> tuple[Any, Any]:
-    from loopcal.papers.hexapod_42.compare import whole_degrees
-    from loopcal.papers.hexapod_42.published import nominal_machine, published, true_machine
+    from loopcal.papers.hexapod_42.published import (
+        load_nominal_machine,
+        make_true_machine,
+        read_published,
+    )
     from loopcal.papers.hexapod_42.steps import Study
+    from loopcal.papers.hexapod_42.study import round_to_degrees
 
-    printed, machine = published(), nominal_machine()
-    truth = true_machine(machine, printed.errors.values * 1e-3)
-    return Study(machine, truth, whole_degrees(printed.nominal_poses)), printed
+    printed, machine = read_published(), load_nominal_machine()
+    truth = make_true_machine(machine, printed.errors.values * 1e-3)
+    return Study(machine, truth, round_to_degrees(printed.nominal_poses)), printed
 
 
 def report_tsvd_2016(name: str, five: bool) -> Report:

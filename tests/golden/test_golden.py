@@ -13,7 +13,15 @@ import pytest
 from tests.golden import compare
 from tests.golden.cases import CASES
 
-EXCEPTIONS: dict[str, tuple[float, str]] = {}
+PER_LEG = (
+    "leg by leg now solves with the pose's sensitivities instead of the engine's closure rows: the "
+    "same numbers, rounded elsewhere, and magnified by condition numbers of 5000 per leg"
+)
+EXCEPTIONS: dict[str, tuple[float, str]] = {
+    "papers/hexapod-42/exact": (1e3, PER_LEG),  # shares of 5e-10 of errors of 0.05 mm
+    "papers/hexapod-42/presumed-noise": (1e3, PER_LEG),
+    "papers/hexapod-42/stated-noise": (1e3, PER_LEG),
+}
 """case -> (factor on all its tolerances, reason)."""
 
 GOLDEN = compare.read()

@@ -7,7 +7,7 @@ import pytest
 from loopcal.errors import EstimationError
 from loopcal.estimate import identify
 from loopcal.measure import sample_truth, simulate, simulate_trials
-from loopcal.papers.per_leg import identify_per_leg
+from loopcal.papers.hexapod_42.leg_form import identify_per_leg
 from tests import zoo
 from tests.estimate.problems import bed, hexapod, hexapod_poses, probed_heights, tracker
 

@@ -69,7 +69,7 @@ PAPERS: Mapping[str, Paper] = {
             "squares leg by leg",
             "study of a 6-DOF parallel mechanism with 42 kinematic parameters, read as text; no "
             "DOI known to us",
-            "loopcal.papers.hexapod_42.compare",
+            "loopcal.papers.hexapod_42.study",
         ),
         Paper(
             "tsvd-2016",

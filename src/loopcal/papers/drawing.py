@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures from data, by matplotlib; the same label has the same colour in all figures of a paper."""
+"""Figures drawn by matplotlib from data; a label has the same color in all figures of a paper."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ def png(figure: Figure, style: Mapping[str, Mapping[str, Any]]) -> bytes:
         )
     for label, value in figure.levels.items():
         axes.axhline(value, color=LEVEL, linestyle="--", linewidth=1.2)
-        axes.annotate(label, (0.008, value), xycoords=("axes fraction", "data"), ha="left", va="bottom",
-                      fontsize=8.5, color=LEVEL)  # fmt: skip
+        place = {"xycoords": ("axes fraction", "data"), "ha": "left", "va": "bottom"}
+        axes.annotate(label, (0.008, value), fontsize=8.5, color=LEVEL, **place)
     if "x" in figure.log:
         axes.set_xscale("log")
     elif all(float(x).is_integer() for series in figure.series for x in series.x):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What repeating a paper yields: tables, verdicts and figures, all as data."""
+"""The result of repeating a paper: tables, verdicts and figures, all as data."""
 
 from __future__ import annotations
 
@@ -9,30 +9,37 @@ from typing import Any
 
 from loopcal.papers.printed import Comparison, Table
 
-ASKED_HERE = "not a statement of the paper, asked here"
+OWN_CHECK = "our own check, not a statement of the paper"
+"""Place of a claim that the paper does not make."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One statement, judged.
+    """The judgement of one claim.
 
     Attributes
     ----------
-    claim : what is stated. agrees : whether what was computed bears it out; None where it cannot be
-        judged, see `why`.
+    claim : the statement. agrees : whether the computed numbers bear it out; None where they cannot
+        decide, see `why`.
     why : the evidence in a sentence or two, with the numbers of this run.
-    where : its place in the paper; ASKED_HERE for what the paper does not state.
+    where : place of the claim in the paper; OWN_CHECK for a check of ours.
+    name : of the claim in text.yaml.
     """
 
     claim: str
     agrees: bool | None
     why: str
     where: str
+    name: str = ""
 
     @property
     def word(self) -> str:
-        """The judgement."""
-        return "Open" if self.agrees is None else "Agrees" if self.agrees else "Does not agree"
+        """The judgement as a word: a claim of the paper agrees, a check of ours is confirmed."""
+        if self.agrees is None:
+            return "Undecided"
+        if self.where == OWN_CHECK:
+            return "Confirmed" if self.agrees else "Not confirmed"
+        return "Agrees" if self.agrees else "Does not agree"
 
 
 @dataclass(frozen=True)
@@ -50,11 +57,10 @@ class Figure:
 
     Attributes
     ----------
-    name : of its file. title, x_label, y_label, caption : text, with units on the axes and numbers
-        of cases in the caption.
-    series : the lines. levels : horizontal lines by label. log : axes that are logarithmic, "", "y"
-        or "xy".
-    joined : whether points of a series are joined by lines; not where their order along x means
+    name : of its file. title, x_label, y_label, caption : texts, with units on the axes and the
+        number of cases in the caption.
+    series : the lines. levels : horizontal lines by label. log : logarithmic axes: "", "y" or "xy".
+    joined : whether lines join the points of a series. They do not where the order along x means
         nothing.
     """
 
@@ -71,15 +77,14 @@ class Figure:
 
 @dataclass(frozen=True)
 class Reproduction:
-    """A paper repeated.
+    """A repeated paper.
 
     Attributes
     ----------
-    paper, title, source : which. about : what was done, a paragraph each. settings : seed and sizes
-        of this run.
+    paper, title, source : which one. about : paragraphs on what was done.
+    settings : seed and sizes of this run.
     comparisons : published beside computed numbers, one for each table of the paper.
-    tables : what was computed beyond them. verdicts : what agrees and what does not, and why.
-        figures : as data.
+    tables : further computed numbers. verdicts : the judged claims. figures : as data.
     """
 
     paper: str
@@ -93,7 +98,7 @@ class Reproduction:
     figures: tuple[Figure, ...]
 
     def summary(self) -> Table:
-        """How many numbers of each published table agree to one unit of their last printed digit."""
+        """Return how many numbers of each published table agree to one unit of their last digit."""
         return Table(
             "summary",
             "Published beside computed",
@@ -111,11 +116,11 @@ class Reproduction:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything by attribute name, for JSON."""
-        parts = {
-            name: getattr(self, name)
-            for name in ("paper", "title", "source", "about", "settings", "verdicts", "figures")
+        """Return all content by attribute name, for JSON."""
+        names = ("paper", "title", "source", "about", "settings", "verdicts", "figures")
+        return {
+            **{name: getattr(self, name) for name in names},
+            "summary": self.summary().to_dict(),
+            "comparisons": [c.table().to_dict() for c in self.comparisons],
+            "tables": [table.to_dict() for table in self.tables],
         }
-        parts["summary"] = self.summary().to_dict()
-        parts["comparisons"] = [c.table().to_dict() for c in self.comparisons]
-        return parts | {"tables": [table.to_dict() for table in self.tables]}

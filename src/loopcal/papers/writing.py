@@ -45,7 +45,7 @@ def page(found: Reproduction, made_by: Mapping[str, Any]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(TEMPLATE).render(found=found, made_by=made_by)
+    return environment.get_template(TEMPLATE).render(reproduction=found, made_by=made_by)
 
 
 def write_folder(

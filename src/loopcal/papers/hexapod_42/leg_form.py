@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The six least-squares problems of the paper's section 3 at one machine: changes of leg length
-against parameters.
+"""The six least-squares problems of the paper's section 3: changes of leg length by parameters.
 
-The error model of a pose, twist = D dp + S dq (S by the readings), becomes S^-1 twist = S^-1 D dp =
-G dp: rows of G belong to one leg each. Derivation: docs/theory/hexapod.md.
+The error model of a pose, twist = D dp + S dq (S by the readings), becomes
+S^-1 twist = S^-1 D dp = G dp. Rows of G belong to one leg each, so each leg is a problem of n rows
+and its own parameters. It ignores that the noise of a pose is shared by all legs, which costs
+accuracy: use `identify` for real work. Derivation: docs/theory/hexapod.md. Source: "Numerical
+simulation of the calibration algorithm for a 6-DOF parallel mechanism", section 3.
 """
 
 from __future__ import annotations
@@ -12,9 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.mechanism import Mechanism, Solution, differentiate_pose
-from loopcal.papers.hexapod_42.published import LEGS
-from loopcal.typing import FloatArray
+from loopcal.errors import EstimationError
+from loopcal.measure import Measurements, Observations
+from loopcal.mechanism import Mechanism, Solution, differentiate_pose, forward
+from loopcal.typing import FloatArray, IntArray
+
+SHARED = 1e-9
+"""Share of a column of G, relative to its largest entry, that counts as no effect on a leg."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,44 +29,125 @@ class LegForm:
 
     Attributes
     ----------
-    G : (n, 6, p) change of each leg's length with the parameters. S : (n, 6, 6) twist by leg
-        length. D : (n, 6, p) twist
-    by parameters. own : for each leg, the positions of its parameters.
+    G : (n, 6, p) change of each leg's length with the parameters.
+    S : (n, 6, 6) twist by leg lengths. D : (n, 6, p) twist by parameters.
+    members : for each leg, the positions of its parameters.
     """
 
     G: FloatArray
     S: FloatArray
     D: FloatArray
-    own: tuple[np.ndarray, ...]
+    members: tuple[IntArray, ...]
 
     @classmethod
-    def at(cls, machine: Mechanism, at: Solution) -> LegForm:
-        """Linearise a machine at poses."""
-        found = differentiate_pose(machine, machine.values[None], at.q[None], at.state)
-        names = machine.parameters.names
-        own = tuple(np.flatnonzero([name.startswith(f"{leg}.") for name in names]) for leg in LEGS)
-        S, D = found.readings[0], found.parameters[0]
-        return cls(np.linalg.solve(S, D), S, D, own)
+    def at(cls, machine: Mechanism, solution: Solution) -> LegForm:
+        """Linearize a machine at solved poses."""
+        slopes = differentiate_pose(machine, machine.values[None], solution.q[None], solution.state)
+        S, D = slopes.readings[0], slopes.parameters[0]
+        G = np.asarray(np.linalg.solve(S, D), dtype=np.float64)
+        size = np.abs(G).max(axis=0)
+        touched = size > SHARED * size.max(axis=0, keepdims=True)
+        members = tuple(np.flatnonzero(row) for row in touched)
+        return cls(G, S, D, members)
 
-    def lengths(self, twists: FloatArray) -> FloatArray:
-        """Changes of leg length (n, 6) [m] that twists (n, 6) mean."""
+    def compute_lengths(self, twists: FloatArray) -> FloatArray:
+        """Return the changes of leg length (n, 6) [m] that twists (n, 6) mean."""
         return np.asarray(np.linalg.solve(self.S, twists[..., None])[..., 0], dtype=np.float64)
 
-    def change(self, twists: FloatArray) -> FloatArray:
-        """Change (p,) of the parameters that explains twists (n, 6) best, leg by leg, unweighted."""
-        lengths, change = self.lengths(twists), np.zeros(self.G.shape[2])
-        for leg, own in enumerate(self.own):
-            change[own] = np.linalg.lstsq(self.G[:, leg, own], lengths[:, leg])[0]
+    def fit(self, twists: FloatArray) -> FloatArray:
+        """Return the change (p,) of the parameters that fits twists (n, 6) best, leg by leg."""
+        lengths, change = self.compute_lengths(twists), np.zeros(self.G.shape[2])
+        for leg, members in enumerate(self.members):
+            change[members] = np.linalg.lstsq(self.G[:, leg, members], lengths[:, leg])[0]
         return change
 
-    def explained(self, twists: FloatArray) -> FloatArray:
-        """Share (6,) of each leg's norm of length changes that parameters could explain; 0 for
-        residuals of least squares.
+    def explain(self, twists: FloatArray) -> FloatArray:
+        """Return the share (6,) of each leg's length changes that parameters could explain.
+
+        It is the ratio of norms, and 0 for residuals of least squares.
         """
-        lengths, shares = self.lengths(twists), []
-        for leg, own in enumerate(self.own):
-            q, _ = np.linalg.qr(self.G[:, leg, own])
-            shares.append(
-                float(np.linalg.norm(q.T @ lengths[:, leg]) / np.linalg.norm(lengths[:, leg]))
-            )
+        lengths, shares = self.compute_lengths(twists), []
+        for leg, members in enumerate(self.members):
+            q, _ = np.linalg.qr(self.G[:, leg, members])
+            explained = np.linalg.norm(q.T @ lengths[:, leg])
+            shares.append(float(explained / np.linalg.norm(lengths[:, leg])))
         return np.array(shares)
+
+    @property
+    def conditions(self) -> FloatArray:
+        """(6,) condition number of each leg's matrix, columns unscaled."""
+        columns = [self.G[:, leg, members] for leg, members in enumerate(self.members)]
+        return np.array([np.linalg.cond(matrix) for matrix in columns])
+
+
+@dataclass(frozen=True, eq=False)
+class PerLegEstimate:
+    """Result of the identification leg by leg.
+
+    Attributes
+    ----------
+    robot : at the estimated values. estimate_history : (steps + 1, p) parameters after each step
+        [SI]. conditions : (6,) condition number of each leg's matrix in the last step.
+    """
+
+    robot: Mechanism
+    estimate_history: FloatArray
+    conditions: FloatArray
+
+
+def identify_per_leg(robot: Mechanism, data: Measurements, steps: int = 3) -> PerLegEstimate:
+    """Identify a hexapod leg by leg in a fixed number of Gauss-Newton steps.
+
+    Parameters
+    ----------
+    robot : start values; all parameters free. data : full poses of one kind. steps : their number.
+
+    Raises
+    ------
+    EstimationError
+        The data are not full poses, a parameter moves no leg or several, or a pose is out of reach.
+    """
+    observations = _select_full_poses(data)
+    q = data.readings[observations.rows]
+    values, history, conditions = robot.values.copy(), [robot.values.copy()], np.zeros(0)
+    for _ in range(steps):
+        machine = robot.with_values(values)
+        solution = forward(machine, q)
+        if not solution.converged.all():
+            raise EstimationError(
+                f"{robot.name} cannot reach {int((~solution.converged).sum())} of these poses; "
+                "check the readings"
+            )
+        legs = LegForm.at(machine, solution)
+        _check_members(robot, legs)
+        seen = observations.kind.evaluate(solution.T[None], observations.measured[None])
+        twists = -np.linalg.solve(seen.jacobian[0], seen.residual[0, :, :, None])[:, :, 0]
+        values = values + legs.fit(twists)
+        history.append(values.copy())
+        conditions = legs.conditions
+    return PerLegEstimate(robot.with_values(values), np.stack(history), conditions)
+
+
+def _check_members(robot: Mechanism, legs: LegForm) -> None:
+    """Refuse parameters that do not move exactly one leg."""
+    count = np.zeros(len(robot.parameters), dtype=int)
+    for members in legs.members:
+        count[members] += 1
+    if (count != 1).any():
+        name = robot.parameters.names[int(np.argmax(count != 1))]
+        raise EstimationError(
+            f"{name} moves {int(count[count != 1][0])} legs, not exactly one, so the legs cannot "
+            "be identified one by one; use identify"
+        )
+
+
+def _select_full_poses(data: Measurements) -> Observations:
+    """Return the rows of the one kind, which must measure all six coordinates of every pose."""
+    kinds = [observations for observations in data.observations if len(observations)]
+    if len(kinds) == 1:
+        kept = kinds[0].take(kinds[0].weight > 0.0)
+        if kept.present.shape[1] == 6 and kept.present.all() and len(kept):
+            return kept
+    raise EstimationError(
+        "identification leg by leg needs full poses of one kind; use identify for other data"
+    )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the paper prints, and the machine of its Tables 2 and 3."""
+"""The printed numbers of the paper, and the machine of its Tables 2 and 3."""
 
 from __future__ import annotations
 
@@ -18,19 +18,17 @@ from loopcal.typing import FloatArray
 MM = 1e-3
 LEGS = tuple(f"leg{i}" for i in range(1, 7))
 PARAMETERS = ("base.x", "base.y", "base.z", "length", "platform.x", "platform.y", "platform.z")
-"""Ours for the columns of Tables 2, 3 and 5."""
+"""Our names for the columns of Tables 2, 3 and 5."""
 
-PARAMETER_COLUMNS = ("XB", "YB", "ZB", "l", "XP", "YP", "ZP")
-POSE_COLUMNS = ("X [mm]", "Y [mm]", "Z [mm]", "alpha [rad]", "beta [rad]", "gamma [rad]")
 ODD_POSE = "A2"
-"""The row of Table 4 that is of another machine; that it is so is found, not assumed: see
-`outliers` in studies.py.
+"""The row of Table 4 that belongs to another machine. The outlier search of table_4_study.py
+finds it without being told.
 """
 
 
 @dataclass(frozen=True)
 class Published:
-    """The printed tables, the statements, and where they stand; see published.yaml."""
+    """The printed tables and statements; see published.yaml."""
 
     source: str
     statements: Mapping[str, Mapping[str, str]]
@@ -46,12 +44,12 @@ class Published:
 
     @property
     def threshold(self) -> float:
-        """Of max dQint [mm + rad], at which the iteration ends."""
+        """Value of max dQint [mm + rad] at which the iteration ends."""
         return float(self.statements["threshold"]["value"])
 
     @property
     def iterations(self) -> int:
-        """After how many it is met."""
+        """Iterations after which the paper meets it."""
         return int(self.statements["iterations"]["value"])
 
     @property
@@ -61,12 +59,12 @@ class Published:
 
     @property
     def order(self) -> str:
-        """Euler order, in our names, of the printed rotation matrix."""
+        """Euler order of the printed rotation matrix, in our names."""
         return self.statements["rotation"]["order"]
 
 
 @cache
-def published() -> Published:
+def read_published() -> Published:
     """Read published.yaml."""
     from loopcal.io.core.yaml_file import read_yaml
 
@@ -92,15 +90,15 @@ def published() -> Published:
     )
 
 
-def nominal_machine() -> Mechanism:
-    """The hexapod of Table 2 (shipped as the robot hexapod-42)."""
+def load_nominal_machine() -> Mechanism:
+    """Return the hexapod of Table 2 (the shipped robot hexapod-42)."""
     from loopcal.io import load_robot
 
     return load_robot("hexapod-42")
 
 
-def true_machine(robot: Mechanism, errors: FloatArray, leg_lengths: bool = True) -> Mechanism:
-    """The hexapod with errors.
+def make_true_machine(robot: Mechanism, errors: FloatArray, leg_lengths: bool = True) -> Mechanism:
+    """Return the hexapod with errors.
 
     Parameters
     ----------
@@ -114,18 +112,18 @@ def true_machine(robot: Mechanism, errors: FloatArray, leg_lengths: bool = True)
 
 
 def to_values(robot: Mechanism, table: FloatArray) -> FloatArray:
-    """(p,) in the robot's order of a table (6, 7) in the paper's layout."""
+    """Return values (p,) in the robot's order of a table (6, 7) in the paper's layout."""
     values = np.zeros(len(robot.parameters))
-    values[_places(robot)] = table
+    values[_find_places(robot)] = table
     return values
 
 
 def to_table(robot: Mechanism, values: FloatArray) -> FloatArray:
-    """(6, 7) in the paper's layout of values (p,) in the robot's order."""
-    return values[_places(robot)]
+    """Return a table (6, 7) in the paper's layout of values (p,) in the robot's order."""
+    return values[_find_places(robot)]
 
 
-def _places(robot: Mechanism) -> np.ndarray:
+def _find_places(robot: Mechanism) -> np.ndarray:
     return np.array(
         [[robot.parameters.index(f"{leg}.{name}") for name in PARAMETERS] for leg in LEGS]
     )

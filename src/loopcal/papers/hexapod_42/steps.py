@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ten steps of the paper's section 5, one function of this library for each of them.
+"""The ten steps of the paper's section 5, one library call for each of them.
 
  1 nominal poses, nominal parameters, errors          Study
- 2 actual poses: inverse kinematics of the nominal,   actual_poses
+ 2 actual poses: inverse kinematics of the nominal,   compute_actual_poses
    forward kinematics of the machine with errors
- 3 measured poses: noise added                        measured_poses
+ 3 measured poses: noise added                        draw_measured_poses
  4 pose errors: measured minus nominal                \
  5 parameter errors, least squares leg by leg          |
  6 corrected parameters                                |  iterate
@@ -26,28 +26,27 @@ from functools import cached_property
 import numpy as np
 
 from loopcal import geometry
-from loopcal.diagnose import compute_pose_errors
 from loopcal.geometry import OrientationForm, parse_orientation
 from loopcal.measure import Measurements, Observations, Pose, make_random_stream
 from loopcal.mechanism import Mechanism, Solution, forward, inverse
-from loopcal.papers.hexapod_42.leg_form import LegForm
-from loopcal.papers.per_leg import identify_per_leg
+from loopcal.papers.hexapod_42.leg_form import LegForm, identify_per_leg
+from loopcal.papers.hexapod_42.published import MM
 from loopcal.typing import FloatArray
 
 ORDER = "xyz"
-"""R = Rz(gamma) Ry(beta) Rx(alpha), with which Table 4 was made; not what equation (2) says, see
-`orders` in studies.py.
+"""R = Rz(gamma) Ry(beta) Rx(alpha), with which Table 4 was made. Equation (2) differs, see
+`rank_euler_orders` in table_4_study.py.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """Step 1: what is given.
+    """Step 1: the given machine, its errors and the poses.
 
     Attributes
     ----------
-    robot : the machine as designed. truth : with its errors. poses : (n, 6) nominal [m, rad]. order
-        : Euler order.
+    robot : the machine as designed. truth : with its errors. poses : (n, 6) nominal [m, rad].
+    order : Euler order.
     """
 
     robot: Mechanism
@@ -57,24 +56,28 @@ class Study:
 
     @cached_property
     def commanded(self) -> Solution:
-        """Nominal poses and the leg readings that the nominal machine answers them with."""
-        return inverse(self.robot, transforms(self.poses, self.order))
+        """Nominal poses with the leg readings of the nominal machine."""
+        return inverse(self.robot, to_transforms(self.poses, self.order))
 
-    def reached(self, machine: Mechanism) -> FloatArray:
-        """(n, 6) poses [m, rad] of a machine at the readings of the nominal one."""
-        return coordinates(forward(machine, self.commanded.q, self.commanded).T, self.order)
+    def solve_truth(self) -> Solution:
+        """Return the poses of the true machine at the readings of the nominal one."""
+        return forward(self.truth, self.commanded.q, self.commanded)
+
+    def compute_reached(self, machine: Mechanism) -> FloatArray:
+        """Return the poses (n, 6) [m, rad] of a machine at the readings of the nominal one."""
+        return to_coordinates(forward(machine, self.commanded.q, self.commanded).T, self.order)
 
 
 @dataclass(frozen=True, eq=False)
 class Iterations:
-    """What steps 4 to 10 yield; index k is the state after k iterations, 0 the nominal machine.
+    """Result of steps 4 to 10. Index k is the state after k iterations, 0 the nominal machine.
 
     Attributes
     ----------
-    machines : (k + 1) corrected machines. pose_errors : (k + 1, n, 6) measured minus corrected [m,
-        rad].
-    integrated : (k + 1,) max dQint [mm + rad]. conditions : (6,) condition of each leg's matrix in
-        the first iteration.
+    machines : (k + 1) corrected machines.
+    pose_errors : (k + 1, n, 6) measured minus corrected [m, rad].
+    integrated : (k + 1,) max dQint [mm + rad].
+    conditions : (6,) condition number of each leg's matrix in the first iteration.
     """
 
     machines: tuple[Mechanism, ...]
@@ -82,118 +85,119 @@ class Iterations:
     integrated: FloatArray
     conditions: FloatArray
 
-    def needed(self, threshold: float) -> int | None:
-        """Iterations until max dQint is at most the threshold; None where it never is."""
+    def count_needed(self, threshold: float) -> int | None:
+        """Return the iterations until max dQint is at most the threshold; None if it never is."""
         met = np.flatnonzero(self.integrated[1:] <= threshold)
         return int(met[0]) + 1 if len(met) else None
 
-    def parameter_errors(self, truth: Mechanism) -> FloatArray:
-        """(k + 1, p) true minus corrected parameters [m]."""
+    def compute_parameter_errors(self, truth: Mechanism) -> FloatArray:
+        """Return true minus corrected parameters (k + 1, p) [m]."""
         return truth.values - np.stack([machine.values for machine in self.machines])
 
 
-def actual_poses(study: Study) -> FloatArray:
-    """Step 2: (n, 6) true poses [m, rad] at the readings with which the nominal machine answers the
-    nominal poses.
-    """
-    return study.reached(study.truth)
+def compute_actual_poses(study: Study) -> FloatArray:
+    """Return the true poses (n, 6) [m, rad] at the readings of the nominal machine: step 2."""
+    return study.compute_reached(study.truth)
 
 
-def measured_poses(
+def draw_measured_poses(
     study: Study, noise: FloatArray | None = None, seed: int = 0, trial: int = 0
 ) -> FloatArray:
-    """Step 3: (n, 6) true poses with noise uniform in +-`noise` (6,) [m, rad]; none: exact.
+    """Return the true poses (n, 6) with noise uniform in +-`noise` (6,) [m, rad]: step 3.
 
-    The numbers drawn are those of `simulate_trials` for the same seed and trial.
+    Without noise they are exact. The drawn numbers are those of `simulate_trials` for the same
+    seed and trial.
     """
-    actual = actual_poses(study)
+    actual = compute_actual_poses(study)
     if noise is None:
         return actual
     drawn = make_random_stream(seed, trial).uniform(-1.0, 1.0, actual.shape)
     return actual + np.roll(drawn, 3, axis=1) * noise  # a kind has its angles first
 
 
-def iterate(study: Study, measured: FloatArray, limit: int = 4, renewed: bool = True) -> Iterations:
-    """Steps 4 to 10: a fixed number of iterations, so that what happens after the rule is met is
-    seen too.
+def iterate(
+    study: Study, measured: FloatArray, limit: int = 4, is_renewed: bool = True
+) -> Iterations:
+    """Run steps 4 to 10 for a fixed number of iterations, beyond the paper's stopping rule too.
 
     Parameters
     ----------
-    study : what is given. measured : (n, 6) [m, rad]. limit : number of iterations.
-    renewed : whether the matrix is made anew at every corrected machine; the paper does not say.
-        False: that of the nominal machine throughout.
+    study : the given machine. measured : (n, 6) [m, rad]. limit : number of iterations.
+    is_renewed : whether the matrix is computed anew at every corrected machine. The paper does not
+        say. False keeps the matrix of the nominal machine throughout.
 
     Raises
     ------
     EstimationError
         A corrected machine cannot reach a pose.
     """
-    data = measurements(study, measured)
-    fixed = None if renewed else LegForm.at(study.robot, study.commanded)
-    machines, errors, conditions = [study.robot], [difference(measured, study.poses)], np.zeros(0)
+    data = to_measurements(study, measured)
+    nominal = LegForm.at(study.robot, study.commanded)
+    machines, errors = [study.robot], [subtract_poses(measured, study.poses)]
+    conditions = np.zeros(0)
     for k in range(limit):
-        if fixed is None or k == 0:
-            found = identify_per_leg(machines[-1], data, steps=1)
-            conditions = found.conditions if k == 0 else conditions
-            corrected = found.robot
+        if is_renewed or k == 0:
+            estimate = identify_per_leg(machines[-1], data, steps=1)
+            conditions = estimate.conditions if k == 0 else conditions
+            corrected = estimate.robot
         else:
-            change = fixed.change(twists(errors[-1], measured, study.order))
+            change = nominal.fit(to_twists(errors[-1], measured, study.order))
             corrected = machines[-1].with_values(machines[-1].values + change)
         machines.append(corrected)
-        errors.append(difference(measured, study.reached(corrected)))
+        errors.append(subtract_poses(measured, study.compute_reached(corrected)))
     stacked = np.stack(errors)
-    return Iterations(tuple(machines), stacked, integrated(stacked), conditions)
+    return Iterations(tuple(machines), stacked, integrate_errors(stacked), conditions)
 
 
-def measurements(
+def to_measurements(
     study: Study, measured: FloatArray, sigma: FloatArray | float = 1.0
 ) -> Measurements:
-    """Measured poses (n, 6) [m, rad] as measurements, with a sigma of one unless sigmas (n, 6) [m,
-    rad] are given.
+    """Return measured poses (n, 6) [m, rad] as measurements.
+
+    Parameters
+    ----------
+    sigma : one for all values, or (n, 6) [m, rad].
     """
-    kind = Pose(form_name(study.order)).with_tool(study.robot.tool)
+    kind = Pose(f"euler-{study.order}").with_tool(study.robot.tool)
     sd = sigma if isinstance(sigma, float) else np.roll(sigma, 3, axis=1)
     rows = Observations.from_sigma(kind, np.arange(len(measured)), np.roll(measured, 3, axis=1), sd)
     labels = tuple(f"A{i + 1}" for i in range(len(measured)))
     return Measurements(study.robot.name, study.commanded.q, (rows,), labels=labels)
 
 
-def integrated(errors: FloatArray) -> FloatArray:
-    """Largest dQint (k,) [mm + rad] over the poses of errors (k, n, 6) [m, rad]: equations (15) to
-    (17).
+def integrate_errors(errors: FloatArray) -> FloatArray:
+    """Return the largest integrated error dQint (k,) [mm + rad] of errors (k, n, 6) [m, rad].
+
+    Equations (15) to (17): dQint = |(dx, dy, dz)| [mm] + |(dalpha, dbeta, dgamma)| [rad]. The index
+    adds millimetres and radians as they are, so it exists in this paper only.
     """
-    return np.array(
-        [compute_pose_errors(e[:, :3], e[:, 3:]).statistics("integrated").max for e in errors]
-    )
+    lengths, angles = (np.linalg.norm(part, axis=2) for part in (errors[..., :3], errors[..., 3:]))
+    return (lengths / MM + angles).max(axis=1)
 
 
-def transforms(poses: FloatArray, order: str) -> FloatArray:
-    """(n, 4, 4) of poses (n, 6) [m, rad]."""
-    return geometry.make_pose(form(order).to_matrix(poses[:, 3:]), poses[:, :3])
+def to_transforms(poses: FloatArray, order: str) -> FloatArray:
+    """Return transforms (n, 4, 4) of poses (n, 6) [m, rad]."""
+    return geometry.make_pose(name_orientation(order).to_matrix(poses[:, 3:]), poses[:, :3])
 
 
-def coordinates(T: FloatArray, order: str) -> FloatArray:
-    """(n, 6) [m, rad] of poses (n, 4, 4)."""
-    return np.concatenate([T[:, :3, 3], form(order).from_matrix(T[:, :3, :3])], axis=1)
+def to_coordinates(T: FloatArray, order: str) -> FloatArray:
+    """Return coordinates (n, 6) [m, rad] of transforms (n, 4, 4)."""
+    angles = name_orientation(order).from_matrix(T[:, :3, :3])
+    return np.concatenate([T[:, :3, 3], angles], axis=1)
 
 
-def difference(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Differences (n, 6) of coordinates, angles wrapped."""
+def subtract_poses(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return differences (n, 6) of coordinates, angles wrapped."""
     change = first - second
     return np.concatenate([change[:, :3], geometry.wrap_angle(change[:, 3:])], axis=1)
 
 
-def form(order: str) -> OrientationForm:
-    """Euler angles of this order."""
-    return parse_orientation(form_name(order))
+def name_orientation(order: str) -> OrientationForm:
+    """Return the Euler angles of this order."""
+    return parse_orientation(f"euler-{order}")
 
 
-def form_name(order: str) -> str:
-    """As measurement files call it."""
-    return f"euler-{order}"
-
-
-def twists(errors: FloatArray, poses: FloatArray, order: str) -> FloatArray:
-    """Twists (n, 6), rotation first, of errors (n, 6) [m, rad] of coordinates near poses (n, 6)."""
-    omega = form(order).rates(poses[:, 3:]) @ errors[:, 3:, None]
+def to_twists(errors: FloatArray, poses: FloatArray, order: str) -> FloatArray:
+    """Return twists (n, 6), rotation first, of coordinate errors (n, 6) [m, rad] near poses."""
+    omega = name_orientation(order).rates(poses[:, 3:]) @ errors[:, 3:, None]
     return np.concatenate([omega[..., 0], errors[:, :3]], axis=1)

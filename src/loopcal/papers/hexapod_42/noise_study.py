@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Studies of noise, method and poses: the results of the ten steps over many draws of noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopcal.errors import EstimationError
+from loopcal.estimate import MAP, LeastSquares, identify_trials
+from loopcal.measure import (
+    Instrument,
+    Pose,
+    Sensor,
+    Trials,
+    Uniform,
+    make_random_stream,
+    simulate_trials,
+)
+from loopcal.mechanism import forward_trials
+from loopcal.papers.hexapod_42.leg_form import identify_per_leg
+from loopcal.papers.hexapod_42.published import MM, Published
+from loopcal.papers.hexapod_42.steps import (
+    Study,
+    compute_actual_poses,
+    draw_measured_poses,
+    integrate_errors,
+    iterate,
+    to_transforms,
+)
+from loopcal.papers.printed import Cell
+from loopcal.typing import FloatArray
+
+STATED = (1e-3, 1e-6)
+"""Limits [mm, rad] of the stated noise. The paper gives none for angles: the same number in the
+unit that its Table 6 prints, 0.001 mrad.
+"""
+PRESUMED = (1e-6, 1e-9)
+"""Limits [mm, rad] of the noise with which Tables 5 and 6 agree, as the sweep shows."""
+LEVELS = (
+    STATED, (1e-4, 1e-7), (1e-5, 1e-8), (1e-6, 0.0), PRESUMED, (1e-6, 5e-9), (1e-6, 1e-6),
+    (1e-7, 1e-10),
+)  # fmt: skip
+NARROW, WIDE = "as in the paper", "wide"
+RANGES = {
+    NARROW: ((-10.0, -10.0, 200.0, -3.0, -3.0, -3.0), (10.0, 10.0, 210.0, 3.0, 3.0, 3.0)),
+    WIDE: ((-40.0, -40.0, 170.0, -14.0, -14.0, -14.0), (40.0, 40.0, 230.0, 14.0, 14.0, 14.0)),
+}
+"""Of drawn poses: low and high x, y, z [mm], alpha, beta, gamma [deg]."""
+UNMEASURED = 100
+"""Poses that are not measured, on which methods are compared."""
+DRAWN_POSES = 3  # purpose of a random stream
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """Results with one level of noise.
+
+    Attributes
+    ----------
+    limits : [mm, rad]. needed : (t,) iterations, infinite for never.
+    sizes : (t, 4) after calibration: pose residual rms [mm] and [rad], parameter error rms [mm],
+        max dQint [mm + rad].
+    """
+
+    limits: tuple[float, float]
+    sizes: FloatArray
+    needed: FloatArray
+
+    @property
+    def median(self) -> FloatArray:
+        """(4,) medians of the sizes."""
+        return np.median(self.sizes, axis=0)
+
+    def contains(self, sizes: FloatArray) -> bool:
+        """Return whether sizes (4,) lie between the smallest and the largest drawn ones."""
+        low, high = self.sizes.min(axis=0), self.sizes.max(axis=0)
+        return bool(np.all((sizes >= low) & (sizes <= high)))
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """Root mean squares [mm] over draws: parameters, and positions in the narrow and wide range."""
+
+    method: str
+    parameters: float
+    narrow: float
+    wide: float
+
+
+def to_si(limits: tuple[float, float]) -> FloatArray:
+    """Return limits (6,) [m, rad] of limits [mm, rad]."""
+    return np.array([limits[0] * MM] * 3 + [limits[1]] * 3)
+
+
+def compute_published_sizes(printed: Published) -> FloatArray:
+    """Return the four sizes of Tables 5 and 6 as printed."""
+    residual = printed.pose_errors_after.values * np.array([MM] * 3 + [1.0] * 3)
+    rms = [_compute_rms(part) for part in (residual[:, :3] / MM, residual[:, 3:])]
+    parameters = _compute_rms(printed.parameter_errors_after.values * 1e-3)
+    return np.array([*rms, parameters, integrate_errors(residual[None])[0]])
+
+
+def sweep_noise(
+    study: Study, iterations: int, threshold: float, seed: int, trials: int
+) -> tuple[Level, ...]:
+    """Repeat the ten steps at every level of noise; sizes are those after `iterations`."""
+    levels = []
+    for limits in LEVELS:
+        sizes, needed = [], []
+        for trial in range(trials):
+            measured = draw_measured_poses(study, to_si(limits), seed, trial)
+            run = iterate(study, measured, limit=iterations + 1)
+            residual = run.pose_errors[iterations]
+            error = run.compute_parameter_errors(study.truth)[iterations]
+            rms = [_compute_rms(x) for x in (residual[:, :3] / MM, residual[:, 3:], error / MM)]
+            sizes.append([*rms, run.integrated[iterations]])
+            needed.append(run.count_needed(threshold) or np.inf)
+        levels.append(Level(limits, np.array(sizes), np.array(needed)))
+    return tuple(levels)
+
+
+def list_levels(levels: tuple[Level, ...], published: FloatArray) -> list[tuple[Cell, ...]]:
+    """Return table rows of the sweep, with the published sizes in the first one."""
+    rows: list[tuple[Cell, ...]] = [
+        ("published, Tables 5 and 6", None, None, *map(float, published), None, None)
+    ]
+    for level in levels:
+        met = f"{int(np.isfinite(level.needed).sum())} of {len(level.needed)}"
+        sizes = (*level.limits, *map(float, level.median))
+        rows.append(("computed, median", *sizes, met, level.contains(published)))
+    return rows
+
+
+def compare_methods(study: Study, seed: int, trials: int) -> tuple[MethodResult, ...]:
+    """Compare the paper's method, all legs weighted together, and MAP on the same stated noise."""
+    simulated = simulate_stated_noise(study, seed, trials)
+    together, prior = (
+        identify_trials(study.robot, simulated, method).values for method in (LeastSquares(), MAP())
+    )
+    values = {
+        "not calibrated": study.robot.values[None],
+        "leg by leg, unweighted (the paper)": _identify_per_leg(study, simulated),
+        "all legs, weighted by the noise": together,
+        "the same with tolerances as prior (MAP)": prior,
+    }
+    unmeasured = [
+        Study(study.robot, study.truth, draw_poses(name, UNMEASURED, seed), study.order)
+        for name in RANGES
+    ]
+    return tuple(
+        MethodResult(
+            name,
+            _compute_rms((v - study.truth.values) / MM),
+            *(_compute_position_error(study, v, other) for other in unmeasured),
+        )
+        for name, v in values.items()
+    )
+
+
+def compare_poses(study: Study, threshold: float, seed: int, trials: int) -> list[tuple]:
+    """Return table rows for other numbers and ranges of poses."""
+    sets = [("first of the paper", study.poses[:n]) for n in (7, 8, 9)]
+    sets.append(("the paper's ten", study.poses))
+    for name, counts in ((NARROW, (20, 40)), (WIDE, (10, 20, 40))):
+        sets += [(f"drawn, {name}", draw_poses(name, n, seed)) for n in counts]
+    rows = []
+    for name, poses in sets:
+        other = Study(study.robot, study.truth, poses, study.order)
+        exact = iterate(other, compute_actual_poses(other))
+        simulated = simulate_stated_noise(other, seed, trials)
+        together = identify_trials(study.robot, simulated, LeastSquares()).values
+        errors = [
+            _compute_rms((values - study.truth.values) / MM)
+            for values in (_identify_per_leg(other, simulated), together)
+        ]
+        needed, condition = exact.count_needed(threshold), float(exact.conditions.max())
+        rows.append((name, len(poses), needed, condition, *errors))
+    return rows
+
+
+def compute_initial_error(study: Study) -> float:
+    """Return the rms parameter error [mm] of the machine as designed."""
+    return _compute_rms((study.robot.values - study.truth.values) / MM)
+
+
+def simulate_stated_noise(study: Study, seed: int, trials: int) -> Trials:
+    """Return measurements with the stated noise; the draws are those of `draw_measured_poses`."""
+    noise = Uniform(np.roll(to_si(STATED), 3))
+    instrument = Instrument((Sensor(Pose(f"euler-{study.order}"), noise),))
+    truth = np.repeat(study.truth.values[None], trials, axis=0)
+    poses = to_transforms(study.poses, study.order)
+    return simulate_trials(study.robot, truth, poses, instrument, seed)
+
+
+def draw_poses(name: str, n: int, seed: int) -> FloatArray:
+    """Return poses (n, 6) [m, rad] drawn uniformly in one of RANGES."""
+    low, high = (np.array(end) * np.array([MM] * 3 + [np.pi / 180.0] * 3) for end in RANGES[name])
+    return make_random_stream(seed, n, DRAWN_POSES).uniform(low, high, (n, 6))
+
+
+def _identify_per_leg(study: Study, simulated: Trials) -> FloatArray:
+    """Return values (t, p); NaN where a corrected machine cannot reach the poses."""
+    values = []
+    for trial in range(len(simulated)):
+        try:
+            values.append(identify_per_leg(study.robot, simulated.trial(trial)).robot.values)
+        except EstimationError:
+            values.append(np.full(len(study.robot.parameters), np.nan))
+    return np.array(values)
+
+
+def _compute_position_error(study: Study, values: FloatArray, other: Study) -> float:
+    """Return the rms distance [mm] of true and predicted positions at equal readings."""
+    commanded = other.commanded
+    predicted, true = (
+        forward_trials(study.robot, v, commanded.q[None], commanded.state).T[..., :3, 3]
+        for v in (values, study.truth.values[None])
+    )
+    return float(np.sqrt(np.mean(np.sum(((predicted - true) / MM) ** 2, axis=-1))))
+
+
+def _compute_rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
