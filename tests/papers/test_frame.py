@@ -11,7 +11,7 @@ from loopcal.cli import main
 from loopcal.errors import DataError, FileError
 from loopcal.papers import PAPERS, Paper, paper
 from loopcal.papers.printed import Comparison, Printed, Table
-from loopcal.papers.reproduction import ASKED_HERE, Figure, Reproduction, Series, Verdict
+from loopcal.papers.reproduction import OWN_CHECK, Figure, Reproduction, Series, Verdict
 from loopcal.papers.writing import page, write_folder
 
 MADE_BY = {"command": ["loopcal", "reproduce", "small"], "versions": {"loopcal": "1", "numpy": "2"}}
@@ -39,7 +39,7 @@ def small() -> Reproduction:
         ("", ".1f"),
         shown=2,
     )
-    verdict = Verdict("It holds.", False, "It does not.", ASKED_HERE)
+    verdict = Verdict("It holds.", False, "It does not.", OWN_CHECK)
     return Reproduction(
         "small",
         "A title",
@@ -72,7 +72,7 @@ def test_the_page_shows_published_beside_computed_and_marks_what_differs() -> No
         "**2.0e+00** | 0 |" in text
     )
     assert (
-        "**Does not agree:** It holds. (not a statement of the paper, asked here)\n   It does not."
+        "**Not confirmed:** It holds. (our own check, not a statement of the paper)\n   It does not."
         in text
     )
     assert "| q | - |" in text

@@ -22,7 +22,7 @@ from loopcal.papers.cmm_constraint_2011.layouts import (
 from loopcal.papers.cmm_constraint_2011.published import MM, published
 from loopcal.papers.cmm_constraint_2011.study import ABSOLUTE, ALIGNED, AT_NOMINAL, MEASURES
 from loopcal.papers.cmm_constraint_2011.tables import Results, pair_rank
-from loopcal.papers.reproduction import ASKED_HERE, Verdict
+from loopcal.papers.reproduction import OWN_CHECK, Verdict
 
 PARAMETERS, POSITION = MEASURES.index("parameters [mm]"), MEASURES.index("position [mm]")
 SEEN = MEASURES.index("position, aligned [mm]")
@@ -172,7 +172,7 @@ def _figure_5(found: Results) -> tuple[Verdict, ...]:
             f" noise of {NOISE:g} is {np.sqrt(NOISE):g} mm, and parameters get worse, a reduction "
             f"of {words[0]} at best"
             f" (position {words[1]}, orientation {words[2]}).",
-            ASKED_HERE,
+            OWN_CHECK,
         ),
         Verdict(
             "Figure 5 follows with errors in all 42 parameters, compared in the absolute frame.",
@@ -196,7 +196,7 @@ def _points(found: Results) -> tuple[Verdict, ...]:
             f"The sd of the identifiable directions falls {ten.gain:.1f} times, from "
             f"{ten.drawn:.3g} to {ten.optimised:.3g} mm"
             f" per mm of noise ({one.gain:.1f} times on one plane, one sweep).",
-            ASKED_HERE,
+            OWN_CHECK,
         ),
         Verdict(
             "One plane and one line are enough.",
@@ -207,7 +207,7 @@ def _points(found: Results) -> tuple[Verdict, ...]:
             "along x and y too. After"
             f" calibration with noise of {NOISE:g} mm the position is wrong by {cost[1]:.2g} mm "
             f"against {cost[0]:.2g} mm.",
-            ASKED_HERE,
+            OWN_CHECK,
         ),
     )
 
@@ -292,7 +292,7 @@ def _prior(found: Results) -> Verdict:
         f" {hardest.median(PRIOR)[SEEN]:.2g} mm; single machines do get worse, here "
         f"{hardest.worse(PRIOR, SEEN)} of"
         f" {len(hardest.iterations)}.",
-        ASKED_HERE,
+        OWN_CHECK,
     )
 
 
@@ -317,7 +317,7 @@ def _weights(found: Results) -> Verdict:
         f" {parameters['printed']:.3g}, {parameters['distance']:.3g}, {parameters['single']:.3g}, "
         f"{parameters['full']:.3g} mm"
         f" (errors {SET:g} mm, noise {NOISE:g} mm).",
-        ASKED_HERE,
+        OWN_CHECK,
     )
 
 
@@ -332,7 +332,7 @@ def _forms(found: Results) -> Verdict:
         f"{forms.rows[-1][0]:g} mm (ten times less"
         f" at a tenth of the noise), variances by {forms.covariance:.0e} of themselves. "
         "Derivation: docs/theory/constraint.md.",
-        ASKED_HERE,
+        OWN_CHECK,
     )
 
 

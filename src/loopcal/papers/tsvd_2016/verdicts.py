@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from loopcal.papers.reproduction import ASKED_HERE, Verdict
+from loopcal.papers.reproduction import OWN_CHECK, Verdict
 from loopcal.papers.tsvd_2016.cases import CHOSEN, LS, PRIOR, RANKED, RE, TSVD, Answer, Case
 from loopcal.papers.tsvd_2016.cases import CROSS as CASE_CROSS
 from loopcal.papers.tsvd_2016.draws import (
@@ -71,7 +71,7 @@ def _noise() -> Verdict:
         "rad"
         f" ({np.rad2deg(largest[3:].max()):.4f} deg); their rms is {rms:.3f} of the limit, that of "
         "uniform noise 0.577.",
-        ASKED_HERE,
+        OWN_CHECK,
     )
 
 
@@ -170,7 +170,7 @@ def _five(found: Results) -> tuple[Verdict, ...]:
             "LS cannot be used with 5-DOF measurement.", not as_good,
             f"Leaving that one direction alone is enough, no lambda is needed: {'; '.join(pairs)} "
             "(one machine, Appendix 1)."
-            f" Over many machines {many}.", ASKED_HERE,
+            f" Over many machines {many}.", OWN_CHECK,
         ),
         _said(
             "no_solution", not as_good,
@@ -292,7 +292,7 @@ def _asked(found: Results) -> tuple[Verdict, ...]:
             "small numbers and hardly"
             f" count. Condition for the 3-PRS: {_raw(first):.0e} raw, {first.known.condition:.0e} "
             "whitened and scaled.",
-            ASKED_HERE,
+            OWN_CHECK,
         ),
         Verdict(
             "MAP with the tolerances as prior is better than raw LS, RE and TSVD at their best, in "
@@ -302,7 +302,7 @@ def _asked(found: Results) -> tuple[Verdict, ...]:
                 f"{d.name}: MAP {_errors(d.median(PRIOR))}, raw LS {_errors(d.median(RAW_LS))}, "
                 "best RE"
                 f" {_errors(d.median(RAW_RE))}, best TSVD {_errors(d.median(RAW_TSVD))}" for d in (tripod, tracker)
-            ) + f" (medians over {len(tripod)} machines).", ASKED_HERE,
+            ) + f" (medians over {len(tripod)} machines).", OWN_CHECK,
         ),
         Verdict(
             "On the 3-PRS MAP is within 5 % of GCV and within 15 % of the best lambda that "
@@ -310,7 +310,7 @@ def _asked(found: Results) -> tuple[Verdict, ...]:
             f"Ratios of medians (position, angle): {_pair(tripod.ratio(PRIOR, CROSS)[:2])} and"
             f" {_pair(tripod.ratio(PRIOR, HINDSIGHT)[:2])}; on the RU-PUS-PRS "
             f"{_pair(tracker.ratio(PRIOR, CROSS)[:2])} and"
-            f" {_pair(tracker.ratio(PRIOR, HINDSIGHT)[:2])}.", ASKED_HERE,
+            f" {_pair(tracker.ratio(PRIOR, HINDSIGHT)[:2])}.", OWN_CHECK,
         ),
     )  # fmt: skip
 
