@@ -9,7 +9,15 @@ import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.estimate import MAP, LeastSquares, identify_trials
-from loopcal.measure import Instrument, Pose, Sensor, Trials, Uniform, simulate_trials, stream
+from loopcal.measure import (
+    Instrument,
+    Pose,
+    Sensor,
+    Trials,
+    Uniform,
+    make_random_stream,
+    simulate_trials,
+)
 from loopcal.mechanism import forward_trials
 from loopcal.papers.hexapod_42.leg_form import identify_per_leg
 from loopcal.papers.hexapod_42.published import MM, Published
@@ -189,7 +197,7 @@ def simulate_stated_noise(study: Study, seed: int, trials: int) -> Trials:
 def draw_poses(name: str, n: int, seed: int) -> FloatArray:
     """Return poses (n, 6) [m, rad] drawn uniformly in one of RANGES."""
     low, high = (np.array(end) * np.array([MM] * 3 + [np.pi / 180.0] * 3) for end in RANGES[name])
-    return stream(seed, n, DRAWN_POSES).uniform(low, high, (n, 6))
+    return make_random_stream(seed, n, DRAWN_POSES).uniform(low, high, (n, 6))
 
 
 def _identify_per_leg(study: Study, simulated: Trials) -> FloatArray:

@@ -27,7 +27,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.geometry import OrientationForm, parse_orientation
-from loopcal.measure import Measurements, Observations, Pose, stream
+from loopcal.measure import Measurements, Observations, Pose, make_random_stream
 from loopcal.mechanism import Mechanism, Solution, forward, inverse
 from loopcal.papers.hexapod_42.leg_form import LegForm, identify_per_leg
 from loopcal.papers.hexapod_42.published import MM
@@ -111,7 +111,7 @@ def draw_measured_poses(
     actual = compute_actual_poses(study)
     if noise is None:
         return actual
-    drawn = stream(seed, trial).uniform(-1.0, 1.0, actual.shape)
+    drawn = make_random_stream(seed, trial).uniform(-1.0, 1.0, actual.shape)
     return actual + np.roll(drawn, 3, axis=1) * noise  # a kind has its angles first
 
 
@@ -158,7 +158,7 @@ def to_measurements(
     ----------
     sigma : one for all values, or (n, 6) [m, rad].
     """
-    kind = Pose(f"euler-{study.order}").mounted(study.robot.tool)
+    kind = Pose(f"euler-{study.order}").with_tool(study.robot.tool)
     sd = sigma if isinstance(sigma, float) else np.roll(sigma, 3, axis=1)
     rows = Observations.from_sigma(kind, np.arange(len(measured)), np.roll(measured, 3, axis=1), sd)
     labels = tuple(f"A{i + 1}" for i in range(len(measured)))
