@@ -454,22 +454,22 @@ def test_the_published_table_names_its_own_euler_order() -> None:
     opposite order.
     """
     from loopcal.measure import Observations
-    from loopcal.papers.hexapod_42.compare import TO_PRINTED, whole_degrees
-    from loopcal.papers.hexapod_42.published import MM, nominal_machine, published
-    from loopcal.papers.hexapod_42.steps import ORDER, Study, form_name, measurements
+    from loopcal.papers.hexapod_42.published import MM, load_nominal_machine, read_published
+    from loopcal.papers.hexapod_42.steps import ORDER, Study, to_measurements
+    from loopcal.papers.hexapod_42.study import TO_PRINTED, round_to_degrees
 
-    printed, robot = published(), nominal_machine()
-    study = Study(robot, robot, whole_degrees(printed.nominal_poses), ORDER)
+    printed, robot = read_published(), load_nominal_machine()
+    study = Study(robot, robot, round_to_degrees(printed.nominal_poses), ORDER)
     values = printed.measured_poses.values / TO_PRINTED
     sigma = printed.measured_poses.unit * np.array([MM] * 3 + [1.0] * 3) / np.sqrt(12.0)
-    right = measurements(study, values, sigma)
+    right = to_measurements(study, values, sigma)
     assert not compare_conventions(robot, right).refused
-    kind = Pose(form_name(printed.order)).with_tool(robot.tool)
+    kind = Pose(f"euler-{printed.order}").with_tool(robot.tool)
     rows = Observations.from_sigma(
         kind, np.arange(len(values)), np.roll(values, 3, axis=1), np.roll(sigma, 3, axis=1)
     )
     found = compare_conventions(robot, replace(right, observations=(rows,)))
-    assert found.other == f"rotations read as {form_name(ORDER)}"
+    assert found.other == f"rotations read as euler-{ORDER}"
     assert found.misfit > 100.0 * found.other_misfit
 
 
