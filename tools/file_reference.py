@@ -14,12 +14,12 @@ from pathlib import Path
 
 from loopcal.io.core import file_reference
 from loopcal.io.data.kind_rows import SETTINGS
-from loopcal.io.data.kind_settings import SYMBOLS, list_kind_settings
+from loopcal.io.data.kind_settings import list_kind_settings
 from loopcal.io.exports.profile import FROM, KEYS
 from loopcal.io.runs.run_folder import MADE_BY
 from loopcal.measure import KINDS, Column, Kind
 from loopcal.mechanism import FAMILIES, RobotRecord
-from loopcal.units import Dimension
+from loopcal.units import DISPLAY_UNITS, Dimension
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGE, EXPORTS = DOCS / "files.md", DOCS / "exports.md"
@@ -44,7 +44,7 @@ def table(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def record_table(record: type, without: Iterable[str] = ()) -> str:
     """Return the keys of a record, those left out that `without` names."""
     left = set(without)
-    found = [key for key in file_reference.keys(record) if key.name not in left]
+    found = [key for key in file_reference.list_keys(record) if key.name not in left]
     if not any(key.meaning for key in found):
         return (
             "; ".join(
@@ -67,27 +67,27 @@ def common_records() -> tuple[type, ...]:
     """Return the records that several families use."""
     seen: dict[type, int] = {}
     for family in FAMILIES.values():
-        for record in file_reference.nested(family):
+        for record in file_reference.list_nested_records(family):
             seen[record] = seen.get(record, 0) + 1
     return tuple(record for record, count in seen.items() if count > 1)
 
 
 def families() -> str:
     """Return the keys of every family, beside the common ones."""
-    shared = [key.name for key in file_reference.keys(RobotRecord)]
+    shared = [key.name for key in file_reference.list_keys(RobotRecord)]
     parts = []
     for name, family in FAMILIES.items():
-        own = [record for record in file_reference.nested(family) if record not in common_records()]
+        own = [record for record in file_reference.list_nested_records(family) if record not in common_records()]
         parts.append(
             "### `family: "
-            f"{name}`\n\n{file_reference.summary(family)}\n\n{record_table(family, shared)}"
+            f"{name}`\n\n{file_reference.summarize(family)}\n\n{record_table(family, shared)}"
         )
         parts += [_nested(record) for record in own]
     return "\n".join(parts)
 
 
 def _nested(record: type) -> str:
-    return f"**{record.__name__}**: {file_reference.summary(record)}\n\n{record_table(record)}"
+    return f"**{record.__name__}**: {file_reference.summarize(record)}\n\n{record_table(record)}"
 
 
 def kinds() -> str:
@@ -96,7 +96,7 @@ def kinds() -> str:
     for name, kind in KINDS.items():
         rows = dict.fromkeys(_example(one) for one in kind.examples())
         columns = table(("settings", "columns", "noise is stated for"), rows)
-        meanings = file_reference.meanings_of(kind)
+        meanings = file_reference.collect_meanings(kind)
         if possible := getattr(kind, "allowed_unknown", ()):
             meanings["unknown"] = (
                 f"Which of {', '.join(f'`{p}`' for p in possible)} are unknown, and identified "
@@ -107,7 +107,7 @@ def kinds() -> str:
             [(f"`{key}`", meanings.get(key, "")) for key in list_kind_settings(kind)],
         )
         parts.append(
-            f"### `kind: {name}`\n\n{file_reference.summary(kind)}\n\n{columns}\n{settings}"
+            f"### `kind: {name}`\n\n{file_reference.summarize(kind)}\n\n{columns}\n{settings}"
         )
     return "\n".join(parts)
 
@@ -132,7 +132,7 @@ def _example(kind: Kind) -> tuple[str, str, str]:
 def _columns(columns: Iterable[Column]) -> str:
     """Return columns with an example of their unit."""
     return " ".join(
-        f"`{c.name}`" + ("" if c.dimension is Dimension.RATIO else f" [{SYMBOLS[c.dimension][0]}]")
+        f"`{c.name}`" + ("" if c.dimension is Dimension.RATIO else f" [{DISPLAY_UNITS[c.dimension].symbol}]")
         for c in columns
     )
 

@@ -38,6 +38,10 @@ class EstimationError(LoopcalError):
     """An estimate that cannot be made from these data with this method."""
 
 
+class ArgumentTypeError(LoopcalError, TypeError):
+    """An argument of the wrong type; the text says what to pass."""
+
+
 class FileError(LoopcalError):
     """A file that cannot be read or written; `str` gives `path:line: sentence`.
 

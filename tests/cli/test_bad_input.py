@@ -60,41 +60,41 @@ ROBOT_CASES = {
     "missing unit": (
         UNITS,
         "",
-        "states no units, and a number without a unit is refused; write for example",
+        "states no units, which every number needs; write for example",
     ),
     "unit of the wrong kind": (
         "length: mm",
         "length: deg",
-        "'deg' is not a unit of length; allowed are m, mm",
+        "'deg' is not a unit of length; allowed: m, mm",
     ),
     "unknown key": ("stroke:", "strok:", "unknown key 'strok' (did you mean 'stroke'?)"),
     "duplicate key": (
         UNITS,
         UNITS * 2,
-        "key 'units' stands here for the second time; keep one of the two",
+        "duplicate key 'units'; remove one",
     ),
     "number typed as text": (
         BASE,
         "[120, '-140', 0]",
-        "is the text '-140' where a number is needed; write the number",
+        "is the text '-140', but a number is needed",
     ),
     "two numbers where three are needed": (
         BASE,
         "[120, -140]",
-        "has 2 values where 3 are needed; add the missing ones",
+        "has 2 values, but 3 are needed; add the missing ones",
     ),
-    "NaN": (BASE, "[120, .nan, 0]", "is nan; every number must be finite"),
+    "NaN": (BASE, "[120, .nan, 0]", "is nan; write a finite number"),
     "a comma in a number": (
         "lengths: 233.238076",
         "lengths: 233,238",
-        "write a point in the number, not a comma",
+        "write a decimal point, not a comma",
     ),
     "a list too long": (
         "[-75, 75]",
         "[-75, 75, 3]",
-        "'stroke' has 3 values where 2 are needed; remove the others",
+        "'stroke' has 3 values, but 2 are needed; remove the others",
     ),
-    "not YAML": (BASE, "[120, -140, 0", "this is not valid YAML"),
+    "not YAML": (BASE, "[120, -140, 0", "not valid YAML"),
     "newer format": (
         "format: 1",
         "format: 2",
@@ -163,9 +163,9 @@ def test_a_home_outside_the_strokes_is_noted(tmp_path, capsys) -> None:
 FILE_CASES = {
     "empty file": (b"", "is empty"),
     "empty but for blanks": (b" \n\n", "is empty"),
-    "a folder for a file": (None, "is a folder where a"),
+    "a folder for a file": (None, "is a folder, but a"),
     "not UTF-8": ("# Länge\n".encode("latin-1"), "is not UTF-8 text (byte 0xe4); save it as UTF-8"),
-    "a zero byte": (b"format: 1\0\n", "holds a zero byte"),
+    "a zero byte": (b"format: 1\0\n", "contains a zero byte"),
 }
 
 
@@ -177,8 +177,8 @@ def test_what_is_no_text_file_is_refused_as_robot_and_as_data(refused, case) -> 
 
 
 def test_an_absent_file_is_refused(refused) -> None:
-    assert "there is no such robot file" in refused("check robot.yaml")
-    assert "there is no such measurement file" in refused("calibrate hexapod-42 data.csv -o run")
+    assert "this robot file does not exist" in refused("check robot.yaml")
+    assert "this measurement file does not exist" in refused("calibrate hexapod-42 data.csv -o run")
     assert "is not a run folder" in refused("validate run data.csv", data_csv=DATA)
 
 
@@ -186,7 +186,7 @@ DATA_CASES = {
     "missing unit": (
         "z [mm]",
         "z",
-        "data.csv:4: column 'z' has no unit; write it in brackets, for example 'z [mm]'",
+        "data.csv:4: column 'z' has no unit; write it in brackets, such as 'z [mm]'",
     ),
     "unknown unit": (
         "z [mm]",
@@ -206,24 +206,24 @@ DATA_CASES = {
     "duplicate setting": (
         "# noise",
         "# kind: pose\n# noise",
-        "data.csv:3: key 'kind' stands here for the second time",
+        "data.csv:3: duplicate key 'kind'",
     ),
     "duplicate column": (
         "q2 [mm]",
         "q1 [mm]",
-        "data.csv:4: column 'q1' stands here for the second time",
+        "data.csv:4: duplicate column 'q1'",
     ),
     "text for a number": (
         "b,1,",
         "b,one,",
-        "data.csv:6: column 'q1' is 'one' where a number is needed",
+        "data.csv:6: column 'q1' is 'one', but a number is needed",
     ),
     "a cell too few": (
         "b,1,",
         "b,",
-        "data.csv:6: this row has 7 cells, but the header names 8 columns",
+        "data.csv:6: this row has 7 cells, but the header has 8 columns",
     ),
-    "NaN": ("201.1", "NaN", "data.csv:6: column 'z' is 'NaN', which is not a finite number"),
+    "NaN": ("201.1", "NaN", "data.csv:6: column 'z' is 'NaN', which is not finite"),
     "a reading outside the stroke": (
         "b,1,",
         "b,80,",
@@ -257,7 +257,7 @@ def test_a_bad_measurement_file_is_refused_with_its_line(refused, case, command)
 POSES = "\n".join(line.rpartition(",")[0] for line in DATA.split("\n")[3:-1])
 HEIGHTS = "# kind: component\n# components: [z]\n# noise: {z: 1 um}\npose,z [mm]\na,200\nb,201.1\n"
 SEVERAL_CASES = {
-    "a pose that is not there": (POSES, HEIGHTS + "d,203\n", "heights.csv:7: there is no pose 'd'"),
+    "a pose that is not there": (POSES, HEIGHTS + "d,203\n", "heights.csv:7: unknown pose 'd'"),
     "other readings": (
         POSES,
         DATA.replace("b,1,1", "b,1,2"),
@@ -277,7 +277,7 @@ SEVERAL_CASES = {
     "no readings": (
         POSES.replace("b,1,1,1,1,1,1", "b,,,,,,"),
         HEIGHTS,
-        "poses.csv:3: pose 'b' has no readings, here or in",
+        "poses.csv:3: pose 'b' has no readings",
     ),
 }
 
@@ -385,7 +385,7 @@ def test_a_controller_that_is_not_there_is_refused(refused) -> None:
     text = DATA.replace(HEADER, f"pose,{commanded},z [mm]").replace(
         "# noise", "# controller: no.yaml\n# noise"
     )
-    assert "there is no such robot file" in refused(
+    assert "this robot file does not exist" in refused(
         "calibrate hexapod-42 data.csv -o run", data_csv=text
     )
 

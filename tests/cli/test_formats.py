@@ -162,7 +162,7 @@ def test_files_that_are_there_stay_without_force(folder, capsys, data_folder) ->
 @pytest.mark.parametrize(
     ("command", "sentence"),
     [
-        ("import no.cfg -o x.yaml", "no.cfg: there is no such printer.cfg"),
+        ("import no.cfg -o x.yaml", "no.cfg: this printer.cfg does not exist"),
         ("import a.txt -o x.yaml", "the name of this file tells no format"),
         ("import a.csv -o x.yaml", "loopcal writes the format csv, but does not read it"),
         ("import a.cfg -o x.yaml --corrected y.cfg", "say where to write them, as --data data.csv"),
@@ -182,7 +182,7 @@ def test_files_that_are_there_stay_without_force(folder, capsys, data_folder) ->
         ),
         (
             "export linear-delta --format klipper --into no.cfg -o x.cfg",
-            "no.cfg: there is no such printer.cfg",
+            "no.cfg: this printer.cfg does not exist",
         ),
     ],
 )

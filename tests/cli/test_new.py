@@ -35,10 +35,10 @@ def test_the_template_lacks_nothing_but_rows(tmp_path, capsys) -> None:
     assert main(words.split()) == 0
     template = tmp_path / "heights.csv"
     assert (
-        "# noise: {z: 20 um}\npose,q1 [mm],q2 [mm],q3 [mm],z [mm]\n# Below come the rows"
+        "# noise: {z: 20 um}\npose,q1 [mm],q2 [mm],q3 [mm],z [mm]\n# Add one row"
         in template.read_text()
     )
-    assert "may be added: block, session, group, time" in template.read_text()
+    assert "Optional columns: block, session, group, time" in template.read_text()
     assert main(["calibrate", "printer.yaml", "heights.csv", "-o", "run"]) == 1
     assert "has a header but no rows; add one row for each measured pose" in capsys.readouterr().err
     rows = [f"p{i},{150 + 7 * i},{150 + i * i},{160 - 3 * i},100.0" for i in range(12)]

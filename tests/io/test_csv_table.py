@@ -70,10 +70,10 @@ def test_a_sidecar_holds_the_settings_and_makes_comments_of_what_begins_with_a_h
     ("old", "new", "line", "message"),
     [
         (GOOD, "", None, "is empty"),
-        (GOOD, "# kind: pose\n", None, "no header and no rows"),
+        (GOOD, "# kind: pose\n", None, "no header"),
         ("p1,233.5,1e-3\n# skipped\n\np2,234.5,\n", "", 4, "a header but no rows"),
         ("# kind: pose", "# cold day", 2, "begin a remark with ##"),
-        ("# kind: pose", "# kind: pose\n# kind: pose", 2, "second time"),
+        ("# kind: pose", "# kind: pose\n# kind: pose", 2, "duplicate key"),
         ("q.leg1 [mm]", "q.leg1", 4, "column 'q.leg1' has no unit; write it in brackets"),
         ("q.leg1 [mm]", "q.leg1 []", 4, "column 'q.leg1': unknown unit ''"),
         (
@@ -84,17 +84,17 @@ def test_a_sidecar_holds_the_settings_and_makes_comments_of_what_begins_with_a_h
         ),
         ("q.leg1 [mm]", "q.leg1 [deg]", 4, "'deg' is a unit of angle, but a length is needed"),
         ("q.leg1 [mm]", "q.leg2 [mm]", 4, "no column 'q.leg1' .did you mean 'q.leg2'"),
-        ("q.leg1 [mm]", "q.leg1 [mm", 4, "column 2 is headed 'q.leg1 .mm'"),
-        ("q.leg1 [mm]", "", 4, "column 2 is headed ''"),
-        ("rx [mrad]", "q.leg1 [mm]", 4, "column 'q.leg1' stands here for the second time"),
-        ("p1,233.5,1e-3", "p1,233.5", 5, "has 2 cells, but the header names 3 columns"),
-        ("p1,233.5,1e-3", "p1,233,5,1e-3", 5, "has 4 cells, but the header names 3 columns"),
+        ("q.leg1 [mm]", "q.leg1 [mm", 4, "header of column 2 is 'q.leg1 .mm'"),
+        ("q.leg1 [mm]", "", 4, "header of column 2 is ''"),
+        ("rx [mrad]", "q.leg1 [mm]", 4, "duplicate column 'q.leg1'"),
+        ("p1,233.5,1e-3", "p1,233.5", 5, "has 2 cells, but the header has 3 columns"),
+        ("p1,233.5,1e-3", "p1,233,5,1e-3", 5, "has 4 cells, but the header has 3 columns"),
         ("p1,233.5,1e-3", "p1,,1e-3", 5, "column 'q.leg1' is empty"),
-        ("p1,233.5,1e-3", "p1,233.5mm,1e-3", 5, "is '233.5mm' where a number is needed"),
-        ("p1,233.5,1e-3", "p1,2_3,1e-3", 5, "is '2_3' where a number is needed"),
-        ("p2,234.5,", "p2,234.5,NaN", 8, "is 'NaN', which is not a finite number; leave empty"),
-        ("p2,234.5,", "p2,234.5,inf", 8, "not a finite number"),
-        ("p2,234.5,", 'p2,"234.5,', 8, "not CSV"),
+        ("p1,233.5,1e-3", "p1,233.5mm,1e-3", 5, "is '233.5mm', but a number"),
+        ("p1,233.5,1e-3", "p1,2_3,1e-3", 5, "is '2_3', but a number"),
+        ("p2,234.5,", "p2,234.5,NaN", 8, "is 'NaN', which is not finite; leave"),
+        ("p2,234.5,", "p2,234.5,inf", 8, "not finite"),
+        ("p2,234.5,", 'p2,"234.5,', 8, "not valid CSV"),
         (
             "pose,q.leg1 [mm],rx [mrad]",
             "pose;q.leg1 [mm];rx [mrad]",
@@ -120,7 +120,7 @@ def test_what_is_not_utf8_is_refused_with_its_line(tmp_path) -> None:
 
 
 def test_a_folder_is_refused(tmp_path) -> None:
-    with pytest.raises(FileError, match="this is a folder where a measurement file is needed"):
+    with pytest.raises(FileError, match="this is a folder, but a measurement file is needed"):
         read_table(tmp_path)
 
 
@@ -135,7 +135,7 @@ def test_settings_in_front_and_beside_are_refused(tmp_path, beside) -> None:
     path = write(tmp_path, GOOD)
     (tmp_path / "data.yaml").write_text(beside)
     with pytest.raises(
-        FileError, match=r"at the top of this file and in data.yaml; keep one of the two"
+        FileError, match=r"at the top of this file and in data.yaml; remove one"
     ):
         read_table(path)
 

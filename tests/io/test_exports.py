@@ -137,7 +137,7 @@ def test_lines_that_do_not_fit_are_listed_and_named_in_the_file(tmp_path) -> Non
     assert [line for line, _ in found.misfits] == [6, 7, 8, 9, 10]
     reasons = " / ".join(reason for _, reason in found.misfits)
     for part in ("it has 3 columns, but 'Z' is column 4", "'two' is no number for 'y'", "'' is no name of a pose",
-                 "'1.234,5' is no number for 'x'", "it has 5 cells, but the header names 4 columns"):  # fmt: skip
+                 "'1.234,5' is no number for 'x'", "it has 5 cells, but the header has 4 columns"):  # fmt: skip
         assert part in reasons
     assert "## lines that did not fit: 6, 7, 8, 9, 10\n" in found.text
     assert found.passed + found.rows + len(found.misfits) == sum(
@@ -310,4 +310,4 @@ def test_options_that_do_not_go_with_a_profile_and_files_that_are_there_are_refu
     assert main(words) == 1
     assert "this file exists" in capsys.readouterr().err
     assert main(["import", "none.txt", *words[2:], "--force"]) == 1
-    assert "there is no such export" in capsys.readouterr().err
+    assert "this export does not exist" in capsys.readouterr().err

@@ -148,7 +148,7 @@ def test_a_template_lacks_only_the_rows(tmp_path, robot, poses, kind) -> None:
         load_measurements(path, robot)
     save_measurements(measured_by(robot, poses, kind), tmp_path / "full.csv", robot)
     full, template = (tmp_path / "full.csv").read_text(), path.read_text()
-    head = template[: template.index("\n# Below come the rows") + 1]
+    head = template[: template.index("\n# Add one row") + 1]
     assert full.startswith(head)
     assert "session, group" in template[len(head) :]
     assert full.count("\n") == head.count("\n") + 6 + (5 if kind.poses_per_row > 1 else 0)
@@ -195,7 +195,7 @@ def test_commanded_coordinates_become_readings_of_the_controller(tmp_path, robot
             "# kind: component\n",
             "",
             None,
-            "do not say what kind of measurement this is; write '# kind: pose'",
+            "no kind of measurement is stated; write '# kind: pose'",
         ),
         (
             "component\n",
@@ -204,11 +204,11 @@ def test_commanded_coordinates_become_readings_of_the_controller(tmp_path, robot
             "'komponent' is not a kind of measurement .did you mean 'component'",
         ),
         ("[z]", "[q]", 2, "component 'q' is unknown"),
-        ("[z]", "[3]", 2, "'components' is .3. where text is needed"),
+        ("[z]", "[3]", 2, "'components entry 1' is the number 3"),
         ("# components", "# componets", 2, "unknown key 'componets' .did you mean 'components'"),
         ("1 um", "1", 3, "'noise.z': '1' has no unit; add one of m, mm, um"),
         ("1 um", "1 urad", 3, "'noise.z': 'urad' is a unit of angle"),
-        ("1 um", "-1 um", 3, "the noise of 'z' is -1 um; give a number above zero"),
+        ("1 um", "-1 um", 3, "the noise of 'z' is -1 um"),
         ("z: 1 um", "zz: 1 um", 3, "unknown key 'zz' in 'noise'"),
         ("# noise: {z: 1 um}\n", "", None, "no noise is stated for 'z'"),
         ("# kind", "# format: 9\n# kind", 1, "has format 9"),
@@ -218,14 +218,14 @@ def test_commanded_coordinates_become_readings_of_the_controller(tmp_path, robot
             "q3 [mm]",
             "note [mm]",
             4,
-            "there is no column 'q3'.*which is the reading of an actuator of hexapod-42",
+            "no column 'q3'.*the reading of an actuator of hexapod-42",
         ),
-        ("z [mm]", "commanded.z [mm]", 4, "there are readings .'q1'. and commanded coordinates"),
-        ("b,1,", "a,1,", 6, "pose 'a' has other readings here than in line 5"),
+        ("z [mm]", "commanded.z [mm]", 4, "has readings .'q1'. and commanded coordinates"),
+        ("b,1,", "a,1,", 6, "pose 'a' has other readings in line 5"),
         ("b,1,", ",1,", 6, "column 'pose' is empty"),
         ("b,1,", "b,,", 6, "column 'q1' is empty"),
-        ("201.1", "201,1", 6, "this row has 9 cells, but the header names 8 columns"),
-        ("201.1", "nan", 6, "column 'z' is 'nan', which is not a finite number"),
+        ("201.1", "201,1", 6, "this row has 9 cells, but the header has 8 columns"),
+        ("201.1", "nan", 6, "column 'z' is 'nan', which is not finite"),
     ],
 )
 def test_a_mistake_is_one_sentence_with_its_line(tmp_path, robot, old, new, line, message) -> None:

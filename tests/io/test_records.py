@@ -78,39 +78,39 @@ def test_numbers_are_scaled_to_si_and_defaults_are_not() -> None:
     ("old", "new", "line", "message"),
     [
         ("name: h\n", "", None, "no key 'name'"),
-        ("- [1, 2, 3]", "- [1, 2]", 7, "'leg.base entry 1' has 2 values where 3 are needed"),
-        ("- [1, 2, 3]", "- [1]", 7, "'leg.base entry 1' has 1 values where 3 are needed"),
-        ("- [1, 2, 3]", "- [1, 2, 3, 4]", 7, "has 4 values where 3 are needed; remove"),
-        ("- [1, 2, 3]", "- 5", 7, "is the number 5 where a list is needed"),
+        ("- [1, 2, 3]", "- [1, 2]", 7, "'leg.base entry 1' has 2 values, but 3"),
+        ("- [1, 2, 3]", "- [1]", 7, "'leg.base entry 1' has 1 values, but 3"),
+        ("- [1, 2, 3]", "- [1, 2, 3, 4]", 7, "has 4 values, but 3 are needed; remove"),
+        ("- [1, 2, 3]", "- 5", 7, "is the number 5, but a list"),
         (
             "[1, 2, 3]",
             "[1, '2', 3]",
             7,
-            "is the text '2' where a number is needed; write the number without quotes",
+            "is the text '2', but a number is needed; write the number without quotes",
         ),
-        ("[1, 2, 3]", "[1, 2mm, 3]", 7, "is the text '2mm' where a number is needed"),
-        ("[1, 2, 3]", "[1, nan, 3]", 7, "is the text 'nan' where a number is needed"),
-        ("[1, 2, 3]", "[1, .nan, 3]", 7, "is nan; every number must be finite"),
-        ("[1, 2, 3]", "[1, -.inf, 3]", 7, "is -inf; every number must be finite"),
-        ("[1, 2, 3]", "[1, 1e999, 3]", 7, "every number must be finite"),
-        ("[1, 2, 3]", "[1, true, 3]", 7, "is the value true where a number is needed"),
+        ("[1, 2, 3]", "[1, 2mm, 3]", 7, "is the text '2mm', but a number"),
+        ("[1, 2, 3]", "[1, nan, 3]", 7, "is the text 'nan', but a number"),
+        ("[1, 2, 3]", "[1, .nan, 3]", 7, "is nan; write a finite number"),
+        ("[1, 2, 3]", "[1, -.inf, 3]", 7, "is -inf; write a finite number"),
+        ("[1, 2, 3]", "[1, 1e999, 3]", 7, "write a finite number"),
+        ("[1, 2, 3]", "[1, true, 3]", 7, "is the value true, but a number"),
         ("[1, 2, 3]", "[1, , 3]", 7, "not valid YAML"),
         ("[1, 2, 3]", "!foo 5", 7, "has a YAML tag"),
         ("legs: rod", "legs: rood", 5, "'leg.legs' is 'rood' .did you mean 'rod'"),
-        ("legs: rod", "legs: ups", 6, "unknown key 'base' in 'leg'; allowed are joints, legs"),
+        ("legs: rod", "legs: ups", 6, "unknown key 'base' in 'leg'; allowed: joints, legs"),
         ("  base:", "  bse:", 6, "unknown key 'bse' in 'leg' .did you mean 'base'"),
         ("units: {length: mm, angle: deg}\n", "", None, "states no units"),
         ("length: mm, ", "", 2, "states no unit of length"),
         ("length: mm", "length: mmm", 2, "'mmm' is not a unit of length .did you mean 'mm'"),
-        ("length: mm", "length: deg", 2, "'deg' is not a unit of length; allowed are m, mm"),
-        ("name: h", "name: 3", 3, "is the number 3 where text is needed"),
-        ("name: h", "name: h\ncount: 3.5", 4, "is the number 3.5 where a whole number is needed"),
+        ("length: mm", "length: deg", 2, "'deg' is not a unit of length; allowed: m, mm"),
+        ("name: h", "name: 3", 3, "is the number 3, but text"),
+        ("name: h", "name: h\ncount: 3.5", 4, "is the number 3.5, but a whole number"),
         ("name: h", "name: h\nmode: u", 4, "'mode' is 'u'.*; allowed: 'up', 'down'"),
-        ("name: h", "name: h\nname: g", 4, "key 'name' stands here for the second time"),
+        ("name: h", "name: h\nname: g", 4, "duplicate key 'name'"),
         ("name: h", "name: h\n3: g", 4, "key 3 is not text"),
         ("name: h", "name: [h", 4, "not valid YAML"),
-        ("{sd: 0.5}", "0.5", 11, "is the number 0.5 where 'key: value' lines are needed"),
-        (GOOD, "- 1\n- 2\n", None, "holds no 'key: value' lines"),
+        ("{sd: 0.5}", "0.5", 11, "is the number 0.5, but a mapping is needed"),
+        (GOOD, "- 1\n- 2\n", None, "contains no 'key: value' lines"),
     ],
 )
 def test_what_does_not_fit_is_one_sentence_with_its_line(
@@ -150,7 +150,7 @@ def test_bytes_that_are_no_text_are_refused(
 
 
 def test_a_folder_and_an_absent_file_are_refused(tmp_path) -> None:
-    with pytest.raises(FileError, match="this is a folder where a robot file is needed"):
+    with pytest.raises(FileError, match="this is a folder, but a robot file is needed"):
         read_yaml(tmp_path, "robot file")
-    with pytest.raises(FileError, match="there is no such robot file"):
+    with pytest.raises(FileError, match="this robot file does not exist"):
         read_yaml(tmp_path / "absent.yaml", "robot file")

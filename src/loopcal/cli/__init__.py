@@ -19,6 +19,7 @@ from loopcal.cli.calibrate import calibrate
 from loopcal.cli.check import check
 from loopcal.cli.compensate import compensate
 from loopcal.cli.export import export
+from loopcal.cli.hints import HINTS
 from loopcal.cli.identifiability import identifiability
 from loopcal.cli.import_ import import_
 from loopcal.cli.new import new
@@ -83,7 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except click.ClickException as error:
         return _refuse(error.format_message())
     except LoopcalError as error:
-        return _refuse(str(error))
+        hint = HINTS.get(error.code or "")
+        return _refuse(f"{error} ({hint})" if hint else str(error))
     except (KeyboardInterrupt, click.exceptions.Abort):
         return _refuse("stopped before the end; no result was written.")
     except BrokenPipeError:

@@ -156,7 +156,7 @@ def _simulated(
 def _filled(machine: Mechanism, sheet: Path, seed: int) -> tuple[Measurements, str]:
     """Fill in the data file of a plan: what was measured, and the file that says so."""
     from loopcal.io import load_measurements
-    from loopcal.io.data.instrument_file import load_instrument, refuse_readings_to_measure
+    from loopcal.io.data.instrument_file import load_instrument, refuse_empty_readings
     from loopcal.io.data.measurement_writer import format_measurements
     from loopcal.io.data.pose_use import insert_use_column, read_pose_use
     from loopcal.measure.sheet_simulation import replace_measured_values
@@ -177,7 +177,7 @@ def _filled(machine: Mechanism, sheet: Path, seed: int) -> tuple[Measurements, s
                 f"--fill {sheet} states poses and instrument; leave out "
                 f"--{name.replace('_', '-')}, or --fill"
             )
-    refuse_readings_to_measure(sheet, machine)
+    refuse_empty_readings(sheet, machine)
     data = replace_measured_values(
         machine, load_measurements(sheet, machine), load_instrument(sheet, machine), seed
     )

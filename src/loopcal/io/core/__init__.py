@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading and writing text, CSV, JSON and YAML."""
+"""Text, CSV, JSON and YAML files, and records read from them."""

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What files may say, read off the records that read them: keys, what they hold, defaults, and the
-words of docstrings.
-"""
+"""Reference of file keys, taken from the records that read them: types, defaults, docstrings."""
 
 from __future__ import annotations
 
@@ -10,10 +8,10 @@ import inspect
 import re
 import types
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from loopcal.io.core.records import field_types
+from loopcal.io.core.records import get_field_types
 from loopcal.units import Dimension
 
 SECTION = re.compile(r"^(Attributes|Parameters|Raises|Returns)\n-{3,}\n", re.MULTILINE)
@@ -32,14 +30,9 @@ class Key:
 
     Parameters
     ----------
-    name : str
-        As written.
-    holds : str
-        What stands there: `length`, `[x, y]`, `a` or `b`, or the name of a record in capitals.
-    default : str
-        What is taken where the key is missing; empty where nothing sensible is.
-    meaning : str
-        A phrase from the docstring; may be empty.
+    name : as written. holds : its type, such as `length`, `[x, y]`, or the name of a record.
+    default : value without the key, "needed" where the key is mandatory, "" where it is empty.
+    meaning : phrase of the docstring, possibly empty.
     """
 
     name: str
@@ -48,65 +41,61 @@ class Key:
     meaning: str
 
 
-def keys(record: type) -> tuple[Key, ...]:
-    """Return the keys that a record takes, its own before those that it inherits."""
-    meanings = meanings_of(record)
-    hints = field_types(record)
-    fields = {field.name: field for field in dataclasses.fields(record) if field.init}
-    inherited = [
-        name
-        for base in record.__mro__[1:]
-        if dataclasses.is_dataclass(base)
-        for name in field_types(base)
-    ]
-    order = [n for n in fields if n not in inherited] + [n for n in fields if n in inherited]
-    return tuple(Key(n, holds(hints[n]), _default(fields[n]), meanings.get(n, "")) for n in order)
+def list_keys(record: type) -> tuple[Key, ...]:
+    """Return the keys that a record takes, its own before inherited ones."""
+    meanings = collect_meanings(record)
+    hints = get_field_types(record)
+    fields = {f.name.removesuffix("_"): f for f in dataclasses.fields(record) if f.init}
+    bases = [base for base in record.__mro__[1:] if dataclasses.is_dataclass(base)]
+    inherited = {name for base in bases for name in get_field_types(base)}
+    order = sorted(fields, key=lambda name: name in inherited)
+    return tuple(
+        Key(n, describe_type(hints[n]), _describe_default(fields[n]), meanings.get(n, ""))
+        for n in order
+    )
 
 
-def meanings_of(record: type) -> dict[str, str]:
-    """Return name -> phrase from the docstrings of a record and what it inherits from."""
-    found: dict[str, str] = {}
+def collect_meanings(record: type) -> dict[str, str]:
+    """Return name -> phrase from the docstrings of a record and of its bases."""
+    meanings: dict[str, str] = {}
     for base in reversed(record.__mro__):
-        found |= _entries(inspect.cleandoc(base.__doc__ or ""))
-    return found
+        meanings |= _parse_entries(inspect.cleandoc(base.__doc__ or ""))
+    return {name.removesuffix("_"): phrase for name, phrase in meanings.items()}
 
 
-def summary(record: type) -> str:
-    """Return the first sentences of a record's docstring, up to its sections."""
+def summarize(record: type) -> str:
+    """Return the text of a record's docstring above its sections."""
     text = SECTION.split(inspect.cleandoc(record.__doc__ or ""))[0]
     return SI.sub("", " ".join(text.split()))
 
 
-def holds(annotation: Any) -> str:
-    """Return what an annotation allows, in words of a file."""
+def describe_type(annotation: Any) -> str:
+    """Return what an annotation allows, in terms of a file."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         marks = [mark for mark in arguments[1:] if isinstance(mark, Dimension)]
-        return (
-            {Dimension.LENGTH: "length", Dimension.ANGLE: "angle"}.get(marks[0], "number")
-            if marks
-            else holds(arguments[0])
-        )
+        names = {Dimension.LENGTH: "length", Dimension.ANGLE: "angle"}
+        return names.get(marks[0], "number") if marks else describe_type(arguments[0])
     if origin in (Union, types.UnionType):
-        return " or ".join(dict.fromkeys(holds(a) for a in arguments if a is not type(None)))
+        branches = (describe_type(a) for a in arguments if a is not type(None))
+        return " or ".join(dict.fromkeys(branches))
     if origin is Literal:
         return " or ".join(f"`{value}`" for value in arguments)
     if origin in (tuple, list):
         if arguments[-1:] == (Ellipsis,) or origin is list:
-            return f"list of {holds(arguments[0])}"
-        return f"[{', '.join(holds(a) for a in arguments)}]"
+            return f"list of {describe_type(arguments[0])}"
+        return f"[{', '.join(describe_type(a) for a in arguments)}]"
     if origin is not None and issubclass(origin, Mapping):
-        return f"name: {holds(arguments[1])}"
+        return f"name: {describe_type(arguments[1])}"
     if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
         return annotation.__name__
-    return {str: "text", float: "number", int: "whole number", bool: "true or false"}.get(
-        annotation, str(annotation)
-    )
+    names = {str: "text", float: "number", int: "whole number", bool: "true or false"}
+    return "anything" if annotation is Any else names.get(annotation, str(annotation))
 
 
-def nested(record: type) -> tuple[type, ...]:
+def list_nested_records(record: type) -> tuple[type, ...]:
     """Return the records that a record's keys hold, in order, each once."""
-    found: dict[type, None] = {}
+    nested: dict[type, None] = {}
 
     def walk(annotation: Any) -> Iterator[type]:
         if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
@@ -116,54 +105,46 @@ def nested(record: type) -> tuple[type, ...]:
 
     queue = [record]
     while queue:
-        for hint in field_types(queue.pop(0)).values():
+        for hint in get_field_types(queue.pop(0)).values():
             for inner in walk(hint):
-                if inner not in found and inner is not record:
-                    found[inner] = None
+                if inner not in nested and inner is not record:
+                    nested[inner] = None
                     queue.append(inner)
-    return tuple(found)
+    return tuple(nested)
 
 
-def _entries(doc: str) -> dict[str, str]:
-    """Return name -> phrase of the Attributes or Parameters section of a docstring."""
+def _parse_entries(doc: str) -> dict[str, str]:
+    """Return name -> phrase of the Attributes and Parameters sections of a docstring.
+
+    An entry is `name : type` with an indented phrase below it, or `name : phrase`, of which
+    several may share a line.
+    """
     parts = SECTION.split(doc)
-    text = "".join(
-        body
-        for title, body in zip(parts[1::2], parts[2::2], strict=True)
-        if title in ("Attributes", "Parameters")
-    )
-    found: dict[str, str] = {}
-    for place in LONG.finditer(
-        text
-    ):  # a type behind the name, or nothing, and the phrase indented below it
-        found |= _phrase(place["names"], place["phrase"])
+    sections = zip(parts[1::2], parts[2::2], strict=True)
+    text = "".join(body for title, body in sections if title in ("Attributes", "Parameters"))
+    entries: dict[str, str] = {}
+    for match in LONG.finditer(text):
+        entries |= _clean_phrase(match["names"], match["phrase"])
     text = LONG.sub("", text)
-    places = list(SHORT.finditer(text))
-    for i, place in enumerate(places):  # all on a line, and several entries on one
-        end = places[i + 1].start() if i + 1 < len(places) else len(text)
-        found |= _phrase(place[1], text[place.end() : end])
-    return found
+    matches = list(SHORT.finditer(text))
+    ends = [*(match.start() for match in matches), len(text)][1:]
+    for match, end in zip(matches, ends, strict=True):
+        entries |= _clean_phrase(match[1], text[match.end() : end])
+    return entries
 
 
-def _phrase(names: str, text: str) -> dict[str, str]:
+def _clean_phrase(names: str, text: str) -> dict[str, str]:
     """Return name -> phrase of one entry; nothing for one that only points elsewhere."""
     phrase = ELSEWHERE.sub("", SI.sub("", " ".join(text.split()))).rstrip(". ")
     return dict.fromkeys(names.split(", "), phrase) if phrase else {}
 
 
-def _default(field: dataclasses.Field[Any]) -> str:
-    """Return a default as a file would say it."""
-    if field.default_factory is not dataclasses.MISSING or field.default in (
-        dataclasses.MISSING,
-        None,
-        (),
-        "",
-    ):
-        return (
-            "needed"
-            if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-            else ""
-        )
+def _describe_default(field: dataclasses.Field[Any]) -> str:
+    """Return a default as a file would state it."""
+    if field.default is MISSING and field.default_factory is MISSING:
+        return "needed"
+    if field.default_factory is not MISSING or field.default in (None, (), ""):
+        return ""
     if isinstance(field.default, tuple):
-        return f"[{', '.join(f'{value:g}' if isinstance(value, float) else str(value) for value in field.default)}]"
+        return f"[{', '.join(f'{v:g}' if isinstance(v, float) else str(v) for v in field.default)}]"
     return f"{field.default:g}" if isinstance(field.default, float) else str(field.default)

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""JSON without NaN: a number that is not finite becomes null, and `nulls` says at which place and
-why.
-"""
+"""JSON text without NaN: numbers that are not finite become null, with the reason under `nulls`."""
 
 from __future__ import annotations
 
@@ -13,18 +11,16 @@ from loopcal import serialization
 
 
 def to_json(document: Mapping[str, Any]) -> str:
-    """Return a document as JSON text with a final line break.
+    """Return a document as JSON text that ends with a line break.
 
     Parameters
     ----------
-    document : mapping
-        Values may be dataclasses, arrays, enums, paths, numbers, text, lists and mappings of these.
+    document : values may be dataclasses, arrays, enums, paths, numbers, text, lists and mappings.
 
     Returns
     -------
-    str
-        Where a number was not finite there is null, and the key `nulls` of the document maps its
-        place, such as `parameters/3/plus_minus`, to the reason.
+    A number that is not finite becomes null. The key `nulls` then maps its place, such as
+    `parameters/3/plus_minus`, to the reason.
     """
     nulls: dict[str, str] = {}
     content = serialization.to_json(document, nulls)

@@ -3,46 +3,53 @@
 
 from __future__ import annotations
 
+import math
 from decimal import Decimal
 
+DIGITS = range(12, 18)
+"""Significant digits that are tried, fewest first; 17 always suffice for one double."""
 
-def shortest(value: float, factor: float) -> str:
-    """Return value / factor with the fewest digits (12 at least) whose product with factor is
-    `value` again.
+
+def format_scaled(value: float, factor: float) -> str:
+    """Return value / factor with the fewest digits whose double times `factor` is `value` again.
 
     Parameters
     ----------
-    value : float
-        In SI.
-    factor : float
-        SI per unit of what is written.
+    value : in SI. factor : SI per unit of the text.
 
     Returns
     -------
-    str
-        All 17 digits where rounding keeps every shorter text from coming back.
+    All 17 digits where rounding prevents that any shorter text returns the value.
     """
     scaled = value / factor
-    texts = (f"{scaled:.{digits}g}" for digits in range(12, 18))
+    texts = (f"{scaled:.{digits}g}" for digits in DIGITS)
     return next((text for text in texts if float(text) * factor == value), repr(float(scaled)))
 
 
-def exact(text: str, factor: float) -> float:
-    """Return the double next to the decimal product of a finite number's text and a factor: rounded
-    once, not twice.
+def format_exact(value: float, factor: float) -> str:
+    """Return the shortest text (12 digits at least) from which `parse_exact` makes the same double.
+
+    Such a text exists for every double, because `parse_exact` rounds only once.
+    """
+    scaled = Decimal(value) / Decimal(repr(factor))
+    texts = (f"{float(scaled):.{digits}g}" for digits in DIGITS)
+    return next((text for text in texts if parse_exact(text, factor) == value), f"{scaled:.24g}")
+
+
+def parse_exact(text: str, factor: float) -> float:
+    """Return the double nearest to the decimal product of a text and a factor, rounded once.
 
     Raises
     ------
-    decimal.InvalidOperation
-        The text is no number.
+    decimal.InvalidOperation : the text is not a number.
     """
     return float(Decimal(text) * Decimal(repr(factor)))
 
 
-def exactly(value: float, factor: float) -> str:
-    """Return the shortest text (12 digits at least) from which `exact` makes the same double, for
-    any double.
-    """
-    scaled = Decimal(value) / Decimal(repr(factor))
-    short = (f"{float(scaled):.{digits}g}" for digits in range(12, 18))
-    return next((text for text in short if exact(text, factor) == value), f"{scaled:.24g}")
+def parse_finite(text: str) -> float | None:
+    """Return the finite number that a text states; None for any other text."""
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) and text.isascii() and "_" not in text else None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which files a command may write: all of them are looked at before the first is written."""
+"""Output files of a command, all checked before the first one is written."""
 
 from __future__ import annotations
 
@@ -9,29 +9,26 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from loopcal.errors import FileError
-from loopcal.io.core.text_file import target_of
+from loopcal.findings import report_finding
+from loopcal.io.core.text_file import resolve_target
 
 
 def refuse_outputs(
     outputs: Sequence[Path | None], inputs: Sequence[Path | None], force: bool
 ) -> None:
-    """Refuse outputs that cannot or should not be written; None among outputs and inputs is passed
-    over.
+    """Refuse outputs that cannot or should not be written.
 
     Parameters
     ----------
-    outputs : sequence of Path or None
-        The files to write.
-    inputs : sequence of Path or None
-        What is read: files, or folders whose files are read.
-    force : bool
-        Files that are there may be replaced; those that are read may not.
+    outputs : files to write; None is skipped.
+    inputs : files that are read, or folders whose files are read; None is skipped.
+    force : existing files may be replaced, except those that are read.
 
     Raises
     ------
     FileError
-        An output is an input or another output, is there without `force`, is a folder or no file,
-        or has no folder to stand in; that of the file that a symbolic link names counts.
+        An output is an input or another output, exists (without `force`), is a folder or a device,
+        or its folder does not exist or is not writable. A symbolic link stands for its target.
     """
     read = [
         file
@@ -41,50 +38,43 @@ def refuse_outputs(
     ]
     wanted = [path for path in outputs if path is not None]
     for i, path in enumerate(wanted):
-        folder = target_of(path).parent
-        if any(_same(path, other) for other in read):
+        folder = resolve_target(path).parent
+        if any(_is_same_file(path, other) for other in read):
             raise FileError(
-                "this file is read by the same command, which would replace it; choose another name",
-                path,
+                "this output is also an input of this command; choose another name", path
             )
-        if any(_same(path, other) for other in wanted[:i]):
-            raise FileError("two outputs have this name; choose another for one of them", path)
+        if any(_is_same_file(path, other) for other in wanted[:i]):
+            raise FileError("two outputs have this name; choose another name for one of them", path)
         if not folder.is_dir():
             raise FileError(
-                f"this cannot be written because there is no folder {folder}; make it first", path
+                f"cannot write here: folder {folder} does not exist; create it first", path
             )
         if not os.access(folder, os.W_OK):
-            raise FileError(
-                "this cannot be written (permission denied); choose another place", path
-            )
+            raise FileError("cannot write here (permission denied); choose another folder", path)
         if path.is_file() and not force:
-            raise FileError(
-                "this file exists; choose another name, or replace it with --force", path
-            )
+            raise FileError(report_finding("files.output-exists"), path)
 
 
 @contextmanager
 def restore_on_failure(outputs: Sequence[Path | None]) -> Iterator[None]:
-    """Put these files back as they were before the body, or take them away, where the body fails;
-    None is passed over.
-    """
+    """Restore or remove these files where the body fails; None is skipped."""
     before = {
         path: path.read_bytes() if path.is_file() else None for path in outputs if path is not None
     }
-    done = False
+    succeeded = False
     try:
         yield
-        done = True
+        succeeded = True
     finally:
-        for path, content in () if done else before.items():
+        for path, content in () if succeeded else before.items():
             if content is not None:
                 path.write_bytes(content)
             elif path.is_file():
-                target_of(path).unlink()
+                resolve_target(path).unlink()
 
 
-def _same(one: Path, other: Path) -> bool:
-    """Tell whether two names are of one file, whether it is there or not."""
-    if one.exists() and other.exists():
-        return one.samefile(other)
-    return one.resolve() == other.resolve()
+def _is_same_file(path: Path, other: Path) -> bool:
+    """Return whether two names denote one file, existing or not."""
+    if path.exists() and other.exists():
+        return path.samefile(other)
+    return path.resolve() == other.resolve()

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From checked file content to a frozen dataclass in SI: one walk over the annotations, then
-pydantic, strictly.
+"""The one reader of records: from the content of a YAML file to a frozen dataclass in SI.
 
-A record's fields say everything: `Length`, `Angle` and `Ratio` numbers are multiplied by the factor
-of the unit that the file states, keys that are not fields are refused, and pydantic's `TypeAdapter`
-checks the rest (text is not a number, two numbers are not three). What pydantic finds is said in
-one sentence with the line of the node.
+The annotations of the fields say everything. Numbers annotated `Length`, `Angle` or `Ratio` are
+converted to SI: by the units of the file, or, where the file has none, from texts such as `5 um`.
+Keys that are not fields are refused; a field `from_` has the key `from`. pydantic checks the rest
+strictly (text is not a number), and its first complaint becomes one sentence with a line.
 """
 
 from __future__ import annotations
@@ -18,144 +17,148 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from loopcal.errors import FileError, suggest_names
-from loopcal.io.core.yaml_file import Location, YamlFile, has_child, refuse_unknown_keys, words
+from loopcal.io.core.yaml_file import (
+    Location,
+    YamlFile,
+    has_child,
+    name_location,
+    refuse_unknown_keys,
+)
 from loopcal.units import Dimension, Unit, find_unit, list_symbols
 
 T = TypeVar("T")
 Units = Mapping[Dimension, Unit]
 
 
-def read_record(file: YamlFile, content: Mapping[str, Any], record: type[T], units: Units) -> T:
-    """Build a record dataclass from the content of a file.
+def read_record(
+    file: YamlFile,
+    content: Mapping[str, Any],
+    record: type[T],
+    units: Units | None,
+    location: Location = (),
+) -> T:
+    """Return a record built from the content of a file.
 
     Parameters
     ----------
-    file : YamlFile
-        Where the content comes from; for lines.
-    content : mapping
-        Plain values as written in the file, keys of the record at the top.
-    record : type
-        A dataclass with annotated fields.
-    units : mapping Dimension -> Unit
-        Units of the file.
-
-    Returns
-    -------
-    T
-        An instance in SI.
+    file : source of `content`, for lines.
+    content : plain values as written in the file.
+    record : a dataclass with annotated fields.
+    units : of the numbers in the file; None where each number states its own, as in `5 um`.
+    location : of `content` in the file.
 
     Raises
     ------
-    FileError
-        The first thing that does not fit, at its line.
+    FileError : the first value that does not fit, at its line.
     """
     from pydantic import TypeAdapter, ValidationError
 
-    scaled = to_si(record, dict(content), file, units, ())
+    scaled = _to_si(record, dict(content), file, units, location)
     try:
         return TypeAdapter(record).validate_json(json.dumps(scaled), strict=True)
     except ValidationError as error:
-        raise _translated(error, file, content) from None
+        raise _translate(error, file, content, location) from None
 
 
 def read_units(file: YamlFile) -> dict[Dimension, Unit]:
-    """Return the units that the file states under `units:`, which is obligatory; ratios have the
-    unit 1.
+    """Return the units that a file states under `units:`, which is mandatory; ratios have unit 1.
 
     Raises
     ------
-    FileError
-        No units, an unknown dimension or unit, or a unit of another dimension.
+    FileError : no units, or an unknown dimension or unit, or a unit of another dimension.
     """
     example = "write for example 'units: {length: mm, angle: deg}'"
-    found = file.content.get("units")
+    stated = file.content.get("units")
     if "units" not in file.content:
-        raise file.error(
-            f"this file states no units, and a number without a unit is refused; {example}"
-        )
-    if not isinstance(found, dict):
-        raise file.error(
-            f"'units' must name a unit of length and one of angle; {example}", ("units",)
-        )
+        raise file.error(f"this file states no units, which every number needs; {example}")
+    if not isinstance(stated, dict):
+        raise file.error(f"'units' must state a unit of length and of angle; {example}", ("units",))
     names = [d.value for d in (Dimension.LENGTH, Dimension.ANGLE)]
-    refuse_unknown_keys(file, list(found), names, ("units",))
+    refuse_unknown_keys(file, list(stated), names, ("units",))
     units = {Dimension.RATIO: find_unit("1")}
     for name in names:
         dimension = Dimension(name)
-        if name not in found:
+        if name not in stated:
             raise file.error(f"'units' states no unit of {name}; {example}", ("units",))
-        symbol = found[name]
-        if not isinstance(symbol, str) or symbol not in list_symbols(dimension):
-            hint = suggest_names(str(symbol), list_symbols(dimension))
-            allowed = ", ".join(list_symbols(dimension))
-            raise file.error(
-                f"{symbol!r} is not a unit of {name}{hint}; allowed are {allowed}", ("units", name)
-            )
+        symbol, allowed = stated[name], list_symbols(dimension)
+        if not isinstance(symbol, str) or symbol not in allowed:
+            hint = suggest_names(str(symbol), allowed)
+            sentence = f"{symbol!r} is not a unit of {name}{hint}; allowed: {', '.join(allowed)}"
+            raise file.error(sentence, ("units", name))
         units[dimension] = find_unit(symbol, dimension)
     return units
 
 
-def to_si(annotation: Any, node: Any, file: YamlFile, units: Units, location: Location) -> Any:
-    """Return `node` with each number annotated by a Dimension in SI; keys that no record knows are
-    refused.
+def get_field_types(record: type) -> dict[str, Any]:
+    """Return key -> annotation of the fields that a record takes from a file."""
+    hints = typing.get_type_hints(record, include_extras=True)
+    return {_key(f.name): hints[f.name] for f in dataclasses.fields(record) if f.init}
 
-    What does not fit the annotation is left as it is, for pydantic to name.
+
+def _key(name: str) -> str:
+    """Return the key of a field: `from` for the field `from_`."""
+    return name.removesuffix("_")
+
+
+def _to_si(
+    annotation: Any, node: Any, file: YamlFile, units: Units | None, location: Location
+) -> Any:
+    """Return `node` with numbers in SI and field names as keys; refuse unknown keys.
+
+    Values that do not fit the annotation stay as they are; pydantic names them.
     """
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         for mark in arguments[1:]:
             if isinstance(mark, Dimension):
-                return _scaled(node, units[mark].factor_to_si)
-        return to_si(arguments[0], node, file, units, location)
+                return _scale(node, mark, file, units, location)
+        return _to_si(arguments[0], node, file, units, location)
     if origin in (Union, types.UnionType):
-        return to_si(_branch(arguments, node), node, file, units, location)
-    if (
-        isinstance(node, dict)
-        and dataclasses.is_dataclass(annotation)
-        and isinstance(annotation, type)
-    ):
-        hints = field_types(annotation)
+        branch = max(arguments, key=lambda branch: _fit(branch, node))
+        return _to_si(branch, node, file, units, location)
+    if isinstance(node, dict) and _is_record(annotation):
+        hints = get_field_types(annotation)
         refuse_unknown_keys(file, list(node), list(hints), location)
+        names = {_key(field.name): field.name for field in dataclasses.fields(annotation)}
         return {
-            key: to_si(hints[key], value, file, units, (*location, key))
+            names[key]: _to_si(hints[key], value, file, units, (*location, key))
             for key, value in node.items()
         }
     if isinstance(node, dict) and origin is not None and issubclass(origin, Mapping):
         return {
-            key: to_si(arguments[1], value, file, units, (*location, key))
+            key: _to_si(arguments[1], value, file, units, (*location, key))
             for key, value in node.items()
         }
     if isinstance(node, list) and origin in (tuple, list):
         repeated = origin is list or (len(arguments) == 2 and arguments[1] is Ellipsis)
         each = [arguments[0]] * len(node) if repeated else list(arguments) + [Any] * len(node)
-        return [to_si(each[i], value, file, units, (*location, i)) for i, value in enumerate(node)]
+        return [_to_si(each[i], item, file, units, (*location, i)) for i, item in enumerate(node)]
     return node
 
 
-def field_types(record: type) -> dict[str, Any]:
-    """Return name -> annotation of the fields that a record takes."""
-    hints = typing.get_type_hints(record, include_extras=True)
-    return {field.name: hints[field.name] for field in dataclasses.fields(record) if field.init}
-
-
-def _scaled(node: Any, factor: float) -> Any:
-    """Return a number times `factor`, or lists of numbers times `factor`; anything else unchanged."""
+def _scale(
+    node: Any, dimension: Dimension, file: YamlFile, units: Units | None, location: Location
+) -> Any:
+    """Return a number, or nested lists of numbers, in SI."""
     if isinstance(node, list):
-        return [_scaled(value, factor) for value in node]
-    if isinstance(node, (int, float)) and not isinstance(node, bool):
-        return node * factor
+        return [_scale(item, dimension, file, units, (*location, i)) for i, item in enumerate(node)]
+    if units is None and dimension is not Dimension.RATIO and node is not None:
+        return file.quantity(node, dimension, location)
+    if isinstance(node, int | float) and not isinstance(node, bool):
+        return float(node) if units is None else node * units[dimension].factor_to_si
     return node
 
 
-def _branch(arguments: tuple[Any, ...], node: Any) -> Any:
-    """Return the branch of a union that `node` was written for: the one whose form and keys fit
-    best.
-    """
-    return max(arguments, key=lambda annotation: _fit(annotation, node))
+def _is_record(annotation: Any) -> bool:
+    return dataclasses.is_dataclass(annotation) and isinstance(annotation, type)
 
 
 def _fit(annotation: Any, node: Any) -> float:
-    """Return how well the form of `node` fits an annotation (negative: not at all)."""
+    """Return how well the form of `node` fits an annotation (negative: not at all).
+
+    It chooses among the branches of a union: a `Literal` key that agrees counts most, then the
+    number of known keys or the length of a list.
+    """
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return _fit(arguments[0], node)
@@ -164,29 +167,19 @@ def _fit(annotation: Any, node: Any) -> float:
     if annotation in (None, type(None)):
         return 1.0 if node is None else -1.0
     if isinstance(node, dict):
-        if dataclasses.is_dataclass(annotation) and isinstance(annotation, type):
-            hints = field_types(annotation)
-            tags = [
-                (key, get_args(h))
-                for key, h in hints.items()
-                if get_origin(h) is Literal and key in node
-            ]
-            tagged = sum(10.0 if node[key] in allowed else -10.0 for key, allowed in tags)
-            return (
-                tagged
-                + sum(key in hints for key in node)
-                - 0.5 * sum(key not in hints for key in node)
-                + 0.1
-            )
-        return 0.05 if origin is not None and issubclass(origin, Mapping) else -1.0
+        if not _is_record(annotation):
+            return 0.05 if origin is not None and issubclass(origin, Mapping) else -1.0
+        hints = get_field_types(annotation)
+        tags = {key: get_args(h) for key, h in hints.items() if get_origin(h) is Literal}
+        score = sum(10.0 if node[key] in tags[key] else -10.0 for key in tags if key in node)
+        return score + sum(1.0 if key in hints else -0.5 for key in node) + 0.1
     if isinstance(node, list):
         if origin not in (tuple, list):
             return -1.0
         fixed = origin is tuple and arguments[-1:] != (Ellipsis,)
         inner = _fit(arguments[0], node[0]) if node and arguments else 0.0
-        return (2.0 if not fixed or len(arguments) == len(node) else 0.5) + (
-            0.5 if inner > 0 else -0.4
-        )
+        length = 2.0 if not fixed or len(arguments) == len(node) else 0.5
+        return length + (0.5 if inner > 0 else -0.4)
     if isinstance(node, str):
         return 1.0 if annotation is str or (origin is Literal and node in arguments) else -1.0
     if isinstance(node, bool):
@@ -194,115 +187,95 @@ def _fit(annotation: Any, node: Any) -> float:
     return 1.0 if annotation in (float, int) else -1.0
 
 
-def _translated(error: Any, file: YamlFile, content: Mapping[str, Any]) -> FileError:
-    """Return pydantic's first finding (by line) as our own sentence."""
-    findings = error.errors(include_url=False, include_context=True)
-    ranked = sorted(findings, key=lambda f: -len(_existing(f["loc"], content)[0]))
-    finding = (
-        ranked[0]
-        if _has_union(findings, content)
-        else min(findings, key=lambda f: _rank(f, file, content))
-    )
-    location, node = _existing(finding["loc"], content)
-    needed = max(
-        [
-            f["loc"][-1] + 1
-            for f in findings
-            if f["loc"][:-1] == finding["loc"][:-1] and _is_index(f)
-        ],
-        default=0,
-    )
-    return file.error(_sentence(finding, location, node, needed), location)
+def _translate(
+    error: Any, file: YamlFile, content: Mapping[str, Any], location: Location
+) -> FileError:
+    """Return the first complaint of pydantic (by line) as our own sentence.
+
+    Where pydantic names branches of a union, the deepest complaint is the relevant one.
+    """
+    complaints = error.errors(include_url=False, include_context=True)
+    places = [_resolve(c["loc"], content) for c in complaints]
+    if any(len(path) < len(c["loc"]) - 1 for (path, _), c in zip(places, complaints, strict=True)):
+        chosen = max(range(len(places)), key=lambda i: len(places[i][0]))
+    else:
+        chosen = min(range(len(places)), key=lambda i: file.line((*location, *places[i][0])))
+    complaint, (path, node) = complaints[chosen], places[chosen]
+    missing = [c["loc"][-1] for c in complaints if c["loc"][:-1] == complaint["loc"][:-1]]
+    needed = max((step + 1 for step in missing if isinstance(step, int)), default=0)
+    path = (*location, *path)
+    return file.error(_word(complaint, path, node, needed), path)
 
 
-def _rank(finding: Any, file: YamlFile, content: Mapping[str, Any]) -> int:
-    """Return the line of a finding."""
-    return file.line(_existing(finding["loc"], content)[0])
-
-
-def _has_union(findings: list[Any], content: Mapping[str, Any]) -> bool:
-    """Tell whether pydantic named branches of a union, of which the deepest is the one meant."""
-    return any(len(_existing(f["loc"], content)[0]) < len(f["loc"]) - 1 for f in findings)
-
-
-def _existing(loc: tuple[str | int, ...], content: Any) -> tuple[Location, Any]:
+def _resolve(loc: tuple[str | int, ...], content: Any) -> tuple[Location, Any]:
     """Return the part of pydantic's location that exists in the file, and the node there."""
     location: list[str | int] = []
     node = content
-    for step in loc:
+    for part in loc:
+        step = part if has_child(node, part) else _key(part) if isinstance(part, str) else part
         if has_child(node, step):
             node = node[step]
             location.append(step)
     return tuple(location), node
 
 
-def _is_index(finding: Any) -> bool:
-    """Tell whether a finding is about an entry of a list."""
-    return isinstance(finding["loc"][-1], int)
+NUMBERS = {
+    **dict.fromkeys(("float_type", "float_parsing"), "a number"),
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "a whole number"),
+}
+SHAPES = {
+    **dict.fromkeys(("tuple_type", "list_type"), ("a list", "write it as [.., ..]")),
+    **dict.fromkeys(
+        ("dataclass_type", "dict_type", "dataclass_exact_type"),
+        ("a mapping", "write 'key: value' lines"),
+    ),
+    "string_type": ("text", "put it in quotes"),
+    "bool_type": ("true or false", "write one of the two"),
+}
+"""Complaint of pydantic -> what is needed, and what to do."""
 
 
-def _sentence(finding: Any, location: Location, node: Any, needed: int) -> str:
-    """Return what was found, what is allowed and what to do, for one finding of pydantic.
+def _word(complaint: Any, location: Location, node: Any, needed: int) -> str:
+    """Return one sentence for a complaint of pydantic: found, allowed, what to do.
 
-    `needed` is the number of values of a fixed list some of which are missing.
+    `needed` is the number of values of a fixed list of which some are missing.
     """
-    kind, context = finding["type"], finding.get("ctx", {})
-    name = repr(words(location)) if location else "this file"
-    if kind == "missing" and isinstance(node, list):
-        return f"{name} has {len(node)} values where {needed} are needed; add the missing ones"
+    kind, context = complaint["type"], complaint.get("ctx", {})
+    name = repr(name_location(location)) if location else "this file"
     if kind in ("missing", "missing_argument"):
-        return f"{name} has no key {finding['loc'][-1]!r}, which is needed; add it"
+        if isinstance(node, list):
+            return f"{name} has {len(node)} values, but {needed} are needed; add the missing ones"
+        return f"{name} has no key {_key(str(complaint['loc'][-1]))!r}; add it"
     if kind in ("too_long", "too_short"):
         bound = context.get("max_length", context.get("min_length"))
         act = "remove the others" if kind == "too_long" else "add the missing ones"
-        return f"{name} has {len(node)} values where {bound} are needed; {act}"
-    if kind in ("float_type", "float_parsing", "int_type", "int_parsing", "int_from_float"):
-        number = "a whole number" if kind.startswith("int") else "a number"
-        if isinstance(node, str):
-            act = (
-                "write the number without quotes and without a unit"
-                if _numeric(node)
-                else "write a number"
-            )
-            act = (
-                "write a point in the number, not a comma"
-                if _numeric(node) and "," in node
-                else act
-            )
-            return f"{name} is the text {node!r} where {number} is needed; {act}"
-        return f"{name} is {_shape(node)} where {number} is needed; write a number"
-    if kind in ("tuple_type", "list_type"):
-        return f"{name} is {_shape(node)} where a list is needed; write it as [.., ..]"
-    if kind in ("dataclass_type", "dict_type", "dataclass_exact_type"):
-        return (
-            f"{name} is {_shape(node)} where 'key: value' lines are needed; write it as a mapping"
-        )
+        return f"{name} has {len(node)} values, but {bound} are needed; {act}"
+    if kind in NUMBERS:
+        act = "write a number"
+        if isinstance(node, str) and node.strip()[:1] in "+-.0123456789":
+            act = "write the number without quotes and without a unit"
+            act = "write a decimal point, not a comma" if "," in node else act
+        return f"{name} is {_describe(node)}, but {NUMBERS[kind]} is needed; {act}"
+    if kind in SHAPES:
+        shape, act = SHAPES[kind]
+        return f"{name} is {_describe(node)}, but {shape} is needed; {act}"
     if kind == "literal_error":
-        hint = suggest_names(
-            str(node), [p.strip("' ") for p in context["expected"].replace(" or ", ",").split(",")]
-        )
-        return f"{name} is {node!r}{hint}; allowed: {context['expected'].replace(' or ', ', ')}"
-    if kind == "string_type":
-        return f"{name} is {_shape(node)} where text is needed; put it in quotes"
-    if kind == "bool_type":
-        return f"{name} is {_shape(node)} where true or false is needed; write one of the two"
+        expected = context["expected"].replace(" or ", ", ")
+        hint = suggest_names(str(node), [part.strip("' ") for part in expected.split(",")])
+        return f"{name} is {node!r}{hint}; allowed: {expected}"
     if kind == "value_error":
-        return f"{name}: {context.get('error', finding['msg'])}"
-    return f"{name} is {_shape(node)}, which does not fit: {finding['msg'][:1].lower()}{finding['msg'][1:]}; correct it"
+        return f"{name}: {context.get('error', complaint['msg'])}"
+    reason = complaint["msg"][:1].lower() + complaint["msg"][1:]
+    return f"{name} is {_describe(node)}, which does not fit ({reason}); correct it"
 
 
-def _numeric(text: str) -> bool:
-    """Tell whether text begins like a number."""
-    return text.strip()[:1].isdigit() or text.strip()[:1] in "+-."
-
-
-def _shape(node: Any) -> str:
-    """Return a node in words: `the number 4`, `a list of 3`, `empty`."""
+def _describe(node: Any) -> str:
+    """Return a node for messages: `the number 4`, `a list of 3`, `empty`."""
     if node is None:
         return "empty"
     if isinstance(node, bool):
         return f"the value {str(node).lower()}"
-    if isinstance(node, (int, float)):
+    if isinstance(node, int | float):
         return f"the number {node:g}"
     if isinstance(node, str):
         return f"the text {node!r}"

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text in and out of the file system: UTF-8 only, written whole or not at all, one sentence when it
-fails.
-"""
+"""Text files: UTF-8 only, written whole or not at all, with one sentence for every failure."""
 
 from __future__ import annotations
 
@@ -10,128 +8,110 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from loopcal.errors import FileError
-
-BOM = "\ufeff"
+from loopcal.errors import ArgumentTypeError, FileError
 
 
-def read_text(path: str | Path, what: str, otherwise: str = "") -> str:
-    """Return the text of a UTF-8 file; a byte order mark at its start is dropped.
+def as_path(path: Any, what: str) -> Path:
+    """Return a path given as text or Path.
+
+    Raises
+    ------
+    ArgumentTypeError : anything else, such as a robot; `what` says what the file should be.
+    """
+    if not isinstance(path, (str, os.PathLike)):
+        sentence = f"the path of a {what} is needed here, not a {type(path).__name__}"
+        raise ArgumentTypeError(f"{sentence}; pass text or a Path")
+    return Path(path)
+
+
+def read_text(path: str | Path, what: str, hint: str = "") -> str:
+    """Return the text of a UTF-8 file without a byte order mark.
 
     Parameters
     ----------
-    path : str or Path
-        The file.
-    what : str
-        What the file should be, for messages: "robot file", "measurement file".
-    otherwise : str
-        What else than saving it as UTF-8 helps; closes the message.
+    path : the file. what : what it should be, for messages, such as "robot file".
+    hint : what else helps, besides saving the file as UTF-8; closes that message.
 
     Raises
     ------
     FileError
-        No such file, a folder, no permission, not UTF-8, or nothing in it.
+        The file does not exist, is a folder, is not readable, is not UTF-8, or is empty.
     """
-    path, raw = Path(path), read_raw(path, what)
+    raw = read_bytes(path, what)
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
-        found = f"byte 0x{raw[error.start]:02x}"
-        raise FileError(
-            f"this {what} is not UTF-8 text ({found}); save it as UTF-8{otherwise}", path, line
-        ) from None
+        byte = f"byte 0x{raw[error.start]:02x}"
+        sentence = f"this {what} is not UTF-8 text ({byte}); save it as UTF-8{hint}"
+        raise FileError(sentence, path, line) from None
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
-        raise FileError(
-            f"this {what} holds a zero byte, so it is not UTF-8 text; save it as UTF-8{otherwise}",
-            path,
-            line,
-        )
+        sentence = f"this {what} contains a zero byte and is not UTF-8 text; save it as UTF-8{hint}"
+        raise FileError(sentence, path, line)
     if not text.strip():
-        raise FileError(
-            f"this {what} is empty; see the examples that come with loopcal for what it should hold",
-            path,
-        )
+        raise FileError(f"this {what} is empty; see the examples that come with loopcal", path)
     return text
 
 
-def read_raw(path: str | Path, what: str) -> bytes:
-    """Return the bytes of a file; `what` it should be is for messages.
+def read_bytes(path: str | Path, what: str) -> bytes:
+    """Return the content of a file; `what` it should be is for messages.
 
     Raises
     ------
-    FileError
-        No such file, a folder, no permission.
+    FileError : the file does not exist, is a folder, or is not readable.
     """
-    path = Path(path)
+    path = as_path(path, what)
     if path.is_dir():
-        raise FileError(f"this is a folder where a {what} is needed; name the file inside it", path)
+        raise FileError(f"this is a folder, but a {what} is needed; name a file in it", path)
     try:
         return path.read_bytes()
     except FileNotFoundError:
-        raise FileError(f"there is no such {what}; check the name and the folder", path) from None
-    except OSError as error:
         raise FileError(
-            f"this {what} cannot be read ({_reason(error)}); check its permissions", path
-        ) from error
+            f"this {what} does not exist; check the name and the folder", path
+        ) from None
+    except OSError as error:
+        sentence = f"this {what} cannot be read ({_reason(error)}); check its permissions"
+        raise FileError(sentence, path) from error
 
 
 def sha256(path: str | Path) -> str:
-    """Return the SHA-256 of a file as hexadecimal text.
+    """Return the SHA-256 digest of a file as hexadecimal text; raise FileError as `read_bytes`."""
+    return hashlib.sha256(read_bytes(path, "file")).hexdigest()
+
+
+def resolve_target(path: str | Path) -> Path:
+    """Return the file that a write to `path` changes: `path`, or the target of a symbolic link.
 
     Raises
     ------
-    FileError
-        The file cannot be read.
+    FileError : the path is a folder, a device or a pipe, or a link without a target.
     """
-    try:
-        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
-    except OSError as error:
-        raise FileError(
-            f"this file cannot be read ({_reason(error)}); check its name and permissions", path
-        ) from error
-
-
-def target_of(path: str | Path) -> Path:
-    """Return the file that is written where `path` is: itself, or what a symbolic link names.
-
-    Raises
-    ------
-    FileError
-        There is something else than a file: a folder, a device, a pipe, a link that ends nowhere.
-    """
-    path = Path(path)
+    path = as_path(path, "file to write")
     if path.is_dir():
-        raise FileError(
-            "this is a folder where a file name is needed; add the name of the file to write", path
-        )
+        raise FileError("this is a folder; add the name of the file to write", path)
     if path.exists() and not path.is_file():
-        raise FileError(
-            "this is a device or a pipe, which would be replaced by a file; choose the name of a "
-            "file",
-            path,
-        )
+        raise FileError("this is a device or a pipe; name an ordinary file", path)
     if not path.is_symlink():
         return path
     try:
         return path.resolve()
     except (OSError, RuntimeError):
-        raise FileError("this symbolic link ends nowhere; choose another name", path) from None
+        raise FileError("this symbolic link has no target; choose another name", path) from None
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a UTF-8 file whole or not at all: to a temporary name beside it, then renamed over it.
+    """Write a UTF-8 file whole or not at all: to a temporary name beside it, then renamed.
 
-    A symbolic link stays one; the file that it names is written.
+    A symbolic link stays a link; its target is written.
 
     Raises
     ------
-    FileError
-        The path is a folder or no file, its folder is missing, no permission, or the disk is full.
+    FileError : see `resolve_target`; or the folder does not exist, no permission, or a full disk.
     """
-    target = target_of(path)
+    target = resolve_target(path)
     with report_write_errors(path):
         temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
         try:
@@ -146,26 +126,19 @@ def write_text(path: str | Path, text: str) -> None:
 
 @contextmanager
 def report_write_errors(path: str | Path) -> Iterator[None]:
-    """Turn every failure of the file system while writing `path` into one sentence.
-
-    Raises
-    ------
-    FileError
-        In place of any OSError of the body.
-    """
+    """Raise FileError in place of every OSError of the body, which writes `path`."""
     try:
         yield
     except FileNotFoundError:
         folder = Path(path).parent
-        raise FileError(
-            f"this cannot be written because there is no folder {folder}; make it first", path
-        ) from None
+        sentence = f"cannot write here: folder {folder} does not exist; create it first"
+        raise FileError(sentence, path) from None
     except OSError as error:
         raise FileError(
-            f"this cannot be written ({_reason(error)}); choose another place", path
+            f"cannot write here ({_reason(error)}); choose another place", path
         ) from error
 
 
 def _reason(error: OSError) -> str:
-    """Return the operating system's own words, in lower case."""
+    """Return the reason that the operating system states, in lower case."""
     return (error.strerror or type(error).__name__).lower()

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The instrument that a measurement file describes: its kinds, their frames and their noise,
-without what it measured.
-"""
+"""The instrument of a measurement file: its kinds, frames and noise, without measured values."""
 
 from __future__ import annotations
 
@@ -10,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from loopcal.errors import FileError
+from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import Table, read_table
-from loopcal.io.data.kind_rows import Sensor as Found
-from loopcal.io.data.kind_rows import read_sensors
+from loopcal.io.data.kind_rows import KindRows, read_kinds
 from loopcal.units import EXAMPLES
 
 if TYPE_CHECKING:
@@ -21,89 +19,63 @@ if TYPE_CHECKING:
 
 
 def load_instrument(path: str | Path, robot: Mechanism) -> Instrument:
-    """Return the instrument of a measurement file, which looks at every pose.
+    """Return the instrument of a measurement file, which measures every pose.
 
     Raises
     ------
-    FileError
-        What does not fit, at its line; noise that is not in the settings.
+    FileError : a value that does not fit, at its line; noise that the settings do not state.
     """
     table = read_table(path)
-    return _instrument(table, read_sensors(table, robot))
+    return _build_instrument(table, read_kinds(table, robot))
 
 
 def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
-    """Return the instrument of a measurement file as `load_instrument` does, where all its sensors
-    can look at every pose.
+    """Return the instrument of a measurement file for planning poses.
 
     Raises
     ------
     FileError
-        As there; or each group of rows has unknowns of its own, such as a surface, which a choice
-        of poses does not give.
+        As `load_instrument`; or each group of rows has setup parameters of its own, such as a
+        surface, which a choice of poses does not determine.
     """
     table = read_table(path)
-    found = read_sensors(table, robot)
-    groups = table.text("group") if "group" in table.units else ("",) * len(table.rows)
-    poses = table.text("pose") if "pose" in table.units else tuple(map(str, range(len(table.rows))))
-    apart = len({frozenset(poses[row] for row in sensor.rows) for sensor in found}) > 1
-    for sensor in found:
-        own = [
-            parameter.name
-            for parameter in sensor.kind.nuisance_parameters
-            if parameter.scope == "group"
-        ]
-        if own and (apart or len({groups[row] for row in sensor.rows}) > 1):
-            surfaces = sensor.kind.name in ("plane", "line")
-            remedy = (
-                "plan planes and lines with --measure plane-line"
-                if surfaces
-                else "describe the instrument by options"
-            )
+    kinds = read_kinds(table, robot)
+    groups, poses = table.text("group"), table.pose_names()
+    apart = len({frozenset(poses[row] for row in one.rows) for one in kinds}) > 1
+    for one in kinds:
+        own = [parameter.name for parameter in one.kind.nuisance_parameters if parameter.scope == "group"]
+        if own and (apart or len({groups[row] for row in one.rows}) > 1):
+            code = "surfaces" if one.kind.name in ("plane", "line") else "groups"
             raise table.settings.error(
-                f"the rows of kind {sensor.kind.name!r} have unknowns of their own group by group "
-                f"({', '.join(own)}), and no "
-                f"pose is seen by all of them; {remedy}",
-                sensor.location,
+                report_finding(f"files.{code}-in-plan", kind=one.kind.name, parameters=tuple(own)),
+                one.location,
             )
-    return _instrument(table, found)
+    return _build_instrument(table, kinds)
 
 
-def refuse_readings_to_measure(path: str | Path, robot: Mechanism) -> None:
-    """Refuse a sheet whose readings are empty because they are what is measured, where poses are to
-    come from readings.
-
-    Raises
-    ------
-    FileError
-        No reading of any actuator is stated.
-    """
+def refuse_empty_readings(path: str | Path, robot: Mechanism) -> None:
+    """Raise FileError for a sheet without any reading, where poses are to come from readings."""
     table = read_table(path)
     columns = [actuator.name for actuator in robot.actuators if actuator.name in table.units]
     if columns and table.rows and not any(cell for name in columns for cell in table.text(name)):
-        raise FileError(
-            "every reading in this sheet is empty, because the machine is to be moved until a "
-            "measuring machine shows the held "
-            "coordinates, which is not simulated; fill in the readings, or simulate a plan of poses",
-            table.path,
-        )
+        sentence = "this sheet has no readings, because they are what is to be measured"
+        act = "fill in the readings, or simulate a plan of poses"
+        raise FileError(f"{sentence}; {act}", table.path)
 
 
-def _instrument(table: Table, found: Sequence[Found]) -> Instrument:
-    """Return the sensors of a table, with the noise that its settings state."""
+def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
+    """Return the instrument with the noise that the settings of a table state."""
     import numpy as np
 
     from loopcal.measure import Gaussian, Instrument, Sensor
 
     sensors = []
-    for one in found:
-        columns = one.kind.noise_columns
-        for column in columns:
+    for one in kinds:
+        for column in one.kind.noise_columns:
             if column.name not in one.noise:
                 example = f"noise: {{{column.name}: {EXAMPLES[column.dimension]}}}"
-                sentence = f"the settings state no noise of {column.name!r}, which a plan needs; add '{example}'"
+                sentence = f"the settings state no noise of {column.name!r}; add '{example}'"
                 raise table.settings.error(sentence, (*one.location, "noise"))
-        sensors.append(
-            Sensor(one.kind, Gaussian(np.array([one.noise[column.name] for column in columns])))
-        )
+        sigma = np.array([one.noise[column.name] for column in one.kind.noise_columns])
+        sensors.append(Sensor(one.kind, Gaussian(sigma)))
     return Instrument(tuple(sensors))

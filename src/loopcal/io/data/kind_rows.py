@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rows of each kind in one measurement file: which they are, what was measured, and how far it
-is believed.
-"""
+"""The rows of each kind in a measurement file: settings, measured values and their noise."""
 
 from __future__ import annotations
 
@@ -10,337 +8,245 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from loopcal.errors import DataError, UnitError, suggest_names
-from loopcal.io.core.csv_table import Table, meant, require_columns
+from loopcal.errors import DataError
+from loopcal.findings import report_finding
+from loopcal.io.core.csv_table import Table, require_columns
 from loopcal.io.core.yaml_file import Location, refuse_unknown_keys
-from loopcal.io.data.context_columns import is_context
+from loopcal.io.data.columns import (
+    SIGMA,
+    list_columns,
+    name_covariance,
+    name_measured,
+    refuse_unknown_columns,
+)
 from loopcal.io.data.kind_settings import list_kind_settings, read_kind, read_noise
-from loopcal.io.data.pose_rows import COMMANDED, OWN_COLUMNS, measured_name
-from loopcal.units import EXAMPLES, find_unit
+from loopcal.units import EXAMPLES
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from loopcal.measure import Column, Kind, Observations
+    from loopcal.measure import Kind, Observations
     from loopcal.mechanism import Mechanism
+    from loopcal.typing import BoolArray, FloatArray, IntArray
 
-SIGMA, COVARIANCE = "sigma.", "cov."
 SETTINGS: Mapping[str, str] = {
     "format": "1",
-    "robot": "name of the robot; another than the one used is noted",
-    "instrument": "what measured; information",
-    "controller": "robot file of the geometry that turned commanded coordinates into readings; "
-    "default: nominal",
+    "robot": "name of the robot; a different name than that of the robot in use is reported",
+    "instrument": "name of the instrument; for information",
+    "controller": "robot file of the geometry that converts commanded coordinates to readings; "
+    "the nominal robot by default",
     "kind": "the kind of all rows, followed by its own settings and noise",
-    "kinds": "label -> kind, settings and noise, where a file holds several kinds",
+    "kinds": "label -> kind, settings and noise, in files with several kinds",
     "noise": "standard deviation of each noise column, with its unit; by name or pattern, such as "
     '`"*.x": 5 um`',
-    "unknowns": "name or pattern -> what is known of an unknown of the kinds: a prior, or that it "
-    "is fixed",
-    "session": "session of all rows that state none in their column",
-    "group": "group of all rows that state none in their column",
-    "reading_noise": "standard deviation of the readings, one for all or actuator -> one; default: "
-    "as the robot file says",
-    "poses": "another file, beside this one, that holds readings of the poses",
+    "unknowns": "name or pattern -> prior knowledge of a setup parameter (frame, target, surface, "
+    "offset), or `fixed`",
+    "session": "session of all rows whose column states none",
+    "group": "group of all rows whose column states none",
+    "reading_noise": "standard deviation of the readings: one for all, or actuator -> one; that of "
+    "the robot file by default",
+    "poses": "another file, in the same folder, with the readings of the poses",
 }
-OF_POSES = ("format", "robot", "controller", "reading_noise")
-"""Settings of a file that measures nothing."""
+POSE_SETTINGS = ("format", "robot", "controller", "reading_noise")
+"""Settings of a file without measured values."""
 
 
 @dataclass(frozen=True)
-class Sensor:
-    """A kind in a file: its rows, and where its settings stand."""
+class KindRows:
+    """A kind in a file: its noise [SI] by column, its rows, and the place of its settings."""
 
     kind: Kind
     noise: dict[str, float]
-    rows: np.ndarray
+    rows: IntArray
     location: Location
 
 
-def measures(table: Table) -> bool:
-    """Tell whether a file holds measured values; one that does not only says where poses are."""
+def has_measured_values(table: Table) -> bool:
+    """Return whether a file states a kind; one that does not only holds readings of poses."""
     return any(key in table.settings.content for key in ("kind", "kinds"))
 
 
-def read_sensors(table: Table, robot: Mechanism) -> tuple[Sensor, ...]:
+def read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
     """Return the kinds of a file, mounted on the robot's tool, with the indices of their rows.
 
     Raises
     ------
-    FileError
-        Settings or columns that mean nothing here.
+    FileError : settings or columns without a meaning.
     """
-    sensors = _sensors(table, robot)
-    _refuse_unknown_columns(table, robot, sensors)
-    return sensors
+    kinds = _read_kinds(table, robot)
+    refuse_unknown_columns(table, robot, [one.kind for one in kinds])
+    return kinds
 
 
-def read_poses_only(table: Table, robot: Mechanism) -> None:
-    """Refuse what has no place in a file that only says where poses are.
-
-    Raises
-    ------
-    FileError
-        As `read_sensors`; the file states no kind and no readings either.
-    """
-    refuse_unknown_keys(table.settings, list(table.settings.content), OF_POSES)
-    _refuse_unknown_columns(table, robot, ())
+def check_pose_file(table: Table, robot: Mechanism) -> None:
+    """Raise FileError for settings and columns that a file without measured values cannot have."""
+    refuse_unknown_keys(table.settings, list(table.settings.content), POSE_SETTINGS)
+    refuse_unknown_columns(table, robot, ())
 
 
 def read_observations(
     table: Table,
     robot: Mechanism,
-    sensor: Sensor,
+    one: KindRows,
     members: Sequence[tuple[int, ...]],
-    context: Mapping[str, np.ndarray],
-    of_poses: Mapping[str, np.ndarray],
+    context: Mapping[str, FloatArray],
+    pose_context: Mapping[str, FloatArray],
 ) -> tuple[Observations, tuple[str, ...]]:
-    """Read the rows of one kind, and where each of them stands.
+    """Read the rows of one kind; return them with file and line of each.
 
     Parameters
     ----------
-    table, robot, sensor : the file, what was measured, and one of `read_sensors`.
-    members : the poses that each row of the file saw.
-    context : name -> (rows,) of the file. of_poses : name -> (n,) of the poses, for rows that say
-        nothing themselves.
+    table, robot, one : file, measured robot, and one of `read_kinds`.
+    members : the poses of each row of the file.
+    context : name -> (rows,) times and temperatures of the file.
+    pose_context : name -> (n,) those of the poses, for rows that state none.
 
     Raises
     ------
-    FileError
-        What does not fit, at its line.
-    DataError
-        Noise that is no covariance; with the file.
+    FileError : a cell that does not fit, at its line.
+    DataError : noise that is not a covariance; with the file.
     """
     import numpy as np
 
     from loopcal.measure import Observations
 
-    chosen = _seen(table, sensor, members)
-    measured, covariance = _values(table, robot, chosen)
-    seen = np.array([members[row] for row in chosen.rows], dtype=np.intp).reshape(
-        -1, chosen.kind.poses_per_row
-    )
+    one = _select_rows(table, one, members)
+    links, rows = one.kind.poses_per_row, one.rows
+    measured, covariance = _read_values(table, robot, one)
+    poses = np.array([members[row] for row in rows], dtype=np.intp).reshape(-1, links)
     beside = {}
-    for name in dict.fromkeys([*context, *of_poses]):
-        own = context[name][chosen.rows] if name in context else np.full(len(seen), np.nan)
-        values = (
-            np.where(np.isnan(own), of_poses[name][seen].mean(axis=1), own)
-            if name in of_poses
-            else own
-        )
+    for name in dict.fromkeys([*context, *pose_context]):
+        values = context[name][rows] if name in context else np.full(len(rows), np.nan)
+        if name in pose_context:
+            values = np.where(np.isnan(values), pose_context[name][poses].mean(axis=1), values)
         if not np.isnan(values).all():
             beside[name] = values
     try:
-        found = Observations(
-            chosen.kind,
-            seen[:, 0] if chosen.kind.poses_per_row == 1 else seen,
+        observations = Observations(
+            one.kind,
+            poses[:, 0] if links == 1 else poses,
             measured,
             covariance,
-            session=_texts(table, "session", chosen.rows),
-            group=_texts(table, "group", chosen.rows),
+            session=_read_names(table, "session", rows),
+            group=_read_names(table, "group", rows),
             context=beside,
         )
     except DataError as error:
         raise DataError(f"{table.path}: {error}") from None
-    return found, tuple(table.place(int(row)) for row in chosen.rows)
+    return observations, tuple(table.place(int(row)) for row in rows)
 
 
-def _sensors(table: Table, robot: Mechanism) -> tuple[Sensor, ...]:
-    """Return the kinds of the file, mounted on the robot's tool, with the indices of their rows."""
+def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
+    """Read the settings `kind` or `kinds`, and the column `kind`."""
     import numpy as np
 
-    file = table.settings
-    content, several = file.content, file.content.get("kinds")
+    file, content = table.settings, table.settings.content
+    several = content.get("kinds")
     if several is None:
         kind = read_kind(file, content, ()).with_tool(robot.tool)
         refuse_unknown_keys(file, list(content), [*SETTINGS, *list_kind_settings(type(kind))])
-        return (Sensor(kind, read_noise(file, content, kind, ()), np.arange(len(table.rows)), ()),)
-    refuse_unknown_keys(
-        file, list(content), [key for key in SETTINGS if key not in ("kind", "noise")]
-    )
-    if not isinstance(several, dict) or not all(
-        isinstance(node, dict) for node in several.values()
-    ):
-        raise file.error(
-            "'kinds' must name each kind, as 'kinds: {height: {kind: component, ..}}'; correct it",
-            ("kinds",),
-        )
-    require_columns(table, ["kind"], "says which of the kinds each row is")
-    cells, sensors = np.array(table.text("kind")), []
+        rows = np.arange(len(table.rows))
+        return (KindRows(kind, read_noise(file, content, kind, ()), rows, ()),)
+    allowed = [key for key in SETTINGS if key not in ("kind", "noise")]
+    refuse_unknown_keys(file, list(content), allowed)
+    if not isinstance(several, dict) or not all(isinstance(n, dict) for n in several.values()):
+        sentence = "'kinds' must map labels to kinds, as 'kinds: {height: {kind: component, ..}}'"
+        raise file.error(sentence, ("kinds",))
+    require_columns(table, ["kind"], "which assigns each row to one of the kinds")
+    cells, kinds = np.array(table.text("kind")), []
     for row, cell in enumerate(cells):
-        if cell and cell not in several:  # without a kind a row only says where a pose is
-            raise table.row_error(
-                row,
-                f"{cell!r} is not one of the kinds of this file: {', '.join(several)}; correct it",
-            )
+        if cell and cell not in several:  # without a kind, a row only holds readings
+            sentence = f"column 'kind' is {cell!r}; allowed: {', '.join(several)}"
+            raise table.row_error(row, sentence)
     for label, node in several.items():
-        location = ("kinds", label)
-        kind = read_kind(file, node, location).with_tool(robot.tool)
-        refuse_unknown_keys(
-            file, list(node), ["kind", "noise", *list_kind_settings(type(kind))], location
-        )
-        sensors.append(
-            Sensor(
-                kind,
-                read_noise(file, node, kind, location),
-                np.flatnonzero(cells == label),
-                location,
-            )
-        )
-    return tuple(sensors)
+        place = ("kinds", label)
+        kind = read_kind(file, node, place).with_tool(robot.tool)
+        own = ["kind", "noise", *list_kind_settings(type(kind))]
+        refuse_unknown_keys(file, list(node), own, place)
+        noise, rows = read_noise(file, node, kind, place), np.flatnonzero(cells == label)
+        kinds.append(KindRows(kind, noise, rows, place))
+    return tuple(kinds)
 
 
-def _refuse_unknown_columns(table: Table, robot: Mechanism, sensors: tuple[Sensor, ...]) -> None:
-    """Refuse columns that mean nothing here."""
-    known = {
-        *OWN_COLUMNS,
-        *(a.name for a in robot.actuators),
-        *(SIGMA + a.name for a in robot.actuators),
-    }
-    known |= {COMMANDED + name for name in robot.controlled}
-    for sensor in sensors:
-        noise = [measured_name(column.name, robot) for column in sensor.kind.noise_columns]
-        known |= {measured_name(column.name, robot) for column in sensor.kind.columns} | {
-            SIGMA + name for name in noise
-        }
-        known |= {f"{COVARIANCE}{a}.{b}" for a in noise for b in noise if a != b}
-    why = (
-        ""
-        if sensors
-        else " (this file states no kind of measurement, so that it only says where poses are)"
-    )
-    for name in table.names:
-        if name not in known and not is_context(name) and not name.startswith("note"):
-            hint = meant(name, table.units[name], {*known, *OWN_COLUMNS}) or suggest_names(
-                name, known
-            )
-            hint = hint or f"; columns of this file can be {', '.join(sorted(known))}"
-            raise table.header_error(
-                f"column {name!r} is unknown{hint}; correct it, or call it 'note {name}' to ignore "
-                f"it{why}"
-            )
-
-
-def _seen(table: Table, sensor: Sensor, members: Sequence[tuple[int, ...]]) -> Sensor:
-    """Return the sensor with those of its rows that measure: for a kind that compares poses, not
-    those that name one.
-    """
-    links = sensor.kind.poses_per_row
+def _select_rows(table: Table, one: KindRows, members: Sequence[tuple[int, ...]]) -> KindRows:
+    """Return only the rows that measure: those of two poses, for a kind that compares poses."""
+    links = one.kind.poses_per_row
     if links > 1 and "kind" not in table.units:
-        sensor = replace(sensor, rows=sensor.rows[[len(members[row]) > 1 for row in sensor.rows]])
-    for row in sensor.rows:
-        found = len(members[row])
-        if found != links:
-            sentence = f"this row names {found} poses, but the kind {sensor.kind.name!r} sees {links}; correct the names"
-            raise table.row_error(int(row), sentence)
-    return sensor
+        one = replace(one, rows=one.rows[[len(members[row]) > 1 for row in one.rows]])
+    for row in one.rows:
+        if (count := len(members[row])) != links:
+            sentence = f"this row names {count} poses, but the kind {one.kind.name!r} needs {links}"
+            raise table.row_error(int(row), f"{sentence}; correct the column 'pose'")
+    return one
 
 
-def _values(table: Table, robot: Mechanism, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
+def _read_values(table: Table, robot: Mechanism, one: KindRows) -> tuple[FloatArray, FloatArray]:
     """Return measured values (r, c) and the covariance (r, m, m) of their residuals [SI]."""
     import numpy as np
 
-    kind, rows = sensor.kind, sensor.rows
-    columns = {measured_name(column.name, robot): column.dimension for column in kind.columns}
-    require_columns(table, list(columns), f"belongs to the kind {kind.name!r}")
-    measured = np.column_stack(
-        [table.numbers(name, dimension) for name, dimension in columns.items()]
-    )[rows]
+    kind, rows = one.kind, one.rows
+    known = list_columns(robot, [kind])
+    names = [name_measured(column.name, robot) for column in kind.columns]
+    require_columns(table, names, f"which the kind {kind.name!r} measures")
+    measured = np.column_stack([known[name].parse(table) for name in names])[rows]
     for i, doubt in kind.find_invalid_rows(measured):
         raise table.row_error(int(rows[i]), f"this row {doubt}")
-    # where the noise columns are the measured ones, what was not measured needs no sigma
-    absent = (
-        np.isnan(measured)
-        if kind.noise_columns == kind.columns
-        else np.zeros((len(rows), len(kind.noise_columns)), bool)
-    )
+    absent = np.zeros((len(rows), len(kind.noise_columns)), bool)
+    if kind.noise_columns == kind.columns:  # then a value that was not measured needs no sigma
+        absent = np.isnan(measured)
     sigma = np.column_stack(
-        [_sigma(table, robot, sensor, i, absent[:, i]) for i in range(len(kind.noise_columns))]
+        [_read_sigma(table, robot, one, i, absent[:, i]) for i in range(absent.shape[1])]
     )
     covariance = sigma[:, :, None] * np.eye(sigma.shape[1]) * sigma[:, None, :]
-    for a, left in enumerate(kind.noise_columns):
-        for b, right in enumerate(kind.noise_columns):
-            name = (
-                f"{COVARIANCE}{measured_name(left.name, robot)}.{measured_name(right.name, robot)}"
-            )
-            if name in table.units:
-                covariance[:, a, b] = covariance[:, b, a] = _products(table, name, left, right)[
-                    rows
-                ]
+    for i, a in enumerate(kind.noise_columns):
+        for j, b in enumerate(kind.noise_columns):
+            name = name_covariance(a.name, b.name, robot)
+            if i != j and name in table.units:
+                covariance[:, i, j] = covariance[:, j, i] = known[name].parse(table)[rows]
     N = kind.linearize_noise(measured)
     return measured, N @ covariance @ np.swapaxes(N, -1, -2)
 
 
-def _texts(table: Table, name: str, rows: np.ndarray) -> np.ndarray:
-    """Return the sessions or groups (r,) of rows: of their cells, else of the setting, else without
-    a name.
-    """
+def _read_names(table: Table, name: str, rows: IntArray) -> FloatArray:
+    """Return the sessions or groups (r,) of rows: of their cells, else of the setting, else ''."""
     import numpy as np
 
     stated = table.settings.content.get(name, "")
-    if isinstance(stated, (dict, list)):
-        raise table.settings.error(
-            f"{name!r} names the {name} of all rows; write a name or a number", (name,)
-        )
+    if isinstance(stated, dict | list):
+        sentence = f"{name!r} names the {name} of all rows; write a name or a number"
+        raise table.settings.error(sentence, (name,))
     usual = str(stated if stated is not None else "").strip()
-    cells = table.text(name) if name in table.units else ("",) * len(table.rows)
-    return np.array(
-        [unicodedata.normalize("NFC", cells[row] or usual) for row in rows], dtype=np.str_
-    )
+    cells = table.text(name)
+    texts = (unicodedata.normalize("NFC", cells[row] or usual) for row in rows)
+    return np.array(list(texts), dtype=np.str_)
 
 
-def _sigma(
-    table: Table, robot: Mechanism, sensor: Sensor, place: int, absent: np.ndarray
-) -> np.ndarray:
-    """Return the standard deviations (r,) [SI] of one noise column: from its sigma column, else
-    from the settings.
+def _read_sigma(
+    table: Table, robot: Mechanism, one: KindRows, place: int, absent: BoolArray
+) -> FloatArray:
+    """Return the standard deviations (r,) [SI] of one noise column, from its column or settings.
 
-    An empty cell of a value that is `absent` (r,) gets the sigma of another row, which counts for
-    nothing.
+    An empty cell of a value that is `absent` (r,) gets the sigma of another row, without effect.
     """
     import numpy as np
 
-    column = sensor.kind.noise_columns[place]
-    name = SIGMA + measured_name(column.name, robot)
-    if name in table.units:
-        found = table.numbers(name, column.dimension)[sensor.rows]
-        sigma = np.where(np.isnan(found), sensor.noise.get(column.name, np.nan), found)
-        if (stated := sigma[sigma > 0]).size:
-            sigma = np.where(absent & np.isnan(sigma), stated[0], sigma)
-        for i in np.flatnonzero(~(sigma > 0)):
-            sentence = f"column {name!r} holds no number above zero; write a standard deviation"
-            raise table.row_error(int(sensor.rows[i]), sentence)
-        return sigma
-    if column.name not in sensor.noise:
-        raise table.settings.error(
-            f"no noise is stated for {column.name!r}, and without it rows cannot be weighed; add "
-            "'noise: "
-            f"{{{column.name}: {EXAMPLES[column.dimension]}}}' to the settings, or a column "
-            f"{name!r} (not known: a guess, "
-            "and calibrate with --noise estimated)",
-            (*sensor.location, "noise"),
-        )
-    return np.full(len(sensor.rows), sensor.noise[column.name])
-
-
-def _products(table: Table, name: str, left: Column, right: Column) -> np.ndarray:
-    """Return a covariance column (rows,) [SI]; its unit is written `[mm*mrad]`."""
-    import numpy as np
-
-    symbols = (table.units[name] or "").split("*")
-    if len(symbols) != 2:
-        raise table.header_error(
-            f"column {name!r} needs two units, as in '{name} [mm*mrad]'; write them"
-        )
-    factor = 1.0
-    for symbol, column in zip(symbols, (left, right), strict=True):
-        try:
-            factor *= find_unit(symbol.strip(), column.dimension).factor_to_si
-        except UnitError as error:
-            raise table.header_error(f"column {name!r}: {error}") from None
-    return (
-        np.array(
-            [table.number(name, i, cell, empty=False) for i, cell in enumerate(table.text(name))]
-        )
-        * factor
-    )
+    column = one.kind.noise_columns[place]
+    name = SIGMA + name_measured(column.name, robot)
+    if name not in table.units:
+        if column.name not in one.noise:
+            raise table.settings.error(
+                report_finding(
+                    "files.noise-missing",
+                    column=column.name,
+                    example=f"noise: {{{column.name}: {EXAMPLES[column.dimension]}}}",
+                    sigma=name,
+                ),
+                (*one.location, "noise"),
+            )
+        return np.full(len(one.rows), one.noise[column.name])
+    own = table.numbers(name, column.dimension)[one.rows]
+    sigma = np.where(np.isnan(own), one.noise.get(column.name, np.nan), own)
+    if (positive := sigma[sigma > 0]).size:
+        sigma = np.where(absent & np.isnan(sigma), positive[0], sigma)
+    for i in np.flatnonzero(~(sigma > 0)):
+        sentence = f"column {name!r} is not positive; write a standard deviation"
+        raise table.row_error(int(one.rows[i]), sentence)
+    return sigma

@@ -1,41 +1,78 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a measurement file knows of its instruments' own unknowns: priors, and values that are not
-to be identified.
+"""Prior knowledge of setup parameters (frames, targets, surfaces, offsets) in measurement files.
 
     unknowns:
-      tracker.x: {start: 12 mm, sd: 1 mm}     a prior: this value, known to this standard deviation
-      tracker.r?: {sd: 2 mrad}                a prior about the value that the kind's settings state
-      "probe.*": fixed                        kept at the value that the kind's settings state
-      tracker.z: {start: 1.2 m, fixed: true}  kept at this value
+      tracker.x: {start: 12 mm, sd: 1 mm}     a prior: this value with this standard deviation
+      tracker.r?: {sd: 2 mrad}                a prior about the value in the settings of the kind
+      "probe.*": fixed                        fixed at the value in the settings of the kind
+      tracker.z: {start: 1.2 m, fixed: true}  fixed at this value
 
-Names are those of results (`loopcal identifiability` and `loopcal calibrate` show them) or patterns
-of them, and mean unknowns of this file; without the session before it a name means the unknown of
-every session. Of several lines that mean one unknown the last one counts.
+Names are those of results, or patterns of them, and denote parameters of this file. Without the
+session in front, a name denotes the parameter of every session. The last matching line counts.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
-from loopcal.errors import UnitError, suggest_names
-from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
-from loopcal.io.data.kind_settings import SYMBOLS, quantity_text
-from loopcal.units import Dimension, parse_quantity
+from loopcal.errors import suggest_names
+from loopcal.io.core.records import read_record
+from loopcal.io.core.yaml_file import Location, YamlFile
+from loopcal.io.data.kind_settings import format_quantity
+from loopcal.units import Angle, Dimension, Length, Ratio
 
 if TYPE_CHECKING:
     from loopcal.measure import Observations, StatedValue
     from loopcal.parameters import Parameter
 
 KEY, FIXED = "unknowns", "fixed"
+EXAMPLE = (
+    f"write '{FIXED}', {{sd: 1 mm}}, {{start: 12 mm, sd: 1 mm}} or {{start: 12 mm, {FIXED}: true}}"
+)
+
+
+@dataclass(frozen=True)
+class KnownLength:
+    """Knowledge of a length."""
+
+    start: Length | None = None
+    sd: Length | None = None
+    fixed: bool = False
+
+
+@dataclass(frozen=True)
+class KnownAngle:
+    """Knowledge of an angle."""
+
+    start: Angle | None = None
+    sd: Angle | None = None
+    fixed: bool = False
+
+
+@dataclass(frozen=True)
+class KnownRatio:
+    """Knowledge of a number without dimension."""
+
+    start: Ratio | None = None
+    sd: Ratio | None = None
+    fixed: bool = False
+
+
+RECORDS: dict[Dimension, type[KnownLength | KnownAngle | KnownRatio]] = {
+    Dimension.LENGTH: KnownLength,
+    Dimension.ANGLE: KnownAngle,
+    Dimension.RATIO: KnownRatio,
+}
 
 
 def read_known(
     files: Sequence[tuple[YamlFile, Sequence[Observations]]], labels: tuple[str, ...]
 ) -> tuple[StatedValue, ...]:
-    """Return what files say of the unknowns of their own rows.
+    """Return the knowledge that files state of the setup parameters of their own rows.
 
     Parameters
     ----------
@@ -43,119 +80,82 @@ def read_known(
 
     Raises
     ------
-    FileError
-        A name that is no unknown of the file, a statement without sense, or two files that
-        contradict each other.
-    DataError
-        Two kinds of a file state one unknown differently.
+    FileError : a name that is not a parameter of the file, a bad statement, contradicting files.
+    DataError : two kinds of a file state one parameter differently.
     """
     from loopcal.measure import collect_nuisance_parameters
 
-    found: dict[str, tuple[StatedValue, YamlFile, Location]] = {}
+    known: dict[str, tuple[StatedValue, YamlFile, Location]] = {}
     for file, observations in files:
         stated = file.content.get(KEY, {})
         if not isinstance(stated, dict):
-            raise file.error(
-                f"{KEY!r} must name unknowns, as {KEY}: {{tracker.x: {{sd: 1 mm}}}}; correct it",
-                (KEY,),
-            )
+            sentence = f"{KEY!r} must name parameters, as {KEY}: {{tracker.x: {{sd: 1 mm}}}}"
+            raise file.error(sentence, (KEY,))
         own: dict[str, tuple[StatedValue, YamlFile, Location]] = {}
         entries = collect_nuisance_parameters(observations, labels).table.entries if stated else ()
         for pattern, node in stated.items():
             place = (KEY, pattern)
-            own |= {
-                known.name: (known, file, place)
-                for known in _known(file, node, _meant(file, entries, pattern), place)
-            }
-        for name, (known, _, place) in own.items():
-            if name in found and found[name][0] != known:
-                _, other, there = found[name]
-                raise file.error(
-                    f"the unknown {name!r} is stated otherwise in "
-                    f"{other.path}:{other.line(there)}; state it once, or alike",
-                    place,
-                )
-        found = own | found
-    return tuple(known for known, _, _ in found.values())
+            matching = _match(file, entries, pattern)
+            own |= {k.name: (k, file, place) for k in _read_one(file, node, matching, place)}
+        for name, (one, _, place) in own.items():
+            if name in known and known[name][0] != one:
+                _, other, there = known[name]
+                line = f"{other.path}:{other.line(there)}"
+                sentence = f"parameter {name!r} is stated differently in {line}; state it once"
+                raise file.error(sentence, place)
+        known = own | known
+    return tuple(one for one, _, _ in known.values())
 
 
-def known_text(known: Sequence[StatedValue], entries: Sequence[Parameter]) -> str:
-    """Return the setting as text that `read_known` reads; names that are not among the entries are
-    left out.
-    """
+def format_known(known: Sequence[StatedValue], entries: Sequence[Parameter]) -> str:
+    """Return the setting as text that `read_known` reads, for the parameters among `entries`."""
     dimensions = {entry.name: entry.dimension for entry in entries}
-    parts = []
+    texts = []
     for one in known:
-        if one.name in dimensions:
-            shown = SYMBOLS[dimensions[one.name]]
-            said = [] if one.nominal is None else [f"start: {quantity_text(one.nominal, shown)}"]
-            said += [f"sd: {quantity_text(one.sd, shown)}"] if one.sd else []
-            text = (
-                f"{{{', '.join(said if one.sd else [*said, f'{FIXED}: true'])}}}" if said else FIXED
-            )
-            parts.append(f"{json.dumps(one.name, ensure_ascii=False)}: {text}")
-    return f"{{{', '.join(parts)}}}" if parts else ""
+        if one.name not in dimensions:
+            continue
+        dimension = dimensions[one.name]
+        start = [] if one.nominal is None else [f"start: {format_quantity(one.nominal, dimension)}"]
+        if one.sd:
+            text = f"{{{', '.join([*start, f'sd: {format_quantity(one.sd, dimension)}'])}}}"
+        else:
+            text = f"{{{start[0]}, {FIXED}: true}}" if start else FIXED
+        texts.append(f"{json.dumps(one.name, ensure_ascii=False)}: {text}")
+    return f"{{{', '.join(texts)}}}" if texts else ""
 
 
-def _meant(file: YamlFile, entries: Sequence[Parameter], pattern: str) -> list[Parameter]:
-    """Return the unknowns that a name or pattern means."""
-    names = [entry.name for entry in entries]
-    if pattern in names:
-        return [entries[names.index(pattern)]]
-    meant = [entry for entry in entries if fnmatchcase(entry.name, pattern)]
-    meant = meant or [entry for entry in entries if fnmatchcase(entry.name, f"*.{pattern}")]
-    if not meant:
-        shown = ", ".join(names[:12]) or "none; say which are, as 'unknown: [frame]' of the kind"
-        hint = suggest_names(pattern, names)
-        raise file.error(
-            f"no unknown of this file is called {pattern!r}{hint}; there are {shown}",
-            (KEY, pattern),
-        )
-    return meant
+def _match(file: YamlFile, entries: Sequence[Parameter], pattern: str) -> list[Parameter]:
+    """Return the parameters that a name or pattern denotes."""
+    exact = [entry for entry in entries if entry.name == pattern]
+    whole = exact or [entry for entry in entries if fnmatchcase(entry.name, pattern)]
+    matching = whole or [entry for entry in entries if fnmatchcase(entry.name, f"*.{pattern}")]
+    if not matching:
+        names = [entry.name for entry in entries]
+        allowed = ", ".join(names[:12]) or "none; state some, as 'unknown: [frame]' of the kind"
+        sentence = f"this file has no setup parameter {pattern!r}{suggest_names(pattern, names)}"
+        raise file.error(f"{sentence}; it has {allowed}", (KEY, pattern))
+    return matching
 
 
-def _known(
-    file: YamlFile, node: Any, meant: Sequence[Parameter], place: Location
+def _read_one(
+    file: YamlFile, node: Any, matching: Sequence[Parameter], place: Location
 ) -> list[StatedValue]:
-    """Return what a statement says of each unknown that it means."""
+    """Return the knowledge that one line states of each parameter that it denotes."""
     from loopcal.measure import StatedValue
 
     if node == FIXED:
-        return [StatedValue(entry.name) for entry in meant]
-    example = f"write '{FIXED}', {{sd: 1 mm}}, {{start: 12 mm, sd: 1 mm}} or {{start: 12 mm, {FIXED}: true}}"
+        return [StatedValue(entry.name) for entry in matching]
     if not isinstance(node, dict):
-        raise file.error(f"this says {node!r} of an unknown; {example}", place)
-    refuse_unknown_keys(file, list(node), ["start", "sd", FIXED], place)
-    fixed = node.get(FIXED, False)
-    if not isinstance(fixed, bool) or fixed == ("sd" in node):
-        raise file.error(
-            f"this says not or not clearly how well the unknown is known; {example}", place
-        )
-    dimensions = {entry.dimension for entry in meant}
+        raise file.error(f"{node!r} does not state knowledge of a parameter; {EXAMPLE}", place)
+    dimensions = {entry.dimension for entry in matching}
     if len(dimensions) > 1 and ("start" in node or "sd" in node):
-        raise file.error(
-            "this means lengths and angles together; state a number for each of the two apart",
-            place,
-        )
-    values = {
-        key: _number(file, node[key], meant[0].dimension, (*place, key))
-        for key in ("start", "sd")
-        if key in node
-    }
-    if not fixed and not values["sd"] > 0.0:
-        raise file.error(
-            f"the standard deviation is {node['sd']}; give a number above zero, or say {FIXED}",
-            (*place, "sd"),
-        )
-    return [
-        StatedValue(entry.name, 0.0 if fixed else values["sd"], values.get("start"))
-        for entry in meant
-    ]
-
-
-def _number(file: YamlFile, text: Any, dimension: Dimension, place: Location) -> float:
-    """Return the SI value of a number with its unit."""
-    try:
-        return parse_quantity(str(text), dimension)
-    except UnitError as error:
-        raise file.error(f"{place[-1]!r}: {error}", place) from None
+        sentence = "this pattern matches lengths and angles; state them in separate lines"
+        raise file.error(sentence, place)
+    stated = read_record(file, node, RECORDS[matching[0].dimension], None, place)
+    if stated.fixed == ("sd" in node):
+        raise file.error(f"state either 'sd' or '{FIXED}: true'; {EXAMPLE}", place)
+    if not stated.fixed and not (stated.sd or 0.0) > 0.0:
+        sentence = f"the standard deviation is {node['sd']}; write a positive number, or {FIXED}"
+        raise file.error(sentence, (*place, "sd"))
+    sd = 0.0 if stated.fixed else stated.sd or 0.0
+    return [StatedValue(entry.name, sd, stated.start) for entry in matching]

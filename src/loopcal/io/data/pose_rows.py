@@ -1,38 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which pose each row of measurement files saw, and the readings of every pose.
+"""The poses of measurement files: their names, readings, reading noise and blocks.
 
-Rows with one name in the column `pose` saw one pose, in whichever file they stand; its readings
-stand in the first of them and are the same, or left out, in the others. `a;b` names the poses that
-a row compares, which have rows of their own. A file without readings refers to poses of other files
-by name.
+Rows with the same name in the column `pose` belong to one pose, in all files. The first of them
+holds the readings; the others repeat them or leave them empty. `a;b` names two poses that a row
+compares; each of them has a row of its own.
+
+Reading noise is `reading_noise: 5 um` (of all readings) or `{q1: 5 um, q2: 8 um}` in the settings,
+or a column `sigma.q1 [um]`, where `inf` marks a reading that is not trusted and an empty cell falls
+back to the setting, then to the robot file. Where noise is stated, an empty reading was not taken;
+otherwise it is refused.
 """
 
 from __future__ import annotations
 
-import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from loopcal.errors import DataError, suggest_names
 from loopcal.io.core.csv_table import Table, require_columns
-from loopcal.io.data.reading_noise import read_reading_sigma, says_noise
+from loopcal.io.core.yaml_file import Location, refuse_unknown_keys
+from loopcal.io.data.column_types import NumberColumn, TextColumn
+from loopcal.io.data.columns import COMMANDED, LINK, SIGMA, list_columns
 from loopcal.io.robot.robot_file import load_robot
-from loopcal.units import Dimension
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from loopcal.mechanism import Mechanism
+    from loopcal.typing import FloatArray, IntArray
 
-COMMANDED, LINK = "commanded.", ";"
-OWN_COLUMNS = ("pose", "use", "block", "kind", "session", "group", "time", "temperature")
-"""Names of columns that mean the same in every file."""
+READING_NOISE = "reading_noise"
+RELATIVE_ROUNDING, ABSOLUTE_ROUNDING = 1e-12, 1e-12
+"""Differences [1] and [m or rad] up to which readings in different units are the same."""
 
-ALIKE, LEAST = 1e-12, 1e-12
-"""Relative difference [1], and difference [m or rad], up to which readings in different units are
-the same.
-"""
+Solver = Callable[["Mechanism", "FloatArray", tuple[str, ...]], "FloatArray"]
+"""Readings (n, a) of a controller for commanded coordinates (n, c) of named poses."""
 
 
 @dataclass(frozen=True)
@@ -41,214 +42,172 @@ class PoseRows:
 
     Parameters
     ----------
-    labels : tuple of str
-        Names of the poses.
-    readings : ndarray
-        (n, a) [SI], NaN where not read.
-    sigma : ndarray or None
-        (n, a) standard deviations of the readings [SI], see `loopcal.measure.Measurements`; None
-        where no file says any.
-    block : ndarray
-        (n,) poses of equal number are never split.
-    members : tuple of tuple of tuple of int
-        The poses that each row of each file saw.
+    labels : names of the poses.
+    readings : (n, a) [SI], NaN where not read.
+    sigma : (n, a) standard deviations of the readings [SI]; None where no file states any.
+    block : (n,) poses with the same number are never split.
+    members : the poses of each row of each file.
     """
 
     labels: tuple[str, ...]
-    readings: np.ndarray
-    sigma: np.ndarray | None
-    block: np.ndarray
+    readings: FloatArray
+    sigma: FloatArray | None
+    block: IntArray
     members: tuple[tuple[tuple[int, ...], ...], ...]
 
 
 @dataclass(frozen=True)
-class _File:
-    """One file: what its rows call their poses, where each stands first, and the readings of these
-    rows.
+class _FilePoses:
+    """The poses of one file.
 
-    `readings` and `sigma` are (rows, a), NaN where a row states none, `None` where the file has no
-    such columns; `stated` are the poses whose readings stand in this file, `unread` those of which
-    it says that nothing was read.
+    `names` of each row; `first` row of each pose; `readings` and `sigma` (rows, a), NaN where a row
+    states none, None without such columns; `read` are the poses with readings in this file,
+    `unread` those whose readings were not taken.
     """
 
     table: Table
     names: tuple[str, ...]
     first: dict[str, int]
-    readings: np.ndarray | None
-    sigma: np.ndarray | None
-    stated: frozenset[str]
+    readings: FloatArray | None
+    sigma: FloatArray | None
+    read: frozenset[str]
     unread: frozenset[str]
 
 
-def read_pose_rows(tables: Sequence[Table], robot: Mechanism) -> PoseRows:
-    """Read the columns `pose`, `block`, and those of the readings or of commanded coordinates.
+def read_pose_rows(tables: Sequence[Table], robot: Mechanism, solve: Solver) -> PoseRows:
+    """Read the columns `pose` and `block`, and those of readings or commanded coordinates.
+
+    Parameters
+    ----------
+    tables : of all files. robot : its actuators name the readings.
+    solve : returns the readings with which a controller answers commanded coordinates.
 
     Raises
     ------
-    FileError
-        A pose without readings or with two sets of them, a comparison with a pose that is not
-        there.
-    DataError
-        A commanded pose that the controller cannot reach.
+    FileError : a pose without readings or with contradicting ones, an unknown pose in a comparison.
+    DataError : a commanded pose that the controller cannot reach.
     """
-    files = [_read(table, robot, several=len(tables) > 1) for table in tables]
-    elsewhere = frozenset().union(*(file.stated for file in files))
+    files = [_read_file(table, robot, solve, several=len(tables) > 1) for table in tables]
+    read = frozenset().union(*(file.read for file in files))
     origin: dict[str, tuple[int, int]] = {}
     for i, file in enumerate(files):
         for name, row in file.first.items():
-            if name in file.stated or (name in file.unread and name not in elsewhere):
-                there = origin.setdefault(name, (i, row))
-                if there != (i, row):
-                    _refuse_other_readings(file, row, files[there[0]], there[1])
-            elif name not in elsewhere and file.readings is not None:
-                raise file.table.row_error(
-                    row,
-                    f"pose {name!r} has no readings, here or in another file; write them in one",
-                )
+            if name in file.read or (name in file.unread and name not in read):
+                k, other_row = origin.setdefault(name, (i, row))
+                if (k, other_row) != (i, row):
+                    _refuse_contradiction(file, row, files[k], other_row)
+            elif name not in read and file.readings is not None:
+                sentence = f"pose {name!r} has no readings in any file; add them in one"
+                raise file.table.row_error(row, sentence)
     if not origin:
-        raise tables[0].row_error(
-            0, "no row has readings of a pose; give each compared pose a row of its own"
-        )
-    place = {name: i for i, name in enumerate(origin)}
+        raise tables[0].row_error(0, "no row has readings; add a row with readings for each pose")
+    index = {name: i for i, name in enumerate(origin)}
     members = tuple(
-        tuple(_members(file.table, row, cell, place) for row, cell in enumerate(file.names))
+        tuple(_find_members(file.table, row, cell, index) for row, cell in enumerate(file.names))
         for file in files
     )
-    readings, sigma = _gathered(files, list(origin.values()), robot)
-    return PoseRows(tuple(origin), readings, sigma, _blocks(files, tuple(origin)), members)
-
-
-def measured_name(column: str, robot: Mechanism) -> str:
-    """Return what a file calls a measured column: `measured.q1` where a reading has the plain name."""
-    taken = {*OWN_COLUMNS, *(actuator.name for actuator in robot.actuators)}
-    return f"measured.{column}" if column in taken else column
-
-
-def dimension_of(coordinate: str) -> Dimension:
-    """Return what a controlled coordinate measures: x, y, z lengths, the others angles."""
-    return Dimension.LENGTH if coordinate in ("x", "y", "z") else Dimension.ANGLE
+    readings, sigma = _gather(files, list(origin.values()), robot)
+    return PoseRows(tuple(origin), readings, sigma, _number_blocks(files, list(origin)), members)
 
 
 def has_readings(table: Table, robot: Mechanism) -> bool:
-    """Tell whether a file has columns of readings, or of commanded coordinates."""
+    """Return whether a file has columns of readings, or of commanded coordinates."""
     names = {actuator.name for actuator in robot.actuators}
     return any(column in names or column.startswith(COMMANDED) for column in table.names)
 
 
-def _read(table: Table, robot: Mechanism, several: bool) -> _File:
+def _read_file(table: Table, robot: Mechanism, solve: Solver, several: bool) -> _FilePoses:
     """Read the poses of one file."""
     import numpy as np
 
     if several and "pose" not in table.units:
-        raise table.header_error(
-            "poses of several files are joined by name, and this one names none; add a column "
-            "'pose'"
-        )
-    written = (
-        table.text("pose")
-        if "pose" in table.units
-        else tuple(str(i + 1) for i in range(len(table.rows)))
-    )
-    names = tuple(unicodedata.normalize("NFC", cell) for cell in written)
-    first = _first_rows(table, names)
+        sentence = "files are joined by the names of poses, and this file names none"
+        raise table.header_error(f"{sentence}; add a column 'pose'")
+    names = TextColumn("pose").parse(table) if "pose" in table.units else table.pose_names()
+    first = _find_first_rows(table, names)
     if several and not has_readings(table, robot):
-        return _File(table, names, first, None, None, frozenset(), frozenset())
-    controller = _controller(table, robot)
-    rows, told = _rows(table, robot, controller), list(_dimensions(robot, controller))
+        return _FilePoses(table, names, first, None, None, frozenset(), frozenset())
+    controller = _load_controller(table, robot)
+    columns = _reading_columns(table, robot, controller)
+    rows = np.column_stack([column.parse(table) for column in columns])
     absent = np.isnan(rows)
-    partly_read = controller is None and says_noise(table, robot)
+    may_be_absent = controller is None and states_reading_noise(table, robot)
     for row, name in enumerate(names):
         begin = first.get(name)
         if row == begin:
-            if absent[row].any() and not partly_read and not (several and absent[row].all()):
-                column = told[int(np.argmax(absent[row]))]
-                way = (
-                    ""
-                    if controller is not None
-                    else ", or state 'reading_noise' where empty means not read"
-                )
-                raise table.row_error(row, f"column {column!r} is empty; write its value{way}")
-        elif not absent[row].all() and (
-            begin is None or not np.array_equal(rows[row], rows[begin], equal_nan=True)
-        ):
-            links = f"a row that compares poses ({name!r}) has no readings of its own; leave these cells empty"
-            has = f"pose {name!r} has other readings here than in line {table.lines[begin or 0]}; give it another name"
-            raise table.row_error(row, links if begin is None else has)
+            if absent[row].any() and not may_be_absent and not (several and absent[row].all()):
+                column = columns[int(np.argmax(absent[row]))].name
+                hint = f", or state '{READING_NOISE}', so that empty means not read"
+                act = f"write its value{'' if controller is not None else hint}"
+                raise table.row_error(row, f"column {column!r} is empty; {act}")
+        elif absent[row].all():
+            continue
+        elif begin is None:
+            sentence = f"the row of {name!r} compares poses and has no readings of its own"
+            raise table.row_error(row, f"{sentence}; leave these cells empty")
+        elif not np.array_equal(rows[row], rows[begin], equal_nan=True):
+            sentence = f"pose {name!r} has other readings in line {table.lines[begin]}"
+            raise table.row_error(row, f"{sentence}; correct them, or rename one of the two poses")
     unread = frozenset(name for name, row in first.items() if absent[row].all())
-    stated = frozenset(first) - unread
+    read = frozenset(first) - unread
     if controller is not None:
-        rows = _from_commanded(
-            table,
-            controller,
-            robot,
-            rows,
-            {row: name for name, row in first.items() if name in stated},
-        )
+        chosen = {row: name for name, row in first.items() if name in read}
+        rows = _solve_commanded(table, controller, robot, rows, chosen, solve)
     sigma = read_reading_sigma(table, robot, rows)
-    return _File(table, names, first, rows, sigma, stated, unread if partly_read else frozenset())
-
-
-def _first_rows(table: Table, names: tuple[str, ...]) -> dict[str, int]:
-    """Return pose -> its first row, in the order of the file."""
-    first: dict[str, int] = {}
-    for row, cell in enumerate(names):
-        if not cell:
-            raise table.row_error(
-                row, "column 'pose' is empty, but every row needs it; write a name or a number"
-            )
-        if LINK not in cell:
-            first.setdefault(cell, row)
-    return first
-
-
-def _members(table: Table, row: int, cell: str, place: dict[str, int]) -> tuple[int, ...]:
-    """Return the poses that a row saw."""
-    found = []
-    for name in (part.strip() for part in cell.split(LINK)):
-        if name not in place:
-            hint = suggest_names(name, place)
-            raise table.row_error(
-                row, f"there is no pose {name!r}{hint}; give it a row with its readings"
-            )
-        found.append(place[name])
-    return tuple(found)
-
-
-def _dimensions(robot: Mechanism, controller: Mechanism | None) -> dict[str, Dimension]:
-    """Return column -> dimension of the readings, or of what the controller was commanded to."""
-    if controller is None:
-        return {actuator.name: actuator.dimension for actuator in robot.actuators}
-    return {COMMANDED + name: dimension_of(name) for name in controller.controlled}
-
-
-def _rows(table: Table, robot: Mechanism, controller: Mechanism | None) -> np.ndarray:
-    """Return (rows, a or c) readings or commanded coordinates [SI], NaN where a row has none."""
-    import numpy as np
-
-    dimensions = _dimensions(robot, controller)
-    why = f"is the reading of an actuator of {robot.name}"
-    if controller is not None:
-        why = f"is a coordinate that {controller.name} is commanded in"
-        read = [a.name for a in robot.actuators if a.name in table.units]
-        if read:
-            raise table.header_error(
-                f"there are readings ({read[0]!r}) and commanded coordinates; keep one of the two"
-            )
-    require_columns(table, list(dimensions), why)
-    return np.column_stack(
-        [table.numbers(name, dimension) for name, dimension in dimensions.items()]
+    return _FilePoses(
+        table, names, first, rows, sigma, read, unread if may_be_absent else frozenset()
     )
 
 
-def _controller(table: Table, robot: Mechanism) -> Mechanism | None:
-    """Return the robot whose geometry turned commanded coordinates into readings; None where
-    readings are given.
-    """
+def _find_first_rows(table: Table, names: tuple[str, ...]) -> dict[str, int]:
+    """Return pose -> its first row, in the order of the file."""
+    first: dict[str, int] = {}
+    for row, name in enumerate(names):
+        if not name:
+            raise table.row_error(row, "column 'pose' is empty; write a name or a number")
+        if LINK not in name:
+            first.setdefault(name, row)
+    return first
+
+
+def _find_members(table: Table, row: int, cell: str, index: Mapping[str, int]) -> tuple[int, ...]:
+    """Return the poses of a row."""
+    names = [part.strip() for part in cell.split(LINK)]
+    for name in names:
+        if name not in index:
+            sentence = f"unknown pose {name!r}{suggest_names(name, index)}"
+            raise table.row_error(row, f"{sentence}; add a row with its readings")
+    return tuple(index[name] for name in names)
+
+
+def _reading_columns(
+    table: Table, robot: Mechanism, controller: Mechanism | None
+) -> list[NumberColumn]:
+    """Return the columns of the readings, or of the coordinates of the controller."""
+    readings = [actuator.name for actuator in robot.actuators]
+    if controller is None:
+        names, why = readings, f"the reading of an actuator of {robot.name}"
+    else:
+        names = [COMMANDED + name for name in controller.controlled]
+        why = f"a commanded coordinate of {controller.name}"
+        both = next((name for name in readings if name in table.units), None)
+        if both is not None:
+            sentence = f"this file has readings ({both!r}) and commanded coordinates"
+            raise table.header_error(f"{sentence}; remove one of the two")
+    require_columns(table, names, why)
+    known = list_columns(robot, ()) | list_columns(controller or robot, ())
+    return [column for name in names if isinstance(column := known[name], NumberColumn)]
+
+
+def _load_controller(table: Table, robot: Mechanism) -> Mechanism | None:
+    """Return the geometry that converts commanded coordinates; None where readings are given."""
     name = table.settings.content.get("controller")
     if not any(column.startswith(COMMANDED) for column in table.names):
         if name is not None:
-            sentence = "a controller is named, but there are readings, not commanded coordinates; remove 'controller'"
-            raise table.settings.error(sentence, ("controller",))
+            sentence = (
+                "a controller is named, but this file has readings, not commanded coordinates"
+            )
+            raise table.settings.error(f"{sentence}; remove 'controller'", ("controller",))
         return None
     if name is None:
         return robot.nominal
@@ -256,61 +215,112 @@ def _controller(table: Table, robot: Mechanism) -> Mechanism | None:
     return load_robot(beside if beside.exists() else str(name))
 
 
-def _from_commanded(
+def _solve_commanded(
     table: Table,
     controller: Mechanism,
     robot: Mechanism,
-    rows: np.ndarray,
-    first: Mapping[int, str],
-) -> np.ndarray:
-    """Return (rows, a) readings, in the rows `first` (row -> pose), from their commanded
-    coordinates (rows, c).
-    """
+    coordinates: FloatArray,
+    rows: Mapping[int, str],
+    solve: Solver,
+) -> FloatArray:
+    """Return readings (rows, a) of the commanded coordinates (rows, c) of `rows`: row -> pose."""
     import numpy as np
 
-    from loopcal.measure import solve_commanded_readings
-
-    readings = np.full((len(rows), len(robot.actuators)), np.nan)
-    try:
-        if first:
-            readings[list(first)] = solve_commanded_readings(
-                controller, rows[list(first)], tuple(first.values())
-            )
-    except DataError as error:
-        raise DataError(f"{table.path}: {error}") from None
+    readings = np.full((len(coordinates), len(robot.actuators)), np.nan)
+    if rows:
+        try:
+            readings[list(rows)] = solve(controller, coordinates[list(rows)], tuple(rows.values()))
+        except DataError as error:
+            raise DataError(f"{table.path}: {error}") from None
     return readings
 
 
-def _refuse_other_readings(file: _File, row: int, other: _File, there: int) -> None:
-    """Refuse a pose that two files give different readings, or different sigma of them, beyond
-    rounding of units.
+def states_reading_noise(table: Table, robot: Mechanism) -> bool:
+    """Return whether a file states the noise of its readings."""
+    names = (SIGMA + actuator.name for actuator in robot.actuators)
+    return READING_NOISE in table.settings.content or any(name in table.units for name in names)
+
+
+def read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) -> FloatArray | None:
+    """Return the standard deviations (rows, a) [SI] of readings (rows, a).
+
+    They are NaN where the file states none for a reading, and infinite where it was not taken; None
+    where the file states none at all.
+
+    Raises
+    ------
+    FileError
+        An unknown actuator, a missing or wrong unit, a negative number, or an empty cell where no
+        setting and no robot file states the noise.
     """
     import numpy as np
 
-    for what, here, before in (
+    if not states_reading_noise(table, robot):
+        return None
+    stated = _read_setting(table, robot)
+    usual = [stated.get(actuator.name, np.nan) for actuator in robot.actuators]
+    sigma = np.tile(usual, (len(readings), 1))
+    known = list_columns(robot, ())
+    for i, actuator in enumerate(robot.actuators):
+        name = SIGMA + actuator.name
+        if name not in table.units:
+            continue
+        own = known[name].parse(table)
+        for row in np.flatnonzero(own < 0.0):
+            sentence = f"column {name!r} is negative; write a standard deviation, 0 where exact"
+            raise table.row_error(int(row), sentence)
+        sigma[:, i] = np.where(np.isnan(own), sigma[:, i], own)
+        if actuator.sigma is None:
+            for row in np.flatnonzero(np.isnan(sigma[:, i]) & ~np.isnan(readings[:, i])):
+                sentence = f"column {name!r} is empty, and no other noise of this reading is stated"
+                act = f"write it, 0 where it is exact or inf, or state '{READING_NOISE}'"
+                raise table.row_error(int(row), f"{sentence}; {act}")
+    return np.where(np.isnan(readings), np.inf, sigma)
+
+
+def _read_setting(table: Table, robot: Mechanism) -> dict[str, float]:
+    """Return actuator -> standard deviation [SI] of the settings."""
+    file, node = table.settings, table.settings.content.get(READING_NOISE, {})
+    dimensions = {actuator.name: actuator.dimension for actuator in robot.actuators}
+    places: dict[str, Location] = {name: (READING_NOISE, name) for name in dimensions}
+    if not isinstance(node, dict):
+        node, places = dict.fromkeys(dimensions, node), dict.fromkeys(places, (READING_NOISE,))
+    refuse_unknown_keys(file, list(node), list(dimensions), (READING_NOISE,))
+    stated = {}
+    for name, text in node.items():
+        stated[name] = file.quantity(text, dimensions[name], places[name])
+        if not stated[name] >= 0.0:
+            sentence = f"the noise of readings is {text}; write a positive number, or 0 where exact"
+            raise file.error(sentence, places[name])
+    return stated
+
+
+def _refuse_contradiction(file: _FilePoses, row: int, other: _FilePoses, other_row: int) -> None:
+    """Raise FileError where two files state different readings, or sigmas, of one pose."""
+    import numpy as np
+
+    for what, here, there in (
         ("readings", file.readings, other.readings),
         ("sigma", file.sigma, other.sigma),
     ):
-        if here is None or before is None:
+        if here is None or there is None:
             continue
-        a, b = here[row], before[there]
-        same = np.isclose(a, b, rtol=ALIKE, atol=LEAST, equal_nan=True)
-        unsaid = (np.isnan(a) | np.isnan(b)) & (what == "sigma")
-        if not (same | unsaid).all():
-            raise file.table.row_error(
-                row,
-                f"pose {file.names[row]!r} has other {what} here than in "
-                f"{other.table.place(there)}; poses of one name are "
-                "one pose in all files, so correct them, or give it another name in one of the "
-                "files",
-            )
+        a, b = here[row], there[other_row]
+        same = np.isclose(a, b, rtol=RELATIVE_ROUNDING, atol=ABSOLUTE_ROUNDING, equal_nan=True)
+        unstated = (np.isnan(a) | np.isnan(b)) & (what == "sigma")
+        if not (same | unstated).all():
+            place = other.table.place(other_row)
+            sentence = f"pose {file.names[row]!r} has other {what} here than in {place}"
+            act = "correct them, or rename the pose in one of the files"
+            raise file.table.row_error(row, f"{sentence}; {act}")
 
 
-def _gathered(
-    files: Sequence[_File], origin: Sequence[tuple[int, int]], robot: Mechanism
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return readings (n, a) and, where any file says it, their sigma: what none says is the
-    robot's, else exact.
+def _gather(
+    files: Sequence[_FilePoses], origin: Sequence[tuple[int, int]], robot: Mechanism
+) -> tuple[FloatArray, FloatArray | None]:
+    """Return readings (n, a) and their sigma, of the robot file (else exact) where none is stated.
+
+    `origin` is file and row of each pose; sigma is None where no file states any.
     """
     import numpy as np
 
@@ -325,30 +335,20 @@ def _gathered(
     return readings, np.where(np.isnan(readings), np.inf, np.where(np.isnan(sigma), usual, sigma))
 
 
-def _blocks(files: Sequence[_File], labels: tuple[str, ...]) -> np.ndarray:
-    """Return (n,) block numbers: those that a file's column `block` gives a pose in its first row,
-    else each pose alone.
-    """
+def _number_blocks(files: Sequence[_FilePoses], labels: Sequence[str]) -> IntArray:
+    """Return block numbers (n,): by the column `block` of a pose's first row, else each alone."""
     import numpy as np
 
     named: dict[str, tuple[str, str]] = {}
-    for file in files:
-        if "block" not in file.table.units:
-            continue
+    for file in (file for file in files if "block" in file.table.units):
         cells = file.table.text("block")
         for name, row in file.first.items():
             if not cells[row]:
-                raise file.table.row_error(
-                    row,
-                    "column 'block' is empty, but every pose needs it; write a name or a number",
-                )
-            block, where = named.setdefault(name, (cells[row], file.table.place(row)))
+                raise file.table.row_error(row, "column 'block' is empty; write a name or a number")
+            block, place = named.setdefault(name, (cells[row], file.table.place(row)))
             if block != cells[row]:
-                raise file.table.row_error(
-                    row,
-                    f"pose {name!r} is in block {cells[row]!r} here, but in {block!r} in {where}; "
-                    "correct one",
-                )
+                sentence = f"pose {name!r} is in block {cells[row]!r} here and {block!r} in {place}"
+                raise file.table.row_error(row, f"{sentence}; correct one")
     keys = [("block", named[name][0]) if name in named else ("pose", name) for name in labels]
-    order = {key: i for i, key in enumerate(dict.fromkeys(keys))}
-    return np.array([order[key] for key in keys])
+    numbers = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    return np.array([numbers[key] for key in keys])

@@ -17,10 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from loopcal.errors import FileError
-from loopcal.io.core.csv_table import quoted
-from loopcal.io.data.kind_rows import COVARIANCE
+from loopcal.io.core.csv_table import quote_cell
+from loopcal.io.data.columns import COVARIANCE, LINK
 from loopcal.io.data.measurement_file import FORMAT
-from loopcal.io.data.pose_rows import LINK
 from loopcal.io.exports.export_cells import plain_number, with_point
 from loopcal.io.exports.export_lines import Line, Misfit, check_count, read_lines, unlike_most
 from loopcal.io.exports.profile import Profile, Source
@@ -238,7 +237,7 @@ def _text(path: Path, profile: Profile, rows: Rows, misfits: Sequence[tuple[int,
         # a target without a line has no covariance
         lines.append(
             ",".join(
-                quoted(cells.get(name, "0" if name.startswith(COVARIANCE) else ""))
+                quote_cell(cells.get(name, "0" if name.startswith(COVARIANCE) else ""))
                 for name in columns
             )
         )

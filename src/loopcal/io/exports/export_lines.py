@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from loopcal.errors import FileError
-from loopcal.io.core.text_file import read_raw
+from loopcal.io.core.text_file import read_bytes
 from loopcal.io.exports.profile import Profile
 
 
@@ -105,7 +105,7 @@ def check_count(line: Line, delimiter: str | None) -> None:
             if count > wanted
             else "one left out, or one cut in two"
         )
-        raise Misfit(f"it has {_counted(count)}, but the header names {wanted} columns ({why})")
+        raise Misfit(f"it has {_counted(count)}, but the header has {wanted} columns ({why})")
 
 
 def unlike_most(lines: Sequence[Line]) -> list[tuple[int, str]]:
@@ -135,7 +135,7 @@ def _counted(count: int) -> str:
 
 def _decoded(path: Path, profile: Profile) -> str:
     """Return the text of the export."""
-    raw = read_raw(path, "export")
+    raw = read_bytes(path, "export")
     try:
         text = raw.decode(profile.encoding)
     except UnicodeDecodeError as error:

@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import UnitError, suggest_names
 from loopcal.io.core.yaml_file import Location, YamlFile, read_yaml, refuse_unknown_keys
-from loopcal.io.data.context_columns import TEMPERATURE_UNITS, TIME, TIME_UNITS, is_context
-from loopcal.io.data.kind_rows import COVARIANCE, SETTINGS, SIGMA
+from loopcal.io.data.column_types import TEMPERATURE_UNITS, TIME, TIME_UNITS
+from loopcal.io.data.columns import COVARIANCE, SIGMA, is_context
+from loopcal.io.data.kind_rows import SETTINGS
 from loopcal.io.data.kind_settings import list_kind_settings, read_kind
 from loopcal.io.exports.export_cells import plain_number, with_point
 from loopcal.io.robot.robot_file import check_format

@@ -13,8 +13,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from loopcal.io.data.context_columns import TIME
-from loopcal.io.data.kind_rows import COVARIANCE, SIGMA
+from loopcal.io.data.column_types import TIME
+from loopcal.io.data.columns import COVARIANCE, SIGMA
 from loopcal.io.exports.export_cells import plain_number
 from loopcal.io.exports.export_lines import Misfit
 from loopcal.io.exports.profile import Profile

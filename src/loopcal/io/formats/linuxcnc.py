@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from loopcal.errors import DataError, FileError
-from loopcal.io.core.numbers import shortest
+from loopcal.io.core.numbers import format_scaled
 from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.program_format import (
     UNCHANGED,
@@ -189,7 +189,7 @@ def write(source: ExportSource, into: Path | None) -> Exported:
             continue
         if present is not None and abs(present - value) <= CLOSE * max(1.0, abs(value)):
             continue
-        text = shortest(value, 1.0)
+        text = format_scaled(value, 1.0)
         if found is None:
             lines.append(f"setp {name} {text}\n")
             changes.append(f"line {len(lines)}: {name} added as {text}")
@@ -217,7 +217,7 @@ def _pins(
                 value = values[f"leg{n + 1}.{kind}.{axis}"] / factor
                 yield (
                     f"genhexkins.{kind}.{n}.{axis}",
-                    float(shortest(value - (lift if axis == "z" else 0.0), 1.0)),
+                    float(format_scaled(value - (lift if axis == "z" else 0.0), 1.0)),
                 )
     if record.screw is None:
         return
@@ -243,7 +243,7 @@ def _unsaid(source: ExportSource, factor: float, symbol: str) -> Iterator[str]:
         length = values.pop(f"leg{n + 1}.length", 0.0) / factor
         if abs(length) > CLOSE:
             yield (
-                f"not said by genhexkins: strut {n} is {shortest(length, 1.0)} {symbol} long at "
+                f"not said by genhexkins: strut {n} is {format_scaled(length, 1.0)} {symbol} long at "
                 "reading zero; "
                 f"add this to HOME_OFFSET of [JOINT_{n}] in the INI file"
             )

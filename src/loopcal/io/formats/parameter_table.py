@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from loopcal.io.core.numbers import shortest
+from loopcal.io.core.numbers import format_scaled
 from loopcal.io.formats.program_format import Exported, ExportSource, Format
 from loopcal.units import find_unit
 
@@ -31,8 +31,8 @@ def rows(source: ExportSource) -> Iterator[dict[str, Any]]:
         half = source.plus_minus.get(parameter.name)
         yield {
             "name": parameter.name,
-            "nominal": shortest(parameter.nominal, shown.factor_to_si),
-            "value": shortest(value, shown.factor_to_si),
+            "nominal": format_scaled(parameter.nominal, shown.factor_to_si),
+            "value": format_scaled(value, shown.factor_to_si),
             "plus_minus": "" if half is None else repr(half),
             "unit": shown.symbol,
             "free": "yes" if parameter.free else "no",

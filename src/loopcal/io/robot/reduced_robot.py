@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot file with some parameters fixed: the file as it was, comments kept, and a longer `fixed:`
-list.
-"""
+"""A robot file with some parameters fixed: the same file, comments kept, with a longer `fixed:`."""
 
 from __future__ import annotations
 
@@ -10,15 +8,14 @@ import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from loopcal.errors import MechanismError
-from loopcal.io.robot.identified_table import table_text
-from loopcal.io.robot.robot_file import RobotSource
+from loopcal.io.robot.identified_table import format_table
+from loopcal.io.robot.robot_file import get_source
 
 if TYPE_CHECKING:
     from loopcal.mechanism import Mechanism
 
 FIXED = re.compile(r"^fixed:.*\n(?:(?:[ \t]+.*|-.*)\n)*", re.MULTILINE)
-"""The list as it stands in a file, in one line or in several."""
+"""The list in a file, in one line or in several."""
 
 PLAIN = re.compile(r"[A-Za-z][\w.-]*$")
 """Names that YAML reads as text without quotes."""
@@ -29,31 +26,23 @@ def format_reduced_robot(robot: Mechanism, dropped: Mapping[str, str]) -> str:
 
     Parameters
     ----------
-    robot : Mechanism
-        A robot that came from `load_robot`, with any values.
-    dropped : name -> what to say of it
-        Parameters to fix, each with a comment behind it.
+    robot : from `load_robot`, with any values.
+    dropped : parameter to fix -> comment that is written after it.
 
     Raises
     ------
-    MechanismError
-        The robot did not come from a file.
+    MechanismError : the robot was not loaded from a file.
     """
-    source = robot.record
-    if not isinstance(source, RobotSource):
-        raise MechanismError(
-            f"{robot.name} was not read from a robot file, so there is none to shorten; use "
-            "load_robot"
-        )
+    source = get_source(robot)
     entries = dict.fromkeys(source.record.fixed, "") | dict(dropped)
     if not entries:
-        return source.text + table_text(robot)
-    written = {name: name if PLAIN.match(name) else json.dumps(name) for name in entries}
-    width = max(len(text) for text in written.values())
+        return source.text + format_table(robot)
+    names = {name: name if PLAIN.match(name) else json.dumps(name) for name in entries}
+    width = max(len(text) for text in names.values())
     lines = [
-        f"  - {written[name]:<{width}}  # {words}" if words else f"  - {written[name]}"
-        for name, words in entries.items()
+        f"  - {names[name]:<{width}}  # {comment}" if comment else f"  - {names[name]}"
+        for name, comment in entries.items()
     ]
     text = FIXED.sub("", source.text)
     text = text if text.endswith("\n") else text + "\n"
-    return text + "\n".join(["fixed:", *lines]) + "\n" + table_text(robot)
+    return text + "\n".join(["fixed:", *lines]) + "\n" + format_table(robot)

@@ -18,8 +18,8 @@ from loopcal.errors import (DataError, suggest_names)
 from loopcal.io.runs.calibration_run import load_calibrated
 from loopcal.io.core.csv_table import read_table, require_columns
 from loopcal.io.data.measurement_file import Paths, list_measurement_files
-from loopcal.io.core.numbers import shortest
-from loopcal.io.data.pose_rows import COMMANDED, dimension_of
+from loopcal.io.core.numbers import format_scaled
+from loopcal.io.data.columns import COMMANDED, get_dimension
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.io.runs.run_folder import find_fitted_file, read_run_folder
 from loopcal.units import (DISPLAY_UNITS, Dimension, Unit, find_unit)
@@ -106,7 +106,7 @@ def load_targets(path: str | Path, robot: Mechanism) -> tuple[np.ndarray, tuple[
                 f"{', '.join(known)}; call it "
                 f"'note {name}' to ignore it"
             )
-    columns = [table.numbers(name, dimension_of(name), empty=False) for name in robot.controlled]
+    columns = [table.numbers(name, get_dimension(name), empty=False) for name in robot.controlled]
     labels = table.text("pose") if "pose" in table.units else tuple(str(i + 1) for i in range(len(table.rows)))
     for i, label in enumerate(labels):
         if not label or label in labels[:i]:
@@ -123,7 +123,7 @@ def format_compensation(found: Compensation) -> str:
         told = [(a.name, _unit(robot, a.dimension)) for a in robot.actuators]
         values = found.readings
     else:
-        told = [(COMMANDED + name, _unit(robot, dimension_of(name))) for name in found.controller.controlled]
+        told = [(COMMANDED + name, _unit(robot, get_dimension(name))) for name in found.controller.controlled]
         values = found.commands
     notes = [("before", found.before), ("remaining", found.remaining)]
     if found.uncertainty is not None:
@@ -135,7 +135,7 @@ def format_compensation(found: Compensation) -> str:
     header += [f"note {title} {name} [{symbol}]" for title, _ in notes for name, symbol in zip(NAMES, shown, strict=True)]
     write([*header, "note status"])
     for i, label in enumerate(found.labels):
-        cells = [shortest(float(v), u.factor_to_si) if found.usable[i] else "" for v, (_, u) in zip(values[i], told, strict=True)]
+        cells = [format_scaled(float(v), u.factor_to_si) if found.usable[i] else "" for v, (_, u) in zip(values[i], told, strict=True)]
         for _, errors in notes:
             cells += [_number(float(v) / u.factor_to_si) for v, u in zip(errors[i], shown, strict=True)]
         write([label, *cells, str(found.findings[i])])

@@ -21,13 +21,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import FileError
-from loopcal.io.core.csv_table import quoted
+from loopcal.io.core.csv_table import quote_cell
 from loopcal.io.core.json_text import to_json
 from loopcal.io.data.measurement_writer import format_data_sheet
-from loopcal.io.core.numbers import exact
-from loopcal.io.data.pose_rows import dimension_of
+from loopcal.io.core.numbers import parse_exact
+from loopcal.io.data.columns import get_dimension
 from loopcal.io.core.text_file import sha256, report_write_errors
-from loopcal.io.data.pose_use import FIT, HELD_OUT, USE, insert_use_column
+from loopcal.io.data.columns import FIT, HELD_OUT
+from loopcal.io.data.pose_use import USE, insert_use_column
 from loopcal.units import (Dimension, find_unit)
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ def format_sheet(plan: Plan) -> str:
     from loopcal.mechanism import inverse
 
     robot = plan.robot
-    commanded = [unit_of(robot, dimension_of(name)) for name in robot.controlled]
+    commanded = [unit_of(robot, get_dimension(name)) for name in robot.controlled]
     reading = [unit_of(robot, actuator.dimension) for actuator in robot.actuators]
     headers = [f"{name} [{symbol}]" for name, (symbol, _) in zip(robot.controlled, commanded, strict=True)]
     headers += [f"{a.name} [{symbol}]" for a, (symbol, _) in zip(robot.actuators, reading, strict=True)]
@@ -71,7 +72,7 @@ def format_sheet(plan: Plan) -> str:
     factors = [factor for _, factor in (*commanded, *reading)]
     for step, (label, use, x, q) in enumerate(stops, 1):
         numbers = (_text(value, factor) for value, factor in zip((*x, *q), factors, strict=True))
-        lines.append(",".join([str(step), quoted(label), use, *numbers]))
+        lines.append(",".join([str(step), quote_cell(label), use, *numbers]))
     return "\n".join(lines) + "\n"
 
 
@@ -81,7 +82,7 @@ def format_plan_data(plan: Plan) -> str:
     looking = tuple(replace(s, rows=plan.units) if s.kind.poses_per_row > 1 else s for s in sensors)
     factors = [unit_of(plan.robot, actuator.dimension)[1] for actuator in plan.robot.actuators]
     # the doubles that the texts of the sheet stand for, so that both files say the same digits
-    readings = [[exact(_text(q, f), f) for q, f in zip(row, factors, strict=True)] for row in plan.readings.tolist()]
+    readings = [[parse_exact(_text(q, f), f) for q, f in zip(row, factors, strict=True)] for row in plan.readings.tolist()]
     text = format_data_sheet(plan.robot, replace(plan.instrument, sensors=looking), readings, plan.labels)
     return insert_use_column(text, {label: HELD_OUT if held else FIT for label, held in zip(plan.labels, plan.held_out, strict=True)})
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from loopcal.io.core.csv_table import quoted
+from loopcal.io.core.csv_table import quote_cell
 from loopcal.io.data.measurement_writer import format_measurements
-from loopcal.io.data.pose_rows import dimension_of
+from loopcal.io.data.columns import get_dimension
 from loopcal.io.runs.plan_folder import DIGITS, VIA, unit_of
 from loopcal.mechanism import POSITION
 from loopcal.units import Dimension
@@ -30,7 +30,7 @@ def format_surface_sheet(plan: SurfacePlan) -> str:
     """
     robot = plan.robot
     symbol, length = unit_of(robot, Dimension.LENGTH)
-    commanded = [unit_of(robot, dimension_of(name)) for name in robot.controlled]
+    commanded = [unit_of(robot, get_dimension(name)) for name in robot.controlled]
     reading = [unit_of(robot, actuator.dimension) for actuator in robot.actuators]
     headers = [
         "step",
@@ -84,7 +84,7 @@ def format_surface_sheet(plan: SurfacePlan) -> str:
                 f"{value / factor:.{DIGITS}g}"
                 for value, factor in zip(numbers, factors, strict=True)
             ]
-            lines.append(",".join(quoted(cell) for cell in cells))
+            lines.append(",".join(quote_cell(cell) for cell in cells))
     return "\n".join(lines) + "\n"
 
 
