@@ -77,7 +77,11 @@ def families() -> str:
     shared = [key.name for key in file_reference.list_keys(RobotRecord)]
     parts = []
     for name, family in FAMILIES.items():
-        own = [record for record in file_reference.list_nested_records(family) if record not in common_records()]
+        own = [
+            record
+            for record in file_reference.list_nested_records(family)
+            if record not in common_records()
+        ]
         parts.append(
             "### `family: "
             f"{name}`\n\n{file_reference.summarize(family)}\n\n{record_table(family, shared)}"
@@ -132,7 +136,8 @@ def _example(kind: Kind) -> tuple[str, str, str]:
 def _columns(columns: Iterable[Column]) -> str:
     """Return columns with an example of their unit."""
     return " ".join(
-        f"`{c.name}`" + ("" if c.dimension is Dimension.RATIO else f" [{DISPLAY_UNITS[c.dimension].symbol}]")
+        f"`{c.name}`"
+        + ("" if c.dimension is Dimension.RATIO else f" [{DISPLAY_UNITS[c.dimension].symbol}]")
         for c in columns
     )
 

@@ -57,22 +57,14 @@ def refused(tmp_path, monkeypatch, capsys):
 
 
 ROBOT_CASES = {
-    "missing unit": (
-        UNITS,
-        "",
-        "states no units, which every number needs; write for example",
-    ),
+    "missing unit": (UNITS, "", "states no units, which every number needs; write for example"),
     "unit of the wrong kind": (
         "length: mm",
         "length: deg",
         "'deg' is not a unit of length; allowed: m, mm",
     ),
     "unknown key": ("stroke:", "strok:", "unknown key 'strok' (did you mean 'stroke'?)"),
-    "duplicate key": (
-        UNITS,
-        UNITS * 2,
-        "duplicate key 'units'; remove one",
-    ),
+    "duplicate key": (UNITS, UNITS * 2, "duplicate key 'units'; remove one"),
     "number typed as text": (
         BASE,
         "[120, '-140', 0]",
@@ -203,16 +195,8 @@ DATA_CASES = {
         "# nois",
         "data.csv:3: unknown key 'nois' (did you mean 'noise'?)",
     ),
-    "duplicate setting": (
-        "# noise",
-        "# kind: pose\n# noise",
-        "data.csv:3: duplicate key 'kind'",
-    ),
-    "duplicate column": (
-        "q2 [mm]",
-        "q1 [mm]",
-        "data.csv:4: duplicate column 'q1'",
-    ),
+    "duplicate setting": ("# noise", "# kind: pose\n# noise", "data.csv:3: duplicate key 'kind'"),
+    "duplicate column": ("q2 [mm]", "q1 [mm]", "data.csv:4: duplicate column 'q1'"),
     "text for a number": (
         "b,1,",
         "b,one,",

@@ -113,15 +113,9 @@ def test_a_target_out_of_the_machines_limits_gives_exit_code_2_and_no_reading(ru
             TARGETS.replace("z [mm]", "z [deg]"),
             "targets.csv:1: column 'z': 'deg' is a unit of angle, but a length is needed",
         ),
-        (
-            TARGETS.replace("yaw", "jaw"),
-            "targets.csv:1: no column 'yaw' (did you mean 'jaw'?)",
-        ),
+        (TARGETS.replace("yaw", "jaw"), "targets.csv:1: no column 'yaw' (did you mean 'jaw'?)"),
         (TARGETS.replace("x [mm]", "X [mm],x [mm]"), "has 8 columns"),
-        (
-            TARGETS.replace("0.21e3", ""),
-            "targets.csv:3: column 'z' is empty",
-        ),
+        (TARGETS.replace("0.21e3", ""), "targets.csv:3: column 'z' is empty"),
         (
             TARGETS.replace("left", "home"),
             "targets.csv:3: the name of this target stands here for the second time",

@@ -101,10 +101,7 @@ def test_planes_and_lines_are_planned_held_filled_in_and_calibrated(here, capsys
         for row in sheet
     )
     assert run("simulate hexapod-nategh-agheli --fill plan/measurements.csv -o filled.csv") == 1
-    assert (
-        "this sheet has no readings"
-        in capsys.readouterr().err
-    )
+    assert "this sheet has no readings" in capsys.readouterr().err
     assert run("calibrate hexapod-nategh-agheli plan/measurements.csv -o run") == 1
     assert "empty" in capsys.readouterr().err
     # the true machine is moved until its point agrees with what the sheet says to hold: its

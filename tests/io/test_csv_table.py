@@ -134,9 +134,7 @@ def test_a_robot_file_of_the_same_name_is_no_sidecar(tmp_path) -> None:
 def test_settings_in_front_and_beside_are_refused(tmp_path, beside) -> None:
     path = write(tmp_path, GOOD)
     (tmp_path / "data.yaml").write_text(beside)
-    with pytest.raises(
-        FileError, match=r"at the top of this file and in data.yaml; remove one"
-    ):
+    with pytest.raises(FileError, match=r"at the top of this file and in data.yaml; remove one"):
         read_table(path)
 
 

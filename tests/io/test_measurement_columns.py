@@ -151,11 +151,7 @@ KNOWN_CASES = {
         "start: 12 mrad",
         "start': 'mrad' is a unit of angle",
     ),
-    "a sigma of nothing": (
-        "sd: 1 mm",
-        "sd: 0 mm",
-        "the standard deviation is 0 mm",
-    ),
+    "a sigma of nothing": ("sd: 1 mm", "sd: 0 mm", "the standard deviation is 0 mm"),
     "a start alone": ("start: 12 mm, sd: 1 mm", "start: 12 mm", "state either 'sd' or 'fixed"),
     "fixed and not": ("sd: 1 mm", "sd: 1 mm, fixed: true", "state either 'sd' or 'fixed"),
     "a wish": ("ball.x: fixed", "ball.x: free", "'free' does not state knowledge.*write 'fixed'"),
@@ -218,13 +214,7 @@ def test_noise_of_readings_is_read_and_an_empty_cell_is_a_reading_not_taken(
         ("{q1: 5 um, q2: 0 mm}", "5 deg", r"data.csv:4: 'reading_noise': 'deg' is a unit of angle"),
         (",7,", ",-7,", r"data.csv:6: column 'sigma.q6' is negative"),
         ("sigma.q6 [um]", "sigma.q6", r"data.csv:5: column 'sigma.q6' has no unit"),
-        (
-            ",7,",
-            ",,",
-            (
-                r"data.csv:6: column 'sigma.q6' is empty, and no other noise"
-            ),
-        ),
+        (",7,", ",,", (r"data.csv:6: column 'sigma.q6' is empty, and no other noise")),
     ],
 )
 def test_noise_of_readings_without_sense_is_refused(tmp_path, robot, old, new, message) -> None:

@@ -191,12 +191,7 @@ def test_commanded_coordinates_become_readings_of_the_controller(tmp_path, robot
 @pytest.mark.parametrize(
     ("old", "new", "line", "message"),
     [
-        (
-            "# kind: component\n",
-            "",
-            None,
-            "no kind of measurement is stated; write '# kind: pose'",
-        ),
+        ("# kind: component\n", "", None, "no kind of measurement is stated; write '# kind: pose'"),
         (
             "component\n",
             "komponent\n",
@@ -214,12 +209,7 @@ def test_commanded_coordinates_become_readings_of_the_controller(tmp_path, robot
         ("# kind", "# format: 9\n# kind", 1, "has format 9"),
         ("z [mm]", "z", 4, "column 'z' has no unit"),
         ("z [mm]", "zz [mm]", 4, "column 'zz' is unknown .did you mean 'z'"),
-        (
-            "q3 [mm]",
-            "note [mm]",
-            4,
-            "no column 'q3'.*the reading of an actuator of hexapod-42",
-        ),
+        ("q3 [mm]", "note [mm]", 4, "no column 'q3'.*the reading of an actuator of hexapod-42"),
         ("z [mm]", "commanded.z [mm]", 4, "has readings .'q1'. and commanded coordinates"),
         ("b,1,", "a,1,", 6, "pose 'a' has other readings in line 5"),
         ("b,1,", ",1,", 6, "column 'pose' is empty"),

@@ -102,17 +102,9 @@ def test_a_robot_that_came_from_no_file_cannot_be_saved(tmp_path, robot) -> None
         ("[120, -140, 0]", "[120, -140]", "'base entry 1' has 2 values, but 3"),
         ("[120, -140, 0]", "[120, '-140', 0]", "is the text '-140', but a number is needed"),
         ("[120, -140, 0]", "[120, .nan, 0]", "is nan; write a finite number"),
-        (
-            "home: {z: 200}",
-            "home: {z: 200}\nhome: {z: 200}",
-            "duplicate key 'home'",
-        ),
+        ("home: {z: 200}", "home: {z: 200}\nhome: {z: 200}", "duplicate key 'home'"),
         ("home: {z: 200}", "home: {zz: 200}", "unknown key 'zz' in 'home'"),
-        (
-            "lengths: 233.238076 ",
-            "lengths: long ",
-            "'lengths' is the text 'long'",
-        ),
+        ("lengths: 233.238076 ", "lengths: long ", "'lengths' is the text 'long'"),
         ("legs: rod", "legs: pole", "'legs' is 'pole'.*; allowed: 'rod'"),
     ],
 )
@@ -139,10 +131,7 @@ def test_a_mistake_in_a_robot_file_names_its_line(
             "{name: leg1.base.x, value: 1, unit: deg}",
             "the unit of 'leg1.base.x': 'deg' is a unit of angle",
         ),
-        (
-            "{name: leg1.base.x, value: a, unit: mm}",
-            "the value of 'leg1.base.x' is 'a'",
-        ),
+        ("{name: leg1.base.x, value: a, unit: mm}", "the value of 'leg1.base.x' is 'a'"),
         ("{name: leg1.base.x, value: 1}", "has no 'unit'"),
         ("{name: leg1.base.x, vale: 1, unit: mm}", "unknown key 'vale' .*did you mean 'value'"),
         ("5", "this row is not a mapping; write"),
@@ -177,7 +166,6 @@ def test_a_robot_that_cannot_be_built_names_its_file(tmp_path) -> None:
 
 def test_a_robot_that_is_nowhere_lists_the_shipped_ones() -> None:
     with pytest.raises(
-        FileError,
-        match=r"does not exist .did you mean 'hexapod-42'.*shipped robots: .*hexapod-42",
+        FileError, match=r"does not exist .did you mean 'hexapod-42'.*shipped robots: .*hexapod-42"
     ):
         load_robot("hexapod-43")

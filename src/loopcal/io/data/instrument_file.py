@@ -43,7 +43,11 @@ def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
     groups, poses = table.text("group"), table.pose_names()
     apart = len({frozenset(poses[row] for row in one.rows) for one in kinds}) > 1
     for one in kinds:
-        own = [parameter.name for parameter in one.kind.nuisance_parameters if parameter.scope == "group"]
+        own = [
+            parameter.name
+            for parameter in one.kind.nuisance_parameters
+            if parameter.scope == "group"
+        ]
         if own and (apart or len({groups[row] for row in one.rows}) > 1):
             code = "surfaces" if one.kind.name in ("plane", "line") else "groups"
             raise table.settings.error(

@@ -246,7 +246,10 @@ def _collect_pose_context(
     of_poses: dict[str, FloatArray] = {}
     for table, own, of_rows, beside in zip(tables, kinds, members, context, strict=True):
         measuring = {
-            int(row) for one in own for row in one.rows if len(of_rows[row]) == one.kind.poses_per_row
+            int(row)
+            for one in own
+            for row in one.rows
+            if len(of_rows[row]) == one.kind.poses_per_row
         }
         for name, values in beside.items():
             for row, poses in enumerate(of_rows):

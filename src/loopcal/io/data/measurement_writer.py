@@ -87,7 +87,10 @@ def format_measurements(data: Measurements, robot: Mechanism, remark: str = "") 
     lines.append(",".join(column.header for column in columns))
 
     measuring = {
-        int(poses[0]) for part in parts if part.rows.kind.poses_per_row == 1 for poses, _ in part.cells()
+        int(poses[0])
+        for part in parts
+        if part.rows.kind.poses_per_row == 1
+        for poses, _ in part.cells()
     }
     rows: list[tuple[tuple[int, ...], Cells]] = [
         ((pose,), {}) for pose in range(data.n_poses) if pose not in measuring
