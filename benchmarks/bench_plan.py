@@ -16,10 +16,7 @@ from loopcal.estimate.free_parameters import FreeParameters, select_free_paramet
 from loopcal.estimate.outlook import scene
 from loopcal.io import load_robot
 from loopcal.mechanism import WorkspaceSample, inverse, sample_workspace
-from loopcal.planning.certified import certified_design
-from loopcal.planning.coordinate import coordinate_exchange
-from loopcal.planning.criteria import D
-from loopcal.planning.design import Start
+from loopcal.planning.design import D, PriorInformation, choose_design, coordinate_exchange
 
 Array = NDArray[np.float64]
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)
@@ -51,7 +48,7 @@ def bench_coordinate_exchange() -> Metric:
     free, drawn, middle, half = _hexapod()
     levels = [m + h * np.array(SHARES) for m, h in zip(middle, half, strict=True)]
     begin = drawn.coordinates[:POSES]
-    start = Start.nothing(len(free))
+    start = PriorInformation.none(len(free))
 
     def once() -> None:
         for c, values in enumerate(levels):
@@ -74,6 +71,6 @@ def bench_certified_design() -> Metric:
     free, drawn, _, _ = _hexapod()
     rows = scene(free, drawn.solution.q).twists[0] / SIGMA[:, None]
     (times,) = time_in_turns(
-        lambda: certified_design(rows, 20, D(), Start.nothing(len(free))), repeats=3
+        lambda: choose_design(rows, 20, D(), PriorInformation.none(len(free))), repeats=3
     )
     return Metric("plan.certified_design", min(times), "s", "lower", 1.0, 10.0, "best of 3")

@@ -37,7 +37,7 @@ from loopcal.papers.cmm_constraint_2011.study import (
     plan,
     spread,
 )
-from loopcal.planning.groups import PlaneAndLine
+from loopcal.planning.plane_line_groups import PlaneLineGroups
 from loopcal.typing import FloatArray
 
 SEED, DRAWS, STARTS, FEW, SOME = 0, 200, 5, 40, 60
@@ -50,14 +50,14 @@ WORDS = {
 """Of the weights of the rows."""
 
 
-def once(planned: PlaneAndLine, design: FloatArray) -> float:
+def once(planned: PlaneLineGroups, design: FloatArray) -> float:
     """Seconds of one evaluation of every group's rows for each level of each coordinate."""
     began = time.process_time()
-    for c, values in enumerate(planned.levels()):
+    for c, values in enumerate(planned.list_levels()):
         for value in values:
             moved = design.copy()
             moved[:, c] = value
-            planned.rows(moved)
+            planned.linearize(moved)
     return time.process_time() - began
 
 
@@ -67,7 +67,7 @@ def start(robot: Mechanism, seed: int) -> tuple[Study, list]:
     study = plan(robot, GROUPS, POINTS, AXES, seed, SWEEPS)
     spent = time.process_time() - began
     before, after = (
-        spread(rows) for rows in (study.planned.rows(study.first), study.optimised.rows)
+        spread(rows) for rows in (study.planned.linearize(study.first), study.optimised.rows)
     )
     cost = spent / once(study.planned, study.first) if seed == SEED else None
     return study, [seed, before, after, before / after, spent, cost]

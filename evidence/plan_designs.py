@@ -5,72 +5,61 @@ plain exchange.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from evidence.planned import CASES, Case
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.outlook import scene
 from loopcal.io import load_robot
 from loopcal.mechanism import sample_workspace
-from loopcal.planning.certified import certified_design
-from loopcal.planning.criteria import Criterion, D, I, evaluate
-from loopcal.planning.design import Start, design_factor
-from loopcal.planning.fedorov import fedorov_exchange
+from loopcal.planning.design import (
+    Criterion,
+    D,
+    I,
+    PriorInformation,
+    choose_design,
+    evaluate_criterion,
+    factor_design,
+    fedorov_exchange,
+)
 
 CANDIDATES, POSES, STARTS, DRAWS, PREDICTED = 1000, 20, 20, 200, 200
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)
 """Of the simulated instrument: rotation [rad], position [m]."""
 
 
-@dataclass(frozen=True)
-class Case:
-    """A robot, what is measured of its pose, and by which criterion."""
-
-    robot: str
-    measured: str
-    criterion: str
+DESIGNS = (*((case, "D") for case in CASES[:4]), *((case, "I") for case in CASES[:3]))
+"""Hexapod and 3-PRS by full poses and by positions, with the criterion of the design."""
 
 
-CASES = (
-    Case("hexapod-42", "full pose", "D"),
-    Case("hexapod-42", "position", "D"),
-    Case("3-prs", "full pose", "D"),
-    Case("3-prs", "position", "D"),
-    Case("hexapod-42", "full pose", "I"),
-    Case("hexapod-42", "position", "I"),
-    Case("3-prs", "full pose", "I"),
-)
-
-
-def study(case: Case) -> list[object]:
+def study(case: Case, criterion_name: str) -> list[object]:
     """One row: efficiencies against the bound, and what the certified design leaves open."""
     free = select_free_parameters(load_robot(case.robot))
     twists = scene(free, sample_workspace(free.robot, CANDIDATES, 0).solution.q).twists[0]
     rows = (twists / SIGMA[:, None])[
         :, slice(0, 6) if case.measured == "full pose" else slice(3, 6)
     ]
-    start, p = Start.nothing(len(free)), len(free)
+    prior, p = PriorInformation.none(len(free)), len(free)
     criterion: Criterion = (
-        D() if case.criterion == "D" else I(twists[:PREDICTED, 3:].reshape(-1, p), PREDICTED)
+        D() if criterion_name == "D" else I(twists[:PREDICTED, 3:].reshape(-1, p), PREDICTED)
     )
-    found = certified_design(rows, POSES, criterion, start)
-    space, relaxed = found.design.directions, found.relaxed
+    found = choose_design(rows, POSES, criterion, prior)
+    space, relaxed = found.design.space, found.relaxed
     random = np.random.default_rng(0)
     even = [
         relaxed.efficiency(
-            evaluate(criterion, design_factor(rows[chosen], start, space), space.machine)
+            evaluate_criterion(criterion, factor_design(rows[chosen], prior, space), space.machine)
         )
         for chosen in (random.choice(CANDIDATES, POSES, replace=False) for _ in range(DRAWS))
     ]
     plain = [
         relaxed.efficiency(value)
-        for value in fedorov_exchange(rows, POSES, criterion, start, starts=STARTS).values
+        for value in fedorov_exchange(rows, POSES, criterion, prior, starts=STARTS).values
     ]
     return [
         case.robot,
         case.measured,
-        case.criterion,
+        criterion_name,
         len(space),
         float(np.median(even)),
         float(np.median(plain)),
@@ -94,7 +83,7 @@ def collect() -> dict:
         "gap to the bound",
     ]
     formats = ["", "", "", "d", ".3f", ".3f", ".4f", ".4f", ".1%"]
-    rows = [study(case) for case in CASES]
+    rows = [study(*design) for design in DESIGNS]
     return {
         "candidates": CANDIDATES,
         "poses": POSES,

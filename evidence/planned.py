@@ -28,9 +28,10 @@ from loopcal.measure import (
     simulate_trials,
 )
 from loopcal.mechanism import Mechanism, forward_trials, sample_workspace
-from loopcal.planning.information import unit_rows
-from loopcal.planning.pose_planning import planned
-from loopcal.planning.problem import Problem, Target, problem
+from loopcal.planning import PlanOptions, Target
+from loopcal.planning.information import linearize_groups
+from loopcal.planning.pose_planning import plan_poses
+from loopcal.planning.problem import PlanningProblem, prepare_problem
 
 Array = NDArray[np.float64]
 
@@ -90,15 +91,16 @@ class Study:
 
     Attributes
     ----------
-    made : the planning problem. drawn : the same with all random poses (seeds * most) as its units.
+    problem : the planning problem. drawn : the same with all random poses (seeds * most) as its
+        groups.
     coordinates : (seeds, most, c) of these. truth : (seeds, m, p). unseen : (u, a) readings of the
         poses to judge at.
     tool : (seeds, m, u, 4, 4) true poses of the tool there [m].
     """
 
     case: Case
-    made: Problem
-    drawn: Problem
+    problem: PlanningProblem
+    drawn: PlanningProblem
     coordinates: Array
     truth: Array
     unseen: Array
@@ -107,7 +109,7 @@ class Study:
     @property
     def robot(self) -> Mechanism:
         """The nominal machine."""
-        return self.made.free.robot
+        return self.problem.robot
 
     def wanted(self, position: Array | float, orientation: Array | float) -> Array:
         """Return the error that poses are planned for [m]: turns count times the size of the robot."""
@@ -126,20 +128,22 @@ def prepare(
 ) -> Study:
     """Draw machines and poses, and make the planning problem ready for a multiple of the noise."""
     robot = load_robot(case.robot)
-    made = problem(robot, instrument(case, louder), count=candidates, seed=SEED)
+    options = PlanOptions(target=case.target, hold_out=0, n_candidates=candidates, seed=SEED)
+    problem = prepare_problem(robot, instrument(case, louder), options)
     pool, judged = (
         sample_workspace(robot, seeds * most, SEED + 1),
         sample_workspace(robot, UNSEEN, SEED + 2),
     )
-    rows = unit_rows(made.free, made.instrument, pool.solution.q, np.arange(seeds * most)[:, None])
+    members = np.arange(seeds * most)[:, None]
+    groups = linearize_groups(problem.free, problem.instrument, pool.solution.q, members)
     truth, q = sample_truth(robot, seeds * machines, SEED), judged.solution.q
     tool = forward_trials(robot, truth, q[None]).T @ robot.tool
     sets = (seeds, machines)
     coordinates = pool.coordinates.reshape(seeds, most, -1)
-    drawn = replace(made, units=rows)
+    drawn = replace(problem, groups=groups)
     return Study(
         case,
-        made,
+        problem,
         drawn,
         coordinates,
         truth.reshape(*sets, -1),
@@ -161,14 +165,14 @@ def instrument(case: Case, louder: float = 1.0) -> Instrument:
 
 def at_planned(study: Study, n: int) -> Errors:
     """Errors of all machines, measured at the same n planned poses."""
-    found = planned(study.made, n, hold_out=0, target=study.case.target, seed=SEED)
+    found = plan_poses(study.problem.with_options(n_poses=n))
     seeds, machines, p = study.truth.shape
     tool = study.tool.reshape(-1, *study.tool.shape[2:])
     position, orientation = calibrated(
-        study, found.coordinates, study.truth.reshape(-1, p), tool, SEED
+        study, found.poses.coordinates, study.truth.reshape(-1, p), tool, SEED
     )
     expected = np.full(
-        seeds, float(study.wanted(found.expected.position, found.expected.orientation))
+        seeds, float(study.wanted(found.errors.after.position, found.errors.after.orientation))
     )
     shape = (seeds, machines)
     return Errors(position.reshape(shape), orientation.reshape(shape), expected)
@@ -200,14 +204,14 @@ def among_candidates(study: Study, n: int) -> float:
     """Median error predicted for as many sets of n candidates drawn at random, of which half lie at
     the boundary.
     """
-    rng, count = np.random.default_rng(SEED), len(study.made.candidates)
+    rng, count = np.random.default_rng(SEED), len(study.problem.candidates)
     sets = [rng.choice(count, n, replace=False) for _ in study.coordinates]
-    return float(np.median([foreseen(study, study.made, chosen) for chosen in sets]))
+    return float(np.median([foreseen(study, study.problem, chosen) for chosen in sets]))
 
 
-def foreseen(study: Study, made: Problem, chosen: NDArray[np.int64]) -> float:
+def foreseen(study: Study, problem: PlanningProblem, chosen: NDArray[np.int64]) -> float:
     """Return the error of the target that the plan's theory predicts for some units."""
-    found = made.accuracy(chosen)
+    found = problem.predict_errors(chosen)
     assert found is not None, "tolerances bound every error"
     return float(study.wanted(found.position, found.orientation))
 
@@ -219,7 +223,9 @@ def calibrated(
     poses (t, u, 4, 4).
     """
     robot = study.robot
-    fit = identify_trials(robot, simulate_trials(robot, truth, poses, study.made.instrument, seed))
+    fit = identify_trials(
+        robot, simulate_trials(robot, truth, poses, study.problem.instrument, seed)
+    )
     assert fit.converged.all(), "machines within their tolerances are always found"
     gap = geometry.pose_difference(
         forward_trials(robot, fit.values, study.unseen[None]).T @ robot.tool, tool
@@ -258,7 +264,7 @@ def compare(
     medians = [float(np.median(error[n])) for n in drawn]
     expected = [float(np.median(random[n].expected)) for n in drawn]
     mixed = [among_candidates(study, n) for n in drawn]
-    for n in (n for n in sizes if n >= study.made.fewest):
+    for n in (n for n in sizes if n >= study.problem.min_groups):
         plan = at_planned(study, n)
         own, other = study.wanted(plan.position, plan.orientation), error[n]
         better = int((_rms(own) < _rms(other)).sum())
@@ -287,7 +293,7 @@ def by_noise(case: Case) -> list:
     found: list[object] = [case.robot, case.measured, GLANCE]
     for louder in LOUDER:
         study = prepare(case, machines=1, louder=louder)
-        plan = planned(study.made, GLANCE, hold_out=0, target=case.target, seed=SEED).expected
+        plan = plan_poses(study.problem.with_options(n_poses=GLANCE)).errors.after
         curve = [float(np.median(foreseen_at_random(study, n))) for n in RANDOM]
         found.append(matching(RANDOM, curve, float(study.wanted(plan.position, plan.orientation))))
     return found

@@ -57,8 +57,11 @@ if TYPE_CHECKING:
     from loopcal.mechanism import sample_workspace as sample_workspace
     from loopcal.mechanism import trace_singularity as trace_singularity
     from loopcal.planning import Constraints as Constraints
+    from loopcal.planning import LineOfSight as LineOfSight
     from loopcal.planning import Plan as Plan
-    from loopcal.planning import Sight as Sight
+    from loopcal.planning import PlanOptions as PlanOptions
+    from loopcal.planning import SurfaceOptions as SurfaceOptions
+    from loopcal.planning import SurfacePlan as SurfacePlan
     from loopcal.planning import plan as plan
     from loopcal.planning import plan_surfaces as plan_surfaces
     from loopcal.workflow import CalibrationOptions as CalibrationOptions
@@ -119,7 +122,16 @@ _WHERE = {
             "sample_workspace",
             "find_working_modes",
         ),
-        "loopcal.planning": ("Constraints", "Plan", "Sight", "plan", "plan_surfaces"),
+        "loopcal.planning": (
+            "Constraints",
+            "LineOfSight",
+            "Plan",
+            "PlanOptions",
+            "SurfaceOptions",
+            "SurfacePlan",
+            "plan",
+            "plan_surfaces",
+        ),
         "loopcal.workflow": ("CalibrationOptions", "CalibrationReport", "Verdict", "calibrate"),
     }.items()
     for name in names

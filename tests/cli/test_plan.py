@@ -38,8 +38,8 @@ def rows_of(path) -> list[dict[str, str]]:
 def test_a_plan_is_measured_filled_in_and_calibrated_with_its_own_poses_held_out(here, capsys):
     assert main(["plan", "linear-delta", "-o", "plan", *SMALL, "--curve"]) == 0
     said = capsys.readouterr().out
-    assert "8 poses of linear-delta to measure (position) and 3 to judge by" in said
-    assert "expected errors by number of poses" in said
+    assert "8 poses of linear-delta for calibration and 3 for validation (position)" in said
+    assert "Expected errors by number of poses" in said
     assert {p.name for p in (here / "plan").iterdir()} == {
         "plan.csv", "measurements.csv", "plan.json", "plan.png", "curve.png",
     }  # fmt: skip
@@ -88,7 +88,7 @@ def test_the_sheet_says_what_to_command_and_agrees_with_the_data_file(here):
 def test_planes_and_lines_are_planned_held_filled_in_and_calibrated(here, capsys):
     ask = "plan hexapod-nategh-agheli -o plan --measure plane-line --groups 9 --points 6 --sigma-position 1um"
     assert run(ask) == 0
-    assert "33 parameter combinations can be told" in capsys.readouterr().out
+    assert "determine 33 parameter combinations" in capsys.readouterr().out
     sheet = rows_of(here / "plan" / "plan.csv")
     assert [row["role"] for row in sheet[:6]] == ["p0", "p1", "plane", "plane", "plane", "plane"]
     assert {(row["role"] == "p0", row["tolerance [mm]"]) for row in sheet} == {
@@ -190,10 +190,10 @@ def test_surfaces_that_each_group_has_of_its_own_describe_no_instrument_to_plan_
         ("--accuracy 20", "unit"),
         ("--accuracy 1nm --kind position --candidates 30", "out of reach"),
         ("--kind posse", "did you mean 'pose'"),
-        ("--kind locked", "tells nothing of the 9 free parameters of linear-delta"),
+        ("--kind locked", "none of the 9 free parameters of linear-delta"),
         ("--accuracy 10urad --kind position --candidates 30", "does not turn"),
         ("--like robot.yaml", "is no measurement file"),
-        ("--accuracy=-5um", "the accuracy asked for is -0.005 mm"),
+        ("--accuracy=-5um", "the accuracy goal is -0.005 mm"),
         ("--groups 3", "belong to --measure plane-line"),
         ("--measure plane-line --poses 10", "--poses does not go with --measure plane-line"),
         ("--measure plane-line --poses 0", "--poses does not go with --measure plane-line"),
@@ -222,7 +222,7 @@ def test_surfaces_that_each_group_has_of_its_own_describe_no_instrument_to_plan_
         ("--max-tilt -3deg", "angle above 0"),
         ("--seen-from 1m,2m", "give three numbers"),
         ("--cone 20deg", "--seen-from"),
-        ("--seen-from 0m,0m,-5m --cone 10deg --candidates 10", "leave nothing of the workspace"),
+        ("--seen-from 0m,0m,-5m --cone 10deg --candidates 10", "exclude the workspace"),
         ("--like nothing.csv", "does not exist"),
     ],
 )

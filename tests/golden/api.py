@@ -33,12 +33,9 @@ from loopcal.measure import (
 )
 from loopcal.mechanism import build, differentiate_pose, forward, inverse, sample_workspace
 from loopcal.parameters import ParameterTable
-from loopcal.planning.coordinate import coordinate_exchange
-from loopcal.planning.criteria import A, D
-from loopcal.planning.design import Start
-from loopcal.planning.fedorov import fedorov_exchange
-from loopcal.planning.groups import PlaneAndLine
-from loopcal.planning.problem import problem
+from loopcal.planning.design import A, D, PriorInformation, coordinate_exchange, fedorov_exchange
+from loopcal.planning.plane_line_groups import PlaneLineGroups
+from loopcal.planning.problem import prepare_problem
 from loopcal.units import Dimension
 
 Array = NDArray[np.float64]
@@ -708,22 +705,27 @@ def report_plan(
     """Plan poses; `station` and `facing` ask for a line of sight, `tilt` [rad] and `margin` for the
     others.
     """
-    found = planning.plan(machine, Instrument(tuple(sensors)), n, criterion, **options)
+    if "candidates" in options:
+        options["n_candidates"] = options.pop("candidates")
+    plan = planning.plan(
+        machine, Instrument(tuple(sensors)), n, criterion, planning.PlanOptions(**options)
+    )
+    poses, errors = plan.poses, plan.errors
     result: Report = {
-        "labels": list(found.labels),
-        "held_out": [bool(x) for x in found.held_out],
-        "via_home": [bool(x) for x in found.via_home],
-        "units": found.units,
-        "coordinates": found.coordinates,
-        "readings": found.readings,
-        "figures": dict(found.figures),
-        "efficiency": found.efficiency,
-        "expected": [found.expected.position, found.expected.orientation],
-        "length": found.length,
-        "considered": found.considered,
+        "labels": list(poses.labels),
+        "held_out": [bool(x) for x in poses.held_out],
+        "via_home": [bool(x) for x in poses.via_home],
+        "units": poses.groups,
+        "coordinates": poses.coordinates,
+        "readings": poses.readings,
+        "figures": dict(plan.quality.figures),
+        "efficiency": plan.quality.efficiency,
+        "expected": [errors.after.position, errors.after.orientation],
+        "length": poses.path_length,
+        "considered": plan.quality.considered,
     }
-    if found.even is not None:
-        result["even"] = [found.even.position, found.even.orientation]
+    if errors.random is not None:
+        result["even"] = [errors.random.position, errors.random.orientation]
     return result
 
 
@@ -731,10 +733,12 @@ def report_fedorov(
     machine: Robot, sensors: Iterable[Any], n: int, criterion: str, candidates: int, starts: int
 ) -> Report:
     """Choose n units from candidates by exchange: their numbers and the criterion."""
-    made = problem(machine, Instrument(tuple(sensors)), count=candidates, seed=1)
-    wanted = made.criterion(criterion, "pose")
-    found = fedorov_exchange(made.units.rows, n, wanted, made.start, seed=1, starts=starts)
-    return {"chosen": found.chosen, "value": found.value, "candidates": len(made.units.rows)}
+    settings = planning.PlanOptions(n_candidates=candidates)
+    problem = prepare_problem(machine, Instrument(tuple(sensors)), settings)
+    wanted = problem.build_criterion(criterion, "pose")
+    rows = problem.groups.rows
+    found = fedorov_exchange(rows, n, wanted, problem.prior, seed=1, starts=starts)
+    return {"chosen": found.chosen, "value": found.value, "candidates": len(rows)}
 
 
 def report_coordinate_exchange(
@@ -746,12 +750,12 @@ def report_coordinate_exchange(
     axes: tuple[str, ...] = ("x", "y", "z"),
 ) -> Report:
     """Improve groups of points on planes and lines by coordinate exchange."""
-    planned = PlaneAndLine(machine, points, 1e-3, axes)
-    first = planned.random(groups, 1)
+    planned = PlaneLineGroups(machine, points, 1e-3, axes)
+    first = planned.draw(groups, 1)
     wanted = {"D": D(), "A": A()}[criterion]
-    start = Start.nothing(len(planned.free_parameters))
+    start = PriorInformation.none(len(planned.free))
     found = coordinate_exchange(
-        planned.evaluate, first, planned.levels(), wanted, start, sweeps=sweeps
+        planned.linearize_indexed, first, planned.list_levels(), wanted, start, sweeps=sweeps
     )
     return {
         "first": first,
@@ -763,15 +767,16 @@ def report_coordinate_exchange(
 
 def report_surface_plan(machine: Robot, groups: int, points: int) -> Report:
     """Plan points on planes and perpendicular lines."""
-    found = planning.plan_surfaces(machine, groups, points)
+    plan = planning.plan_surfaces(machine, planning.SurfaceOptions(groups, points))
+    u, k = plan.poses.groups.shape
     return {
-        "labels": list(found.labels),
-        "axis": found.axis,
-        "coordinates": found.coordinates,
-        "via_home": found.via_home,
-        "rank": found.rank,
-        "first": found.first,
-        "last": found.last,
+        "labels": list(plan.poses.labels),
+        "axis": plan.axis,
+        "coordinates": plan.poses.coordinates.reshape(u, k, -1),
+        "via_home": plan.poses.via_home.reshape(u, k),
+        "rank": plan.rank,
+        "first": plan.sd_first,
+        "last": plan.sd_last,
     }
 
 
@@ -892,7 +897,7 @@ def report_cmm_constraint_2011(groups: int, points: int, sweeps: int, trials: in
     return {
         "design": study.optimised.design,
         "value": study.optimised.value,
-        "spread": [spread(study.planned.rows(study.first)), spread(study.optimised.rows)],
+        "spread": [spread(study.planned.linearize(study.first)), spread(study.optimised.rows)],
         "failed": [one.failed for one in made.values()],
         "errors": {weights: dict(one.errors) for weights, one in made.items()},
     }

@@ -19,7 +19,7 @@ from loopcal.estimate.outlook import information
 from loopcal.papers.cmm_constraint_2011.forms import RANK, covariance_difference, measurements
 from loopcal.papers.cmm_constraint_2011.steps import Layout, PaperRows, identify_from_rows, row_map
 from loopcal.papers.cmm_constraint_2011.study import true_machines
-from loopcal.planning.groups import PlaneAndLine, surface_rows
+from loopcal.planning.plane_line_groups import PlaneLineGroups, linearize_surfaces
 
 MM = 1e-3
 NOISE = 1e-6  # [m]
@@ -27,13 +27,13 @@ GROUPS, POINTS = 4, 12
 
 
 @pytest.fixture(scope="module")
-def planned() -> PlaneAndLine:
-    return PlaneAndLine(lc.load_robot("hexapod-nategh-agheli"), POINTS, MM, ("z",))
+def planned() -> PlaneLineGroups:
+    return PlaneLineGroups(lc.load_robot("hexapod-nategh-agheli"), POINTS, MM, ("z",))
 
 
 @pytest.fixture(scope="module")
 def layout(planned) -> Layout:
-    return Layout(planned.robot, planned.coordinates(planned.random(GROUPS, 0)))
+    return Layout(planned.robot, planned.place_points(planned.draw(GROUPS, 0)))
 
 
 def exact(layout: Layout) -> np.ndarray:
@@ -82,7 +82,7 @@ def test_rank_is_33_of_42_in_both_forms_and_the_nine_others_are_motions_of_base_
 def test_the_papers_rows_are_what_no_motion_of_the_surfaces_changes(layout) -> None:
     at, _, _ = layout.sloped(layout.robot.parameters.nominal[None], exact(layout))
     each = np.eye(3 * POINTS).reshape(POINTS, 3, 3 * POINTS)
-    F, A = surface_rows(at[0], np.repeat(each[None], GROUPS, axis=0), np.full(GROUPS, 2))
+    F, A = linearize_surfaces(at[0], np.repeat(each[None], GROUPS, axis=0), np.full(GROUPS, 2))
     B = row_map(*layout.levers)  # rows by points; A: held coordinates by points
     for g in range(GROUPS):
         held = np.linalg.lstsq(A[g].T, B[g].T, rcond=None)[0].T  # rows as sums of held coordinates
@@ -97,29 +97,29 @@ def test_both_forms_and_the_rows_of_planning_give_every_direction_the_same_varia
     assert covariance_difference(layout, NOISE) < 1e-9  # relative, rounding by a condition of 1e4
     free = select_free_parameters(layout.robot)
     R = information(free, measurements(layout, exact(layout)[0], MM))[0][0, :42, :42]
-    rows = planned.rows(planned.random(GROUPS, 0)).reshape(-1, 42)
+    rows = planned.linearize(planned.draw(GROUPS, 0)).reshape(-1, 42)
     np.testing.assert_allclose(rows.T @ rows, R.T @ R, atol=1e-9 * np.abs(R.T @ R).max())
 
 
 @pytest.mark.parametrize("name", ["6-pus", "linear-delta", "rotary-delta"])
 def test_rows_of_planning_are_those_of_surfaces_as_unknowns_on_other_robots_too(name) -> None:
     robot = lc.load_robot(name)
-    planned = PlaneAndLine(robot, 8, MM)
-    design = planned.random(8, 0)
-    layout = Layout(robot, planned.coordinates(design))
+    planned = PlaneLineGroups(robot, 8, MM)
+    design = planned.draw(8, 0)
+    layout = Layout(robot, planned.place_points(design))
     free = select_free_parameters(robot)
     R = information(free, measurements(layout, exact(layout)[0], MM))[0][
         0, : len(free), : len(free)
     ]
-    rows = planned.rows(design).reshape(-1, len(free))
+    rows = planned.linearize(design).reshape(-1, len(free))
     np.testing.assert_allclose(rows.T @ rows, R.T @ R, atol=1e-9 * np.abs(R.T @ R).max())
 
 
 def test_both_forms_agree_with_lines_along_different_axes(planned) -> None:
     mixed = replace(planned, axes=("x", "y", "z"))
-    design = mixed.random(GROUPS, 5)
+    design = mixed.draw(GROUPS, 5)
     assert len(np.unique(design[:, 3])) > 1
-    layout = Layout(mixed.robot, mixed.coordinates(design))
+    layout = Layout(mixed.robot, mixed.place_points(design))
     assert len(measurements(layout, exact(layout)[0], NOISE).observations) > 2
     assert covariance_difference(layout, NOISE) < 1e-9
 

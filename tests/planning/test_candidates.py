@@ -11,8 +11,9 @@ from loopcal.errors import DataError, MechanismError
 from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.mechanism import analyze_singularity, check_limits, workspace_ranges
-from loopcal.planning.candidates import candidates, listed_candidates
-from loopcal.planning.constraints import Constraints, Sight
+from loopcal.planning.candidates import check_listed_poses, draw_candidates
+from loopcal.planning.constraints import Constraints, LineOfSight
+from tests.planning.refusals import refuses
 
 STATION = np.array([0.5, -0.3, 0.6])
 
@@ -20,14 +21,14 @@ STATION = np.array([0.5, -0.3, 0.6])
 @pytest.fixture(scope="module")
 def strict():
     """Candidates of a hexapod under every constraint at once."""
-    sight = Sight(STATION, np.array([0.0, 0.0, 2.0]), np.radians(60.0), 0.1, 2.0)
-    return candidates(
+    sight = LineOfSight(STATION, np.array([0.0, 0.0, 2.0]), np.radians(60.0), 0.1, 2.0)
+    return draw_candidates(
         load_robot("hexapod-42"), Constraints(0.6, np.radians(12.0), sight), 100, seed=3
     )
 
 
 def test_every_candidate_keeps_to_every_constraint_as_computed_anew(strict):
-    robot, T = strict.rules.robot, strict.solution.T
+    robot, T = strict.checker.robot, strict.solution.T
     assert strict.solution.converged.all()
     assert check_limits(robot, robot.values[None], strict.solution.q[None], strict.solution.state)[
         0
@@ -44,22 +45,23 @@ def test_every_candidate_keeps_to_every_constraint_as_computed_anew(strict):
 
 
 def test_what_is_refused_is_counted_by_its_reason(strict):
-    assert set(strict.refused) >= {
-        "the tilt exceeds 12 deg",
-        "the target faces away from the instrument",
-    }
-    assert sum(strict.refused.values()) == strict.tried - len(strict)
-    assert f"{len(strict)} of {strict.tried} poses may be measured" in strict.sentence()
+    assert {"tilt-exceeded", "target-faces-away"} <= {v.code for v in strict.excluded}
+    assert any(dict(v.data).get("max_tilt_deg") == pytest.approx(12.0) for v in strict.excluded)
+    assert sum(strict.excluded.values()) == strict.n_drawn - len(strict)
+    found = strict.report()
+    assert found.code == "plan.candidates"
+    assert (found.data["allowed"], found.data["total"]) == (len(strict), strict.n_drawn)
+    assert sum(reason["count"] for reason in found.data["reasons"]) == strict.n_drawn - len(strict)
 
 
 @pytest.mark.parametrize("name", ["hexapod-42", "linear-delta"])
 def test_many_candidates_lie_at_the_boundary_of_the_workspace(name):
-    found = candidates(load_robot(name), None, 60, seed=1)
-    low, high = np.array(list(workspace_ranges(found.rules.robot).values())).T
+    found = draw_candidates(load_robot(name), None, 60, seed=1)
+    low, high = np.array(list(workspace_ranges(found.checker.robot).values())).T
     at_end = np.isclose(found.coordinates, low, atol=1e-6) | np.isclose(
         found.coordinates, high, atol=1e-6
     )  # [m, rad]
-    edge = ~found.even
+    edge = ~found.is_uniform
     # of thirty that are drawn; corners drawn twice count once
     assert 15 <= edge.sum() <= 30
     # not all: what cannot be reached there was drawn back
@@ -76,13 +78,11 @@ def test_commanded_coordinates_have_few_digits(strict):
 
 def test_a_workspace_that_the_constraints_leave_empty_is_refused_with_the_counts():
     nobody_sees = Constraints(
-        sight=Sight(np.array([0.0, 0.0, -5.0]), np.array([0.0, 0.0, 1.0]), np.radians(20.0))
+        sight=LineOfSight(np.array([0.0, 0.0, -5.0]), np.array([0.0, 0.0, 1.0]), np.radians(20.0))
     )
-    with pytest.raises(
-        MechanismError,
-        match=r"leave nothing of the workspace.*0 of \d+ poses.*faces away.*\(\d+\).*relax",
-    ):
-        candidates(load_robot("hexapod-42"), nobody_sees, 200)
+    with refuses("plan.workspace-excluded", MechanismError, allowed=0) as data:
+        draw_candidates(load_robot("hexapod-42"), nobody_sees, 200)
+    assert "target-faces-away" in {reason["code"] for reason in data["reasons"]}
 
 
 def test_home_that_breaks_a_constraint_is_refused_because_every_way_starts_there(tmp_path):
@@ -92,20 +92,23 @@ def test_home_that_breaks_a_constraint_is_refused_because_every_way_starts_there
         .replace("home: {z: 200}", "home: {z: 200, roll: 10}")
     )
     (tmp_path / "leaning.yaml").write_text(text)
-    with pytest.raises(
-        MechanismError, match=r"starts at the home.*tilt exceeds 5 deg.*choose another home"
-    ):
-        candidates(load_robot(tmp_path / "leaning.yaml"), Constraints(max_tilt=np.radians(5.0)), 50)
+    with refuses("plan.home-excluded", MechanismError) as data:
+        draw_candidates(
+            load_robot(tmp_path / "leaning.yaml"), Constraints(max_tilt=np.radians(5.0)), 50
+        )
+    (reason,) = data["reasons"]
+    assert reason["code"] == "tilt-exceeded"
+    assert reason["max_tilt_deg"] == pytest.approx(5.0)
 
 
 def test_poses_of_a_user_are_judged_and_the_others_said():
     robot = load_robot("hexapod-42")
     poses = np.array([[0.0, 0.0, 0.2, 0.0, 0.0, 0.0], [0.0, 0.0, 0.9, 0.0, 0.0, 0.0]])
-    found = listed_candidates(robot, poses)
+    found = check_listed_poses(robot, poses)
     assert len(found) == 1
-    assert any("stroke" in reason for reason in found.refused)
-    with pytest.raises(MechanismError, match="none of the 1 poses given"):
-        listed_candidates(robot, poses[1:])
+    assert any("stroke" in dict(v.data).get("limit", "") for v in found.excluded)
+    with refuses("plan.listed-poses-excluded", MechanismError, total=1):
+        check_listed_poses(robot, poses[1:])
 
 
 @pytest.mark.parametrize(
@@ -113,11 +116,11 @@ def test_poses_of_a_user_are_judged_and_the_others_said():
     [
         (lambda: Constraints(min_margin=1.5), "share of the median"),
         (lambda: Constraints(max_tilt=-1.0), "angle above 0"),
-        (lambda: Sight(np.zeros(3), np.zeros(3)), "points somewhere"),
-        (lambda: Sight(np.array([np.nan, 0, 0]), np.ones(3)), "three finite numbers"),
-        (lambda: Sight(np.zeros(3), np.ones(3), cone=0.0), "at most 180 deg"),
+        (lambda: LineOfSight(np.zeros(3), np.zeros(3)), "length above 0"),
+        (lambda: LineOfSight(np.array([np.nan, 0, 0]), np.ones(3)), "three finite numbers"),
+        (lambda: LineOfSight(np.zeros(3), np.ones(3), cone=0.0), "at most 180 deg"),
         (
-            lambda: Sight(np.zeros(3), np.ones(3), nearest=2.0, farthest=1.0),
+            lambda: LineOfSight(np.zeros(3), np.ones(3), nearest=2.0, farthest=1.0),
             "a smaller and a larger",
         ),
     ],

@@ -13,10 +13,17 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.outlook import scene
 from loopcal.io import load_robot
 from loopcal.mechanism import sample_workspace
-from loopcal.planning.certified import certified_design
-from loopcal.planning.criteria import A, D, I, efficiency, evaluate
-from loopcal.planning.design import Start, design_factor
-from loopcal.planning.fedorov import fedorov_exchange
+from loopcal.planning.design import (
+    A,
+    D,
+    I,
+    PriorInformation,
+    choose_design,
+    compute_efficiency,
+    evaluate_criterion,
+    factor_design,
+    fedorov_exchange,
+)
 from tests.planning.polynomials import Array, random_rows
 
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)  # [rad, m]
@@ -32,16 +39,14 @@ def pose_rows(robot: str, count: int, components: slice = slice(0, 6)) -> Array:
 @pytest.mark.slow
 def test_twenty_of_a_thousand_full_poses_of_a_hexapod_are_certified_to_95_percent() -> None:
     rows = pose_rows("hexapod-42", 1000)
-    start = Start.nothing(rows.shape[2])
-    found = certified_design(rows, 20, D(), start)
+    start = PriorInformation.none(rows.shape[2])
+    found = choose_design(rows, 20, D(), start)
     assert found.relaxed.converged
-    assert len(found.design.directions) == 42
+    assert len(found.design.space) == 42
     assert found.efficiency > 0.95  # 0.980 measured
     even = np.arange(20)
-    random = evaluate(
-        D(),
-        design_factor(rows[even], start, found.design.directions),
-        found.design.directions.machine,
+    random = evaluate_criterion(
+        D(), factor_design(rows[even], start, found.design.space), found.design.space.machine
     )
     assert found.relaxed.efficiency(random) < 0.5  # the first twenty drawn: 0.4 measured
 
@@ -54,30 +59,32 @@ def test_a_certified_design_is_no_worse_than_the_best_of_twenty_starts(
     robot: str, components: slice
 ) -> None:
     rows = pose_rows(robot, 250, components)
-    start = Start.nothing(rows.shape[2])
-    found = certified_design(rows, 20, D(), start)
+    start = PriorInformation.none(rows.shape[2])
+    found = choose_design(rows, 20, D(), start)
     best = fedorov_exchange(rows, 20, D(), start, starts=20)
     assert found.design.value >= best.value - 1e-6 * len(
-        found.design.directions
+        found.design.space
     )  # to a millionth of the efficiency
     assert 0.9 < found.relaxed.efficiency(best.value) <= found.efficiency + 1e-6
 
 
 def test_tolerances_as_prior_give_the_design_of_the_cut_directions_once_the_data_say_more() -> None:
-    cut, prior = Start.nothing(42), Start.tolerances(42)
+    cut, prior = PriorInformation.none(42), PriorInformation.from_tolerances(42)
     kept = []
     for precision in (1.0, 1e3):
         rows = precision * pose_rows(
             "hexapod-42", 150, slice(3, 6)
         )  # position only: three directions that no pose shows
-        plain, bayes = (certified_design(rows, 20, D(), start, shakes=5) for start in (cut, prior))
-        space = plain.design.directions
-        assert (len(space), len(bayes.design.directions)) == (39, 42)
+        plain, bayes = (
+            choose_design(rows, 20, D(), start, perturbations=5) for start in (cut, prior)
+        )
+        space = plain.design.space
+        assert (len(space), len(bayes.design.space)) == (39, 42)
         values = [
-            evaluate(D(), design_factor(rows[c.design.chosen], cut, space), space.machine)
+            evaluate_criterion(D(), factor_design(rows[c.design.chosen], cut, space), space.machine)
             for c in (plain, bayes)
         ]
-        kept.append(efficiency(D(), values[1], values[0], 39))
+        kept.append(compute_efficiency(D(), values[1], values[0], 39))
     assert (
         kept[0] < 0.9
     )  # with coarse data other poses are better: what the tolerances say need not be measured
@@ -87,13 +94,11 @@ def test_tolerances_as_prior_give_the_design_of_the_cut_directions_once_the_data
 def test_a_design_for_a_prediction_predicts_better_than_one_for_the_determinant() -> None:
     rows = random_rows(N=60, machine=6, seed=2)
     L = np.random.default_rng(3).normal(size=(4, 6)) * np.array([9.0, 3.0, 1.0, 0.3, 0.1, 0.03])
-    start = Start.nothing(6)
+    start = PriorInformation.none(6)
     wanted = I(L, 4)
-    for_I, for_D = (
-        certified_design(rows, 8, criterion, start).design for criterion in (wanted, D())
-    )
-    other = evaluate(
-        wanted, design_factor(rows[for_D.chosen], start, for_D.directions), for_D.directions.machine
+    for_I, for_D = (choose_design(rows, 8, criterion, start).design for criterion in (wanted, D()))
+    other = evaluate_criterion(
+        wanted, factor_design(rows[for_D.chosen], start, for_D.space), for_D.space.machine
     )
     assert for_I.value < other
 
@@ -102,30 +107,36 @@ def test_a_design_for_a_prediction_predicts_better_than_one_for_the_determinant(
 def test_the_efficiency_is_a_promise_below_one_and_repeats_only_help(criterion: D | A) -> None:
     rows = random_rows(N=30)
     once, often = (
-        certified_design(rows, 7, criterion, Start.nothing(4), repeats=repeats)
+        choose_design(rows, 7, criterion, PriorInformation.none(4), repeats=repeats)
         for repeats in (False, True)
     )
     assert 0.8 < once.efficiency <= 1.0 + 1e-9
     assert 0.8 < often.efficiency <= 1.0 + 1e-9
-    assert efficiency(criterion, once.design.value, often.design.value, 4) <= 1.0 + 1e-9
+    assert compute_efficiency(criterion, once.design.value, often.design.value, 4) <= 1.0 + 1e-9
 
 
 def test_the_same_seed_gives_the_same_design() -> None:
     rows = random_rows(N=80, machine=6)
-    first, second = (certified_design(rows, 9, D(), Start.nothing(6), seed=4) for _ in range(2))
+    first, second = (
+        choose_design(rows, 9, D(), PriorInformation.none(6), seed=4) for _ in range(2)
+    )
     np.testing.assert_array_equal(first.design.chosen, second.design.chosen)
 
 
 def test_all_candidates_can_be_asked_for() -> None:
-    found = certified_design(random_rows(), 12, D(), Start.nothing(4))
+    found = choose_design(random_rows(), 12, D(), PriorInformation.none(4))
     np.testing.assert_array_equal(found.design.chosen, np.arange(12))
     assert found.efficiency == pytest.approx(1.0, abs=1e-9)
 
 
 def test_a_design_begun_with_fewer_units_is_filled_up() -> None:
     rows = random_rows(N=30)
-    found = certified_design(
-        rows, 7, D(), Start.nothing(4), first=[np.array([3, 5]), np.array([], dtype=np.int64)]
+    found = choose_design(
+        rows,
+        7,
+        D(),
+        PriorInformation.none(4),
+        first=[np.array([3, 5]), np.array([], dtype=np.int64)],
     )
     assert len(found.design.chosen) == 7
 
@@ -145,6 +156,6 @@ def test_evidence_certified_designs_of_shipped_robots(root: Path) -> None:
 
 
 def test_units_that_tell_nothing_leave_what_is_known_before() -> None:
-    found = certified_design(np.zeros((6, 2, 3)), 2, D(), Start.tolerances(3))
+    found = choose_design(np.zeros((6, 2, 3)), 2, D(), PriorInformation.from_tolerances(3))
     assert found.efficiency == 1.0
     assert found.design.value == pytest.approx(0.0, abs=1e-12)  # log det of the unit matrix

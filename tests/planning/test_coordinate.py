@@ -9,10 +9,17 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.outlook import scene
 from loopcal.io import load_robot
 from loopcal.mechanism import inverse, sample_workspace
-from loopcal.planning.coordinate import coordinate_exchange
-from loopcal.planning.criteria import A, Criterion, D, evaluate
-from loopcal.planning.design import Start, design_factor
+from loopcal.planning.design import (
+    A,
+    Criterion,
+    D,
+    PriorInformation,
+    coordinate_exchange,
+    evaluate_criterion,
+    factor_design,
+)
 from tests.planning.polynomials import Array, Places, polynomial
+from tests.planning.refusals import refuses
 
 LEVELS = [np.linspace(-1.0, 1.0, 5)]
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)  # [rad, m]
@@ -32,13 +39,13 @@ def test_any_start_ends_at_the_known_design_of_a_parabola(
     criterion: Criterion, best: list[float], seed: int
 ) -> None:
     begin = np.random.default_rng(seed).uniform(-1, 1, (12, 1))
-    found = coordinate_exchange(parabola, begin, LEVELS, criterion, Start.nothing(3))
+    found = coordinate_exchange(parabola, begin, LEVELS, criterion, PriorInformation.none(3))
     np.testing.assert_allclose(np.sort(found.design[:, 0]), best, atol=1e-12)
     np.testing.assert_array_equal(found.rows, parabola(np.arange(12), found.design))
 
 
 def test_a_start_with_all_units_at_one_place_is_moved_apart() -> None:
-    found = coordinate_exchange(parabola, np.zeros((6, 1)), LEVELS, D(), Start.nothing(3))
+    found = coordinate_exchange(parabola, np.zeros((6, 1)), LEVELS, D(), PriorInformation.none(3))
     assert found.history[0] == -np.inf
     np.testing.assert_allclose(np.sort(found.design[:, 0]), [-1, -1, 0, 0, 1, 1], atol=1e-12)
 
@@ -49,7 +56,7 @@ def test_levels_that_are_not_allowed_are_never_taken() -> None:
         rows[(x[:, 0] < -0.9) & (which % 2 == 0)] = np.nan
         return rows
 
-    found = coordinate_exchange(half, np.full((6, 1), 0.25), LEVELS, D(), Start.nothing(3))
+    found = coordinate_exchange(half, np.full((6, 1), 0.25), LEVELS, D(), PriorInformation.none(3))
     assert (found.design[::2, 0] > -0.9).all()
     assert (found.design[1::2, 0] < -0.9).any()
 
@@ -62,7 +69,7 @@ def test_rows_are_asked_for_all_units_and_levels_of_a_coordinate_at_once() -> No
         return parabola(which, x)
 
     found = coordinate_exchange(
-        counted, np.linspace(-1, 1, 7)[:, None], LEVELS, D(), Start.nothing(3)
+        counted, np.linspace(-1, 1, 7)[:, None], LEVELS, D(), PriorInformation.none(3)
     )
     sweeps = len(found.history) - 1
     assert asked[0] == 7
@@ -72,17 +79,19 @@ def test_rows_are_asked_for_all_units_and_levels_of_a_coordinate_at_once() -> No
 
 def test_a_coordinate_without_levels_stays() -> None:
     begin = np.random.default_rng(0).uniform(-1, 1, (6, 2))
-    found = coordinate_exchange(parabola, begin, [*LEVELS, np.zeros(0)], D(), Start.nothing(3))
+    found = coordinate_exchange(
+        parabola, begin, [*LEVELS, np.zeros(0)], D(), PriorInformation.none(3)
+    )
     np.testing.assert_array_equal(found.design[:, 1], begin[:, 1])
 
 
 def test_a_first_design_that_is_not_allowed_and_too_few_units_are_refused() -> None:
-    with pytest.raises(EstimationError, match="unit 1 of the first design is not allowed"):
+    with pytest.raises(EstimationError, match="group 1 of the first design is not allowed"):
         coordinate_exchange(
-            parabola, np.array([[0.0], [np.nan], [1.0]]), LEVELS, D(), Start.nothing(3)
+            parabola, np.array([[0.0], [np.nan], [1.0]]), LEVELS, D(), PriorInformation.none(3)
         )
-    with pytest.raises(EstimationError, match="ask for at least 3"):
-        coordinate_exchange(parabola, np.zeros((2, 1)), LEVELS, D(), Start.nothing(3))
+    with refuses("plan.design-too-small", needed=3):
+        coordinate_exchange(parabola, np.zeros((2, 1)), LEVELS, D(), PriorInformation.none(3))
 
 
 def test_units_that_cannot_be_moved_apart_are_refused() -> None:
@@ -91,8 +100,8 @@ def test_units_that_cannot_be_moved_apart_are_refused() -> None:
         rows[(which > 0) & (x[:, 0] != 0.0)] = np.nan
         return rows
 
-    with pytest.raises(EstimationError, match="leave some of the 3 unknowns open"):
-        coordinate_exchange(only_the_first, np.zeros((4, 1)), LEVELS, D(), Start.nothing(3))
+    with refuses("plan.design-singular", unknowns=3):
+        coordinate_exchange(only_the_first, np.zeros((4, 1)), LEVELS, D(), PriorInformation.none(3))
 
 
 def test_poses_of_a_hexapod_move_to_where_its_parameters_show() -> None:
@@ -108,12 +117,12 @@ def test_poses_of_a_hexapod_move_to_where_its_parameters_show() -> None:
     levels = [
         m + h * np.array([-1.0, -0.5, 0.0, 0.5, 1.0]) for m, h in zip(middle, half, strict=True)
     ]
-    found = coordinate_exchange(rows_of, drawn[:20], levels, D(), Start.nothing(len(free)))
+    found = coordinate_exchange(rows_of, drawn[:20], levels, D(), PriorInformation.none(len(free)))
     before, after = (
-        evaluate(
+        evaluate_criterion(
             A(),
-            design_factor(rows, Start.nothing(len(free)), found.directions),
-            found.directions.machine,
+            factor_design(rows, PriorInformation.none(len(free)), found.space),
+            found.space.machine,
         )
         for rows in (rows_of(np.arange(20), drawn[:20]), found.rows)
     )

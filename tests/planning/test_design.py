@@ -6,10 +6,20 @@ the reason.
 import numpy as np
 import pytest
 
-from loopcal.errors import EstimationError
-from loopcal.planning.criteria import A, D, E, I, efficiency, evaluate
-from loopcal.planning.design import Start, design_factor, directions, require_enough
+from loopcal.planning.design import (
+    A,
+    D,
+    E,
+    I,
+    PriorInformation,
+    compute_efficiency,
+    evaluate_criterion,
+    factor_design,
+    find_observable_space,
+)
+from loopcal.planning.design.design_space import require_enough
 from tests.planning.polynomials import covariance, random_rows
+from tests.planning.refusals import refuses
 
 CLOSE = 1e-10  # relative: rounding of inverses of well-conditioned 6 x 6 matrices
 
@@ -20,10 +30,10 @@ def test_criteria_are_those_of_the_covariance_with_the_own_unknowns_eliminated(
     own: int, prior: bool
 ) -> None:
     rows = random_rows(own=own)
-    start = Start.tolerances(4, own) if prior else Start.nothing(4, own)
+    start = PriorInformation.from_tolerances(4, own) if prior else PriorInformation.none(4, own)
     L = np.random.default_rng(1).normal(size=(9, 4))
-    space = directions(rows, start)
-    factor = design_factor(rows[:5], start, space)
+    space = find_observable_space(rows, start)
+    factor = factor_design(rows[:5], start, space)
     C = covariance(rows[:5], start.rows, own)
     expected = {
         D(): -np.linalg.slogdet(C)[1],
@@ -32,7 +42,9 @@ def test_criteria_are_those_of_the_covariance_with_the_own_unknowns_eliminated(
         I(L, 3): np.trace(L @ C @ L.T) / 3,
     }
     for criterion, value in expected.items():
-        assert evaluate(criterion, factor, space.machine) == pytest.approx(value, rel=CLOSE)
+        assert evaluate_criterion(criterion, factor, space.machine) == pytest.approx(
+            value, rel=CLOSE
+        )
 
 
 def test_directions_that_own_unknowns_imitate_are_left_out_and_change_no_criterion() -> None:
@@ -40,8 +52,8 @@ def test_directions_that_own_unknowns_imitate_are_left_out_and_change_no_criteri
     rows[..., 3] = (
         rows[..., 0] - 2.0 * rows[..., 4]
     )  # parameters 1 and 2 together, 1 to 2, do what a frame does
-    start = Start.nothing(4, 2)
-    space = directions(rows, start)
+    start = PriorInformation.none(4, 2)
+    space = find_observable_space(rows, start)
     assert len(space) == 3
     assert space.singular_values[3] < 1e-13 * space.singular_values[0]
     np.testing.assert_allclose(space.machine.T @ np.array([0.0, 1.0, 2.0, 0.0]), 0.0, atol=CLOSE)
@@ -50,7 +62,7 @@ def test_directions_that_own_unknowns_imitate_are_left_out_and_change_no_criteri
     expected = covariance(np.delete(rows[:6], 3, axis=2), np.zeros((0, 5)), 2)
     told = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, -2.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     np.testing.assert_allclose(told @ space.machine @ space.machine.T, told, atol=1e-12)
-    factor = design_factor(rows[:6], start, space)
+    factor = factor_design(rows[:6], start, space)
     C = space.machine @ np.linalg.inv(factor.T @ factor) @ space.machine.T
     np.testing.assert_allclose(
         told @ C @ told.T, expected, rtol=1e-8
@@ -59,13 +71,13 @@ def test_directions_that_own_unknowns_imitate_are_left_out_and_change_no_criteri
 
 def test_rows_already_measured_count_the_same_as_rows_of_the_design() -> None:
     rows = random_rows(own=1)
-    none = Start.nothing(4, 1)
-    space = directions(rows, none)
-    before = none.plus(rows[:3])
+    none = PriorInformation.none(4, 1)
+    space = find_observable_space(rows, none)
+    before = none.with_rows(rows[:3])
     assert before.rows.shape == (5, 5)
     np.testing.assert_allclose(
-        np.abs(design_factor(rows[3:6], before, space)),
-        np.abs(design_factor(rows[:6], none, space)),
+        np.abs(factor_design(rows[3:6], before, space)),
+        np.abs(factor_design(rows[:6], none, space)),
         rtol=CLOSE,
         atol=CLOSE,
     )
@@ -73,43 +85,43 @@ def test_rows_already_measured_count_the_same_as_rows_of_the_design() -> None:
 
 def test_efficiency_is_the_share_of_poses_that_the_best_design_would_need() -> None:
     rows = random_rows()
-    start = Start.nothing(4)
-    space = directions(rows, start)
-    once, twice = (design_factor(np.repeat(rows, k, axis=0), start, space) for k in (1, 2))
+    start = PriorInformation.none(4)
+    space = find_observable_space(rows, start)
+    once, twice = (factor_design(np.repeat(rows, k, axis=0), start, space) for k in (1, 2))
     for criterion in (D(), A(), I(np.eye(4)), E()):
-        values = [evaluate(criterion, factor, space.machine) for factor in (once, twice)]
-        assert efficiency(criterion, values[0], values[1], len(space)) == pytest.approx(
+        values = [evaluate_criterion(criterion, factor, space.machine) for factor in (once, twice)]
+        assert compute_efficiency(criterion, values[0], values[1], len(space)) == pytest.approx(
             0.5, rel=CLOSE
         )
 
 
 def test_a_design_that_leaves_a_direction_open_has_the_worst_value() -> None:
     rows = random_rows()
-    start = Start.nothing(4)
-    space = directions(rows, start)
-    factor = design_factor(rows[:1], start, space)
-    assert evaluate(D(), factor, space.machine) == -np.inf
-    assert evaluate(A(), factor, space.machine) == np.inf
+    start = PriorInformation.none(4)
+    space = find_observable_space(rows, start)
+    factor = factor_design(rows[:1], start, space)
+    assert evaluate_criterion(D(), factor, space.machine) == -np.inf
+    assert evaluate_criterion(A(), factor, space.machine) == np.inf
 
 
 @pytest.mark.parametrize(
-    ("n", "rows", "words"),
+    ("n", "rows", "code", "data"),
     [
-        (2, random_rows(own=1), "ask for at least 3"),
-        (13, random_rows(), "12 candidates are allowed"),
-        (5, np.full((3, 2, 4), np.nan), "none of the 3 candidates is allowed"),
-        (5, np.zeros((6, 2, 4)), "depend on no parameter"),
+        (2, random_rows(own=1), "plan.design-too-small", {"needed": 3}),
+        (13, random_rows(), "plan.too-few-candidates", {"available": 12}),
+        (5, np.full((3, 2, 4), np.nan), "plan.no-candidate-allowed", {"total": 3}),
+        (5, np.zeros((6, 2, 4)), "plan.no-direction-observable", {}),
     ],
 )
 def test_what_cannot_determine_the_unknowns_is_refused(
-    n: int, rows: np.ndarray, words: str
+    n: int, rows: np.ndarray, code: str, data: dict
 ) -> None:
-    start = Start.nothing(4, rows.shape[2] - 4)
-    with pytest.raises(EstimationError, match=words):
-        require_enough(n, rows, start, directions(rows, start), repeats=False)
+    start = PriorInformation.none(4, rows.shape[2] - 4)
+    with refuses(code, **data):
+        require_enough(n, rows, start, find_observable_space(rows, start), repeats=False)
 
 
 def test_tolerances_as_prior_make_any_number_of_poses_enough() -> None:
     rows = random_rows()
-    start = Start.tolerances(4)
-    require_enough(1, rows, start, directions(rows, start))
+    start = PriorInformation.from_tolerances(4)
+    require_enough(1, rows, start, find_observable_space(rows, start))

@@ -12,10 +12,13 @@ import pytest
 import loopcal as lc
 from loopcal.errors import EstimationError
 from loopcal.mechanism import Mechanism, forward, inverse
-from loopcal.planning.coordinate import coordinate_exchange
-from loopcal.planning.criteria import D
-from loopcal.planning.design import Start
-from loopcal.planning.groups import PlaneAndLine, surface_rows, without_surfaces
+from loopcal.planning.design import D, PriorInformation, coordinate_exchange
+from loopcal.planning.plane_line_groups import (
+    PlaneLineGroups,
+    eliminate_surfaces,
+    linearize_surfaces,
+)
+from tests.planning.refusals import refuses
 
 MM = 1e-3
 
@@ -25,16 +28,16 @@ def robot() -> Mechanism:
     return lc.load_robot("hexapod-nategh-agheli")
 
 
-def points(planned: PlaneAndLine, design: np.ndarray) -> np.ndarray:
+def points(planned: PlaneLineGroups, design: np.ndarray) -> np.ndarray:
     """Tool origins (u, k, 3) of designs."""
-    x = planned.coordinates(design)
+    x = planned.place_points(design)
     T = inverse(planned.robot, x.reshape(-1, x.shape[2])).T @ planned.robot.tool
     return T[:, :3, 3].reshape(*x.shape[:2], 3)
 
 
 def test_points_lie_in_a_plane_and_on_a_line_across_it_inside_the_workspace(robot) -> None:
-    planned = PlaneAndLine(robot, 7, MM)
-    design = planned.random(12, 1)
+    planned = PlaneLineGroups(robot, 7, MM)
+    design = planned.draw(12, 1)
     assert {int(axis) for axis in design[:, 3]} == {0, 1, 2}
     at = points(planned, design)
     for x, axis in zip(at, design[:, 3].astype(int), strict=True):
@@ -53,18 +56,18 @@ def test_with_a_tool_it_is_the_tool_that_follows_plane_and_line(robot) -> None:
     tool = np.eye(4)
     tool[:3, 3] = 0.02, -0.03, 0.05
     assembly = replace(robot.assembly, tool=tool)
-    planned = PlaneAndLine(replace(robot, assembly=assembly), 5, MM, ("z",))
-    lever = points(planned, planned.random(3, 0))
+    planned = PlaneLineGroups(replace(robot, assembly=assembly), 5, MM, ("z",))
+    lever = points(planned, planned.draw(3, 0))
     lever = lever - lever[:, :1]
     np.testing.assert_allclose(lever[:, 2:, 2], 0.0, atol=1e-9)  # [m]
     np.testing.assert_allclose(lever[:, 1, :2], 0.0, atol=1e-9)
 
 
 def test_slopes_are_those_of_the_forward_kinematics(robot) -> None:
-    planned = PlaneAndLine(robot, 5, MM, ("x",))
-    design = planned.random(1, 3)
-    q = inverse(robot, planned.coordinates(design)[0])
-    _, J, _ = planned._seen(planned.coordinates(design)[0])
+    planned = PlaneLineGroups(robot, 5, MM, ("x",))
+    design = planned.draw(1, 3)
+    q = inverse(robot, planned.place_points(design)[0])
+    _, J, _ = planned._linearize_points(planned.place_points(design)[0])
     for place in (0, 4, 20, 41):
         step = np.zeros(42)
         step[place] = 1e-6
@@ -72,19 +75,21 @@ def test_slopes_are_those_of_the_forward_kinematics(robot) -> None:
             forward(robot.with_values(robot.values + s * step), q.q, q).T[:, :3, 3]
             for s in (1.0, -1.0)
         ]
-        by_hand = (ends[0] - ends[1]) / 2e-6 * planned.free_parameters.tolerance[place]
+        by_hand = (ends[0] - ends[1]) / 2e-6 * planned.free.tolerance[place]
         np.testing.assert_allclose(
             J[:, :, place], by_hand, atol=1e-11
         )  # [m per tolerance], central differences of 1e-3
 
 
 def test_moving_a_surface_moves_its_rows_as_its_columns_say(robot) -> None:
-    planned, axis = PlaneAndLine(robot, 6, MM), np.arange(3)
-    design = planned.random(3, 5)
+    planned, axis = PlaneLineGroups(robot, 6, MM), np.arange(3)
+    design = planned.draw(3, 5)
     design[:, 3] = axis
     at = points(planned, design)
-    F, A = surface_rows(at, np.repeat(np.eye(3)[None, None], 3, axis=0).repeat(6, axis=1), axis)
-    told, shown = without_surfaces(F, A)
+    F, A = linearize_surfaces(
+        at, np.repeat(np.eye(3)[None, None], 3, axis=0).repeat(6, axis=1), axis
+    )
+    told, shown = eliminate_surfaces(F, A)
     assert shown.all()
     assert told.shape == (3, 4, 3)
     turn = 1e-6
@@ -104,8 +109,8 @@ def test_moving_a_surface_moves_its_rows_as_its_columns_say(robot) -> None:
 
 def test_rank_is_33_of_42_for_1_to_30_groups(robot) -> None:
     for groups, k in ((1, 40), (3, 15), (10, 8), (30, 8)):
-        planned = PlaneAndLine(robot, k, MM)
-        rows = planned.rows(planned.random(groups, 0))
+        planned = PlaneLineGroups(robot, k, MM)
+        rows = planned.linearize(planned.draw(groups, 0))
         assert rows.shape == (groups, k - 2, 42)
         s = np.linalg.svd(rows.reshape(-1, 42), compute_uv=False)
         assert s[32] > 1e-6 * s[0]
@@ -113,24 +118,30 @@ def test_rank_is_33_of_42_for_1_to_30_groups(robot) -> None:
 
 
 def test_too_short_a_line_and_poses_out_of_reach_are_not_allowed(robot) -> None:
-    planned = PlaneAndLine(robot, 5, MM, ("z",))
-    design = planned.random(2, 0)
+    planned = PlaneLineGroups(robot, 5, MM, ("z",))
+    design = planned.draw(2, 0)
     design[1, planned.names.index("p1.along")] = design[1, 2] + 0.9 * planned.shortest
-    assert [np.isnan(r).all() for r in planned.rows(design)] == [False, True]
+    assert [np.isnan(r).all() for r in planned.linearize(design)] == [False, True]
     design[0, 2] = 30.0  # 3 m above the workspace
-    assert np.isnan(planned.rows(design)).all()
+    assert np.isnan(planned.linearize(design)).all()
 
 
 def test_where_every_point_is_in_reach_groups_are_drawn_once_and_no_line_is_too_short(
     monkeypatch,
 ) -> None:
-    planned, rows, calls = PlaneAndLine(lc.load_robot("linear-delta"), 8, MM), PlaneAndLine.rows, []
-    monkeypatch.setattr(
-        PlaneAndLine, "rows", lambda self, design: calls.append(len(design)) or rows(self, design)
+    planned, rows, calls = (
+        PlaneLineGroups(lc.load_robot("linear-delta"), 8, MM),
+        PlaneLineGroups.linearize,
+        [],
     )
-    design = planned.random(200, 1)
+    monkeypatch.setattr(
+        PlaneLineGroups,
+        "linearize",
+        lambda self, design: calls.append(len(design)) or rows(self, design),
+    )
+    design = planned.draw(200, 1)
     assert calls == [200]  # of lines drawn without their least length, a fifth is too short
-    assert planned._length(design).min() >= planned.shortest
+    assert planned._line_length(design).min() >= planned.shortest
     assert np.abs(np.delete(design, 3, axis=1)).max() <= 1.0
 
 
@@ -139,26 +150,31 @@ def test_settings_without_sense_are_refused_in_a_sentence(robot) -> None:
         ({"points": 3}, "at least 4"),
         ({"sigma": 0.0}, "above 0"),
         ({"axes": ("w",)}, "choose from x, y, z"),
-        ({"robot": lc.load_robot("3-prs")}, "is not sent to x, y"),
+        ({"robot": lc.load_robot("3-prs")}, "is not controlled in x and y"),
     ):
         given: dict[str, Any] = {"robot": robot, "points": 5, "sigma": MM} | settings
         with pytest.raises(EstimationError, match=words):
-            PlaneAndLine(**given)
-    with pytest.raises(EstimationError, match="reaches no group"):
-        PlaneAndLine(robot, 5, MM, shortest=3.0).random(1)
+            PlaneLineGroups(**given)
+    with refuses("plan.surfaces-out-of-reach", points=5):
+        PlaneLineGroups(robot, 5, MM, shortest=3.0).draw(1)
 
 
 @pytest.mark.slow
 def test_one_sweep_of_coordinate_exchange_makes_the_sd_at_least_three_times_smaller(robot) -> None:
-    planned = PlaneAndLine(robot, 10, MM, ("z",))
-    first = planned.random(10, 3)
+    planned = PlaneLineGroups(robot, 10, MM, ("z",))
+    first = planned.draw(10, 3)
     found = coordinate_exchange(
-        planned.evaluate, first, planned.levels(), D(), Start.nothing(42), sweeps=1
+        planned.linearize_indexed,
+        first,
+        planned.list_levels(),
+        D(),
+        PriorInformation.none(42),
+        sweeps=1,
     )
 
     def sd(rows: np.ndarray) -> float:
         s = np.linalg.svd(rows.reshape(-1, 42), compute_uv=False)[:33]
         return float(np.sqrt(np.mean(s**-2.0)))
 
-    assert sd(planned.rows(first)) > 3.0 * sd(found.rows)
-    np.testing.assert_array_equal(planned.rows(found.design), found.rows)
+    assert sd(planned.linearize(first)) > 3.0 * sd(found.rows)
+    np.testing.assert_array_equal(planned.linearize(found.design), found.rows)

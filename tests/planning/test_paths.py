@@ -12,10 +12,15 @@ from numpy.testing import assert_allclose
 from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.mechanism import check_limits, inverse, trace_singularity
-from loopcal.planning.candidates import candidates, home_coordinates
-from loopcal.planning.constraints import Constraints, rules
-from loopcal.planning.order import shortest, visiting_order
-from loopcal.planning.paths import between, distance, follow
+from loopcal.planning.candidates import draw_candidates, home_coordinates
+from loopcal.planning.constraints import Constraints, build_checker
+from loopcal.planning.path import (
+    check_paths,
+    find_short_order,
+    interpolate_path,
+    measure_distance,
+    order_poses,
+)
 
 
 @pytest.fixture(scope="module")
@@ -29,17 +34,19 @@ def hexapod(tmp_path_factory):
         .read_text("utf-8")
         .replace("stroke: [-75, 75]", "stroke: [-20, 75]")
     )
-    return candidates(load_robot(path), Constraints(min_margin=0.3), 120, seed=1)
+    return draw_candidates(load_robot(path), Constraints(min_margin=0.3), 120, seed=1)
 
 
 def _fine(found, start, end, steps):
-    """Whether a way keeps to strokes, limits, margin and side at many more places than `follow`
-    looks at.
+    """Limits, margin and closure sign of a path at many more places than `check_paths`
+    checks.
     """
-    robot = found.rules.robot
+    robot = found.checker.robot
     share = np.linspace(0.0, 1.0, steps)
-    x = between(robot, np.repeat(start[None], steps, 0), np.repeat(end[None], steps, 0), share)
-    path = trace_singularity(robot, coordinates=x, medians=found.rules.medians)
+    x = interpolate_path(
+        robot, np.repeat(start[None], steps, 0), np.repeat(end[None], steps, 0), share
+    )
+    path = trace_singularity(robot, coordinates=x, medians=found.checker.medians)
     inside = check_limits(robot, robot.values[None], path.solution.q[None], path.solution.state)[0][
         0
     ]
@@ -49,27 +56,27 @@ def _fine(found, start, end, steps):
 
 def test_ways_that_are_allowed_break_nothing_at_five_times_as_many_places(hexapod):
     rng = np.random.default_rng(2)
-    edge = hexapod.coordinates[~hexapod.even]
+    edge = hexapod.coordinates[~hexapod.is_uniform]
     pairs = rng.integers(0, len(edge), (60, 2))
-    verdict = follow(hexapod.rules, edge[pairs[:, 0]], edge[pairs[:, 1]])
+    verdict = check_paths(hexapod.checker, edge[pairs[:, 0]], edge[pairs[:, 1]])
     assert verdict.allowed.sum() > 30
     for a, b in pairs[verdict.allowed][:2]:
-        inside, margin, side = _fine(hexapod, edge[a], edge[b], 150)
+        inside, margin, sign = _fine(hexapod, edge[a], edge[b], 150)
         assert inside.all()
         assert margin.min() > 0.3 - 1e-3
-        assert (side == hexapod.rules.side).all()
+        assert (sign == hexapod.checker.closure_sign).all()
 
 
 def test_a_way_that_leaves_the_strokes_between_two_allowed_poses_is_refused_with_the_reason(
     hexapod,
 ):
     rng = np.random.default_rng(2)
-    edge = hexapod.coordinates[~hexapod.even]
+    edge = hexapod.coordinates[~hexapod.is_uniform]
     pairs = rng.integers(0, len(edge), (60, 2))
-    verdict = follow(hexapod.rules, edge[pairs[:, 0]], edge[pairs[:, 1]])
+    verdict = check_paths(hexapod.checker, edge[pairs[:, 0]], edge[pairs[:, 1]])
     refused = np.flatnonzero(~verdict.allowed)
     assert len(refused)
-    assert all("stroke" in verdict.why[i] for i in refused)
+    assert all("stroke" in dict(verdict.violations[i].data)["limit"] for i in refused)
     a, b = pairs[refused[0]]
     inside, *_ = _fine(hexapod, edge[a], edge[b], 100)
     assert inside[[0, -1]].all()
@@ -78,14 +85,14 @@ def test_a_way_that_leaves_the_strokes_between_two_allowed_poses_is_refused_with
 
 def test_a_way_through_a_singularity_is_refused():
     robot = load_robot("five-bar")
-    judged = rules(robot, Constraints(min_margin=0.0))
+    checker = build_checker(robot, Constraints(min_margin=0.0))
     home = home_coordinates(robot)
     # mirrored at the line through both feet: the other side of the singularity where the links are
     # in line
     across = home * np.array([1.0, -1.0])
-    verdict = follow(judged, home[None], across[None])
+    verdict = check_paths(checker, home[None], across[None])
     assert not verdict.allowed[0]
-    assert verdict.why[0]
+    assert verdict.violations[0] is not None
 
 
 def test_a_tilted_way_goes_the_shorter_way_round_and_through_zero_tilt():
@@ -95,12 +102,14 @@ def test_a_tilted_way_goes_the_shorter_way_round_and_through_zero_tilt():
     z, phi, theta = (names.index(name) for name in ("z", "phi", "theta"))
     start[0, [z, phi, theta]] = 0.5, np.radians(170.0), 0.2
     end[0, [z, phi, theta]] = 0.6, np.radians(-170.0), 0.2
-    middle = between(robot, start, end, 0.5)[0]
+    middle = interpolate_path(robot, start, end, 0.5)[0]
     assert abs(abs(middle[phi]) - np.pi) < 1e-12
     assert_allclose(middle[theta], 0.2 * np.cos(np.radians(10.0)), rtol=1e-12)
     end[0, phi] = np.radians(-10.0)
-    assert between(robot, start, end, 0.5)[0, theta] < 1e-15
-    assert_allclose(distance(robot, start, end), np.hypot(0.1, 0.4 * robot.size), rtol=1e-12)
+    assert interpolate_path(robot, start, end, 0.5)[0, theta] < 1e-15
+    assert_allclose(
+        measure_distance(robot, start, end), np.hypot(0.1, 0.4 * robot.size), rtol=1e-12
+    )
 
 
 def test_the_order_is_the_shortest_of_all_for_few_poses():
@@ -110,7 +119,7 @@ def test_the_order_is_the_shortest_of_all_for_few_poses():
         points = rng.random((8, 2))
         cost = np.linalg.norm(points[1:, None] - points[None, 1:], axis=2)
         begin = np.linalg.norm(points[1:] - points[0], axis=1)
-        order, length = shortest(cost, begin)
+        order, length = find_short_order(cost, begin)
         ways = np.array(list(permutations(range(7))))
         lengths = begin[ways[:, 0]] + cost[ways[:, :-1], ways[:, 1:]].sum(axis=1)
         assert sorted(order) == list(range(7))
@@ -122,29 +131,29 @@ def test_the_order_is_the_shortest_of_all_for_few_poses():
 
 def test_every_way_of_an_order_is_allowed_and_home_stands_where_none_is(hexapod):
     rng = np.random.default_rng(2)
-    edge = hexapod.coordinates[~hexapod.even]
+    edge = hexapod.coordinates[~hexapod.is_uniform]
     pairs = rng.integers(0, len(edge), (60, 2))
-    verdict = follow(hexapod.rules, edge[pairs[:, 0]], edge[pairs[:, 1]])
+    verdict = check_paths(hexapod.checker, edge[pairs[:, 0]], edge[pairs[:, 1]])
     a, b = pairs[~verdict.allowed][0]
-    only = visiting_order(hexapod.rules, edge[[a, b]])
+    only = order_poses(hexapod.checker, edge[[a, b]])
     assert only.via_home.tolist() == [False, True]
     poses = edge[rng.choice(len(edge), 12, replace=False)]
-    visit = visiting_order(hexapod.rules, poses)
+    visit = order_poses(hexapod.checker, poses)
     ordered = poses[visit.order]
     direct = np.flatnonzero(~visit.via_home[1:]) + 1
-    assert follow(hexapod.rules, ordered[direct - 1], ordered[direct]).allowed.all()
-    plain = distance(hexapod.rules.robot, poses[:-1], poses[1:]).sum()
+    assert check_paths(hexapod.checker, ordered[direct - 1], ordered[direct]).allowed.all()
+    plain = measure_distance(hexapod.checker.robot, poses[:-1], poses[1:]).sum()
     assert visit.length < 0.9 * plain
 
 
 def test_a_way_ends_with_the_readings_of_its_end(hexapod):
-    robot = hexapod.rules.robot
+    robot = hexapod.checker.robot
     x = hexapod.coordinates[:5]
     home = np.broadcast_to(home_coordinates(robot), x.shape)
-    assert follow(hexapod.rules, home, x).allowed.all()
+    assert check_paths(hexapod.checker, home, x).allowed.all()
     last = trace_singularity(
         robot,
-        coordinates=between(
+        coordinates=interpolate_path(
             robot, home[:1].repeat(20, 0), x[:1].repeat(20, 0), np.linspace(0, 1, 20)
         ),
     )

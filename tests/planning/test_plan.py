@@ -17,19 +17,19 @@ from loopcal.estimate.outlook import information
 from loopcal.io import load_robot
 from loopcal.measure import KINDS, sample_truth
 from loopcal.mechanism import sample_workspace
-from loopcal.planning.certified import certified_design
-from loopcal.planning.compared import MOST, units_of
-from loopcal.planning.criteria import D
-from loopcal.planning.design import Start, design_factor
-from loopcal.planning.information import considered, start_of, unit_rows
-from loopcal.planning.needed import poses_needed
-from loopcal.planning.pose_planning import planned, planned_for
-from loopcal.planning.problem import problem
+from loopcal.planning import PlanOptions
+from loopcal.planning.design import D, PriorInformation, choose_design, factor_design
+from loopcal.planning.information import combine_prior, linearize_candidate_groups, linearize_groups
+from loopcal.planning.pose_combinations import MOST, list_groups
+from loopcal.planning.pose_planning import plan_poses
+from loopcal.planning.problem import prepare_problem
+from loopcal.planning.sample_size import find_sample_size
+from tests.planning.refusals import refuses
 
 UM, URAD = 1e-6, 1e-6
 
 
-def looking(kind: str, sigma: float = 10 * UM, **settings) -> lc.Instrument:
+def instrument_of(kind: str, sigma: float = 10 * UM, **settings) -> lc.Instrument:
     """One kind with one sigma."""
     made = KINDS[kind](**settings)
     return lc.Instrument((lc.Sensor(made, lc.Gaussian(np.full(len(made.noise_columns), sigma))),))
@@ -38,13 +38,17 @@ def looking(kind: str, sigma: float = 10 * UM, **settings) -> lc.Instrument:
 @pytest.fixture(scope="module")
 def tracker():
     """A hexapod to be seen by a laser tracker that measures whole poses."""
-    return problem(load_robot("hexapod-42"), looking("pose", 10 * UM), count=80, seed=1)
+    return prepare_problem(
+        load_robot("hexapod-42"),
+        instrument_of("pose", 10 * UM),
+        PlanOptions(n_candidates=80, seed=1),
+    )
 
 
 @pytest.fixture(scope="module")
 def found(tracker):
     """A plan of twelve poses."""
-    return planned(tracker, 12, hold_out=5)
+    return plan_poses(tracker.with_options(n_poses=12, hold_out=5))
 
 
 @pytest.mark.parametrize(
@@ -58,19 +62,24 @@ def found(tracker):
 )
 def test_rows_of_units_are_those_that_identification_folds(name, kind, settings):
     robot = load_robot(name)
-    free, seen_by = select_free_parameters(robot), looking(kind, **settings)
+    free, seen_by = select_free_parameters(robot), instrument_of(kind, **settings)
     q = sample_workspace(robot, 30, seed=2).solution.q
-    members = units_of(len(q), seen_by, np.random.default_rng(0))
+    members = list_groups(len(q), seen_by, np.random.default_rng(0))
     if members.shape[1] > 1:  # as a sensor looks that is told nothing: each with the next
         members = np.stack([np.arange(30), (np.arange(30) + 1) % 30], axis=1)
-    units = unit_rows(free, seen_by, q, members)
+    units = linearize_groups(free, seen_by, q, members)
     data = lc.simulate(
         robot, sample_workspace(robot, 30, seed=2).coordinates, seen_by, seed=0, controller=robot
     )
     rows = np.concatenate(
-        [units.rows.reshape(-1, units.rows.shape[2]), np.eye(units.rows.shape[2])[len(units.own) :]]
+        [
+            units.rows.reshape(-1, units.rows.shape[2]),
+            np.eye(units.rows.shape[2])[len(units.nuisance) :],
+        ]
     )
-    ours = design_factor(rows[None], Start.nothing(len(free), len(units.own)), _all(free, units))
+    ours = factor_design(
+        rows[None], PriorInformation.none(len(free), len(units.nuisance)), _all(free, units)
+    )
     theirs = information(free, data)[0][0, :-1, :-1]
     theirs = np.concatenate([theirs, np.eye(len(free))])
     # data of this seed have noise, so that the frames found from them differ by some 1e-4 from the
@@ -84,18 +93,20 @@ def test_rows_of_units_are_those_that_identification_folds(name, kind, settings)
 
 def _all(free, units):
     """Every direction of the machine, and those of the own unknowns."""
-    from loopcal.planning.design import directions
+    from loopcal.planning.design import find_observable_space
 
-    return directions(units.rows, Start.tolerances(len(free), len(units.own)))
+    return find_observable_space(
+        units.rows, PriorInformation.from_tolerances(len(free), len(units.nuisance))
+    )
 
 
 def test_what_is_predicted_comes_true(tracker, found):
-    robot, trials = tracker.free.robot, 40
+    robot, trials = tracker.robot, 40
     truth = sample_truth(robot, trials, seed=5)
-    fitted = found.coordinates[~found.held_out]
+    fitted = found.poses.coordinates[~found.poses.held_out]
     measured = lc.simulate_trials(robot, truth, fitted, found.instrument, seed=6)
     estimates = lc.identify_trials(robot, measured, method=lc.MAP()).values
-    q = tracker.candidates.solution.q[tracker.candidates.even]
+    q = tracker.candidates.solution.q[tracker.candidates.is_uniform]
     errors = []
     for true, estimate in zip(truth, estimates, strict=True):
         a, b = (lc.forward(robot.with_values(values), q).T[:, :3, 3] for values in (true, estimate))
@@ -103,160 +114,194 @@ def test_what_is_predicted_comes_true(tracker, found):
     rms = np.sqrt(np.mean(errors))
     # mean of 40 squares that are dominated by a dozen directions: relative sd about sqrt(2 / (40 *
     # 12)) = 0.065 of the square
-    assert rms == pytest.approx(found.expected.position, rel=0.12)
+    assert rms == pytest.approx(found.errors.after.position, rel=0.12)
 
 
 def test_planned_poses_predict_better_than_drawn_ones_and_the_certificate_is_near_one(found):
-    assert found.even is not None
-    assert found.before is not None
-    assert found.expected.position < 0.85 * found.even.position < found.before.position
-    assert 0.9 < found.efficiency <= 1.0
-    assert set(found.figures) == {"D", "I", "A", "E"}
-    text = str(found)
-    assert "12 poses of hexapod-42 to measure (pose) and 5 to judge by" in text
-    assert "mm" in text
-    assert "deg" in text
+    before, random, after = found.errors.before, found.errors.random, found.errors.after
+    assert after.position < 0.85 * random.position < before.position
+    assert 0.9 < found.quality.efficiency <= 1.0
+    assert set(found.quality.figures) == {"D", "I", "A", "E"}
+    by_code = {finding.code: finding.data for finding in found.findings}
+    assert by_code["plan.poses"]["fitted"] == 12
+    assert by_code["plan.poses"]["held_out"] == 5
+    assert by_code["plan.certificate"]["shortfall"] < 10.0
+    assert [q.unit for q in by_code["plan.expected-errors"]["after"]] == ["mm", "deg"]
+    assert 0.0 < by_code["plan.expected-errors"]["reduction"] < 1.0
+
+
+def test_a_plan_is_plain_english_on_one_screen(found):
+    lines = str(found).splitlines()
+    assert lines[0] == "12 poses of hexapod-42 for calibration and 5 for validation (pose)."
+    assert len(lines) < 24
+    assert all(line.endswith(".") for line in lines)
+    for value in (found, found.poses, found.options, found.quality, found.errors):
+        assert len(repr(value)) < 600
 
 
 def test_poses_to_judge_by_are_others_than_those_fitted_and_lie_inside(found, tracker):
+    poses = found.poses
     assert found.n_poses == 12
-    assert found.held_out.sum() == 5
-    assert len(np.unique(found.coordinates, axis=0)) == 17
-    even = tracker.candidates.coordinates[tracker.candidates.even]
-    for pose in found.coordinates[found.held_out]:
-        assert (np.abs(even - pose).max(axis=1) == 0.0).any()
+    assert poses.held_out.sum() == 5
+    assert len(np.unique(poses.coordinates, axis=0)) == 17
+    uniform = tracker.candidates.coordinates[tracker.candidates.is_uniform]
+    for pose in poses.coordinates[poses.held_out]:
+        assert (np.abs(uniform - pose).max(axis=1) == 0.0).any()
 
 
 def test_a_plan_is_the_same_for_the_same_seed():
-    small = problem(load_robot("linear-delta"), looking("position"), count=20, seed=4)
-    one, other = (planned(small, 4, hold_out=2, seed=9) for _ in range(2))
-    np.testing.assert_array_equal(one.coordinates, other.coordinates)
-    np.testing.assert_array_equal(one.held_out, other.held_out)
+    options = PlanOptions(n_poses=4, hold_out=2, n_candidates=20, seed=4)
+    small = prepare_problem(load_robot("linear-delta"), instrument_of("position"), options)
+    one, other = (plan_poses(small) for _ in range(2))
+    np.testing.assert_array_equal(one.poses.coordinates, other.poses.coordinates)
+    np.testing.assert_array_equal(one.poses.held_out, other.poses.held_out)
+
+
+def test_number_and_criterion_are_short_for_options():
+    robot, seen_by = load_robot("linear-delta"), instrument_of("position")
+    short = lc.plan(robot, seen_by, 4, "D", lc.PlanOptions(n_candidates=20, hold_out=0))
+    options = lc.PlanOptions(n_poses=4, criterion="D", n_candidates=20, hold_out=0)
+    long = lc.plan(robot, seen_by, options=options)
+    assert short.to_dict() == long.to_dict()
 
 
 def test_poses_measured_already_are_taken_into_account(tracker, found):
-    robot = tracker.free.robot
-    data = lc.simulate(robot, found.coordinates[~found.held_out], found.instrument, seed=3)
-    after = problem(robot, looking("pose", 10 * UM), measured=data, count=30, seed=2)
-    more = planned(after, 2, hold_out=2)
-    assert more.before is not None
+    robot = tracker.robot
+    fitted = found.poses.coordinates[~found.poses.held_out]
+    data = lc.simulate(robot, fitted, found.instrument, seed=3)
+    options = PlanOptions(n_poses=2, hold_out=2, measured=data, n_candidates=30, seed=2)
+    more = lc.plan(robot, instrument_of("pose", 10 * UM), options=options).errors
     # nothing new was measured yet: what is known now is what the first plan promised, on other
     # poses of the workspace
-    assert more.before.position == pytest.approx(found.expected.position, rel=0.15)
-    assert more.expected.position < more.before.position
+    assert more.before.position == pytest.approx(found.errors.after.position, rel=0.15)
+    assert more.after.position < more.before.position
 
 
 def test_how_many_poses_reach_a_goal_and_below_how_many_none_can():
-    made, goal = (
-        problem(load_robot("linear-delta"), looking("position", 20 * UM), count=60, seed=1),
-        15 * UM,
+    goal = 15 * UM
+    made = prepare_problem(
+        load_robot("linear-delta"),
+        instrument_of("position", 20 * UM),
+        PlanOptions(goal=goal, target="position", hold_out=10, n_candidates=60),
     )
-    needed = poses_needed(made, goal, "position")
-    assert needed.at_least is not None
-    assert needed.enough is not None
+    needed = find_sample_size(made)
     assert needed.values[needed.numbers == needed.enough] <= goal
     assert needed.at_least <= needed.enough <= 1.2 * needed.at_least
     assert (needed.bounds <= needed.values * (1 + 1e-9)).all()
     assert (np.diff(needed.values) < 0.0).all()
-    plan = planned_for(made, goal, "position", hold_out=10)
-    assert plan.expected.position <= goal
+    plan = plan_poses(made)
+    assert plan.errors.after.position <= goal
     assert plan.n_poses < 1.5 * needed.at_least
-    with pytest.raises(
-        EstimationError,
-        match=r"out of reach: \d+ poses leave .* mm, and no choice .*better instrument",
-    ):
-        planned_for(made, 0.05 * UM, "position")
+    with refuses("plan.goal-unreachable", target="position", counted="poses") as data:
+        plan_poses(made.with_options(goal=0.05 * UM))
+    assert data["goal"].value < data["bound"].value <= data["best"].value
 
 
 @pytest.mark.parametrize(
-    ("ask", "said"),
+    ("options", "code", "data"),
     [
-        (
-            {"n_poses": 6},
-            r"6 poses give 36 equations, but there are 42 unknowns .*plan at least 7 poses",
-        ),
-        ({"n_poses": 0}, "0 poses to measure were asked for; ask for 1 or more"),
+        ({"n_poses": 6}, "plan.too-few-equations", {"equations": 36, "unknowns": 42, "needed": 7}),
+        ({"n_poses": 10, "hold_out": 100}, "plan.too-few-held-out", {"requested": 100}),
+        ({"n_poses": 5000, "hold_out": 0}, "plan.too-few-candidates", {"requested": 5000}),
+    ],
+)
+def test_demands_that_cannot_be_met_are_refused_with_the_reason(tracker, options, code, data):
+    with refuses(code, **data):
+        plan_poses(tracker.with_options(**options))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"n_poses": 0}, "0 poses for the fit; give 1 or more"),
         ({"n_poses": 10, "hold_out": -1}, "-1 poses to hold out"),
-        ({"n_poses": 10, "hold_out": 100}, "hold out fewer"),
-        ({"n_poses": 5000, "hold_out": 0}, "only .* are left to choose from"),
         ({"n_poses": 10, "criterion": "G"}, "allowed are I .* and D"),
     ],
 )
-def test_demands_that_cannot_be_met_are_refused_with_the_reason(tracker, ask, said):
-    with pytest.raises(EstimationError, match=said):
-        planned(tracker, **ask)
+def test_numbers_and_names_that_cannot_be_are_refused(tracker, options, message):
+    with pytest.raises(EstimationError, match=message):
+        plan_poses(tracker.with_options(**options))
+
+
+def test_a_number_and_a_goal_exclude_each_other():
+    with pytest.raises(DataError, match="give one of them"):
+        PlanOptions(n_poses=8, goal=1e-5)
 
 
 @pytest.fixture(scope="module")
 def callipers():
     """A delta of which distances between places are measured."""
-    return problem(load_robot("linear-delta"), looking("separation"), count=80, seed=1)
+    options = PlanOptions(n_candidates=80)
+    return prepare_problem(load_robot("linear-delta"), instrument_of("separation"), options)
 
 
 def test_kinds_that_compare_poses_are_planned_in_pairs(callipers):
-    made = callipers
-    found = planned(made, 24, hold_out=4)
-    judged = {i for pair in found.units[found.held_out[found.units].all(axis=1)] for i in pair}
-    assert (
-        f"12 pairs to measure (separation) and 2 to judge by, of {len(found.labels)} poses of "
-        "linear-delta" in str(found)
-    )
-    assert f"of the {found.considered} pairs considered allow" in str(found)
-    assert found.considered == comb(len(made.candidates) - len(judged), 2)
-    assert found.units.shape[1] == 2
-    held = found.held_out[found.units]
+    found = plan_poses(callipers.with_options(n_poses=24, hold_out=4))
+    groups, held_out = found.poses.groups, found.poses.held_out
+    judged = {i for pair in groups[held_out[groups].all(axis=1)] for i in pair}
+    by_code = {finding.code: finding.data for finding in found.findings}
+    content = {"fitted": 12, "held_out": 2, "counted": "pairs", "poses": len(found.poses)}
+    assert content.items() <= by_code["plan.poses"].items()
+    assert by_code["plan.certificate"]["counted"] == "pairs"
+    assert by_code["plan.certificate"]["considered"] == found.quality.considered
+    assert by_code["plan.frames-undetermined"]["frames"] == ("base",)
+    assert found.quality.considered == comb(len(callipers.candidates) - len(judged), 2)
+    assert groups.shape[1] == 2
+    held = held_out[groups]
     assert (held.all(axis=1) | ~held.any(axis=1)).all()
     assert held.all(axis=1).sum() == 2
-    assert "cannot tell how the frame base lies as a whole" in str(found)
     with pytest.raises(EstimationError, match="in multiples of 2"):
-        planned(made, 25)
+        plan_poses(callipers.with_options(n_poses=25))
 
 
 def test_no_choice_of_pairs_beats_what_is_said_of_pairs_not_even_all_pairs_of_few_poses(callipers):
-    made = callipers
-    assert len(made.units.members) == comb(len(made.candidates), 2)
+    members = callipers.groups.members
+    assert len(members) == comb(len(callipers.candidates), 2)
     # twelve poses with all their 66 pairs, the best of some that are drawn
-    poses, rng, tried = np.unique(made.units.members), np.random.default_rng(0), []
+    poses, rng, tried = np.unique(members), np.random.default_rng(0), []
     for few in (rng.choice(poses, 12, replace=False) for _ in range(300)):
-        chosen = np.flatnonzero(np.isin(made.units.members, few).all(axis=1))
-        tried.append((made.accuracy(chosen), len(chosen)))
+        chosen = np.flatnonzero(np.isin(members, few).all(axis=1))
+        tried.append((callipers.predict_errors(chosen), len(chosen)))
     reached, pairs = min(tried, key=lambda one: one[0].position if one[0] else np.inf)
-    assert reached is not None
-    needed = poses_needed(made, reached.position, "position")
-    assert needed.at_least is not None
+    goal = callipers.with_options(goal=reached.position, target="position")
+    needed = find_sample_size(goal)
     # were each pair counted as two poses, twelve poses would contradict what is said
     assert 12 < 2 * needed.at_least <= 2 * pairs == 132
-    sentence = needed.sentences(made.free.robot)[0]
-    assert f"{needed.enough} pairs reach" in sentence
-    assert (
-        f"no choice of fewer than {needed.at_least} of the {len(made.units.members)} pairs "
-        "considered can" in sentence
+    finding = needed.report(callipers.robot)
+    assert finding.code == "plan.goal-reached"
+    numbers = {"number": needed.enough, "at_least": needed.at_least, "considered": len(members)}
+    assert ({"counted": "pairs", "decided_by_equations": False} | numbers).items() <= (
+        finding.data.items()
     )
     assert needed.to_dict()["counted"] == "pairs"
 
 
 def test_of_many_poses_the_pairs_considered_are_different_and_tell_more_than_as_many_drawn():
-    robot, seen_by = load_robot("linear-delta"), looking("separation")
+    robot, seen_by = load_robot("linear-delta"), instrument_of("separation")
     free, q = select_free_parameters(robot), sample_workspace(robot, 400, seed=2).solution.q
     mounted = seen_by.with_tool(robot)
-    ours = considered(free, mounted, q, np.random.default_rng(3))
-    drawn = unit_rows(
-        free, mounted, q, units_of(len(q), mounted, np.random.default_rng(3), len(ours.members))
+    ours = linearize_candidate_groups(free, mounted, q, np.random.default_rng(3))
+    drawn = linearize_groups(
+        free, mounted, q, list_groups(len(q), mounted, np.random.default_rng(3), len(ours.members))
     )
     assert 0.9 * MOST < len(ours.members) <= MOST
     for units in (ours, drawn):
         assert (units.members[:, 0] < units.members[:, 1]).all()
         assert len(np.unique(units.members, axis=0)) == len(units.members)
     best = [
-        certified_design(u.rows, 12, D(), Start.tolerances(len(free)), shakes=5).design.value
+        choose_design(
+            u.rows, 12, D(), PriorInformation.from_tolerances(len(free)), perturbations=5
+        ).design.value
         for u in (ours, drawn)
     ]
     assert best[0] > best[1]
 
 
 def test_a_weak_certificate_is_called_weak(found):
-    assert "little is guaranteed" in str(replace(found, efficiency=0.4))
-    assert "little is guaranteed" not in str(found)
+    weak = replace(found, quality=replace(found.quality, efficiency=0.4))
+    finding = next(f for f in weak.findings if f.code == "plan.weak-certificate")
+    assert finding.data["shortfall"] == pytest.approx(60.0)
+    assert "plan.weak-certificate" not in {f.code for f in found.findings}
 
 
 def test_an_instrument_with_rows_of_its_own_is_refused():
@@ -266,24 +311,24 @@ def test_an_instrument_with_rows_of_its_own_is_refused():
 
 
 def test_an_unknown_frame_changes_nothing_of_what_is_expected_before():
-    robot = load_robot("3-prs")
+    robot, options = load_robot("3-prs"), PlanOptions(n_candidates=30)
     known, unknown = (
-        problem(robot, looking("pose", unknown=u), count=30, seed=1) for u in ((), ("frame",))
+        prepare_problem(robot, instrument_of("pose", unknown=u), options) for u in ((), ("frame",))
     )
     nothing = np.zeros(0, dtype=int)
-    before, behind = known.accuracy(nothing), unknown.accuracy(nothing)
+    before, hidden = known.predict_errors(nothing), unknown.predict_errors(nothing)
     assert before is not None
-    assert behind is not None
+    assert hidden is not None
     assert before.position == pytest.approx(
-        np.sqrt((known.wanted.position**2).sum() / len(known.wanted.shifts)), rel=1e-9
+        np.sqrt((known.prediction.position**2).sum() / len(known.prediction)), rel=1e-9
     )
     # motions of the base, which an unknown frame hides, are left out
-    assert 0.0 < behind.position <= before.position * (1 + 1e-9)
+    assert 0.0 < hidden.position <= before.position * (1 + 1e-9)
 
 
 def test_stated_tolerances_are_the_only_prior():
     free = select_free_parameters(load_robot("hexapod-42"))
     q = sample_workspace(free.robot, 4, seed=1).solution.q
-    units = unit_rows(free, looking("pose"), q, np.arange(4)[:, None])
-    assert len(start_of(free, units).rows) >= 42
+    units = linearize_groups(free, instrument_of("pose"), q, np.arange(4)[:, None])
+    assert len(combine_prior(free, units).rows) >= 42
     assert not free.assumed.any()

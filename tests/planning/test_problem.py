@@ -3,26 +3,29 @@
 what tells nothing.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 import loopcal as lc
-from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.outlook import scene
 from loopcal.io import load_robot
 from loopcal.measure import KINDS
 from loopcal.mechanism import sample_workspace
-from loopcal.planning.needed import poses_needed
-from loopcal.planning.pose_planning import planned, planned_for
-from loopcal.planning.problem import problem
-from loopcal.planning.result import at_least
+from loopcal.planning import PlanOptions
+from loopcal.planning.problem import prepare_problem
+from loopcal.planning.result import round_shortfall
+from loopcal.planning.sample_size import find_sample_size
+from tests.planning.refusals import refuses
 
 UM, URAD = 1e-6, 1e-6
+FEW = PlanOptions(n_candidates=20)
 
 
-def looking(kind: str, sigma: float = 10 * UM, **settings) -> lc.Instrument:
+def instrument_of(kind: str, sigma: float = 10 * UM, **settings) -> lc.Instrument:
     """One kind with one sigma."""
     made = KINDS[kind](**settings)
     return lc.Instrument((lc.Sensor(made, lc.Gaussian(np.full(len(made.noise_columns), sigma))),))
@@ -31,34 +34,35 @@ def looking(kind: str, sigma: float = 10 * UM, **settings) -> lc.Instrument:
 def test_where_errors_are_predicted_depends_neither_on_the_line_of_sight_nor_on_the_candidates():
     robot, sight = (
         load_robot("hexapod-42"),
-        lc.Sight(np.array([0.5, -0.3, 0.6]), np.array([0.0, 0.0, 1.0]), np.radians(60.0)),
+        lc.LineOfSight(np.array([0.5, -0.3, 0.6]), np.array([0.0, 0.0, 1.0]), np.radians(60.0)),
     )
     free, other, narrow = (
-        problem(robot, looking("pose"), constraints, count=count, seed=1)
+        prepare_problem(
+            robot, instrument_of("pose"), PlanOptions(constraints=constraints, n_candidates=count)
+        )
         for constraints, count in (
-            (None, 30),
-            (None, 60),
+            (lc.Constraints(), 30),
+            (lc.Constraints(), 60),
             (lc.Constraints(0.3, np.radians(12.0), sight), 30),
         )
     )
     for made in (other, narrow):
-        assert_allclose(made.wanted.pose, free.wanted.pose, atol=1e-12)  # [m] per tolerance
-    assert len(free.wanted.shifts) == 200
+        assert_allclose(made.prediction.pose, free.prediction.pose, atol=1e-12)  # [m] per tolerance
+    assert len(free.prediction) == 200
 
 
 def test_of_many_listed_poses_errors_are_predicted_all_over_the_list():
     robot = load_robot("linear-delta")
     listed = sample_workspace(robot, 260, seed=3).coordinates
     listed = listed[np.lexsort(listed.T[::-1])]
-    made = problem(robot, looking("position"), poses=listed)
-    twists = scene(select_free_parameters(robot), lc.inverse(robot, listed[200:]).q).twists[
-        0, :, 3:
-    ]
-    # the instrument tells all nine parameters: nothing is projected out of what is predicted
+    made = prepare_problem(robot, instrument_of("position"), PlanOptions(allowed_poses=listed))
+    free = select_free_parameters(robot)
+    twists = scene(free, lc.inverse(robot, listed[200:]).q).twists[0, :, 3:]
+    # the instrument determines all nine parameters: nothing is projected out of the prediction
     found = [
-        np.abs(made.wanted.shifts - one).max(axis=(1, 2)).min() < 1e-9 for one in twists
+        np.abs(made.prediction.displacements - one).max(axis=(1, 2)).min() < 1e-9 for one in twists
     ]  # [m] per tolerance
-    assert len(made.wanted.shifts) == 200
+    assert len(made.prediction) == 200
     # the last 60 of the list: with 200 of 260 drawn, 46 of them expected with a standard deviation
     # of 2.9
     assert sum(found) > 30
@@ -66,55 +70,48 @@ def test_of_many_listed_poses_errors_are_predicted_all_over_the_list():
 
 @pytest.mark.parametrize("kind", ["locked", "joint", "inclination"])
 def test_an_instrument_that_tells_nothing_is_refused(kind):
-    with pytest.raises(
-        EstimationError,
-        match=f"kind {kind} tells nothing of the 9 free parameters .*choose another kind",
-    ):
-        problem(load_robot("linear-delta"), looking(kind), count=20)
+    with refuses("plan.nothing-observable", kinds=(kind,), parameters=9):
+        prepare_problem(load_robot("linear-delta"), instrument_of(kind), FEW)
 
 
 def test_equations_of_earlier_measurements_pay_for_their_own_set_up_first():
     robot = load_robot("linear-delta")
-    before = lc.simulate(
-        robot,
-        sample_workspace(robot, 5, seed=3).coordinates,
-        looking("position", unknown=("frame",)),
-        seed=1,
-    )
-    assert problem(robot, looking("position"), measured=before, count=20).equations == 15 - 6
+    poses = sample_workspace(robot, 5, seed=3).coordinates
+    before = lc.simulate(robot, poses, instrument_of("position", unknown=("frame",)), seed=1)
+    made = prepare_problem(robot, instrument_of("position"), replace(FEW, measured=before))
+    assert made.n_earlier_equations == 15 - 6
 
 
 def test_an_orientation_that_the_machine_does_not_have_cannot_be_asked_for():
-    made = problem(load_robot("linear-delta"), looking("position"), count=20)
-    with pytest.raises(EstimationError, match=r"linear-delta does not turn.*give a length"):
-        planned_for(made, 10 * URAD, "orientation")
+    options = replace(FEW, goal=10 * URAD, target="orientation")
+    with refuses("plan.target-unobservable", target="orientation", robot="linear-delta"):
+        lc.plan(load_robot("linear-delta"), instrument_of("position"), options=options)
 
 
-def test_where_equations_decide_the_number_of_poses_the_sentence_says_so():
-    made = problem(load_robot("linear-delta"), looking("position", 0.1 * UM), count=20)
-    found = poses_needed(made, 100 * UM, "position")
+def test_where_equations_decide_the_number_of_poses_the_finding_says_so():
+    options = replace(FEW, goal=100 * UM, target="position")
+    made = prepare_problem(load_robot("linear-delta"), instrument_of("position", 0.1 * UM), options)
+    found = find_sample_size(made)
     assert found.enough == 3
-    assert "3 poses reach" in found.sentences(made.free.robot)[0]
-    assert (
-        "fewer give fewer equations than there are unknowns" in found.sentences(made.free.robot)[0]
-    )
+    finding = found.report(made.robot)
+    assert finding.code == "plan.goal-reached"
+    assert finding.data["number"] == 3
+    assert finding.data["decided_by_equations"]
 
 
-def test_what_is_guaranteed_is_rounded_down():
-    assert [at_least(share) for share in (0.99965, 1.0, 0.5)] == ["99.9%", "100.0%", "50.0%"]
+def test_what_a_certificate_leaves_open_is_rounded_up():
+    assert [round_shortfall(share) for share in (0.99965, 1.0, 0.5)] == [0.1, 0.0, 50.0]
 
 
 def test_poses_get_names_that_were_not_measured_yet():
     robot = load_robot("linear-delta")
-    before = lc.simulate(
-        robot, sample_workspace(robot, 12, seed=3).coordinates, looking("position"), seed=1
+    poses = sample_workspace(robot, 12, seed=3).coordinates
+    before = lc.simulate(robot, poses, instrument_of("position"), seed=1)
+    options = PlanOptions(
+        n_poses=3, hold_out=0, measured=before, n_candidates=20, used_names=("14", "p3")
     )
-    found = planned(
-        problem(robot, looking("position"), measured=before, count=20, taken=("14", "p3")),
-        3,
-        hold_out=0,
-    )
-    assert found.labels == ("15", "16", "17")
+    found = lc.plan(robot, instrument_of("position"), options=options)
+    assert found.poses.labels == ("15", "16", "17")
 
 
 def test_readings_are_stated_as_finely_in_metres_as_in_millimetres(tmp_path):
@@ -126,10 +123,10 @@ def test_readings_are_stated_as_finely_in_metres_as_in_millimetres(tmp_path):
         "workspace: {x: [-0.06, 0.06], y: [-0.06, 0.06], z: [0, 0.25]}\n"
         "tolerances: {radius: {sd: 0.0005}, arms: {sd: 0.0003}, stops: {sd: 0.0005}}\n"
     )
-    found = planned(
-        problem(load_robot(tmp_path / "metres.yaml"), looking("position"), count=20), 4, hold_out=0
-    )
-    exact = lc.inverse(found.robot, found.coordinates).q
+    robot = load_robot(tmp_path / "metres.yaml")
+    options = replace(FEW, n_poses=4, hold_out=0)
+    found = lc.plan(robot, instrument_of("position"), options=options)
+    exact = lc.inverse(found.robot, found.poses.coordinates).q
     assert (
-        np.abs(found.readings - exact).max() <= 0.51e-9
+        np.abs(found.poses.readings - exact).max() <= 0.51e-9
     )  # [m], half of the last decimal place, a nanometre

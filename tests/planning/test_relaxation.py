@@ -8,11 +8,18 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from loopcal.errors import EstimationError
-from loopcal.planning.criteria import A, Criterion, D, I, evaluate
-from loopcal.planning.design import Start, design_factor
-from loopcal.planning.relaxation import relaxed_design
+from loopcal.planning.design import (
+    A,
+    Criterion,
+    D,
+    I,
+    PriorInformation,
+    evaluate_criterion,
+    factor_design,
+    relax_design,
+)
 from tests.planning.polynomials import Array, grid, polynomial, random_rows
+from tests.planning.refusals import refuses
 
 GAP = 1e-7
 MOMENTS = np.linalg.cholesky(
@@ -40,8 +47,8 @@ def test_parabola_known_weights_and_values(
     criterion: Criterion, own: int, shares: tuple[float, ...], value: float
 ) -> None:
     x, n = grid(), 12
-    start = Start.nothing(3 - own, own)
-    found = relaxed_design(polynomial(x, 2), n, criterion, start, GAP, repeats=True)
+    start = PriorInformation.none(3 - own, own)
+    found = relax_design(polynomial(x, 2), n, criterion, start, GAP, repeats=True)
     q = 3 - own
     known = value + q * np.log(n) if isinstance(criterion, D) else value / n
     assert found.converged
@@ -55,26 +62,26 @@ def test_parabola_known_weights_and_values(
 
 def test_cubic_known_points() -> None:
     x = grid(extra=1 / np.sqrt(5))
-    found = relaxed_design(polynomial(x, 3), 4, D(), Start.nothing(4), GAP, repeats=True)
+    found = relax_design(polynomial(x, 3), 4, D(), PriorInformation.none(4), GAP, repeats=True)
     for at in (-1.0, -1 / np.sqrt(5), 1 / np.sqrt(5), 1.0):
         assert found.weights[abs(x - at) < 0.05].sum() == pytest.approx(1.0, abs=2e-3)
 
 
 def test_at_the_optimum_no_slope_exceeds_the_mean_and_the_design_lies_where_it_is_reached() -> None:
-    found = relaxed_design(polynomial(grid(), 2), 12, D(), Start.nothing(3), GAP, repeats=True)
+    found = relax_design(
+        polynomial(grid(), 2), 12, D(), PriorInformation.none(3), GAP, repeats=True
+    )
     assert (12 * found.slopes).max() == pytest.approx(
         3.0, rel=1e-5
     )  # variance of the prediction at most p: Kiefer, Wolfowitz
     np.testing.assert_allclose(12 * found.slopes[found.weights > 0.1], 3.0, rtol=1e-3)
 
 
-def best_of_all(rows: Array, n: int, criterion: Criterion, start: Start, found) -> float:
+def best_of_all(rows: Array, n: int, criterion: Criterion, start: PriorInformation, found) -> float:
     """Best value of all subsets."""
     values = [
-        evaluate(
-            criterion,
-            design_factor(rows[list(chosen)], start, found.directions),
-            found.directions.machine,
+        evaluate_criterion(
+            criterion, factor_design(rows[list(chosen)], start, found.space), found.space.machine
         )
         for chosen in combinations(range(len(rows)), n)
     ]
@@ -88,9 +95,9 @@ def test_the_bound_is_better_than_every_subset_and_the_cap_makes_it_tighter(
     criterion: Criterion, own: int, prior: bool
 ) -> None:
     rows = random_rows(own=own)
-    start = Start.tolerances(4, own) if prior else Start.nothing(4, own)
-    capped = relaxed_design(rows, 5, criterion, start, 1e-6)
-    free = relaxed_design(rows, 5, criterion, start, 1e-6, repeats=True)
+    start = PriorInformation.from_tolerances(4, own) if prior else PriorInformation.none(4, own)
+    capped = relax_design(rows, 5, criterion, start, 1e-6)
+    free = relax_design(rows, 5, criterion, start, 1e-6, repeats=True)
     best = best_of_all(rows, 5, criterion, start, capped)
     assert capped.converged
     assert free.converged
@@ -102,14 +109,14 @@ def test_the_bound_is_better_than_every_subset_and_the_cap_makes_it_tighter(
 
 def test_the_bound_holds_long_before_the_optimum() -> None:
     rows = random_rows()
-    rough = relaxed_design(rows, 5, D(), Start.nothing(4), gap=0.9)
-    assert rough.bound >= best_of_all(rows, 5, D(), Start.nothing(4), rough)
+    rough = relax_design(rows, 5, D(), PriorInformation.none(4), gap=0.9)
+    assert rough.bound >= best_of_all(rows, 5, D(), PriorInformation.none(4), rough)
     assert rough.value <= rough.bound
 
 
 def test_all_candidates_are_the_best_design_of_all_candidates() -> None:
     rows = random_rows()
-    found = relaxed_design(rows, 12, A(), Start.nothing(4))
+    found = relax_design(rows, 12, A(), PriorInformation.none(4))
     assert found.value == found.bound
     np.testing.assert_array_equal(found.weights, 1.0)
 
@@ -117,7 +124,7 @@ def test_all_candidates_are_the_best_design_of_all_candidates() -> None:
 def test_units_that_are_not_allowed_have_no_weight() -> None:
     rows = random_rows(N=30)
     rows[:10, 0, 0] = np.nan
-    found = relaxed_design(rows, 6, D(), Start.nothing(4))
+    found = relax_design(rows, 6, D(), PriorInformation.none(4))
     assert found.weights[:10].max() == 0.0
     assert found.converged
 
@@ -125,5 +132,5 @@ def test_units_that_are_not_allowed_have_no_weight() -> None:
 def test_weights_of_a_prediction_that_nothing_determines_are_refused() -> None:
     rows = random_rows()
     rows[:, :, 3] = 0.0
-    with pytest.raises(EstimationError, match="depends on no direction that can be known"):
-        relaxed_design(rows, 5, I(np.array([[0.0, 0.0, 0.0, 1.0]])), Start.nothing(4))
+    with refuses("plan.prediction-unobservable"):
+        relax_design(rows, 5, I(np.array([[0.0, 0.0, 0.0, 1.0]])), PriorInformation.none(4))

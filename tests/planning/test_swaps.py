@@ -4,11 +4,15 @@
 import numpy as np
 import pytest
 
-from loopcal.planning.barrier import derivatives
-from loopcal.planning.criteria import A, Criterion, D, I
-from loopcal.planning.design import Start, directions
-from loopcal.planning.scoring import Scoring, make_scoring
-from loopcal.planning.swaps import additions, see, swaps
+from loopcal.planning.design import A, Criterion, D, I, PriorInformation, find_observable_space
+from loopcal.planning.design.relaxation import differentiate_score
+from loopcal.planning.design.scoring import (
+    Scoring,
+    build_scoring,
+    compute_swap_terms,
+    score_additions,
+    score_swaps,
+)
 from tests.planning.polynomials import Array, random_rows
 
 CRITERIA = (D(), A(), I(np.random.default_rng(1).normal(size=(9, 4)), 3))
@@ -23,9 +27,9 @@ NAMES = [
 def ready(criterion: Criterion, own: int, prior: bool) -> tuple[Scoring, Array]:
     """A random problem's scoring and rows."""
     rows = random_rows(own=own)
-    start = Start.tolerances(4, own) if prior else Start.nothing(4, own)
-    scoring = make_scoring(rows, 0.5, criterion, start, directions(rows, start))
-    return scoring, scoring.ready(rows)
+    start = PriorInformation.from_tolerances(4, own) if prior else PriorInformation.none(4, own)
+    scoring = build_scoring(rows, 0.5, criterion, start, find_observable_space(rows, start))
+    return scoring, scoring.scale_rows(rows)
 
 
 @pytest.mark.parametrize(("criterion", "own", "prior"), CASES, ids=NAMES)
@@ -35,9 +39,9 @@ def test_the_gain_of_every_swap_is_that_of_the_new_design(
     scoring, X = ready(criterion, own, prior)
     chosen = np.array([0, 3, 4, 7, 9])
     R = scoring.factor(X[chosen])
-    seen = see(scoring, R, X)
+    terms = compute_swap_terms(scoring, R, X)
     for j, out in enumerate(chosen):
-        gains = swaps(seen, seen.Y[out], None if seen.V is None else seen.V[out])
+        gains = score_swaps(terms, out)
         designs = [np.concatenate([np.delete(chosen, j), [k]]) for k in range(len(X))]
         anew = [scoring.score(scoring.factor(X[design])) - scoring.score(R) for design in designs]
         np.testing.assert_allclose(
@@ -55,7 +59,9 @@ def test_the_gain_of_every_addition_is_that_of_the_new_design(
         scoring.score(scoring.factor(np.concatenate([X[:4], X[k : k + 1]]))) - scoring.score(R)
         for k in range(len(X))
     ]
-    np.testing.assert_allclose(additions(see(scoring, R, X)), anew, atol=1e-9)  # in logs, as above
+    np.testing.assert_allclose(
+        score_additions(compute_swap_terms(scoring, R, X)), anew, atol=1e-9
+    )  # in logs, as above
 
 
 @pytest.mark.parametrize("criterion", CRITERIA, ids=lambda criterion: criterion.name)
@@ -64,8 +70,8 @@ def test_a_swap_is_exact_where_the_design_without_the_unit_is_singular(
 ) -> None:
     scoring, X = ready(criterion, 0, False)
     R = scoring.factor(X[:2])  # four equations for four unknowns
-    seen = see(scoring, R, X)
-    gains = swaps(seen, seen.Y[0], None if seen.V is None else seen.V[0])
+    terms = compute_swap_terms(scoring, R, X)
+    gains = score_swaps(terms, 0)
     anew = [scoring.score(scoring.factor(X[[k, 1]])) - scoring.score(R) for k in range(2, len(X))]
     np.testing.assert_allclose(
         gains[2:], anew, atol=1e-8
@@ -74,7 +80,7 @@ def test_a_swap_is_exact_where_the_design_without_the_unit_is_singular(
 
 
 @pytest.mark.parametrize(("criterion", "own", "prior"), CASES, ids=NAMES)
-def testderivatives_by_weights_agree_with_differences(
+def test_derivatives_by_weights_agree_with_differences(
     criterion: Criterion, own: int, prior: bool
 ) -> None:
     scoring, X = ready(criterion, own, prior)
@@ -83,14 +89,15 @@ def testderivatives_by_weights_agree_with_differences(
     def score(weights: Array) -> float:
         return scoring.score(scoring.factor(np.sqrt(weights)[:, None, None] * X))
 
-    slope, curve = derivatives(scoring, X, w)
+    slope, curve = differentiate_score(scoring, X, w)
     h = 1e-4
     steps = h * np.eye(len(w))
     np.testing.assert_allclose(
         slope, [(score(w + e) - score(w - e)) / (2 * h) for e in steps], atol=1e-6
     )  # h^2
     differences = [
-        (derivatives(scoring, X, w + e)[0] - derivatives(scoring, X, w - e)[0]) / (2 * h)
+        (differentiate_score(scoring, X, w + e)[0] - differentiate_score(scoring, X, w - e)[0])
+        / (2 * h)
         for e in steps
     ]
     np.testing.assert_allclose(

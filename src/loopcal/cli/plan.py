@@ -63,7 +63,7 @@ class Asked:
 
     def constraints(self) -> Constraints:
         """Return the constraints that the options describe."""
-        from loopcal.planning.constraints import Constraints, Sight
+        from loopcal.planning.constraints import Constraints, LineOfSight
 
         if self.seen_from is None:
             given = click.get_current_context().get_parameter_source
@@ -75,7 +75,7 @@ class Asked:
             return Constraints(self.min_margin, self.max_tilt)
         station = _three(self.seen_from, "--seen-from", Dimension.LENGTH)
         facing = _three(self.facing, "--facing", None)
-        sight = Sight(
+        sight = LineOfSight(
             station,
             facing,
             self.cone,
@@ -304,8 +304,8 @@ def _planned(
 ) -> Plan:
     """Plan as the options ask."""
     from loopcal.io.data.measurement_file import load_poses
-    from loopcal.planning.pose_planning import planned, planned_for
-    from loopcal.planning.problem import problem
+    from loopcal.planning import PlanOptions
+    from loopcal.planning import plan as plan_poses
 
     goal, n = options["accuracy"], options["poses"]
     if goal is not None and n is not None:
@@ -317,21 +317,24 @@ def _planned(
         raise DataError("--accuracy shows its own curve; leave out --curve")
     poses = None if allowed is None else load_poses(allowed, robot)
     before, taken = (None, ()) if not measured else _known(measured, robot)
-    made = problem(
+    error, target = (None, "pose") if goal is None else goal
+    return plan_poses(
         robot,
         looking,
-        options["asked"].constraints(),
-        poses,
-        before,
-        options["candidates"],
-        seed,
-        taken,
-    )
-    criterion, held = options["criterion"], options["hold_out"]
-    if goal is not None:
-        return planned_for(made, goal[0], goal[1], criterion, hold_out=held, seed=seed)
-    return planned(
-        made, POSES if n is None else n, criterion, hold_out=held, curve=options["curve"], seed=seed
+        options=PlanOptions(
+            n_poses=n,
+            criterion=options["criterion"],
+            target=target,
+            goal=error,
+            hold_out=options["hold_out"],
+            constraints=options["asked"].constraints(),
+            allowed_poses=poses,
+            n_candidates=options["candidates"],
+            measured=before,
+            used_names=taken,
+            curve=options["curve"],
+            seed=seed,
+        ),
     )
 
 
@@ -380,7 +383,7 @@ def _write(output: Path, made: Plan, inputs: Mapping[str, Path], force: bool) ->
 
     texts = {SHEET: format_sheet(made), DATA: format_plan_data(made)}
     document = made.to_dict() | {
-        "made_by": collect_provenance(sys.argv, inputs, {"plan": made.seed})
+        "made_by": collect_provenance(sys.argv, inputs, {"plan": made.options.seed})
     }
     pictures = {"plan.png": functools.partial(save_figure, figure=draw_plan(made))}
     if made.curve is not None:

@@ -73,14 +73,14 @@ def plan_groups(
     from loopcal.io.runs.plan_folder import DATA, SHEET, write_plan_folder
     from loopcal.io.runs.run_folder import collect_provenance
     from loopcal.io.runs.surface_sheet import format_surface_data, format_surface_sheet
-    from loopcal.planning.surface_groups import plan_surfaces
+    from loopcal.planning.plane_line_planning import SurfaceOptions, plan_surfaces
 
     groups, points = (
         usual if given is None else given
         for given, usual in zip(counts, (GROUPS, POINTS), strict=True)
     )
     show.progress("planning ...")
-    made = plan_surfaces(robot, groups, points, sigma, constraints, seed)
+    made = plan_surfaces(robot, SurfaceOptions(groups, points, sigma, constraints, seed))
     document = made.to_dict() | {"made_by": collect_provenance(sys.argv, inputs, {"plan": seed})}
     write_plan_folder(
         output,

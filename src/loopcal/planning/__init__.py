@@ -2,7 +2,11 @@
 """Plan which poses to measure."""
 
 from loopcal.planning.constraints import Constraints as Constraints
-from loopcal.planning.constraints import Sight as Sight
+from loopcal.planning.constraints import LineOfSight as LineOfSight
+from loopcal.planning.options import PlanOptions as PlanOptions
+from loopcal.planning.options import Target as Target
+from loopcal.planning.plane_line_planning import SurfaceOptions as SurfaceOptions
+from loopcal.planning.plane_line_planning import SurfacePlan as SurfacePlan
+from loopcal.planning.plane_line_planning import plan_surfaces as plan_surfaces
 from loopcal.planning.pose_planning import plan as plan
 from loopcal.planning.result import Plan as Plan
-from loopcal.planning.surface_groups import plan_surfaces as plan_surfaces

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses that could be measured: spread through the workspace and along its boundary, each judged by
-every constraint.
+"""Candidate poses, drawn inside the workspace and at its boundary, and checked by all constraints.
 
-Informative poses lie at the boundary of what can be reached: half of the candidates are therefore
-drawn inside, and half are drawn on faces, edges and corners of the stated ranges and, where these
-cannot be reached, drawn back along a straight line towards the middle until they can. Kept are
-those with an allowed straight way from home, so that home is a way round everything that may not be
-crossed.
+Informative poses lie at the boundary of what can be reached. Half of the candidates are therefore
+drawn inside. The other half are drawn on faces, edges and corners of the stated ranges; where these
+cannot be reached, they move back along a straight line towards the middle until they can.
+Candidates have an allowed straight path from home, so that every pose can be approached via home.
 """
 
 from __future__ import annotations
@@ -18,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.errors import MechanismError
+from loopcal.findings import Finding, report_finding
 from loopcal.mechanism import (
     MIN_DRAWS,
     MIN_REACHABLE_SHARE,
@@ -29,13 +28,20 @@ from loopcal.mechanism import (
     read_coordinates,
     workspace_ranges,
 )
-from loopcal.planning.constraints import Constraints, Rules, Verdicts, refusals, rules
-from loopcal.planning.paths import between, distance, follow
-from loopcal.typing import FloatArray
+from loopcal.planning.constraints import (
+    ConstraintChecker,
+    Constraints,
+    Violation,
+    build_checker,
+    list_reasons,
+    mark_on_path,
+)
+from loopcal.planning.path import check_paths, interpolate_path, measure_distance
+from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, find_unit
 
 HALVINGS = 12
-"""Bisections of the line to the middle: the boundary is met to 1/4096 of it."""
+"""Bisections of the line to the middle: the boundary is located to 1/4096 of it."""
 DIGITS = 5
 """Decimal places of the robot's size, in its unit, to which coordinates are commanded; the same of
 a radian.
@@ -53,29 +59,30 @@ class Candidates:
     Attributes
     ----------
     coordinates : (n, c) controlled coordinates [m, rad]. solution : their readings and poses.
-    even : (n,) True for those drawn evenly from the workspace, which stand for it.
-    refused : reason -> number of poses that it ruled out. tried : number of poses in all. rules :
-        judged by.
+    is_uniform : (n,) True for those drawn evenly from the workspace, which represent it.
+    excluded : violation -> number of poses that it excluded.
+    n_drawn : number of poses before exclusion. checker : the constraints.
     """
 
     coordinates: FloatArray
     solution: Solution
-    even: np.ndarray
-    refused: Mapping[str, int]
-    tried: int
-    rules: Rules
+    is_uniform: BoolArray
+    excluded: Mapping[Violation, int]
+    n_drawn: int
+    checker: ConstraintChecker
 
     def __len__(self) -> int:
         return len(self.coordinates)
 
-    def sentence(self) -> str:
-        """Say how many poses are left, and what ruled out the others."""
-        out = self.tried - len(self)
-        ruled = f"; ruled out: {refusals(dict(self.refused), len(self.refused))}" if out else ""
-        return f"{len(self)} of {self.tried} poses may be measured{ruled}"
+    def report(self) -> Finding:
+        """Return how many poses remain, and which constraints excluded the others."""
+        reasons = list_reasons(self.excluded)
+        return report_finding(
+            "plan.candidates", allowed=len(self), total=self.n_drawn, reasons=reasons
+        )
 
 
-def candidates(
+def draw_candidates(
     robot: Mechanism,
     constraints: Constraints | None = None,
     count: int = 1000,
@@ -86,53 +93,56 @@ def candidates(
     Raises
     ------
     MechanismError
-        The robot states no workspace, nothing of it is left by the constraints, or home itself
-        breaks one.
+        The robot states no workspace, the constraints exclude all of it, or home itself violates
+        one.
     """
     rng = np.random.default_rng(seed)
-    judged_by, wanted = _at_home(robot, constraints), workspace_ranges(robot)
-    refused: Counter[str] = Counter()
-    inside, tried = _inside(judged_by, rng, wanted, count - count // 2, refused)
-    edge = _boundary(judged_by, rng, wanted, count // 2, inside)
+    checker, bounds = _build_home_checker(robot, constraints), workspace_ranges(robot)
+    excluded: Counter[Violation] = Counter()
+    inside, n_drawn = _draw_inside(checker, rng, bounds, count - count // 2, excluded)
+    edge = _draw_boundary(checker, rng, bounds, count // 2, inside)
     poses = np.concatenate([inside, edge])
-    even = np.arange(len(poses)) < len(inside)
-    return _reached(judged_by, poses, even, refused, tried + len(edge))
+    uniform = np.arange(len(poses)) < len(inside)
+    return _keep_reachable(checker, poses, uniform, excluded, n_drawn + len(edge))
 
 
-def listed_candidates(
+def check_listed_poses(
     robot: Mechanism, poses: FloatArray, constraints: Constraints | None = None
 ) -> Candidates:
-    """Return those of the given poses (n, c) [m, rad] that are allowed; they stand for the
+    """Return those of the given poses (n, c) [m, rad] that are allowed; they represent the
     workspace themselves.
 
     Raises
     ------
     MechanismError
-        None of them is allowed, or home itself breaks a constraint.
+        None of them is allowed, or home itself violates a constraint.
     """
-    judged_by = _at_home(robot, constraints)
+    checker = _build_home_checker(robot, constraints)
     poses = np.unique(poses, axis=0)
-    verdict = judged_by.judge(inverse(robot, poses))
-    refused: Counter[str] = Counter(verdict.counts())
-    good = poses[verdict.allowed]
+    check = checker.check_poses(inverse(robot, poses))
+    excluded: Counter[Violation] = Counter(check.count_violations())
+    good = poses[check.allowed]
     if not len(good):
         raise MechanismError(
-            f"none of the {len(poses)} poses given for {robot.name} is allowed: "
-            f"{refusals(dict(refused))}; correct the poses, "
-            "or relax a constraint"
+            report_finding(
+                "plan.listed-poses-excluded",
+                robot=robot.name,
+                total=len(poses),
+                reasons=list_reasons(excluded),
+            )
         )
-    return _reached(judged_by, good, np.ones(len(good), dtype=bool), refused, len(poses))
+    return _keep_reachable(checker, good, np.ones(len(good), dtype=bool), excluded, len(poses))
 
 
-def rounded(
+def round_coordinates(
     robot: Mechanism, coordinates: FloatArray, towards: FloatArray | None = None
 ) -> FloatArray:
-    """Round coordinates (n, c) to a step that a person types: DIGITS of the robot's size and of a
+    """Round coordinates (n, c) to steps that a person can type: DIGITS of the robot's size and of a
     radian, in its units.
 
     Parameters
     ----------
-    towards : (c,) place to which everything is rounded; default: to the nearest.
+    towards : (c,) place towards which everything is rounded; default: to the nearest.
     """
     steps = []
     for name in robot.controlled:
@@ -150,115 +160,112 @@ def rounded(
 
 
 def home_coordinates(robot: Mechanism) -> FloatArray:
-    """Controlled coordinates (c,) of home [m, rad]."""
+    """Return the controlled coordinates (c,) of home [m, rad]."""
     return read_coordinates(robot.home, robot.controlled)
 
 
-def _at_home(robot: Mechanism, constraints: Constraints | None) -> Rules:
-    """Return the rules, after a look at home, from which every way starts."""
-    found = rules(robot, constraints or Constraints())
-    verdict = found.judge(inverse(robot, home_coordinates(robot)[None]), at_pose=False)
-    if not verdict.allowed[0]:
+def _build_home_checker(robot: Mechanism, constraints: Constraints | None) -> ConstraintChecker:
+    """Return the checker of a robot whose home is allowed, since every path starts there."""
+    checker = build_checker(robot, constraints)
+    check = checker.check_poses(inverse(robot, home_coordinates(robot)[None]), at_pose=False)
+    if not check.allowed[0]:
+        reasons = list_reasons(check.count_violations())
         raise MechanismError(
-            f"every way starts at the home of {robot.name}, and there {verdict.why[0]}; choose "
-            "another home in the robot file, "
-            "or relax the constraint"
+            report_finding("plan.home-excluded", robot=robot.name, reasons=reasons)
         )
-    return found
+    return checker
 
 
-def _inside(
-    judged_by: Rules,
+def _draw_inside(
+    checker: ConstraintChecker,
     rng: np.random.Generator,
-    wanted: Mapping[str, tuple[float, float]],
+    bounds: Mapping[str, tuple[float, float]],
     count: int,
-    refused: Counter[str],
+    excluded: Counter[Violation],
 ) -> tuple[FloatArray, int]:
-    """Draw poses evenly (count, c) and count the refused; also how many were tried."""
-    robot, parts, kept, tried = judged_by.robot, [], 0, 0
+    """Draw allowed poses evenly (count, c), count the excluded; return also the number drawn."""
+    robot, parts, kept, total = checker.robot, [], 0, 0
     while kept < count:
-        poses = rounded(
-            robot,
-            draw_coordinates(
-                rng,
-                robot.controlled,
-                wanted,
-                count if not kept else max(count - kept, count // 10, 1),
-            ),
-        )
-        verdict = judged_by.judge(inverse(robot, poses))
-        refused.update(verdict.counts())
-        parts.append(poses[verdict.allowed])
-        kept, tried = kept + len(parts[-1]), tried + len(poses)
-        if tried >= MIN_DRAWS and kept < MIN_REACHABLE_SHARE * tried:
+        number = count if not kept else max(count - kept, count // 10, 1)
+        poses = round_coordinates(robot, draw_coordinates(rng, robot.controlled, bounds, number))
+        check = checker.check_poses(inverse(robot, poses))
+        excluded.update(check.count_violations())
+        parts.append(poses[check.allowed])
+        kept, total = kept + len(parts[-1]), total + len(poses)
+        if total >= MIN_DRAWS and kept < MIN_REACHABLE_SHARE * total:
             raise MechanismError(
-                f"the constraints leave nothing of the workspace of {robot.name}: {kept} of "
-                f"{tried} poses drawn from it are "
-                f"allowed; refused were {refusals(dict(refused.most_common()))}; relax one of these"
+                report_finding(
+                    "plan.workspace-excluded",
+                    robot=robot.name,
+                    allowed=kept,
+                    total=total,
+                    reasons=list_reasons(dict(excluded.most_common())),
+                )
             )
-    return np.concatenate(parts), tried
+    return np.concatenate(parts), total
 
 
-def _boundary(
-    judged_by: Rules,
+def _draw_boundary(
+    checker: ConstraintChecker,
     rng: np.random.Generator,
-    wanted: Mapping[str, tuple[float, float]],
+    bounds: Mapping[str, tuple[float, float]],
     count: int,
     inside: FloatArray,
 ) -> FloatArray:
-    """Poses (count, c) at the ends of ranges, drawn back to the boundary of what is allowed."""
-    robot, names = judged_by.robot, judged_by.robot.controlled
-    low, high = np.array([wanted[name] for name in names]).T
+    """Draw poses (count, c) at the ends of ranges, moved back to the boundary of the allowed."""
+    robot, names = checker.robot, checker.robot.controlled
+    low, high = np.array([bounds[name] for name in names]).T
     full = np.isclose(high - low, 2.0 * np.pi)
-    poses = draw_coordinates(rng, names, wanted, count)
+    poses = draw_coordinates(rng, names, bounds, count)
     end = rng.random((count, len(names))) < 0.5
     put = (rng.random((count, len(names))) < ON_BOUNDARY) & ~full
-    # one coordinate at least is at an end, unless none has one
+    # at least one coordinate is at an end, unless none has an end
     put[
         np.arange(count), rng.choice(np.flatnonzero(~full), count) if not full.all() else 0
     ] |= not full.all()
     poses = np.where(put, np.where(end, high, low), poses)
-    middle = inside[np.argmin(distance(robot, inside, np.median(inside, axis=0)[None]))]
+    median = np.median(inside, axis=0)[None]
+    middle = inside[np.argmin(measure_distance(robot, inside, median))]
     anchor = np.broadcast_to(middle, poses.shape)
     good = np.zeros(count)
-    good[judged_by.judge(inverse(robot, poses)).allowed] = 1.0
+    good[checker.check_poses(inverse(robot, poses)).allowed] = 1.0
     bad = np.ones(count)
     for _ in range(HALVINGS):
-        open_ = np.flatnonzero(good < 1.0)
-        if not len(open_):
+        left = np.flatnonzero(good < 1.0)
+        if not len(left):
             break
-        share = (good[open_] + bad[open_]) / 2.0
-        allowed = judged_by.judge(
-            inverse(robot, between(robot, anchor[open_], poses[open_], share))
-        ).allowed
-        good[open_], bad[open_] = (
-            np.where(allowed, share, good[open_]),
-            np.where(allowed, bad[open_], share),
+        share = (good[left] + bad[left]) / 2.0
+        trial = interpolate_path(robot, anchor[left], poses[left], share)
+        allowed = checker.check_poses(inverse(robot, trial)).allowed
+        good[left], bad[left] = (
+            np.where(allowed, share, good[left]),
+            np.where(allowed, bad[left], share),
         )
-    found = np.where(good[:, None] == 1.0, poses, between(robot, anchor, poses, good))[good > 0.0]
-    # towards the middle, so that what is rounded stays inside
-    found = rounded(robot, found, middle)
-    found = np.unique(found, axis=0)
-    return found[judged_by.judge(inverse(robot, found)).allowed]
+    moved = interpolate_path(robot, anchor, poses, good)
+    edge = np.where(good[:, None] == 1.0, poses, moved)[good > 0.0]
+    # towards the middle, so that rounding does not leave the allowed region
+    edge = round_coordinates(robot, edge, middle)
+    edge = np.unique(edge, axis=0)
+    return edge[checker.check_poses(inverse(robot, edge)).allowed]
 
 
-def _reached(
-    judged_by: Rules, poses: FloatArray, even: np.ndarray, refused: Counter[str], tried: int
+def _keep_reachable(
+    checker: ConstraintChecker,
+    poses: FloatArray,
+    uniform: BoolArray,
+    excluded: Counter[Violation],
+    n_drawn: int,
 ) -> Candidates:
-    """Keep the poses to which a straight way leads from home."""
-    robot = judged_by.robot
+    """Return the poses that an allowed straight path connects with home."""
+    robot = checker.robot
     home = np.broadcast_to(home_coordinates(robot), poses.shape)
-    way: Verdicts = follow(judged_by, home, poses)
-    refused.update(
-        {f"no straight way from home: {reason}": n for reason, n in way.counts().items()}
-    )
-    if not way.allowed.any():
+    path = check_paths(checker, home, poses)
+    counts = path.count_violations()
+    excluded.update(dict(mark_on_path(counts)))
+    if not path.allowed.any():
         raise MechanismError(
-            f"no pose of {robot.name} can be reached from home on an allowed straight way: "
-            f"{refusals(way.counts())}; relax a "
-            "constraint, or choose another home in the robot file"
+            report_finding("plan.home-isolated", robot=robot.name, reasons=list_reasons(counts))
         )
-    kept = poses[way.allowed]
-    return Candidates(
-        kept, inverse(robot, kept), even[way.allowed], dict(refused.most_common()), tried, judged_by
-    )
+    kept = poses[path.allowed]
+    counted = dict(excluded.most_common())
+    return Candidates(kept, inverse(robot, kept), uniform[path.allowed], counted, n_drawn, checker)

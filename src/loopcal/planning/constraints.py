@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a planned pose must keep to: the machine's own limits, a margin from singularities, tilt,
-and being seen.
+"""Constraints on planned poses: machine limits, margin from singularities, tilt and line of sight.
 
-Everything is judged for many poses at once, with the reason in words. Margins are those of
+Many poses are checked at once; a violation is a code with numbers. Margins are those of
 `loopcal.mechanism.singularities`, as shares of their medians over the workspace.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,20 +32,21 @@ ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """A place from which the target on the tool must be seen.
+class LineOfSight:
+    """A station from which the target on the tool must be visible.
 
     Attributes
     ----------
-    station : (3,) place of the instrument in the base frame [m].
-    facing : (3,) where the target faces, in the axes of the platform; any length above zero.
-    cone : half the angle within which the target can be seen [rad]. nearest, farthest : allowed
-        distance [m].
+    station : (3,) position of the instrument in the base frame [m].
+    facing : (3,) direction in which the target faces, in the axes of the platform; any length
+        above 0.
+    cone : half the angle within which the target is visible [rad].
+    nearest, farthest : allowed distance [m].
 
     Raises
     ------
     DataError
-        A number that cannot be.
+        A vector is not finite or has no length, or an angle or a distance is out of range.
     """
 
     station: FloatArray
@@ -59,63 +60,60 @@ class Sight:
             given = np.array(getattr(self, name), dtype=float)
             if given.shape != (3,) or not np.isfinite(given).all():
                 raise DataError(
-                    f"the {name} of a line of sight needs three finite numbers, but "
-                    f"{given.tolist()} was given"
+                    f"{name} of the line of sight is {given.tolist()}; give three finite numbers"
                 )
             given.setflags(write=False)
             object.__setattr__(self, name, given)
         if not np.linalg.norm(self.facing) > 0.0:
             raise DataError(
-                "the direction in which the target faces is 0, 0, 0; give one that points somewhere"
+                "facing of the line of sight is 0, 0, 0; give a direction with a length above 0"
             )
         if not 0.0 < self.cone <= np.pi:
             raise DataError(
-                f"the target is seen within {np.degrees(self.cone):g} deg; give an angle above 0, "
-                "at most 180 deg"
+                f"cone of the line of sight is {np.degrees(self.cone):g} deg; give an angle above "
+                "0, at most 180 deg"
             )
         if not 0.0 <= self.nearest < self.farthest:
             raise DataError(
-                f"the distance of the target is to be {self.nearest:g} to {self.farthest:g} m; "
-                "give a smaller and a larger one"
+                f"the line of sight allows distances from {self.nearest:g} to {self.farthest:g} m; "
+                "give a smaller and a larger distance, 0 or more"
             )
 
-    def broken(self, T: FloatArray, tool: FloatArray) -> Iterator[tuple[str, BoolArray]]:
-        """Yield what is not met in words and at which of the poses T (n, 4, 4); tool is
-        T_platform_tool (4, 4).
-        """
+    def find_violations(
+        self, T: FloatArray, tool: FloatArray
+    ) -> Iterator[tuple[Violation, BoolArray]]:
+        """Yield each violation and the poses T (n, 4, 4) where it occurs; tool: T_platform_tool."""
         to_station = self.station - (T @ tool)[:, :3, 3]
         distance = np.linalg.norm(to_station, axis=1)
-        faces = T[:, :3, :3] @ (self.facing / np.linalg.norm(self.facing))
-        across = np.linalg.norm(np.cross(faces, to_station), axis=1)
-        off = np.arctan2(across, np.einsum("ni,ni->n", faces, to_station))
-        yield (
-            "the instrument is too near or too far",
-            ~((distance >= self.nearest) & (distance <= self.farthest)),
-        )
-        yield "the target faces away from the instrument", ~(off <= self.cone)
+        normal = T[:, :3, :3] @ (self.facing / np.linalg.norm(self.facing))
+        across = np.linalg.norm(np.cross(normal, to_station), axis=1)
+        angle = np.arctan2(across, np.einsum("ni,ni->n", normal, to_station))
+        in_range = (distance >= self.nearest) & (distance <= self.farthest)
+        yield Violation("distance-out-of-range"), ~in_range
+        yield Violation("target-faces-away"), ~(angle <= self.cone)
 
 
 @dataclass(frozen=True)
 class Constraints:
-    """What is asked of planned poses beside the machine's own strokes, joint limits and cones.
+    """Requirements on planned poses beside the machine's own strokes, joint limits and cones.
 
     Attributes
     ----------
     min_margin : smallest distance from a singularity, as a share of its median over the workspace,
-        0 to 1; on the way too.
-    max_tilt : largest angle between the z axis of the platform and that of the base [rad]; on the
-        way too.
-    sight : a place from which the target must be seen at each pose.
+        0 to 1; also required on paths.
+    max_tilt : largest angle between the z axis of the platform and that of the base [rad]; also
+        required on paths.
+    sight : line of sight to the target, required at each pose.
 
     Raises
     ------
     DataError
-        A number that cannot be.
+        The margin or the tilt is out of range.
     """
 
     min_margin: float = NEAR_SHARE
     max_tilt: float | None = None
-    sight: Sight | None = None
+    sight: LineOfSight | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.min_margin < 1.0:
@@ -130,79 +128,113 @@ class Constraints:
             )
 
 
-@dataclass(frozen=True, eq=False)
-class Rules:
-    """Constraints of one robot, with what they are compared with.
+@dataclass(frozen=True)
+class Violation:
+    """The first constraint that a pose or a path violates.
 
     Attributes
     ----------
-    medians : of margin and drive margin over the workspace. side : sign of the determinant at home.
+    code : of the reason; worded in `loopcal.findings.catalog.plan`.
+    data : names and numbers of the reason.
+    on_path : whether it occurs on the straight path from home, not at the pose itself.
+    """
+
+    code: str
+    data: tuple[tuple[str, Any], ...] = ()
+    on_path: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return code, path flag and numbers, for a finding."""
+        return {"code": self.code, "on_path": self.on_path, **dict(self.data)}
+
+
+@dataclass(frozen=True, eq=False)
+class ConstraintCheck:
+    """Result of checking n poses or paths.
+
+    Attributes
+    ----------
+    allowed : (n,). violations : (n,) the first `Violation` of each; None where allowed.
+    """
+
+    allowed: BoolArray
+    violations: NDArray[np.object_]
+
+    def count_violations(self) -> dict[Violation, int]:
+        """Return how often each violation was the first, most frequent first."""
+        return dict(Counter(self.violations[~self.allowed].tolist()).most_common())
+
+
+@dataclass(frozen=True, eq=False)
+class ConstraintChecker:
+    """The constraints of one robot with their reference values.
+
+    Attributes
+    ----------
+    medians : of margin and drive margin over the workspace.
+    closure_sign : of the determinant at home; another sign is beyond a singularity.
     """
 
     robot: Mechanism
     constraints: Constraints
     medians: tuple[float, float]
-    side: int
+    closure_sign: int
 
-    def judge(self, found: Solution, at_pose: bool = True) -> Verdicts:
-        """Judge poses; `at_pose` False leaves out what holds only where something is measured: the
-        line of sight.
-        """
-        allowed = np.array(found.converged)
-        why = np.full(len(allowed), "", dtype=object)
-        why[~allowed] = "the loops cannot be closed"
-        for words, broken in self._broken(found, at_pose):
-            first = broken & allowed
-            why[first] = words
-            allowed &= ~broken
-        return Verdicts(allowed, why)
+    def check_poses(self, solution: Solution, at_pose: bool = True) -> ConstraintCheck:
+        """Check poses; `at_pose` False omits the line of sight, which only measuring needs."""
+        allowed = np.array(solution.converged)
+        violations = np.full(len(allowed), None, dtype=object)
+        violations[~allowed] = Violation("loops-open")
+        for violation, violated in self._find_violations(solution, at_pose):
+            first = violated & allowed
+            violations[first] = violation
+            allowed &= ~violated
+        return ConstraintCheck(allowed, violations)
 
-    def _broken(self, found: Solution, at_pose: bool) -> Iterator[tuple[str, BoolArray]]:
-        """Yield each constraint in words, and where it is not met (n,)."""
-        robot, asked = self.robot, self.constraints
-        for limit in evaluate_limits(robot, robot.values[None], found.q[None], found.state):
+    def _find_violations(
+        self, solution: Solution, at_pose: bool
+    ) -> Iterator[tuple[Violation, BoolArray]]:
+        """Yield each violation and the poses (n,) where it occurs."""
+        robot, required = self.robot, self.constraints
+        for limit in evaluate_limits(robot, robot.values[None], solution.q[None], solution.state):
+            slack = ROUNDING * max(abs(limit.low), abs(limit.high))
             yield (
-                f"{limit.name} is exceeded",
-                ~(limit.margin[0] >= -ROUNDING * max(abs(limit.low), abs(limit.high))),
+                Violation("limit-exceeded", (("limit", limit.name),)),
+                ~(limit.margin[0] >= -slack),
             )
-        near = analyze_singularity(robot, found, self.medians)
-        yield "a singularity lies between it and home", near.closure_sign != self.side
+        near = analyze_singularity(robot, solution, self.medians)
+        yield Violation("beyond-singularity"), near.closure_sign != self.closure_sign
+        margin = required.min_margin
         yield (
-            f"a singularity is near (margin below {asked.min_margin:g} of the median)",
-            ~((near.ratio >= asked.min_margin) & (near.drive_ratio >= asked.min_margin)),
+            Violation("near-singularity", (("min_margin", margin),)),
+            ~((near.ratio >= margin) & (near.drive_ratio >= margin)),
         )
-        if asked.max_tilt is not None:
-            upright = found.T[:, 2, 2]
-            tilt = np.arctan2(np.hypot(found.T[:, 0, 2], found.T[:, 1, 2]), upright)
+        if required.max_tilt is not None:
+            T = solution.T
+            tilt = np.arctan2(np.hypot(T[:, 0, 2], T[:, 1, 2]), T[:, 2, 2])
             yield (
-                f"the tilt exceeds {np.degrees(asked.max_tilt):.6g} deg",
-                ~(tilt <= asked.max_tilt * (1.0 + ROUNDING)),
+                Violation(
+                    "tilt-exceeded", (("max_tilt_deg", float(np.degrees(required.max_tilt))),)
+                ),
+                ~(tilt <= required.max_tilt * (1.0 + ROUNDING)),
             )
-        if at_pose and asked.sight is not None:
-            yield from asked.sight.broken(found.T, robot.tool)
+        if at_pose and required.sight is not None:
+            yield from required.sight.find_violations(solution.T, robot.tool)
 
 
-@dataclass(frozen=True, eq=False)
-class Verdicts:
-    """Which of n poses or ways are allowed (n,), and the first reason against each of the others,
-    '' where there is none.
-    """
-
-    allowed: BoolArray
-    why: NDArray[np.object_]
-
-    def counts(self) -> dict[str, int]:
-        """Reason -> how often it was the first, most frequent first."""
-        return dict(Counter(self.why[~self.allowed].tolist()).most_common())
+def build_checker(robot: Mechanism, constraints: Constraints | None) -> ConstraintChecker:
+    """Return the checker of a robot's poses; None stands for the default constraints."""
+    closure_sign = int(compute_closure_sign(robot, robot.values[None], robot.home_state)[0, 0])
+    return ConstraintChecker(
+        robot, constraints or Constraints(), compute_median_margins(robot), closure_sign
+    )
 
 
-def rules(robot: Mechanism, constraints: Constraints) -> Rules:
-    """Return what poses of a robot are judged by."""
-    side = int(compute_closure_sign(robot, robot.values[None], robot.home_state)[0, 0])
-    return Rules(robot, constraints, compute_median_margins(robot), side)
+def list_reasons(counts: Mapping[Violation, int]) -> tuple[dict[str, Any], ...]:
+    """Return counted violations as data of a finding, in their order."""
+    return tuple({**violation.to_dict(), "count": count} for violation, count in counts.items())
 
 
-def refusals(counts: dict[str, int], most: int = 3) -> str:
-    """Return counts of refusals in words, the most frequent first."""
-    shown = [f"{reason} ({count})" for reason, count in list(counts.items())[:most]]
-    return "; ".join([*shown, *(["..."] if len(counts) > most else [])])
+def mark_on_path(counts: Mapping[Violation, int]) -> Iterable[tuple[Violation, int]]:
+    """Return counted violations as violations on the path from home."""
+    return [(replace(violation, on_path=True), count) for violation, count in counts.items()]

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which poses to measure with a stated instrument, so that the tool is predicted best everywhere in
-the workspace.
+"""Plan which poses to measure, so that the tool is predicted best all over the workspace.
 
-Candidates that keep to every constraint, the convex relaxation for the bound, Fedorov exchange for
-the poses, poses drawn evenly to judge by, and an order to visit them all in. Theory:
+Candidates satisfy every constraint. The convex relaxation gives the bound, exchange the poses. The
+validation poses are drawn evenly, and a short path visits all of them. Theory:
 docs/theory/planning.md.
 """
 
@@ -12,68 +11,57 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from loopcal.errors import EstimationError
-from loopcal.measure import Instrument, Measurements
+from loopcal.findings import Finding, report_finding
+from loopcal.measure import Instrument
 from loopcal.mechanism import Mechanism
-from loopcal.planning.certified import certified_design
-from loopcal.planning.constraints import Constraints
-from loopcal.planning.criteria import A, Criterion, E, I, evaluate
-from loopcal.planning.design import Start, allowed, design_factor
-from loopcal.planning.needed import counted, pose_curve, poses_needed
-from loopcal.planning.order import Visit, visiting_order
-from loopcal.planning.problem import Accuracy, Problem, Target, problem
-from loopcal.planning.result import Plan
+from loopcal.planning.design import (
+    A,
+    Criterion,
+    E,
+    I,
+    choose_design,
+    evaluate_criterion,
+    factor_design,
+    is_allowed,
+)
+from loopcal.planning.options import N_POSES, PlanOptions
+from loopcal.planning.path import order_poses
+from loopcal.planning.problem import ExpectedErrors, PlanningProblem, prepare_problem
+from loopcal.planning.result import DesignQuality, ErrorForecast, Plan, PlannedPoses
+from loopcal.planning.sample_size import compute_error_curve, find_sample_size
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension, find_unit
 
-SHAKES = 10
-"""Times that a design is shaken out of local optima: more gain some tenths of a per cent."""
+PERTURBATIONS = 10
+"""Number of perturbations of a design: more of them gain some tenths of a per cent."""
 GAP = 5e-3
-"""Of the efficiency, up to which the bound is computed."""
+"""Gap of the efficiency up to which the bound is computed."""
 DRAWS = 20
 """Sets of evenly drawn poses that a plan is compared with."""
 DIGITS = 8
 """Decimal places of the robot's size, in its unit, or of a radian, to which readings are stated."""
-MORE = 12
-"""Times that poses are added where those found do not reach a goal when some are held out."""
-HELD_OUT = 4
-"""One pose is held out for so many that are fitted, where nothing else is asked for."""
+EXTENSIONS = 12
+"""Largest number of times that poses are added where a goal is missed because some are held out."""
+FITTED_PER_HELD_OUT = 4
+"""Poses of the fit for each validation pose, by default."""
 
 
 def plan(
     robot: Mechanism,
     instrument: Instrument,
-    n_poses: int = 40,
-    criterion: str = "I",
-    *,
-    hold_out: int | None = None,
-    constraints: Constraints | None = None,
-    poses: ArrayLike | None = None,
-    measured: Measurements | None = None,
-    target: Target = "pose",
-    curve: bool = False,
-    candidates: int = 1000,
-    seed: int = 1,
+    n_poses: int | None = None,
+    criterion: str | None = None,
+    options: PlanOptions | None = None,
 ) -> Plan:
     """Plan the poses to measure.
 
     Parameters
     ----------
-    robot : at the values that are believed now. instrument : what will measure there, with its
-        noise.
-    n_poses : number of poses for the fit. criterion : "I", the mean predicted variance of `target`
-        over the workspace, or "D", the volume of uncertainty of the parameters.
-    hold_out : number of further poses to judge by, drawn evenly; default a quarter of n_poses.
-    constraints : margin from singularities, tilt, line of sight; strokes, joint limits and cones
-        are always kept to.
-    poses : (n, c) controlled coordinates that are allowed [m, rad]; default: about `candidates`
-        from the workspace.
-    measured : measurements made already, which count as known.
-    target : what is to be predicted: "pose" (turns times the robot's size), "position" or
-        "orientation".
-    curve : also expected errors by the number of poses. seed : of all random choices.
+    robot : at its present values. instrument : what will measure, with its noise.
+    n_poses, criterion : short for these options.
+    options : constraints, candidates, goal, earlier measurements, seed; see `PlanOptions`.
 
     Returns
     -------
@@ -82,170 +70,175 @@ def plan(
     Raises
     ------
     EstimationError
-        Fewer equations than unknowns, an unknown criterion, or a number that cannot be.
+        Fewer equations than unknowns, an unknown criterion, a goal out of reach, or a number of
+        poses that is not possible.
     MechanismError
-        The constraints leave nothing of the workspace.
+        The constraints exclude the whole workspace.
     """
-    given = None if poses is None else np.atleast_2d(np.asarray(poses, dtype=float))
-    made = problem(robot, instrument, constraints, given, measured, candidates, seed)
-    return planned(
-        made, n_poses, criterion, hold_out=hold_out, target=target, curve=curve, seed=seed
-    )
+    options = options or PlanOptions()
+    if n_poses is not None:
+        options = replace(options, n_poses=n_poses)
+    if criterion is not None:
+        options = replace(options, criterion=criterion)
+    return plan_poses(prepare_problem(robot, instrument, options))
 
 
-def planned_for(
-    made: Problem,
-    goal: float,
-    target: Target,
-    criterion: str = "I",
-    *,
-    hold_out: int | None = None,
-    seed: int = 1,
-) -> Plan:
-    """Plan the fewest poses found whose expected error reaches a goal.
+def plan_poses(problem: PlanningProblem) -> Plan:
+    """Plan the poses of a prepared problem; see `plan`."""
+    options = problem.options
+    if options.goal is not None:
+        return _plan_for_goal(problem)
+    number = N_POSES if options.n_poses is None else options.n_poses
+    found = _plan_number(problem, number)
+    return replace(found, curve=compute_error_curve(problem)) if options.curve else found
 
-    Parameters
-    ----------
-    made : of `problem`. goal : root mean square of `target` over the workspace [m, rad]; a pose's
-        turns times the size.
+
+def _plan_for_goal(problem: PlanningProblem) -> Plan:
+    """Plan the smallest number of poses whose expected error reaches the goal.
 
     Raises
     ------
     EstimationError
-        No number of poses reaches it; or as `plan`.
+        No number of poses reaches it.
     """
-    needed = poses_needed(made, goal, target, seed)
-    assert needed.enough is not None  # a goal was given
-    n, k = needed.enough, made.poses_in_unit
-    # poses to judge by are taken from the candidates, and D is not what the goal counts: both can
-    # cost some more poses
-    for _ in range(MORE):
-        found = planned(made, n * k, criterion, hold_out=hold_out, target=target, seed=seed)
-        if found.expected.of(target, made.wanted.size) <= goal:
-            return replace(found, curve=replace(needed, enough=n))
+    options, k, curve = problem.options, problem.poses_per_group, find_sample_size(problem)
+    assert curve.enough is not None, "a goal was given"
+    assert options.goal is not None, "a goal was given"
+    n = curve.enough
+    # Validation poses are taken from the candidates, and D is not what the goal counts: both can
+    # cost some more poses.
+    for _ in range(EXTENSIONS):
+        found = _plan_number(problem, n * k)
+        if found.errors.after.select(options.target, problem.prediction.size) <= options.goal:
+            return replace(found, curve=replace(curve, enough=n))
         n += max(n // 20, 1)
     raise EstimationError(
-        f"{n} {counted(k)} chosen by criterion {criterion} do not reach the error that "
-        f"{needed.enough} could; hold out fewer, "
-        "or use criterion I"
+        report_finding(
+            "plan.goal-missed",
+            number=n,
+            counted=problem.group_name,
+            criterion=options.criterion,
+            expected=curve.enough,
+        )
     )
 
 
-def planned(
-    made: Problem,
-    n_poses: int,
-    criterion: str = "I",
-    *,
-    hold_out: int | None = None,
-    target: Target = "pose",
-    curve: bool = False,
-    seed: int = 1,
-) -> Plan:
-    """Plan the poses of a problem that is ready; see `plan`."""
-    k, held = made.poses_in_unit, _held_out(made, n_poses, hold_out)
+def _plan_number(problem: PlanningProblem, n_poses: int) -> Plan:
+    """Plan a number of poses."""
+    k, robot, options = problem.poses_per_group, problem.robot, problem.options
+    n_held_out = _require_numbers(problem, n_poses)
     n = n_poses // k
-    made.require_equations(n)
-    wanted = made.criterion(criterion, target)
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
-    kept_back = _drawn_to_judge(made, held // k, rng)
-    rows = np.array(made.units.rows)
-    rows[np.isin(made.units.members, made.units.members[kept_back]).any(axis=1)] = np.nan
-    _require_candidates(rows, n, k)
-    best = certified_design(rows, n, wanted, made.start, seed, SHAKES, gap=GAP)
+    problem.require_equations(n)
+    criterion = problem.build_criterion()
+    rng = np.random.default_rng(np.random.SeedSequence(options.seed, spawn_key=(1,)))
+    held_out = _draw_held_out(problem, n_held_out // k, rng)
+    rows, members = np.array(problem.groups.rows), problem.groups.members
+    rows[np.isin(members, members[held_out]).any(axis=1)] = np.nan
+    _require_candidates(problem, rows, n)
+    best = choose_design(rows, n, criterion, problem.prior, options.seed, PERTURBATIONS, gap=GAP)
     chosen = best.design.chosen
-    expected = made.accuracy(chosen)
-    assert expected is not None  # the exchange leaves no direction open
-    visited, visit, units = _visited(made, np.concatenate([chosen, kept_back]))
+    after = problem.predict_errors(chosen)
+    assert after is not None, "the exchange determines every direction"
+    forecast = ErrorForecast(
+        before=problem.predict_errors(np.zeros(0, dtype=np.int64)),
+        random=_predict_random(problem, n, criterion, rng),
+        after=after,
+    )
+    quality = DesignQuality(
+        _compute_figures(problem, rows[chosen]),
+        min(best.efficiency, 1.0),
+        int(is_allowed(rows).sum()),
+    )
     return Plan(
-        robot=made.free.robot,
-        instrument=made.instrument,
-        coordinates=made.candidates.coordinates[visited],
-        readings=_typed(made.free.robot, made.candidates.solution.q[visited]),
-        held_out=np.isin(visited, made.units.members[kept_back]),
-        via_home=visit.via_home,
-        labels=_names(made, len(visited)),
-        units=units,
-        criterion=criterion,
-        figures=_figures(made, rows[chosen], made.start, target),
-        efficiency=min(best.efficiency, 1.0),
-        expected=expected,
-        before=made.accuracy(np.zeros(0, dtype=np.int64)),
-        even=_even(made, n, wanted, target, rng),
-        length=visit.length,
-        seed=seed,
-        notes=_notes(made),
-        curve=pose_curve(made, n_poses, target, seed) if curve else None,
-        target=target,
-        considered=int(allowed(rows).sum()),
+        robot,
+        problem.instrument,
+        options,
+        _arrange_poses(problem, chosen, held_out),
+        quality,
+        forecast,
+        _collect_notes(problem),
     )
 
 
-def _held_out(made: Problem, n_poses: int, hold_out: int | None) -> int:
-    """Return how many poses to hold out, after a look at both numbers."""
-    k = made.poses_in_unit
-    held = n_poses // HELD_OUT // k * k if hold_out is None else hold_out
-    for words, number, least in (("to measure", n_poses, 1), ("to hold out", held, 0)):
+def _require_numbers(problem: PlanningProblem, n_poses: int) -> int:
+    """Return the number of poses to hold out; refuse impossible numbers."""
+    k, hold_out = problem.poses_per_group, problem.options.hold_out
+    n_held_out = n_poses // FITTED_PER_HELD_OUT // k * k if hold_out is None else hold_out
+    for use, number, least in (("for the fit", n_poses, 1), ("to hold out", n_held_out, 0)):
         if number < least or number % k:
-            compared = (
+            multiples = (
                 f", in multiples of {k} because the instrument compares {k} poses" if k > 1 else ""
             )
-            raise EstimationError(
-                f"{number} poses {words} were asked for; ask for {least} or more{compared}"
-            )
-    return held
+            raise EstimationError(f"{number} poses {use}; give {least} or more{multiples}")
+    return n_held_out
 
 
-def _drawn_to_judge(made: Problem, count: int, rng: np.random.Generator) -> IntArray:
-    """Return units (count,) to judge by: of poses drawn evenly, no pose in two of them."""
-    even = np.flatnonzero(
-        made.candidates.even[made.units.members].all(axis=1)
-        & np.isfinite(made.units.rows).all(axis=(1, 2))
-    )
-    found: list[int] = []
+def _list_uniform_groups(problem: PlanningProblem) -> IntArray:
+    """Return the groups whose poses were drawn evenly."""
+    groups = problem.groups
+    uniform = problem.candidates.is_uniform[groups.members].all(axis=1)
+    return np.flatnonzero(uniform & is_allowed(groups.rows))
+
+
+def _draw_held_out(problem: PlanningProblem, count: int, rng: np.random.Generator) -> IntArray:
+    """Draw groups (count,) for validation: of evenly drawn poses, no pose in two of them."""
+    chosen: list[int] = []
     used: set[int] = set()
-    for u in rng.permutation(even).tolist():
-        if len(found) == count:
+    for group in rng.permutation(_list_uniform_groups(problem)).tolist():
+        if len(chosen) == count:
             break
-        poses = made.units.members[u].tolist()
+        poses = problem.groups.members[group].tolist()
         if not used & set(poses):
-            found.append(u)
+            chosen.append(group)
             used.update(poses)
-    if len(found) < count:
+    if len(chosen) < count:
         raise EstimationError(
-            f"{count} measurements to judge by were asked for, but the {len(made.candidates)} "
-            f"allowed poses give {len(found)}; "
-            "hold out fewer, or relax a constraint"
+            report_finding(
+                "plan.too-few-held-out",
+                requested=count,
+                counted=problem.group_name,
+                candidates=len(problem.candidates),
+                available=len(chosen),
+            )
         )
-    return np.array(found, dtype=np.int64)
+    return np.array(chosen, dtype=np.int64)
 
 
-def _require_candidates(rows: FloatArray, n: int, k: int) -> None:
-    """Refuse more units of k poses than there are to choose from."""
-    left = int(np.isfinite(rows).all(axis=(1, 2)).sum())
+def _require_candidates(problem: PlanningProblem, rows: FloatArray, n: int) -> None:
+    """Refuse more groups than remain to choose from."""
+    left = int(is_allowed(rows).sum())
     if left < n:
         raise EstimationError(
-            f"{n} {counted(k)} were asked for, but only {left} are left to choose from; ask for "
-            "fewer, hold out fewer, or "
-            "relax a constraint"
+            report_finding(
+                "plan.too-few-candidates", requested=n, what=problem.group_name, available=left
+            )
         )
 
 
-def _visited(made: Problem, units: IntArray) -> tuple[IntArray, Visit, IntArray]:
-    """Return the poses (m,) of units in the order of visiting, the visit, and the units (u, k) as
-    rows of it.
-    """
-    members = made.units.members[units]
-    poses = np.unique(members)
-    visit = visiting_order(made.candidates.rules, made.candidates.coordinates[poses])
-    visited = poses[visit.order]
-    place = np.empty(len(made.candidates), dtype=np.int64)
-    place[visited] = np.arange(len(visited))
-    return visited, visit, place[members]
+def _arrange_poses(problem: PlanningProblem, chosen: IntArray, held_out: IntArray) -> PlannedPoses:
+    """Return the poses of groups for the fit and for validation in the order of visiting."""
+    members = problem.groups.members
+    selected = members[np.concatenate([chosen, held_out])]
+    poses = np.unique(selected)
+    candidates = problem.candidates
+    visit = order_poses(candidates.checker, candidates.coordinates[poses])
+    ordered = poses[visit.order]
+    place = np.empty(len(candidates), dtype=np.int64)
+    place[ordered] = np.arange(len(ordered))
+    return PlannedPoses(
+        _name_poses(problem, len(ordered)),
+        candidates.coordinates[ordered],
+        _round_readings(problem.robot, candidates.solution.q[ordered]),
+        np.isin(ordered, members[held_out]),
+        visit.via_home,
+        place[selected],
+        visit.length,
+    )
 
 
-def _typed(robot: Mechanism, readings: FloatArray) -> FloatArray:
-    """Round readings (m, a) to DIGITS in the robot's units, which a person can type and no
-    instrument tells apart.
+def _round_readings(robot: Mechanism, readings: FloatArray) -> FloatArray:
+    """Round readings (m, a) to DIGITS in the robot's units: a person can type them, and no
+    instrument resolves the difference.
     """
     factors = np.array(
         [find_unit(robot.units[actuator.dimension]).factor_to_si for actuator in robot.actuators]
@@ -261,61 +254,53 @@ def _typed(robot: Mechanism, readings: FloatArray) -> FloatArray:
     return np.round(readings / factors / steps) * steps * factors + 0.0
 
 
-def _names(made: Problem, count: int) -> tuple[str, ...]:
-    """Return names of poses: numbers, which go on behind the largest that was measured already."""
-    numbers = [int(name) for name in made.taken if name.isdecimal()]
+def _name_poses(problem: PlanningProblem, count: int) -> tuple[str, ...]:
+    """Return numbers as names of poses, beginning after the largest one measured already."""
+    numbers = [int(name) for name in problem.used_names if name.isdecimal()]
     return tuple(str(max(numbers, default=0) + i) for i in range(1, count + 1))
 
 
-def _figures(made: Problem, rows: FloatArray, start: Start, target: Target) -> dict[str, float]:
+def _compute_figures(problem: PlanningProblem, rows: FloatArray) -> dict[str, float]:
     """Return D, I, A and E of a design."""
-    factor, machine = design_factor(rows, start, made.space), made.space.machine
-    criteria: tuple[Criterion, ...] = (made.criterion("D"), made.criterion("I", target), A(), E())
-    return {c.name: evaluate(c, factor, machine) for c in criteria}
-
-
-def _even(
-    made: Problem, n: int, wanted: Criterion, target: Target, rng: np.random.Generator
-) -> Accuracy | None:
-    """Return the errors of the median, by I, of some sets of n units of evenly drawn poses; None
-    where there are too few.
-    """
-    even = np.flatnonzero(
-        made.candidates.even[made.units.members].all(axis=1)
-        & np.isfinite(made.units.rows).all(axis=(1, 2))
+    factor = factor_design(rows, problem.prior, problem.space)
+    criteria: tuple[Criterion, ...] = (
+        problem.build_criterion("D"),
+        problem.build_criterion("I"),
+        A(),
+        E(),
     )
-    if len(even) < n:
+    return {c.name: evaluate_criterion(c, factor, problem.space.machine) for c in criteria}
+
+
+def _predict_random(
+    problem: PlanningProblem, n: int, criterion: Criterion, rng: np.random.Generator
+) -> ExpectedErrors | None:
+    """Return the errors of the median, by I, of some sets of n evenly drawn groups.
+
+    None where there are too few.
+    """
+    uniform = _list_uniform_groups(problem)
+    if len(uniform) < n:
         return None
-    by = wanted if isinstance(wanted, I) else made.criterion("I", target)
-    sets = [rng.choice(even, n, replace=False) for _ in range(DRAWS)]
-    values = [
-        evaluate(
-            by, design_factor(made.units.rows[chosen], made.start, made.space), made.space.machine
-        )
-        for chosen in sets
-    ]
-    return made.accuracy(sets[int(np.argsort(values)[DRAWS // 2])])
+    criterion = criterion if isinstance(criterion, I) else problem.build_criterion("I")
+    sets = [rng.choice(uniform, n, replace=False) for _ in range(DRAWS)]
+    values = []
+    for chosen in sets:
+        factor = factor_design(problem.groups.rows[chosen], problem.prior, problem.space)
+        values.append(evaluate_criterion(criterion, factor, problem.space.machine))
+    return problem.predict_errors(sets[int(np.argsort(values)[DRAWS // 2])])
 
 
-def _notes(made: Problem) -> tuple[str, ...]:
-    """Say what was assumed and left out."""
-    p, rank = len(made.free), int(made.seen.rank[0])
-    notes = [made.candidates.sentence()]
-    assumed = made.free.note()
-    if assumed is not None:
-        notes.append(f"{assumed}; in a plan these are not taken as known")
-    if made.wanted.frames:
-        one = len(made.wanted.frames) == 1
-        lies = f"frame {made.wanted.frames[0]} lies" if one else "frames base and platform lie"
+def _collect_notes(problem: PlanningProblem) -> tuple[Finding, ...]:
+    """Return findings on what was assumed and excluded."""
+    p, rank, assumed = len(problem.free), int(problem.observable.rank[0]), problem.free.assumed
+    notes = [problem.candidates.report()]
+    if assumed.any():
         notes.append(
-            f"this instrument cannot tell how the {lies} as a whole; expected errors are in the "
-            "frame that the calibration "
-            "defines"
+            report_finding("plan.tolerances-missing", missing=int(assumed.sum()), parameters=p)
         )
+    if problem.prediction.frames:
+        notes.append(report_finding("plan.frames-undetermined", frames=problem.prediction.frames))
     if rank < p:
-        notes.append(
-            f"{p - rank} of {p} parameter combinations cannot be told by this instrument at any "
-            "pose; "
-            f"`loopcal identifiability` names them"
-        )
+        notes.append(report_finding("plan.unobservable", count=p - rank, parameters=p))
     return tuple(notes)

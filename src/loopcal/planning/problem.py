@@ -1,53 +1,66 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A planning problem made ready: candidates, the rows an instrument would give there, what is
-known, what is wanted.
-"""
+"""A planning problem: candidates, their rows, the prior, and the prediction to improve."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any
 
 import numpy as np
 
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.outlook import equations, information
+from loopcal.findings import Quantity, report_finding
 from loopcal.measure import Instrument, Measurements, check_actuators
 from loopcal.mechanism import Mechanism, Solution, inverse, sample_workspace
 from loopcal.numerics.decomposition import Decomposition
-from loopcal.planning.candidates import Candidates, candidates, listed_candidates
+from loopcal.planning.candidates import Candidates, check_listed_poses, draw_candidates
 from loopcal.planning.constraints import Constraints
-from loopcal.planning.criteria import Criterion, D, I
-from loopcal.planning.design import Directions, Start, design_factor, directions, triangle
-from loopcal.planning.information import (
-    Predicted,
-    UnitRows,
-    considered,
-    knowable,
-    predicted,
-    start_of,
+from loopcal.planning.design import (
+    Criterion,
+    D,
+    I,
+    ObservableSpace,
+    PriorInformation,
+    factor_design,
+    factor_rows,
+    find_observable_space,
+    is_allowed,
 )
-from loopcal.typing import FloatArray
+from loopcal.planning.information import (
+    GroupRows,
+    Prediction,
+    combine_prior,
+    decompose_information,
+    linearize_candidate_groups,
+    linearize_prediction,
+)
+from loopcal.planning.options import PlanOptions, Target
+from loopcal.typing import FloatArray, IntArray
+from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 PREDICTED = 200
 """Poses of the workspace whose errors are predicted."""
-NOTHING = 1e-6
-"""Largest singular value, in information per tolerance, up to which an instrument tells nothing:
-what is left is rounding.
+NO_INFORMATION = 1e-6
+"""Largest singular value, in information per tolerance, up to which an instrument determines
+nothing: the rest is rounding.
 """
-STILL = 1e-9
-"""Share of a pose's error up to which its position or orientation does not change at all: what is
-left is rounding.
+NO_MOTION = 1e-9
+"""Share of a pose's error up to which its position or orientation does not change at all: the rest
+is rounding.
 """
-
-Target = Literal["pose", "position", "orientation"]
+DIMENSIONS: dict[Target, Dimension] = {
+    "pose": Dimension.LENGTH,
+    "position": Dimension.LENGTH,
+    "orientation": Dimension.ANGLE,
+}
+"""Dimension of the error of each target."""
 
 
 @dataclass(frozen=True, eq=False)
-class Accuracy:
+class ExpectedErrors:
     """Predicted errors of the tool, root mean square over the workspace.
 
     Attributes
@@ -58,173 +71,248 @@ class Accuracy:
     position: float
     orientation: float
 
-    def of(self, target: Target, size: float) -> float:
-        """Return the error of a target [m, rad]; of a pose with turns times the robot's size [m]."""
+    def select(self, target: Target, size: float) -> float:
+        """Return the error of a target [m, rad]; of a pose with rotations times `size` [m]."""
         if target == "pose":
             return float(np.hypot(self.position, size * self.orientation))
         return self.position if target == "position" else self.orientation
 
+    def to_quantities(self, robot: Mechanism) -> tuple[Quantity, ...]:
+        """Return the errors above 0 in the units of the robot's file."""
+        pairs = ((self.position, Dimension.LENGTH), (self.orientation, Dimension.ANGLE))
+        return tuple(
+            to_quantity(robot, value, dimension) for value, dimension in pairs if value > 0.0
+        )
+
 
 @dataclass(frozen=True, eq=False)
-class Problem:
-    """Everything that a choice of poses is made from.
+class PlanningProblem:
+    """Everything that a choice of poses depends on.
 
     Attributes
     ----------
-    free : the robot's unknowns. instrument : mounted on its tool. candidates : poses that may be
-        measured.
-    units : their rows. start : what is known before. seen : what all candidates together could
-        tell, without tolerances.
-    wanted : what is to be predicted. equations : that measurements made already give of the robot,
-        those taken off that
-        their own unknowns need. taken : names of poses that were measured already.
+    free : the robot's free parameters. instrument : mounted on its tool.
+    options : of the plan. candidates : poses that may be measured. groups : their rows.
+    prior : information before the first new pose.
+    observable : decomposition of all candidates together, without tolerances.
+    prediction : of the tool's pose over the workspace.
+    n_earlier_equations : of measurements made already, less their own nuisance parameters.
+    used_names : names of poses that were measured already.
     """
 
     free: FreeParameters
     instrument: Instrument
+    options: PlanOptions
     candidates: Candidates
-    units: UnitRows
-    start: Start
-    seen: Decomposition
-    wanted: Predicted
-    equations: int
-    taken: tuple[str, ...] = ()
+    groups: GroupRows
+    prior: PriorInformation
+    observable: Decomposition
+    prediction: Prediction
+    n_earlier_equations: int = 0
+    used_names: tuple[str, ...] = ()
+
+    @property
+    def robot(self) -> Mechanism:
+        """The robot at its present values."""
+        return self.free.robot
+
+    def with_options(self, **changes: Any) -> PlanningProblem:
+        """Return the same problem with other options that do not concern candidates and data:
+        number of poses, goal, held-out poses, criterion, target, curve.
+        """
+        return replace(self, options=replace(self.options, **changes))
 
     @cached_property
-    def space(self) -> Directions:
+    def space(self) -> ObservableSpace:
         """The directions in which designs are compared."""
-        return directions(self.units.rows, self.start)
+        return find_observable_space(self.groups.rows, self.prior)
 
     @property
-    def poses_in_unit(self) -> int:
+    def poses_per_group(self) -> int:
         """Number of poses that are measured together."""
-        return self.units.members.shape[1]
+        return self.groups.members.shape[1]
 
-    def criterion(self, name: str, target: Target = "pose") -> Criterion:
-        """Return D, or I for what is to be predicted; raises EstimationError for another name."""
-        if name == "D":
-            return D()
-        if name != "I":
-            raise EstimationError(
-                f"the criterion is {name!r}; allowed are I (mean predicted variance of poses) and "
-                "D (volume of uncertainty)"
-            )
-        if target != "pose" and not self._shown(target) > STILL * self._shown("pose"):
-            moves, other = (
-                ("turn", "a length") if target == "orientation" else ("move its tool", "an angle")
-            )
-            raise EstimationError(
-                f"no {target} is to be predicted: {self.free.robot.name} does not {moves}, or this "
-                "instrument cannot tell by "
-                f"how much; give {other}, or choose another kind"
-            )
-        # the triangular factor of the rows gives the same trace from fewer rows
-        return I(triangle(getattr(self.wanted, target)), len(self.wanted.shifts))
+    @property
+    def group_name(self) -> str:
+        """Plural noun for the groups: poses, pairs or sets of k poses."""
+        return name_groups(self.poses_per_group)
 
-    def _shown(self, target: Target) -> float:
-        """Return how much errors of the parameters show in a target, turns times the size [m]."""
-        rows = getattr(self.wanted, target)
-        return float(np.abs(rows).max(initial=0.0)) * (
-            self.wanted.size if target == "orientation" else 1.0
-        )
-
-    def accuracy(self, chosen: np.ndarray) -> Accuracy | None:
-        """Return the predicted errors after measuring units (n,), none at all allowed; None where
-        nothing bounds them.
-        """
-        if len(chosen):
-            factor = design_factor(self.units.rows[chosen], self.start, self.space)
-        # no row of the start speaks of own unknowns and of the machine at once, see `start_of`
-        else:
-            told = self.start.rows[:, self.start.own :] @ self.space.machine
-            factor = triangle(np.concatenate([told, np.zeros((told.shape[1], told.shape[1]))]))
-        s = np.linalg.svd(factor, compute_uv=False)
-        if not s[-1] > np.finfo(float).eps * len(s) * s[0]:
-            return None
-        k = len(self.wanted.shifts)
-        found = [
-            float(np.sqrt((np.linalg.solve(factor.T, (L @ self.space.machine).T) ** 2).sum() / k))
-            for L in (self.wanted.position, self.wanted.orientation)
-        ]
-        return Accuracy(*found)
+    @property
+    def n_candidates(self) -> int:
+        """Number of groups that may be chosen."""
+        return int(is_allowed(self.groups.rows).sum())
 
     @cached_property
-    def unknown(self) -> int:
-        """How many equations it takes: parameters, or those that can be told with the instrument's
-        own unknowns.
-        """
-        own = self.space.own.shape[1] - int(np.any(self.units.prior != 0.0, axis=1).sum())
-        return max(len(self.free), int(self.seen.rank[0]) + max(own, 0))
+    def n_unknowns(self) -> int:
+        """Number of equations needed: parameters, or observable ones with nuisance parameters."""
+        stated = int(np.any(self.groups.nuisance_prior != 0.0, axis=1).sum())
+        nuisance = self.space.nuisance.shape[1] - stated
+        return max(len(self.free), int(self.observable.rank[0]) + max(nuisance, 0))
 
     @property
-    def fewest(self) -> int:
-        """Units that give as many equations as there are unknowns."""
-        return max(-(-(self.unknown - self.equations) // self.units.rows.shape[1]), 1)
+    def min_groups(self) -> int:
+        """Smallest number of groups that give as many equations as there are unknowns."""
+        missing = self.n_unknowns - self.n_earlier_equations
+        return max(-(-missing // self.groups.rows.shape[1]), 1)
 
-    def require_equations(self, n: int) -> None:
-        """Refuse n units that give fewer equations than there are unknowns.
+    def build_criterion(self, name: str | None = None, target: Target | None = None) -> Criterion:
+        """Return criterion D, or I for a target; by default those of the options.
 
         Raises
         ------
         EstimationError
-            With the number of poses that it takes.
+            The name is another one, or the target does not move or is not observable.
         """
-        r, k, p = self.units.rows.shape[1], self.poses_in_unit, len(self.free)
-        if n < self.fewest:
-            least, needed = self.fewest * k, self.unknown
-            also = f" and {self.equations} were measured already" if self.equations else ""
+        name, target = name or self.options.criterion, target or self.options.target
+        if name == "D":
+            return D()
+        if name != "I":
             raise EstimationError(
-                f"{n * k} poses give {n * r} equations{also}, but there are {needed} unknowns ({p} "
-                "parameters of "
-                f"{self.free.robot.name}, the others of the instrument); plan at least {least} "
-                "poses, or fix parameters in the "
-                "robot file"
+                f"unknown criterion {name!r}; allowed are I (mean predicted variance of poses) "
+                "and D (volume of uncertainty of the parameters)"
+            )
+        if target != "pose" and not self._sensitivity(target) > NO_MOTION * self._sensitivity(
+            "pose"
+        ):
+            raise EstimationError(
+                report_finding("plan.target-unobservable", robot=self.robot.name, target=target)
+            )
+        # the triangular factor of the rows gives the same trace from fewer rows
+        return I(factor_rows(getattr(self.prediction, target)), len(self.prediction))
+
+    def _sensitivity(self, target: Target) -> float:
+        """Return the largest effect of one tolerance on a target, rotations times size [m]."""
+        rows = getattr(self.prediction, target)
+        scale = self.prediction.size if target == "orientation" else 1.0
+        return float(np.abs(rows).max(initial=0.0)) * scale
+
+    def predict_errors(self, chosen: IntArray) -> ExpectedErrors | None:
+        """Return the errors expected after measuring groups (n,), possibly none.
+
+        None where nothing bounds them.
+        """
+        if len(chosen):
+            factor = factor_design(self.groups.rows[chosen], self.prior, self.space)
+        else:
+            # no row of the prior has both nuisance and machine columns, see `combine_prior`
+            rows = self.prior.rows[:, self.prior.n_nuisance :] @ self.space.machine
+            factor = factor_rows(np.concatenate([rows, np.zeros((rows.shape[1], rows.shape[1]))]))
+        s = np.linalg.svd(factor, compute_uv=False)
+        if not s[-1] > np.finfo(float).eps * len(s) * s[0]:
+            return None
+        k = len(self.prediction)
+        rms = [
+            float(np.sqrt((np.linalg.solve(factor.T, (L @ self.space.machine).T) ** 2).sum() / k))
+            for L in (self.prediction.position, self.prediction.orientation)
+        ]
+        return ExpectedErrors(*rms)
+
+    def require_equations(self, n: int) -> None:
+        """Refuse n groups that give fewer equations than there are unknowns.
+
+        Raises
+        ------
+        EstimationError
+            With the smallest number of poses.
+        """
+        k = self.poses_per_group
+        if n < self.min_groups:
+            raise EstimationError(
+                report_finding(
+                    "plan.too-few-equations",
+                    robot=self.robot.name,
+                    poses=n * k,
+                    equations=n * self.groups.rows.shape[1],
+                    earlier=self.n_earlier_equations,
+                    unknowns=self.n_unknowns,
+                    parameters=len(self.free),
+                    needed=self.min_groups * k,
+                )
             )
 
 
-def problem(
-    robot: Mechanism,
-    instrument: Instrument,
-    constraints: Constraints | None = None,
-    poses: FloatArray | None = None,
-    measured: Measurements | None = None,
-    count: int = 1000,
-    seed: int = 1,
-    taken: Sequence[str] = (),
-) -> Problem:
-    """Make a planning problem ready.
+def prepare_problem(
+    robot: Mechanism, instrument: Instrument, options: PlanOptions | None = None
+) -> PlanningProblem:
+    """Return the planning problem of a robot and an instrument.
+
+    Errors are predicted for PREDICTED poses drawn evenly from the workspace within the machine's
+    own limits, wherever the constraints allow measuring. With allowed poses in the options, they
+    are predicted for as many of these, drawn at random.
 
     Parameters
     ----------
-    robot : at the values that are believed now; its free parameters and tolerances.
-    instrument : what will measure, with its noise. constraints : what poses must keep to.
-    poses : (n, c) controlled coordinates that are allowed [m, rad]; default: about `count` drawn
-        from the workspace.
-    measured : measurements that were made already; the instrument is taken to be set up anew after
-        them.
-    taken : names that new poses may not get, beside those of `measured`, such as of poses held out
-        there.
-
-    Errors are predicted for PREDICTED poses drawn evenly from the workspace within the machine's
-    own limits, wherever `constraints` allow to measure; of given poses, for as many of them drawn
-    at random.
+    robot : at its present values, with its free parameters and tolerances.
+    instrument : what will measure, with its noise. options : constraints, candidates, measurements
+        made already (the instrument is taken to be set up anew after them), seed.
 
     Raises
     ------
     EstimationError
-        The robot has no free parameter, or this instrument tells nothing of those there are.
+        The robot has no free parameter, or the instrument determines none of them.
     MechanismError, DataError
-        See `candidates`, `considered`.
+        See `draw_candidates`, `linearize_candidate_groups`.
     """
+    options = options or PlanOptions()
     free = select_free_parameters(robot)
     if not len(free):
+        raise EstimationError(report_finding("plan.no-free-parameter", robot=robot.name))
+    _require_plain_sensors(instrument)
+    rng = np.random.default_rng(options.seed)
+    candidates = (
+        draw_candidates(robot, options.constraints, options.n_candidates, rng)
+        if options.allowed_poses is None
+        else check_listed_poses(robot, options.allowed_poses, options.constraints)
+    )
+    mounted = instrument.with_tool(robot)
+    groups = linearize_candidate_groups(free, mounted, candidates.solution.q, rng)
+    observable = decompose_information(free, groups)
+    if not observable.singular_values.max(initial=0.0) > NO_INFORMATION:
         raise EstimationError(
-            f"there is nothing to plan for: {robot.name} has no free parameter; free one in its "
-            "file"
+            report_finding(
+                "plan.nothing-observable",
+                robot=robot.name,
+                kinds=tuple(sensor.kind.name for sensor in mounted.sensors),
+                parameters=len(free),
+                poses=len(candidates),
+            )
         )
+    measured = options.measured
+    earlier, n_equations = (None, 0) if measured is None else _fold_measured(free, measured)
+    if earlier is not None:
+        observable = decompose_information(free, groups, earlier)
+    to_predict = _select_predicted(candidates, options)
+    labels = () if measured is None else measured.labels
+    return PlanningProblem(
+        free,
+        mounted,
+        options,
+        candidates,
+        groups,
+        combine_prior(free, groups, earlier),
+        observable,
+        linearize_prediction(free, to_predict, observable),
+        n_equations,
+        tuple(dict.fromkeys([*labels, *options.used_names])),
+    )
+
+
+def name_groups(poses_per_group: int) -> str:
+    """Return the plural noun for groups of so many poses."""
+    return {1: "poses", 2: "pairs"}.get(poses_per_group, f"sets of {poses_per_group} poses")
+
+
+def to_quantity(robot: Mechanism, value: float, dimension: Dimension) -> Quantity:
+    """Return a number [SI] in the unit of the robot's file."""
+    symbol = robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol)
+    return Quantity(value / find_unit(symbol).factor_to_si, symbol)
+
+
+def _require_plain_sensors(instrument: Instrument) -> None:
+    """Refuse sensors that measure some poses only, or in sessions or groups."""
     if any(sensor.rows is not None for sensor in instrument.sensors):
         raise DataError(
-            "an instrument for planning looks at every pose; leave out the rows of its sensors"
+            "an instrument for planning measures every pose; leave out the rows of its sensors"
         )
     if any(
         set(np.unique(label)) != {""} for s in instrument.sensors for label in (s.session, s.group)
@@ -233,65 +321,34 @@ def problem(
             "an instrument for planning is set up once; leave out sessions and groups of its "
             "sensors"
         )
-    rng = np.random.default_rng(seed)
-    found = (
-        candidates(robot, constraints, count, rng)
-        if poses is None
-        else listed_candidates(robot, poses, constraints)
-    )
-    mounted = instrument.with_tool(robot)
-    units = considered(free, mounted, found.solution.q, rng)
-    told = knowable(free, units)
-    if not told.singular_values.max(initial=0.0) > NOTHING:
-        kinds = ", ".join(sensor.kind.name for sensor in mounted.sensors)
-        raise EstimationError(
-            f"an instrument of kind {kinds} tells nothing of the {len(free)} free parameters of "
-            f"{robot.name} at any of "
-            f"{len(found)} poses; choose another kind"
-        )
-    known, given = (None, 0) if measured is None else _known(free, measured)
-    seen = told if known is None else knowable(free, units, known)
-    wanted = predicted(free, _to_predict(found, poses, seed), seen)
-    names = tuple(dict.fromkeys([*(() if measured is None else measured.labels), *taken]))
-    return Problem(
-        free, mounted, found, units, start_of(free, units, known), seen, wanted, given, names
-    )
 
 
-def _known(free: FreeParameters, measured: Measurements) -> tuple[FloatArray, int]:
-    """Return the factor (p, p) of measurements made already, and how many equations they leave for
-    the robot.
+def _fold_measured(free: FreeParameters, measured: Measurements) -> tuple[FloatArray, int]:
+    """Return the factor (p, p) of earlier measurements, and the number of equations that they leave
+    for the robot.
     """
     robot = free.robot
     check_actuators(measured, robot)
     if not measured.n_rows:
-        raise DataError(
-            "what is said to be measured already holds no measured value; fill it in, or leave it "
-            "out"
-        )
+        raise DataError(report_finding("plan.measured-empty"))
     factor, reached = information(free, measured)
     if not reached.all():
-        lost = measured.labels[int(np.flatnonzero(~reached)[0])]
+        label = measured.labels[int(np.flatnonzero(~reached)[0])]
         raise DataError(
-            f"{robot.name} does not reach the measured pose {lost!r} with the readings given "
-            "there; correct the readings, "
-            "or plan with the calibrated robot file"
+            report_finding("plan.measured-pose-unreachable", robot=robot.name, pose=label)
         )
     table = measured.nuisance_parameters.table
-    own = int((table.free & np.isnan(table.tolerance)).sum())
-    return factor[0, :-1, :-1], max(equations(robot, measured) - own, 0)
+    nuisance = int((table.free & np.isnan(table.tolerance)).sum())
+    return factor[0, :-1, :-1], max(equations(robot, measured) - nuisance, 0)
 
 
-def _to_predict(found: Candidates, poses: FloatArray | None, seed: int) -> Solution:
-    """Return the poses whose errors are predicted; they depend neither on constraints nor on the
-    candidates drawn.
-    """
-    robot = found.rules.robot
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
-    if poses is None:
+def _select_predicted(candidates: Candidates, options: PlanOptions) -> Solution:
+    """Return the poses to predict; they do not depend on constraints and candidates."""
+    robot = candidates.checker.robot
+    rng = np.random.default_rng(np.random.SeedSequence(options.seed, spawn_key=(2,)))
+    if options.allowed_poses is None:
         return sample_workspace(robot, PREDICTED, rng).solution
-    listed = np.unique(poses, axis=0)
-    solution = inverse(robot, listed)
-    bare = replace(found.rules, constraints=Constraints(min_margin=0.0))
-    reached = np.flatnonzero(bare.judge(solution).allowed)
+    solution = inverse(robot, np.unique(options.allowed_poses, axis=0))
+    machine = replace(candidates.checker, constraints=Constraints(min_margin=0.0))
+    reached = np.flatnonzero(machine.check_poses(solution).allowed)
     return solution.take(np.sort(rng.permutation(reached)[:PREDICTED]))

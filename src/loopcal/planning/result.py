@@ -1,157 +1,240 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A plan: the poses to measure in the order of visiting, what they are worth, and what to expect of
-them.
-"""
+"""A plan: poses to measure in their order, quality of the choice, and expected errors."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure import Instrument
 from loopcal.mechanism import Mechanism
-from loopcal.planning.needed import PoseCurve, counted, in_words
-from loopcal.planning.problem import Accuracy, Target
+from loopcal.planning.options import PlanOptions
+from loopcal.planning.problem import ExpectedErrors, name_groups
+from loopcal.planning.sample_size import ErrorCurve
+from loopcal.serialization import to_json
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 WEAK = 0.5
-"""Efficiency below which it is said that little is guaranteed."""
+"""Efficiency below which the certificate guarantees little."""
 
 
-def at_least(share: float) -> str:
-    """Return a share of which no less is guaranteed in per cent, rounded down."""
-    return f"{np.floor(1e3 * share) / 10.0:.1f}%"
+def round_shortfall(efficiency: float) -> float:
+    """Return how far a guaranteed efficiency can be from 1, in per cent, rounded up to 0.1."""
+    return float(np.round(100.0 - np.floor(1e3 * efficiency) / 10.0, 1))
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """Poses to measure, in the order of visiting.
+class PlannedPoses:
+    """Poses in the order of visiting.
 
     Attributes
     ----------
-    robot : for whose present values it was made. instrument : that will measure.
-    coordinates : (m, c) controlled coordinates [m, rad]. readings : (m, a) that these poses are
-        commanded with [m, rad].
-    held_out : (m,) True for the poses to judge by. via_home : (m,) True where home must be visited
-        before.
-    labels : (m,) names of the poses. units : (u, k) rows of the poses that are measured together.
-    criterion : I or D. figures : D, I, A, E of the fitted poses, in tolerances.
-    efficiency : at least this share of the best possible (det ratio^(1/p) for D, variance ratio for
-        I).
-    expected : errors after calibration with the fitted poses; before : without; even : median of as
-        many evenly drawn.
-    length : of the way [m]. seed : of all random choices. notes : sentences on what was assumed or
-        left out.
-    curve : expected errors by the number of poses, where it was asked for.
-    target : what I is the mean variance of: pose, turns times the robot's size [m^2], position
-        [m^2] or orientation [rad^2]. considered : units that were chosen from; `efficiency` holds
-        among them.
+    labels : (m,) names. coordinates : (m, c) controlled coordinates [m, rad].
+    readings : (m, a) actuator readings to command [m, rad].
+    held_out : (m,) True for validation poses.
+    via_home : (m,) True where the path goes via home before the pose.
+    groups : (u, k) indices of the poses that are measured together.
+    path_length : from home through all poses [m], rotations times the robot's size; None where it
+        was not computed.
     """
 
-    robot: Mechanism
-    instrument: Instrument
+    labels: tuple[str, ...]
     coordinates: FloatArray
     readings: FloatArray
     held_out: BoolArray
     via_home: BoolArray
-    labels: tuple[str, ...]
-    units: IntArray
-    criterion: str
-    figures: dict[str, float]
+    groups: IntArray
+    path_length: float | None = None
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def __repr__(self) -> str:
+        return f"PlannedPoses({len(self)} poses, {int(self.held_out.sum())} held out)"
+
+    def to_dicts(self, robot: Mechanism) -> list[dict[str, Any]]:
+        """Return for each pose its name, use, command and readings, SI."""
+        actuators = [actuator.name for actuator in robot.actuators]
+        return [
+            {
+                "name": label,
+                "use": "held-out" if self.held_out[i] else "fit",
+                "via_home": bool(self.via_home[i]),
+                "commanded": dict(zip(robot.controlled, self.coordinates[i].tolist(), strict=True)),
+                "readings": dict(zip(actuators, self.readings[i].tolist(), strict=True)),
+            }
+            for i, label in enumerate(self.labels)
+        ]
+
+
+@dataclass(frozen=True)
+class DesignQuality:
+    """Quality of the poses for the fit.
+
+    Attributes
+    ----------
+    figures : D, I, A and E, in tolerances.
+    efficiency : lower bound on the efficiency relative to the best possible choice: (ratio of
+        determinants)^(1/p) for D, ratio of variances for I.
+    considered : number of candidate groups; the efficiency holds among them.
+    """
+
+    figures: Mapping[str, float]
     efficiency: float
-    expected: Accuracy
-    before: Accuracy | None
-    even: Accuracy | None
-    length: float
-    seed: int
-    notes: tuple[str, ...]
-    curve: PoseCurve | None = None
-    target: Target = "pose"
-    considered: int = 0
+    considered: int
+
+
+@dataclass(frozen=True)
+class ErrorForecast:
+    """Expected errors of the tool over the workspace.
+
+    Attributes
+    ----------
+    before : with the prior information only; None where nothing bounds them.
+    random : with as many poses drawn evenly, median of several draws; None where there are too few
+        candidates.
+    after : with the planned poses.
+    """
+
+    before: ExpectedErrors | None
+    random: ExpectedErrors | None
+    after: ExpectedErrors
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Poses to measure.
+
+    Attributes
+    ----------
+    robot : at the values for which the plan was made. instrument : what will measure.
+    options : of the plan. poses : in the order of visiting.
+    quality : of the choice. errors : expected over the workspace.
+    notes : findings on assumptions and exclusions.
+    curve : expected errors by the number of poses, where requested.
+    """
+
+    robot: Mechanism
+    instrument: Instrument
+    options: PlanOptions
+    poses: PlannedPoses
+    quality: DesignQuality
+    errors: ErrorForecast
+    notes: tuple[Finding, ...] = ()
+    curve: ErrorCurve | None = None
 
     @property
     def n_poses(self) -> int:
-        """Number of poses that are fitted."""
-        return int((~self.held_out).sum())
+        """Number of poses for the fit."""
+        return int((~self.poses.held_out).sum())
+
+    @property
+    def n_groups(self) -> int:
+        """Number of groups for the fit."""
+        return int((~self.poses.held_out[self.poses.groups].any(axis=1)).sum())
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Everything that the plan reports: content, certificate, errors, curve and notes."""
+        curve = () if self.curve is None else (self.curve.report(self.robot),)
+        return (
+            self._report_poses(),
+            self._report_path(),
+            self._report_certificate(),
+            self._report_errors(),
+            *curve,
+            *self.notes,
+        )
+
+    def __repr__(self) -> str:
+        return (
+            f"Plan({self.robot.name}: {self.n_poses} poses for the fit, "
+            f"{int(self.poses.held_out.sum())} held out, criterion {self.options.criterion}, "
+            f"efficiency at least {self.quality.efficiency:.3f})"
+        )
 
     def __str__(self) -> str:
-        return "\n".join([*self.sentences(), *(f"note: {note}" for note in self.notes)])
+        return "\n".join(str(finding) for finding in self.findings)
 
-    def sentences(self) -> list[str]:
-        """What was planned and what to expect of it."""
-        via = int(self.via_home.sum())
-        ways = f", {via} of the ways via home" if via else ""
-        seen = ", ".join(sensor.kind.name for sensor in self.instrument.sensors)
-        held, best = int(self.held_out.sum()), at_least(self.efficiency)
-        what = f"{self.n_poses} pose{'s'[: self.n_poses != 1]} of {self.robot.name} to measure ({seen}) and {held} to judge by"
-        among, drawn = "candidates", "poses"
-        if (k := self.units.shape[1]) > 1:
-            judged = int(self.held_out[self.units].any(axis=1).sum())
-            fitted, drawn = len(self.units) - judged, counted(k)
-            among = f"{self.considered} {drawn} considered"
-            what = f"{fitted} {drawn} to measure ({seen}) and {judged} to judge by, of {len(self.labels)} poses of "
-            what += self.robot.name
-        lines = [
-            what,
-            f"way from home through all of them: {self.length:.3g} m{ways}",
-            (
-                f"criterion {self.criterion}: at least {best} of the best that as many of the "
-                f"{among} "
-                "allow"
-            ),
-        ]
-        if self.efficiency < WEAK:
-            lines[-1] += (
-                " (little is guaranteed: a plan that tells twice as much may exist; try another "
-                "seed, or more poses)"
-            )
-        shown = [
-            ("before", self.before),
-            (f"as many evenly drawn {drawn}", self.even),
-            ("after this plan", self.expected),
-        ]
-        found = [
-            f"{words} {in_words(self.robot, errors)}"
-            for words, errors in shown
-            if errors is not None
-        ]
-        lines.append(f"expected errors over the workspace (rms): {'; '.join(found)}")
-        return lines if self.curve is None else [*lines, *self.curve.sentences(self.robot)]
+    def _report_poses(self) -> Finding:
+        """Return how many poses or groups the plan has."""
+        groups = len(self.poses.groups)
+        return report_finding(
+            "plan.poses",
+            robot=self.robot.name,
+            poses=len(self.poses),
+            counted=name_groups(self.poses.groups.shape[1]),
+            fitted=self.n_groups,
+            held_out=groups - self.n_groups,
+            kinds=tuple(sensor.kind.name for sensor in self.instrument.sensors),
+        )
+
+    def _report_path(self) -> Finding:
+        """Return the length of the path."""
+        assert self.poses.path_length is not None, "a plan has a path"
+        length = Quantity(self.poses.path_length, "m")
+        return report_finding("plan.path", length=length, via_home=int(self.poses.via_home.sum()))
+
+    def _report_certificate(self) -> Finding:
+        """Return how far the choice can be from the best possible one."""
+        efficiency = self.quality.efficiency
+        return report_finding(
+            "plan.weak-certificate" if efficiency < WEAK else "plan.certificate",
+            shortfall=round_shortfall(efficiency),
+            chosen=self.n_groups,
+            counted=name_groups(self.poses.groups.shape[1]),
+            considered=self.quality.considered,
+            criterion=self.options.criterion,
+        )
+
+    def _report_errors(self) -> Finding:
+        """Return the expected errors: before, with random poses, and after."""
+        before, random, after = (
+            None if errors is None else errors.to_quantities(self.robot)
+            for errors in (self.errors.before, self.errors.random, self.errors.after)
+        )
+        target, size = self.options.target, self.robot.size
+        share = (
+            None
+            if self.errors.random is None
+            else 1.0
+            - self.errors.after.select(target, size) / self.errors.random.select(target, size)
+        )
+        return report_finding(
+            "plan.expected-errors",
+            before=before,
+            random=random,
+            after=after,
+            counted=name_groups(self.poses.groups.shape[1]),
+            target=target,
+            reduction=share,
+        )
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything by name for JSON, SI."""
-        errors = {"before": self.before, "evenly_drawn": self.even, "after": self.expected}
-        rows = zip(
-            self.labels, self.held_out, self.via_home, self.coordinates, self.readings, strict=True
-        )
-        actuators = [actuator.name for actuator in self.robot.actuators]
+        """Return everything by name for JSON, SI."""
+        errors, poses = self.errors, self.poses
+        forecast = {"before": errors.before, "evenly_drawn": errors.random, "after": errors.after}
         return {
             "robot": self.robot.name,
             "kinds": [sensor.kind.name for sensor in self.instrument.sensors],
             "n_poses": self.n_poses,
-            "criterion": self.criterion,
-            "target": self.target,
-            "figures": self.figures,
-            "efficiency": self.efficiency,
-            "considered": self.considered,
-            "expected": {name: None if e is None else dict(vars(e)) for name, e in errors.items()},
-            "path_length": self.length,
-            "seed": self.seed,
-            "poses": [
-                {
-                    "name": label,
-                    "use": "held-out" if held else "fit",
-                    "via_home": bool(via),
-                    "commanded": dict(zip(self.robot.controlled, x.tolist(), strict=True)),
-                    "readings": dict(zip(actuators, q.tolist(), strict=True)),
-                }
-                for label, held, via, x, q in rows
-            ],
-            "compared": [[self.labels[i] for i in unit_] for unit_ in self.units]
-            if self.units.shape[1] > 1
+            "criterion": self.options.criterion,
+            "target": self.options.target,
+            "figures": dict(self.quality.figures),
+            "efficiency": self.quality.efficiency,
+            "considered": self.quality.considered,
+            "expected": {k: None if e is None else dict(vars(e)) for k, e in forecast.items()},
+            "path_length": poses.path_length,
+            "seed": self.options.seed,
+            "poses": poses.to_dicts(self.robot),
+            "compared": [[poses.labels[i] for i in group] for group in poses.groups]
+            if poses.groups.shape[1] > 1
             else [],
             "curve": None if self.curve is None else self.curve.to_dict(),
-            "notes": list(self.notes),
+            "notes": [str(note) for note in self.notes],
+            "findings": to_json(self.findings),
         }

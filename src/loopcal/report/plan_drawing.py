@@ -12,8 +12,9 @@ import numpy as np
 
 from loopcal.mechanism import POSITION, Mechanism
 from loopcal.planning.candidates import home_coordinates
-from loopcal.planning.needed import DIMENSION, PoseCurve
+from loopcal.planning.problem import DIMENSIONS
 from loopcal.planning.result import Plan
+from loopcal.planning.sample_size import ErrorCurve
 from loopcal.report.robot_drawing import COLOURS, DPI
 from loopcal.units import Dimension, Unit, find_unit
 
@@ -30,7 +31,7 @@ def draw_plan(plan: Plan) -> Figure:
 
     names = plan.robot.controlled
     columns = [
-        plan.coordinates[:, i] / _unit(plan.robot, name).factor_to_si
+        plan.poses.coordinates[:, i] / _unit(plan.robot, name).factor_to_si
         for i, name in enumerate(names)
     ]
     pairs = [(i, i + 1) for i in range(0, len(names) - 1, 2)] + (
@@ -39,7 +40,7 @@ def draw_plan(plan: Plan) -> Figure:
     figure = Figure(figsize=(4.2 * len(pairs), 4.4), layout="constrained")
     home = home_coordinates(plan.robot)
     start = [home[i] / _unit(plan.robot, name).factor_to_si for i, name in enumerate(names)]
-    step = np.arange(1, len(plan.labels) + 1)
+    step = np.arange(1, len(plan.poses.labels) + 1)
     for place, (i, j) in enumerate(pairs, 1):
         axes: Any = figure.add_subplot(1, len(pairs), place)
         x, y = (columns[i], columns[j]) if j is not None else (step, columns[i])
@@ -47,8 +48,8 @@ def draw_plan(plan: Plan) -> Figure:
         axes.plot([first[0], *x], [first[1], *y], color="0.7", lw=0.8, zorder=1, label="way")
         axes.plot(*first, "k+", ms=8.0, label="home", zorder=3)
         for chosen, colour, label in (
-            (~plan.held_out, FITTED, "to fit"),
-            (plan.held_out, JUDGED, "to judge by"),
+            (~plan.poses.held_out, FITTED, "to fit"),
+            (plan.poses.held_out, JUDGED, "to judge by"),
         ):
             axes.plot(x[chosen], y[chosen], "o", color=colour, ms=4.5, label=label, zorder=2)
         axes.set_xlabel(_label(plan.robot, names[i]) if j is not None else "step [1], home is 0")
@@ -61,21 +62,21 @@ def draw_plan(plan: Plan) -> Figure:
         frameon=False,
         fontsize=8,
     )
-    held = int(plan.held_out.sum())
+    held = int(plan.poses.held_out.sum())
     figure.suptitle(
         f"{plan.robot.name}: n = {plan.n_poses} poses to fit, {held} to judge by", fontsize=10
     )
     return figure
 
 
-def draw_curve(robot: Mechanism, curve: PoseCurve) -> Figure:
+def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
     """Draw expected errors by the number of poses, with the bound that no choice of so many
     candidates can beat.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter, ScalarFormatter
 
-    dimension = DIMENSION[curve.target]
+    dimension = DIMENSIONS[curve.target]
     shown = find_unit(robot.units[dimension])
     figure = Figure(figsize=(6.4, 4.4), layout="constrained")
     axes: Any = figure.add_subplot(1, 1, 1)

@@ -58,10 +58,10 @@ def format_sheet(plan: Plan) -> str:
     headers += [f"{a.name} [{symbol}]" for a, (symbol, _) in zip(robot.actuators, reading, strict=True)]
     home = home_coordinates(robot)
     stops = []
-    for i, label in enumerate(plan.labels):
-        if plan.via_home[i]:
+    for i, label in enumerate(plan.poses.labels):
+        if plan.poses.via_home[i]:
             stops.append(("home", VIA, home, inverse(robot, home[None]).q[0]))
-        stops.append((label, HELD_OUT if plan.held_out[i] else FIT, plan.coordinates[i], plan.readings[i]))
+        stops.append((label, HELD_OUT if plan.poses.held_out[i] else FIT, plan.poses.coordinates[i], plan.poses.readings[i]))
     lines = [
         f"## Poses of {robot.name} to measure, in this order, from home; between two of them the "
         "machine moves straight in",
@@ -79,17 +79,17 @@ def format_sheet(plan: Plan) -> str:
 def format_plan_data(plan: Plan) -> str:
     """Return the data file to fill in."""
     sensors = plan.instrument.sensors
-    looking = tuple(replace(s, rows=plan.units) if s.kind.poses_per_row > 1 else s for s in sensors)
+    looking = tuple(replace(s, rows=plan.poses.groups) if s.kind.poses_per_row > 1 else s for s in sensors)
     factors = [unit_of(plan.robot, actuator.dimension)[1] for actuator in plan.robot.actuators]
     # the doubles that the texts of the sheet stand for, so that both files say the same digits
-    readings = [[parse_exact(_text(q, f), f) for q, f in zip(row, factors, strict=True)] for row in plan.readings.tolist()]
-    text = format_data_sheet(plan.robot, replace(plan.instrument, sensors=looking), readings, plan.labels)
-    return insert_use_column(text, {label: HELD_OUT if held else FIT for label, held in zip(plan.labels, plan.held_out, strict=True)})
+    readings = [[parse_exact(_text(q, f), f) for q, f in zip(row, factors, strict=True)] for row in plan.poses.readings.tolist()]
+    text = format_data_sheet(plan.robot, replace(plan.instrument, sensors=looking), readings, plan.poses.labels)
+    return insert_use_column(text, {label: HELD_OUT if held else FIT for label, held in zip(plan.poses.labels, plan.poses.held_out, strict=True)})
 
 
 def straight_in(robot: Mechanism) -> str:
     """Say in what a way is straight; a tilt by phi and theta goes by its vector, see
-    `loopcal.planning.paths`.
+    `loopcal.planning.path`.
     """
     names = [name for name in robot.controlled if name not in ("phi", "theta")]
     tilt = ["theta*cos(phi)", "theta*sin(phi)"] if "phi" in robot.controlled else []

@@ -17,7 +17,7 @@ from loopcal.mechanism import POSITION
 from loopcal.units import Dimension
 
 if TYPE_CHECKING:
-    from loopcal.planning.surface_groups import SurfacePlan
+    from loopcal.planning.plane_line_planning import SurfacePlan
 
 
 FREE = "free"
@@ -66,20 +66,20 @@ def format_surface_sheet(plan: SurfacePlan) -> str:
         ",".join(headers),
     ]
     factors = [factor for _, factor in (*commanded, *reading)]
-    u, k = plan.coordinates.shape[:2]
-    for g in range(u):
-        for i, role in enumerate(plan.roles(k)):
-            hold = plan.hold(g, i)
-            cells = [str(g * k + i + 1), plan.labels[g * k + i], f"group{g + 1}", role]
+    poses = plan.poses
+    for g, members in enumerate(poses.groups):
+        for i, (role, row) in enumerate(zip(plan.list_roles(), members, strict=True)):
+            hold = plan.list_held(g, i)
+            cells = [str(row + 1), poses.labels[row], f"group{g + 1}", role]
             held, exactly = (
-                (" ".join(hold), f"{plan.sigma / length:.{DIGITS}g}") if i else (FREE, "")
+                (" ".join(hold), f"{plan.options.sigma / length:.{DIGITS}g}") if i else (FREE, "")
             )
-            cells += [held + (f" ({VIA} home)" if plan.via_home[g, i] else ""), exactly]
+            cells += [held + (f" ({VIA} home)" if poses.via_home[row] else ""), exactly]
             cells += [
-                f"{plan.held[g, 0, j] / length:.{DIGITS}g}" if n in hold else ""
+                f"{plan.positions[g, 0, j] / length:.{DIGITS}g}" if n in hold else ""
                 for j, n in enumerate(POSITION)
             ]
-            numbers = (*plan.coordinates[g, i], *plan.readings[g, i])
+            numbers = (*poses.coordinates[row], *poses.readings[row])
             cells += [
                 f"{value / factor:.{DIGITS}g}"
                 for value, factor in zip(numbers, factors, strict=True)
@@ -94,16 +94,18 @@ def format_surface_data(plan: SurfacePlan) -> str:
 
     robot = plan.robot
     observations = []
-    for sensor in plan.instrument().sensors:
+    for sensor in plan.instrument.sensors:
         assert sensor.rows is not None  # the plan spells them out
         zero = np.zeros((len(sensor.rows), len(sensor.kind.columns)))
         seen = Observations.from_sigma(
             sensor.kind, sensor.rows, zero, sensor.noise.sigma, "", sensor.group
         )
         observations.append(seen)
-    flat = plan.readings.reshape(-1, len(robot.actuators))
     text = format_measurements(
-        Measurements(robot.name, flat, tuple(observations), labels=plan.labels), robot
+        Measurements(
+            robot.name, plan.poses.readings, tuple(observations), labels=plan.poses.labels
+        ),
+        robot,
     )
     return _by_pose(plan, text)
 
@@ -114,7 +116,7 @@ def _by_pose(plan: SurfacePlan, text: str) -> str:
     first = next(i for i, line in enumerate(lines) if not line.startswith("#"))
     names = {f"{a.name} [{unit_of(plan.robot, a.dimension)[0]}]" for a in plan.robot.actuators}
     places = {i for i, name in enumerate(lines[first].split(",")) if name in names}
-    order = {label: i for i, label in enumerate(plan.labels)}
+    order = {label: i for i, label in enumerate(plan.poses.labels)}
     rows = sorted(
         (line.split(",") for line in lines[first + 1 :]), key=lambda cells: order[cells[0]]
     )

@@ -93,7 +93,8 @@ def printed_reductions() -> FloatArray:
 
 def arranged(name: str, study: Study, seed: int, trials: int) -> Arrangement:
     """Look at one way to place the points."""
-    first, last = (spread(rows) for rows in (study.planned.rows(study.first), study.optimised.rows))
+    designs = (study.planned.linearize(study.first), study.optimised.rows)
+    first, last = (spread(rows) for rows in designs)
     return Arrangement(name, first, last, cell(study, SET * MM, NOISE * MM, seed, trials), study)
 
 

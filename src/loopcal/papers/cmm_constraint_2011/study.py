@@ -19,10 +19,8 @@ from loopcal.mechanism import Mechanism, Solution, forward_trials, sample_worksp
 from loopcal.papers.cmm_constraint_2011.gauge import without_gauge
 from loopcal.papers.cmm_constraint_2011.published import MM
 from loopcal.papers.cmm_constraint_2011.steps import Layout
-from loopcal.planning.coordinate import MovedDesign, coordinate_exchange
-from loopcal.planning.criteria import D
-from loopcal.planning.design import Start
-from loopcal.planning.groups import PlaneAndLine
+from loopcal.planning.design import D, MovedDesign, PriorInformation, coordinate_exchange
+from loopcal.planning.plane_line_groups import PlaneLineGroups
 from loopcal.typing import FloatArray
 
 ROBOT = "hexapod-nategh-agheli"
@@ -118,7 +116,7 @@ class Study:
     """
 
     robot: Mechanism
-    planned: PlaneAndLine
+    planned: PlaneLineGroups
     first: FloatArray
     optimised: MovedDesign
     seed: int
@@ -126,7 +124,7 @@ class Study:
     @cached_property
     def layout(self) -> Layout:
         """The points that are measured."""
-        return Layout(self.robot, self.planned.coordinates(self.optimised.design))
+        return Layout(self.robot, self.planned.place_points(self.optimised.design))
 
     @cached_property
     def unseen(self) -> Unseen:
@@ -147,14 +145,14 @@ def plan(
     """Draw groups at random and improve them by coordinate exchange for log det of what they tell;
     0 sweeps: as drawn.
     """
-    planned = PlaneAndLine(robot, points, MM, axes)
-    first = planned.random(groups, seed)
+    planned = PlaneLineGroups(robot, points, MM, axes)
+    first = planned.draw(groups, seed)
     found = coordinate_exchange(
-        planned.evaluate,
+        planned.linearize_indexed,
         first,
-        planned.levels(),
+        planned.list_levels(),
         D(),
-        Start.nothing(len(planned.free_parameters)),
+        PriorInformation.none(len(planned.free)),
         sweeps=sweeps,
     )
     return Study(robot, planned, first, found, seed)

@@ -25,7 +25,7 @@ from loopcal.papers.cmm_constraint_2011.published import MM, Published
 from loopcal.papers.cmm_constraint_2011.study import AXES, MEASURES, ROBOT, Study
 from loopcal.papers.printed import Cell as Entry
 from loopcal.papers.printed import Table
-from loopcal.planning.groups import PlaneAndLine
+from loopcal.planning.plane_line_groups import PlaneLineGroups
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
@@ -77,8 +77,8 @@ def ranks(study: Study, seed: int) -> tuple[tuple[int, int, int, int, FloatArray
     """Ranks of random groups, with the tolerance 1e-10 of the largest singular value."""
     found = []
     for groups, points in RANKS:
-        planned = PlaneAndLine(study.robot, points, MM, AXES)
-        rows = planned.rows(planned.random(groups, seed)).reshape(-1, len(planned.free_parameters))
+        planned = PlaneLineGroups(study.robot, points, MM, AXES)
+        rows = planned.linearize(planned.draw(groups, seed)).reshape(-1, len(planned.free))
         s = np.linalg.svd(rows, compute_uv=False)
         found.append((groups, points, len(rows), int((s > 1e-10 * s[0]).sum()), s))
     return tuple(found)

@@ -1,0 +1,350 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exchange algorithms: designs that no swap (Fedorov) or no move of a coordinate improves.
+
+Fedorov exchange chooses from a list of candidates. Group after group of the design, in random
+order, is replaced by the candidate that gains most (the order of exchanges of Cook and
+Nachtsheim). Coordinate exchange has no list: one coordinate of one group moves to the best of a few
+levels (Meyer and Nachtsheim 1995, Technometrics 37). Both compute the gain of all alternatives at
+once with the formulas of `scoring`, compute the factor anew after every exchange, and accept an
+exchange only if the new score is larger. Sources and derivations: docs/theory/planning.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopcal.errors import EstimationError
+from loopcal.findings import report_finding
+from loopcal.planning.design.criteria import Criterion
+from loopcal.planning.design.design_space import (
+    Design,
+    ObservableSpace,
+    PriorInformation,
+    find_observable_space,
+    is_allowed,
+    require_enough,
+)
+from loopcal.planning.design.relaxation import RelaxedDesign
+from loopcal.planning.design.scoring import (
+    GAIN,
+    RIDGE,
+    Scoring,
+    build_scoring,
+    compute_swap_terms,
+    is_determined,
+    score_additions,
+    score_swaps,
+)
+from loopcal.typing import FloatArray, IntArray
+
+LinearizeGroups = Callable[[IntArray, FloatArray], FloatArray]
+"""(b,) indices of groups, (b, c) coordinates -> rows (b, r, o + p), NaN where not allowed."""
+
+SWEEP_GAIN = 1e-3
+"""Sweeps end when one has multiplied the efficiency by less than 1 + this."""
+
+PROBES = 4
+"""Copies of each group at random levels, which with the first design define the observable
+directions.
+"""
+
+
+def fedorov_exchange(
+    rows: FloatArray,
+    n: int,
+    criterion: Criterion,
+    prior: PriorInformation,
+    seed: int = 0,
+    starts: int = 20,
+    repeats: bool = False,
+    relaxed: RelaxedDesign | None = None,
+    first: Iterable[IntArray] = (),
+) -> Design:
+    """Choose n of N groups by exchange from several starts.
+
+    Parameters
+    ----------
+    rows : (N, r, o + p) whitened and in tolerances; NaN where a group is not allowed.
+    n : number of groups to choose. criterion : D, I or A. prior : information that exists before.
+    seed : of the random starts; start i always has the same stream. starts : their number.
+    repeats : whether a group may be chosen more than once.
+    relaxed : the relaxed design of the same problem. Its rounding is one more start, and random
+        starts are drawn with its weights instead of evenly.
+    first : more designs to start from; one of fewer than n groups is completed by the groups that
+        gain most.
+
+    Returns
+    -------
+    Design; the best of all starts.
+
+    Raises
+    ------
+    EstimationError
+        n groups cannot determine the unknowns, fewer are allowed than requested, or there is no
+        start.
+    """
+    space = find_observable_space(rows, prior) if relaxed is None else relaxed.space
+    require_enough(n, rows, prior, space, repeats)
+    usable = np.flatnonzero(is_allowed(rows))
+    scoring = build_scoring(rows[usable], n / len(usable), criterion, prior, space)
+    scaled = scoring.scale_rows(rows[usable])
+    weights = None if relaxed is None else relaxed.weights[usable]
+    begins = [] if weights is None else [round_weights(weights, n, repeats)]
+    begins += [
+        complete_design(scoring, scaled, np.searchsorted(usable, chosen), n, repeats)
+        for chosen in first
+    ]
+    if not begins and starts < 1:
+        raise EstimationError(f"exchange needs a start; {starts} were requested, give 1 or more")
+    streams = np.random.default_rng(seed).spawn(len(begins) + starts)
+    ends = []
+    for i, stream in enumerate(streams):
+        chosen = (
+            begins[i] if i < len(begins) else draw_groups(stream, len(usable), n, repeats, weights)
+        )
+        ends.append(exchange_from_start(scoring, scaled, chosen, stream, repeats))
+    scores = [history[-1] for _, history in ends]
+    chosen, history = ends[int(np.argmax(scores))]
+    require_determined(history[-1], n, len(usable), space)
+    values = tuple(scoring.value(score) for score in history)
+    final = tuple(scoring.value(score) for score in scores)
+    return Design(np.sort(usable[chosen]), values[-1], values, final, space)
+
+
+def require_determined(score: float, n: int, count: int, space: ObservableSpace) -> None:
+    """Refuse the best of n of `count` groups where its score says that it is singular.
+
+    Raises
+    ------
+    EstimationError
+        The score is not finite.
+    """
+    if not np.isfinite(score):
+        raise EstimationError(
+            report_finding(
+                "plan.design-singular", chosen=n, available=count, unknowns=space.n_unknowns
+            )
+        )
+
+
+def exchange_from_start(
+    scoring: Scoring,
+    scaled: FloatArray,
+    chosen: IntArray,
+    stream: np.random.Generator,
+    repeats: bool,
+) -> tuple[IntArray, list[float]]:
+    """Exchange from one start; a singular start is first exchanged with a ridge."""
+    if not is_determined(scoring.factor(scaled[chosen])):
+        chosen, _ = exchange_groups(scoring.with_ridge(RIDGE), scaled, chosen, stream, repeats)
+        if not is_determined(scoring.factor(scaled[chosen])):
+            return chosen, [-np.inf]
+    return exchange_groups(scoring, scaled, chosen, stream, repeats)
+
+
+def exchange_groups(
+    scoring: Scoring,
+    scaled: FloatArray,
+    chosen: IntArray,
+    stream: np.random.Generator,
+    repeats: bool,
+) -> tuple[IntArray, list[float]]:
+    """Exchange the chosen groups (n,) of scaled rows (N, r, Q) until no single swap gains.
+
+    The chosen groups must be nonsingular.
+
+    Returns
+    -------
+    chosen : (n,). history : scores at the beginning and after each exchange.
+    """
+    chosen, n = chosen.copy(), len(chosen)
+    R = scoring.factor(scaled[chosen])
+    history, terms, idle = [scoring.score(R)], compute_swap_terms(scoring, R, scaled), 0
+    while idle < n:
+        for j in stream.permutation(n):
+            gain = score_swaps(terms, chosen[j])
+            if not repeats:
+                gain[chosen] = -np.inf
+            idle += 1
+            if gain.max() > GAIN * scoring.height:
+                trial = chosen.copy()
+                trial[j] = int(np.argmax(gain))
+                R = scoring.factor(scaled[trial])
+                score = scoring.score(R)
+                if score > history[-1]:
+                    chosen, terms, idle = trial, compute_swap_terms(scoring, R, scaled), 0
+                    history.append(score)
+            if idle >= n:
+                break
+    return chosen, history
+
+
+def complete_design(
+    scoring: Scoring, scaled: FloatArray, chosen: IntArray, n: int, repeats: bool
+) -> IntArray:
+    """Return a design (n,): the chosen groups, and one after another the groups that gain most."""
+    ridged = scoring if is_determined(scoring.factor(scaled[chosen])) else scoring.with_ridge(RIDGE)
+    while len(chosen) < n:
+        gain = score_additions(compute_swap_terms(ridged, ridged.factor(scaled[chosen]), scaled))
+        if not repeats:
+            gain[chosen] = -np.inf
+        chosen = np.append(chosen, np.argmax(gain))
+    return chosen
+
+
+def draw_groups(
+    stream: np.random.Generator, N: int, n: int, repeats: bool, weights: FloatArray | None
+) -> IntArray:
+    """Draw n of N groups, evenly or by weights; every group has a small weight, so that n exist."""
+    share = None if weights is None else (weights + 1e-3 * n / N) / (weights + 1e-3 * n / N).sum()
+    return stream.choice(N, n, replace=repeats, p=share)
+
+
+def round_weights(weights: FloatArray, n: int, repeats: bool) -> IntArray:
+    """Round weights (N,) of sum n to n groups: whole parts first, then the largest remainders."""
+    whole = (
+        np.floor(weights).astype(np.int64) if repeats else np.zeros(len(weights), dtype=np.int64)
+    )
+    order = np.argsort(whole - weights, kind="stable")
+    whole[order[: n - int(whole.sum())]] += 1
+    return np.repeat(np.arange(len(weights)), whole)
+
+
+@dataclass(frozen=True, eq=False)
+class MovedDesign:
+    """A design of groups that were moved.
+
+    Attributes
+    ----------
+    design : (u, c) coordinates. rows : (u, r, o + p) of it. value : of the criterion.
+    history : value before the first sweep (-inf for D, inf for I and A where it is singular), and
+        after each.
+    evaluated : number of groups that were linearized in all.
+    space : the directions in which the value counts.
+    """
+
+    design: FloatArray
+    rows: FloatArray
+    value: float
+    history: tuple[float, ...]
+    evaluated: int
+    space: ObservableSpace
+
+
+def coordinate_exchange(
+    linearize: LinearizeGroups,
+    design0: FloatArray,
+    levels: Sequence[FloatArray],
+    criterion: Criterion,
+    prior: PriorInformation,
+    sweeps: int = 10,
+) -> MovedDesign:
+    """Improve a design by moving one coordinate of one group at a time.
+
+    Parameters
+    ----------
+    linearize : (indices (b,), coordinates (b, c)) -> rows (b, r, o + p), NaN where not allowed. It
+        is called for all groups and all levels of one coordinate at once. Rows of a group may
+        depend on its index and its coordinates only, so that an accepted move leaves the rows of
+        the other groups valid.
+    design0 : (u, c) coordinates to start from.
+    levels : for each of the c coordinates its allowed values (k,); none for one that stays.
+    criterion : D, I or A. prior : information that exists before.
+    sweeps : largest number of passes over all coordinates.
+
+    Returns
+    -------
+    MovedDesign; the same for the same arguments.
+
+    Raises
+    ------
+    EstimationError
+        A group of the first design is not allowed, or the groups cannot determine the unknowns.
+    """
+    design = np.array(design0, dtype=np.float64)
+    indices = np.arange(len(design))
+    rows = np.array(linearize(indices, design))
+    excluded = np.flatnonzero(~is_allowed(rows))
+    if len(excluded):
+        raise EstimationError(
+            f"group {excluded[0]} of the first design is not allowed; start from groups that are"
+        )
+    probes = _probe_levels(linearize, design, rows, levels)
+    space = find_observable_space(probes, prior)
+    require_enough(len(design), rows, prior, space)
+    allowed = is_allowed(probes)
+    weight = len(design) / int(allowed.sum())
+    scoring = build_scoring(probes[allowed], weight, criterion, prior, space)
+    history, evaluated = [_score_design(scoring, rows)], len(probes)
+    for _ in range(sweeps):
+        used = scoring if np.isfinite(history[-1]) else scoring.with_ridge(RIDGE)
+        for c, values in enumerate(levels):
+            moved = np.repeat(design[:, None], len(values), axis=1)
+            moved[:, :, c] = values
+            which = np.repeat(indices, len(values))
+            flat = moved.reshape(-1, design.shape[1])
+            trials = linearize(which, flat) if len(values) else rows[:0]
+            trials = trials.reshape(len(design), len(values), *rows.shape[1:])
+            evaluated += len(which)
+            best = _choose_levels(used, rows, trials)
+            accepted = np.flatnonzero(best >= 0)
+            design[accepted, c] = np.asarray(values)[best[accepted]]
+            rows[accepted] = trials[accepted, best[accepted]]
+        history.append(_score_design(scoring, rows))
+        if history[-1] - history[-2] < SWEEP_GAIN * scoring.height:
+            break
+    require_determined(history[-1], len(design), len(design), space)
+    values = tuple(scoring.value(score) for score in history)
+    return MovedDesign(design, rows, values[-1], values, evaluated, space)
+
+
+def _probe_levels(
+    linearize: LinearizeGroups, design: FloatArray, rows: FloatArray, levels: Sequence[FloatArray]
+) -> FloatArray:
+    """Return rows of the design and of its groups moved to random levels of all coordinates."""
+    random = np.random.default_rng(0)
+    moved = np.tile(design, (PROBES, 1))
+    for c, values in enumerate(levels):
+        if len(values):
+            moved[:, c] = random.choice(np.asarray(values), len(moved))
+    return np.concatenate([rows, linearize(np.tile(np.arange(len(design)), PROBES), moved)])
+
+
+def _score_design(scoring: Scoring, rows: FloatArray) -> float:
+    """Return the score of a design; -inf where it is singular."""
+    R = scoring.factor(scoring.scale_rows(rows))
+    return scoring.score(R) if is_determined(R) else -np.inf
+
+
+def _choose_levels(scoring: Scoring, rows: FloatArray, trials: FloatArray) -> IntArray:
+    """Return the best level (u,) of each group in turn, -1 where it stays.
+
+    Parameters
+    ----------
+    rows : (u, r, c) at present. trials : (u, k, r, c) at the levels.
+    """
+    u, k = trials.shape[:2]
+    best = np.full(u, -1, dtype=np.int64)
+    usable = is_allowed(trials.reshape(u * k, *rows.shape[1:])).reshape(u, k)
+    present = scoring.scale_rows(rows)
+    scaled = scoring.scale_rows(np.where(usable[:, :, None, None], trials, 0.0))
+    R = scoring.factor(present)
+    score = scoring.score(R)
+    for i in np.flatnonzero(usable.any(axis=1)):
+        terms = compute_swap_terms(scoring, R, np.concatenate([present[i : i + 1], scaled[i]]))
+        gain = np.where(usable[i], score_swaps(terms, 0)[1:], -np.inf)
+        if gain.max() <= GAIN * scoring.height:
+            continue
+        level = int(np.argmax(gain))
+        old = present[i].copy()
+        present[i] = scaled[i, level]
+        new_R = scoring.factor(present)
+        new_score = scoring.score(new_R)
+        if new_score > score:
+            R, score, best[i] = new_R, new_score, level
+        else:
+            present[i] = old
+    return best

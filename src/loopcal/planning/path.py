@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Straight paths between poses: interpolation, distance, constraints, and a short order.
+
+A path is straight in the controlled coordinates: positions and angles change evenly, the shorter
+way round, and a tilt given by phi and theta changes as the vector (theta cos phi, theta sin phi),
+which is regular at zero tilt. Paths are checked in small steps, many paths at once. Each step is
+solved from the step before, so that a path keeps its branch; it must end with the readings that its
+end is commanded with.
+
+The order of visiting comes from nearest neighbors with several first poses, each improved by
+reversing sections while that makes the path shorter (2-opt, Croes 1958,
+doi:10.1287/opre.6.6.791). It is within a few per cent of the shortest for the few dozen poses of a
+plan. Where no straight path is allowed between two poses, the path goes via home.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.mechanism import POSITION, TILT, Mechanism, inverse, read_coordinates
+from loopcal.planning.constraints import ConstraintCheck, ConstraintChecker, Violation
+from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.units import Dimension
+
+STEPS = 40
+"""Steps in which a path as long as the robot's size, or one radian, is checked."""
+AT_ONCE = 4096
+"""Paths that are checked at once."""
+BRANCH = 1e-6
+"""Difference of readings, in the robot's size or in radians, above which a path ended on another
+branch than its end.
+"""
+FIRST_POSES = 8
+"""First poses that the order of visiting tries."""
+LEAST_GAIN = 1e-12
+"""Share of the length by which a path must become shorter to count: rounding is no gain."""
+
+
+def interpolate_path(
+    robot: Mechanism, start: FloatArray, end: FloatArray, share: float | FloatArray
+) -> FloatArray:
+    """Return coordinates (n, c) at a share (number or (n,)) of the straight paths from start to
+    end, (n, c) each.
+    """
+    names, s = robot.controlled, np.asarray(share, dtype=float)
+    angular = np.array([name not in POSITION for name in names])
+    step = end - start
+    step = np.where(angular, geometry.wrap_angle(step), step)
+    point = start + (s[..., None] if s.ndim else s) * step
+    if "phi" in names:
+        places = [names.index(name) for name in TILT[:2]]
+        vector = (1.0 - s) * _tilt_vector(start, places) + s * _tilt_vector(end, places)
+        point[:, places] = np.stack([np.angle(vector), np.abs(vector)], axis=1)
+    return point
+
+
+def measure_distance(robot: Mechanism, start: FloatArray, end: FloatArray) -> FloatArray:
+    """Return the length (..,) of straight paths [m]: the root of the squared changes, angles times
+    the robot's size.
+    """
+    names = robot.controlled
+    scale = np.array([1.0 if name in POSITION else robot.size for name in names])
+    step = np.where(scale == 1.0, end - start, geometry.wrap_angle(end - start)) * scale
+    if "phi" in names:
+        places = [names.index(name) for name in TILT[:2]]
+        tilted = robot.size * (_tilt_vector(end, places) - _tilt_vector(start, places))
+        step[..., places] = np.stack([tilted.real, tilted.imag], axis=-1)
+    return np.linalg.norm(step, axis=-1)
+
+
+def check_paths(
+    checker: ConstraintChecker, start: FloatArray, end: FloatArray, steps: int = STEPS
+) -> ConstraintCheck:
+    """Check straight paths from start (n, c) to end (n, c), both ends included.
+
+    The line of sight is not required on a path.
+
+    Parameters
+    ----------
+    steps : of a path as long as the robot's size; longer paths get more, every path at least 4.
+    """
+    robot, n = checker.robot, len(start)
+    allowed, violations = np.ones(n, dtype=bool), np.full(n, None, dtype=object)
+    order = np.argsort(measure_distance(robot, start, end), kind="stable")
+    for first in range(0, n, AT_ONCE):
+        rows = order[first : first + AT_ONCE]
+        check = _check_similar_paths(checker, start[rows], end[rows], steps)
+        allowed[rows], violations[rows] = check.allowed, check.violations
+    return ConstraintCheck(allowed, violations)
+
+
+def _check_similar_paths(
+    checker: ConstraintChecker, start: FloatArray, end: FloatArray, steps: int
+) -> ConstraintCheck:
+    """Check paths of similar length, all in the same number of steps."""
+    robot = checker.robot
+    longest = float(measure_distance(robot, start, end).max(initial=0.0)) / robot.size
+    count = max(int(np.ceil(steps * longest)), 4)
+    solution = inverse(robot, start)
+    check = checker.check_poses(solution, at_pose=False)
+    violations = np.array(check.violations)
+    left = np.flatnonzero(check.allowed)
+    solution = solution.take(left)
+    for i in range(1, count + 1):
+        if not len(left):
+            break
+        point = interpolate_path(robot, start[left], end[left], i / count)
+        solution = inverse(robot, point, solution)
+        step = checker.check_poses(solution, at_pose=False)
+        violations[left] = step.violations
+        left, solution = left[step.allowed], solution.take(step.allowed)
+    if len(left):
+        scale = np.array(
+            [robot.size if a.dimension is Dimension.LENGTH else 1.0 for a in robot.actuators]
+        )
+        difference = np.abs(solution.q - inverse(robot, end[left]).q) / scale
+        violations[left[~(difference <= BRANCH).all(axis=1)]] = Violation("branch-changed")
+    allowed = np.array([violation is None for violation in violations], dtype=bool)
+    return ConstraintCheck(allowed, violations)
+
+
+def _tilt_vector(coordinates: FloatArray, places: list[int]) -> np.ndarray:
+    """Return the tilt vector (..,) as a complex number: theta at the angle phi."""
+    return coordinates[..., places[1]] * np.exp(1j * coordinates[..., places[0]])
+
+
+@dataclass(frozen=True, eq=False)
+class VisitingOrder:
+    """An order of n poses.
+
+    Attributes
+    ----------
+    order : (n,) indices of the poses.
+    via_home : (n,) True where the path goes via home before the pose, because the straight path is
+        not allowed.
+    length : of the whole path from home to the last pose [m], see `measure_distance`.
+    """
+
+    order: IntArray
+    via_home: BoolArray
+    length: float
+
+
+def order_poses(checker: ConstraintChecker, poses: FloatArray) -> VisitingOrder:
+    """Return a short order of poses (n, c) [m, rad] that straight paths connect with home.
+
+    See `draw_candidates` for these paths.
+    """
+    robot, n = checker.robot, len(poses)
+    home = np.broadcast_to(read_coordinates(robot.home, robot.controlled), poses.shape)
+    from_home = measure_distance(robot, home, poses)
+    direct = measure_distance(robot, poses[:, None], poses[None, :])
+    around = from_home[:, None] + from_home[None, :]
+    known, free = np.eye(n, dtype=bool), np.ones((n, n), dtype=bool)
+    # A path is checked when an order uses it; one that is not allowed costs the way via home, and
+    # the order is computed anew.
+    while True:
+        order, length = find_short_order(np.where(free, direct, around), from_home)
+        first, second = order[:-1], order[1:]
+        new = ~known[first, second]
+        if not new.any():
+            break
+        first, second = first[new], second[new]
+        allowed = check_paths(checker, poses[first], poses[second]).allowed
+        known[first, second] = known[second, first] = True
+        free[first, second] = free[second, first] = allowed
+    via = np.concatenate([[False], ~free[order[:-1], order[1:]]])
+    return VisitingOrder(order, via, length)
+
+
+def find_short_order(cost: FloatArray, from_home: FloatArray) -> tuple[IntArray, float]:
+    """Return a short order (n,) and its length, from symmetric costs (n, n) and costs from home
+    (n,).
+    """
+    n = len(cost)
+    whole = np.zeros((n + 1, n + 1))
+    whole[1:, 1:], whole[0, 1:], whole[1:, 0] = cost, from_home, from_home
+    best: tuple[IntArray, float] | None = None
+    for first in np.argsort(from_home, kind="stable")[:FIRST_POSES]:
+        tour = _reverse_sections(whole, _visit_nearest(whole, int(first) + 1))
+        length = float(whole[tour[:-1], tour[1:]].sum())
+        if best is None or length < best[1] * (1.0 - LEAST_GAIN):
+            best = (tour[1:] - 1, length)
+    assert best is not None
+    return best
+
+
+def _visit_nearest(cost: FloatArray, first: int) -> IntArray:
+    """Return the tour from home (0) to `first` and then always to the nearest pose left."""
+    tour, left = [0, first], set(range(1, len(cost))) - {first}
+    while left:
+        tour.append(min(left, key=lambda i: (cost[tour[-1], i], i)))
+        left.remove(tour[-1])
+    return np.array(tour)
+
+
+def _reverse_sections(cost: FloatArray, tour: IntArray) -> IntArray:
+    """Return the tour after reversing the section that shortens it most, until none does.
+
+    The end is free, the beginning is not.
+    """
+    tour = np.array(tour)
+    m = len(tour)
+    while m > 2:
+        steps = cost[tour[:-1], tour[1:]]
+        # reversing i..j replaces the steps before i and after j; after the last pose there is none
+        after = np.concatenate([steps[1:], [0.0]])
+        new = cost[tour[:-1, None], tour[None, 1:]]
+        beyond = np.concatenate(
+            [cost[tour[1:, None], tour[None, 2:]], np.zeros((m - 1, 1))], axis=1
+        )
+        gain = steps[:, None] + after[None, :] - new - beyond
+        gain[np.tril_indices(m - 1)] = -np.inf
+        i, j = np.unravel_index(int(np.argmax(gain)), gain.shape)
+        if not gain[i, j] > LEAST_GAIN * steps.sum():
+            break
+        tour[i + 1 : j + 2] = tour[i + 1 : j + 2][::-1]
+    return tour
