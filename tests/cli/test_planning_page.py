@@ -60,4 +60,7 @@ def test_the_python_of_the_page_runs(page, capsys) -> None:
     names: dict = {}
     exec(block[1], names)  # noqa: S102
     assert names["plan"].n_poses == 12
-    assert "12 poses of printer for calibration and 3 for validation (component)" in capsys.readouterr().out
+    assert (
+        "12 poses of printer for calibration and 3 for validation (component)"
+        in capsys.readouterr().out
+    )
