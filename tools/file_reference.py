@@ -91,7 +91,7 @@ def families() -> str:
 
 
 def _nested(record: type) -> str:
-    return f"**{record.__name__}**: {file_reference.summarize(record)}\n\n{record_table(record)}"
+    return f"**{file_reference.name_record(record)}**: {file_reference.summarize(record)}\n\n{record_table(record)}"
 
 
 def kinds() -> str:

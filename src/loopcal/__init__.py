@@ -32,10 +32,13 @@ if TYPE_CHECKING:
     from loopcal.estimate import identify_trials as identify_trials
     from loopcal.estimate import prior_from as prior_from
     from loopcal.estimate import recalibrate as recalibrate
+    from loopcal.io import Run as Run
     from loopcal.io import load_measurements as load_measurements
     from loopcal.io import load_robot as load_robot
+    from loopcal.io import load_run as load_run
     from loopcal.io import save_measurements as save_measurements
     from loopcal.io import save_robot as save_robot
+    from loopcal.io import save_run as save_run
     from loopcal.measure import KINDS as KINDS
     from loopcal.measure import Component as Component
     from loopcal.measure import Gaussian as Gaussian
@@ -97,7 +100,15 @@ _WHERE = {
             "prior_from",
             "recalibrate",
         ),
-        "loopcal.io": ("load_measurements", "load_robot", "save_measurements", "save_robot"),
+        "loopcal.io": (
+            "Run",
+            "load_measurements",
+            "load_robot",
+            "load_run",
+            "save_measurements",
+            "save_robot",
+            "save_run",
+        ),
         "loopcal.measure": (
             "Component",
             "Gaussian",

@@ -118,7 +118,7 @@ def test_a_target_out_of_the_machines_limits_gives_exit_code_2_and_no_reading(ru
         (TARGETS.replace("0.21e3", ""), "targets.csv:3: column 'z' is empty"),
         (
             TARGETS.replace("left", "home"),
-            "targets.csv:3: the name of this target stands here for the second time",
+            "targets.csv:3: duplicate target",
         ),
         ("pose\n", "has a header but no rows"),
     ],
@@ -139,7 +139,7 @@ def test_bad_targets_are_refused_in_a_sentence(run, made, text, sentence) -> Non
         ("compensate run targets.csv --controller nobody", "nobody"),
         (
             "calibrate hexapod-42 measurements.csv -o new --prior run",
-            "the earlier run was fitted to these very measurements",
+            "the earlier run was fitted to these measurements",
         ),
         (
             "calibrate hexapod-42 measurements.csv -o new --free-limb leg3",

@@ -103,11 +103,11 @@ def test_any_division_into_files_gives_the_same_calibration(folder, capsys) -> N
     with np.load(folder / "both" / "arrays.npz") as arrays:
         np.testing.assert_array_equal(arrays["temperature_0_pose"], 20 + 0.1 * np.arange(20.0))
     assert main(["validate", "values", "poses.csv", "tracker.csv"]) == 1
-    assert "tracker.csv: this run was fitted to these very measurements" in capsys.readouterr().err
+    assert "tracker.csv contains the measurements of this calibration" in capsys.readouterr().err
     assert (
         main(["validate", "both", "poses.csv", "values.csv"]) == 1
     )  # the same rows under another name
-    assert "20 of 20 rows are rows that this run was fitted to" in capsys.readouterr().err
+    assert "20 of 20 rows belong to the data of this calibration" in capsys.readouterr().err
     assert main(["validate", "both", "poses.csv", "values.csv", "--allow-fitted-data"]) == 0
 
 

@@ -33,7 +33,7 @@ def test_what_is_written_is_read_back(tmp_path) -> None:
 def test_a_run_is_replaced_only_with_force(tmp_path) -> None:
     write(tmp_path / "run")
     with pytest.raises(
-        FileError, match="not empty; choose another name, or replace the run in it with --force"
+        FileError, match="not empty"
     ):
         write(tmp_path / "run", value=2.5)
     assert read_run_folder(tmp_path / "run").result["value"] == 1.5
@@ -46,7 +46,7 @@ def test_force_does_not_replace_what_is_not_a_run(tmp_path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(FileError, match="something other than a run"):
         write(tmp_path, force=True)
-    with pytest.raises(FileError, match="this is a file where a run folder"):
+    with pytest.raises(FileError, match="this is a file, but the run"):
         write(tmp_path / "thesis.tex", force=True)
 
 

@@ -95,10 +95,10 @@ def calibrate(
       loopcal calibrate robot.yaml poses.csv tracker.csv inclinometer.csv -o run loopcal calibrate
       hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
     """  # noqa: D301
+    from loopcal.diagnose import check_start_values
     from loopcal.estimate.recalibration import recalibrate
     from loopcal.io import load_robot
-    from loopcal.io.runs.calibration_run import build_result_document, save_run
-    from loopcal.io.runs.compensation_file import load_prior
+    from loopcal.io.runs.calibration_run import load_prior, save_calibration
     from loopcal.io.runs.run_folder import collect_provenance, refuse_run_folder
 
     planned = _held_out(data, hold_out)
@@ -135,11 +135,12 @@ def calibrate(
     found = {name: _document(finding) for name, finding in findings.items() if finding is not None}
     reasons = _reasons(fit, validation, unjudged)
     document = (
-        build_result_document(fit, validation, origin, split)
+        {"made_by": origin, "fit": fit, "start": check_start_values(fit), "split": split}
+        | {"validation": validation}
         | found
         | {"passed": not reasons, "reasons": reasons}
     )
-    save_run(output, fit, document, force, fitted)
+    save_calibration(output, fit, document, force, fitted)
     show.json_document(document) if as_json else _print(
         fit, errors, unseen is None, findings, output
     )

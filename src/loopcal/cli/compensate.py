@@ -64,16 +64,13 @@ def compensate(
     from loopcal.io import load_robot
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
-    from loopcal.io.runs.compensation_file import (
-        format_compensation,
-        load_calibrated_or_posterior,
-        load_targets,
-    )
+    from loopcal.io.runs.calibration_run import load_posterior_or_robot
+    from loopcal.io.runs.compensation_file import format_compensation, load_targets
 
     refuse_outputs(
         (output,), (run, targets, None if controller is None else Path(controller)), force
     )
-    known = load_calibrated_or_posterior(run)
+    known = load_posterior_or_robot(run)
     robot = known.robot if isinstance(known, Posterior) else known
     wanted, labels = load_targets(targets, robot)
     found = compute(

@@ -6,6 +6,8 @@ from __future__ import annotations
 HINTS: dict[str, str] = {
     "files.output-exists": "--force replaces it",
     "files.folder-in-use": "--force replaces it",
+    "validation.file-reused": "--allow-fitted-data accepts it",
+    "validation.rows-reused": "--allow-fitted-data accepts them",
     "files.noise-missing": "calibrate with --noise estimated",
     "files.surfaces-in-plan": "use --measure plane-line",
 }

@@ -379,9 +379,10 @@ def _write(output: Path, made: Plan, inputs: Mapping[str, Path], force: bool) ->
         write_plan_folder,
     )
     from loopcal.io.runs.run_folder import collect_provenance
+    from loopcal.planning.stops import list_stops
     from loopcal.report.plan_drawing import draw_curve, draw_plan, save_figure
 
-    texts = {SHEET: format_sheet(made), DATA: format_plan_data(made)}
+    texts = {SHEET: format_sheet(made, list_stops(made)), DATA: format_plan_data(made)}
     document = made.to_dict() | {
         "made_by": collect_provenance(sys.argv, inputs, {"plan": made.options.seed})
     }

@@ -59,19 +59,19 @@ def validate(
       loopcal validate robot.yaml measurements.csv --limit-position 0.1mm
     """  # noqa: D301
     from loopcal.apply import validate as compare
-    from loopcal.io.runs.calibration_run import check_reused_data, load_calibrated
+    from loopcal.io.runs.calibration_run import check_reused_data, load_run_or_robot
 
-    calibrated = load_calibrated(run)
+    calibrated = load_run_or_robot(run)
     measured = measurements(data, calibrated.robot, **allowed)
     if not allow_fitted_data and (again := check_reused_data(calibrated, data, measured)):
         click.echo(f"loopcal: note: {again}", err=True)
-    known = {"known": calibrated.local, "known_before": calibrated.local_before, "refit": refit}
+    known = {"known": calibrated.nuisance_values, "known_before": calibrated.initial_nuisance_values, "refit": refit}
     found = compare(
-        calibrated.robot, measured, limit_position, limit_angle, calibrated.before, **known
+        calibrated.robot, measured, limit_position, limit_angle, calibrated.initial_robot, **known
     )
     if as_json:
         show.json_document(found.to_dict())
     else:
-        changed = bool((calibrated.robot.values != calibrated.before.values).any())
+        changed = bool((calibrated.robot.values != calibrated.initial_robot.values).any())
         show.validation(found, "measured", before=changed)
     return show.gates(map(str, found.failures))

@@ -1,7 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files: robots, measurements, run folders."""
+"""Files: robots, measurements, run folders, and files of other programs.
+
+This package parses and writes. It uses the types of lower layers, and leaves computations to them.
+"""
 
 from loopcal.io.data.measurement_file import load_measurements as load_measurements
 from loopcal.io.data.measurement_writer import save_measurements as save_measurements
 from loopcal.io.robot.robot_file import load_robot as load_robot
 from loopcal.io.robot.robot_file import save_robot as save_robot
+from loopcal.io.runs.calibration_run import Run as Run
+from loopcal.io.runs.calibration_run import load_run as load_run
+from loopcal.io.runs.calibration_run import save_run as save_run

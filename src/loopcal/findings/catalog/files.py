@@ -53,4 +53,12 @@ ENTRIES: tuple[Entry, ...] = (
         "A plan of poses takes its instrument from a file of planes or lines.",
         "Plan surfaces in place of poses.",
     ),
+    Entry(
+        "files.prior-data-reused",
+        Severity.REFUSAL,
+        "{file}: the earlier run was fitted to these measurements, which would count twice; use "
+        "new measurements",
+        "Data for a recalibration are the data of the run that serves as the prior.",
+        "Measure again, or calibrate without the prior.",
+    ),
 )

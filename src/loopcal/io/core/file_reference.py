@@ -69,6 +69,11 @@ def summarize(record: type) -> str:
     return SI.sub("", " ".join(text.split()))
 
 
+def name_record(record: type) -> str:
+    """Return the name of a record in the file reference: `Pose` for `PoseRecord`."""
+    return record.__name__.removesuffix("Record")
+
+
 def describe_type(annotation: Any) -> str:
     """Return what an annotation allows, in terms of a file."""
     origin, arguments = get_origin(annotation), get_args(annotation)
@@ -88,7 +93,7 @@ def describe_type(annotation: Any) -> str:
     if origin is not None and issubclass(origin, Mapping):
         return f"name: {describe_type(arguments[1])}"
     if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
-        return annotation.__name__
+        return name_record(annotation)
     names = {str: "text", float: "number", int: "whole number", bool: "true or false"}
     return "anything" if annotation is Any else names.get(annotation, str(annotation))
 

@@ -27,20 +27,17 @@ EQUAL = 1e-9
 and correlation up to which there is none [1].
 """
 
-ADDED = (
-    "# Add one row for each pose below: its name, readings and measured values; leave empty what "
-    "was not measured.",
-    "# Optional columns: block, session, group, time, temperature [degC], sigma.NAME, note; see "
-    "docs/files.md.",
-)
+ADDED = """\
+# Add one row for each pose below: its name, readings and measured values; leave empty what was not
+# measured.
+# Optional columns: block, session, group, time, temperature [degC], sigma.NAME, note; see
+# docs/files.md."""
 """Remarks below the header of a template."""
 
-COMPARED = (
-    f"# A row of the kind {{}} compares two poses: name them in the column pose as a{LINK}b and "
-    "leave its readings empty.",
-    "# Each of these poses needs a row of its own with its readings and without a measured value.",
-)
-"""Remarks of a template on kinds that compare poses."""
+COMPARED = f"""\
+# A row of the kind {{}} compares two poses: name them in the column pose as a{LINK}b and leave its
+# readings empty. Each of these poses needs a row of its own with its readings."""
+"""Remark of a template on a kind that compares poses."""
 
 Cells = dict[str, Any]
 """Column -> value [SI] or text."""
@@ -96,8 +93,8 @@ def format_measurements(data: Measurements, robot: Mechanism, remark: str = "") 
         ((pose,), {}) for pose in range(data.n_poses) if pose not in measuring
     ]
     rows += [(poses, {"kind": p.label, **cells}) for p in parts for poses, cells in p.cells()]
-    for poses, cells in rows:
-        cells = {"pose": LINK.join(data.labels[pose] for pose in poses), **cells}
+    for poses, values in rows:
+        cells = {"pose": LINK.join(data.labels[pose] for pose in poses), **values}
         if len(poses) == 1:
             cells |= _reading_cells(data, robot, poses[0], own)
         lines.append(",".join(c.format(cells[c.name]) if c.name in cells else "" for c in columns))
@@ -121,13 +118,12 @@ def format_template(robot: Mechanism, instrument: Instrument) -> str:
     names += [name_measured(column.name, robot) for kind in kinds for column in kind.columns]
     header = ",".join(known[name].header for name in dict.fromkeys(names))
     compared = [
-        line.format(label)
+        COMPARED.format(label)
         for label, kind in zip(labels, kinds, strict=True)
         if kind.poses_per_row > 1
-        for line in COMPARED
     ]
     settings = _format_settings(robot, list(zip(labels, kinds, noise, strict=True)), "")
-    return "\n".join([*settings, header, *ADDED, *compared]) + "\n"
+    return "\n".join([*settings, header, ADDED, *compared]) + "\n"
 
 
 def format_data_sheet(

@@ -14,7 +14,7 @@ from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.program_format import Exported, ExportSource, Format, Imported
 from loopcal.io.robot.robot_file import load_robot
-from loopcal.io.runs.calibration_run import load_calibrated
+from loopcal.io.runs.calibration_run import load_run_or_robot
 
 if TYPE_CHECKING:
     from loopcal.mechanism import Mechanism
@@ -86,7 +86,7 @@ def load_source(path: str | Path) -> ExportSource:
     FileError
         None of these.
     """
-    run = load_calibrated(path)
+    run = load_run_or_robot(path)
     rows = run.result.get("fit", {}).get("parameters", [])
     nulls = run.result.get("nulls", {})
     why = {

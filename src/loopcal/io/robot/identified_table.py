@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The `identified:` table of a corrected robot file: name, value, uncertainty, unit of parameters."""
+"""The `identified:` table of a corrected robot file: values of parameters."""
 
 from __future__ import annotations
 

@@ -50,11 +50,10 @@ def format_new_robot(family: str, name: str) -> str:
         line = f"{key}: {value}"
         text = re.sub(rf"^{key}: .*$", lambda _, line=line: line, text, count=1, flags=re.MULTILINE)
     lines = [
-        f"# A new robot of the family {record} with the numbers of the shipped robot {example}: "
-        "replace them by your own.",
+        f"# A new robot of the family {record}, with the numbers of the shipped robot {example}.",
+        "# Replace them by your own.",
         "#",
-        f"# Keys of this family (`loopcal check {name}.yaml` shows how the file is read; see "
-        "docs/files.md):",
+        f"# Keys of this family (docs/files.md; `loopcal check {name}.yaml` shows how it is read):",
     ]
     for key in file_reference.list_keys(FAMILIES[record]):
         default = f", default {key.default}" if key.default not in ("", "needed") else ""

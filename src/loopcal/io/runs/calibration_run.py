@@ -1,144 +1,233 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a calibration leaves behind: its result as one document, and the run folder that keeps it.
+"""The run folder of a calibration: a view of its report, and what can be read back from it.
 
-result.json    made_by    how (see `loopcal.io.runs.run_folder.MADE_BY`)
-               fit        `Identification.to_dict()`: parameters in the units of the robot's file, the rest in SI
-               start      `StartCheck.to_dict()`: the geometry of the robot file against the fit, on the fitted rows
-               split      share and labels of the poses that were held out; null where none were
-               validation `Validation.to_dict()` on those poses, SI; null where none were
-arrays.npz     `Identification.arrays()`, `initial`: the values before calibration of all parameters [SI], and the rows that
-               were fitted (see `loopcal.apply.reused_rows`)
+result.json    made_by    see `run_folder.MADE_BY`
+others     `CalibrationReport.to_dict()`: `fit`, `start`, `split`, `validation`
+and more; parameters in the units of the robot file, the rest in SI
+arrays.npz     `Identification.arrays()`, `initial` (values of all parameters before the
+calibration [SI]) and the fitted rows (`loopcal.apply.reused_rows`)
 robot.yaml     the corrected robot file
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from loopcal.errors import DataError
+from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
-from loopcal.apply.reused_rows import collect_fitted_rows, find_reused_rows
-from loopcal.io.data.measurement_file import Paths, list_measurement_files
-from loopcal.io.robot.robot_file import load_robot, format_robot, list_shipped_robots
-from loopcal.io.runs.run_folder import find_fitted_file, read_run_folder, write_run_folder
+from loopcal.io.core.text_file import as_path, sha256
+from loopcal.io.data.measurement_file import Paths, list_measurement_files, load_measurements
+from loopcal.io.robot.robot_file import format_robot, list_shipped_robots, load_robot
+from loopcal.io.runs.run_folder import (
+    collect_provenance,
+    find_fitted_file,
+    list_inputs,
+    read_run_folder,
+    write_run_folder,
+)
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from loopcal.estimate import Identification
-    from loopcal.apply import Validation
+    from loopcal.estimate import Identification, Posterior
     from loopcal.measure import Measurements
     from loopcal.mechanism import Mechanism
+    from loopcal.workflow import CalibrationReport
 
 
 @dataclass(frozen=True)
-class CalibratedRun:
-    """A calibration read back: the corrected robot, and the one it started from."""
+class Run:
+    """A calibration read from its run folder, or a robot file as if it were one.
+
+    Parameters
+    ----------
+    path : of the folder or file. result : content of result.json, empty for a robot file.
+    robot : the corrected robot. initial_robot : the robot before the calibration.
+    nuisance_values : name -> estimate of frames, targets and surfaces, such as `tracker.x` [SI].
+    initial_nuisance_values : the same with the geometry before the calibration.
+    arrays : content of arrays.npz, SI.
+    """
 
     path: Path
     result: dict[str, Any]
     robot: Mechanism
-    before: Mechanism
-    local: Mapping[str, float] = field(default_factory=dict)
-    """Frames, targets and surfaces as the run found them: values by name, such as `tracker.x` [SI].
-    """
-    local_before: Mapping[str, float] = field(default_factory=dict)
-    """The same with the geometry before calibration, on the rows that were fitted."""
-    arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Arrays of the run, among them those of `loopcal.apply.reused_rows`."""
+    initial_robot: Mechanism
+    nuisance_values: Mapping[str, float] = field(default_factory=dict)
+    initial_nuisance_values: Mapping[str, float] = field(default_factory=dict)
+    arrays: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
 
+    @property
+    def held_out(self) -> tuple[str, ...]:
+        """Labels of the poses that were held out for validation."""
+        return tuple((self.result.get("split") or {}).get("held_out", ()))
 
-def build_result_document(
-    fit: Identification, validation: Validation | None, origin: Mapping[str, Any], split: Mapping[str, Any] | None = None
-) -> dict[str, Any]:
-    """Return the content of result.json; see the module."""
-    from loopcal.diagnose import check_start_values
+    @property
+    def excluded(self) -> tuple[str, ...]:
+        """Labels of the poses that were excluded from the fit."""
+        return tuple(self.result.get("fit", {}).get("dropped") or ())
 
-    shown = None if validation is None else validation.to_dict()
-    start = check_start_values(fit).to_dict()
-    return {"made_by": dict(origin), "fit": fit.to_dict(), "start": start, "split": split, "validation": shown}
+    def load_posterior(self) -> Posterior:
+        """Return estimates and uncertainties, as a prior for new data or for `accuracy_map`.
+
+        Raises
+        ------
+        EstimationError : the run does not contain them, or its robot file was changed.
+        """
+        from loopcal.estimate.inference.posterior import posterior_from_arrays
+
+        return posterior_from_arrays(self.robot, self.arrays)
+
+    def load_measurements(self, **allowed: bool) -> tuple[Measurements, Measurements | None]:
+        """Return the fitted and the held-out measurements, from the unchanged input files.
+
+        Parameters
+        ----------
+        allowed : see `loopcal.load_measurements`.
+
+        Returns
+        -------
+        fitted : without excluded poses. held_out : None where no pose was held out.
+
+        Raises
+        ------
+        FileError : the run names no data, or a file is missing or was changed since.
+        """
+        roles = ("data", "poses")
+        files = {r: f for r, f in list_inputs(self.result).items() if r.partition("-")[0] in roles}
+        if not files:
+            sentence = "this run names no measurement files; load them by load_measurements"
+            raise FileError(sentence, self.path)
+        for file in files.values():
+            if sha256(file["path"]) != file["sha256"]:
+                sentence = f"this file was changed since the run in {self.path}; restore it"
+                raise FileError(sentence, file["path"])
+        data = load_measurements([f["path"] for f in files.values()], self.robot, **allowed)
+        fitted = [label not in (*self.held_out, *self.excluded) for label in data.labels]
+        held_out = [label in self.held_out for label in data.labels]
+        return data.take(fitted), data.take(held_out) if any(held_out) else None
 
 
 def save_run(
-    path: str | Path, fit: Identification, document: Mapping[str, Any], force: bool = False, fitted: Measurements | None = None
+    path: str | Path,
+    report: CalibrationReport,
+    inputs: Mapping[str, Path] | None = None,
+    command: Sequence[str] = (),
+    force: bool = False,
 ) -> Path:
-    """Write the run folder of a calibration.
+    """Write the run folder of a calibration, and return it.
 
     Parameters
     ----------
-    path : str or Path
-        The folder to make.
-    fit : Identification
-        Of a robot that came from a file.
-    document : mapping
-        What `build_result_document` returned.
-    force : bool
-        Replace a run that is there.
-    fitted : Measurements, optional
-        What was fitted, to be known again.
+    path : the folder to make. report : of `loopcal.calibrate`, with a robot from `load_robot`.
+    inputs : role -> file, such as `{"robot": .., "data": ..}`; their names and digests are kept.
+    command : the command line that made the report.
+    force : replace an older run.
 
     Raises
     ------
-    FileError
-        The folder is in use, or cannot be written.
-    MechanismError
-        The robot did not come from a file.
+    FileError : the folder is in use, or cannot be written; an input cannot be read.
+    MechanismError : the robot was not loaded from a file.
     """
+    seeds = dict(report.provenance.seeds)
+    files = {role: as_path(file, "input") for role, file in (inputs or {}).items()}
+    document = {"made_by": collect_provenance(command, files, seeds), **report.to_dict()}
+    return save_calibration(path, report.identification, document, force, report.split.fitted)
+
+
+def save_calibration(
+    path: str | Path,
+    fit: Identification,
+    document: Mapping[str, Any],
+    force: bool = False,
+    fitted: Measurements | None = None,
+) -> Path:
+    """Write the run folder of a fit with `document` as result.json, and return it.
+
+    `fitted` are the fitted data; their rows are kept, to be recognized in other data.
+    """
+    from loopcal.apply.reused_rows import collect_fitted_rows
+
     rows = {} if fitted is None else collect_fitted_rows(fitted, fit.dropped)
     arrays = {**fit.arrays(), "initial": fit.initial.values, **rows}
     return write_run_folder(path, document, arrays, format_robot(fit.robot, fit.plus_minus), force)
 
 
-def load_run(path: str | Path) -> CalibratedRun:
+def load_run(path: str | Path) -> Run:
     """Read the run folder of a calibration.
 
     Raises
     ------
-    FileError
-        Not a run folder, damaged, or made by a newer loopcal.
+    FileError : not a run folder, damaged, or made by a newer loopcal.
     """
     run = read_run_folder(path)
     robot = load_robot(run.robot_path)
     initial = run.arrays.get("initial", robot.parameters.nominal)
     names = [row["name"] for row in run.result.get("fit", {}).get("local") or ()]
-    local, start = (
-        dict(zip(names, found.tolist(), strict=True)) if found is not None and len(found) == len(names) else {}
-        for found in (run.arrays.get("local_estimate"), run.arrays.get("local_start"))
+    values, initial_values = (
+        dict(zip(names, array.tolist(), strict=True))
+        if (array := run.arrays.get(key)) is not None and len(array) == len(names)
+        else {}
+        for key in ("local_estimate", "local_start")
     )
-    return CalibratedRun(run.path, run.result, robot, robot.with_values(initial), local, start, run.arrays)
+    before = robot.with_values(initial)
+    return Run(run.path, run.result, robot, before, values, initial_values, run.arrays)
 
 
-def load_calibrated(path: str | Path) -> CalibratedRun:
-    """Read a run folder, or a robot file (or the name of a shipped robot) as if a run had made it.
+def load_run_or_robot(path: str | Path) -> Run:
+    """Read a run folder, or a robot file (or a shipped robot by its name) as if it were a run.
 
     Raises
     ------
-    FileError
-        Neither.
+    FileError : neither of them.
     """
-    path = Path(path)
+    path = as_path(path, "run folder or robot file")
     if path.is_dir() or (not path.exists() and str(path) not in list_shipped_robots()):
         return load_run(path)
     robot = load_robot(path)
-    return CalibratedRun(path, {}, robot, robot.nominal)
+    return Run(path, {}, robot, robot.nominal)
 
 
-def check_reused_data(run: CalibratedRun, data: Paths, measured: Measurements) -> Finding | None:
-    """Refuse to validate a run with measurements that it was fitted to, as files or row by row.
+def load_posterior(path: str | Path) -> Posterior:
+    """Read estimates and uncertainties of a run; raise as `load_run`, `Run.load_posterior`."""
+    return load_run(path).load_posterior()
 
-    Returns
-    -------
-    Finding or None
-        A warning where fewer than half of the rows were fitted.
+
+def load_prior(path: str | Path, data: Paths) -> Posterior:
+    """Read the posterior of an earlier run, as a prior for new measurements.
 
     Raises
     ------
-    DataError
-        A file is the same to the last byte, or half of the rows or more were fitted.
+    FileError, EstimationError : see `load_posterior`.
+    DataError : the run was fitted to these measurements, which would count twice.
     """
+    run = load_run(path)
+    reused = find_fitted_file(run.result, list_measurement_files(data))
+    if reused is not None:
+        raise DataError(report_finding("files.prior-data-reused", file=str(reused)))
+    return run.load_posterior()
+
+
+def load_posterior_or_robot(path: str | Path) -> Mechanism | Posterior:
+    """Read a run folder with its uncertainties, or a robot file (or shipped robot) without any."""
+    return load_posterior(path) if Path(path).is_dir() else load_run_or_robot(path).robot
+
+
+def check_reused_data(run: Run, data: Paths, measured: Measurements) -> Finding | None:
+    """Refuse data for validation that the run was fitted to, as files or row by row.
+
+    Returns
+    -------
+    A finding where fewer than half of the rows were fitted; None without such rows.
+
+    Raises
+    ------
+    DataError : a file is one of the run's inputs, or half of the rows or more were fitted.
+    """
+    from loopcal.apply.reused_rows import find_reused_rows
+
     reused = find_fitted_file(run.result, list_measurement_files(data))
     if reused is not None:
         raise DataError(report_finding("validation.file-reused", file=str(reused)))

@@ -1,28 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run folder holds one result for good: numbers, arrays, the corrected robot file and where they
-come from.
+"""Run folders: one result with its numbers, arrays, corrected robot file and provenance.
 
-    result.json    what was found, and under `made_by` how (see MADE_BY); no NaN: null, with the reason under `nulls`
-    arrays.npz     the arrays of the result, by name, SI (no pickles)
-    robot.yaml     the corrected robot file: the nominal file plus its `identified:` table
-
-The folder is written under a temporary name and renamed, so it is either whole or absent.
+result.json    the result, and under `made_by` its provenance (see MADE_BY); a number that is
+not finite is null, with the reason under `nulls`
+arrays.npz     the arrays of the result, by name, SI (no pickles)
+robot.yaml     the corrected robot file: the nominal file plus its `identified:` table
 """
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import FileError
+from loopcal.io.core.folders import refuse_folder_in_use, replace_folder
 from loopcal.io.core.json_text import to_json
-from loopcal.io.core.text_file import read_text, sha256, report_write_errors
+from loopcal.io.core.text_file import as_path, read_text, sha256
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,27 +26,22 @@ if TYPE_CHECKING:
 FORMAT = 1
 RESULT, ARRAYS, ROBOT = "result.json", "arrays.npz", "robot.yaml"
 
-# The keys of `made_by` and what they mean; the file reference is made from this.
 MADE_BY: Mapping[str, str] = {
     "command": "the command line, as a list of words",
     "versions": "versions of loopcal, python, numpy and scipy",
-    "seeds": "every seed that was used, by name",
+    "seeds": "all seeds in use, by name",
     "inputs": "each input file: its name as given, and its sha256",
 }
+"""Keys of `made_by` and their meanings, for the file reference."""
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """What a run folder holds.
+    """The content of a run folder.
 
     Parameters
     ----------
-    path : Path
-        The folder.
-    result : dict
-        Content of result.json.
-    arrays : dict of ndarray
-        Content of arrays.npz, SI.
+    path : of the folder. result : content of result.json. arrays : content of arrays.npz, SI.
     """
 
     path: Path
@@ -63,135 +54,88 @@ class RunFolder:
         return self.path / ROBOT
 
 
-def collect_provenance(command: Sequence[str], inputs: Mapping[str, Path], seeds: Mapping[str, int]) -> dict[str, Any]:
-    """Return where a result comes from, with the keys of MADE_BY.
+def collect_provenance(
+    command: Sequence[str], inputs: Mapping[str, Path], seeds: Mapping[str, int]
+) -> dict[str, Any]:
+    """Return the provenance of a result, with the keys of MADE_BY.
 
     Parameters
     ----------
-    command : sequence of str
-        The command line.
-    inputs : mapping
-        Role ("robot", "data") -> file.
-    seeds : mapping
-        Name -> seed.
+    command : the command line. inputs : role ("robot", "data") -> file. seeds : name -> seed.
 
     Raises
     ------
-    FileError
-        An input cannot be read.
+    FileError : an input cannot be read.
     """
     import platform
     from importlib.metadata import version
 
-    versions = {name: version(name) for name in ("loopcal", "numpy", "scipy")} | {"python": platform.python_version()}
+    versions = {name: version(name) for name in ("loopcal", "numpy", "scipy")}
+    versions["python"] = platform.python_version()
     files = {role: {"path": str(path), "sha256": sha256(path)} for role, path in inputs.items()}
     return {"command": list(command), "versions": versions, "seeds": dict(seeds), "inputs": files}
 
 
+def list_inputs(result: Mapping[str, Any]) -> dict[str, Mapping[str, str]]:
+    """Return role -> `path` and `sha256` of the input files of a result."""
+    return dict(result.get("made_by", {}).get("inputs", {}))
+
+
 def find_fitted_file(result: Mapping[str, Any], inputs: Mapping[str, Path]) -> Path | None:
-    """Return the first file of measured values, by its role in `inputs`, that a run was made from;
-    None where none is.
+    """Return the first data file (by its role in `inputs`) that a result was made from, or None.
 
     Raises
     ------
-    FileError
-        A file cannot be read.
+    FileError : a file cannot be read.
     """
-    made = result.get("made_by", {}).get("inputs", {})
-    used = {file.get("sha256") for role, file in made.items() if role.partition("-")[0] == "data"}
-    given = (path for role, path in inputs.items() if role.partition("-")[0] == "data")
+    used = {f.get("sha256") for role, f in list_inputs(result).items() if _is_data(role)}
+    given = (path for role, path in inputs.items() if _is_data(role))
     return next((path for path in given if sha256(path) in used), None)
 
 
 def refuse_used_folder(path: str | Path, force: bool) -> None:
-    """Raise where a run folder would replace something; called before the work as well as after it.
-
-    Raises
-    ------
-    FileError
-        The path is a file, or a folder that holds something and `force` is not given, or something
-        other than a run.
-    """
-    path = Path(path)
-    if path.exists() and not path.is_dir():
-        raise FileError("this is a file where a run folder is to be written; choose another name", path)
-    if not path.is_dir() or not any(path.iterdir()):
-        return
-    if not force:
-        raise FileError("this folder is not empty; choose another name, or replace the run in it "
-                        "with --force", path)
-    if not (path / RESULT).exists():
-        raise FileError(
-            "this folder holds something other than a run, which --force does not replace; choose "
-            "another name", path
-        )
+    """Raise FileError where a run folder would replace something else, or a run without `force`."""
+    refuse_folder_in_use(as_path(path, "run folder"), "run", RESULT, force)
 
 
 def refuse_run_folder(folder: Path, inputs: Sequence[Path], force: bool) -> None:
-    """Refuse a run folder that would replace something it may not, or a file that is read.
-
-    Raises
-    ------
-    FileError
-        See `refuse_used_folder`; or an input is in the folder.
-    """
+    """Raise FileError as `refuse_used_folder`, or where the folder contains an input."""
     refuse_used_folder(folder, force)
     for path in inputs:
         if path.exists() and path.resolve().is_relative_to(folder.resolve()):
-            raise FileError(
-                f"this folder would be replaced, but {path} in it is read; choose another name",
-                folder,
-            )
+            sentence = f"this folder contains the input {path} and cannot be replaced"
+            raise FileError(f"{sentence}; choose another name", folder)
 
 
 def write_run_folder(
-    path: str | Path, result: Mapping[str, Any], arrays: Mapping[str, np.ndarray], robot_text: str, force: bool = False
+    path: str | Path,
+    result: Mapping[str, Any],
+    arrays: Mapping[str, np.ndarray],
+    robot_text: str,
+    force: bool = False,
 ) -> Path:
-    """Write a run folder whole or not at all.
+    """Write a run folder whole or not at all, and return it.
 
     Parameters
     ----------
-    path : str or Path
-        The folder to make.
-    result : mapping
-        Content of result.json; `format` is added.
-    arrays : mapping
-        Name -> array, SI.
-    robot_text : str
-        Text of the corrected robot file.
-    force : bool
-        Replace a run that is there.
-
-    Returns
-    -------
-    Path
-        The folder.
+    path : the folder to make. result : content of result.json; `format` is added.
+    arrays : name -> array, SI. robot_text : of the corrected robot file.
+    force : replace an older run.
 
     Raises
     ------
-    FileError
-        The folder is in use, or cannot be written.
+    FileError : the folder is in use, or cannot be written.
     """
     import numpy as np
 
-    path = Path(path)
+    path = as_path(path, "run folder")
     refuse_used_folder(path, force)
     text = to_json({"format": FORMAT, **result})
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with report_write_errors(path):
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.mkdir()
-            (temporary / RESULT).write_text(text, encoding="utf-8")
-            (temporary / ROBOT).write_text(robot_text, encoding="utf-8")
-            with (temporary / ARRAYS).open("wb") as stream:
-                np.savez(stream, allow_pickle=False, **arrays)
-            if path.is_dir():
-                _replace(path, temporary)
-            else:
-                temporary.rename(path)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+    with replace_folder(path) as folder:
+        (folder / RESULT).write_text(text, encoding="utf-8")
+        (folder / ROBOT).write_text(robot_text, encoding="utf-8")
+        with (folder / ARRAYS).open("wb") as stream:
+            np.savez(stream, allow_pickle=False, **arrays)
     return path
 
 
@@ -200,37 +144,25 @@ def read_run_folder(path: str | Path) -> RunFolder:
 
     Raises
     ------
-    FileError
-        Not a run folder, made by a newer loopcal, or damaged.
+    FileError : not a run folder, made by a newer loopcal, or damaged.
     """
     import numpy as np
 
-    path = Path(path)
+    path = as_path(path, "run folder")
     if not (path / RESULT).is_file():
-        raise FileError(f"this is not a run folder (it has no {RESULT}); name one made by 'loopcal "
-                        "calibrate -o'", path)
+        sentence = f"this is not a run folder (it has no {RESULT})"
+        raise FileError(f"{sentence}; name a folder that a calibration wrote", path)
     try:
         result = json.loads(read_text(path / RESULT, "run result"))
         with np.load(path / ARRAYS, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError) as error:
-        raise FileError(f"this run folder is damaged ({error}); make the run again", path) from error
+        raise FileError(f"this run folder is damaged ({error}); repeat the run", path) from error
     if not isinstance(result, dict) or result.get("format", 0) > FORMAT:
-        raise FileError(f"this run has a format newer than {FORMAT}; use a newer loopcal, or make "
-                        "the run again", path)
+        sentence = f"this run has a newer format than {FORMAT}"
+        raise FileError(f"{sentence}; use a newer loopcal, or repeat the run", path)
     return RunFolder(path, result, arrays)
 
 
-def _replace(path: Path, temporary: Path) -> None:
-    """Put `temporary` in the place of the folder `path`; the old one goes only when the new one is
-    there.
-    """
-    old = path.with_name(f".{path.name}.{os.getpid()}.old")
-    path.rename(old)
-    try:
-        temporary.rename(path)
-    except OSError:
-        with suppress(OSError):
-            old.rename(path)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
+def _is_data(role: str) -> bool:
+    return role.partition("-")[0] == "data"
