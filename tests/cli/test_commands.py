@@ -127,7 +127,9 @@ def test_a_calibration_can_start_from_a_corrected_robot_file(run) -> None:
     assert run("calibrate run/robot.yaml measurements.csv -o run2")[0] == 0
     first, second = load_run("run"), load_run("run2")
     np.testing.assert_allclose(second.robot.values, first.robot.values, rtol=0, atol=1e-10)  # [m]
-    np.testing.assert_allclose(second.initial_robot.values, first.robot.values, rtol=0, atol=1e-15)  # [m]
+    np.testing.assert_allclose(
+        second.initial_robot.values, first.robot.values, rtol=0, atol=1e-15
+    )  # [m]
     assert first.robot.record.text == second.robot.record.text
 
 

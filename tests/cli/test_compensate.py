@@ -116,10 +116,7 @@ def test_a_target_out_of_the_machines_limits_gives_exit_code_2_and_no_reading(ru
         (TARGETS.replace("yaw", "jaw"), "targets.csv:1: no column 'yaw' (did you mean 'jaw'?)"),
         (TARGETS.replace("x [mm]", "X [mm],x [mm]"), "has 8 columns"),
         (TARGETS.replace("0.21e3", ""), "targets.csv:3: column 'z' is empty"),
-        (
-            TARGETS.replace("left", "home"),
-            "targets.csv:3: duplicate target",
-        ),
+        (TARGETS.replace("left", "home"), "targets.csv:3: duplicate target"),
         ("pose\n", "has a header but no rows"),
     ],
 )

@@ -181,9 +181,6 @@ def test_an_import_whose_calibration_fails_leaves_everything_as_it_was(run) -> N
 
 def test_the_template_of_a_kind_that_compares_poses_says_how_they_are_named(run) -> None:
     assert run("new gough -o a.yaml --measurements m.csv --kind separation")[0] == 0
-    assert (
-        "name them in the column pose as a;b and leave its"
-        in Path("m.csv").read_text()
-    )
+    assert "name them in the column pose as a;b and leave its" in Path("m.csv").read_text()
     assert run("new gough -o b.yaml --measurements n.csv --kind position")[0] == 0
     assert "compares two poses" not in Path("n.csv").read_text()

@@ -346,7 +346,10 @@ def test_the_sheet_says_that_a_tilt_goes_straight_by_its_vector(here):
         )
         == 0
     )
-    assert "straight in z, theta*cos(phi), theta*sin(phi). Measure" in (here / "plan" / "plan.csv").read_text()
+    assert (
+        "straight in z, theta*cos(phi), theta*sin(phi). Measure"
+        in (here / "plan" / "plan.csv").read_text()
+    )
 
 
 def test_the_column_use_is_checked_and_not_overruled(here, capsys):

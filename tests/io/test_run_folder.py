@@ -32,9 +32,7 @@ def test_what_is_written_is_read_back(tmp_path) -> None:
 
 def test_a_run_is_replaced_only_with_force(tmp_path) -> None:
     write(tmp_path / "run")
-    with pytest.raises(
-        FileError, match="not empty"
-    ):
+    with pytest.raises(FileError, match="not empty"):
         write(tmp_path / "run", value=2.5)
     assert read_run_folder(tmp_path / "run").result["value"] == 1.5
     write(tmp_path / "run", force=True, value=2.5)

@@ -65,7 +65,11 @@ def validate(
     measured = measurements(data, calibrated.robot, **allowed)
     if not allow_fitted_data and (again := check_reused_data(calibrated, data, measured)):
         click.echo(f"loopcal: note: {again}", err=True)
-    known = {"known": calibrated.nuisance_values, "known_before": calibrated.initial_nuisance_values, "refit": refit}
+    known = {
+        "known": calibrated.nuisance_values,
+        "known_before": calibrated.initial_nuisance_values,
+        "refit": refit,
+    }
     found = compare(
         calibrated.robot, measured, limit_position, limit_angle, calibrated.initial_robot, **known
     )

@@ -36,7 +36,9 @@ def list_stops(plan: Plan) -> tuple[Stop, ...]:
         if home is not None and plan.poses.via_home[i]:
             stops.append(home)
         held_out = bool(plan.poses.held_out[i])
-        stops.append(Stop(label, False, held_out, plan.poses.coordinates[i], plan.poses.readings[i]))
+        stops.append(
+            Stop(label, False, held_out, plan.poses.coordinates[i], plan.poses.readings[i])
+        )
     return tuple(stops)
 
 
