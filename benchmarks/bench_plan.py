@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Planning: coordinate exchange of 100 poses against evaluating their rows once, and a certified
-choice of 20 of 1000.
+"""Planning: coordinate exchange of 100 poses relative to one evaluation of their rows, and a
+certified choice of 20 of 1000.
 
-The reference of coordinate exchange is the rows of all 100 poses, once at each of the five levels
-of each of the six coordinates: what one sweep asks of the mechanism.
+One evaluation is the rows of all 100 poses, once at each of the five levels of each of the six
+coordinates: what one sweep computes with the mechanism.
 """
 
 from functools import cache
@@ -27,14 +27,14 @@ POSES, SHARES = 100, (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 @cache
 def _hexapod() -> tuple[FreeParameters, WorkspaceSample, Array, Array]:
-    """The shipped hexapod's unknowns, and the half ranges of its drawn positions about their means."""
+    """Return free parameters, sampled poses, and mean and half range of their coordinates."""
     free = select_free_parameters(load_robot("hexapod-42"))
     drawn = sample_workspace(free.robot, 1000, 0)
     return free, drawn, drawn.coordinates.mean(axis=0), 0.5 * np.ptp(drawn.coordinates, axis=0)
 
 
 def _rows(coordinates: np.ndarray) -> np.ndarray:
-    """Whitened rows (b, 6, p) at controlled coordinates (b, 6); NaN where out of reach."""
+    """Return whitened rows (b, 6, p) at controlled coordinates (b, 6); NaN where out of reach."""
     free = _hexapod()[0]
     found = inverse(free.robot, coordinates)
     rows = scene(free, np.where(found.converged[:, None], found.q, 0.0)).twists[0] / SIGMA[:, None]
@@ -42,8 +42,8 @@ def _rows(coordinates: np.ndarray) -> np.ndarray:
 
 
 def bench_coordinate_exchange() -> Metric:
-    """Time the improvement of 100 random poses of the hexapod, D-criterion, against one evaluation
-    of all their rows.
+    """Time the improvement of 100 random poses of the hexapod, criterion D, relative to one
+    evaluation of all their rows.
     """
     free, drawn, middle, half = _hexapod()
     levels = [m + h * np.array(SHARES) for m, h in zip(middle, half, strict=True)]

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good are planned poses? 20 of 1000 candidates, against the certified bound, even draws and
-plain exchange.
+"""Quality of designs: 20 of 1000 candidates compared with the certified bound, even draws and plain
+exchange. Robots and measurements are those of `evidence.planned`.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ DESIGNS = (*((case, "D") for case in CASES[:4]), *((case, "I") for case in CASES
 """Hexapod and 3-PRS by full poses and by positions, with the criterion of the design."""
 
 
-def study(case: Case, criterion_name: str) -> list[object]:
-    """One row: efficiencies against the bound, and what the certified design leaves open."""
+def evaluate_design(case: Case, criterion_name: str) -> list[object]:
+    """Return one row: efficiencies relative to the bound, and the gap of the certified design."""
     free = select_free_parameters(load_robot(case.robot))
     twists = scene(free, sample_workspace(free.robot, CANDIDATES, 0).solution.q).twists[0]
     rows = (twists / SIGMA[:, None])[
@@ -70,7 +70,7 @@ def study(case: Case, criterion_name: str) -> list[object]:
 
 
 def collect() -> dict:
-    """Make the table."""
+    """Compute the table."""
     columns = [
         "robot",
         "measured",
@@ -83,7 +83,7 @@ def collect() -> dict:
         "gap to the bound",
     ]
     formats = ["", "", "", "d", ".3f", ".3f", ".4f", ".4f", ".1%"]
-    rows = [study(*design) for design in DESIGNS]
+    rows = [evaluate_design(*design) for design in DESIGNS]
     return {
         "candidates": CANDIDATES,
         "poses": POSES,

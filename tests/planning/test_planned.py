@@ -9,7 +9,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from evidence.planned import CASES, SEEDS, at_planned, at_random, matching, prepare
+from evidence.planned import (
+    CASES,
+    SEEDS,
+    find_equal_number,
+    measure_planned,
+    measure_random,
+    prepare_study,
+)
 
 FEW, MACHINES, POSES = 6, 4, 16
 ONE_OF_EACH = (CASES[1], CASES[2], CASES[4])
@@ -22,38 +29,38 @@ chance of 2 %.
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ONE_OF_EACH, ids=lambda case: case.robot)
-def test_machines_calibrated_at_planned_poses_are_better_at_unseen_poses_than_at_as_many_random_ones(
+def test_machines_calibrated_at_planned_poses_are_better_than_at_as_many_random_poses(
     case,
 ):
-    study = prepare(case, FEW, MACHINES, POSES, candidates=200)
+    study = prepare_study(case, FEW, MACHINES, POSES, candidates=200)
     found = [
-        (e, study.wanted(e.position, e.orientation))
-        for e in (at_planned(study, POSES), at_random(study, POSES))
+        (e, study.target_error(e.position, e.orientation))
+        for e in (measure_planned(study, POSES), measure_random(study, POSES))
     ]
     (_, planned), (_, random) = found
     assert np.median(planned) < np.median(random)
-    for errors, wanted in found:
+    for errors, error in found:
         # an rms of 24 machines whose error has 9 or more degrees of freedom: standard deviation 1 /
         # sqrt(2 * 24 * 9), of which four; 0.05 more for what the prediction, linear and at the
         # nominal machine, leaves out
-        rms, expected = np.sqrt((wanted**2).mean()), np.sqrt((errors.expected**2).mean())
-        assert rms / expected == pytest.approx(1.0, abs=4.0 / np.sqrt(2 * wanted.size * 9) + 0.05)
+        rms, expected = np.sqrt((error**2).mean()), np.sqrt((errors.expected**2).mean())
+        assert rms / expected == pytest.approx(1.0, abs=4.0 / np.sqrt(2 * error.size * 9) + 0.05)
 
 
 def test_errors_that_fall_with_the_root_of_the_number_of_poses_are_matched_by_that_law():
     numbers = (8, 16, 64)
     errors = [1.0 / np.sqrt(n) for n in numbers]
-    assert matching(numbers, errors, 1.0 / np.sqrt(30.0)) == pytest.approx(30.0, rel=1e-12)
-    assert matching(numbers, errors, errors[0]) == pytest.approx(8.0, rel=1e-12)
+    assert find_equal_number(numbers, errors, 1.0 / np.sqrt(30.0)) == pytest.approx(30.0, rel=1e-12)
+    assert find_equal_number(numbers, errors, errors[0]) == pytest.approx(8.0, rel=1e-12)
 
 
 def test_a_rise_by_chance_does_not_make_more_poses_count_as_worse():
-    assert matching((8, 16, 32), [2.0, 1.0, 1.1], 1.0) == pytest.approx(16.0, rel=1e-12)
+    assert find_equal_number((8, 16, 32), [2.0, 1.0, 1.1], 1.0) == pytest.approx(16.0, rel=1e-12)
 
 
-@pytest.mark.parametrize("wanted", [1.1, 0.1])
-def test_an_error_that_no_number_of_poses_had_is_matched_by_none(wanted):
-    assert matching((8, 16, 64), [1.0, 0.7, 0.35], wanted) is None
+@pytest.mark.parametrize("error", [1.1, 0.1])
+def test_an_error_that_no_number_of_poses_had_is_matched_by_none(error):
+    assert find_equal_number((8, 16, 64), [1.0, 0.7, 0.35], error) is None
 
 
 @pytest.fixture(scope="module")
