@@ -17,7 +17,7 @@ REASONS = {
     "limit-exceeded": "{limit} exceeded",
     "beyond-singularity": "beyond a singularity",
     "near-singularity": "near a singularity (margin below {min_margin} of the median)",
-    "tilt-exceeded": "tilt above {max_tilt_deg:.6g} deg",
+    "tilt-exceeded": "tilt above {max_tilt_deg:.4g} deg",
     "distance-out-of-range": "instrument too near or too far",
     "target-faces-away": "target faces away from the instrument",
     "branch-changed": "the path ends on another branch than the commanded pose",
@@ -89,7 +89,7 @@ def _errors(data: Mapping[str, Any]) -> str:
     ]
     gain = ""
     if data["reduction"] is not None and data["reduction"] > 0.0:
-        gain = fill_template(" ({reduction:percent} less than random)", **data)
+        gain = fill_template(" ({target} error {reduction:percent} below random)", **data)
     return f"Expected error over the workspace (rms): {', '.join(parts)}{gain}."
 
 
@@ -126,10 +126,11 @@ def _frames(data: Mapping[str, Any]) -> str:
 
 def _equations(data: Mapping[str, Any]) -> str:
     earlier = " and {earlier} were measured already" if data["earlier"] else ""
+    instrument = ", the others of the instrument" if data["unknowns"] > data["parameters"] else ""
     return fill_template(
         "{poses:count pose} give {equations} equations" + earlier + ", but there are {unknowns} "
-        "unknowns ({parameters} parameters of {robot}, the others of the instrument); plan at "
-        "least {needed} poses, or fix parameters of the robot",
+        "unknowns ({parameters} parameters of {robot}" + instrument + "); plan at least {needed} "
+        "poses, or fix parameters of the robot",
         **data,
     )
 
