@@ -29,9 +29,7 @@ chance of 2 %.
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ONE_OF_EACH, ids=lambda case: case.robot)
-def test_machines_calibrated_at_planned_poses_are_better_than_at_as_many_random_poses(
-    case,
-):
+def test_machines_calibrated_at_planned_poses_are_better_than_at_as_many_random_poses(case):
     study = prepare_study(case, FEW, MACHINES, POSES, candidates=200)
     found = [
         (e, study.target_error(e.position, e.orientation))
