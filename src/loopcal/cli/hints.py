@@ -1,29 +1,67 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options of the command line that help with an error, by the code of its finding."""
+"""From the code of a finding or an error to the command-line option that helps.
+
+Messages of the library do not know the command line. `main` and the views add these hints.
+"""
 
 from __future__ import annotations
 
-HINTS: dict[str, str] = {
-    "files.output-exists": "--force replaces it",
-    "files.folder-in-use": "--force replaces it",
-    "validation.file-reused": "--allow-fitted-data accepts it",
-    "validation.rows-reused": "--allow-fitted-data accepts them",
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from loopcal.findings import Finding
+
+HINTS = {
+    "files.output-exists": "use --force to replace it",
+    "files.folder-in-use": "use --force to replace it",
     "files.noise-missing": "calibrate with --noise estimated",
     "files.surfaces-in-plan": "use --measure plane-line",
-    "plan.goal-missed": "--hold-out, --criterion I",
-    "plan.goal-unreachable": "--candidates draws more poses, --accuracy states the goal",
-    "plan.groups-excluded": "--points, or one of --min-margin and --max-tilt",
-    "plan.home-excluded": "--min-margin, --max-tilt",
-    "plan.home-isolated": "--min-margin, --max-tilt",
+    "plan.goal-missed": "use a larger --hold-out, or --criterion I",
+    "plan.goal-unreachable": "draw more poses with --candidates, or relax --accuracy",
+    "plan.groups-excluded": "use fewer --points, or relax --min-margin or --max-tilt",
+    "plan.home-excluded": "relax --min-margin or --max-tilt",
+    "plan.home-isolated": "relax --min-margin or --max-tilt",
     "plan.listed-poses-excluded": "--allowed lists the poses",
     "plan.measured-empty": "--measured names the file",
-    "plan.nothing-observable": "--kind, or --like with a measurement file",
-    "plan.points-isolated": "--seed, or one of --min-margin and --max-tilt",
-    "plan.target-unobservable": "--accuracy takes a length or an angle",
-    "plan.too-few-candidates": "--poses, --hold-out, --candidates",
-    "plan.too-few-equations": "--poses",
-    "plan.too-few-groups": "--groups, --points",
-    "plan.too-few-held-out": "--hold-out, --candidates",
-    "plan.workspace-excluded": "--min-margin, --max-tilt, --seen-from",
+    "plan.nothing-observable": "choose another --kind, or use --like with a measurement file",
+    "plan.points-isolated": "use another --seed, or relax --min-margin or --max-tilt",
+    "plan.target-unobservable": "give --accuracy as a length or as an angle",
+    "plan.too-few-candidates": "use fewer --poses or --hold-out, or more --candidates",
+    "plan.too-few-equations": "use more --poses",
+    "plan.too-few-groups": "use more --groups or --points",
+    "plan.too-few-held-out": "use a larger --hold-out, or more --candidates",
+    "plan.workspace-excluded": "relax --min-margin, --max-tilt or --seen-from",
+    "workflow.limit-needs-held-out-poses": "add --hold-out 0.25",
+    "workflow.next-hold-out": "use --hold-out 0.25, or loopcal validate RUN OTHER-DATA",
+    "workflow.no-held-out-poses": "use --hold-out 0.25",
+    "workflow.few-held-out-poses": "use a larger --hold-out",
+    "workflow.free-limb-needs-prior": "add --prior RUN",
+    "workflow.option-excludes-prior": "leave out --method, --loss and --choose-model",
+    "workflow.too-few-equations": "use --method map to let the tolerances decide",
+    "workflow.no-parameter-chosen": "leave out --choose-model",
+    "workflow.next-check-outliers": "exclude a pose with --drop POSE, or use --loss huber",
+    "workflow.next-check-noise": "use --noise estimated, or --verbose for all findings",
+    "workflow.next-check-data": "see loopcal identifiability ROBOT DATA",
+    "workflow.next-measure-more": "use --choose-model to free fewer parameters, or loopcal plan",
+    "workflow.next-resolve-warnings": "use --verbose for all findings, loopcal validate for other "
+    "data",
+    "validation.rows-reused": "use --allow-fitted-data to accept them",
+    "validation.file-reused": "use --allow-fitted-data to accept it",
+    "validation.setup-moved": "use --refit NAME",
 }
-"""Code -> hint, printed in parentheses after the sentence."""
+"""Code -> advice, in the imperative."""
+
+
+def find_hint(code: str | None) -> str | None:
+    """Return the hint for a code; None where there is none."""
+    return None if code is None else HINTS.get(code)
+
+
+def hint_for(finding: Finding) -> str | None:
+    """Return the hint for a finding, with the names it contains."""
+    if finding.code == "workflow.next-check-outliers":
+        poses = [str(label).removeprefix("pose ") for label in finding.data["poses"]]
+        return f"exclude them with {' '.join(f'--drop {p}' for p in poses)}, or use --loss huber"
+    if finding.code in ("validation.setup-moved", "residuals.setup-moved"):
+        return f"use {' '.join(f'--refit {name}' for name in finding.data['names'])}"
+    return find_hint(finding.code)

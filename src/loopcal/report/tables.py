@@ -70,7 +70,10 @@ class Table:
         """
         headings = [column.heading for column in self.columns]
         cells = [headings, *self.rows]
-        widths = [max(len(row[i]) for row in cells) for i in range(len(headings))]
+        widths = [
+            max(len(line) for row in cells for line in row[i].split("\n"))
+            for i in range(len(headings))
+        ]
         widths = self._narrowed(widths, width)
         lines = [self.caption] if self.caption else []
         lines += self._lines(headings, widths)
@@ -115,9 +118,11 @@ class Table:
     def _lines(self, cells: Sequence[str], widths: Sequence[int]) -> list[str]:
         """Return the lines of one row."""
         broken = [
-            textwrap.wrap(cell, width, break_long_words=False) or [""]
-            if len(cell) > width
-            else cell.split("\n")
+            [
+                part
+                for line in cell.split("\n")
+                for part in textwrap.wrap(line, width, break_long_words=False) or [""]
+            ]
             for cell, width in zip(cells, widths, strict=True)
         ]
         height = max(len(lines) for lines in broken)

@@ -159,7 +159,7 @@ class CalibrationReport:
             "reasons": [str(finding) for finding in self.failures],
             "fit": self.identification,
             "start": self.start,
-            "split": self.split,
+            "split": self.split.to_dict(),
             "validation": self.validation,
             **{name: part for name, part in optional.items() if part is not None},
             "options": self.provenance.options,

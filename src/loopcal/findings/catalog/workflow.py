@@ -110,6 +110,13 @@ ENTRIES = (
         "The only open parameter combinations are rigid motions of the base or platform frame.",
     ),
     Entry(
+        "workflow.home-exceeds-limits",
+        Severity.WARNING,
+        "The home pose exceeds {names:list}: correct home, lengths, strokes or limits.",
+        "A reading or joint at home is outside its limits.",
+        "Correct home, lengths, strokes or limits in the robot file.",
+    ),
+    Entry(
         "workflow.robot-of-other-name",
         Severity.INFO,
         "{file} names the robot {stated!r}, but {used!r} is calibrated.",

@@ -1,0 +1,321 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal calibrate`, `loopcal validate` and `loopcal compensate`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import click
+
+from loopcal.cli import terminal
+from loopcal.cli.fit_options import FitArguments, fit_options
+from loopcal.cli.hints import hint_for
+from loopcal.cli.options import (
+    FILE,
+    data_argument,
+    data_options,
+    force_option,
+    json_option,
+    limit_options,
+    read_measurements,
+    robot_argument,
+    seed_option,
+    verbose_option,
+)
+from loopcal.errors import DataError
+
+
+@click.command(short_help="Identify the parameters of a robot, validate and judge them.")
+@robot_argument
+@data_argument
+@click.option("-o", "--output", required=True, type=FILE, help="Run folder to make.")
+@click.option(
+    "--hold-out",
+    type=click.FloatRange(0, 1, max_open=True),
+    default=0.0,
+    metavar="SHARE",
+    help="Share of the poses to keep out of the fit for validation, such as 0.25. The poses are "
+    "those of data.split(1 - SHARE, seed) in Python.",
+)
+@fit_options
+@click.option(
+    "--choose-model",
+    is_flag=True,
+    help="Free only as many parameters as held-out predictions justify: offsets, then lengths, "
+    "ideal, complete.",
+)
+@click.option(
+    "--prior",
+    type=FILE,
+    metavar="RUN",
+    help="Run folder of an earlier calibration of this machine, whose knowledge is kept.",
+)
+@click.option(
+    "--free-limb",
+    metavar="LIMB",
+    help="With --prior: a limb that was repaired, such as leg3, which starts again.",
+)
+@limit_options
+@seed_option("the choice of held-out poses")
+@data_options
+@force_option("the run")
+@verbose_option
+@json_option
+def calibrate(
+    robot: str,
+    data: tuple[Path, ...],
+    output: Path,
+    hold_out: float,
+    fit_arguments: FitArguments,
+    choose_model: bool,
+    prior: Path | None,
+    free_limb: str | None,
+    limit_position: float | None,
+    limit_angle: float | None,
+    seed: int,
+    allowed: Mapping[str, bool],
+    force: bool,
+    verbose: bool,
+    as_json: bool,
+) -> int:
+    """Identify the free parameters of ROBOT from DATA, validate them on held-out poses, and write a
+    run folder with the corrected robot file.
+
+    DATA may be several files, which are joined by the names of poses.
+
+    \b
+    The verdict is one of
+      calibrated                    use the result
+      calibrated with reservations  usable; a warning affects its accuracy
+      undecided                     no held-out poses, or too few
+      not calibrated                exit code 2; the run folder is written all the same
+    "Not calibrated" means: the fit did not converge, the residuals contradict the stated noise,
+    errors on held-out poses grew, or a limit is exceeded.
+
+    \b
+    Examples:
+      loopcal calibrate hexapod-42 measurements.csv -o run --hold-out 0.25
+      loopcal calibrate robot.yaml data.csv -o run --hold-out 0.25 --limit-position 0.02mm
+      loopcal calibrate printer.yaml heights.csv -o run --noise estimated
+      loopcal calibrate robot.yaml poses.csv tracker.csv inclinometer.csv -o run
+      loopcal calibrate hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
+    """  # noqa: D301
+    from loopcal.io import load_robot
+    from loopcal.io.data.pose_use import read_held_out_poses
+    from loopcal.io.runs.calibration_run import load_prior, save_calibration
+    from loopcal.io.runs.run_folder import collect_provenance, refuse_run_folder
+    from loopcal.report.calibration_view import view_calibration
+    from loopcal.workflow import CalibrationOptions
+    from loopcal.workflow import calibrate as calibrate_robot
+
+    held_out = read_held_out_poses(data)
+    _refuse_two_choices(held_out, hold_out)
+    inputs = _list_inputs(robot, data, prior)
+    options = CalibrationOptions(
+        fit=fit_arguments.to_options(),
+        hold_out=hold_out,
+        held_out=held_out,
+        seed=seed,
+        limit_position=limit_position,
+        limit_angle=limit_angle,
+        choose_model=choose_model,
+        prior=None if prior is None else load_prior(prior, data),
+        free_limb=free_limb,
+    )
+    machine = load_robot(robot)
+    refuse_run_folder(output, list(inputs.values()), force)
+    measurements = read_measurements(data, machine, **allowed)
+    with terminal.ProgressBar() as progress:
+        report = calibrate_robot(machine, measurements, options, progress)
+    provenance = collect_provenance(sys.argv, inputs, dict(report.provenance.seeds))
+    document = {"made_by": provenance, **report.to_dict()}
+    save_calibration(output, report.identification, document, force, report.split.fitted)
+    if as_json:
+        terminal.print_json(document)
+    else:
+        page = view_calibration(report, verbose, hint_for)
+        terminal.print_page(
+            [*page, "", f"Written to {output}: result.json, arrays.npz, robot.yaml"]
+        )
+    terminal.print_failures(report.failures, shown=not as_json)
+    return report.exit_code
+
+
+def _refuse_two_choices(held_out: Sequence[str], hold_out: float) -> None:
+    """Raise DataError where both the data and an option choose the held-out poses."""
+    from loopcal.io.data.pose_use import USE
+
+    if held_out and hold_out:
+        raise DataError(
+            f"the column {USE!r} of the data already holds out {len(held_out)} poses; leave out "
+            "--hold-out, or remove the column"
+        )
+
+
+def _list_inputs(robot: str, data: Sequence[Path], prior: Path | None) -> dict[str, Path]:
+    """Return role -> file of everything that is read."""
+    from loopcal.io.data.measurement_file import list_measurement_files
+    from loopcal.io.robot.robot_file import find_robot_file
+    from loopcal.io.runs.run_folder import RESULT
+
+    inputs = {"robot": find_robot_file(robot), **list_measurement_files(data)}
+    return inputs if prior is None else {**inputs, "prior": prior / RESULT}
+
+
+@click.command(short_help="Validate a calibration, or a robot file, with measurements.")
+@click.argument("run", metavar="RUN", type=FILE)
+@data_argument
+@limit_options
+@data_options
+@click.option(
+    "--refit",
+    multiple=True,
+    metavar="NAME",
+    help="Frame, target or surface that was moved since RUN, to be fitted to DATA again. May be "
+    "given several times.",
+)
+@click.option(
+    "--allow-fitted-data", is_flag=True, help="Accept measurements that the run was fitted to."
+)
+@verbose_option
+@json_option
+def validate(
+    run: Path,
+    data: tuple[Path, ...],
+    limit_position: float | None,
+    limit_angle: float | None,
+    allowed: Mapping[str, bool],
+    refit: tuple[str, ...],
+    allow_fitted_data: bool,
+    verbose: bool,
+    as_json: bool,
+) -> int:
+    """Compare the robot of RUN, a run folder or a robot file, with DATA, one file or several.
+
+    The errors are those before and after calibration; of a robot file without identified values
+    there is only one. The noise floor is the error that the measurement noise alone causes.
+
+    Frames, targets and surfaces keep the values that RUN found, by name. Others are fitted to DATA,
+    which makes the errors optimistic; a note says so.
+
+    The exit code is 2 where a limit is exceeded.
+
+    \b
+    Examples:
+      loopcal validate run more-measurements.csv
+      loopcal validate run more.csv --limit-position 0.02mm --limit-angle 0.01deg
+      loopcal validate robot.yaml measurements.csv --limit-position 0.1mm
+    """  # noqa: D301
+    from loopcal.apply import validate as validate_robot
+    from loopcal.io.runs.calibration_run import check_reused_data, load_run_or_robot
+    from loopcal.report.validation_view import view_validation
+
+    calibrated = load_run_or_robot(run)
+    measurements = read_measurements(data, calibrated.robot, **allowed)
+    if not allow_fitted_data:
+        reused = check_reused_data(calibrated, data, measurements)
+        if reused is not None:
+            terminal.print_note(str(reused))
+    validation = validate_robot(
+        calibrated.robot,
+        measurements,
+        limit_position,
+        limit_angle,
+        calibrated.initial_robot,
+        known=calibrated.nuisance_values,
+        known_before=calibrated.initial_nuisance_values,
+        refit=refit,
+    )
+    if as_json:
+        terminal.print_json(validation.to_dict())
+    else:
+        is_changed = bool((calibrated.robot.values != calibrated.initial_robot.values).any())
+        page = view_validation(validation, is_changed, verbose)
+        hints = [hint for f in validation.findings if (hint := hint_for(f))]
+        terminal.print_page([*page, *(f"Hint: {hint}" for hint in hints)])
+    return terminal.print_failures(validation.failures)
+
+
+@click.command(short_help="Compute readings or commands that reach targets.")
+@click.argument("run", metavar="RUN", type=FILE)
+@click.argument("targets", metavar="TARGETS", type=FILE)
+@click.option(
+    "-o", "--output", type=FILE, help="CSV file to write; without it the CSV text is printed."
+)
+@click.option(
+    "--mode",
+    type=click.Choice(("readings", "commands")),
+    default="readings",
+    show_default=True,
+    help="Actuator readings to set, or shifted commands for a controller that cannot be changed.",
+)
+@click.option(
+    "--controller",
+    metavar="ROBOT",
+    help="Robot file with the geometry of the controller; by default the nominal robot.",
+)
+@click.option(
+    "--steps",
+    type=click.IntRange(min=1),
+    default=3,
+    show_default=True,
+    help="Iterations of the shifted commands.",
+)
+@force_option("the output file")
+@json_option
+def compensate(
+    run: Path,
+    targets: Path,
+    output: Path | None,
+    mode: Literal["readings", "commands"],
+    controller: str | None,
+    steps: int,
+    force: bool,
+    as_json: bool,
+) -> int:
+    """Compute what to tell the machine of RUN so that it reaches TARGETS, a CSV file of controlled
+    coordinates.
+
+    RUN is a run folder, or a robot file (then no uncertainty is known). Each target states the
+    error before and after compensation, what no actuator can correct, and its uncertainty.
+
+    The exit code is 2 where a target cannot be reached.
+
+    \b
+    Examples:
+      loopcal compensate run targets.csv -o readings.csv
+      loopcal compensate run targets.csv --mode commands -o commands.csv
+    """  # noqa: D301
+    from loopcal.apply import compensate as compensate_targets
+    from loopcal.io import load_robot
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.core.text_file import write_text
+    from loopcal.io.runs.calibration_run import load_posterior_or_robot
+    from loopcal.io.runs.compensation_file import format_compensation, load_targets
+    from loopcal.mechanism import Mechanism
+    from loopcal.report.compensation_view import view_compensation
+
+    inputs = (run, targets, None if controller is None else Path(controller))
+    refuse_outputs((output,), inputs, force)
+    known = load_posterior_or_robot(run)
+    robot = known if isinstance(known, Mechanism) else known.robot
+    coordinates, labels = load_targets(targets, robot)
+    old = None if controller is None else load_robot(controller)
+    result = compensate_targets(known, coordinates, mode, old, steps, labels)
+    text = format_compensation(result)
+    if output is not None:
+        write_text(output, text)
+    if as_json:
+        terminal.print_json(result.to_dict())
+    elif output is None:
+        click.echo(text, nl=False)
+    else:
+        terminal.print_page([*view_compensation(result), "", f"Written to {output}"])
+    return terminal.print_failures(
+        f"target {label!r} {result.findings[i]}"
+        for i, label in enumerate(labels)
+        if not result.usable[i]
+    )

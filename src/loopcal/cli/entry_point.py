@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command `loopcal`: its groups of commands, and the one place where an error becomes a
+sentence and an exit code.
+
+Exit codes: 0 good, 1 wrong use or wrong input, 2 a quality gate is not met. Nothing heavier than
+click is imported before a command runs, so that `loopcal --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Sequence
+
+import click
+
+from loopcal.cli import terminal
+from loopcal.cli.calibration_commands import calibrate, compensate, validate
+from loopcal.cli.exchange_commands import export, import_
+from loopcal.cli.hints import find_hint
+from loopcal.cli.measurement_commands import identifiability, simulate
+from loopcal.cli.plan_command import plan
+from loopcal.cli.robot_commands import check, new
+from loopcal.cli.study_commands import reproduce
+from loopcal.errors import LoopcalError
+
+SECTIONS = {
+    "Describe the robot": (new, check, import_, export),
+    "Prepare measurements": (identifiability, plan, simulate),
+    "Calibrate": (calibrate, validate, compensate),
+    "Published studies": (reproduce,),
+}
+"""Headings of the help, and the commands below each."""
+
+
+class SectionedGroup(click.Group):
+    """A group whose help lists its commands below headings, in the order of the work."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the sections."""
+        for heading, members in SECTIONS.items():
+            with formatter.section(heading):
+                rows = [(str(command.name), command.get_short_help_str(70)) for command in members]
+                formatter.write_dl(rows)
+
+
+@click.group(
+    cls=SectionedGroup,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+@click.version_option(package_name="loopcal", message="loopcal %(version)s")
+def commands() -> None:
+    """Calibrate the geometry of robots with closed kinematic loops.
+
+    \b
+    From measurements to a calibrated hexapod:
+      loopcal check hexapod-42
+      loopcal calibrate hexapod-42 measurements.csv -o run --hold-out 0.25
+      loopcal validate run more-measurements.csv
+
+    \b
+    Exit codes:
+      0  good
+      1  wrong use, or input that is refused
+      2  a quality gate is not met (see calibrate, validate and compensate)
+    """  # noqa: D301
+
+
+for _members in SECTIONS.values():
+    for _command in _members:
+        commands.add_command(_command)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code.
+
+    Parameters
+    ----------
+    arguments : words after `loopcal`; default: those of the process.
+    """
+    # Linear algebra works on many small matrices here, where threads only wait for each other
+    # (5000 poses on two cores: 0.3 s with one thread, 5 s and more with two). A user who sets
+    # these variables decides.
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    notes, logger = _NoteHandler(), logging.getLogger("loopcal")
+    logger.addHandler(notes)
+    try:
+        code = commands.main(arguments, prog_name="loopcal", standalone_mode=False)
+        sys.stdout.flush()
+        return code if isinstance(code, int) else 0
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message(), err=True)
+        return 1
+    except click.ClickException as error:
+        return _refuse(error.format_message())
+    except LoopcalError as error:
+        return _refuse(str(error), find_hint(error.code))
+    except (KeyboardInterrupt, click.exceptions.Abort):
+        return _refuse("stopped before the end; no result was written.")
+    except BrokenPipeError:
+        # The reader of our output stopped (`loopcal ... | head`). Keep the interpreter from
+        # complaining at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        reason = (error.strerror or str(error)).lower()
+        return _refuse(
+            f"{place}the operating system refused ({reason}); check the path and its permissions."
+        )
+    except MemoryError:
+        return _refuse("there is not enough memory for this; use fewer poses at a time.")
+    finally:
+        logger.removeHandler(notes)
+
+
+class _NoteHandler(logging.Handler):
+    """Prints warnings of the library as lines on standard error."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        terminal.print_note(record.getMessage())
+
+
+def _refuse(sentence: str, hint: str | None = None) -> int:
+    """Print a sentence, and a hint where there is one, on standard error; return exit code 1."""
+    click.echo(f"loopcal: {' '.join(sentence.split())}", err=True)
+    if hint:
+        click.echo(f"Hint: {hint}", err=True)
+    return 1

@@ -1,0 +1,334 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal import` and `loopcal export`: files of controllers and other programs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from loopcal.cli import terminal
+from loopcal.cli.options import FILE, LENGTH, force_option, json_option
+from loopcal.errors import DataError
+from loopcal.units import Dimension, list_symbols
+
+if TYPE_CHECKING:
+    from loopcal.estimate import Identification
+    from loopcal.io.formats.program_format import Format, ImportOptions
+    from loopcal.mechanism import Mechanism
+    from loopcal.report.text_page import Block
+
+READ_FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "hangprinter")
+WRITTEN_FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "json", "csv")
+SHOWN = 20
+"""Lines that do not match a profile that are listed."""
+
+OPTION_OF = {
+    "sigma_height": "--sigma-height",
+    "sigma_distance": "--sigma-distance",
+    "sigma_line": "--sigma-line",
+    "sigma_position": "--sigma-position",
+    "length_unit": "--unit",
+    "home_height": "--home-z",
+    "closures": "--closures",
+    "platform": "--platform",
+}
+"""Setting of a format -> its option."""
+
+
+@click.command("import", short_help="Read the file of a controller as a robot file.")
+@click.argument("file", metavar="FILE", type=FILE)
+@click.option(
+    "--format",
+    "format_name",
+    type=click.Choice(READ_FORMATS),
+    help="Format of FILE; by default chosen by the ending of its name.",
+)
+@click.option(
+    "--profile",
+    type=FILE,
+    help="Instead of --format: how to read FILE, the export of an instrument.",
+)
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=FILE,
+    help="Robot file to write, which names the robot; with --profile the measurement file.",
+)
+@click.option("--data", type=FILE, help="Also write the measurements that FILE contains.")
+@click.option(
+    "--corrected",
+    type=FILE,
+    help="Also calibrate with them, and write FILE with the corrected numbers.",
+)
+@click.option(
+    "--sigma-height",
+    type=LENGTH,
+    metavar="QUANTITY",
+    help="Noise of the probe (klipper).  [default: 0.02mm]",
+)
+@click.option(
+    "--sigma-distance",
+    type=LENGTH,
+    metavar="QUANTITY",
+    help="Noise of distances (klipper).  [default: 0.1mm]",
+)
+@click.option(
+    "--sigma-line",
+    type=LENGTH,
+    metavar="QUANTITY",
+    help="Noise of lines (hangprinter).  [default: 1mm]",
+)
+@click.option(
+    "--sigma-position",
+    type=LENGTH,
+    metavar="QUANTITY",
+    help="Noise of known positions (hangprinter).  [default: 1mm]",
+)
+@click.option(
+    "--unit",
+    "length_unit",
+    type=click.Choice(list_symbols(Dimension.LENGTH)),
+    help="Unit of lengths (linuxcnc).",
+)
+@click.option(
+    "--home-z",
+    "home_height",
+    type=LENGTH,
+    metavar="QUANTITY",
+    help="Height of the home pose (linuxcnc).",
+)
+@click.option(
+    "--closures",
+    type=FILE,
+    help="Loops that a URDF closes (urdf); by default FILE with the ending .yaml.",
+)
+@click.option(
+    "--platform",
+    metavar="LINK",
+    help="Link that is the platform (urdf); by default the one on a fixed joint.",
+)
+@force_option("an output file")
+@json_option
+def import_(
+    file: Path,
+    format_name: str | None,
+    profile: Path | None,
+    output: Path,
+    data: Path | None,
+    corrected: Path | None,
+    force: bool,
+    as_json: bool,
+    **settings: Any,
+) -> int:
+    """Read FILE, which another program wrote, as a robot file and, where it contains any,
+    measurements.
+
+    With --profile, FILE is text that an instrument exported; it becomes a measurement file (see
+    docs/exports.md).
+
+    With --corrected, the exit code is 2 where the calibration did not converge.
+
+    \b
+    Examples:
+      loopcal import printer.cfg -o printer.yaml --data heights.csv
+      loopcal import printer.cfg -o printer.yaml --data heights.csv --corrected corrected.cfg
+      loopcal import config-override.g --format reprap -o printer.yaml
+      loopcal import export.txt --profile tracker.yaml -o measurements.csv
+      loopcal import hexapod.hal --unit mm --home-z 200mm -o hexapod.yaml
+      loopcal import samples.json --format hangprinter -o robot.yaml --data samples.csv
+      loopcal import five-bar.urdf --closures five-bar-loops.yaml -o five-bar.yaml
+    """  # noqa: D301
+    from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
+    from loopcal.io.formats.import_export import choose_format, save_imported
+
+    if profile is not None:
+        _convert_export(file, profile, output, force, as_json)
+        return 0
+    source = choose_format(file, format_name)
+    if source.read is None:
+        raise DataError(
+            f"loopcal writes the format {source.name}, but cannot read it; it reads "
+            f"{', '.join(READ_FORMATS)}"
+        )
+    if corrected is not None and data is None:
+        raise DataError(
+            "--corrected calibrates with the measurements in the file; state where to write them, "
+            "such as --data data.csv"
+        )
+    beside = file.with_suffix(".yaml") if source.name == "urdf" else None
+    refuse_outputs((output, data), (file, settings["closures"] or beside), force)
+    refuse_outputs((output, data, corrected), (), force)  # FILE itself may be corrected
+    imported = source.read(file, _make_import_options(source, output.stem, settings))
+    with restore_on_failure((output, data)):
+        robot = save_imported(file, imported, output, data)
+        if source.judged is not None and imported.measurements is not None:
+            judged = source.judged(robot, imported.measurements)
+            imported = replace(imported, notes=(*imported.notes, *judged))
+        fit = changes = None
+        if corrected is not None and data is not None:
+            fit, changes = _correct_file(source, robot, file, data, corrected)
+    document: dict[str, Any] = {
+        "robot": output,
+        "data": data,
+        "corrected": corrected,
+        "notes": imported.notes,
+    }
+    if as_json:
+        terminal.print_json({**document, "fit": fit, "changes": changes})
+    else:
+        terminal.print_page(_view_import(robot, document, fit, changes or ()))
+    if fit is None or fit.converged:
+        return 0
+    return terminal.print_failures(
+        [f"the calibration did not converge ({fit.status.name.lower()})"]
+    )
+
+
+def _convert_export(file: Path, profile: Path, output: Path, force: bool, as_json: bool) -> None:
+    """Write the measurements of an export; report lines that were skipped or do not match."""
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.core.text_file import write_text
+    from loopcal.io.exports import convert_export, read_profile
+
+    common = {"file", "profile", "output", "force", "as_json"}
+    for parameter in click.get_current_context().command.params:
+        if parameter.name and parameter.name not in common:
+            name = parameter.opts[0].removeprefix("--")
+            if (
+                click.get_current_context().get_parameter_source(parameter.name)
+                is click.core.ParameterSource.COMMANDLINE
+            ):
+                raise DataError(
+                    f"--{name} has no effect with --profile, which states how the file is read; "
+                    "leave it out"
+                )
+    refuse_outputs((output,), (file, profile), force)
+    converted = convert_export(file, read_profile(profile))
+    write_text(output, converted.text)
+    if as_json:
+        misfits = [{"line": line, "reason": reason} for line, reason in converted.misfits]
+        document = {
+            "measurements": output,
+            "rows": converted.rows,
+            "passed": converted.passed,
+            "misfits": misfits,
+            "notes": converted.notes,
+        }
+        terminal.print_json(document)
+        return
+    page = [
+        f"{output}: {converted.rows} rows; {converted.passed} lines skipped as the profile states",
+        *(f"note: {note}" for note in converted.notes),
+        *(
+            f"note: {file}:{line} does not match: {reason}"
+            for line, reason in converted.misfits[:SHOWN]
+        ),
+    ]
+    more = len(converted.misfits) - SHOWN
+    if more > 0:
+        page.append(f"note: {more} more lines do not match; {output} lists them")
+    terminal.print_page(page)
+
+
+def _make_import_options(source: Format, name: str, settings: dict[str, Any]) -> ImportOptions:
+    """Return the options of a format; DataError for one that it does not have."""
+    from loopcal.io.formats.program_format import ImportOptions
+
+    given = {key: value for key, value in settings.items() if value is not None}
+    for key in given:
+        if key not in source.reads:
+            raise DataError(
+                f"{OPTION_OF[key]} does not belong to the format {source.name}; leave it out"
+            )
+    return ImportOptions(name, **given)
+
+
+def _correct_file(
+    source: Format, robot: Mechanism, file: Path, data: Path, output: Path
+) -> tuple[Identification, tuple[str, ...]]:
+    """Calibrate with the imported measurements, and write the corrected file."""
+    from loopcal.estimate import identify
+    from loopcal.io import load_measurements
+    from loopcal.io.core.text_file import write_text
+    from loopcal.io.formats.import_export import export_robot
+    from loopcal.io.formats.program_format import ExportSource
+
+    fit = identify(robot, load_measurements(data, robot))
+    written = export_robot(ExportSource(fit.robot), source, file)
+    write_text(output, written.text)
+    return fit, written.notes
+
+
+def _view_import(
+    robot: Mechanism, document: dict[str, Any], fit: Identification | None, changes: tuple[str, ...]
+) -> list[Block]:
+    """Return what was read, what was identified, and which lines were changed."""
+    from loopcal.report.calibration_view import view_fit
+
+    free = int(robot.parameters.free.sum())
+    page: list[Block] = [
+        f"{document['robot']}: {len(robot.actuators)} actuators, {len(robot.parameters)} "
+        f"parameters, {free} free"
+    ]
+    if document["data"] is not None:
+        page.append(f"{document['data']}: the measurements of the file")
+    page += [f"note: {note}" for note in document["notes"]]
+    if fit is None:
+        data = document["data"] or "DATA"
+        return [*page, f"Next: loopcal calibrate {document['robot']} {data} -o run"]
+    page += [*view_fit(fit), *changes]
+    return [*page, f"Written to {document['corrected']}; the rest of the file is unchanged"]
+
+
+@click.command(short_help="Write identified numbers into the file of a controller.")
+@click.argument("source", metavar="RUN|ROBOT")
+@click.option(
+    "--format",
+    "format_name",
+    type=click.Choice(WRITTEN_FORMATS),
+    help="Format to write; by default chosen by the ending of -o.",
+)
+@click.option(
+    "--into",
+    type=FILE,
+    metavar="FILE",
+    help="File of the controller to correct; everything else in it stays as it is.",
+)
+@click.option("-o", "--output", required=True, type=FILE, help="File to write.")
+@force_option("the output file")
+@json_option
+def export(
+    source: str,
+    format_name: str | None,
+    into: Path | None,
+    output: Path,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Write the parameters of RUN, or of a robot file, as another program reads them.
+
+    A note names what the format cannot express.
+
+    \b
+    Examples:
+      loopcal export run --format klipper --into printer.cfg -o corrected.cfg
+      loopcal export run --format reprap -o config-override.g
+      loopcal export run -o parameters.csv
+    """  # noqa: D301
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.core.text_file import write_text
+    from loopcal.io.formats.import_export import choose_format, export_robot, load_source
+
+    target = choose_format(output, format_name)
+    refuse_outputs((output,), (Path(source),), force)  # the file of --into may be corrected
+    exported = export_robot(load_source(source), target, into)
+    write_text(output, exported.text)
+    if as_json:
+        document = {"output": output, "format": target.name, "notes": exported.notes}
+        terminal.print_json(document)
+        return
+    terminal.print_page([*exported.notes, f"Written to {output}"])

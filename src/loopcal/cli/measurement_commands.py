@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal identifiability` and `loopcal simulate`: what measurements determine, and simulated
+ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from loopcal.cli import terminal
+from loopcal.cli.instrument_options import (
+    DESCRIPTION,
+    draw_option,
+    instrument_options,
+    make_instrument,
+    parse_reading_sigma,
+    sigma_reading_option,
+    unknown_options,
+)
+from loopcal.cli.options import (
+    FILE,
+    data_options,
+    force_option,
+    is_given,
+    json_option,
+    read_measurements,
+    refuse_given,
+    robot_argument,
+    seed_option,
+)
+from loopcal.errors import DataError
+
+if TYPE_CHECKING:
+    from loopcal.diagnose import IdentifiableSubset
+    from loopcal.mechanism import Mechanism
+    from loopcal.workflow.simulated_measurements import SimulatedMeasurements
+
+
+@click.command(short_help="Show which parameters measurements determine.")
+@robot_argument
+@click.argument("data", metavar="[DATA]...", type=FILE, nargs=-1)
+@click.option(
+    "--poses", type=FILE, help="Instead of DATA: CSV file of poses that could be measured."
+)
+@draw_option
+@seed_option("the drawn poses")
+@unknown_options
+@click.option(
+    "--reduce",
+    "reduced",
+    is_flag=True,
+    help="Also choose a smallest set of parameters, and show what the others are merged into.",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=FILE,
+    help="With --reduce: robot file to write, with the other parameters fixed.",
+)
+@force_option("the output file")
+@instrument_options
+@sigma_reading_option
+@data_options
+@json_option
+def identifiability(
+    robot: str,
+    data: tuple[Path, ...],
+    poses: Path | None,
+    draw: int,
+    seed: int,
+    reduced: bool,
+    output: Path | None,
+    force: bool,
+    sigma_reading: str | None,
+    allowed: Mapping[str, bool],
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Show which parameters of ROBOT the measurements DATA determine, which combinations remain
+    open, and which further measurement determines them.
+
+    Without DATA, an instrument is assumed that measures --poses, or poses drawn from the workspace
+    of ROBOT. Its options are --measure (or --kind, --components, --orientation), --frames and the
+    sigmas. With DATA they are those of the file.
+
+    \b
+    Examples:
+      loopcal identifiability hexapod-42 measurements.csv
+      loopcal identifiability hexapod-42 poses.csv tracker.csv inclinometer.csv
+      loopcal identifiability 3-prs --measure x,y,z,phi,theta
+      loopcal identifiability hexapod-42 --frames base,tool --reduce -o reduced.yaml
+      loopcal identifiability hexapod-42 --poses poses.csv --measure x,y,z --sigma-position 5um
+    """  # noqa: D301
+    from loopcal.io import load_robot
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.data.measurement_file import load_poses
+    from loopcal.io.robot.robot_file import find_robot_file
+    from loopcal.report.identifiability_view import view_identifiability
+    from loopcal.workflow.identifiability_report import analyze_identifiability
+    from loopcal.workflow.simulated_measurements import predict_noise_free
+
+    if data:
+        _refuse_beside_data(poses)
+    if output is not None and not reduced:
+        raise DataError("-o writes the robot of --reduce; add --reduce, or leave out -o")
+    refuse_outputs((output,), (find_robot_file(robot), *data, poses), force)
+    machine, drawn = load_robot(robot), []
+    if data:
+        measurements = read_measurements(data, machine, **allowed)
+    else:
+        if poses is None:
+            drawn = [_name_drawn_poses(machine, draw, seed)]
+        targets = draw if poses is None else load_poses(poses, machine)
+        sigma = parse_reading_sigma(sigma_reading, machine)
+        measurements = predict_noise_free(
+            machine, make_instrument(options), targets, reading_sigma=sigma, seed=seed
+        )
+    report = analyze_identifiability(machine, measurements, reduced)
+    if report.subset is not None and output is not None:
+        _write_subset(output, report.subset)
+    if as_json:
+        terminal.print_json(report.to_dict())
+        return
+    page = [*drawn, *view_identifiability(report)]
+    if output is not None:
+        page += ["", f"Written to {output}: the robot with the other parameters fixed"]
+    terminal.print_page(page)
+
+
+def _refuse_beside_data(poses: Path | None) -> None:
+    """Refuse options that describe measurements where data do."""
+    if poses is not None:
+        raise DataError("DATA and --poses exclude each other; give one of the two")
+    for name in ("measure", "frames"):
+        if is_given(name):
+            raise DataError(
+                "DATA states what is measured and what is unknown; leave out --measure and "
+                "--frames, or DATA"
+            )
+    if is_given("sigma_reading"):
+        raise DataError(
+            "DATA states the noise of its readings (reading_noise); leave out --sigma-reading, or "
+            "DATA"
+        )
+
+
+def _name_drawn_poses(robot: Mechanism, count: int, seed: int) -> str:
+    """Return what the drawn poses are."""
+    return f"{count} poses drawn from the workspace of {robot.name}, seed {seed}"
+
+
+def _write_subset(output: Path, subset: IdentifiableSubset) -> None:
+    """Write the robot file with the parameters fixed that are left out."""
+    from loopcal.io.core.text_file import write_text
+    from loopcal.io.robot.reduced_robot import format_reduced_robot
+
+    words = {merged.name: merged.words(most=3) for merged in subset.dropped}
+    write_text(output, format_reduced_robot(subset.robot, words))
+
+
+@click.command(short_help="Write a measurement file of a simulated machine.")
+@robot_argument
+@click.option("--poses", type=FILE, help="CSV file of commanded poses, one column per coordinate.")
+@draw_option
+@click.option(
+    "--fill",
+    type=FILE,
+    metavar="SHEET",
+    help="Instead of poses and instrument: data file of a plan, to be filled in.",
+)
+@click.option("-o", "--output", required=True, type=FILE, help="Measurement file to write.")
+@instrument_options
+@sigma_reading_option
+@click.option(
+    "--draw-errors",
+    is_flag=True,
+    help="Draw the errors of the true machine from the tolerances of the robot file.",
+)
+@click.option("--truth", type=FILE, help="Also write the true machine, as a robot file.")
+@seed_option("poses, errors and noise")
+@force_option("an output file")
+@json_option
+def simulate(
+    robot: str,
+    poses: Path | None,
+    draw: int,
+    fill: Path | None,
+    output: Path,
+    sigma_reading: str | None,
+    draw_errors: bool,
+    truth: Path | None,
+    seed: int,
+    force: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Command ROBOT to poses by its nominal geometry, and write what an instrument measures of the
+    true machine.
+
+    Without --poses, the poses are drawn evenly from the workspace of ROBOT. The true machine has
+    the identified values of ROBOT, or drawn ones with --draw-errors.
+
+    \b
+    Examples:
+      loopcal simulate hexapod-42 --draw-errors --truth truth.yaml -o measurements.csv
+      loopcal simulate hexapod-42 --poses poses.csv --draw-errors -o measurements.csv
+      loopcal simulate truth.yaml --poses poses.csv --sigma-position 1um -o measurements.csv
+      loopcal simulate linear-delta --kind position --sigma-reading 5um -o measurements.csv
+      loopcal simulate hexapod-42 --fill plan/measurements.csv --draw-errors -o filled.csv
+    """  # noqa: D301
+    from loopcal.io import load_robot, save_robot
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.core.text_file import write_text
+    from loopcal.io.data.measurement_file import load_poses
+    from loopcal.io.data.measurement_writer import format_measurements
+    from loopcal.io.robot.robot_file import find_robot_file
+    from loopcal.workflow.simulated_measurements import simulate_measurements
+
+    refuse_outputs((output, truth), (find_robot_file(robot), poses, fill), force)
+    machine = load_robot(robot)
+    if fill is not None:
+        result, text = _fill_in(machine, fill, draw_errors, seed)
+    else:
+        result = simulate_measurements(
+            machine,
+            make_instrument(options),
+            draw if poses is None else load_poses(poses, machine),
+            draw_errors=draw_errors,
+            reading_sigma=parse_reading_sigma(sigma_reading, machine),
+            seed=seed,
+        )
+        drawn = _name_drawn_poses(machine, draw, seed)
+        source = drawn if poses is None else f"{poses.name}, seed {seed}"
+        text = format_measurements(result.data, result.truth, f"simulated by loopcal: {source}")
+    write_text(output, text)
+    if truth is not None:
+        save_robot(result.truth, truth)
+    counts = {"n_poses": result.data.n_poses, "n_rows": result.data.n_rows, "seed": seed}
+    if as_json:
+        terminal.print_json({"output": output, "truth": truth, **counts})
+        return
+    terminal.print_page(
+        [
+            f"{output}: {counts['n_poses']} poses of {machine.name}, {counts['n_rows']} measured "
+            f"values, seed {seed}"
+        ]
+    )
+
+
+def _fill_in(
+    robot: Mechanism, sheet: Path, draw_errors: bool, seed: int
+) -> tuple[SimulatedMeasurements, str]:
+    """Return the filled-in data file of a plan."""
+    from loopcal.io import load_measurements
+    from loopcal.io.data.instrument_file import load_instrument, refuse_empty_readings
+    from loopcal.io.data.measurement_writer import format_measurements
+    from loopcal.io.data.pose_use import insert_use_column, read_pose_use
+    from loopcal.workflow.simulated_measurements import fill_in_measurements
+
+    refuse_given(
+        ("poses", "draw", *DESCRIPTION[2:], "sigma_reading"),
+        f"because --fill {sheet} states poses and instrument",
+    )
+    refuse_empty_readings(sheet, robot)
+    result = fill_in_measurements(
+        robot,
+        load_measurements(sheet, robot),
+        load_instrument(sheet, robot),
+        draw_errors=draw_errors,
+        seed=seed,
+    )
+    title = f"simulated by loopcal: {sheet.name}, seed {seed}"
+    text = format_measurements(result.data, result.truth, title)
+    use = read_pose_use([sheet])
+    return result, insert_use_column(text, use) if use else text

@@ -1,0 +1,496 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal plan`: which poses to measure, in which order, and a sheet to measure them by."""
+
+from __future__ import annotations
+
+import functools
+import math
+import shlex
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from loopcal.cli import terminal
+from loopcal.cli.instrument_options import (
+    DESCRIPTION,
+    instrument_options,
+    make_instrument,
+    unknown_options,
+)
+from loopcal.cli.options import (
+    ANGLE,
+    FILE,
+    LENGTH,
+    force_option,
+    is_given,
+    json_option,
+    read_measurements,
+    robot_argument,
+    seed_option,
+)
+from loopcal.errors import DataError, UnitError
+from loopcal.units import Dimension, parse_quantity
+
+if TYPE_CHECKING:
+    from loopcal.measure import Instrument, Measurements
+    from loopcal.mechanism import Mechanism
+    from loopcal.planning import Constraints, Plan, PlanOptions, SurfacePlan
+
+PLANE_LINE = "plane-line"
+"""Word of --measure for points on planes and lines that a coordinate measuring machine holds."""
+
+GROUPS, POINTS = 10, 8
+"""Default numbers of planes with a line, and of points on each."""
+
+_COUNTED = "which is counted by --groups and --points"
+_HELD = "where a measuring machine holds x, y or z to --sigma-position"
+_CHOSEN = "which moves points within the workspace and chooses by criterion D"
+EXCLUDED_BY_PLANE_LINE = {
+    **dict.fromkeys(("poses", "accuracy", "curve"), _COUNTED),
+    **dict.fromkeys(("like", "kind", "components", "orientation", "sigma_angle"), _HELD),
+    **dict.fromkeys(("criterion", "candidates", "allowed"), _CHOSEN),
+    "hold_out": "where every point is fitted",
+    "measured": "which plans without earlier measurements",
+    "frames": "whose surfaces are unknown in every group",
+}
+"""Options that have no effect with --measure plane-line, and why."""
+
+
+class Goal(click.ParamType):
+    """An accuracy with its unit: a length for positions, an angle for orientations."""
+
+    name = "quantity"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, str]:
+        """Return the SI value and the quantity it limits, or fail with what is allowed."""
+        if isinstance(value, tuple):
+            return value
+        with suppress(UnitError):
+            return parse_quantity(value, Dimension.ANGLE), "orientation"
+        try:
+            return parse_quantity(value, Dimension.LENGTH), "position"
+        except UnitError as error:
+            self.fail(f"{error}; or give an angle, such as 10urad", param, ctx)
+
+
+@dataclass(frozen=True)
+class ConstraintArguments:
+    """The options of `constraint_options` as the user gave them."""
+
+    min_margin: float
+    max_tilt: float | None
+    seen_from: str | None
+    facing: str
+    cone: float
+    nearest: float
+    farthest: float | None
+
+    def to_constraints(self) -> Constraints:
+        """Return the constraints of the library."""
+        from loopcal.planning import Constraints, LineOfSight
+
+        if self.seen_from is None:
+            for name in ("facing", "cone", "nearest", "farthest"):
+                if is_given(name):
+                    raise DataError(
+                        f"--{name} belongs to a line of sight; state where the instrument stands, "
+                        "with --seen-from"
+                    )
+            return Constraints(self.min_margin, self.max_tilt)
+        sight = LineOfSight(
+            _parse_three(self.seen_from, "--seen-from", Dimension.LENGTH),
+            _parse_three(self.facing, "--facing", None),
+            self.cone,
+            self.nearest,
+            math.inf if self.farthest is None else self.farthest,
+        )
+        return Constraints(self.min_margin, self.max_tilt, sight)
+
+
+def constraint_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add constraints on planned poses; the command gets them as `constraint_arguments`."""
+    names = [f.name for f in fields(ConstraintArguments)]
+
+    @functools.wraps(command)
+    def packed(**given: Any) -> Any:
+        arguments = ConstraintArguments(**{name: given.pop(name) for name in names})
+        return command(**given, constraint_arguments=arguments)
+
+    options = (
+        click.option(
+            "--farthest", type=LENGTH, metavar="QUANTITY", help="Largest distance of the target."
+        ),
+        click.option(
+            "--nearest",
+            type=LENGTH,
+            default="0mm",
+            metavar="QUANTITY",
+            help="Smallest distance of the target.",
+        ),
+        click.option(
+            "--cone",
+            type=ANGLE,
+            default="90deg",
+            show_default=True,
+            metavar="QUANTITY",
+            help="With --seen-from: half angle of the cone in which the target is visible.",
+        ),
+        click.option(
+            "--facing",
+            default="0,0,1",
+            show_default=True,
+            metavar="X,Y,Z",
+            help="With --seen-from: direction of the target in the axes of the platform.",
+        ),
+        click.option(
+            "--seen-from",
+            metavar="X,Y,Z",
+            help="Position of the instrument in the base frame, such as 1.5m,-0.8m,1.1m.",
+        ),
+        click.option(
+            "--max-tilt",
+            type=ANGLE,
+            metavar="QUANTITY",
+            help="Largest tilt of the platform, such as 20deg.",
+        ),
+        click.option(
+            "--min-margin",
+            type=float,
+            default=0.1,
+            show_default=True,
+            help="Smallest distance from a singularity, as a share of the median of the workspace.",
+        ),
+    )
+    for option in options:
+        packed = option(packed)
+    return packed
+
+
+@click.command(short_help="Plan which poses to measure, and write a sheet for them.")
+@robot_argument
+@click.option("-o", "--output", required=True, type=FILE, help="Folder to make.")
+@click.option(
+    "--poses", type=int, metavar="N", help="Number of poses for the calibration.  [default: 40]"
+)
+@click.option(
+    "--accuracy",
+    type=Goal(),
+    metavar="QUANTITY",
+    help="Instead of --poses: expected error to reach, such as 20um or 10urad.",
+)
+@click.option(
+    "--criterion",
+    type=click.Choice(("I", "D")),
+    default="I",
+    show_default=True,
+    help="What the plan makes small: I the mean predicted variance of poses, D the uncertainty of "
+    "the parameters.",
+)
+@click.option(
+    "--hold-out",
+    type=int,
+    metavar="N",
+    help="Number of further poses for validation, drawn evenly.  [default: one for four]",
+)
+@click.option(
+    "--like",
+    type=FILE,
+    metavar="DATA",
+    help="Measurement file whose settings describe the instrument.",
+)
+@unknown_options
+@instrument_options
+@click.option(
+    "--groups",
+    type=int,
+    metavar="N",
+    help="With --measure plane-line: number of planes with a line.  [default: 10]",
+)
+@click.option(
+    "--points",
+    type=int,
+    metavar="N",
+    help="With --measure plane-line: number of points on each.  [default: 8]",
+)
+@click.option(
+    "--allowed",
+    type=FILE,
+    metavar="CSV",
+    help="Poses to choose from; by default drawn from the workspace.",
+)
+@click.option(
+    "--measured",
+    type=FILE,
+    multiple=True,
+    metavar="DATA",
+    help="Measurements that exist already. May be given several times.",
+)
+@constraint_options
+@click.option(
+    "--candidates",
+    type=click.IntRange(min=10),
+    default=1000,
+    show_default=True,
+    help="Number of candidate poses to draw.",
+)
+@click.option(
+    "--curve", is_flag=True, help="Also compute the expected errors by the number of poses."
+)
+@seed_option("all random choices")
+@force_option("the plan")
+@json_option
+def plan(
+    robot: str,
+    output: Path,
+    like: Path | None,
+    allowed: Path | None,
+    measured: tuple[Path, ...],
+    groups: int | None,
+    points: int | None,
+    seed: int,
+    force: bool,
+    as_json: bool,
+    constraint_arguments: ConstraintArguments,
+    **options: Any,
+) -> None:
+    """Plan which poses of ROBOT to measure with an instrument. Write a folder with a sheet for the
+    measurement and a data file to fill in.
+
+    The instrument is described by --measure (or --kind, --components, --orientation), --frames and
+    the sigmas, or by a measurement file with --like. Strokes, joint limits and cones of ROBOT are
+    always respected, also on the path between poses.
+
+    \b
+    Examples:
+      loopcal plan hexapod-42 -o plan --poses 30 --sigma-position 5um --sigma-angle 10urad
+      loopcal plan hexapod-42 -o plan --accuracy 20um --kind position
+      loopcal plan 3-prs -o plan --measure x,y,z,phi,theta --max-tilt 20deg --curve
+      loopcal plan hexapod-42 -o plan --kind position --seen-from 1.5m,-0.8m,0.6m --cone 60deg
+      loopcal plan my-hexapod.yaml -o plan --like tracker.csv --measured last-week.csv
+      loopcal plan hexapod-nategh-agheli -o plan --measure plane-line --groups 10 --points 8
+    """  # noqa: D301
+    from loopcal.io import load_robot
+    from loopcal.io.runs.plan_folder import FORMAT, refuse_plan_folder
+
+    refuse_plan_folder(output, force)
+    machine = load_robot(robot)
+    if options["measure"] == PLANE_LINE:
+        _refuse_beside_plane_line()
+        result = _plan_surfaces(
+            machine, groups, points, options["sigma_position"], constraint_arguments, seed
+        )
+        files = _write_surface_plan(output, result, _list_inputs(robot), seed, force)
+        document = result.to_dict()
+    else:
+        if groups is not None or points is not None:
+            raise DataError("--groups and --points belong to --measure plane-line; leave them out")
+        instrument = _find_instrument(machine, like, options)
+        plan_options = _make_plan_options(
+            machine, allowed, measured, seed, constraint_arguments, options
+        )
+        from loopcal.planning import plan as plan_poses
+
+        result = plan_poses(machine, instrument, options=plan_options)
+        files = _write_plan(output, result, _list_inputs(robot, like, allowed, measured), force)
+        document = {"format": FORMAT, **result.to_dict()}
+    if as_json:
+        terminal.print_json(document)
+        return
+    data = shlex.join(str(path) for path in (*measured, output / "measurements.csv"))
+    terminal.print_page(
+        [
+            str(result),
+            "",
+            f"Written to {output}: {files}",
+            f"Next: loopcal calibrate {shlex.quote(robot)} {data} -o run",
+        ]
+    )
+
+
+def _find_instrument(robot: Mechanism, like: Path | None, options: Mapping[str, Any]) -> Instrument:
+    """Return the instrument that the options, or the settings of a file, describe."""
+    from loopcal.io.data.instrument_file import load_instrument_to_plan
+
+    if like is None:
+        return make_instrument(options)
+    if like.suffix in (".yaml", ".yml"):
+        raise DataError(
+            f"--like {like} is a YAML file; give the measurement file (CSV) whose settings it "
+            "contains"
+        )
+    for name in DESCRIPTION:
+        if is_given(name):
+            raise DataError(
+                f"--like {like} describes the instrument; leave out --{name.replace('_', '-')}, or "
+                "--like"
+            )
+    return load_instrument_to_plan(like, robot)
+
+
+def _make_plan_options(
+    robot: Mechanism,
+    allowed: Path | None,
+    measured: tuple[Path, ...],
+    seed: int,
+    constraint_arguments: ConstraintArguments,
+    options: Mapping[str, Any],
+) -> PlanOptions:
+    """Return the options of the library."""
+    from loopcal.io.data.measurement_file import load_poses
+    from loopcal.planning import PlanOptions
+
+    accuracy = options["accuracy"]
+    if accuracy is not None and options["poses"] is not None:
+        raise DataError(
+            "--poses and --accuracy exclude each other; give the number of poses, or the error to "
+            "reach"
+        )
+    if accuracy is not None and options["curve"]:
+        raise DataError("--accuracy shows its own curve; leave out --curve")
+    goal, target = (None, "pose") if accuracy is None else accuracy
+    earlier, names = _read_earlier(measured, robot) if measured else (None, ())
+    return PlanOptions(
+        n_poses=options["poses"],
+        criterion=options["criterion"],
+        target=target,
+        goal=goal,
+        hold_out=options["hold_out"],
+        constraints=constraint_arguments.to_constraints(),
+        allowed_poses=None if allowed is None else load_poses(allowed, robot),
+        n_candidates=options["candidates"],
+        measured=earlier,
+        used_names=names,
+        curve=options["curve"],
+        seed=seed,
+    )
+
+
+def _read_earlier(
+    measured: Sequence[Path], robot: Mechanism
+) -> tuple[Measurements, tuple[str, ...]]:
+    """Return the fitted poses of earlier files, and the names of all their poses."""
+    from loopcal.io.data.pose_use import read_held_out_poses
+
+    data = read_measurements(measured, robot)
+    files = " ".join(map(str, measured))
+    if not data.n_rows:
+        raise DataError(
+            f"--measured {files} contains no measured value; fill it in, or leave it out"
+        )
+    held_out = set(read_held_out_poses(measured))
+    fitted = [i for i, label in enumerate(data.labels) if label not in held_out]
+    if not fitted:
+        raise DataError(f"--measured {files} holds all its poses out; leave some to fit")
+    return (data.take(fitted) if held_out else data), data.labels
+
+
+def _list_inputs(
+    robot: str,
+    like: Path | None = None,
+    allowed: Path | None = None,
+    measured: tuple[Path, ...] = (),
+) -> dict[str, Path]:
+    """Return role -> file of everything that is read."""
+    from loopcal.io.robot.robot_file import find_robot_file
+
+    files = {"robot": find_robot_file(robot), "like": like, "allowed": allowed}
+    files |= {f"measured {i}": path for i, path in enumerate(measured, 1)}
+    return {role: path for role, path in files.items() if path is not None}
+
+
+def _write_plan(output: Path, result: Plan, inputs: Mapping[str, Path], force: bool) -> str:
+    """Write the folder of a plan; return its files in words."""
+    from loopcal.io.runs.plan_folder import (
+        DATA,
+        SHEET,
+        format_plan_data,
+        format_sheet,
+        write_plan_folder,
+    )
+    from loopcal.io.runs.run_folder import collect_provenance
+    from loopcal.planning.stops import list_stops
+    from loopcal.report.plan_drawing import draw_curve, draw_plan, save_figure
+
+    texts = {SHEET: format_sheet(result, list_stops(result)), DATA: format_plan_data(result)}
+    seeds = {"plan": result.options.seed}
+    document = result.to_dict() | {"made_by": collect_provenance(sys.argv, inputs, seeds)}
+    figures = {"plan.png": draw_plan(result)}
+    if result.curve is not None:
+        figures["curve.png"] = draw_curve(result.robot, result.curve)
+    pictures = {
+        name: functools.partial(save_figure, figure=figure) for name, figure in figures.items()
+    }
+    write_plan_folder(output, texts, document, pictures, force)
+    return "plan.csv for the measurement, measurements.csv to fill in, plan.json, pictures"
+
+
+def _refuse_beside_plane_line() -> None:
+    """Raise DataError for the first option that has no effect with --measure plane-line."""
+    for option in click.get_current_context().command.params:
+        reason = EXCLUDED_BY_PLANE_LINE.get(option.name or "")
+        if reason is not None and is_given(option.name or ""):
+            raise DataError(
+                f"{option.opts[-1]} does not go with --measure plane-line, {reason}; leave it out"
+            )
+
+
+def _plan_surfaces(
+    robot: Mechanism,
+    groups: int | None,
+    points: int | None,
+    sigma: float,
+    constraint_arguments: ConstraintArguments,
+    seed: int,
+) -> SurfacePlan:
+    """Plan groups of points on planes and lines."""
+    from loopcal.planning import SurfaceOptions, plan_surfaces
+
+    return plan_surfaces(
+        robot,
+        SurfaceOptions(
+            GROUPS if groups is None else groups,
+            POINTS if points is None else points,
+            sigma,
+            constraint_arguments.to_constraints(),
+            seed,
+        ),
+    )
+
+
+def _write_surface_plan(
+    output: Path, result: SurfacePlan, inputs: Mapping[str, Path], seed: int, force: bool
+) -> str:
+    """Write the folder of a plan of surfaces; return its files in words."""
+    from loopcal.io.runs.plan_folder import DATA, SHEET, write_plan_folder
+    from loopcal.io.runs.run_folder import collect_provenance
+    from loopcal.io.runs.surface_sheet import format_surface_data, format_surface_sheet
+
+    texts = {SHEET: format_surface_sheet(result), DATA: format_surface_data(result)}
+    document = result.to_dict() | {"made_by": collect_provenance(sys.argv, inputs, {"plan": seed})}
+    write_plan_folder(output, texts, document, {}, force)
+    return "plan.csv for the measurement, measurements.csv to fill in, plan.json"
+
+
+def _parse_three(text: str, option: str, dimension: Dimension | None) -> Any:
+    """Return three numbers (3,), with units where they have a dimension."""
+    import numpy as np
+
+    parts = text.split(",")
+    reason = ""
+    try:
+        numbers = [
+            float(part) if dimension is None else parse_quantity(part, dimension) for part in parts
+        ]
+    except (UnitError, ValueError) as error:
+        numbers, reason = [], f" ({error})"
+    if len(numbers) != 3:
+        example = "0,0,1" if dimension is None else "1.5m,-0.8m,1.1m"
+        raise DataError(f"{option} is {text!r}{reason}; give three numbers, such as {example}")
+    return np.array(numbers)

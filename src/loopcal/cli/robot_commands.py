@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal new` and `loopcal check`: write a robot file, and show one."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from loopcal.cli import terminal
+from loopcal.cli.instrument_options import instrument_options, make_instrument
+from loopcal.cli.options import FILE, force_option, json_option, robot_argument
+
+if TYPE_CHECKING:
+    from loopcal.measure import Instrument
+
+
+@click.command(short_help="Write a robot file, and a measurement file, to fill in.")
+@click.argument("family", metavar="FAMILY")
+@click.option(
+    "-o", "--output", required=True, type=FILE, help="Robot file to write; the robot gets its name."
+)
+@click.option(
+    "--measurements", type=FILE, help="Also write a measurement file with columns but no rows."
+)
+@instrument_options
+@force_option("an output file")
+@json_option
+def new(
+    family: str, output: Path, measurements: Path | None, force: bool, as_json: bool, **options: Any
+) -> None:
+    """Write a robot file of FAMILY: gough, linear-delta, 3-prs, ru-pus-prs, limbs, or the name of a
+    shipped robot.
+
+    The file contains a complete robot. Replace its numbers with your own. The options of the
+    instrument are for --measurements.
+
+    \b
+    Examples:
+      loopcal new gough -o my-hexapod.yaml --measurements tracker.csv
+      loopcal new linear-delta -o printer.yaml --measurements heights.csv \\
+          --kind component --components z
+    """  # noqa: D301
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.core.text_file import write_text
+    from loopcal.io.robot.new_robot import format_new_robot
+
+    instrument = make_instrument(options)
+    refuse_outputs((output, measurements), (), force)
+    robot_text = format_new_robot(family, output.stem)
+    template = None if measurements is None else _format_template(robot_text, instrument)
+    write_text(output, robot_text)
+    if measurements is not None and template is not None:
+        write_text(measurements, template)
+    if as_json:
+        terminal.print_json({"robot": output, "measurements": measurements})
+        return
+    page = [
+        f"{output}: a complete robot. Replace its numbers with yours.",
+        f"Next: loopcal check {output}",
+    ]
+    if measurements is not None:
+        page += [
+            f"{measurements}: columns without rows. Fill in your measurements.",
+            f"Next: loopcal calibrate {output} {measurements} -o run",
+        ]
+    terminal.print_page(page)
+
+
+def _format_template(robot_text: str, instrument: Instrument) -> str:
+    """Return a measurement file without rows, for a robot file that is not yet written."""
+    from loopcal.io import load_robot
+    from loopcal.io.data.measurement_writer import format_template
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.yaml"
+        path.write_text(robot_text, encoding="utf-8")
+        return format_template(load_robot(path), instrument)
+
+
+@click.command(short_help="Read a robot file and show what it contains.")
+@robot_argument
+@click.option(
+    "--plot",
+    type=FILE,
+    metavar="FILE",
+    help="Draw the robot at home into FILE (.png, .svg or .pdf).",
+)
+@force_option("the picture")
+@click.option(
+    "--expand",
+    is_flag=True,
+    help="Also show links, joints, transmissions, and how parameters enter.",
+)
+@json_option
+def check(robot: str, plot: Path | None, force: bool, expand: bool, as_json: bool) -> None:
+    """Read ROBOT, a robot file or the name of a shipped robot, and show its actuators and
+    parameters.
+
+    An error in the file is reported with its line: units, joints, dimensions, mobility.
+
+    \b
+    Examples:
+      loopcal check hexapod-42
+      loopcal check my-robot.yaml --json
+      loopcal check linear-delta --expand
+      loopcal check 3-prs --plot 3-prs.png
+    """  # noqa: D301
+    from loopcal.io import load_robot
+    from loopcal.io.core.outputs import refuse_outputs
+    from loopcal.io.robot.robot_file import find_robot_file
+    from loopcal.workflow.robot_inspection import inspect_robot
+
+    refuse_outputs((plot,), (find_robot_file(robot),), force)
+    inspection = inspect_robot(load_robot(robot))
+    if plot is not None:
+        from loopcal.report import save_picture
+
+        save_picture(plot, inspection.robot)
+    if as_json:
+        assembly = {"assembly": inspection.robot.assembly} if expand else {}
+        terminal.print_json(inspection.to_dict() | assembly)
+        return
+    from loopcal.report.assembly_view import view_assembly
+    from loopcal.report.robot_view import view_robot
+
+    page = view_robot(inspection)
+    if expand:
+        page += view_assembly(inspection.robot)
+    if plot is not None:
+        page += ["", f"Picture: {plot}"]
+    terminal.print_page(page)

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`loopcal reproduce`: repeat a published study and compare its printed numbers."""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from loopcal.cli import terminal
+from loopcal.cli.options import FILE, json_option
+
+if TYPE_CHECKING:
+    from loopcal.papers.printed import Table as PrintedTable
+    from loopcal.papers.reproduction import Reproduction
+    from loopcal.report.tables import Table
+    from loopcal.report.text_page import Block
+
+HEADING = 18
+"""Characters of a line of a heading."""
+
+
+@click.command(short_help="Repeat a published study and compare its numbers.")
+@click.argument("paper", metavar="[PAPER]", required=False)
+@click.option(
+    "-o",
+    "--output",
+    type=FILE,
+    metavar="FOLDER",
+    help="Folder for a page, all tables (CSV, JSON) and figures (PNG).",
+)
+@click.option("--seed", default=0, show_default=True, help="Seed of everything random.")
+@click.option(
+    "--trials",
+    type=int,
+    metavar="N",
+    help="Number of trials behind each statistical number.  [default: 50]",
+)
+@click.option("--force", is_flag=True, help="Replace an earlier result in FOLDER.")
+@json_option
+def reproduce(
+    paper: str | None,
+    output: Path | None,
+    seed: int,
+    trials: int | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Repeat the study PAPER; without PAPER, list the studies.
+
+    Every number called computed comes from this run. Statements of the paper that it does not
+    confirm are listed with the reason.
+
+    \b
+    Examples:
+      loopcal reproduce
+      loopcal reproduce hexapod-42
+      loopcal reproduce hexapod-42 -o hexapod-42 --seed 1
+    """  # noqa: D301
+    from loopcal.papers import PAPERS, TRIALS
+    from loopcal.papers import paper as find_paper
+
+    if paper is None:
+        _list_papers(as_json)
+        return
+    chosen = PAPERS[paper] if paper in PAPERS else find_paper(paper)
+    if output is not None:
+        from loopcal.io.runs.run_folder import refuse_used_folder
+
+        refuse_used_folder(output, force)
+    result = chosen.run(seed, TRIALS if trials is None else trials, _print_step)
+    if output is not None:
+        from loopcal.io.runs.run_folder import collect_provenance
+        from loopcal.papers.writing import write_folder
+
+        command = ["loopcal", *sys.argv[1:]]
+        write_folder(output, result, collect_provenance(command, {}, {"seed": seed}), force)
+    if as_json:
+        terminal.print_json(result.to_dict())
+        return
+    written = f"Written to {output}: page.md, tables, figures"
+    last = written if output else "Add -o FOLDER for all tables and figures."
+    terminal.print_page([*_view_reproduction(result), "", last])
+
+
+def _print_step(text: str) -> None:
+    """Print a step on standard error where it is a terminal."""
+    if sys.stderr.isatty():
+        click.echo(text, err=True)
+
+
+def _list_papers(as_json: bool) -> None:
+    """Print the studies."""
+    from loopcal.papers import PAPERS
+
+    if as_json:
+        rows = [{"name": p.name, "title": p.title, "source": p.source} for p in PAPERS.values()]
+        terminal.print_json({"papers": rows})
+        return
+    for paper in PAPERS.values():
+        terminal.print_page([paper.name, f"    {paper.title}", f"    {paper.source}"])
+
+
+def _view_reproduction(result: Reproduction) -> list[Block]:
+    """Return the summary, the tables and the statements of the paper."""
+    page: list[Block] = [f"{result.paper}: {result.title}"]
+    page += [_make_table(table) for table in (result.summary(), *result.tables)]
+    for i, verdict in enumerate(result.verdicts, 1):
+        word = verdict.word.upper() if verdict.agrees is False else verdict.word.lower()
+        page += [f"{i:2}. {word}: {verdict.claim} ({verdict.where})", f"    {verdict.why}"]
+    return page
+
+
+def _make_table(printed: PrintedTable) -> Table:
+    """Return a table of a study; long headings are broken."""
+    from loopcal.report.tables import Column, Table, word_column
+
+    headings = ["\n".join(textwrap.wrap(column, HEADING)) for column in printed.columns]
+    columns = (word_column(headings[0], wraps=True), *(Column(title) for title in headings[1:]))
+    return Table(printed.title, columns, tuple(printed.text()))

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Output to the terminal: wrapped pages, JSON, notes, quality gates and progress."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from collections.abc import Iterable
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import click
+
+if TYPE_CHECKING:
+    from loopcal.findings import Finding
+    from loopcal.report.text_page import Block
+
+WIDEST = 120
+"""Characters of the longest line of prose, on wide terminals."""
+
+DELAY = 2.0
+"""Seconds of work before progress is shown."""
+
+
+def width() -> int:
+    """Return the characters of a line: those of the terminal, or 80 where there is none."""
+    return min(shutil.get_terminal_size((80, 24)).columns, WIDEST)
+
+
+def print_page(blocks: Iterable[Block]) -> None:
+    """Print paragraphs and tables, wrapped to the terminal."""
+    from loopcal.report.text_page import render_text
+
+    click.echo(render_text(blocks, width()))
+
+
+def print_json(document: Any) -> None:
+    """Print one JSON document."""
+    from loopcal.io.core.json_text import to_json
+
+    click.echo(to_json(document), nl=False)
+
+
+def print_note(text: str) -> None:
+    """Print a note on standard error."""
+    click.echo(f"loopcal: note: {text}", err=True)
+
+
+def print_failures(failures: Iterable[Finding | str], shown: bool = False) -> int:
+    """Print quality gates that are not met on standard error, and return exit code 0 or 2.
+
+    Parameters
+    ----------
+    shown : whether standard output already contains them; then a terminal does not repeat them.
+    """
+    sentences = [str(failure) for failure in failures]
+    if not (shown and sys.stdout.isatty()):
+        for sentence in sentences:
+            click.echo(f"loopcal: quality gate not met: {sentence}", err=True)
+    return 2 if sentences else 0
+
+
+class ProgressBar:
+    """The progress callback of the command line: a bar on standard error.
+
+    It is drawn only where standard error is a terminal, and only after two seconds of work.
+    """
+
+    def __init__(self) -> None:
+        self._started = time.monotonic()
+        self._bar: Any = None
+        self._task: Any = None
+        self._what = ""
+
+    def __enter__(self) -> Self:
+        self._started = time.monotonic()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+    def __call__(self, done: int, total: int, what: str, /) -> None:
+        """Draw `done` of `total` steps of `what`."""
+        if not sys.stderr.isatty() or time.monotonic() - self._started < DELAY:
+            return
+        if self._bar is None:
+            self._bar = _make_bar()
+            self._bar.start()
+        if what != self._what:
+            if self._task is not None:
+                self._bar.remove_task(self._task)
+            self._task, self._what = self._bar.add_task(what, total=total), what
+        self._bar.update(self._task, completed=done, total=total)
+
+
+def _make_bar() -> Any:
+    """Return a bar with percentage and remaining time that disappears at the end."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    )

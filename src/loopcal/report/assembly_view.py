@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The assembly of a robot as people read it: links, joints, transmissions and parameter maps.
+
+Numbers are in the units of the robot file. Each link is placed in the frame before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.mechanism import Mechanism
+from loopcal.report.numbers import format_number, units_of
+from loopcal.report.tables import Column, Table, word_column
+from loopcal.units import Dimension, Unit
+
+if TYPE_CHECKING:
+    from loopcal.mechanism.assembly import Address
+
+Units = Mapping[Dimension, Unit]
+JOINTS = {"R": ("turns about z", Dimension.ANGLE), "P": ("slides along z", Dimension.LENGTH)}
+POWERS = {"gain": 1, "curve": 2}
+DIGITS = 9
+PLACE = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+def view_assembly(robot: Mechanism) -> list[Table]:
+    """Return the tables of an assembly."""
+    units = units_of(robot)
+    return [
+        _build_link_table(robot, units),
+        _build_joint_table(robot, units),
+        _build_ending_table(robot, units),
+        _build_transmission_table(robot, units),
+        _build_map_table(robot, units),
+    ]
+
+
+def _build_link_table(robot: Mechanism, units: Units) -> Table:
+    """Return the transforms of links, attachments, platform and tool."""
+    rows = []
+    for limb in robot.assembly.limbs:
+        for link in limb.links:
+            rows.append((limb.name, link.name, *_place(link.transform, units)))
+        attachment = limb.attachment
+        rows.append((limb.name, attachment.name, *_place(attachment.transform, units)))
+    rows.append(("platform", "home", *_place(robot.assembly.home, units)))
+    rows.append(("platform", "tool", *_place(robot.assembly.tool, units)))
+    columns = (word_column("limb"), word_column("link"), *(Column(title) for title in PLACE))
+    length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
+    return Table(f"Links, from base to platform [{length}, {angle}]", columns, tuple(rows))
+
+
+def _build_joint_table(robot: Mechanism, units: Units) -> Table:
+    """Return the joints with their values at home."""
+    values = _joint_values_at_home(robot)
+    rows = []
+    for i, limb in enumerate(robot.assembly.limbs):
+        for j, joint in enumerate(limb.joints):
+            motion, dimension = JOINTS[joint.kind]
+            length = units[Dimension.LENGTH]
+            if joint.pitch:
+                motion += f", {_format(joint.pitch, length)} {length}/rad"
+            value = _format(float(values[i][j]), units[dimension])
+            driven = joint.actuator or ""
+            rows.append((limb.name, joint.name, motion, driven, value, str(units[dimension])))
+    columns = (
+        word_column("limb"),
+        word_column("joint"),
+        word_column("motion"),
+        word_column("driven by"),
+        Column("at home"),
+        Column("unit", align="left"),
+    )
+    return Table("Joints", columns, tuple(rows))
+
+
+def _build_ending_table(robot: Mechanism, units: Units) -> Table:
+    """Return how each limb ends at the platform."""
+    length = units[Dimension.LENGTH]
+    rows = tuple(
+        (
+            limb.name,
+            limb.ending,
+            _format(limb.length, length) if limb.ending == "distance" else "-",
+            length.symbol if limb.ending == "distance" else "",
+            limb.actuator or "",
+        )
+        for limb in robot.assembly.limbs
+    )
+    columns = (
+        word_column("limb"),
+        word_column("ending"),
+        Column("rod length"),
+        Column("unit", align="left"),
+        word_column("driven by"),
+    )
+    return Table("Limb ends", columns, rows)
+
+
+def _build_transmission_table(robot: Mechanism, units: Units) -> Table:
+    """Return the terms that are not zero."""
+    rows = []
+    for actuator in robot.actuators:
+        joint_unit = units[_joint_dimension(robot, actuator.name)]
+        reading = units[actuator.dimension]
+        for term, value in {"gain": 1.0, **actuator.terms}.items():
+            if value:
+                power = POWERS.get(term, 0)
+                number = value * reading.factor_to_si**power / joint_unit.factor_to_si
+                rows.append(
+                    (
+                        actuator.name,
+                        ", ".join(_driven_joints(robot, actuator.name)),
+                        term,
+                        format_number(number, DIGITS),
+                        _unit_of_term(joint_unit, reading, power),
+                    )
+                )
+    columns = (
+        word_column("actuator"),
+        word_column("drives", wraps=True),
+        word_column("term"),
+        Column("value"),
+        Column("unit", align="left"),
+    )
+    return Table("Transmissions: from reading to joint value", columns, tuple(rows))
+
+
+def _build_map_table(robot: Mechanism, units: Units) -> Table:
+    """Return how parameters enter; a shared map has a function instead of a number."""
+    rows = []
+    table = robot.parameters
+    for entry in robot.assembly.maps:
+        parameter = units[table.dimensions[table.index(entry.parameter)]]
+        factor, symbol = _unit_of_address(robot, entry.address, units)
+        number = entry.coefficient * parameter.factor_to_si / factor
+        if parameter.symbol == symbol:
+            unit = "1"
+        else:
+            unit = f"{symbol}/{parameter}" if "/" not in symbol else f"({symbol})/{parameter}"
+        rows.append((entry.parameter, str(entry.address), format_number(number), unit))
+    for shared in robot.assembly.shared:
+        outputs = ", ".join(str(address) for address in shared.outputs)
+        rows.append((" ".join(shared.inputs), outputs, type(shared).__name__, ""))
+    columns = (
+        word_column("parameter", wraps=True),
+        word_column("changes", wraps=True),
+        Column("by"),
+        Column("unit", align="left"),
+    )
+    return Table("Maps: how parameters enter", columns, tuple(rows))
+
+
+def _joint_values_at_home(robot: Mechanism) -> dict[int, np.ndarray]:
+    """Return number of a limb -> values of its joints [m, rad] with the platform at home."""
+    groups = zip(robot.program.groups, robot.home_state.joints, strict=True)
+    return {i: joints[0, 0, k] for group, joints in groups for k, i in enumerate(group.limbs)}
+
+
+def _driven_joints(robot: Mechanism, actuator: str) -> list[str]:
+    """Return the names of the joints and rods that an actuator drives."""
+    limbs = robot.assembly.limbs
+    joints = [
+        f"{limb.name}/{joint.name}"
+        for limb in limbs
+        for joint in limb.joints
+        if joint.actuator == actuator
+    ]
+    return joints + [f"{limb.name}/rod" for limb in limbs if limb.actuator == actuator]
+
+
+def _place(T: np.ndarray, units: Units) -> tuple[str, ...]:
+    """Return x y z roll pitch yaw of a transform (4, 4) as text."""
+    angles = geometry.matrix_to_euler(T[:3, :3], "xyz")
+    lengths = tuple(_format(float(x), units[Dimension.LENGTH]) for x in T[:3, 3])
+    return lengths + tuple(_format(float(a), units[Dimension.ANGLE]) for a in angles)
+
+
+def _unit_of_term(joint: Unit, reading: Unit, power: int) -> str:
+    """Return the unit of a term of a transmission."""
+    if power == 0 or (power == 1 and joint == reading):
+        return "1" if power else joint.symbol
+    return f"{joint}/{reading}" + (f"^{power}" if power > 1 else "")
+
+
+def _unit_of_address(robot: Mechanism, address: Address, units: Units) -> tuple[float, str]:
+    """Return factor to SI and symbol of what an address changes."""
+    length = units[Dimension.LENGTH]
+    if address.element == "transmission":
+        reading = units[next(a.dimension for a in robot.actuators if a.name == address.owner)]
+        joint, power = units[_joint_dimension(robot, address.owner)], POWERS.get(address.axis, 0)
+        factor = joint.factor_to_si / reading.factor_to_si**power
+        return factor, _unit_of_term(joint, reading, power)
+    if address.axis == "pitch":
+        return length.factor_to_si, f"{length}/rad"
+    unit = units[Dimension.ANGLE] if address.axis in ("rx", "ry", "rz") else length
+    return unit.factor_to_si, unit.symbol
+
+
+def _joint_dimension(robot: Mechanism, actuator: str) -> Dimension:
+    """Return the dimension of the joint that an actuator drives."""
+    kinds = [
+        joint.kind
+        for limb in robot.assembly.limbs
+        for joint in limb.joints
+        if joint.actuator == actuator
+    ]
+    return JOINTS[kinds[0]][1] if kinds else Dimension.LENGTH
+
+
+def _format(value: float, unit: Unit) -> str:
+    """Return a number in a unit."""
+    return format_number(value / unit.factor_to_si, DIGITS)

@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compensation as people read it: the targets with their errors before and after."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from loopcal.apply import Compensation
+from loopcal.report.numbers import format_number, units_of
+from loopcal.report.tables import Column, Table, word_column
+from loopcal.report.text_page import Block
+from loopcal.units import Dimension
+
+
+def view_compensation(result: Compensation) -> list[Block]:
+    """Return the table of targets, the convergence of shifted commands, and the frame."""
+    units = units_of(result.robot)
+    length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
+    columns = [word_column("target"), word_column("status")]
+    values = []
+    for rows, shown in ((slice(3, 6), length), (slice(0, 3), angle)):
+        for name, errors in (("before", result.before), ("after", result.remaining)):
+            columns.append(Column(name, shown.symbol))
+            values.append(np.linalg.norm(errors[:, rows], axis=1) / shown.factor_to_si)
+    if result.uncertainty is not None:
+        columns += [Column("U", length.symbol), Column("U", angle.symbol)]
+        values += [
+            2 * result.uncertainty.position / length.factor_to_si,
+            2 * result.uncertainty.orientation / angle.factor_to_si,
+        ]
+    cells = tuple(
+        (label, result.reach[i].value, *(format_number(float(column[i]), 3) for column in values))
+        for i, label in enumerate(result.labels)
+    )
+    caption = f"{result.robot.name}: {len(cells)} targets, {result.mode}"
+    blocks: list[Block] = [Table(caption, tuple(columns), cells)]
+    if result.commands is not None:
+        for step in range(1, len(result.residual_position)):
+            position = np.nanmax(result.residual_position[step]) / length.factor_to_si
+            turn = np.nanmax(result.residual_orientation[step]) / angle.factor_to_si
+            blocks.append(
+                f"After step {step}: at most {format_number(position, 3)} {length} and "
+                f"{format_number(turn, 3)} {angle} from the best reachable poses."
+            )
+    if result.uncertainty is not None:
+        blocks.append(f"U = 2 x rms uncertainty: {result.uncertainty.frame}.")
+    return blocks

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simulate a calibration's measurements: draw a true machine, command poses, measure them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from loopcal.measure import Instrument, Measurements, check_strokes, sample_truth, simulate
+from loopcal.measure.sheet_simulation import replace_measured_values
+from loopcal.mechanism import Mechanism, sample_workspace
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedMeasurements:
+    """Measurements of a simulated machine, and that machine."""
+
+    data: Measurements
+    truth: Mechanism
+
+
+def simulate_measurements(
+    robot: Mechanism,
+    instrument: Instrument,
+    poses: ArrayLike | int = 40,
+    *,
+    draw_errors: bool = False,
+    reading_sigma: ArrayLike | None = None,
+    seed: int = 1,
+) -> SimulatedMeasurements:
+    """Command a robot to poses by its nominal geometry, and measure where the true machine goes.
+
+    Parameters
+    ----------
+    robot : its values are those of the true machine, its nominal values those of the controller.
+    poses : (n, c) controlled coordinates [m, rad], or how many to draw from the workspace.
+    draw_errors : draw the true machine from the tolerances instead.
+    reading_sigma : (a,) [SI] noise of the recorded readings; None as the robot states.
+    seed : of poses, errors and noise.
+
+    Raises
+    ------
+    MechanismError, DataError
+        The robot states no workspace, or a pose is outside its reach or strokes.
+    """
+    truth = draw_true_machine(robot, seed) if draw_errors else robot
+    if isinstance(poses, int):
+        targets = sample_workspace(truth.nominal, poses, seed).coordinates
+    else:
+        targets = np.asarray(poses, dtype=np.float64)
+    data = simulate(truth, targets, instrument, seed, reading_sigma=reading_sigma)
+    check_strokes(data, truth)
+    return SimulatedMeasurements(data, truth)
+
+
+def fill_in_measurements(
+    robot: Mechanism,
+    sheet: Measurements,
+    instrument: Instrument,
+    *,
+    draw_errors: bool = False,
+    seed: int = 1,
+) -> SimulatedMeasurements:
+    """Simulate the measured values of a planned data sheet; the other arguments as above."""
+    truth = draw_true_machine(robot, seed) if draw_errors else robot
+    return SimulatedMeasurements(replace_measured_values(truth, sheet, instrument, seed), truth)
+
+
+def draw_true_machine(robot: Mechanism, seed: int) -> Mechanism:
+    """Return a robot whose values are drawn from its tolerances."""
+    return robot.with_values(sample_truth(robot, 1, seed)[0])
+
+
+def predict_noise_free(
+    robot: Mechanism,
+    instrument: Instrument,
+    poses: ArrayLike | int = 40,
+    *,
+    reading_sigma: ArrayLike | None = None,
+    seed: int = 1,
+) -> Measurements:
+    """Return what an instrument would measure of the robot as it is, to analyze its data.
+
+    Parameters
+    ----------
+    poses : (n, c) controlled coordinates [m, rad], or how many to draw from the workspace.
+    seed : of the poses.
+    """
+    if isinstance(poses, int):
+        poses = sample_workspace(robot, poses, seed).coordinates
+    return simulate(robot, poses, instrument, 0, robot, reading_sigma=reading_sigma)
