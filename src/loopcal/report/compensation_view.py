@@ -11,6 +11,9 @@ from loopcal.report.tables import Column, Table, word_column
 from loopcal.report.text_page import Block
 from loopcal.units import Dimension
 
+ROUNDING = 1e-9
+"""Errors below this share of the robot's size (or this many radians) are rounding."""
+
 
 def view_compensation(result: Compensation) -> list[Block]:
     """Return the table of targets, the convergence of shifted commands, and the frame."""
@@ -21,7 +24,9 @@ def view_compensation(result: Compensation) -> list[Block]:
     for rows, shown in ((slice(3, 6), length), (slice(0, 3), angle)):
         for name, errors in (("before", result.before), ("after", result.remaining)):
             columns.append(Column(name, shown.symbol))
-            values.append(np.linalg.norm(errors[:, rows], axis=1) / shown.factor_to_si)
+            size = np.linalg.norm(errors[:, rows], axis=1)
+            rounding = ROUNDING * (result.robot.size if shown is length else 1.0)
+            values.append(np.where(size < rounding, 0.0, size) / shown.factor_to_si)
     if result.uncertainty is not None:
         columns += [Column("U", length.symbol), Column("U", angle.symbol)]
         values += [

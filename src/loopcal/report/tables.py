@@ -69,15 +69,13 @@ class Table:
             not enough the table is wider. Default: no limit.
         """
         headings = [column.heading for column in self.columns]
-        cells = [headings, *self.rows]
-        widths = [
-            max(len(line) for row in cells for line in row[i].split("\n"))
-            for i in range(len(headings))
-        ]
-        widths = self._narrowed(widths, width)
+        widths = self._natural_widths(headings)
+        if width is not None and _total(widths) > width:
+            headings = [heading.replace(" [", "\n[") for heading in headings]
+            widths = self._narrowed(self._natural_widths(headings), width)
         lines = [self.caption] if self.caption else []
         lines += self._lines(headings, widths)
-        lines.append(RULE * (sum(widths) + GAP * (len(widths) - 1)))
+        lines.append(RULE * _total(widths))
         for row in self.rows:
             lines += self._lines(row, widths)
         return "\n".join(line.rstrip() for line in lines)
@@ -104,11 +102,18 @@ class Table:
         body = "\n".join(row("td", cells) for cells in self.rows)
         return f"<table>{caption}\n<thead>{head}</thead>\n<tbody>\n{body}\n</tbody>\n</table>"
 
-    def _narrowed(self, widths: list[int], width: int | None) -> list[int]:
+    def _natural_widths(self, headings: Sequence[str]) -> list[int]:
+        """Return the characters of each column without wrapping."""
+        cells = [headings, *self.rows]
+        return [
+            max(len(line) for row in cells for line in row[i].split("\n"))
+            for i in range(len(headings))
+        ]
+
+    def _narrowed(self, widths: list[int], width: int) -> list[int]:
         """Return the widths with wrapping columns narrowed, the widest first."""
-        widths = list(widths)
         wrapping = [i for i, column in enumerate(self.columns) if column.wraps]
-        while width is not None and sum(widths) + GAP * (len(widths) - 1) > width:
+        while _total(widths) > width:
             widest = max(wrapping, key=lambda i: widths[i], default=None)
             if widest is None or widths[widest] <= NARROWEST:
                 break
@@ -135,3 +140,8 @@ class Table:
             cell.ljust(width) if column.align == "left" else cell.rjust(width)
             for cell, width, column in zip(cells, widths, self.columns, strict=True)
         ]
+
+
+def _total(widths: Sequence[int]) -> int:
+    """Return the characters of a line of columns."""
+    return sum(widths) + GAP * (len(widths) - 1)
