@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from loopcal.papers.tsvd_2016.draws import document, draw
+from loopcal.papers.tsvd_2016.draws import draw_machines, to_document
 
 DRAWS, SEED = 60, 0
 
 
 def collect() -> dict[str, Any]:
     """Medians with bootstrap intervals, ratios, and curves over lambda and k."""
-    return document(draw("RU-PUS-PRS", SEED, DRAWS), SEED)
+    return to_document(draw_machines("RU-PUS-PRS", SEED, DRAWS), SEED)

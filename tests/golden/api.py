@@ -862,24 +862,32 @@ def report_tsvd_2016(name: str, five: bool) -> Report:
     the printed noise.
     """
     from loopcal.papers.tsvd_2016 import cases
-    from loopcal.papers.tsvd_2016.steps import iterate, linearised, ridge, truncated
+    from loopcal.papers.tsvd_2016.steps import (
+        iterate,
+        linearize,
+        penalize_ridge,
+        penalize_truncated,
+    )
 
-    measured = cases.measure(name, 0)
+    measured = cases.measure_case(name, 0)
     measured = measured.five if five else measured
     p = len(measured.robot.parameters)
     nominal = measured.robot.parameters.nominal[None]
-    s = linearised(measured, nominal, np.zeros(1, dtype=np.int64))[0].singular_values[0]
+    s = linearize(measured, nominal, np.zeros(1, dtype=np.int64))[0].singular_values[0]
     rank = int((s > 1e-11 * s[0]).sum())
     ks = np.array([rank, rank - 2, rank - 5])
-    run = iterate(measured, np.concatenate([truncated(ks, p), ridge(np.array([1e-3, 1e-1]), p)]))
-    library = cases.library(measured)
+    run = iterate(
+        measured,
+        np.concatenate([penalize_truncated(ks, p), penalize_ridge(np.array([1e-3, 1e-1]), p)]),
+    )
+    library = cases.run_library(measured)
     return {
         "rank": rank,
         "singular_values": s,
-        "converged": run.converged,
-        "diverged": run.diverged,
+        "converged": run.is_converged,
+        "diverged": run.is_diverged,
         "values": run.values,
-        "errors": measured.output_errors(run.values, run.machine),
+        "errors": measured.compute_output_errors(run.values, run.machine),
         "library": {name: {"values": a.values, "errors": a.errors} for name, a in library.items()},
     }
 

@@ -76,7 +76,7 @@ PAPERS: Mapping[str, Paper] = {
             "Least squares, ridge estimation and truncated SVD compared on a 3-PRS and an "
             "RU-PUS-PRS manipulator",
             "Advances in Mechanical Engineering 2016, doi:10.1177/1687814016667908",
-            "loopcal.papers.tsvd_2016.compare",
+            "loopcal.papers.tsvd_2016.study",
         ),
         Paper(
             "cmm-constraint-2011",

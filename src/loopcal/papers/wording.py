@@ -47,7 +47,7 @@ class Wording:
         """Return the paragraphs at the beginning of the page."""
         return tuple(fill_template(text, **data) for text in self.paragraphs)
 
-    def judge(self, claim: str, agrees: bool | None, evidence: str = "", **data: Any) -> Verdict:
+    def judge(self, claim: str, agrees: bool | None, evidence: str = "", /, **data: Any) -> Verdict:
         """Return the verdict on a claim.
 
         Parameters
@@ -66,7 +66,7 @@ class Wording:
         )
 
     def table(
-        self, name: str, rows: Iterable[Sequence[Cell]], file_name: str = "", **data: Any
+        self, name: str, rows: Iterable[Sequence[Cell]], file_name: str = "", /, **data: Any
     ) -> Table:
         """Return a table of computed rows.
 
@@ -92,6 +92,7 @@ class Wording:
         published: Printed,
         computed: FloatArray,
         yardstick: FloatArray | None = None,
+        /,
         **data: Any,
     ) -> Comparison:
         """Return printed numbers beside computed ones (r, c).
@@ -118,6 +119,7 @@ class Wording:
         series: Iterable[Series],
         levels: Mapping[str, float] | None = None,
         file_name: str = "",
+        /,
         **data: Any,
     ) -> Figure:
         """Return a figure.

@@ -3,116 +3,140 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
 import numpy as np
 
 from loopcal.papers.reproduction import Figure, Series
 from loopcal.papers.tsvd_2016.cases import LS, PRIOR, RE, TSVD, Case
-from loopcal.papers.tsvd_2016.draws import Draws
-from loopcal.papers.tsvd_2016.tables import Results, file_name, history, parameter_units, steps
+from loopcal.papers.tsvd_2016.draws import Draws, write_file_name
+from loopcal.papers.tsvd_2016.tables import (
+    Results,
+    collect_history,
+    collect_steps,
+    list_units,
+    name_file,
+)
+from loopcal.papers.wording import read_wording
+from loopcal.typing import BoolArray, FloatArray
 
 NUMBERS = {("RU-PUS-PRS", 6): 6, ("RU-PUS-PRS", 5): 8, ("3-PRS", 6): 10, ("3-PRS", 5): 11}
 HISTORIES = {6: 7, 5: 9}
-"""Figures of the paper with parameters over iterations, RU-PUS-PRS, by measured coordinates."""
+"""Figures of the paper with parameters by iteration, RU-PUS-PRS, by measured coordinates."""
 NAMED = 6
 """Parameters named in the legend of a figure of all of them."""
-ERRORS = "rms error [mm], [deg]"
-POSITION, ANGLE = "position [mm]", "phi and theta [deg]"
-SETTING = {RE: "lambda [1]", TSVD: "k [1]"}
+LABELS = ("position [mm]", "phi and theta [deg]")
+SETTING = {RE: "lambda", TSVD: "k"}
+LOG = {RE: "xy", TSVD: "y"}
 
 
-def figures(found: Results) -> tuple[Figure, ...]:
-    """All figures."""
-    curves = [_curve(case, algorithm) for case in found.cases for algorithm in (RE, TSVD)]
-    medians = [_medians(drawn, algorithm) for drawn in found.draws for algorithm in (RE, TSVD)]
+def make_figures(results: Results) -> tuple[Figure, ...]:
+    """Return all figures."""
+    medians = [_draw_medians(draws, a) for draws in results.draws for a in (RE, TSVD)]
+    curves = [_draw_curve(case, algorithm) for case in results.cases for algorithm in (RE, TSVD)]
     histories = []
     for freedoms, algorithms in ((6, (LS, RE, TSVD)), (5, (RE, TSVD))):
-        case = found.case("RU-PUS-PRS", freedoms)
-        histories += [
-            _history(case, algorithm, unit) for algorithm in algorithms for unit in ("mm", "rad")
-        ]
-    return (*medians, *curves, *histories, _steps(found))
+        case = results.find_case("RU-PUS-PRS", freedoms)
+        histories += [_draw_history(case, a, unit) for a in algorithms for unit in ("mm", "rad")]
+    return (*medians, *curves, *histories, _draw_steps(results))
 
 
-def _curve(case: Case, algorithm: str) -> Figure:
-    """Output errors over lambda or k."""
+def _draw_curve(case: Case, algorithm: str) -> Figure:
+    """Return output errors over lambda or k."""
     sweep = case.ridge if algorithm == RE else case.truncated
-    there = ~sweep.runs.diverged
-    x = tuple(map(float, sweep.settings[there]))
-    series = tuple(
-        Series(label, x, tuple(map(float, sweep.errors[there, i])))
-        for i, label in enumerate((POSITION, ANGLE))
+    usable = ~sweep.runs.is_diverged
+    number = NUMBERS[case.study.name, case.study.freedoms]
+    part = "a" if algorithm == RE else "b"
+    figure = read_wording(__file__).figure(
+        "curve",
+        _make_series(sweep.settings, sweep.errors, usable),
+        _mark_prior(case.answers[PRIOR].errors),
+        f"figure_{number}{part}",
+        number=f"{number}({part})",
+        algorithm=algorithm,
+        case=case.name,
+        setting=SETTING[algorithm],
+        best=case.answers[algorithm].setting,
+        diverged=int((~usable).sum()),
     )
-    number, part = NUMBERS[case.study.name, case.study.freedoms], "a" if algorithm == RE else "b"
-    best = case.answers[algorithm]
-    prior = case.answers[PRIOR].errors
-    lost = "" if there.all() else f" Diverged: {int((~there).sum())} settings, not drawn."
-    return Figure(
-        f"figure_{number}{part}", f"Figure {number}({part}): {algorithm}, {case.name}", SETTING[algorithm], ERRORS,
-        "One machine with our dimensions, 36 poses measured with the noise of Appendix 1, errors "
-        "over 96 poses. Bottom:"
-        f" {best.setting}.{lost} Dashed: MAP, without any setting.", series,
-        {f"MAP, {POSITION}": float(prior[0]), f"MAP, {ANGLE}": float(prior[1])}, "xy" if algorithm == RE else "y",
-    )  # fmt: skip
+    return _set_log(figure, LOG[algorithm])
 
 
-def _medians(drawn: Draws, algorithm: str) -> Figure:
-    """The same curves, medians over many machines."""
-    settings = drawn.lambdas if algorithm == RE else drawn.ks
-    curve = drawn.curve(algorithm)[-len(settings) :]
-    there = np.isfinite(curve).all(axis=1)
-    x = tuple(map(float, np.asarray(settings, dtype=np.float64)[there]))
-    series = tuple(
-        Series(label, x, tuple(map(float, curve[there, i])))
-        for i, label in enumerate((POSITION, ANGLE))
+def _draw_medians(draws: Draws, algorithm: str) -> Figure:
+    """Return the same curves as medians over many machines."""
+    settings = draws.lambdas if algorithm == RE else draws.ks
+    curve = draws.compute_curve(algorithm)[-len(settings) :]
+    figure = read_wording(__file__).figure(
+        "medians",
+        _make_series(settings, curve, np.isfinite(curve).all(axis=1)),
+        _mark_prior(draws.compute_median(PRIOR)),
+        f"medians_{write_file_name(draws.name)}_{algorithm.lower()}",
+        algorithm=algorithm,
+        name=draws.name,
+        setting=SETTING[algorithm],
+        trials=len(draws),
     )
-    prior = drawn.median(PRIOR)
-    return Figure(
-        f"medians_{drawn.name.lower().replace('-', '_')}_{algorithm.lower()}",
-        f"{algorithm}, {drawn.name}, 6-DOF: medians over machines", SETTING[algorithm], ERRORS,
-        f"Medians over {len(drawn)} drawn machines and noises, errors over 96 poses each. Dashed: "
-        "MAP, without any setting.",
-        series, {f"MAP, {POSITION}": float(prior[0]), f"MAP, {ANGLE}": float(prior[1])}, "xy" if algorithm == RE else "y",
-    )  # fmt: skip
+    return _set_log(figure, LOG[algorithm])
 
 
-def _history(case: Case, algorithm: str, unit: str) -> Figure:
-    """Parameters of one unit over iterations; those that LS (RE with 5-DOF) moves most are named."""
-    robot = case.study.robot
-    chosen = [i for i, u in enumerate(parameter_units(robot)) if u == unit]
-    reference = history(case, LS if case.study.freedoms == 6 else RE)[-1]
+def _draw_history(case: Case, algorithm: str, unit: str) -> Figure:
+    """Return the parameters of one unit by iteration.
+
+    Those that LS (RE with 5-DOF) changes most are named.
+    """
+    names, units = case.study.robot.parameters.names, list_units(case.study.robot)
+    chosen = [i for i, u in enumerate(units) if u == unit]
+    reference = collect_history(case, LS if case.study.freedoms == 6 else RE)[-1]
     named = sorted(chosen, key=lambda i: -abs(reference[i]))[:NAMED]
-    values = history(case, algorithm)
+    values = collect_history(case, algorithm)
     k = tuple(float(i) for i in range(len(values)))
-    series = [
-        Series(
-            robot.parameters.names[i] if i in named else f"_{robot.parameters.names[i]}",
-            k,
-            tuple(map(float, values[:, i])),
-        )
+    # matplotlib leaves a label that begins with _ out of the legend
+    lines = [
+        Series(names[i] if i in named else f"_{names[i]}", k, tuple(map(float, values[:, i])))
         for i in (*named, *(i for i in chosen if i not in named))
-    ]  # matplotlib leaves a label that begins with _ out of the legend
-    number = HISTORIES[case.study.freedoms]
-    what = "lengths" if unit == "mm" else "angles"
-    setting = "" if algorithm == LS else f" ({case.answers[algorithm].setting})"
-    return Figure(
-        f"figure_{number}_{algorithm.lower()}_{what}", f"Figure {number}: {algorithm}{setting}, "
-                                                       f"{what}", "iteration [1]",
-        f"identified error [{unit}]",
-        f"{case.name}: {len(chosen)} of {len(robot.parameters)} parameters; named are the "
-        f"{len(named)} largest. All numbers:"
-        f" tables/history_{file_name(case)}.csv.", tuple(series), log="",
-    )  # fmt: skip
+    ]
+    number, what = HISTORIES[case.study.freedoms], "lengths" if unit == "mm" else "angles"
+    return read_wording(__file__).figure(
+        "history",
+        lines,
+        None,
+        f"figure_{number}_{algorithm.lower()}_{what}",
+        number=number,
+        algorithm=algorithm,
+        setting=case.answers[algorithm].setting,
+        what=what,
+        unit=unit,
+        case=case.name,
+        chosen=len(chosen),
+        count=len(names),
+        named=len(named),
+        file=name_file(case),
+    )
 
 
-def _steps(found: Results) -> Figure:
-    """Largest component of each step."""
-    series = []
-    for case in found.cases:
-        if case.study.freedoms == 6:
-            for algorithm in (LS, RE, TSVD):
-                y = steps(case, algorithm)
-                x = tuple(float(i + 1) for i in range(len(y)))
-                series.append(Series(f"{algorithm}, {case.study.name}", x, tuple(map(float, y))))
-    return Figure("convergence", "How fast the iterations converge", "iteration [1]", "largest component of the step [mm, rad]",
-                  "6-DOF measurement, one machine each, RE and TSVD at the bottom of their curves.", tuple(series),
-                  {"end of the iteration": 1e-6})  # fmt: skip
+def _draw_steps(results: Results) -> Figure:
+    """Return the largest component of each step."""
+    lines = []
+    for case in (case for case in results.cases if case.study.freedoms == 6):
+        for algorithm in (LS, RE, TSVD):
+            y = collect_steps(case, algorithm)
+            x = tuple(float(i + 1) for i in range(len(y)))
+            lines.append(Series(f"{algorithm}, {case.study.name}", x, tuple(map(float, y))))
+    return read_wording(__file__).figure("convergence", lines, {"end of the iteration": 1e-6})
+
+
+def _make_series(settings: FloatArray, errors: FloatArray, usable: BoolArray) -> list[Series]:
+    """Return position and angle errors (s, ..) over the usable settings (s,)."""
+    x = tuple(map(float, np.asarray(settings, dtype=np.float64)[usable]))
+    return [
+        Series(label, x, tuple(map(float, errors[usable, i]))) for i, label in enumerate(LABELS)
+    ]
+
+
+def _mark_prior(errors: FloatArray) -> Mapping[str, float]:
+    return {f"MAP, {label}": float(errors[i]) for i, label in enumerate(LABELS)}
+
+
+def _set_log(figure: Figure, log: str) -> Figure:
+    return replace(figure, log=log)

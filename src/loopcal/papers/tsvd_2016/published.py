@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the paper prints and states, as far as our text of it goes."""
+"""The printed numbers and names of the paper, as far as our text of it goes."""
 
 from __future__ import annotations
 
@@ -23,14 +23,13 @@ class Published:
     Attributes
     ----------
     source : what we have of the paper. noise : Appendix 1. counts : numbers that the text states.
-    parameters : names as printed, by manipulator. statements : claims with their place.
+    parameters : names as printed, by manipulator.
     """
 
     source: str
     noise: Printed
     counts: Printed
     parameters: Mapping[str, str]
-    statements: Mapping[str, Mapping[str, str]]
 
     @cached_property
     def noise_si(self) -> FloatArray:
@@ -42,7 +41,7 @@ class Published:
 
 
 @cache
-def published() -> Published:
+def read_published() -> Published:
     """Read published.yaml."""
     from loopcal.io.core.yaml_file import read_yaml
 
@@ -54,5 +53,4 @@ def published() -> Published:
         noise=Printed.parse(content["appendix_1"]),
         counts=Printed.parse(content["counts"]),
         parameters=content["parameters"],
-        statements=content["statements"],
     )

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The nine steps of the paper, for t machines or t settings of lambda and k at once.
 
- 1 nominal parameters, e = 0                          `machine`                      \
+ 1 nominal parameters, e = 0                          `load_machine`                 \
  2 forward kinematic model                            `forward_trials`                |
- 3 measured poses                                     `measured_poses`                | study.py
+ 3 measured poses                                     `list_measured_poses`          | machines.py
  4 measured data: true machine, with noise            `simulate_trials`               /
- 5 error transfer matrix T_j of pose j                `sensitivity`, in rows of x, y, z, phi, theta (, psi)
+ 5 error transfer matrix T_j of pose j                `differentiate_pose`, x y z phi theta (psi)
  6 identification matrix H, all T_j in one column     `fold`: one triangular factor
  7 de from H de = D, by LS, RE or TSVD                `decompose`, with the filter factors below
  8 e + de; again from step 5 unless |de| is small     `iterate`
@@ -26,9 +26,9 @@ import numpy as np
 from loopcal import engine
 from loopcal.mechanism import Mechanism, Status, differentiate_pose, forward_trials
 from loopcal.numerics.decomposition import Decomposition, decompose, empty_factor
+from loopcal.papers.tsvd_2016.machines import Study
 from loopcal.papers.tsvd_2016.published import MM
-from loopcal.papers.tsvd_2016.study import Study
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 ENOUGH = 1e-6
@@ -45,44 +45,44 @@ LOST = 1e4
 
 @dataclass(frozen=True, eq=False)
 class Iterations:
-    """What the steps yield for t settings; index k of a history is the state after k iterations.
+    """Result of the steps for t settings; index k of a history is the state after k iterations.
 
     Attributes
     ----------
     values : (t, p) identified parameters [SI], NaN where diverged. history : (k + 1, t, p) [SI].
     steps : (k, t) largest component of each step [mm, rad], NaN after the end. count : (t,)
         iterations done.
-    converged, diverged : (t,); neither: `LIMIT` was met. machine : (t,) as given.
+    is_converged, is_diverged : (t,); neither: `LIMIT` was reached. machine : (t,) as given.
     """
 
     values: FloatArray
     history: FloatArray
     steps: FloatArray
     count: IntArray
-    converged: np.ndarray
-    diverged: np.ndarray
+    is_converged: BoolArray
+    is_diverged: BoolArray
     machine: IntArray
 
 
-def least_squares(parameters: int) -> FloatArray:
-    """(1, p) penalties of LS: none, whatever the singular values."""
+def penalize_none(parameters: int) -> FloatArray:
+    """Return the penalties (1, p) of LS: none."""
     return np.zeros((1, parameters))
 
 
-def ridge(lam: FloatArray, parameters: int) -> FloatArray:
-    """(l, p) penalties of RE for each lambda."""
+def penalize_ridge(lam: FloatArray, parameters: int) -> FloatArray:
+    """Return the penalties (l, p) of RE for each lambda."""
     return np.repeat(np.asarray(lam, dtype=np.float64)[:, None], parameters, axis=1)
 
 
-def truncated(k: IntArray, parameters: int) -> FloatArray:
-    """(l, p) penalties of TSVD for each k: infinite beyond it."""
+def penalize_truncated(k: IntArray, parameters: int) -> FloatArray:
+    """Return the penalties (l, p) of TSVD for each k: infinite beyond it."""
     return np.where(np.arange(parameters) < np.asarray(k)[:, None], 0.0, np.inf)
 
 
 def iterate(
     study: Study, penalty: FloatArray, machine: IntArray | None = None, limit: int = LIMIT
 ) -> Iterations:
-    """Steps 5 to 9.
+    """Run steps 5 to 9.
 
     Parameters
     ----------
@@ -99,11 +99,11 @@ def iterate(
         active = np.flatnonzero(running)
         if not active.size:
             break
-        found, reached = linearised(study, values[active], machine[active])
-        step = found.deviation(found.solution(penalty[active]))
+        decomposition, reached = linearize(study, values[active], machine[active])
+        step = decomposition.deviation(decomposition.solution(penalty[active]))
         size = np.abs(step).max(axis=1)
         good = reached & (size < LOST)
-        values[active] += np.where(good[:, None], step, 0.0) * units(study.robot)
+        values[active] += np.where(good[:, None], step, 0.0) * list_scales(study.robot)
         count[active] += 1
         running[active], diverged[active] = good & (size > ENOUGH), ~good
         history.append(values.copy())
@@ -115,10 +115,10 @@ def iterate(
     )
 
 
-def linearised(
+def linearize(
     study: Study, values: FloatArray, machine: IntArray
-) -> tuple[Decomposition, np.ndarray]:
-    """Steps 5 and 6 and the decomposition of H, and which of the settings (a,) reach all poses.
+) -> tuple[Decomposition, BoolArray]:
+    """Return the decomposition of H (steps 5 and 6), and which settings (a,) reach all poses.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def linearised(
     T = np.where(reached[:, None, None, None], state.T, np.eye(4))
     D = np.where(
         reached[:, None, None, None], differentiate_pose(robot, at, readings, state).parameters, 0.0
-    ) * units(robot)
+    ) * list_scales(robot)
     if shared:
         T, reached = (
             np.broadcast_to(T, (len(values), *T.shape[1:])),
@@ -148,6 +148,6 @@ def linearised(
     return decompose(factor, np.full(len(values), rows.shape[1]), tolerance=0.0), reached
 
 
-def units(robot: Mechanism) -> FloatArray:
-    """(p,) the paper's units in SI: millimetres and radians."""
+def list_scales(robot: Mechanism) -> FloatArray:
+    """Return the paper's units (p,) in SI: millimetres and radians."""
     return np.where([d is Dimension.LENGTH for d in robot.parameters.dimensions], MM, 1.0)

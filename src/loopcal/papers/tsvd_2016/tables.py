@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was computed, as tables: the analogues of Tables 1 to 8, and what the figures show as
-numbers.
-"""
+"""Tables of the computed numbers: the analogues of Tables 1 to 8, and the figures as numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,42 +19,44 @@ from loopcal.papers.tsvd_2016.cases import (
     WHITENED,
     Case,
     Sweep,
-    in_paper_units,
+    to_paper_units,
 )
-from loopcal.papers.tsvd_2016.draws import BEFORE, Draws, curves_table, medians_table, ratios_table
-from loopcal.papers.tsvd_2016.published import NOISE_COLUMNS, Published, published
-from loopcal.papers.tsvd_2016.study import EVALUATED_TILTS, HEIGHTS, LIMITS, MEASURES, machine
+from loopcal.papers.tsvd_2016.draws import (
+    BEFORE,
+    Draws,
+    make_median_curves,
+    make_medians,
+    make_ratios,
+    write_file_name,
+)
+from loopcal.papers.tsvd_2016.machines import EVALUATED_TILTS, HEIGHTS, LIMITS, load_machine
+from loopcal.papers.tsvd_2016.published import NOISE_COLUMNS, Published, read_published
+from loopcal.papers.wording import read_wording
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
 RIDGE_STEPS = (5, 10, 20, 50, 100)
-"""Iterations of RE after which its curve over lambda is looked at."""
+"""Iterations of RE after which its curve over lambda is examined."""
 SIZES = {
     "3-PRS": ("platform_radius", "base_radius", "rod"),
     "RU-PUS-PRS": ("platform_radius", "base_radius", "rod", "post"),
 }
 IDENTIFIED = (
-    (LS, 6),
-    (RE, 6),
-    (TSVD, 6),
-    (RANKED, 5),
-    (RE, 5),
-    (TSVD, 5),
-    (WHITENED, 6),
-    (PRIOR, 6),
+    (LS, 6), (RE, 6), (TSVD, 6), (RANKED, 5), (RE, 5), (TSVD, 5), (WHITENED, 6), (PRIOR, 6),
     (PRIOR, 5),
-)
+)  # fmt: skip
+"""Methods and measured coordinates of the columns of the identified errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """All that was computed, before it is judged.
+    """All computed numbers, before they are judged.
 
     Attributes
     ----------
     cases : both manipulators, each with 6- and 5-DOF measurement. draws : of both manipulators.
-    steps : best lambda and errors of RE after RIDGE_STEPS, 3-PRS with 6-DOF measurement. counts :
-        published beside computed.
+    steps : best lambda and errors of RE after RIDGE_STEPS, 3-PRS with 6-DOF measurement.
+    counts : published beside computed.
     """
 
     printed: Published
@@ -65,241 +65,170 @@ class Results:
     steps: list[tuple[int, float, FloatArray]]
     counts: Comparison
 
-    def case(self, name: str, freedoms: int) -> Case:
-        """The case of a manipulator and a measurement."""
+    def find_case(self, name: str, freedoms: int) -> Case:
+        """Return the case of a manipulator and a number of measured coordinates."""
         return next(c for c in self.cases if c.study.name == name and c.study.freedoms == freedoms)
 
-    def drawn(self, name: str) -> Draws:
-        """The draws of a manipulator."""
-        return next(d for d in self.draws if d.name == name)
+    def find_draws(self, name: str) -> Draws:
+        """Return the draws of a manipulator."""
+        return next(draws for draws in self.draws if draws.name == name)
 
 
-def tables(found: Results) -> tuple[Table, ...]:
-    """All tables of the reproduction."""
-    robots = tuple(dict.fromkeys(case.study.name for case in found.cases))
+def make_tables(results: Results) -> tuple[Table, ...]:
+    """Return all tables of the reproduction."""
+    names = tuple(dict.fromkeys(case.study.name for case in results.cases))
     return (
-        _given(robots),
-        _noise(),
-        _ranks(found.cases),
-        *(_outputs(name, found) for name in robots),
-        *(medians_table(drawn) for drawn in found.draws),
-        *(ratios_table(drawn) for drawn in found.draws),
-        _convergence(found.cases),
-        _ridge_steps(found),
-        *(_identified(name, found) for name in robots),
-        *(_curves(case) for case in found.cases),
-        *(curves_table(drawn) for drawn in found.draws),
-        *(_history(case) for case in found.cases),
+        _list_machines(names),
+        _list_noise(),
+        _list_ranks(results.cases),
+        *(_list_outputs(name, results) for name in names),
+        *(make_medians(draws) for draws in results.draws),
+        *(make_ratios(draws) for draws in results.draws),
+        _list_convergence(results.cases),
+        _list_ridge_steps(results),
+        *(_list_identified(name, results) for name in names),
+        *(_list_curves(case) for case in results.cases),
+        *(make_median_curves(draws) for draws in results.draws),
+        *(_list_history(case) for case in results.cases),
     )
 
 
-def file_name(case: Case) -> str:
-    """Of a case, in names of files."""
-    return f"{case.study.name.lower().replace('-', '_')}_{case.study.freedoms}"
+def name_file(case: Case) -> str:
+    """Return the name of a case in file names."""
+    return f"{write_file_name(case.study.name)}_{case.study.freedoms}"
 
 
-def history(case: Case, algorithm: str) -> FloatArray:
-    """(k + 1, p) identified errors [mm, rad] over the iterations of LS, RE or TSVD at its best."""
-    sweep: Sweep = case.ridge if algorithm == RE else case.truncated
-    i = 0 if algorithm == LS else sweep.best
-    return in_paper_units(case.study, sweep.runs.history[: sweep.runs.count[i] + 1, i])
+def collect_history(case: Case, algorithm: str) -> FloatArray:
+    """Return identified errors (k + 1, p) [mm, rad] by iteration of LS, or of RE or TSVD at their
+    best setting.
+    """
+    sweep, i = _find_run(case, algorithm)
+    return to_paper_units(case.study, sweep.runs.history[: sweep.runs.count[i] + 1, i])
 
 
-def steps(case: Case, algorithm: str) -> FloatArray:
-    """(k,) largest component of each step [mm, rad]."""
-    sweep: Sweep = case.ridge if algorithm == RE else case.truncated
-    i = 0 if algorithm == LS else sweep.best
+def collect_steps(case: Case, algorithm: str) -> FloatArray:
+    """Return the largest component (k,) of each step [mm, rad]."""
+    sweep, i = _find_run(case, algorithm)
     return sweep.runs.steps[: sweep.runs.count[i], i]
 
 
-def parameter_units(robot: Mechanism) -> tuple[str, ...]:
-    """(p,) of the paper's raw numbers."""
+def list_units(robot: Mechanism) -> tuple[str, ...]:
+    """Return the unit of each of the paper's raw numbers (p,)."""
     return tuple("mm" if d is Dimension.LENGTH else "rad" for d in robot.parameters.dimensions)
 
 
-def _given(robots: Sequence[str]) -> Table:
+def _find_run(case: Case, algorithm: str) -> tuple[Sweep, int]:
+    sweep = case.ridge if algorithm == RE else case.truncated
+    return sweep, 0 if algorithm == LS else sweep.best
+
+
+def _list_machines(names: Sequence[str]) -> Table:
     rows: list[tuple[Cell, ...]] = []
-    for name in robots:
-        robot = machine(name)
+    for name in names:
+        robot = load_machine(name)
         record = robot.record.record  # of the file: dimensions in SI
         rows += [
             (name, size.replace("_", " "), f"{1e3 * getattr(record, size):g} mm")
             for size in SIZES[name]
         ]
         tilts = ", ".join(f"{tilt:g}" for tilt in EVALUATED_TILTS)
-        heights = (
-            f" at z {', '.join(f'{1e3 * z:g}' for z in HEIGHTS)} mm"
-            if "z" in robot.controlled
-            else ""
-        )
-        rows.append((name, "output range", f"96 poses, tilts of {tilts} deg{heights}"))
-    note = "Ours: the paper's Tables 1 to 4 are not in our text, so no number below can equal one of Tables 5 to 8."
-    return Table(
-        "given",
-        "What is given (in place of Tables 1 to 4)",
-        ("manipulator", "", "value"),
-        tuple(rows),
-        ("",) * 3,
-        note,
-    )
+        heights = ", ".join(f"{1e3 * z:g}" for z in HEIGHTS)
+        z = f" at z {heights} mm" if "z" in robot.controlled else ""
+        rows.append((name, "output range", f"96 poses, tilts of {tilts} deg{z}"))
+    return read_wording(__file__).table("given", rows)
 
 
-def _noise() -> Table:
-    values = published().noise.values
+def _list_noise() -> Table:
+    values = read_published().noise.values
     limits = np.array([*LIMITS[:3] * 1e3, *LIMITS[3:]])
-    rows = tuple(
-        (
-            name,
-            float(np.abs(column).max()),
-            float(limit),
-            float(np.sqrt(np.mean(column**2))),
-            float(limit / np.sqrt(3.0)),
-        )
-        for name, column, limit in zip(NOISE_COLUMNS, values.T, limits, strict=True)
-    )
-    columns = (
-        "column",
-        "largest as printed",
-        "limit taken: 0.01 mm, 0.01 deg",
-        "rms as printed",
-        "rms of uniform noise",
-    )
-    return Table("noise", "Appendix 1: the noise", columns, rows, ("", ".6f", ".6f", ".6f", ".6f"))
+    largest, rms = np.abs(values).max(axis=0), np.sqrt(np.mean(values**2, axis=0))
+    columns = np.stack([largest, limits, rms, limits / np.sqrt(3.0)], axis=1)
+    rows = [(name, *map(float, row)) for name, row in zip(NOISE_COLUMNS, columns, strict=True)]
+    return read_wording(__file__).table("noise", rows)
 
 
-def _ranks(cases: Sequence[Case]) -> Table:
+def _list_ranks(cases: Sequence[Case]) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for case in cases:
         s = case.singular_values
         null = "; ".join(str(c) for c in case.known.unidentifiable)
-        rows.append((case.name, f"{case.rank} of {len(s)}", float(s[0]), float(s[-2]), float(s[-1]),
-                     float(s[0] / s[case.rank - 1]), case.known.condition, case.normal_equations, null or None))  # fmt: skip
-    columns = ("case", "rank", "largest singular value", "last but one", "smallest", ("condition, "
-                                                                                     "raw"),
-               "condition, whitened and scaled", "first step of (H'H)^-1 H'D [mm, rad]", "cannot be told")  # fmt: skip
-    note = (
-        "At nominal parameters; raw: in mm and rad. Rank and the combination that changes nothing: "
-        "`identifiability`. With a"
-        " singular value that is zero but for rounding, the printed formula returns rounding times "
-        "its inverse."
-    )
-    formats = ("", "", ".5g", ".2g", ".2g", ".1e", ".1e", ".2g", "")
-    return Table("ranks", "What 5-DOF measurement leaves open", columns, tuple(rows), formats, note)
+        values = (float(s[0]), float(s[-2]), float(s[-1]), float(s[0] / s[case.rank - 1]))
+        rank = f"{case.rank} of {len(s)}"
+        tail = (case.known.condition, case.normal_equations, null or None)
+        rows.append((case.name, rank, *values, *tail))
+    return read_wording(__file__).table("ranks", rows)
 
 
-def _outputs(name: str, found: Results) -> Table:
-    number = 8 if name == "3-PRS" else 7
+def _list_outputs(name: str, results: Results) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for freedoms in (6, 5):
-        case = found.case(name, freedoms)
-        before = case.study.output_errors(case.study.robot.parameters.nominal[None])[0]
+        case = results.find_case(name, freedoms)
+        nominal = case.study.robot.parameters.nominal[None]
+        before = case.study.compute_output_errors(nominal)[0]
         if freedoms == 6:
             rows.append(("", BEFORE, None, *map(float, before), None, None))
         for method, answer in case.answers.items():
-            errors = [None] * 4 if answer.diverged else [float(e) for e in answer.errors]
-            ended = "diverged" if answer.diverged else "yes" if answer.converged else "no"
-            rows.append(
-                (f"{freedoms}-DOF", method, answer.setting, *errors, answer.iterations, ended)
-            )
-    columns = ("measured", "method", "setting", *MEASURES, "iterations", "converged")
-    note = (
-        "One machine with drawn errors, the noise of Appendix 1, 96 poses of the output range at "
-        "equal readings. LS, RE, TSVD"
-        " as in the paper, RE and TSVD at the bottom of their curves; below them the methods of "
-        "loopcal.calibrate."
-    )
-    formats = ("", "", "", ".2g", ".2g", ".2g", ".2g", "d", "")
-    title = f"Output errors of the {name} manipulator (in place of Table {number})"
-    return Table(f"table_{number}", title, columns, tuple(rows), formats, note)
+            errors = [None] * 4 if answer.is_diverged else [float(e) for e in answer.errors]
+            end = "diverged" if answer.is_diverged else "yes" if answer.is_converged else "no"
+            label = (f"{freedoms}-DOF", method, answer.setting)
+            rows.append((*label, *errors, answer.iterations, end))
+    number = 8 if name == "3-PRS" else 7
+    words = read_wording(__file__)
+    return words.table("outputs", rows, f"table_{number}", name=name, number=number)
 
 
-def _identified(name: str, found: Results) -> Table:
-    number = 6 if name == "3-PRS" else 5
-    case = found.case(name, 6)
+def _list_identified(name: str, results: Results) -> Table:
+    case = results.find_case(name, 6)
     robot = case.study.robot
-    true = in_paper_units(case.study, case.study.trials.truth[0])
-    answers = [
-        in_paper_units(case.study, found.case(name, f).answers[m].values) for m, f in IDENTIFIED
-    ]
-    rows = tuple(
-        (parameter, unit, float(true[i]), *(float(a[i]) for a in answers))
-        for i, (parameter, unit) in enumerate(
-            zip(robot.parameters.names, parameter_units(robot), strict=True)
-        )
-    )
-    columns = ("parameter", "unit", "true", *(f"{m}, {f}-DOF" for m, f in IDENTIFIED))
-    title = f"Identified errors of the {name} manipulator (in place of Table {number})"
-    return Table(
-        f"table_{number}", title, columns, rows, ("", "", *[".4f"] * (1 + len(answers))), shown=11
-    )
+    columns = [case.study.trials.truth[0]]
+    columns += [results.find_case(name, f).answers[m].values for m, f in IDENTIFIED]
+    values = to_paper_units(case.study, np.array(columns))
+    labels = zip(robot.parameters.names, list_units(robot), strict=True)
+    rows = [(*label, *map(float, values[:, i])) for i, label in enumerate(labels)]
+    number = 6 if name == "3-PRS" else 5
+    words = read_wording(__file__)
+    return words.table("identified", rows, f"table_{number}", name=name, number=number)
 
 
-def _convergence(cases: Sequence[Case]) -> Table:
-    rows: list[tuple[Cell, ...]] = []
+def _list_convergence(cases: Sequence[Case]) -> Table:
+    rows = []
     for case in cases:
         shown = (LS if case.study.freedoms == 6 else RANKED, RE, TSVD, WHITENED, PRIOR)
-        rows.append((case.name, *(_count(case, m) for m in shown)))
-    note = "Until no component of a step exceeds 1e-6 mm or rad (MAP, whitened LS: by the rule of the library)."
-    columns = ("case", "LS (5-DOF: with rank detection)", RE, TSVD, WHITENED, PRIOR)
-    return Table("convergence", "Iterations needed", columns, tuple(rows), ("",) * 6, note)
+        rows.append((case.name, *(case.answers[method].needed for method in shown)))
+    return read_wording(__file__).table("convergence", rows)
 
 
-def _count(case: Case, method: str) -> str:
-    answer = case.answers[method]
-    return str(answer.iterations) if answer.converged else f"more than {answer.iterations}"
+def _list_ridge_steps(results: Results) -> Table:
+    rows = [(count, lam, *map(float, errors[:2])) for count, lam, errors in results.steps]
+    return read_wording(__file__).table("ridge_steps", rows)
 
 
-def _ridge_steps(found: Results) -> Table:
-    rows = tuple((count, lam, *map(float, errors[:2])) for count, lam, errors in found.steps)
-    note = "3-PRS, 6-DOF. lambda acts on each step, so that RE forgets it step by step: its bottom wanders with their number."
-    columns = ("iterations", "lambda at the bottom", *MEASURES[:2])
-    return Table(
-        "ridge_steps",
-        "The bottom of RE depends on the iterations",
-        columns,
-        rows,
-        ("d", ".2g", ".2g", ".2g"),
-        note,
-    )
-
-
-def _curves(case: Case) -> Table:
+def _list_curves(case: Case) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for algorithm, sweep in ((RE, case.ridge), (TSVD, case.truncated)):
         for i, setting in enumerate(sweep.settings):
-            errors = (
-                [None] * 3 if sweep.runs.diverged[i] else [float(e) for e in sweep.errors[i, :3]]
-            )
-            place = (
-                ("equal intervals" if case.equal[i] else "equal ratios")
-                if algorithm == RE
-                else None
-            )
-            rows.append((algorithm, float(setting), place, *errors, int(sweep.runs.count[i])))
-    columns = ("algorithm", "lambda or k", "spacing", *MEASURES[:3], "iterations")
+            lost = bool(sweep.runs.is_diverged[i])
+            errors = [None] * 3 if lost else [float(e) for e in sweep.errors[i, :3]]
+            spacing = None
+            if algorithm == RE:
+                spacing = "equal intervals" if case.is_equal[i] else "equal ratios"
+            count = int(sweep.runs.count[i])
+            rows.append((algorithm, float(setting), spacing, *errors, count))
     low, high = case.bracket
-    note = f"Of the lambdas tried from 1e-20 to 1e6, {low:.0e} to {high:.0e} do not diverge. A dash: diverged."
-    return Table(f"curves_{file_name(case)}", f"Errors over lambda and k, {case.name}", columns, tuple(rows),
-                 ("", ".3g", "", ".2g", ".2g", ".2g", "d"), note, 8)  # fmt: skip
+    words, name = read_wording(__file__), f"curves_{name_file(case)}"
+    return words.table("curves", rows, name, case=case.name, low=low, high=high)
 
 
-def _history(case: Case) -> Table:
+def _list_history(case: Case) -> Table:
     robot = case.study.robot
-    names = tuple(
-        f"{n} [{u}]" for n, u in zip(robot.parameters.names, parameter_units(robot), strict=True)
-    )
+    labels = zip(robot.parameters.names, list_units(robot), strict=True)
     rows = [
         (algorithm, i, *map(float, values))
         for algorithm in (LS, RE, TSVD)
-        for i, values in enumerate(history(case, algorithm))
+        for i, values in enumerate(collect_history(case, algorithm))
     ]
-    formats = ("", "d", *([".3g"] * len(names)))
-    title = f"Every parameter over iterations, {case.name}"
-    return Table(
-        f"history_{file_name(case)}",
-        title,
-        ("algorithm", "iteration", *names),
-        tuple(rows),
-        formats,
-        shown=2,
-    )
+    words, name = read_wording(__file__), f"history_{name_file(case)}"
+    table = words.table("history", rows, name, case=case.name)
+    columns = (*table.columns, *(f"{parameter} [{unit}]" for parameter, unit in labels))
+    formats = (*table.formats, *[".3g"] * len(robot.parameters))
+    return replace(table, columns=columns, formats=formats)
