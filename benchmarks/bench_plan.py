@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from benchmarks.harness import Metric, measure_ratio, time_in_turns
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
-from loopcal.estimate.outlook import scene
+from loopcal.estimate.information import observe_poses
 from loopcal.io import load_robot
 from loopcal.mechanism import WorkspaceSample, inverse, sample_workspace
 from loopcal.planning.design import D, PriorInformation, choose_design, coordinate_exchange
@@ -37,7 +37,7 @@ def _rows(coordinates: np.ndarray) -> np.ndarray:
     """Return whitened rows (b, 6, p) at controlled coordinates (b, 6); NaN where out of reach."""
     free = _hexapod()[0]
     found = inverse(free.robot, coordinates)
-    rows = scene(free, np.where(found.converged[:, None], found.q, 0.0)).twists[0] / SIGMA[:, None]
+    rows = observe_poses(free, np.where(found.converged[:, None], found.q, 0.0)).twists[0] / SIGMA[:, None]
     return np.where(found.converged[:, None, None], rows, np.nan)
 
 
@@ -69,7 +69,7 @@ def bench_coordinate_exchange() -> Metric:
 def bench_certified_design() -> Metric:
     """Time the choice of 20 of 1000 full poses of the hexapod, with its certificate."""
     free, drawn, _, _ = _hexapod()
-    rows = scene(free, drawn.solution.q).twists[0] / SIGMA[:, None]
+    rows = observe_poses(free, drawn.solution.q).twists[0] / SIGMA[:, None]
     (times,) = time_in_turns(
         lambda: choose_design(rows, 20, D(), PriorInformation.none(len(free))), repeats=3
     )

@@ -9,13 +9,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from loopcal.estimate.steps import penalised
 from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.estimate import MAP, LeastSquares, identify_trials
 from loopcal.estimate.identification import IdentifiedTrials
 from loopcal.estimate.methods.penalties import Method
-from loopcal.estimate.steps import penalised
 from loopcal.io import load_robot
 from loopcal.measure import (
     Component,

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from loopcal.estimate.local_estimate import local_estimate
+from loopcal.estimate.rows import rows_of, rows_of_trials
 from numpy.typing import NDArray
 
 from loopcal import geometry
@@ -20,8 +22,6 @@ from loopcal.diagnose import PoseErrors, find_frame_motions
 from loopcal.errors import LoopcalError
 from loopcal.estimate import MAP, Identification, LeastSquares, identify, identify_trials
 from loopcal.estimate.identification import IdentifiedTrials
-from loopcal.estimate.local_estimate import local_estimate
-from loopcal.estimate.rows import rows_of, rows_of_trials
 from loopcal.io import load_robot
 from loopcal.measure import (
     KINDS,

@@ -9,7 +9,7 @@ import numpy as np
 
 from evidence.planned import CASES, Case
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.outlook import scene
+from loopcal.estimate.information import observe_poses
 from loopcal.io import load_robot
 from loopcal.mechanism import sample_workspace
 from loopcal.planning.design import (
@@ -35,7 +35,7 @@ DESIGNS = (*((case, "D") for case in CASES[:4]), *((case, "I") for case in CASES
 def evaluate_design(case: Case, criterion_name: str) -> list[object]:
     """Return one row: efficiencies relative to the bound, and the gap of the certified design."""
     free = select_free_parameters(load_robot(case.robot))
-    twists = scene(free, sample_workspace(free.robot, CANDIDATES, 0).solution.q).twists[0]
+    twists = observe_poses(free, sample_workspace(free.robot, CANDIDATES, 0).solution.q).twists[0]
     rows = (twists / SIGMA[:, None])[
         :, slice(0, 6) if case.measured == "full pose" else slice(3, 6)
     ]

@@ -161,15 +161,13 @@ def test_the_words_are_sentences_and_the_json_has_the_attributes():
 
 
 def test_what_it_reads_is_the_factor_of_a_fit_without_own_unknowns():
-    from loopcal.estimate.outlook import information
-    from loopcal.estimate.rows import rows_of
+    from loopcal.estimate.information import collect_information, observe_poses, observe_rows
 
     free, data = select_free_parameters(hexapod()), hexapod_data(30)
-    z = free.deviation(hexapod().values[None])
-    expected = decompose(
-        rows_of(free, data).fold(z, np.arange(1))[0], np.full(1, 180)
-    ).singular_values
-    factor, reached = information(free, data)
+    none = data.nuisance_parameters
+    rows = observe_rows(observe_poses(free, data.readings), data, none, none.values())
+    expected = decompose(folded(rows), np.full(1, 180)).singular_values
+    factor, reached = collect_information(free, data)
     np.testing.assert_allclose(
         decompose(factor, np.full(1, 180)).singular_values, expected, rtol=1e-11
     )  # [1] rounding
@@ -177,12 +175,14 @@ def test_what_it_reads_is_the_factor_of_a_fit_without_own_unknowns():
 
 
 def test_elimination_is_the_projection_onto_the_complement_even_of_columns_that_repeat():
-    from loopcal.estimate.outlook import without_own
+    from loopcal.numerics.elimination import eliminate_from_factor
 
     rng = np.random.default_rng(1)
     F, A = rng.normal(size=(20, 3)), rng.normal(size=(20, 4))
     F = np.concatenate([F, F[:, :1] - 2 * F[:, 1:2]], axis=1)
-    factor = without_own(folded(np.concatenate([F, A, rng.normal(size=(20, 1))], axis=1)[None]), 4)
+    factor = eliminate_from_factor(
+        folded(np.concatenate([F, A, rng.normal(size=(20, 1))], axis=1)[None]), 4
+    )
     left = A - F @ (np.linalg.pinv(F) @ A)
     R = factor[0, :4, :4]
     np.testing.assert_allclose(R.T @ R, left.T @ left, atol=1e-12)  # [1] rounding

@@ -7,7 +7,7 @@ import pytest
 from loopcal.diagnose.leave_one_out_errors import build_regularization_path, score_leave_one_out
 from loopcal.estimate import MAP, LeastSquares, Ridge, TruncatedSVD, identify
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.rows import rows_of
+from loopcal.estimate.problem import problem_of
 from tests.estimate.problems import hexapod, hexapod_data, tracker
 
 DATA = hexapod_data(14, instrument=tracker(20e-6, 100e-6))
@@ -16,10 +16,10 @@ DATA = hexapod_data(14, instrument=tracker(20e-6, 100e-6))
 @pytest.mark.parametrize("method", [LeastSquares(), MAP(), Ridge(30.0)])
 def test_scores_are_those_of_refits_of_the_linear_problem(method):
     found = score_leave_one_out(hexapod(), DATA, (method,))
-    rows = rows_of(select_free_parameters(hexapod()), DATA)
-    A = np.concatenate(
-        [part.reshape(-1, 43) for kinds in rows.linearised(np.zeros((1, 42))) for _, part in kinds]
-    )
+    problem = problem_of(select_free_parameters(hexapod()), DATA)
+    at = problem.linearize(np.zeros((1, 42)), problem.start())
+    parts = [part for block in problem.leverage_rows(at) for part in block]
+    A = np.concatenate([part.rows.reshape(-1, 43) for part in parts])
     lam = {LeastSquares(): 0.0, MAP(): 1.0, Ridge(30.0): 30.0}[method]
     total = 0.0
     for j in range(14):

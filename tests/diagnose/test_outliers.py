@@ -17,7 +17,7 @@ from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import MAP, Huber, LeastSquares, Tukey, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.methods.losses import block_limit
-from loopcal.estimate.rows import rows_of
+from loopcal.estimate.problem import problem_of
 from loopcal.io import load_robot
 from loopcal.measure import (
     Component,
@@ -101,19 +101,19 @@ def test_blunders_are_named_in_words_and_nothing_is_dropped(loss, method):
 def test_the_shortcut_is_the_residual_of_a_refit_without_the_block(method):
     # one linearisation: with it the shortcut is exact
     data, free = hexapod_data(12), select_free_parameters(hexapod())
-    rows = rows_of(free, data)
+    problem = problem_of(free, data)
     member, z = np.arange(12) // 2, np.zeros((1, 42))  # two poses to a block
 
     def fitted(weight):
-        kept = rows.weighted(weight)
-        factor, _ = kept.fold(z, np.arange(1))
-        d = decompose(factor, kept.rows, z)
+        kept = problem.weighted(weight).linearize(z, problem.start(z))
+        d = decompose(kept.factor, kept.equations, z)
         penalty = method.penalty(d)
-        return d, penalty, d.deviation(d.solution(penalty))
+        return kept, d, penalty, d.deviation(d.solution(penalty))
 
-    d, penalty, at = fitted(np.ones(12))
-    found = compute_influence(rows, member, d, penalty, np.ones(6), z, at)
-    A = np.concatenate([part.reshape(-1, 43) for kinds in rows.linearised(z) for _, part in kinds])
+    whole, d, penalty, at = fitted(np.ones(12))
+    found = compute_influence(problem, whole, member, d, penalty, np.ones(6), at)
+    parts = [part for block in problem.leverage_rows(whole) for part in block]
+    A = np.concatenate([part.rows.reshape(-1, 43) for part in parts])
     for j in range(6):
         own = slice(12 * j, 12 * j + 12)
         if method == LeastSquares():
@@ -130,8 +130,8 @@ def test_the_shortcut_is_the_residual_of_a_refit_without_the_block(method):
         assert found.distance[j] == pytest.approx(expected, rel=1e-6)
         # the same from a fit in which the block has no weight
         outside = (np.arange(6) != j).astype(float)
-        d_j, penalty_j, at_j = fitted(outside[member])
-        again = compute_influence(rows, member, d_j, penalty_j, outside, z, at_j)
+        kept, d_j, penalty_j, at_j = fitted(outside[member])
+        again = compute_influence(problem, kept, member, d_j, penalty_j, outside, at_j)
         assert again.distance[j] == pytest.approx(expected, rel=1e-6)
         assert again.leverage[j] == 0.0
     if method == LeastSquares():

@@ -11,7 +11,7 @@ import pytest
 from loopcal.diagnose import identifiability
 from loopcal.diagnose.parameter_subset import choose_identifiable_subset
 from loopcal.errors import MechanismError
-from loopcal.estimate.outlook import scene
+from loopcal.estimate.information import observe_poses
 from loopcal.io import load_robot
 from loopcal.io.core.json_text import to_json
 from loopcal.io.robot.reduced_robot import format_reduced_robot
@@ -144,6 +144,6 @@ def test_the_json_says_the_same():
 
 def test_a_scene_marks_what_is_not_reached_and_leaves_no_number_that_is_none():
     found = identifiability(hexapod(), hexapod_data(60))
-    at = scene(found.unknowns, np.array([np.zeros(6), 9.0 * np.eye(6)[0]]))
-    assert at.reached.tolist() == [True, False]
+    at = observe_poses(found.unknowns, np.array([np.zeros(6), 9.0 * np.eye(6)[0]]))
+    assert at.is_reached.tolist() == [True, False]
     assert np.isfinite(at.twists).all()

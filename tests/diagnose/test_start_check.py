@@ -8,7 +8,7 @@ from loopcal.diagnose import StartVerdict, check_start_values
 from loopcal.estimate import Huber, Tukey, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.inference.prior import Prior
-from loopcal.estimate.rows import rows_of
+from loopcal.estimate.problem import problem_of
 from tests import zoo
 from tests.estimate.problems import hexapod, hexapod_data
 
@@ -73,7 +73,8 @@ def test_with_a_loss_the_cost_of_the_start_is_weighted_as_that_of_the_fit_and_ho
     fit = identify(robot, data, prior=prior, loss=Huber())
     assert fit.weight.min() < 0.99
     start = free.deviation(robot.values[None])
-    rows = rows_of(free, data).weighted(fit.weight).fold(start, np.arange(1))[1][0]
+    problem = problem_of(free, data).weighted(fit.weight)
+    cost = problem.linearize(start, problem.start(start)).cost[0]
     held = (((robot.values[free.places] - prior.mean) / spread) ** 2).sum()
     assert held > 100.0
-    assert fit.cost_history[0] == pytest.approx(rows + held, rel=1e-12)  # rounding of sums
+    assert fit.cost_history[0] == pytest.approx(cost + held, rel=1e-12)  # rounding of sums

@@ -4,8 +4,9 @@
 import numpy as np
 import pytest
 
-from loopcal.estimate.descent import DescentStatus, StepControl, descend
+from loopcal.estimate.descent import FunctionProblem, StepControl, descend
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Ridge
+from loopcal.numerics.gauss_newton import DescentStatus
 from tests.estimate.problems import folded
 
 
@@ -14,11 +15,9 @@ class Exponentials:
 
     def __init__(self, y: np.ndarray) -> None:
         self.y, self.x = y, np.linspace(0.0, 3.0, y.shape[1])
-        self.parameters, self.rows = 3, np.full(len(y), y.shape[1])
-        self.calls = 0
+        self.parameters, self.equations = 3, np.full(len(y), y.shape[1])
 
-    def fold(self, deviation, trials):
-        self.calls += 1
+    def evaluate(self, deviation, trials):
         a, b, c = (deviation[:, i, None] for i in range(3))
         decay = np.exp(-(1.0 + b) * self.x)
         residual = (1.0 + a) * decay + c - self.y[trials]
@@ -29,9 +28,9 @@ class Exponentials:
 class Circle:
     """One equation, two unknowns: |(1 + z0, z1)| = 2, so one direction is never determined."""
 
-    parameters, rows = 2, np.array([1])
+    parameters, equations = 2, np.array([1])
 
-    def fold(self, deviation, trials):
+    def evaluate(self, deviation, trials):
         x, y = 1.0 + deviation[:, 0], deviation[:, 1]
         length = np.hypot(x, y)
         row = np.stack([x / length, y / length, length - 2.0], axis=1)[:, None, :]
@@ -41,11 +40,16 @@ class Circle:
 class Unreachable:
     """Finite at the start only."""
 
-    parameters, rows = 1, np.array([3])
+    parameters, equations = 1, np.array([3])
 
-    def fold(self, deviation, trials):
+    def evaluate(self, deviation, trials):
         cost = np.where(deviation[:, 0] == 0.0, 1.0, np.inf)
         return np.tile(np.array([[1.0, 1.0], [0.0, 0.0]]), (len(deviation), 1, 1)), cost
+
+
+def problem_of(functions):
+    """The problem that functions of this module define."""
+    return FunctionProblem(functions.parameters, functions.evaluate, functions.equations)
 
 
 def noisy(t: int) -> np.ndarray:
@@ -59,10 +63,10 @@ def noisy(t: int) -> np.ndarray:
 @pytest.mark.parametrize("method", [LeastSquares(), MAP(), Ridge(0.01)])
 def test_trials_stacked_equal_trials_alone_bit_for_bit(method):
     y = noisy(7)
-    together = descend(Exponentials(y), np.zeros((7, 3)), method)
+    together = descend(problem_of(Exponentials(y)), np.zeros((7, 3)), method)
     assert (together.status == DescentStatus.CONVERGED).all()
     for i in range(7):
-        alone = descend(Exponentials(y[i : i + 1]), np.zeros((1, 3)), method)
+        alone = descend(problem_of(Exponentials(y[i : i + 1])), np.zeros((1, 3)), method)
         assert np.array_equal(together.deviation[i], alone.deviation[0])
         assert together.iterations[i] == alone.iterations[0]
         assert together.cost[i] == alone.cost[0]
@@ -70,21 +74,21 @@ def test_trials_stacked_equal_trials_alone_bit_for_bit(method):
 
 def test_ridge_minimises_the_sum_of_squares_plus_the_penalty_on_the_total_deviation():
     y = noisy(1)
-    fit = descend(Exponentials(y), np.zeros((1, 3)), Ridge(0.3))
-    factor, _ = Exponentials(y).fold(fit.deviation, np.array([0]))
+    fit = descend(problem_of(Exponentials(y)), np.zeros((1, 3)), Ridge(0.3))
+    factor, _ = Exponentials(y).evaluate(fit.deviation, np.array([0]))
     gradient = factor[0, :3, :3].T @ factor[0, :3, 3] + 0.3 * fit.deviation[0]
     np.testing.assert_allclose(gradient, 0.0, atol=1e-8)
 
 
 def test_the_answer_does_not_depend_on_the_start():
     y = noisy(1)
-    a = descend(Exponentials(y), np.zeros((1, 3)), MAP())
-    b = descend(Exponentials(y), np.array([[2.0, 1.5, -1.0]]), MAP())
+    a = descend(problem_of(Exponentials(y)), np.zeros((1, 3)), MAP())
+    b = descend(problem_of(Exponentials(y)), np.array([[2.0, 1.5, -1.0]]), MAP())
     np.testing.assert_allclose(a.deviation, b.deviation, atol=1e-7)
 
 
 def test_least_squares_takes_the_smallest_total_deviation_where_nothing_is_known():
-    fit = descend(Circle(), np.array([[0.4, 0.9]]), LeastSquares())
+    fit = descend(problem_of(Circle()), np.array([[0.4, 0.9]]), LeastSquares())
     assert fit.status[0] == DescentStatus.CONVERGED
     assert fit.decomposition.rank[0] == 1
     np.testing.assert_allclose(fit.deviation, [[1.0, 0.0]], atol=1e-6)
@@ -92,7 +96,10 @@ def test_least_squares_takes_the_smallest_total_deviation_where_nothing_is_known
 
 def test_too_few_iterations_are_said():
     fit = descend(
-        Exponentials(noisy(1)), np.zeros((1, 3)), LeastSquares(), StepControl(iterations=1)
+        problem_of(Exponentials(noisy(1))),
+        np.zeros((1, 3)),
+        LeastSquares(),
+        StepControl(iterations=1),
     )
     assert fit.status[0] == DescentStatus.OUT_OF_ITERATIONS
     assert "did not converge" in DescentStatus(fit.status[0]).sentence
@@ -101,25 +108,25 @@ def test_too_few_iterations_are_said():
 def test_a_trial_that_fails_at_its_start_is_marked_and_the_others_go_on():
     y = noisy(3)
     y[1, 4] = np.nan
-    fit = descend(Exponentials(y), np.zeros((3, 3)), LeastSquares())
+    fit = descend(problem_of(Exponentials(y)), np.zeros((3, 3)), LeastSquares())
     assert fit.status.tolist() == [
         DescentStatus.CONVERGED,
         DescentStatus.BAD_START,
         DescentStatus.CONVERGED,
     ]
-    alone = descend(Exponentials(y[2:]), np.zeros((1, 3)), LeastSquares())
+    alone = descend(problem_of(Exponentials(y[2:])), np.zeros((1, 3)), LeastSquares())
     assert np.array_equal(fit.deviation[2], alone.deviation[0])
 
 
 def test_a_wall_on_every_side_is_said():
-    fit = descend(Unreachable(), np.zeros((1, 1)), LeastSquares())
+    fit = descend(problem_of(Unreachable()), np.zeros((1, 1)), LeastSquares())
     assert fit.status[0] == DescentStatus.NO_DESCENT
 
 
 def test_noise_free_rows_converge_to_rounding():
     x = np.linspace(0.0, 3.0, 25)
     y = (1.2 * np.exp(-0.7 * x) + 0.1)[None]
-    fit = descend(Exponentials(y), np.zeros((1, 3)), LeastSquares())
+    fit = descend(problem_of(Exponentials(y)), np.zeros((1, 3)), LeastSquares())
     assert fit.status[0] == DescentStatus.CONVERGED
     np.testing.assert_allclose(fit.deviation, [[0.2, -0.3, 0.1]], atol=1e-12)
     assert fit.iterations[0] <= 6

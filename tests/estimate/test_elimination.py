@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-import loopcal.estimate.rows as rows_module
+import loopcal.estimate.problem as problem_module
 from loopcal.estimate import LeastSquares, identify
-from loopcal.estimate.elimination import OWN_RANK, Factors, eliminate
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.nesting import Nesting, nest
-from loopcal.estimate.outlook import look, scene
-from loopcal.estimate.rows import rows_of
+from loopcal.estimate.information import observe_poses, observe_rows
+from loopcal.estimate.problem import problem_of
 from loopcal.measure import Gaussian, Instrument, Plane, Sensor, simulate
-from loopcal.numerics.decomposition import NULL_COMPONENT
+from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, NULL_COMPONENT
+from loopcal.numerics.elimination_tree import EliminationTree, build_tree
+from loopcal.numerics.tree_elimination import NodeFactors, eliminate_tree
 from tests import zoo
 from tests.estimate.problems import hexapod, hexapod_poses
 
@@ -40,9 +40,9 @@ class Problem:
     of: np.ndarray
 
     @property
-    def nesting(self) -> Nesting:
+    def tree(self) -> EliminationTree:
         pairs = [(i, x) for i, some in enumerate(self.sets) for x in some]
-        return nest(self.free, self.scopes, np.array(pairs, dtype=np.int64).reshape(-1, 2))
+        return build_tree(self.free, self.scopes, np.array(pairs, dtype=np.int64).reshape(-1, 2))
 
 
 def random_problem(rng, unseen):
@@ -76,26 +76,26 @@ def random_problem(rng, unseen):
     )
 
 
-def folded(problem, nesting):
+def folded(problem, tree):
     """The factors of a problem, its rows folded in two blocks; the rows without unknowns are left
     out.
     """
-    factors = Factors(nesting, 1, problem.right.shape[1] - 1)
+    factors = NodeFactors(tree, 1, problem.right.shape[1] - 1)
     for half in (slice(0, None, 2), slice(1, None, 2)):
         F, right, of = problem.F[half], problem.right[half], problem.of[half]
         for i in np.unique(of):
             used = np.array([x for x in problem.sets[i] if problem.free[x]], dtype=np.int64)
             if len(used):
-                node, some = nesting.node[used].max(), of == i
-                width, k = int(nesting.width[node]), int(some.sum())
+                node, some = tree.node[used].max(), of == i
+                width, k = int(tree.width[node]), int(some.sum())
                 rows = np.zeros((1, k, width + right.shape[1]))
-                rows[0][:, nesting.columns(np.array([node]), used[None])[0]] = F[np.ix_(some, used)]
+                rows[0][:, tree.columns(np.array([node]), used[None])[0]] = F[np.ix_(some, used)]
                 rows[0, :, width:] = right[some]
-                factors.add(int(nesting.form[node]), rows, np.full(k, nesting.place[node]))
+                factors.add(int(tree.structure[node]), rows, np.full(k, tree.place[node]))
     return factors
 
 
-def dense(problem, nesting):
+def dense(problem, tree):
     """Best values, their variance, what is open, rank, and the rows left, by one pseudo-inverse for
     each cluster.
     """
@@ -107,15 +107,15 @@ def dense(problem, nesting):
         0,
     )
     left = []
-    for c in range(int(nesting.cluster.max()) + 1):
-        inside = np.flatnonzero(nesting.cluster == c)
+    for c in range(int(tree.cluster.max()) + 1):
+        inside = np.flatnonzero(tree.cluster == c)
         sets = [i for i, some in enumerate(problem.sets) if set(some) & set(inside.tolist())]
         rows = np.isin(problem.of, sets)
         F, right = problem.F[np.ix_(rows, inside)], problem.right[rows]
         norm = np.linalg.norm(F, axis=0)
         norm = np.where(norm > 0.0, norm, 1.0)
         u, s, vt = np.linalg.svd(F / norm)
-        seen = int((s > OWN_RANK * s[0]).sum())
+        seen = int((s > NUISANCE_TOLERANCE * s[0]).sum())
         inverse = (vt[:seen].T / s[:seen]) @ u[:, :seen].T / norm[:, None]
         best[inside], variance[inside] = -inverse @ right, (inverse**2).sum(axis=1)
         open_[inside] = np.linalg.norm(vt[seen:], axis=0) > NULL_COMPONENT
@@ -131,11 +131,11 @@ def test_nested_elimination_is_the_dense_one_whatever_is_unseen(unseen):
         problem = random_problem(np.random.default_rng(seed), unseen)
         if not problem.free.any():
             continue
-        nesting = problem.nesting
-        best, variance, open_, rank, left = dense(problem, nesting)
-        found, rest = eliminate(folded(problem, nesting))
+        tree = problem.tree
+        best, variance, open_, rank, left = dense(problem, tree)
+        found, rest = eliminate_tree(folded(problem, tree))
         assert found.rank[0] == rank, seed
-        assert (found.open[0] == open_).all(), seed
+        assert (found.is_unobservable[0] == open_).all(), seed
         # each unknown in the unit of its own column: 1e-9 is rounding times the worst condition of
         # 60 problems
         scale = np.maximum(np.linalg.norm(problem.F, axis=0), 1e-3)[:, None]
@@ -147,26 +147,28 @@ def test_nested_elimination_is_the_dense_one_whatever_is_unseen(unseen):
             atol=1e-9 * max(1.0, np.abs(best * scale).max()),
             err_msg=f"{seed}",
         )
-        assert_allclose(found.variance()[0][~open_], variance[~open_], rtol=1e-8, err_msg=f"{seed}")
+        assert_allclose(
+            found.variances()[0][~open_], variance[~open_], rtol=1e-8, err_msg=f"{seed}"
+        )
         squares = (problem.right**2).sum()
         assert_allclose(
             rest[0].T @ rest[0], left.T @ left, rtol=0, atol=1e-10 * squares, err_msg=f"{seed}"
         )
-        deep += len({form.outer for form in nesting.forms}) > 1
+        deep += len({structure.parent for structure in tree.structures}) > 1
     assert deep > 30, "too few of the problems are nested at all"
 
 
 def test_rows_in_units_of_their_standard_deviations_are_orthonormal():
     problem = random_problem(np.random.default_rng(8), 0)
-    nesting = problem.nesting
-    found, _ = eliminate(folded(problem, nesting))
-    assert len(nesting.forms) > 2
-    assert not found.open.any()
+    tree = problem.tree
+    found, _ = eliminate_tree(folded(problem, tree))
+    assert len(tree.structures) > 2
+    assert not found.is_unobservable.any()
     whitened = np.zeros_like(problem.F)
     for row, i in enumerate(problem.of):
         used = [x for x in problem.sets[i] if problem.free[x]]
         if used:
-            path, root, _ = found.at(np.array([nesting.node[used].max()]))
+            path, root, _ = found.at_nodes(np.array([tree.node[used].max()]))
             whitened[row, path[0]] = problem.F[row, path[0]] @ root[0]
     free = problem.free
     assert_allclose(
@@ -183,10 +185,10 @@ def test_what_the_leaves_take_up_whole_is_not_taken_for_seen():
     sets = [[i, G] for i in range(G)]
     problem = Problem(np.ones(G + 1, dtype=bool), ["group"] * G + ["machine"], sets, F, rng.normal(size=(5 * G, 3)),
                       np.repeat(np.arange(G), 5))  # fmt: skip
-    found, rest = eliminate(folded(problem, problem.nesting))
+    found, rest = eliminate_tree(folded(problem, problem.tree))
     assert found.rank[0] == G
-    assert found.open.all()
-    best, _, _, _, left = dense(problem, problem.nesting)
+    assert found.is_unobservable.all()
+    best, _, _, _, left = dense(problem, problem.tree)
     assert_allclose(found.shift[0], best[:, -1], rtol=0, atol=1e-12)
     assert_allclose(
         rest[0].T @ rest[0], left.T @ left, rtol=0, atol=1e-12 * np.abs(left.T @ left).max()
@@ -194,7 +196,7 @@ def test_what_the_leaves_take_up_whole_is_not_taken_for_seen():
 
 
 def nested(scopes, sets):
-    return nest(
+    return build_tree(
         np.ones(len(scopes), dtype=bool),
         scopes,
         np.array([(i, x) for i, some in enumerate(sets) for x in some]),
@@ -207,8 +209,12 @@ def test_groups_are_nested_in_their_session_and_sessions_in_what_they_share():
         [0, 1 + 5 * day, 2 + 5 * day, 3 + 5 * day + group] for day in range(2) for group in range(3)
     ]
     found = nested(scopes, sets)
-    assert [(len(form), *form.path.shape[1:]) for form in found.forms] == [(1, 1), (2, 3), (6, 4)]
-    assert found.forms[2].path[4].tolist() == [9, 6, 7, 0]
+    assert [(len(structure), *structure.path.shape[1:]) for structure in found.structures] == [
+        (1, 1),
+        (2, 3),
+        (6, 4),
+    ]
+    assert found.structures[2].path[4].tolist() == [9, 6, 7, 0]
     assert (found.cluster == 0).all()
     assert found.columns(found.node[[9]], np.array([[0, 6, 7, 9]])).tolist() == [[3, 1, 2, 0]]
 
@@ -216,18 +222,18 @@ def test_groups_are_nested_in_their_session_and_sessions_in_what_they_share():
 def test_many_targets_are_nested_in_the_frame_from_which_they_are_seen():
     scopes = ["session"] * 6 + ["machine"] * 60
     found = nested(scopes, [[*range(6), *range(6 + 3 * i, 9 + 3 * i)] for i in range(20)])
-    assert [form.path.shape for form in found.forms] == [(1, 6), (20, 9)]
+    assert [structure.path.shape for structure in found.structures] == [(1, 6), (20, 9)]
 
 
 def test_unknowns_of_two_scopes_that_every_row_uses_are_one_node():
     found = nested(["session"] * 6 + ["machine"] * 3, [list(range(9))])
-    assert [form.path.tolist() for form in found.forms] == [[list(range(9))]]
+    assert [structure.path.tolist() for structure in found.structures] == [[list(range(9))]]
 
 
 def test_without_free_unknowns_there_is_nothing_to_nest():
-    found = nest(np.zeros(3, dtype=bool), ["group"] * 3, np.array([[0, 0], [0, 1], [0, 2]]))
-    assert found.forms == ()
-    eliminated, rest = eliminate(Factors(found, 2, 4))
+    found = build_tree(np.zeros(3, dtype=bool), ["group"] * 3, np.array([[0, 0], [0, 1], [0, 2]]))
+    assert found.structures == ()
+    eliminated, rest = eliminate_tree(NodeFactors(found, 2, 4))
     assert eliminated.slope.shape == (2, 3, 4)
     assert not rest.any()
 
@@ -252,23 +258,23 @@ def fold_of(data):
     these.
     """
     free = select_free_parameters(hexapod())
-    rows = rows_of(free, data)
-    assert rows.own is not None
-    rows.own.started[:] = True
-    return rows.fold(free.deviation(hexapod().values[None]), np.arange(1))[0][0], rows.own
+    problem = problem_of(free, data)
+    z = free.deviation(hexapod().values[None])
+    at = problem.linearize(z, problem.start(z, seek=False))
+    return at.factor[0], at.nuisance
 
 
 def test_planes_that_share_a_probe_cost_twice_as_much_where_there_are_twice_as_many(monkeypatch):
-    counted, add = {"rows": 0, "kept": 0, "widest": 0}, Factors.add
+    counted, add = {"rows": 0, "kept": 0, "widest": 0}, NodeFactors.add
 
-    def counting(self, form, rows, places):
-        add(self, form, rows, places)
+    def counting(self, structure, rows, places):
+        add(self, structure, rows, places)
         if self.parameters:
-            kept = sum(factor.size for factor in self.whole())
+            kept = sum(factor.size for factor in self.arrays())
             widest = max(counted["widest"], rows.shape[2])
             counted.update(rows=counted["rows"] + rows.size, kept=kept, widest=widest)
 
-    monkeypatch.setattr(Factors, "add", counting)
+    monkeypatch.setattr(NodeFactors, "add", counting)
     found = []
     for groups in (5, 10, 20):
         counted.update(rows=0, kept=0, widest=0)
@@ -276,7 +282,7 @@ def test_planes_that_share_a_probe_cost_twice_as_much_where_there_are_twice_as_m
         # three numbers of a plane, three of the probe, the machine, the residual; dense it were 3 *
         # groups + 46
         assert counted["widest"] == 3 + 3 + 42 + 1
-        assert int(own.nesting.width.max()) == 6
+        assert int(own.elimination.tree.width.max()) == 6
         found.append((counted["rows"], counted["kept"]))
     one, two, four = np.array(found)
     assert (four - two == 2 * (two - one)).all()
@@ -293,12 +299,12 @@ def test_planes_and_the_probe_they_share_give_the_joint_solution(held):
         else data.nuisance_parameters
     )
     local = local.with_fixed("plate5.plane.u")
-    rows = rows_of(free, data, local)
-    assert rows.own is not None
-    rows.own.started[:] = True
-    factor = rows.fold(free.deviation(hexapod().values[None]), np.arange(1))[0][0]
-    values, table = rows.own.values[0], local.table
-    F = look(scene(free, data.readings), data, local, values)[0]
+    problem = problem_of(free, data, local)
+    z = free.deviation(hexapod().values[None])
+    at = problem.linearize(z, problem.start(z, seek=False))
+    assert at.nuisance is not None
+    factor, values, table = at.factor[0], at.nuisance.values[0], local.table
+    F = observe_rows(observe_poses(free, data.readings), data, local, values)[0]
     F[:, : len(local)][:, ~table.free] = 0.0
     priors = np.flatnonzero(table.free & ~np.isnan(table.tolerance))
     weight = np.zeros((len(priors), F.shape[1]))
@@ -311,14 +317,14 @@ def test_planes_and_the_probe_they_share_give_the_joint_solution(held):
     assert_allclose(
         factor.T @ factor, left.T @ left, rtol=0, atol=1e-10 * np.abs(left.T @ left).max()
     )
-    assert rows.rows[0] == len(F) - used.shape[1]
-    assert len(rows.own.nesting.forms) > 1
+    assert at.equations[0] == len(F) - used.shape[1]
+    assert len(at.nuisance.elimination.tree.structures) > 1
 
 
 def test_groups_whose_rows_come_in_several_blocks_are_folded_as_whole(monkeypatch):
     data = probed(7)
     whole = fold_of(data)[0]
-    monkeypatch.setattr(rows_module, "BLOCK", 5)
+    monkeypatch.setattr(problem_module, "BLOCK", 5)
     parts = fold_of(data)[0]
     assert_allclose(
         parts.T @ parts, whole.T @ whole, rtol=0, atol=1e-10 * np.abs(whole.T @ whole).max()

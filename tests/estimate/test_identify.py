@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import loopcal.estimate.rows as rows_module
+import loopcal.estimate.problem as problem_module
 from loopcal.errors import EstimationError
 from loopcal.estimate import (
     MAP,
@@ -125,7 +125,7 @@ def test_the_order_of_poses_changes_rounding_only(data, fit):
 
 
 def test_blocks_of_poses_change_rounding_only(data, fit, monkeypatch):
-    monkeypatch.setattr(rows_module, "BLOCK", 7)
+    monkeypatch.setattr(problem_module, "BLOCK", 7)
     blocked = identify(hexapod(), data, LeastSquares())
     np.testing.assert_allclose(blocked.estimate, fit.estimate, rtol=0, atol=1e-12)  # [m]
     np.testing.assert_allclose(blocked.residuals[0].raw, fit.residuals[0].raw, rtol=0, atol=1e-12)

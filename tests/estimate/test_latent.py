@@ -11,9 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import least_squares
 from scipy.stats import binom, chi2
 
-import loopcal.estimate.components as components_module
-import loopcal.estimate.latent as latent_module
-import loopcal.estimate.settle as settle_module
+import loopcal.estimate.poses.components as components_module
+import loopcal.estimate.problem as problem_module
 from loopcal.apply import validate
 from loopcal.diagnose import cross_validate, examine_fit, find_outliers, identifiability
 from loopcal.errors import DataError, EstimationError
@@ -365,7 +364,7 @@ def test_a_pose_whose_position_alone_is_known_adds_nothing_and_is_named():
         max(largest_difference(found, known)) < 1e-6
     )  # both fits end where steps are a millionth of the residual
     assert found.dof == known.dof
-    assert latent_of(found).open.tolist() == [False] * 11 + [True]
+    assert latent_of(found).is_undetermined.tolist() == [False] * 11 + [True]
     assert any("not determined" in note and "pose 12" in note for note in found.notes)
 
 
@@ -431,8 +430,7 @@ def test_blocks_of_poses_change_nothing(monkeypatch):
     )
     data = measured_hexapod(12, 2 * UM, sensors=sensors)
     whole = identify(hexapod(), data, LeastSquares())
-    for module in (latent_module, settle_module):
-        monkeypatch.setattr(module, "BLOCK", 5)
+    monkeypatch.setattr(problem_module, "BLOCK", 5)
     parts = identify(hexapod(), data, LeastSquares())
     assert parts.chi_square == pytest.approx(whole.chi_square, rel=1e-9)
     assert_allclose(parts.singular_values[:36], whole.singular_values[:36], rtol=1e-9)

@@ -10,12 +10,11 @@ from numpy.testing import assert_allclose
 import loopcal.mechanism.batch_kinematics as trials_module
 from loopcal.estimate import identify
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.latent import LatentRows
-from loopcal.estimate.latent_doubts import latent_doubts
-from loopcal.estimate.measured_poses import measured_poses
-from loopcal.estimate.rows import rows_of
-from loopcal.estimate.settle import HALVINGS, STEPS, Poses
-from loopcal.estimate.standing import Standing
+from loopcal.estimate.poses.estimate import report_doubtful_readings
+from loopcal.estimate.poses.measured import measure_poses
+from loopcal.estimate.poses.states import PoseStates
+from loopcal.estimate.poses.uncertain import UncertainPoses
+from loopcal.estimate.problem import problem_of
 from loopcal.io import load_robot
 from loopcal.measure import (
     Component,
@@ -29,6 +28,7 @@ from loopcal.measure import (
     simulate,
 )
 from loopcal.mechanism import find_directly_reachable, forward, inverse, sample_workspace
+from loopcal.numerics.gauss_newton import Halving
 from tests.estimate.problems import UM, noise
 
 
@@ -74,7 +74,7 @@ def counted(monkeypatch):
 
         monkeypatch.setattr(owner, attribute, wrapped)
 
-    counting(Poses, "look", "looks")
+    counting(UncertainPoses, "_evaluate", "looks")
     counting(trials_module, "_followed", "followed")
     return count
 
@@ -112,20 +112,18 @@ def test_rows_that_tell_all_freedoms_of_the_platform_give_its_pose(said):
     robot = load_robot(robot)
     found = inverse(robot, sample_workspace(robot, 6, 1).coordinates)
     data = simulate(robot, found.T, Instrument(sensors), 0, reading_sigma=20 * UM)
-    rows = rows_of(select_free_parameters(robot), data)
-    assert isinstance(rows, LatentRows)
-    T, known = measured_poses(robot, rows.sensed[:-1], np.zeros(6, dtype=int), np.arange(6))
+    problem = problem_of(select_free_parameters(robot), data)
+    T, known = measure_poses(robot, problem.rows[:-1], np.zeros(6, dtype=int), np.arange(6))
     assert known.all()
     assert_allclose(
         T[:, :3, 3], found.T[:, :3, 3], atol=2e-3, rtol=0
     )  # [m] of noise and, for 3-prs, of its weak direction
     fewer = tuple(replace(s, rows=np.array([0, 1, 3])) for s in sensors[:1])
-    rows = rows_of(
+    problem = problem_of(
         select_free_parameters(robot),
         simulate(robot, found.T, Instrument((*fewer, *sensors[1:])), 0, reading_sigma=20 * UM),
     )
-    assert isinstance(rows, LatentRows)
-    _, known = measured_poses(robot, rows.sensed[:-1], np.zeros(6, dtype=int), np.arange(6))
+    _, known = measure_poses(robot, problem.rows[:-1], np.zeros(6, dtype=int), np.arange(6))
     assert known.tolist() == [True, True, False, True, False, False]
 
 
@@ -177,17 +175,25 @@ def test_a_reading_found_outside_its_stroke_or_on_another_branch_is_told():
     lost[7, 0] = lost[9, 2] = True
     fit = identify(robot, without(data, lost))
     assert fit.latent is not None
-    assert latent_doubts(fit.robot, fit.latent) == []
+    assert report_doubtful_readings(fit.robot, fit.latent) == ()
     found = fit.latent.readings.copy()
     found[7, 0] += 0.1 if found[7, 0] < 0.3 else -0.1  # [m]: within the stroke of 0 to 0.4 m
     found[9, 2] = -0.02
-    outside, beside = latent_doubts(fit.robot, replace(fit.latent, readings=found))
+    outside, beside = report_doubtful_readings(fit.robot, replace(fit.latent, readings=found))
     name = robot.actuators[2].name
-    assert outside.startswith(f"found outside the stroke: {name} at pose 10 (-20 mm); ")
-    assert f"{robot.actuators[0].name} at pose 8" in beside
+    assert outside.code == "poses.outside-stroke"
+    reading = outside.data["readings"][-1]
+    assert (reading["actuator"], reading["pose"]) == (name, "10")
+    assert reading["value"].value == pytest.approx(-20.0)
+    assert reading["value"].unit == "mm"
+    assert beside.code == "poses.other-branch"
+    reading = beside.data["readings"][0]
+    assert (reading["actuator"], reading["pose"]) == (robot.actuators[0].name, "8")
     assert (
-        latent_doubts(fit.robot, replace(fit.latent, readings=found, open=np.ones(20, dtype=bool)))
-        == []
+        report_doubtful_readings(
+            fit.robot, replace(fit.latent, readings=found, is_undetermined=np.ones(20, dtype=bool))
+        )
+        == ()
     )
 
 
@@ -201,24 +207,26 @@ def test_from_random_starts_the_search_is_bounded_and_never_ends_higher_than_it_
     lost = np.zeros(data.readings.shape, dtype=bool)
     lost[:, 0] = True
     data = without(data, lost)
-    rows = rows_of(select_free_parameters(robot), data)
-    assert isinstance(rows, LatentRows)
+    problem = problem_of(select_free_parameters(robot), data)
+    assert isinstance(problem.poses, UncertainPoses)
     stroke = np.array([a.stroke for a in robot.actuators], dtype=float)
-    rng, z, trial = np.random.default_rng(3), np.zeros((1, rows.parameters)), np.arange(1)
+    rng, z = np.random.default_rng(3), np.zeros((1, problem.parameters))
     for _ in range(4):
         readings = data.readings.copy()
         readings[:, 0] = stroke[0, 0] + (stroke[0, 1] - stroke[0, 0]) * rng.random(len(readings))
         reached = find_directly_reachable(robot, robot.values[None], readings[None])[0]
         readings = np.where(reached[:, None], readings, robot_home(robot))
-        begin = Standing(forward(robot, readings).state, readings[None])
-        first = rows.poses.look(z, trial, begin, None, own=False)
+        begin = PoseStates(forward(robot, readings).state, readings[None])
+        start = replace(problem.start(z), poses=begin)
+        at_once = replace(problem, control=Halving(steps=0))
+        first = at_once.linearize(z, start)
         assert np.isfinite(first.cost).all()
         counted.update(looks=0, followed=0)
-        here = rows.poses.settle(z, trial, begin)
-        assert counted["looks"] <= 1 + STEPS * (HALVINGS + 1)
+        last = problem.linearize(z, start)
+        assert counted["looks"] <= 1 + problem.control.steps * (problem.control.attempts + 1)
         assert counted["followed"] == 0
-        assert not here.failed.any()
-        assert here.cost[0] <= first.cost[0]
+        assert np.isfinite(last.cost).all()
+        assert last.cost[0] <= first.cost[0]
 
 
 def robot_home(robot):

@@ -8,16 +8,16 @@ import pytest
 from numpy.testing import assert_allclose
 
 import loopcal as lc
-import loopcal.estimate.rows as rows_module
+import loopcal.estimate.problem as problem_module
 from loopcal import geometry
 from loopcal.apply import validate
 from loopcal.cli import main
 from loopcal.diagnose import find_outliers
 from loopcal.estimate import MAP, LeastSquares, identify, identify_trials
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.local import Own
-from loopcal.estimate.outlook import look, scene
-from loopcal.estimate.rows import rows_of
+from loopcal.estimate.information import observe_poses, observe_rows
+from loopcal.estimate.nuisance import NuisanceElimination
+from loopcal.estimate.problem import problem_of
 from loopcal.measure import (
     Gaussian,
     Instrument,
@@ -38,6 +38,7 @@ from tests.estimate.problems import hexapod, hexapod_data, hexapod_poses, tracke
 UM = 1e-6
 POINT = np.array([[0.03, -0.02, 0.05]])
 THREE = np.array([[0.1, 0.0, 0.02], [-0.06, 0.1, 0.03], [-0.05, -0.1, 0.01]])
+NAMES = ("frame", "a", "b", "c")
 STATION = geometry.make_pose(np.eye(3), np.array([-2.5, -1.8, 0.1]))
 TRACKER = Position(targets=("a", "b", "c"), places=THREE, unknown=("frame", "targets"))
 TRUE = {
@@ -88,30 +89,30 @@ def mixed_data(seed=1, noise: type[Gaussian] = Gaussian):
 
 def test_the_projected_solution_is_the_joint_one():
     data, free = mixed_data(), select_free_parameters(hexapod())
-    rows = rows_of(free, data)
-    assert rows.own is not None
+    problem = problem_of(free, data)
     z = free.deviation(hexapod().values[None])
-    factor, _ = rows.fold(z, np.arange(1))
+    linearized = problem.linearize(z, problem.start(z))
+    factor, nuisance = linearized.factor, linearized.nuisance
+    assert nuisance is not None
     projected = -np.linalg.solve(factor[0, :-1, :-1], factor[0, :-1, -1])
     local = collect_nuisance_parameters(data.observations, data.labels)
-    stacked = look(scene(free, data.readings), data, local, rows.own.values[0])[0]
+    stacked = observe_rows(observe_poses(free, data.readings), data, local, nuisance.values[0])[0]
     scale = np.linalg.norm(stacked[:, :-1], axis=0)
     joint = -np.linalg.lstsq(stacked[:, :-1] / scale, stacked[:, -1], rcond=None)[0] / scale
     assert_allclose(projected, joint[len(local) :], rtol=0, atol=1e-12 * np.abs(projected).max())
-    done = rows.own.solved
-    assert done is not None
+    done = nuisance.elimination
     assert_allclose(
         done.shift[0] + done.slope[0] @ projected, joint[: len(local)], rtol=0, atol=1e-11
     )
-    assert rows.rows[0] == len(stacked) - len(local)
+    assert linearized.equations[0] == len(stacked) - len(local)
 
 
 def test_standard_deviations_are_those_of_the_joint_problem():
     data = mixed_data()
     fit = identify(hexapod(), data, LeastSquares())
     free = select_free_parameters(fit.robot)
-    at = scene(free, data.readings)
-    rows = look(
+    at = observe_poses(free, data.readings)
+    rows = observe_rows(
         at, data, collect_nuisance_parameters(data.observations, data.labels), fit.local.estimate
     )[0, :, :-1]
     scale = np.linalg.norm(rows, axis=0)
@@ -145,8 +146,9 @@ def test_a_fit_in_an_unknown_frame_is_that_in_the_known_frame_up_to_gauge():
     assert_allclose(second.estimate, truth.values, rtol=0, atol=1e-9 * 0.2)
     assert all("frame" in c.meaning or "a, b and c" in c.meaning for c in first.unidentifiable)
     assert np.isinf(first.local.sd).all()
-    assert validate(first, others).notes == ("frame, a, b and c: as the fit found it",)
-    assert "found anew" in validate(second.robot, others).notes[0]
+    (kept,) = validate(first, others).findings
+    assert (kept.code, tuple(kept.data["names"])) == ("validation.setup-kept", NAMES)
+    assert validate(second.robot, others).findings[0].code == "validation.setup-fitted"
 
 
 def test_intervals_of_machine_and_frame_hold_the_truth():
@@ -180,9 +182,9 @@ def test_intervals_of_machine_and_frame_hold_the_truth():
         # the delta does not turn: where the target sits and where the frame begins are one and the
         # same
         assert np.isinf(sd).sum() == 6
-        assert (
-            "not identifiable, whatever the robot: frame and target, or only together" in fit.notes
-        )
+        (finding,) = fit.local.report_unobservable()
+        assert finding.code == "setup.unobservable"
+        assert finding.data["names"] == ["frame", "target"]
     assert all(fit.converged for fit in fits)
     # intervals of one fit are correlated: the band is that of as many draws as there are fits, at
     # four standard deviations
@@ -191,7 +193,7 @@ def test_intervals_of_machine_and_frame_hold_the_truth():
 
 @pytest.mark.parametrize("block", [16, 512])
 def test_rows_that_link_poses_and_joint_sensors_are_fitted_in_blocks_as_whole(monkeypatch, block):
-    monkeypatch.setattr(rows_module, "BLOCK", block)
+    monkeypatch.setattr(problem_module, "BLOCK", block)
     robot, truth, poses = machine("3-prs", 40)
     passive = lc.inverse(robot, poses[:1]).passive_names[0]
     far = Sensor(
@@ -226,9 +228,9 @@ def test_sessions_have_frames_of_their_own_and_are_eliminated_one_by_one():
     sensor = Sensor(kind, Gaussian(np.full(6, UM)), session=day)
     moved = {f"day{i}.frame.{axis}": 0.1 * i for i in range(8) for axis in ("x", "rz")}
     data = simulate(truth, hexapod_poses(80), Instrument((sensor,)), 1, nuisance_values=moved)
-    rows = rows_of(select_free_parameters(hexapod()), data)
-    assert rows.own is not None
-    assert [len(columns) for columns in rows.own.clusters] == [6] * 8
+    nuisance = problem_of(select_free_parameters(hexapod()), data).nuisance
+    assert nuisance is not None
+    assert np.bincount(nuisance.tree.cluster).tolist() == [6] * 8
     fit = identify(hexapod(), data)
     assert fit.converged
     assert fit.p_value > 1e-4
@@ -301,9 +303,11 @@ def test_trials_with_unknown_frames_are_identified_as_each_alone():
 
 def test_starts_are_sought_once_for_all_trials_that_an_instrument_looks_at(monkeypatch):
     sought = []
-    begin = Own.begin
+    begin = NuisanceElimination.start_values
     monkeypatch.setattr(
-        Own, "begin", lambda own, trial, *rest: (sought.append(trial), begin(own, trial, *rest))
+        NuisanceElimination,
+        "start_values",
+        lambda nuisance, data, *rest: (sought.append(data), begin(nuisance, data, *rest))[1],
     )
     robot = lc.load_robot("linear-delta")
     kind = Position(places=POINT, unknown=("frame",))
@@ -312,7 +316,7 @@ def test_starts_are_sought_once_for_all_trials_that_an_instrument_looks_at(monke
         nuisance_values=true_of(kind),
     )  # fmt: skip
     assert identify_trials(robot, trials, MAP()).converged.all()
-    assert sought == [0]
+    assert len(sought) == 1
 
 
 def test_a_known_instrument_has_no_unknowns():
@@ -349,4 +353,3 @@ def test_the_command_line_calibrates_from_a_tracker_in_an_unknown_frame(tmp_path
     )
     out, _ = capsys.readouterr()
     assert "frame.rz" in out
-    assert "frame, a, b and c: as the fit found it" in out

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.estimate.descent import DescentStatus, StepControl, descend
+from loopcal.estimate.descent import FunctionProblem, StepControl, descend
 from loopcal.estimate.methods.penalties import LeastSquares
+from loopcal.numerics.gauss_newton import DescentStatus
 from tests.estimate.nist import MODELS, Certified, matching_digits, read, residual_and_jacobian
 from tests.estimate.problems import folded
 
@@ -28,12 +29,12 @@ class Regression:
     def __init__(self, certified: Certified, start: np.ndarray) -> None:
         self.certified, self.start = certified, start
         self.parameters = len(start)
-        self.rows = np.array([len(certified.y)])
+        self.equations = np.array([len(certified.y)])
 
     def values(self, deviation: np.ndarray) -> np.ndarray:
         return self.start + np.abs(self.start) * deviation
 
-    def fold(self, deviation, trials):
+    def evaluate(self, deviation, trials):
         assert trials.tolist() == [0]
         residual, jacobian = residual_and_jacobian(self.certified, self.values(deviation[0]))
         rows = np.column_stack([jacobian * np.abs(self.start), residual])
@@ -48,8 +49,9 @@ def score(certified: Certified, start: np.ndarray) -> tuple[float, float, int, s
     """Fit and return matching digits of values and of standard errors, accepted steps, status."""
     problem = Regression(certified, start)
     control = StepControl(iterations=2000, relative=1e-8)
+    function = FunctionProblem(problem.parameters, problem.evaluate, problem.equations)
     fit = descend(
-        problem, np.zeros((1, problem.parameters)), LeastSquares(), control, tolerance=NO_CUT
+        function, np.zeros((1, problem.parameters)), LeastSquares(), control, tolerance=NO_CUT
     )
     errors = fit.decomposition.standard_deviations(fit.penalty, fit.cost / certified.degrees)[
         0

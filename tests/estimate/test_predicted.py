@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from loopcal.apply import validate
 from loopcal.errors import DataError
-from loopcal.estimate.predicted import predicted
+from loopcal.estimate.poses.prediction import predict_from_readings
 from loopcal.io import load_robot
 from loopcal.measure import Instrument, Position, Sensor, simulate
 from loopcal.mechanism import forward, inverse, sample_workspace
@@ -46,14 +46,14 @@ def test_a_line_that_is_hardly_believed_leaves_the_pose_to_the_other_three(cable
     usual = validate(robot, data, before=robot)
     found = validate(robot, changed(data, sigma, off), before=robot)
     assert found.poses == usual.poses
-    assert found.failed == ()
-    assert found.notes == usual.notes
+    assert found.unreachable == ()
+    assert found.findings == usual.findings
     error = found.after.position
     assert_allclose(
         np.delete(error, 2), np.delete(usual.after.position, 2), atol=1e-6
     )  # [m]: two ways to solve the same
     assert error[2] < 10 * MM  # three lines; 50 rad of the fourth are metres
-    at, told = predicted(robot, changed(data, sigma, off))
+    at, told = predict_from_readings(robot, changed(data, sigma, off))
     assert told.all()
     assert_allclose(at.T[2, :3, 3], positions[2], atol=10 * MM)
     assert_allclose(
@@ -66,15 +66,16 @@ def test_a_pose_that_too_few_believed_lines_hold_is_left_out_and_named(cable):
     two = changed(changed(data, np.inf, np.nan), np.inf, np.nan, line=2)
     found = validate(robot, two, before=robot)
     assert found.poses == ("1", "2", "4", "5", "6", "7", "8")
-    assert found.failed == ()
-    assert any("not taken or is not believed: 3" in note for note in found.notes)
+    assert found.unreachable == ()
+    (missing,) = [f for f in found.findings if f.code == "validation.missing-readings"]
+    assert tuple(missing.data["names"]) == ("3",)
 
 
 def test_equal_sigmas_predict_as_the_robot_does(cable):
     robot, _, data = cable
-    found, _ = predicted(robot, data)
+    found, _ = predict_from_readings(robot, data)
     assert_allclose(found.T, forward(robot, data.readings).T, atol=0)
-    other, _ = predicted(
+    other, _ = predict_from_readings(
         robot,
         replace(data, reading_sigma=data.reading_sigma * np.array([1.0, 1.0, 1.0, 1.0 + 1e-6])),
     )

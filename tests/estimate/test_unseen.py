@@ -9,10 +9,10 @@ from numpy.testing import assert_array_equal
 from scipy.stats import chi2
 
 from loopcal.estimate import identify
-from loopcal.estimate.components import project
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.rows import Rows, rows_of
-from loopcal.estimate.settle import by_pose
+from loopcal.estimate.linearization import Linearization
+from loopcal.estimate.poses.linearization import coordinate_derivative
+from loopcal.estimate.problem import problem_of
 from loopcal.measure import (
     Instrument,
     Measurements,
@@ -23,6 +23,7 @@ from loopcal.measure import (
     simulate,
 )
 from loopcal.numerics.decomposition import ROUNDING, without_rounding
+from loopcal.numerics.elimination import eliminate_columns
 from tests import zoo
 from tests.estimate.problems import UM, URAD, hexapod, noise
 
@@ -44,24 +45,20 @@ def parallel(unknown: tuple[str, ...], truth: np.ndarray | None = None) -> Measu
     )
 
 
-def folded(data: Measurements) -> tuple[Rows, np.ndarray]:
-    """Rows at the nominal robot, and their factor."""
-    free = select_free_parameters(hexapod())
-    rows = rows_of(free, data)
-    assert isinstance(rows, Rows)
-    return rows, rows.fold(np.zeros((1, len(free))), np.arange(1))[0][0]
+def linearized(data: Measurements) -> Linearization:
+    """The problem at the nominal robot."""
+    problem, z = problem_of(select_free_parameters(hexapod()), data), np.zeros((1, 42))
+    return problem.linearize(z, problem.start(z))
 
 
 def test_a_target_that_cancels_stays_where_it_was_and_changes_nothing_of_the_machine():
-    (known, without), (rows, factor) = folded(parallel(())), folded(parallel(("targets",)))
-    assert rows.own is not None
-    assert int(rows.own.rank[0]) == 0
-    assert_array_equal(rows.own.values[0], 0.0)
-    assert rows.rows == known.rows
-    gram, expected = (
-        factor.T @ factor,
-        without.T @ without,
-    )  # of factors: the rows may have been reflected
+    known, unknown = linearized(parallel(())), linearized(parallel(("targets",)))
+    assert unknown.nuisance is not None
+    assert int(unknown.nuisance.elimination.rank[0]) == 0
+    assert_array_equal(unknown.nuisance.values[0], 0.0)
+    assert unknown.equations == known.equations
+    # of factors: the rows may have been reflected
+    gram, expected = (at.factor[0].T @ at.factor[0] for at in (unknown, known))
     np.testing.assert_allclose(gram, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
@@ -95,7 +92,7 @@ def test_a_column_that_the_poses_take_up_whole_leaves_zeros():
     rng = np.random.default_rng(0)
     free = rng.standard_normal((1, 5, 12, 3)) * np.array([1.0, 1e3, 1e-3])
     whole, other = free @ rng.standard_normal((3, 1)), rng.standard_normal((1, 5, 12, 2))
-    done = project(np.concatenate([free, 1e6 * whole, other], axis=-1), 3)
+    done = eliminate_columns(np.concatenate([free, 1e6 * whole, other], axis=-1), 3)
     assert_array_equal(done.rest[..., 0], 0.0)
     assert np.linalg.norm(done.rest[..., 1], axis=-1).min() > 1.0
     assert_array_equal(done.rank, 3)
@@ -109,10 +106,10 @@ def test_a_point_on_the_axis_of_a_pose_s_move_does_not_see_it():
     jacobian[0, :, :, :3] = -np.cross(np.eye(3), -point[:, None, :]).swapaxes(1, 2)
     jacobian[0, :, :, 3:] = np.eye(3)
     assert np.any(jacobian @ move != 0.0)
-    assert_array_equal(by_pose(jacobian, move), 0.0)
+    assert_array_equal(coordinate_derivative(jacobian, move), 0.0)
     shifted = move + 1e-9 * np.eye(6)[3, :, None]
     np.testing.assert_allclose(
-        by_pose(jacobian, shifted)[0, :, 0, 0], 1e-9, rtol=1e-5
+        coordinate_derivative(jacobian, shifted)[0, :, 0, 0], 1e-9, rtol=1e-5
     )  # 1e-15 of rounding in 1e-9
 
 

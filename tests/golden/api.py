@@ -383,7 +383,7 @@ def report_fit(found: Fit, parts: bool = True) -> Report:
             np.full(len(local), 1e-3),
         )
         result["local_names"] = list(local.names)
-        result["local_open"] = [bool(x) for x in local.open]
+        result["local_open"] = [bool(x) for x in local.is_unobservable]
         result["local"] = {"estimate": told, "sd": local.sd, "scale": scale}
     if found.conflict is not None:
         one = found.conflict
@@ -398,9 +398,9 @@ def report_fit(found: Fit, parts: bool = True) -> Report:
         result["latent"] = {
             "pose": _pose(found.robot, at.poses),
             "readings": at.readings,
-            "calm": bool(at.calm),
+            "calm": bool(at.is_converged),
         }
-        result["latent"]["open"] = [bool(x) for x in at.open]
+        result["latent"]["open"] = [bool(x) for x in at.is_undetermined]
     return result
 
 

@@ -15,7 +15,7 @@ import loopcal as lc
 from loopcal.diagnose import identifiability
 from loopcal.estimate import MAP, LeastSquares, identify
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.outlook import information
+from loopcal.estimate.information import collect_information
 from loopcal.papers.cmm_constraint_2011.forms import RANK, covariance_difference, measurements
 from loopcal.papers.cmm_constraint_2011.steps import Layout, PaperRows, identify_from_rows, row_map
 from loopcal.papers.cmm_constraint_2011.study import true_machines
@@ -96,7 +96,7 @@ def test_both_forms_and_the_rows_of_planning_give_every_direction_the_same_varia
 ) -> None:
     assert covariance_difference(layout, NOISE) < 1e-9  # relative, rounding by a condition of 1e4
     free = select_free_parameters(layout.robot)
-    R = information(free, measurements(layout, exact(layout)[0], MM))[0][0, :42, :42]
+    R = collect_information(free, measurements(layout, exact(layout)[0], MM))[0][0, :42, :42]
     rows = planned.linearize(planned.draw(GROUPS, 0)).reshape(-1, 42)
     np.testing.assert_allclose(rows.T @ rows, R.T @ R, atol=1e-9 * np.abs(R.T @ R).max())
 
@@ -108,7 +108,7 @@ def test_rows_of_planning_are_those_of_surfaces_as_unknowns_on_other_robots_too(
     design = planned.draw(8, 0)
     layout = Layout(robot, planned.place_points(design))
     free = select_free_parameters(robot)
-    R = information(free, measurements(layout, exact(layout)[0], MM))[0][
+    R = collect_information(free, measurements(layout, exact(layout)[0], MM))[0][
         0, : len(free), : len(free)
     ]
     rows = planned.linearize(design).reshape(-1, len(free))

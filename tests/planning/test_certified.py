@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.outlook import scene
+from loopcal.estimate.information import observe_poses
 from loopcal.io import load_robot
 from loopcal.mechanism import sample_workspace
 from loopcal.planning.design import (
@@ -32,7 +32,7 @@ SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)  # [rad, m]
 def pose_rows(robot: str, count: int, components: slice = slice(0, 6)) -> Array:
     """Whitened rows (count, r, p) of poses drawn from a shipped robot's workspace."""
     free = select_free_parameters(load_robot(robot))
-    twists = scene(free, sample_workspace(free.robot, count, 0).solution.q).twists[0]
+    twists = observe_poses(free, sample_workspace(free.robot, count, 0).solution.q).twists[0]
     return (twists / SIGMA[:, None])[:, components]
 
 

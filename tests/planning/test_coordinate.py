@@ -6,7 +6,7 @@ import pytest
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.outlook import scene
+from loopcal.estimate.information import observe_poses
 from loopcal.io import load_robot
 from loopcal.mechanism import inverse, sample_workspace
 from loopcal.planning.design import (
@@ -111,7 +111,7 @@ def test_poses_of_a_hexapod_move_to_where_its_parameters_show() -> None:
 
     def rows_of(_: Places, x: Array) -> Array:
         at = inverse(free.robot, x)
-        rows = scene(free, np.where(at.converged[:, None], at.q, 0.0)).twists[0] / SIGMA[:, None]
+        rows = observe_poses(free, np.where(at.converged[:, None], at.q, 0.0)).twists[0] / SIGMA[:, None]
         return np.where(at.converged[:, None, None], rows, np.nan)
 
     levels = [

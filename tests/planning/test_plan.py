@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 import loopcal as lc
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.outlook import information
+from loopcal.estimate.information import collect_information
 from loopcal.io import load_robot
 from loopcal.measure import KINDS, sample_truth
 from loopcal.mechanism import sample_workspace
@@ -80,7 +80,7 @@ def test_rows_of_units_are_those_that_identification_folds(name, kind, settings)
     ours = factor_design(
         rows[None], PriorInformation.none(len(free), len(units.nuisance)), _all(free, units)
     )
-    theirs = information(free, data)[0][0, :-1, :-1]
+    theirs = collect_information(free, data)[0][0, :-1, :-1]
     theirs = np.concatenate([theirs, np.eye(len(free))])
     # data of this seed have noise, so that the frames found from them differ by some 1e-4 from the
     # stated ones

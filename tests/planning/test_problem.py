@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 import loopcal as lc
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.outlook import scene
+from loopcal.estimate.information import observe_poses
 from loopcal.io import load_robot
 from loopcal.measure import KINDS
 from loopcal.mechanism import sample_workspace
@@ -57,7 +57,7 @@ def test_of_many_listed_poses_errors_are_predicted_all_over_the_list():
     listed = listed[np.lexsort(listed.T[::-1])]
     made = prepare_problem(robot, instrument_of("position"), PlanOptions(allowed_poses=listed))
     free = select_free_parameters(robot)
-    twists = scene(free, lc.inverse(robot, listed[200:]).q).twists[0, :, 3:]
+    twists = observe_poses(free, lc.inverse(robot, listed[200:]).q).twists[0, :, 3:]
     # the instrument determines all nine parameters: nothing is projected out of the prediction
     found = [
         np.abs(made.prediction.displacements - one).max(axis=(1, 2)).min() < 1e-9 for one in twists

@@ -466,7 +466,7 @@ def _size(way: InterpretedData) -> str:
     """
     square: dict[Dimension, list[FloatArray]] = {}
     way.misfits()
-    for s, r in zip(way.rows.sensed, way.residuals(), strict=True):
+    for s, r in zip(way.problem.rows, way.residuals(), strict=True):
         there = np.einsum("rmm->rm", s.whitener[0]) != 0.0
         for j, column in enumerate(s.kind.noise_columns):
             square.setdefault(column.dimension, []).append(r.raw[0, there[:, j], j] ** 2)

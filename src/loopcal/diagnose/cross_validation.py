@@ -21,7 +21,7 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import Method
-from loopcal.estimate.rows import rows_of
+from loopcal.estimate.problem import problem_of
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray, IntArray
@@ -154,10 +154,11 @@ def cross_validate(
 
 def _mean_square(robot: Mechanism, data: Measurements) -> float:
     """Mean square of the whitened residuals of a robot; infinite where it cannot reach a pose."""
-    rows = rows_of(select_free_parameters(robot), data)
-    values = rows.unknowns.deviation(robot.values[None])
-    total = 0.0
-    for sensed, found in zip(rows.sensed, rows.residuals(values), strict=True):
-        present = np.einsum("rii->ri", sensed.whitener[0]) != 0.0
-        total += float(np.where(present, found.whitened[0] ** 2, 0.0).sum())
-    return total / int(rows.rows[0]) if np.isfinite(total) and rows.rows[0] else np.inf
+    problem = problem_of(select_free_parameters(robot), data)
+    z = problem.free.deviation(robot.values[None])
+    at = problem.linearize(z, problem.start(z))
+    equations, total = int(at.equations[0]), 0.0
+    solution = problem.solve(z, at.next_start)
+    for rows, residuals in zip(problem.rows, problem.residuals(z, solution), strict=True):
+        total += float(np.where(rows.is_present[0], residuals.whitened[0] ** 2, 0.0).sum())
+    return total / equations if np.isfinite(total) and equations else np.inf

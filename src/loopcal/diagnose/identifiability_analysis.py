@@ -21,7 +21,7 @@ from loopcal.estimate.inference.null_space import (
     listed,
     sparsify_basis,
 )
-from loopcal.estimate.outlook import equations, information
+from loopcal.estimate.information import collect_information, count_equations
 from loopcal.measure import Instrument, Measurements, check_actuators, simulate
 from loopcal.mechanism import Mechanism, sample_workspace
 from loopcal.numerics.decomposition import NULL_COMPONENT, RANK_TOLERANCE, Decomposition, decompose
@@ -210,7 +210,7 @@ def identifiability(
         )
     check_actuators(data, robot)
     free = select_free_parameters(robot)
-    count = equations(robot, data)
+    count = count_equations(robot, data)
     if not len(free) or not count:
         what = (
             f"{robot.name} has no free parameter; free one"
@@ -218,7 +218,7 @@ def identifiability(
             else "no measured value counts; give at least one"
         )
         raise EstimationError(f"there is nothing to tell: {what}")
-    factor, reached = information(free, data)
+    factor, reached = collect_information(free, data)
     if not reached.all():
         raise EstimationError(_unreached(data, reached))
     return summarize_identifiability(

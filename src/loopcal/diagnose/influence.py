@@ -21,7 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.estimate.rows import AnyRows
+from loopcal.estimate.linearization import Linearization
+from loopcal.estimate.problem import Problem
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import FloatArray, IntArray
 
@@ -56,34 +57,34 @@ class Influence:
 
 
 def compute_influence(
-    rows: AnyRows,
+    problem: Problem,
+    linearization: Linearization,
     member: IntArray,
     decomposition: Decomposition,
     penalty: FloatArray,
     weight: FloatArray,
-    deviation: FloatArray,
     at: FloatArray | None = None,
 ) -> Influence:
     """Return the influence of every block (one trial).
 
     Parameters
     ----------
-    rows : unweighted. member : (n,) block 0..u-1 of each pose. weight : (u,) weight of each block
-        in the fit.
-    decomposition, penalty : of the weighted fit. deviation : (1, p) where the rows are linearised.
-    at : (1, p), optional. Deviation at which the residuals are taken, to first order; default
-        `deviation`.
+    problem : unweighted. linearization : of the weighted problem.
+    member : (n,) block 0..u-1 of each pose. weight : (u,) weight of each block in the fit.
+    decomposition, penalty : of the weighted fit.
+    at : (1, p), optional. Deviation at which the residuals are taken, to first order; default that
+        of the linearization.
     """
     d = decomposition
     variance = d.variances(penalty)[0]
     root = np.sqrt(np.where(np.isfinite(variance), variance, UNKNOWN**2))
     spread = d.scale[:, None] * d.directions[0] * root
-    change = np.zeros(d.scale.shape) if at is None else (at - deviation)[0]
+    change = np.zeros(d.scale.shape) if at is None else (at - linearization.deviation)[0]
     u = len(weight)
     found = Influence(
         np.zeros(u), np.zeros(u, np.int64), np.zeros(u), np.zeros(u, np.int64), np.zeros(u)
     )
-    for blocks, columns, r in _by_block(rows, member, deviation, u):
+    for blocks, columns, r in _by_block(problem, linearization, member, u):
         A, own = (
             columns[..., -len(root) :],
             columns[..., : -len(root)],
@@ -110,19 +111,19 @@ def compute_influence(
 
 
 def _by_block(
-    rows: AnyRows, member: IntArray, deviation: FloatArray, count: int
+    problem: Problem, linearization: Linearization, member: IntArray, count: int
 ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
     """Give blocks of equal size together: their numbers (b,), matrices (b, m, p) and residuals (b,
     m).
 
     A block whose rows come with several blocks of poses waits until the last of them.
     """
-    total = rows.sizes(member, count)
+    total = problem.count_leverage_rows(member, count)
     waiting: list[tuple[IntArray, FloatArray]] = []
-    for kinds in rows.linearised(deviation):
+    for parts in problem.leverage_rows(linearization):
         waiting += [
-            (np.repeat(member[poses], part.shape[1]), part.reshape(-1, part.shape[2]))
-            for poses, part in kinds
+            (np.repeat(member[part.poses], part.rows.shape[1]), part.rows.reshape(-1, part.rows.shape[2]))
+            for part in parts
         ]
         if not waiting:
             continue

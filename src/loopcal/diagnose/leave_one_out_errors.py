@@ -16,8 +16,8 @@ import numpy as np
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.methods.penalties import Method, Ridge, TruncatedSVD, adapt_method
-from loopcal.estimate.rows import rows_of
-from loopcal.estimate.sensed import linked
+from loopcal.estimate.observation_rows import linked_blocks
+from loopcal.estimate.problem import problem_of
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition, decompose
@@ -64,24 +64,24 @@ def score_leave_one_out(
         The kinds have unknowns of their own.
     """
     free = select_free_parameters(robot)
-    rows = rows_of(free, data)
-    if rows.own is not None:
+    problem = problem_of(free, data)
+    if problem.nuisance is not None:
         raise EstimationError(
             "leave-one-out of many methods needs known frames and targets; state them, or use "
             "cross_validate"
         )
     z = free.deviation(robot.values[None])
-    factor, _ = rows.fold(z, np.arange(1))
-    d = decompose(factor, rows.rows, z)
+    at = problem.linearize(z, problem.start(z))
+    d = decompose(at.factor, at.equations, z)
     used = tuple(
         adapt_method(method, np.zeros(len(free), dtype=bool), "given") for method in methods
     )
     penalty = np.concatenate([method.penalty(d) for method in used])
     weight, y = _solutions(d, penalty)
-    member = np.unique(linked(data), return_inverse=True)[1]
-    parts = [part for kinds in rows.linearised(z) for part in kinds]
-    of = np.concatenate([np.repeat(member[poses], part.shape[1]) for poses, part in parts])
-    A = np.concatenate([part.reshape(-1, part.shape[2]) for _, part in parts])
+    member = np.unique(linked_blocks(data), return_inverse=True)[1]
+    parts = [part for block in problem.leverage_rows(at) for part in block]
+    of = np.concatenate([np.repeat(member[part.poses], part.rows.shape[1]) for part in parts])
+    A = np.concatenate([part.rows.reshape(-1, part.rows.shape[2]) for part in parts])
     B, b = A[:, :-1] @ d.directions[0], A[:, :-1] @ z[0] - A[:, -1]
     residual = b - y @ B.T
     total = np.zeros(len(penalty))
@@ -95,7 +95,7 @@ def score_leave_one_out(
         total += np.where(singular, np.inf, (deleted**2).sum(axis=2)).sum(axis=1)
     dof = np.stack([d.filter_factors(row[None])[0].sum() for row in penalty])
     estimate = free.nominal + free.tolerance * (y @ d.directions[0].T)
-    return LeaveOneOut(tuple(methods), total / int(rows.rows[0]), dof, estimate)
+    return LeaveOneOut(tuple(methods), total / int(at.equations[0]), dof, estimate)
 
 
 def build_regularization_path(data_scale: float, count: int, parameters: int) -> tuple[Method, ...]:

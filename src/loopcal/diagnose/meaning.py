@@ -18,7 +18,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import Combination
-from loopcal.estimate.outlook import Scene, scene
+from loopcal.estimate.information import ObservedPoses, observe_poses
 from loopcal.mechanism import Mechanism, compute_readings
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
@@ -38,13 +38,13 @@ ALIKE = 1e-6
 """Relative difference of motions that are called the same."""
 
 
-def probed(free: FreeParameters, joints: Iterable[str] = ()) -> Scene:
+def probed(free: FreeParameters, joints: Iterable[str] = ()) -> ObservedPoses:
     """Poses about home, reached for certain by no more than chance: readings spread evenly, those
     out of reach left out.
     """
     robot = free.robot
-    found = scene(free, _spread_readings(robot), joints)
-    return scene(free, found.readings[found.reached], joints)
+    found = observe_poses(free, _spread_readings(robot), joints)
+    return observe_poses(free, found.readings[found.is_reached], joints)
 
 
 def _spread_readings(robot: Mechanism) -> FloatArray:

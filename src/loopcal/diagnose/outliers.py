@@ -23,10 +23,11 @@ import numpy as np
 from loopcal.diagnose.influence import Influence, compute_influence
 from loopcal.estimate.excluded_poses import exclude_poses
 from loopcal.estimate.inference.null_space import listed
+from loopcal.estimate.observation_rows import linked_blocks
+from loopcal.estimate.problem import Problem, problem_of
 from loopcal.estimate.result import Identification
-from loopcal.estimate.robust_descent import scale_of
-from loopcal.estimate.rows import AnyRows, rows_of
-from loopcal.estimate.sensed import linked
+from loopcal.estimate.robust_descent import estimate_scale_of
+from loopcal.estimate.start import Start
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.numerics.decomposition import Decomposition, decompose
 from loopcal.typing import BoolArray, FloatArray
@@ -179,13 +180,15 @@ def find_outliers(fit: Identification, data: Measurements, level: float = 0.05) 
     level : probability of naming any block where none is wrong.
     """
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.dropped)
-    rows = rows_of(fit.unknowns, data)
-    numbers, member = np.unique(linked(data), return_inverse=True)
+    problem = problem_of(fit.unknowns, data)
+    numbers, member = np.unique(linked_blocks(data), return_inverse=True)
     labels = tuple(tuple(np.array(data.labels)[member == i].tolist()) for i in range(len(numbers)))
     z = fit.unknowns.deviation(fit.robot.values[None])
 
+    begin = problem.linearize(z, problem.start(z)).next_start
+
     def ask(aside: BoolArray) -> _State:
-        return _ask(fit, rows, member, aside, z)
+        return _ask(fit, problem, member, aside, z, begin)
 
     whole = ask(np.zeros(len(numbers), dtype=bool))
     tested = int((whole.found.degrees > 0).sum())
@@ -222,24 +225,28 @@ def find_outliers(fit: Identification, data: Measurements, level: float = 0.05) 
 
 
 def _ask(
-    fit: Identification, rows: AnyRows, member: np.ndarray, aside: BoolArray, z: FloatArray
+    fit: Identification,
+    problem: Problem,
+    member: np.ndarray,
+    aside: BoolArray,
+    z: FloatArray,
+    start: Start,
 ) -> _State:
     """Fit linearly without the blocks aside (u,) and return what that says of every block."""
     weight = (~aside).astype(np.float64)
-    kept = rows.weighted(weight[member])
-    factor, _ = kept.fold(z, np.arange(1))
-    method, p = fit.method, rows.parameters
+    kept = problem.weighted(weight[member]).linearize(z, start)
+    method, p = fit.method, problem.parameters
     d: Decomposition = decompose(
-        factor, kept.rows, z, method.scale(p), fit.rank_tolerance, method.flat(p)
+        kept.factor, kept.equations, z, method.scale(p), fit.rank_tolerance, method.flat(p)
     )
     penalty = np.array(method.penalty(d), dtype=np.float64)
     at = d.deviation(d.solution(penalty))
-    found = compute_influence(rows, member, d, penalty, weight, z, at)
+    found = compute_influence(problem, kept, member, d, penalty, weight, at)
     there = (found.degrees > 0) & ~aside
     scale = 1.0
     if fit.noise == "estimated":
         degrees = found.degrees[there].astype(np.float64)
-        scale = scale_of(np.sqrt(found.distance[there]), degrees) if there.any() else np.nan
+        scale = estimate_scale_of(np.sqrt(found.distance[there]), degrees) if there.any() else np.nan
     return _State(aside, found, scale, int(np.isfinite(penalty).sum()))
 
 

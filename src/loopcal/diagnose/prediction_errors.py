@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.estimate.predicted import predicted
+from loopcal.estimate.poses.prediction import predict_from_readings
 from loopcal.measure import (
     Measurements,
     NuisanceParameters,
@@ -209,7 +209,7 @@ def compare_predictions(
     ]
     if not rows:
         raise DataError("there is no row to validate with: every row is absent or has weight 0")
-    (first, _), (last, predictable) = predicted(before, data), predicted(after, data)
+    (first, _), (last, predictable) = predict_from_readings(before, data), predict_from_readings(after, data)
     commanded = inverse(after, first.T)
     usable = first.converged & last.converged & commanded.converged & predictable
     if not usable.any():

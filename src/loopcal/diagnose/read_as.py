@@ -17,12 +17,15 @@ from loopcal import engine
 from loopcal.diagnose.interpretations import Interpretation
 from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.local import Own
-from loopcal.estimate.rows import Rows, rows_of
-from loopcal.estimate.sensed import Residuals, Sensed
+from loopcal.estimate.linearization import Linearization
+from loopcal.estimate.nuisance import plan_elimination
+from loopcal.estimate.observation_rows import ObservationRows, Residuals
+from loopcal.estimate.problem import Problem, problem_of
+from loopcal.estimate.start import Start
 from loopcal.measure import Measurements, NuisanceParameters
 from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.mechanism import find_directly_reachable, forward, forward_trials
+from loopcal.numerics.gauss_newton import Halving
 from loopcal.typing import FloatArray
 
 FEWEST = 8
@@ -70,15 +73,13 @@ def quick_misfit(free: FreeParameters, data: Measurements) -> float:
     """
     if not find_directly_reachable(free.robot, free.robot.values[None], data.readings[None]).all():
         return np.inf
-    rows = rows_of(free, data, data.nuisance_parameters)
-    if rows.own is not None:
-        rows.own.started[:] = True
+    problem = problem_of(free, data)
     z = free.deviation(free.robot.values[None])
     with np.errstate(all="ignore"):
-        factor, cost = rows.fold(z, np.arange(1))
+        at = problem.linearize(z, problem.start(z, seek=False))
         found = (
-            _rms(_cost(factor, np.zeros_like(z)), rows.rows)
-            if np.isfinite(cost[0])
+            _rms(_cost(at.factor, np.zeros_like(z)), at.equations)
+            if np.isfinite(at.cost[0])
             else np.full(1, np.inf)
         )
     return float(found[0])
@@ -122,7 +123,8 @@ class InterpretedData:
         self.begin = begin
         self.failed = False
         self.left_out: tuple[str, ...] = ()
-        self.rows = self._rows(self.sensed)
+        self.problem = self._make_problem(self.sensed)
+        self.at: Linearization | None = None
 
     def misfit(self) -> float:
         """The misfit of the first way; infinite where poses are out of reach, NaN where too few
@@ -139,13 +141,13 @@ class InterpretedData:
         try:
             if self.begin is None and len(self.local):
                 self._start()
-            factor, _ = self.rows.fold(self.z, np.arange(self.t))
+            self.at = self.problem.linearize(self.z, self._warm_start())
         except (
             DataError
         ):  # where something is cannot be found from these rows: the fit says it in its own words
             self.failed = True
             return np.full(self.t, np.nan)
-        return _rms(_cost(factor, np.zeros_like(self.z)), self.rows.rows)
+        return _rms(_cost(self.at.factor, np.zeros_like(self.z)), self.at.equations)
 
     def leave_out(self) -> None:
         """Leave out the rows of each way that stand far from its others; to be called after
@@ -168,29 +170,39 @@ class InterpretedData:
             kept = ~(ratio > limit[:, None])
             far = s.poses.reshape(len(kept[0]), -1)[~kept[0]]
             self.left_out += tuple("/".join(self.data.labels[i] for i in poses) for poses in far)
-            weights.append(replace(s, whitener=s.trials(every)[1] * kept[..., None, None]))
-        if self.rows.own is not None:
-            self.begin = None if self.t == 1 and not self.quick else self.rows.own.values
-        self.rows = self._rows(tuple(weights))
+            weights.append(replace(s, whitener=s.take_trials(every)[1] * kept[..., None, None]))
+        if self.nuisance is not None:
+            self.begin = None if self.t == 1 and not self.quick else self.nuisance
+        self.problem, self.at = self._make_problem(tuple(weights)), None
 
     def residuals(self) -> tuple[Residuals, ...]:
         """Residuals of every way with the frames that `misfits` found."""
-        return self.rows.residuals(self.z, None if self.rows.own is None else self.rows.own.values)
+        assert self.at is not None
+        solution = self.problem.solve(self.z, self.at.next_start, self.nuisance)
+        return self.problem.residuals(self.z, solution)
+
+    @property
+    def nuisance(self) -> FloatArray | None:
+        """Nuisance parameters (t, U) of every way after `misfits`; None without any."""
+        at = self.at
+        return None if at is None or at.nuisance is None else at.nuisance.values
 
     def allowed(self) -> list[FloatArray]:
         """Standard deviations (r, m) [1] of whitened residuals by tolerances and noise, after
         `misfits`.
         """
         found = [np.ones(s.whitener.shape[1:3]) for s in self.sensed]
-        for block, given in zip(self.rows.blocks, self.rows.linearised(self.z[:1]), strict=True):
-            parts = iter(given)
-            for sd, chosen in zip(found, block.rows, strict=True):
-                if len(chosen):
-                    A = next(parts)[1][..., -len(self.free) - 1 : -1]
-                    sd[chosen] = np.sqrt(1.0 + (A**2).sum(axis=-1))
+        assert self.at is not None
+        first = np.arange(1)
+        given = self.problem.take(first).leverage_rows(self.at.take(first))
+        for block, parts in zip(self.problem.poses.blocks, given, strict=True):
+            for part in parts:
+                A = part.rows[..., -len(self.free) - 1 : -1]
+                chosen = block.row_numbers[part.kind][part.numbers]
+                found[part.kind][chosen] = np.sqrt(1.0 + (A**2).sum(axis=-1))
         return found
 
-    def _sensed(self, ways: tuple[Interpretation, ...]) -> tuple[Sensed, ...]:
+    def _sensed(self, ways: tuple[Interpretation, ...]) -> tuple[ObservationRows, ...]:
         """Rows of every kind; a row that another way of reading leaves without some of its
         residuals is absent there.
         """
@@ -202,7 +214,7 @@ class InterpretedData:
             )
             same = (o.kind.detect_present(measured) == o.present).all(axis=-1)
             white = o.whitener * same[..., None, None]
-            made.append(Sensed(o.kind, o.rows, measured, white, self.local.indices[i]))
+            made.append(ObservationRows(o.kind, o.rows, measured, white, self.local.indices[i]))
         return tuple(made)
 
     def _start(self) -> None:
@@ -225,23 +237,26 @@ class InterpretedData:
         self.begin = guess_nuisance_values_batch(
             data, measured, T, self.local, most=most, steps=steps
         )
-        self._put(self.rows)
 
-    def _put(self, rows: Rows) -> None:
-        if rows.own is not None and self.begin is not None:
-            rows.own.values, rows.own.started = self.begin.copy(), np.ones(self.t, dtype=bool)
+    def _warm_start(self) -> Start:
+        """Where the next linearization begins."""
+        if self.at is not None:
+            return self.at.next_start
+        start = self.problem.start(self.z, seek=False)
+        return start if self.begin is None else start.with_nuisance(self.begin)
 
-    def _rows(self, sensed: tuple[Sensed, ...]) -> Rows:
-        places = tuple(s.places for s in sensed)
-        local = NuisanceParameters(self.local.table, places)
-        own = (
-            Own(local, sensed, self.t, len(self.free), lambda _: self.data) if len(local) else None
+    def _make_problem(self, rows: tuple[ObservationRows, ...]) -> Problem:
+        local = NuisanceParameters(self.local.table, tuple(r.nuisance for r in rows))
+        steps, attempts = SETTLING_QUICKLY if self.quick else SETTLING
+        return Problem(
+            self.free,
+            self.data.readings[None],
+            rows,
+            np.arange(self.t),
+            plan_elimination(local, rows),
+            lambda _: self.data,
+            control=Halving(steps, attempts),
         )
-        rows = Rows(self.free, self.data.readings, sensed, self.t, own=own)
-        if own is not None:
-            own.steps, own.halvings = SETTLING_QUICKLY if self.quick else SETTLING
-            self._put(rows)
-        return rows
 
 
 def begun(
@@ -322,16 +337,20 @@ def refined(way: InterpretedData) -> float:
         return np.inf
     z, moved, best = way.z[:1], np.zeros_like(way.z[:1]), np.inf
     p = z.shape[1]
+    problem, at = way.problem.take(np.arange(1)), way.at
+    assert at is not None
+    start = at.next_start.take(np.arange(1))
     for _ in range(ROUNDS + 1):
-        factor, cost = way.rows.fold(z + moved, np.arange(1))
-        if not np.isfinite(cost[0]):
+        at = problem.linearize(z + moved, start)
+        if not np.isfinite(at.cost[0]):
             break
-        now = float(_rms(cost + (moved**2).sum(axis=1), way.rows.rows)[0])
+        now = float(_rms(at.cost + (moved**2).sum(axis=1), at.equations)[0])
         if p == 0 or not now < best:
             best = min(best, now)
             break
-        best = now
-        whole = engine.fold(factor, np.concatenate([np.eye(p), moved.T], axis=1)[None])[0]
+        best, start = now, at.next_start
+        way.at = at
+        whole = engine.fold(at.factor, np.concatenate([np.eye(p), moved.T], axis=1)[None])[0]
         moved = moved - np.linalg.solve(whole[:p, :p], whole[:p, p])[None]
         if np.abs(moved).max() > LARGEST:
             break

@@ -20,8 +20,8 @@ import numpy as np
 
 from loopcal.estimate.excluded_poses import exclude_poses
 from loopcal.estimate.inference.residual_test import DOUBT
+from loopcal.estimate.problem import problem_of
 from loopcal.estimate.result import Identification
-from loopcal.estimate.rows import rows_of
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.typing import FloatArray, IntArray
 
@@ -130,15 +130,16 @@ def repeated(readings: FloatArray) -> tuple[IntArray, IntArray]:
 
 def _pure_error(fit: Identification, data: Measurements, member: IntArray) -> tuple[float, int]:
     """Sum of squares between repeats, and its degrees of freedom; each kind has means of its own."""
-    rows = rows_of(fit.unknowns, data)
+    problem = problem_of(fit.unknowns, data)
     z = fit.unknowns.deviation(fit.robot.values[None])
     total, degrees = 0.0, 0
-    for sensed, found in zip(rows.sensed, rows.residuals(z), strict=True):
-        same = np.column_stack([member[sensed.per_pose], sensed.places])
+    residuals = problem.residuals(z, problem.solve(z, problem.start(z)))
+    for rows, found in zip(problem.rows, residuals, strict=True):
+        same = np.column_stack([member[rows.poses_by_link], rows.nuisance])
         of = np.unique(same, axis=0, return_inverse=True)[1].ravel()
         for group in np.flatnonzero(np.bincount(of) > 1):
             own = of == group
-            W = sensed.whitener[0, own]
+            W = rows.whitener[0, own]
             present = np.einsum("rii->ri", W) != 0.0
             A = W.reshape(-1, W.shape[-1])
             b = np.where(present, found.whitened[0, own], 0.0).ravel()

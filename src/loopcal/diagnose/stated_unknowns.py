@@ -72,8 +72,7 @@ def contradicted(
             [(names, best), *(one for one in single if one[1][1] * better < misfit)], key=_fewest
         )
     stated_as, meant = stated.local.table, best[0]
-    own = meant.rows.own
-    values = meant.local.values() if own is None else own.values[0]
+    values = meant.local.values() if meant.nuisance is None else meant.nuisance[0]
     shown = [
         _shown(
             free,

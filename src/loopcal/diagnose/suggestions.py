@@ -19,7 +19,7 @@ from loopcal.diagnose.meaning import probed
 from loopcal.errors import DataError, MechanismError
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import Combination, listed, sparsify_basis
-from loopcal.estimate.outlook import Scene, alone, scene
+from loopcal.estimate.information import ObservedPoses, instrument_factor, observe_poses
 from loopcal.measure import (
     KINDS,
     Component,
@@ -133,7 +133,7 @@ def suggest_measurements(
     at = _scene(free, [name for name, _ in passive])
     for words, kind in _candidates(free.robot, passive):
         try:
-            X = alone(at, _seen(at, kind, SIGMA | (sigma or {})))[0, :-1, :-1]
+            X = instrument_factor(at, _seen(at, kind, SIGMA | (sigma or {})))[0, :-1, :-1]
         except DataError:
             continue  # this kind has nothing to look at on this robot
         determined = _determined(X, B, floor)
@@ -167,13 +167,13 @@ def describe_missing_equations(robot: Mechanism, data: Measurements) -> str:
     return f" ({'; '.join(str(remedy.combination) for remedy in found)}; {advice})"
 
 
-def _scene(free: FreeParameters, joints: list[str]) -> Scene:
+def _scene(free: FreeParameters, joints: list[str]) -> ObservedPoses:
     """Poses drawn from the workspace, or about home where none is stated."""
     try:
         q = sample_workspace(free.robot, POSES, seed=0).solution.q
     except MechanismError:
         return probed(free, joints)
-    return scene(free, q, joints)
+    return observe_poses(free, q, joints)
 
 
 def _passive(robot: Mechanism) -> list[tuple[str, str]]:
@@ -219,7 +219,7 @@ def _words(kind: Kind) -> str:
     return f"{words} ({listed(unknown)} unknown)" if unknown else words
 
 
-def _seen(at: Scene, kind: Kind, sigma: dict[Dimension, float]) -> Measurements:
+def _seen(at: ObservedPoses, kind: Kind, sigma: dict[Dimension, float]) -> Measurements:
     """What an instrument of this kind reads at the scene, without noise."""
     robot = at.free.robot
     noise = Gaussian(np.array([sigma[column.dimension] for column in kind.noise_columns]))

@@ -1,97 +1,142 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gauss-Newton on whitened, scaled rows with step control, many trials at once and each on its own.
+"""The descent to the filtered solution: damped Gauss-Newton, many trials at once.
 
-At every accepted point the rows are one triangular factor and that factor one decomposition. The
-first step tried is the full one to the filtered solution for the TOTAL deviation z from nominal;
-where it does not lower the sum of squares, Levenberg-Marquardt damping shortens it, adapted as by
-Nielsen. Trials that ended are frozen. Sources: Madsen, Nielsen, Tingleff, "Methods for non-linear
-least squares problems" (2004); docs/theory/estimation.md.
+At every accepted point the whitened, scaled rows are one triangular factor and that factor one
+decomposition. The first step tried is the full one to the filtered solution for the TOTAL deviation
+z from nominal. Where it does not lower the sum of squares plus penalty, Levenberg-Marquardt damping
+shortens it.
+
+In the coordinates y = V'z the target of the method is y*, and the curvature of direction i is
+h_i = s_i^2 + penalty_i. Damping adds mu |dz|^2, z in tolerances, and so moves direction i by the
+share h_i / (h_i + mu) of y*_i - y_i. It acts on the singular values, so that a damped step costs no
+new decomposition. See docs/theory/estimation.md.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from enum import IntEnum
-from typing import Protocol
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.methods.penalties import Method
-from loopcal.estimate.steps import Step, penalised, propose
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, decompose
+from loopcal.numerics.gauss_newton import ROUNDING, Damping, DescentStatus, minimize
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
-ACCEPT = 1e-4
+ACCEPTED_SHARE = 1e-4
 """Share of the predicted decrease that a step must bring."""
 
-ROUNDING = 1e-12
-"""Change of the sum of squares, relative, that is rounding and says nothing about a step."""
+ROUNDING_STEP, SMALL_STEP, SHORTEST_STEP = 1e-6, 1e-3, 1e-9
+"""Lengths in tolerances, relative to 1 + |z|. A full step below ROUNDING_STEP that brings no
+decrease has met rounding: the trial converged. So has one that was damped below SHORTEST_STEP
+without a decrease, if its full step is below SMALL_STEP."""
 
-TINY, SMALL, SHORTEST = 1e-6, 1e-3, 1e-9
-"""Lengths in tolerances, relative to 1 + |z|. A full step below TINY that brings no decrease has
-met rounding:
-converged. Damped below SHORTEST without a decrease it has too, if the full step is below SMALL."""
-
-SMALLEST = np.finfo(np.float64).tiny
 FIRST_DAMPING = 1e-6
 """Damping after the first rejected step, in units of the largest squared singular value."""
 
 
-class DescentStatus(IntEnum):
-    """How a fit ended, one per trial."""
-
-    CONVERGED = 0
-    OUT_OF_ITERATIONS = 1
-    NO_DESCENT = 2
-    BAD_START = 3
-    RUNNING = 4
+class Linearized(Protocol):
+    """What the descent reads from a linearization of a trials; see `Linearization`."""
 
     @property
-    def sentence(self) -> str:
-        """What happened and what to do about it."""
-        return _SENTENCES[self]
+    def factor(self) -> FloatArray:
+        """(a, p + 1, p + 1) triangular factor of rows [A | residual]."""
+        ...
+
+    @property
+    def cost(self) -> FloatArray:
+        """(a,) sum of squares; infinite or NaN where it cannot be evaluated."""
+        ...
+
+    @property
+    def equations(self) -> IntArray:
+        """(a,) number of equations, those of weight zero not counted."""
+        ...
+
+    @property
+    def next_start(self) -> Any:
+        """Warm start for the next linearization."""
+        ...
 
 
-_SENTENCES = {
-    DescentStatus.CONVERGED: "converged",
-    DescentStatus.OUT_OF_ITERATIONS: "did not converge within the allowed iterations; allow more "
-    "or start closer",
-    DescentStatus.NO_DESCENT: "no further step stays within the mechanism's reach; start closer or "
-    "look for wrong rows",
-    DescentStatus.BAD_START: "the start gives no finite residuals (rows out of reach); check units "
-    "and readings",
-    DescentStatus.RUNNING: "still running",
-}
-
-
-class Problem(Protocol):
-    """A least-squares problem as the descent sees it: whitened rows, columns scaled by tolerance."""
+class LeastSquaresProblem(Protocol):
+    """A least-squares problem of t trials: whitened rows, columns scaled by tolerance."""
 
     @property
     def parameters(self) -> int:
         """Number of unknowns p."""
         ...
 
-    @property
-    def rows(self) -> IntArray:
-        """(t,) number of equations of each trial, those of weight zero not counted."""
+    def start(self, deviation: FloatArray) -> Any:
+        """Return the warm start, with `take` and `put`, of a descent from deviations (t, p)."""
         ...
 
-    def fold(self, deviation: FloatArray, trials: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Evaluate some trials.
-
-        Parameters
-        ----------
-        deviation : (a, p) z, one row for each of the trials.
-        trials : (a,) which trials of the problem these are.
-
-        Returns
-        -------
-        factor : (a, p + 1, p + 1) triangular factor of rows [A | residual].
-        cost : (a,) sum of squares; infinite or nan where it cannot be evaluated.
-        """
+    def linearize(self, deviation: FloatArray, start: Any) -> Linearized:
+        """Linearize at deviations (t, p)."""
         ...
+
+    def take(self, trials: IntArray) -> Self:
+        """Return the problem of some trials."""
+        ...
+
+
+class FunctionStart(NamedTuple):
+    """The warm start of a `FunctionProblem`: there is nothing to begin with."""
+
+    trials: int
+
+    def take(self, trials: IntArray) -> FunctionStart:
+        """Return some trials."""
+        return FunctionStart(len(trials))
+
+    def put(self, trials: IntArray, other: FunctionStart) -> FunctionStart:
+        """Return this start with some trials taken from another one."""
+        del trials, other
+        return self
+
+
+class FunctionLinearization(NamedTuple):
+    """A linearization of a `FunctionProblem`; see `Linearized`."""
+
+    factor: FloatArray
+    cost: FloatArray
+    equations: IntArray
+    next_start: FunctionStart
+
+
+@dataclass(frozen=True, eq=False)
+class FunctionProblem:
+    """A least-squares problem that is given by a function.
+
+    Parameters
+    ----------
+    parameters : number of unknowns p.
+    evaluate : from deviations (a, p) and numbers of trials (a,) to factor (a, p + 1, p + 1) and sum
+        of squares (a,). equations : (t,) of each trial. trials : (t,) numbers, default all.
+    """
+
+    parameters: int
+    evaluate: Callable[[FloatArray, IntArray], tuple[FloatArray, FloatArray]]
+    equations: IntArray
+    trials: IntArray | None = None
+
+    def start(self, deviation: FloatArray) -> FunctionStart:
+        """Return an empty start."""
+        return FunctionStart(len(deviation))
+
+    def linearize(self, deviation: FloatArray, start: FunctionStart) -> FunctionLinearization:
+        """Evaluate the function."""
+        trials = np.arange(len(self.equations)) if self.trials is None else self.trials
+        factor, cost = self.evaluate(deviation, trials)
+        return FunctionLinearization(factor, cost, self.equations, start)
+
+    def take(self, trials: IntArray) -> FunctionProblem:
+        """Return the problem of some trials."""
+        numbers = np.arange(len(self.equations)) if self.trials is None else self.trials
+        return replace(self, equations=self.equations[trials], trials=numbers[trials])
 
 
 @dataclass(frozen=True)
@@ -102,12 +147,16 @@ class StepControl:
     ----------
     iterations : evaluations of the rows after the first, at most.
     relative : converged when the step changes the whitened residuals by at most this share of their
-        norm (the relative offset of Bates and Watts, Technometrics 23, 1981). That step is still
-        taken, without evaluating the rows again: the result is the solution of the last
-        decomposition.
+        norm. That step is still taken, without evaluating the rows again: the result is the
+        solution of the last decomposition.
     absolute : converged when the step is at most this long, in tolerances, relative to 1 + |z|.
     damping : of the first step, in units of the largest squared singular value; zero tries the full
         step.
+
+    Raises
+    ------
+    EstimationError
+        A setting is out of its range.
     """
 
     iterations: int = 50
@@ -119,12 +168,12 @@ class StepControl:
         for name in ("relative", "absolute"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise EstimationError(
-                    f"{name} is {getattr(self, name)}; it must be finite and above 0"
+                    f"{name} is {getattr(self, name)}; give a finite number above 0"
                 )
         if self.iterations < 0:
-            raise EstimationError(f"iterations is {self.iterations}; it must not be negative")
+            raise EstimationError(f"iterations is {self.iterations}; give 0 or more")
         if not 0.0 <= self.damping < np.inf:
-            raise EstimationError(f"damping is {self.damping}; it must be finite and not negative")
+            raise EstimationError(f"damping is {self.damping}; give 0 or a finite number above it")
 
 
 @dataclass(frozen=True)
@@ -135,12 +184,12 @@ class Descent:
     ----------
     deviation : (t, p) total deviation z from nominal, in tolerances.
     decomposition : of the rows next to `deviation`, for the total deviation.
-    penalty : (t, p) what the method penalised there.
+    penalty : (t, p) what the method penalized there.
     cost : (t,) sum of squares of the whitened residuals.
-    status : (t,) DescentStatus. iterations : (t,) steps taken. step : (t,) length of the last step
-        considered.
-    deviation_history, cost_history : (i + 1, t, p) and (i + 1, t) after each round; what ended
-        repeats.
+    status : (t,) DescentStatus. iterations : (t,) steps taken.
+    start : warm start of the last points at which rows were evaluated and accepted.
+    deviation_history, cost_history : (i + 1, t, p) and (i + 1, t) after each round; trials that
+        have ended repeat.
     """
 
     deviation: FloatArray
@@ -149,7 +198,7 @@ class Descent:
     cost: FloatArray
     status: IntArray
     iterations: IntArray
-    step: FloatArray
+    start: Any
     deviation_history: FloatArray
     cost_history: FloatArray
 
@@ -164,147 +213,256 @@ class Descent:
 
 
 def descend(
-    problem: Problem,
-    start: FloatArray,
+    problem: LeastSquaresProblem,
+    deviation: FloatArray,
     method: Method,
     control: StepControl | None = None,
     tolerance: float = RANK_TOLERANCE,
+    start: Any = None,
 ) -> Descent:
-    """Minimise the whitened sum of squares, filtered by the method, from `start`.
+    """Minimize the whitened sum of squares, filtered by the method.
 
     Parameters
     ----------
-    problem : the rows.
-    start : (t, p) deviation to start from, in tolerances.
-    method : how directions are penalised.
-    control : settings of the steps.
+    problem : of t trials. deviation : (t, p) where to begin, in tolerances.
+    method : how directions are penalized. control : settings of the steps.
     tolerance : relative rank tolerance.
+    start : warm start; default: the first one of the problem.
 
     Returns
     -------
     Descent; a trial that fails is marked in `status` and never stops the others.
     """
     control = control or StepControl()
-    run = _Run(problem, method, tolerance, np.array(start, dtype=np.float64), control.damping)
-    deviations, costs = [run.z.copy()], [run.cost.copy()]
-    for _ in range(control.iterations):
-        active, step = run.propose(control)
-        if active.size == 0:
-            break
-        if run.attempt(active, step):
-            deviations.append(run.z.copy())
-            costs.append(run.cost.copy())
-    else:
-        run.propose(control)  # the last accepted point may be good enough
-    if (run.z != deviations[-1]).any():
-        deviations.append(run.z)
-        costs.append(run.cost)
-    run.status[run.status == DescentStatus.RUNNING] = DescentStatus.OUT_OF_ITERATIONS
+    model = _FilteredDescent(problem, method, tolerance, control)
+    z = np.array(deviation, dtype=np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):  # reported as a bad start
+        begin = problem.start(z) if start is None else start
+        first = problem.linearize(z, begin)
+    good = np.isfinite(first.cost) & np.isfinite(first.factor).all(axis=(1, 2))
+    factor = np.where(good[:, None, None], first.factor, 0.0)
+    point = model.decompose(
+        z, factor, np.where(good, first.cost, np.inf), first.equations, first.next_start
+    )
+    largest = point.decomposition.singular_values[:, 0] ** 2
+    deviations, costs = [z.copy()], [point.cost.copy()]
+
+    def observe(moved: _Point) -> None:
+        deviations.append(moved.z.copy())
+        costs.append(moved.cost.copy())
+
+    damping = Damping(control.damping * largest, FIRST_DAMPING * largest)
+    minimum = minimize(model, point, damping, control.iterations, observe)
+    last: _Point = minimum.point
+    if (last.z != deviations[-1]).any():
+        deviations.append(last.z)
+        costs.append(last.cost)
     return Descent(
-        deviation=run.z,
-        decomposition=run.decomposition,
-        penalty=run.penalty,
-        cost=run.cost,
-        status=run.status,
-        iterations=run.iterations,
-        step=run.step,
+        deviation=last.z,
+        decomposition=last.decomposition,
+        penalty=last.penalty,
+        cost=last.cost,
+        status=minimum.status,
+        iterations=minimum.iterations,
+        start=last.start,
         deviation_history=np.stack(deviations),
         cost_history=np.stack(costs),
     )
 
 
-class _Run:
-    """The current point of every trial: working memory of one call of `descend`."""
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Deviations z (a, p) with sums of squares (a,), decomposition, penalty and warm start."""
 
-    def __init__(
-        self, problem: Problem, method: Method, tolerance: float, start: FloatArray, damping: float
-    ) -> None:
-        self.problem, self.method, self.tolerance = problem, method, tolerance
-        self.scale, self.flat = method.scale(problem.parameters), method.flat(problem.parameters)
-        t = len(start)
-        with np.errstate(over="ignore", invalid="ignore"):  # told as a bad start
-            factor, self.cost = problem.fold(start, np.arange(t))
-        good = np.isfinite(self.cost) & np.isfinite(factor).all(axis=(1, 2))
-        self.z = start
-        self.decomposition = decompose(
-            np.where(good[:, None, None], factor, 0.0),
-            problem.rows.copy(),
-            start,
-            self.scale,
-            tolerance,
-            self.flat,
-        )
-        self.penalty: FloatArray = np.array(method.penalty(self.decomposition), dtype=np.float64)
-        self.status = np.where(good, DescentStatus.RUNNING, DescentStatus.BAD_START).astype(
-            np.int64
-        )
-        self.iterations = np.zeros(t, dtype=np.int64)
-        self.step = np.zeros(t)
-        self.damping = damping * self.decomposition.singular_values[:, 0] ** 2
-        self.growth = np.full(t, 2.0)
+    z: FloatArray
+    cost: FloatArray
+    decomposition: Decomposition
+    penalty: FloatArray
+    start: Any
 
-    def propose(self, control: StepControl) -> tuple[IntArray, Step]:
-        """Mark trials whose next step is negligible as converged; return the others and their
-        steps.
-        """
-        active = np.flatnonzero(self.status == DescentStatus.RUNNING)
-        step = propose(
-            self.z[active],
-            self.decomposition.take(active),
-            self.penalty[active],
-            self.damping[active],
-        )
-        self.step[active] = step.length
-        done = step.offset <= control.relative**2 * self.cost[active]
-        done |= step.full_length <= control.absolute * self._spread(active)
-        self.status[active[done]] = DescentStatus.CONVERGED
-        self.iterations[active[done]] += 1
-        self.z[active[done]] = step.target[done]
-        return (active[~done], step.take(~done)) if done.any() else (active, step)
+    @property
+    def spread(self) -> FloatArray:
+        """(a,) 1 + |z|, with which lengths of steps are compared."""
+        return 1.0 + np.linalg.norm(self.z, axis=1)
 
-    def attempt(self, active: IntArray, step: Step) -> bool:
-        """Evaluate the steps of the active trials, move those that gain, adapt each damping; tell
-        if any moved.
-        """
-        factor, cost = self.problem.fold(step.deviation, active)
-        here, penalty = self.decomposition.take(active), self.penalty[active]
-        before = self.cost[active] + penalised(here, penalty, self.z[active])
-        good = np.isfinite(cost) & np.isfinite(factor).all(axis=(1, 2))
-        after = np.where(good, cost, np.inf) + penalised(here, penalty, step.deviation)
+    def take(self, trials: IntArray) -> _Point:
+        """Return some trials."""
+        return _Point(
+            self.z[trials],
+            self.cost[trials],
+            self.decomposition.take(trials),
+            self.penalty[trials],
+            self.start.take(trials),
+        )
+
+    def put(self, trials: IntArray, other: _Point) -> _Point:
+        """Return these points with some trials taken from others."""
+        z, cost, penalty = self.z.copy(), self.cost.copy(), self.penalty.copy()
+        z[trials], cost[trials], penalty[trials] = other.z, other.cost, other.penalty
+        decomposition = self.decomposition.put(trials, other.decomposition)
+        return _Point(z, cost, decomposition, penalty, self.start.put(trials, other.start))
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """The linearization at proposed deviations (a, p); decomposed where it is accepted."""
+
+    model: _FilteredDescent
+    z: FloatArray
+    linearized: Linearized
+    is_valid: BoolArray
+
+    def take(self, trials: IntArray) -> _Point:
+        """Return the points of some trials."""
+        at = self.linearized
+        return self.model.decompose(
+            self.z[trials],
+            at.factor[trials],
+            at.cost[trials],
+            at.equations[trials],
+            at.next_start.take(trials),
+        )
+
+
+@dataclass(frozen=True)
+class FilteredStep:
+    """A step of some trials towards the filtered solution.
+
+    Attributes
+    ----------
+    deviation : (a, p) total deviation to which it leads. target : (a, p) that of the full step.
+    length, full_length : (a,) of this step and of the full one, in tolerances.
+    predicted : (a,) decrease of sum of squares plus penalty by the linear model.
+    change : (a,) squared length of the full step measured in the whitened residuals and the
+        penalty.
+    """
+
+    deviation: FloatArray
+    target: FloatArray
+    length: FloatArray
+    full_length: FloatArray
+    predicted: FloatArray
+    change: FloatArray
+
+    def take(self, trials: np.ndarray) -> FilteredStep:
+        """Return some trials."""
+        return FilteredStep(*(array[trials] for array in vars(self).values()))
+
+
+@dataclass(frozen=True, eq=False)
+class _FilteredDescent:
+    """The rules of the descent for `loopcal.numerics.gauss_newton.minimize`."""
+
+    problem: LeastSquaresProblem
+    method: Method
+    tolerance: float
+    control: StepControl
+
+    def decompose(
+        self, z: FloatArray, factor: FloatArray, cost: FloatArray, equations: IntArray, start: Any
+    ) -> _Point:
+        """Return the points of a linearization."""
+        p, method = self.problem.parameters, self.method
+        decomposition = decompose(
+            factor, equations, z, method.scale(p), self.tolerance, method.flat(p)
+        )
+        penalty = np.array(method.penalty(decomposition), dtype=np.float64)
+        return _Point(z, cost, decomposition, penalty, start)
+
+    def propose(self, point: _Point, damping: FloatArray) -> FilteredStep:
+        """Return the damped steps."""
+        return propose_step(point.z, point.decomposition, point.penalty, damping)
+
+    def is_negligible(self, point: _Point, step: FilteredStep) -> BoolArray:
+        """Return which steps are the last."""
+        by_residuals = step.change <= self.control.relative**2 * point.cost
+        return by_residuals | (step.full_length <= self.control.absolute * point.spread)
+
+    def finish(self, point: _Point, step: FilteredStep) -> _Point:
+        """Return the points after their full step, the rest unchanged."""
+        return replace(point, z=step.target)
+
+    def evaluate(self, point: _Point, step: FilteredStep, trials: IntArray) -> _Candidate:
+        """Linearize at the deviations of the steps."""
+        at = self.problem.take(trials).linearize(step.deviation, point.start)
+        good = np.isfinite(at.cost) & np.isfinite(at.factor).all(axis=(1, 2))
+        return _Candidate(self, step.deviation, at, good)
+
+    def judge(
+        self, point: _Point, step: FilteredStep, candidate: _Candidate
+    ) -> tuple[BoolArray, FloatArray]:
+        """Accept steps that bring a share of the decrease that was predicted."""
+        decomposition, penalty = point.decomposition, point.penalty
+        before = point.cost + penalize(decomposition, penalty, point.z)
+        cost = np.where(candidate.is_valid, candidate.linearized.cost, np.inf)
+        after = cost + penalize(decomposition, penalty, step.deviation)
         gained = before - after + ROUNDING * before
-        # A truncated direction on its way back to nominal may cost something: up to twice what was
-        # predicted.
-        accepted = gained >= np.where(step.predicted > 0.0, ACCEPT, 2.0) * step.predicted
-        self._adapt(active, accepted, gained / np.maximum(np.abs(step.predicted), SMALLEST))
-        spread = self._spread(active)
-        met_rounding = good & (step.full_length <= TINY * spread)
-        stuck = ~accepted & (met_rounding | (step.length <= SHORTEST * spread))
-        converged = good & (step.full_length <= SMALL * spread)
-        self.status[active[stuck]] = np.where(
-            converged, DescentStatus.CONVERGED, DescentStatus.NO_DESCENT
-        )[stuck]
-        if accepted.any():
-            self._move(active[accepted], step.deviation[accepted], factor[accepted], cost[accepted])
-        return bool(accepted.any())
+        # a truncated direction on its way back to nominal may cost something: up to twice what was
+        # predicted
+        needed = np.where(step.predicted > 0.0, ACCEPTED_SHARE, 2.0) * step.predicted
+        smallest = np.finfo(np.float64).tiny
+        return gained >= needed, gained / np.maximum(np.abs(step.predicted), smallest)
 
-    def _spread(self, trials: IntArray) -> FloatArray:
-        """1 + |z| (a,), with which lengths are compared."""
-        return 1.0 + np.linalg.norm(self.z[trials], axis=1)
+    def ending(
+        self, point: _Point, step: FilteredStep, candidate: _Candidate, accepted: BoolArray
+    ) -> IntArray:
+        """End trials that met rounding, or whose steps became too short."""
+        spread, good = point.spread, candidate.is_valid
+        met_rounding = good & (step.full_length <= ROUNDING_STEP * spread)
+        is_stuck = ~accepted & (met_rounding | (step.length <= SHORTEST_STEP * spread))
+        converged = good & (step.full_length <= SMALL_STEP * spread)
+        ending = np.where(converged, DescentStatus.CONVERGED, DescentStatus.NO_DESCENT)
+        return np.where(is_stuck, ending, DescentStatus.RUNNING)
 
-    def _adapt(self, active: IntArray, accepted: BoolArray, ratio: FloatArray) -> None:
-        """Less damping after a step as good as predicted, ever faster more after rejected ones
-        (Nielsen).
-        """
-        first = FIRST_DAMPING * self.decomposition.singular_values[active, 0] ** 2
-        less = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.clip(ratio, 0.0, 1.0) - 1.0) ** 3)
-        more = np.maximum(self.damping[active] * self.growth[active], first)
-        self.damping[active] = np.where(accepted, self.damping[active] * less, more)
-        self.growth[active] = np.where(accepted, 2.0, 2.0 * self.growth[active])
 
-    def _move(self, trials: IntArray, z: FloatArray, factor: FloatArray, cost: FloatArray) -> None:
-        """Put some trials at a new point."""
-        new = decompose(factor, self.problem.rows[trials], z, self.scale, self.tolerance, self.flat)
-        penalty = self.method.penalty(new)
-        self.iterations[trials] += 1
-        self.z[trials], self.cost[trials], self.penalty[trials] = z, cost, penalty
-        self.decomposition = self.decomposition.put(trials, new)
+def propose_step(
+    deviation: FloatArray, decomposition: Decomposition, penalty: FloatArray, damping: FloatArray
+) -> FilteredStep:
+    """Return the step from `deviation` (a, p) to the filtered solution, damped by mu (a,)."""
+    s, c = decomposition.singular_values, decomposition.projections
+    now = decomposition.coordinates(deviation)
+    solution = decomposition.solution(penalty)
+    full = solution - now
+    curvature = _curvature(s, penalty)
+    new = now + curvature / (curvature + damping[:, None]) * full
+    # differences of squares as products, so that a small decrease is not lost in a large sum
+    data = s * (now - new) * (s * (now + new) - 2.0 * c)
+    prior = _finite(penalty) * (now - new) * (now + new)
+    reached = decomposition.deviation(new)
+    return FilteredStep(
+        deviation=reached,
+        target=decomposition.deviation(solution),
+        length=np.linalg.norm(reached - deviation, axis=1),
+        full_length=np.linalg.norm(decomposition.deviation(full), axis=1),
+        predicted=(data + prior).sum(axis=1),
+        change=(curvature * full**2).sum(axis=1),
+    )
+
+
+def penalize(
+    decomposition: Decomposition, penalty: FloatArray, deviation: FloatArray
+) -> FloatArray:
+    """Return what the penalty adds to the sum of squares at `deviation` (a, p).
+
+    It is the sum of penalty_i (v_i'z)^2, (a,), without directions that are not used.
+    """
+    weight = _finite(penalty)
+    if not weight.any():
+        return np.zeros(len(deviation))
+    return (weight * decomposition.coordinates(deviation) ** 2).sum(axis=1)
+
+
+def _finite(penalty: FloatArray) -> FloatArray:
+    """Return the penalty with zero for directions that are not used."""
+    return np.where(np.isfinite(penalty), penalty, 0.0)
+
+
+def _curvature(s: FloatArray, penalty: FloatArray) -> FloatArray:
+    """Return the curvature h (a, p) of each direction.
+
+    A direction that is not used is as stiff as the weakest one that is.
+    """
+    used = np.isfinite(penalty)
+    h = s**2 + _finite(penalty)
+    weakest = np.where(used, h, np.inf).min(axis=1, initial=np.inf)
+    return np.where(used, h, np.where(np.isfinite(weakest), weakest, 1.0)[:, None])

@@ -5,7 +5,7 @@ many trials at once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, get_args
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import EstimationError
-from loopcal.estimate.closure import descend_from_closure, not_used
+from loopcal.estimate.closure_start import descend_from_closure, report_unused_closure
 from loopcal.estimate.descent import Descent, DescentStatus, StepControl, descend
 from loopcal.estimate.divergence import find_diverged
 from loopcal.estimate.excluded_poses import exclude_poses
@@ -24,22 +24,26 @@ from loopcal.estimate.inference.posterior import compute_posterior
 from loopcal.estimate.inference.prior import Prior
 from loopcal.estimate.inference.residual_test import ResidualTest, run_residual_test
 from loopcal.estimate.input_checks import check_count, check_rows, check_settings, check_start
-from loopcal.estimate.latent import LatentRows
-from loopcal.estimate.latent_doubts import latent_doubts, uneven
-from loopcal.estimate.latent_estimate import latent_estimate
-from loopcal.estimate.local_estimate import (
-    LocalEstimate,
-    local_estimate,
-    nothing_local,
-    with_followers,
-)
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method, adapt_method
 from loopcal.estimate.methods.prior_conflict import assess_prior_conflict
+from loopcal.estimate.nuisance_estimate import (
+    NuisanceEstimate,
+    add_followers,
+    empty_nuisance_estimate,
+    estimate_nuisance,
+)
+from loopcal.estimate.observation_rows import Residuals, linked_blocks
+from loopcal.estimate.poses.estimate import (
+    estimate_poses,
+    report_doubtful_readings,
+    report_uneven_sigmas,
+)
+from loopcal.estimate.poses.solution import PoseSolution
+from loopcal.estimate.problem import Problem, problem_of, problem_of_trials
 from loopcal.estimate.result import Identification, KindResiduals
-from loopcal.estimate.robust_descent import descend_robustly
-from loopcal.estimate.rows import AnyRows, rows_of, rows_of_trials
-from loopcal.estimate.sensed import Residuals, linked
+from loopcal.estimate.robust_descent import Run, descend_robustly
+from loopcal.estimate.start import Start
 from loopcal.measure import Measurements, NuisanceParameters, Trials, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition
@@ -47,8 +51,6 @@ from loopcal.typing import FloatArray, IntArray
 
 Begin = Literal["kinematics", "closure"]
 BEGINS = get_args(Begin)
-Run = Callable[[AnyRows, FloatArray], Descent]
-"""Descends rows from a deviation."""
 
 
 def identify(
@@ -103,7 +105,7 @@ def identify(
     method = adapt_method(
         LeastSquares() if method is None and prior is not None else method, free.assumed, noise
     )
-    rows = rows_of(free, data := exclude_poses(fill_in_reading_sigma(robot, data), drop), local)
+    rows = problem_of(free, data := exclude_poses(fill_in_reading_sigma(robot, data), drop), local)
     check_rows(rows, data, robot)
     check_count(rows, data, method, allow_fewer_equations or prior is not None)
     z = free.deviation((robot if start is None else robot.with_values(start)).values[None])
@@ -125,51 +127,52 @@ def identify(
         loss is not None,
         fit.status[0] == DescentStatus.CONVERGED,
     )
-    residuals = _labelled(_residuals(rows, weighed, fit.deviation), data, rows)
+    solution = _solve_unweighted(rows, weighed, fit)
+    residuals = _labelled(rows.residuals(fit.deviation, solution), data, rows)
     result = _identification(robot, free, method, fit, check, residuals, weighed)
-    latent = latent_estimate(rows, data, drop) if isinstance(rows, LatentRows) else None
+    latent = None if solution.estimates is None else estimate_poses(solution.estimates, data, drop)
     notes = (
         *result.notes,
         *_row_notes(rows, method, begin),
         *_weight_notes(data, weight, loss),
         *_drop_notes(drop),
     )
-    doubts = (*latent.notes(), *latent_doubts(result.robot, latent)) if latent else ()
-    doubts += tuple(uneven(rows)) if isinstance(rows, LatentRows) else ()
-    return replace(
-        result, weight=weight, dropped=tuple(drop), notes=(*notes, *doubts), latent=latent
-    )
+    doubts = (*latent.report(), *report_doubtful_readings(result.robot, latent)) if latent else ()
+    doubts += report_uneven_sigmas(rows) if latent else ()
+    notes += tuple(str(doubt) for doubt in doubts)
+    return replace(result, weight=weight, dropped=tuple(drop), notes=notes, latent=latent)
 
 
 def _weighed(
-    rows: AnyRows,
+    rows: Problem,
     data: Measurements,
     z: FloatArray,
     loss: Loss | None,
     noise: str,
     run: Run,
     prior: Prior | None,
-) -> tuple[Descent, FloatArray, AnyRows]:
+) -> tuple[Descent, FloatArray, Problem]:
     """Descend, with a loss or without; return the weight (n,) of each pose, too, and the rows with
     these weights.
     """
     if loss is None:
-        return run(rows, z), np.ones(data.n_poses), rows
-    robust = descend_robustly(rows, linked(data), loss, z, noise == "estimated", run, prior)
-    return robust.fit, robust.weight, robust.rows
+        return run(rows, z, None), np.ones(data.n_poses), rows
+    robust = descend_robustly(rows, linked_blocks(data), loss, z, noise == "estimated", run, prior)
+    return robust.fit, robust.weight, robust.problem
 
 
-def _residuals(rows: AnyRows, weighed: AnyRows, z: FloatArray) -> tuple[Residuals, ...]:
-    """Residuals of rows, own unknowns being those that fit best with the weights of the fit."""
-    return rows.residuals(z, None if weighed is rows else weighed.own_values(z))
+def _solve_unweighted(rows: Problem, weighed: Problem, fit: Descent) -> PoseSolution:
+    """Solve for the poses of unweighted rows at the nuisance parameters of the weighted fit."""
+    nuisance = None if weighed is rows else weighed.solve(fit.deviation, fit.start).nuisance
+    return rows.solve(fit.deviation, fit.start, nuisance)
 
 
-def _row_notes(rows: AnyRows, method: Method, begin: Begin) -> list[str]:
+def _row_notes(rows: Problem, method: Method, begin: Begin) -> list[str]:
     """Say where tolerances alone hold some directions, equations being fewer than parameters, and
     where it could not begin.
     """
     m, p = int(rows.equations[0]), rows.parameters
-    notes = [why] if begin == "closure" and (why := not_used(rows)) else []
+    notes = [str(why)] if begin == "closure" and (why := report_unused_closure(rows)) else []
     if m < p and isinstance(method, MAP):
         notes.append(
             f"{m} equations for {p} parameters: at least {p - m} directions rest on tolerances "
@@ -245,11 +248,11 @@ def identify_trials(
         `identify`.
     """
     free = select_free_parameters(robot)
-    rows = rows_of_trials(free, trials)
+    rows = problem_of_trials(free, trials)
     values = np.atleast_2d(robot.values if start is None else np.asarray(start, dtype=np.float64))
     z = np.broadcast_to(free.deviation(values), (len(trials), len(free)))
     fit = _descended(
-        rows, z, adapt_method(method, free.assumed, "given"), control, rank_tolerance, begin
+        rows, z, None, adapt_method(method, free.assumed, "given"), control, rank_tolerance, begin
     )
     return IdentifiedTrials(
         free.values(fit.deviation),
@@ -263,8 +266,9 @@ def identify_trials(
 
 
 def _descended(
-    rows: AnyRows,
+    rows: Problem,
     z: FloatArray,
+    start: Start | None,
     method: Method,
     control: StepControl | None,
     tolerance: float,
@@ -279,9 +283,9 @@ def _descended(
         raise EstimationError(f"begin is {begin!r}; it must be one of {', '.join(BEGINS)}")
     problem = rows if prior is None else prior.added(rows)
     if begin == "kinematics":
-        return descend(problem, z, method, control, tolerance)
+        return descend(problem, z, method, control, tolerance, start)
     z, first = descend_from_closure(rows, z, method, control, tolerance)
-    fit = descend(problem, z, method, control, tolerance)
+    fit = descend(problem, z, method, control, tolerance, start)
     return fit if first is None else fit.after(first)
 
 
@@ -292,7 +296,7 @@ def _identification(
     fit: Descent,
     check: ResidualTest,
     residuals: tuple[KindResiduals, ...],
-    rows: AnyRows,
+    rows: Problem,
 ) -> Identification:
     """Put the result together; `rows` are folded once more where they have unknowns of their own."""
     d, penalty, variance = (
@@ -312,8 +316,8 @@ def _identification(
     covariance = d.covariance(penalty, variance)[0] * free.tolerance[:, None] * free.tolerance
     values = free.values(fit.deviation)[0]
     status = DescentStatus(int(fit.status[0]))
-    local = _local(rows, robot, fit.deviation, d, penalty, variance)
-    open_ = with_followers(describe_null_space(free, plain.null_space()), plain.null_space(), local)
+    local = _estimate_nuisance(rows, robot, fit, d, penalty, variance)
+    open_ = add_followers(describe_null_space(free, plain.null_space()), plain.null_space(), local)
     converged = status is DescentStatus.CONVERGED
     notes = [
         *([] if converged else [status.sentence]),
@@ -323,7 +327,7 @@ def _identification(
     if converged and conflict is not None and conflict.conflict:
         notes.append(conflict.sentence)
     notes += [f"not identifiable: {combination}" for combination in open_]
-    notes += local.notes()
+    notes += [str(finding) for finding in local.report_unobservable()]
     if assumed := free.note():
         notes.append(assumed)
     return Identification(
@@ -355,40 +359,38 @@ def _identification(
     )
 
 
-def _local(
-    rows: AnyRows,
+def _estimate_nuisance(
+    rows: Problem,
     robot: Mechanism,
-    z: FloatArray,
+    fit: Descent,
     d: Decomposition,
     penalty: FloatArray,
     variance: float,
-) -> LocalEstimate:
-    """The unknowns of the measurements at the estimate z (1, p)."""
-    if rows.own is None:
-        return nothing_local(rows.parameters)
-    rows.own.cost[:] = np.inf
-    if not np.isfinite(rows.fold(z, np.arange(1))[1][0]):
-        rows.own.solved = None
-    return local_estimate(rows.own, robot, rows.own.start, d, penalty, variance)
+) -> NuisanceEstimate:
+    """Return the nuisance parameters at the estimate, linearized there once more."""
+    if rows.nuisance is None:
+        return empty_nuisance_estimate(rows.parameters)
+    at = rows.linearize(fit.deviation, fit.start)
+    return estimate_nuisance(rows.nuisance, at, robot, d, penalty, variance)
 
 
 def _labelled(
-    residuals: tuple[Residuals, ...], data: Measurements, rows: AnyRows
+    residuals: tuple[Residuals, ...], data: Measurements, rows: Problem
 ) -> tuple[KindResiduals, ...]:
     """Put names to the residuals (t = 1) of every kind, uncertain readings the last."""
     observations = [o for o in data.observations if len(o)]
     present, context = [o.present for o in observations], [o.context for o in observations]
-    if isinstance(rows, LatentRows):
+    if rows.is_uncertain:
         present.append(np.isfinite(data.readings))
         context.append(data.context)
     return tuple(
         KindResiduals(
             kind=s.kind.name,
             components=tuple(column.name for column in s.kind.noise_columns),
-            poses=tuple("/".join(data.labels[i] for i in seen) for seen in s.per_pose),
+            poses=tuple("/".join(data.labels[i] for i in seen) for seen in s.poses_by_link),
             raw=np.where(there, r.raw[0], np.nan),
             whitened=r.whitened[0],
             context=beside,
         )
-        for s, there, beside, r in zip(rows.sensed, present, context, residuals, strict=True)
+        for s, there, beside, r in zip(rows.rows, present, context, residuals, strict=True)
     )

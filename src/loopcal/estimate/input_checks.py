@@ -7,7 +7,7 @@ import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.methods.penalties import Method
-from loopcal.estimate.rows import AnyRows
+from loopcal.estimate.problem import Problem
 from loopcal.measure import Measurements, check_actuators
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
@@ -50,7 +50,7 @@ def check_settings(method: object, rank_tolerance: float, noise: str) -> None:
         raise EstimationError(f"rank_tolerance is {rank_tolerance}; it must be above 0 and below 1")
 
 
-def check_rows(rows: AnyRows, data: Measurements, robot: Mechanism) -> None:
+def check_rows(rows: Problem, data: Measurements, robot: Mechanism) -> None:
     """Refuse readings of another robot, a robot without free parameters, and data without any row.
 
     Raises
@@ -65,13 +65,13 @@ def check_rows(rows: AnyRows, data: Measurements, robot: Mechanism) -> None:
         raise EstimationError(
             f"{robot.name} has no free parameter: free at least one of {len(robot.parameters)}"
         )
-    if rows.counted[0] == 0:
+    if rows.residual_count[0] == 0:
         raise EstimationError(
             "no measured value counts: every row is absent or has weight 0; give at least one"
         )
 
 
-def check_count(rows: AnyRows, data: Measurements, method: Method, allow_fewer: bool) -> None:
+def check_count(rows: Problem, data: Measurements, method: Method, allow_fewer: bool) -> None:
     """Refuse fewer equations than parameters where the method has no prior to fill the gap.
 
     Raises
@@ -79,7 +79,7 @@ def check_count(rows: AnyRows, data: Measurements, method: Method, allow_fewer: 
     EstimationError
         Naming both numbers and the poses that would do.
     """
-    own = 0 if rows.own is None else rows.own.unheld
+    own = 0 if rows.nuisance is None else rows.nuisance.unpenalized_count
     m, p = int(rows.equations[0]), method.needs(rows.parameters) + own
     if m >= p or allow_fewer:
         return
@@ -101,7 +101,7 @@ def check_count(rows: AnyRows, data: Measurements, method: Method, allow_fewer: 
     )
 
 
-def check_start(rows: AnyRows, data: Measurements, deviation: FloatArray, cost: FloatArray) -> None:
+def check_start(rows: Problem, data: Measurements, deviation: FloatArray, cost: FloatArray) -> None:
     """Refuse a start from which some poses cannot be reached.
 
     Raises
@@ -111,14 +111,15 @@ def check_start(rows: AnyRows, data: Measurements, deviation: FloatArray, cost: 
     """
     if np.isfinite(cost[0]):
         return
-    lost = rows.unreachable(deviation)
+    start = rows.start(deviation)
+    lost = rows.find_unreached(deviation, start)
     if len(lost) == 0:
         with np.errstate(all="ignore"):
-            parts = rows.residuals(deviation)
+            parts = rows.residuals(deviation, rows.solve(deviation, start))
         bad = {
             int(i)
-            for s, r in zip(rows.sensed, parts, strict=True)
-            for i in s.per_pose[~(np.abs(r.whitened[0]) < HUGE).all(axis=1)].ravel()
+            for s, r in zip(rows.rows, parts, strict=True)
+            for i in s.poses_by_link[~(np.abs(r.whitened[0]) < HUGE).all(axis=1)].ravel()
         }
         poses = ", ".join(repr(data.labels[i]) for i in sorted(bad)[:5]) + (
             ", ..." if len(bad) > 5 else ""

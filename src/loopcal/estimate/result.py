@@ -17,10 +17,10 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import Combination
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.inference.residual_test import LEVEL, ResidualTest, coverage_factor
-from loopcal.estimate.latent_estimate import LatentEstimate
-from loopcal.estimate.local_estimate import LocalEstimate
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.methods.prior_conflict import PriorConflict
+from loopcal.estimate.nuisance_estimate import NuisanceEstimate
+from loopcal.estimate.poses.estimate import EstimatedPoses
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
 
@@ -97,8 +97,8 @@ class Identification:
     notes: tuple[str, ...]
     weight: FloatArray
     dropped: tuple[str, ...]
-    local: LocalEstimate
-    latent: LatentEstimate | None = None
+    local: NuisanceEstimate
+    latent: EstimatedPoses | None = None
 
     @property
     def names(self) -> tuple[str, ...]:

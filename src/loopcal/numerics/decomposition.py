@@ -3,7 +3,7 @@
 is read.
 
 Rows [A | b] of a linear least-squares problem are folded, block by block, into the triangular
-factor of their QR decomposition (`loopcal.engine.fold`); the right-hand side rides along as
+factor of their QR decomposition (`loopcal.numerics.triangular_factor`); the right-hand side is
 the last column, so that the norm of what no solution explains is the last diagonal entry. Singular
 values, rank, solutions, filters and covariances come from the singular value decomposition of that
 factor. The product A'A is never formed: it would turn null directions of 1e-14 into 1e-7. Every
@@ -26,6 +26,14 @@ RANK_TOLERANCE = 1e-11
 The matrix must be whitened and its columns scaled. Null directions of an exact model come out at
 1e-17 to 1e-13 by double rounding; the weakest genuine directions seen in complete error models of
 real machines are near 1e-9.
+"""
+
+NUISANCE_TOLERANCE = 1e-10
+"""The same rule for columns that are eliminated (frames, targets, surfaces, offsets, poses).
+
+It is ten times wider than RANK_TOLERANCE: these columns have passed the eliminations of the scopes
+inside them, each with its rounding, and a direction that is wrongly called observable would take a
+genuine equation away from the machine.
 """
 
 NULL_COMPONENT = 1e-8
@@ -55,13 +63,6 @@ def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:
     return np.where(
         (np.abs(values) <= ROUNDING * size) & (size > 0.0) & (size < np.inf), 0.0, values
     )
-
-
-def empty_factor(trials: int, parameters: int) -> FloatArray:
-    """Return the factor of no rows at all, zeros (t, p + 1, p + 1), into which the engine folds
-    rows [A | b].
-    """
-    return np.zeros((trials, parameters + 1, parameters + 1))
 
 
 PER_TRIAL = ("singular_values", "directions", "projections", "outside", "rows", "dual", "flat")
@@ -310,7 +311,7 @@ def decompose(
 
     Parameters
     ----------
-    factor : (t, p + 1, p + 1) upper triangular, as `engine.fold` folds it.
+    factor : (t, p + 1, p + 1) upper triangular, see `loopcal.numerics.triangular_factor`.
     rows : (t,) number of equations that were folded.
     about : (t, p), optional. With it the last column is read as a residual r at the deviation z =
         `about`, and the problem becomes the one for the total deviation: |A z_new - b| with b = A z

@@ -25,7 +25,7 @@ from loopcal.apply.accuracy import transport
 from loopcal.diagnose import find_frame_motions
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.posterior import Posterior
-from loopcal.estimate.outlook import look, scene, without_own
+from loopcal.estimate.information import observe_poses, observe_rows
 from loopcal.measure import (
     Instrument,
     Measurements,
@@ -35,7 +35,9 @@ from loopcal.measure import (
     list_sensed_joints,
 )
 from loopcal.mechanism import Solution
-from loopcal.numerics.decomposition import Decomposition, decompose, empty_factor
+from loopcal.numerics.decomposition import Decomposition, decompose
+from loopcal.numerics.elimination import eliminate_from_factor
+from loopcal.numerics.triangular_factor import empty_factor
 from loopcal.planning.design import PriorInformation, is_allowed
 from loopcal.planning.pose_combinations import (
     MOST,
@@ -152,7 +154,7 @@ def decompose_information(
     allowed = groups.rows[is_allowed(groups.rows)]
     flat = np.concatenate([allowed.reshape(-1, o + p), groups.nuisance_prior])
     factor = engine.fold(factor, np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)[None])
-    factor = without_own(factor, o)
+    factor = eliminate_from_factor(factor, o)
     if measured is not None:
         factor = engine.fold(factor, np.concatenate([measured, np.zeros((p, 1))], axis=1)[None])
     return decompose(factor, np.full(1, len(flat)))
@@ -203,7 +205,7 @@ def linearize_prediction(
     ----------
     solution : the poses to predict. observable : of `decompose_information`.
     """
-    poses = scene(free, solution.q)
+    poses = observe_poses(free, solution.q)
     tool_twists = transport(free.robot, poses.T[0], "base", "tool") @ poses.twists[0]
     used, V = observable.used[0], observable.directions[0]
     variance = np.where(used, 1.0, np.where(free.assumed.any(), np.inf, 1.0))
@@ -211,7 +213,7 @@ def linearize_prediction(
     motions = find_frame_motions(posterior)
     # P removes rigid motions of frames from a deviation and leaves the rest as it is
     P = V[:, used] @ V[:, used].T + motions.kept @ V[:, ~used].T
-    kept = tool_twists[poses.reached] @ P
+    kept = tool_twists[poses.is_reached] @ P
     return Prediction(kept[:, :3], kept[:, 3:], free.robot.size, motions.frames)
 
 
@@ -236,7 +238,7 @@ def _linearize_block(
     """Return the rows (b, r, o + p) of some groups."""
     poses, places = np.unique(members, return_inverse=True)
     places = places.reshape(members.shape)
-    at = scene(free, readings[poses], list_sensed_joints(sensor.kind for sensor in mounted.sensors))
+    at = observe_poses(free, readings[poses], list_sensed_joints(sensor.kind for sensor in mounted.sensors))
     nuisance = _list_nuisance(mounted, places)
     observations, unusable = [], np.zeros(len(members), dtype=bool)
     for i, (sensor, rows) in enumerate(_assign_poses(mounted, places)):
@@ -259,11 +261,11 @@ def _linearize_block(
             Observations.from_sigma(kind, rows, measured, sensor.noise.sigma, "", "")
         )
     data = Measurements(free.robot.name, at.readings, tuple(observations))
-    whitened = look(at, data, nuisance, nuisance.values())[0, :, :-1]
+    whitened = observe_rows(at, data, nuisance, nuisance.values())[0, :, :-1]
     counts = [len(part) * len(part.kind.noise_columns) for part in observations]
     pieces = np.split(whitened, np.cumsum(counts)[:-1])
     rows = np.concatenate(
         [piece.reshape(len(members), -1, whitened.shape[1]) for piece in pieces], axis=1
     )
-    rows[unusable | ~at.reached[places].all(axis=1)] = np.nan
+    rows[unusable | ~at.is_reached[places].all(axis=1)] = np.nan
     return rows

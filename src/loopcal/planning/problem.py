@@ -11,7 +11,7 @@ import numpy as np
 
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
-from loopcal.estimate.outlook import equations, information
+from loopcal.estimate.information import collect_information, count_equations
 from loopcal.findings import Quantity, report_finding
 from loopcal.measure import Instrument, Measurements, check_actuators
 from loopcal.mechanism import Mechanism, Solution, inverse, sample_workspace
@@ -331,7 +331,7 @@ def _fold_measured(free: FreeParameters, measured: Measurements) -> tuple[FloatA
     check_actuators(measured, robot)
     if not measured.n_rows:
         raise DataError(report_finding("plan.measured-empty"))
-    factor, reached = information(free, measured)
+    factor, reached = collect_information(free, measured)
     if not reached.all():
         label = measured.labels[int(np.flatnonzero(~reached)[0])]
         raise DataError(
@@ -339,7 +339,7 @@ def _fold_measured(free: FreeParameters, measured: Measurements) -> tuple[FloatA
         )
     table = measured.nuisance_parameters.table
     nuisance = int((table.free & np.isnan(table.tolerance)).sum())
-    return factor[0, :-1, :-1], max(equations(robot, measured) - nuisance, 0)
+    return factor[0, :-1, :-1], max(count_equations(robot, measured) - nuisance, 0)
 
 
 def _select_predicted(candidates: Candidates, options: PlanOptions) -> Solution:

@@ -26,7 +26,7 @@ from loopcal.diagnose import (
 from loopcal.errors import DataError
 from loopcal.estimate import Change, Identification, recalibrate
 from loopcal.estimate.excluded_poses import exclude_poses
-from loopcal.estimate.outlook import equations
+from loopcal.estimate.information import count_equations
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.importance import sort_by_importance
 from loopcal.measure import Measurements
@@ -170,7 +170,7 @@ def _fit(
         if not choice.chosen.parameters:
             raise DataError(report_finding("workflow.no-parameter-chosen"))
     chosen = robot if choice is None else choice.robot
-    free, available = int(chosen.parameters.free.sum()), equations(chosen, data)
+    free, available = int(chosen.parameters.free.sum()), count_equations(chosen, data)
     if fit_options.method is None and available < free:
         raise DataError(
             report_finding(

@@ -13,16 +13,19 @@ exempt from a prior); J'J and C are never inverted. See docs/theory/uncertainty.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal import engine
 from loopcal.errors import EstimationError, suggest_names
 from loopcal.estimate.inference.posterior import Posterior
-from loopcal.estimate.rows import AnyRows
+from loopcal.estimate.linearization import Linearization
+from loopcal.estimate.problem import Problem
+from loopcal.estimate.start import Start
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import RANK_TOLERANCE
+from loopcal.numerics.triangular_factor import fold_rows
 from loopcal.typing import FloatArray, IntArray
 
 PARALLEL = 1e-2
@@ -50,9 +53,9 @@ class Prior:
     unit: FloatArray
     rows: FloatArray
 
-    def added(self, rows: AnyRows) -> WithPrior:
+    def added(self, problem: Problem) -> WithPrior:
         """Return the problem of these rows and the prior's, as the descent sees it."""
-        return WithPrior(rows, self)
+        return WithPrior(problem, self)
 
     def without(self, names: Sequence[str]) -> Prior:
         """Return what this prior says of the other parameters when nothing is said of these."""
@@ -83,39 +86,48 @@ class WithPrior:
     out of the prior's rows.
     """
 
-    def __init__(self, rows: AnyRows, prior: Prior) -> None:
-        unknowns = rows.unknowns
-        table = unknowns.robot.parameters
+    def __init__(self, problem: Problem, prior: Prior) -> None:
+        free = problem.free
+        table = free.robot.parameters
         places = np.array([table.index(name) for name in prior.names], dtype=np.int64)
         B = np.zeros((len(prior.rows), len(table)))
         B[:, places] = prior.rows
-        mean = unknowns.robot.values.copy()
+        mean = free.robot.values.copy()
         mean[places] = prior.mean
-        self.measured = rows
-        self.parameters = rows.parameters
-        self.slope = B[:, unknowns.places] * unknowns.tolerance
-        self.centre = unknowns.deviation(mean[None])
+        self.measured = problem
+        self.parameters = problem.parameters
+        self.slope = B[:, free.places] * free.tolerance
+        self.centre = free.deviation(mean[None])
         # parameters that are not free any more contribute what they differ from the mean
-        self.constant = B @ (unknowns.values(self.centre)[0] - mean)
+        self.constant = B @ (free.values(self.centre)[0] - mean)
         self.open = np.linalg.svd(self.slope, full_matrices=True)[2][len(B) :].T
-        self.added = len(B)
 
-    @property
-    def rows(self) -> IntArray:
-        """(t,) equations of the measurements, as the last fold counted them, and of the prior."""
-        return self.measured.rows + self.added
+    def start(self, deviation: FloatArray) -> Start:
+        """Return the warm start of the measurements."""
+        return self.measured.start(deviation)
 
-    def fold(self, deviation: FloatArray, trials: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return factor and sum of squares of all rows, see `Problem.fold`."""
-        factor, cost = self.measured.fold(deviation, trials)
+    def take(self, trials: IntArray) -> WithPrior:
+        """Return the problem of some trials."""
+        other = copy(self)
+        other.measured = self.measured.take(trials)
+        return other
+
+    def linearize(self, deviation: FloatArray, start: Start) -> Linearization:
+        """Linearize the measurements and append the rows of the prior."""
+        at = self.measured.linearize(deviation, start)
         if not len(self.slope):
-            return factor, cost
-        slope = np.broadcast_to(self.slope, (len(trials), *self.slope.shape))
+            return at
+        slope = np.broadcast_to(self.slope, (len(deviation), *self.slope.shape))
         if self.open.shape[1]:
-            slope = np.stack([self._consistent(triangle) for triangle in factor[:, :-1, :-1]])
+            slope = np.stack([self._consistent(triangle) for triangle in at.factor[:, :-1, :-1]])
         residual = np.matmul(slope, (deviation - self.centre)[..., None])[..., 0] + self.constant
         rows = np.concatenate([slope, residual[..., None]], axis=2)
-        return engine.fold(factor, rows), cost + (residual**2).sum(axis=1)
+        return replace(
+            at,
+            factor=fold_rows(at.factor, rows),
+            cost=at.cost + (residual**2).sum(axis=1),
+            equations=at.equations + len(self.slope),
+        )
 
     def _consistent(self, triangle: FloatArray) -> FloatArray:
         """The prior's rows without the null directions (p, d) of measured rows that it does not

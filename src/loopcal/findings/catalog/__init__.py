@@ -7,7 +7,7 @@ from importlib import import_module
 
 from loopcal.findings.wording import Entry
 
-SUBJECTS: tuple[str, ...] = ("gates", "workflow", "apply", "files", "plan")
+SUBJECTS: tuple[str, ...] = ("gates", "workflow", "apply", "files", "plan", "poses")
 """Modules of this package, in the order of docs/findings.md. Each defines `ENTRIES`."""
 
 

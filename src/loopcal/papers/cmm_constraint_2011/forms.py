@@ -15,7 +15,7 @@ import numpy as np
 
 from loopcal.estimate import identify
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.outlook import information
+from loopcal.estimate.information import collect_information
 from loopcal.measure import Line, Measurements, Observations, Plane
 from loopcal.mechanism import POSITION
 from loopcal.papers.cmm_constraint_2011.cells import METHODS
@@ -110,7 +110,7 @@ def covariance_difference(layout: Layout, noise: float) -> float:
     robot = layout.robot
     q = layout.held(robot.parameters.nominal[None], 0.0, 0)
     free = select_free_parameters(robot)
-    factor = information(free, measurements(layout, q[0], noise))[0]
+    factor = collect_information(free, measurements(layout, q[0], noise))[0]
     s, vt = _seen(PaperRows(layout, q, free.tolerance[0], noise))
     ratio = np.linalg.svd(factor[0, : len(free), : len(free)] @ (vt.T / s), compute_uv=False)
     return float(np.abs(ratio**2 - 1.0).max())

@@ -26,7 +26,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from loopcal.engine import State
-from loopcal.estimate.descent import Descent, StepControl, descend
+from loopcal.estimate.descent import Descent, FunctionProblem, StepControl, descend
 from loopcal.estimate.methods.penalties import Method
 from loopcal.measure import make_random_stream
 from loopcal.mechanism import (
@@ -147,11 +147,6 @@ class PaperRows:
         """p."""
         return len(self.layout.robot.parameters)
 
-    @property
-    def rows(self) -> IntArray:
-        """(t,) equations."""
-        return np.full(len(self.q), self.layout.equations)
-
     @cached_property
     def whitener(self) -> FloatArray:
         """(g, k - 2, k - 2) what the rows of a group are multiplied by; made at the points as
@@ -173,7 +168,7 @@ class PaperRows:
         return rows.reshape(len(trials), self.layout.equations, -1), reached
 
     def fold(self, deviation: FloatArray, trials: IntArray) -> tuple[FloatArray, FloatArray]:
-        """See `loopcal.estimate.descent.Problem`."""
+        """Return factor (a, p + 1, p + 1) and sum of squares (a,) of some machines."""
         if not deviation.any() and len(trials) == len(self.q):
             factor, cost = self.nominal_fold
             return factor.copy(), cost.copy()
@@ -199,7 +194,9 @@ def identify_from_rows(problem: PaperRows, method: Method, relative: float = 1e-
     that the next one would change them by its square or so.
     """
     begin = np.zeros((len(problem.q), problem.parameters))
-    return descend(problem, begin, method, StepControl(relative=relative))
+    equations = np.full(len(problem.q), problem.layout.equations)
+    rows = FunctionProblem(problem.parameters, problem.fold, equations)
+    return descend(rows, begin, method, StepControl(relative=relative))
 
 
 def levers(at: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Information that measurements hold of a robot at its present values.
+
+Rows are [F | A | r]: nuisance parameters, the robot's free parameters in tolerances, the residual,
+all whitened. Identifiability is read from the triangular factor of what is left of A once F is
+eliminated: the projection onto the complement of F, without forming it. See
+docs/theory/identification.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
+from loopcal.estimate.poses.linearization import LinearizedPoses, linearize_at_readings
+from loopcal.estimate.problem import problem_of
+from loopcal.measure import (
+    Measurements,
+    NuisanceParameters,
+    evaluate_all,
+    resolve_reading_sigma,
+    whitened_rows,
+)
+from loopcal.mechanism import Mechanism
+from loopcal.numerics.elimination import eliminate_from_factor
+from loopcal.numerics.triangular_factor import empty_factor, fold_rows
+from loopcal.typing import BoolArray, FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedPoses:
+    """Poses of a robot, solved and linearized once, that any kind may observe.
+
+    Attributes
+    ----------
+    free : the free parameters. readings : (n, actuators) [SI]. linearized : (1, n) poses.
+    """
+
+    free: FreeParameters
+    readings: FloatArray
+    linearized: LinearizedPoses
+
+    @property
+    def T(self) -> FloatArray:
+        """(1, n, 4, 4) T_base_platform [m]."""
+        return self.linearized.T
+
+    @property
+    def twists(self) -> FloatArray:
+        """(1, n, 6, p) by deviations in tolerances."""
+        return self.linearized.by_parameters
+
+    @property
+    def joints(self) -> Mapping[str, FloatArray]:
+        """name -> (1, n) values [SI] of the joints that were asked for."""
+        return self.linearized.joints
+
+    @property
+    def is_reached(self) -> BoolArray:
+        """(n,) poses at which the loops close."""
+        return self.linearized.is_reached[0]
+
+
+def observe_poses(
+    free: FreeParameters, readings: FloatArray, joints: Iterable[str] = ()
+) -> ObservedPoses:
+    """Solve and linearize a robot at readings (n, actuators) and its present values.
+
+    `joints` are names of joints whose values and derivatives are needed.
+    """
+    return ObservedPoses(free, readings, linearize_at_readings(free, readings, joints))
+
+
+def observe_rows(
+    poses: ObservedPoses, measured: Measurements, local: NuisanceParameters, values: FloatArray
+) -> FloatArray:
+    """Return whitened rows (1, M, U + p + 1), [nuisance | machine | residual], of measurements.
+
+    `values` (U,) are those of the nuisance parameters `local`.
+    """
+    at = poses.linearized
+    parts = evaluate_all(measured, at.T, values[None], local, at.joints)
+    rows = whitened_rows(parts, at.by_parameters, at.joints_by_parameters)
+    p, own = len(poses.free), len(local)
+    return np.concatenate([rows[..., p : p + own], rows[..., :p], rows[..., p + own :]], axis=-1)
+
+
+def collect_information(free: FreeParameters, data: Measurements) -> tuple[FloatArray, BoolArray]:
+    """Fold all rows of measurements at the robot's present values.
+
+    Nuisance parameters and uncertain poses are where the measurements put them.
+
+    Returns
+    -------
+    factor : (1, p + 1, p + 1) of rows [A | r], nuisance parameters eliminated.
+    is_reached : (n,) poses that close or that no row needs; the rows of the others are missing.
+    """
+    problem = problem_of(free, data)
+    z = free.deviation(free.robot.values[None])
+    start = problem.start(z)
+    at = problem.linearize(z, start)
+    is_reached = np.ones(data.n_poses, dtype=bool)
+    if not np.isfinite(at.cost[0]):
+        is_reached[problem.find_unreached(z, start)] = False
+    return at.factor, is_reached
+
+
+def count_equations(robot: Mechanism, data: Measurements) -> int:
+    """Return how many equations measurements give.
+
+    They are the present residuals and, where readings are uncertain, less those that poses take up.
+    """
+    if resolve_reading_sigma(robot, data.reading_sigma, data.n_poses) is None:
+        return data.n_rows
+    return int(problem_of(select_free_parameters(robot), data).equations[0])
+
+
+def instrument_factor(poses: ObservedPoses, measured: Measurements) -> FloatArray:
+    """Return the factor (1, p + 1, p + 1) of one instrument's rows at observed poses.
+
+    Its nuisance parameters are eliminated at their stated values.
+    """
+    local = measured.nuisance_parameters
+    rows = observe_rows(poses, measured, local, local.values())
+    factor = fold_rows(empty_factor(1, len(local) + len(poses.free)), rows)
+    with_prior = fold_rows(factor, _prior_rows(local, len(poses.free)))
+    return eliminate_from_factor(with_prior, len(local))
+
+
+def _prior_rows(local: NuisanceParameters, p: int) -> FloatArray:
+    """Return rows (1, U, U + p + 1) of nuisance parameters with a tolerance; zero for others."""
+    known = local.table.free & ~np.isnan(local.table.tolerance)
+    weight = np.where(known, 1.0 / np.where(known, local.table.tolerance, 1.0), 0.0)
+    return np.concatenate([np.diag(weight), np.zeros((len(local), p + 1))], axis=1)[None]

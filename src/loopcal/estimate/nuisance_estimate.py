@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Estimates of the nuisance parameters after a fit: frames, targets, surfaces, offsets.
+
+Given the machine's deviation z, the best nuisance parameters are b = b0 + S (z - z0) with the
+covariance (F'F)^+ of their own. z has the covariance C of the fit, so that b has
+(F'F)^+ + S C S'. A direction of infinite variance that moves b makes the variance of b infinite,
+too: a frame is then known only together with the machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from loopcal.estimate.inference.null_space import Combination, listed, sparsify_basis
+from loopcal.estimate.linearization import Linearization
+from loopcal.estimate.nuisance import NuisanceElimination
+from loopcal.findings import Finding, report_finding
+from loopcal.mechanism import Mechanism
+from loopcal.numerics.decomposition import Decomposition
+from loopcal.parameters import Parameter, ParameterTable
+from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import DISPLAY_UNITS, find_unit
+
+SMALLEST_EFFECT = 1e-7
+"""Share of all that the machine does to a nuisance parameter below which a direction does not move
+it: rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class NuisanceEstimate:
+    """Nuisance parameters after a fit. Arrays are (U,) in the order of `table`, SI.
+
+    Attributes
+    ----------
+    table : nominal values, priors, and which were kept fixed.
+    start : values with which the fit began.
+    estimate : (U,).
+    sd : standard deviations; infinite where the data do not determine the parameter, 0 where it is
+        fixed, NaN without an interval.
+    slope : (U, p) change of the best values by the machine's deviations in tolerances.
+    is_unobservable : (U,) parameters with a part in a direction that no row determines, whatever
+        the machine.
+    display : factor to SI and symbol of the unit in which each is shown.
+    """
+
+    table: ParameterTable
+    start: FloatArray
+    estimate: FloatArray
+    sd: FloatArray
+    slope: FloatArray
+    is_unobservable: BoolArray
+    display: tuple[tuple[float, str], ...]
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names, such as `tracker.x`."""
+        return self.table.names
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        """Estimates by name [SI]."""
+        return dict(zip(self.names, self.estimate.tolist(), strict=True))
+
+    @property
+    def starts(self) -> Mapping[str, float]:
+        """Values by name [SI] with which the fit began: those that fit the initial machine."""
+        return dict(zip(self.names, self.start.tolist(), strict=True))
+
+    def rows(self, coverage: float) -> list[dict[str, Any]]:
+        """Return one entry for each, in its unit, ready for JSON.
+
+        `coverage` is the number of standard deviations in `plus_minus`.
+        """
+        shown = []
+        for i, entry in enumerate(self.table.entries):
+            factor, symbol = self.display[i]
+            numbers = {
+                "nominal": entry.nominal,
+                "estimate": self.estimate[i],
+                "sd": self.sd[i],
+                "plus_minus": coverage * self.sd[i],
+            }
+            tolerance = None if entry.tolerance is None else entry.tolerance / factor
+            scaled = {name: float(value) / factor for name, value in numbers.items()}
+            shown.append(
+                {
+                    "name": entry.name,
+                    "unit": symbol,
+                    **scaled,
+                    "tolerance": tolerance,
+                    "free": entry.free,
+                }
+            )
+        return shown
+
+    def report_unobservable(self) -> tuple[Finding, ...]:
+        """Return which frames, targets, surfaces and offsets cannot be determined."""
+        owners = _owners(
+            n for n, lost in zip(self.names, self.is_unobservable, strict=True) if lost
+        )
+        return (report_finding("setup.unobservable", names=owners),) if owners else ()
+
+
+def empty_nuisance_estimate(parameters: int) -> NuisanceEstimate:
+    """Return the estimate of no nuisance parameters at all, for p parameters."""
+    nothing, slope = np.zeros(0), np.zeros((0, parameters))
+    return NuisanceEstimate(
+        ParameterTable(()), nothing, nothing, nothing, slope, np.zeros(0, dtype=bool), ()
+    )
+
+
+def estimate_nuisance(
+    nuisance: NuisanceElimination,
+    at: Linearization,
+    robot: Mechanism,
+    decomposition: Decomposition,
+    penalty: FloatArray,
+    noise: float,
+    start: FloatArray | None = None,
+) -> NuisanceEstimate:
+    """Return the nuisance parameters of one trial after a fit.
+
+    Parameters
+    ----------
+    nuisance : of the problem. at : the linearization at the estimate (t = 1).
+    robot : for its units. decomposition, penalty : of the fit (t = 1).
+    noise : variance of the whitened rows; NaN where no interval is given.
+    start : (U,) values with which the fit began; default: those of the warm start.
+    """
+    table = nuisance.local.table
+    begin = at.next_start.first_nuisance[0] if start is None else start
+    shown = tuple(_display_unit(robot, p) for p in table.entries)
+    U, p = len(table), len(decomposition.scale)
+    if at.nuisance is None or not np.isfinite(at.cost[0]):
+        estimate, nothing = at.next_start.nuisance[0].copy(), np.zeros(U)
+        unobservable = np.zeros(U, dtype=bool)
+        return NuisanceEstimate(
+            table, begin, estimate, nothing, np.zeros((U, p)), unobservable, shown
+        )
+    done, is_free = at.nuisance.elimination, nuisance.is_free
+    known = decomposition.variances(penalty, noise)[0]
+    V = decomposition.scale[:, None] * decomposition.directions[0]
+    slope, is_unobservable = done.slope[0], done.is_unobservable[0]
+    moved = slope[is_free] @ V
+    unknown = np.isinf(known)
+    moved_by_unknown = np.linalg.norm(moved[:, unknown], axis=1)
+    is_infinite = moved_by_unknown > SMALLEST_EFFECT * np.linalg.norm(moved, axis=1)
+    by_machine = (moved**2) @ np.where(unknown, 0.0, known)
+    variance = np.zeros(U)
+    variance[is_free] = np.where(
+        is_infinite | is_unobservable[is_free],
+        np.inf,
+        done.variances()[0, is_free] * noise + by_machine,
+    )
+    return NuisanceEstimate(
+        table, begin, at.nuisance.best[0], np.sqrt(variance), slope, is_unobservable, shown
+    )
+
+
+def add_followers(
+    combinations: tuple[Combination, ...], null: FloatArray, nuisance: NuisanceEstimate
+) -> tuple[Combination, ...]:
+    """Add the frames and targets that change with unidentifiable combinations to their meaning.
+
+    The combinations must be those that describe the null space (p, d).
+    """
+    if not len(nuisance) or not combinations:
+        return combinations
+    changed = np.abs(sparsify_basis(null) @ nuisance.slope.T)
+    limit = SMALLEST_EFFECT * np.abs(nuisance.slope).max(axis=1, initial=0.0)
+    described = []
+    for combination, moved in zip(combinations, changed > limit, strict=True):
+        names = _owners(n for n, m in zip(nuisance.names, moved, strict=True) if m)
+        verb = "moves" if len(names) == 1 else "move"
+        follows = f"{listed(names)} {verb} with it" if names else ""
+        meaning = ", and ".join(part for part in (combination.meaning, follows) if part)
+        described.append(replace(combination, meaning=meaning))
+    return tuple(described)
+
+
+def _owners(names: Iterable[str]) -> list[str]:
+    """Return the frames, targets and surfaces to which parameters such as `tracker.x` belong."""
+    return list(dict.fromkeys(name.rsplit(".", 1)[0] for name in names))
+
+
+def _display_unit(robot: Mechanism, entry: Parameter) -> tuple[float, str]:
+    """Return factor to SI and symbol of the unit in which a parameter is shown."""
+    symbol = robot.units.get(entry.dimension, DISPLAY_UNITS[entry.dimension].symbol)
+    return find_unit(symbol).factor_to_si, symbol

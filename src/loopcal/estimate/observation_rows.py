@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Observed rows of every kind for a batch of trials, and the blocks of poses they are divided into.
+
+A block is a run of consecutive poses with the rows that observed these poses alone. Rows that link
+poses of different runs form blocks of their own, with the poses that they name, so that no block is
+larger than it must be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from loopcal.measure import Kind, Measurements
+from loopcal.numerics.elimination_tree import connected_groups
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+BLOCK = 512
+"""Poses (of all trials together) whose rows are made at once: enough for NumPy to be efficient, few
+enough for the cache."""
+
+
+def _no_nuisance() -> IntArray:
+    return np.zeros((0, 0), dtype=np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationRows:
+    """Rows of one kind for t trials.
+
+    Attributes
+    ----------
+    kind : what was measured.
+    poses : (r,) pose that each row observed; (r, links) where rows compare several poses.
+    measured : (t | 1, r, c) [SI]. whitener : (t | 1, r, m, m), zero rows for absent components.
+    nuisance : (r, u) which nuisance parameters each row uses.
+    """
+
+    kind: Kind
+    poses: IntArray
+    measured: FloatArray
+    whitener: FloatArray
+    nuisance: IntArray = field(default_factory=_no_nuisance)
+
+    def __post_init__(self) -> None:
+        if not self.nuisance.size:
+            object.__setattr__(self, "nuisance", np.zeros((len(self.poses), 0), dtype=np.int64))
+
+    @property
+    def poses_by_link(self) -> IntArray:
+        """(r, links) poses of each row."""
+        return self.poses.reshape(len(self.poses), self.kind.poses_per_row)
+
+    @property
+    def first_poses(self) -> IntArray:
+        """(r,) first pose of each row; its block of linked poses is the block of the row."""
+        return self.poses_by_link[:, 0]
+
+    @property
+    def is_present(self) -> BoolArray:
+        """(t | 1, r, m) components that are not absent."""
+        return np.asarray(np.einsum("trii->tri", self.whitener) != 0.0)
+
+    def take_rows(self, rows: IntArray, place: IntArray) -> ObservationRows:
+        """Return some rows with poses renumbered: pose i becomes place[i]."""
+        if len(rows) == len(self.poses):
+            return replace(self, poses=place[self.poses])
+        parts = (self.measured[:, rows], self.whitener[:, rows], self.nuisance[rows])
+        return ObservationRows(self.kind, place[self.poses[rows]], *parts)
+
+    def take_trials(self, trials: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return measured values and whiteners of some trials; one set stands for all of them."""
+        measured = self.measured if len(self.measured) == 1 else self.measured[trials]
+        return measured, self.whitener if len(self.whitener) == 1 else self.whitener[trials]
+
+    def weighted(self, weight: FloatArray) -> ObservationRows:
+        """Return the rows with a factor (n,) on each pose's squares; linked poses share it."""
+        linked = np.sqrt(weight)[self.poses_by_link]
+        each = linked.prod(axis=1) ** (1.0 / linked.shape[1])
+        return replace(self, whitener=self.whitener * each[:, None, None])
+
+
+class Residuals(NamedTuple):
+    """Residuals (predicted - measured) of one kind: raw (t, r, m) [SI], whitened (t, r, m)."""
+
+    raw: FloatArray
+    whitened: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class PoseBlock:
+    """Some poses and the rows that observed them.
+
+    Attributes
+    ----------
+    poses : (b,) numbers of the poses. readings : (1, b, a) [SI].
+    row_numbers : of every kind, (k,). rows : of every kind, poses numbered within the block.
+    is_needed : (b,) poses that some row needs.
+    """
+
+    poses: IntArray
+    readings: FloatArray
+    row_numbers: tuple[IntArray, ...]
+    rows: tuple[ObservationRows, ...]
+    is_needed: BoolArray
+
+
+def linked_blocks(data: Measurements) -> IntArray:
+    """Return the block (n,) of each pose, where rows that compare poses join their blocks."""
+    numbers, member = np.unique(data.block, return_inverse=True)
+    pairs = [o.rows for o in data.observations if o.kind.poses_per_row > 1 and len(o)]
+    if not pairs:
+        return member
+    links = member[np.concatenate([consecutive_pairs(rows) for rows in pairs])]
+    return connected_groups(links, len(numbers))[member]
+
+
+def consecutive_pairs(poses: IntArray) -> IntArray:
+    """Return pairs (r (l - 1), 2) of poses that rows (r, l) link."""
+    return np.column_stack([poses[:, :-1].ravel(), poses[:, 1:].ravel()])
+
+
+def divide_poses(
+    readings: FloatArray, rows: Sequence[ObservationRows], is_needed: BoolArray, size: int
+) -> tuple[PoseBlock, ...]:
+    """Divide n poses into blocks of `size` poses.
+
+    The first blocks cover every pose once, in order. Those of linked rows follow.
+    """
+    n = len(readings)
+    runs = [r.poses_by_link // size for r in rows]
+    inside = [
+        np.where(np.ptp(run, axis=1) == 0, run[:, 0], -1) if len(run) else run[:, 0] for run in runs
+    ]
+    blocks = []
+    for k in range(0, n, size):
+        poses = np.arange(k, min(k + size, n))
+        chosen = tuple(np.flatnonzero(run == k // size) for run in inside)
+        blocks.append(make_block(poses, readings, rows, chosen, is_needed))
+    nothing = np.zeros(0, dtype=np.int64)
+    for i, run in enumerate(inside):
+        for linking in _chunks(np.flatnonzero(run < 0), size // 2):
+            poses = np.unique(rows[i].poses[linking])
+            chosen = tuple(linking if j == i else nothing for j in range(len(rows)))
+            blocks.append(make_block(poses, readings, rows, chosen, is_needed))
+    return tuple(blocks)
+
+
+def make_block(
+    poses: IntArray,
+    readings: FloatArray,
+    rows: Sequence[ObservationRows],
+    chosen: tuple[IntArray, ...],
+    is_needed: BoolArray,
+) -> PoseBlock:
+    """Return the block of poses (b,) with the chosen rows of every kind, whose poses lie in it."""
+    place = np.zeros(len(readings), dtype=np.int64)
+    place[poses] = np.arange(len(poses))
+    inside = tuple(r.take_rows(numbers, place) for r, numbers in zip(rows, chosen, strict=True))
+    return PoseBlock(poses, readings[None, poses], chosen, inside, is_needed[poses])
+
+
+def _chunks(rows: IntArray, size: int) -> Iterator[IntArray]:
+    for first in range(0, len(rows), size):
+        yield rows[first : first + size]

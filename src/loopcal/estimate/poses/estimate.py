@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Estimated poses and true readings after a fit of uncertain readings, and doubts about them.
+
+Rows at the platform do not distinguish the ways in which a limb bends to one pose, and they do not
+know end stops. A reading that was not taken is therefore reported where its estimate lies outside
+the stroke or on another branch than home's, so that nobody takes it for a measured one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from loopcal.estimate.poses.solution import PoseEstimates
+from loopcal.estimate.problem import Problem
+from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.geometry import wrap_angle
+from loopcal.measure import Measurements
+from loopcal.mechanism import Mechanism, inverse
+from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
+
+SAME_READING = 1e-6
+"""Difference of readings, as a share of the robot's size or in radians, up to which they are the
+same solution: above rounding."""
+
+UNEVEN = 1e9
+"""Ratio of standard deviations beyond which the rows of larger sigma drown in the rounding of the
+others."""
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedPoses:
+    """Poses where the machine stood, by all that was measured there and the identified machine.
+
+    Attributes
+    ----------
+    labels : (n,). poses : (n, 4, 4) T_base_platform [m], NaN where not reached or excluded.
+    readings : (n, actuators) [SI], the true ones, NaN where excluded.
+    sigma : (n, actuators) [SI] of the recorded ones: 0 exact, infinite not taken or not believed.
+    kept : (n,) poses that were not excluded.
+    is_undetermined : (n,) poses of these that the data do not determine in some direction; they
+        stand where the search began.
+    is_converged : whether the search for the poses converged.
+    """
+
+    labels: tuple[str, ...]
+    poses: FloatArray
+    readings: FloatArray
+    sigma: FloatArray
+    kept: BoolArray
+    is_undetermined: BoolArray
+    is_converged: bool
+
+    def report(self) -> tuple[Finding, ...]:
+        """Return what is not known of the poses."""
+        findings = []
+        if self.is_undetermined.any():
+            names = _labels_of(self.labels, self.is_undetermined)
+            findings.append(report_finding("poses.undetermined", poses=names, n=len(names)))
+        if not self.is_converged:
+            findings.append(report_finding("poses.not-converged"))
+        return tuple(findings)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return numbers of readings by how they were believed, for JSON.
+
+        Excluded poses are not counted. The arrays are in `arrays`.
+        """
+        sigma = self.sigma[self.kept]
+        return {
+            "exact": int((sigma == 0.0).sum()),
+            "uncertain": int(((sigma > 0.0) & np.isfinite(sigma)).sum()),
+            "not_taken": int(np.isinf(sigma).sum()),
+            "open": _labels_of(self.labels, self.is_undetermined),
+            "calm": self.is_converged,
+        }
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Return the arrays by name [SI], for the run folder."""
+        return {"pose_estimate": self.poses, "reading_estimate": self.readings}
+
+
+def estimate_poses(
+    estimates: PoseEstimates, data: Measurements, drop: Sequence[str] = ()
+) -> EstimatedPoses:
+    """Return the estimated poses of measurements (one trial).
+
+    `drop` are labels of poses that were excluded: nothing is reported of them.
+    """
+    kept = ~np.isin(data.labels, drop)
+    known = estimates.is_reached[0] & kept
+    T = np.where(known[:, None, None], estimates.states.state.T[0], np.nan)
+    readings = np.where(kept[:, None], estimates.states.q[0], np.nan)
+    sigma = np.zeros(data.readings.shape) if data.reading_sigma is None else data.reading_sigma
+    return EstimatedPoses(
+        labels=data.labels,
+        poses=T,
+        readings=readings,
+        sigma=sigma,
+        kept=kept,
+        is_undetermined=estimates.is_undetermined[0] & known,
+        is_converged=bool(estimates.is_converged[0]),
+    )
+
+
+def report_doubtful_readings(robot: Mechanism, poses: EstimatedPoses) -> tuple[Finding, ...]:
+    """Return estimated readings outside their stroke, or on another branch than home's.
+
+    `robot` is the identified one.
+    """
+    known = np.asarray(np.isfinite(poses.poses).all(axis=(1, 2)) & ~poses.is_undetermined)
+    estimated = np.isinf(poses.sigma) & known[:, None]
+    low, high = np.array([a.stroke or (-np.inf, np.inf) for a in robot.actuators]).T
+    outside = estimated & ((poses.readings < low) | (poses.readings > high))
+    beside = estimated & _is_on_other_branch(robot, poses, np.asarray(estimated.any(axis=1)))
+    codes = (("poses.outside-stroke", outside), ("poses.other-branch", beside))
+    return tuple(
+        report_finding(code, readings=_describe_readings(robot, poses, chosen))
+        for code, chosen in codes
+        if chosen.any()
+    )
+
+
+def report_uneven_sigmas(problem: Problem) -> tuple[Finding, ...]:
+    """Return whether the sigmas of all rows differ by more than rounding bears.
+
+    They are compared in sizes of the robot and in radians.
+    """
+    robot = problem.free.robot
+    least, most, name = np.inf, 0.0, ""
+    for rows in problem.rows:
+        weight = np.einsum("trii->tri", rows.whitener)
+        for i, column in enumerate(rows.kind.noise_columns):
+            present = weight[..., i][weight[..., i] > 0.0]
+            if len(present) and column.dimension in (Dimension.LENGTH, Dimension.ANGLE):
+                scale = robot.size if column.dimension is Dimension.LENGTH else 1.0
+                most = max(most, 1.0 / (present.min() * scale))
+                if 1.0 / (present.max() * scale) < least:
+                    least = 1.0 / (present.max() * scale)
+                    name = f"{rows.kind.name} {column.name}"
+    if most <= UNEVEN * least:
+        return ()
+    return (report_finding("poses.uneven-sigmas", ratio=most / least, smallest=name),)
+
+
+def _is_on_other_branch(robot: Mechanism, poses: EstimatedPoses, chosen: BoolArray) -> BoolArray:
+    """Return readings (n, actuators) that differ from those of home's branch at the same pose."""
+    other = np.zeros(poses.readings.shape, dtype=bool)
+    if chosen.any():
+        home = inverse(robot, poses.poses[chosen])
+        gap = poses.readings[chosen] - home.q
+        turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
+        size = np.where(turning, 1.0, robot.size)
+        gap = np.abs(np.where(turning, wrap_angle(gap), gap)) / size
+        other[chosen] = home.converged[:, None] & (gap > SAME_READING)
+    return other
+
+
+def _describe_readings(
+    robot: Mechanism, poses: EstimatedPoses, chosen: BoolArray
+) -> list[dict[str, Any]]:
+    """Return actuator, pose and value of chosen readings (n, actuators)."""
+    described = []
+    for pose, column in np.argwhere(chosen):
+        actuator = robot.actuators[column]
+        symbol = robot.units.get(actuator.dimension, DISPLAY_UNITS[actuator.dimension].symbol)
+        value = poses.readings[pose, column] / find_unit(symbol).factor_to_si
+        described.append(
+            {
+                "actuator": actuator.name,
+                "pose": poses.labels[pose],
+                "value": Quantity(float(value), symbol),
+            }
+        )
+    return described
+
+
+def _labels_of(labels: Sequence[str], chosen: BoolArray) -> list[str]:
+    """Return the labels of chosen poses."""
+    return [label for label, is_chosen in zip(labels, chosen, strict=True) if is_chosen]

@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses at exact readings: the forward kinematics determine them, and they have no coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from loopcal import engine
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.nuisance import (
+    NodeMembers,
+    NodeRows,
+    NuisanceElimination,
+    divide_among_nodes,
+    fold_node_rows,
+    solve_for_nuisance,
+)
+from loopcal.estimate.observation_rows import PoseBlock
+from loopcal.estimate.poses.linearization import (
+    LinearizedPoses,
+    linearize_closure,
+    linearize_poses,
+    linearize_rows,
+    locate_poses,
+)
+from loopcal.estimate.poses.solution import PoseSolution
+from loopcal.estimate.poses.states import PoseStates, map_states
+from loopcal.estimate.start import Start, spread_states
+from loopcal.mechanism.batch_kinematics import forward_trials
+from loopcal.numerics.gauss_newton import Halving
+from loopcal.numerics.tree_elimination import NodeFactors
+from loopcal.numerics.triangular_factor import empty_factor
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class ExactPoses:
+    """Rows at poses of exact readings.
+
+    Attributes
+    ----------
+    free : the free parameters. count : n poses. names : joints that kinds look at.
+    blocks : of poses. members : of every block and kind, the rows by nodes.
+    nuisance : nuisance parameters, if any.
+    located : (t | 1, n, 4, 4) [m], optional. With it closure is linearized at these poses and not
+        solved, see `loopcal.estimate.closure_start`.
+    """
+
+    free: FreeParameters
+    count: int
+    names: tuple[str, ...]
+    blocks: tuple[PoseBlock, ...]
+    members: tuple[tuple[tuple[NodeMembers, ...], ...], ...]
+    nuisance: NuisanceElimination | None
+    located: FloatArray | None = None
+
+    @property
+    def block_size(self) -> int:
+        """Poses of the largest block of consecutive poses."""
+        return len(self.blocks[0].poses)
+
+    @property
+    def is_single_block(self) -> bool:
+        """Whether all rows belong to one block, so that poses are kept from start to start."""
+        return len(self.blocks) == 1 and self.located is None
+
+    def first_states(self, trials: int) -> PoseStates | None:
+        """Return the home pose for all trials and poses; None where poses are not kept."""
+        if not self.is_single_block:
+            return None
+        state = spread_states(self.free.robot.home_state, trials, self.count)
+        return PoseStates(state, np.zeros((trials, self.count, 0)))
+
+    def next_start(
+        self, solution: PoseSolution, start: Start
+    ) -> tuple[PoseStates | None, np.ndarray | None]:
+        """Return the states and their predicted motion for the next start."""
+        linearized, states, old = solution.linearized, solution.states, start.poses
+        if linearized is None or states is None or old is None:
+            return start.poses, start.motion
+        a, ok = len(start), linearized.is_reached
+
+        def kept(new: np.ndarray, before: np.ndarray) -> np.ndarray:
+            if ok.all():
+                return np.broadcast_to(new, (a, *new.shape[1:]))
+            return np.where(ok.reshape(*ok.shape, *[1] * (new.ndim - 2)), new, before)
+
+        motion = linearized.by_parameters.astype(np.float32)
+        state = map_states(kept, states.state, old.state)
+        return PoseStates(state, old.q), np.broadcast_to(motion, (a, *motion.shape[1:]))
+
+    def solve(
+        self,
+        z: FloatArray,
+        trials: IntArray,
+        start: Start,
+        control: Halving,
+        fixed: FloatArray | None = None,
+        shared: PoseSolution | None = None,
+        derivatives: bool = True,
+    ) -> PoseSolution:
+        """Solve for the poses, and for the nuisance parameters that fit best there.
+
+        Parameters
+        ----------
+        z : (a, p) deviations. trials : (a,) numbers of the rows' trials. start : of the a trials.
+        fixed : (a, U), optional; nuisance parameters that are not solved for.
+        shared : poses that are the same for all trials, where they are known already.
+        derivatives : whether poses are linearized, too.
+        """
+        single = shared
+        if single is None and len(self.blocks) == 1:
+            if derivatives:
+                single = self.solve_single_block(z, trials, start)
+            else:
+                begin = start.predict_states(z)
+                single = PoseSolution(None, self._locate(self.blocks[0], z, begin))
+        linearized = None if single is None else single.linearized
+        nuisance = fixed
+        if self.nuisance is not None and fixed is None:
+            located = (
+                [linearized]
+                if linearized is not None
+                else [self._locate(b, z) for b in self.blocks]
+            )
+            nuisance = self._solve_for_nuisance(located, start.predict_nuisance(z), trials, control)
+        return PoseSolution(nuisance, linearized, None if single is None else single.states)
+
+    def solve_single_block(self, z: FloatArray, trials: IntArray, start: Start) -> PoseSolution:
+        """Solve and linearize the poses of the only block at deviations z (a | 1, p)."""
+        first = start.take(np.arange(len(z))) if len(z) < len(start) else start
+        linearized, state = self._linearize(self.blocks[0], z, trials, first.predict_states(z))
+        return PoseSolution(None, linearized, PoseStates(state, np.zeros(0)))
+
+    def iterate_rows(
+        self, solution: PoseSolution, z: FloatArray, trials: IntArray
+    ) -> Iterator[tuple[list[NodeRows], BoolArray]]:
+        """Give, block by block, the rows of the nodes, and which trials (a,) lack a needed pose."""
+        tree = None if self.nuisance is None else self.nuisance.tree
+        for block, members in zip(self.blocks, self.members, strict=True):
+            poses = solution.linearized or self._linearize(block, z, trials, None)[0]
+            parts = []
+            for i, (rows, nodes) in enumerate(zip(block.rows, members, strict=True)):
+                if len(rows.poses):
+                    kind = linearize_rows(rows, poses, trials, solution.nuisance)
+                    parts += [p._replace(kind=i) for p in divide_among_nodes(kind, nodes, tree)]
+            yield parts, poses.is_lost(block.is_needed)
+
+    def poses_of(self, block: PoseBlock, part: NodeRows) -> IntArray:
+        """Return the first pose of each of the rows of a part."""
+        return block.poses[block.rows[part.kind].first_poses[part.numbers]]
+
+    def iterate_poses(
+        self, solution: PoseSolution, z: FloatArray
+    ) -> Iterator[tuple[PoseBlock, LinearizedPoses]]:
+        """Give every block with its solved poses."""
+        for block in self.blocks:
+            yield block, solution.linearized or self._locate(block, z)
+
+    def find_unreached(self, z: FloatArray, start: Start) -> IntArray:
+        """Return the poses that a row needs and that cannot be reached at deviation z (1, p)."""
+        del start
+        lost = [
+            block.poses[~self._locate(block, z).is_reached[0] & block.is_needed]
+            for block in self.blocks
+        ]
+        return np.unique(np.concatenate(lost))
+
+    def locate(
+        self, z: FloatArray, start: Start
+    ) -> tuple[FloatArray, dict[str, FloatArray]] | None:
+        """Return poses (n, 4, 4) and joints name -> (1, n) of one trial; None if one is lost."""
+        located = [
+            (block, self._locate(block, z, start.predict_states(z))) for block in self.blocks
+        ]
+        if any(poses.is_lost(block.is_needed)[0] for block, poses in located):
+            return None
+        T = np.concatenate([poses.T[0] for _, poses in located])[: self.count]
+        joints = {
+            name: np.concatenate(
+                [
+                    np.broadcast_to(poses.joints[name], poses.is_reached.shape)[0]
+                    for _, poses in located
+                ]
+            )[None, : self.count]
+            for name in self.names
+        }
+        return T, joints
+
+    def _solve_for_nuisance(
+        self, located: list[LinearizedPoses], values: FloatArray, trials: IntArray, control: Halving
+    ) -> FloatArray:
+        """Return the values (a, U) that fit best at the poses of all blocks."""
+        nuisance = self.nuisance
+        assert nuisance is not None
+
+        def fold_at(tried: FloatArray) -> NodeFactors:
+            factors = NodeFactors(nuisance.tree, len(trials), 0)
+            for block, members, poses in zip(self.blocks, self.members, located, strict=True):
+                parts = []
+                for rows, nodes in zip(block.rows, members, strict=True):
+                    if rows.nuisance.shape[1] and len(rows.poses):
+                        kind = linearize_rows(rows, poses, trials, tried, by_parameters=False)
+                        parts += divide_among_nodes(kind, nodes, nuisance.tree)
+                within = [part for part in parts if part.structure >= 0]
+                fold_node_rows(empty_factor(0, 0), factors, within)
+            return factors
+
+        return solve_for_nuisance(nuisance, values, fold_at, control)
+
+    def _linearize(
+        self, block: PoseBlock, z: FloatArray, trials: IntArray, begin: engine.State | None
+    ) -> tuple[LinearizedPoses, engine.State]:
+        """Solve and linearize the poses of a block."""
+        values = self.free.values(z)
+        if self.located is not None:
+            T = self.located if len(self.located) == 1 else self.located[trials]
+            T = np.broadcast_to(T, (len(trials), *T.shape[1:]))[:, block.poses]
+            poses = linearize_closure(self.free, values, block.readings, T)
+            return poses, self.free.robot.home_state
+        state = forward_trials(self.free.robot, values, block.readings, begin)
+        poses = linearize_poses(self.free, values, block.readings, state, self.names)
+        return poses, state
+
+    def _locate(
+        self, block: PoseBlock, z: FloatArray, begin: engine.State | None = None
+    ) -> LinearizedPoses:
+        """Solve the poses of a block without linearizing them."""
+        state = forward_trials(self.free.robot, self.free.values(z), block.readings, begin)
+        return locate_poses(self.free, block.readings, state, self.names)

@@ -1,0 +1,313 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses and their first derivatives, and the whitened rows that observe them.
+
+At solved poses the pose and the joint values are linear functions of the scaled parameters z and,
+where readings are uncertain, of the coordinates u in which a pose may move:
+
+    twist = D dz + Y du,    joint = slope dz + turn du
+
+For a row with residual r = predicted - measured, whitener W, and the kind's derivatives G by the
+platform's twist, J by joint values and F by nuisance parameters, the whitened row is
+[W (G Y + J turn) | W F | W (G D + J slope) | W r]. A row that compares poses has the sum over its
+poses. This module is the only place where poses and rows are linearized.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from loopcal import engine, geometry
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.observation_rows import ObservationRows
+from loopcal.measure import Evaluation, select_joint_values
+from loopcal.mechanism import Status
+from loopcal.mechanism.batch_kinematics import forward_trials
+from loopcal.mechanism.passive_joints import differentiate_passive_joints
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.transmission import joints_from_readings
+from loopcal.numerics.decomposition import without_rounding
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class LinearizedPoses:
+    """Poses of a batch of trials, with their derivatives. Leading axes are (a | 1, n).
+
+    Where a pose is not reached T is the identity and all derivatives are zero.
+
+    Attributes
+    ----------
+    T : (a, n, 4, 4) T_base_platform [m]. is_reached : (a, n).
+    by_parameters : (a, n, 6, p) twist by the scaled parameters; p = 0 where not asked for.
+    joints : name -> (a, n) [SI]. joints_by_parameters : name -> (a, n, p), passive joints and
+        those that move although readings are fixed.
+    by_coordinates : (a, n, 6, k) twist by the coordinates of the pose.
+    joints_by_coordinates : name -> (a, n, k).
+    closure_step : (a, n, 6) Newton step of closure, where closure is linearized and not solved.
+    """
+
+    T: FloatArray
+    is_reached: BoolArray
+    by_parameters: FloatArray
+    joints: Mapping[str, FloatArray] = field(default_factory=dict)
+    joints_by_parameters: Mapping[str, FloatArray] = field(default_factory=dict)
+    by_coordinates: FloatArray | None = None
+    joints_by_coordinates: Mapping[str, FloatArray] = field(default_factory=dict)
+    closure_step: FloatArray | None = None
+
+    def is_lost(self, is_needed: BoolArray) -> BoolArray:
+        """Return the trials (a,) in which a needed pose (n,) is not reached."""
+        return np.asarray(np.any(~self.is_reached & is_needed, axis=1))
+
+
+def scale_parameters(free: FreeParameters, by_parameter: FloatArray) -> FloatArray:
+    """Return derivatives (.., p) by the free parameters in units of their tolerance."""
+    p = by_parameter.shape[-1]
+    columns = by_parameter[..., free.places] if len(free.places) < p else by_parameter
+    return columns * free.tolerance
+
+
+def locate_poses(
+    free: FreeParameters, q: FloatArray, state: engine.State, names: Sequence[str]
+) -> LinearizedPoses:
+    """Return solved poses without derivatives, with the values of the named joints."""
+    none = np.zeros((*state.T.shape[:2], 6, 0))
+    unmasked = LinearizedPoses(state.T, np.zeros(0, dtype=bool), none)
+    return mask_unreached(free, names, q, state, unmasked)
+
+
+def linearize_poses(
+    free: FreeParameters,
+    values: FloatArray,
+    q: FloatArray,
+    state: engine.State,
+    names: Sequence[str] = (),
+    reading_scale: FloatArray | None = None,
+) -> LinearizedPoses:
+    """Linearize solved poses by the implicit function theorem.
+
+    Parameters
+    ----------
+    values : (a | 1, p of the robot) [SI]. q : (a | 1, n, actuators) readings [SI].
+    state : (a, n) solved there. names : joints whose values and derivatives are needed.
+    reading_scale : (n, actuators) [SI], optional. With it the coordinates of a pose are its
+        readings in these units.
+    """
+    robot = free.robot
+    solved = differentiate_pose(robot, values, q, state)
+    D = scale_parameters(free, solved.parameters)
+    actuators = [actuator.name for actuator in robot.actuators]
+    passive = [name for name in names if name not in actuators]
+    slopes, turns, Y = {}, {}, None
+    if reading_scale is not None:
+        Y = solved.readings * reading_scale[:, None, :]
+        unit = np.eye(len(actuators))
+        turns = {n: unit[actuators.index(n)] * reading_scale[None] for n in names if n in actuators}
+    if passive:
+        moved = differentiate_passive_joints(robot, values, q, state)
+        for name in passive:
+            i = moved.names.index(name)
+            slopes[name] = scale_parameters(free, moved.parameters[:, :, i])
+            if reading_scale is not None:
+                turns[name] = moved.readings[:, :, i] * reading_scale
+    poses = LinearizedPoses(
+        state.T,
+        np.zeros(0, dtype=bool),
+        D,
+        joints_by_parameters=slopes,
+        by_coordinates=Y,
+        joints_by_coordinates=turns,
+    )
+    return mask_unreached(free, names, q, state, poses)
+
+
+def linearize_at_readings(
+    free: FreeParameters, readings: FloatArray, names: Iterable[str] = ()
+) -> LinearizedPoses:
+    """Solve and linearize a robot at readings (n, actuators) and its present values: (1, n)."""
+    values = free.robot.values[None]
+    state = forward_trials(free.robot, values, readings[None])
+    return linearize_poses(free, values, readings[None], state, tuple(names))
+
+
+def linearize_closure(
+    free: FreeParameters, values: FloatArray, readings: FloatArray, T: FloatArray
+) -> LinearizedPoses:
+    """Linearize the loop closure at given poses T (a, n, 4, 4), without solving it."""
+    robot = free.robot
+    e, tau = robot.slots(values)
+    joints = joints_from_readings(readings, tau, robot.slots.frequency)
+    begin = replace(robot.home_state, T=T)
+    state = engine.solve(robot.program, e, joints, begin, max_iterations=1)
+    step = geometry.pose_difference(state.T, T)
+    at = replace(state, T=T, status=np.zeros_like(state.status))
+    D = differentiate_pose(robot, values, readings, at).parameters
+    ok = np.asarray(np.isfinite(step).all(axis=2) & np.isfinite(D).all(axis=(2, 3)))
+    step, D = np.where(ok[..., None], step, 0.0), np.where(ok[..., None, None], D, 0.0)
+    return LinearizedPoses(T, ok, scale_parameters(free, D), closure_step=step)
+
+
+def mask_unreached(
+    free: FreeParameters,
+    names: Sequence[str],
+    q: FloatArray,
+    state: engine.State,
+    poses: LinearizedPoses,
+) -> LinearizedPoses:
+    """Complete linearized poses: joint values, which are reached, and zeros where one is not."""
+    shape = state.T.shape[:2]
+    Y, slopes, turns = poses.by_coordinates, poses.joints_by_parameters, poses.joints_by_coordinates
+    derivatives = [poses.by_parameters, *slopes.values(), *turns.values()]
+    derivatives += [] if Y is None else [Y, q]
+    ok = np.asarray(state.status == Status.CONVERGED)
+    for array in derivatives:
+        ok = ok & np.isfinite(array).all(axis=tuple(range(2, array.ndim)))
+    values = select_joint_values(free.robot, tuple(names), q, state)
+
+    def masked(array: np.ndarray) -> FloatArray:
+        if ok.all():
+            return array
+        return np.where(ok.reshape(*ok.shape, *[1] * (array.ndim - 2)), array, 0.0)
+
+    def spread(array: np.ndarray) -> FloatArray:
+        return np.broadcast_to(masked(array), (*shape, array.shape[-1]))
+
+    return LinearizedPoses(
+        T=state.T if ok.all() else np.where(ok[..., None, None], state.T, np.eye(4)),
+        is_reached=ok,
+        by_parameters=masked(poses.by_parameters),
+        joints={name: masked(value) for name, value in values.items()},
+        joints_by_parameters={name: masked(slope) for name, slope in slopes.items()},
+        by_coordinates=None if Y is None else masked(Y),
+        joints_by_coordinates={name: spread(turn) for name, turn in turns.items()},
+    )
+
+
+class KindRows(NamedTuple):
+    """Whitened rows of one kind.
+
+    Attributes
+    ----------
+    residual : (a, r, m).
+    by_parameters : (a, r, m, p); p = 0 where not asked for.
+    by_nuisance : (a, r, m, u) by the nuisance parameters that each row uses; None without any.
+    by_coordinates : (a, r, links, m, k) by the coordinates of each linked pose; None where poses
+        have none.
+    """
+
+    residual: FloatArray
+    by_parameters: FloatArray
+    by_nuisance: FloatArray | None
+    by_coordinates: FloatArray | None
+
+
+def evaluate_rows(
+    rows: ObservationRows, poses: LinearizedPoses, trials: IntArray, nuisance: FloatArray | None
+) -> tuple[Evaluation, FloatArray]:
+    """Return residuals and derivatives of a kind at poses, and its whiteners.
+
+    `trials` (a,) are numbers of the rows' trials. `nuisance` (a, U) are values of the nuisance
+    parameters.
+    """
+    measured, white = rows.take_trials(trials)
+    T = poses.T
+    if not _is_every_pose(rows, T.shape[1]):
+        T = T[:, rows.poses]
+    T = np.broadcast_to(T, (len(trials), *T.shape[1:]))
+    used = nuisance is not None and rows.nuisance.shape[1]
+    own = nuisance[:, rows.nuisance] if nuisance is not None and used else None
+    names, joints = rows.kind.sensed_joints, None
+    if names:
+        observed = np.stack([poses.joints[name][:, rows.poses] for name in names], axis=-1)
+        joints = np.broadcast_to(observed, (len(trials), *observed.shape[1:]))
+    return rows.kind.evaluate(T, measured, own, joints), white
+
+
+def linearize_rows(
+    rows: ObservationRows,
+    poses: LinearizedPoses,
+    trials: IntArray,
+    nuisance: FloatArray | None,
+    by_parameters: bool = True,
+) -> KindRows:
+    """Return the whitened rows of a kind at linearized poses; arguments as of `evaluate_rows`."""
+    at, white = evaluate_rows(rows, poses, trials, nuisance)
+    residual = at.residual
+    if poses.closure_step is not None:
+        step = poses.closure_step[:, rows.poses, :, None]
+        residual = residual + np.matmul(at.jacobian, step)[..., 0]
+    a, r, m = residual.shape
+    own = None
+    if at.nuisance is not None:
+        own = np.matmul(white, np.broadcast_to(at.nuisance, (a, r, m, at.nuisance.shape[-1])))
+    return KindRows(
+        residual=whiten(white, residual),
+        by_parameters=_parameter_columns(rows, at, white, poses)
+        if by_parameters
+        else np.zeros((a, r, m, 0)),
+        by_nuisance=own,
+        by_coordinates=None
+        if poses.by_coordinates is None
+        else _coordinate_columns(rows, at, white, poses, poses.by_coordinates),
+    )
+
+
+def whiten(whitener: FloatArray, residual: FloatArray) -> FloatArray:
+    """Return whitened residuals (.., m) of whiteners (.., m, m) and residuals (.., m)."""
+    return np.matmul(whitener, residual[..., None])[..., 0]
+
+
+def coordinate_derivative(jacobian: FloatArray, Y: FloatArray) -> FloatArray:
+    """Return derivatives (a, r, m, k) of rows by the coordinates of a pose.
+
+    They are zero where a row depends on a coordinate by rounding alone.
+    """
+    return without_rounding(np.matmul(jacobian, Y), np.matmul(np.abs(jacobian), np.abs(Y)))
+
+
+def _parameter_columns(
+    rows: ObservationRows, at: Evaluation, white: FloatArray, poses: LinearizedPoses
+) -> FloatArray:
+    """Return whitened derivatives (a, r, m, p) of a kind by the scaled parameters."""
+    D = poses.by_parameters
+    if rows.kind.poses_per_row > 1:
+        linked = (
+            at.jacobian[:, :, i] @ D[:, rows.poses[:, i]] for i in range(rows.kind.poses_per_row)
+        )
+        return np.matmul(white, sum(linked, start=np.zeros(1)))
+    if not _is_every_pose(rows, D.shape[1]):
+        D = D[:, rows.poses]
+    columns = np.matmul(white, np.matmul(at.jacobian, D))
+    for j, name in enumerate(rows.kind.sensed_joints):
+        if name in poses.joints_by_parameters and at.joints is not None:
+            slope = poses.joints_by_parameters[name][:, rows.poses, None, :]
+            columns = columns + np.matmul(white, at.joints[..., j, None] * slope)
+    return columns
+
+
+def _coordinate_columns(
+    rows: ObservationRows, at: Evaluation, white: FloatArray, poses: LinearizedPoses, Y: FloatArray
+) -> FloatArray:
+    """Return whitened derivatives (a, r, links, m, k) of a kind by the coordinates of its poses."""
+    if rows.kind.poses_per_row > 1:
+        linked = [
+            np.matmul(white, coordinate_derivative(at.jacobian[:, :, i], Y[:, rows.poses[:, i]]))
+            for i in range(rows.kind.poses_per_row)
+        ]
+        return np.stack(linked, axis=2)
+    columns = coordinate_derivative(at.jacobian, Y[:, rows.poses])
+    if at.joints is not None and rows.kind.sensed_joints:
+        turns = [
+            poses.joints_by_coordinates[name][:, rows.poses] for name in rows.kind.sensed_joints
+        ]
+        columns = columns + np.matmul(at.joints, np.stack(turns, axis=2))
+    return np.matmul(white, columns)[:, :, None]
+
+
+def _is_every_pose(rows: ObservationRows, count: int) -> bool:
+    """Return whether row i observed pose i and there are no other poses."""
+    return np.array_equal(rows.poses, np.arange(count))

@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses that rows measure in full, without readings.
+
+A robot with m freedoms stands where the rows of a pose fit best, if these rows determine m
+directions: a position determines a delta robot, two coordinates determine a planar one.
+Gauss-Newton begins at home and uses all rows that need nothing but the pose. See
+docs/theory/latent.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from loopcal import engine, geometry
+from loopcal.estimate.observation_rows import ObservationRows
+from loopcal.estimate.poses.linearization import whiten
+from loopcal.estimate.poses.states import map_states
+from loopcal.mechanism import Mechanism, Status, read_coordinates
+from loopcal.mechanism.batch_kinematics import inverse_trials
+from loopcal.mechanism.projection import differentiate_by_coordinates
+from loopcal.numerics.gauss_newton import DescentStatus, FixedFactors, minimize
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+STEPS = 30
+"""Gauss-Newton steps, at most. A position takes one, an orientation four."""
+
+LONGEST_STEP = 0.5
+"""Longest step, as a share of the robot's size."""
+
+NEGLIGIBLE_STEP = 1e-6
+"""Step, as a share of the size, at which a pose is found: a search begins there, no more."""
+
+FULL_RANK = 1e-6
+"""Smallest singular value of the whitened rows, columns of length one, relative to the largest,
+with which they determine all freedoms."""
+
+
+def measure_poses(
+    robot: Mechanism, rows: Sequence[ObservationRows], trial: IntArray, pose: IntArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return where the rows of k poses put the platform.
+
+    Rows that use nuisance parameters, compare poses, or look at joints are passed over.
+
+    Parameters
+    ----------
+    robot : at its present values. rows : what was measured. trial, pose : (k,) which poses.
+
+    Returns
+    -------
+    T : (k, 4, 4). is_full : (k,) poses that the rows determine in full; T has no meaning for the
+        others.
+    """
+    usable = _usable_rows(rows, pose)
+    T = np.tile(robot.home, (len(pose), 1, 1))
+    if not usable:
+        return T, np.zeros(len(pose), dtype=bool)
+    model = _MeasuredPoses(robot, usable)
+    start = _Point(T, trial, np.arange(len(pose)), np.zeros(len(pose)), None)
+    minimum = minimize(model, start, FixedFactors(np.ones(len(pose))), STEPS)
+    return minimum.point.T, minimum.status == DescentStatus.CONVERGED
+
+
+def sum_squares_at(
+    rows: Sequence[ObservationRows], trial: IntArray, pose: IntArray, T: FloatArray
+) -> FloatArray:
+    """Return the sum of whitened squares (k,) of the rows of k poses, platform at T (k, 4, 4)."""
+    parts = [_whitened_rows(r, places, trial, T)[0] for r, places in _usable_rows(rows, pose)]
+    return sum(((part**2).sum(axis=1) for part in parts), start=np.zeros(len(pose)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Poses T (k, 4, 4) with their trials and numbers (k,); `cost` is not looked at."""
+
+    T: FloatArray
+    trial: IntArray
+    number: IntArray
+    cost: FloatArray
+    state: engine.State | None
+
+    def take(self, chosen: IntArray) -> _Point:
+        """Return some poses."""
+        state = self.state and map_states(lambda array: array[:, chosen], self.state)
+        arrays = (self.T, self.trial, self.number, self.cost)
+        return _Point(*(array[chosen] for array in arrays), state)
+
+    def put(self, chosen: IntArray, other: _Point) -> _Point:
+        """Return these poses with some taken from another value."""
+        T = self.T.copy()
+        T[chosen] = other.T
+        state = other.state if len(chosen) == len(T) else None
+        return replace(self, T=T, state=state)
+
+
+@dataclass(frozen=True, eq=False)
+class _FullStep:
+    """Twists (k, 6) from closed poses T, their lengths (k,), and whether rows are sufficient."""
+
+    T: FloatArray
+    twist: FloatArray
+    length: FloatArray
+    is_full: BoolArray
+    is_closed: BoolArray
+    state: engine.State | None
+
+    def take(self, chosen: np.ndarray) -> _FullStep:
+        """Return some poses."""
+        arrays = (self.T, self.twist, self.length, self.is_full, self.is_closed)
+        state = self.state and map_states(lambda array: array[:, chosen], self.state)
+        return _FullStep(*(array[chosen] for array in arrays), state)
+
+
+@dataclass(frozen=True, eq=False)
+class _MeasuredPoses:
+    """Gauss-Newton by full steps over what the platform can do: every step is accepted."""
+
+    robot: Mechanism
+    rows: list[tuple[ObservationRows, IntArray]]
+
+    def propose(self, point: _Point, damping: FloatArray) -> _FullStep:
+        """Return the full steps, limited in length."""
+        del damping
+        robot, k = self.robot, len(point.T)
+        parts = [
+            _whitened_rows(rows, places[point.number], point.trial, point.T)
+            for rows, places in self.rows
+        ]
+        residual, by_twist = (np.concatenate([part[i] for part in parts], axis=1) for i in (0, 1))
+        state, T, closed = None, point.T, np.ones(k, dtype=bool)
+        if self.moves_freely:
+            slope = np.diag([1.0 / robot.size] * 3 + [1.0] * 3)[:, robot.program.freedoms]
+        else:
+            target = read_coordinates(T[None], robot.controlled)
+            state = inverse_trials(robot, robot.values[None], target, point.state)
+            slope = differentiate_by_coordinates(robot, robot.values[None], state)[0]
+            closed = np.asarray(state.status[0] == Status.CONVERGED)
+            T = np.where(closed[:, None, None], state.T[0], T)
+        step, is_full = _least_squares_step(by_twist @ slope, residual)
+        length = np.linalg.norm(step, axis=1)
+        longest = LONGEST_STEP * robot.size
+        step *= np.minimum(1.0, longest / np.maximum(length, longest))[:, None]
+        twist = np.matmul(slope, step[..., None])[..., 0]
+        return _FullStep(T, twist, length, is_full, closed, state)
+
+    @property
+    def moves_freely(self) -> bool:
+        """Whether every motion of the platform is one of its freedoms."""
+        robot = self.robot
+        return set(robot.controlled) == set(robot.freedoms) or len(robot.controlled) == 6
+
+    def is_negligible(self, point: _Point, step: _FullStep) -> BoolArray:
+        """Return which poses (k,) are found."""
+        del point
+        return step.is_full & step.is_closed & (step.length < NEGLIGIBLE_STEP * self.robot.size)
+
+    def finish(self, point: _Point, step: _FullStep) -> _Point:
+        """Return the poses after their step."""
+        return replace(point, T=geometry.apply_twist(step.T, step.twist), state=step.state)
+
+    def evaluate(self, point: _Point, step: _FullStep, trials: IntArray) -> _Point:
+        """Return the poses after their step."""
+        del trials
+        return self.finish(point, step)
+
+    def judge(
+        self, point: _Point, step: _FullStep, candidate: _Point
+    ) -> tuple[BoolArray, FloatArray]:
+        """Accept every step."""
+        del point, candidate
+        return np.ones(len(step.T), dtype=bool), np.ones(len(step.T))
+
+    def ending(
+        self, point: _Point, step: _FullStep, candidate: _Point, accepted: BoolArray
+    ) -> IntArray:
+        """End where rows do not determine all freedoms."""
+        del point, candidate, accepted
+        return np.where(step.is_full, DescentStatus.RUNNING, DescentStatus.NO_DESCENT)
+
+
+def _usable_rows(
+    rows: Sequence[ObservationRows], pose: IntArray
+) -> list[tuple[ObservationRows, IntArray]]:
+    """Return the kinds whose rows need nothing but a pose, and their rows (k, c) of k poses."""
+    if not len(pose):
+        return []
+    usable = [
+        r
+        for r in rows
+        if not r.nuisance.shape[1]
+        and r.kind.poses_per_row == 1
+        and not r.kind.sensed_joints
+        and len(r.poses)
+    ]
+    return [(r, _rows_of_poses(r, pose)) for r in usable]
+
+
+def _rows_of_poses(rows: ObservationRows, pose: IntArray) -> IntArray:
+    """Return the rows (k, c) that observed each of k poses, -1 where there are fewer than c."""
+    order = np.argsort(rows.poses, kind="stable")
+    count = np.bincount(rows.poses, minlength=pose.max() + 1)
+    nth = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
+    table = np.full((len(count), count.max()), -1)
+    table[rows.poses[order], nth] = order
+    return table[pose]
+
+
+def _whitened_rows(
+    observed: ObservationRows, rows: IntArray, trial: IntArray, T: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return whitened residuals (k, c m) of rows (k, c) at poses T (k, 4, 4), and their derivatives
+    (k, c m, 6) by the twist.
+    """
+    k, c = rows.shape
+    measured, white = (
+        array[np.where(len(array) > 1, trial, 0)[:, None], np.maximum(rows, 0)]
+        for array in (observed.measured, observed.whitener)
+    )
+    at = observed.kind.evaluate(np.repeat(T, c, axis=0)[None], measured.reshape(1, k * c, -1))
+    white = np.where(rows[..., None, None] >= 0, white, 0.0)
+    m = white.shape[-1]
+    residual = whiten(white, at.residual.reshape(k, c, m))
+    jacobian = np.matmul(white, at.jacobian.reshape(k, c, m, 6))
+    return residual.reshape(k, c * m), jacobian.reshape(k, c * m, 6)
+
+
+def _least_squares_step(rows: FloatArray, residual: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return steps (k, m) of rows (k, h, m), and which rows determine all of it (k,).
+
+    Where they do not, the step is zero.
+    """
+    k, h, m = rows.shape
+    finite = np.asarray(np.isfinite(rows).all(axis=(1, 2)) & np.isfinite(residual).all(axis=1))
+    length = np.linalg.norm(np.where(finite[:, None, None], rows, 0.0), axis=1)
+    full = finite & (length > 0.0).all(axis=1) & (h >= m)
+    step = np.zeros((k, m))
+    if full.any():
+        U, s, Vt = np.linalg.svd(rows[full] / length[full, None], full_matrices=False)
+        good = s[:, -1] > FULL_RANK * s[:, 0]
+        full[full] = good
+        along = np.matmul(np.swapaxes(U[good], 1, 2), -residual[full][..., None])
+        along = along / s[good][..., None]
+        step[full] = np.matmul(np.swapaxes(Vt[good], 1, 2), along)[..., 0] / length[full]
+    return step, full

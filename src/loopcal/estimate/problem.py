@@ -1,0 +1,475 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The least-squares problem of an identification, linearized by a pure function.
+
+A problem holds the free parameters of a robot, the whitened rows of every kind, the table of
+nuisance parameters with its elimination tree, and how poses follow from readings. It has no state:
+`linearize(z, start)` depends on its arguments alone. Warm starts are passed in and returned.
+
+For a row with residual r = predicted - measured, whitener W, the kind's derivative G by the
+platform's twist, and the error model D = d twist / d parameter, the row is [W G D diag(tolerance) |
+W r]. FreeParameters of all scopes are eliminated from the innermost outwards: the coordinates of poses
+whose readings are uncertain (block by block, while rows are made), then groups, sessions and what
+all rows share. What is left is folded into one triangular factor, so that the memory of a fit is
+its parameters squared plus one block. See docs/theory/identification.md and docs/theory/latent.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.linearization import LeverageRows, Linearization
+from loopcal.estimate.nuisance import (
+    NodeMembers,
+    NuisanceElimination,
+    fold_node_rows,
+    plan_elimination,
+)
+from loopcal.estimate.observation_rows import BLOCK, ObservationRows, Residuals, divide_poses
+from loopcal.estimate.poses.components import divide_components, find_components, group_components
+from loopcal.estimate.poses.coordinates import PoseCoordinates, ReadingCoordinates, TwistCoordinates
+from loopcal.estimate.poses.exact import ExactPoses
+from loopcal.estimate.poses.initialization import first_poses
+from loopcal.estimate.poses.linearization import evaluate_rows, whiten
+from loopcal.estimate.poses.solution import PoseSolution
+from loopcal.estimate.poses.states import PoseStates
+from loopcal.estimate.poses.uncertain import UncertainPoses, groups_of_nodes
+from loopcal.estimate.start import Start
+from loopcal.measure import (
+    Measurements,
+    NuisanceParameters,
+    Trials,
+    collect_nuisance_parameters,
+    list_sensed_joints,
+    make_readings_kind,
+    resolve_reading_sigma,
+)
+from loopcal.measure.simulation import rows_of as sensor_rows
+from loopcal.measure.whitening import whitener
+from loopcal.numerics.gauss_newton import Halving
+from loopcal.numerics.tree_elimination import NodeFactors
+from loopcal.numerics.triangular_factor import empty_factor, fold_rows
+from loopcal.typing import FloatArray, IntArray
+from loopcal.units import Dimension
+
+UNKNOWN_READING = 1e-3
+"""Unit of a reading that was not taken: this share of the robot's size, or this many radians. It
+has no row."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Whitened rows of t machines that share readings and kinds.
+
+    Attributes
+    ----------
+    free : the free parameters and their units.
+    readings : (T | 1, n, actuators) [SI] recorded ones, NaN where not taken.
+    rows : of every kind; uncertain readings are the last kind.
+    trials : (t,) numbers of the problem's trials among the T trials of the arrays.
+    nuisance : nuisance parameters and their elimination tree; None without any.
+    data : from the number of a trial to its measurements, from which nuisance parameters start.
+    control : of the iteration to the best nuisance parameters and poses.
+    sigma : (n, actuators) [SI] of the readings, 0 exact, infinite not taken or not believed; None
+        where all readings are exact.
+    member : (n,) component of each pose where readings are uncertain.
+    coordinates : in which poses of uncertain readings move.
+    located : (T | 1, n, 4, 4) [m], optional; see `ExactPoses`.
+    residual_count : (T,) residuals that are present, those of uncertain readings included.
+    """
+
+    free: FreeParameters
+    readings: FloatArray
+    rows: tuple[ObservationRows, ...]
+    trials: IntArray
+    nuisance: NuisanceElimination | None
+    data: Callable[[int], Measurements]
+    control: Halving = Halving()  # noqa: RUF009
+    sigma: FloatArray | None = None
+    member: IntArray | None = None
+    coordinates: PoseCoordinates | None = None
+    located: FloatArray | None = None
+    poses: ExactPoses | UncertainPoses = field(init=False)
+    component_count: IntArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        exact = self.coordinates is None or self.member is None
+        n = self.readings.shape[1]
+        member = np.zeros(n, dtype=np.int64) if self.member is None else self.member
+        count = _count_by_component(self.rows, member)
+        object.__setattr__(self, "component_count", count)
+        make = self._exact_poses if exact else self._uncertain_poses
+        object.__setattr__(self, "poses", make())
+
+    def __len__(self) -> int:
+        return len(self.trials)
+
+    @property
+    def parameters(self) -> int:
+        """Number p of free parameters."""
+        return len(self.free)
+
+    @property
+    def is_uncertain(self) -> bool:
+        """Whether readings are uncertain, so that poses are unknowns."""
+        return isinstance(self.poses, UncertainPoses)
+
+    @property
+    def residual_count(self) -> IntArray:
+        """(t,) residuals that are present."""
+        return _of_trials(self.component_count.sum(axis=1), self.trials)
+
+    @property
+    def equations(self) -> IntArray:
+        """(t,) equations, at least, once every pose is determined; nuisance parameters not counted."""
+        count = self.component_count
+        if self.coordinates is not None and self.member is not None:
+            free = self.coordinates.is_free(np.arange(len(self.member))).sum(axis=1)
+            used = np.bincount(self.member, free, count.shape[1]).astype(np.int64)
+            count = np.maximum(count - used, 0)
+        return _of_trials(count.sum(axis=1), self.trials)
+
+    def take(self, trials: IntArray) -> Problem:
+        """Return the problem of some trials; this object where these are all of them."""
+        if np.array_equal(trials, np.arange(len(self))):
+            return self
+        other = object.__new__(Problem)
+        for name, value in vars(self).items():
+            object.__setattr__(other, name, value)
+        object.__setattr__(other, "trials", self.trials[trials])
+        return other
+
+    def weighted(self, weight: FloatArray) -> Problem:
+        """Return the problem with a factor (n,) on each pose's squares, its readings included.
+
+        A weight of 0 makes the rows of a pose absent.
+        """
+        return replace(self, rows=tuple(r.weighted(weight) for r in self.rows))
+
+    def start(self, deviation: FloatArray | None = None, seek: bool = True) -> Start:
+        """Return the first start.
+
+        Parameters
+        ----------
+        deviation : (t, p), optional; default: the robot's present values.
+        seek : whether nuisance parameters without a prior are found from the data; otherwise they
+            begin at their nominal values.
+
+        All trials begin with the nuisance parameters that fit the first one whose poses are
+        reached: trials are measured with the same instruments.
+        """
+        t, p = len(self), self.parameters
+        if deviation is None:
+            deviation = np.repeat(self.free.deviation(self.free.robot.values[None]), t, axis=0)
+        nominal = np.zeros(0) if self.nuisance is None else self.nuisance.local.values()
+        values = np.broadcast_to(nominal, (t, len(nominal)))
+        slope = np.broadcast_to(0.0, (t, len(nominal), p))
+        start = Start(deviation, values, slope, values, self._first_states())
+        if self.nuisance is None or not seek or not self.nuisance.is_free.any():
+            return start
+        for i in range(t):
+            one = np.array([i])
+            located = self.poses.locate(deviation[one], start.take(one))
+            if located is not None:
+                data = self.data(int(self.trials[i]))
+                return start.with_nuisance(self.nuisance.start_values(data, *located))
+        return start
+
+    def linearize(self, deviation: FloatArray, start: Start) -> Linearization:
+        """Linearize at deviations (t, p), nuisance parameters and poses eliminated.
+
+        Nuisance parameters and uncertain poses are those that fit best there; the iteration to them
+        begins at `start`.
+        """
+        t = len(self)
+        shared = None
+        if isinstance(self.poses, ExactPoses) and self.poses.is_single_block and t > 1:
+            if (deviation == deviation[0]).all():
+                shared = self.poses.solve_single_block(deviation[:1], self.trials, start)
+        together = max(1, BLOCK // self.poses.block_size)
+        parts = []
+        for first in range(0, t, together):
+            chosen = np.arange(first, min(first + together, t))
+            z, trials, begin = deviation[chosen], self.trials[chosen], start.take(chosen)
+            if shared is not None and isinstance(self.poses, ExactPoses):
+                solution = self.poses.solve(z, trials, begin, self.control, shared=shared)
+            else:
+                solution = self.poses.solve(z, trials, begin, self.control)
+            parts.append(self._eliminate(solution, z, trials, begin))
+        return Linearization.join(parts)
+
+    def solve(
+        self, deviation: FloatArray, start: Start, nuisance: FloatArray | None = None
+    ) -> PoseSolution:
+        """Solve for poses and nuisance parameters at deviations (t, p).
+
+        `nuisance` (t, U) are nuisance parameters that are not solved for.
+        """
+        return self.poses.solve(
+            deviation, self.trials, start, self.control, nuisance, derivatives=False
+        )
+
+    def residuals(self, deviation: FloatArray, solution: PoseSolution) -> tuple[Residuals, ...]:
+        """Return the residuals of every kind at a solution; NaN where a pose is not reached."""
+        t = len(self)
+        shapes = [(t, *r.whitener.shape[1:3]) for r in self.rows]
+        kinds = [Residuals(np.full(shape, np.nan), np.full(shape, np.nan)) for shape in shapes]
+        for block, poses in self.poses.iterate_poses(solution, deviation):
+            for kind, numbers, rows in zip(kinds, block.row_numbers, block.rows, strict=True):
+                if not len(numbers):
+                    continue
+                at, white = evaluate_rows(rows, poses, self.trials, solution.nuisance)
+                ok = np.all(poses.is_reached[:, rows.poses_by_link], axis=2, keepdims=True)
+                raw = np.where(ok, at.residual, np.nan)
+                kind.raw[:, numbers], kind.whitened[:, numbers] = raw, whiten(white, raw)
+        return tuple(kinds)
+
+    def leverage_rows(self, at: Linearization) -> Iterator[list[LeverageRows]]:
+        """Give, block by block, the rows by everything that they determine (one trial).
+
+        `at` is a linearization of this problem, or of the same one with other weights: nuisance
+        parameters and their elimination are taken from it. Uncertain poses are where the rows of
+        this problem put them at these nuisance parameters.
+        """
+        p, z = self.parameters, at.deviation
+        fixed = None if at.nuisance is None else at.nuisance.values
+        solution = self.poses.solve(z, self.trials, at.next_start, self.control, fixed)
+        wide = 0 if self.nuisance is None else len(self.nuisance)
+        rows_of_blocks = self.poses.iterate_rows(solution, z, self.trials)
+        for block, (parts, _) in zip(self.poses.blocks, rows_of_blocks, strict=True):
+            given = []
+            for part in parts:
+                own = part.rows[0]
+                w = own.shape[-1] - p - 1
+                rows = np.zeros((*own.shape[:2], wide + p + 1))
+                rows[..., -p - 1 :] = own[..., w:]
+                if at.nuisance is not None and part.structure >= 0:
+                    path, root, slope = at.nuisance.elimination.at_nodes(part.nodes)
+                    rows[..., -p - 1 : -1] += own[..., :w] @ slope
+                    k, m = np.arange(len(own))[:, None, None], np.arange(own.shape[1])[:, None]
+                    rows[k, m, path[:, None, :]] = own[..., :w] @ root
+                poses = self.poses.poses_of(block, part)
+                given.append(LeverageRows(poses, rows, part.kind, part.numbers))
+            yield given
+
+    def count_leverage_rows(self, member: IntArray, count: int) -> IntArray:
+        """Return how many rows `leverage_rows` gives of each of `count` blocks of poses.
+
+        `member` (n,) is the block of each pose.
+        """
+        total = np.zeros(count, dtype=np.int64)
+        if isinstance(self.poses, UncertainPoses):
+            k, first = self.poses.coordinates.freedoms, self.poses.first_pose
+            for group in (group for groups in self.poses.groups for group in groups):
+                height = max(group.height, group.poses.shape[1] * k)
+                blocks = member[first[group.components]]
+                total += height * np.bincount(blocks, minlength=count)
+            return total
+        for r in self.rows:
+            blocks = member[r.first_poses]
+            total += np.bincount(blocks, minlength=count) * r.whitener.shape[-1]
+        return total
+
+    def count_pose_directions(
+        self, solution: PoseSolution, member: IntArray, count: int
+    ) -> IntArray:
+        """Return how many residuals of each of `count` blocks the poses take up (first trial).
+
+        `member` (n,) is the block of each pose. Poses of exact readings take up none.
+        """
+        if solution.estimates is None or not isinstance(self.poses, UncertainPoses):
+            return np.zeros(count, dtype=np.int64)
+        blocks = member[self.poses.first_pose]
+        return np.bincount(blocks, solution.estimates.rank[0], count).astype(np.int64)
+
+    def find_unreached(self, deviation: FloatArray, start: Start) -> IntArray:
+        """Return the poses that a row needs and that are not reached at deviation (1, p)."""
+        return self.poses.find_unreached(deviation, start)
+
+    def _eliminate(
+        self, solution: PoseSolution, z: FloatArray, trials: IntArray, start: Start
+    ) -> Linearization:
+        """Fold all rows at a solution and eliminate the nuisance parameters."""
+        a, p, nuisance = len(trials), self.parameters, self.nuisance
+        factor, is_lost = empty_factor(a, p), np.zeros(a, dtype=bool)
+        factors = None if nuisance is None else NodeFactors(nuisance.tree, a, p)
+        for parts, lost in self.poses.iterate_rows(solution, z, trials):
+            factor = fold_node_rows(factor, factors, parts)
+            is_lost |= lost
+        equations = _of_trials(self.component_count.sum(axis=1), trials)
+        if solution.estimates is not None:
+            equations = equations - solution.estimates.rank.sum(axis=1)
+        states, motion = self.poses.next_start(solution, start)
+        next_start = replace(start, deviation=z, poses=states, motion=motion)
+        estimate = None
+        if nuisance is not None and factors is not None and solution.nuisance is not None:
+            estimate, rest = nuisance.eliminate(factors, solution.nuisance)
+            factor = fold_rows(factor, rest)
+            equations = equations + nuisance.prior_count - estimate.elimination.rank
+            slope = estimate.elimination.slope
+            next_start = replace(next_start, nuisance=solution.nuisance, slope=slope)
+        cost = np.where(is_lost, np.inf, (factor[:, :, -1] ** 2).sum(axis=1))
+        return Linearization(z, factor, cost, equations, next_start, estimate, solution.estimates)
+
+    def _first_states(self) -> PoseStates | None:
+        """Return the states with which poses begin."""
+        if isinstance(self.poses, ExactPoses):
+            return self.poses.first_states(len(self))
+        assert self.sigma is not None
+        total = max(len(self.readings), int(self.trials.max(initial=0)) + 1)
+        states = first_poses(self.free.robot, self.readings, self.sigma, self.rows[:-1], total)
+        return states if len(self.trials) == total else states.take(self.trials)
+
+    def _exact_poses(self) -> ExactPoses:
+        """Return the rows at poses of exact readings, in blocks of poses."""
+        readings = self.readings[0]
+        is_needed = _needed_poses(self.rows, len(readings))
+        blocks = divide_poses(readings, self.rows, is_needed, BLOCK)
+        members = tuple(
+            tuple(_members(self.nuisance, rows) for rows in block.rows) for block in blocks
+        )
+        names = list_sensed_joints(r.kind for r in self.rows)
+        return ExactPoses(
+            self.free, len(readings), names, blocks, members, self.nuisance, self.located
+        )
+
+    def _uncertain_poses(self) -> UncertainPoses:
+        """Return the rows at poses of uncertain readings, in blocks of components."""
+        member, coordinates = self.member, self.coordinates
+        assert member is not None
+        assert coordinates is not None
+        redundant = isinstance(coordinates, TwistCoordinates)
+        is_needed = _needed_poses(self.rows if redundant else self.rows[:-1], len(member))
+        blocks = divide_components(self.readings[0], self.rows, member, is_needed, BLOCK)
+        nodes, structures = groups_of_nodes(self.rows, member, self.nuisance)
+        groups = tuple(group_components(block, member, nodes, structures) for block in blocks)
+        names = list_sensed_joints(r.kind for r in self.rows)
+        return UncertainPoses(
+            self.free, names, coordinates, member, blocks, groups, self.nuisance, is_needed
+        )
+
+
+def problem_of(
+    free: FreeParameters, data: Measurements, local: NuisanceParameters | None = None
+) -> Problem:
+    """Return the problem of one machine's measurements.
+
+    Where readings have a sigma above 0, poses are unknowns, too. `local` are the nuisance
+    parameters of the measurements, default as stated there.
+    """
+    own = data.nuisance_parameters if local is None else local
+    rows = tuple(
+        ObservationRows(o.kind, o.rows, o.measured[None], o.whitener[None], places)
+        for o, places in zip(data.observations, own.indices, strict=True)
+        if len(o)
+    )
+    return make_problem(free, data.readings[None], data.reading_sigma, rows, 1, own, lambda _: data)
+
+
+def problem_of_trials(free: FreeParameters, trials: Trials) -> Problem:
+    """Return the problem of t simulated machines."""
+    sensors, first = trials.instrument.sensors, trials.trial(0)
+    local = collect_nuisance_parameters(first.observations, first.labels)
+    rows = []
+    for sensor, measured, places in zip(sensors, trials.measured, local.indices, strict=True):
+        kind = sensor.kind
+        present = kind.detect_present(measured)
+        N = kind.linearize_noise(measured)
+        covariance = (N * np.asarray(sensor.noise.sigma) ** 2) @ np.swapaxes(N, -1, -2)
+        t, r, m = present.shape
+        flat = np.broadcast_to(covariance, (t, r, m, m)).reshape(-1, m, m)
+        white = whitener(flat, present.reshape(-1, m), np.ones(t * r)).reshape(t, r, m, m)
+        rows.append(ObservationRows(kind, sensor_rows(sensor), measured, white, places))
+    recorded = trials.readings[None] if trials.recorded is None else trials.recorded
+    return make_problem(
+        free, recorded, trials.reading_sigma, tuple(rows), len(trials), local, trials.trial
+    )
+
+
+def make_problem(
+    free: FreeParameters,
+    recorded: FloatArray,
+    sigma: FloatArray | None,
+    rows: tuple[ObservationRows, ...],
+    trials: int,
+    local: NuisanceParameters,
+    data: Callable[[int], Measurements],
+) -> Problem:
+    """Return the problem of observed rows at readings (t | 1, n, actuators) [SI].
+
+    `sigma` (n, actuators) [SI] of the readings; None where they are exact unless the robot states
+    the sigma of its actuators.
+    """
+    numbers, robot = np.arange(trials), free.robot
+    believed = resolve_reading_sigma(robot, sigma, recorded.shape[1])
+    if believed is None:
+        nuisance = plan_elimination(local, rows)
+        return Problem(free, recorded[:1], rows, numbers, nuisance, data)
+    every = (*rows, _reading_rows(free, recorded, believed))
+    names = list_sensed_joints(r.kind for r in every)
+    if robot.program.sigma is None:
+        unit = [robot.size if a.dimension is Dimension.LENGTH else 1.0 for a in robot.actuators]
+        scale = np.where(np.isinf(believed), UNKNOWN_READING * np.array(unit), believed)
+        coordinates: PoseCoordinates = ReadingCoordinates(free, scale, names)
+    else:
+        coordinates = TwistCoordinates(free, names)
+    member = find_components(recorded.shape[1], every, coordinates.freedoms)
+    nuisance = plan_elimination(local, rows, member)
+    return Problem(
+        free,
+        recorded,
+        every,
+        numbers,
+        nuisance,
+        data,
+        sigma=believed,
+        member=member,
+        coordinates=coordinates,
+    )
+
+
+def _reading_rows(free: FreeParameters, recorded: FloatArray, sigma: FloatArray) -> ObservationRows:
+    """Return the rows of uncertain readings, (true - recorded) / sigma."""
+    is_row = np.isfinite(sigma) & (sigma > 0.0)
+    weight = np.where(is_row, 1.0 / np.where(is_row, sigma, 1.0), 0.0)
+    white = weight[None, :, :, None] * np.eye(sigma.shape[1])
+    return ObservationRows(make_readings_kind(free.robot), np.arange(len(sigma)), recorded, white)
+
+
+def _needed_poses(rows: Sequence[ObservationRows], n: int) -> np.ndarray:
+    """Return the poses (n,) that a row with a present residual needs."""
+    needed = np.zeros(n, dtype=bool)
+    for r in rows:
+        needed[r.poses[r.is_present.any(axis=(0, 2))]] = True
+    return needed
+
+
+def _count_by_component(rows: Sequence[ObservationRows], member: IntArray) -> IntArray:
+    """Return the residuals (T | 1, components) that are present; member (n,) of each pose."""
+    components = int(member.max(initial=0)) + 1
+    total = np.zeros((1, components), dtype=np.int64)
+    for r in rows:
+        present = r.is_present.sum(axis=2)
+        of = member[r.first_poses]
+        total = total + np.stack([np.bincount(of, row, components) for row in present]).astype(
+            np.int64
+        )
+    return total
+
+
+def _members(
+    nuisance: NuisanceElimination | None, rows: ObservationRows
+) -> tuple[NodeMembers, ...]:
+    """Return the rows of a kind by nodes; all are of the machine without nuisance parameters."""
+    if nuisance is not None:
+        return nuisance.members(rows)
+    numbers = np.arange(len(rows.poses))
+    return (NodeMembers(-1, numbers, np.full(len(numbers), -1), rows.nuisance),)
+
+
+def _of_trials(count: IntArray, trials: IntArray) -> IntArray:
+    """Return counts (T | 1,) of some trials (t,)."""
+    return np.full(len(trials), count[0]) if len(count) == 1 else count[trials]
