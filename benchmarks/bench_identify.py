@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from loopcal.estimate.rows import rows_of
+from loopcal.estimate.problem import problem_of
 
 from benchmarks.harness import Metric, measure_ratio, time_in_turns
 from loopcal.diagnose import build_regularization_path, score_leave_one_out
@@ -160,11 +160,11 @@ def bench_poses() -> list[Metric]:
 def _memory_of_folding(robot: Mechanism, data: Measurements) -> float:
     """Peak of what one folding of the rows allocates [bytes], its input not counted."""
     free = select_free_parameters(robot)
-    rows = rows_of(free, data)
+    problem = problem_of(free, data)
     z = free.deviation(robot.values[None])
-    rows.fold(z, np.arange(1))
+    start = problem.linearize(z, problem.start(z)).next_start
     tracemalloc.start()
-    rows.fold(z, np.arange(1))
+    problem.linearize(z, start)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     return float(peak)
@@ -200,10 +200,9 @@ def bench_groups() -> Metric:
     def folding(unknown: tuple[str, ...]) -> Callable[[], object]:
         probe = Plane(unknown=unknown, targets=("probe",), places=np.array([[0.0, 0.0, 0.06]]))
         touching = Instrument((Sensor(probe, Gaussian(np.full(1, 5 * UM)), group=group),))
-        rows = rows_of(free, simulate(robot, _poses(robot, len(group)), touching, 0))
-        assert rows.own is not None
-        rows.own.started[:] = True
-        return lambda: rows.fold(z, np.arange(1))
+        problem = problem_of(free, simulate(robot, _poses(robot, len(group)), touching, 0))
+        start = problem.start(z, seek=False)
+        return lambda: problem.linearize(z, start)
 
     return measure_ratio(
         "identify.shared_of_known_probe",

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from loopcal.estimate.steps import penalised
+from loopcal.estimate.descent import penalize
 from numpy.typing import NDArray
 
 from loopcal import geometry
@@ -121,7 +121,7 @@ def fits(case: Case, count: int) -> Iterator[Outcome]:
         decided = np.isfinite(sd)
         inside = np.abs(error) <= NORMAL_95 * np.where(decided, sd, np.inf)
         z = found.unknowns.deviation(found.values)
-        chi_square = found.cost + penalised(found.decomposition, found.penalty, z)
+        chi_square = found.cost + penalize(found.decomposition, found.penalty, z)
         # a prior counts as one equation for each direction it holds
         dof = (
             case.poses * (3 if case.kind == "component" else 6)

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from loopcal.estimate.local_estimate import local_estimate
-from loopcal.estimate.rows import rows_of, rows_of_trials
+from loopcal.estimate.nuisance_estimate import estimate_nuisance
+from loopcal.estimate.problem import problem_of, problem_of_trials
 from numpy.typing import NDArray
 
 from loopcal import geometry
@@ -273,8 +273,8 @@ def along_gauge(fit: Identification, data: Measurements, truth: Array) -> float:
     larger of the two counts.
     """
     free = fit.unknowns
-    rows, z, goal = (
-        rows_of(free, data),
+    problem, z, goal = (
+        problem_of(free, data),
         free.deviation(fit.robot.values[None])[0],
         free.deviation(truth[None])[0],
     )
@@ -282,8 +282,10 @@ def along_gauge(fit: Identification, data: Measurements, truth: Array) -> float:
         [fit.robot.size if p.dimension is Dimension.LENGTH else 1.0 for p in free.parameters]
     )
     first = None
+    start = problem.start(z[None])
     for _ in range(WALK):
-        factor = rows.fold(z[None], np.arange(1))[0][0]
+        at = problem.linearize(z[None], start)
+        factor, start = at.factor[0], at.next_start
         U, s, vt = np.linalg.svd(factor[:-1, :-1])
         rank = int((s > RANK_TOLERANCE * s[0]).sum())
         back = -vt[:rank].T @ ((U[:, :rank].T @ factor[:-1, -1]) / s[:rank])
@@ -336,25 +338,20 @@ def _own_covered(
     found: IdentifiedTrials, trials: Trials, good: IntArray, own: dict[str, float]
 ) -> NDArray[np.bool_]:
     """Whether intervals of the own unknowns hold the truth, those that are finite."""
-    rows, free = rows_of_trials(found.unknowns, trials), found.unknowns
-    if rows.own is None:
+    problem, free = problem_of_trials(found.unknowns, trials), found.unknowns
+    if problem.nuisance is None:
         return np.zeros(0, dtype=bool)
     inside = []
-    truth = np.array([own[name] for name in rows.own.local.table.names])
-    rows.own.values[:], rows.own.started[:] = (
-        truth,
-        True,
-    )  # how starts are found is proved elsewhere
-    for first in range(0, len(good), TOGETHER):
-        some = good[first : first + TOGETHER]
-        rows.fold(free.deviation(found.values[some]), some)
-        for place, i in enumerate(some.tolist()):
-            one = found.decomposition.take(np.array([i]))
-            local = local_estimate(
-                rows.own, free.robot, truth, one, found.penalty[i : i + 1], 1.0, i, place
-            )
-            off = local.estimate - truth
-            inside.append((np.abs(off) <= NORMAL_95 * local.sd)[np.isfinite(local.sd)])
+    truth = np.array([own[name] for name in problem.nuisance.local.table.names])
+    for i in good.tolist():
+        one = np.array([i])
+        z, alone = free.deviation(found.values[one]), problem.take(one)
+        # how starts are found is proved elsewhere
+        at = alone.linearize(z, alone.start(z, seek=False).with_nuisance(truth[None]))
+        d, penalty = found.decomposition.take(one), found.penalty[one]
+        local = estimate_nuisance(problem.nuisance, at, free.robot, d, penalty, 1.0)
+        off = local.estimate - truth
+        inside.append((np.abs(off) <= NORMAL_95 * local.sd)[np.isfinite(local.sd)])
     return np.concatenate(inside)
 
 
