@@ -9,11 +9,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from loopcal.estimate.descent import penalize
 from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.estimate import MAP, LeastSquares, identify_trials
+from loopcal.estimate.descent import penalize
 from loopcal.estimate.identification import IdentifiedTrials
 from loopcal.estimate.methods.penalties import Method
 from loopcal.io import load_robot

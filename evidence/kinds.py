@@ -12,8 +12,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from loopcal.estimate.nuisance_estimate import estimate_nuisance
-from loopcal.estimate.problem import problem_of, problem_of_trials
 from numpy.typing import NDArray
 
 from loopcal import geometry
@@ -22,6 +20,8 @@ from loopcal.diagnose import PoseErrors, find_frame_motions
 from loopcal.errors import LoopcalError
 from loopcal.estimate import MAP, Identification, LeastSquares, identify, identify_trials
 from loopcal.estimate.identification import IdentifiedTrials
+from loopcal.estimate.nuisance_estimate import estimate_nuisance
+from loopcal.estimate.problem import problem_of, problem_of_trials
 from loopcal.io import load_robot
 from loopcal.measure import (
     KINDS,

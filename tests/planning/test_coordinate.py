@@ -111,7 +111,10 @@ def test_poses_of_a_hexapod_move_to_where_its_parameters_show() -> None:
 
     def rows_of(_: Places, x: Array) -> Array:
         at = inverse(free.robot, x)
-        rows = observe_poses(free, np.where(at.converged[:, None], at.q, 0.0)).twists[0] / SIGMA[:, None]
+        rows = (
+            observe_poses(free, np.where(at.converged[:, None], at.q, 0.0)).twists[0]
+            / SIGMA[:, None]
+        )
         return np.where(at.converged[:, None, None], rows, np.nan)
 
     levels = [

@@ -122,7 +122,10 @@ def _by_block(
     waiting: list[tuple[IntArray, FloatArray]] = []
     for parts in problem.leverage_rows(linearization):
         waiting += [
-            (np.repeat(member[part.poses], part.rows.shape[1]), part.rows.reshape(-1, part.rows.shape[2]))
+            (
+                np.repeat(member[part.poses], part.rows.shape[1]),
+                part.rows.reshape(-1, part.rows.shape[2]),
+            )
             for part in parts
         ]
         if not waiting:

@@ -246,7 +246,9 @@ def _ask(
     scale = 1.0
     if fit.noise == "estimated":
         degrees = found.degrees[there].astype(np.float64)
-        scale = estimate_scale_of(np.sqrt(found.distance[there]), degrees) if there.any() else np.nan
+        scale = (
+            estimate_scale_of(np.sqrt(found.distance[there]), degrees) if there.any() else np.nan
+        )
     return _State(aside, found, scale, int(np.isfinite(penalty).sum()))
 
 

@@ -209,7 +209,10 @@ def compare_predictions(
     ]
     if not rows:
         raise DataError("there is no row to validate with: every row is absent or has weight 0")
-    (first, _), (last, predictable) = predict_from_readings(before, data), predict_from_readings(after, data)
+    (first, _), (last, predictable) = (
+        predict_from_readings(before, data),
+        predict_from_readings(after, data),
+    )
     commanded = inverse(after, first.T)
     usable = first.converged & last.converged & commanded.converged & predictable
     if not usable.any():

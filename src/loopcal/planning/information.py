@@ -238,7 +238,9 @@ def _linearize_block(
     """Return the rows (b, r, o + p) of some groups."""
     poses, places = np.unique(members, return_inverse=True)
     places = places.reshape(members.shape)
-    at = observe_poses(free, readings[poses], list_sensed_joints(sensor.kind for sensor in mounted.sensors))
+    at = observe_poses(
+        free, readings[poses], list_sensed_joints(sensor.kind for sensor in mounted.sensors)
+    )
     nuisance = _list_nuisance(mounted, places)
     observations, unusable = [], np.zeros(len(members), dtype=bool)
     for i, (sensor, rows) in enumerate(_assign_poses(mounted, places)):

@@ -152,9 +152,6 @@ ENTRIES: tuple[Entry, ...] = (
         "Check units and readings.",
     ),
     Entry(
-        "descent.running",
-        Severity.INFO,
-        "The fit is still running.",
-        "A descent has not ended.",
+        "descent.running", Severity.INFO, "The fit is still running.", "A descent has not ended."
     ),
 )
