@@ -15,7 +15,7 @@ from pathlib import Path
 from loopcal.io.core import file_reference
 from loopcal.io.data.kind_rows import SETTINGS
 from loopcal.io.data.kind_settings import list_kind_settings
-from loopcal.io.exports.profile import FROM, KEYS
+from loopcal.io.exports.profile import ColumnSource, ProfileRecord
 from loopcal.io.runs.run_folder import MADE_BY
 from loopcal.measure import KINDS, Column, Kind
 from loopcal.mechanism import FAMILIES, RobotRecord
@@ -154,12 +154,12 @@ def collect_provenance() -> str:
 
 def profile() -> str:
     """Return the keys of a profile of exports."""
-    return table(("key", "meaning"), [(f"`{key}`", words) for key, words in KEYS.items()])
+    return record_table(ProfileRecord)
 
 
 def profile_columns() -> str:
     """Return the keys of a column in a profile."""
-    return table(("key", "meaning"), [(f"`{key}`", words) for key, words in FROM.items()])
+    return record_table(ColumnSource)
 
 
 def profile_example(name: str) -> Callable[[], str]:

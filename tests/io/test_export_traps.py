@@ -112,7 +112,7 @@ def test_below_another_header_columns_are_read_by_that_one(tmp_path) -> None:
 
 
 def test_a_later_header_that_names_a_column_twice_is_refused(tmp_path) -> None:
-    with pytest.raises(FileError, match=r"export.txt:3: two columns are headed 'X'"):
+    with pytest.raises(FileError, match=r"export.txt:3: duplicate column 'X'"):
         converted(tmp_path, "Name,X,Y,Z\n1,1,2,3\nName,X,X,Y,Z\n", BY_NAME)
 
 
@@ -180,8 +180,8 @@ def test_a_target_that_gives_the_pose_another_reading_is_no_row(tmp_path) -> Non
              "P1_b;1;2;4;6;0;0;0;0;0"]  # fmt: skip
     found = converted(tmp_path, "Name;X;Y;Z;J1;J2;J3;J4;J5;J6\n" + "\n".join(lines), profile)
     assert found.misfits == (
-        (5, "'q1' is 9 here, but 8 in a line of the pose 'P2' before"),
-        (6, "'q1' is 6 here, but 7.0 in a line of the pose 'P1' before"),
+        (5, "'q1' is 9 here, but 8 in an earlier line of the pose 'P2'"),
+        (6, "'q1' is 6 here, but 7.0 in an earlier line of the pose 'P1'"),
     )
     assert found.rows == 2
 
@@ -205,14 +205,8 @@ def test_targets_at_another_temperature_have_rows_of_their_own_and_another_time_
         "P2,20,,1,2,3,,,",
         "P2,21,,,,,1,2,3",
     ]
-    assert found.notes == (
-        (
-            "1 line of a further target states another time than the first line of the row, whose "
-            "time "
-            "is kept"
-        ),
-    )
-    assert f"## {found.notes[0]}\n" in found.text
+    assert [(f.code, f.data["count"]) for f in found.findings] == [("files.other-times", 1)]
+    assert f"## {found.findings[0]}\n" in found.text
 
 
 def test_missing_numbers_are_compared_by_value_and_missing_words_by_their_letters(tmp_path) -> None:
@@ -232,7 +226,7 @@ def test_missing_numbers_are_compared_by_value_and_missing_words_by_their_letter
 )
 def test_what_only_looks_like_a_number_is_none(tmp_path, cell) -> None:
     found = converted(tmp_path, f"Name,X,Y,Z\nP1,1,2,3\nP2,{cell},2,3\n", BY_NAME)
-    assert found.misfits == ((3, f"{cell!r} is no number for 'x'"),)
+    assert found.misfits == ((3, f"{cell!r} is not a number for 'x'"),)
 
 
 def test_missing_cells_of_a_rotation_matrix_are_missing(tmp_path) -> None:
@@ -261,31 +255,26 @@ def test_a_joint_that_is_read_and_measured_has_two_columns(tmp_path) -> None:
     assert table(found.text) == ["pose,sigma.measured.q1 [um],q1 [mm],measured.q1 [mm]", "1,3,7,5"]
     with pytest.raises(
         FileError,
-        match=r"'q1' is a reading and a measured column, too; call the measured one 'measured.q1'",
+        match=r"'q1' is a reading and a measured column; name the measured one 'measured.q1'",
     ):
         converted(tmp_path, "Name,B1,J1\n1,5,7\n", JOINT.replace("  measured.q1", "  q1"))
 
 
 BAD = {
-    "hex": ("delimiter", "encoding: hex\ndelimiter", 2, "'hex' is no encoding of text"),
-    "rot13": ("delimiter", "encoding: rot13\ndelimiter", 2, "'rot13' is no encoding of text"),
+    "hex": ("delimiter", "encoding: hex\ndelimiter", 2, "'hex' is not a known encoding"),
+    "rot13": ("delimiter", "encoding: rot13\ndelimiter", 2, "'rot13' is not a known encoding"),
     "a newer format": ("format: 1", "format: 7", 1, "this file has format 7"),
-    "an angle for a length": ("from: X, unit: mm", "from: X, unit: deg", 5, ("'deg' is no unit of "
-                                                                            "'x'; write one of m, "
-                                                                            "mm")),
-    "one unit for a covariance": ("  z:", "  cov.x.y: {from: C, unit: mm}\n  z:", 7, ("'mm' is no "
-                                                                                     "unit of .*of "
-                                                                                     "2 factors")),
-    "a sigma of nothing": ("  z:", "  sigma.w: {from: C, unit: mm}\n  z:", 7, ("'sigma.w' is no "
+    "an angle for a length": ("from: X, unit: mm", "from: X, unit: deg", 5, "'deg' is not a unit of 'x'"),
+    "one unit for a covariance": ("  z:", "  cov.x.y: {from: C, unit: mm}\n  z:", 7, "'mm' is not a unit"),
+    "a sigma of nothing": ("  z:", "  sigma.w: {from: C, unit: mm}\n  z:", 7, ("'sigma.w' is not a "
                                                                               "column .*did you "
                                                                               "mean 'sigma")),
-    "another unit in the header": ("from: X, unit: mm", '"from": "X [m]", unit: mm', 5, "heads this column 'X .m.', but"),
+    "another unit in the header": ("from: X, unit: mm", '"from": "X [m]", unit: mm', 5, "header is 'X .m.', but"),
     "degrees in the header": ("from: X, unit: mm", '"from": "X (°)", unit: mm', 5, ("write the "
                                                                                     "unit "
                                                                                    "deg")),
-    "readings of nothing": ("settings", "readings:\nsettings", 8, "'readings' must name columns"),
-    "nothing for missing": ("delimiter", "missing: [null]\ndelimiter", 2, ("'missing' has None "
-                                                                          "where the text of a cell")),
+    "readings of nothing": ("settings", "readings:\nsettings", 8, "'readings' is empty"),
+    "nothing for missing": ("delimiter", "missing: [null]\ndelimiter", 2, "'missing entry 1' is empty"),
 }  # fmt: skip
 
 
@@ -316,7 +305,7 @@ def test_the_command_tells_what_targets_say_differently(tmp_path, monkeypatch, c
     lines = "Name;X;Y;Z;When\nP1_a;1;2;3;2026-05-04\nP1_b;1;2;3;2026-05-05\n"
     converted(tmp_path, lines, TARGETS.replace("MORE", "time: {from: When}"))
     assert main(["import", "export.txt", "--profile", "profile.yaml", "-o", "data.csv"]) == 0
-    assert "note: 1 line of a further target states another time" in capsys.readouterr().out
+    assert "note: 1 line of further targets state another time" in capsys.readouterr().out
     assert (
         main(
             [

@@ -136,10 +136,10 @@ def test_lines_that_do_not_fit_are_listed_and_named_in_the_file(tmp_path) -> Non
     assert found.rows == 3
     assert [line for line, _ in found.misfits] == [6, 7, 8, 9, 10]
     reasons = " / ".join(reason for _, reason in found.misfits)
-    for part in ("it has 3 columns, but 'Z' is column 4", "'two' is no number for 'y'", "'' is no name of a pose",
-                 "'1.234,5' is no number for 'x'", "it has 5 cells, but the header has 4 columns"):  # fmt: skip
+    for part in ("it has 3 columns, but 'Z' is column 4", "'two' is not a number for 'y'", "'' is not a name of a pose",
+                 "'1.234,5' is not a number for 'x'", "it has 5 cells, but the header has 4 columns"):  # fmt: skip
         assert part in reasons
-    assert "## lines that did not fit: 6, 7, 8, 9, 10\n" in found.text
+    assert "## lines that do not fit: 6, 7, 8, 9, 10\n" in found.text
     assert found.passed + found.rows + len(found.misfits) == sum(
         bool(line.strip()) for line in export.split("\n")
     )
@@ -159,7 +159,7 @@ settings: {kind: pose, orientation: quaternion}
 """
     found = converted(tmp_path, "\n".join([*lines, broken]), profile)
     assert [reason for _, reason in found.misfits] == [
-        "the nine numbers are no rotation matrix (off by 3)"
+        "the nine numbers are not a rotation matrix (error 3)"
     ]
     cells = np.array([row.split(",") for row in rows_of(found.text)])
     read = geometry.quaternion_to_matrix(cells[:, 1:5].astype(float))
@@ -175,25 +175,25 @@ def test_targets_with_lines_of_their_own_share_a_row_and_repeats_get_another(tmp
     lines = ["P1-a;1;1;1", "P1-b;2;2;2", "P1-b;2;2;3", "P2-b;3;3;3", "P2-c;3;3;3"]
     found = converted(tmp_path, "Name;X;Y;Z\n" + "\n".join(lines), profile)
     assert rows_of(found.text) == ["P1,1,1,1,2,2,2", "P1,,,,2,2,3", "P2,,,,3,3,3"]
-    assert found.misfits == ((6, "the target 'c' is none of a, b"),)
+    assert found.misfits == ((6, "the target 'c' is not one of a, b"),)
 
 
 BAD_EXPORTS = {
     "an empty file": (" \n", "export.txt: this export is empty; export it again"),
-    "a preamble alone": ("Liste\n", ("export.txt:1: no line names the columns Name, X, Y, Z, as "
-                                    ".*profile.yaml says")),
+    "a preamble alone": ("Liste\n", ("export.txt:1: no line names the columns Name, X, Y, Z of "
+                                    ".*profile.yaml")),
     "another header": ("A;B;C\n1;2;3\n", ("export.txt:1: no line names the columns Name, X, Y, "
-                                         "Z.*the first, has 'A . B . C'")),
+                                         "Z.*the first line is 'A . B . C'")),
     "other separators": (EXPORT.replace(";", "\t"), "no line names the columns"),
     "numbers of another country": (
         "Name;X;Y;Z\nP1;1.5;2.5;3\n",
-        ("export.txt:2: no line of this export fits .*profile.yaml; this one, the first: '1.5' is "
-        "no number for 'x'"),
+        ("export.txt:2: no line of this export fits .*profile.yaml; reason for the first one: '1.5' is "
+        "not a number for 'x'"),
     ),
-    "a header alone": ("Name;X;Y;Z\n", "every line of this export is passed over"),
+    "a header alone": ("Name;X;Y;Z\n", "the profile skips every line"),
     "another encoding": ("Name;X;Y;Z\nø1;1;2;3\n".encode("latin-1"), ("export.txt:2: byte 0xf8 is "
-                                                                     "not utf-8.*state 'encoding'")),
-    "a header twice": ("Name;X;X;Y;Z\nP;1;1;2;3\n", "export.txt:1: two columns are headed 'X'"),
+                                                                     "not utf-8.*'encoding'")),
+    "a header twice": ("Name;X;X;Y;Z\nP;1;1;2;3\n", "export.txt:1: duplicate column 'X'"),
 }  # fmt: skip
 
 
@@ -208,38 +208,38 @@ def test_an_export_that_the_profile_does_not_fit_is_refused_with_its_first_line_
 
 
 BAD_PROFILES = {
-    "no delimiter": ("delimiter: semicolon\n", "", None, "does not say 'delimiter'"),
+    "no delimiter": ("delimiter: semicolon\n", "", None, "no key 'delimiter'"),
     "an unknown one": (
         "semicolon",
         "pipe",
         2,
-        "'delimiter' is 'pipe'; write one of comma, semicolon, tab, spaces",
+        "'delimiter' is 'pipe'; allowed: 'comma'",
     ),
     "a comma for two things": (
         "semicolon",
         "comma",
         3,
-        "a comma cannot be the decimal mark and stand between columns",
+        "a comma cannot be both the decimal mark and the separator",
     ),
     "an unknown key": ("decimal", "decimals", 3, "unknown key 'decimals'.*did you mean 'decimal'"),
     "a column that is none": (
         "  z:",
         "  zz:",
         8,
-        "'zz' is no column of a measurement file of the kind 'position'",
+        "'zz' is not a column of measurement files of the kind 'position'",
     ),
     "a column forgotten": (
         "  z: {from: Z, unit: mm}\n",
         "",
         4,
-        "does not say where 'z' comes from",
+        "states 0 sources of 'z'",
     ),
-    "no unit": ("from: Z, unit: mm", "from: Z", 8, "'z' needs the unit of its numbers; add it"),
+    "no unit": ("from: Z, unit: mm", "from: Z", 8, "'z' has no unit"),
     "a unit that is none": (
         "from: Z, unit: mm",
         "from: Z, unit: mmm",
         8,
-        "'mmm' is no unit.*did you mean 'mm'",
+        "'mmm' is not a unit.*did you mean 'mm'",
     ),
     "a unit of text": ("from: Name", "from: Name, unit: mm", 5, "'pose' is text and has no unit"),
     "a place that is none": (
@@ -248,12 +248,12 @@ BAD_PROFILES = {
         8,
         "0 is neither a name in the export's header nor a place",
     ),
-    "no place": ("{from: Z, unit: mm}", "Z", 8, "'z' needs 'from'"),
+    "no place": ("{from: Z, unit: mm}", "Z", 8, "'columns.z' is the text 'Z'"),
     "a pattern that is none": (
         "from: Name",
         "from: Name, match: '('",
         5,
-        "is no regular expression",
+        "is not a regular expression",
     ),
     "a pattern without a pose": (
         "from: Name",
@@ -265,7 +265,7 @@ BAD_PROFILES = {
         "position,",
         "position, targets: [a, b],",
         5,
-        "say how 'match' of 'pose' finds",
+        "to 'match' of 'pose'",
     ),
     "an unknown kind": (
         "position",
@@ -277,7 +277,7 @@ BAD_PROFILES = {
         "decimal",
         "encoding: utf-99\ndecimal",
         3,
-        "'utf-99' is no encoding of text that is known",
+        "'utf-99' is not a known encoding",
     ),
     "a matrix of four": (
         "decimal",

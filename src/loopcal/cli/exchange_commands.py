@@ -216,13 +216,14 @@ def _convert_export(file: Path, profile: Path, output: Path, force: bool, as_jso
             "rows": converted.rows,
             "passed": converted.passed,
             "misfits": misfits,
-            "notes": converted.notes,
+            "notes": [str(finding) for finding in converted.findings],
+            "findings": converted.findings,
         }
         terminal.print_json(document)
         return
     page = [
         f"{output}: {converted.rows} rows; {converted.passed} lines skipped as the profile states",
-        *(f"note: {note}" for note in converted.notes),
+        *(f"note: {finding}" for finding in converted.findings),
         *(
             f"note: {file}:{line} does not match: {reason}"
             for line, reason in converted.misfits[:SHOWN]

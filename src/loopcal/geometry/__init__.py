@@ -27,4 +27,5 @@ from loopcal.geometry.rotations import left_jacobian_inverse_so3 as left_jacobia
 from loopcal.geometry.rotations import left_jacobian_so3 as left_jacobian_so3
 from loopcal.geometry.rotations import log_so3 as log_so3
 from loopcal.geometry.rotations import matrix_to_quaternion as matrix_to_quaternion
+from loopcal.geometry.rotations import project_to_rotation as project_to_rotation
 from loopcal.geometry.rotations import quaternion_to_matrix as quaternion_to_matrix

@@ -210,3 +210,22 @@ def matrix_to_quaternion(rotation: FloatArray) -> FloatArray:
     ]
     scale = np.where(chosen[0] < 0.0, -1.0, 1.0) / np.sqrt(sum(entry * entry for entry in chosen))
     return np.stack([scale * entry for entry in chosen], axis=-1)
+
+
+def project_to_rotation(matrix: FloatArray) -> tuple[FloatArray, float]:
+    """Return the rotation nearest to a matrix, and how far the matrix is from a rotation.
+
+    With the singular value decomposition M = U S V', the nearest rotation is U V' (Frobenius norm).
+
+    Parameters
+    ----------
+    matrix : (3, 3)
+
+    Returns
+    -------
+    rotation : (3, 3)
+    error : largest entry of |M M' - 1|; infinite for a reflection.
+    """
+    error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
+    U, _, Vt = np.linalg.svd(matrix)
+    return U @ Vt, float("inf") if np.linalg.det(matrix) < 0.0 else error

@@ -61,4 +61,11 @@ ENTRIES: tuple[Entry, ...] = (
         "Data for a recalibration are the data of the run that serves as the prior.",
         "Measure again, or calibrate without the prior.",
     ),
+    Entry(
+        "files.other-times",
+        Severity.INFO,
+        "{count:count line} of further targets state another time than the first line of their "
+        "pose; the time of the first line is kept",
+        "An instrument's export has a line for each target, with different times.",
+    ),
 )

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""A profile: how the text that an instrument's software exports is to be read.
+r"""Profiles: how to read the text that an instrument's software exports.
 
 delimiter: semicolon                    comma, semicolon, tab or spaces
 columns:
   pose: {from: Name, match: 'P(?P<pose>\d+)_(?P<target>\w+)'}
-  x: {from: X, unit: mm}                by the name in the export's header, or its place counted from 1
-settings: {kind: position, ...}         what the measurement file will state
+  x: {from: X, unit: mm}                by the name in the export's header, or its place from 1
+settings: {kind: position, ...}         settings of the measurement file
 """
 
 from __future__ import annotations
@@ -13,17 +13,19 @@ from __future__ import annotations
 import codecs
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from loopcal.errors import UnitError, suggest_names
+from loopcal.io.core.numbers import parse_finite
+from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import Location, YamlFile, read_yaml, refuse_unknown_keys
 from loopcal.io.data.column_types import TEMPERATURE_UNITS, TIME, TIME_UNITS
-from loopcal.io.data.columns import COVARIANCE, SIGMA, is_context
+from loopcal.io.data.columns import COVARIANCE, MEASURED, NOTE, SIGMA, is_context
 from loopcal.io.data.kind_rows import SETTINGS
 from loopcal.io.data.kind_settings import list_kind_settings, read_kind
-from loopcal.io.exports.export_cells import plain_number, with_point
 from loopcal.io.robot.robot_file import check_format
 from loopcal.units import Dimension, find_unit, list_symbols
 
@@ -33,33 +35,9 @@ if TYPE_CHECKING:
 FORMAT = 1
 DELIMITERS: Mapping[str, str | None] = {"comma": ",", "semicolon": ";", "tab": "\t", "spaces": None}
 DECIMALS: Mapping[str, str] = {"point": ".", "comma": ","}
-KEYS: Mapping[str, str] = {
-    "format": "1",
-    "delimiter": "what stands between columns: comma, semicolon, tab, or spaces (any number of "
-    "blanks and tabs)",
-    "decimal": "the decimal mark: point (if left out) or comma",
-    "comment": "what a line begins with that holds nothing",
-    "skip": "number of lines in front to pass over",
-    "ignore": "pattern of lines that are none of the measurement, such as totals",
-    "encoding": "of the text; utf-8 if left out, with or without byte order mark",
-    "missing": "cells that mean not measured, beside empty ones; numbers by their value: -999 is "
-    "-999.000, too",
-    "columns": "our column -> where it comes from",
-    "readings": "actuator -> where its reading comes from, where the export holds it",
-    "matrix": "nine columns of a rotation matrix, row by row, in place of the columns of an "
-    "orientation",
-    "settings": "settings of the measurement file, see docs/files.md; `poses` names the file in "
-    "which the poses stand",
-}
-FROM: Mapping[str, str] = {
-    "from": "name in the export's header, or place counted from 1; a list of them is joined by "
-    "blanks",
-    "unit": "unit of a number",
-    "match": "of pose: pattern that finds (?P<pose>..), and (?P<target>..) where each target has a "
-    "line of its own",
-    "format": "of time: as Python's strptime has it, such as '%d.%m.%Y %H:%M:%S'",
-}
-MEASURED = "measured."
+TEXTS = ("pose", "block", "session", "group")
+"""Columns of text that an export may have."""
+
 STATED = re.compile(r"[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\])]$")
 """The unit behind a name in a header, as in `X [mm]` or `X (mm)`."""
 
@@ -74,59 +52,137 @@ ALIASES: Mapping[str, str] = {
 }
 """Units as instruments write them -> ours."""
 
-TEXTS = ("pose", "block", "session", "group")
+Place = int | str
 
 
 @dataclass(frozen=True)
-class Source:
-    """Where one of our columns comes from.
+class ColumnSource:
+    """The source of one column of the measurement file.
 
     Parameters
     ----------
-    places : tuple of str or int
-        Names in the export's header, or places counted from 1.
-    unit : str or None
-        Of a number; None for text.
-    match : Pattern or None
-        What finds the pose, and the target, in a name.
-    time : str or None
-        How a date and time is written.
+    from_ : name in the export's header, or place counted from 1; several are joined by blanks.
+    unit : unit of a number.
+    match : of `pose`: pattern that finds (?P<pose>..), and (?P<target>..) where each target has a
+        line of its own.
+    format : of `time`: format of Python's strptime, such as '%d.%m.%Y %H:%M:%S'.
     """
 
-    places: tuple[str | int, ...]
-    unit: str | None = None
-    match: re.Pattern[str] | None = None
-    time: str | None = None
+    from_: Place | tuple[Place, ...]
+    unit: str | int | None = None
+    match: str | None = None
+    format: str | None = None
+
+    @property
+    def places(self) -> tuple[Place, ...]:
+        """Names in the export's header, or places counted from 1."""
+        return self.from_ if isinstance(self.from_, tuple) else (self.from_,)
+
+    @property
+    def symbol(self) -> str | None:
+        """Unit of a number; None for text."""
+        return None if self.unit is None else str(self.unit)
+
+    @cached_property
+    def pattern(self) -> re.Pattern[str] | None:
+        """The compiled `match`."""
+        return None if self.match is None else re.compile(self.match)
+
+
+@dataclass(frozen=True)
+class ProfileRecord:
+    """The keys of a profile.
+
+    Parameters
+    ----------
+    delimiter : separator of columns; `spaces` is any number of blanks and tabs.
+    columns : column of the measurement file -> its source.
+    settings : settings of the measurement file, see docs/files.md; `poses` names the file with the
+        readings of the poses.
+    format : version of the format, 1.
+    decimal : the decimal mark.
+    comment : start of lines without data.
+    skip : number of lines at the top without data.
+    ignore : pattern of further lines without data, such as totals.
+    encoding : of the text; UTF-8 with or without byte order mark by default.
+    missing : cells that mean not measured, besides empty ones; numbers count by value, so that -999
+        includes -999.000.
+    readings : actuator -> source of its reading, where the export contains readings.
+    matrix : nine columns of a rotation matrix, row by row, in place of the columns of an
+        orientation.
+    """
+
+    delimiter: Literal["comma", "semicolon", "tab", "spaces"]
+    columns: Mapping[str, ColumnSource]
+    settings: Mapping[str, Any]
+    format: int = 1
+    decimal: Literal["point", "comma"] = "point"
+    comment: str | None = None
+    skip: int = 0
+    ignore: str | None = None
+    encoding: str = "utf-8"
+    missing: str | int | float | tuple[str | int | float, ...] = ()
+    readings: Mapping[str, ColumnSource] = field(default_factory=dict)
+    matrix: tuple[Place, ...] = ()
 
 
 @dataclass(frozen=True)
 class Profile:
-    """A profile; its fields are the keys of KEYS.
-
-    `columns` has the readings, too, whose names are `readings`; `matrix` is empty where the export
-    has none. `kind` is what `settings` describe; `missing_numbers` are those of `missing` that are
-    numbers.
-    """
+    """A checked profile; `kind` is the kind that its settings describe."""
 
     file: YamlFile
-    delimiter: str | None
-    decimal: str
-    comment: str | None
-    skip: int
-    ignore: re.Pattern[str] | None
-    encoding: str
-    missing: tuple[str, ...]
-    missing_numbers: tuple[float, ...]
-    columns: Mapping[str, Source]
-    readings: tuple[str, ...]
-    matrix: tuple[str | int, ...]
+    record: ProfileRecord
     kind: Kind
-    settings: Mapping[str, Any]
 
-    def called(self, name: str) -> str:
-        """Return what the profile calls a column of the kind: `measured.NAME` where NAME is a
-        reading, too.
-        """
+    @property
+    def delimiter(self) -> str | None:
+        """The separator; None for blanks and tabs."""
+        return DELIMITERS[self.record.delimiter]
+
+    @property
+    def encoding(self) -> str:
+        """Name of the codec; that of UTF-8 skips a byte order mark."""
+        name = codecs.lookup(self.record.encoding).name
+        return "utf-8-sig" if name == "utf-8" else name
+
+    @cached_property
+    def ignored(self) -> re.Pattern[str] | None:
+        """The compiled `ignore`."""
+        return None if self.record.ignore is None else re.compile(self.record.ignore)
+
+    @cached_property
+    def columns(self) -> Mapping[str, ColumnSource]:
+        """Sources of all columns, readings included."""
+        return {**self.record.columns, **self.record.readings}
+
+    @cached_property
+    def missing(self) -> tuple[str, ...]:
+        """Cells that mean not measured."""
+        cells = self.record.missing
+        return tuple(str(c) for c in (cells if isinstance(cells, tuple) else (cells,)))
+
+    @cached_property
+    def missing_numbers(self) -> tuple[float, ...]:
+        """Numbers that mean not measured."""
+        numbers = (self.parse(text) for text in self.missing)
+        return tuple(number for number in numbers if number is not None)
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Targets of the kind; empty for a kind without targets."""
+        return getattr(self.kind, "targets", ())
+
+    def with_point(self, text: str) -> str:
+        """Return a number with a decimal point; a misplaced point becomes an invalid number."""
+        mark = DECIMALS[self.record.decimal]
+        return text if mark == "." else text.replace(".", "?").replace(mark, ".")
+
+    def parse(self, text: str) -> float | None:
+        """Return the finite number of a cell; None for other text."""
+        return parse_finite(self.with_point(text))
+
+    def name_measured(self, name: str) -> str:
+        """Return the profile's name of a measured column: `measured.NAME` where it is stated so."""
         return MEASURED + name if MEASURED + name in self.columns else name
 
 
@@ -136,333 +192,197 @@ def read_profile(path: str | Path) -> Profile:
     Raises
     ------
     FileError
-        A key that is missing, unknown or without sense, a column that is none of ours, a pattern
-        that is none; at its line.
+        A missing or unknown key, an unknown column, a bad unit, pattern or encoding; at its line.
     """
     file = read_yaml(path, "profile of an export")
-    content = file.content
-    refuse_unknown_keys(file, list(content), list(KEYS))
-    for key in ("delimiter", "columns", "settings"):
-        if key not in content:
-            raise file.error(f"this profile does not say {key!r} ({KEYS[key]}); add it")
-    if "format" in content:
+    record = read_record(file, file.content, ProfileRecord, None)
+    if "format" in file.content:
         check_format(file, FORMAT)
-    kind = _kind(file)
-    matrix = _matrix(file, kind)
-    decimal = DECIMALS[_choice(file, "decimal", list(DECIMALS), "point")]
-    delimiter = DELIMITERS[_choice(file, "delimiter", list(DELIMITERS), "comma")]
-    if delimiter == decimal:
-        raise file.error(
-            "a comma cannot be the decimal mark and stand between columns, too; correct one",
-            ("decimal",),
-        )
-    return Profile(
-        file,
-        delimiter,
-        decimal,
-        _text(file, "comment"),
-        _count(file, "skip"),
-        _pattern(file, content["ignore"], ("ignore",)) if "ignore" in content else None,
-        _encoding(file),
-        *_missing(file, decimal),
-        _columns(file, kind, bool(matrix)),
-        tuple(content.get("readings", {})),
-        matrix,
-        kind,
-        content["settings"],
-    )
+    place = ("settings",)
+    kind = read_kind(file, record.settings, place)
+    allowed = [key for key in SETTINGS if key != "kinds"]
+    own = list_kind_settings(type(kind))
+    refuse_unknown_keys(file, list(record.settings), [*allowed, *own], place)
+    if DELIMITERS[record.delimiter] == DECIMALS[record.decimal]:
+        sentence = "a comma cannot be both the decimal mark and the separator; correct one"
+        raise file.error(sentence, ("decimal",))
+    if record.skip < 0:
+        raise file.error(f"'skip' is {record.skip}; write a number of lines, 0 or more", ("skip",))
+    if record.comment == "":
+        raise file.error("'comment' is empty; write the start of a comment line", ("comment",))
+    if record.ignore is not None:
+        _check_pattern(file, record.ignore, ("ignore",))
+    _check_encoding(file, record.encoding)
+    profile = Profile(file, record, kind)
+    _check_matrix(profile)
+    _check_columns(profile)
+    return profile
 
 
-def _kind(file: YamlFile) -> Kind:
-    """Return the kind that the settings describe."""
-    settings, place = file.content["settings"], ("settings",)
-    if not isinstance(settings, dict):
-        raise file.error(
-            "'settings' holds what the measurement file states: kind, noise, ..; correct it", place
-        )
-    kind = read_kind(file, settings, place)
-    known = [key for key in SETTINGS if key != "kinds"]
-    refuse_unknown_keys(file, list(settings), [*known, *list_kind_settings(type(kind))], place)
-    return kind
-
-
-def _columns(file: YamlFile, kind: Kind, matrix: bool) -> dict[str, Source]:
-    """Return our columns, readings among them, with where they come from."""
-    several = len(getattr(kind, "targets", ())) > 1
-    own = list(dict.fromkeys(c.name.partition(".")[2] if several else c.name for c in kind.columns))
-    if matrix:
-        own = own[-3:]
-    dimensions, columns = _dimensions(kind, several), dict[str, Source]()
-    stated = {part: file.content.get(part, {}) for part in ("columns", "readings")}
-    for part, node in stated.items():
-        if not isinstance(node, dict):
+def _check_columns(profile: Profile) -> None:
+    """Raise FileError for columns that a measurement file of this kind cannot have, or lacks."""
+    file, kind, record = profile.file, profile.kind, profile.record
+    several = len(profile.targets) > 1
+    own = list(dict.fromkeys(strip_target(c.name) if several else c.name for c in kind.columns))
+    own = own[-3:] if record.matrix else own
+    dimensions = _list_dimensions(kind, several)
+    known = [*TEXTS, TIME, "temperature", *own, *(MEASURED + name for name in own)]
+    noise = [n for n in dimensions if n.startswith((SIGMA, COVARIANCE))]
+    noise += [SIGMA + name for name in record.readings]
+    for name, source in record.columns.items():
+        is_noise = name.startswith((SIGMA, COVARIANCE))
+        allowed, plain = (noise, name.replace(MEASURED, "")) if is_noise else (known, name)
+        if plain not in allowed and not is_context(name) and not name.startswith(NOTE):
+            hint = suggest_names(name, allowed) or f"; allowed: {', '.join(allowed)}"
+            sentence = f"{name!r} is not a column of measurement files of the kind {kind.name!r}"
+            raise file.error(f"{sentence}{hint}", ("columns", name))
+        _check_source(file, name, source, ("columns", name), dimensions)
+    for name, source in record.readings.items():
+        if name in record.columns:
+            act = f"name the measured one {MEASURED + name!r} under 'columns'"
             raise file.error(
-                f"{part!r} must name columns, as {part}: {{x: {{from: X, unit: mm}}}}; correct it",
-                (part,),
+                f"{name!r} is a reading and a measured column; {act}", ("readings", name)
             )
-    for part, node in stated.items():
-        for name, said in node.items():
-            if part == "columns":
-                known = [*TEXTS, "time", "temperature", *own, *(MEASURED + n for n in own)]
-                beside = [*dimensions, *(SIGMA + one for one in stated["readings"])]
-                _check_name(
-                    file,
-                    kind,
-                    name,
-                    known,
-                    [n for n in beside if n.startswith((SIGMA, COVARIANCE))],
-                )
-            elif name in columns:
-                sentence = f"{name!r} is a reading and a measured column, too"
-                raise file.error(
-                    f"{sentence}; call the measured one {MEASURED + name!r} under 'columns'",
-                    (part, name),
-                )
-            columns[name] = _source(
-                file, name, said, (part, name), dimensions if part == "columns" else {}
-            )
+        _check_source(file, name, source, ("readings", name), {})
     for name in own:
-        if sum(one in stated["columns"] for one in (name, MEASURED + name)) != 1:
-            sentence = f"'columns' does not say where {name!r} comes from, once, which the kind {kind.name!r} needs"
-            raise file.error(sentence, ("columns",))
-    _check_targets(file, columns, several)
-    return columns
+        count = sum(one in record.columns for one in (name, MEASURED + name))
+        if count != 1:
+            sentence = f"'columns' states {count} sources of {name!r}, but the kind {kind.name!r}"
+            raise file.error(f"{sentence} needs one; correct it", ("columns",))
+    pattern = record.columns["pose"].pattern if "pose" in record.columns else None
+    if several and (pattern is None or "target" not in pattern.groupindex):
+        sentence = "the kind has several targets, each with a line of its own"
+        act = "add (?P<target>..) to 'match' of 'pose'"
+        raise file.error(f"{sentence}; {act}", ("columns", "pose"))
 
 
-def _check_name(file: YamlFile, kind: Kind, name: str, known: list[str], noise: list[str]) -> None:
-    """Refuse a column that a measurement file of this kind cannot have."""
-    of_noise = name.startswith((SIGMA, COVARIANCE))
-    allowed, plain = (noise, name.replace(MEASURED, "")) if of_noise else (known, name)
-    if plain not in allowed and not is_context(name) and not name.startswith("note"):
-        hint = suggest_names(name, allowed) or f"; there are {', '.join(allowed)}"
-        raise file.error(
-            f"{name!r} is no column of a measurement file of the kind {kind.name!r}{hint}",
-            ("columns", name),
-        )
+def strip_target(column: str) -> str:
+    """Return the name of a column of several targets without its target: `x` for `a.x`."""
+    return column.partition(".")[2]
 
 
-def _check_targets(file: YamlFile, columns: Mapping[str, Source], several: bool) -> None:
-    """Refuse lines of several targets that nothing tells apart."""
-    match = columns["pose"].match if "pose" in columns else None
-    if several and (match is None or "target" not in match.groupindex):
-        raise file.error(
-            "the kind has several targets, each with a line of its own; say how 'match' of 'pose' "
-            "finds (?P<target>..)",
-            ("columns", "pose"),
-        )
+def _list_dimensions(kind: Kind, several: bool) -> dict[str, tuple[Dimension, ...]]:
+    """Return the dimensions of the columns of a kind, of sigma and (two) of covariances."""
 
+    def list_plain(columns: Sequence[Column]) -> dict[str, Dimension]:
+        return {strip_target(c.name) if several else c.name: c.dimension for c in columns}
 
-def _dimensions(kind: Kind, several: bool) -> dict[str, tuple[Dimension, ...]]:
-    """Return what each column of the kind measures, and each sigma and covariance: two dimensions
-    for a product.
-    """
-
-    def plain(columns: Sequence[Column]) -> dict[str, Dimension]:
-        return {c.name.partition(".")[2] if several else c.name: c.dimension for c in columns}
-
-    noise = plain(kind.noise_columns)
-    found: dict[str, tuple[Dimension, ...]] = {
-        name: (d,) for name, d in plain(kind.columns).items()
+    noise = list_plain(kind.noise_columns)
+    dimensions: dict[str, tuple[Dimension, ...]] = {
+        name: (d,) for name, d in list_plain(kind.columns).items()
     }
-    found |= {SIGMA + name: (d,) for name, d in noise.items()}
-    found |= {f"{COVARIANCE}{a}.{b}": (noise[a], noise[b]) for a in noise for b in noise if a != b}
-    return found
+    dimensions |= {SIGMA + name: (d,) for name, d in noise.items()}
+    pairs = ((a, b) for a in noise for b in noise if a != b)
+    return dimensions | {f"{COVARIANCE}{a}.{b}": (noise[a], noise[b]) for a, b in pairs}
 
 
-def _source(
+def _check_source(
     file: YamlFile,
     name: str,
-    node: Any,
+    source: ColumnSource,
     place: Location,
     dimensions: Mapping[str, tuple[Dimension, ...]],
-) -> Source:
-    """Return where a column comes from."""
-    if not isinstance(node, dict) or "from" not in node:
-        raise file.error(
-            f"{name!r} needs 'from', a name or a place in the export, as {{from: X, unit: mm}}; "
-            "correct it",
-            place,
-        )
-    refuse_unknown_keys(file, list(node), list(FROM), place)
-    places = _places(file, node["from"], (*place, "from"))
-    text = name in TEXTS or name.startswith("note") or (name == TIME and "unit" not in node)
-    if text != ("unit" not in node):
-        raise file.error(
-            f"{name!r} {'is text and has no unit; remove it' if text else 'needs the unit of its numbers; add it'}",
-            place,
-        )
-    if len(places) > 1 and not text:
-        raise file.error(f"{name!r} is a number and comes from one column; name one", place)
-    if "unit" in node:
+) -> None:
+    """Raise FileError for a source without sense."""
+    _check_places(file, source.places, (*place, "from"))
+    has_unit = source.unit is not None
+    is_text = name in TEXTS or name.startswith(NOTE) or (name == TIME and not has_unit)
+    if is_text and has_unit:
+        raise file.error(f"{name!r} is text and has no unit; remove 'unit'", place)
+    if not is_text and not has_unit:
+        raise file.error(f"{name!r} has no unit; add 'unit'", place)
+    if len(source.places) > 1 and not is_text:
+        raise file.error(f"{name!r} is a number and has one source; name one column", place)
+    if source.symbol is not None:
+        unit_place = (*place, "unit")
         wanted = dimensions.get(name.replace(MEASURED, ""), ())
-        _check_unit(file, name, str(node["unit"]), (*place, "unit"), wanted)
-        _check_header(file, " ".join(map(str, places)), str(node["unit"]), (*place, "unit"))
-    for key, owner in (("match", "pose"), ("format", TIME)):
-        if key in node and (name != owner or not text):
-            raise file.error(
-                f"{key!r} belongs to {owner!r}, not to {name!r}; remove it", (*place, key)
-            )
-    match = _pattern(file, node["match"], (*place, "match")) if "match" in node else None
-    if match is not None and "pose" not in match.groupindex:
-        raise file.error(
-            "this pattern finds no pose; put its part of the name in (?P<pose>..)",
-            (*place, "match"),
-        )
-    return Source(
-        places,
-        str(node["unit"]) if "unit" in node else None,
-        match,
-        str(node["format"]) if "format" in node else None,
-    )
+        _check_unit(file, name, source.symbol, unit_place, wanted)
+        _check_header_unit(file, " ".join(map(str, source.places)), source.symbol, unit_place)
+    for key, value, owner in (("match", source.match, "pose"), ("format", source.format, TIME)):
+        if value is not None and (name != owner or not is_text):
+            sentence = f"{key!r} belongs to {owner!r}, not to {name!r}; remove it"
+            raise file.error(sentence, (*place, key))
+    if source.match is not None:
+        _check_pattern(file, source.match, (*place, "match"))
+        if source.pattern is None or "pose" not in source.pattern.groupindex:
+            sentence = "this pattern finds no pose; put its part of the name in (?P<pose>..)"
+            raise file.error(sentence, (*place, "match"))
 
 
 def _check_unit(
     file: YamlFile, name: str, symbol: str, place: Location, wanted: tuple[Dimension, ...]
 ) -> None:
-    """Refuse a unit that the column cannot have; `wanted` is empty where any will do."""
+    """Raise FileError for a unit that the column cannot have; any unit where `wanted` is empty."""
     if is_context(name):
         known = TIME_UNITS if name == TIME else TEMPERATURE_UNITS
         if symbol not in known:
-            raise file.error(
-                f"{symbol!r} is no unit of {name!r}; write one of {', '.join(known)}", place
-            )
+            sentence = f"{symbol!r} is not a unit of {name!r}; allowed: {', '.join(known)}"
+            raise file.error(sentence, place)
         return
-    parts = [part.strip() for part in symbol.split("*")]
+    factors = [part.strip() for part in symbol.split("*")]
     needed = wanted or (None,)
-    if len(parts) != len(needed):
-        like = "*".join("mm" for _ in needed)
+    if len(factors) != len(needed):
+        example = "*".join("mm" for _ in needed)
         raise file.error(
-            f"{symbol!r} is no unit of {name!r}; write one of {len(needed)} factors, such as {like}",
-            place,
+            f"{symbol!r} is not a unit of {name!r}; write a unit such as {example}", place
         )
-    for part, dimension in zip(parts, needed, strict=True):
+    for factor, dimension in zip(factors, needed, strict=True):
         try:
-            find_unit(part, dimension)
+            find_unit(factor, dimension)
         except UnitError:
-            of = (
-                f"unit of {name!r}"
-                if part in list_symbols()
-                else f"unit{suggest_names(part, list_symbols(dimension))}"
-            )
-            raise file.error(
-                f"{part!r} is no {of}; write one of {', '.join(list_symbols(dimension))}", place
-            ) from None
+            allowed = list_symbols(dimension)
+            hint = "" if factor in list_symbols() else suggest_names(factor, allowed)
+            sentence = f"{factor!r} is not a unit of {name!r}{hint}; allowed: {', '.join(allowed)}"
+            raise file.error(sentence, place) from None
 
 
-def _check_header(file: YamlFile, header: str, symbol: str, place: Location) -> None:
-    """Refuse a unit other than the one that the export's header states behind the name."""
-    found = STATED.search(header)
-    behind = symbol if found is None else found["unit"]
+def _check_header_unit(file: YamlFile, header: str, symbol: str, place: Location) -> None:
+    """Raise FileError where the export's header states another unit behind the name."""
+    match = STATED.search(header)
+    behind = symbol if match is None else match["unit"]
     stated = ALIASES.get(behind, behind)
     if stated != symbol and stated in {*list_symbols(), *TIME_UNITS, *TEMPERATURE_UNITS} - {"1"}:
-        sentence = f"the export heads this column {header!r}, but the unit here is {symbol!r}"
-        raise file.error(
-            f"{sentence}; write the unit {stated}, or name the column by its place", place
-        )
+        sentence = f"the export's header is {header!r}, but the unit here is {symbol!r}"
+        act = f"write the unit {stated}, or name the column by its place"
+        raise file.error(f"{sentence}; {act}", place)
 
 
-def _matrix(file: YamlFile, kind: Kind) -> tuple[str | int, ...]:
-    """Return the nine places of a rotation matrix, row by row."""
-    if "matrix" not in file.content:
-        return ()
-    places = _places(file, file.content["matrix"], ("matrix",))
-    if (
-        len(places) != 9
-        or getattr(kind, "orientation", None) != "quaternion"
-        or kind.name != "pose"
-    ):
-        sentence = "a matrix has nine columns, row by row, and becomes the quaternion of 'kind: pose, orientation: quaternion'"
-        raise file.error(f"{sentence}; correct it", ("matrix",))
-    return places
+def _check_matrix(profile: Profile) -> None:
+    """Raise FileError for a matrix that does not have nine columns, or a kind without it."""
+    places, kind = profile.record.matrix, profile.kind
+    if "matrix" not in profile.file.content:
+        return
+    _check_places(profile.file, places, ("matrix",))
+    is_quaternion = getattr(kind, "orientation", None) == "quaternion" and kind.name == "pose"
+    if len(places) != 9 or not is_quaternion:
+        sentence = "a matrix has nine columns, row by row, and needs 'kind: pose, orientation:"
+        raise profile.file.error(f"{sentence} quaternion'; correct it", ("matrix",))
 
 
-def _places(file: YamlFile, node: Any, place: Location) -> tuple[str | int, ...]:
-    """Return names, or places counted from 1."""
-    given = node if isinstance(node, list) else [node]
-    for one in given:
-        if (
-            isinstance(one, bool)
-            or not isinstance(one, (str, int))
-            or (isinstance(one, int) and one < 1)
-            or one == ""
-        ):
-            raise file.error(
-                f"{one!r} is neither a name in the export's header nor a place counted from 1; "
-                "correct it",
-                place,
-            )
-    if not given:
-        raise file.error(
-            "this names no column; write a name in the export's header or a place counted from 1",
-            place,
-        )
-    return tuple(given)
+def _check_places(file: YamlFile, places: Sequence[Place], location: Location) -> None:
+    """Raise FileError for places that are neither names nor numbers from 1."""
+    for place in places:
+        if place == "" or (isinstance(place, int) and place < 1):
+            sentence = f"{place!r} is neither a name in the export's header nor a place from 1"
+            raise file.error(f"{sentence}; correct it", location)
+    if not places:
+        sentence = "no column is named; write a name in the export's header or a place from 1"
+        raise file.error(sentence, location)
 
 
-def _choice(file: YamlFile, key: str, allowed: list[str], usual: str) -> str:
-    """Return one of a few words."""
-    value = file.content.get(key, usual)
-    if value not in allowed:
-        raise file.error(f"{key!r} is {value!r}; write one of {', '.join(allowed)}", (key,))
-    return value
-
-
-def _pattern(file: YamlFile, text: Any, place: Location) -> re.Pattern[str]:
-    """Return a regular expression."""
+def _check_pattern(file: YamlFile, text: str, place: Location) -> None:
+    """Raise FileError for text that is not a regular expression."""
     try:
-        return re.compile(str(text))
+        re.compile(text)
     except re.error as error:
-        raise file.error(
-            f"{text!r} is no regular expression ({error}); correct it", place
-        ) from None
+        sentence = f"{text!r} is not a regular expression ({error}); correct it"
+        raise file.error(sentence, place) from None
 
 
-def _encoding(file: YamlFile) -> str:
-    """Return the name of an encoding of text; UTF-8 passes over a byte order mark."""
-    name = str(file.content.get("encoding", "utf-8"))
+def _check_encoding(file: YamlFile, name: str) -> None:
+    """Raise FileError for a name that is not a known encoding of text."""
     try:
-        found = codecs.lookup(name).name
-        "".encode(found)  # refuses codecs that are no text, such as hex
+        "".encode(codecs.lookup(name).name)  # refuses codecs that are not text, such as hex
     except (LookupError, ValueError):
-        sentence = (
-            f"{name!r} is no encoding of text that is known; write utf-8, utf-16, latin-1 or cp1252"
-        )
+        sentence = f"{name!r} is not a known encoding; write utf-8, utf-16, latin-1 or cp1252"
         raise file.error(sentence, ("encoding",)) from None
-    return "utf-8-sig" if found == "utf-8" else found
-
-
-def _text(file: YamlFile, key: str) -> str | None:
-    """Return text that is not empty, None where the key is not there."""
-    value = file.content.get(key)
-    if value is not None and (not isinstance(value, str) or not value):
-        raise file.error(f"{key!r} is {value!r} where text is needed; put it in quotes", (key,))
-    return value
-
-
-def _count(file: YamlFile, key: str) -> int:
-    """Return a number of lines."""
-    value = file.content.get(key, 0)
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise file.error(
-            f"{key!r} is {value!r} where a number of lines is needed; write 0, 1, ..", (key,)
-        )
-    return value
-
-
-def _missing(file: YamlFile, decimal: str) -> tuple[tuple[str, ...], tuple[float, ...]]:
-    """Return the cells that mean not measured, as text, and those of them that are numbers."""
-    value = file.content.get("missing", [])
-    given = value if isinstance(value, list) else [value]
-    for one in given:
-        if isinstance(one, bool) or not isinstance(one, (str, int, float)):
-            raise file.error(
-                f"'missing' has {one!r} where the text of a cell is needed; put it in quotes",
-                ("missing",),
-            )
-    numbers = [
-        plain_number(with_point(one, decimal) if isinstance(one, str) else repr(one))
-        for one in given
-    ]
-    return tuple(str(one) for one in given), tuple(
-        number for number in numbers if number is not None
-    )
