@@ -209,12 +209,7 @@ def test_an_export_that_the_profile_does_not_fit_is_refused_with_its_first_line_
 
 BAD_PROFILES = {
     "no delimiter": ("delimiter: semicolon\n", "", None, "no key 'delimiter'"),
-    "an unknown one": (
-        "semicolon",
-        "pipe",
-        2,
-        "'delimiter' is 'pipe'; allowed: 'comma'",
-    ),
+    "an unknown one": ("semicolon", "pipe", 2, "'delimiter' is 'pipe'; allowed: 'comma'"),
     "a comma for two things": (
         "semicolon",
         "comma",
@@ -228,12 +223,7 @@ BAD_PROFILES = {
         8,
         "'zz' is not a column of measurement files of the kind 'position'",
     ),
-    "a column forgotten": (
-        "  z: {from: Z, unit: mm}\n",
-        "",
-        4,
-        "states 0 sources of 'z'",
-    ),
+    "a column forgotten": ("  z: {from: Z, unit: mm}\n", "", 4, "states 0 sources of 'z'"),
     "no unit": ("from: Z, unit: mm", "from: Z", 8, "'z' has no unit"),
     "a unit that is none": (
         "from: Z, unit: mm",

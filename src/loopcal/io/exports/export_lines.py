@@ -132,7 +132,9 @@ def _decode(path: Path, profile: Profile) -> str:
         sentence = f"byte 0x{raw[error.start]:02x} is not {profile.record.encoding} text; {act}"
         raise FileError(sentence, path, line) from None
     except UnicodeError as error:
-        raise FileError(f"this is not {profile.record.encoding} text ({error}); {act}", path) from None
+        raise FileError(
+            f"this is not {profile.record.encoding} text ({error}); {act}", path
+        ) from None
     if not text.strip():
         raise FileError("this export is empty; export it again", path)
     return text
