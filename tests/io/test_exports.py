@@ -295,7 +295,7 @@ def test_options_that_do_not_go_with_a_profile_and_files_that_are_there_are_refu
     converted(tmp_path)
     words = ["import", "export.txt", "--profile", "profile.yaml", "-o", "data.csv"]
     assert main([*words, "--format", "klipper"]) == 1
-    assert "--format does not go with --profile" in capsys.readouterr().err
+    assert "--format has no effect with --profile" in capsys.readouterr().err
     assert main(words) == 0
     assert main(words) == 1
     assert "this file exists" in capsys.readouterr().err
