@@ -105,8 +105,8 @@ def calibrate(
     """  # noqa: D301
     from loopcal.io import load_robot
     from loopcal.io.data.pose_use import read_held_out_poses
-    from loopcal.io.runs.calibration_run import load_prior, save_calibration
-    from loopcal.io.runs.run_folder import collect_provenance, refuse_run_folder
+    from loopcal.io.runs.calibration_run import build_document, load_prior, save_run
+    from loopcal.io.runs.run_folder import refuse_run_folder
     from loopcal.report.calibration_view import view_calibration
     from loopcal.workflow import CalibrationOptions
     from loopcal.workflow import calibrate as calibrate_robot
@@ -130,11 +130,9 @@ def calibrate(
     measurements = read_measurements(data, machine, **allowed)
     with terminal.ProgressBar() as progress:
         report = calibrate_robot(machine, measurements, options, progress)
-    provenance = collect_provenance(sys.argv, inputs, dict(report.provenance.seeds))
-    document = {"made_by": provenance, **report.to_dict()}
-    save_calibration(output, report.identification, document, force, report.split.fitted)
+    save_run(output, report, inputs, sys.argv, force)
     if as_json:
-        terminal.print_json(document)
+        terminal.print_json(build_document(report, inputs, sys.argv))
     else:
         page = view_calibration(report, verbose, hint_for)
         terminal.print_page(

@@ -32,7 +32,7 @@ from loopcal.io.runs.run_folder import (
 if TYPE_CHECKING:
     import numpy as np
 
-    from loopcal.estimate import Identification, Posterior
+    from loopcal.estimate import Posterior
     from loopcal.measure import Measurements
     from loopcal.mechanism import Mechanism
     from loopcal.workflow import CalibrationReport
@@ -131,28 +131,24 @@ def save_run(
     FileError : the folder is in use, or cannot be written; an input cannot be read.
     MechanismError : the robot was not loaded from a file.
     """
-    seeds = dict(report.provenance.seeds)
-    files = {role: as_path(file, "input") for role, file in (inputs or {}).items()}
-    document = {"made_by": collect_provenance(command, files, seeds), **report.to_dict()}
-    return save_calibration(path, report.identification, document, force, report.split.fitted)
-
-
-def save_calibration(
-    path: str | Path,
-    fit: Identification,
-    document: Mapping[str, Any],
-    force: bool = False,
-    fitted: Measurements | None = None,
-) -> Path:
-    """Write the run folder of a fit with `document` as result.json, and return it.
-
-    `fitted` are the fitted data; their rows are kept, to be recognized in other data.
-    """
     from loopcal.apply.reused_rows import collect_fitted_rows
 
-    rows = {} if fitted is None else collect_fitted_rows(fitted, fit.dropped)
+    fit = report.identification
+    rows = collect_fitted_rows(report.split.fitted, fit.dropped)
     arrays = {**fit.arrays(), "initial": fit.initial.values, **rows}
-    return write_run_folder(path, document, arrays, format_robot(fit.robot, fit.plus_minus), force)
+    text = format_robot(fit.robot, fit.plus_minus)
+    return write_run_folder(path, build_document(report, inputs, command), arrays, text, force)
+
+
+def build_document(
+    report: CalibrationReport,
+    inputs: Mapping[str, Path] | None = None,
+    command: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Return the content of result.json; see `save_run`."""
+    files = {role: as_path(file, "input") for role, file in (inputs or {}).items()}
+    provenance = collect_provenance(command, files, report.provenance.seeds)
+    return {"made_by": provenance, **report.to_dict()}
 
 
 def load_run(path: str | Path) -> Run:
