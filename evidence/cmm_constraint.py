@@ -15,16 +15,21 @@ from loopcal.papers.cmm_constraint_2011.cells import (
     METHODS,
     PRIOR,
     Cell,
-    cell,
-    correlation,
-    grid,
+    calibrate_cell,
+    calibrate_grid,
+    compute_rank_correlation,
 )
-from loopcal.papers.cmm_constraint_2011.fifty import LINES, fifty
-from loopcal.papers.cmm_constraint_2011.layouts import NOISE, ONE, SET, TEN, arranged, candidates
-from loopcal.papers.cmm_constraint_2011.layouts import printed_reductions as printed
-from loopcal.papers.cmm_constraint_2011.published import MM
-from loopcal.papers.cmm_constraint_2011.steps import WEIGHTS
-from loopcal.papers.cmm_constraint_2011.study import (
+from loopcal.papers.cmm_constraint_2011.fifty_points import LINES, calibrate_fifty
+from loopcal.papers.cmm_constraint_2011.layouts import (
+    NOISE,
+    ONE,
+    SET,
+    TEN,
+    evaluate_arrangement,
+    list_printed,
+    rank_candidates,
+)
+from loopcal.papers.cmm_constraint_2011.machines import (
     ALIGNED,
     AXES,
     FRAMES,
@@ -33,10 +38,12 @@ from loopcal.papers.cmm_constraint_2011.study import (
     POINTS,
     SWEEPS,
     Study,
-    machine,
-    plan,
-    spread,
+    compute_spread,
+    load_machine,
+    plan_points,
 )
+from loopcal.papers.cmm_constraint_2011.published import MM
+from loopcal.papers.cmm_constraint_2011.steps import WEIGHTS
 from loopcal.planning.plane_line_groups import PlaneLineGroups
 from loopcal.typing import FloatArray
 
@@ -64,10 +71,11 @@ def once(planned: PlaneLineGroups, design: FloatArray) -> float:
 def start(robot: Mechanism, seed: int) -> tuple[Study, list]:
     """Coordinate exchange from one random start: the study, and its row."""
     began = time.process_time()
-    study = plan(robot, GROUPS, POINTS, AXES, seed, SWEEPS)
+    study = plan_points(robot, GROUPS, POINTS, AXES, seed, SWEEPS)
     spent = time.process_time() - began
     before, after = (
-        spread(rows) for rows in (study.planned.linearize(study.first), study.optimised.rows)
+        compute_spread(rows)
+        for rows in (study.planned.linearize(study.first), study.optimized.rows)
     )
     cost = spent / once(study.planned, study.first) if seed == SEED else None
     return study, [seed, before, after, before / after, spent, cost]
@@ -85,7 +93,7 @@ MEDIANS = {
 def medians(c: Cell) -> list[float]:
     """Position errors in each frame and the parameters', before, LS and MAP."""
     return [
-        float(c.median(m)[MEASURES.index(name)])
+        float(c.compute_median(m)[MEASURES.index(name)])
         for name in MEDIANS.values()
         for m in (BEFORE, LS, PRIOR)
     ]
@@ -96,101 +104,162 @@ def weighed(study: Study, full: Cell) -> list[list[Any]]:
     that as printed.
     """
     cells = {
-        w: full if w == "full" else cell(study, SET * MM, NOISE * MM, SEED, DRAWS, weights=w)
+        w: full
+        if w == "full"
+        else calibrate_cell(study, SET * MM, NOISE * MM, SEED, DRAWS, weights=w)
         for w in WEIGHTS
     }
     position, parameters = (
         MEASURES.index(name) for name in ("position, aligned [mm]", "parameters without gauge [mm]")
     )
-    first = cells["printed"].median(LS)[position]
+    first = cells["printed"].compute_median(LS)[position]
     return [
-        [WORDS[w], *(float(c.median(m)[i]) for i in (position, parameters) for m in (LS, PRIOR)),
-         float(c.median(LS)[position] / first)]
+        [
+            WORDS[w],
+            *(float(c.compute_median(m)[i]) for i in (position, parameters) for m in (LS, PRIOR)),
+            float(c.compute_median(LS)[position] / first),
+        ]
         for w, c in cells.items()
-    ]  # fmt: skip
+    ]
 
 
 def readings(study: Study) -> list[list[Any]]:
     """Figure 5 as printed and under every reading."""
-    found = candidates((arranged(TEN, study, SEED, SOME),), SEED, SOME)
+    found = rank_candidates((evaluate_arrangement(TEN, study, SEED, SOME),), SEED, SOME)
     rows = [[c.reading, c.truth, c.frame, *map(float, c.reductions)] for c in found]
-    return [["as printed", None, None, *map(float, printed())], *rows]
+    return [["as printed", None, None, *map(float, list_printed())], *rows]
 
 
 def fifties(study: Study) -> list[list[Any]]:
     """Mean position error before, by LS and by MAP in each frame, and how often LS converges within
     5 iterations.
     """
-    found = [fifty(study, groups, SEED, FEW) for groups in LINES]
+    found = [calibrate_fifty(study, groups, SEED, FEW) for groups in LINES]
     return [
-        [f.groups, frame, *(float(f.median(m, frame)[0]) for m in (BEFORE, LS, PRIOR)),
-         f.within_five if frame == ALIGNED else None]
-        for f in found for frame in FRAMES
-    ]  # fmt: skip
+        [
+            f.groups,
+            frame,
+            *(float(f.compute_median(m, frame)[0]) for m in (BEFORE, LS, PRIOR)),
+            f.within_five if frame == ALIGNED else None,
+        ]
+        for f in found
+        for frame in FRAMES
+    ]
 
 
 def collect() -> dict[str, Any]:
     """The 3 x 4 cells, the five starts, one plane against ten, the weights, readings of figure 5,
     and fifty points.
     """
-    robot = machine()
+    robot = load_machine()
     study, first = start(robot, SEED)
     starts = [first, *(start(robot, seed)[1] for seed in range(SEED + 1, SEED + STARTS))]
-    cells = grid(study, SEED, DRAWS, lambda _: None)
+    cells = calibrate_grid(study, SEED, DRAWS, lambda _: None)
     rows = [
-        [given, noise, *medians(c), c.worse(PRIOR, 2), c.failed]
+        [given, noise, *medians(c), c.count_worse(PRIOR, 2), c.failed]
         for (given, noise), c in cells.items()
     ]
     ten, one = (
         cells["1", "0.01"],
-        arranged(ONE, plan(robot, 1, GROUPS * POINTS, AXES, SEED, sweeps=1), SEED, FEW),
+        evaluate_arrangement(
+            ONE, plan_points(robot, 1, GROUPS * POINTS, AXES, SEED, sweeps=1), SEED, FEW
+        ),
     )
     layouts = [
         ["ten planes, a line each", first[1], first[2], *_pair(ten), DRAWS],
-        ["one plane, one line", one.drawn, one.optimised, *_pair(one.cell), FEW],
+        ["one plane, one line", one.drawn, one.optimized, *_pair(one.cell), FEW],
     ]
-    ranks = [[method, correlation(cells.values(), method), len(cells), len({c.ratio for c in cells.values()})]
-             for method in METHODS]  # fmt: skip
+    ranks = [
+        [
+            method,
+            compute_rank_correlation(cells.values(), method),
+            len(cells),
+            len({c.ratio for c in cells.values()}),
+        ]
+        for method in METHODS
+    ]
     table_3 = [f"{what}, {m}" for what in MEDIANS for m in (BEFORE, LS, PRIOR)]
     return {
         "seed": SEED,
         "draws": DRAWS,
         "tables": {
             "table_3": table(
-                ["errors [mm]", "noise [mm]", *table_3, f"made worse by MAP, of {DRAWS}", "not converged"],
+                [
+                    "errors [mm]",
+                    "noise [mm]",
+                    *table_3,
+                    f"made worse by MAP, of {DRAWS}",
+                    "not converged",
+                ],
                 ["", "", *[".2g"] * len(table_3), "d", "d"],
                 rows,
             ),
             "exchange": table(
-                ["start", "drawn [mm / mm]", "optimised [mm / mm]", "gain", "CPU [s]", "cost [evaluations]"],
+                [
+                    "start",
+                    "drawn [mm / mm]",
+                    "optimized [mm / mm]",
+                    "gain",
+                    "CPU [s]",
+                    "cost [evaluations]",
+                ],
                 ["d", ".3g", ".3g", ".2g", ".2g", ".2g"],
                 starts,
             ),
             "layouts": table(
-                ["100 points on", "drawn [mm / mm]", "optimised [mm / mm]", "LS [mm]", "MAP [mm]", "draws"],
+                [
+                    "100 points on",
+                    "drawn [mm / mm]",
+                    "optimized [mm / mm]",
+                    "LS [mm]",
+                    "MAP [mm]",
+                    "draws",
+                ],
                 ["", ".3g", ".3g", ".3g", ".3g", "d"],
                 layouts,
             ),
             "weights": table(
-                ["rows", *(f"{what}, {m}" for what in ("position, aligned [mm]", "parameters [mm]") for m in (LS, PRIOR)),
-                 "position, LS, as printed = 1"],
+                [
+                    "rows",
+                    *(
+                        f"{what}, {m}"
+                        for what in ("position, aligned [mm]", "parameters [mm]")
+                        for m in (LS, PRIOR)
+                    ),
+                    "position, LS, as printed = 1",
+                ],
                 ["", ".3g", ".3g", ".3g", ".3g", ".2f"],
                 weighed(study, ten),
             ),
             "readings": table(
-                ['"variance" read as', "true errors in", "frame", "parameters [%]", "position [%]", "orientation [%]"],
+                [
+                    '"variance" read as',
+                    "true errors in",
+                    "frame",
+                    "parameters [%]",
+                    "position [%]",
+                    "orientation [%]",
+                ],
                 ["", "", "", ".0f", ".0f", ".0f"],
                 readings(study),
             ),
             "fifty": table(
-                ["planes", "frame", "before [mm]", "LS [mm]", "MAP [mm]", ("LS within 5 iterations "
-                                                                          "[%]")],
+                [
+                    "planes",
+                    "frame",
+                    "before [mm]",
+                    "LS [mm]",
+                    "MAP [mm]",
+                    "LS within 5 iterations [%]",
+                ],
                 ["d", "", ".2g", ".2g", ".2g", ".0f"],
                 fifties(study),
             ),
-            "correlation": table(["method", "rank correlation", "cells", "ratios"], ["", ".2f", "d", "d"], ranks),
+            "correlation": table(
+                ["method", "rank correlation", "cells", "ratios"], ["", ".2f", "d", "d"], ranks
+            ),
         },
-    }  # fmt: skip
+    }
 
 
 def table(columns: list[str], formats: list[str], rows: list[list[Any]]) -> dict[str, Any]:
@@ -200,4 +269,6 @@ def table(columns: list[str], formats: list[str], rows: list[list[Any]]) -> dict
 
 def _pair(c: Cell) -> list[float]:
     """Aligned position error by LS and MAP."""
-    return [float(c.median(m)[MEASURES.index("position, aligned [mm]")]) for m in (LS, PRIOR)]
+    return [
+        float(c.compute_median(m)[MEASURES.index("position, aligned [mm]")]) for m in (LS, PRIOR)
+    ]

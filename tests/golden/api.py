@@ -894,18 +894,26 @@ def report_tsvd_2016(name: str, five: bool) -> Report:
 
 def report_cmm_constraint_2011(groups: int, points: int, sweeps: int, trials: int) -> Report:
     """Plan points, draw machines, and calibrate them from planes and lines in the paper's form."""
-    from loopcal.papers.cmm_constraint_2011.cells import cell
-    from loopcal.papers.cmm_constraint_2011.study import AXES, machine, plan, spread
+    from loopcal.papers.cmm_constraint_2011.cells import calibrate_cell
+    from loopcal.papers.cmm_constraint_2011.machines import (
+        AXES,
+        compute_spread,
+        load_machine,
+        plan_points,
+    )
 
-    study = plan(machine(), groups, points, AXES, 0, sweeps)
+    study = plan_points(load_machine(), groups, points, AXES, 0, sweeps)
     made = {
-        weights: cell(study, 1e-3, 1e-5, 0, trials, weights=weights)
+        weights: calibrate_cell(study, 1e-3, 1e-5, 0, trials, weights=weights)
         for weights in ("printed", "full")
     }
     return {
-        "design": study.optimised.design,
-        "value": study.optimised.value,
-        "spread": [spread(study.planned.linearize(study.first)), spread(study.optimised.rows)],
+        "design": study.optimized.design,
+        "value": study.optimized.value,
+        "spread": [
+            compute_spread(study.planned.linearize(study.first)),
+            compute_spread(study.optimized.rows),
+        ],
         "failed": [one.failed for one in made.values()],
         "errors": {weights: dict(one.errors) for weights, one in made.items()},
     }
@@ -914,10 +922,15 @@ def report_cmm_constraint_2011(groups: int, points: int, sweeps: int, trials: in
 def report_cmm_constraint_2011_surfaces(groups: int, points: int, noise: float) -> Report:
     """Calibrate one machine from planes and lines with the surfaces as unknowns."""
     from loopcal.papers.cmm_constraint_2011 import forms
-    from loopcal.papers.cmm_constraint_2011.study import AXES, machine, plan, true_machines
+    from loopcal.papers.cmm_constraint_2011.machines import (
+        AXES,
+        draw_true_machines,
+        load_machine,
+        plan_points,
+    )
 
-    study = plan(machine(), groups, points, AXES, 0, 0)
-    q = study.layout.held(true_machines(study.robot, 1e-3, 1, 0), noise, 0)
+    study = plan_points(load_machine(), groups, points, AXES, 0, 0)
+    q = study.layout.held(draw_true_machines(study.robot, 1e-3, 1, 0), noise, 0)
     data = forms.measurements(study.layout, q[0], noise)
     found = estimate.identify(study.robot, data, estimate.MAP(), rank_tolerance=forms.RANK)
     return report_fit(found, parts=False)

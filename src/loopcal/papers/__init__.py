@@ -83,7 +83,7 @@ PAPERS: Mapping[str, Paper] = {
             "A hexapod calibrated from points on planes and perpendicular lines, held by a "
             "coordinate measuring machine",
             "International Journal of Advanced Robotic Systems 2011, doi:10.5772/45684",
-            "loopcal.papers.cmm_constraint_2011.compare",
+            "loopcal.papers.cmm_constraint_2011.study",
         ),
     )
 }

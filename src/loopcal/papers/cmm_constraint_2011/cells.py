@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Table 3 again: true machines of three sizes of errors, four levels of noise, many draws, least
-squares and MAP.
-"""
+"""Table 3 repeated: machines with three sizes of errors and four levels of noise, LS and MAP."""
 
 from __future__ import annotations
 
@@ -11,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method
-from loopcal.papers.cmm_constraint_2011.published import MM, published
+from loopcal.papers.cmm_constraint_2011.machines import MEASURES, Study, draw_true_machines
+from loopcal.papers.cmm_constraint_2011.published import MM, read_published
 from loopcal.papers.cmm_constraint_2011.steps import PaperRows, Weights, identify_from_rows
-from loopcal.papers.cmm_constraint_2011.study import MEASURES, Study, true_machines
 from loopcal.typing import FloatArray, IntArray
 
 BEFORE, LS, PRIOR = "before", "LS", "MAP"
@@ -26,40 +24,38 @@ class Cell:
 
     Attributes
     ----------
-    sd, noise : standard deviations [m]. gauge_free : whether the true errors have no part that
-        plane and line cannot tell.
+    sd, noise : standard deviations [m]. is_gauge_free : whether the true errors have no part
+        that plane and line cannot determine.
     errors : by BEFORE, LS, MAP, (t, 7) see MEASURES. iterations : (t,) of LS. failed : descents
         that did not converge.
     """
 
     sd: float
     noise: float
-    gauge_free: bool
+    is_gauge_free: bool
     errors: Mapping[str, FloatArray]
     iterations: IntArray
     failed: int
 
-    def median(self, method: str) -> FloatArray:
-        """(7,) over the draws."""
+    def compute_median(self, method: str) -> FloatArray:
+        """Return medians (7,) over the draws."""
         return np.median(self.errors[method], axis=0)
 
-    def reduction(self, method: str) -> FloatArray:
-        """(7,) percentages by which the medians fall."""
-        return 100.0 * (1.0 - self.median(method) / self.median(BEFORE))
+    def compute_reduction(self, method: str) -> FloatArray:
+        """Return percentages (7,) by which the medians fall."""
+        return 100.0 * (1.0 - self.compute_median(method) / self.compute_median(BEFORE))
 
     @property
     def ratio(self) -> float:
-        """Noise over errors, by which alone the reductions of cells differ, but for what is not
-        linear.
-        """
+        """Noise over errors. To first order the reductions of cells depend on it only."""
         return float(f"{self.noise / self.sd:.6g}")
 
-    def worse(self, method: str, measure: int) -> int:
-        """How many machines a method makes worse."""
+    def count_worse(self, method: str, measure: int) -> int:
+        """Return how many machines a method makes worse."""
         return int((self.errors[method][:, measure] > self.errors[BEFORE][:, measure]).sum())
 
 
-def cell(
+def calibrate_cell(
     study: Study,
     sd: float,
     noise: float,
@@ -68,48 +64,51 @@ def cell(
     gauge_free: bool = False,
     weights: Weights = "full",
 ) -> Cell:
-    """Draw true machines, hold their coordinates with noise, identify by each method, compare at
-    unseen poses.
+    """Draw machines, hold their coordinates with noise, identify, compare at held-out poses.
 
     Parameters
     ----------
     sd, noise : standard deviations [m], of a parameter and of a coordinate of a point. The prior of
         MAP has this sd.
     """
-    truth = true_machines(study.robot, sd, trials, seed, gauge_free)
+    truth = draw_true_machines(study.robot, sd, trials, seed, gauge_free)
     problem = PaperRows(study.layout, study.layout.held(truth, noise, seed), sd, noise, weights)
-    true = study.unseen.poses(truth)
-    errors = {BEFORE: study.unseen.errors(study.robot.parameters.nominal[None], truth, true)}
+    true = study.held_out.solve(truth)
+    errors = {
+        BEFORE: study.held_out.compute_errors(study.robot.parameters.nominal[None], truth, true)
+    }
     failed, iterations = 0, np.zeros(trials, dtype=np.int64)
     for name, method in METHODS.items():
-        found = identify_from_rows(problem, method)
-        errors[name] = study.unseen.errors(problem.values(found.deviation), truth, true)
-        failed += int((found.status != 0).sum())
-        iterations = found.iterations if name == LS else iterations
+        descent = identify_from_rows(problem, method)
+        errors[name] = study.held_out.compute_errors(problem.values(descent.deviation), truth, true)
+        failed += int((descent.status != 0).sum())
+        iterations = descent.iterations if name == LS else iterations
     return Cell(sd, noise, gauge_free, errors, iterations, failed)
 
 
-def grid(
+def calibrate_grid(
     study: Study, seed: int, trials: int, progress: Callable[[str], None]
 ) -> dict[tuple[str, str], Cell]:
-    """Compute the 3 x 4 cells by (set, noise) as printed, read as standard deviations."""
+    """Return the 3 x 4 cells by (set, noise) as printed, taken as standard deviations."""
     cells = {}
-    for given in published().sets:
+    for given in read_published().sets:
         progress(f"Table 3, set {given} mm")
-        for noise in published().noises:
-            cells[given, noise] = cell(study, float(given) * MM, float(noise) * MM, seed, trials)
+        for noise in read_published().noises:
+            cells[given, noise] = calibrate_cell(
+                study, float(given) * MM, float(noise) * MM, seed, trials
+            )
     return cells
 
 
-def correlation(cells: Iterable[Cell], method: str) -> float:
-    """Rank correlation over cells of the reductions of parameter error and position error."""
-    both = np.array([c.reduction(method) for c in cells])
-    return spearman(
+def compute_rank_correlation(cells: Iterable[Cell], method: str) -> float:
+    """Return the rank correlation over cells of the reductions of parameters and positions."""
+    both = np.array([c.compute_reduction(method) for c in cells])
+    return _compute_spearman(
         both[:, MEASURES.index("parameters [mm]")], both[:, MEASURES.index("position [mm]")]
     )
 
 
-def spearman(x: FloatArray, y: FloatArray) -> float:
-    """Rank correlation of numbers without ties."""
+def _compute_spearman(x: FloatArray, y: FloatArray) -> float:
+    """Return the rank correlation of numbers without ties."""
     first, second = (np.argsort(np.argsort(v)).astype(np.float64) for v in (x, y))
     return float(np.corrcoef(first, second)[0, 1])

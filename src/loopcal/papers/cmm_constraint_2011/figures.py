@@ -3,106 +3,90 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from loopcal.papers.cmm_constraint_2011.cells import BEFORE, LS, METHODS, PRIOR
 from loopcal.papers.cmm_constraint_2011.layouts import NOISE, SET
-from loopcal.papers.cmm_constraint_2011.published import MM
-from loopcal.papers.cmm_constraint_2011.steps import PaperRows, identify_from_rows
-from loopcal.papers.cmm_constraint_2011.study import (
+from loopcal.papers.cmm_constraint_2011.machines import (
     ABSOLUTE,
     ALIGNED,
     MEASURES,
     Study,
-    true_machines,
+    draw_true_machines,
 )
+from loopcal.papers.cmm_constraint_2011.published import MM
+from loopcal.papers.cmm_constraint_2011.steps import PaperRows, identify_from_rows
 from loopcal.papers.cmm_constraint_2011.tables import Results
 from loopcal.papers.reproduction import Figure, Series
+from loopcal.papers.wording import read_wording
+from loopcal.typing import FloatArray
+
+FRAMES = {
+    "": ("parameters [mm]", "position [mm]"),
+    ", aligned": ("parameters without gauge [mm]", "position, aligned [mm]"),
+}
+"""Measures of figure 4 by frame."""
 
 
-def figures(found: Results, seed: int) -> tuple[Figure, ...]:
-    """All figures."""
-    return _figure_4(found), _figure_5(found.study, seed), _curves(found)
+def make_figures(results: Results, seed: int) -> tuple[Figure, ...]:
+    """Return all figures."""
+    return _draw_figure_4(results), _draw_figure_5(results.study, seed), _draw_table_3(results)
 
 
-def _figure_4(found: Results) -> Figure:
-    """Pose error over the parameters' error, both as shares of what they were, so that errors that
-    grew have a place, too.
-    """
-    frames = {
-        "": ("parameters [mm]", "position [mm]"),
-        ", aligned": ("parameters without gauge [mm]", "position, aligned [mm]"),
-    }
-    series = []
-    for frame, names in frames.items():
+def _draw_figure_4(results: Results) -> Figure:
+    """Return pose error over parameter error, both after / before, so that growth has a place."""
+    lines = []
+    for frame, names in FRAMES.items():
         places = [MEASURES.index(name) for name in names]
         for method in METHODS:
-            both = np.array(
-                [c.median(method)[places] / c.median(BEFORE)[places] for c in found.cells.values()]
-            )
+            cells = results.cells.values()
+            ratios = [c.compute_median(method) / c.compute_median(BEFORE) for c in cells]
+            both = np.array(ratios)[:, places]
             x, y = both[np.argsort(both[:, 0])].T
-            series.append(Series(f"{method}{frame}", tuple(map(float, x)), tuple(map(float, y))))
-    return Figure(
-        "figure_4", "Figure 4: pose error over parameter error", "parameters' error, after / "
-                                                                 "before [1]",
-        "position error, after / before [1]",
-        f"Medians of the {len(found.cells)} cells of Table 3; aligned: after the motions that "
-        "plane and line leave open, over"
-        " the parameters' error without them. The paper draws reductions in percent: 0.25 here is "
-        "one of 75 %, and above 1"
-        " an error grew.",
-        tuple(series), log="xy", joined=False,
-    )  # fmt: skip
+            lines.append(_make_series(f"{method}{frame}", x, y))
+    figure = read_wording(__file__).figure("figure_4", lines, count=len(results.cells))
+    return replace(figure, joined=False)
 
 
-def _figure_5(study: Study, seed: int) -> Figure:
-    """Position errors of single poses before and after."""
-    truth = true_machines(study.robot, SET * MM, 1, seed)
-    problem = PaperRows(
-        study.layout, study.layout.held(truth, NOISE * MM, seed), SET * MM, NOISE * MM
-    )
-    true = study.unseen.poses(truth)
+def _draw_figure_5(study: Study, seed: int) -> Figure:
+    """Return position errors of single poses before and after."""
+    truth = draw_true_machines(study.robot, SET * MM, 1, seed)
+    q = study.layout.held(truth, NOISE * MM, seed)
+    problem = PaperRows(study.layout, q, SET * MM, NOISE * MM)
+    true = study.held_out.solve(truth)
     machines = {BEFORE: study.robot.parameters.nominal[None]}
-    machines |= {
-        name: problem.values(identify_from_rows(problem, method).deviation)
-        for name, method in METHODS.items()
-    }
+    for name, method in METHODS.items():
+        machines[name] = problem.values(identify_from_rows(problem, method).deviation)
     sizes = {}
     for name, values in machines.items():
         for frame in (ABSOLUTE, ALIGNED):
-            size = np.linalg.norm(study.unseen.twists(values, true, frame)[0, :, 3:], axis=1) / MM
-            sizes[name if frame == ABSOLUTE else f"{name}, {frame}"] = size
+            twists = study.held_out.compute_twists(values, true, frame)[0]
+            label = name if frame == ABSOLUTE else f"{name}, {frame}"
+            sizes[label] = np.linalg.norm(twists[:, 3:], axis=1) / MM
     order = np.argsort(sizes[BEFORE])
-    x = tuple(map(float, range(1, len(order) + 1)))
-    series = tuple(
-        Series(label, x, tuple(map(float, size[order]))) for label, size in sizes.items()
-    )
-    return Figure(
-        "figure_5", "Figure 5: pose errors before and after", "unseen pose, in order of its error "
-                                                              "before [1]",
-        "position error [mm]",
-        f"One machine with errors of {SET:g} mm, noise of {NOISE:g} mm, {len(order)} random poses.", series, joined=False,
-    )  # fmt: skip
+    x = np.arange(1.0, len(order) + 1)
+    lines = [_make_series(label, x, size[order]) for label, size in sizes.items()]
+    data = {"errors": SET, "noise": NOISE, "count": len(order)}
+    return replace(read_wording(__file__).figure("figure_5", lines, **data), joined=False)
 
 
-def _curves(found: Results) -> Figure:
-    """Position error over noise, set by set."""
+def _draw_table_3(results: Results) -> Figure:
+    """Return the position error by noise, for each set of errors."""
     place = MEASURES.index("position, aligned [mm]")
-    series, levels = [], {}
-    for given in found.printed.sets:
-        cells = [found.cells[given, noise] for noise in found.printed.noises]
-        levels[f"before, errors of {given} mm"] = float(cells[0].median(BEFORE)[place])
-        x = tuple(c.noise / MM for c in cells)
-        series += [
-            Series(
-                f"{method}, errors of {given} mm",
-                x,
-                tuple(float(c.median(method)[place]) for c in cells),
-            )
-            for method in (LS, PRIOR)
-        ]
-    first = next(iter(found.cells.values()))
-    return Figure(
-        "table_3", "Table 3 as curves: position error over noise", "noise of a held coordinate [mm]",
-        "position error, aligned [mm]", f"Medians of {len(first.iterations)} drawn machines.", tuple(series), levels, "xy",
-    )  # fmt: skip
+    lines, levels = [], {}
+    for given in results.printed.sets:
+        cells = [results.cells[given, noise] for noise in results.printed.noises]
+        before = float(cells[0].compute_median(BEFORE)[place])
+        levels[f"before, errors of {given} mm"] = before
+        x = np.array([c.noise / MM for c in cells])
+        for method in (LS, PRIOR):
+            y = np.array([c.compute_median(method)[place] for c in cells])
+            lines.append(_make_series(f"{method}, errors of {given} mm", x, y))
+    trials = len(next(iter(results.cells.values())).iterations)
+    return read_wording(__file__).figure("table_3", lines, levels, trials=trials)
+
+
+def _make_series(label: str, x: FloatArray, y: FloatArray) -> Series:
+    return Series(label, tuple(map(float, x)), tuple(map(float, y)))

@@ -19,10 +19,9 @@ from loopcal.estimate.information import collect_information
 from loopcal.measure import Line, Measurements, Observations, Plane
 from loopcal.mechanism import POSITION
 from loopcal.papers.cmm_constraint_2011.cells import METHODS
+from loopcal.papers.cmm_constraint_2011.machines import Study, draw_true_machines
 from loopcal.papers.cmm_constraint_2011.published import MM
 from loopcal.papers.cmm_constraint_2011.steps import Layout, PaperRows, identify_from_rows
-from loopcal.papers.cmm_constraint_2011.study import Study, true_machines
-from loopcal.papers.printed import Table
 from loopcal.typing import FloatArray
 
 SURFACE = "held"
@@ -89,7 +88,7 @@ def compare_forms(study: Study, seed: int) -> Forms:
     """Identify one machine in both forms, at several noises and by both methods."""
     rows = []
     for noise in NOISES:
-        truth = true_machines(study.robot, ERRORS, 1, seed)
+        truth = draw_true_machines(study.robot, ERRORS, 1, seed)
         q = study.layout.held(truth, noise, seed)
         problem = PaperRows(
             study.layout, q, select_free_parameters(study.robot).tolerance[0], noise
@@ -114,32 +113,6 @@ def covariance_difference(layout: Layout, noise: float) -> float:
     s, vt = _seen(PaperRows(layout, q, free.tolerance[0], noise))
     ratio = np.linalg.svd(factor[0, : len(free), : len(free)] @ (vt.T / s), compute_uv=False)
     return float(np.abs(ratio**2 - 1.0).max())
-
-
-def forms_table(found: Forms) -> Table:
-    """Both forms side by side."""
-    columns = (
-        "noise [mm]",
-        "method",
-        "rank, surfaces as unknowns",
-        "difference of the estimates [sd]",
-    )
-    note = (
-        f"One machine with errors of {ERRORS / MM:g} mm; surfaces as unknowns (`identify`) against "
-        "the paper's rows with full"
-        " covariance. Differences are the largest along the 33 directions and fall with the noise: "
-        "beyond the linear part the"
-        " forms differ. On surfaces that are reached exactly, variances of any direction differ by"
-        f" {found.covariance:.0e} of themselves."
-    )
-    return Table(
-        "forms",
-        "The two forms of the constraint",
-        columns,
-        found.rows,
-        (".3g", "", "d", ".1e"),
-        note,
-    )
 
 
 def _in_sds(problem: PaperRows, change: FloatArray) -> FloatArray:

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the paper prints and states, as far as our text of it goes, and whether its quotients follow
-from its numbers.
-"""
+"""The printed numbers of the paper, and whether its quotients follow from them."""
 
 from __future__ import annotations
 
@@ -18,11 +16,11 @@ MM = 1e-3
 
 @dataclass(frozen=True)
 class Stated:
-    """A number before and after, and the improvement that is stated for it.
+    """A number before and after, and its stated improvement.
 
     Attributes
     ----------
-    before, after : as printed, "" where not. stated : percentage or factor, as printed. unit : of
+    before, after : as printed, or "". stated : percentage or factor, as printed. unit : of
         before and after.
     """
 
@@ -43,7 +41,7 @@ class Stated:
 
     @property
     def possible(self) -> tuple[float, float]:
-        """Least and largest factor of numbers that are rounded to those printed."""
+        """Least and largest factor of numbers that round to the printed ones."""
         (b, h), (c, k) = (
             (float(text), 0.5 * last_digit(text)) for text in (self.before, self.after)
         )
@@ -51,7 +49,7 @@ class Stated:
 
     @property
     def follows(self) -> bool:
-        """Whether the stated factor, rounded itself, is one of those possible."""
+        """Whether the stated factor, itself rounded, is possible."""
         low, high = self.possible
         half = 0.5 * last_digit(self.stated)
         return low - half <= float(self.stated) <= high + half
@@ -66,7 +64,6 @@ class Published:
     source : what we have of the paper. parameters, simulated, measured : counts. sets, noises : as
         printed, in mm.
     repeatability, accuracy : of the measuring machine [m]. figure_5, table_4 : improvements.
-        statements : with their place.
     """
 
     source: str
@@ -79,11 +76,10 @@ class Published:
     accuracy: float
     figure_5: Mapping[str, Stated]
     table_4: Mapping[str, Stated]
-    statements: Mapping[str, Mapping[str, str]]
 
 
 @cache
-def published() -> Published:
+def read_published() -> Published:
     """Read published.yaml."""
     from loopcal.io.core.yaml_file import read_yaml
 
@@ -101,5 +97,4 @@ def published() -> Published:
         accuracy=float(content["accuracy"]["accuracy"]) * MM,
         figure_5={name: Stated(**given) for name, given in content["figure_5"].items()},
         table_4={name: Stated(**given) for name, given in content["table_4"].items()},
-        statements=content["statements"],
     )

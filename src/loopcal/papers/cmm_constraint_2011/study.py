@@ -1,204 +1,101 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is given and what is asked: robot, points, true machines, and the errors by which a
-calibration is judged.
-
-Robot and workspace are ours, those of the robot file hexapod-nategh-agheli: the paper's Tables 1
-and 2 are not in our text.
-"""
+"""The whole study: choose points, draw machines, calibrate, judge, and answer open questions."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable
 
 import numpy as np
 
-from loopcal import geometry
-from loopcal.measure import make_random_stream
-from loopcal.mechanism import Mechanism, Solution, forward_trials, sample_workspace
-from loopcal.papers.cmm_constraint_2011.gauge import without_gauge
-from loopcal.papers.cmm_constraint_2011.published import MM
-from loopcal.papers.cmm_constraint_2011.steps import Layout
-from loopcal.planning.design import D, MovedDesign, PriorInformation, coordinate_exchange
-from loopcal.planning.plane_line_groups import PlaneLineGroups
-from loopcal.typing import FloatArray
-
-ROBOT = "hexapod-nategh-agheli"
-GROUPS, POINTS = 10, 10
-"""Planes with a line each, and points of each: the paper's 100 positions."""
-AXES = ("z",)
-"""Along which lines run, as the paper describes it: planes of equal z."""
-SWEEPS = 3
-UNSEEN = 100
-"""Random poses over which errors are taken, as in the paper."""
-TRUTH = 1  # purpose of a random stream
-MEASURES = (
-    "position [mm]",
-    "orientation [deg]",
-    "position, aligned [mm]",
-    "orientation, aligned [deg]",
-    "parameters [mm]",
-    "parameters without gauge [mm]",
-    "position, gauge at nominal [mm]",
+from loopcal.papers import PAPERS
+from loopcal.papers.cmm_constraint_2011.cells import calibrate_grid
+from loopcal.papers.cmm_constraint_2011.fifty_points import LINES, calibrate_fifty
+from loopcal.papers.cmm_constraint_2011.figures import make_figures
+from loopcal.papers.cmm_constraint_2011.forms import compare_forms
+from loopcal.papers.cmm_constraint_2011.layouts import (
+    compare_arrangements,
+    compare_weights,
+    rank_candidates,
 )
-"""Root mean squares over the unseen poses, and the 2-norm of what is wrong with the 42 parameters.
-"""
-ABSOLUTE, AT_NOMINAL, ALIGNED = FRAMES = ("absolute", "gauge at nominal", "aligned")
-"""Where the base and the platform's turn, which plane and line leave open, are put: where the least
-deviation leaves them;
-where poses are nearest to those as designed, which needs no truth; where they are nearest to the
-true ones."""
+from loopcal.papers.cmm_constraint_2011.machines import (
+    AXES,
+    GROUPS,
+    POINTS,
+    SWEEPS,
+    load_machine,
+    plan_points,
+)
+from loopcal.papers.cmm_constraint_2011.published import read_published
+from loopcal.papers.cmm_constraint_2011.tables import Results, compute_ranks, make_tables
+from loopcal.papers.cmm_constraint_2011.verdicts import judge_claims
+from loopcal.papers.printed import Comparison, Printed
+from loopcal.papers.reproduction import Reproduction
+from loopcal.papers.wording import read_wording
 
 
-@dataclass(frozen=True, eq=False)
-class Unseen:
-    """Poses that were not measured, at which identified machines are compared with true ones.
-
-    Attributes
-    ----------
-    robot : as designed. solution : 100 random poses of its workspace, as it is commanded to them.
-    """
-
-    robot: Mechanism
-    solution: Solution
-
-    def poses(self, values: FloatArray) -> FloatArray:
-        """(t, n, 4, 4) of machines (t, p) at the readings."""
-        return forward_trials(self.robot, values, self.solution.q[None], self.solution.state).T
-
-    def placed(self, T: FloatArray, true: FloatArray, frame: str) -> FloatArray:
-        """Poses (t, n, 4, 4) in one of FRAMES."""
-        if frame == ABSOLUTE:
-            return T
-        return best_fit(
-            T, true if frame == ALIGNED else np.broadcast_to(self.solution.T, true.shape)
-        )
-
-    def twists(self, values: FloatArray, true: FloatArray, frame: str) -> FloatArray:
-        """Differences (t, n, 6) [rad, m], rotation first, of the poses of machines (t | 1, p) from
-        true ones (t, n, 4, 4).
-
-        In one of FRAMES.
-        """
-        return geometry.pose_difference(
-            self.placed(np.broadcast_to(self.poses(values), true.shape), true, frame), true
-        )
-
-    def errors(self, values: FloatArray, truth: FloatArray, true: FloatArray) -> FloatArray:
-        """(t, 7) see MEASURES; values (t | 1, p) and truth (t, p) [m], true (t, n, 4, 4) the
-        `poses` of the truth.
-        """
-        T = np.broadcast_to(self.poses(values), true.shape)
-        found = {}
-        for frame in FRAMES:
-            squares = np.mean(
-                geometry.pose_difference(self.placed(T, true, frame), true) ** 2, axis=1
-            )
-            found[frame] = [
-                np.sqrt(squares[:, 3:].sum(axis=1)) / MM,
-                np.rad2deg(np.sqrt(squares[:, :3].sum(axis=1))),
-            ]
-        wrong = values - truth
-        lengths = (
-            np.linalg.norm(e, axis=1) / MM for e in (wrong, without_gauge(self.robot, wrong))
-        )
-        return np.stack([*found[ABSOLUTE], *found[ALIGNED], *lengths, found[AT_NOMINAL][0]], axis=1)
+def reproduce(seed: int, trials: int, progress: Callable[[str], None]) -> Reproduction:
+    """Repeat the paper; see `loopcal.papers.Paper.run`."""
+    return present_results(compute(seed, trials, progress), seed, trials)
 
 
-@dataclass(frozen=True, eq=False)
-class Study:
-    """The robot, the points it is sent to, and the poses at which it is judged.
-
-    Attributes
-    ----------
-    planned : how groups are written as designs. first, optimised : before and after coordinate
-        exchange. seed : of both.
-    """
-
-    robot: Mechanism
-    planned: PlaneLineGroups
-    first: FloatArray
-    optimised: MovedDesign
-    seed: int
-
-    @cached_property
-    def layout(self) -> Layout:
-        """The points that are measured."""
-        return Layout(self.robot, self.planned.place_points(self.optimised.design))
-
-    @cached_property
-    def unseen(self) -> Unseen:
-        """Drawn by another seed than the points."""
-        return Unseen(self.robot, sample_workspace(self.robot, UNSEEN, self.seed + 1).solution)
-
-
-def machine() -> Mechanism:
-    """The hexapod as designed."""
-    from loopcal.io import load_robot
-
-    return load_robot(ROBOT)
-
-
-def plan(
-    robot: Mechanism, groups: int, points: int, axes: tuple[str, ...], seed: int, sweeps: int
-) -> Study:
-    """Draw groups at random and improve them by coordinate exchange for log det of what they tell;
-    0 sweeps: as drawn.
-    """
-    planned = PlaneLineGroups(robot, points, MM, axes)
-    first = planned.draw(groups, seed)
-    found = coordinate_exchange(
-        planned.linearize_indexed,
-        first,
-        planned.list_levels(),
-        D(),
-        PriorInformation.none(len(planned.free)),
-        sweeps=sweeps,
+def present_results(results: Results, seed: int, trials: int) -> Reproduction:
+    """Return the results as tables, figures and verdicts."""
+    paper = PAPERS["cmm-constraint-2011"]
+    return Reproduction(
+        paper=paper.name,
+        title=paper.title,
+        source=paper.source,
+        about=read_wording(__file__).about(source=results.printed.source),
+        settings={"seed": seed, "trials": trials},
+        comparisons=(_compare_counts(results), _compare_figure_5(results)),
+        tables=make_tables(results),
+        verdicts=judge_claims(results),
+        figures=make_figures(results, seed),
     )
-    return Study(robot, planned, first, found, seed)
 
 
-def spread(rows: FloatArray) -> float:
-    """Root mean square sd of the identifiable directions [mm per mm of noise], of rows for a noise
-    of 1 mm.
-    """
-    s = np.linalg.svd(rows.reshape(-1, rows.shape[-1]), compute_uv=False)
-    s = s[s > 1e-10 * s[0]]
-    return float(np.sqrt(np.mean(1.0 / s**2)))
-
-
-def true_machines(
-    robot: Mechanism, sd: float, trials: int, seed: int, gauge_free: bool = False
-) -> FloatArray:
-    """(t, p) [m] nominal values with Gaussian errors; machine i has the same errors, scaled,
-    whatever sd and trials.
-    """
-    drawn = np.stack(
-        [
-            make_random_stream(seed, trial, TRUTH).standard_normal(len(robot.parameters))
-            for trial in range(trials)
-        ]
+def compute(seed: int, trials: int, progress: Callable[[str], None]) -> Results:
+    """Compute everything."""
+    progress("coordinate exchange, ten planes")
+    study = plan_points(load_machine(), GROUPS, POINTS, AXES, seed, SWEEPS)
+    cells = calibrate_grid(study, seed, trials, progress)
+    arrangements = compare_arrangements(study, seed, trials, progress)
+    progress("interpretations of figure 5")
+    candidates = rank_candidates(arrangements, seed, trials)
+    progress("weights of the rows")
+    weights = compare_weights(study, seed, trials)
+    progress("fifty points, and both forms")
+    return Results(
+        printed=read_published(),
+        study=study,
+        cells=cells,
+        arrangements=arrangements,
+        candidates=candidates,
+        weights=weights,
+        fifties=tuple(calibrate_fifty(study, groups, seed, trials) for groups in LINES),
+        forms=compare_forms(study, seed),
+        ranks=compute_ranks(study, seed),
     )
-    return robot.parameters.nominal + sd * (without_gauge(robot, drawn) if gauge_free else drawn)
 
 
-def best_fit(T: FloatArray, others: FloatArray) -> FloatArray:
-    """Poses (t, n, 4, 4) after the motion of the base and the turn of the platform that bring them
-    nearest to others.
+def _compare_counts(results: Results) -> Comparison:
+    """Return the stated numbers of parameters and iterations beside the computed ones."""
+    printed = Printed.parse(
+        {
+            "parameters identified": str(results.printed.parameters),
+            "iterations for 50 points, at most": "5",
+        }
+    )
+    rank = max(r.rank for r in results.ranks)
+    iterations = max(f.iterations.max() for f in results.fifties)
+    computed = np.array([[float(rank)], [float(iterations)]])
+    return read_wording(__file__).compare("counts", printed, computed)
 
-    Positions fix the base's motion (their least squares), then orientations the platform's turn
-    (nearest rotations): what plane and line leave open, and nothing else.
-    """
-    x, y = T[..., :3, 3], others[..., :3, 3]
-    middle, centre = x.mean(axis=1, keepdims=True), y.mean(axis=1, keepdims=True)
-    Q = nearest_rotations(np.swapaxes(y - centre, 1, 2) @ (x - middle))
-    R = Q[:, None] @ T[..., :3, :3]
-    turn = nearest_rotations(np.sum(np.swapaxes(R, 2, 3) @ others[..., :3, :3], axis=1))
-    return geometry.make_pose(R @ turn[:, None], (x - middle) @ np.swapaxes(Q, 1, 2) + centre)
 
-
-def nearest_rotations(M: FloatArray) -> FloatArray:
-    """Rotations (t, 3, 3) nearest to matrices (t, 3, 3), in the mean square of their entries."""
-    U, _, Vt = np.linalg.svd(M)
-    U[..., 2] *= np.linalg.det(U @ Vt)[..., None]
-    return U @ Vt
+def _compare_figure_5(results: Results) -> Comparison:
+    """Return figure 5 beside the nearest interpretation."""
+    figure, nearest = results.printed.figure_5, results.candidates[0]
+    printed = Printed.parse({name: given.stated for name, given in figure.items()})
+    order = {"estimation": 0, "position": 1, "orientation": 2}
+    computed = np.array([[nearest.reductions[order[name]]] for name in figure])
+    return read_wording(__file__).compare("figure_5", printed, computed, None, nearest=nearest)

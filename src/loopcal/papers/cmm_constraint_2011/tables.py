@@ -1,48 +1,69 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was computed, as tables: Table 3 in both frames, ranks and gauge directions, the paper's own
-arithmetic.
-"""
+"""Tables of the computed numbers: Table 3 in both frames, ranks, interpretations, arithmetic."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loopcal.papers.cmm_constraint_2011.cells import BEFORE, LS, PRIOR, Cell
-from loopcal.papers.cmm_constraint_2011.fifty import Fifty, fifty_table
-from loopcal.papers.cmm_constraint_2011.forms import Forms, forms_table
-from loopcal.papers.cmm_constraint_2011.gauge import NAMES, gauge_directions
-from loopcal.papers.cmm_constraint_2011.layouts import (
-    Arrangement,
-    Candidate,
-    arrangements_table,
-    candidates_table,
-    weights_table,
-)
+from loopcal.papers.cmm_constraint_2011.fifty_points import FiftyPoints
+from loopcal.papers.cmm_constraint_2011.forms import ERRORS, Forms
+from loopcal.papers.cmm_constraint_2011.gauge import NAMES, list_gauge_directions
+from loopcal.papers.cmm_constraint_2011.layouts import Arrangement, Candidate, list_printed
+from loopcal.papers.cmm_constraint_2011.machines import AXES, MEASURES, ROBOT, Study
 from loopcal.papers.cmm_constraint_2011.published import MM, Published
-from loopcal.papers.cmm_constraint_2011.study import AXES, MEASURES, ROBOT, Study
 from loopcal.papers.printed import Cell as Entry
 from loopcal.papers.printed import Table
+from loopcal.papers.wording import Wording, read_wording
 from loopcal.planning.plane_line_groups import PlaneLineGroups
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
 RANKS = ((1, 100), (2, 50), (5, 20), (10, 10), (20, 10), (30, 10))
-"""Groups and points of each, drawn at random, whose rank is looked at."""
+"""Groups and points of each, drawn at random, whose rank is computed."""
+ALIGNED = ("position, aligned [mm]", "orientation, aligned [deg]", "parameters without gauge [mm]")
+ABSOLUTE = (
+    "position [mm]",
+    "orientation [deg]",
+    "parameters [mm]",
+    "position, gauge at nominal [mm]",
+)
+WEIGHTS = {
+    "printed": "as printed: weight one",
+    "distance": "divided by |d_1|",
+    "single": "divided by the sd of each",
+    "full": "full covariance",
+}
+MOTIONS = (
+    "the end point moves along it",
+    "the end point rotates about it, the base's origin fixed",
+    "the end point stays; the platform rotates about it",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class GroupRank:
+    """Rank of random groups. rows : their number. singular_values : (p,)."""
+
+    groups: int
+    points: int
+    rows: int
+    rank: int
+    singular_values: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """All that was computed, before it is judged.
+    """All computed numbers, before they are judged.
 
     Attributes
     ----------
-    study : the ten groups. cells : Table 3, by (set, noise) as printed. arrangements, candidates,
-        weights : see layouts.py.
-    fifties : see fifty.py. forms : see forms.py. ranks : groups, points of each, rows, rank, and
-        the singular values (p,).
+    study : the ten groups. cells : Table 3, by (set, noise) as printed.
+    arrangements, candidates, weights : see layouts.py. fifties : see fifty_points.py.
+    forms : see forms.py.
     """
 
     printed: Published
@@ -51,42 +72,54 @@ class Results:
     arrangements: tuple[Arrangement, ...]
     candidates: tuple[Candidate, ...]
     weights: Mapping[str, Cell]
-    fifties: tuple[Fifty, ...]
+    fifties: tuple[FiftyPoints, ...]
     forms: Forms
-    ranks: tuple[tuple[int, int, int, int, FloatArray], ...]
+    ranks: tuple[GroupRank, ...]
 
 
-def tables(found: Results) -> tuple[Table, ...]:
-    """All tables of the reproduction."""
+def make_tables(results: Results) -> tuple[Table, ...]:
+    """Return all tables of the reproduction."""
+    words = read_wording(__file__)
+    trials = len(results.arrangements[0].cell.iterations)
+    printed: tuple[Entry, ...] = ("as printed", "", "", "", *map(float, list_printed()), None)
+    candidates = [
+        (c.name, c.reading, c.truth, c.frame, *map(float, c.reductions), c.distance)
+        for c in results.candidates
+    ]
+    forms = results.forms
     return (
-        _given(found.study),
-        _ranks(found),
-        _gauge(found.study),
-        _table_3(found, aligned=True),
-        _table_3(found, aligned=False),
-        candidates_table(found.candidates),
-        arrangements_table(found.arrangements),
-        weights_table(found.weights),
-        fifty_table(found.fifties),
-        forms_table(found.forms),
-        _arithmetic(found.printed),
+        _list_given(words, results.study),
+        _list_ranks(words, results),
+        _list_gauge(words, results.study),
+        _list_table_3(words, results, "table_3", ALIGNED),
+        _list_table_3(words, results, "table_3_absolute", ABSOLUTE),
+        words.table("figure_5_readings", [printed, *candidates]),
+        words.table(
+            "arrangements", map(_list_arrangement, results.arrangements), "", trials=trials
+        ),
+        _list_weights(words, results.weights),
+        _list_fifty(words, results),
+        words.table("forms", forms.rows, "", errors=ERRORS / MM, covariance=forms.covariance),
+        _list_arithmetic(words, results.printed),
     )
 
 
-def ranks(study: Study, seed: int) -> tuple[tuple[int, int, int, int, FloatArray], ...]:
-    """Ranks of random groups, with the tolerance 1e-10 of the largest singular value."""
-    found = []
+def compute_ranks(study: Study, seed: int) -> tuple[GroupRank, ...]:
+    """Return the ranks of random groups, with the tolerance 1e-10 of the largest singular value."""
+    ranks = []
     for groups, points in RANKS:
         planned = PlaneLineGroups(study.robot, points, MM, AXES)
-        rows = planned.linearize(planned.draw(groups, seed)).reshape(-1, len(planned.free))
+        rows = planned.linearize(planned.draw(groups, seed))
+        rows = rows.reshape(-1, len(planned.free))
         s = np.linalg.svd(rows, compute_uv=False)
-        found.append((groups, points, len(rows), int((s > 1e-10 * s[0]).sum()), s))
-    return tuple(found)
+        ranks.append(GroupRank(groups, points, len(rows), int((s > 1e-10 * s[0]).sum()), s))
+    return tuple(ranks)
 
 
-def pair_rank(study: Study) -> tuple[int, int]:
-    """Points of the first group, and the rank of the equations (14) of all its pairs, at the points
-    as commanded.
+def compute_pair_rank(study: Study) -> tuple[int, int]:
+    """Return the points of the first group and the rank of the equations (14) of all its pairs.
+
+    The points are those commanded.
     """
     nominal = study.robot.parameters.nominal[None]
     points, slopes, _ = study.layout.sloped(nominal, study.layout.held(nominal, 0.0, 0))
@@ -98,166 +131,93 @@ def pair_rank(study: Study) -> tuple[int, int]:
     return len(at), int(np.linalg.matrix_rank(rows, rtol=1e-9))
 
 
-def _given(study: Study) -> Table:
-    rows: list[tuple[Entry, ...]] = [
-        ("robot", f"{ROBOT}, 42 parameters, nominal geometry of Nategh and Agheli 2009")
-    ]
+def _list_given(words: Wording, study: Study) -> Table:
+    rows = [("robot", f"{ROBOT}, 42 parameters, nominal geometry of Nategh and Agheli 2009")]
     for name, (low, high) in study.robot.assembly.workspace.items():
-        angle = name in {"roll", "pitch", "yaw"}
-        shown = (np.rad2deg(low), np.rad2deg(high), "deg") if angle else (low / MM, high / MM, "mm")
-        rows.append((f"workspace, {name}", f"{shown[0]:.4g} to {shown[1]:.4g} {shown[2]}"))
-    layout = study.layout
-    rows.append(
-        (
-            "points",
-            (
-                f"{layout.groups} planes of equal z, {layout.points // layout.groups} points each "
-                "with "
-                "their line"
-            ),
-        )
-    )
-    history = ", ".join(f"{v:.1f}" for v in study.optimised.history)
+        scale, unit = (MM, "mm")
+        if name in {"roll", "pitch", "yaw"}:
+            scale, unit = np.pi / 180.0, "deg"
+        rows.append((f"workspace, {name}", f"{low / scale:.4g} to {high / scale:.4g} {unit}"))
+    groups, points = study.layout.groups, study.layout.points
+    each = f"{groups} planes of equal z, {points // groups} points each with their line"
+    rows.append(("points", each))
+    history = ", ".join(f"{v:.1f}" for v in study.optimized.history)
     rows.append(("coordinate exchange", f"log det {history} [tolerance 1 mm, noise 1 mm]"))
     assert all(p.dimension is Dimension.LENGTH for p in study.robot.parameters.entries)
-    note = "Ours: the paper's Tables 1 and 2 and the number of its planes are not in our text."
-    return Table(
-        "given",
-        "What is given (in place of Tables 1 and 2)",
-        ("", "value"),
-        tuple(rows),
-        ("", ""),
-        note,
-    )
+    return words.table("given", rows)
 
 
-def _ranks(found: Results) -> Table:
-    rows = tuple(
-        (g, k, m, r, float(s[r - 1]), float(s[r]) if r < len(s) else None)
-        for g, k, m, r, s in found.ranks
-    )
-    columns = (
-        "planes",
-        "points of each",
-        "rows",
-        "rank",
-        "smallest that counts",
-        "largest that does not",
-    )
-    note = (
-        "Of 42 parameters; singular values of rows in noise of 1 mm by errors of 1 mm; points "
-        "drawn at random; cut at 1e-10 of"
-        " the largest."
-    )
-    return Table(
-        "ranks",
-        "33 of 42 for any number of planes and lines",
-        columns,
-        rows,
-        ("d",) * 4 + (".2g", ".1e"),
-        note,
-    )
-
-
-def _gauge(study: Study) -> Table:
-    rows_of = study.optimised.rows.reshape(-1, 42)
-    top = np.linalg.svd(rows_of, compute_uv=False)[0]
-    g = gauge_directions(study.robot)
-    effect = np.linalg.norm(rows_of @ g.T, axis=0) / np.linalg.norm(g, axis=1) / top
-    moved = (
-        "moves along it",
-        "turns about it, the base's origin staying",
-        "stays; the platform turns about it",
-    )
-    rows = tuple(
-        (name, f"the end point {moved[i // 3]}", float(effect[i])) for i, name in enumerate(NAMES)
-    )
-    note = "Effect on the rows of the ten groups, over the largest singular value: rounding."
-    columns = ("direction", "what it does to every pose", "effect")
-    return Table(
-        "gauge",
-        "The nine directions that plane and line cannot tell",
-        columns,
-        rows,
-        ("", "", ".0e"),
-        note,
-    )
-
-
-def _table_3(found: Results, aligned: bool) -> Table:
-    chosen = (
-        ("position, aligned [mm]", "orientation, aligned [deg]", "parameters without gauge [mm]")
-        if aligned
-        else (
-            "position [mm]",
-            "orientation [deg]",
-            "parameters [mm]",
-            "position, gauge at nominal [mm]",
-        )
-    )
-    places = [MEASURES.index(name) for name in chosen]
+def _list_ranks(words: Wording, results: Results) -> Table:
     rows = []
-    for (given, noise), c in found.cells.items():
-        medians = [float(c.median(m)[i]) for i in places for m in (BEFORE, LS, PRIOR)]
-        rows.append((given, noise, *medians, c.worse(LS, places[0]), c.worse(PRIOR, places[0])))
-    columns = ("errors, sd [mm]", "noise, sd [mm]", *(f"{name}, {m}" for name in chosen for m in (BEFORE, LS, PRIOR)),
-               "LS worse than before", "MAP worse than before")  # fmt: skip
-    first = next(iter(found.cells.values()))
-    frame = (
-        "after the base's best motion and the platform's best turn, which the data leave open"
-        if aligned
-        else "as they are, which for least squares is mostly where the least deviation puts what "
-        "the data leave open (gauge at"
-        " nominal: put where poses are nearest to those as designed, as good an answer to the same "
-        "data)"
-    )
-    note = (
-        f"Medians of {len(first.iterations)} drawn machines; root mean squares over 100 unseen "
-        "poses at equal readings,"
-        f" {frame}; the 2-norm of the parameters' error. Rows with their full covariance. Last: "
-        "how many machines a method made"
-        " worse in position."
-    )
-    name = "table_3" if aligned else "table_3_absolute"
-    title = f"Table 3 repeated, {'after alignment' if aligned else 'in the absolute frame'}"
-    return Table(
-        name, title, columns, tuple(rows), ("", "", *[".2g"] * 3 * len(chosen), "d", "d"), note
+    for r in results.ranks:
+        s = r.singular_values
+        unused = float(s[r.rank]) if r.rank < len(s) else None
+        rows.append((r.groups, r.points, r.rows, r.rank, float(s[r.rank - 1]), unused))
+    return words.table("ranks", rows)
+
+
+def _list_gauge(words: Wording, study: Study) -> Table:
+    rows = study.optimized.rows.reshape(-1, 42)
+    largest = np.linalg.svd(rows, compute_uv=False)[0]
+    g = list_gauge_directions(study.robot)
+    effect = np.linalg.norm(rows @ g.T, axis=0) / np.linalg.norm(g, axis=1) / largest
+    table = [(name, MOTIONS[i // 3], float(effect[i])) for i, name in enumerate(NAMES)]
+    return words.table("gauge", table)
+
+
+def _list_table_3(words: Wording, results: Results, name: str, measures: tuple[str, ...]) -> Table:
+    places, methods = [MEASURES.index(measure) for measure in measures], (BEFORE, LS, PRIOR)
+    rows = []
+    for (given, noise), c in results.cells.items():
+        medians = [float(c.compute_median(m)[i]) for i in places for m in methods]
+        worse = [c.count_worse(m, places[0]) for m in (LS, PRIOR)]
+        rows.append((given, noise, *medians, *worse))
+    trials = len(next(iter(results.cells.values())).iterations)
+    table = words.table(name, rows, "", trials=trials)
+    columns = [f"{measure}, {m}" for measure in measures for m in methods]
+    return replace(
+        table,
+        columns=(*table.columns, *columns, "LS worse than before", "MAP worse than before"),
+        formats=(*table.formats, *[".2g"] * len(columns), "d", "d"),
     )
 
 
-def _arithmetic(printed: Published) -> Table:
+def _list_arrangement(a: Arrangement) -> tuple[Entry, ...]:
+    place = MEASURES.index("position, aligned [mm]")
+    errors = (float(a.cell.compute_median(m)[place]) for m in (LS, PRIOR))
+    return (a.name, a.study.layout.equations, a.drawn, a.optimized, a.gain, *errors)
+
+
+def _list_weights(words: Wording, weights: Mapping[str, Cell]) -> Table:
+    names = ("position, aligned [mm]", "parameters without gauge [mm]")
+    places = [MEASURES.index(name) for name in names]
+    rows = [
+        (WEIGHTS[w], *(float(c.compute_median(m)[i]) for m in (LS, PRIOR) for i in places))
+        for w, c in weights.items()
+    ]
+    return words.table("weights", rows)
+
+
+def _list_fifty(words: Wording, results: Results) -> Table:
+    rows = []
+    for fifty in results.fifties:
+        plural = "plane, one line" if fifty.groups == 1 else "planes, a line each"
+        for method, frame in fifty.statistics:
+            median = map(float, fifty.compute_median(method, frame))
+            rows.append((f"{fifty.groups} {plural}", frame, method, *median))
+    noise, trials = results.printed.accuracy / MM, len(results.fifties[0].iterations)
+    return words.table("table_4", rows, "", trials=trials, noise=noise)
+
+
+def _list_arithmetic(words: Wording, printed: Published) -> Table:
     rows: list[tuple[Entry, ...]] = []
     for name, given in printed.table_4.items():
         low, high = given.possible
-        rows.append((f"Table 4, {name}", given.before, given.after, given.stated, given.factor, f"{low:.2f} to {high:.2f}",
-                     given.follows))  # fmt: skip
+        numbers = (given.before, given.after, given.stated, given.factor)
+        rows.append((f"Table 4, {name}", *numbers, f"{low:.2f} to {high:.2f}", given.follows))
     for name, given in printed.figure_5.items():
         if given.before:
             follows = abs(given.reduction - float(given.stated)) <= 0.5
-            rows.append(
-                (
-                    f"Figure 5, {name} [%]",
-                    given.before,
-                    given.after,
-                    given.stated,
-                    given.reduction,
-                    None,
-                    follows,
-                )
-            )
-    columns = (
-        "quantity",
-        "before",
-        "after",
-        "stated",
-        "from the printed numbers",
-        "possible, numbers being rounded",
-        "follows",
-    )
-    return Table(
-        "arithmetic",
-        "The paper's own quotients",
-        columns,
-        tuple(rows),
-        ("", "", "", "", ".3g", "", ""),
-    )
+            numbers = (given.before, given.after, given.stated, given.reduction)
+            rows.append((f"Figure 5, {name} [%]", *numbers, None, follows))
+    return words.table("arithmetic", rows)

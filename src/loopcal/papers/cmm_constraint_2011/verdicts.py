@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What agrees with the paper and what does not, and why: each sentence is made from the numbers of
-this run.
-"""
+"""Judge every claim of the paper, and our own checks, by the numbers of this run."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from loopcal.papers.cmm_constraint_2011.cells import BEFORE, LS, METHODS, PRIOR, correlation
-from loopcal.papers.cmm_constraint_2011.fifty import STATISTICS, Fifty
-from loopcal.papers.cmm_constraint_2011.gauge import gauge_directions
+from loopcal.papers.cmm_constraint_2011.cells import (
+    BEFORE,
+    LS,
+    METHODS,
+    PRIOR,
+    compute_rank_correlation,
+)
+from loopcal.papers.cmm_constraint_2011.fifty_points import STATISTICS, FiftyPoints
+from loopcal.papers.cmm_constraint_2011.gauge import list_gauge_directions
 from loopcal.papers.cmm_constraint_2011.layouts import (
     ANY,
     NOISE,
@@ -19,331 +23,255 @@ from loopcal.papers.cmm_constraint_2011.layouts import (
     VARIANCE,
     Arrangement,
 )
-from loopcal.papers.cmm_constraint_2011.published import MM, published
-from loopcal.papers.cmm_constraint_2011.study import ABSOLUTE, ALIGNED, AT_NOMINAL, MEASURES
-from loopcal.papers.cmm_constraint_2011.tables import Results, pair_rank
-from loopcal.papers.reproduction import OWN_CHECK, Verdict
+from loopcal.papers.cmm_constraint_2011.machines import ABSOLUTE, ALIGNED, AT_NOMINAL, MEASURES
+from loopcal.papers.cmm_constraint_2011.published import MM, read_published
+from loopcal.papers.cmm_constraint_2011.tables import Results, compute_pair_rank
+from loopcal.papers.reproduction import Verdict
+from loopcal.papers.wording import Wording, read_wording
 
 PARAMETERS, POSITION = MEASURES.index("parameters [mm]"), MEASURES.index("position [mm]")
-SEEN = MEASURES.index("position, aligned [mm]")
-KNOWN = MEASURES.index("parameters without gauge [mm]")
+POSITION_ALIGNED = MEASURES.index("position, aligned [mm]")
+PARAMETERS_WITHOUT_GAUGE = MEASURES.index("parameters without gauge [mm]")
 SURE = 0.1
-"""Ratio of two medians of some fifty machines, less one, that says nothing."""
+"""A ratio of two medians of some fifty machines, minus one, that is not significant."""
 NEARLY_ALL = 90.0
 """Percentage of machines for which a statement must hold."""
 
 
-def verdicts(found: Results) -> tuple[Verdict, ...]:
-    """Judge every statement."""
+def judge_claims(results: Results) -> tuple[Verdict, ...]:
+    """Return a verdict for each claim."""
+    words = read_wording(__file__)
     return (
-        _independent(found),
-        _counted(found),
-        _least_squares(found),
-        _three_quarters(found),
-        _better(found),
-        _correlation(found),
-        *_figure_5(found),
-        *_points(found),
-        *_fifty(found),
-        *_arithmetic(),
-        _prior(found),
-        _weights(found),
-        _forms(found),
+        _judge_independence(words, results),
+        _judge_count(words, results),
+        _judge_least_squares(words, results),
+        _judge_three_quarters(words, results),
+        _judge_improvement(words, results),
+        _judge_correlation(words, results),
+        *_judge_figure_5(words, results),
+        *_judge_points(words, results),
+        *_judge_fifty(words, results),
+        *_judge_arithmetic(words),
+        _judge_prior(words, results),
+        _judge_weights(words, results),
+        _judge_forms(words, results),
     )
 
 
-def _said(name: str, agrees: bool | None, why: str) -> Verdict:
-    """Judge a statement of published.yaml."""
-    statement = published().statements[name]
-    return Verdict(statement["claim"], agrees, why, statement["where"])
+def _judge_independence(words: Wording, results: Results) -> Verdict:
+    rows = results.study.optimized.rows.reshape(-1, 42)
+    moved = rows @ list_gauge_directions(results.study.robot)[:6].T
+    effect = np.abs(moved).max() / np.abs(rows).max()
+    return words.judge("independent", effect < 1e-9, effect=effect)
 
 
-def _independent(found: Results) -> Verdict:
-    rows = found.study.optimised.rows.reshape(-1, 42)
-    effect = np.abs(rows @ gauge_directions(found.study.robot)[:6].T).max() / np.abs(rows).max()
-    return _said(
-        "independent",
-        bool(effect < 1e-9),
-        f"Moving or turning the whole base changes the rows by {effect:.0e} of themselves, which "
-        "is rounding. The price is that"
-        " the robot's own base cannot be found either.",
-    )
+def _judge_count(words: Wording, results: Results) -> Verdict:
+    points, rank = compute_pair_rank(results.study)
+    agrees = None if rank == points - 2 else rank == points - 1
+    return words.judge("counted", agrees, points=points, rank=rank)
 
 
-def _counted(found: Results) -> Verdict:
-    points, rank = pair_rank(found.study)
-    return _said(
-        "counted",
-        None if rank == points - 2 else rank == points - 1,
-        f"It depends on how points are counted: all pairs of the {points} points of a plane and "
-        f"its line give {rank}"
-        " independent equations, two less than there are points. The paper's points begin with "
-        "p_0; if n is the last one's"
-        " number, n - 1 is right, if n is how many there are, it is n - 2. Every further plane "
-        "costs two more points.",
-    )
-
-
-def _least_squares(found: Results) -> Verdict:
-    all_ranks = sorted({r[3] for r in found.ranks})
-    largest = max(float(s[r] / s[0]) for _, _, _, r, s in found.ranks if r < len(s))
-    groups = [r[0] for r in found.ranks]
-    return _said(
+def _judge_least_squares(words: Wording, results: Results) -> Verdict:
+    ranks = sorted({r.rank for r in results.ranks})
+    groups = [r.groups for r in results.ranks]
+    unused = [r.singular_values[r.rank] / r.singular_values[0] for r in results.ranks]
+    return words.judge(
         "least_squares",
-        all_ranks == [42],
-        f"A has rank {' or '.join(map(str, all_ranks))} of 42 for {min(groups)} to {max(groups)} "
-        "planes; the next singular"
-        f" value is {largest:.0e} of the largest, so A'A has no inverse. Nine directions change no "
-        "row: the base moved (3), the"
-        " base turned (3), the platform turned about the end point (3). Leg lengths and scale are "
-        "found, through the encoders.",
+        ranks == [42],
+        ranks=ranks,
+        fewest=min(groups),
+        most=max(groups),
+        largest=max(unused),
     )
 
 
-def _three_quarters(found: Results) -> Verdict:
-    """What 33 of 42 means for the paper's 75 %."""
+def _judge_three_quarters(words: Wording, results: Results) -> Verdict:
     from scipy.stats import beta
 
-    quiet = found.cells["1", "0.0001"]
-    left = quiet.errors[LS][:, PARAMETERS] / quiet.errors[BEFORE][:, PARAMETERS]
-    chance = float(beta.cdf(0.25**2, 4.5, 16.5))
-    return Verdict(
-        "With errors drawn in all 42 parameters, their norm can be reduced by 75 %.",
-        bool(np.mean(left) <= 0.25),
-        "Nine of 42 directions stay as they are, on average sqrt(9/42) of the norm: 54 % is the "
-        "best to expect, and 75 % comes"
-        f" about in {100 * chance:.1f} % of draws. Here, noise {quiet.noise / MM:g} mm: "
-        f"{100 * (1 - left.mean()):.0f} % on"
-        f" average, {int((left <= 0.25).sum())} of {len(left)} draws at 75 % or more.",
-        "section 4, text on figure 5",
+    quiet = results.cells["1", "0.0001"]
+    share = quiet.errors[LS][:, PARAMETERS] / quiet.errors[BEFORE][:, PARAMETERS]
+    return words.judge(
+        "three_quarters",
+        np.mean(share) <= 0.25,
+        chance=100.0 * float(beta.cdf(0.25**2, 4.5, 16.5)),
+        noise=quiet.noise / MM,
+        mean=100.0 * (1.0 - share.mean()),
+        reached=int((share <= 0.25).sum()),
+        count=len(share),
     )
 
 
-def _better(found: Results) -> Verdict:
-    cells = found.cells
-    worse = [key for key, c in cells.items() if c.median(LS)[SEEN] > c.median(BEFORE)[SEEN]]
-    ratio = np.median([c.median(LS)[SEEN] * MM / c.noise for c in cells.values()])
-    names = ", ".join(f"errors {s} mm with noise {n} mm" for s, n in worse) or "none"
-    return _said(
+def _judge_improvement(words: Wording, results: Results) -> Verdict:
+    errors = {
+        key: (c.compute_median(BEFORE)[POSITION_ALIGNED], c.compute_median(LS)[POSITION_ALIGNED])
+        for key, c in results.cells.items()
+    }
+    worse = [key for key, (before, after) in errors.items() if after > before]
+    ratios = [errors[key][1] * MM / c.noise for key, c in results.cells.items()]
+    return words.judge(
         "better",
         not worse,
-        f"By least squares the position error after alignment is {ratio:.2g} times the noise, "
-        "whatever the errors were: better"
-        f" in {len(cells) - len(worse)} of {len(cells)} cells, worse where the noise is as large "
-        f"as the errors ({names}).",
+        ratio=np.median(ratios),
+        better=len(errors) - len(worse),
+        count=len(errors),
+        worse=", ".join(f"errors {s} mm with noise {n} mm" for s, n in worse) or "none",
     )
 
 
-def _correlation(found: Results) -> Verdict:
-    ranks = {method: correlation(found.cells.values(), method) for method in METHODS}
-    cell = found.cells["1", "0.01"]
-    ratios = len({c.ratio for c in found.cells.values()})
-    known, position = (cell.reduction(LS)[i] for i in (PARAMETERS, POSITION))
-    return _said(
+def _judge_correlation(words: Wording, results: Results) -> Verdict:
+    cells = results.cells.values()
+    ranks = {method: compute_rank_correlation(cells, method) for method in METHODS}
+    reduction = results.cells["1", "0.01"].compute_reduction(LS)
+    return words.judge(
         "correlation",
         all(r > 0.7 for r in ranks.values()),
-        f"Over the {len(found.cells)} cells, which hold only {ratios} different ratios of noise to "
-        "errors, the rank correlation"
-        f" is {ranks[LS]:.2f} by LS and {ranks[PRIOR]:.2f} by MAP; cells of one ratio are nearly "
-        "tied, so it wanders with the"
-        " draws. It is no proportion: for errors of 1 mm and noise of 0.01 mm parameters improve "
-        f"by {known:.0f} %, positions"
-        f" by {position:.0f} %, and after alignment by {cell.reduction(LS)[SEEN]:.0f} %.",
+        count=len(cells),
+        ratios=len({c.ratio for c in cells}),
+        ls=ranks[LS],
+        prior=ranks[PRIOR],
+        parameters=reduction[PARAMETERS],
+        position=reduction[POSITION],
+        aligned=reduction[POSITION_ALIGNED],
     )
 
 
-def _figure_5(found: Results) -> tuple[Verdict, ...]:
-    nearest = found.candidates[0]
-    other = next(c for c in found.candidates if c.reading == VARIANCE)
-    read = [f"{a:.0f} %" for a in nearest.reductions]
-    words = [f"{a:.0f} %" for a in other.reductions]
-    literal = next(c for c in found.candidates if c.truth == "all 42" and c.frame == "absolute")
-    best = ", ".join(f"{a:.0f} %" for a in literal.reductions)
+def _judge_figure_5(words: Wording, results: Results) -> tuple[Verdict, ...]:
+    nearest = results.candidates[0]
+    other = next(c for c in results.candidates if c.reading == VARIANCE)
+    literal = next(c for c in results.candidates if c.truth == "all 42" and c.frame == "absolute")
+    texts = [[f"{a:.0f} %" for a in c.reductions] for c in (nearest, other, literal)]
     return (
-        Verdict(
-            '"Variances of 0.01 mm" and so on are variances.',
+        words.judge(
+            "variances",
             None if nearest.reading == VARIANCE else False,
-            "Their unit, mm, is that of a standard deviation. The numbers are an indication only, "
-            "as our robot is another: read"
-            " as standard deviations, reductions of the errors come nearest to the printed 75, 83 "
-            "and 87 % (parameters,"
-            f" position, orientation), {', '.join(read)} ({nearest.name}, {nearest.truth}, "
-            f"{nearest.frame}); read as variances,"
-            f" noise of {NOISE:g} is {np.sqrt(NOISE):g} mm, and parameters get worse, a reduction "
-            f"of {words[0]} at best"
-            f" (position {words[1]}, orientation {words[2]}).",
-            OWN_CHECK,
+            nearest=nearest,
+            deviations=texts[0],
+            variances=texts[1],
+            given=NOISE,
+            root=np.sqrt(NOISE),
         ),
-        Verdict(
-            "Figure 5 follows with errors in all 42 parameters, compared in the absolute frame.",
-            literal.distance < 10.0,
-            f"The nearest such reading gives {best}. With true errors without gauge part, or after "
-            "alignment, it comes within"
-            f" {nearest.distance:.0f} percentage points: figure 5 asks for one of the two, which "
-            "the paper does not mention.",
-            "section 4, text on figure 5",
+        words.judge(
+            "figure_5", literal.distance < 10.0, literal=texts[2], distance=nearest.distance
         ),
     )
 
 
-def _points(found: Results) -> tuple[Verdict, ...]:
-    ten, one, free = (_arrangement(found, name) for name in (TEN, ONE, ANY))
-    cost = (ten.cell.median(LS)[SEEN], one.cell.median(LS)[SEEN])
+def _judge_points(words: Wording, results: Results) -> tuple[Verdict, ...]:
+    ten, one, free = (_find_arrangement(results, name) for name in (TEN, ONE, ANY))
+    cost_ten, cost_one = (a.cell.compute_median(LS)[POSITION_ALIGNED] for a in (ten, one))
     return (
-        Verdict(
-            "Choosing the positions by coordinate exchange pays.",
-            ten.gain >= 3.0,
-            f"The sd of the identifiable directions falls {ten.gain:.1f} times, from "
-            f"{ten.drawn:.3g} to {ten.optimised:.3g} mm"
-            f" per mm of noise ({one.gain:.1f} times on one plane, one sweep).",
-            OWN_CHECK,
-        ),
-        Verdict(
-            "One plane and one line are enough.",
-            bool(cost[1] < 1.5 * cost[0]),
-            f"The rank is the same, the accuracy is not: {one.drawn:.3g} mm per mm as drawn and "
-            f"{one.optimised:.3g} optimised,"
-            f" against {ten.optimised:.3g} on ten planes, {free.optimised:.3g} where lines may run "
-            "along x and y too. After"
-            f" calibration with noise of {NOISE:g} mm the position is wrong by {cost[1]:.2g} mm "
-            f"against {cost[0]:.2g} mm.",
-            OWN_CHECK,
+        words.judge("exchange", ten.gain >= 3.0, ten=ten, one=one),
+        words.judge(
+            "one_plane",
+            cost_one < 1.5 * cost_ten,
+            one=one,
+            ten=ten,
+            free=free,
+            noise=NOISE,
+            cost_one=cost_one,
+            cost_ten=cost_ten,
         ),
     )
 
 
-def _fifty(found: Results) -> tuple[Verdict, ...]:
-    one, five = found.fifties
-    most = [int(f.iterations.max()) for f in found.fifties]
+def _judge_fifty(words: Wording, results: Results) -> tuple[Verdict, ...]:
+    one, five = results.fifties
+    factors = five.compute_factors(PRIOR, ABSOLUTE)[: len(STATISTICS)]
     return (
-        _said(
+        words.judge(
             "iterations",
             one.within_five >= NEARLY_ALL,
-            "Until a step changes the residuals by 1 % at most, on one plane and line: "
-            f"{one.within_five:.0f} % of the machines"
-            f" (most: {most[0]}). On five planes, which is our reading, not the paper's, it is "
-            f"{five.within_five:.0f} % (most:"
-            f" {most[1]}): random points leave directions so weak that the noise carries least "
-            "squares far along them.",
+            one=one.within_five,
+            five=five.within_five,
+            most=[int(f.iterations.max()) for f in results.fifties],
         ),
-        Verdict(
-            "Full poses confirm the calibration: errors and their scatter fall (Table 4).",
+        words.judge(
+            "full_poses",
             None,
-            "It cannot be judged by absolute poses: where base and platform end up is not in the "
-            "data but chosen. With the"
-            f" least deviation least squares goes from {_pair(one, ABSOLUTE)} on one plane and "
-            f"{_pair(five, ABSOLUTE)} on five,"
-            " with the same answer put where poses are nearest to those as designed from "
-            f"{_pair(one, AT_NOMINAL)} and"
-            f" {_pair(five, AT_NOMINAL)}. Of what the data do tell, the position error after "
-            "alignment goes from"
-            f" {_pair(one, ALIGNED)} by LS on one plane and {_pair(five, ALIGNED)} on five, by MAP"
-            f" {_pair(one, ALIGNED, PRIOR)} and {_pair(five, ALIGNED, PRIOR)}. Factors of the "
-            "absolute poses by MAP on five"
-            f" planes are {_factors(five)}, those of the paper "
-            f"{', '.join(g.stated for g in found.printed.table_4.values())}:"
-            " of one size, with a prior that the paper does not mention.",
-            "section 4, Table 4",
+            ls_one=_format_change(one, ABSOLUTE),
+            ls_five=_format_change(five, ABSOLUTE),
+            nominal_one=_format_change(one, AT_NOMINAL),
+            nominal_five=_format_change(five, AT_NOMINAL),
+            aligned_one=_format_change(one, ALIGNED),
+            aligned_five=_format_change(five, ALIGNED),
+            prior_one=_format_change(one, ALIGNED, PRIOR),
+            prior_five=_format_change(five, ALIGNED, PRIOR),
+            factors=", ".join(f"{f:.1f}" for f in factors),
+            stated=", ".join(given.stated for given in results.printed.table_4.values()),
         ),
     )
 
 
-def _arithmetic() -> tuple[Verdict, ...]:
-    made = []
-    for name, given in published().table_4.items():
+def _judge_arithmetic(words: Wording) -> tuple[Verdict, ...]:
+    verdicts = []
+    for name, given in read_published().table_4.items():
         low, high = given.possible
-        made.append(
-            Verdict(
-                f"Table 4, {name}: from {given.before} to {given.after} {given.unit} is a factor "
-                f"of {given.stated}.",
-                given.follows,
-                f"{given.before} / {given.after} = {given.factor:.2g}; of numbers rounded to these "
-                f"it is {low:.2f} to"
-                f" {high:.2f}.",
-                "section 4, text on Table 4",
-            )
+        verdicts.append(
+            words.judge("factor", given.follows, "", name=name, given=given, low=low, high=high)
         )
-    made.append(
-        _said(
-            "conclusion",
-            False,
-            "The text on Table 4 calls the same two factors, 2.7 and 3.9, improvements of the mean "
-            "value.",
-        )
-    )
-    return tuple(made)
+    return (*verdicts, words.judge("conclusion", False))
 
 
-def _prior(found: Results) -> Verdict:
-    cells = found.cells
-    better = [
-        c for c in cells.values() if c.median(PRIOR)[SEEN] <= (1.0 + SURE) * c.median(LS)[SEEN]
-    ]
-    harmed = [key for key, c in cells.items() if c.median(PRIOR)[SEEN] > c.median(BEFORE)[SEEN]]
+def _judge_prior(words: Wording, results: Results) -> Verdict:
+    cells = results.cells
+    medians = {
+        key: [c.compute_median(m)[POSITION_ALIGNED] for m in (BEFORE, LS, PRIOR)]
+        for key, c in cells.items()
+    }
+    better = [key for key, (_, ls, prior) in medians.items() if prior <= (1.0 + SURE) * ls]
+    harmed = [key for key, (before, _, prior) in medians.items() if prior > before]
     hardest = cells["0.01", "0.1"]
-    return Verdict(
-        "MAP, with the sd of the errors as prior, is never worse than least squares, and never "
-        "makes the median worse.",
+    before, ls, prior = medians["0.01", "0.1"]
+    return words.judge(
+        "prior",
         len(better) == len(cells) and not harmed,
-        f"It is no more than {100 * SURE:.0f} % worse in {len(better)} of {len(cells)} cells. "
-        "Errors of 0.01 mm with noise of"
-        f" 0.1 mm: before {hardest.median(BEFORE)[SEEN]:.2g} mm, LS {hardest.median(LS)[SEEN]:.2g} "
-        "mm, MAP"
-        f" {hardest.median(PRIOR)[SEEN]:.2g} mm; single machines do get worse, here "
-        f"{hardest.worse(PRIOR, SEEN)} of"
-        f" {len(hardest.iterations)}.",
-        OWN_CHECK,
+        sure=100 * SURE,
+        better=len(better),
+        count=len(cells),
+        before=before,
+        ls=ls,
+        map=prior,
+        worse=hardest.count_worse(PRIOR, POSITION_ALIGNED),
+        trials=len(hardest.iterations),
     )
 
 
-def _weights(found: Results) -> Verdict:
-    position, parameters = (
-        {n: c.median(m)[i] for n, c in found.weights.items()}
-        for m, i in ((LS, SEEN), (PRIOR, KNOWN))
-    )
-    less = {name: 100.0 * (1.0 - position["full"] / position[name]) for name in position}
-    nearer = 100.0 * (1.0 - position["distance"] / position["printed"])
-    return Verdict(
-        "Rows of weight one, as printed, are as good as rows with their covariance.",
-        bool(position["printed"] < 1.1 * position["full"]),
-        f"Position after alignment by LS: {position['printed']:.2g} mm as printed, "
-        f"{position['distance']:.2g} divided by |d_1|,"
-        f" {position['single']:.2g} divided by the sd of each row, {position['full']:.2g} with the "
-        "full covariance (rows of a"
-        f" plane share p_0 and p_1): {less['printed']:.0f} % less than as printed, of which "
-        "division by |d_1| alone gives"
-        f" {nearer:.0f} %, and {less['single']:.0f} % less than rows that are taken as "
-        "independent. Parameters by MAP:"
-        f" {parameters['printed']:.3g}, {parameters['distance']:.3g}, {parameters['single']:.3g}, "
-        f"{parameters['full']:.3g} mm"
-        f" (errors {SET:g} mm, noise {NOISE:g} mm).",
-        OWN_CHECK,
+def _judge_weights(words: Wording, results: Results) -> Verdict:
+    position = {n: c.compute_median(LS)[POSITION_ALIGNED] for n, c in results.weights.items()}
+    parameters = {
+        n: c.compute_median(PRIOR)[PARAMETERS_WITHOUT_GAUGE] for n, c in results.weights.items()
+    }
+    return words.judge(
+        "weights",
+        position["printed"] < 1.1 * position["full"],
+        position=position,
+        parameters=parameters,
+        less={name: 100.0 * (1.0 - position["full"] / p) for name, p in position.items()},
+        nearer=100.0 * (1.0 - position["distance"] / position["printed"]),
+        set=SET,
+        noise=NOISE,
     )
 
 
-def _forms(found: Results) -> Verdict:
-    forms = found.forms
+def _judge_forms(words: Wording, results: Results) -> Verdict:
+    forms = results.forms
     largest = max(row[3] for row in forms.rows)
-    return Verdict(
-        "Surfaces as unknowns of the measurement give the same estimate and covariance as the "
-        "paper's elimination.",
+    quietest = min(row[0] for row in forms.rows)
+    return words.judge(
+        "forms",
         largest < 0.05 and forms.covariance < 1e-6,
-        f"Estimates differ by at most {largest:.1e} standard deviations at noise up to "
-        f"{forms.rows[-1][0]:g} mm (ten times less"
-        f" at a tenth of the noise), variances by {forms.covariance:.0e} of themselves. "
-        "Derivation: docs/theory/constraint.md.",
-        OWN_CHECK,
+        largest=largest,
+        noise=max(row[0] for row in forms.rows),
+        small=max(row[3] for row in forms.rows if row[0] == quietest),
+        covariance=forms.covariance,
     )
 
 
-def _arrangement(found: Results, name: str) -> Arrangement:
-    return next(a for a in found.arrangements if a.name == name)
+def _find_arrangement(results: Results, name: str) -> Arrangement:
+    return next(a for a in results.arrangements if a.name == name)
 
 
-def _pair(one: Fifty, frame: str, method: str = LS) -> str:
-    """Mean position error before and after."""
-    return f"{one.median(BEFORE, frame)[0]:.2g} to {one.median(method, frame)[0]:.2g} mm"
-
-
-def _factors(one: Fifty) -> str:
-    return ", ".join(f"{f:.1f}" for f in one.factors(PRIOR, ABSOLUTE)[: len(STATISTICS)])
+def _format_change(fifty: FiftyPoints, frame: str, method: str = LS) -> str:
+    """Return the mean position error before and after, as text."""
+    before, after = (fifty.compute_median(m, frame)[0] for m in (BEFORE, method))
+    return f"{before:.2g} to {after:.2g} mm"
