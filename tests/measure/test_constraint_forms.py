@@ -17,8 +17,8 @@ from loopcal.estimate import MAP, LeastSquares, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import collect_information
 from loopcal.papers.cmm_constraint_2011.forms import RANK, covariance_difference, measurements
+from loopcal.papers.cmm_constraint_2011.machines import draw_true_machines
 from loopcal.papers.cmm_constraint_2011.steps import Layout, PaperRows, identify_from_rows, row_map
-from loopcal.papers.cmm_constraint_2011.study import true_machines
 from loopcal.planning.plane_line_groups import PlaneLineGroups, linearize_surfaces
 
 MM = 1e-3
@@ -127,7 +127,7 @@ def test_both_forms_agree_with_lines_along_different_axes(planned) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [LeastSquares(), MAP()], ids=["least squares", "MAP"])
 def test_both_forms_give_the_same_estimate_up_to_what_is_not_linear(layout, method) -> None:
-    truth = true_machines(layout.robot, MM, 1, 3)
+    truth = draw_true_machines(layout.robot, MM, 1, 3)
     unlike = []
     for noise in (NOISE, 10.0 * NOISE):
         q = layout.held(truth, noise, 3)
