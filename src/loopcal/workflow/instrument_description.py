@@ -89,7 +89,7 @@ def _setting_names(kind: str) -> set[str]:
 
 def _name_unknown_frames(frames: Sequence[str], kind: object) -> tuple[str, ...]:
     """Return the names that a kind has for unknown frames."""
-    possible: tuple[str, ...] = getattr(kind, "possible", ())
+    possible: tuple[str, ...] = getattr(kind, "allowed_unknown", ())
     names = []
     for frame in frames:
         if frame not in FRAMES:
