@@ -3,6 +3,8 @@
 a run are used again.
 """
 
+import json
+
 import numpy as np
 import pytest
 
@@ -41,6 +43,16 @@ def saved(path, kind, n=9, seed=0, change=None, unknowns=None):
     if change is not None:
         path.write_text(change(path.read_text()))
     return robot
+
+
+MOVED = "validation.setup-moved"
+
+
+def codes(result: tuple[int, str, str]) -> set[str]:
+    """Return the codes of the findings in a JSON document of a command that succeeded."""
+    code, out, _ = result
+    assert code == 0
+    return {finding["code"] for finding in json.loads(out)["findings"]}
 
 
 def metres(text: str) -> str:
@@ -97,15 +109,11 @@ def test_validate_uses_the_frame_that_the_run_found(here) -> None:
     saved(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)
     saved(folder / "more.csv", Pose(unknown=("frame",)), 6, 1, unknowns=placed)
     assert run("calibrate hexapod-42 data.csv -o run")[0] == 0
-    code, out, _ = run("validate run more.csv")
-    assert code == 0
-    assert "note: frame: as the fit found it" in out
-    code, out, _ = run("validate run more.csv --refit frame")
-    assert code == 0
-    assert "errors are those after the best fit of frame" in out
+    assert codes(run("validate run more.csv --json")) == {"validation.setup-kept"}
+    assert codes(run("validate run more.csv --refit frame --json")) == {"validation.setup-fitted"}
     code, _, err = run("validate run more.csv --refit tracker")
     assert code == 1
-    assert "is called 'tracker'; there are frame" in err
+    assert "is called 'tracker'; the data have: frame" in err
 
 
 def test_a_frame_that_was_moved_since_the_fit_is_named_and_both_errors_are_taken_with_the_frame_that_the_run_found(
@@ -121,20 +129,15 @@ def test_a_frame_that_was_moved_since_the_fit_is_named_and_both_errors_are_taken
     assert run("calibrate hexapod-42 data.csv -o run")[0] == 0
     code, out, _ = run("validate run moved.csv")
     assert code == 0
-    assert (
-        "position error (rms): the same before and after calibration" in out
-    )  # 5 mm of the frame in both
-    assert (
-        "note: frame seems to have been set up anew since the fit: found anew from these rows, "
-        "errors are" in out
-    )
-    assert "use --refit frame" in out
+    assert "Position error (rms): the same" in out  # 5 mm of the frame in both
+    assert "Hint: use --refit frame" in out
+    assert MOVED in codes(run("validate run moved.csv --json"))
     code, out, _ = run("validate run moved.csv --refit frame")
     assert code == 0
     assert "times smaller after calibration" in out
-    assert "set up anew" not in out
-    code, out, _ = run("validate run one.csv")  # one pose does not tell: six numbers, six unknowns
-    assert (code, "set up anew" in out) == (0, False)
+    assert MOVED not in codes(run("validate run moved.csv --refit frame --json"))
+    # one pose cannot show it: six numbers, six unknowns
+    assert MOVED not in codes(run("validate run one.csv --json"))
 
 
 def test_a_prior_or_a_fixed_coordinate_that_the_data_contradict_is_refused_by_its_name(

@@ -35,16 +35,14 @@ def test_a_blundered_cell_is_told_and_widens_the_intervals(blundered, capsys) ->
     assert main(["calibrate", "hexapod-42", "measurements.csv", "-o", "good"]) == 0
     assert main(["calibrate", "hexapod-42", "bad.csv", "-o", "bad"]) == 2
     out, err = capsys.readouterr()
-    assert "times what the stated noise explains" in err
-    assert "times wider than by the stated noise" in err
-    bad = out[out.index("written to good") :]
-    assert "within the noise" not in bad
-    assert "expected errors" not in bad
+    assert "loopcal: quality gate not met: The residuals" in err
+    assert out[out.index("Written to good") :].count("Not calibrated: ") == 1
     good, bad = (
         json.loads((blundered / name / "result.json").read_text()) for name in ("good", "bad")
     )
     assert (good["passed"], good["reasons"]) == (True, [])
-    assert not bad["passed"]
+    assert (bad["passed"], bad["verdict"]) == (False, "not_calibrated")
+    assert good["verdict"] == "undecided"  # nothing was held out
     scale = bad["fit"]["sigma_scale"]
     assert scale > 100  # 12 degrees against 5 urad in one of 240 equations
     assert scale == pytest.approx(
@@ -65,7 +63,9 @@ def test_errors_that_grew_on_unseen_poses_are_a_reason(blundered, capsys) -> Non
     ]
     assert grown
     assert code == 2
-    assert [r.split()[0] for r in document["reasons"] if "LARGER" in r] == grown
+    grew = [f["data"] for f in document["findings"] if f["code"] == "gates.errors-grew"]
+    assert [data["quantity"] for data in grew] == grown
+    assert all(data["times"] > 1.1 for data in grew)
 
 
 @pytest.mark.parametrize("hold_out", ["", "--hold-out 0.25"])
@@ -75,15 +75,17 @@ def test_a_fit_that_reaches_none_of_its_poses_is_a_reason_and_not_a_user_error(
     def astray(*_):
         raise DataError("the calibrated geometry cannot follow")
 
-    monkeypatch.setattr("loopcal.apply.validate", astray)
+    monkeypatch.setattr("loopcal.workflow.calibration.validate", astray)
     assert (
         main(["calibrate", "hexapod-42", "measurements.csv", "-o", "run", *hold_out.split()]) == 2
     )
     out, err = capsys.readouterr()
-    assert err == "loopcal: quality gate not met: the calibrated geometry cannot follow\n"
-    assert out.endswith("written to run: result.json, arrays.npz, robot.yaml\n")
+    assert err.startswith("loopcal: quality gate not met: ")
+    assert err.count("\n") == 1
+    assert out.endswith("Written to run: result.json, arrays.npz, robot.yaml\n")
     result = json.loads((blundered / "run" / "result.json").read_text())
-    assert (result["passed"], result["reasons"]) == (
-        False,
-        ["the calibrated geometry cannot follow"],
-    )
+    assert result["passed"] is False
+    (failure,) = [f for f in result["findings"] if f["severity"] == "failure"]
+    assert failure["code"] == "gates.poses-unreachable"
+    assert "the calibrated geometry cannot follow" in failure["data"]["reason"]
+    assert result["reasons"] == [failure["text"]]

@@ -53,9 +53,7 @@ def test_readings_from_the_file_take_the_calibrated_robot_to_the_targets(run, ma
     code, out, err = run("compensate run targets.csv -o readings.csv")
     assert code == 0, err
     assert "home" in out
-    assert (
-        "U = 2 x rms uncertainty: tool point, base axes, in the base frame of the robot file" in out
-    )
+    assert "U = 2 x rms uncertainty: tool point, base axes, in the base frame" in out
     table = read_table(made / "readings.csv")
     q = np.column_stack([table.numbers(f"q{i}", Dimension.LENGTH) for i in range(1, 7)])
     np.testing.assert_allclose(
@@ -68,7 +66,7 @@ def test_readings_from_the_file_take_the_calibrated_robot_to_the_targets(run, ma
 def test_commands_lead_the_nominal_controller_to_the_same_readings(run, made) -> None:
     code, out, err = run("compensate run targets.csv --mode commands --steps 4 -o commands.csv")
     assert code == 0, err
-    assert "after step 4: within" in out
+    assert "After step 4: at most" in out
     table = read_table(made / "commands.csv")
     commanded = [table.numbers(f"commanded.{n}", Dimension.LENGTH) for n in "xyz"]
     commanded += [
@@ -140,11 +138,11 @@ def test_bad_targets_are_refused_in_a_sentence(run, made, text, sentence) -> Non
         ),
         (
             "calibrate hexapod-42 measurements.csv -o new --free-limb leg3",
-            "name it with --prior RUN",
+            "Hint: add --prior RUN",
         ),
         (
             "calibrate hexapod-42 later.csv -o new --prior run --method map",
-            "--method does not go with --prior",
+            "Hint: leave out --method",
         ),
         (
             "calibrate hexapod-42 later.csv -o new --prior run --free-limb leg9",
@@ -158,7 +156,7 @@ def test_requests_that_make_no_sense_are_refused_in_a_sentence(
     code, _, err = run(words)
     assert code == 1
     assert sentence in err
-    assert err.count("\n") == 1
+    assert err.count("\n") == 1 + err.count("\nHint: ")
     assert not (made / "new").exists()
 
 
@@ -185,9 +183,7 @@ def test_calibrate_with_a_prior_says_whether_the_machine_moved(run, later, made)
         "calibrate hexapod-42 later.csv -o second --prior run --free-limb leg3 --force"
     )
     assert code == 0, err
-    assert "leg3 has not moved beyond the noise since the earlier calibration" in " ".join(
-        out.split()
-    )
+    assert out.startswith("Undecided: hexapod-42")
     result = json.loads((made / "second" / "result.json").read_text())
     assert result["change"]["what"] == "leg3"
     assert result["change"]["moved"] is False

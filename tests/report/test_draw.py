@@ -57,7 +57,7 @@ def test_a_pose_of_a_solution_moves_the_platform():
 def test_check_writes_the_picture(tmp_path, capsys):
     assert main(["check", "five-bar", "--plot", str(tmp_path / "five-bar.png")]) == 0
     assert (tmp_path / "five-bar.png").read_bytes().startswith(b"\x89PNG")
-    assert "picture: " in capsys.readouterr().out
+    assert "Picture:" in capsys.readouterr().out
 
 
 def test_a_format_that_cannot_be_written_is_refused(tmp_path):

@@ -8,6 +8,9 @@ from collections.abc import Iterable, Sequence
 
 from loopcal.report.tables import Table
 
+COMMAND = "Next: loopcal "
+"""Start of a line that contains a command."""
+
 Block = str | Table
 """A paragraph or a table. A paragraph may have several lines; each is wrapped on its own."""
 
@@ -43,8 +46,11 @@ def format_list(labels_and_texts: Sequence[tuple[str, str]]) -> list[str]:
 
 
 def _wrap_line(line: str, width: int) -> str:
-    """Return one line wrapped; the indentation ends where a second column begins."""
-    if len(line) <= width:
+    """Return one line wrapped; the indentation ends where a second column begins.
+
+    A command to copy is not wrapped.
+    """
+    if len(line) <= width or line.startswith(COMMAND):
         return line
     stripped = line.lstrip()
     indent = len(line) - len(stripped)
