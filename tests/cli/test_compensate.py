@@ -136,10 +136,7 @@ def test_bad_targets_are_refused_in_a_sentence(run, made, text, sentence) -> Non
             "calibrate hexapod-42 measurements.csv -o new --prior run",
             "the earlier run was fitted to these measurements",
         ),
-        (
-            "calibrate hexapod-42 measurements.csv -o new --free-limb leg3",
-            "Hint: add --prior RUN",
-        ),
+        ("calibrate hexapod-42 measurements.csv -o new --free-limb leg3", "Hint: add --prior RUN"),
         (
             "calibrate hexapod-42 later.csv -o new --prior run --method map",
             "Hint: leave out --method",

@@ -165,7 +165,10 @@ def test_files_that_are_there_stay_without_force(folder, capsys, data_folder) ->
         ("import no.cfg -o x.yaml", "no.cfg: this printer.cfg does not exist"),
         ("import a.txt -o x.yaml", "the name of this file tells no format"),
         ("import a.csv -o x.yaml", "loopcal writes the format csv, but cannot read it"),
-        ("import a.cfg -o x.yaml --corrected y.cfg", "state where to write them, such as --data data.csv"),
+        (
+            "import a.cfg -o x.yaml --corrected y.cfg",
+            "state where to write them, such as --data data.csv",
+        ),
         ("import a.cfg -o x.yaml --unit mm", "--unit does not belong to the format klipper"),
         (
             "import a.hal -o x.yaml --sigma-height 1mm",

@@ -79,10 +79,7 @@ def test_the_json_holds_all_of_it(run):
             "3-prs --frames floor",
             "'floor' is not a frame that can be unknown; allowed are base, tool",
         ),
-        (
-            "3-prs --kind inclination --frames base",
-            "this kind of measurement has no base frame",
-        ),
+        ("3-prs --kind inclination --frames base", "this kind of measurement has no base frame"),
         ("3-prs data.csv --measure x", "DATA states what is measured"),
         ("3-prs -o smaller.yaml", "-o writes the robot of --reduce"),
     ],

@@ -323,7 +323,7 @@ def test_a_second_plan_goes_on_where_the_first_was_measured(here, capsys):
     assert known == pytest.approx(promised, rel=1e-3)
     assert run(fill.format("two", "two")) == 0
     assert run("calibrate linear-delta one.csv two.csv -o run") == 0
-    assert "Errors on 5 unseen rows" in capsys.readouterr().out
+    assert "Error on 5 held-out rows" in capsys.readouterr().out
 
 
 def test_the_data_file_states_the_digits_of_the_sheet(here):
