@@ -12,12 +12,13 @@ from numpy.testing import assert_allclose
 from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.mechanism import check_limits, inverse, trace_singularity
-from loopcal.planning.candidates import draw_candidates, home_coordinates
+from loopcal.planning.candidates import draw_candidates
 from loopcal.planning.constraints import Constraints, build_checker
 from loopcal.planning.path import (
     check_paths,
     find_short_order,
     interpolate_path,
+    locate_home,
     measure_distance,
     order_poses,
 )
@@ -86,7 +87,7 @@ def test_a_way_that_leaves_the_strokes_between_two_allowed_poses_is_refused_with
 def test_a_way_through_a_singularity_is_refused():
     robot = load_robot("five-bar")
     checker = build_checker(robot, Constraints(min_margin=0.0))
-    home = home_coordinates(robot)
+    home = locate_home(robot)
     # mirrored at the line through both feet: the other side of the singularity where the links are
     # in line
     across = home * np.array([1.0, -1.0])
@@ -149,7 +150,7 @@ def test_every_way_of_an_order_is_allowed_and_home_stands_where_none_is(hexapod)
 def test_a_way_ends_with_the_readings_of_its_end(hexapod):
     robot = hexapod.checker.robot
     x = hexapod.coordinates[:5]
-    home = np.broadcast_to(home_coordinates(robot), x.shape)
+    home = np.broadcast_to(locate_home(robot), x.shape)
     assert check_paths(hexapod.checker, home, x).allowed.all()
     last = trace_singularity(
         robot,

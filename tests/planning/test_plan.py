@@ -171,6 +171,7 @@ def test_poses_measured_already_are_taken_into_account(tracker, found):
     data = lc.simulate(robot, fitted, found.instrument, seed=3)
     options = PlanOptions(n_poses=2, hold_out=2, measured=data, n_candidates=30, seed=2)
     more = lc.plan(robot, instrument_of("pose", 10 * UM), options=options).errors
+    assert more.before is not None
     # nothing new was measured yet: what is known now is what the first plan promised, on other
     # poses of the workspace
     assert more.before.position == pytest.approx(found.errors.after.position, rel=0.15)
@@ -185,6 +186,8 @@ def test_how_many_poses_reach_a_goal_and_below_how_many_none_can():
         PlanOptions(goal=goal, target="position", hold_out=10, n_candidates=60),
     )
     needed = find_sample_size(made)
+    assert needed.enough is not None
+    assert needed.at_least is not None
     assert needed.values[needed.numbers == needed.enough] <= goal
     assert needed.at_least <= needed.enough <= 1.2 * needed.at_least
     assert (needed.bounds <= needed.values * (1 + 1e-9)).all()
@@ -265,6 +268,7 @@ def test_no_choice_of_pairs_beats_what_is_said_of_pairs_not_even_all_pairs_of_fe
     reached, pairs = min(tried, key=lambda one: one[0].position if one[0] else np.inf)
     goal = callipers.with_options(goal=reached.position, target="position")
     needed = find_sample_size(goal)
+    assert needed.at_least is not None
     # were each pair counted as two poses, twelve poses would contradict what is said
     assert 12 < 2 * needed.at_least <= 2 * pairs == 132
     finding = needed.report(callipers.robot)

@@ -415,7 +415,7 @@ def _write_plan(output: Path, result: Plan, inputs: Mapping[str, Path], force: b
         write_plan_folder,
     )
     from loopcal.io.runs.run_folder import collect_provenance
-    from loopcal.planning.stops import list_stops
+    from loopcal.planning.result import list_stops
     from loopcal.report.plan_drawing import draw_curve, draw_plan, save_figure
 
     texts = {SHEET: format_sheet(result, list_stops(result)), DATA: format_plan_data(result)}

@@ -25,7 +25,6 @@ from loopcal.mechanism import (
     Solution,
     draw_coordinates,
     inverse,
-    read_coordinates,
     workspace_ranges,
 )
 from loopcal.planning.constraints import (
@@ -36,7 +35,7 @@ from loopcal.planning.constraints import (
     list_reasons,
     mark_on_path,
 )
-from loopcal.planning.path import check_paths, interpolate_path, measure_distance
+from loopcal.planning.path import check_paths, interpolate_path, locate_home, measure_distance
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension, find_unit
 
@@ -159,15 +158,10 @@ def round_coordinates(
     )
 
 
-def home_coordinates(robot: Mechanism) -> FloatArray:
-    """Return the controlled coordinates (c,) of home [m, rad]."""
-    return read_coordinates(robot.home, robot.controlled)
-
-
 def _build_home_checker(robot: Mechanism, constraints: Constraints | None) -> ConstraintChecker:
     """Return the checker of a robot whose home is allowed, since every path starts there."""
     checker = build_checker(robot, constraints)
-    check = checker.check_poses(inverse(robot, home_coordinates(robot)[None]), at_pose=False)
+    check = checker.check_poses(inverse(robot, locate_home(robot)[None]), at_pose=False)
     if not check.allowed[0]:
         reasons = list_reasons(check.count_violations())
         raise MechanismError(
@@ -258,7 +252,7 @@ def _keep_reachable(
 ) -> Candidates:
     """Return the poses that an allowed straight path connects with home."""
     robot = checker.robot
-    home = np.broadcast_to(home_coordinates(robot), poses.shape)
+    home = np.broadcast_to(locate_home(robot), poses.shape)
     path = check_paths(checker, home, poses)
     counts = path.count_violations()
     excluded.update(dict(mark_on_path(counts)))

@@ -39,6 +39,11 @@ LEAST_GAIN = 1e-12
 """Share of the length by which a path must become shorter to count: rounding is no gain."""
 
 
+def locate_home(robot: Mechanism) -> FloatArray:
+    """Return the controlled coordinates (c,) of home [m, rad], where every path starts."""
+    return read_coordinates(robot.home, robot.controlled)
+
+
 def interpolate_path(
     robot: Mechanism, start: FloatArray, end: FloatArray, share: float | FloatArray
 ) -> FloatArray:
@@ -150,7 +155,7 @@ def order_poses(checker: ConstraintChecker, poses: FloatArray) -> VisitingOrder:
     See `draw_candidates` for these paths.
     """
     robot, n = checker.robot, len(poses)
-    home = np.broadcast_to(read_coordinates(robot.home, robot.controlled), poses.shape)
+    home = np.broadcast_to(locate_home(robot), poses.shape)
     from_home = measure_distance(robot, home, poses)
     direct = measure_distance(robot, poses[:, None], poses[None, :])
     around = from_home[:, None] + from_home[None, :]

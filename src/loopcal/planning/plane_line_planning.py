@@ -20,7 +20,6 @@ from loopcal.measure import Gaussian, Instrument, Sensor
 from loopcal.measure.kinds.line import Line
 from loopcal.measure.kinds.plane import Plane
 from loopcal.mechanism import POSITION, Mechanism, inverse
-from loopcal.planning.candidates import home_coordinates
 from loopcal.planning.constraints import ConstraintChecker, Constraints, build_checker, list_reasons
 from loopcal.planning.design import (
     D,
@@ -29,7 +28,7 @@ from loopcal.planning.design import (
     find_observable_space,
     is_allowed,
 )
-from loopcal.planning.path import check_paths
+from loopcal.planning.path import check_paths, locate_home
 from loopcal.planning.plane_line_groups import AXIS, PlaneLineGroups
 from loopcal.planning.result import PlannedPoses
 from loopcal.serialization import to_json
@@ -307,7 +306,7 @@ def _require_paths(checker: ConstraintChecker, x: FloatArray) -> BoolArray:
         No straight path leads from home to a point.
     """
     flat = x.reshape(-1, x.shape[2])
-    home = np.broadcast_to(home_coordinates(checker.robot), flat.shape)
+    home = np.broadcast_to(locate_home(checker.robot), flat.shape)
     from_home = check_paths(checker, home, flat)
     if not from_home.allowed.all():
         raise EstimationError(

@@ -11,8 +11,9 @@ import numpy as np
 
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure import Instrument
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism import Mechanism, inverse
 from loopcal.planning.options import PlanOptions
+from loopcal.planning.path import locate_home
 from loopcal.planning.problem import ExpectedErrors, name_groups
 from loopcal.planning.sample_size import ErrorCurve
 from loopcal.serialization import to_json
@@ -69,6 +70,23 @@ class PlannedPoses:
             }
             for i, label in enumerate(self.labels)
         ]
+
+
+@dataclass(frozen=True, eq=False)
+class Stop:
+    """One stop of the machine: a pose of the plan, or home between two poses.
+
+    Attributes
+    ----------
+    label : of the pose, or "home". is_via : only passed through. is_held_out : for validation.
+    coordinates : (c,) controlled coordinates [m, rad]. readings : (a,) of these coordinates [SI].
+    """
+
+    label: str
+    is_via: bool
+    is_held_out: bool
+    coordinates: FloatArray
+    readings: FloatArray
 
 
 @dataclass(frozen=True)
@@ -238,3 +256,16 @@ class Plan:
             "notes": [str(note) for note in self.notes],
             "findings": to_json(self.findings),
         }
+
+
+def list_stops(plan: Plan) -> tuple[Stop, ...]:
+    """Return the poses of a plan in order, with home where a straight path is blocked."""
+    home, poses = locate_home(plan.robot), plan.poses
+    via = Stop("home", True, False, home, inverse(plan.robot, home[None]).q[0])
+    stops = []
+    for i, label in enumerate(poses.labels):
+        if poses.via_home[i]:
+            stops.append(via)
+        held_out = bool(poses.held_out[i])
+        stops.append(Stop(label, False, held_out, poses.coordinates[i], poses.readings[i]))
+    return tuple(stops)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from loopcal.mechanism import POSITION, Mechanism
-from loopcal.planning.candidates import home_coordinates
+from loopcal.planning.path import locate_home
 from loopcal.planning.problem import DIMENSIONS
 from loopcal.planning.result import Plan
 from loopcal.planning.sample_size import ErrorCurve
@@ -38,7 +38,7 @@ def draw_plan(plan: Plan) -> Figure:
         [(len(names) - 1, None)] if len(names) % 2 else []
     )
     figure = Figure(figsize=(4.2 * len(pairs), 4.4), layout="constrained")
-    home = home_coordinates(plan.robot)
+    home = locate_home(plan.robot)
     start = [home[i] / _unit(plan.robot, name).factor_to_si for i, name in enumerate(names)]
     step = np.arange(1, len(plan.poses.labels) + 1)
     for place, (i, j) in enumerate(pairs, 1):

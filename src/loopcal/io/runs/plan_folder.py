@@ -32,8 +32,7 @@ from loopcal.units import Dimension, find_unit
 
 if TYPE_CHECKING:
     from loopcal.mechanism import Mechanism
-    from loopcal.planning.result import Plan
-    from loopcal.planning.stops import Stop
+    from loopcal.planning.result import Plan, Stop
 
 FORMAT = 1
 SHEET, DATA, RESULT = "plan.csv", "measurements.csv", "plan.json"
@@ -47,7 +46,7 @@ DIGITS = 12
 def format_sheet(plan: Plan, stops: Sequence[Stop]) -> str:
     """Return the operator's sheet: the stops in order, with home where a straight path is blocked.
 
-    `stops` are those of `loopcal.planning.stops.list_stops`.
+    `stops` are those of `loopcal.planning.result.list_stops`.
     """
     robot = plan.robot
     commanded = [get_unit(robot, get_dimension(name)) for name in robot.controlled]

@@ -165,7 +165,7 @@ def exchange_groups(
     history, terms, idle = [scoring.score(R)], compute_swap_terms(scoring, R, scaled), 0
     while idle < n:
         for j in stream.permutation(n):
-            gain = score_swaps(terms, chosen[j])
+            gain = score_swaps(terms, int(chosen[j]))
             if not repeats:
                 gain[chosen] = -np.inf
             idle += 1
