@@ -20,7 +20,6 @@ from math import comb
 
 import numpy as np
 
-from loopcal import engine
 from loopcal.apply.accuracy import transport
 from loopcal.diagnose import find_frame_motions
 from loopcal.estimate.free_parameters import FreeParameters
@@ -37,7 +36,7 @@ from loopcal.measure import (
 from loopcal.mechanism import Solution
 from loopcal.numerics.decomposition import Decomposition, decompose
 from loopcal.numerics.elimination import eliminate_from_factor
-from loopcal.numerics.triangular_factor import empty_factor
+from loopcal.numerics.triangular_factor import empty_factor, fold_rows
 from loopcal.planning.design import PriorInformation, is_allowed
 from loopcal.planning.pose_combinations import (
     MOST,
@@ -153,10 +152,10 @@ def decompose_information(
     factor = empty_factor(1, o + p)
     allowed = groups.rows[is_allowed(groups.rows)]
     flat = np.concatenate([allowed.reshape(-1, o + p), groups.nuisance_prior])
-    factor = engine.fold(factor, np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)[None])
+    factor = fold_rows(factor, np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)[None])
     factor = eliminate_from_factor(factor, o)
     if measured is not None:
-        factor = engine.fold(factor, np.concatenate([measured, np.zeros((p, 1))], axis=1)[None])
+        factor = fold_rows(factor, np.concatenate([measured, np.zeros((p, 1))], axis=1)[None])
     return decompose(factor, np.full(1, len(flat)))
 
 

@@ -42,6 +42,7 @@ from loopcal.mechanism import (
     pose_from_coordinates,
     workspace_ranges,
 )
+from loopcal.numerics.elimination import eliminate_columns
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 AXIS = 3
@@ -60,11 +61,6 @@ SHRINKAGE, ROUNDS = 0.85, 12
 
 SURFACE = 5
 """Nuisance parameters of a group: two rotations, a height, two shifts."""
-
-DEGENERATE = 1e-10
-"""Share of a column of the nuisance parameters, after those before it, below which the points do
-not determine it.
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,7 +321,5 @@ def eliminate_surfaces(F: FloatArray, A: FloatArray) -> tuple[FloatArray, BoolAr
     """Return rows A (u, m, p) projected onto the complement of F (u, m, 5), and where F has full
     rank: (u, m - 5, p) and (u,).
     """
-    norm = np.linalg.norm(F, axis=1, keepdims=True)
-    Q, R = np.linalg.qr(F / np.where(norm > 0.0, norm, 1.0), mode="complete")
-    determined = np.abs(np.diagonal(R, axis1=1, axis2=2)).min(axis=1) > DEGENERATE
-    return np.swapaxes(Q[:, :, SURFACE:], 1, 2) @ A, determined
+    done = eliminate_columns(np.concatenate([F, A], axis=2), SURFACE)
+    return done.rest[:, SURFACE:], done.rank == SURFACE

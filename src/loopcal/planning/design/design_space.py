@@ -17,12 +17,8 @@ from numpy.typing import ArrayLike
 from loopcal.errors import EstimationError
 from loopcal.findings import report_finding
 from loopcal.numerics.decomposition import RANK_TOLERANCE
+from loopcal.numerics.elimination import eliminate_from_triangle
 from loopcal.typing import BoolArray, FloatArray, IntArray
-
-NUISANCE_TOLERANCE = 1e-10
-"""Relative singular value (columns scaled to length one) below which a direction of the nuisance
-parameters is unobservable.
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,15 +67,11 @@ class ObservableSpace:
     machine : (p, q) orthonormal directions of the machine's unknowns.
     nuisance : (o, o') directions of the nuisance parameters.
     singular_values : (p,) of the machine's columns after elimination, descending.
-    nuisance_singular_values : (o,) of the nuisance columns scaled to length one.
-    tolerance : relative tolerance that was applied to `singular_values`.
     """
 
     machine: FloatArray
     nuisance: FloatArray
     singular_values: FloatArray
-    nuisance_singular_values: FloatArray
-    tolerance: float
 
     def __len__(self) -> int:
         return self.machine.shape[1]
@@ -132,8 +124,8 @@ def find_observable_space(
 ) -> ObservableSpace:
     """Return the directions that all groups and the prior determine together.
 
-    The columns of nuisance parameters are scaled to length one and cut at NUISANCE_TOLERANCE. The
-    remainder of the machine's columns is cut at `tolerance` times its largest singular value.
+    The nuisance parameters are eliminated by `loopcal.numerics.elimination`. The remainder of the
+    machine's columns is cut at `tolerance` times its largest singular value.
 
     Parameters
     ----------
@@ -142,17 +134,15 @@ def find_observable_space(
     allowed = rows[is_allowed(rows)].reshape(-1, rows.shape[-1])
     o = prior.n_nuisance
     R = _pad_factor(factor_rows(np.concatenate([prior.rows, allowed])))
-    nuisance, nuisance_s, rest = np.zeros((0, 0)), np.zeros(0), R
+    nuisance, rest = np.zeros((0, 0)), R
     if o:
         norm = np.linalg.norm(R[:o, :o], axis=0)
-        scale = np.where(norm > 0.0, norm, 1.0)
-        u, nuisance_s, vt = np.linalg.svd(R[:o, :o] / scale)
-        observable = nuisance_s > NUISANCE_TOLERANCE * max(nuisance_s[0], 1.0)
-        nuisance = vt[observable].T / scale[:, None]
-        rest = np.concatenate([(u.T @ R[:o, o:])[~observable], R[o:, o:]])
-    _, s, vt = np.linalg.svd(rest if o else R)
+        length = np.where(norm > 0.0, norm, 1.0)
+        done = eliminate_from_triangle(R[:o, :o], R[:o, o:], R[o:, o:], length)
+        nuisance, rest = done.directions[done.is_observable].T / length[:, None], done.rest
+    _, s, vt = np.linalg.svd(rest)
     used = s > tolerance * (s[0] if s.size else 0.0)
-    return ObservableSpace(vt[: len(s)][used].T, nuisance, s, nuisance_s, tolerance)
+    return ObservableSpace(vt[: len(s)][used].T, nuisance, s)
 
 
 def factor_design(rows: FloatArray, prior: PriorInformation, space: ObservableSpace) -> FloatArray:
