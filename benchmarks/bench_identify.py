@@ -57,7 +57,7 @@ def bench_fit() -> Metric:
     """
     robot = load_robot("hexapod-42")
     data = _measured(robot, 50)
-    steps = identify(robot, data, LeastSquares()).iterations
+    steps = identify(robot, data, LeastSquares()).history.iterations
     A = np.random.default_rng(0).normal(size=(300, 42))
 
     def decompositions() -> None:

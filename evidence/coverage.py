@@ -120,7 +120,7 @@ def fits(case: Case, count: int) -> Iterator[Outcome]:
         error = (found.values - truth)[good][:, places]
         decided = np.isfinite(sd)
         inside = np.abs(error) <= NORMAL_95 * np.where(decided, sd, np.inf)
-        z = found.unknowns.deviation(found.values)
+        z = found.free_parameters.deviation(found.values)
         chi_square = found.cost + penalize(found.decomposition, found.penalty, z)
         # a prior counts as one equation for each direction it holds
         dof = (
@@ -150,7 +150,7 @@ def _spread(
     error = geometry.pose_difference(predicted.T, true.T)
     D = differentiate_pose(robot, values, q[None], predicted).parameters[..., robot.parameters.free]
     C = found.decomposition.take(np.flatnonzero(good)).covariance(found.penalty[good], 1.0)
-    tolerance = found.unknowns.tolerance
+    tolerance = found.free_parameters.tolerance
     C = C * tolerance[:, None] * tolerance
     variance = np.einsum("tnip,tpq,tniq->tni", D, C, D)
     return error / np.sqrt(np.where(variance > 0, variance, np.nan))

@@ -18,7 +18,14 @@ from loopcal import geometry
 from loopcal.apply import validate
 from loopcal.diagnose import PoseErrors, find_frame_motions
 from loopcal.errors import LoopcalError
-from loopcal.estimate import MAP, Identification, LeastSquares, identify, identify_trials
+from loopcal.estimate import (
+    MAP,
+    FitOptions,
+    Identification,
+    LeastSquares,
+    identify,
+    identify_trials,
+)
 from loopcal.estimate.identification import IdentifiedTrials
 from loopcal.estimate.nuisance_estimate import estimate_nuisance
 from loopcal.estimate.problem import problem_of, problem_of_trials
@@ -221,7 +228,7 @@ def recover(case: Case, seed: int = SEED) -> Recovery:
     try:
         data = simulate(truth, _commanded(case.robot, seed), looking, seed, nuisance_values=own)
         some, others = data.take(np.arange(POSES)), data.take(np.arange(POSES, POSES + HELD_OUT))
-        fit = identify(robot, some, LeastSquares(), allow_fewer_equations=True)
+        fit = identify(robot, some, LeastSquares(), options=FitOptions(allow_fewer_equations=True))
     except LoopcalError as error:
         return Recovery(0, len(robot.parameters), np.nan, np.nan, np.nan, np.nan, (), 0, str(error))
     checked = validate(fit, others)
@@ -272,7 +279,7 @@ def along_gauge(fit: Identification, data: Measurements, truth: Array) -> float:
     the truth it arrives there. What the first step back corrects is an error of the fit, too: the
     larger of the two counts.
     """
-    free = fit.unknowns
+    free = fit.free_parameters
     problem, z, goal = (
         problem_of(free, data),
         free.deviation(fit.robot.values[None])[0],
@@ -321,7 +328,7 @@ def cover(
     trials = simulate_trials(robot, truth, coordinates, looking, seed, nuisance_values=own)
     found = identify_trials(robot, trials, MAP())
     good = np.flatnonzero(found.converged)
-    free, d, penalty = found.unknowns, found.decomposition.take(good), found.penalty[good]
+    free, d, penalty = found.free_parameters, found.decomposition.take(good), found.penalty[good]
     off = free.deviation(found.values[good]) - free.deviation(truth[good])
     sd = d.standard_deviations(penalty, 1.0)
     s, along = d.singular_values, np.matmul(d.directions.swapaxes(-1, -2), off[..., None])[..., 0]
@@ -338,7 +345,7 @@ def _own_covered(
     found: IdentifiedTrials, trials: Trials, good: IntArray, own: dict[str, float]
 ) -> NDArray[np.bool_]:
     """Whether intervals of the own unknowns hold the truth, those that are finite."""
-    problem, free = problem_of_trials(found.unknowns, trials), found.unknowns
+    problem, free = problem_of_trials(found.free_parameters, trials), found.free_parameters
     if problem.nuisance is None:
         return np.zeros(0, dtype=bool)
     inside = []

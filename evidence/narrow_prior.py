@@ -55,7 +55,7 @@ def judge(name: str, factor: float, machines: int = MACHINES) -> dict[str, float
 def _names_conflict(robot: Mechanism, data: Measurements) -> bool:
     """Whether the default fit says that data and tolerances contradict each other."""
     fit = identify(robot, data)
-    return fit.conflict is not None and fit.conflict.conflict
+    return fit.prior_conflict is not None and fit.prior_conflict.conflict
 
 
 def collect() -> dict:

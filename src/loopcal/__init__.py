@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from loopcal.diagnose import identifiability as identifiability
     from loopcal.errors import LoopcalError as LoopcalError
     from loopcal.estimate import MAP as MAP
+    from loopcal.estimate import FitOptions as FitOptions
     from loopcal.estimate import Huber as Huber
     from loopcal.estimate import Identification as Identification
     from loopcal.estimate import LeastSquares as LeastSquares
@@ -87,6 +88,7 @@ _WHERE = {
         "loopcal.diagnose": ("check_conventions", "compare_with_truth", "identifiability"),
         "loopcal.errors": ("LoopcalError",),
         "loopcal.estimate": (
+            "FitOptions",
             "Huber",
             "Identification",
             "LeastSquares",

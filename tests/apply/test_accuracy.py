@@ -136,7 +136,11 @@ def base_motion_unknown(fit, extra=None):
     k = known.shape[1]
     variance = np.r_[np.full(k, np.inf), np.full(42 - k, 1e-4)]
     return replace(
-        fit.posterior, unit=fit.tolerance, directions=q, variance=variance, seen=np.arange(42) >= k
+        fit.posterior,
+        unit=fit.tolerance,
+        directions=q,
+        variance=variance,
+        determined=np.arange(42) >= k,
     )
 
 
@@ -159,7 +163,7 @@ def test_what_is_no_motion_of_a_frame_stays_infinite(fit):
 
 def test_a_frame_known_from_its_prior_alone_is_left_out_too(fit):
     known = base_motion_unknown(fit)
-    with_prior = replace(known, variance=np.where(known.seen, known.variance, 1.0))
+    with_prior = replace(known, variance=np.where(known.determined, known.variance, 1.0))
     left_out, kept = (
         pose_uncertainty(with_prior, WHERE, gauge=g) for g in ("left out", "infinite")
     )

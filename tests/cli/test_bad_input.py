@@ -298,7 +298,7 @@ def test_an_export_of_which_no_line_fits_the_profile_is_refused(refused) -> None
 def test_fewer_equations_than_parameters_are_refused_with_both_numbers(refused) -> None:
     found = refused("calibrate hexapod-42 data.csv -o run --method ls", data_csv=DATA)
     assert (
-        "3 equations from 3 poses cannot determine 42 parameters: measure at least 42 poses"
+        "3 equations from 3 poses cannot determine 42 parameters. Measure at least 42 poses"
         in found
     )
 

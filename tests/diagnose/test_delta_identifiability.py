@@ -122,14 +122,14 @@ def test_probe_and_callipers_of_usual_sigmas_explain_the_residual_and_give_inter
     """
     robot, data = printers[WITH_DISTANCES]
     small = identify(robot, with_sigmas(data, 0.02e-3, 0.1e-3), LeastSquares())
-    assert small.check.failed
-    assert small.check.sigma_scale > 2.5
+    assert small.residual_test.failed
+    assert small.residual_test.sigma_scale > 2.5
     fit = identify(robot, with_sigmas(data, 0.05e-3, 0.3e-3), LeastSquares())
-    assert fit.dof == pytest.approx(10.0)
-    assert not fit.check.failed
+    assert fit.residual_test.dof == pytest.approx(10.0)
+    assert not fit.residual_test.failed
     # chi-square of 10 degrees of freedom is between 3.25 and 20.5 in 95 % of data
     assert 3.25 < fit.chi_square < 20.5
-    half = dict(zip(fit.names, 1.96 * fit.sd / 1e-3, strict=True))  # [mm]
+    half = dict(zip(fit.names, 1.96 * fit.standard_deviations / 1e-3, strict=True))  # [mm]
     assert all(1.5 < half[arm] < 3.0 for arm in ARMS)  # the arms are hardly known
     assert all(half[f"tower{k}.stop"] < 0.5 for k in (1, 2, 3))
     # the firmware's own optimum is 0.2 mm from what it stored: far inside these intervals
@@ -143,6 +143,6 @@ def test_a_sigma_twice_as_large_makes_intervals_twice_as_wide_and_chi_square_a_q
         identify(robot, with_sigmas(data, sigma, 1.0), LeastSquares())
         for sigma in (0.01e-3, 0.02e-3)
     )
-    assert not narrow.check.failed
-    np.testing.assert_allclose(wide.sd, 2 * narrow.sd, rtol=1e-6)
+    assert not narrow.residual_test.failed
+    np.testing.assert_allclose(wide.standard_deviations, 2 * narrow.standard_deviations, rtol=1e-6)
     assert wide.chi_square == pytest.approx(narrow.chi_square / 4, rel=1e-6)

@@ -52,11 +52,11 @@ def test_what_an_unknown_frame_leaves_open_is_projected_out_and_named(fit):
 def test_a_truth_moved_along_what_is_open_gives_the_same_error(fit):
     known = fit.posterior
     rng = np.random.default_rng(0)
-    open_ = known.directions[:, ~known.seen]
+    open_ = known.directions[:, ~known.determined]
     move = known.unit * (open_ @ rng.standard_normal(open_.shape[1]))
     one, other = (compare_with_truth(fit, zoo.hexapod_truth() + step) for step in (0.0, move))
     np.testing.assert_allclose(one.error, other.error, atol=1e-15)  # [m] double rounding
-    seen = known.unit * known.directions[:, known.seen][:, 0]
+    seen = known.unit * known.directions[:, known.determined][:, 0]
     assert (
         np.abs(compare_with_truth(fit, zoo.hexapod_truth() + seen).error - one.error).max() > 1e-6
     )
@@ -85,7 +85,7 @@ def test_validation_keeps_the_frame_of_the_fit_or_says_after_which_best_fit_it_c
     others = in_unknown_frame(8, seed=5)
     kept = validate(fit, others)
     assert kept.alignment == {"kept": ("frame",), "fitted": ()}
-    by_name = validate(fit.robot, others, before=fit.initial, known=fit.local.values)
+    by_name = validate(fit.robot, others, before=fit.initial, known=fit.nuisance.values)
     np.testing.assert_allclose(by_name.after.position, kept.after.position, rtol=1e-9)
     anew = validate(fit, others, refit=("fra*",))
     assert anew.alignment == {"kept": (), "fitted": ("frame",)}

@@ -89,10 +89,8 @@ def test_without_torsion_the_3_prs_knows_32_of_33_and_the_sentence_names_its_thr
     assert (found.rank, found.n_parameters) == (32, 33)
     assert turn.names == ("a1y", "a2y", "a3y")
     np.testing.assert_allclose(turn.weights, 1 / np.sqrt(3), rtol=1e-6)
-    sentence = "together a1y, a2y and a3y, in equal parts, change nothing that was measured"
-    assert f"not identifiable: {sentence}: it is the whole platform turned about its z" in str(
-        found
-    )
+    assert turn.meaning == "it is the whole platform turned about its z"
+    assert str(turn) in str(found)
 
 
 def test_without_torsion_the_tracker_knows_24_of_25():
@@ -118,7 +116,8 @@ def test_directions_known_no_better_than_their_tolerance_are_named_the_weakest_f
     found = identifiability(load_robot("3-prs"), five_dof(), poses=36)
     assert [c.singular_value for c in found.weak] == sorted(found.singular_values[: found.rank])[:5]
     assert found.improved + (found.rank - found.improved) == found.rank
-    assert "hardly identifiable: together" in str(found)
+    assert found.weak[0].finding.code == "fit.hardly-observable"
+    assert str(found.weak[0]) in str(found)
 
 
 def test_indices_are_those_of_the_definitions():
@@ -152,7 +151,7 @@ def test_the_words_are_sentences_and_the_json_has_the_attributes():
     found = identifiability(hexapod(), hexapod_data(6))
     text = str(found)
     assert "36 of 42 parameter combinations can be identified from 36 equations" in text
-    assert text.count("change nothing that was measured") == 6
+    assert text.count("cannot determine") == 6
     document = json.loads(to_json(found.to_dict()))
     assert document["rank"] == 36
     assert len(document["singular_values"]) == 42

@@ -40,7 +40,7 @@ def test_a_whole_path_is_scored_and_its_ends_are_known():
     np.testing.assert_allclose(found.estimate[40], fit.nominal, rtol=0, atol=1e-15)
     whole = identify(hexapod(), DATA, LeastSquares())
     assert (
-        np.abs((found.estimate[-1] - whole.estimate) / whole.sd).max() < 0.1
+        np.abs((found.estimate[-1] - whole.estimate) / whole.standard_deviations).max() < 0.1
     )  # one linearisation at another point
     inside = found.score.min()
     assert inside < min(found.score[0], found.score[39], found.score[40], found.score[-1])

@@ -14,7 +14,7 @@ from loopcal.diagnose.examination import examine_fit
 from loopcal.diagnose.influence import Influence, compute_influence
 from loopcal.diagnose.outliers import _in_turn, _search, _sentence, _State
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate import MAP, Huber, LeastSquares, Tukey, identify
+from loopcal.estimate import MAP, FitOptions, Huber, LeastSquares, Tukey, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.methods.losses import block_limit
 from loopcal.estimate.problem import problem_of
@@ -74,7 +74,7 @@ def test_a_robust_fit_of_blunders_is_nearly_as_good_as_the_fit_of_clean_data(los
         fit = identify(hexapod(), bad, loss=loss)
         robust.append(rms(fit))
         plain.append(rms(identify(hexapod(), bad)))
-        assert all(fit.weight[int(name) - 1] < 0.5 for name in NAMED)
+        assert all(fit.pose_weights[int(name) - 1] < 0.5 for name in NAMED)
     ratio = np.sqrt(np.mean(np.square(robust)) / np.mean(np.square(clean)))
     assert ratio < 1.3
     assert np.sqrt(np.mean(np.square(plain)) / np.mean(np.square(clean))) > 2.0
@@ -90,10 +90,10 @@ def test_blunders_are_named_in_words_and_nothing_is_dropped(loss, method):
     assert found.influence.leverage.sum() / 240 < 0.3
     assert "3 of 40 blocks" in found.sentence
     assert "does not fit the others" in str(found.outliers[0])
-    assert fit.check.degrees in {240 - 42, 240} or loss is not None
-    fitted = identify(hexapod(), bad, method, drop=found.names)
-    assert set(fitted.dropped) == set(NAMED)
-    assert any("left out as asked: poses" in note for note in fitted.notes)
+    assert fit.residual_test.degrees in {240 - 42, 240} or loss is not None
+    fitted = identify(hexapod(), bad, method, options=FitOptions(excluded_poses=found.names))
+    assert set(fitted.options.excluded_poses) == set(NAMED)
+    assert "fit.excluded-poses" in {finding.code for finding in fitted.findings}
     assert find_outliers(fitted, bad).outliers == ()
 
 
@@ -152,7 +152,7 @@ def test_with_estimated_noise_the_scale_is_not_taken_from_the_blunders():
     _, bad = blundered(1)
     claimed = bad.observations[0]
     sharp = replace(bad, observations=(replace(claimed, covariance=claimed.covariance / 9.0),))
-    fit = identify(hexapod(), sharp, loss=Huber(), noise="estimated")
+    fit = identify(hexapod(), sharp, loss=Huber(), options=FitOptions(noise="estimated"))
     found = find_outliers(fit, sharp)
     assert found.scale == pytest.approx(3.0, rel=0.3)
     assert set(found.names) == set(NAMED)
@@ -179,10 +179,10 @@ def test_limits_of_blocks_are_as_rarely_exceeded_as_that_of_one_residual():
 
 def test_what_cannot_be_left_out_or_weighed_is_refused():
     data = hexapod_data(20)
-    with pytest.raises(DataError, match="there is no pose '99' to leave out"):
-        identify(hexapod(), data, drop=("99",))
-    with pytest.raises(DataError, match="give a sequence of labels"):
-        identify(hexapod(), data, drop="12")
+    with pytest.raises(DataError, match="no pose '99' to exclude"):
+        identify(hexapod(), data, options=FitOptions(excluded_poses=("99",)))
+    with pytest.raises(EstimationError, match="give a sequence of labels"):
+        identify(hexapod(), data, options=FitOptions(excluded_poses="12"))
     with pytest.raises(EstimationError, match="Huber loss with constant 0"):
         Huber(0.0)
     with pytest.raises(EstimationError, match="Tukey loss with constant"):
@@ -213,12 +213,13 @@ def test_the_distance_of_a_pose_set_aside_is_what_the_others_say_of_it_where_a_r
         observations=(replace(rows, measured=measured),),
     )
     fit = identify(robot, data, LeastSquares(), loss=Tukey())
-    assert fit.weight[7] < 0.5  # set aside in the first round
+    assert fit.pose_weights[7] < 0.5  # set aside in the first round
     found = find_outliers(fit, data)
     assert "8" in found.names
     others = tuple(name for name in found.names if name != "8")
     with_it, without = (
-        identify(robot, data, LeastSquares(), drop=names) for names in (others, found.names)
+        identify(robot, data, LeastSquares(), options=FitOptions(excluded_poses=names))
+        for names in (others, found.names)
     )
     # what is not linear over 0.1 mm
     assert found.influence.distance[7] == pytest.approx(
@@ -263,7 +264,7 @@ def test_with_one_degree_of_freedom_a_disagreement_is_told_and_nobody_is_blamed(
     assert found.settled
     assert found.blocks == 7
     assert found.names == ()
-    assert fit.check.failed
+    assert fit.residual_test.failed
     (group,) = found.undecided
     assert len(group.poses) == 7
     assert group.times == pytest.approx(np.sqrt(fit.chi_square), rel=1e-3)  # not linear over 1 mm
@@ -273,7 +274,9 @@ def test_with_one_degree_of_freedom_a_disagreement_is_told_and_nobody_is_blamed(
 
 def test_with_one_degree_of_freedom_and_unknown_noise_nothing_is_said_to_fit():
     robot, data = probed(7, {3: 1e-3})
-    found = find_outliers(identify(robot, data, LeastSquares(), noise="estimated"), data)
+    found = find_outliers(
+        identify(robot, data, LeastSquares(), options=FitOptions(noise="estimated")), data
+    )
     assert found.outliers == found.undecided == ()
     assert "no block of rows can be checked: one degree of freedom" in found.sentence
 
@@ -298,7 +301,7 @@ def test_noise_that_is_spread_over_all_rows_is_no_all_clear():
     data = replace(data, observations=(replace(rows, covariance=rows.covariance * (20 / 38) ** 2),))
     fit = identify(robot, data, LeastSquares())
     found = find_outliers(fit, data, level=1e-9)  # so that none is named though all are too large
-    assert fit.check.failed
+    assert fit.residual_test.failed
     assert found.outliers == found.undecided == ()
     assert (
         found.sentence

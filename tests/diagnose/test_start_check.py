@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from loopcal.diagnose import StartVerdict, check_start_values
-from loopcal.estimate import Huber, Tukey, identify
+from loopcal.estimate import FitOptions, Huber, Tukey, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.inference.prior import Prior
 from loopcal.estimate.problem import problem_of
@@ -25,7 +25,7 @@ def test_a_start_at_the_truth_is_as_good_as_the_fit_within_the_noise() -> None:
 
 @pytest.mark.parametrize("noise", ["given", "estimated"])
 def test_a_nominal_start_is_not_calibrated(noise) -> None:
-    found = check_start_values(identify(hexapod(), hexapod_data(), noise=noise))
+    found = check_start_values(identify(hexapod(), hexapod_data(), options=FitOptions(noise=noise)))
     assert found.verdict is StartVerdict.NOT_CALIBRATED
     assert found.p_value < 1e-6
     assert found.before > 10 * found.after
@@ -41,9 +41,9 @@ def test_a_loss_does_not_make_the_nominal_start_look_calibrated(loss) -> None:
     """Reweighting begins at its own last estimate, which is not the start that was given."""
     fit = identify(hexapod(), hexapod_data(), loss=loss)
     assert check_start_values(fit).verdict is StartVerdict.NOT_CALIBRATED
-    assert len(fit.cost_history) == fit.iterations + 1
+    assert len(fit.history.cost) == fit.history.iterations + 1
     np.testing.assert_array_equal(
-        fit.estimate_history[0], hexapod().values[hexapod().parameters.free]
+        fit.history.estimate[0], hexapod().values[hexapod().parameters.free]
     )
     best = identify(fit.robot, hexapod_data(), loss=loss)
     assert check_start_values(best).verdict is StartVerdict.BEST
@@ -55,12 +55,12 @@ def test_with_a_loss_every_step_is_counted_and_the_history_is_one_way_from_the_s
     loss.
     """
     plain, fit = identify(hexapod(), hexapod_data()), identify(hexapod(), hexapod_data(), loss=loss)
-    assert fit.iterations > plain.iterations
-    assert len(fit.cost_history) == len(fit.estimate_history) == fit.iterations + 1
+    assert fit.history.iterations > plain.history.iterations
+    assert len(fit.history.cost) == len(fit.history.estimate) == fit.history.iterations + 1
     np.testing.assert_array_equal(
-        fit.estimate_history[: plain.iterations + 1], plain.estimate_history
+        fit.history.estimate[: plain.history.iterations + 1], plain.history.estimate
     )
-    np.testing.assert_array_equal(fit.estimate_history[-1], fit.estimate)
+    np.testing.assert_array_equal(fit.history.estimate[-1], fit.estimate)
 
 
 def test_with_a_loss_the_cost_of_the_start_is_weighted_as_that_of_the_fit_and_holds_the_prior() -> (
@@ -70,11 +70,11 @@ def test_with_a_loss_the_cost_of_the_start_is_weighted_as_that_of_the_fit_and_ho
     free = select_free_parameters(robot)
     spread = 0.1 * free.tolerance
     prior = Prior(free.names, zoo.hexapod_truth(), free.tolerance, np.diag(1.0 / spread))
-    fit = identify(robot, data, prior=prior, loss=Huber())
-    assert fit.weight.min() < 0.99
+    fit = identify(robot, data, loss=Huber(), options=FitOptions(prior=prior))
+    assert fit.pose_weights.min() < 0.99
     start = free.deviation(robot.values[None])
-    problem = problem_of(free, data).weighted(fit.weight)
+    problem = problem_of(free, data).weighted(fit.pose_weights)
     cost = problem.linearize(start, problem.start(start)).cost[0]
     held = (((robot.values[free.places] - prior.mean) / spread) ** 2).sum()
     assert held > 100.0
-    assert fit.cost_history[0] == pytest.approx(cost + held, rel=1e-12)  # rounding of sums
+    assert fit.history.cost[0] == pytest.approx(cost + held, rel=1e-12)  # rounding of sums

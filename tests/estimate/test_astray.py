@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from loopcal.diagnose import StartVerdict, check_start_values
-from loopcal.errors import EstimationError
-from loopcal.estimate import MAP, LeastSquares, identify
+from loopcal.estimate import MAP, FitOptions, LeastSquares, identify
 from loopcal.estimate.descent import StepControl
 from loopcal.estimate.inference.prior import prior_from
 from tests.estimate.problems import hexapod, hexapod_data
+from tests.findings.reported import codes_of, one_of, refused
 
 ONE_STEP = StepControl(iterations=1)
 
@@ -24,23 +24,24 @@ def test_a_fit_that_did_not_converge_says_nothing_of_the_noise_and_gives_no_inte
     # with sigmas a hundred times too large even the first step leaves less than noise explains
     loose = replace(data, observations=(replace(rows, covariance=rows.covariance * 1e4),))
     for some in (data, loose):
-        fit = identify(hexapod(), some, method, noise=noise, control=ONE_STEP)
+        fit = identify(hexapod(), some, method, options=FitOptions(noise=noise, control=ONE_STEP))
         assert not fit.converged
         assert np.isnan(fit.interval()).all()
-        assert np.isnan(fit.p_value)
-        assert not fit.check.failed
-        notes = " ".join(fit.notes)
-        assert "no interval is given and nothing is said of the noise" in notes
-        assert "sigma is too large" not in notes
-        assert "stated noise explains" not in notes
-        assert ("--method map" in notes) == (method == LeastSquares())
+        assert np.isnan(fit.residual_test.p_value)
+        assert not fit.residual_test.failed
+        codes = codes_of(fit.findings)
+        assert {"fit.out-of-iterations", "noise.not-tested"} <= codes
+        assert not {code for code in codes if code.startswith("noise.")} - {"noise.not-tested"}
+        assert bool(codes & {"fit.no-prior", "fit.beyond-tolerance"}) == (method == LeastSquares())
         assert check_start_values(fit).verdict is StartVerdict.OPEN
         assert "did not converge" in check_start_values(fit).sentence
 
 
 def test_a_fit_that_did_not_converge_cannot_be_a_prior():
-    with pytest.raises(EstimationError, match=r"uncertainty \(it did not converge"):
-        prior_from(identify(hexapod(), hexapod_data(12), control=ONE_STEP).posterior)
+    with refused("prior.no-uncertainty"):
+        prior_from(
+            identify(hexapod(), hexapod_data(12), options=FitOptions(control=ONE_STEP)).posterior
+        )
 
 
 def test_an_estimate_far_outside_its_stated_tolerance_is_named_with_the_remedy():
@@ -53,12 +54,8 @@ def test_an_estimate_far_outside_its_stated_tolerance_is_named_with_the_remedy()
     wrong = replace(robot, parameters=replace(robot.parameters, entries=tuple(entries)))
     fit = identify(wrong, data, LeastSquares())
     assert fit.converged
-    (note,) = [note for note in fit.notes if "left the stated tolerance" in note]
-    assert note.startswith("leg1.length left the stated tolerance, by up to ")
-    assert "--method map" in note
-    assert not any(
-        "left the stated tolerance" in note for note in identify(robot, data, LeastSquares()).notes
-    )
-    assert not any(
-        "left the stated tolerance" in note for note in identify(wrong, data, MAP()).notes
-    )
+    far = one_of(fit.findings, "fit.beyond-tolerance")
+    assert far.data["names"][0] == "leg1.length"
+    assert far.data["factor"] > 10.0
+    calm = identify(robot, data, LeastSquares()).findings + identify(wrong, data, MAP()).findings
+    assert "fit.beyond-tolerance" not in codes_of(calm)

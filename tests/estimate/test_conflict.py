@@ -8,8 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.errors import EstimationError
-from loopcal.estimate import MAP, InflatedTolerances, LeastSquares, identify, identify_trials
+from loopcal.estimate import (
+    MAP,
+    FitOptions,
+    InflatedTolerances,
+    LeastSquares,
+    identify,
+    identify_trials,
+)
 from loopcal.estimate.methods.prior_conflict import compute_prior_statistic
 from loopcal.measure import sample_truth, simulate_trials
 from loopcal.numerics.decomposition import decompose
@@ -23,6 +29,7 @@ from tests.estimate.problems import (
     tracker,
     with_tolerance,
 )
+from tests.findings.reported import one_of, refused
 
 WEAK = tracker(20e-6, 100e-6)  # a prior of 35 um matters to an instrument this poor
 
@@ -71,14 +78,15 @@ def test_true_tolerances_are_hardly_ever_doubted():
 def test_too_narrow_a_prior_is_named_and_the_default_is_not_held_by_it(narrow):
     robot, measured = trials(40)
     believed = with_tolerance(robot, 0.035e-3 / narrow)
-    named = [identify(believed, measured.trial(i)).conflict for i in range(5)]
+    named = [identify(believed, measured.trial(i)).prior_conflict for i in range(5)]
     for conflict in named:
         assert conflict is not None
         assert conflict.conflict
-        assert conflict.spread > 1.5
-        assert "contradict the stated tolerances" in conflict.sentence
+        assert conflict.inflation > 1.5
+        assert conflict.finding.code == "prior.tolerances-inflated"
     held = identify(believed, measured.trial(0), MAP())
-    assert any("held too close to nominal" in note for note in held.notes)
+    narrow_prior = one_of(held.findings, "prior.tolerances-too-narrow")
+    assert narrow_prior.data["ratio"] > 1.5
 
     def error(method):
         found = identify_trials(believed, measured, method).values - measured.truth
@@ -104,11 +112,13 @@ def test_a_parameter_without_a_tolerance_is_not_held_back_and_the_others_are():
     )
     expected = identify(replace(robot, parameters=ParameterTable(wide)), data, MAP())
     np.testing.assert_allclose(fit.estimate, expected.estimate, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(fit.sd, expected.sd, rtol=1e-4)
-    assert (fit.sd[~lengths] < 0.035e-3).all()
+    np.testing.assert_allclose(fit.standard_deviations, expected.standard_deviations, rtol=1e-4)
+    assert (fit.standard_deviations[~lengths] < 0.035e-3).all()
     assert fit.rank == 42
     np.testing.assert_allclose(
-        fit.singular_values, identify(mixed, data, LeastSquares()).singular_values, rtol=1e-2
+        fit.spectrum.singular_values,
+        identify(mixed, data, LeastSquares()).spectrum.singular_values,
+        rtol=1e-2,
     )
 
 
@@ -116,8 +126,8 @@ def test_without_any_tolerance_the_default_is_least_squares():
     data = hexapod_data(20)
     a, b = identify(zoo.hexapod(), data), identify(zoo.hexapod(), data, LeastSquares())
     np.testing.assert_allclose(a.estimate, b.estimate, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(a.sd, b.sd, rtol=1e-9)
-    with pytest.raises(EstimationError, match=r"cannot determine 42 parameters: measure"):
+    np.testing.assert_allclose(a.standard_deviations, b.standard_deviations, rtol=1e-9)
+    with refused("fit.too-few-equations", unknowns=42, has_prior=False):
         identify(zoo.hexapod(), data.take(np.arange(5)))
 
 
@@ -130,10 +140,13 @@ def test_an_estimated_sigma_weighs_the_prior_as_the_true_one_would():
     sharp = replace(
         measured, observations=(replace(claimed, covariance=claimed.covariance / 25.0),)
     )
-    expected, found = identify(robot, measured), identify(robot, sharp, noise="estimated")
-    assert found.check.sigma_scale == pytest.approx(5.0, rel=0.15)
-    np.testing.assert_allclose(found.sd, expected.sd, rtol=0.15)
-    assert np.abs((found.estimate - expected.estimate) / expected.sd).max() < 0.3
+    expected, found = (
+        identify(robot, measured),
+        identify(robot, sharp, options=FitOptions(noise="estimated")),
+    )
+    assert found.residual_test.sigma_scale == pytest.approx(5.0, rel=0.15)
+    np.testing.assert_allclose(found.standard_deviations, expected.standard_deviations, rtol=0.15)
+    assert np.abs((found.estimate - expected.estimate) / expected.standard_deviations).max() < 0.3
 
 
 def test_a_sigma_that_is_too_small_does_not_pass_for_a_narrow_prior():
@@ -143,9 +156,9 @@ def test_a_sigma_that_is_too_small_does_not_pass_for_a_narrow_prior():
         measured.trial(0), observations=(replace(claimed, covariance=claimed.covariance / 25.0),)
     )
     fit = identify(robot, sharp)
-    assert fit.conflict is not None
-    assert not fit.conflict.conflict
-    assert "sigma too small" in fit.check.sentence
+    assert fit.prior_conflict is not None
+    assert not fit.prior_conflict.conflict
+    assert fit.residual_test.finding.code == "noise.residuals-too-large"
 
 
 def test_the_factor_by_rule_is_never_below_one():

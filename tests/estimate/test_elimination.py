@@ -335,7 +335,7 @@ def test_a_fit_with_planes_that_share_a_probe_finds_it():
     data = probed(12, per_group=10)
     fit = identify(hexapod(), data, LeastSquares())
     assert fit.converged
-    assert fit.p_value > 1e-3
+    assert fit.residual_test.p_value > 1e-3
     assert (
         fit.rank == 30
     )  # of 42, less the frames of the base and of the tool: the probe and the planes are free

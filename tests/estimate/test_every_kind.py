@@ -31,7 +31,7 @@ from evidence.kinds import (
 )
 from loopcal import geometry
 from loopcal.diagnose import identifiability
-from loopcal.estimate import MAP, LeastSquares, identify, identify_trials
+from loopcal.estimate import MAP, FitOptions, LeastSquares, identify, identify_trials
 from loopcal.io import load_robot
 from loopcal.measure import (
     KINDS,
@@ -108,10 +108,10 @@ def test_what_a_kind_cannot_show_of_a_delta_is_said(case):
         instrument(case.kind, POSES, Silent),
         SEED,
     )
-    fit = identify(robot, data, LeastSquares(), allow_fewer_equations=True)
+    fit = identify(robot, data, LeastSquares(), options=FitOptions(allow_fewer_equations=True))
     assert fit.rank == 0
-    assert np.isinf(fit.sd).all()
-    assert any(note.startswith("not identifiable") for note in fit.notes)
+    assert np.isinf(fit.standard_deviations).all()
+    assert {"fit.unidentifiable", "fit.note"} & {f.code for f in fit.findings}
     assert identifiability(robot, data).rank == 0
 
 
@@ -168,7 +168,7 @@ def judged(kinds):
     )
     found = identify_trials(robot, trials, MAP())
     assert found.converged.all()
-    free = found.unknowns
+    free = found.free_parameters
     off = free.deviation(found.values) - free.deviation(truth)
     return ((found.standard_deviations() / free.tolerance) ** 2).sum(axis=1), (off**2).sum(axis=1)
 
@@ -278,7 +278,7 @@ def test_joints_locked_at_constants_nobody_knows_recover_a_tripod_up_to_its_fram
     )
     # [rad]: a lock without play shows zeros, which is all that is measured
     assert max(np.abs(o.measured).max() for o in data.observations) < 1e-12
-    fit = identify(robot, data, LeastSquares(), allow_fewer_equations=True)
+    fit = identify(robot, data, LeastSquares(), options=FitOptions(allow_fewer_equations=True))
     assert fit.rank == 21
     assert along_gauge(fit, data, truth.values) < EXACT
     assert (
@@ -287,7 +287,7 @@ def test_joints_locked_at_constants_nobody_knows_recover_a_tripod_up_to_its_fram
         )
         < EXACT
     )
-    assert fit.local.values.keys() == constants.keys()
+    assert fit.nuisance.values.keys() == constants.keys()
 
 
 @pytest.fixture(scope="module")

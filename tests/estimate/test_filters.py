@@ -25,7 +25,10 @@ def rows() -> np.ndarray:
 def estimate(rows: np.ndarray, method) -> np.ndarray:
     """Deviation (t, p) that the method finds for linear rows [A | b]."""
     d = decompose(
-        folded(rows), np.full(len(rows), rows.shape[1]), scale=method.scale(P), flat=method.flat(P)
+        folded(rows),
+        np.full(len(rows), rows.shape[1]),
+        scale=method.scale(P),
+        unpenalized=method.unpenalized(P),
     )
     return d.deviation(d.solution(method.penalty(d)))
 
@@ -58,19 +61,23 @@ def test_one_lambda_per_parameter_equals_extra_rows_of_different_weight(rows):
 def test_a_parameter_with_lambda_zero_is_not_held_back(rows):
     lam = np.array([1.0, 0.0, 20.0, 3.0, 0.0, 5.0])
     method = Ridge(tuple(lam))
-    d = decompose(folded(rows), np.full(T, M), scale=method.scale(P), flat=method.flat(P))
+    d = decompose(
+        folded(rows), np.full(T, M), scale=method.scale(P), unpenalized=method.unpenalized(P)
+    )
     penalty = method.penalty(d)
     np.testing.assert_allclose(d.deviation(d.solution(penalty)), stacked(rows, lam), rtol=1e-12)
     for r, c in zip(rows, d.covariance(penalty), strict=True):
         np.testing.assert_allclose(
             c @ (r[:, :P].T @ r[:, :P] + np.diag(lam)), np.eye(P), atol=1e-12
         )
-    assert method.needs(P) == 2
+    assert method.required_equations(P) == 2
     # all alike: the plain method
     assert np.array_equal(estimate(rows, Ridge((0.0,) * P)), estimate(rows, LeastSquares()))
     plain = decompose(folded(rows), np.full(T, M))
     np.testing.assert_allclose(
-        decompose(folded(rows), np.full(T, M), flat=method.flat(P)).plain().singular_values,
+        decompose(folded(rows), np.full(T, M), unpenalized=method.unpenalized(P))
+        .plain()
+        .singular_values,
         plain.singular_values,
         rtol=1e-12,
     )
@@ -80,9 +87,9 @@ def test_an_unseen_parameter_with_lambda_zero_stays_unknown_and_leaves_the_other
     rows = rows.copy()
     rows[:, :, 4] = rows[:, :, 1]
     flat = np.array([False, True, False, False, True, False])
-    d = decompose(folded(rows), np.full(T, M), flat=flat)
-    assert d.flat is not None
-    penalty = np.where(d.flat, np.where(d.used, 0.0, np.inf), 1.0)
+    d = decompose(folded(rows), np.full(T, M), unpenalized=flat)
+    assert d.unpenalized is not None
+    penalty = np.where(d.unpenalized, np.where(d.used, 0.0, np.inf), 1.0)
     sd = d.standard_deviations(penalty)
     assert np.isinf(sd[:, flat]).all()
     assert np.isfinite(sd[:, ~flat]).all()
@@ -204,7 +211,7 @@ def test_rules_choose_for_each_trial_on_its_own(rows):
         (lambda: Ridge((1.0, -1.0)), "finite number >= 0"),
         (lambda: MAP(0.0), "finite factor above 0"),
         (lambda: Ridge(float("nan")), "finite number >= 0"),
-        (lambda: TruncatedSVD(-1), "0 or more"),
+        (lambda: TruncatedSVD(-1), "integer >= 0"),
         (lambda: Ridge((1.0, 2.0)).scale(3), "2 values of lam for 3"),
     ],
 )

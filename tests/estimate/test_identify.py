@@ -14,6 +14,7 @@ from loopcal.errors import EstimationError
 from loopcal.estimate import (
     MAP,
     DescentStatus,
+    FitOptions,
     LeastSquares,
     Ridge,
     StepControl,
@@ -36,6 +37,7 @@ from tests.estimate.problems import (
     tracker,
     with_tolerance,
 )
+from tests.findings.reported import codes_of, one_of, refused
 
 MM = 1e-3
 
@@ -51,13 +53,13 @@ def fit(data):
 
 
 def test_the_true_parameters_lie_within_their_uncertainty(fit):
-    pull = (fit.estimate - zoo.hexapod_truth()) / fit.sd
+    pull = (fit.estimate - zoo.hexapod_truth()) / fit.standard_deviations
     assert fit.converged
     assert fit.rank == 42
     assert np.abs(pull).max() < 4.5  # 42 correlated normal numbers
     assert 0.5 < np.sqrt(np.mean(pull**2)) < 1.5
-    assert 1e-4 < fit.p_value < 1 - 1e-4
-    assert fit.dof == 30 * 6 - 42
+    assert 1e-4 < fit.residual_test.p_value < 1 - 1e-4
+    assert fit.residual_test.dof == 30 * 6 - 42
 
 
 def test_the_corrected_robot_carries_the_estimate(fit):
@@ -73,9 +75,9 @@ def test_exact_poses_of_the_nategh_hexapod_are_recovered_quadratically():
     for seed in range(100):
         T = zoo.nategh_poses(np.random.default_rng(seed))
         exact = simulate(robot.with_values(truth), T, tracker(1e-16, 5e-16), seed)
-        fit = identify(robot, exact, LeastSquares(), begin="closure")
+        fit = identify(robot, exact, LeastSquares(), options=FitOptions(begin="closure"))
         assert fit.converged
-        errors = np.abs(fit.estimate_history - truth).max(axis=1) / MM
+        errors = np.abs(fit.history.estimate - truth).max(axis=1) / MM
         steps.append(errors[1:4])
     assert (np.median(steps, axis=0) <= [0.6, 4e-4, 1e-9]).all()
     assert (np.max(steps, axis=0) <= [2.0, 4e-3, 2e-8]).all()
@@ -83,7 +85,10 @@ def test_exact_poses_of_the_nategh_hexapod_are_recovered_quadratically():
 
 @pytest.mark.parametrize("method", [LeastSquares(), MAP()])
 def test_beginning_from_closure_leads_to_the_same_estimate(data, method):
-    a, b = identify(hexapod(), data, method), identify(hexapod(), data, method, begin="closure")
+    a, b = (
+        identify(hexapod(), data, method),
+        identify(hexapod(), data, method, options=FitOptions(begin="closure")),
+    )
     np.testing.assert_allclose(a.estimate, b.estimate, rtol=0, atol=1e-12)  # [m]
     assert a.chi_square == pytest.approx(b.chi_square, rel=1e-9)
 
@@ -91,21 +96,15 @@ def test_beginning_from_closure_leads_to_the_same_estimate(data, method):
 def test_beginning_from_closure_changes_nothing_where_poses_are_not_measured_in_full():
     heights = hexapod_data(60, instrument=probe())
     a = identify(hexapod(), heights, MAP())
-    b = identify(hexapod(), heights, MAP(), begin="closure")
+    b = identify(hexapod(), heights, MAP(), options=FitOptions(begin="closure"))
     assert np.array_equal(a.estimate, b.estimate)
-    (note,) = set(b.notes) - set(a.notes)
-    assert note.startswith(
-        "begin closure was not used: it needs one kind that measures all poses in full"
-    )
+    assert codes_of(b.findings) - codes_of(a.findings) == {"poses.closure-start-incomplete-poses"}
 
 
 def test_that_uncertain_readings_cannot_begin_from_closure_is_noted(data):
     few = replace(data.take(np.arange(10)), reading_sigma=2e-6)
-    fit = identify(hexapod(), few, MAP(), begin="closure")
-    assert (
-        "begin closure was not used: it needs exact readings; the fit began with the kinematics"
-        in fit.notes
-    )
+    fit = identify(hexapod(), few, MAP(), options=FitOptions(begin="closure"))
+    assert "poses.closure-start-uncertain-readings" in codes_of(fit.findings)
 
 
 def test_leaving_poses_out_by_weight_equals_removing_them(data):
@@ -114,8 +113,10 @@ def test_leaving_poses_out_by_weight_equals_removing_them(data):
     by_weight = identify(hexapod(), data.with_weights(weight), LeastSquares())
     removed = identify(hexapod(), data.take(weight > 0.0), LeastSquares())
     np.testing.assert_allclose(by_weight.estimate, removed.estimate, rtol=0, atol=1e-12)  # [m]
-    np.testing.assert_allclose(by_weight.sd, removed.sd, rtol=1e-9)
-    assert by_weight.dof == removed.dof
+    np.testing.assert_allclose(
+        by_weight.standard_deviations, removed.standard_deviations, rtol=1e-9
+    )
+    assert by_weight.residual_test.dof == removed.residual_test.dof
 
 
 def test_the_order_of_poses_changes_rounding_only(data, fit):
@@ -138,13 +139,15 @@ def test_blocks_of_poses_change_rounding_only(data, fit, monkeypatch):
 def test_stacked_trials_equal_single_ones_bit_for_bit(method, begin):
     robot = hexapod()
     trials = simulate_trials(robot, sample_truth(robot, 7, 1), hexapod_poses(15), tracker(), 2)
-    together = identify_trials(robot, trials, method, begin=begin)
+    together = identify_trials(robot, trials, method, options=FitOptions(begin=begin))
     assert together.converged.all()
     for i in range(7):
-        alone = identify(robot, trials.trial(i), method, begin=begin)
+        alone = identify(robot, trials.trial(i), method, options=FitOptions(begin=begin))
         assert np.array_equal(together.values[i], alone.robot.values)
-        assert together.iterations[i] == alone.iterations
-        np.testing.assert_allclose(together.standard_deviations()[i], alone.sd, rtol=1e-12)
+        assert together.iterations[i] == alone.history.iterations
+        np.testing.assert_allclose(
+            together.standard_deviations()[i], alone.standard_deviations, rtol=1e-12
+        )
 
 
 def test_a_trial_out_of_reach_is_marked_and_leaves_the_others_alone():
@@ -153,7 +156,7 @@ def test_a_trial_out_of_reach_is_marked_and_leaves_the_others_alone():
     trials = simulate_trials(robot, truth, hexapod_poses(15), tracker(), 2)
     start = np.repeat(robot.values[None], 3, axis=0)
     start[1] += 1.0  # [m]
-    found = identify_trials(robot, trials, start=start)
+    found = identify_trials(robot, trials, options=FitOptions(start=start))
     assert found.status[1] == DescentStatus.BAD_START
     assert found.converged[[0, 2]].all()
     # the trials no longer share a start, so this also proves the path without sharing
@@ -165,9 +168,9 @@ def test_a_trial_out_of_reach_is_marked_and_leaves_the_others_alone():
 def test_map_is_ridge_one_and_pulls_towards_nominal(data, fit):
     posterior, ridge = identify(hexapod(), data, MAP()), identify(hexapod(), data, Ridge(1.0))
     np.testing.assert_allclose(posterior.estimate, ridge.estimate, rtol=0, atol=1e-15)
-    assert (posterior.sd < fit.sd).all()
-    assert (posterior.sd < fit.tolerance).all()
-    assert posterior.check.degrees == 180
+    assert (posterior.standard_deviations < fit.standard_deviations).all()
+    assert (posterior.standard_deviations < fit.tolerance).all()
+    assert posterior.residual_test.degrees == 180
 
 
 def test_truncation_at_full_rank_is_least_squares(data, fit):
@@ -185,8 +188,8 @@ def test_fixed_parameters_stay_and_have_no_uncertainty(data):
     assert len(fit.names) == 35
     assert np.array_equal(fit.robot.values[held], robot.values[held])
     assert np.isnan(fit.plus_minus[held]).all()
-    assert fit.p_value < 1e-6
-    assert "times what the stated noise explains" in fit.check.sentence
+    assert fit.residual_test.p_value < 1e-6
+    assert fit.residual_test.finding.code == "noise.residuals-too-large"
 
 
 def test_what_the_data_cannot_tell_is_named_has_infinite_uncertainty_and_stays_nearest_to_nominal():
@@ -194,9 +197,13 @@ def test_what_the_data_cannot_tell_is_named_has_infinite_uncertainty_and_stays_n
     fit = identify(robot, data, LeastSquares())
     assert fit.rank == 41
     (turn,) = fit.unidentifiable
-    assert {n for n, sd in zip(fit.names, fit.sd, strict=True) if np.isinf(sd)} == set(turn.names)
-    assert sum("not identifiable: together" in note for note in fit.notes) == 1
-    assert np.isnan(fit.covariance[np.isinf(fit.sd)][:, np.isfinite(fit.sd)]).all()
+    assert {
+        n for n, sd in zip(fit.names, fit.standard_deviations, strict=True) if np.isinf(sd)
+    } == set(turn.names)
+    assert one_of(fit.findings, "fit.unidentifiable").data["names"] == turn.names
+    assert np.isnan(
+        fit.covariance[np.isinf(fit.standard_deviations)][:, np.isfinite(fit.standard_deviations)]
+    ).all()
     # walking along the combination changes no measured value, and only adds to the deviation
     step = np.zeros(42)
     step[[fit.names.index(n) for n in turn.names]] = turn.changes * 1e-6  # [m]
@@ -208,30 +215,30 @@ def test_what_the_data_cannot_tell_is_named_has_infinite_uncertainty_and_stays_n
     assert np.abs((fit.estimate - fit.nominal) @ step) < 1e-6 * np.linalg.norm(
         step
     ) * np.linalg.norm(fit.estimate - fit.nominal)
-    assert identify(robot, data, MAP()).sd.max() < 0.035 * MM
+    assert identify(robot, data, MAP()).standard_deviations.max() < 0.035 * MM
 
 
 def test_missing_tolerances_are_assumed_aloud(data):
     fit = identify(zoo.hexapod(), data, LeastSquares())
-    assert any("42 of 42 parameters have no tolerance" in note for note in fit.notes)
-    assert not any(
-        "no tolerance" in note for note in identify(hexapod(), data, LeastSquares()).notes
-    )
+    assumed = one_of(fit.findings, "fit.default-tolerances").data
+    assert (assumed["count"], assumed["total"]) == (42, 42)
+    stated = identify(hexapod(), data, LeastSquares()).findings
+    assert "fit.default-tolerances" not in codes_of(stated)
 
 
 def test_fewer_equations_than_parameters_are_refused_unless_asked_for_or_a_prior_fills_the_gap(
     data,
 ):
     few = data.take(np.arange(5))
-    with pytest.raises(
-        EstimationError, match=r"30 equations from 5 poses cannot determine 42 .* at least 7 poses"
-    ):
+    with refused("fit.too-few-equations", equations=30, poses=5, unknowns=42, poses_needed=7):
         identify(hexapod(), few, LeastSquares())
-    forced = identify(hexapod(), few, LeastSquares(), allow_fewer_equations=True)
+    forced = identify(
+        hexapod(), few, LeastSquares(), options=FitOptions(allow_fewer_equations=True)
+    )
     assert forced.rank == 30
     assert len(forced.unidentifiable) == 12
-    assert "no degree of freedom" in forced.check.sentence
-    assert np.isfinite(identify(hexapod(), few, MAP()).sd).all()
+    assert forced.residual_test.finding.code == "noise.no-degrees-of-freedom"
+    assert np.isfinite(identify(hexapod(), few, MAP()).standard_deviations).all()
 
 
 def test_few_degrees_of_freedom_give_no_intervals_unless_sigma_is_given():
@@ -240,38 +247,41 @@ def test_few_degrees_of_freedom_give_no_intervals_unless_sigma_is_given():
     some = replace(robot, parameters=robot.parameters.with_free(six))
     data = probed_heights(robot, bed(len(six) + 1))
     estimated, given = (
-        identify(some, data, LeastSquares(), noise="estimated"),
+        identify(some, data, LeastSquares(), options=FitOptions(noise="estimated")),
         identify(some, data, LeastSquares()),
     )
-    assert estimated.dof == 1
-    assert (
-        "one degree of freedom is too few for intervals unless the instrument's sigma is given"
-        in estimated.notes
-    )
-    assert np.isnan(estimated.sd).all()
-    assert np.isfinite(given.sd).all()
+    assert estimated.residual_test.dof == 1
+    few = one_of(estimated.findings, "noise.too-few-degrees")
+    assert few.data["dof"] == 1
+    assert np.isnan(estimated.standard_deviations).all()
+    assert np.isfinite(given.standard_deviations).all()
 
 
 def test_estimated_noise_scales_the_uncertainty(data):
     quarter = hexapod_data(instrument=tracker(4e-6, 20e-6))
     claimed = quarter.observations[0]
     sharp = replace(quarter, observations=(replace(claimed, covariance=claimed.covariance / 16.0),))
-    fit = identify(hexapod(), sharp, LeastSquares(), noise="estimated")
-    assert fit.check.sigma_scale == pytest.approx(4.0, rel=0.25)  # 138 degrees of freedom: sd 6 %
+    fit = identify(hexapod(), sharp, LeastSquares(), options=FitOptions(noise="estimated"))
+    assert fit.residual_test.sigma_scale == pytest.approx(
+        4.0, rel=0.25
+    )  # 138 degrees of freedom: sd 6 %
     np.testing.assert_allclose(
-        fit.sd,
-        identify(hexapod(), quarter, LeastSquares()).sd * fit.check.sigma_scale / 4.0,
+        fit.standard_deviations,
+        identify(hexapod(), quarter, LeastSquares()).standard_deviations
+        * fit.residual_test.sigma_scale
+        / 4.0,
         rtol=1e-3,
     )
-    assert np.isnan(fit.p_value)
-    assert "sigma too small" in identify(hexapod(), sharp, LeastSquares()).check.sentence
+    assert np.isnan(fit.residual_test.p_value)
+    given = identify(hexapod(), sharp, LeastSquares())
+    assert given.residual_test.finding.code == "noise.residuals-too-large"
 
 
 def test_poses_out_of_reach_are_refused_by_name_and_ignored_without_weight(data):
     readings = data.readings.copy()
     readings[4] = -0.2  # [m]
     broken = replace(data, readings=readings)
-    with pytest.raises(EstimationError, match=r"cannot reach 1 of 30 poses .*'5'"):
+    with refused("fit.poses-out-of-reach", count=1, total=30, poses=("5",)):
         identify(hexapod(), broken, LeastSquares())
     weight = np.ones(30)
     weight[4] = 0.0
@@ -281,15 +291,17 @@ def test_poses_out_of_reach_are_refused_by_name_and_ignored_without_weight(data)
 
 
 def test_an_iteration_cut_short_says_so(data):
-    fit = identify(hexapod(), data, LeastSquares(), control=StepControl(iterations=0))
+    fit = identify(
+        hexapod(), data, LeastSquares(), options=FitOptions(control=StepControl(iterations=0))
+    )
     assert fit.status is DescentStatus.OUT_OF_ITERATIONS
-    assert "did not converge" in fit.notes[0]
+    assert fit.findings[0].code == "fit.out-of-iterations"
     assert "did not converge" in str(fit)
 
 
 def test_a_start_far_off_converges_to_the_same_answer(data, fit):
     start = zoo.hexapod().values + np.random.default_rng(1).uniform(-5 * MM, 5 * MM, 42)
-    far = identify(hexapod(), data, LeastSquares(), start=start)
+    far = identify(hexapod(), data, LeastSquares(), options=FitOptions(start=start))
     assert far.converged
     np.testing.assert_allclose(
         far.estimate, fit.estimate, rtol=0, atol=1e-9
@@ -297,19 +309,21 @@ def test_a_start_far_off_converges_to_the_same_answer(data, fit):
 
 
 def test_rows_of_weight_zero_alone_and_no_free_parameter_are_refused(data):
-    with pytest.raises(EstimationError, match="every row is absent or has weight 0"):
+    with refused("fit.no-measured-value"):
         identify(hexapod(), data.with_weights(np.zeros(30)), LeastSquares())
     fixed = replace(hexapod(), parameters=hexapod().parameters.with_free([]))
-    with pytest.raises(EstimationError, match="no free parameter"):
+    with refused("fit.no-free-parameter", total=42):
         identify(fixed, data, LeastSquares())
     with pytest.raises(EstimationError, match="'given' or 'estimated'"):
-        identify(hexapod(), data, LeastSquares(), noise="guessed")  # pyright: ignore[reportArgumentType]
+        identify(hexapod(), data, LeastSquares(), options=FitOptions(noise="guessed"))  # pyright: ignore[reportArgumentType]
 
 
 def test_the_printed_table_and_the_json_name_every_parameter(fit):
     text = str(fit)
     assert all(name in text for name in fit.names)
-    assert "rank 42 of 42" in text
+    assert "Rank 42 of 42" in text
+    assert len(repr(fit).splitlines()) <= 20
+    assert len(repr(fit)) < 1000
     document = json.loads(to_json(fit.to_dict()))
     assert [p["name"] for p in document["parameters"]] == list(fit.names)
     assert document["parameters"][0]["unit"] == "mm"

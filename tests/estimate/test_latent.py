@@ -16,8 +16,8 @@ import loopcal.estimate.problem as problem_module
 from loopcal.apply import validate
 from loopcal.diagnose import cross_validate, examine_fit, find_outliers, identifiability
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate import Huber, LeastSquares, Tukey, identify, identify_trials
-from loopcal.estimate.excluded_poses import exclude_poses
+from loopcal.estimate import FitOptions, Huber, LeastSquares, Tukey, identify, identify_trials
+from loopcal.estimate.fit_input import exclude_poses
 from loopcal.io import load_robot
 from loopcal.measure import (
     Instrument,
@@ -46,14 +46,14 @@ def sigma_of(data):
 
 def latent_of(fit):
     """What a fit found of its poses."""
-    assert fit.latent is not None
-    return fit.latent
+    assert fit.poses is not None
+    return fit.poses
 
 
 def largest_difference(a, b):
     """Of two fits, in standard deviations of the second: estimates, and covariances."""
-    return np.abs((a.estimate - b.estimate) / b.sd).max(), np.abs(
-        (a.covariance - b.covariance) / np.outer(b.sd, b.sd)
+    return np.abs((a.estimate - b.estimate) / b.standard_deviations).max(), np.abs(
+        (a.covariance - b.covariance) / np.outer(b.standard_deviations, b.standard_deviations)
     ).max()
 
 
@@ -87,24 +87,29 @@ def case(name):
 )
 def test_a_sigma_that_vanishes_gives_the_fit_of_exact_readings(name):
     robot, data = case(name)
-    exact = identify(robot, data, LeastSquares(), rank_tolerance=1e-9)
+    exact = identify(robot, data, LeastSquares(), options=FitOptions(rank_tolerance=1e-9))
     for sigma in (TINY, np.where(np.arange(data.readings.shape[1]) == 1, 0.0, TINY)):
         found = identify(
-            robot, replace(data, reading_sigma=sigma), LeastSquares(), rank_tolerance=1e-9
+            robot,
+            replace(data, reading_sigma=sigma),
+            LeastSquares(),
+            options=FitOptions(rank_tolerance=1e-9),
         )
         assert found.rank == exact.rank
-        assert found.dof == exact.dof
-        if np.isfinite(exact.sd).all():
+        assert found.residual_test.dof == exact.residual_test.dof
+        if np.isfinite(exact.standard_deviations).all():
             assert max(largest_difference(found, exact)) < 1e-9
         else:  # a frame is known only together with the machine: what is known is the same
-            known = exact.posterior.directions[:, exact.posterior.seen]
+            known = exact.posterior.directions[:, exact.posterior.determined]
             change = known.T @ ((found.estimate - exact.estimate) / exact.posterior.unit)
             assert (
-                np.abs(change / np.sqrt(exact.posterior.variance[exact.posterior.seen])).max()
+                np.abs(change / np.sqrt(exact.posterior.variance[exact.posterior.determined])).max()
                 < 1e-9
             )
             assert_allclose(
-                found.singular_values[: found.rank], exact.singular_values[: found.rank], rtol=1e-9
+                found.spectrum.singular_values[: found.rank],
+                exact.spectrum.singular_values[: found.rank],
+                rtol=1e-9,
             )
 
 
@@ -113,7 +118,7 @@ def test_readings_stated_as_exact_take_the_ordinary_path_to_the_last_bit():
     plain, stated = (
         identify(hexapod(), d, LeastSquares()) for d in (data, replace(data, reading_sigma=0.0))
     )
-    assert stated.latent is None
+    assert stated.poses is None
     assert_array_equal(stated.estimate, plain.estimate)
     assert_array_equal(stated.covariance, plain.covariance)
 
@@ -147,7 +152,7 @@ def test_noise_missing_readings_and_linked_poses_equal_the_problem_with_every_re
     sd = np.sqrt(np.diag(covariance))
     assert_allclose(found.estimate, expected, atol=1e-4 * sd.min(), rtol=0)  # [m], differences
     stated = (
-        found.covariance / found.check.sigma_scale**2
+        found.covariance / found.residual_test.sigma_scale**2
     )  # six of 42 wrong parameters are free: it is widened
     assert_allclose(stated, covariance, atol=1e-4 * sd.max() ** 2, rtol=0)
     assert latent_of(found).to_dict() == {
@@ -211,7 +216,7 @@ def test_redundant_readings_equal_the_problem_with_every_position_unknown(cable)
         found.estimate, robot.parameters.nominal + unit * fit.x[:p], atol=1e-3 * sd.min(), rtol=0
     )
     assert_allclose(
-        found.sd, sd, rtol=1e-4
+        found.standard_deviations, sd, rtol=1e-4
     )  # at two solutions that differ by the noise's curvature
     assert_allclose(latent_of(found).poses[:, :3, 3], fit.x[p:].reshape(-1, 3), atol=1e-7)  # [m]
 
@@ -266,9 +271,9 @@ def coverage(robot, trials):
     """How many of the trials have the truth inside the 95 % ellipsoid of their fit."""
     fits = identify_trials(robot, trials, LeastSquares())
     assert fits.converged.all()
-    places = fits.unknowns.places
+    places = fits.free_parameters.places
     covariance = fits.decomposition.covariance(fits.penalty) * np.outer(
-        fits.unknowns.tolerance, fits.unknowns.tolerance
+        fits.free_parameters.tolerance, fits.free_parameters.tolerance
     )
     error = fits.values[:, places] - trials.truth[:, places]
     square = np.einsum("ti,tij,tj->t", error, np.linalg.inv(covariance), error)
@@ -288,9 +293,9 @@ def test_ellipsoids_cover_as_stated_with_noisy_readings_and_far_too_little_if_th
     for i in range(10):
         data = replace(trials.trial(i), reading_sigma=0.0)
         fit = identify(robot, data, LeastSquares())
-        error = fit.estimate - trials.truth[i, fit.unknowns.places]
+        error = fit.estimate - trials.truth[i, fit.free_parameters.places]
         stated = (
-            fit.covariance / fit.check.sigma_scale**2
+            fit.covariance / fit.residual_test.sigma_scale**2
         )  # a residual that noise does not explain has widened it
         ignored += bool(error @ np.linalg.solve(stated, error) <= chi2.ppf(0.95, len(error)))
     assert ignored < binom.ppf(0.0005, 10, 0.95)
@@ -344,9 +349,9 @@ def test_a_trial_is_the_same_alone_and_among_others():
     for i in (0, 2):
         alone = identify(robot, trials.trial(i), LeastSquares())
         assert_allclose(
-            together.values[i, together.unknowns.places],
+            together.values[i, together.free_parameters.places],
             alone.estimate,
-            atol=1e-6 * alone.sd.min(),
+            atol=1e-6 * alone.standard_deviations.min(),
             rtol=0,
         )
 
@@ -363,9 +368,10 @@ def test_a_pose_whose_position_alone_is_known_adds_nothing_and_is_named():
     assert (
         max(largest_difference(found, known)) < 1e-6
     )  # both fits end where steps are a millionth of the residual
-    assert found.dof == known.dof
+    assert found.residual_test.dof == known.residual_test.dof
     assert latent_of(found).is_undetermined.tolist() == [False] * 11 + [True]
-    assert any("not determined" in note and "pose 12" in note for note in found.notes)
+    (lost,) = (f for f in found.findings if f.code == "poses.undetermined")
+    assert "12" in str(lost)
 
 
 def test_a_reading_that_is_not_believed_is_found_from_the_pose():
@@ -396,15 +402,19 @@ def wrong_reading():
 def test_a_wrong_reading_is_named_and_a_loss_or_its_absence_mends_the_fit(wrong_reading):
     plain = identify(hexapod(), wrong_reading, LeastSquares())
     assert find_outliers(plain, wrong_reading).names == ("5",)
-    dropped = identify(hexapod(), wrong_reading, LeastSquares(), drop=("5",))
+    dropped = identify(
+        hexapod(), wrong_reading, LeastSquares(), options=FitOptions(excluded_poses=("5",))
+    )
     without = identify(hexapod(), wrong_reading.take(np.arange(16) != 4), LeastSquares())
     assert max(largest_difference(dropped, without)) < 1e-6
-    assert dropped.dof == without.dof
-    assert np.abs((plain.estimate - without.estimate) / without.sd).max() > 30.0
+    assert dropped.residual_test.dof == without.residual_test.dof
+    assert np.abs((plain.estimate - without.estimate) / without.standard_deviations).max() > 30.0
     for loss, most in ((Huber(), 4.0), (Tukey(), 1.5)):
         robust = identify(hexapod(), wrong_reading, LeastSquares(), loss=loss)
-        assert robust.weight[4] < 0.05
-        assert np.abs((robust.estimate - without.estimate) / without.sd).max() < most
+        assert robust.pose_weights[4] < 0.05
+        assert (
+            np.abs((robust.estimate - without.estimate) / without.standard_deviations).max() < most
+        )
     assert examine_fit(dropped, wrong_reading).outliers.outliers == ()
 
 
@@ -433,7 +443,9 @@ def test_blocks_of_poses_change_nothing(monkeypatch):
     monkeypatch.setattr(problem_module, "BLOCK", 5)
     parts = identify(hexapod(), data, LeastSquares())
     assert parts.chi_square == pytest.approx(whole.chi_square, rel=1e-9)
-    assert_allclose(parts.singular_values[:36], whole.singular_values[:36], rtol=1e-9)
+    assert_allclose(
+        parts.spectrum.singular_values[:36], whole.spectrum.singular_values[:36], rtol=1e-9
+    )
     assert_allclose(latent_of(parts).readings, latent_of(whole).readings, atol=1e-9 * UM)
 
 
@@ -443,8 +455,12 @@ def test_frames_and_noisy_readings_together_leave_what_a_known_frame_leaves_to_b
     fit = identify(hexapod(), data, LeastSquares())
     assert fit.converged
     assert fit.rank == 36
-    assert fit.dof == 14 * 6 - 42
-    assert chi2.ppf(1e-4, fit.dof) < fit.chi_square < chi2.ppf(1 - 1e-4, fit.dof)
+    assert fit.residual_test.dof == 14 * 6 - 42
+    assert (
+        chi2.ppf(1e-4, fit.residual_test.dof)
+        < fit.chi_square
+        < chi2.ppf(1 - 1e-4, fit.residual_test.dof)
+    )
 
 
 def test_exact_readings_of_redundant_actuators_are_refused(cable):
@@ -474,9 +490,9 @@ def test_too_few_readings_and_chains_too_long_are_refused(cable, monkeypatch):
 
 def test_a_pose_left_out_is_neither_undetermined_nor_without_readings():
     data = measured_hexapod(12, 2 * UM)
-    fit = identify(hexapod(), data, drop=("3", "9"))
+    fit = identify(hexapod(), data, options=FitOptions(excluded_poses=("3", "9")))
     found, out = latent_of(fit), np.isin(np.arange(12), (2, 8))
-    assert not [note for note in fit.notes if "not determined" in note]
+    assert "poses.undetermined" not in {f.code for f in fit.findings}
     assert found.to_dict() == {
         "exact": 0,
         "uncertain": 60,

@@ -146,7 +146,7 @@ def test_missing_readings_are_found_in_few_looks_and_nothing_is_followed(said, c
         counted.update(looks=0, followed=0)
         fit = identify(robot, data)
         assert fit.converged
-        assert fit.chi_square < 2.0 * fit.dof
+        assert fit.chi_square < 2.0 * fit.residual_test.dof
         assert (
             counted["looks"] < 60
         )  # some ten folds of two to four looks; 559 and more without a bound of the step
@@ -161,12 +161,12 @@ def test_a_missing_reading_is_that_of_the_branch_on_which_the_machine_is_built()
         lost = np.zeros(data.readings.shape, dtype=bool)
         lost[7, 0] = True
         fit = identify(robot, without(data, lost))
-        assert fit.latent is not None
+        assert fit.poses is not None
         true = inverse(truth, sample_workspace(robot, 20, seed).coordinates).q[7, 0]
-        assert fit.latent.readings[7, 0] == pytest.approx(
+        assert fit.poses.readings[7, 0] == pytest.approx(
             true, abs=2e-3
         )  # [m]: errors of lengths; the other branch is 0.3 off
-        assert not any("branch" in note or "stroke" in note for note in fit.notes)
+        assert not any("branch" in note or "stroke" in note for note in map(str, fit.findings))
 
 
 def test_a_reading_found_outside_its_stroke_or_on_another_branch_is_told():
@@ -174,12 +174,12 @@ def test_a_reading_found_outside_its_stroke_or_on_another_branch_is_told():
     lost = np.zeros(data.readings.shape, dtype=bool)
     lost[7, 0] = lost[9, 2] = True
     fit = identify(robot, without(data, lost))
-    assert fit.latent is not None
-    assert report_doubtful_readings(fit.robot, fit.latent) == ()
-    found = fit.latent.readings.copy()
+    assert fit.poses is not None
+    assert report_doubtful_readings(fit.robot, fit.poses) == ()
+    found = fit.poses.readings.copy()
     found[7, 0] += 0.1 if found[7, 0] < 0.3 else -0.1  # [m]: within the stroke of 0 to 0.4 m
     found[9, 2] = -0.02
-    outside, beside = report_doubtful_readings(fit.robot, replace(fit.latent, readings=found))
+    outside, beside = report_doubtful_readings(fit.robot, replace(fit.poses, readings=found))
     name = robot.actuators[2].name
     assert outside.code == "poses.outside-stroke"
     reading = outside.data["readings"][-1]
@@ -191,7 +191,7 @@ def test_a_reading_found_outside_its_stroke_or_on_another_branch_is_told():
     assert (reading["actuator"], reading["pose"]) == (robot.actuators[0].name, "8")
     assert (
         report_doubtful_readings(
-            fit.robot, replace(fit.latent, readings=found, is_undetermined=np.ones(20, dtype=bool))
+            fit.robot, replace(fit.poses, readings=found, is_undetermined=np.ones(20, dtype=bool))
         )
         == ()
     )

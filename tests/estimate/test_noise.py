@@ -89,7 +89,7 @@ def test_correlated_parameters_are_grouped_in_words():
     assert abs(groups[0].correlation) > 0.9
     assert set(groups[0].pair) <= set(groups[0].names)
     assert "are known better together than alone" in str(groups[0])
-    rho = fit.covariance / fit.sd[:, None] / fit.sd
+    rho = fit.covariance / fit.standard_deviations[:, None] / fit.standard_deviations
     a, b = (fit.names.index(name) for name in groups[0].pair)
     assert groups[0].correlation == pytest.approx(rho[a, b])
     names = [name for group in groups for name in group.names]

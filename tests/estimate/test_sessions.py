@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 
 import loopcal as lc
 from loopcal import geometry
-from loopcal.estimate import LeastSquares, identify
+from loopcal.estimate import FitOptions, LeastSquares, identify
 from loopcal.measure import (
     Bearing,
     Gaussian,
@@ -67,18 +67,18 @@ def fixed(data: Measurements, pattern: str, values: Mapping[str, float] | None =
 def right(fit, true: Mapping[str, float]):
     """A fit that explains the data, with these own unknowns within five standard deviations."""
     assert fit.converged
-    assert fit.p_value > USUAL
+    assert fit.residual_test.p_value > USUAL
     for name, value in true.items():
-        i = fit.local.names.index(name)
-        assert np.isfinite(fit.local.sd[i])
-        assert abs(fit.local.estimate[i] - value) < 5 * fit.local.sd[i], name
+        i = fit.nuisance.names.index(name)
+        assert np.isfinite(fit.nuisance.sd[i])
+        assert abs(fit.nuisance.estimate[i] - value) < 5 * fit.nuisance.sd[i], name
 
 
 def wrong(fit):
     """A fit whose residual says that something stated is not so."""
-    assert fit.p_value < UNLIKELY
-    assert fit.check.sentence in fit.notes
-    assert not fit.check.intervals or fit.check.sigma_scale > 1.0
+    assert fit.residual_test.p_value < UNLIKELY
+    assert fit.residual_test.finding in fit.findings
+    assert not fit.residual_test.intervals or fit.residual_test.sigma_scale > 1.0
 
 
 def test_a_base_that_drifts_is_re_measured_in_every_session():
@@ -88,7 +88,12 @@ def test_a_base_that_drifts_is_re_measured_in_every_session():
     data = seen(poses, sensor(kind, session=day), true=drift)
     # the first session says where the base is, the others how far it has drifted since
     first = {"morning.frame.x": 0.0, "morning.frame.ry": 0.0}
-    fit = identify(hexapod(), data, LeastSquares(), local=fixed(data, "morning.*", first))
+    fit = identify(
+        hexapod(),
+        data,
+        LeastSquares(),
+        options=FitOptions(nuisance=fixed(data, "morning.*", first)),
+    )
     assert fit.rank == 42
     right(fit, drift)
     free = identify(hexapod(), data, LeastSquares())
@@ -96,7 +101,9 @@ def test_a_base_that_drifts_is_re_measured_in_every_session():
     frames = [
         parts.frame_at(
             np.eye(4),
-            np.array([free.local.values[f"{s}.frame.{a}"] for a in parts.TURNS + parts.POSITION]),
+            np.array(
+                [free.nuisance.values[f"{s}.frame.{a}"] for a in parts.TURNS + parts.POSITION]
+            ),
         )
         for s in ("morning", "evening")
     ]
@@ -104,7 +111,7 @@ def test_a_base_that_drifts_is_re_measured_in_every_session():
     # 20 poses, five times over
     moved = geometry.log_so3(frames[1][:3, :3] @ frames[0][:3, :3].T)
     assert_allclose(moved, [0.0, 100 * URAD, 0.0], atol=5 * 20 * URAD)
-    wrong(identify(hexapod(), data, LeastSquares(), local=fixed(data, "*")))
+    wrong(identify(hexapod(), data, LeastSquares(), options=FitOptions(nuisance=fixed(data, "*"))))
 
 
 def test_a_station_that_was_moved_is_found_anew_and_not_taken_for_the_same():
@@ -141,7 +148,7 @@ def test_a_prior_on_a_frame_stands_between_a_free_and_a_fixed_one_and_is_weighed
     robot, truth, data = printed()
     local = collect_nuisance_parameters(data.observations, data.labels)
     free, held, known = (
-        identify(robot, data, LeastSquares(), local=one)
+        identify(robot, data, LeastSquares(), options=FitOptions(nuisance=one))
         for one in (
             local,
             local.with_prior("frame.*", 50 * UM),
@@ -149,20 +156,35 @@ def test_a_prior_on_a_frame_stands_between_a_free_and_a_fixed_one_and_is_weighed
         )
     )
     right(held, {"frame.x": 60 * UM})
-    assert np.isinf(free.sd).any()
-    assert np.isfinite(held.sd).all()
-    assert (known.sd <= held.sd * (1 + 1e-9)).all()
-    off = np.abs(held.estimate - truth.values[held.unknowns.places])
-    assert (off < 5 * held.sd).all()
+    assert np.isinf(free.standard_deviations).any()
+    assert np.isfinite(held.standard_deviations).all()
+    assert (known.standard_deviations <= held.standard_deviations * (1 + 1e-9)).all()
+    off = np.abs(held.estimate - truth.values[held.free_parameters.places])
+    assert (off < 5 * held.standard_deviations).all()
     # 60 um are thirty standard deviations of this one: a prior is a row like others, and its
     # residual counts
-    wrong(identify(robot, data, LeastSquares(), local=local.with_prior("frame.*", 2 * UM)))
+    wrong(
+        identify(
+            robot,
+            data,
+            LeastSquares(),
+            options=FitOptions(nuisance=local.with_prior("frame.*", 2 * UM)),
+        )
+    )
 
 
 def test_a_frame_fixed_where_it_is_not_is_found_out_where_the_machine_cannot_take_it_up():
     robot, _, data = printed()
-    right(identify(robot, data, LeastSquares(), local=fixed(data, "*", {"frame.x": 60 * UM})), {})
-    wrong(identify(robot, data, LeastSquares(), local=fixed(data, "*")))
+    right(
+        identify(
+            robot,
+            data,
+            LeastSquares(),
+            options=FitOptions(nuisance=fixed(data, "*", {"frame.x": 60 * UM})),
+        ),
+        {},
+    )
+    wrong(identify(robot, data, LeastSquares(), options=FitOptions(nuisance=fixed(data, "*"))))
 
 
 def test_a_probe_s_offset_is_found_on_planes_and_a_wrong_one_is_found_out():
@@ -180,7 +202,7 @@ def test_a_probe_s_offset_is_found_on_planes_and_a_wrong_one_is_found_out():
             hexapod(),
             data,
             LeastSquares(),
-            local=fixed(data, "probe.*", true | {"probe.x": 2.2e-3}),
+            options=FitOptions(nuisance=fixed(data, "probe.*", true | {"probe.x": 2.2e-3})),
         )
     )
 
@@ -197,6 +219,9 @@ def test_a_tool_s_offset_is_found_and_a_wrong_one_is_found_out():
     right(fit, true)
     wrong(
         identify(
-            hexapod(), data, LeastSquares(), local=fixed(data, "tool.*", true | {"tool.y": 1.1e-3})
+            hexapod(),
+            data,
+            LeastSquares(),
+            options=FitOptions(nuisance=fixed(data, "tool.*", true | {"tool.y": 1.1e-3})),
         )
     )

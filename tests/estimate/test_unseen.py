@@ -83,9 +83,9 @@ def test_a_fit_begins_where_a_target_is_not_seen_and_ends_where_it_is_hardly(sig
     fit = identify(hexapod(), data)
     assert fit.converged
     assert fit.rank == 42
-    assert chi2.cdf(fit.chi_square, fit.dof) < 0.9999
-    assert np.abs((fit.estimate - truth) / fit.sd).max() < 4.5  # of 42: 3e-4
-    assert np.abs(fit.local.estimate / fit.local.sd).max() < 4.0
+    assert chi2.cdf(fit.chi_square, fit.residual_test.dof) < 0.9999
+    assert np.abs((fit.estimate - truth) / fit.standard_deviations).max() < 4.5  # of 42: 3e-4
+    assert np.abs(fit.nuisance.estimate / fit.nuisance.sd).max() < 4.0
 
 
 def test_a_column_that_the_poses_take_up_whole_leaves_zeros():

@@ -328,7 +328,9 @@ def loss(name: str, constant: float | None = None) -> Any:
 
 def fit(machine: Robot, data: Data, how: Any = None, **options: Any) -> Fit:
     """Identify the free parameters."""
-    return estimate.identify(machine, data, how, **options)
+    names = {"drop": "excluded_poses", "local": "nuisance"}
+    given = {names.get(name, name): value for name, value in options.items()}
+    return estimate.identify(machine, data, how, options=estimate.FitOptions(**given))
 
 
 def polished(machine: Robot, data: Data, how: Any = None, **options: Any) -> Fit:
@@ -349,15 +351,19 @@ def report_fit(found: Fit, parts: bool = True) -> Report:
     """Report estimates, standard deviations and diagnostics; with `parts` own unknowns, poses and
     combinations, too.
     """
-    check = found.check
+    check = found.residual_test
     result: Report = {
         "names": list(found.names),
         "status": found.status.name,
         "rank": found.rank,
-        "fit": {"estimate": found.estimate, "sd": found.sd, "scale": found.tolerance},
-        "condition": found.condition,
-        "singular_values": found.singular_values,
-        "cost": found.cost_history[-1],
+        "fit": {
+            "estimate": found.estimate,
+            "sd": found.standard_deviations,
+            "scale": found.tolerance,
+        },
+        "condition": found.spectrum.condition,
+        "singular_values": found.spectrum.singular_values,
+        "cost": found.history.cost[-1],
         "chi_square": check.chi_square,
         "degrees": check.degrees,
         "dof": check.dof,
@@ -368,14 +374,16 @@ def report_fit(found: Fit, parts: bool = True) -> Report:
     }
     if not parts:
         return result
-    finite = np.isfinite(found.sd)
+    finite = np.isfinite(found.standard_deviations)
     result["half_widths"] = found.interval()[finite][:1]
-    result["weight"] = found.weight if (found.weight != 1.0).any() else "all poses count in full"
+    result["weight"] = (
+        found.pose_weights if (found.pose_weights != 1.0).any() else "all poses count in full"
+    )
     result["squares"] = {
         f"{i}_{r.kind}": (r.whitened**2).sum(axis=0) for i, r in enumerate(found.residuals)
     }
-    if len(found.local):
-        local = found.local
+    if len(found.nuisance):
+        local = found.nuisance
         # where an unknown is known only together with the machine, it stands where the search for a
         # start put it
         told, scale = (
@@ -385,16 +393,16 @@ def report_fit(found: Fit, parts: bool = True) -> Report:
         result["local_names"] = list(local.names)
         result["local_open"] = [bool(x) for x in local.is_unobservable]
         result["local"] = {"estimate": told, "sd": local.sd, "scale": scale}
-    if found.conflict is not None:
-        one = found.conflict
+    if found.prior_conflict is not None:
+        one = found.prior_conflict
         result["conflict"] = {
             "found": one.conflict,
             "statistic": one.statistic,
-            "spread": one.spread,
+            "spread": one.inflation,
             "p_value": one.p_value,
         }
-    if found.latent is not None:
-        at = found.latent
+    if found.poses is not None:
+        at = found.poses
         result["latent"] = {
             "pose": _pose(found.robot, at.poses),
             "readings": at.readings,
@@ -431,7 +439,7 @@ def _open(names: Sequence[str], combinations: Sequence[Any]) -> Report:
 def report_trials(machine: Robot, trials: Data, how: Any) -> Report:
     """Identify stacked trials at once."""
     found = estimate.identify_trials(machine, trials, how)
-    free = found.unknowns
+    free = found.free_parameters
     return {
         "status": found.status,
         "fit": {
@@ -481,7 +489,7 @@ def report_recalibration(
     """Calibrate again with an earlier fit as prior, and test for a change."""
     found, change = estimate.recalibrate(machine, data, earlier.posterior, limb)
     tested = {
-        "what": change.what,
+        "what": change.subject,
         "names": list(change.names),
         "moved": change.moved,
         "change": change.change,
@@ -932,5 +940,7 @@ def report_cmm_constraint_2011_surfaces(groups: int, points: int, noise: float) 
     study = plan_points(load_machine(), groups, points, AXES, 0, 0)
     q = study.layout.held(draw_true_machines(study.robot, 1e-3, 1, 0), noise, 0)
     data = forms.measurements(study.layout, q[0], noise)
-    found = estimate.identify(study.robot, data, estimate.MAP(), rank_tolerance=forms.RANK)
+    found = estimate.identify(
+        study.robot, data, estimate.MAP(), options=estimate.FitOptions(rank_tolerance=forms.RANK)
+    )
     return report_fit(found, parts=False)

@@ -13,7 +13,7 @@ import pytest
 
 import loopcal as lc
 from loopcal.diagnose import identifiability
-from loopcal.estimate import MAP, LeastSquares, identify
+from loopcal.estimate import MAP, FitOptions, LeastSquares, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import collect_information
 from loopcal.papers.cmm_constraint_2011.forms import RANK, covariance_difference, measurements
@@ -137,8 +137,7 @@ def test_both_forms_give_the_same_estimate_up_to_what_is_not_linear(layout, meth
             layout.robot,
             measurements(layout, q[0], noise),
             method,
-            rank_tolerance=RANK,
-            allow_fewer_equations=True,
+            options=FitOptions(rank_tolerance=RANK, allow_fewer_equations=True),
         )
         A = problem.whitened(np.zeros((1, 42)), np.zeros(1, dtype=int))[0][0, :, :42]
         unlike.append(float(np.linalg.norm(A @ (found.robot.values - paper) / MM)))

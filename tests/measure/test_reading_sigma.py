@@ -98,7 +98,7 @@ def test_one_exact_reading_among_redundant_ones_is_refused_as_a_limit_of_the_met
 def test_sigmas_that_drown_others_in_rounding_are_noted():
     robot, data = data_of("cable-4")
     usual = identify(robot, data, LeastSquares())
-    assert not any("standard deviations differ" in note for note in usual.notes)
+    assert not any("standard deviations differ" in note for note in map(str, usual.findings))
     extreme = identify(robot, replace(data, reading_sigma=1e-15), LeastSquares())
-    note = next(note for note in extreme.notes if "standard deviations differ" in note)
+    note = next(note for note in map(str, extreme.findings) if "standard deviations differ" in note)
     assert f"check the smallest, of readings {robot.actuators[0].name}" in note

@@ -22,7 +22,7 @@ from loopcal.diagnose import (
     identifiability,
     suggest_measurements,
 )
-from loopcal.estimate import Identification, LeastSquares, identify
+from loopcal.estimate import FitOptions, Identification, LeastSquares, identify
 from loopcal.io.formats import hangprinter
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import Imported, ImportOptions
@@ -101,17 +101,17 @@ def test_the_optimum_is_that_of_all_poses_as_explicit_unknowns(fit, answer):
     assert fit.converged
     assert fit.rank == 21
     assert answer.dof == 50
-    assert fit.dof == pytest.approx(50.0)
+    assert fit.residual_test.dof == pytest.approx(50.0)
     assert fit.chi_square == pytest.approx(answer.chi_square, rel=1e-6)
     # the sigmas of the robot file have seven digits
     assert (np.abs(fit.estimate * 1e3 - answer.values) / answer.sd).max() < 1e-5
-    np.testing.assert_allclose(fit.sd * 1e3, answer.sd, rtol=1e-5)
+    np.testing.assert_allclose(fit.standard_deviations * 1e3, answer.sd, rtol=1e-5)
     correlation = fit.covariance * 1e6 / np.outer(answer.sd, answer.sd)
     expected = answer.covariance / np.outer(answer.sd, answer.sd)
     np.testing.assert_allclose(correlation, expected, rtol=0, atol=1e-5)
-    assert fit.latent is not None
+    assert fit.poses is not None
     np.testing.assert_allclose(
-        fit.latent.poses[:, :3, 3] * 1e3, answer.poses, rtol=0, atol=1e-4
+        fit.poses.poses[:, :3, 3] * 1e3, answer.poses, rtol=0, atol=1e-4
     )  # [mm]
 
 
@@ -121,7 +121,9 @@ def distance_from_published(fit: Identification) -> tuple[np.ndarray, float]:
     """
     at = [fit.names.index(f"{line}.anchor.{axis}") for line in "ABCD" for axis in "xyz"]
     off = fit.estimate[at] - np.ravel(PUBLISHED) * 1e-3
-    return off / fit.sd[at], float(off @ np.linalg.solve(fit.covariance[np.ix_(at, at)], off))
+    return off / fit.standard_deviations[at], float(
+        off @ np.linalg.solve(fit.covariance[np.ix_(at, at)], off)
+    )
 
 
 def test_published_anchors_agree_one_by_one_and_not_together(fit, printer):
@@ -147,7 +149,7 @@ def test_published_anchors_agree_one_by_one_and_not_together(fit, printer):
     assert held.chi_square - fit.chi_square == pytest.approx(64.0, rel=0.05)
     # each alone says little of those that the data tell to 2 cm only, and more of x and y of the
     # line from above
-    half = 1.96 * fit.sd[ANCHORS] * 1e3
+    half = 1.96 * fit.standard_deviations[ANCHORS] * 1e3
     assert half.max() < 30.0  # [mm]
     assert half[[0, 9, 10]].max() < 5.0  # [mm]
 
@@ -155,7 +157,7 @@ def test_published_anchors_agree_one_by_one_and_not_together(fit, printer):
 def test_the_residual_is_a_third_of_a_millimetre_and_fits_the_stated_sigmas(fit, answer, printer):
     # chi-square of 50 degrees of freedom is between 32.4 and 71.4 in 95 % of data
     assert 32.4 < fit.chi_square < 71.4
-    assert not fit.check.failed
+    assert not fit.residual_test.failed
     rms = np.sqrt((answer.lines**2).mean(axis=0))
     assert rms.max() < 0.35  # [mm]
     (readings,) = (part for part in fit.residuals if part.kind == "readings")
@@ -177,11 +179,13 @@ def test_errors_of_readings_leave_out_dropped_poses_and_are_none_where_readings_
     printer, fit
 ):
     robot, data = printer
-    errors = compute_reading_errors(identify(robot, data, LeastSquares(), drop=["sample19"]), data)
+    errors = compute_reading_errors(
+        identify(robot, data, LeastSquares(), options=FitOptions(excluded_poses=["sample19"])), data
+    )
     assert errors is not None
     assert {error.count for error in errors} == {43}
     assert "sample19" not in {error.pose for error in errors}
-    assert compute_reading_errors(replace(fit, latent=None), data) is None
+    assert compute_reading_errors(replace(fit, poses=None), data) is None
 
 
 def test_no_row_is_doubted_and_a_wrong_motor_angle_is(printer, fit):
@@ -219,7 +223,9 @@ def test_rows_of_a_file_in_which_nothing_was_measured_are_no_degrees_of_freedom(
     )
     np.testing.assert_array_equal(theirs.degrees, ours.degrees)
     np.testing.assert_allclose(theirs.distance, ours.distance, rtol=1e-6, atol=1e-9)
-    estimated = examine_fit(identify(robot, padded, noise="estimated"), padded).outliers
+    estimated = examine_fit(
+        identify(robot, padded, options=FitOptions(noise="estimated")), padded
+    ).outliers
     assert estimated.outliers == ()
     assert 0.7 < estimated.scale < 1.3
 
@@ -229,7 +235,7 @@ def test_no_start_far_off_changes_the_optimum(printer, fit):
     rng = np.random.default_rng(3)
     for _ in range(3):
         off = rng.uniform(-60e-3, 60e-3, 21) * np.isin(np.arange(21), ANCHORS)
-        again = identify(robot, data, LeastSquares(), start=robot.values + off)
+        again = identify(robot, data, LeastSquares(), options=FitOptions(start=robot.values + off))
         assert again.converged
         np.testing.assert_allclose(
             again.estimate, fit.estimate, rtol=0, atol=1e-6
@@ -272,8 +278,8 @@ def test_the_models_of_the_spools_fit_as_the_page_says(models, root):
             float(chi_square), abs=0.06
         )  # one decimal is printed
         assert fit.estimate[D] * 1e3 == pytest.approx(float(height), abs=0.6)  # no decimal [mm]
-        assert 1.96e3 * fit.sd[D] == pytest.approx(float(half), abs=0.6)
-        if fit.check.failed:
+        assert 1.96e3 * fit.standard_deviations[D] == pytest.approx(float(half), abs=0.6)
+        if fit.residual_test.failed:
             assert joint == "-"
         else:
             assert distance_from_published(fit)[1] == pytest.approx(float(joint), abs=0.6)
@@ -289,7 +295,9 @@ def test_the_build_up_of_d_differs_and_no_more_is_asked_for(models):
 
     def fall(small: Any, large: Any) -> float:
         after = models[large]
-        return (models[small].chi_square - after.chi_square) / (after.chi_square / after.dof)
+        return (models[small].chi_square - after.chi_square) / (
+            after.chi_square / after.residual_test.dof
+        )
 
     assert fall(((), 1), (("ABCD",), 1)) > 200.0
     assert fall((("ABCD",), 1), (("ABC", "D"), 1)) > 50.0  # D differs
@@ -299,14 +307,14 @@ def test_the_build_up_of_d_differs_and_no_more_is_asked_for(models):
     shared, own = models[("ABC", "D"), 1], models[tuple("ABCD"), 1]
     values, half = (
         {n: v * 1e3 for n, v in zip(shared.names, x, strict=True)}
-        for x in (shared.estimate, 1.96 * shared.sd)
+        for x in (shared.estimate, 1.96 * shared.standard_deviations)
     )
     assert (values["ABC.buildup"], half["ABC.buildup"]) == pytest.approx(
         (0.120, 0.014), abs=6e-4
     )  # [mm]
     assert (values["D.buildup"], half["D.buildup"]) == pytest.approx((0.053, 0.008), abs=6e-4)
     narrower = {
-        n: shared.sd[shared.names.index(n)] / own.sd[i]
+        n: shared.standard_deviations[shared.names.index(n)] / own.standard_deviations[i]
         for i, n in enumerate(own.names)
         if "anchor" in n
     }
@@ -319,7 +327,7 @@ def test_the_published_anchors_are_those_of_one_build_up_and_four_radii(models):
     together = {
         model: distance_from_published(fit)[1]
         for model, fit in models.items()
-        if not fit.check.failed
+        if not fit.residual_test.failed
     }
     assert min(together, key=together.__getitem__) == (("ABCD",), 4)
     assert together[("ABCD",), 4] < 21.0
@@ -424,8 +432,8 @@ def test_known_positions_at_the_edge_are_worth_more_than_high_ones(printer, fit)
     """
     data = printer[1]
     (seen,) = data.observations
-    assert fit.latent is not None
-    at = fit.latent.poses[:, :3, 3]
+    assert fit.poses is not None
+    at = fit.poses.poses[:, :3, 3]
 
     def half_of(further: np.ndarray) -> np.ndarray:
         cells = np.full((44, 3), np.nan)
@@ -434,7 +442,7 @@ def test_known_positions_at_the_edge_are_worth_more_than_high_ones(printer, fit)
         again = identify(fit.robot, replace(data, observations=(told,)), LeastSquares())
         return (
             1.96e3
-            * again.sd[
+            * again.standard_deviations[
                 [NAMES.index(n) for n in ("A.anchor.y", "B.anchor.x", "C.anchor.x", "D.anchor.z")]
             ]
         )
@@ -450,8 +458,8 @@ def test_the_examples_truth_lies_in_its_intervals(tmp_path, root):
     found = json.loads((root / "examples" / "cable-robot" / "samples.json").read_text("utf-8"))
     robot, data = machine(tmp_path, found, 0.5)
     fit = identify(robot, data, LeastSquares())
-    assert not fit.check.failed
-    off = (fit.estimate * 1e3 - TRUTH) / (fit.sd * 1e3)
+    assert not fit.residual_test.failed
+    off = (fit.estimate * 1e3 - TRUTH) / (fit.standard_deviations * 1e3)
     assert (
         np.abs(off).max() < 3.1
     )  # the largest of 21 standard normal numbers is below 3.1 in 96 % of cases
@@ -480,7 +488,7 @@ def test_over_forty_machines_intervals_hold_the_truth_as_often_as_stated(tmp_pat
         fit = identify(robot, data, LeastSquares())
         assert fit.converged
         error = fit.estimate - TRUTH * 1e-3
-        held += np.abs(error) < 1.96 * fit.sd
+        held += np.abs(error) < 1.96 * fit.standard_deviations
         total += float(error @ np.linalg.solve(fit.covariance, error))
     assert 652.0 < total < 972.0
     assert held.min() >= 32

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from loopcal.apply import validate
-from loopcal.estimate import identify
+from loopcal.estimate import FitOptions, identify
 from loopcal.measure import Component, Measurements, Observations
 from loopcal.mechanism import Mechanism, PoseRecord, build
 from loopcal.mechanism.families.linear_delta import LinearDelta
@@ -67,7 +67,7 @@ def heights(record: dict) -> Measurements:
 @pytest.mark.parametrize("off", [0.0, 40 * MM, -40 * MM])
 def test_the_answer_of_the_firmware_comes_back_from_starts_far_off(records, name, off):
     record = records[name]
-    fit = identify(printer(record, off), heights(record), noise="estimated")
+    fit = identify(printer(record, off), heights(record), options=FitOptions(noise="estimated"))
     stored = printer(record)
     assert fit.converged
     assert fit.rank == 6
@@ -79,13 +79,10 @@ def test_the_answer_of_the_firmware_comes_back_from_starts_far_off(records, name
 
 def test_one_degree_of_freedom_gives_intervals_only_with_the_sigma_of_the_probe(records):
     record = records["cupsster"]
-    estimated = identify(printer(record), heights(record), noise="estimated")
-    assert estimated.dof == len(record["heights"]) - 6 == 1
-    assert (
-        "one degree of freedom is too few for intervals unless the instrument's sigma is given"
-        in estimated.notes
-    )
-    assert np.isfinite(identify(printer(record), heights(record)).sd).all()
+    estimated = identify(printer(record), heights(record), options=FitOptions(noise="estimated"))
+    assert estimated.residual_test.dof == len(record["heights"]) - 6 == 1
+    assert "noise.too-few-degrees" in {finding.code for finding in estimated.findings}
+    assert np.isfinite(identify(printer(record), heights(record)).standard_deviations).all()
 
 
 def test_the_factory_default_is_flagged_as_not_calibrated(records):
@@ -93,7 +90,9 @@ def test_the_factory_default_is_flagged_as_not_calibrated(records):
     # can
     for name, record in records.items():
         data = heights(record)
-        found = validate(identify(printer(record), data, noise="estimated"), data)
+        found = validate(
+            identify(printer(record), data, options=FitOptions(noise="estimated")), data
+        )
         if "factory" in name:
             assert found.improvement() > 3.0
             refused = validate(printer(record), data, limit_position=0.2 * MM)

@@ -174,7 +174,7 @@ def _covariance_roots(
     """
     directions = known.directions.copy()
     if gauge == "left out":
-        directions[:, ~known.seen] = motions.kept
+        directions[:, ~known.determined] = motions.kept
     infinite = np.isinf(known.variance)
     return directions[:, ~infinite] * np.sqrt(known.variance[~infinite]), directions[:, infinite]
 

@@ -76,7 +76,7 @@ def simulate_accuracy(
     closed = [(state.status == Status.CONVERGED).all(axis=1) for state in states]
     valid = fits.converged & closed[0] & closed[1]
     errors = geometry.pose_difference(states[0].T[valid], states[1].T[valid])
-    free, first = fits.unknowns, int(np.flatnonzero(valid)[0])
+    free, first = fits.free_parameters, int(np.flatnonzero(valid)[0])
     trial = np.array([first])
     identified = robot.with_values(fits.values[first])
     known = compute_posterior(

@@ -253,7 +253,7 @@ def _kept_setup(
     ------
     DataError : a name in `refit` belongs to nothing in the data.
     """
-    local = fit.local if isinstance(fit, Identification) else None
+    local = fit.nuisance if isinstance(fit, Identification) else None
     known_before, known_after = known
     if known_before is None:
         is_own = local is not None and before is None and known_after is None

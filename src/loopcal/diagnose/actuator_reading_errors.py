@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.estimate.excluded_poses import exclude_poses
+from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.result import Identification
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism, joints_from_readings
@@ -62,18 +62,18 @@ def compute_reading_errors(
     ----------
     fit : an identification. data : the measurements it was made from.
     """
-    if fit.latent is None:
+    if fit.poses is None:
         return None
-    recorded, found = exclude_poses(data, fit.dropped).readings, fit.latent.readings
+    recorded, found = exclude_poses(data, fit.excluded_poses).readings, fit.poses.readings
     believed = (
-        np.isfinite(fit.latent.sigma)
-        & (fit.latent.sigma > 0.0)
+        np.isfinite(fit.poses.sigma)
+        & (fit.poses.sigma > 0.0)
         & np.isfinite(recorded)
         & np.isfinite(found)
     )
     off = np.where(believed, recorded - found, np.nan)
     moved = np.where(believed, _joints(fit.robot, recorded) - _joints(fit.robot, found), np.nan)
-    drives, labels, errors = _driven(fit.robot), fit.latent.labels, []
+    drives, labels, errors = _driven(fit.robot), fit.poses.labels, []
     for i, actuator in enumerate(fit.robot.actuators):
         if not believed[:, i].any():
             continue

@@ -61,13 +61,13 @@ def estimate_calibration_gain(fit: Identification, data: Measurements) -> Calibr
     fit : an identification; its tolerances must be stated. data : the measurements it was made
         from, or other readings.
     """
-    free = fit.unknowns
+    free = fit.free_parameters
     if free.assumed.any():
         missing = f"{int(free.assumed.sum())} parameters have no tolerance"
         return _open(f"{missing}; state them")
-    if fit.check.failed:
+    if fit.residual_test.failed:
         return _open("the residual does not fit the stated noise")
-    known = data.readings if fit.latent is None else fit.latent.readings[fit.latent.kept]
+    known = data.readings if fit.poses is None else fit.poses.readings[fit.poses.kept]
     chosen = np.unique(np.linspace(0, len(known) - 1, min(POSES, len(known))).astype(int))
     readings, values = known[None, chosen], fit.robot.values[None]
     state = forward_trials(fit.robot, values, readings)

@@ -46,7 +46,7 @@ def correlation(fit: Identification) -> FloatArray:
     """Return the correlation matrix (p, p) of the errors; nan where a parameter's variance is
     infinite or not given.
     """
-    sd = fit.sd
+    sd = fit.standard_deviations
     known = np.isfinite(sd) & (sd > 0.0)
     scale = np.where(known, 1.0 / np.where(known, sd, 1.0), np.nan)
     return np.where(known[:, None] & known, fit.covariance, np.nan) * scale[:, None] * scale

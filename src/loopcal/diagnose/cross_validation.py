@@ -21,6 +21,7 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import Method
+from loopcal.estimate.options import FitOptions
 from loopcal.estimate.problem import problem_of
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
@@ -128,8 +129,8 @@ def cross_validate(
                 robot,
                 data.take(np.setdiff1d(np.arange(data.n_poses), held)),
                 method,
-                noise=noise,
                 loss=loss,
+                options=FitOptions(noise=noise),
             )
             fitted, converged = fit.robot, converged and fit.converged
         if (

@@ -58,7 +58,7 @@ class FrameMotions:
 
 def find_frame_motions(known: Posterior) -> FrameMotions:
     """Take the motions of frames out of the directions that the rows of a fit do not determine."""
-    null = known.directions[:, ~known.seen]
+    null = known.directions[:, ~known.determined]
     if null.shape[1] == 0:
         return FrameMotions(null, (), 0)
     D, base, platform = _motions(known)
@@ -72,7 +72,7 @@ def find_frame_motions(known: Posterior) -> FrameMotions:
     count = int((np.linalg.svd(moving, compute_uv=False) > limit).sum()) if gauge.shape[1] else 0
     frames = _frames(moving, base, platform, limit) if count else ()
     return FrameMotions(
-        null @ _without(gauge, np.isinf(known.variance[~known.seen])), frames, count
+        null @ _without(gauge, np.isinf(known.variance[~known.determined])), frames, count
     )
 
 

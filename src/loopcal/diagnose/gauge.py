@@ -106,11 +106,11 @@ def compare_with_truth(fit: Identification, truth: ArrayLike) -> TruthComparison
             "give"
             f" {whole} values for all parameters of {fit.robot.name!r}, or {p} for the free ones"
         )
-    true = true[fit.unknowns.places] if len(true) == whole else true
+    true = true[fit.free_parameters.places] if len(true) == whole else true
     raw = fit.estimate - true
     z = raw / fit.tolerance
     known = fit.posterior
-    open_ = (known.unit / fit.tolerance)[:, None] * known.directions[:, ~known.seen]
+    open_ = (known.unit / fit.tolerance)[:, None] * known.directions[:, ~known.determined]
     basis = np.linalg.qr(open_)[0]
     z = z - basis @ (basis.T @ z)
     return TruthComparison(fit.names, raw, z * fit.tolerance, z, fit.unidentifiable)

@@ -135,8 +135,8 @@ class Identifiability:
                 f"singular values around the cut: {_numbers(self.counted)} | {_numbers(self.cut)}"
                 f" ({self.gap:.1e} times below the next)"
             )
-            lines += [f"not identifiable: {combination}" for combination in self.unidentifiable]
-        lines += [f"hardly identifiable: {combination}" for combination in self.weak]
+            lines += [str(combination) for combination in self.unidentifiable]
+        lines += [str(combination) for combination in self.weak]
         if (more := self.rank - self.improved - len(self.weak)) > 0:
             lines.append(f"{more} more directions are known no better than their tolerance")
         return [*lines, *(f"note: {note}" for note in self.notes)]
@@ -235,7 +235,7 @@ def summarize_identifiability(
     null = decomposition.null_space()
     improved = int((s[:rank] > 1.0).sum())
     weakest = range(rank - 1, max(improved, rank - WEAKEST) - 1, -1)
-    note = free.note()
+    note = next(map(str, free.findings()), None)
     return Identifiability(
         n_parameters=len(free),
         n_equations=equations,

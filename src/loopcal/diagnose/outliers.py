@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.diagnose.influence import Influence, compute_influence
-from loopcal.estimate.excluded_poses import exclude_poses
+from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.inference.null_space import listed
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.problem import Problem, problem_of
@@ -179,11 +179,11 @@ def find_outliers(fit: Identification, data: Measurements, level: float = 0.05) 
     fit : the identification, with or without a loss. data : the measurements it was made from.
     level : probability of naming any block where none is wrong.
     """
-    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.dropped)
-    problem = problem_of(fit.unknowns, data)
+    data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
+    problem = problem_of(fit.free_parameters, data)
     numbers, member = np.unique(linked_blocks(data), return_inverse=True)
     labels = tuple(tuple(np.array(data.labels)[member == i].tolist()) for i in range(len(numbers)))
-    z = fit.unknowns.deviation(fit.robot.values[None])
+    z = fit.free_parameters.deviation(fit.robot.values[None])
 
     begin = problem.linearize(z, problem.start(z)).next_start
 
@@ -194,7 +194,7 @@ def find_outliers(fit: Identification, data: Measurements, level: float = 0.05) 
     tested = int((whole.found.degrees > 0).sum())
     alone = -np.expm1(np.log1p(-level) / max(tested, 1))
     doubted_by_loss = np.zeros(len(numbers), dtype=bool)
-    doubted_by_loss[member] = fit.weight < 0.5
+    doubted_by_loss[member] = fit.pose_weights < 0.5
     start = ask(doubted_by_loss) if doubted_by_loss.any() else whole
     visited = _search(
         ask, whole, start if _bearable(start, whole) else whole, alone, int(MOST * tested)
@@ -237,14 +237,19 @@ def _ask(
     kept = problem.weighted(weight[member]).linearize(z, start)
     method, p = fit.method, problem.parameters
     d: Decomposition = decompose(
-        kept.factor, kept.equations, z, method.scale(p), fit.rank_tolerance, method.flat(p)
+        kept.factor,
+        kept.equations,
+        z,
+        method.scale(p),
+        fit.spectrum.tolerance,
+        method.unpenalized(p),
     )
     penalty = np.array(method.penalty(d), dtype=np.float64)
     at = d.deviation(d.solution(penalty))
     found = compute_influence(problem, kept, member, d, penalty, weight, at)
     there = (found.degrees > 0) & ~aside
     scale = 1.0
-    if fit.noise == "estimated":
+    if fit.residual_test.noise == "estimated":
         degrees = found.degrees[there].astype(np.float64)
         scale = (
             estimate_scale_of(np.sqrt(found.distance[there]), degrees) if there.any() else np.nan
@@ -362,7 +367,7 @@ def _sentence(
         return "no block of rows can be checked: each determines parameters that no other sees; measure more"
     if tested == 1:
         return "all rows belong to one block, which has no others to be compared with"
-    if fit.noise == "estimated" and round(fit.dof) <= 1:
+    if fit.residual_test.noise == "estimated" and round(fit.residual_test.dof) <= 1:
         return "no block of rows can be checked: one degree of freedom tells the noise or a wrong row; state sigma or measure more"
     named = f"{len(outliers)} of {tested} blocks of rows do not fit the others (chance names one in {level:.0%} of right data)"
     advice = "look at them; leave them out with drop, or fit with a loss"
@@ -374,6 +379,6 @@ def _sentence(
         return f"{found}{unsure} of {tested} blocks of rows disagree, and which is wrong cannot be told: measure more poses"
     if outliers:
         return f"{named}: {advice}"
-    if fit.check.failed:
+    if fit.residual_test.failed:
         return f"none of {tested} blocks of rows stands out: what the noise does not explain is spread over them"
     return f"all {tested} blocks of rows fit each other (false alarm in {level:.0%} of data sets)"

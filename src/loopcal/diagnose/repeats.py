@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.estimate.excluded_poses import exclude_poses
-from loopcal.estimate.inference.residual_test import DOUBT
+from loopcal.estimate.fit_input import exclude_poses
+from loopcal.estimate.inference.residual_test import SIGNIFICANCE
 from loopcal.estimate.problem import problem_of
 from loopcal.estimate.result import Identification
 from loopcal.measure import Measurements, fill_in_reading_sigma
@@ -75,11 +75,11 @@ def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
             "readings are uncertain, so poses of equal readings differ, and repeats are no pure "
             "error"
         )
-    data = exclude_poses(data, fit.dropped)
+    data = exclude_poses(data, fit.options.excluded_poses)
     member, times = repeated(data.readings)
     pure, degrees = _pure_error(fit, data, member)
-    left = float(fit.cost_history[-1]) - pure
-    lack_degrees = fit.dof - degrees
+    left = float(fit.history.cost[-1]) - pure
+    lack_degrees = fit.residual_test.dof - degrees
     if degrees == 0:
         return _open(
             "no pose was measured twice, so pure error cannot be told from a wrong model; repeat "
@@ -87,7 +87,7 @@ def check_lack_of_fit(fit: Identification, data: Measurements) -> LackOfFit:
         )
     scale = float(np.sqrt(pure / degrees))
     groups = int((times > 1).sum())
-    if fit.weight.min(initial=1.0) < 1.0:
+    if fit.pose_weights.min(initial=1.0) < 1.0:
         return _open(
             "weights by residuals: there is no test of the lack of fit",
             groups,
@@ -130,8 +130,8 @@ def repeated(readings: FloatArray) -> tuple[IntArray, IntArray]:
 
 def _pure_error(fit: Identification, data: Measurements, member: IntArray) -> tuple[float, int]:
     """Sum of squares between repeats, and its degrees of freedom; each kind has means of its own."""
-    problem = problem_of(fit.unknowns, data)
-    z = fit.unknowns.deviation(fit.robot.values[None])
+    problem = problem_of(fit.free_parameters, data)
+    z = fit.free_parameters.deviation(fit.robot.values[None])
     total, degrees = 0.0, 0
     residuals = problem.residuals(z, problem.solve(z, problem.start(z)))
     for rows, found in zip(problem.rows, residuals, strict=True):
@@ -166,8 +166,8 @@ def _sentence(ratio: float, p_value: float, scale: float, degrees: int) -> str:
     from scipy.special import chdtrc
 
     tail = float(chdtrc(degrees, scale**2 * degrees))
-    if tail < DOUBT:
+    if tail < SIGNIFICANCE:
         return f"{sentence}; repeats differ by {scale:.3g} times the stated sigma"
-    if tail > 1.0 - DOUBT:
+    if tail > 1.0 - SIGNIFICANCE:
         return f"{sentence}; repeats differ by only {scale:.3g} of the stated sigma"
     return sentence

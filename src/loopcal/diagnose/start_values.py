@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.estimate.inference.residual_test import DOUBT, FEWEST_DEGREES
+from loopcal.estimate.inference.residual_test import FEWEST_DEGREES, SIGNIFICANCE
 from loopcal.estimate.result import Identification
 
 NOTHING = 1e-3
@@ -69,7 +69,7 @@ def check_start_values(fit: Identification) -> StartCheck:
     -------
     StartCheck
     """
-    first, last = float(fit.cost_history[0]), float(fit.cost_history[-1])
+    first, last = float(fit.history.cost[0]), float(fit.history.cost[-1])
     rows = sum(int(np.isfinite(r.raw).sum()) for r in fit.residuals)
     before, after = np.sqrt(first / rows), np.sqrt(last / rows)
     if not fit.converged:
@@ -90,13 +90,13 @@ def check_start_values(fit: Identification) -> StartCheck:
         if after > 0.0
         else "the fit leaves no residual"
     )
-    if p_value < DOUBT:
+    if p_value < SIGNIFICANCE:
         sentence = f"the robot file's geometry is NOT calibrated to these rows: {ratio}, which noise does not explain"
         return StartCheck(StartVerdict.NOT_CALIBRATED, before, after, p_value, sentence)
-    if fit.dof < FEWEST_DEGREES and not _trusted(fit):
+    if fit.residual_test.dof < FEWEST_DEGREES and not _trusted(fit):
         sentence = f"the robot file's geometry: {ratio}; whether noise explains that can only be said with its true sigma"
         return StartCheck(StartVerdict.OPEN, before, after, p_value, sentence)
-    if fit.check.failed:
+    if fit.residual_test.failed:
         sentence = f"the robot file's geometry: {ratio}; neither fits the stated noise, so which is better cannot be said"
         return StartCheck(StartVerdict.OPEN, before, after, p_value, sentence)
     sentence = f"the robot file's geometry is as good as the fit within the noise ({ratio})"
@@ -105,7 +105,7 @@ def check_start_values(fit: Identification) -> StartCheck:
 
 def _trusted(fit: Identification) -> bool:
     """Whether the noise is stated, and explains what the fit leaves (or nothing is left to tell)."""
-    return fit.noise == "given" and not fit.check.failed
+    return fit.residual_test.noise == "given" and not fit.residual_test.failed
 
 
 def _p_value(fit: Identification, gain: float, last: float) -> float:
@@ -116,6 +116,8 @@ def _p_value(fit: Identification, gain: float, last: float) -> float:
 
     if _trusted(fit):
         return float(chdtrc(fit.rank, gain))
-    if fit.dof < 1.0 or last <= 0.0:
+    if fit.residual_test.dof < 1.0 or last <= 0.0:
         return float("nan")
-    return float(fdtrc(fit.rank, fit.dof, gain / fit.rank / (last / fit.dof)))
+    return float(
+        fdtrc(fit.rank, fit.residual_test.dof, gain / fit.rank / (last / fit.residual_test.dof))
+    )

@@ -83,7 +83,7 @@ def stored_answer(robot: Mechanism, measured: Measurements) -> StoredAnswer | No
         return None  # fewer probes than numbers, or a geometry that cannot reach them
     if not fit.converged or fit.rank < len(fit.names):
         return None
-    return StoredAnswer(float(fit.cost_history[0]), float(fit.cost_history[-1]), tuple(_moved(fit)))
+    return StoredAnswer(float(fit.history.cost[0]), float(fit.history.cost[-1]), tuple(_moved(fit)))
 
 
 def _weighed(measured: Measurements) -> Measurements:
@@ -103,7 +103,7 @@ def _weighed(measured: Measurements) -> Measurements:
 def _moved(fit: Identification) -> list[tuple[str, float, float]]:
     """Parameters that the optimum has elsewhere, by name."""
     unit = np.array([np.pi / 180.0 if name.endswith(".angle") else MM for name in fit.names])
-    stored = fit.initial.values[fit.unknowns.places] / unit
+    stored = fit.initial.values[fit.free_parameters.places] / unit
     best = fit.estimate / unit
     return [
         (name, float(one), float(other))

@@ -10,6 +10,7 @@ from loopcal.estimate.inference.null_space import Combination as Combination
 from loopcal.estimate.inference.posterior import Posterior as Posterior
 from loopcal.estimate.inference.prior import Prior as Prior
 from loopcal.estimate.inference.prior import prior_from as prior_from
+from loopcal.estimate.inference.residual_test import ResidualTest as ResidualTest
 from loopcal.estimate.methods.losses import Huber as Huber
 from loopcal.estimate.methods.losses import Tukey as Tukey
 from loopcal.estimate.methods.penalties import MAP as MAP
@@ -21,6 +22,7 @@ from loopcal.estimate.methods.prior_conflict import PriorConflict as PriorConfli
 from loopcal.estimate.methods.regularization_rules import GCV as GCV
 from loopcal.estimate.methods.regularization_rules import MarginalLikelihood as MarginalLikelihood
 from loopcal.estimate.methods.regularization_rules import TruncationGCV as TruncationGCV
+from loopcal.estimate.options import FitOptions as FitOptions
 from loopcal.estimate.recalibration import Change as Change
 from loopcal.estimate.recalibration import recalibrate as recalibrate
 from loopcal.estimate.result import Identification as Identification

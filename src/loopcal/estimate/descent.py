@@ -364,7 +364,7 @@ class _FilteredDescent:
         """Return the points of a linearization."""
         p, method = self.problem.parameters, self.method
         decomposition = decompose(
-            factor, equations, z, method.scale(p), self.tolerance, method.flat(p)
+            factor, equations, z, method.scale(p), self.tolerance, method.unpenalized(p)
         )
         penalty = np.array(method.penalty(decomposition), dtype=np.float64)
         return _Point(z, cost, decomposition, penalty, start)

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The unit in which each parameter's deviation is counted: its tolerance, or a stated default where
-it has none.
+"""The free parameters of a robot, each in units of its tolerance.
 
-Rank, null directions, the smallest deviation and every filter are decided in these units, so they
-are part of the result and said in the output.
+Rank, null space, the smallest deviation and every penalty depend on these units, so they are part
+of the result. Where no tolerance is stated, a default one scales the parameter.
 """
 
 from __future__ import annotations
@@ -12,37 +11,43 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.parameters import Parameter
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
-DEFAULT = 1e-3
-"""Tolerance where none is stated: this share of the robot's size for lengths, this many radians,
-this ratio.
+DEFAULT_TOLERANCE = 1e-3
+"""Tolerance where none is stated: this share of the robot's size for lengths, this many radians for
+angles, this value for ratios.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class FreeParameters:
-    """The free parameters of a robot as the estimators see them: e = nominal + tolerance * z.
+    """The free parameters as estimation uses them: value = nominal + tolerance * z.
 
     Attributes
     ----------
     robot : Mechanism; fixed parameters keep its values.
     places : (p,) positions of the free parameters in the robot's table.
     nominal, tolerance : (p,) [SI].
-    assumed : (p,) where the tolerance is the default.
+    assumed : (p,) True where the tolerance is the default one.
     """
 
     robot: Mechanism
-    places: np.ndarray
+    places: IntArray
     nominal: FloatArray
     tolerance: FloatArray
-    assumed: np.ndarray
+    assumed: BoolArray
 
     def __len__(self) -> int:
         return len(self.places)
+
+    def __repr__(self) -> str:
+        """Return the robot's name and the number of free parameters."""
+        total = len(self.robot.parameters)
+        return f"<FreeParameters of {self.robot.name}: {len(self)} of {total}>"
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -51,57 +56,55 @@ class FreeParameters:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names in order."""
         return tuple(parameter.name for parameter in self.parameters)
 
     def values(self, deviation: FloatArray) -> FloatArray:
-        """Return all parameter values (t, p of the robot) at deviations z (t, p)."""
+        """Return all values (t, p of the robot) [SI] at deviations z (t, p)."""
         values = np.repeat(self.robot.values[None], len(deviation), axis=0)
         values[:, self.places] = self.nominal + self.tolerance * deviation
         return values
 
     def deviation(self, values: FloatArray) -> FloatArray:
-        """Return the deviations z (t, p) of all parameter values (t, p of the robot)."""
+        """Return the deviations z (t, p) of all values (t, p of the robot) [SI]."""
         return (values[:, self.places] - self.nominal) / self.tolerance
 
     def display(self) -> tuple[FloatArray, tuple[str, ...]]:
-        """Return factor to SI (p,) and symbol of the unit in which each parameter is shown: that of
-        the robot's file.
+        """Return the factor to SI (p,) and the symbol of the unit in which each one is shown: that
+        of the robot's file.
         """
-        symbols = [
-            self.robot.units.get(q.dimension, DISPLAY_UNITS[q.dimension].symbol)
-            for q in self.parameters
-        ]
-        return np.array([find_unit(symbol).factor_to_si for symbol in symbols]), tuple(symbols)
+        symbols = tuple(self._symbol(parameter.dimension) for parameter in self.parameters)
+        return np.array([find_unit(symbol).factor_to_si for symbol in symbols]), symbols
 
-    def note(self) -> str | None:
-        """Return the sentence that says which tolerances were assumed; None where all are stated."""
+    def findings(self) -> tuple[Finding, ...]:
+        """Return a finding on default tolerances; nothing where all tolerances are stated."""
         count = int(self.assumed.sum())
         if count == 0:
-            return None
-        shown = []
+            return ()
+        assumed = []
         for dimension in Dimension:
-            chosen = [
-                i
-                for i, p in enumerate(self.parameters)
-                if self.assumed[i] and p.dimension is dimension
-            ]
-            if chosen:
-                symbol = self.robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol)
-                value = self.tolerance[chosen[0]] / find_unit(symbol).factor_to_si
-                shown.append(f"{value:.4g} {symbol} for {dimension.value}s")
+            chosen = [p.dimension is dimension for p in self.parameters] & self.assumed
+            if chosen.any():
+                symbol = self._symbol(dimension)
+                value = float(self.tolerance[chosen][0]) / find_unit(symbol).factor_to_si
+                assumed.append(Quantity(value, "" if symbol == "1" else symbol))
         return (
-            f"{count} of {len(self)} parameters have no tolerance; assumed: {', '.join(shown)}"
-            f" (a thousandth of the robot's size, of a radian, of one)"
+            report_finding(
+                "fit.default-tolerances", count=count, total=len(self), assumed=tuple(assumed)
+            ),
         )
+
+    def _symbol(self, dimension: Dimension) -> str:
+        """Return the symbol of the unit in which the robot's file shows a dimension."""
+        return self.robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol)
 
 
 def select_free_parameters(robot: Mechanism) -> FreeParameters:
-    """Return the free parameters of a robot with the unit of each."""
+    """Return the free parameters of a robot with their tolerances, stated or default."""
     table = robot.parameters
     places = np.flatnonzero(table.free)
-    default = {Dimension.LENGTH: DEFAULT * robot.size}
+    default = {Dimension.LENGTH: DEFAULT_TOLERANCE * robot.size}
     assumed = np.isnan(table.tolerance[places])
-    fallback = np.array([default.get(table.dimensions[i], DEFAULT) for i in places])
+    fallback = np.array([default.get(table.dimensions[i], DEFAULT_TOLERANCE) for i in places])
     tolerance = np.where(assumed, fallback, table.tolerance[places])
     return FreeParameters(robot, places, table.nominal[places], tolerance, assumed)

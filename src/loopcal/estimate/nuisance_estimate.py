@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.estimate.inference.null_space import Combination, listed, sparsify_basis
+from loopcal.estimate.inference.null_space import Combination, sparsify_basis
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.nuisance import NuisanceElimination
 from loopcal.findings import Finding, report_finding
@@ -167,7 +167,7 @@ def estimate_nuisance(
 def add_followers(
     combinations: tuple[Combination, ...], null: FloatArray, nuisance: NuisanceEstimate
 ) -> tuple[Combination, ...]:
-    """Add the frames and targets that change with unidentifiable combinations to their meaning.
+    """Add to unidentifiable combinations the frames and targets that change with them.
 
     The combinations must be those that describe the null space (p, d).
     """
@@ -178,10 +178,7 @@ def add_followers(
     described = []
     for combination, moved in zip(combinations, changed > limit, strict=True):
         names = _owners(n for n, m in zip(nuisance.names, moved, strict=True) if m)
-        verb = "moves" if len(names) == 1 else "move"
-        follows = f"{listed(names)} {verb} with it" if names else ""
-        meaning = ", and ".join(part for part in (combination.meaning, follows) if part)
-        described.append(replace(combination, meaning=meaning))
+        described.append(replace(combination, nuisance=tuple(names)))
     return tuple(described)
 
 

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibrate a machine again: keep what the earlier calibration knew, and say whether the machine is
-still the same.
+"""Calibrate a machine again: keep what the earlier calibration knows, and test whether the machine
+has changed.
 
-Two fits of the new rows and the earlier posterior tell: one that keeps all parameters as they were,
-one that says nothing about those in question. If nothing moved, the fall of chi-square from the
-first to the second has a chi-square distribution with as many degrees of freedom as directions were
-set free and seen: it is the chi-square of the change against its predicted covariance. See
-docs/theory/uncertainty.md.
+Two fits of the new rows with the earlier posterior are compared: one keeps all parameters of the
+earlier calibration, one has no information on those in question. If nothing has changed, the
+decrease of chi-square from the first to the second has a chi-square distribution; its degrees of
+freedom are the directions that the second fit frees and the rows determine. It is the chi-square of
+the change against its predicted covariance. See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -21,45 +22,68 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.inference.prior import Prior, limb_parameters, prior_from
-from loopcal.estimate.inference.residual_test import DOUBT
+from loopcal.estimate.inference.residual_test import SIGNIFICANCE
 from loopcal.estimate.methods.penalties import LeastSquares
+from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.result import Identification
+from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
+from loopcal.serialization import json_fields
 from loopcal.typing import FloatArray
 
-MOST = 60
-"""Parameters up to which each is tried alone as the explanation of a change."""
+MOST_TRIED = 60
+"""Number of parameters up to which each is tried alone as the explanation of a change."""
 
 EXPLAINED = 0.5
-"""Share of the chi-square without a change below which a single parameter explains most of it."""
+"""A single parameter explains a change if freeing it leaves less than this share of chi-square."""
+
+MACHINE = "the machine"
+"""Subject of a change where no limb is in question."""
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """Whether parameters moved between two calibrations.
+    """Whether parameters have changed between two calibrations.
 
     Attributes
     ----------
-    what : a limb, or "the machine". names : the parameters in question.
-    change : (k,) new estimate without the earlier one, minus the earlier one [SI].
-    chi_square, degrees, p_value : of the change; p_value is NaN where the new rows see none of
-        these parameters.
-    moved : None where it cannot be said. sentence : what this means.
+    subject : a limb, or "the machine". names : the parameters in question.
+    change : (k,) estimate without the earlier calibration minus the earlier estimate [SI].
+    chi_square, degrees, p_value : of the change; p_value is NaN where the new rows determine none
+        of these parameters, or a fit did not converge.
+    moved : whether they have changed; None where it cannot be decided.
+    finding : the result with its code.
     """
 
-    what: str
+    JSON_FIELDS: ClassVar[Mapping[str, str]] = {
+        "what": "subject",
+        "names": "names",
+        "change": "change",
+        "chi_square": "chi_square",
+        "degrees": "degrees",
+        "p_value": "p_value",
+        "moved": "moved",
+        "sentence": "sentence",
+    }
+
+    subject: str
     names: tuple[str, ...]
     change: FloatArray
     chi_square: float
     degrees: float
     p_value: float
     moved: bool | None
-    sentence: str
+    finding: Finding
+
+    @property
+    def sentence(self) -> str:
+        """The text of the finding."""
+        return str(self.finding)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the attributes by name for JSON, SI."""
-        return dict(vars(self))
+        """Return the content for JSON, SI."""
+        return json_fields(self)
 
 
 def recalibrate(
@@ -67,95 +91,108 @@ def recalibrate(
     data: Measurements,
     earlier: Posterior,
     free_limb: str | None = None,
-    noise: Literal["given", "estimated"] = "given",
+    *,
+    options: FitOptions | None = None,
 ) -> tuple[Identification, Change]:
     """Identify a robot from new measurements and an earlier calibration.
 
     Parameters
     ----------
-    robot : its table says what is nominal and tolerated. data : the new measurements.
-    earlier : `Identification.posterior`, or that of a run folder.
-    free_limb : a limb that was repaired: its parameters get the tolerance of the robot's file about
-        nominal again, the others keep what the earlier calibration knew of them.
-    noise : see `identify`. The method is least squares: the prior stands in the place of the
-        tolerances.
+    robot : its table states what is nominal and tolerated. data : the new measurements.
+    earlier : `Identification.posterior`, or the one of a run folder.
+    free_limb : a limb that was repaired. Its parameters get the tolerances of the robot file about
+        nominal again; the others keep what the earlier calibration knows of them.
+    options : see `FitOptions`. The method is least squares: the prior replaces the tolerances.
 
     Returns
     -------
-    fit, change : the identification, and whether the limb (or without one, anything) moved since.
+    fit, change : the identification, and whether the limb (or without one, the machine) has changed
+        since the earlier calibration.
 
     Raises
     ------
-    EstimationError
-        An unknown limb, other parameters, or an earlier calibration without uncertainty.
+    EstimationError : an unknown limb, other parameters, an earlier calibration without uncertainty,
+        or options with another method, a loss or a prior.
     """
+    options = _check_options(merge_options(options))
     prior = prior_from(earlier)
     _check_names(robot, prior)
     names = prior.names if free_limb is None else limb_parameters(robot, free_limb)
-    change = change_since(
-        robot, data, prior, names, "the machine" if free_limb is None else free_limb
-    )
-    fit = identify(
-        robot, data, LeastSquares(), noise=noise, prior=_used(robot, prior, free_limb, names)
-    )
-    return replace(fit, notes=(*fit.notes, change.sentence)), change
+    change = assess_change(robot, data, prior, names, free_limb or MACHINE, options)
+    used = _used_prior(robot, prior, free_limb, names)
+    fit = identify(robot, data, LeastSquares(), options=replace(options, prior=used))
+    return replace(fit, findings=(*fit.findings, change.finding)), change
 
 
-def change_since(
-    robot: Mechanism, data: Measurements, prior: Prior, names: tuple[str, ...], what: str
+def assess_change(
+    robot: Mechanism,
+    data: Measurements,
+    prior: Prior,
+    names: tuple[str, ...],
+    subject: str,
+    options: FitOptions | None = None,
 ) -> Change:
-    """Test whether these parameters are still what an earlier calibration found.
+    """Test whether these parameters are still those of an earlier calibration.
 
     Parameters
     ----------
-    robot, data : as for `identify`, noise as stated. prior : the earlier calibration.
-    names : the parameters in question. what : their common name in the sentence.
+    robot, data : as for `identify`. prior : the earlier calibration.
+    names : the parameters in question. subject : their common name for the finding.
+    options : of the fits; the noise is taken as given.
     """
-    kept = identify(robot, data, LeastSquares(), prior=prior)
-    opened = identify(robot, data, LeastSquares(), prior=prior.without(names))
-    of_prior, of_fit = ([table.index(n) for n in names] for table in (prior.names, opened.names))
-    change = opened.estimate[of_fit] - prior.mean[of_prior]
-    degrees = kept.check.degrees - opened.check.degrees
-    gain = max(kept.chi_square - opened.chi_square, 0.0)
-    if degrees < 1.0 or not (kept.converged and opened.converged):
-        why = "see none of its parameters" if degrees < 1.0 else "led to no converged fit"
-        sentence = (
-            f"whether {what} moved since the earlier calibration cannot be said: the new rows {why}"
-        )
-        return Change(what, names, change, gain, degrees, np.nan, None, sentence)
+    options = replace(options or FitOptions(), method=LeastSquares(), noise="given")
+    kept = identify(robot, data, options=replace(options, prior=prior))
+    freed = identify(robot, data, options=replace(options, prior=prior.without(names)))
+    of_prior, of_fit = ([table.index(n) for n in names] for table in (prior.names, freed.names))
+    change = freed.estimate[of_fit] - prior.mean[of_prior]
+    degrees = kept.residual_test.degrees - freed.residual_test.degrees
+    gain = max(kept.chi_square - freed.chi_square, 0.0)
+    if degrees < 1.0 or not (kept.converged and freed.converged):
+        code = "prior.change-not-observable" if degrees < 1.0 else "prior.change-not-converged"
+        finding = report_finding(code, subject=subject)
+        return Change(subject, names, change, gain, degrees, np.nan, None, finding)
     from scipy.special import chdtrc
 
     p_value = float(chdtrc(degrees, gain))
-    moved = p_value < DOUBT
-    sentence = f"the change has chi-square {gain:.4g} where {degrees:.0f} is expected of noise"
+    moved = p_value < SIGNIFICANCE
+    result = {"subject": subject, "chi_square": gain, "degrees": degrees, "p_value": p_value}
     if moved:
-        alone = _alone(robot, data, prior, names, kept.chi_square) if len(names) <= MOST else ""
-        sentence = f"{what} HAS moved since the earlier calibration: {sentence}{alone}"
+        single = _explain_by_one(robot, data, prior, names, kept.chi_square, options)
+        finding = report_finding("prior.machine-changed", **result, **single)
     else:
-        sentence = (
-            f"{what} has not moved beyond the noise since the earlier calibration: {sentence}"
-        )
-    return Change(what, names, change, gain, degrees, p_value, moved, sentence)
+        finding = report_finding("prior.machine-unchanged", **result)
+    return Change(subject, names, change, gain, degrees, p_value, moved, finding)
 
 
-def _alone(
-    robot: Mechanism, data: Measurements, prior: Prior, names: tuple[str, ...], kept: float
-) -> str:
-    """Say which single parameter explains most of the change, if it explains most of it."""
-    fits = [identify(robot, data, LeastSquares(), prior=prior.without((name,))) for name in names]
+def _explain_by_one(
+    robot: Mechanism,
+    data: Measurements,
+    prior: Prior,
+    names: tuple[str, ...],
+    kept: float,
+    options: FitOptions,
+) -> dict[str, Any]:
+    """Return which single parameter explains most of a change: `tried`, `parameter`, `change`."""
+    unexplained = {"tried": len(names) <= MOST_TRIED, "parameter": "", "change": ""}
+    if len(names) > MOST_TRIED:
+        return unexplained
+    fits = [
+        identify(robot, data, options=replace(options, prior=prior.without((name,))))
+        for name in names
+    ]
     values = [fit.chi_square if fit.converged else np.inf for fit in fits]
     best = int(np.argmin(values))
     fit, name = fits[best], names[best]
     if not values[best] < EXPLAINED * kept:
-        return ", and no single parameter explains it"
+        return unexplained
     i = fit.names.index(name)
-    factor, symbols = fit.unknowns.display()
-    by = (fit.estimate[i] - prior.mean[prior.names.index(name)]) / factor[i]
-    return f"; a change of {name} alone, by {by:+.3g} {symbols[i]}, explains most of it"
+    factor, symbols = fit.free_parameters.display()
+    change = (fit.estimate[i] - prior.mean[prior.names.index(name)]) / factor[i]
+    return {"tried": True, "parameter": name, "change": f"{change:+.3g} {symbols[i]}"}
 
 
-def _used(robot: Mechanism, prior: Prior, limb: str | None, names: tuple[str, ...]) -> Prior:
-    """Return the prior of the fit: all of it, or with a freed limb back at its tolerances."""
+def _used_prior(robot: Mechanism, prior: Prior, limb: str | None, names: tuple[str, ...]) -> Prior:
+    """Return the prior of the fit: all of it, or with a freed limb at its tolerances again."""
     if limb is None:
         return prior
     free = select_free_parameters(robot)
@@ -163,14 +200,23 @@ def _used(robot: Mechanism, prior: Prior, limb: str | None, names: tuple[str, ..
     return prior.without(names).toleranced(names, free.nominal[places], free.tolerance[places])
 
 
+def _check_options(options: FitOptions) -> FitOptions:
+    """Return options for fits with an earlier calibration; refuse what does not go with it."""
+    if options.method is not None and not isinstance(options.method, LeastSquares):
+        raise EstimationError(
+            f"method is {options.method!r}; recalibration uses LeastSquares(), because the earlier "
+            "calibration replaces the tolerances"
+        )
+    if options.loss is not None or options.prior is not None:
+        name = "loss" if options.loss is not None else "prior"
+        raise EstimationError(f"recalibration takes no {name}; remove it from the options")
+    return options
+
+
 def _check_names(robot: Mechanism, prior: Prior) -> None:
     """Refuse a prior of another robot."""
     free = select_free_parameters(robot).names
     for name in (*prior.names, *free):
         if name not in prior.names or name not in free:
-            where = "the earlier run" if name in prior.names else "the robot file"
-            raise EstimationError(
-                f"{name!r} is free in {where} alone, so the two do not describe the same robot; "
-                "free the same parameters in"
-                " both"
-            )
+            place = "the earlier run" if name in prior.names else "the robot file"
+            raise EstimationError(report_finding("prior.other-parameters", name=name, place=place))

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The result of an identification: the corrected robot, how sure each number is, and how well the
-data were explained.
-"""
+"""The result of an identification: corrected robot, uncertainty of each number, fit to the data."""
 
 from __future__ import annotations
 
@@ -13,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from loopcal.estimate.descent import DescentStatus
+from loopcal.estimate.fit_findings import report_status
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import Combination
 from loopcal.estimate.inference.posterior import Posterior
@@ -20,14 +19,16 @@ from loopcal.estimate.inference.residual_test import LEVEL, ResidualTest, covera
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.methods.prior_conflict import PriorConflict
 from loopcal.estimate.nuisance_estimate import NuisanceEstimate
+from loopcal.estimate.options import FitOptions
 from loopcal.estimate.poses.estimate import EstimatedPoses
+from loopcal.findings import Finding
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class KindResiduals:
-    """Residuals (predicted - measured) of one kind's rows after the fit.
+    """Residuals (predicted - measured) of the rows of one kind after the fit.
 
     Attributes
     ----------
@@ -44,92 +45,125 @@ class KindResiduals:
     whitened: FloatArray
     context: Mapping[str, FloatArray] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        """Return the kind and the size of the residuals."""
+        return f"<KindResiduals of {self.kind}: {len(self.raw)} rows of {len(self.components)}>"
+
 
 @dataclass(frozen=True, eq=False)
-class Identification:
-    """A robot identified from measurements. Arrays over parameters are (p,) in the order of
-    `names`, SI.
+class Spectrum:
+    """Singular values of the whitened, tolerance-scaled matrix of a fit.
 
     Attributes
     ----------
-    robot : Mechanism at the estimated values. initial : the same robot as it was given, to compare
-        with.
-    method, unknowns : how it was estimated, and the free parameters with their units.
-    estimate : (p,). covariance : (p, p), infinite and NaN where the data cannot tell.
-    posterior : the same knowledge by directions, from which the accuracy of poses and a later prior
-    are made.
-    rank, condition, singular_values, rank_tolerance : of the whitened, tolerance-scaled matrix.
-    unidentifiable : combinations that change nothing that was measured.
-    check : the residual against its degrees of freedom.
-    conflict : the stated tolerances against the data, where the method uses them; else None.
-    residuals : of every kind. status : how the iteration ended. iterations : steps taken.
-    cost_history : (i + 1,) whitened sum of squares; with a loss, the first and those after the last
-        change of weights are at the final weights, those between at the weights of their time.
-        estimate_history : (i + 1, p).
-    notes : sentences that belong to the result.
-    weight : (n,) of each pose by the loss, 1 without one. dropped : labels of the poses that were
-        left out as asked.
-    local : what was found of the unknowns that the measurements bring with them: frames, targets,
-        surfaces.
-    latent : where the machine stood and what its readings were, where these are not exact; else
-        None.
+    rank : number of singular values above `tolerance` times the largest.
+    condition : the largest over the smallest that counts. singular_values : (p,), descending.
+    """
+
+    rank: int
+    condition: float
+    singular_values: FloatArray
+    tolerance: float
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """The iteration of a fit.
+
+    Attributes
+    ----------
+    status : how it ended. iterations : steps taken.
+    cost : (i + 1,) whitened sum of squares. With a loss, the first and those after the last change
+        of weights use the final weights; those between use the weights of their time.
+    estimate : (i + 1, p) [SI].
+    """
+
+    status: DescentStatus
+    iterations: int
+    cost: FloatArray
+    estimate: FloatArray
+
+    @property
+    def finding(self) -> Finding:
+        """How the iteration ended."""
+        return report_status(self.status, self.iterations)
+
+    def __repr__(self) -> str:
+        """Return the status and the number of iterations."""
+        return f"<History: {self.status.name.lower()} after {self.iterations} steps>"
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """A robot identified from measurements.
+
+    Arrays over parameters are (p,) in the order of `names`, in SI units.
+
+    Attributes
+    ----------
+    robot : Mechanism at the estimate. initial : the robot as it was given.
+    options : of the fit, with the method that was used.
+    free_parameters : names, nominal values and tolerances.
+    covariance : (p, p), infinite and NaN where the data do not determine a parameter.
+    posterior : the same uncertainty by directions; accuracy of poses and a later prior use it.
+    spectrum : singular values and rank. unidentifiable : combinations that change no measured
+        value.
+    residual_test : the residuals against the noise.
+    prior_conflict : the stated tolerances against the data, where the method uses them; else None.
+    residuals : of every kind. pose_weights : (n,) by the loss; 1 without one.
+    history : status, steps and values of the iteration.
+    nuisance : frames, targets, surfaces and offsets of the measurements.
+    poses : pose and reading estimates, where readings are uncertain; else None.
+    findings : what the fit noticed.
     """
 
     robot: Mechanism
     initial: Mechanism
-    method: Method
-    unknowns: FreeParameters
-    estimate: FloatArray
+    options: FitOptions
+    free_parameters: FreeParameters
     covariance: FloatArray
     posterior: Posterior
-    rank: int
-    condition: float
-    singular_values: FloatArray
-    rank_tolerance: float
+    spectrum: Spectrum
     unidentifiable: tuple[Combination, ...]
-    check: ResidualTest
-    conflict: PriorConflict | None
+    residual_test: ResidualTest
+    prior_conflict: PriorConflict | None
     residuals: tuple[KindResiduals, ...]
-    status: DescentStatus
-    iterations: int
-    cost_history: FloatArray
-    estimate_history: FloatArray
-    notes: tuple[str, ...]
-    weight: FloatArray
-    dropped: tuple[str, ...]
-    local: NuisanceEstimate
-    latent: EstimatedPoses | None = None
+    pose_weights: FloatArray
+    history: History
+    nuisance: NuisanceEstimate
+    poses: EstimatedPoses | None
+    findings: tuple[Finding, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the free parameters."""
-        return self.unknowns.names
+        return self.free_parameters.names
 
     @property
     def nominal(self) -> FloatArray:
         """(p,) nominal values."""
-        return self.unknowns.nominal
+        return self.free_parameters.nominal
 
     @property
     def tolerance(self) -> FloatArray:
-        """(p,) tolerances used, stated or assumed."""
-        return self.unknowns.tolerance
+        """(p,) tolerances used, stated or default."""
+        return self.free_parameters.tolerance
 
     @property
-    def converged(self) -> bool:
-        """Whether the iteration converged."""
-        return self.status is DescentStatus.CONVERGED
+    def estimate(self) -> FloatArray:
+        """(p,) estimates."""
+        return self.robot.values[self.free_parameters.places]
 
     @cached_property
-    def sd(self) -> FloatArray:
-        """(p,) standard deviations: infinite where the data cannot tell, NaN where no interval can
-        be given.
+    def standard_deviations(self) -> FloatArray:
+        """(p,) standard deviations: infinite where the data do not determine a parameter, NaN
+        without intervals.
         """
         return np.sqrt(np.diag(self.covariance))
 
     def interval(self, level: float = LEVEL) -> FloatArray:
         """Return half-widths (p,) of intervals of this coverage."""
-        return coverage_factor(self.check, level) * self.sd
+        return coverage_factor(self.residual_test, level) * self.standard_deviations
 
     @property
     def plus_minus(self) -> FloatArray:
@@ -137,121 +171,149 @@ class Identification:
         `save_robot`.
         """
         result = np.full(len(self.robot.parameters), np.nan)
-        result[self.unknowns.places] = self.interval()
+        result[self.free_parameters.places] = self.interval()
         return result
 
     @property
-    def dof(self) -> float:
-        """Equations minus parameters effectively used."""
-        return self.check.dof
+    def method(self) -> Method:
+        """The method that was used."""
+        assert self.options.method is not None
+        return self.options.method
+
+    @property
+    def excluded_poses(self) -> tuple[str, ...]:
+        """Labels of the poses that the options exclude."""
+        return tuple(self.options.excluded_poses)
+
+    @property
+    def rank(self) -> int:
+        """Number of directions that the data determine."""
+        return self.spectrum.rank
+
+    @property
+    def status(self) -> DescentStatus:
+        """How the iteration ended."""
+        return self.history.status
+
+    @property
+    def converged(self) -> bool:
+        """Whether the iteration converged."""
+        return self.history.status is DescentStatus.CONVERGED
 
     @property
     def chi_square(self) -> float:
         """Whitened sum of squares, see `ResidualTest`."""
-        return self.check.chi_square
+        return self.residual_test.chi_square
 
-    @property
-    def p_value(self) -> float:
-        """Probability of a larger chi-square."""
-        return self.check.p_value
-
-    @property
-    def noise(self) -> str:
-        """`given` or `estimated`."""
-        return self.check.noise
+    def __repr__(self) -> str:
+        """Return a summary on one screen; `print` shows the parameters."""
+        test = self.residual_test
+        codes = ", ".join(dict.fromkeys(finding.code for finding in self.findings))
+        return "\n".join(
+            [
+                f"<Identification of {self.robot.name} by {type(self.method).__name__}",
+                f"  {len(self.names)} parameters, rank {self.rank}, {len(self.nuisance)} nuisance "
+                "parameters",
+                f"  {self.status.name.lower()} after {self.history.iterations} steps",
+                f"  chi-square {test.chi_square:.5g} with {test.degrees:.4g} degrees of freedom",
+                f"  findings: {codes or 'none'}>",
+            ]
+        )
 
     def __str__(self) -> str:
-        factor, symbols = self.unknowns.display()
+        """Return the parameters as a table, the status and the findings."""
+        factor, symbols = self.free_parameters.display()
         half = self.interval()
-        width = max(len(name) for name in (*self.names, *self.local.names))
+        width = max(len(name) for name in (*self.names, *self.nuisance.names))
         lines = [f"{'parameter':<{width}} {'nominal':>14} {'estimate':>14} {'+/- (95 %)':>12} unit"]
         for i, name in enumerate(self.names):
-            decimals, shown = _uncertainty(half[i] / factor[i])
+            decimals, shown = _format_half_width(half[i] / factor[i])
             nominal, estimate = self.nominal[i] / factor[i], self.estimate[i] / factor[i]
             lines.append(
                 f"{name:<{width}} {nominal:>14.{decimals}f} {estimate:>14.{decimals}f} {shown:>12} "
                 f"{symbols[i]}"
             )
-        for entry in self.local.rows(coverage_factor(self.check)):
-            decimals, shown = _uncertainty(entry["plus_minus"]) if entry["free"] else (6, "fixed")
-            nominal, estimate = (
-                f"{entry[name]:>14.{decimals}f}" for name in ("nominal", "estimate")
-            )
+        for entry in self.nuisance.rows(coverage_factor(self.residual_test)):
+            half_width = _format_half_width(entry["plus_minus"])
+            decimals, shown = half_width if entry["free"] else (6, "fixed")
+            nominal, estimate = (f"{entry[key]:>14.{decimals}f}" for key in ("nominal", "estimate"))
             lines.append(
                 f"{entry['name']:<{width}} {nominal} {estimate} {shown:>12} {entry['unit']}"
             )
+        test = self.residual_test
         lines += [
             "",
-            (
-                f"{self.status.sentence} after {self.iterations} steps; rank {self.rank} of "
-                f"{len(self.names)}"
-            ),
+            f"{self.history.finding} Rank {self.rank} of {len(self.names)}. Chi-square "
+            f"{test.chi_square:.5g} with {test.degrees:.4g} degrees of freedom.",
         ]
-        lines += [
-            f"chi-square {self.chi_square:.5g} with {self.check.degrees:.4g} degrees of freedom"
-        ]
-        return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
+        return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self._further_findings)])
+
+    @property
+    def _further_findings(self) -> list[Finding]:
+        """The findings but the status."""
+        return [f for f in self.findings if f.code != self.history.finding.code]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result by attribute name for JSON; parameters in SI and in the units of the
-        robot's file.
-        """
-        factor, symbols = self.unknowns.display()
-        half = self.interval()
+        """Return the content for JSON; parameters in the units of the robot's file, the rest SI."""
+        factor, symbols = self.free_parameters.display()
+        half, test = self.interval(), self.residual_test
         parameters = [
             {
                 "name": parameter.name,
                 "unit": symbols[i],
                 "nominal": self.nominal[i] / factor[i],
                 "estimate": self.estimate[i] / factor[i],
-                "sd": self.sd[i] / factor[i],
+                "sd": self.standard_deviations[i] / factor[i],
                 "plus_minus": half[i] / factor[i],
                 "tolerance": self.tolerance[i] / factor[i],
-                "tolerance_assumed": bool(self.unknowns.assumed[i]),
+                "tolerance_assumed": bool(self.free_parameters.assumed[i]),
             }
-            for i, parameter in enumerate(self.unknowns.parameters)
+            for i, parameter in enumerate(self.free_parameters.parameters)
         ]
         return {
             "robot": self.robot.name,
             "method": repr(self.method),
             "parameters": parameters,
-            "local": self.local.rows(coverage_factor(self.check)),
+            "local": self.nuisance.rows(coverage_factor(test)),
             "rank": self.rank,
-            "condition": self.condition,
-            "singular_values": self.singular_values,
-            "rank_tolerance": self.rank_tolerance,
+            "condition": self.spectrum.condition,
+            "singular_values": self.spectrum.singular_values,
+            "rank_tolerance": self.spectrum.tolerance,
             "unidentifiable": [c.to_dict() for c in self.unidentifiable],
-            "dof": self.dof,
-            "chi_square": self.chi_square,
-            "degrees": self.check.degrees,
-            "p_value": self.p_value,
-            "noise": self.noise,
-            "sigma_scale": self.check.sigma_scale,
-            "prior_conflict": None if self.conflict is None else self.conflict.to_dict(),
-            "dropped": list(self.dropped),
-            "readings": None if self.latent is None else self.latent.to_dict(),
+            "dof": test.dof,
+            "chi_square": test.chi_square,
+            "degrees": test.degrees,
+            "p_value": test.p_value,
+            "noise": test.noise,
+            "sigma_scale": test.sigma_scale,
+            "prior_conflict": None
+            if self.prior_conflict is None
+            else self.prior_conflict.to_dict(),
+            "dropped": self.excluded_poses,
+            "readings": None if self.poses is None else self.poses.to_dict(),
             "status": self.status.name.lower(),
-            "iterations": self.iterations,
-            "cost_history": self.cost_history,
-            "notes": list(self.notes),
+            "iterations": self.history.iterations,
+            "cost_history": self.history.cost,
+            "notes": [str(finding) for finding in self.findings],
+            "findings": [finding.to_dict() for finding in self.findings],
         }
 
     def arrays(self) -> dict[str, FloatArray]:
-        """Return the arrays of the result by name [SI], for the run folder."""
+        """Return the arrays of the run folder by name [SI]."""
         result = {
             "nominal": self.nominal,
             "estimate": self.estimate,
-            "sd": self.sd,
+            "sd": self.standard_deviations,
             "covariance": self.covariance,
-            "singular_values": self.singular_values,
-            "estimate_history": self.estimate_history,
-            "cost_history": self.cost_history,
-            "weight": self.weight,
-            "local_estimate": self.local.estimate,
-            "local_sd": self.local.sd,
-            "local_start": self.local.start,
+            "singular_values": self.spectrum.singular_values,
+            "estimate_history": self.history.estimate,
+            "cost_history": self.history.cost,
+            "weight": self.pose_weights,
+            "local_estimate": self.nuisance.estimate,
+            "local_sd": self.nuisance.sd,
+            "local_start": self.nuisance.start,
             **self.posterior.arrays(),
-            **({} if self.latent is None else self.latent.arrays()),
+            **({} if self.poses is None else self.poses.arrays()),
         }
         for i, r in enumerate(self.residuals):
             result[f"residual_{i}_{r.kind}"] = r.raw
@@ -260,8 +322,8 @@ class Identification:
         return result
 
 
-def _uncertainty(half: float) -> tuple[int, str]:
-    """Decimals that an uncertainty leaves, and the uncertainty to two digits in words or figures."""
+def _format_half_width(half: float) -> tuple[int, str]:
+    """Return the decimals that an uncertainty leaves, and the uncertainty with two digits."""
     if np.isnan(half):
         return 6, "not given"
     if np.isinf(half):

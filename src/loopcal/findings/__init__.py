@@ -20,7 +20,7 @@ def report_finding(code: str, severity: Severity | None = None, **data: Any) -> 
 
     Raises
     ------
-    KeyError : the code is not in the catalog, or a field of its sentence is missing in `data`.
+    KeyError : the code is not in the catalog, or `data` lacks one of its fields.
     """
     from loopcal.findings.catalog import CATALOG
 

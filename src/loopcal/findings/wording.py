@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import string
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from loopcal.findings.finding import Severity
@@ -82,6 +82,8 @@ class Entry:
         differ in more than their numbers.
     when : one sentence for docs/findings.md: when it is reported.
     action : one sentence for docs/findings.md: what to do next. Empty where there is nothing to do.
+    example : data of one case, for tests and documentation. Needed where `text` is a function, and
+        where the data hold more than the sentence shows.
     """
 
     code: str
@@ -89,6 +91,7 @@ class Entry:
     text: str | Callable[[Mapping[str, Any]], str]
     when: str
     action: str = ""
+    example: Mapping[str, Any] = field(default_factory=dict)
 
     def word(self, data: Mapping[str, Any]) -> str:
         """Return the sentence for these data."""
@@ -98,11 +101,10 @@ class Entry:
 
     @property
     def fields(self) -> frozenset[str]:
-        """Names of the data that the template needs; empty for a function."""
-        if callable(self.text):
-            return frozenset()
-        parts = string.Formatter().parse(self.text)
-        return frozenset(name.split(".")[0].split("[")[0] for _, name, _, _ in parts if name)
+        """Names of the data: those of the template and of the example."""
+        parts = [] if callable(self.text) else string.Formatter().parse(self.text)
+        shown = {name.split(".")[0].split("[")[0] for _, name, _, _ in parts if name}
+        return frozenset(shown | self.example.keys())
 
 
 def fill_template(template: str, **data: Any) -> str:

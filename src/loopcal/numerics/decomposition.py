@@ -65,7 +65,15 @@ def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:
     )
 
 
-PER_TRIAL = ("singular_values", "directions", "projections", "outside", "rows", "dual", "flat")
+PER_TRIAL = (
+    "singular_values",
+    "directions",
+    "projections",
+    "outside",
+    "rows",
+    "dual",
+    "unpenalized",
+)
 
 
 @dataclass(frozen=True)
@@ -77,8 +85,8 @@ class Decomposition:
     plain least squares, infinite where a direction is not used at all. Its filter factors are f_i =
     s_i^2 / (s_i^2 + penalty_i).
 
-    Where some columns are `flat`, never penalised, V holds two groups of columns: those of flat
-    parameters alone, and those of the others, each with the change of the flat ones that goes best
+    Where some columns are never penalized, V holds two groups of columns: those of
+    unpenalized parameters alone, and those of the others, each with the change of the unpenalized ones that goes best
     with it. U stays orthonormal and V'z of the second group depends on the penalised parameters
     alone, so that all formulas stay as they are; V itself is oblique and its inverse is kept as
     `dual`.
@@ -93,7 +101,7 @@ class Decomposition:
     scale : (p,) by which the columns were multiplied.
     tolerance : singular values below tolerance * s_1 count as zero.
     dual : (t, p, p) inverse of V where V is oblique; None where it is V'.
-    flat : (t, p) directions of parameters that are never penalised; None where there are none.
+    unpenalized : (t, p) directions of parameters that are never penalized; None where there are none.
     """
 
     singular_values: FloatArray
@@ -104,7 +112,7 @@ class Decomposition:
     scale: FloatArray
     tolerance: float = RANK_TOLERANCE
     dual: FloatArray | None = None
-    flat: BoolArray | None = None
+    unpenalized: BoolArray | None = None
 
     @cached_property
     def used(self) -> BoolArray:
@@ -239,16 +247,16 @@ class Decomposition:
 
     def null_space(self, trial: int = 0) -> FloatArray:
         """Return a basis (p, d) of the scaled deviations that change no row, for one trial;
-        orthonormal without `flat`.
+        orthonormal without `unpenalized`.
         """
         return self.directions[trial][:, ~self.used[trial]]
 
     def plain(self) -> Decomposition:
-        """Return the decomposition without flat columns, which alone has the singular values of A
+        """Return the decomposition without unpenalized columns, which alone has the singular values of A
         (itself where it has).
         """
         if self.dual is None:
-            return replace(self, flat=None)
+            return replace(self, unpenalized=None)
         u, s, vt = np.linalg.svd(self.singular_values[:, :, None] * self.dual)
         projections = np.matmul(self.projections[:, None, :], u)[:, 0]
         directions = np.ascontiguousarray(vt.swapaxes(-1, -2))
@@ -258,7 +266,7 @@ class Decomposition:
             directions=directions,
             projections=projections,
             dual=None,
-            flat=None,
+            unpenalized=None,
         )
 
     def knowledge(
@@ -305,7 +313,7 @@ def decompose(
     about: FloatArray | None = None,
     scale: FloatArray | None = None,
     tolerance: float = RANK_TOLERANCE,
-    flat: BoolArray | None = None,
+    unpenalized: BoolArray | None = None,
 ) -> Decomposition:
     """Decompose a triangular factor of rows [A | b].
 
@@ -319,7 +327,7 @@ def decompose(
     scale : (p,), optional. Factors for the columns before the decomposition; the penalty then acts
         on z / scale.
     tolerance : relative rank tolerance.
-    flat : (p,), optional. Columns that no penalty may touch.
+    unpenalized : (p,), optional. Columns that no penalty may touch.
     """
     p = factor.shape[-1] - 1
     triangle, last = factor[:, :p, :p], factor[:, :p, p]
@@ -329,15 +337,17 @@ def decompose(
         triangle = triangle * scale
     factors = np.ones(p) if scale is None else scale
     outside = factor[:, p, p] ** 2
-    if flat is not None and flat.any() and not flat.all():
-        return _split(triangle, last, outside, rows, factors, tolerance, flat)
+    if unpenalized is not None and unpenalized.any() and not unpenalized.all():
+        return _split(triangle, last, outside, rows, factors, tolerance, unpenalized)
     u, s, vt = np.linalg.svd(triangle)
     projections = np.matmul(last[:, None, :], u)[:, 0]
     # One memory layout, whichever trials are taken later: products round by the layout of their
     # factors.
     directions = np.ascontiguousarray(vt.swapaxes(-1, -2))
-    marked = np.ones(s.shape, dtype=bool) if flat is not None and flat.all() else None
-    return Decomposition(s, directions, projections, outside, rows, factors, tolerance, flat=marked)
+    marked = np.ones(s.shape, dtype=bool) if unpenalized is not None and unpenalized.all() else None
+    return Decomposition(
+        s, directions, projections, outside, rows, factors, tolerance, unpenalized=marked
+    )
 
 
 def _split(
@@ -347,16 +357,16 @@ def _split(
     rows: IntArray,
     scale: FloatArray,
     tolerance: float,
-    flat: BoolArray,
+    unpenalized: BoolArray,
 ) -> Decomposition:
-    """Decompose [F G] with flat columns F first: F = U1 S1 W', then what F cannot explain of G, (I
+    """Decompose [F G] with unpenalized columns F first: F = U1 S1 W', then what F cannot explain of G, (I
     - U1 U1') G = U2 S2 V2'.
 
     With T = S1^+ U1'G the columns of V are (W, 0) and (-W T V2, V2), and its inverse is [[W', T],
     [0, V2']].
     """
-    p, k = len(flat), int(flat.sum())
-    order = np.concatenate([np.flatnonzero(flat), np.flatnonzero(~flat)])
+    p, k = len(unpenalized), int(unpenalized.sum())
+    order = np.concatenate([np.flatnonzero(unpenalized), np.flatnonzero(~unpenalized)])
     reduced: FloatArray = np.array(
         np.linalg.qr(np.concatenate([triangle[:, :, order], last[:, :, None]], axis=2), mode="r")
     )

@@ -78,7 +78,7 @@ def _view_details(report: CalibrationReport, rows: Mapping[str, Any]) -> list[Bl
         blocks.append(build_parameter_table("Setup parameters", rows["local"]))
     blocks += [
         "",
-        f"Iteration: {fit.status.name.lower().replace('_', ' ')} after {fit.iterations} steps; "
+        f"Iteration: {fit.status.name.lower().replace('_', ' ')} after {fit.history.iterations} steps; "
         f"rank {fit.rank} of {len(fit.names)}.",
         f"Chi-square {fit.chi_square:.5g} with {rows['degrees']:.4g} degrees of freedom.",
     ]

@@ -24,8 +24,8 @@ from loopcal.diagnose import (
     suggest_measurements,
 )
 from loopcal.errors import DataError
-from loopcal.estimate import Change, Identification, recalibrate
-from loopcal.estimate.excluded_poses import exclude_poses
+from loopcal.estimate import Change, FitOptions, Identification, recalibrate
+from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.information import count_equations
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.importance import sort_by_importance
@@ -160,7 +160,13 @@ def _fit(
     count("choosing the parameters" if options.choose_model else "preparing")
     if options.prior is not None:
         count("fitting")
-        fit, change = recalibrate(robot, data, options.prior, options.free_limb, fit_options.noise)
+        fit, change = recalibrate(
+            robot,
+            data,
+            options.prior,
+            options.free_limb,
+            options=FitOptions(noise=fit_options.noise),
+        )
         return _FitResult(fit, change=change)
     choice = None
     if options.choose_model:
@@ -207,8 +213,8 @@ def _report_fit(fit: Identification) -> list[Finding]:
     codes = {f.code for f in findings}
     if not fit.converged and not any(code.startswith("fit.") for code in codes):
         findings.append(report_finding("gates.not-converged", status=fit.status.name.lower()))
-    if fit.check.failed and "noise.residuals-too-large" not in codes:
-        ratio = float(np.sqrt(fit.check.chi_square / fit.check.degrees))
+    if fit.residual_test.failed and "noise.residuals-too-large" not in codes:
+        ratio = float(np.sqrt(fit.residual_test.chi_square / fit.residual_test.degrees))
         findings.append(report_finding("gates.residuals-exceed-noise", ratio=ratio))
     return [
         replace(f, severity=Severity.FAILURE) if f.code == "noise.residuals-too-large" else f

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from loopcal.errors import DataError
-from loopcal.estimate import Posterior
+from loopcal.estimate import FitOptions, Posterior
 from loopcal.findings import report_finding
-from loopcal.workflow.fit_adapter import FitOptions
 
 
 @dataclass(frozen=True)

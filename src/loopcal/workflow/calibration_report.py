@@ -124,7 +124,7 @@ class CalibrationReport:
     def headline(self) -> str:
         """The verdict in one sentence."""
         fit = self.identification
-        fitted = self.split.fitted.n_poses - len(fit.dropped)
+        fitted = self.split.fitted.n_poses - len(fit.excluded_poses)
         verdict = self.verdict.value
         return (
             f"{verdict[0].upper()}{verdict[1:]}: {self.robot.name}, {len(fit.names)} parameters "

@@ -3,35 +3,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
-from loopcal.estimate import Identification, identify
+from loopcal.estimate import FitOptions, Identification, identify
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 
 
-@dataclass(frozen=True)
-class FitOptions:
-    """Options of a fit."""
-
-    method: Any = None
-    loss: Any = None
-    noise: Literal["given", "estimated"] = "given"
-    excluded_poses: tuple[str, ...] = ()
-
-
 def fit_robot(robot: Mechanism, data: Measurements, options: FitOptions) -> Identification:
     """Identify with options."""
-    return identify(
-        robot,
-        data,
-        options.method,
-        noise=options.noise,
-        loss=options.loss,
-        drop=tuple(options.excluded_poses),
-    )
+    return identify(robot, data, options=options)
 
 
 def findings_of(*sources: Any) -> list[Finding]:

@@ -1,51 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Directions that the data cannot tell, as named combinations of parameters and as words.
+"""The null space as combinations of parameters that change no measured value.
 
-A basis of the null space is turned into its sparsest readable form, one leading parameter a
-combination, by elimination with pivoting; coefficients are displacements in the units of the
+A basis of the null space is brought to a sparse form, in which each combination has a leading
+parameter of its own, by elimination with pivoting. Coefficients are changes in the units of the
 robot's file.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.findings import Finding, report_finding
+from loopcal.findings.catalog.fit import MOST_PARTS, MOST_WEAK_PARTS, list_changes
+from loopcal.findings.wording import list_names
 from loopcal.typing import FloatArray
 
 NEGLIGIBLE = 1e-6
-"""Part of a combination, in tolerances and relative to its largest, that is rounding and not shown.
+"""Part of a combination, in tolerances and relative to its largest, that is rounding and left out.
 """
 
 MINOR = 0.1
-"""The same for a direction that is weak but not null, which has a small part of nearly every
-parameter.
-"""
+"""The same for a weak direction, which has a small part of nearly every parameter."""
 
-SHOWN, SHOWN_WEAK = 8, 4
-"""Parameters written out in the words of a combination, and of one that is only weak; the others
-are counted.
-"""
-
-EQUAL = 1e-6
-"""Relative difference of changes that are called equal parts."""
+SHOWN = MOST_PARTS
 
 
 @dataclass(frozen=True, eq=False)
 class Combination:
-    """Parameters that, changed together like this, change nothing that was measured, or hardly
-    anything.
+    """A combined change of parameters that changes no measured value, or hardly any.
 
     Attributes
     ----------
-    names : (k,) strongest first. changes : (k,) displacements that belong together, in `units`
-        (symbols).
+    names : (k,) strongest first. changes : (k,) changes that belong together, in `units` (symbols).
     weights : (k,) the same in tolerances, of length one over all parameters.
-    singular_value : what one tolerance along the direction changes, in standard deviations of the
-        noise; 0 for a null one.
-    meaning : what the robot does with such a change, in words; empty where there is nothing to say.
+    singular_value : change of the whitened residuals per tolerance along the direction, in standard
+        deviations of the noise; 0 for a null direction.
+    meaning : what the robot does with such a change; empty where it is no rigid motion.
+    nuisance : frames, targets and surfaces of the measurements that change with it.
     """
 
     names: tuple[str, ...]
@@ -54,78 +49,69 @@ class Combination:
     weights: FloatArray = field(default_factory=lambda: np.zeros(0))
     singular_value: float = 0.0
     meaning: str = ""
+    nuisance: tuple[str, ...] = ()
+
+    @property
+    def finding(self) -> Finding:
+        """That the data do not determine this combination, or hardly."""
+        weak = self.singular_value > 0.0
+        return report_finding(
+            "fit.hardly-observable" if weak else "fit.unidentifiable",
+            names=self.names,
+            changes=tuple(self.changes.tolist()),
+            units=self.units,
+            singular_value=self.singular_value,
+            meaning=str(self.meaning),
+            nuisance=self.nuisance,
+        )
 
     def __str__(self) -> str:
-        rest = f": {self.meaning}" if self.meaning else ""
-        several = len(self.names) > 1
-        if self.singular_value > 0.0:
-            shows = (
-                f"one tolerance shows as {self.singular_value:.2g} standard deviations of the noise"
-            )
-            return (
-                f"together {self.parts}: {shows}" if several else f"{self.names[0]} alone: {shows}"
-            )
-        if several:
-            return f"together {self.parts} change nothing that was measured{rest}"
-        return f"{self.names[0]} alone changes nothing that was measured{rest}"
+        """Return the text of the finding."""
+        return str(self.finding)
 
     @property
     def parts(self) -> str:
-        """The parameters and how much of each: in equal parts, or each with its change."""
-        signs = np.sign(self.changes)
-        if len(set(self.units)) == 1 and (np.abs(np.abs(self.changes) - 1.0) < EQUAL).all():
-            names = [n if s > 0 else f"minus {n}" for n, s in zip(self.names, signs, strict=True)]
-            return f"{listed(names)}, in equal parts,"
-        parts = [
-            f"{n} {c:+.4g} {u}"
-            for n, c, u in zip(self.names, self.changes, self.units, strict=True)
-        ]
-        return listed(parts, SHOWN if self.singular_value == 0.0 else SHOWN_WEAK)
+        """The parameters, each with its change."""
+        most = MOST_PARTS if self.singular_value == 0.0 else MOST_WEAK_PARTS
+        return list_changes(self.names, self.changes.tolist(), self.units, most)
 
-    def to_dict(self) -> dict[str, object]:
-        """All attributes by name, and the sentence."""
-        numbers = {
-            "changes": self.changes.tolist(),
-            "units": list(self.units),
-            "weights": self.weights.tolist(),
-        }
-        words = {
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content for JSON, with the sentence."""
+        return {
+            "names": self.names,
+            "changes": self.changes,
+            "units": self.units,
+            "weights": self.weights,
             "singular_value": self.singular_value,
-            "meaning": self.meaning,
+            "meaning": str(self.meaning),
+            "nuisance": self.nuisance,
             "sentence": str(self),
         }
-        return {"names": list(self.names), **numbers, **words}
 
 
 def listed(words: list[str] | tuple[str, ...], most: int = SHOWN) -> str:
-    """Words in a sentence, `a, b and c`; those beyond `most` are counted."""
-    if len(words) > most:
-        return f"{', '.join(words[:most])} and {len(words) - most} more"
-    return f"{', '.join(words[:-1])} and {words[-1]}" if len(words) > 1 else "".join(words)
+    """Return `a, b and c`; names beyond `most` are counted."""
+    return list_names(words, most)
 
 
-def describe_null_space(
-    unknowns: FreeParameters, null_space: FloatArray
-) -> tuple[Combination, ...]:
+def describe_null_space(free: FreeParameters, null_space: FloatArray) -> tuple[Combination, ...]:
     """Return the combinations that span a null space (p, d) of deviations in tolerances."""
-    return tuple(
-        describe_direction(unknowns, direction) for direction in sparsify_basis(null_space)
-    )
+    return tuple(describe_direction(free, direction) for direction in sparsify_basis(null_space))
 
 
 def describe_direction(
-    unknowns: FreeParameters, direction: FloatArray, singular_value: float = 0.0
+    free: FreeParameters, direction: FloatArray, singular_value: float = 0.0
 ) -> Combination:
-    """Return one direction (p,) of deviations in tolerances by names; small parts are left out."""
-    factor, symbols = unknowns.display()
+    """Return a direction (p,) of deviations in tolerances by names; small parts are left out."""
+    factor, symbols = free.display()
     size = np.abs(direction)
     chosen = np.flatnonzero(size > (MINOR if singular_value > 0.0 else NEGLIGIBLE) * size.max())
-    # parts that differ by rounding stand in the order of the robot's parameters
+    # parts that differ by rounding stay in the order of the robot's parameters
     order = chosen[np.argsort(-np.round(size[chosen] / size.max(), 9), kind="stable")]
-    changes = direction[order] * unknowns.tolerance[order] / factor[order]
+    changes = direction[order] * free.tolerance[order] / factor[order]
     sign = np.sign(changes[0])
     return Combination(
-        names=tuple(unknowns.names[i] for i in order),
+        names=tuple(free.names[i] for i in order),
         changes=changes / changes[0],
         units=tuple(symbols[i] for i in order),
         weights=sign * direction[order] / np.linalg.norm(direction),
@@ -134,14 +120,13 @@ def describe_direction(
 
 
 def sparsify_basis(null_space: FloatArray) -> FloatArray:
-    """Return a basis (d, p) of the same space in which each vector has a parameter of its own."""
+    """Return a basis (d, p) of the space (p, d) in which each vector has a parameter of its own."""
     d = null_space.shape[1]
     if d == 0:
         return np.zeros((0, len(null_space)))
     from scipy.linalg import lu_factor, lu_solve, qr
 
     *_, order = qr(null_space.T, mode="r", pivoting=True)
-    pivots = np.sort(
-        np.asarray(order)[:d]
-    )  # a well-conditioned choice of leaders, in the order of the parameters
+    # a well-conditioned choice of leading parameters, in the order of the robot's parameters
+    pivots = np.sort(np.asarray(order)[:d])
     return lu_solve(lu_factor(null_space[pivots].T), null_space.T)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a fit knows of the parameters, direction by direction: nothing is lost where a covariance
-would be infinite.
+"""The posterior of a fit, direction by direction, also where a covariance would be infinite.
 
 The deviation from the estimate is e - estimate = diag(unit) V y, with independent coordinates y_i
-of variance `variance_i`: infinite where nothing is known. See docs/theory/uncertainty.md.
+of variance `variance_i`. The variance is infinite for directions of which nothing is known. See
+docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
@@ -14,24 +14,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.errors import EstimationError
+from loopcal.findings import report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 PREFIX = "posterior_"
-STORED = ("unit", "directions", "variance", "seen")
+STORED = {"unit": "unit", "directions": "directions", "variance": "variance", "seen": "determined"}
+"""Arrays of a run folder (after `PREFIX`), and the attributes that they hold."""
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Free parameters of a robot with their errors.
+    """Free parameters of a robot with their uncertainty.
 
     Attributes
     ----------
     robot : Mechanism at the estimate. places : (p,) positions of the free parameters in its table.
-    unit : (p,) [SI]. directions : (p, p) V. variance : (p,) of each direction, infinite or NaN (no
-        interval can be given).
-    seen : (p,) directions that the rows determine; of the others only a prior or nothing at all is
+    unit : (p,) [SI]. directions : (p, p) V.
+    variance : (p,) of each direction; infinite for unknown ones, NaN without intervals.
+    determined : (p,) True for directions that the rows determine; of the others at most a prior is
         known.
     """
 
@@ -40,7 +42,14 @@ class Posterior:
     unit: FloatArray
     directions: FloatArray
     variance: FloatArray
-    seen: BoolArray
+    determined: BoolArray
+
+    def __repr__(self) -> str:
+        """Return the robot's name and the numbers of parameters and of determined directions."""
+        return (
+            f"<Posterior of {self.robot.name}: {len(self.places)} parameters, "
+            f"{int(self.determined.sum())} directions determined>"
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -53,8 +62,11 @@ class Posterior:
         return self.robot.values[self.places]
 
     def arrays(self) -> dict[str, FloatArray]:
-        """Return what `posterior_from_arrays` reads back, for the run folder."""
-        return {PREFIX + name: np.asarray(getattr(self, name)) for name in STORED}
+        """Return the arrays of the run folder, which `posterior_from_arrays` reads."""
+        return {
+            PREFIX + name: np.asarray(getattr(self, attribute))
+            for name, attribute in STORED.items()
+        }
 
 
 def compute_posterior(
@@ -65,49 +77,44 @@ def compute_posterior(
     penalty: FloatArray,
     noise: float = 1.0,
 ) -> Posterior:
-    """Return what trial 0 of a decomposition knows.
+    """Return the posterior of trial 0 of a decomposition.
 
     Parameters
     ----------
     robot : at the estimate. places, tolerance : (p,) of the free parameters.
-    decomposition, penalty : of the fit; columns scaled by tolerance. noise : variance of the
-        whitened rows.
+    decomposition, penalty : of the fit; columns scaled by tolerance.
+    noise : variance of the whitened rows.
     """
-    directions, variance, seen = decomposition.knowledge(penalty, noise)
+    directions, variance, determined = decomposition.knowledge(penalty, noise)
     return Posterior(
         robot=robot,
         places=places,
         unit=tolerance * decomposition.scale,
         directions=directions,
         variance=variance,
-        seen=seen,
+        determined=determined,
     )
 
 
 def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) -> Posterior:
-    """Return the posterior that a run folder keeps.
+    """Return the posterior in the arrays of a run folder.
 
     Parameters
     ----------
-    robot : the corrected robot of the run. arrays : those of the run folder.
+    robot : the corrected robot of the run. arrays : of the run folder.
 
     Raises
     ------
     EstimationError
-        The run has none, or its robot has other free parameters now.
+        The run has no posterior, or its robot now has other free parameters.
     """
-    missing = [name for name in STORED if PREFIX + name not in arrays]
+    missing = [PREFIX + name for name in STORED if PREFIX + name not in arrays]
     if missing:
-        raise EstimationError(
-            f"this run holds no posterior (there is no {PREFIX}{missing[0]}); make it again with "
-            "this version of loopcal"
-        )
-    unit, directions, variance, seen = (arrays[PREFIX + name] for name in STORED)
+        raise EstimationError(report_finding("prior.no-posterior", array=missing[0]))
+    unit, directions, variance, determined = (arrays[PREFIX + name] for name in STORED)
     places = np.flatnonzero(robot.parameters.free)
     if len(places) != len(unit):
         raise EstimationError(
-            f"this run identified {len(unit)} parameters, but its robot file has {len(places)} "
-            "free ones; restore the file, "
-            "or make the run again"
+            report_finding("prior.other-count", identified=len(unit), free=len(places))
         )
-    return Posterior(robot, places, unit, directions, variance, seen.astype(bool))
+    return Posterior(robot, places, unit, directions, variance, determined.astype(bool))

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An earlier calibration as the prior of the next one: its whitened rows, appended to the factor of
-the new rows.
+"""An earlier calibration as the prior of the next one: its whitened rows join the new rows.
 
-A posterior e ~ N(mean, C), C = diag(unit) V diag(var) V' diag(unit), is the rows B (e - mean) of
-unit variance with B = diag(var)^(-1/2) V^-1 diag(1 / unit); a direction of infinite variance has no
-row. Least squares over these and the new rows is the estimate from both calibrations together. A
-limb that was repaired is freed by eliminating its columns from B (an orthogonal reduction, which is
-the marginal distribution of the others). V is well conditioned (orthonormal, if no parameter is
-exempt from a prior); J'J and C are never inverted. See docs/theory/uncertainty.md.
+A posterior e ~ N(mean, C), C = diag(unit) V diag(var) V' diag(unit), equals the rows B (e - mean)
+of unit variance with B = diag(var)^(-1/2) V^-1 diag(1 / unit); a direction of infinite variance has
+no row. Least squares over these and the new rows is the joint estimate of both calibrations. To
+free a limb that was repaired, its columns are eliminated from B by an orthogonal reduction, which
+is the marginal distribution of the others. V is well conditioned (orthonormal, if all parameters
+have a prior); neither J'J nor C is inverted. See docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations
@@ -23,29 +22,27 @@ from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.start import Start
+from loopcal.findings import report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.numerics.triangular_factor import fold_rows
 from loopcal.typing import FloatArray, IntArray
 
 PARALLEL = 1e-2
-"""Sine of the angle up to which two null directions are one and the same, seen from two estimates.
-"""
+"""Sine of the angle up to which null directions of two estimates are the same direction."""
 
 ELIMINATED = 1e-11
-"""Share of the largest singular value below which an eliminated column counts as dependent on the
-others.
-"""
+"""Share of the largest singular value below which an eliminated column depends on the others."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Rows B (e - mean) of independent errors of unit variance.
+    """Rows B (e - mean) with independent errors of unit variance.
 
     Attributes
     ----------
-    names : (p,) parameters. mean, unit : (p,) [SI], `unit` makes columns comparable. rows : (r, p)
-        B [1 / SI].
+    names : (p,) parameters. mean, unit : (p,) [SI]; `unit` makes columns comparable.
+    rows : (r, p) B [1 / SI].
     """
 
     names: tuple[str, ...]
@@ -53,37 +50,41 @@ class Prior:
     unit: FloatArray
     rows: FloatArray
 
+    def __repr__(self) -> str:
+        """Return the numbers of rows and parameters."""
+        return f"<Prior: {len(self.rows)} rows on {len(self.names)} parameters>"
+
     def added(self, problem: Problem) -> WithPrior:
-        """Return the problem of these rows and the prior's, as the descent sees it."""
+        """Return the problem of these rows and the rows of the prior, for the descent."""
         return WithPrior(problem, self)
 
     def without(self, names: Sequence[str]) -> Prior:
-        """Return what this prior says of the other parameters when nothing is said of these."""
-        gone = np.isin(self.names, names)
-        u, s, _ = np.linalg.svd((self.rows * self.unit)[:, gone], full_matrices=True)
+        """Return the marginal prior of the other parameters, without information on these."""
+        freed = np.isin(self.names, names)
+        u, s, _ = np.linalg.svd((self.rows * self.unit)[:, freed], full_matrices=True)
         rank = int((s > ELIMINATED * s[0]).sum()) if len(s) else 0
         rows = u[:, rank:].T @ self.rows
-        rows[:, gone] = 0.0
+        rows[:, freed] = 0.0
         return replace(self, rows=rows)
 
     def toleranced(self, names: Sequence[str], mean: FloatArray, tolerance: FloatArray) -> Prior:
-        """Return this prior with independent rows (e - mean) / tolerance for some parameters it
-        says nothing of.
+        """Return this prior with independent rows (e - mean) / tolerance for some parameters of
+        which it knows nothing.
         """
         places = [self.names.index(name) for name in names]
-        more, centre = np.zeros((len(names), len(self.names))), self.mean.copy()
+        more, center = np.zeros((len(names), len(self.names))), self.mean.copy()
         more[np.arange(len(names)), places] = 1.0 / tolerance
-        centre[places] = mean
-        return Prior(self.names, centre, self.unit, np.concatenate([self.rows, more]))
+        center[places] = mean
+        return Prior(self.names, center, self.unit, np.concatenate([self.rows, more]))
 
 
 class WithPrior:
     """Rows of measurements followed by those of a prior; a `Problem` of the descent.
 
-    What neither calibration can tell must stay unknown. Both see the same null direction, but each
-    as it is at its own linearisation; the small angle between the two would pass for knowledge.
-    Null directions of the measured rows that are parallel to one of the prior's are therefore taken
-    out of the prior's rows.
+    A direction that neither calibration determines must stay unknown. Both have the same null
+    direction, but each at its own linearization; the small angle between the two would count as
+    information. Null directions of the measured rows that are parallel to one of the prior's are
+    therefore removed from the rows of the prior.
     """
 
     def __init__(self, problem: Problem, prior: Prior) -> None:
@@ -97,10 +98,10 @@ class WithPrior:
         self.measured = problem
         self.parameters = problem.parameters
         self.slope = B[:, free.places] * free.tolerance
-        self.centre = free.deviation(mean[None])
-        # parameters that are not free any more contribute what they differ from the mean
-        self.constant = B @ (free.values(self.centre)[0] - mean)
-        self.open = np.linalg.svd(self.slope, full_matrices=True)[2][len(B) :].T
+        self.center = free.deviation(mean[None])
+        # parameters that are no longer free contribute their difference from the mean
+        self.constant = B @ (free.values(self.center)[0] - mean)
+        self.unknown = np.linalg.svd(self.slope, full_matrices=True)[2][len(B) :].T
 
     def start(self, deviation: FloatArray) -> Start:
         """Return the warm start of the measurements."""
@@ -118,9 +119,10 @@ class WithPrior:
         if not len(self.slope):
             return at
         slope = np.broadcast_to(self.slope, (len(deviation), *self.slope.shape))
-        if self.open.shape[1]:
-            slope = np.stack([self._consistent(triangle) for triangle in at.factor[:, :-1, :-1]])
-        residual = np.matmul(slope, (deviation - self.centre)[..., None])[..., 0] + self.constant
+        if self.unknown.shape[1]:
+            triangles = at.factor[:, :-1, :-1]
+            slope = np.stack([self._consistent_slope(triangle) for triangle in triangles])
+        residual = np.matmul(slope, (deviation - self.center)[..., None])[..., 0] + self.constant
         rows = np.concatenate([slope, residual[..., None]], axis=2)
         return replace(
             at,
@@ -129,15 +131,15 @@ class WithPrior:
             equations=at.equations + len(self.slope),
         )
 
-    def _consistent(self, triangle: FloatArray) -> FloatArray:
-        """The prior's rows without the null directions (p, d) of measured rows that it does not
-        know either.
+    def _consistent_slope(self, triangle: FloatArray) -> FloatArray:
+        """Return the rows of the prior without the null directions of the measured rows that it
+        does not know either.
         """
         if not np.isfinite(triangle).all():
             return self.slope
         _, s, vt = np.linalg.svd(triangle)
         null = vt[s <= RANK_TOLERANCE * s[0]].T
-        outside = null - self.open @ (self.open.T @ null)
+        outside = null - self.unknown @ (self.unknown.T @ null)
         _, sine, combine = np.linalg.svd(outside, full_matrices=True)
         sine = np.r_[sine, np.zeros(len(combine) - len(sine))]
         common = null @ combine[sine < PARALLEL].T
@@ -150,15 +152,10 @@ def prior_from(earlier: Posterior) -> Prior:
     Raises
     ------
     EstimationError
-        The earlier calibration gives no intervals.
+        The earlier calibration has no intervals.
     """
     if np.isnan(earlier.variance).any():
-        raise EstimationError(
-            "the earlier calibration gives no uncertainty (it did not converge, or too few degrees "
-            "of freedom tell its noise),"
-            " so it cannot be a prior; make it again until it converges, with the instrument's "
-            "sigma"
-        )
+        raise EstimationError(report_finding("prior.no-uncertainty"))
     known = np.isfinite(earlier.variance)
     rows = (
         np.linalg.inv(earlier.directions)[known]
@@ -169,20 +166,19 @@ def prior_from(earlier: Posterior) -> Prior:
 
 
 def limb_parameters(robot: Mechanism, limb: str) -> tuple[str, ...]:
-    """Return the free parameters of a limb, those whose names begin with its name and a point.
+    """Return the free parameters of a limb: those whose names begin with its name and a point.
 
     Raises
     ------
     EstimationError
-        No free parameter belongs to it; with the names that there are.
+        The limb has no free parameter; the text names the limbs that have.
     """
     free = [p.name for p in robot.parameters.entries if p.free]
-    found = tuple(name for name in free if name.startswith(f"{limb}."))
-    if not found:
+    names = tuple(name for name in free if name.startswith(f"{limb}."))
+    if not names:
         limbs = list(dict.fromkeys(name.split(".")[0] for name in free if "." in name))
         raise EstimationError(
-            f"no free parameter of {robot.name} belongs to {limb!r}{suggest_names(limb, limbs)}; limbs "
-            "with free parameters are "
-            f"{', '.join(limbs)}"
+            f"{robot.name} has no limb {limb!r} with free parameters{suggest_names(limb, limbs)}; limbs "
+            f"with free parameters are {', '.join(limbs)}"
         )
-    return found
+    return names

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does the residual fit its degrees of freedom, and how wide are intervals: chi-square and
-Student's t, in words.
+"""Test the residuals of a fit against the noise (chi-square), and scale its intervals.
+
+Intervals use the normal distribution where the noise is given, and Student's t where it is
+estimated.
 """
 
 from __future__ import annotations
@@ -9,40 +11,39 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from loopcal.findings import Finding, report_finding
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import FloatArray
 
 FEWEST_DEGREES = 5
-"""Degrees of freedom below which an estimated noise is too uncertain for intervals (at 4 its own sd
-is 35 %).
+"""Degrees of freedom below which an estimated noise is too uncertain for intervals: with 4 its own
+standard deviation is 35 %.
 """
 
 LEVEL = 0.95
 """Coverage of the intervals called +/-."""
 
-DOUBT = 1e-3
-"""Probability below which the residual is said not to fit the noise."""
-
-ASTRAY = "no interval is given and nothing is said of the noise: what is left is not the residual of a best fit"
-"""What is said of the residual where the iteration did not converge."""
+SIGNIFICANCE = 1e-3
+"""Probability below which a test rejects: residuals that do not agree with the noise, tolerances
+that do not agree with the data.
+"""
 
 
 @dataclass(frozen=True)
 class ResidualTest:
-    """The residual against its degrees of freedom.
+    """The residuals of a fit against the noise.
 
     Attributes
     ----------
     chi_square : whitened sum of squares, with the penalty of a prior.
-    degrees : of freedom that chi_square has when model, noise and prior are right.
-    p_value : probability of a larger chi_square; NaN where the noise is estimated or nothing is
-        left over.
+    degrees : degrees of freedom of chi_square if model, noise and prior are right.
+    p_value : probability of a larger chi_square; NaN where nothing can be tested.
     dof : equations minus the number of parameters that the method effectively uses.
-    noise : "given" or "estimated". sigma_scale : factor on the stated sigmas; 1 where the noise is
-        given, unless the residual is too large for it: then the intervals are wider by this factor,
-        as the stated noise is not believed.
+    noise : "given" or "estimated".
+    sigma_scale : factor on the stated sigmas. With given noise it is 1, unless the test rejects the
+        residuals: then the intervals are wider by this factor.
     intervals : whether intervals are given at all.
-    sentence : what this means.
+    converged, weighted : whether the iteration converged, and whether a loss chose the weights.
     """
 
     chi_square: float
@@ -52,34 +53,63 @@ class ResidualTest:
     noise: str
     sigma_scale: float
     intervals: bool
-    sentence: str
+    converged: bool = True
+    weighted: bool = False
 
     @property
     def failed(self) -> bool:
-        """Whether the residual is, beyond doubt, larger than the stated noise explains."""
-        return self.noise == "given" and self.p_value < DOUBT
+        """Whether the residuals exceed the stated noise beyond doubt."""
+        return self.noise == "given" and self.p_value < SIGNIFICANCE
+
+    @property
+    def finding(self) -> Finding:
+        """The result of the test."""
+        if not self.converged:
+            return report_finding("noise.not-tested")
+        if self.noise == "estimated":
+            return self._estimated
+        if self.weighted:
+            return report_finding("noise.weighted")
+        if self.degrees < 0.5:
+            return report_finding("noise.no-degrees-of-freedom")
+        code = "noise.consistent"
+        if self.p_value < SIGNIFICANCE:
+            code = "noise.residuals-too-large"
+        elif self.p_value > 1.0 - SIGNIFICANCE:
+            code = "noise.residuals-too-small"
+        ratio = float(np.sqrt(self.chi_square / self.degrees))
+        return report_finding(code, ratio=ratio, degrees=self.degrees, p_value=self.p_value)
+
+    @property
+    def _estimated(self) -> Finding:
+        """The result where the noise is estimated."""
+        if self.dof < 0.5:
+            return report_finding("noise.not-estimated")
+        if not self.intervals:
+            return report_finding("noise.too-few-degrees", dof=self.dof, fewest=FEWEST_DEGREES)
+        return report_finding("noise.estimated", scale=self.sigma_scale, dof=self.dof)
 
 
 def run_residual_test(
     decomposition: Decomposition,
     penalty: FloatArray,
     noise: str,
-    robust: bool = False,
+    weighted: bool = False,
     converged: bool = True,
 ) -> ResidualTest:
-    """Check the residual of a fit (t = 1).
+    """Test the residuals of a fit (t = 1).
 
-    chi_square = |W r|^2 + sum penalty_i y_i^2 over the directions used, with one degree of freedom
-    for each equation less one for each direction used without penalty: m - rank for least squares,
-    m for MAP.
+    chi_square = |W r|^2 + sum penalty_i y_i^2 over the directions used. Each equation is a degree
+    of freedom, less one for each direction used without penalty: m - rank for least squares, m for
+    MAP.
 
     Parameters
     ----------
     decomposition, penalty : of the fit. noise : "given" or "estimated".
-    robust : whether a loss gave the rows weights by their residuals, so that chi_square has no
-        known distribution.
-    converged : whether the iteration did; elsewhere than at the minimum neither noise nor intervals
-        can be spoken of.
+    weighted : whether a loss chose the weights by the residuals, so that chi_square has no known
+        distribution.
+    converged : whether the iteration did; elsewhere than at the minimum there are neither tests nor
+        intervals.
     """
     finite = np.where(np.isfinite(penalty), penalty, 0.0)
     left = float(decomposition.remaining(penalty)[0])
@@ -89,65 +119,26 @@ def run_residual_test(
     m = float(decomposition.rows[0])
     degrees = m - float((used & (penalty == 0.0)).sum())
     dof = m - float(decomposition.filter_factors(penalty).sum())
-    if not converged:
-        return ResidualTest(chi_square, degrees, np.nan, dof, noise, 1.0, False, ASTRAY)
-    if noise == "estimated":
-        enough = dof >= FEWEST_DEGREES
+    p_value, scale, intervals = np.nan, 1.0, converged
+    if converged and noise == "estimated":
+        intervals = dof >= FEWEST_DEGREES
         scale = float(np.sqrt(left / dof)) if dof > 0 else np.nan
-        return ResidualTest(
-            chi_square, degrees, np.nan, dof, noise, scale, enough, _estimated(dof, scale, enough)
-        )
-    from scipy.special import chdtrc
+    elif converged and not weighted:
+        from scipy.special import chdtrc
 
-    if robust:
-        return ResidualTest(
-            chi_square,
-            degrees,
-            np.nan,
-            dof,
-            noise,
-            1.0,
-            True,
-            "weights by residuals: no test of the noise",
-        )
-    p_value = float(chdtrc(degrees, chi_square)) if degrees > 0 else np.nan
-    scale = max(1.0, float(np.sqrt(chi_square / degrees))) if p_value < DOUBT else 1.0
+        p_value = float(chdtrc(degrees, chi_square)) if degrees > 0 else np.nan
+        if p_value < SIGNIFICANCE:
+            scale = max(1.0, float(np.sqrt(chi_square / degrees)))
     return ResidualTest(
-        chi_square, degrees, p_value, dof, noise, scale, True, _given(chi_square, degrees, p_value)
+        chi_square, degrees, p_value, dof, noise, scale, intervals, converged, weighted
     )
 
 
-def coverage_factor(check: ResidualTest, level: float = LEVEL) -> float:
-    """Return by how many standard deviations an interval of this coverage extends to each side."""
+def coverage_factor(test: ResidualTest, level: float = LEVEL) -> float:
+    """Return the half-width of an interval of this coverage, in standard deviations."""
     from scipy.special import ndtri, stdtrit
 
     quantile = 0.5 + 0.5 * level
-    if check.noise == "estimated":
-        return float(stdtrit(check.dof, quantile)) if check.intervals else np.nan
+    if test.noise == "estimated":
+        return float(stdtrit(test.dof, quantile)) if test.intervals else np.nan
     return float(ndtri(quantile))
-
-
-def _estimated(dof: float, scale: float, enough: bool) -> str:
-    if dof < 0.5:
-        return "no degree of freedom is left: neither noise nor intervals can be estimated; measure more, or state sigma"
-    word = "one degree of freedom is" if round(dof) == 1 else f"{dof:.3g} degrees of freedom are"
-    if not enough:
-        return f"{word} too few for intervals unless the instrument's sigma is given"
-    return f"noise estimated from the residual with {dof:.3g} degrees of freedom: {scale:.3g} times the stated sigma"
-
-
-def _given(chi_square: float, degrees: float, p_value: float) -> str:
-    if degrees < 0.5:
-        return "no degree of freedom is left: the residual cannot be checked against the noise; measure more"
-    ratio = np.sqrt(chi_square / degrees)
-    if p_value < DOUBT:
-        return (
-            f"the residual is {ratio:.3g} times what the stated noise explains: sigma too small, "
-            "wrong rows,"
-            f" or a model that misses something; intervals are {ratio:.3g} times wider than by the "
-            "stated noise,"
-            " and hold only if no row is wrong"
-        )
-    if p_value > 1.0 - DOUBT:
-        return f"the residual is only {ratio:.3g} of what the stated noise explains: sigma is too large"
-    return "the residual fits the stated noise"

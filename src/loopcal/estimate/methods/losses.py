@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Losses that give blocks of rows far from the fit less weight, on the Mahalanobis norm d of a
-whole block.
+"""Losses reduce the weight of observation blocks that lie far from the fit.
 
-For a block of m whitened residuals d^2 = |W r|^2 has a chi-square distribution with m degrees of
-freedom if the block belongs to the model. A loss is the weight w(d) that its squares get in
-iteratively reweighted least squares. Its constant is stated for one residual and carried to blocks
-of m by equal probability: P(|N(0, 1)| > k) = P(chi2_m > limit^2). Huber, Robust Statistics (1981);
-the usual constants give 95 % efficiency for one normal residual.
+For a block of m whitened residuals, d^2 = |W r|^2 has a chi-square distribution with m degrees of
+freedom if the block belongs to the model. A loss is the weight w(d) of its squares in iteratively
+reweighted least squares. Its constant is stated for a single residual and carried over to blocks of
+m by equal probability: P(|N(0, 1)| > k) = P(chi2_m > limit^2). Huber, Robust Statistics (1981); the
+usual constants give 95 % efficiency for a single normal residual.
 """
 
 from __future__ import annotations
@@ -19,9 +18,12 @@ import numpy as np
 from loopcal.errors import EstimationError
 from loopcal.typing import FloatArray
 
+LARGEST = 8.0
+"""Largest constant [standard deviations]; the probability of more is below double precision."""
+
 
 class Loss(Protocol):
-    """What reweighting asks of a loss."""
+    """The interface of a loss."""
 
     def weight(self, distance: FloatArray, degrees: FloatArray) -> FloatArray:
         """Return the weight (u,) of blocks at distance d (u,) with this many residuals (u,)."""
@@ -30,8 +32,9 @@ class Loss(Protocol):
 
 @dataclass(frozen=True)
 class Huber:
-    """Weight 1 up to the limit and limit / d beyond: far blocks pull with a constant force; the
-    minimum is the only one.
+    """Weight 1 up to the limit and limit / d beyond it.
+
+    Blocks far from the fit pull with a constant force; the minimum is unique for linear rows.
 
     Parameters
     ----------
@@ -40,13 +43,13 @@ class Huber:
     Raises
     ------
     EstimationError
-        k is not above 0.
+        k is not above 0, or too large.
     """
 
     k: float = 1.345
 
     def __post_init__(self) -> None:
-        _check(self.k, "Huber")
+        _check_constant("Huber", self.k)
 
     def weight(self, distance: FloatArray, degrees: FloatArray) -> FloatArray:
         """Return min(1, limit / d)."""
@@ -56,8 +59,9 @@ class Huber:
 
 @dataclass(frozen=True)
 class Tukey:
-    """Weight (1 - (d / limit)^2)^2 below the limit and 0 beyond: far blocks do not count at all.
-    Begun from Huber's fit.
+    """Weight (1 - (d / limit)^2)^2 below the limit and 0 beyond it.
+
+    Blocks far from the fit do not count at all. The fit starts from that with Huber's loss.
 
     Parameters
     ----------
@@ -66,13 +70,13 @@ class Tukey:
     Raises
     ------
     EstimationError
-        c is not above 0.
+        c is not above 0, or too large.
     """
 
     c: float = 4.685
 
     def __post_init__(self) -> None:
-        _check(self.c, "Tukey")
+        _check_constant("Tukey", self.c)
 
     def weight(self, distance: FloatArray, degrees: FloatArray) -> FloatArray:
         """Return (1 - (d / limit)^2)^2, or 0 beyond the limit."""
@@ -80,18 +84,23 @@ class Tukey:
         return (1.0 - share**2) ** 2
 
 
-def block_limit(one: float, degrees: FloatArray) -> FloatArray:
-    """Return the limit of a block's norm that is as rarely exceeded as `one` by a single normal
-    residual.
+def block_limit(single: float, degrees: FloatArray) -> FloatArray:
+    """Return the limit (u,) of a block's norm with the exceedance probability of `single`.
+
+    Parameters
+    ----------
+    single : limit of one normal residual, in standard deviations. degrees : (u,) residuals of each
+        block.
     """
     from scipy.special import chdtri, ndtr
 
-    return np.sqrt(chdtri(np.maximum(degrees, 1.0), 2.0 * float(ndtr(-one))))
+    return np.sqrt(chdtri(np.maximum(degrees, 1.0), 2.0 * float(ndtr(-single))))
 
 
-def _check(constant: float, name: str) -> None:
-    if not 0.0 < constant <= 8.0:
+def _check_constant(name: str, constant: float) -> None:
+    """Refuse a constant outside (0, LARGEST]."""
+    if not 0.0 < constant <= LARGEST:
         raise EstimationError(
             f"{name} loss with constant {constant}: give a number of standard deviations above 0 "
-            "and up to 8"
+            f"and up to {LARGEST:g}"
         )

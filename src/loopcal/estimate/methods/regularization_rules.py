@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rules that choose the ridge parameter or the truncation from the decomposition itself.
 
-Each rule is a small value, called with the decomposition, that minimises one criterion over a fixed
-grid, every trial on its own. With c_i = u_i'b, m equations and filter factors f_i:
+Each rule is a small value, called with the decomposition. It minimizes a criterion over a fixed
+grid, for every trial separately. With c_i = u_i'b, m equations and filter factors f_i:
 
-    GCV                 RSS / (m - sum f_i)^2            (generalised cross-validation)
+    GCV                 RSS / (m - sum f_i)^2            (generalized cross-validation)
     MarginalLikelihood  sum_i log(1 + s_i^2 / lam) + c_i^2 / (1 + s_i^2 / lam)
 
 GCV needs no sigma; the marginal likelihood takes the rows as whitened by their true sigma. Golub,
@@ -23,18 +23,15 @@ from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import FloatArray, IntArray
 
 PER_DECADE = 16
-"""Grid points per factor of ten; the criteria are flat to far less than this around their minimum.
-"""
+"""Grid points per factor of ten; around their minimum the criteria are flat over much more."""
 
 LOWEST, HIGHEST = 1e-12, 1e4
-"""Range of lam in units of the largest squared singular value: from no effect at all to hardly any
-data.
-"""
+"""Range of lam in units of the largest squared singular value: from no effect to hardly any data."""
 
 
 @dataclass(frozen=True)
 class GCV:
-    """Ridge parameter that minimises generalised cross-validation."""
+    """Choose the ridge parameter that minimizes generalized cross-validation."""
 
     def __call__(self, decomposition: Decomposition) -> FloatArray:
         """Return lam (t,)."""
@@ -43,33 +40,31 @@ class GCV:
             penalty = np.broadcast_to(lam[:, None], decomposition.singular_values.shape)
             return _gcv(decomposition, penalty)
 
-        return _smallest(criterion, decomposition)
+        return _minimize(criterion, decomposition)
 
 
 @dataclass(frozen=True)
 class MarginalLikelihood:
-    """Ridge parameter under which the whitened data are most probable."""
+    """Choose the ridge parameter under which the whitened data are most probable."""
 
     def __call__(self, decomposition: Decomposition) -> FloatArray:
         """Return lam (t,)."""
-        held = (
-            np.ones(1) if decomposition.flat is None else ~decomposition.flat
-        )  # flat directions tell nothing
-        square, projected = (
-            decomposition.singular_values**2 * held,
-            decomposition.projections**2 * held,
-        )
+        # directions of unpenalized parameters contain no information on lam
+        unpenalized = decomposition.unpenalized
+        counted = np.ones(1) if unpenalized is None else ~unpenalized
+        square = decomposition.singular_values**2 * counted
+        projected = decomposition.projections**2 * counted
 
         def criterion(lam: FloatArray) -> FloatArray:
             variance = 1.0 + square / lam[:, None]
             return (np.log(variance) + projected / variance).sum(axis=1)
 
-        return _smallest(criterion, decomposition)
+        return _minimize(criterion, decomposition)
 
 
 @dataclass(frozen=True)
 class TruncationGCV:
-    """Truncation k that minimises generalised cross-validation."""
+    """Choose the truncation k that minimizes generalized cross-validation."""
 
     def __call__(self, decomposition: Decomposition) -> IntArray:
         """Return k (t,)."""
@@ -83,7 +78,7 @@ class TruncationGCV:
 
 
 def _gcv(decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
-    """Generalised cross-validation (t,); infinite where no equation is left over."""
+    """Return generalized cross-validation (t,); infinite where no equation is left over."""
     left = decomposition.rows - decomposition.filter_factors(penalty).sum(axis=1)
     spare = left > 1e-6
     return np.where(
@@ -91,11 +86,12 @@ def _gcv(decomposition: Decomposition, penalty: FloatArray) -> FloatArray:
     )
 
 
-def _smallest(
+def _minimize(
     criterion: Callable[[FloatArray], FloatArray], decomposition: Decomposition
 ) -> FloatArray:
-    """Minimise a criterion of lam (t,) over the grid, refined by the parabola through the best
-    three points.
+    """Minimize a criterion of lam (t,) over the grid.
+
+    The parabola through the best grid point and its neighbors refines the minimum.
     """
     reference = np.maximum(decomposition.singular_values[:, 0] ** 2, np.finfo(np.float64).tiny)
     decades = np.log10(HIGHEST / LOWEST)

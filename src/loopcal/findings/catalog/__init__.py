@@ -7,7 +7,17 @@ from importlib import import_module
 
 from loopcal.findings.wording import Entry
 
-SUBJECTS: tuple[str, ...] = ("gates", "workflow", "apply", "files", "plan", "poses")
+SUBJECTS: tuple[str, ...] = (
+    "gates",
+    "workflow",
+    "fit",
+    "noise",
+    "prior",
+    "poses",
+    "apply",
+    "plan",
+    "files",
+)
 """Modules of this package, in the order of docs/findings.md. Each defines `ENTRIES`."""
 
 

@@ -134,7 +134,7 @@ def save_run(
     from loopcal.apply.reused_rows import collect_fitted_rows
 
     fit = report.identification
-    rows = collect_fitted_rows(report.split.fitted, fit.dropped)
+    rows = collect_fitted_rows(report.split.fitted, fit.excluded_poses)
     arrays = {**fit.arrays(), "initial": fit.initial.values, **rows}
     text = format_robot(fit.robot, fit.plus_minus)
     return write_run_folder(path, build_document(report, inputs, command), arrays, text, force)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.estimate import identify
+from loopcal.estimate import FitOptions, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import collect_information
 from loopcal.measure import Line, Measurements, Observations, Plane
@@ -96,7 +96,7 @@ def compare_forms(study: Study, seed: int) -> Forms:
         for name, method in METHODS.items():
             paper = problem.values(identify_from_rows(problem, method, 1e-6).deviation)[0]
             data = measurements(study.layout, q[0], noise)
-            found = identify(study.robot, data, method, rank_tolerance=RANK)
+            found = identify(study.robot, data, method, options=FitOptions(rank_tolerance=RANK))
             unlike = float(np.abs(_in_sds(problem, found.robot.values - paper)).max())
             rows.append((noise / MM, name, found.rank, unlike))
     return Forms(tuple(rows), covariance_difference(study.layout, NOISES[0]))

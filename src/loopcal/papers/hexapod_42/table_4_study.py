@@ -115,7 +115,9 @@ def search_outliers(study: Study, printed: Published, measured: FloatArray) -> O
         whole = identify(study.robot, data.take(keep), LeastSquares()).chi_square
         fits = []
         for pose in keep:
-            check = identify(study.robot, data.take(keep[keep != pose]), LeastSquares()).check
+            check = identify(
+                study.robot, data.take(keep[keep != pose]), LeastSquares()
+            ).residual_test
             numbers = (check.chi_square, check.degrees, check.p_value)
             fits.append(ReducedFit(data.labels[pose], *numbers, whole - check.chi_square))
         rounds.append(tuple(fits))

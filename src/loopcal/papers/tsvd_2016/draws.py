@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.estimate import GCV, MAP, LeastSquares, Ridge, identify_trials
+from loopcal.estimate import GCV, MAP, FitOptions, LeastSquares, Ridge, identify_trials
 from loopcal.measure import make_random_stream
 from loopcal.papers.printed import Cell, Table
 from loopcal.papers.tsvd_2016.machines import (
@@ -174,7 +174,9 @@ def _run_in_hindsight(measured: Study) -> FloatArray:
     """Return the least error of each machine and measure over HINDSIGHT_LAMBDAS."""
     start, tried = None, []
     for lam in HINDSIGHT_LAMBDAS:
-        fit = identify_trials(measured.robot, measured.trials, Ridge(float(lam)), start=start)
+        fit = identify_trials(
+            measured.robot, measured.trials, Ridge(float(lam)), options=FitOptions(start=start)
+        )
         start = fit.values
         tried.append(measured.compute_output_errors(fit.values))
     return np.min(tried, axis=0)

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Findings of a fit: how the iteration ended, poses with low weight, estimates beyond tolerance."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from loopcal.estimate.descent import DescentStatus
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.methods.losses import Loss
+from loopcal.estimate.methods.penalties import MAP, Method
+from loopcal.findings import Finding, report_finding
+from loopcal.measure import Measurements
+from loopcal.typing import FloatArray
+
+FAR = 10.0
+"""Deviation from nominal, in stated tolerances (standard deviations), that contradicts the
+tolerance; noise alone does not cause it.
+"""
+
+LOW_WEIGHT = 0.5
+"""Weight of a pose below which it is named."""
+
+STATUS_CODES = {
+    DescentStatus.CONVERGED: "fit.converged",
+    DescentStatus.OUT_OF_ITERATIONS: "fit.out-of-iterations",
+    DescentStatus.NO_DESCENT: "fit.no-descent",
+    DescentStatus.BAD_START: "fit.bad-start",
+}
+
+
+def report_status(status: DescentStatus, iterations: int) -> Finding:
+    """Return how the iteration ended."""
+    code = STATUS_CODES[status]
+    if status is DescentStatus.BAD_START:
+        return report_finding("fit.bad-start")
+    return report_finding(code, iterations=iterations)
+
+
+def report_divergence(
+    free: FreeParameters, deviation: FloatArray, method: Method, converged: bool
+) -> list[Finding]:
+    """Return findings on estimates far beyond their stated tolerances.
+
+    Nothing is reported where the tolerances are a prior: then `PriorConflict` tests them.
+
+    Parameters
+    ----------
+    free : the parameters. deviation : (p,) estimate - nominal, in tolerances.
+    method : of the fit. converged : whether the iteration did.
+    """
+    if isinstance(method, MAP):
+        return []
+    far = np.flatnonzero((np.abs(deviation) > FAR) & ~free.assumed)
+    if len(far) == 0:
+        stated = not free.assumed.all()
+        return [report_finding("fit.no-prior")] if stated and not converged else []
+    order = far[np.argsort(-np.abs(deviation[far]), kind="stable")]
+    return [
+        report_finding(
+            "fit.beyond-tolerance",
+            names=tuple(free.names[i] for i in order),
+            factor=abs(float(deviation[order[0]])),
+        )
+    ]
+
+
+def report_weights(data: Measurements, weights: FloatArray, loss: Loss | None) -> list[Finding]:
+    """Return which poses a loss gave less than half of their weight.
+
+    Parameters
+    ----------
+    weights : (n,) of the poses. loss : None reports nothing.
+    """
+    if loss is None:
+        return []
+    low = tuple(data.labels[i] for i in np.flatnonzero(weights < LOW_WEIGHT))
+    if not low:
+        return [report_finding("fit.full-weights", loss=repr(loss), total=data.n_poses)]
+    return [
+        report_finding(
+            "fit.low-weights", loss=repr(loss), count=len(low), total=data.n_poses, poses=low
+        )
+    ]
+
+
+def report_equations(equations: int, parameters: int, method: Method) -> list[Finding]:
+    """Return how many directions are known from tolerances alone."""
+    if equations >= parameters or not isinstance(method, MAP):
+        return []
+    return [
+        report_finding(
+            "fit.few-equations",
+            equations=equations,
+            parameters=parameters,
+            directions=parameters - equations,
+        )
+    ]

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The input of a fit: exclude poses, and refuse what cannot be fitted, before and after the start."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from loopcal.errors import DataError, EstimationError, suggest_names
+from loopcal.estimate.methods.penalties import Method
+from loopcal.estimate.problem import Problem
+from loopcal.findings import report_finding
+from loopcal.measure import Measurements, check_actuators
+from loopcal.measure.measurements import weight_reading_sigma
+from loopcal.mechanism import Mechanism
+from loopcal.typing import FloatArray
+
+HUGE = 1e150
+"""Residuals, in units of sigma, whose squares cannot be summed."""
+
+
+def check_types(robot: object, data: object, measurements: type = Measurements) -> None:
+    """Refuse arguments of another type, such as file names.
+
+    Raises
+    ------
+    EstimationError
+        What to pass instead.
+    """
+    if not isinstance(robot, Mechanism):
+        raise EstimationError(
+            f"robot is {_shorten(robot)}; pass a robot, such as load_robot('hexapod-42')"
+        )
+    if not isinstance(data, measurements):
+        maker = "simulate_trials(...)" if measurements is not Measurements else "load_measurements"
+        example = maker if "(" in maker else f"{maker}('measurements.csv', robot)"
+        raise EstimationError(f"data is {_shorten(data)}; pass measurements, such as {example}")
+
+
+def exclude_poses(data: Measurements, excluded: Sequence[str]) -> Measurements:
+    """Return the measurements with weight 0 for every row that belongs to one of these poses.
+
+    The poses keep their places; their readings do not count either.
+
+    Parameters
+    ----------
+    data : measurements. excluded : labels of poses.
+
+    Raises
+    ------
+    DataError
+        The data have no such pose, or a text was given instead of a sequence of labels.
+    """
+    if isinstance(excluded, str):
+        raise DataError(
+            f"the poses to exclude are the text {excluded!r}; give a sequence of labels, such as "
+            f"[{excluded!r}]"
+        )
+    if not excluded:
+        return data
+    for label in excluded:
+        if label not in data.labels:
+            raise DataError(
+                f"no pose {label!r} to exclude{suggest_names(label, data.labels)}; give labels of poses "
+                "in the data"
+            )
+    kept = np.array([label not in excluded for label in data.labels])
+    observations = tuple(
+        o.with_weights(o.weight * kept[o.rows].reshape(len(o), -1).all(axis=1))
+        for o in data.observations
+    )
+    return replace(
+        data,
+        observations=observations,
+        reading_sigma=weight_reading_sigma(data.reading_sigma, kept.astype(np.float64)),
+    )
+
+
+def check_rows(problem: Problem, data: Measurements, robot: Mechanism) -> None:
+    """Refuse readings of another robot, a robot without free parameters, and data without any row.
+
+    Raises
+    ------
+    DataError
+        Wrong number of actuators.
+    EstimationError
+        `fit.no-free-parameter` or `fit.no-measured-value`.
+    """
+    check_actuators(data, robot)
+    if problem.parameters == 0:
+        raise EstimationError(
+            report_finding("fit.no-free-parameter", robot=robot.name, total=len(robot.parameters))
+        )
+    if problem.residual_count[0] == 0:
+        raise EstimationError(report_finding("fit.no-measured-value"))
+
+
+def check_count(problem: Problem, data: Measurements, method: Method, allow_fewer: bool) -> None:
+    """Refuse fewer equations than parameters where the method has no prior to fill the gap.
+
+    Raises
+    ------
+    EstimationError
+        `fit.too-few-equations`, with the number of poses that would be enough, or
+        `fit.no-equation-left`.
+    """
+    nuisance = 0 if problem.nuisance is None else problem.nuisance.unpenalized_count
+    required = method.required_equations(problem.parameters)
+    m, p = int(problem.equations[0]), required + nuisance
+    if m >= p or allow_fewer:
+        return
+    if m == 0:
+        raise EstimationError(
+            report_finding("fit.no-equation-left", poses=data.n_poses, unknowns=p)
+        )
+    raise EstimationError(
+        report_finding(
+            "fit.too-few-equations",
+            equations=m,
+            poses=data.n_poses,
+            unknowns=p,
+            nuisance=nuisance,
+            has_prior=required != problem.parameters,
+            poses_needed=int(np.ceil(p * data.n_poses / m)),
+        )
+    )
+
+
+def check_start(
+    problem: Problem, data: Measurements, deviation: FloatArray, cost: FloatArray
+) -> None:
+    """Refuse a start at which some residuals are not finite.
+
+    Raises
+    ------
+    EstimationError
+        `fit.poses-out-of-reach` or `fit.residuals-not-finite`, with the poses.
+    """
+    if np.isfinite(cost[0]):
+        return
+    start = problem.start(deviation)
+    lost = problem.find_unreached(deviation, start)
+    if len(lost) > 0:
+        raise EstimationError(
+            report_finding(
+                "fit.poses-out-of-reach",
+                count=len(lost),
+                total=data.n_poses,
+                poses=tuple(data.labels[i] for i in lost),
+            )
+        )
+    with np.errstate(all="ignore"):
+        residuals = problem.residuals(deviation, problem.solve(deviation, start))
+    bad = {
+        int(i)
+        for s, r in zip(problem.rows, residuals, strict=True)
+        for i in s.poses_by_link[~(np.abs(r.whitened[0]) < HUGE).all(axis=1)].ravel()
+    }
+    raise EstimationError(
+        report_finding("fit.residuals-not-finite", poses=tuple(data.labels[i] for i in sorted(bad)))
+    )
+
+
+def _shorten(value: object) -> str:
+    """Return a text as it is, and the type of any other value."""
+    return f"the text {value!r}" if isinstance(value, str) else f"a {type(value).__name__}"

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What tests ask of findings: their codes, and which code refused an input."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from loopcal.errors import EstimationError, LoopcalError
+from loopcal.findings import Finding
+
+
+def codes_of(findings: Iterable[Finding]) -> set[str]:
+    """Return the codes of findings."""
+    return {finding.code for finding in findings}
+
+
+def one_of(findings: Iterable[Finding], code: str) -> Finding:
+    """Return the only finding with this code."""
+    (finding,) = (finding for finding in findings if finding.code == code)
+    return finding
+
+
+@contextmanager
+def refused(
+    code: str, error: type[LoopcalError] = EstimationError, **data: object
+) -> Iterator[None]:
+    """Expect an error made from the finding with this code and, among others, these data."""
+    with pytest.raises(error) as caught:
+        yield
+    assert caught.value.code == code, str(caught.value)
+    reported = caught.value.args[0].data
+    assert {name: reported[name] for name in data} == data
