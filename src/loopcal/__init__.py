@@ -2,37 +2,73 @@
 """Geometric calibration of robots with closed kinematic loops.
 
 These names are the public API; every other module may change. Each is imported when it is first
-used, so that `import loopcal` costs nothing.
+used, so that `import loopcal` costs nothing. docs/api.md lists them with their purpose.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from loopcal.apply import AccuracyMap as AccuracyMap
+    from loopcal.apply import AccuracySimulation as AccuracySimulation
+    from loopcal.apply import Compensation as Compensation
+    from loopcal.apply import PoseUncertainty as PoseUncertainty
     from loopcal.apply import Validation as Validation
     from loopcal.apply import accuracy_map as accuracy_map
     from loopcal.apply import compensate as compensate
     from loopcal.apply import pose_uncertainty as pose_uncertainty
+    from loopcal.apply import simulate_accuracy as simulate_accuracy
     from loopcal.apply import validate as validate
+    from loopcal.diagnose import ConventionCheck as ConventionCheck
+    from loopcal.diagnose import CrossValidation as CrossValidation
+    from loopcal.diagnose import FitExamination as FitExamination
+    from loopcal.diagnose import Identifiability as Identifiability
+    from loopcal.diagnose import ModelChoice as ModelChoice
+    from loopcal.diagnose import OutlierCheck as OutlierCheck
+    from loopcal.diagnose import TruthComparison as TruthComparison
     from loopcal.diagnose import check_conventions as check_conventions
+    from loopcal.diagnose import choose_identifiable_subset as choose_identifiable_subset
+    from loopcal.diagnose import choose_model as choose_model
+    from loopcal.diagnose import compare_conventions as compare_conventions
     from loopcal.diagnose import compare_with_truth as compare_with_truth
+    from loopcal.diagnose import cross_validate as cross_validate
+    from loopcal.diagnose import examine_fit as examine_fit
+    from loopcal.diagnose import find_outliers as find_outliers
     from loopcal.diagnose import identifiability as identifiability
+    from loopcal.diagnose import suggest_measurements as suggest_measurements
+    from loopcal.errors import DataError as DataError
+    from loopcal.errors import EstimationError as EstimationError
+    from loopcal.errors import FileError as FileError
     from loopcal.errors import LoopcalError as LoopcalError
+    from loopcal.errors import MechanismError as MechanismError
+    from loopcal.errors import UnitError as UnitError
+    from loopcal.estimate import GCV as GCV
     from loopcal.estimate import MAP as MAP
+    from loopcal.estimate import Combination as Combination
+    from loopcal.estimate import DescentStatus as DescentStatus
     from loopcal.estimate import FitOptions as FitOptions
     from loopcal.estimate import Huber as Huber
     from loopcal.estimate import Identification as Identification
+    from loopcal.estimate import IdentifiedTrials as IdentifiedTrials
+    from loopcal.estimate import InflatedTolerances as InflatedTolerances
     from loopcal.estimate import LeastSquares as LeastSquares
+    from loopcal.estimate import MarginalLikelihood as MarginalLikelihood
+    from loopcal.estimate import Prior as Prior
     from loopcal.estimate import Ridge as Ridge
     from loopcal.estimate import StepControl as StepControl
     from loopcal.estimate import TruncatedSVD as TruncatedSVD
+    from loopcal.estimate import TruncationGCV as TruncationGCV
     from loopcal.estimate import Tukey as Tukey
     from loopcal.estimate import identify as identify
     from loopcal.estimate import identify_trials as identify_trials
     from loopcal.estimate import prior_from as prior_from
     from loopcal.estimate import recalibrate as recalibrate
+    from loopcal.findings import Finding as Finding
+    from loopcal.findings import Quantity as Quantity
+    from loopcal.findings import Severity as Severity
     from loopcal.io import Run as Run
     from loopcal.io import load_measurements as load_measurements
     from loopcal.io import load_robot as load_robot
@@ -41,14 +77,29 @@ if TYPE_CHECKING:
     from loopcal.io import save_robot as save_robot
     from loopcal.io import save_run as save_run
     from loopcal.measure import KINDS as KINDS
+    from loopcal.measure import Autocollimation as Autocollimation
+    from loopcal.measure import Bearing as Bearing
     from loopcal.measure import Component as Component
+    from loopcal.measure import Direction as Direction
+    from loopcal.measure import Distance as Distance
     from loopcal.measure import Gaussian as Gaussian
+    from loopcal.measure import Inclination as Inclination
     from loopcal.measure import Instrument as Instrument
+    from loopcal.measure import JointSensor as JointSensor
+    from loopcal.measure import Line as Line
+    from loopcal.measure import Locked as Locked
     from loopcal.measure import Measurements as Measurements
     from loopcal.measure import Observations as Observations
+    from loopcal.measure import Plane as Plane
     from loopcal.measure import Pose as Pose
+    from loopcal.measure import Position as Position
     from loopcal.measure import Sensor as Sensor
+    from loopcal.measure import Separation as Separation
+    from loopcal.measure import Sphere as Sphere
+    from loopcal.measure import StatedValue as StatedValue
+    from loopcal.measure import Trials as Trials
     from loopcal.measure import Uniform as Uniform
+    from loopcal.measure import sample_truth as sample_truth
     from loopcal.measure import simulate as simulate
     from loopcal.measure import simulate_trials as simulate_trials
     from loopcal.mechanism import Mechanism as Mechanism
@@ -75,96 +126,149 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0.dev0"
 
-_WHERE = {
-    name: module
-    for module, names in {
-        "loopcal.apply": (
-            "Validation",
-            "accuracy_map",
-            "compensate",
-            "pose_uncertainty",
-            "validate",
-        ),
-        "loopcal.diagnose": ("check_conventions", "compare_with_truth", "identifiability"),
-        "loopcal.errors": ("LoopcalError",),
-        "loopcal.estimate": (
-            "FitOptions",
-            "Huber",
-            "Identification",
-            "LeastSquares",
-            "MAP",
-            "Ridge",
-            "StepControl",
-            "TruncatedSVD",
-            "Tukey",
-            "identify",
-            "identify_trials",
-            "prior_from",
-            "recalibrate",
-        ),
-        "loopcal.io": (
-            "Run",
-            "load_measurements",
-            "load_robot",
-            "load_run",
-            "save_measurements",
-            "save_robot",
-            "save_run",
-        ),
-        "loopcal.measure": (
-            "Component",
-            "Gaussian",
-            "Instrument",
-            "KINDS",
-            "Measurements",
-            "Observations",
-            "Pose",
-            "Sensor",
-            "Uniform",
-            "simulate",
-            "simulate_trials",
-        ),
-        "loopcal.mechanism": (
-            "Mechanism",
-            "Solution",
-            "Status",
-            "trace_singularity",
-            "find_assembly_modes",
-            "forward",
-            "inverse",
-            "sample_workspace",
-            "find_working_modes",
-        ),
-        "loopcal.planning": (
-            "Constraints",
-            "LineOfSight",
-            "Plan",
-            "PlanOptions",
-            "SurfaceOptions",
-            "SurfacePlan",
-            "plan",
-            "plan_surfaces",
-        ),
-        "loopcal.workflow": ("CalibrationOptions", "CalibrationReport", "Verdict", "calibrate"),
-    }.items()
-    for name in names
+PUBLIC_NAMES: Mapping[str, tuple[str, ...]] = {
+    "loopcal.apply": (
+        "AccuracyMap",
+        "AccuracySimulation",
+        "Compensation",
+        "PoseUncertainty",
+        "Validation",
+        "accuracy_map",
+        "compensate",
+        "pose_uncertainty",
+        "simulate_accuracy",
+        "validate",
+    ),
+    "loopcal.diagnose": (
+        "ConventionCheck",
+        "CrossValidation",
+        "FitExamination",
+        "Identifiability",
+        "ModelChoice",
+        "OutlierCheck",
+        "TruthComparison",
+        "check_conventions",
+        "choose_identifiable_subset",
+        "choose_model",
+        "compare_conventions",
+        "compare_with_truth",
+        "cross_validate",
+        "examine_fit",
+        "find_outliers",
+        "identifiability",
+        "suggest_measurements",
+    ),
+    "loopcal.errors": (
+        "DataError",
+        "EstimationError",
+        "FileError",
+        "LoopcalError",
+        "MechanismError",
+        "UnitError",
+    ),
+    "loopcal.estimate": (
+        "Combination",
+        "DescentStatus",
+        "FitOptions",
+        "GCV",
+        "Huber",
+        "Identification",
+        "IdentifiedTrials",
+        "InflatedTolerances",
+        "LeastSquares",
+        "MAP",
+        "MarginalLikelihood",
+        "Prior",
+        "Ridge",
+        "StepControl",
+        "TruncatedSVD",
+        "TruncationGCV",
+        "Tukey",
+        "identify",
+        "identify_trials",
+        "prior_from",
+        "recalibrate",
+    ),
+    "loopcal.findings": ("Finding", "Quantity", "Severity"),
+    "loopcal.io": (
+        "Run",
+        "load_measurements",
+        "load_robot",
+        "load_run",
+        "save_measurements",
+        "save_robot",
+        "save_run",
+    ),
+    "loopcal.measure": (
+        "Autocollimation",
+        "Bearing",
+        "Component",
+        "Direction",
+        "Distance",
+        "Gaussian",
+        "Inclination",
+        "Instrument",
+        "JointSensor",
+        "KINDS",
+        "Line",
+        "Locked",
+        "Measurements",
+        "Observations",
+        "Plane",
+        "Pose",
+        "Position",
+        "Sensor",
+        "Separation",
+        "Sphere",
+        "StatedValue",
+        "Trials",
+        "Uniform",
+        "sample_truth",
+        "simulate",
+        "simulate_trials",
+    ),
+    "loopcal.mechanism": (
+        "Mechanism",
+        "Solution",
+        "Status",
+        "find_assembly_modes",
+        "find_working_modes",
+        "forward",
+        "inverse",
+        "sample_workspace",
+        "trace_singularity",
+    ),
+    "loopcal.planning": (
+        "Constraints",
+        "LineOfSight",
+        "Plan",
+        "PlanOptions",
+        "SurfaceOptions",
+        "SurfacePlan",
+        "plan",
+        "plan_surfaces",
+    ),
+    "loopcal.workflow": ("CalibrationOptions", "CalibrationReport", "Verdict", "calibrate"),
 }
+"""Public names by the package that defines them."""
 
-__all__ = ["__version__", *sorted(_WHERE)]  # pyright: ignore[reportUnsupportedDunderAll]  # noqa: PLE0604
+_PACKAGES = {name: package for package, names in PUBLIC_NAMES.items() for name in names}
+
+__all__ = ["__version__", *sorted(_PACKAGES)]  # noqa: PLE0604  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used."""
-    if name not in _WHERE:
+    if name not in _PACKAGES:
         raise AttributeError(
             f"module 'loopcal' has no attribute {name!r}; public names are "
-            f"{', '.join(sorted(_WHERE))}"
+            f"{', '.join(sorted(_PACKAGES))}"
         )
-    value = getattr(import_module(_WHERE[name]), name)
+    value = getattr(import_module(_PACKAGES[name]), name)
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
-    """List the public names."""
+    """Return the public names."""
     return __all__

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write docs/api.md: every public name with its signature and one line.
+
+python -m tools.api_reference            rewrite the page
+"""
+
+from __future__ import annotations
+
+import enum
+import inspect
+import re
+import sys
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import loopcal
+
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "api.md"
+
+SECTIONS = {
+    "loopcal.workflow": "Whole tasks",
+    "loopcal.io": "Files",
+    "loopcal.mechanism": "Robots and kinematics",
+    "loopcal.measure": "Instruments and measurements",
+    "loopcal.estimate": "Estimation",
+    "loopcal.diagnose": "Diagnosis",
+    "loopcal.apply": "Use of a calibration",
+    "loopcal.planning": "Planning",
+    "loopcal.findings": "Findings",
+    "loopcal.errors": "Errors",
+}
+"""Headings by the package that defines the names."""
+
+HEAD = """\
+# Python API
+
+`import loopcal as lc` gives these names, and no other name is public. Inside, all numbers are SI:
+metres and radians. Arrays have the poses first; `T` has shape (n, 4, 4) and maps platform
+coordinates to base coordinates. Terms are in the [glossary](glossary.md). `help(lc.NAME)` shows
+shapes, units and errors. This page is made from the code by `make docs`.
+"""
+
+
+def write_page() -> str:
+    """Return the text of the page."""
+    parts = [HEAD]
+    for package, heading in SECTIONS.items():
+        names = sorted(loopcal.PUBLIC_NAMES[package], key=lambda name: (name.lower(), name))
+        lines = [f"\n## {heading}\n", "| name | purpose |", "|---|---|"]
+        lines += [f"| `{name}` | {describe_name(name)} |" for name in names]
+        parts.append("\n".join(lines) + "\n")
+    return "".join(parts)
+
+
+def describe_name(name: str) -> str:
+    """Return the first sentence of a public name's docstring."""
+    value: Any = getattr(loopcal, name)
+    if isinstance(value, dict | MappingProxyType):
+        return f"Mapping: {', '.join(f'`{key}`' for key in value)}."
+    text = inspect.getdoc(value) or ""
+    if not text or (isinstance(value, type) and text.startswith(f"{name}(")):
+        raise SystemExit(f"{name} has no docstring of its own")
+    paragraph = " ".join(text.split("\n\n")[0].split())
+    sentence = re.split(r"(?<=[.!?]) (?=[A-Z`])", paragraph)[0]
+    members = f" ({', '.join(m.name for m in value)})" if _is_enum(value) else ""
+    return sentence.replace("|", "\\|").rstrip(".") + members + "."
+
+
+def _is_enum(value: Any) -> bool:
+    return isinstance(value, type) and issubclass(value, enum.Enum)
+
+
+def main() -> int:
+    """Rewrite the page."""
+    PAGE.write_text(write_page(), encoding="utf-8")
+    print(f"wrote {PAGE.name}: {len(loopcal.__all__) - 1} names")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
