@@ -36,12 +36,12 @@ def _hexapod() -> tuple[FreeParameters, WorkspaceSample, Array, Array]:
 def _rows(coordinates: np.ndarray) -> np.ndarray:
     """Return whitened rows (b, 6, p) at controlled coordinates (b, 6); NaN where out of reach."""
     free = _hexapod()[0]
-    found = inverse(free.robot, coordinates)
+    solution = inverse(free.robot, coordinates)
     rows = (
-        observe_poses(free, np.where(found.converged[:, None], found.q, 0.0)).twists[0]
+        observe_poses(free, np.where(solution.converged[:, None], solution.q, 0.0)).twists[0]
         / SIGMA[:, None]
     )
-    return np.where(found.converged[:, None, None], rows, np.nan)
+    return np.where(solution.converged[:, None, None], rows, np.nan)
 
 
 def bench_coordinate_exchange() -> Metric:

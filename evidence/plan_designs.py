@@ -43,8 +43,8 @@ def evaluate_design(case: Case, criterion_name: str) -> list[object]:
     criterion: Criterion = (
         D() if criterion_name == "D" else I(twists[:PREDICTED, 3:].reshape(-1, p), PREDICTED)
     )
-    found = choose_design(rows, POSES, criterion, prior)
-    space, relaxed = found.design.space, found.relaxed
+    certified = choose_design(rows, POSES, criterion, prior)
+    space, relaxed = certified.design.space, certified.relaxed
     random = np.random.default_rng(0)
     even = [
         relaxed.efficiency(
@@ -64,8 +64,8 @@ def evaluate_design(case: Case, criterion_name: str) -> list[object]:
         float(np.median(even)),
         float(np.median(plain)),
         max(plain),
-        found.efficiency,
-        1.0 - found.efficiency,
+        certified.efficiency,
+        1.0 - certified.efficiency,
     ]
 
 

@@ -163,15 +163,14 @@ def instrument(case: Case, noise_factor: float = 1.0) -> Instrument:
 
 def measure_planned(study: Study, n: int) -> Errors:
     """Return the errors of all machines, measured at the same n planned poses."""
-    found = plan_poses(study.problem.with_options(n_poses=n))
+    plan = plan_poses(study.problem.with_options(n_poses=n))
     seeds, machines, p = study.truth.shape
     tool = study.tool.reshape(-1, *study.tool.shape[2:])
     position, orientation = calibrate_machines(
-        study, found.poses.coordinates, study.truth.reshape(-1, p), tool, SEED
+        study, plan.poses.coordinates, study.truth.reshape(-1, p), tool, SEED
     )
     expected = np.full(
-        seeds,
-        float(study.target_error(found.errors.after.position, found.errors.after.orientation)),
+        seeds, float(study.target_error(plan.errors.after.position, plan.errors.after.orientation))
     )
     shape = (seeds, machines)
     return Errors(position.reshape(shape), orientation.reshape(shape), expected)
@@ -183,10 +182,10 @@ def measure_random(study: Study, n: int) -> Errors:
     sets = zip(
         study.coordinates, study.truth, study.tool, range(SEED + 1, SEED + 1 + seeds), strict=True
     )
-    found = [
+    errors = [
         calibrate_machines(study, poses[:n], truth, tool, seed) for poses, truth, tool, seed in sets
     ]
-    position, orientation = np.stack(found, axis=1)
+    position, orientation = np.stack(errors, axis=1)
     return Errors(position, orientation, predict_random(study, n))
 
 
@@ -213,9 +212,9 @@ def predict_among_candidates(study: Study, n: int) -> float:
 
 def predict_error(study: Study, problem: PlanningProblem, chosen: NDArray[np.int64]) -> float:
     """Return the error of the target that the theory predicts for some groups."""
-    found = problem.predict_errors(chosen)
-    assert found is not None, "tolerances bound every error"
-    return float(study.target_error(found.position, found.orientation))
+    errors = problem.predict_errors(chosen)
+    assert errors is not None, "tolerances bound every error"
+    return float(study.target_error(errors.position, errors.orientation))
 
 
 def calibrate_machines(
@@ -298,17 +297,17 @@ def compare_noise(case: Case) -> list:
     """Return how many random poses the theory predicts to be as good as GLANCE planned ones, for
     each multiple of the noise.
     """
-    found: list[object] = [case.robot, case.measured, GLANCE]
+    row: list[object] = [case.robot, case.measured, GLANCE]
     for noise_factor in NOISE_FACTORS:
         study = prepare_study(case, machines=1, noise_factor=noise_factor)
         plan = plan_poses(study.problem.with_options(n_poses=GLANCE)).errors.after
         curve = [float(np.median(predict_random(study, n))) for n in RANDOM]
-        found.append(
+        row.append(
             find_equal_number(
                 RANDOM, curve, float(study.target_error(plan.position, plan.orientation))
             )
         )
-    return found
+    return row
 
 
 def select_glance(accuracy: list, saving: list) -> list:

@@ -178,14 +178,14 @@ def _draw_inside(
     excluded: Counter[Violation],
 ) -> tuple[FloatArray, int]:
     """Draw allowed poses evenly (count, c), count the excluded; return also the number drawn."""
-    robot, parts, kept, total = checker.robot, [], 0, 0
+    robot, batches, kept, total = checker.robot, [], 0, 0
     while kept < count:
         number = count if not kept else max(count - kept, count // 10, 1)
         poses = round_coordinates(robot, draw_coordinates(rng, robot.controlled, bounds, number))
         check = checker.check_poses(inverse(robot, poses))
         excluded.update(check.count_violations())
-        parts.append(poses[check.allowed])
-        kept, total = kept + len(parts[-1]), total + len(poses)
+        batches.append(poses[check.allowed])
+        kept, total = kept + len(batches[-1]), total + len(poses)
         if total >= MIN_DRAWS and kept < MIN_REACHABLE_SHARE * total:
             raise MechanismError(
                 report_finding(
@@ -196,7 +196,7 @@ def _draw_inside(
                     reasons=list_reasons(dict(excluded.most_common())),
                 )
             )
-    return np.concatenate(parts), total
+    return np.concatenate(batches), total
 
 
 def _draw_boundary(

@@ -237,7 +237,7 @@ def _linearize_block(
     """Return the rows (b, r, o + p) of some groups."""
     poses, places = np.unique(members, return_inverse=True)
     places = places.reshape(members.shape)
-    at = observe_poses(
+    observed = observe_poses(
         free, readings[poses], list_sensed_joints(sensor.kind for sensor in mounted.sensors)
     )
     nuisance = _list_nuisance(mounted, places)
@@ -248,12 +248,12 @@ def _linearize_block(
             nuisance.select(i, nuisance.table.nominal[None]) if kind.nuisance_parameters else None
         )
         joints = (
-            np.stack([at.joints[name][:, rows] for name in kind.sensed_joints], axis=-1)
+            np.stack([observed.joints[name][:, rows] for name in kind.sensed_joints], axis=-1)
             if kind.sensed_joints
             else None
         )
         noise = np.zeros((1, len(rows), len(kind.noise_columns)))
-        measured = kind.measure(at.T[:, rows], noise, values, joints)[0]
+        measured = kind.measure(observed.T[:, rows], noise, values, joints)[0]
         # what is undefined there, such as the direction from a point to itself
         undefined = [row for row, _ in kind.find_invalid_rows(measured)]
         unusable[[row * len(members) // len(rows) for row in undefined]] = True
@@ -261,12 +261,12 @@ def _linearize_block(
         observations.append(
             Observations.from_sigma(kind, rows, measured, sensor.noise.sigma, "", "")
         )
-    data = Measurements(free.robot.name, at.readings, tuple(observations))
-    whitened = observe_rows(at, data, nuisance, nuisance.values())[0, :, :-1]
+    data = Measurements(free.robot.name, observed.readings, tuple(observations))
+    whitened = observe_rows(observed, data, nuisance, nuisance.values())[0, :, :-1]
     counts = [len(part) * len(part.kind.noise_columns) for part in observations]
     pieces = np.split(whitened, np.cumsum(counts)[:-1])
     rows = np.concatenate(
         [piece.reshape(len(members), -1, whitened.shape[1]) for piece in pieces], axis=1
     )
-    rows[unusable | ~at.is_reached[places].all(axis=1)] = np.nan
+    rows[unusable | ~observed.is_reached[places].all(axis=1)] = np.nan
     return rows

@@ -213,8 +213,8 @@ class PlaneLineGroups:
         different, back = np.unique(x.reshape(-1, x.shape[2]), axis=0, return_inverse=True)
         T, J, reached = self._linearize_points(different)
         back = back.reshape(x.shape[:2])
-        at, J = (T[:, :3, :3] @ self.robot.tool[:3, 3] + T[:, :3, 3])[back], J[back]
-        F, A = linearize_surfaces(at, J, self._axis(design))
+        points = (T[:, :3, :3] @ self.robot.tool[:3, 3] + T[:, :3, 3])[back]
+        F, A = linearize_surfaces(points, J[back], self._axis(design))
         rows, determined = eliminate_surfaces(F, A)
         allowed = determined & reached[back].all(axis=1)
         allowed &= self._line_length(design) >= self.shortest

@@ -219,8 +219,25 @@ def plan_surfaces(robot: Mechanism, options: SurfaceOptions | None = None) -> Su
         prior,
         SWEEPS,
     )
-    x = groups.place_points(best.design)
-    solution = inverse(robot, x.reshape(-1, x.shape[2]))
+    poses, positions = _arrange_points(groups, checker, best.design)
+    return SurfacePlan(
+        robot,
+        options,
+        poses,
+        positions,
+        np.rint(best.design[:, AXIS]).astype(np.int64),
+        rank,
+        _rms_sd(rows[: options.groups], rank),
+        _rms_sd(best.rows, rank),
+    )
+
+
+def _arrange_points(
+    groups: PlaneLineGroups, checker: ConstraintChecker, design: FloatArray
+) -> tuple[PlannedPoses, FloatArray]:
+    """Return the poses of a design in their order, and the positions of the tool (u, k, 3) [m]."""
+    x = groups.place_points(design)
+    solution = inverse(groups.robot, x.reshape(-1, x.shape[2]))
     u, k = x.shape[:2]
     poses = PlannedPoses(
         tuple(
@@ -232,16 +249,7 @@ def plan_surfaces(robot: Mechanism, options: SurfaceOptions | None = None) -> Su
         _require_paths(checker, x),
         np.arange(u * k).reshape(u, k),
     )
-    return SurfacePlan(
-        robot,
-        options,
-        poses,
-        (solution.T @ robot.tool)[:, :3, 3].reshape(u, k, 3),
-        np.rint(best.design[:, AXIS]).astype(np.int64),
-        rank,
-        _rms_sd(rows[: options.groups], rank),
-        _rms_sd(best.rows, rank),
-    )
+    return poses, (solution.T @ groups.robot.tool)[:, :3, 3].reshape(u, k, 3)
 
 
 def _draw_allowed(

@@ -89,8 +89,8 @@ def plan_poses(problem: PlanningProblem) -> Plan:
     if options.goal is not None:
         return _plan_for_goal(problem)
     number = N_POSES if options.n_poses is None else options.n_poses
-    found = _plan_number(problem, number)
-    return replace(found, curve=compute_error_curve(problem)) if options.curve else found
+    result = _plan_number(problem, number)
+    return replace(result, curve=compute_error_curve(problem)) if options.curve else result
 
 
 def _plan_for_goal(problem: PlanningProblem) -> Plan:
@@ -108,9 +108,9 @@ def _plan_for_goal(problem: PlanningProblem) -> Plan:
     # Validation poses are taken from the candidates, and D is not what the goal counts: both can
     # cost some more poses.
     for _ in range(EXTENSIONS):
-        found = _plan_number(problem, n * k)
-        if found.errors.after.select(options.target, problem.prediction.size) <= options.goal:
-            return replace(found, curve=replace(curve, enough=n))
+        result = _plan_number(problem, n * k)
+        if result.errors.after.select(options.target, problem.prediction.size) <= options.goal:
+            return replace(result, curve=replace(curve, enough=n))
         n += max(n // 20, 1)
     raise EstimationError(
         report_finding(

@@ -259,11 +259,7 @@ def prepare_problem(
         raise EstimationError(report_finding("plan.no-free-parameter", robot=robot.name))
     _require_plain_sensors(instrument)
     rng = np.random.default_rng(options.seed)
-    candidates = (
-        draw_candidates(robot, options.constraints, options.n_candidates, rng)
-        if options.allowed_poses is None
-        else check_listed_poses(robot, options.allowed_poses, options.constraints)
-    )
+    candidates = _list_candidates(robot, options, rng)
     mounted = instrument.with_tool(robot)
     groups = linearize_candidate_groups(free, mounted, candidates.solution.q, rng)
     observable = decompose_information(free, groups)
@@ -277,12 +273,10 @@ def prepare_problem(
                 poses=len(candidates),
             )
         )
-    measured = options.measured
-    earlier, n_equations = (None, 0) if measured is None else _fold_measured(free, measured)
+    earlier, n_equations, labels = _fold_measured(free, options.measured)
     if earlier is not None:
         observable = decompose_information(free, groups, earlier)
     to_predict = _select_predicted(candidates, options)
-    labels = () if measured is None else measured.labels
     return PlanningProblem(
         free,
         mounted,
@@ -295,6 +289,15 @@ def prepare_problem(
         n_equations,
         tuple(dict.fromkeys([*labels, *options.used_names])),
     )
+
+
+def _list_candidates(
+    robot: Mechanism, options: PlanOptions, rng: np.random.Generator
+) -> Candidates:
+    """Return the allowed poses of the options, or poses drawn from the workspace."""
+    if options.allowed_poses is None:
+        return draw_candidates(robot, options.constraints, options.n_candidates, rng)
+    return check_listed_poses(robot, options.allowed_poses, options.constraints)
 
 
 def name_groups(poses_per_group: int) -> str:
@@ -323,10 +326,14 @@ def _require_plain_sensors(instrument: Instrument) -> None:
         )
 
 
-def _fold_measured(free: FreeParameters, measured: Measurements) -> tuple[FloatArray, int]:
-    """Return the factor (p, p) of earlier measurements, and the number of equations that they leave
-    for the robot.
+def _fold_measured(
+    free: FreeParameters, measured: Measurements | None
+) -> tuple[FloatArray | None, int, tuple[str, ...]]:
+    """Return the factor (p, p) of earlier measurements, the number of equations that they leave for
+    the robot, and the names of their poses.
     """
+    if measured is None:
+        return None, 0, ()
     robot = free.robot
     check_actuators(measured, robot)
     if not measured.n_rows:
@@ -339,7 +346,8 @@ def _fold_measured(free: FreeParameters, measured: Measurements) -> tuple[FloatA
         )
     table = measured.nuisance_parameters.table
     nuisance = int((table.free & np.isnan(table.tolerance)).sum())
-    return factor[0, :-1, :-1], max(count_equations(robot, measured) - nuisance, 0)
+    n_equations = max(count_equations(robot, measured) - nuisance, 0)
+    return factor[0, :-1, :-1], n_equations, tuple(measured.labels)
 
 
 def _select_predicted(candidates: Candidates, options: PlanOptions) -> Solution:

@@ -174,7 +174,7 @@ def find_sample_size(problem: PlanningProblem) -> ErrorCurve:
 
 def _convert_curve(problem: PlanningProblem, curve: DesignCurve) -> ErrorCurve:
     """Return a curve of variances as a curve of errors."""
-    expected = [problem.predict_errors(one.design.chosen) for one in curve.designs]
+    expected = [problem.predict_errors(made.design.chosen) for made in curve.designs]
     return ErrorCurve(
         curve.sizes,
         tuple(errors for errors in expected if errors is not None),  # every design is determined

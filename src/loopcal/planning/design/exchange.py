@@ -267,11 +267,7 @@ def coordinate_exchange(
     design = np.array(design0, dtype=np.float64)
     indices = np.arange(len(design))
     rows = np.array(linearize(indices, design))
-    excluded = np.flatnonzero(~is_allowed(rows))
-    if len(excluded):
-        raise EstimationError(
-            f"group {excluded[0]} of the first design is not allowed; start from groups that are"
-        )
+    _require_allowed(rows)
     probes = _probe_levels(linearize, design, rows, levels)
     space = find_observable_space(probes, prior)
     require_enough(len(design), rows, prior, space)
@@ -284,8 +280,7 @@ def coordinate_exchange(
         for c, values in enumerate(levels):
             moved = np.repeat(design[:, None], len(values), axis=1)
             moved[:, :, c] = values
-            which = np.repeat(indices, len(values))
-            flat = moved.reshape(-1, design.shape[1])
+            which, flat = np.repeat(indices, len(values)), moved.reshape(-1, design.shape[1])
             trials = linearize(which, flat) if len(values) else rows[:0]
             trials = trials.reshape(len(design), len(values), *rows.shape[1:])
             evaluated += len(which)
@@ -299,6 +294,15 @@ def coordinate_exchange(
     require_determined(history[-1], len(design), len(design), space)
     values = tuple(scoring.value(score) for score in history)
     return MovedDesign(design, rows, values[-1], values, evaluated, space)
+
+
+def _require_allowed(rows: FloatArray) -> None:
+    """Refuse a first design (u, r, c) with a group that is not allowed."""
+    excluded = np.flatnonzero(~is_allowed(rows))
+    if len(excluded):
+        raise EstimationError(
+            f"group {excluded[0]} of the first design is not allowed; start from groups that are"
+        )
 
 
 def _probe_levels(

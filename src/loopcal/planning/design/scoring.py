@@ -232,16 +232,16 @@ def score_swaps(terms: SwapTerms, j: int) -> FloatArray:
     """
     Y = terms.Y[j]
     U = terms.Y @ Y.T
-    E = terms.W @ U
-    S = np.eye(len(Y)) - Y @ Y.T + U.swapaxes(1, 2) @ E
+    WU = terms.W @ U
+    S = np.eye(len(Y)) - Y @ Y.T + U.swapaxes(1, 2) @ WU
     sign, logdet = np.linalg.slogdet(S)
     regular = sign > 0.0
     if terms.V is None or terms.gram is None:
         nuisance = 0.0 if terms.nuisance is None else score_swaps(terms.nuisance, j)
         return np.where(regular, terms.log_added + logdet - nuisance, -np.inf)
     V = terms.V[j]
-    cross = E.swapaxes(1, 2) @ (terms.V @ V.T)
-    product = V @ V.T - cross - cross.swapaxes(1, 2) + E.swapaxes(1, 2) @ terms.gram @ E
+    cross = WU.swapaxes(1, 2) @ (terms.V @ V.T)
+    product = V @ V.T - cross - cross.swapaxes(1, 2) + WU.swapaxes(1, 2) @ terms.gram @ WU
     S = np.where(regular[:, None, None], S, np.eye(len(Y)))
     back = np.trace(np.linalg.solve(S, product), axis1=1, axis2=2)
     trace = terms.trace - (terms.W * terms.gram).sum(axis=(1, 2)) + back

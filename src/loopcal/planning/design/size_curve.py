@@ -191,7 +191,7 @@ def _meets_target(criterion: Criterion, value: float, target: float) -> bool:
 
 def _collect_curve(designs: list[CertifiedDesign]) -> DesignCurve:
     """Return the curve of designs, ascending in size."""
-    sizes = np.array([len(one.design.chosen) for one in designs], dtype=np.int64)
-    values = np.array([one.design.value for one in designs])
-    bounds = np.array([one.relaxed.bound for one in designs])
+    sizes = np.array([len(made.design.chosen) for made in designs], dtype=np.int64)
+    values = np.array([made.design.value for made in designs])
+    bounds = np.array([made.relaxed.bound for made in designs])
     return DesignCurve(sizes, values, bounds, tuple(designs))
