@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from loopcal import geometry
-from loopcal.diagnose import IMPLAUSIBLE, compare_conventions
+from loopcal.diagnose import IMPLAUSIBLE, ConventionCheck, compare_conventions
 from loopcal.errors import LoopcalError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.io import load_robot
@@ -94,7 +95,7 @@ def false_alarms(times: float) -> list:
         if data is not None:
             found = compare_conventions(robot, data)
             misfits.append(found.misfit)
-            refused += found.refused
+            refused += found.is_refused
     said = np.array(misfits)[~np.isnan(misfits)]
     doubted = int((said > IMPLAUSIBLE).sum())
     return [times, len(misfits), len(misfits) - len(said), float(np.median(said)), doubted, refused]
@@ -121,42 +122,77 @@ def rewritten(change: Change) -> Change:
     return lambda values: np.concatenate([change(values[:, :3]), values[:, 3:]], axis=1)
 
 
+Details = dict[str, Any]
+"""Kind of a slip, and what it changes."""
+
+
+def unit_slip(quantity: str, factor: float) -> Details:
+    """A wrong unit: the values are meant to be `factor` times larger."""
+    return {"slip": "unit", "quantity": quantity, "factor": factor}
+
+
+def is_named(check: ConventionCheck, details: Details) -> bool:
+    """Whether the slip is the best interpretation or one of those that fit as well."""
+    if check.interpretation is None:
+        return False
+    every = (check.interpretation, *check.alternatives)
+    return any(details.items() <= {"slip": one.slip, **one.details}.items() for one in every)
+
+
 XYZ = Pose("euler-xyz")
-VALUE_SLIPS: tuple[tuple[str, Kind, Change, str], ...] = (
-    ("mm written as m", Pose(), columns([3, 4, 5], 1e3), "lengths 1000 times smaller"),
-    ("deg written as rad", Pose(), columns([0, 1, 2], 180.0 / np.pi), "angles 57.3 times smaller"),
-    ("x and y swapped", Pose(), exchanged([0, 1, 2, 4, 3, 5]), "columns x and y swapped"),
-    ("rotations inverted", Pose(), columns([0, 1, 2], -1.0), "rotations inverted"),
+VALUE_SLIPS: tuple[tuple[str, Kind, Change, Details], ...] = (
+    ("mm written as m", Pose(), columns([3, 4, 5], 1e3), unit_slip("lengths", 1e-3)),
+    (
+        "deg written as rad",
+        Pose(),
+        columns([0, 1, 2], 180.0 / np.pi),
+        unit_slip("angles", 1.0 / (180.0 / np.pi)),
+    ),
+    (
+        "x and y swapped",
+        Pose(),
+        exchanged([0, 1, 2, 4, 3, 5]),
+        {"slip": "swapped-columns", "columns": ("x", "y")},
+    ),
+    ("rotations inverted", Pose(), columns([0, 1, 2], -1.0), {"slip": "inverted-rotations"}),
     (
         "euler-zyx for euler-xyz",
         XYZ,
         rewritten(lambda a: geometry.matrix_to_euler(geometry.euler_to_matrix(a, "xyz"), "zyx")),
-        "rotations read as euler-zyx",
+        {"slip": "orientation-form", "form": "euler-zyx"},
     ),
     (
         "moving for fixed axes",
         XYZ,
         rewritten(lambda a: geometry.matrix_to_euler(geometry.euler_to_matrix(a, "xyz"), "XYZ")),
-        "rotations read as euler-XYZ",
+        {"slip": "orientation-form", "form": "euler-XYZ"},
     ),
     (
         "inches written as mm, frame unknown",
         UNKNOWN,
         columns([0, 1, 2], 1.0 / 25.4),
-        "lengths 25.4 times larger",
+        unit_slip("lengths", 25.4),
     ),
     (
         "cm written as mm, frame unknown",
         UNKNOWN,
         columns([0, 1, 2], 0.1),
-        "lengths 10 times larger",
+        unit_slip("lengths", 10.0),
     ),
-    ("drop for rise", Component(("z",)), columns([0], -1.0), "z of the other sign"),
+    ("drop for rise", Component(("z",)), columns([0], -1.0), {"slip": "sign", "column": "z"}),
 )
-READING_SLIPS: tuple[tuple[str, Change, str], ...] = (
-    ("two actuators swapped", lambda q: q[:, [1, 0, *range(2, q.shape[1])]], "swapped"),
-    ("readings of the other sign", lambda q: -q, "all readings of the other sign"),
-    ("rows moved by one", lambda q: np.roll(q, 1, axis=0), "row below"),
+READING_SLIPS: tuple[tuple[str, Change, Details], ...] = (
+    (
+        "two actuators swapped",
+        lambda q: q[:, [1, 0, *range(2, q.shape[1])]],
+        {"slip": "swapped-readings"},
+    ),
+    ("readings of the other sign", lambda q: -q, {"slip": "reading-sign"}),
+    (
+        "rows moved by one",
+        lambda q: np.roll(q, 1, axis=0),
+        {"slip": "shifted-readings", "neighbor": "below"},
+    ),
 )
 
 
@@ -184,17 +220,17 @@ def detected() -> list[list]:
     """For each slip: data sets, those it makes implausible, refused, and named first or among
     others that fit as well.
     """
-    tried = [(name, kind, change, None, words) for name, kind, change, words in VALUE_SLIPS]
-    tried += [(name, Pose(), None, change, words) for name, change, words in READING_SLIPS]
+    tried = [(name, kind, change, None, slip) for name, kind, change, slip in VALUE_SLIPS]
+    tried += [(name, Pose(), None, change, slip) for name, change, slip in READING_SLIPS]
     machines = [load_robot(name) for name in SLIPPED]
     rows = []
-    for name, kind, change, change_readings, words in tried:
+    for name, kind, change, change_readings, details in tried:
         every = [(robot, slipped(robot, kind, change, change_readings)) for robot in machines]
         found = [compare_conventions(robot, data) for robot, data in every if data is not None]
-        named = sum(any(words in one for one in (f.other or "", *f.alike)) for f in found)
-        rows.append(
-            [name, len(found), sum(f.doubtful for f in found), sum(f.refused for f in found), named]
-        )
+        named = sum(is_named(check, details) for check in found)
+        doubtful = sum(check.is_doubtful for check in found)
+        refused = sum(check.is_refused for check in found)
+        rows.append([name, len(found), doubtful, refused, named])
     return rows
 
 

@@ -18,8 +18,13 @@ class LoopcalError(Exception):
 
     @property
     def code(self) -> str | None:
-        """Code of the finding behind this error; None where it was made from a sentence."""
-        return getattr(self.args[0], "code", None) if self.args else None
+        """Code of the finding behind this error, or behind the error that caused it; None where
+        both were made from sentences.
+        """
+        code = getattr(self.args[0], "code", None) if self.args else None
+        if code is None and isinstance(self.__cause__, LoopcalError):
+            return self.__cause__.code
+        return code
 
 
 class UnitError(LoopcalError):

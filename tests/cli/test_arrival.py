@@ -65,16 +65,14 @@ def test_a_slip_is_refused_in_one_sentence_and_overridden_by_its_flag(here) -> N
     for command in ("calibrate hexapod-42 data.csv -o run", "identifiability hexapod-42 data.csv"):
         code, out, err = run(command)
         assert (code, out) == (1, "")
-        assert err.startswith(
-            "loopcal: data.csv: the data do not fit 'hexapod-42' as they are written: "
-        )
-        assert "with lengths 1000 times smaller (mm written as m, or um as mm)" in err
-        assert err.endswith("correct the unit in the header, or use --allow-implausible\n")
-        assert err.count("\n") == 1
+        assert err.startswith("loopcal: data.csv: ")
+        assert "lengths 1000 times smaller" in err
+        assert "--allow-implausible" in err
     assert not (folder / "run").exists()
     assert run("identifiability hexapod-42 data.csv --allow-implausible")[0] == 0
-    with pytest.raises(DataError, match="--allow-implausible"):
+    with pytest.raises(DataError) as error:
         load_measurements(folder / "data.csv", robot)
+    assert error.value.code == "conventions.other-interpretation"
     assert load_measurements(folder / "data.csv", robot, allow_implausible=True).n_poses == 9
 
 
@@ -99,7 +97,7 @@ def test_a_target_that_no_pose_moves_is_refused_and_overridden_by_its_flag(here)
     code, out, err = run("calibrate hexapod-42 data.csv -o run")
     assert (code, out) == (1, "")
     assert "'pose' of kind 'pose' never moves: its readings stay within 0" in err
-    assert "or use --allow-still" in err
+    assert "--allow-still" in err
     assert run("identifiability hexapod-42 data.csv --allow-still --allow-implausible")[0] == 0
 
 
@@ -160,19 +158,15 @@ def test_a_prior_or_a_fixed_coordinate_that_the_data_contradict_is_refused_by_it
         ("frame.x: fixed", "not at 0 mm (fixed)"),
     ):
         code, out, err = said(statement)
-        assert (code, out, err.count("\n")) == (1, "", 1)
-        assert err.startswith(
-            "loopcal: stated.csv: the data contradict what 'unknowns' states: they put frame.x at "
-        )
-        assert shown in err
-        assert "with frame.x left to the data" in err
-        assert err.endswith("correct or remove the statement, or use --allow-implausible\n")
+        assert (code, out) == (1, "")
+        assert err.startswith("loopcal: stated.csv: ")
+        assert "frame.x at " in err
+        assert shown in " ".join(err.split())
+        assert "--allow-implausible" in err
     assert said("frame.x: {start: 101 mm, sd: 1 mm}")[0] == 0
     code, out, err = said(
         "frame.x: {start: 105 mm, sd: 10 um}"
     )  # noted: a robot far off its tolerances shows the same
     assert code == 0
-    assert (
-        "note: stated.csv: the data contradict what 'unknowns' states: they put frame.x at 100"
-        in err
-    )
+    assert "note: stated.csv: " in err
+    assert "frame.x at 100" in " ".join(err.split())

@@ -26,7 +26,7 @@ def run(tmp_path, monkeypatch, capsys):
 def test_five_of_six_coordinates_of_the_3_prs(run):
     code, out, err = run("3-prs --measure x,y,z,phi,theta")
     assert (code, err) == (0, "")
-    assert "32 of 33 parameter combinations can be identified" in out
+    assert "determine 32 of 33 parameter combinations" in out
     document = json.loads(run("3-prs --measure x,y,z,phi,theta --json")[1])
     (open_,) = document["unidentifiable"]
     assert set(open_["names"]) == {"a1y", "a2y", "a3y"}
@@ -37,24 +37,22 @@ def test_five_of_six_coordinates_of_the_3_prs(run):
 
 
 def test_five_of_six_coordinates_of_the_tracker(run):
-    assert (
-        "24 of 25 parameter combinations can be identified"
-        in run("ru-pus-prs --measure x,y,z,phi,theta")[1]
-    )
+    document = json.loads(run("ru-pus-prs --measure x,y,z,phi,theta --json")[1])
+    assert (document["rank"], document["n_parameters"]) == (24, 25)
 
 
 @pytest.mark.parametrize(("frames", "rank"), [("base", 36), ("tool", 36), ("base,tool", 30)])
 def test_unknown_frames_of_the_hexapod(run, frames, rank):
-    assert f"{rank} of 42 parameter combinations" in run(f"hexapod-42 --frames {frames}")[1]
+    assert json.loads(run(f"hexapod-42 --frames {frames} --json")[1])["rank"] == rank
 
 
 def test_the_reduced_file_is_written_and_whole(run, tmp_path):
     code, out, _ = run("hexapod-42 --frames base --reduce -o smaller.yaml")
     assert code == 0
-    assert "36 of 42 parameters say all that the measurements tell" in out
-    assert out.count("left out: leg") == 6
+    assert "36 of 42 parameters carry all information" in out
+    assert out.count("Fix leg") == 6
     assert load_robot(tmp_path / "smaller.yaml").parameters.free.sum() == 36
-    assert "36 of 36 parameter combinations" in run("smaller.yaml --frames base")[1]
+    assert json.loads(run("smaller.yaml --frames base --json")[1])["rank"] == 36
     assert "this file exists" in run("hexapod-42 --frames base --reduce -o smaller.yaml")[2]
     assert run("hexapod-42 --frames base --reduce -o smaller.yaml --force")[0] == 0
 
@@ -63,7 +61,7 @@ def test_the_json_holds_all_of_it(run):
     document = json.loads(run("3-prs --measure x,y,z,phi,theta --reduce --json")[1])
     assert sorted(document["unidentifiable"][0]["names"]) == ["a1y", "a2y", "a3y"]
     assert document["remedies"][0]["cures"][0]["words"] == "psi"
-    assert document["reduction"]["dropped"][0]["name"] in ("a1y", "a2y", "a3y")
+    assert document["reduction"]["dropped"][0]["name"] == "a3y"
     assert set(document["indices"]) >= {"o1", "o2", "o3", "o4", "o5", "scaling"}
 
 

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopcal.diagnose import identifiability
-from loopcal.diagnose.suggestions import suggest_measurements
+from loopcal.diagnose import identifiability, suggest_measurements
 from loopcal.estimate import LeastSquares, identify
 from loopcal.io.formats import klipper
 from loopcal.io.formats.import_export import build_imported_robot
@@ -101,7 +100,7 @@ def test_nine_parameters_from_heights_alone_lack_two_and_distances_are_what_tell
         assert all(names & set(ARMS) for names in open_names), name
         for remedy in suggest_measurements(found):
             assert (
-                remedy.cures[0].words
+                remedy.measurements[0].words
                 == "distances between two poses (ball bar; callipers on a printed part)"
             ), name
 

@@ -29,7 +29,7 @@ MM = 1e-3
 def rows(kind, count: int, sigma: float) -> Observations:
     columns = len(kind.columns)
     return Observations.from_sigma(
-        kind.mounted(np.eye(4)), np.arange(count), np.zeros((count, columns)), sigma
+        kind.with_tool(np.eye(4)), np.arange(count), np.zeros((count, columns)), sigma
     )
 
 
@@ -71,8 +71,8 @@ def test_a_fit_that_follows_the_better_instrument_is_not_called_larger_for_the_w
     assert found.improvement() == pytest.approx(
         1 / np.sqrt(3.0), rel=1e-6
     )  # as millimetres they grew
-    ((name, times),) = found.comparisons()
-    assert name == "error of all kinds, divided by sigma"
+    ((name, times),) = found.improvements().items()
+    assert name == "weighted"
     assert times == pytest.approx(np.sqrt(10 * 5.0**2 / (30 * 0.1**2)), rel=1e-6)
     assert [k["kind"] for k in found.to_dict()["kinds"]] == ["component", "position", "all"]
 
@@ -87,10 +87,9 @@ def test_every_error_says_of_how_many_rows_it_is_and_too_few_are_noted():
     )  # position of three rows, orientation of eleven, and a row of nothing
     measured[11] = np.nan
     found = validate(hexapod(), replace(data, observations=(replace(pose, measured=measured),)))
-    counts = {(title, index): count for title, index, _, count, *_ in found.rows()}
     assert len(found.poses) == 11
-    assert counts["predicted after", "position"] == 3
-    assert counts["predicted after", "orientation"] == 11
-    assert "only 3 rows measure position: too few to judge its errors by" in found.notes
-    assert not any("orientation:" in note for note in found.notes)
-    assert found.notes == () or not validate(hexapod(), data).notes
+    assert found.after.statistics("position").count == 3
+    assert found.after.statistics("orientation").count == 11
+    (few,) = [f for f in found.findings if f.code == "validation.few-rows"]
+    assert few.data == {"quantity": "position", "count": 3}
+    assert not validate(hexapod(), data).findings

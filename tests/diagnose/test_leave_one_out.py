@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from loopcal.diagnose.leave_one_out_errors import build_regularization_path, score_leave_one_out
+from loopcal.diagnose import build_regularization_path, score_leave_one_out
 from loopcal.estimate import MAP, LeastSquares, Ridge, TruncatedSVD, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.problem import problem_of

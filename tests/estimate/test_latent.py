@@ -502,6 +502,6 @@ def test_a_pose_left_out_is_neither_undetermined_nor_without_readings():
     }
     assert_array_equal(np.isnan(found.poses).all(axis=(1, 2)), out)
     assert_array_equal(np.isnan(found.readings).all(axis=1), out)
-    assert examine_fit(fit, data).worth.calibrate
+    assert examine_fit(fit, data).gain.is_worthwhile
     held = validate(fit, exclude_poses(data, ("3", "9")))
     assert not [note for note in held.notes if "not taken" in note]

@@ -40,7 +40,7 @@ def test_pure_error_is_the_spread_within_the_groups():
         expected, rel=1e-2
     )  # rotation residuals are those differences to first order
     assert found.lack_degrees == 12 * 6 - 42
-    assert found.explained
+    assert found.is_explained
 
 
 def test_a_right_model_is_hardly_ever_blamed_and_the_true_sigma_does_not_matter():
@@ -51,7 +51,7 @@ def test_a_right_model_is_hardly_ever_blamed_and_the_true_sigma_does_not_matter(
         wrong = replace(data, observations=(replace(claimed, covariance=claimed.covariance / 9.0),))
         found = check_lack_of_fit(identify(hexapod(), wrong, LeastSquares()), wrong)
         assert found.sigma_scale == pytest.approx(3.0, rel=0.3)
-        blamed += not found.explained
+        blamed += not found.is_explained
     assert blamed <= 4  # P(binomial(60, 0.01) > 4) = 3e-4
 
 
@@ -62,18 +62,18 @@ def test_something_else_than_geometry_is_told_from_noise():
     warm[:, 5] += 5 * UM * np.sin(300.0 * data.readings[:, 0])  # the same in all repeats of a pose
     bent = replace(data, observations=(replace(rows, measured=warm),))
     found = check_lack_of_fit(identify(hexapod(), bent, LeastSquares()), bent)
-    assert found.explained is False
-    assert "something else than the geometry" in found.sentence
+    assert found.is_explained is False
+    assert "residuals.lack-of-fit" in [f.code for f in found.findings]
     assert found.sigma_scale == pytest.approx(1.0, abs=0.2)
 
 
 def test_without_repeats_or_with_a_loss_nothing_is_claimed():
     data = hexapod_data(20)
     found = check_lack_of_fit(identify(hexapod(), data), data)
-    assert found.explained is None
-    assert "no pose was measured twice" in found.sentence
+    assert found.is_explained is None
+    assert [f.code for f in found.findings] == ["residuals.no-repeats"]
     again = repeats(2)
-    assert check_lack_of_fit(identify(hexapod(), again, loss=Tukey()), again).explained is None
+    assert check_lack_of_fit(identify(hexapod(), again, loss=Tukey()), again).is_explained is None
 
 
 def test_correlated_parameters_are_grouped_in_words():
@@ -88,7 +88,7 @@ def test_correlated_parameters_are_grouped_in_words():
     assert groups
     assert abs(groups[0].correlation) > 0.9
     assert set(groups[0].pair) <= set(groups[0].names)
-    assert "are known better together than alone" in str(groups[0])
+    assert groups[0].finding.code == "residuals.correlated-parameters"
     rho = fit.covariance / fit.standard_deviations[:, None] / fit.standard_deviations
     a, b = (fit.names.index(name) for name in groups[0].pair)
     assert groups[0].correlation == pytest.approx(rho[a, b])
@@ -100,12 +100,12 @@ def test_correlated_parameters_are_grouped_in_words():
 def test_an_instrument_coarser_than_the_tolerances_is_advised_against():
     good, poor = hexapod_data(20), hexapod_data(20, instrument=tracker(2 * MM, 10e-3))
     fine = estimate_calibration_gain(identify(hexapod(), good), good)
-    assert fine.calibrate
+    assert fine.is_worthwhile
     assert fine.position_after < 0.1 * fine.position_before
     for method in (None, LeastSquares()):
         useless = estimate_calibration_gain(identify(hexapod(), poor, method), poor)
-        assert useless.calibrate is False
-        assert useless.sentence.startswith("do not calibrate with this instrument")
+        assert useless.is_worthwhile is False
+        assert useless.finding.code == "model.no-expected-gain"
     assert (
         estimate_calibration_gain(identify(hexapod(), poor, LeastSquares()), poor).position_after
         > 3 * fine.position_before
@@ -127,7 +127,7 @@ def test_what_tolerances_allow_before_is_what_drawn_machines_do():
 
 def test_without_tolerances_no_gain_is_predicted():
     data = hexapod_data(20)
-    assert estimate_calibration_gain(identify(zoo.hexapod(), data), data).calibrate is None
+    assert estimate_calibration_gain(identify(zoo.hexapod(), data), data).is_worthwhile is None
     assert estimate_calibration_gain(
         identify(with_tolerance(zoo.hexapod(), 1e-4), data), data
-    ).calibrate
+    ).is_worthwhile

@@ -516,7 +516,7 @@ def report_identifiability(machine: Robot, data: Data, cures: bool = False) -> R
         "improved": found.improved,
         "condition": found.condition,
         "singular_values": found.singular_values,
-        **_open(found.unknowns.names, found.unidentifiable),
+        **_open(found.free_parameters.names, found.unidentifiable),
         "weak_values": [c.singular_value for c in found.weak],
         "indices": {name: getattr(found.indices, name) for name in ("o1", "o2", "o3", "o4", "o5")},
         "states": [v.state for v in found.parameters],
@@ -525,8 +525,8 @@ def report_identifiability(machine: Robot, data: Data, cures: bool = False) -> R
     }
     if cures:
         told = suggest_measurements(found)
-        result["cures"] = [[c.words for c in r.cures] for r in told]
-        result["cures_left"] = {str(i): [c.left for c in r.cures] for i, r in enumerate(told)}
+        result["cures"] = [[c.words for c in r.measurements] for r in told]
+        result["cures_left"] = {str(i): [c.left for c in r.measurements] for i, r in enumerate(told)}
     return result
 
 
@@ -641,11 +641,11 @@ def report_outliers(found: Fit, data: Data) -> Report:
     seen = diagnose.find_outliers(found, data)
     return {
         "names": list(seen.names),
-        "undecided": [[list(block) for block in one.poses] for one in seen.undecided],
+        "undecided": [[list(block) for block in one.poses] for one in seen.ambiguous],
         "distance": [o.distance for o in seen.outliers],
         "degrees": [o.degrees for o in seen.outliers],
         "p_value": [o.p_value for o in seen.outliers],
-        "settled": bool(seen.settled),
+        "settled": bool(seen.is_converged),
         "blocks": seen.blocks,
         "scale": seen.scale,
         "leverage": seen.influence.leverage,
@@ -657,7 +657,7 @@ def report_examination(found: Fit, data: Data) -> Report:
     with the fit.
     """
     seen = diagnose.examine_fit(found, data)
-    lack, worth, start = seen.lack_of_fit, seen.worth, diagnose.check_start_values(found)
+    lack, worth, start = seen.lack_of_fit, seen.gain, diagnose.check_start_values(found)
     return {
         "groups": lack.groups,
         "pure": lack.pure,
@@ -665,14 +665,14 @@ def report_examination(found: Fit, data: Data) -> Report:
         "lack": lack.lack,
         "lack_degrees": lack.lack_degrees,
         "p_value": lack.p_value,
-        "explained": lack.explained,
+        "explained": lack.is_explained,
         "worth": [
             worth.position_before,
             worth.position_after,
             worth.angle_before,
             worth.angle_after,
         ],
-        "calibrate": worth.calibrate,
+        "calibrate": worth.is_worthwhile,
         "correlated": [list(group.names) for group in seen.correlated],
         "start": start.verdict.name,
         "start_before": start.before,
@@ -685,10 +685,10 @@ def report_arrival(machine: Robot, data: Data) -> Report:
     found = compare_conventions(machine, data)
     return {
         "misfit": found.misfit,
-        "doubtful": bool(found.doubtful),
-        "refused": bool(found.refused),
+        "doubtful": bool(found.is_doubtful),
+        "refused": bool(found.is_refused),
         "other_misfit": found.other_misfit,
-        "alike": len(found.alike),
+        "alike": len(found.alternatives),
     }
 
 

@@ -16,6 +16,7 @@ from loopcal.diagnose import identifiability
 from loopcal.estimate import MAP, FitOptions, LeastSquares, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import collect_information
+from loopcal.findings import Finding
 from loopcal.papers.cmm_constraint_2011.forms import RANK, covariance_difference, measurements
 from loopcal.papers.cmm_constraint_2011.machines import draw_true_machines
 from loopcal.papers.cmm_constraint_2011.steps import Layout, PaperRows, identify_from_rows, row_map
@@ -68,9 +69,10 @@ def test_rank_is_33_of_42_in_both_forms_and_the_nine_others_are_motions_of_base_
     known = identifiability(layout.robot, measurements(layout, exact(layout)[0], NOISE))
     assert known.rank == 33
     assert known.singular_values[32] > 1e6 * known.singular_values[33]
-    meanings = [c.meaning for c in known.unidentifiable]
-    assert sum("the whole base" in m for m in meanings) == 6
-    assert sum("the whole platform turned about its" in m for m in meanings) == 3
+    motions = [c.meaning.data for c in known.unidentifiable if isinstance(c.meaning, Finding)]
+    assert [m["frame"] for m in motions].count("base") == 6
+    turns = [m for m in motions if m["frame"] == "platform" and m["motion"] == "rotation"]
+    assert sum(m["through_origin"] for m in turns) == 3
     rows, _ = PaperRows(layout, exact(layout), MM, NOISE).whitened(
         np.zeros((1, 42)), np.zeros(1, dtype=int)
     )

@@ -421,7 +421,7 @@ def test_without_a_known_pose_seven_directions_are_the_frame_and_the_scale(print
     origin = data.take(np.concatenate([[0], np.arange(9, 44)]))
     found = identifiability(fit.robot, replace(origin, observations=(seen.take([0]),)))
     assert found.rank == 17
-    told = {r.combination.names[0]: r.cures[0].words for r in suggest_measurements(found)}
+    told = {r.combination.names[0]: r.measurements[0].words for r in suggest_measurements(found)}
     assert len(told) == 4
     assert told["spool.radius"].startswith("distances between two poses")
 

@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from loopcal.findings import Finding
 
 HINTS = {
+    "conventions.other-interpretation": "use --allow-implausible to accept the data as written",
+    "conventions.stated-values-contradicted": "use --allow-implausible to accept the statement",
+    "conventions.target-never-moves": "use --allow-still to accept it",
+    "outliers.some": "use --drop POSE, or --loss huber",
     "files.output-exists": "use --force to replace it",
     "files.folder-in-use": "use --force to replace it",
     "files.noise-missing": "calibrate with --noise estimated",
@@ -62,6 +66,6 @@ def hint_for(finding: Finding) -> str | None:
     if finding.code == "workflow.next-check-outliers":
         poses = [str(label).removeprefix("pose ") for label in finding.data["poses"]]
         return f"exclude them with {' '.join(f'--drop {p}' for p in poses)}, or use --loss huber"
-    if finding.code in ("validation.setup-moved", "residuals.setup-moved"):
+    if finding.code == "validation.setup-moved":
         return f"use {' '.join(f'--refit {name}' for name in finding.data['names'])}"
     return find_hint(finding.code)

@@ -158,7 +158,7 @@ def _write_subset(output: Path, subset: IdentifiableSubset) -> None:
     from loopcal.io.core.text_file import write_text
     from loopcal.io.robot.reduced_robot import format_reduced_robot
 
-    words = {merged.name: merged.words(most=3) for merged in subset.dropped}
+    words = {merged.name: merged.describe_effect(most=3) for merged in subset.dropped}
     write_text(output, format_reduced_robot(subset.robot, words))
 
 

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far recorded readings are from those that a fit found, actuator by actuator, as readings and
-as what they move.
+"""Compute the errors of recorded actuator readings, per actuator and in terms of the driven joint.
 
-A reading of stated sigma is a measurement with a residual. People judge it by what it moves: a
-degree of a motor is a tenth of a millimetre of line on one spool and a millimetre on another. With
+A reading of stated sigma is a measurement with a residual. Its effect matters more than its size: a
+degree of a motor is a tenth of a millimeter of line on one spool and a millimeter on another. With
 the transmission g of the identified robot the residual of the driven joint is g(recorded) -
-g(found).
+g(estimated).
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ from loopcal.units import Dimension
 
 @dataclass(frozen=True)
 class ReadingError:
-    """Recorded minus found, of one actuator.
+    """Recorded minus estimated readings of one actuator.
 
     Attributes
     ----------
-    name : of the actuator. count : readings that were taken.
-    reading, joint : root mean square of the reading and of the joint it drives [SI], of these
+    name : of the actuator. count : number of readings.
+    reading, joint : root mean square of the reading and of the driven joint [SI], of these
         dimensions.
-    largest : of the joint, by size, with its sign [SI]. pose : where that is.
+    largest : of the joint, by size, with its sign [SI]. pose : label of its pose.
     """
 
     name: str
@@ -46,17 +45,17 @@ class ReadingError:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the attributes by name for JSON, SI."""
-        words = {
+        dimensions = {
             "reading_dimension": self.reading_dimension.value,
             "joint_dimension": self.joint_dimension.value,
         }
-        return {**vars(self), **words}
+        return {**vars(self), **dimensions}
 
 
 def compute_reading_errors(
     fit: Identification, data: Measurements
 ) -> tuple[ReadingError, ...] | None:
-    """Compare recorded readings with those found; None where readings were taken for exact.
+    """Compare recorded readings with the estimated ones; None where the readings are exact.
 
     Parameters
     ----------
@@ -64,44 +63,40 @@ def compute_reading_errors(
     """
     if fit.poses is None:
         return None
-    recorded, found = exclude_poses(data, fit.excluded_poses).readings, fit.poses.readings
-    believed = (
-        np.isfinite(fit.poses.sigma)
-        & (fit.poses.sigma > 0.0)
-        & np.isfinite(recorded)
-        & np.isfinite(found)
-    )
-    off = np.where(believed, recorded - found, np.nan)
-    moved = np.where(believed, _joints(fit.robot, recorded) - _joints(fit.robot, found), np.nan)
-    drives, labels, errors = _driven(fit.robot), fit.poses.labels, []
+    recorded, estimated = (exclude_poses(data, fit.options.excluded_poses).readings, fit.poses.readings)
+    sigma = fit.poses.sigma
+    compared = np.isfinite(sigma) & (sigma > 0.0) & np.isfinite(recorded) & np.isfinite(estimated)
+    reading = np.where(compared, recorded - estimated, np.nan)
+    joints = _joint_values(fit.robot, recorded) - _joint_values(fit.robot, estimated)
+    joint = np.where(compared, joints, np.nan)
+    driven, labels, errors = _driven_dimensions(fit.robot), fit.poses.labels, []
     for i, actuator in enumerate(fit.robot.actuators):
-        if not believed[:, i].any():
+        if not compared[:, i].any():
             continue
-        worst = int(np.nanargmax(np.abs(moved[:, i])))
-        reading, joint = (float(np.sqrt(np.nanmean(part[:, i] ** 2))) for part in (off, moved))
+        worst = int(np.nanargmax(np.abs(joint[:, i])))
         errors.append(
             ReadingError(
                 name=actuator.name,
-                count=int(believed[:, i].sum()),
-                reading=reading,
+                count=int(compared[:, i].sum()),
+                reading=float(np.sqrt(np.nanmean(reading[:, i] ** 2))),
                 reading_dimension=actuator.dimension,
-                joint=joint,
-                joint_dimension=drives[actuator.name],
-                largest=float(moved[worst, i]),
+                joint=float(np.sqrt(np.nanmean(joint[:, i] ** 2))),
+                joint_dimension=driven[actuator.name],
+                largest=float(joint[worst, i]),
                 pose=labels[worst],
             )
         )
     return tuple(errors) or None
 
 
-def _joints(robot: Mechanism, readings: FloatArray) -> FloatArray:
-    """Values of the driven joints (n, a) at these readings."""
+def _joint_values(robot: Mechanism, readings: FloatArray) -> FloatArray:
+    """Values (n, a) of the driven joints at these readings."""
     _, tau = robot.slots(robot.values[None])
     return joints_from_readings(readings[None], tau, robot.slots.frequency)[0]
 
 
-def _driven(robot: Mechanism) -> dict[str, Dimension]:
-    """What each actuator moves: an angle of a turning joint, else a length."""
+def _driven_dimensions(robot: Mechanism) -> dict[str, Dimension]:
+    """Dimension of what each actuator moves: an angle of a revolute joint, else a length."""
     limbs = robot.assembly.limbs
     turning = {joint.actuator for limb in limbs for joint in limb.joints if joint.kind == "R"}
     return {

@@ -1,6 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""k-fold cross-validation over whole blocks: every pose is predicted once by a fit that has not
-seen it.
+"""Score fits on held-out poses: by folds that are fitted again, and by leaving out one block.
+
+Folds: every pose is predicted once by a fit that did not use it.
+
+Leave-one-out: many penalties are scored from one linearization. With the rows of block j in the
+coordinates of the decomposition, B_j = A_j V, the hat matrix of a penalty is H_jj = B_j diag(1 /
+(s^2 + penalty)) B_j', and the residual that the block would have without it r_(j) = (I - H_jj)^-1
+r_j. No fit is repeated. This holds to first order in the deviation from the linearization, and
+exactly for a linear problem.
 """
 
 from __future__ import annotations
@@ -16,21 +23,23 @@ from loopcal.diagnose.prediction_errors import (
     compute_row_errors,
     join_errors,
 )
-from loopcal.errors import DataError
+from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
 from loopcal.estimate.methods.losses import Loss
-from loopcal.estimate.methods.penalties import Method
+from loopcal.estimate.methods.penalties import Method, Ridge, TruncatedSVD, adapt_method
+from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.problem import problem_of
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
+from loopcal.numerics.decomposition import Decomposition, decompose
 from loopcal.typing import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """Prediction errors of poses by fits that have not seen them.
+    """Prediction errors of poses by fits that did not use them.
 
     Attributes
     ----------
@@ -38,7 +47,7 @@ class CrossValidation:
         fits.
     fold : (f,) mean square of the whitened residuals of each fold's held-out rows (1: noise alone).
         before_fold : the same of the given robot.
-    converged : whether every fit did.
+    converged : whether every fit converged.
     """
 
     poses: tuple[str, ...]
@@ -55,36 +64,55 @@ class CrossValidation:
 
     @property
     def standard_error(self) -> float:
-        """Standard error of the score, from the spread over folds."""
+        """Standard error of the score, from the scatter over folds."""
         return float(self.fold.std(ddof=1) / np.sqrt(len(self.fold)))
 
     def improvement(self, index: str = "position", statistic: str = "rms") -> float:
-        """Return how many times smaller a statistic of the prediction error became on unseen poses."""
+        """Return the factor by which a statistic of the held-out error became smaller."""
         after = getattr(self.after.statistics(index), statistic)
         return getattr(self.before.statistics(index), statistic) / after if after > 0.0 else np.inf
 
+    def __repr__(self) -> str:
+        score = f"score {self.score:.4g} +/- {self.standard_error:.2g}"
+        return f"<CrossValidation: {len(self.fold)} folds, {len(self.poses)} rows, {score}>"
+
     def to_dict(self) -> dict[str, Any]:
-        """Return the result by name for JSON, SI."""
-        return {
-            "poses": list(self.poses),
-            "before": self.before.to_dict(),
-            "after": self.after.to_dict(),
-            "fold": self.fold,
-            "before_fold": self.before_fold,
-            "score": self.score,
-            "standard_error": self.standard_error,
-            "converged": self.converged,
-        }
+        """Return the attributes, the score and its standard error for JSON, SI."""
+        return {**vars(self), "score": self.score, "standard_error": self.standard_error}
+
+
+@dataclass(frozen=True, eq=False)
+class LeaveOneOut:
+    """Scores of k methods.
+
+    Attributes
+    ----------
+    methods : the methods. score : (k,) mean square of whitened leave-one-block-out residuals (1:
+        noise alone), infinite where a block cannot be left out.
+    dof : (k,) effective number of parameters. estimate : (k, p) their estimates [SI].
+    """
+
+    methods: tuple[Method, ...]
+    score: FloatArray
+    dof: FloatArray
+    estimate: FloatArray
+
+    @property
+    def best(self) -> Method:
+        """The method with the lowest score."""
+        return self.methods[int(np.argmin(self.score))]
+
+    def __repr__(self) -> str:
+        return f"<LeaveOneOut: {len(self.methods)} methods, best {self.best}>"
 
 
 def draw_folds(data: Measurements, count: int, seed: int) -> tuple[IntArray, ...]:
-    """Return the poses held out in each of `count` folds: whole blocks drawn at random, folds of
-    nearly equal size.
+    """Draw the poses held out in each of `count` folds: whole blocks, folds of nearly equal size.
 
     Raises
     ------
     DataError
-        Fewer than two folds, or fewer blocks than folds.
+        There are fewer than two folds, or more folds than blocks.
     """
     names, member = np.unique(data.block, return_inverse=True)
     if count < 2 or len(names) < count:
@@ -106,50 +134,107 @@ def cross_validate(
     noise: Literal["given", "estimated"] = "given",
     loss: Loss | None = None,
 ) -> CrossValidation:
-    """Fit `count` times without one fold and predict it.
+    """Fit `count` times without one fold, and predict the held-out fold.
 
     Parameters
     ----------
     robot, data, method, noise, loss : as for `identify`. A robot without free parameters is only
-        predicted with.
+        used to predict.
     count : number of folds. seed : of their choice.
 
     Raises
     ------
     DataError, EstimationError
-        As `folds` and `identify`.
+        As `draw_folds` and `identify`.
     """
     labels: list[str] = []
-    before, after, scores, plain, converged = [], [], [], [], True
-    for held in draw_folds(data, count, seed):
-        unseen = data.take(held)
+    before, after, scores, scores_before, converged = [], [], [], [], True
+    for places in draw_folds(data, count, seed):
+        held_out = data.take(places)
         fitted = robot
         if robot.parameters.free.any():
-            fit = identify(
-                robot,
-                data.take(np.setdiff1d(np.arange(data.n_poses), held)),
-                method,
-                loss=loss,
-                options=FitOptions(noise=noise),
-            )
+            remaining = data.take(np.setdiff1d(np.arange(data.n_poses), places))
+            options = FitOptions(method=method, noise=noise, loss=loss)
+            fit = identify(robot, remaining, options=options)
             fitted, converged = fit.robot, converged and fit.converged
-        if (
-            unseen.n_rows
-        ):  # else readings alone, of redundant actuators: there is a score, but no measured error
-            compared = compare_predictions(robot, fitted, unseen)
-            rows = compared.data.observations
-            labels += compared.rows
-            before.append(compute_row_errors(rows, compared.before.residuals(rows)))
-            after.append(compute_row_errors(rows, compared.after.residuals(rows)))
-        scores.append(_mean_square(fitted, unseen))
-        plain.append(_mean_square(robot, unseen))
+        if held_out.n_rows:  # readings alone, of redundant actuators, have a score but no errors
+            comparison = compare_predictions(robot, fitted, held_out)
+            rows = comparison.data.observations
+            labels += comparison.rows
+            before.append(compute_row_errors(rows, comparison.before.residuals(rows)))
+            after.append(compute_row_errors(rows, comparison.after.residuals(rows)))
+        scores.append(_mean_square(fitted, held_out))
+        scores_before.append(_mean_square(robot, held_out))
     return CrossValidation(
         tuple(labels),
         join_errors(before),
         join_errors(after),
         np.array(scores),
-        np.array(plain),
+        np.array(scores_before),
         converged,
+    )
+
+
+def score_leave_one_out(
+    robot: Mechanism, data: Measurements, methods: tuple[Method, ...]
+) -> LeaveOneOut:
+    """Score methods that keep the columns as they are: ridge, truncation, least squares, MAP.
+
+    Parameters
+    ----------
+    robot : linearization point; best the robot of a fit. data : the measurements.
+    methods : at least one.
+
+    Raises
+    ------
+    EstimationError
+        The measurements have nuisance parameters.
+    """
+    free = select_free_parameters(robot)
+    problem = problem_of(free, data)
+    if problem.nuisance is not None:
+        raise EstimationError(
+            "leave-one-out of many methods needs known frames and targets; state them, or use "
+            "cross_validate"
+        )
+    z = free.deviation(robot.values[None])
+    at = problem.linearize(z, problem.start(z))
+    d = decompose(at.factor, at.equations, z)
+    used = tuple(
+        adapt_method(method, np.zeros(len(free), dtype=bool), "given") for method in methods
+    )
+    penalty = np.concatenate([method.penalty(d) for method in used])
+    weight, y = _solutions(d, penalty)
+    member = np.unique(linked_blocks(data), return_inverse=True)[1]
+    parts = [part for block in problem.leverage_rows(at) for part in block]
+    block_of_row = np.concatenate(
+        [np.repeat(member[part.poses], part.rows.shape[1]) for part in parts]
+    )
+    A = np.concatenate([part.rows.reshape(-1, part.rows.shape[2]) for part in parts])
+    B, b = A[:, :-1] @ d.directions[0], A[:, :-1] @ z[0] - A[:, -1]
+    residual = b - y @ B.T
+    total = np.zeros(len(penalty))
+    for places in _blocks_by_size(block_of_row):
+        B_j = B[places]  # (u, m, p)
+        H = np.matmul(B_j[None] * weight[:, None, None, :], B_j.swapaxes(-1, -2)[None])
+        remaining = np.eye(places.shape[1]) - H
+        singular = np.linalg.det(remaining) <= 1e-12
+        remaining = np.where(singular[..., None, None], np.eye(places.shape[1]), remaining)
+        deleted = np.linalg.solve(remaining, residual[:, places][..., None])[..., 0]
+        total += np.where(singular, np.inf, (deleted**2).sum(axis=2)).sum(axis=1)
+    dof = np.stack([d.filter_factors(row[None])[0].sum() for row in penalty])
+    estimate = free.nominal + free.tolerance * (y @ d.directions[0].T)
+    return LeaveOneOut(tuple(methods), total / int(at.equations[0]), dof, estimate)
+
+
+def build_regularization_path(data_scale: float, count: int, parameters: int) -> tuple[Method, ...]:
+    """Return `count` ridges, lam from 1e-8 to 1e4 of `data_scale`, and every truncation from 0 to
+    all parameters.
+    """
+    lam = data_scale * np.logspace(-8.0, 4.0, count)
+    return (
+        *(Ridge(float(value)) for value in lam),
+        *(TruncatedSVD(k) for k in range(parameters + 1)),
     )
 
 
@@ -163,3 +248,20 @@ def _mean_square(robot: Mechanism, data: Measurements) -> float:
     for rows, residuals in zip(problem.rows, problem.residuals(z, solution), strict=True):
         total += float(np.where(rows.is_present[0], residuals.whitened[0] ** 2, 0.0).sum())
     return total / equations if np.isfinite(total) and equations else np.inf
+
+
+def _solutions(d: Decomposition, penalty: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return 1 / (s^2 + penalty) and the coordinates y, both (k, p); zero for unused directions."""
+    s, c = d.singular_values[0], d.projections[0]
+    total = s**2 + penalty
+    weight = np.divide(
+        1.0, total, out=np.zeros_like(total), where=(total > 0.0) & np.isfinite(total)
+    )
+    return weight, weight * (s * c)
+
+
+def _blocks_by_size(block_of_row: IntArray) -> list[IntArray]:
+    """Return the places (u, m) of the rows of blocks, those of equal size together."""
+    order = np.argsort(block_of_row, kind="stable")
+    _, first, sizes = np.unique(block_of_row[order], return_index=True, return_counts=True)
+    return [order[first[sizes == size][:, None] + np.arange(size)] for size in np.unique(sizes)]

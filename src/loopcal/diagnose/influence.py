@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each block of rows does to the fit, and what the others say of it, in one more pass over the
-rows.
+"""Compute the influence of each observation block on a fit, in one more pass over the rows.
 
 With the information M = sum_j w_j A_j'A_j + P (P the penalty), G = A_j M^-1 A_j' and the residual
-r_j of block j, the residual that the block has with respect to a fit without it, and that
-residual's squared Mahalanobis norm, are
+r_j of block j, the residual that the block has with respect to a fit without it, and the squared
+Mahalanobis norm of that residual, are
 
-    r_(j) = (I - w_j G)^-1 r_j,      d^2 = r_(j)' (I + G_(j))^-1 r_(j),      G_(j) = (I - w_j G)^-1 G
+    r_(j) = (I - w_j G)^-1 r_j,    d^2 = r_(j)' (I + G_(j))^-1 r_(j),    G_(j) = (I - w_j G)^-1 G
 
 In the eigenvectors of G, eigenvalues g, d^2 = sum r^2 / ((1 - w g)(1 + (1 - w) g)): for a block
 inside the fit r^2 / (1 - g), for one outside r^2 / (1 + g). If block and model are right it has a
@@ -27,13 +26,12 @@ from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import FloatArray, IntArray
 
 TESTABLE = 1e-6
-"""Part of a block's direction, 1 - w g, below which the block alone determines it and its residual
-tests nothing.
+"""Remaining part 1 - w g of a direction below which only this block determines it, so that its
+residual tests nothing.
 """
 
-UNKNOWN = 1e6
-"""Standard deviation, in tolerances, with which a direction that the fit does not use counts in G.
-"""
+UNDETERMINED = 1e6
+"""Standard deviation in tolerances that stands in G for a direction that the fit does not use."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +40,11 @@ class Influence:
 
     Attributes
     ----------
-    leverage : (u,) trace of w G: parameters that the block determines. residuals : (u,) how many it
-        has.
-    distance : (u,) d^2. degrees : (u,) its degrees of freedom.
-    deleted : (n,) squared norm of the block's leave-one-out residual r_(j), whitened, counted where
-        it can be tested.
+    leverage : (u,) trace of w G: number of parameters that the block determines.
+    residuals : (u,) number of residuals. distance : (u,) d^2. degrees : (u,) its degrees of
+        freedom.
+    deleted : (u,) squared norm of the whitened leave-one-out residual r_(j), over the directions
+        that can be tested.
     """
 
     leverage: FloatArray
@@ -72,75 +70,63 @@ def compute_influence(
     problem : unweighted. linearization : of the weighted problem.
     member : (n,) block 0..u-1 of each pose. weight : (u,) weight of each block in the fit.
     decomposition, penalty : of the weighted fit.
-    at : (1, p), optional. Deviation at which the residuals are taken, to first order; default that
-        of the linearization.
+    at : (1, p), optional. Deviation at which the residuals are evaluated, to first order; default
+        that of the linearization.
     """
     d = decomposition
     variance = d.variances(penalty)[0]
-    root = np.sqrt(np.where(np.isfinite(variance), variance, UNKNOWN**2))
-    spread = d.scale[:, None] * d.directions[0] * root
+    sd = np.sqrt(np.where(np.isfinite(variance), variance, UNDETERMINED**2))
+    covariance_factor = d.scale[:, None] * d.directions[0] * sd
     change = np.zeros(d.scale.shape) if at is None else (at - linearization.deviation)[0]
-    u = len(weight)
-    found = Influence(
-        np.zeros(u), np.zeros(u, np.int64), np.zeros(u), np.zeros(u, np.int64), np.zeros(u)
-    )
-    for blocks, columns, r in _by_block(problem, linearization, member, u):
-        A, own = (
-            columns[..., -len(root) :],
-            columns[..., : -len(root)],
-        )  # own unknowns are in units of their sd
+    u, p = len(weight), len(sd)
+    leverage, distance, deleted = np.zeros(u), np.zeros(u), np.zeros(u)
+    residuals, degrees = np.zeros(u, np.int64), np.zeros(u, np.int64)
+    for blocks, columns, r in _linearize_blocks(problem, linearization, member, u):
+        # nuisance parameters come first, in units of their standard deviation
+        A, nuisance = columns[..., -p:], columns[..., :-p]
         residual = r + A @ change
-        present = np.any(A != 0.0, axis=2) | np.any(own != 0.0, axis=2) | (r != 0.0)
-        half = np.concatenate([own, A @ spread], axis=2)
+        present = np.any(A != 0.0, axis=2) | np.any(nuisance != 0.0, axis=2) | (r != 0.0)
+        half = np.concatenate([nuisance, A @ covariance_factor], axis=2)
         g, vectors = np.linalg.eigh(half @ half.swapaxes(-1, -2))
         w = weight[blocks][:, None]
-        inside = 1.0 - w * g
-        # absent rows are zero: they are eigenvectors of value zero and of residual zero, and not
-        # counted below
-        tested = inside > TESTABLE
-        parts = np.matmul(residual[:, None, :], vectors)[:, 0] ** 2
-        safe = np.where(tested, inside, 1.0)
-        found.leverage[blocks] = (w * g).sum(axis=1)
-        found.residuals[blocks] = present.sum(axis=1)
-        found.distance[blocks] = np.where(tested, parts / (safe * (1.0 + (1.0 - w) * g)), 0.0).sum(
-            axis=1
-        )
-        found.degrees[blocks] = tested.sum(axis=1) - (~present).sum(axis=1)
-        found.deleted[blocks] = np.where(tested, parts / safe**2, 0.0).sum(axis=1)
-    return found
+        remaining = 1.0 - w * g
+        # absent rows are zero: eigenvectors of value zero and residual zero, subtracted below
+        tested = remaining > TESTABLE
+        square = np.matmul(residual[:, None, :], vectors)[:, 0] ** 2
+        safe = np.where(tested, remaining, 1.0)
+        leverage[blocks] = (w * g).sum(axis=1)
+        residuals[blocks] = present.sum(axis=1)
+        normed = square / (safe * (1.0 + (1.0 - w) * g))
+        distance[blocks] = np.where(tested, normed, 0.0).sum(axis=1)
+        degrees[blocks] = tested.sum(axis=1) - (~present).sum(axis=1)
+        deleted[blocks] = np.where(tested, square / safe**2, 0.0).sum(axis=1)
+    return Influence(leverage, residuals, distance, degrees, deleted)
 
 
-def _by_block(
+def _linearize_blocks(
     problem: Problem, linearization: Linearization, member: IntArray, count: int
 ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
-    """Give blocks of equal size together: their numbers (b,), matrices (b, m, p) and residuals (b,
-    m).
+    """Yield blocks of equal size together: numbers (b,), matrices (b, m, p), residuals (b, m).
 
-    A block whose rows come with several blocks of poses waits until the last of them.
+    A block whose rows come with several chunks of poses waits until the last of them.
     """
     total = problem.count_leverage_rows(member, count)
     waiting: list[tuple[IntArray, FloatArray]] = []
     for parts in problem.leverage_rows(linearization):
-        waiting += [
-            (
-                np.repeat(member[part.poses], part.rows.shape[1]),
-                part.rows.reshape(-1, part.rows.shape[2]),
-            )
-            for part in parts
-        ]
+        for part in parts:
+            blocks = np.repeat(member[part.poses], part.rows.shape[1])
+            waiting.append((blocks, part.rows.reshape(-1, part.rows.shape[2])))
         if not waiting:
             continue
-        of, stacked = (
-            np.concatenate([w[0] for w in waiting]),
-            np.concatenate([w[1] for w in waiting]),
-        )
-        order = np.argsort(of, kind="stable")
-        of, stacked = of[order], stacked[order]
-        numbers, first, sizes = np.unique(of, return_index=True, return_counts=True)
+        block_of_row = np.concatenate([w[0] for w in waiting])
+        stacked = np.concatenate([w[1] for w in waiting])
+        order = np.argsort(block_of_row, kind="stable")
+        block_of_row, stacked = block_of_row[order], stacked[order]
+        numbers, first, sizes = np.unique(block_of_row, return_index=True, return_counts=True)
         complete = sizes == total[numbers]
         for size in np.unique(sizes[complete]):
             chosen = complete & (sizes == size)
             places = first[chosen][:, None] + np.arange(size)
             yield numbers[chosen], stacked[places, :-1], stacked[places, -1]
         left = np.repeat(~complete, sizes)
-        waiting = [(of[left], stacked[left])] if left.any() else []
+        waiting = [(block_of_row[left], stacked[left])] if left.any() else []

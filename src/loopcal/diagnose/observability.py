@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Indices of how well poses determine parameters: five functions of the singular values, with their
-scaling said.
+"""Compute observability indices: five functions of the singular values, with their scaling.
 
 Formulas and sources: docs/theory/observability.md.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
 from loopcal.typing import FloatArray
 
 SCALING = "rows divided by sigma, columns multiplied by tolerance"
-"""What the singular values are counted in; every index depends on it."""
+"""Units of the singular values; every index depends on them."""
 
 MEANING = {
     "o1": "(product of s)^(1/L) / sqrt(m): a small uncertainty ellipsoid",
@@ -27,12 +26,12 @@ MEANING = {
 
 @dataclass(frozen=True)
 class Observability:
-    """The five indices over the L directions that count.
+    """The five indices over the L observable directions.
 
     Attributes
     ----------
-    o1, o2, o3, o4, o5 : the larger the better. directions : L. left_out : null directions, which
-        would make all five zero.
+    o1, o2, o3, o4, o5 : the larger the better. directions : L. left_out : number of null
+        directions, which would make all five zero.
     equations : m. scaling : of rows and columns.
     """
 
@@ -47,30 +46,27 @@ class Observability:
     scaling: str = SCALING
 
     def rows(self) -> list[tuple[str, float, str]]:
-        """Index, value and meaning, for a table."""
+        """Return index, value and meaning, for a table."""
         return [(name.upper(), getattr(self, name), meaning) for name, meaning in MEANING.items()]
 
     def __str__(self) -> str:
         values = ", ".join(f"{name} {value:.3g}" for name, value, _ in self.rows())
-        without = f", {self.left_out} null directions left out" if self.left_out else ""
-        return f"observability {values} ({self.scaling}; m = {self.equations}, L = {self.directions}{without})"
-
-    def to_dict(self) -> dict[str, object]:
-        """All attributes by name."""
-        return asdict(self)
+        without = f", without {self.left_out} null directions" if self.left_out else ""
+        counts = f"m = {self.equations}, L = {self.directions}{without}"
+        return f"Observability: {values} ({self.scaling}; {counts})"
 
 
 def compute_observability(singular_values: FloatArray, rank: int, equations: int) -> Observability:
-    """Return the indices of singular values (p,), descending, of whitened and tolerance-scaled
-    rows.
+    """Return the indices of the singular values of whitened rows in units of tolerance.
 
     Parameters
     ----------
-    singular_values : (p,). rank : how many of them count. equations : m, the number of rows.
+    singular_values : (p,), descending. rank : how many of them count. equations : m, number of
+        rows.
 
     Returns
     -------
-    Observability; all indices zero where nothing counts.
+    Observability; all indices are zero where the rank is zero.
     """
     s = singular_values[:rank]
     left_out = len(singular_values) - rank

@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which blocks of rows do not belong: each against what all others predict of it, at a level for
-the whole family.
+"""Detect poses that do not fit the others, at a false-alarm rate for the whole data set.
 
-A block is named where the probability of its distance is below 1 - (1 - level)^(1/u), u blocks
-tested (Sidak), so that data without a wrong block name none in 95 % of cases. Several wrong blocks
-hide each other; therefore what is doubted is set aside, the others are fitted again (linearly,
-which needs no kinematics), and every block is asked again, inside or outside, until the same blocks
-are doubted twice. Nothing is set aside without which the others determine fewer parameters. A
-doubted block is only named where no other would do as well: with j set aside instead of i, i must
-still be doubted. With one degree of freedom every block explains the disagreement of all, and none
-is named. Nothing is dropped: the names are for whoever decides.
+Rows that belong together form an observation block: a pose, or several poses that share rows. Each
+block is compared with the prediction of all others. It is an outlier where the probability of its
+distance is below 1 - (1 - level)^(1/u), u blocks tested (Sidak), so that data without a wrong block
+raise no alarm in 95 % of cases.
+
+Several wrong blocks hide each other. Therefore suspects are excluded, the others are fitted again
+(linearly, which needs no kinematics), and every block is tested again, inside or outside the fit,
+until the same blocks are suspected twice. A block is never excluded where the others would then
+determine fewer parameters. A suspect is an outlier only where excluding another block would not do
+as well: with j excluded instead of i, i must still be a suspect. With one degree of freedom every
+block explains the misfit of all, and none is named. Nothing is removed from the data: the result
+names the blocks for whoever decides.
 """
 
 from __future__ import annotations
@@ -22,38 +25,37 @@ import numpy as np
 
 from loopcal.diagnose.influence import Influence, compute_influence
 from loopcal.estimate.fit_input import exclude_poses
-from loopcal.estimate.inference.null_space import listed
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.problem import Problem, problem_of
 from loopcal.estimate.result import Identification
 from loopcal.estimate.robust_descent import estimate_scale_of
 from loopcal.estimate.start import Start
+from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.numerics.decomposition import Decomposition, decompose
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
-ROUNDS = 20
-"""Times that blocks are set aside at most."""
+MOST_ROUNDS = 20
+"""Largest number of searches with other suspects."""
 
-MOST = 0.5
-"""Share of the blocks that is set aside at most; with more, nothing can be said of the rest."""
+MOST_EXCLUDED = 0.5
+"""Largest share of excluded blocks; beyond it nothing can be said of the others."""
 
-COMPARED = 10
-"""Doubted blocks, farthest first, for which it is asked whether others would do as well; more are a
-matter of the model.
+MOST_COMPARED = 10
+"""Suspects, farthest first, that are compared with others which would do as well; more suspects are
+a matter of the model.
 """
 
 
 @dataclass(frozen=True)
 class Outlier:
-    """A block that does not belong.
+    """A block that does not fit the others.
 
     Attributes
     ----------
     poses : its labels. distance : squared Mahalanobis norm of its residual against a fit of the
-        others.
-    degrees : degrees of freedom of that. p_value : probability of a larger one, for this block
-        alone.
+        others. degrees : degrees of freedom of the distance. p_value : probability of a larger one,
+        for this block alone.
     """
 
     poses: tuple[str, ...]
@@ -61,118 +63,130 @@ class Outlier:
     degrees: int
     p_value: float
 
-    def __str__(self) -> str:
-        names = (
-            f"pose {self.poses[0]}" if len(self.poses) == 1 else f"poses {', '.join(self.poses)}"
+    @property
+    def finding(self) -> Finding:
+        """The outlier as a finding."""
+        return report_finding(
+            "outliers.pose",
+            poses=self.poses,
+            factor=float(np.sqrt(self.distance / self.degrees)),
+            residuals=self.degrees,
+            p_value=self.p_value,
         )
-        times = np.sqrt(self.distance / self.degrees)
-        return f"{names} does not fit the others: {times:.3g} times the noise expected of its {self.degrees} residuals"
 
 
 @dataclass(frozen=True)
-class Disagreement:
-    """Blocks that do not fit each other, any one of which may be the wrong one.
+class Conflict:
+    """Blocks that contradict each other, any one of which may be wrong.
 
     Attributes
     ----------
-    poses : labels of each block. times : largest disagreement with a fit to all, in units of the
-        noise expected of it.
+    poses : labels of each block. factor : largest distance from a fit to all, in units of the
+        expected noise.
     """
 
     poses: tuple[tuple[str, ...], ...]
-    times: float
+    factor: float
 
-    def __str__(self) -> str:
-        names = [
-            ", ".join(block) if len(block) == 1 else f"({', '.join(block)})" for block in self.poses
-        ]
-        return f"rows of poses {listed(names)} disagree by {self.times:.3g} times the noise; which one is wrong cannot be told"
+    @property
+    def finding(self) -> Finding:
+        """The conflict as a finding."""
+        return report_finding("outliers.conflict", **vars(self))
 
 
 @dataclass(frozen=True, eq=False)
 class OutlierCheck:
-    """The outcome for all blocks.
+    """The result for all blocks.
 
     Attributes
     ----------
-    outliers : what does not belong, farthest first. undecided : groups of blocks of which some one
-        does not.
-    settled : whether the same blocks were doubted twice; otherwise those doubted in turn are
-        undecided.
-    level : probability of naming any block if all are right.
-    blocks : number of blocks tested. poses : labels of each of the u blocks.
-    influence : of all blocks, with the doubted ones set aside. scale : factor on sigma used.
-    sentence : what this means.
+    outliers : blocks that do not fit, farthest first. ambiguous : groups of blocks of which at
+        least one does not fit.
+    is_converged : whether the same blocks were suspected twice; otherwise those suspected in turn
+        are ambiguous.
+    level : probability of any outlier where all blocks are right.
+    blocks : number of tested blocks. poses : labels of each of the u blocks.
+    influence : of all blocks, with the suspects excluded. scale : factor on sigma used.
+    summary : the finding on all blocks.
     """
 
     outliers: tuple[Outlier, ...]
-    undecided: tuple[Disagreement, ...]
-    settled: bool
+    ambiguous: tuple[Conflict, ...]
+    is_converged: bool
     level: float
     blocks: int
     poses: tuple[tuple[str, ...], ...]
     influence: Influence
     scale: float
-    sentence: str
+    summary: tuple[Finding, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Labels of all poses of these blocks."""
+        """Labels of all poses of the outliers."""
         return tuple(label for outlier in self.outliers for label in outlier.poses)
 
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """The summary, then every outlier and every conflict."""
+        details = [one.finding for one in (*self.outliers, *self.ambiguous)]
+        return (*self.summary, *details)
+
+    def __repr__(self) -> str:
+        return f"<OutlierCheck: {len(self.outliers)} of {self.blocks} blocks are outliers>"
+
+    def __str__(self) -> str:
+        return "\n".join(str(finding) for finding in self.findings)
+
     def to_dict(self) -> dict[str, Any]:
-        """Return what was found by name for JSON."""
+        """Return the result by name for JSON."""
+        mean = self.influence.leverage.sum() / max(int(self.influence.residuals.sum()), 1)
         return {
-            "outliers": [vars(o) | {"poses": list(o.poses)} for o in self.outliers],
-            "undecided": [{**vars(one), "sentence": str(one)} for one in self.undecided],
-            "settled": self.settled,
+            "outliers": self.outliers,
+            "undecided": self.ambiguous,
+            "settled": self.is_converged,
             "level": self.level,
             "blocks": self.blocks,
             "scale": self.scale,
-            "mean_leverage": float(
-                self.influence.leverage.sum() / max(int(self.influence.residuals.sum()), 1)
-            ),
-            "sentence": self.sentence,
+            "mean_leverage": float(mean),
+            "findings": self.findings,
         }
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """What a fit without the blocks `aside` (u,) says of every block; `used` is the number of
-    directions it determines.
+    """A fit without the `excluded` blocks (u,), and its influence on every block.
 
-    `scale` is NaN where it is to be estimated and no block inside the fit can be tested.
+    `directions` is the number of directions that it determines. `scale` is NaN where it is to be
+    estimated and no block inside the fit can be tested.
     """
 
-    aside: BoolArray
-    found: Influence
+    excluded: BoolArray
+    influence: Influence
     scale: float
-    used: int
+    directions: int
 
     @property
     def ratio(self) -> FloatArray:
-        """(u,) distance for each degree of freedom, in units of the noise; zero where nothing can
-        be tested.
-        """
-        return (
-            np.where(
-                self.found.degrees > 0, self.found.distance / np.maximum(self.found.degrees, 1), 0.0
-            )
-            / self.scale**2
-        )
+        """(u,) distance per degree of freedom in units of the noise; zero without a test."""
+        degrees = self.influence.degrees
+        ratio = self.influence.distance / np.maximum(degrees, 1)
+        return np.where(degrees > 0, ratio, 0.0) / self.scale**2
 
     def p_value(self) -> FloatArray:
-        """(u,) probability of a larger distance; 1 where nothing can be tested."""
+        """Return (u,) the probability of a larger distance; 1 where there is no test."""
         from scipy.special import chdtrc
 
-        degrees = self.found.degrees
-        return np.where(
-            degrees > 0, chdtrc(np.maximum(degrees, 1), self.found.distance / self.scale**2), 1.0
-        )
+        degrees = self.influence.degrees
+        tail = chdtrc(np.maximum(degrees, 1), self.influence.distance / self.scale**2)
+        return np.where(degrees > 0, tail, 1.0)
+
+
+_Fit = Callable[[BoolArray], _State]
+"""From the excluded blocks (u,) to the linear fit without them."""
 
 
 def find_outliers(fit: Identification, data: Measurements, level: float = 0.05) -> OutlierCheck:
-    """Name the blocks of rows that do not fit what all others say.
+    """Find the observation blocks that do not fit what all others predict.
 
     Parameters
     ----------
@@ -185,55 +199,56 @@ def find_outliers(fit: Identification, data: Measurements, level: float = 0.05) 
     labels = tuple(tuple(np.array(data.labels)[member == i].tolist()) for i in range(len(numbers)))
     z = fit.free_parameters.deviation(fit.robot.values[None])
 
-    begin = problem.linearize(z, problem.start(z)).next_start
+    start = problem.linearize(z, problem.start(z)).next_start
 
-    def ask(aside: BoolArray) -> _State:
-        return _ask(fit, problem, member, aside, z, begin)
+    def refit(excluded: BoolArray) -> _State:
+        return _fit_without(fit, problem, member, excluded, z, start)
 
-    whole = ask(np.zeros(len(numbers), dtype=bool))
-    tested = int((whole.found.degrees > 0).sum())
-    alone = -np.expm1(np.log1p(-level) / max(tested, 1))
-    doubted_by_loss = np.zeros(len(numbers), dtype=bool)
-    doubted_by_loss[member] = fit.pose_weights < 0.5
-    start = ask(doubted_by_loss) if doubted_by_loss.any() else whole
-    visited = _search(
-        ask, whole, start if _bearable(start, whole) else whole, alone, int(MOST * tested)
-    )
-    end, settled = visited[-1], len(visited) == 1
-    always = np.all([state.aside for state in visited], axis=0)
-    groups = _rivals(ask, end, whole, alone) if settled else _in_turn(visited, always)
-    unsure = np.any(groups, axis=0) if groups else np.zeros_like(always)
+    whole = refit(np.zeros(len(numbers), dtype=bool))
+    tested = int((whole.influence.degrees > 0).sum())
+    limit = -np.expm1(np.log1p(-level) / max(tested, 1))
+    low_weight = np.zeros(len(numbers), dtype=bool)
+    low_weight[member] = fit.pose_weights < 0.5
+    first = refit(low_weight) if low_weight.any() else whole
+    first = first if _determines_as_much(first, whole) else whole
+    states = _search(refit, whole, first, limit, int(MOST_EXCLUDED * tested))
+    end, is_converged = states[-1], len(states) == 1
+    always = np.all([state.excluded for state in states], axis=0)
+    groups = _find_rivals(refit, end, whole, limit) if is_converged else _suspected_in_turn(states)
+    ambiguous = np.any(groups, axis=0) if groups else np.zeros_like(always)
     p_value, ratio = end.p_value(), np.sqrt(whole.ratio)
     outliers = tuple(
         Outlier(
             labels[i],
-            float(end.found.distance[i] / end.scale**2),
-            int(end.found.degrees[i]),
+            float(end.influence.distance[i] / end.scale**2),
+            int(end.influence.degrees[i]),
             float(p_value[i]),
         )
         for i in np.argsort(p_value, kind="stable")
-        if always[i] and not unsure[i]
+        if always[i] and not ambiguous[i]
     )
-    undecided = tuple(
-        Disagreement(tuple(labels[i] for i in np.flatnonzero(g)), float(ratio[g].max()))
-        for g in groups
+    conflicts = tuple(
+        Conflict(tuple(labels[i] for i in np.flatnonzero(group)), float(ratio[group].max()))
+        for group in groups
     )
-    sentence = _sentence(fit, outliers, int(unsure.sum()), settled, tested, level)
+    counts = {"outliers": len(outliers), "ambiguous": int(ambiguous.sum()), "blocks": tested}
+    single = all(len(poses) == 1 for poses in labels)
+    summary = _summarize(fit, counts, level, is_converged=is_converged, single_poses=single)
     return OutlierCheck(
-        outliers, undecided, settled, level, tested, labels, end.found, end.scale, sentence
+        outliers, conflicts, is_converged, level, tested, labels, end.influence, end.scale, summary
     )
 
 
-def _ask(
+def _fit_without(
     fit: Identification,
     problem: Problem,
-    member: np.ndarray,
-    aside: BoolArray,
+    member: IntArray,
+    excluded: BoolArray,
     z: FloatArray,
     start: Start,
 ) -> _State:
-    """Fit linearly without the blocks aside (u,) and return what that says of every block."""
-    weight = (~aside).astype(np.float64)
+    """Fit linearly without the excluded blocks (u,), and compute the influence of every block."""
+    weight = (~excluded).astype(np.float64)
     kept = problem.weighted(weight[member]).linearize(z, start)
     method, p = fit.method, problem.parameters
     d: Decomposition = decompose(
@@ -246,60 +261,61 @@ def _ask(
     )
     penalty = np.array(method.penalty(d), dtype=np.float64)
     at = d.deviation(d.solution(penalty))
-    found = compute_influence(problem, kept, member, d, penalty, weight, at)
-    there = (found.degrees > 0) & ~aside
+    influence = compute_influence(problem, kept, member, d, penalty, weight, at)
+    inside = (influence.degrees > 0) & ~excluded
     scale = 1.0
     if fit.residual_test.noise == "estimated":
-        degrees = found.degrees[there].astype(np.float64)
+        degrees = influence.degrees[inside].astype(np.float64)
         scale = (
-            estimate_scale_of(np.sqrt(found.distance[there]), degrees) if there.any() else np.nan
+            estimate_scale_of(np.sqrt(influence.distance[inside]), degrees)
+            if inside.any()
+            else np.nan
         )
-    return _State(aside, found, scale, int(np.isfinite(penalty).sum()))
+    return _State(excluded, influence, scale, int(np.isfinite(penalty).sum()))
 
 
-def _bearable(state: _State, whole: _State) -> bool:
-    """Whether the blocks that are left determine as much as all do, and the noise where that is
-    estimated.
+def _determines_as_much(state: _State, whole: _State) -> bool:
+    """Whether the remaining blocks determine as many directions as all do, and the noise where it
+    is estimated.
     """
-    return state.used >= whole.used and bool(np.isfinite(state.scale))
+    return state.directions >= whole.directions and bool(np.isfinite(state.scale))
 
 
 def _search(
-    ask: Callable[[BoolArray], _State], whole: _State, start: _State, alone: float, most: int
+    refit: _Fit, whole: _State, start: _State, limit: float, most: int
 ) -> tuple[_State, ...]:
-    """Set aside what is doubted until the same is doubted twice; return that state, or all those
-    that are visited in turn.
+    """Exclude suspects until the same ones are suspected twice.
+
+    Return that state, or all states of a cycle.
     """
-    visited = [start]
-    while len(visited) <= ROUNDS:
-        state = visited[-1]
-        beyond = np.flatnonzero(state.p_value() < alone)
+    states = [start]
+    while len(states) <= MOST_ROUNDS:
+        state = states[-1]
+        beyond = np.flatnonzero(state.p_value() < limit)
         order = beyond[np.argsort(-state.ratio[beyond], kind="stable")][:most]
-        after = _farthest(ask, order, whole)
-        if (after.aside == state.aside).all():
+        after = _exclude_farthest(refit, order, whole)
+        if (after.excluded == state.excluded).all():
             return (state,)
-        again = [i for i, old in enumerate(visited) if (old.aside == after.aside).all()]
+        again = [i for i, old in enumerate(states) if (old.excluded == after.excluded).all()]
         if again:
-            return tuple(visited[again[0] :])
-        visited.append(after)
-    return tuple(visited)
+            return tuple(states[again[0] :])
+        states.append(after)
+    return tuple(states)
 
 
-def _farthest(ask: Callable[[BoolArray], _State], order: np.ndarray, whole: _State) -> _State:
-    """Set aside as many blocks of the order as can be spared; that fewer can be spared if few can
-    makes bisection find it.
-    """
+def _exclude_farthest(refit: _Fit, order: IntArray, whole: _State) -> _State:
+    """Exclude as many blocks of the order as possible without losing a direction, by bisection."""
 
     def without(count: int) -> _State:
-        aside = np.zeros_like(whole.aside)
-        aside[order[:count]] = True
-        return ask(aside) if count else whole
+        excluded = np.zeros_like(whole.excluded)
+        excluded[order[:count]] = True
+        return refit(excluded) if count else whole
 
     good, bad, best = 0, len(order) + 1, whole
     count = len(order)
     while bad - good > 1:
         state = without(count)
-        if _bearable(state, whole):
+        if _determines_as_much(state, whole):
             good, best = count, state
         else:
             bad = count
@@ -307,39 +323,37 @@ def _farthest(ask: Callable[[BoolArray], _State], order: np.ndarray, whole: _Sta
     return best
 
 
-def _rivals(
-    ask: Callable[[BoolArray], _State], end: _State, whole: _State, alone: float
-) -> list[BoolArray]:
-    """Return groups (u,) of blocks of which one set aside does as well as another.
+def _find_rivals(refit: _Fit, end: _State, whole: _State, limit: float) -> list[BoolArray]:
+    """Return groups (u,) of blocks of which excluding one does as well as excluding another.
 
-    With i back in the fit, taking out block j lowers chi-square by d_j^2, and i after that by d_i^2
-    - d_j^2 at least; so only a j whose d_j^2 comes near d_i^2 can do as well as i.
+    With i back in the fit, excluding block j lowers chi-square by d_j^2, and excluding i after that
+    by at least d_i^2 - d_j^2; so only a j whose d_j^2 comes near d_i^2 can replace i.
     """
     from scipy.special import chdtri
 
     groups: list[BoolArray] = []
-    doubted = np.flatnonzero(end.aside)
-    for i in doubted[np.argsort(-end.ratio[doubted], kind="stable")][:COMPARED]:
-        aside = end.aside.copy()
-        aside[i] = False
-        back = ask(aside)
-        square = back.found.distance / back.scale**2
-        limit = float(chdtri(max(int(end.found.degrees[i]), 1), alone))
-        group = np.zeros_like(aside)
-        for j in np.flatnonzero(
-            ~end.aside & (back.p_value() < alone) & (square > square[i] - limit)
-        ):
-            aside[j] = True
-            instead = ask(aside)
-            aside[j] = False
-            group[j] = _bearable(instead, whole) and instead.p_value()[i] >= alone
+    suspects = np.flatnonzero(end.excluded)
+    for i in suspects[np.argsort(-end.ratio[suspects], kind="stable")][:MOST_COMPARED]:
+        excluded = end.excluded.copy()
+        excluded[i] = False
+        back = refit(excluded)
+        square = back.influence.distance / back.scale**2
+        far = float(chdtri(max(int(end.influence.degrees[i]), 1), limit))
+        group = np.zeros_like(excluded)
+        near = ~end.excluded & (back.p_value() < limit) & (square > square[i] - far)
+        for j in np.flatnonzero(near):
+            excluded[j] = True
+            instead = refit(excluded)
+            excluded[j] = False
+            replaces = instead.p_value()[i] >= limit
+            group[j] = _determines_as_much(instead, whole) and replaces
         if group.any():
             group[i] = True
             groups.append(group)
-    return _joined(groups)
+    return _join_groups(groups)
 
 
-def _joined(groups: list[BoolArray]) -> list[BoolArray]:
+def _join_groups(groups: list[BoolArray]) -> list[BoolArray]:
     """Join groups that share a block."""
     joined: list[BoolArray] = []
     for group in groups:
@@ -349,36 +363,40 @@ def _joined(groups: list[BoolArray]) -> list[BoolArray]:
     return joined
 
 
-def _in_turn(visited: tuple[_State, ...], always: BoolArray) -> list[BoolArray]:
-    """Return the one group (u,) of the blocks that are doubted in some of the states only."""
-    return [np.any([state.aside for state in visited], axis=0) & ~always]
+def _suspected_in_turn(states: tuple[_State, ...]) -> list[BoolArray]:
+    """Return the one group (u,) of the blocks that are suspected in some of the states only."""
+    excluded = np.array([state.excluded for state in states])
+    return [excluded.any(axis=0) & ~excluded.all(axis=0)]
 
 
-def _sentence(
+def _summarize(
     fit: Identification,
-    outliers: tuple[Outlier, ...],
-    unsure: int,
-    settled: bool,
-    tested: int,
+    counts: dict[str, int],
     level: float,
-) -> str:
-    """Say how many blocks do not belong."""
-    if tested == 0:
-        return "no block of rows can be checked: each determines parameters that no other sees; measure more"
-    if tested == 1:
-        return "all rows belong to one block, which has no others to be compared with"
+    *,
+    is_converged: bool,
+    single_poses: bool,
+) -> tuple[Finding, ...]:
+    """Return the findings on all blocks together."""
+    blocks, ambiguous = counts["blocks"], counts["ambiguous"]
+    if blocks == 0:
+        return (report_finding("outliers.not-testable"),)
+    if blocks == 1:
+        return (report_finding("outliers.single-block"),)
     if fit.residual_test.noise == "estimated" and round(fit.residual_test.dof) <= 1:
-        return "no block of rows can be checked: one degree of freedom tells the noise or a wrong row; state sigma or measure more"
-    named = f"{len(outliers)} of {tested} blocks of rows do not fit the others (chance names one in {level:.0%} of right data)"
-    advice = "look at them; leave them out with drop, or fit with a loss"
-    if not settled:
-        found = f"{named}, and " if outliers else ""
-        return f"{found}the search for wrong blocks of rows did not settle: {unsure} of {tested} are doubted in turn; measure more"
-    if unsure:
-        found = f"{named}: {advice}; " if outliers else ""
-        return f"{found}{unsure} of {tested} blocks of rows disagree, and which is wrong cannot be told: measure more poses"
-    if outliers:
-        return f"{named}: {advice}"
+        return (report_finding("outliers.unknown-noise"),)
+    shared = {"blocks": blocks, "single_poses": single_poses}
+    findings = []
+    if counts["outliers"]:
+        code, count = "outliers.some", counts["outliers"]
+        findings.append(report_finding(code, count=count, level=level, **shared))
+    if not is_converged:
+        code = "outliers.search-not-converged"
+        findings.append(report_finding(code, count=ambiguous, **shared))
+    elif ambiguous:
+        findings.append(report_finding("outliers.ambiguous", count=ambiguous, **shared))
+    if findings:
+        return tuple(findings)
     if fit.residual_test.failed:
-        return f"none of {tested} blocks of rows stands out: what the noise does not explain is spread over them"
-    return f"all {tested} blocks of rows fit each other (false alarm in {level:.0%} of data sets)"
+        return (report_finding("outliers.none-but-misfit", **shared),)
+    return (report_finding("outliers.none", level=level, **shared),)

@@ -28,6 +28,7 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.estimate.poses.prediction import predict_from_readings
+from loopcal.findings import Finding, report_finding
 from loopcal.measure import (
     Measurements,
     NuisanceParameters,
@@ -208,15 +209,14 @@ def compare_predictions(
         if len(counted := o.take((o.weight > 0.0) & o.present.any(axis=1)))
     ]
     if not rows:
-        raise DataError("there is no row to validate with: every row is absent or has weight 0")
-    (first, _), (last, predictable) = (
-        predict_from_readings(before, data),
-        predict_from_readings(after, data),
-    )
+        raise DataError(report_finding("residuals.no-rows-to-predict"))
+    first, _ = predict_from_readings(before, data)
+    last, predictable = predict_from_readings(after, data)
     commanded = inverse(after, first.T)
     usable = first.converged & last.converged & commanded.converged & predictable
     if not usable.any():
-        raise DataError(_unreached(after, predictable, first.converged, last.converged))
+        finding = _explain_unreached(after, predictable, first.converged, last.converged)
+        raise DataError(finding)
     rows = [o.take(usable[o.rows].reshape(len(o), -1).all(axis=1)) for o in rows]
     labels = tuple(
         "/".join(data.labels[i] for i in poses)
@@ -355,23 +355,19 @@ def _balance(components: FloatArray) -> FloatArray:
     return np.where(enough, np.where(enough, high, 0.0) - np.where(enough, low, 0.0), np.nan)
 
 
-def _unreached(
+def _explain_unreached(
     robot: Mechanism, predictable: BoolArray, before: BoolArray, after: BoolArray
-) -> str:
+) -> Finding:
     """Why no pose is left: readings are missing, or one of the geometries does not reach it."""
-    n, reached = len(predictable), int(before.sum())
+    poses, reached = len(predictable), int(before.sum())
     if not predictable.any():
-        return (
-            f"none of the {n} poses has all the readings from which {robot.name} can be predicted: "
-            "give readings, and a finite"
-            " sigma to those that are to be believed"
-        )
+        return report_finding("residuals.readings-missing", robot=robot.name, poses=poses)
     if not reached:
-        return f"{robot.name} reaches none of the {n} poses; check the readings and their units"
-    return (
-        f"the calibrated geometry of {robot.name} cannot follow where the one before goes: with "
-        "these readings that reaches"
-        f" {reached} of {n} poses, the calibrated one {int(after.sum())}, and none of them the same; "
-        "do not use this calibration,"
-        " and check what is stated of frames and noise"
+        return report_finding("residuals.poses-out-of-reach", robot=robot.name, poses=poses)
+    return report_finding(
+        "residuals.calibrated-out-of-reach",
+        robot=robot.name,
+        poses=poses,
+        before=reached,
+        after=int(after.sum()),
     )

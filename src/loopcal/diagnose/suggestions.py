@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What further measurement would determine a combination that stays open: by trying every known
-kind.
+"""Suggest further measurements that determine what the data leave open, by testing every kind.
 
-With a basis B (d, p) of the open combinations, in tolerances, and the triangular factor X of a
-further instrument's rows (its own unknowns eliminated), what stays open is the null space of X B'.
-A combination is determined when no direction of it has a part left in that combination.
+With a basis B (d, p) of the unidentifiable combinations, in tolerances, and the triangular factor X
+of the rows of a further instrument (its nuisance parameters eliminated), the null space of X B'
+stays open. A combination is determined when no direction of that null space has a part in it.
 """
 
 from __future__ import annotations
@@ -14,12 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.diagnose.identifiability_analysis import Identifiability, identifiability
-from loopcal.diagnose.meaning import probed
+from loopcal.diagnose.identifiable_parameters import Identifiability, identifiability
+from loopcal.diagnose.null_space import probe_workspace
 from loopcal.errors import DataError, MechanismError
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.inference.null_space import Combination, listed, sparsify_basis
+from loopcal.estimate.inference.null_space import Combination, sparsify_basis
 from loopcal.estimate.information import ObservedPoses, instrument_factor, observe_poses
+from loopcal.findings import Finding, report_finding
+from loopcal.findings.wording import list_names
 from loopcal.measure import (
     KINDS,
     Component,
@@ -31,32 +32,28 @@ from loopcal.measure import (
     Sensor,
 )
 from loopcal.mechanism import Mechanism, sample_workspace
-from loopcal.typing import FloatArray
+from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
 POSES = 24
-"""Poses at which a further instrument is supposed to look."""
+"""Number of poses of a further measurement."""
 
-SEEN = 1e-8
-"""Singular value, relative to the largest of the instrument's rows and of those there are, above
-which it shows a direction.
+OBSERVED = 1e-8
+"""Singular value above which an instrument observes a direction, relative to the largest of its
+rows and of those that exist.
 """
 
-HELP = 0.9
-"""A cure must bring the leading parameter below this share of what is left of its tolerance now."""
+IMPROVEMENT = 0.9
+"""A further measurement must reduce the remaining uncertainty of the leading parameter below this
+share.
+"""
 
-NAMED = 4
-"""Further measurements written out in a sentence; the others are counted."""
-
-FEW = 3
-"""Open combinations at most that are written out in a refusal."""
+MOST_MISSING = 3
+"""Largest number of open combinations that a refusal lists."""
 
 TILT = "tilt-torsion"
 SINGLE = (("x",), ("y",), ("z",), ("psi",), ("theta",), ("phi", "theta"))
-"""Coordinates to measure one by one, the simplest remedies."""
-
-ASSUMED_FRAMES = "frames of further measurements are known in the base (a datum on it), unless they are said to be unknown"
-"""What a remedy takes for granted."""
+"""Single coordinates, the simplest further measurements."""
 
 SIGMA = {Dimension.LENGTH: 1e-5, Dimension.ANGLE: 5e-5, Dimension.RATIO: 5e-5}
 """Standard deviations [SI] of a further instrument where none are stated."""
@@ -68,9 +65,9 @@ class FurtherMeasurement:
 
     Attributes
     ----------
-    words : what to measure. kind : its kind. left : standard deviation of the combination's first
-        parameter over its tolerance, from the data, the further measurement and the tolerances
-        together.
+    words : what is measured, such as `psi`. kind : its kind. left : standard deviation of the first
+        parameter of the combination over its tolerance, from the data, the further measurement and
+        the tolerances together.
     """
 
     words: str
@@ -80,104 +77,112 @@ class FurtherMeasurement:
 
 @dataclass(frozen=True, eq=False)
 class MeasurementSuggestion:
-    """A combination that stays open, and what would determine it: simplest first."""
+    """An unidentifiable combination, and the measurements that determine it, simplest first."""
 
     combination: Combination
-    cures: tuple[FurtherMeasurement, ...]
+    measurements: tuple[FurtherMeasurement, ...]
+
+    @property
+    def finding(self) -> Finding:
+        """The suggestion: a further measurement, or fixing a parameter."""
+        names = self.combination.names
+        if not self.measurements:
+            return report_finding("identifiability.fix-one", names=names)
+        measurements = tuple(dict(vars(one)) for one in self.measurements)
+        return report_finding(
+            "identifiability.measure-also", names=names, measurements=measurements, poses=POSES
+        )
 
     def __str__(self) -> str:
-        names, one = listed(self.combination.names), len(self.combination.names) == 1
-        if not self.cures:
-            return f"{names}: none of the known kinds of measurement would tell; fix {'it' if one else 'one of them'}"
-        first, others = self.cures[0], [cure.words for cure in self.cures[1:]]
-        them = "it" if one else "them"
-        words = (
-            f"{names}: measuring {first.words} as well would determine {them} "
-            f"({self.combination.names[0]} to "
-            f"{first.left:.2g} of its tolerance, from {POSES} poses)"
-        )
-        return f"{words}; so would {listed(others, NAMED)}" if others else words
+        return str(self.finding)
 
     def to_dict(self) -> dict[str, object]:
-        """Names, all cures, and the sentence."""
-        cures = [vars(cure) for cure in self.cures]
-        return {"names": list(self.combination.names), "cures": cures, "sentence": str(self)}
+        """Return names, measurements and the finding for JSON."""
+        return {
+            "names": self.combination.names,
+            "cures": self.measurements,
+            "finding": self.finding,
+        }
 
 
 def suggest_measurements(
-    found: Identifiability, sigma: dict[Dimension, float] | None = None
+    identifiability: Identifiability, sigma: dict[Dimension, float] | None = None
 ) -> tuple[MeasurementSuggestion, ...]:
-    """Try every known kind at poses of the workspace, one after the other, on the combinations that
-    stay open.
+    """Test every kind of measurement, one after the other, on the unidentifiable combinations.
 
     Parameters
     ----------
-    found : what `identifiability` returned. sigma : standard deviations of the further instrument
-        by dimension [SI].
+    identifiability : of the data. sigma : standard deviations of the further instrument by
+        dimension [SI].
 
     Returns
     -------
-    One remedy for each of `found.unidentifiable`, in order.
+    One suggestion for each of `identifiability.unidentifiable`, in order.
     """
-    if not found.unidentifiable:
+    combinations, factor = identifiability.unidentifiable, identifiability.factor
+    if not combinations:
         return ()
-    free = found.unknowns
-    B = sparsify_basis(found.null_space())
+    free = identifiability.free_parameters
+    B = sparsify_basis(identifiability.null_space())
     B = B / np.linalg.norm(B, axis=1, keepdims=True)
-    leading = [free.names.index(c.names[0]) for c in found.unidentifiable]
-    cures: list[list[FurtherMeasurement]] = [[] for _ in leading]
-    # what a kind sees must stand out from the rounding of what is measured already, not only from
-    # its own
-    floor, present = float(np.linalg.norm(found.factor, ord=2)), _left(found.factor)
-    passive = _passive(free.robot)
-    at = _scene(free, [name for name, _ in passive])
-    for words, kind in _candidates(free.robot, passive):
+    leading = [free.names.index(c.names[0]) for c in combinations]
+    found: list[list[FurtherMeasurement]] = [[] for _ in leading]
+    # an observed direction must exceed the rounding of the existing rows, too
+    floor, present = float(np.linalg.norm(factor, ord=2)), _remaining_sd(factor)
+    joints = _passive_joints(free.robot)
+    at = _draw_scene(free, [name for name, _ in joints])
+    for words, kind in _list_candidates(free.robot, joints):
         try:
-            X = instrument_factor(at, _seen(at, kind, SIGMA | (sigma or {})))[0, :-1, :-1]
+            X = instrument_factor(at, _measure_at(at, kind, SIGMA | (sigma or {})))[0, :-1, :-1]
         except DataError:
-            continue  # this kind has nothing to look at on this robot
-        determined = _determined(X, B, floor)
+            continue  # this kind has nothing to measure on this robot
+        determined = _find_determined(X, B, floor)
         if determined.any():
-            left = _left(np.concatenate([found.factor, X]))
-            for i in np.flatnonzero(determined & (left[leading] < HELP * present[leading])):
-                cures[i].append(FurtherMeasurement(words, kind.name, float(left[leading[i]])))
-    pairs = zip(found.unidentifiable, cures, strict=True)
+            left = _remaining_sd(np.concatenate([factor, X]))
+            better = determined & (left[leading] < IMPROVEMENT * present[leading])
+            for i in np.flatnonzero(better):
+                found[i].append(FurtherMeasurement(words, kind.name, float(left[leading[i]])))
+    pairs = zip(combinations, found, strict=True)
     return tuple(MeasurementSuggestion(combination, tuple(some)) for combination, some in pairs)
 
 
-def describe_missing_equations(robot: Mechanism, data: Measurements) -> str:
-    """What too few equations leave open and what would determine it, for a refusal; empty where
-    that is too much to say.
+def describe_missing_equations(robot: Mechanism, data: Measurements) -> Finding | None:
+    """Return what too few equations leave open and what determines it, for a refusal.
+
+    Return None where more than a few combinations are open.
 
     Parameters
     ----------
     robot, data : as for `identifiability`.
     """
-    if int(robot.parameters.free.sum()) - data.n_rows > FEW:
-        return ""
-    found = suggest_measurements(identifiability(robot, data))
-    if not 0 < len(found) <= FEW:
-        return ""
+    if int(robot.parameters.free.sum()) - data.n_rows > MOST_MISSING:
+        return None
+    suggestions = suggest_measurements(identifiability(robot, data))
+    if not 0 < len(suggestions) <= MOST_MISSING:
+        return None
     common = [
-        cure.words
-        for cure in found[0].cures
-        if all(cure.words in {c.words for c in other.cures} for other in found)
+        one.words
+        for one in suggestions[0].measurements
+        if all(one.words in {m.words for m in other.measurements} for other in suggestions)
     ]
-    advice = f"add {common[0]}" if common else "no one kind of measurement would tell all of it"
-    return f" ({'; '.join(str(remedy.combination) for remedy in found)}; {advice})"
+    return report_finding(
+        "identifiability.missing-equations",
+        combinations=tuple(dict(one.combination.finding.data) for one in suggestions),
+        measurement=common[0] if common else None,
+    )
 
 
-def _scene(free: FreeParameters, joints: list[str]) -> ObservedPoses:
+def _draw_scene(free: FreeParameters, joints: list[str]) -> ObservedPoses:
     """Poses drawn from the workspace, or about home where none is stated."""
     try:
         q = sample_workspace(free.robot, POSES, seed=0).solution.q
     except MechanismError:
-        return probed(free, joints)
+        return probe_workspace(free, joints)
     return observe_poses(free, q, joints)
 
 
-def _passive(robot: Mechanism) -> list[tuple[str, str]]:
-    """Passive joints a sensor could be put on, with what it would measure."""
+def _passive_joints(robot: Mechanism) -> list[tuple[str, str]]:
+    """Passive joints to which a sensor could be attached, with what it would measure."""
     return [
         (f"{limb.name}.{joint.name}", "length" if joint.kind == "P" else "angle")
         for limb in robot.assembly.limbs
@@ -186,41 +191,41 @@ def _passive(robot: Mechanism) -> list[tuple[str, str]]:
     ]
 
 
-def _candidates(robot: Mechanism, passive: list[tuple[str, str]]) -> Iterator[tuple[str, Kind]]:
-    """What could be measured, in words, the simplest first: what needs no frame, single
+def _list_candidates(robot: Mechanism, joints: list[tuple[str, str]]) -> Iterator[tuple[str, Kind]]:
+    """Yield measurements with their descriptions, the simplest first: without a frame, single
     coordinates, other kinds, joints.
     """
-    # examples of Component and JointSensor are of one robot; both are made for this one
+    # examples of Component and JointSensor belong to one robot; both are made for this one
     known = [kind for kind in KINDS.values() if not issubclass(kind, (Component, JointSensor))]
-    yield from _examples([kind for kind in known if kind.poses_per_row > 1])
+    yield from _list_examples([kind for kind in known if kind.poses_per_row > 1])
     for names in SINGLE:
         yield " and ".join(names), Component(names, None if names[0] in "xyz" else TILT)
-    yield from _examples([kind for kind in known if kind.poses_per_row == 1])
-    for name, measures in passive:
+    yield from _list_examples([kind for kind in known if kind.poses_per_row == 1])
+    for name, measures in joints:
         yield f"the joint {name}", JointSensor(joints=(name,), measures=measures)
 
 
-def _examples(kinds: Iterable[type[Kind]]) -> Iterator[tuple[str, Kind]]:
-    """Examples of kinds that differ in words."""
-    said: set[str] = set()
-    for kind in (example for one in kinds for example in one.examples()):
-        words = _words(kind)
-        if words not in said:
-            said.add(words)
+def _list_examples(kinds: Iterable[type[Kind]]) -> Iterator[tuple[str, Kind]]:
+    """Yield examples of kinds whose descriptions differ."""
+    listed: set[str] = set()
+    for kind in (example for cls in kinds for example in cls.examples()):
+        words = _describe_kind(kind)
+        if words not in listed:
+            listed.add(words)
             yield words, kind
 
 
-def _words(kind: Kind) -> str:
-    """A kind with what is unknown of it."""
+def _describe_kind(kind: Kind) -> str:
+    """Noun phrase for a kind, with its nuisance parameters."""
     targets, unknown = getattr(kind, "targets", ()), list(kind.setup_items)
     if kind.description and not unknown:
         return kind.description
     words = f"the {kind.name}" + (f" of {len(targets)} targets" if len(targets) > 1 else "")
-    return f"{words} ({listed(unknown)} unknown)" if unknown else words
+    return f"{words} ({list_names(unknown)} unknown)" if unknown else words
 
 
-def _seen(at: ObservedPoses, kind: Kind, sigma: dict[Dimension, float]) -> Measurements:
-    """What an instrument of this kind reads at the scene, without noise."""
+def _measure_at(at: ObservedPoses, kind: Kind, sigma: dict[Dimension, float]) -> Measurements:
+    """Noiseless measurements of a kind at the scene."""
     robot = at.free.robot
     noise = Gaussian(np.array([sigma[column.dimension] for column in kind.noise_columns]))
     sensor = Sensor(kind.with_tool(robot.tool), noise).assign_rows(len(at.readings))
@@ -233,23 +238,23 @@ def _seen(at: ObservedPoses, kind: Kind, sigma: dict[Dimension, float]) -> Measu
     )
     zero = np.zeros((1, len(rows), len(kind.noise_columns)))
     measured = mounted.measure(at.T[:, rows], zero, None, joints)[0]
-    seen = Observations.from_sigma(
+    observations = Observations.from_sigma(
         mounted, rows, measured, noise.sigma, sensor.session, sensor.group
     )
-    return Measurements(robot.name, at.readings, (seen,))
+    return Measurements(robot.name, at.readings, (observations,))
 
 
-def _determined(X: FloatArray, B: FloatArray, floor: float) -> np.ndarray:
-    """Which combinations (d,) the rows X (p, p) tell from all others; `floor` is the size of the
-    rows there are already.
+def _find_determined(X: FloatArray, B: FloatArray, floor: float) -> BoolArray:
+    """Combinations (d,) that the rows X (p, p) separate from all others; `floor` is the size of the
+    existing rows.
     """
     _, s, vt = np.linalg.svd(X @ B.T)
     largest = max(float(np.linalg.norm(X, ord=2)), floor)
-    still_open = vt[s <= SEEN * largest] if largest > 0.0 else vt
-    return np.asarray(np.linalg.norm(still_open, axis=0) <= np.sqrt(SEEN))
+    still_open = vt[s <= OBSERVED * largest] if largest > 0.0 else vt
+    return np.asarray(np.linalg.norm(still_open, axis=0) <= np.sqrt(OBSERVED))
 
 
-def _left(rows: FloatArray) -> FloatArray:
-    """Standard deviations (p,) over tolerances, tolerances as a prior."""
+def _remaining_sd(rows: FloatArray) -> FloatArray:
+    """Standard deviations (p,) over tolerances, with the tolerances as a prior."""
     _, s, vt = np.linalg.svd(rows, full_matrices=False)
     return np.sqrt((vt**2 / (1.0 + s[:, None] ** 2)).sum(axis=0))

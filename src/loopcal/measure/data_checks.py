@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from loopcal.errors import DataError
+from loopcal.findings import Quantity, report_finding
 from loopcal.measure.kinds import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.observations import Observations
@@ -161,7 +162,7 @@ def _same(one: Kind, other: Kind) -> bool:
 
 
 def check_targets_move(
-    measurements: Measurements, T: FloatArray, *, allow: bool = False, override: str = ""
+    measurements: Measurements, T: FloatArray, *, allow: bool = False
 ) -> None:
     """Refuse a target that no pose moves: its readings stay within the noise, though the robot
     carried it about.
@@ -176,8 +177,6 @@ def check_targets_move(
         T_base_platform of each pose, by the nominal robot.
     allow : bool
         True accepts them.
-    override : str
-        How a user of the caller says so; closes the message.
 
     Raises
     ------
@@ -196,14 +195,17 @@ def check_targets_move(
             worst = int(np.argmax(planned / still.noise))
             shown = DISPLAY_UNITS[kind.columns[still.places[worst]].dimension]
             moved, should = (
-                f"{range_[worst] / shown.factor_to_si:.3g} {shown}"
+                Quantity(float(range_[worst]) / shown.factor_to_si, str(shown))
                 for range_ in (still.moved, planned)
             )
             raise DataError(
-                f"{still.target!r} of kind {kind.name!r} never moves: its readings stay within "
-                f"{moved}, but"
-                f" the robot moves it by {should}; check that it sits on the platform and that the"
-                " column is its own" + _or_use(override)
+                report_finding(
+                    "conventions.target-never-moves",
+                    target=still.target,
+                    kind=kind.name,
+                    moved=moved,
+                    expected=should,
+                )
             )
 
 

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from loopcal.diagnose import ASSUMED_FRAMES
+from loopcal.findings import report_finding
+from loopcal.findings.wording import list_names
 from loopcal.report.numbers import format_number
 from loopcal.report.tables import Column, Table, word_column
 from loopcal.report.text_page import Block
@@ -13,14 +14,15 @@ from loopcal.workflow.identifiability_report import IdentifiabilityReport
 def view_identifiability(report: IdentifiabilityReport) -> list[Block]:
     """Return the page of an identifiability analysis."""
     analysis = report.analysis
-    blocks: list[Block] = list(analysis.sentences())
-    blocks += [f"to determine {suggestion}" for suggestion in report.suggestions]
+    blocks: list[Block] = [str(finding) for finding in analysis.findings]
+    blocks += [str(suggestion) for suggestion in report.suggestions]
     if report.suggestions:
-        blocks.append(f"note: {ASSUMED_FRAMES}")
+        blocks.append(str(report_finding("identifiability.known-frames-assumed")))
+    states = {"determined": "yes", "not at all": "no"}
     rows = tuple(
         (
             parameter.name,
-            "yes" if parameter.state == "determined" else str(parameter),
+            states.get(parameter.state) or f"only with {list_names(parameter.others)}",
             f"{parameter.left:.2f}",
         )
         for parameter in analysis.parameters

@@ -183,7 +183,7 @@ def _fit(
                 "workflow.too-few-equations",
                 equations=available,
                 parameters=free,
-                suggestions=describe_missing_equations(chosen, data),
+                suggestions=describe_missing_equations(chosen, data) or "",
             )
         )
     count(f"fitting {free} parameters")

@@ -100,18 +100,17 @@ def load_measurements(
     try:
         check_strokes(data, robot, allow=allow_outside_stroke, override="--allow-outside-stroke")
         check_duplicates(data, allow=allow_duplicates, override="--allow-duplicates", places=places)
-        told = check_conventions(
+        check = check_conventions(
             robot,
             data,
             allow_still=allow_still,
             allow_implausible=allow_implausible,
-            overrides=("--allow-still", "--allow-implausible"),
-            parts=files,
+            sources=files,
         )
     except DataError as error:
-        raise DataError(f"{parsed.names}: {error}") from None
-    if told.sentence:
-        logging.getLogger(__name__).warning("%s: %s", parsed.names, told.sentence)
+        raise DataError(f"{parsed.names}: {error}") from error
+    if check.finding is not None:
+        logging.getLogger(__name__).warning("%s: %s", parsed.names, check.finding)
     return data
 
 

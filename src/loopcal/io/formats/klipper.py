@@ -250,9 +250,9 @@ def judged(robot: Mechanism, measured: Measurements) -> tuple[str, ...]:
     """Whether the stored geometry is the optimum of Klipper's own cost; nothing where the probes do
     not determine one.
     """
-    from loopcal.diagnose import stored_answer
+    from loopcal.diagnose import compare_stored_geometry
 
-    found = stored_answer(robot, measured)
+    found = compare_stored_geometry(robot, measured)
     return () if found is None else (str(found),)
 
 

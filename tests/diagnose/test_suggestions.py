@@ -3,8 +3,7 @@
 
 import pytest
 
-from loopcal.diagnose import identifiability
-from loopcal.diagnose.suggestions import suggest_measurements
+from loopcal.diagnose import identifiability, suggest_measurements
 from loopcal.io import load_robot
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import KINDS, Instrument, Pose, Sensor
@@ -13,11 +12,11 @@ from tests.estimate.problems import five_dof, hexapod, hexapod_data, tracker
 
 def test_torsion_is_what_the_3_prs_lacks():
     (remedy,) = suggest_measurements(identifiability(load_robot("3-prs"), five_dof(), poses=36))
-    assert remedy.cures[0].words == "psi"
-    assert str(remedy).startswith(
-        "a1y, a2y and a3y: measuring psi as well would determine them (a1y to 0."
-    )
-    words = {cure.words for cure in remedy.cures}
+    assert remedy.measurements[0].words == "psi"
+    assert remedy.finding.code == "identifiability.measure-also"
+    assert remedy.finding.data["names"] == ("a1y", "a2y", "a3y")
+    assert remedy.finding.data["measurements"][0]["words"] == "psi"
+    words = {cure.words for cure in remedy.measurements}
     assert "the pose" in words
     # the length of the normal's path, heights and a point in the axis of the turn show nothing of
     # it
@@ -41,7 +40,7 @@ def test_a_known_frame_is_what_an_unknown_one_lacks(unknown, datum):
     )
     assert len(found) == 6
     for remedy in found:
-        words = {cure.words for cure in remedy.cures}
+        words = {cure.words for cure in remedy.measurements}
         assert datum in words
         assert "the pose (frame and tool unknown)" not in words
 
@@ -55,9 +54,9 @@ def test_what_no_pose_depends_on_only_a_sensor_on_the_joint_could_tell(tmp_path)
         r.combination.names[0]: r
         for r in suggest_measurements(identifiability(load_robot(path), tracker(), poses=36))
     }
-    assert str(found["thB1z"]) == "thB1z: none of the known kinds of measurement would tell; fix it"
-    assert {cure.words for cure in found["thC1y"].cures} == {"the joint chain1.joint"}
-    assert "fix one of them" in str(found["b1z"])
+    assert found["thB1z"].finding.code == "identifiability.fix-one"
+    assert {cure.words for cure in found["thC1y"].measurements} == {"the joint chain1.joint"}
+    assert found["b1z"].finding.code == "identifiability.fix-one"
 
 
 def test_nothing_is_proposed_where_nothing_is_open():
@@ -68,16 +67,15 @@ def test_every_cure_is_of_a_known_kind_and_leaves_less():
     found = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
     before = {v.name: v.left for v in found.parameters}
     (remedy,) = suggest_measurements(found)
-    for cure in remedy.cures:
+    for cure in remedy.measurements:
         assert cure.kind in KINDS
         assert cure.left < before[remedy.combination.names[0]]
-    assert remedy.to_dict()["sentence"] == str(remedy)
 
 
 def test_a_robot_without_a_workspace_is_looked_at_about_home():
     found = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
     assert not hexapod().assembly.workspace
-    assert "psi" in {cure.words for cure in suggest_measurements(found)[0].cures}
+    assert "psi" in {cure.words for cure in suggest_measurements(found)[0].measurements}
 
 
 TRANSLATIONAL = """\
@@ -116,5 +114,5 @@ def test_what_is_measured_in_full_already_is_no_remedy(tmp_path):
     assert found.rank < found.n_parameters
     for remedy in suggest_measurements(found):
         assert not {"psi", "theta", "phi and theta", "the pose"} & {
-            cure.words for cure in remedy.cures
+            cure.words for cure in remedy.measurements
         }, str(remedy)

@@ -39,10 +39,9 @@ def test_what_an_unknown_frame_leaves_open_is_projected_out_and_named(fit):
     assert (
         np.abs(found.error).max() < 0.001e-3
     )  # [m] noise of 0.02 um and 0.1 urad, condition about 100
-    assert found.sentence.startswith(
-        "errors of 42 parameters in the 36 directions that the data determine; not compared"
-    )
-    assert all(combination.parts in found.sentence for combination in found.dropped)
+    finding = found.finding
+    assert (finding.data["parameters"], finding.data["compared"]) == (42, 36)
+    assert [c["names"] for c in finding.data["excluded"]] == [c.names for c in found.dropped]
     np.testing.assert_allclose(
         found.tolerances * fit.tolerance, found.error, rtol=1e-12, atol=1e-18
     )
@@ -68,7 +67,7 @@ def test_where_all_is_determined_nothing_is_dropped():
     assert found.dropped == ()
     np.testing.assert_array_equal(found.error, found.tolerances * fit.tolerance)
     np.testing.assert_allclose(found.error, found.raw, rtol=1e-12)
-    assert "the data determine all of them" in found.sentence
+    assert found.finding.data["compared"] == 42
 
 
 @pytest.mark.parametrize(
@@ -89,8 +88,8 @@ def test_validation_keeps_the_frame_of_the_fit_or_says_after_which_best_fit_it_c
     np.testing.assert_allclose(by_name.after.position, kept.after.position, rtol=1e-9)
     anew = validate(fit, others, refit=("fra*",))
     assert anew.alignment == {"kept": (), "fitted": ("frame",)}
-    assert anew.notes[0].endswith("errors are those after the best fit of frame")
+    assert "validation.setup-fitted" in [f.code for f in anew.findings]
     assert anew.after.statistics("position").rms <= kept.after.statistics("position").rms
     assert json.loads(to_json(anew.to_dict()))["alignment"]["fitted"] == ["frame"]
-    with pytest.raises(DataError, match=r"is called 'tracker'; there are frame"):
+    with pytest.raises(DataError, match=r"is called 'tracker'; the data have: frame"):
         validate(fit, others, refit=("tracker",))

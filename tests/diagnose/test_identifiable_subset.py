@@ -8,10 +8,10 @@ import json
 import numpy as np
 import pytest
 
-from loopcal.diagnose import identifiability
-from loopcal.diagnose.parameter_subset import choose_identifiable_subset
+from loopcal.diagnose import choose_identifiable_subset, identifiability
 from loopcal.errors import MechanismError
 from loopcal.estimate.information import observe_poses
+from loopcal.findings import Finding
 from loopcal.io import load_robot
 from loopcal.io.core.json_text import to_json
 from loopcal.io.robot.reduced_robot import format_reduced_robot
@@ -46,25 +46,27 @@ def test_fourteen_natural_parameters_a_chain_reduce_to_eleven_by_dropping_bz_thb
     smaller = choose_identifiable_subset(found)
     assert {m.name for m in smaller.dropped} == called("bz", "thBz", "thCy")
     assert smaller.kept == load_robot("3-prs").parameters.names
-    words = {m.name: str(m) for m in smaller.dropped}
-    assert words["b2z"] == "b2z: 1 mm of it counts as q2 +1 mm"
-    assert words["thB3z"] == "thB3z: nothing that was measured depends on it"
+    merged = {m.name: m for m in smaller.dropped}
+    assert merged["b2z"].into == ("q2",)
+    assert merged["b2z"].units == ("mm",)
+    np.testing.assert_allclose(merged["b2z"].changes, [1.0], rtol=1e-9)
+    assert merged["thB3z"].into == ()
     assert {v.name for v in found.parameters if v.state == "not at all"} == called("thBz", "thCy")
 
 
-def test_twenty_seven_parameters_of_the_tracker_reduce_to_26_by_merging_the_two_turns_about_the_post(
-    with_line,
-):
+def test_twenty_seven_parameters_of_the_tracker_reduce_to_26_by_merging_two_turns(with_line):
     found = identifiability(
         with_line("ru-pus-prs", "parameters: twenty-seven"), tracker(), poses=36
     )
     (merged,) = choose_identifiable_subset(found).dropped
     assert found.rank == 26
     assert {merged.name, *merged.into} == {"thOz", "thU1z"}
-    assert str(merged).endswith("counts as thOz +1 deg")
+    assert merged.into == ("thOz",)
+    np.testing.assert_allclose(merged.changes, [1.0], rtol=1e-9)
     (tied,) = found.unidentifiable
     assert set(tied.names) == {"thOz", "thU1z"}
-    assert tied.meaning == "no pose depends on it"
+    assert isinstance(tied.meaning, Finding)
+    assert tied.meaning.code == "identifiability.no-motion"
 
 
 @pytest.mark.parametrize("unknown", [("frame",), ("tool",), ("frame", "tool")])
@@ -72,7 +74,7 @@ def test_what_is_merged_moves_what_was_measured_as_its_replacement_does(unknown)
     instrument = Instrument((Sensor(Pose(unknown=unknown), tracker().sensors[0].noise),))
     found = identifiability(hexapod(), hexapod_data(60, instrument=instrument))
     smaller = choose_identifiable_subset(found)
-    free = found.unknowns
+    free = found.free_parameters
     assert len(smaller.kept) == found.rank
     s = np.linalg.svd(
         found.factor[:, [free.names.index(n) for n in smaller.kept]], compute_uv=False
@@ -95,7 +97,7 @@ def test_what_is_merged_moves_what_was_measured_as_its_replacement_does(unknown)
 def test_a_full_set_stays_whole_and_says_so():
     smaller = choose_identifiable_subset(identifiability(hexapod(), hexapod_data(60)))
     assert smaller.dropped == ()
-    assert str(smaller) == "all 42 parameters can be told apart: none is left out"
+    assert [f.code for f in smaller.findings] == ["model.not-reducible"]
 
 
 def test_the_written_file_loads_keeps_its_comments_and_loses_nothing(tmp_path):
@@ -104,7 +106,8 @@ def test_the_written_file_loads_keeps_its_comments_and_loses_nothing(tmp_path):
     smaller = choose_identifiable_subset(found)
     path = tmp_path / "smaller.yaml"
     path.write_text(
-        format_reduced_robot(smaller.robot, {m.name: m.words() for m in smaller.dropped}), "utf-8"
+        format_reduced_robot(smaller.robot, {m.name: m.describe_effect() for m in smaller.dropped}),
+        "utf-8",
     )
     again = load_robot(path)
     assert again.parameters.free.sum() == 32
@@ -124,26 +127,27 @@ def test_a_list_that_is_there_grows_and_identified_values_stay(with_line):
     path = robot.record.path
     path.write_text(text, "utf-8")
     again = load_robot(path)
-    assert [n for n, free in zip(again.parameters.names, again.parameters.free, strict=True) if not free] == [
-        "leg1.length", "leg2.base.x", "leg2.base.y", "leg2.base.z", "leg6.base.z"]  # fmt: skip
+    pairs = zip(again.parameters.names, again.parameters.free, strict=True)
+    fixed = [name for name, free in pairs if not free]
+    assert fixed == ["leg1.length", "leg2.base.x", "leg2.base.y", "leg2.base.z", "leg6.base.z"]
     np.testing.assert_allclose(again.values, robot.values, rtol=1e-15)
 
 
 def test_a_robot_without_a_file_cannot_be_shortened():
-    with pytest.raises(MechanismError, match="was not read from a robot file"):
+    with pytest.raises(MechanismError, match="was not loaded from a robot file"):
         format_reduced_robot(hexapod(), {})
 
 
 def test_the_json_says_the_same():
     smaller = choose_identifiable_subset(identifiability(load_robot("3-prs"), five_dof(), poses=36))
     document = json.loads(to_json(smaller.to_dict()))
-    assert [m["name"] for m in document["dropped"]] == ["a2y"]
-    assert document["dropped"][0]["into"] == ["a1y", "a3y"]
+    assert [m["name"] for m in document["dropped"]] == ["a3y"]  # the last of equal parameters
+    assert document["dropped"][0]["into"] == ["a1y", "a2y"]
     assert len(document["kept"]) == 32
 
 
 def test_a_scene_marks_what_is_not_reached_and_leaves_no_number_that_is_none():
     found = identifiability(hexapod(), hexapod_data(60))
-    at = observe_poses(found.unknowns, np.array([np.zeros(6), 9.0 * np.eye(6)[0]]))
+    at = observe_poses(found.free_parameters, np.array([np.zeros(6), 9.0 * np.eye(6)[0]]))
     assert at.is_reached.tolist() == [True, False]
     assert np.isfinite(at.twists).all()

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Conventions on arrival: slips are named by what fits instead, and true data pass, however far the
-robot is off.
+"""Conventions: slips are named by what fits instead, and true data pass, however far the robot is
+off.
 """
 
 import json
@@ -13,14 +13,15 @@ import pytest
 
 from loopcal import geometry
 from loopcal.diagnose.conventions import (
-    ALLOWED,
-    BETTER,
     IMPLAUSIBLE,
+    ConventionCheck,
     check_conventions,
     compare_conventions,
+    list_interpretations,
+    list_reading_interpretations,
 )
-from loopcal.diagnose.interpretations import list_interpretations, list_reading_interpretations
-from loopcal.diagnose.read_as import InterpretedData
+from loopcal.diagnose.conventions.interpretation_search import ALLOWED, BETTER
+from loopcal.diagnose.conventions.interpreted_data import InterpretedData
 from loopcal.errors import DataError, LoopcalError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.io import load_robot
@@ -119,6 +120,25 @@ def scalar_last(values):
     values[:, :4] = values[:, [1, 2, 3, 0]]
 
 
+def slips(check: ConventionCheck) -> list[dict]:
+    """The best interpretation and its alternatives, as kind of the slip and data."""
+    best = () if check.interpretation is None else (check.interpretation,)
+    return [
+        {"slip": one.slip, **one.details, "source": one.source}
+        for one in (*best, *check.alternatives)
+    ]
+
+
+def has_slip(check: ConventionCheck, slip: str, **details) -> bool:
+    """Whether this slip is among the interpretations."""
+    wanted = {"slip": slip, **details}
+    return any(wanted.items() <= one.items() for one in slips(check))
+
+
+def times(quantity: str, factor: float, **more) -> dict:
+    return {"slip": "unit", "quantity": quantity, "factor": factor, **more}
+
+
 STATION = geometry.make_pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
 XYZ = Pose("euler-xyz")
 SLIPS = {
@@ -126,102 +146,102 @@ SLIPS = {
         "3-prs",
         FULL,
         scaled([0, 1, 2], 1e3),
-        "angles 1000 times smaller",
+        times("angles", 1e-3),
     ),
     "another Euler order": (
         "hexapod-42",
         XYZ,
         turned(lambda a: geometry.matrix_to_euler(geometry.euler_to_matrix(a, "xyz"), "zyx")),
-        "rotations read as euler-zyx",
+        {"slip": "orientation-form", "form": "euler-zyx"},
     ),
     "moving for fixed axes": (
         "hexapod-42",
         XYZ,
         turned(lambda a: geometry.matrix_to_euler(geometry.euler_to_matrix(a, "xyz"), "XYZ")),
-        "rotations read as euler-XYZ",
+        {"slip": "orientation-form", "form": "euler-XYZ"},
     ),
     "a rotation vector for Euler angles": (
         "hexapod-42",
         XYZ,
         turned(lambda a: geometry.log_so3(geometry.euler_to_matrix(a, "xyz"))),
-        "rotations read as rotation-vector",
+        {"slip": "orientation-form", "form": "rotation-vector"},
     ),
-    "scalar last": ("hexapod-42", Pose("quaternion"), scalar_last, "quaternions read scalar last"),
-    "a left-handed frame": ("hexapod-42", FULL, left_handed, "left-handed"),
-    "one column in inches": (
-        "hexapod-42",
-        FULL,
-        scaled([3], 1.0 / 25.4),
-        "x 25.4 times larger (inches written as mm)",
+    "scalar last": ("hexapod-42", Pose("quaternion"), scalar_last, {"slip": "scalar-last"}),
+    "a left-handed frame": ("hexapod-42", FULL, left_handed, {"slip": "left-handed-frame"}),
+    "one column in inches": ("hexapod-42", FULL, scaled([3], 1.0 / 25.4), times("x", 25.4)),
+    "gon for degrees": ("hexapod-42", FULL, scaled([0, 1, 2], 10.0 / 9.0), times("angles", 0.9)),
+    "x and y swapped": (
+        "linear-delta",
+        Position(),
+        swapped(0, 1),
+        {"slip": "swapped-columns", "columns": ("x", "y")},
     ),
-    "gon for degrees": (
-        "hexapod-42",
-        FULL,
-        scaled([0, 1, 2], 10.0 / 9.0),
-        "angles 10/9 times smaller (gon written as deg)",
-    ),
-    "x and y swapped": ("linear-delta", Position(), swapped(0, 1), "columns x and y swapped"),
     "targets swapped": (
         "3-prs",
         Distance(targets=("a", "b"), places=PAIR, anchor=PAIR[0] * 9),
         swapped(0, 1),
-        "'a' and 'b'",
+        {"slip": "swapped-targets", "targets": ("a", "b")},
     ),
     "zenith angles": (
         "hexapod-42",
         Bearing(T_base_frame=STATION),
         zenith,
-        "elevations read as zenith angles",
+        {"slip": "zenith-angles"},
     ),
     "tilts swapped": (
         "3-prs",
         Inclination(unknown=("gravity",)),
         swapped(0, 1),
-        "columns tilt_x and tilt_y swapped",
+        {"slip": "swapped-columns", "columns": ("tilt_x", "tilt_y")},
     ),
     "sensors swapped": (
         "hexapod-42",
         JointSensor(joints=("q1", "q2", "q3")),
         swapped(0, 2),
-        "columns q1 and q3 swapped",
+        {"slip": "swapped-columns", "columns": ("q1", "q3")},
     ),
 }
 
 
 @pytest.mark.parametrize("slip", SLIPS)
 def test_a_slip_is_refused_with_what_fits_instead(slip) -> None:
-    name, kind, change, words = SLIPS[slip]
+    name, kind, change, expected = SLIPS[slip]
     data = changed(measured(name, kind), change)
     found = compare_conventions(robot_of(name), data)
-    assert found.refused, found
-    named = (found.other or "", *found.alike)
-    assert any(words in one for one in named), named
+    assert found.is_refused, found
+    assert has_slip(found, **expected), slips(found)
     assert found.misfit > IMPLAUSIBLE
     assert found.other_misfit < min(found.misfit / BETTER, ALLOWED)
-    assert "which is what tolerances and noise allow" in found.sentence
+    assert found.finding is not None
+    assert found.finding.code == "conventions.other-interpretation"
+    assert found.finding.data["is_consistent"]
 
 
 READINGS = {
     "actuators swapped": (
         "hexapod-42",
         lambda q: q[:, [1, 0, 2, 3, 4, 5]],
-        "readings of q1 and q2 swapped",
+        {"slip": "swapped-readings", "actuators": ("q1", "q2")},
     ),
-    "drop for rise": ("linear-delta", lambda q: -q, "all readings of the other sign"),
+    "drop for rise": (
+        "linear-delta",
+        lambda q: -q,
+        {"slip": "reading-sign", "actuators": ("q1", "q2", "q3")},
+    ),
     "rows moved by one": (
         "linear-delta",
         lambda q: np.roll(q, 1, axis=0),
-        "every row belonging to the readings of the row below",
+        {"slip": "shifted-readings", "neighbor": "below"},
     ),
 }
 
 
 @pytest.mark.parametrize("slip", READINGS)
 def test_a_slip_of_the_readings_is_refused_with_what_fits_instead(slip) -> None:
-    name, change, words = READINGS[slip]
+    name, change, expected = READINGS[slip]
     data = measured(name, Position())
     found = compare_conventions(robot_of(name), replace(data, readings=change(data.readings)))
-    assert words in (found.other or ""), found
+    assert expected.items() <= slips(found)[0].items(), found
 
 
 def test_at_full_size_no_true_data_are_refused_and_slips_are_named_wherever_they_are_seen(
@@ -250,7 +270,7 @@ def test_a_slip_is_seen_through_blunders() -> None:
     )
     bad = changed(data, lambda values: values.__setitem__((slice(3, 5), 0), values[3:5, 0] + 0.01))
     found = compare_conventions(robot_of("hexapod-42"), bad)
-    assert "lengths 10 times larger" in (found.other or ""), found
+    assert has_slip(found, **times("lengths", 10.0)), found
 
 
 def test_a_unit_is_named_where_a_constant_in_its_place_leaves_no_frame_to_be_found() -> None:
@@ -258,19 +278,19 @@ def test_a_unit_is_named_where_a_constant_in_its_place_leaves_no_frame_to_be_fou
         measured("linear-delta", Position(unknown=("frame",)), n=20), scaled(slice(None), 1e3)
     )
     found = compare_conventions(robot_of("linear-delta"), data)
-    assert "lengths 1000 times smaller" in (found.other or ""), found
+    assert has_slip(found, **times("lengths", 1e-3)), found
 
 
 def test_blunders_alone_are_left_to_their_own_check() -> None:
     data = measured("hexapod-42", Position(unknown=("frame",)), n=20)
     bad = changed(data, lambda values: values.__setitem__((slice(3, 5), 0), values[3:5, 0] + 0.1))
     found = compare_conventions(robot_of("hexapod-42"), bad)
-    assert not found.refused
+    assert not found.is_refused
     assert found.misfit < IMPLAUSIBLE  # without the two rows all is well
-    assert found.sentence.startswith(
-        "2 of 20 rows that were compared do not fit the others by far (poses 4 and 5); check"
-    )
-    assert compare_conventions(robot_of("hexapod-42"), data).sentence == ""
+    assert found.finding is not None
+    assert found.finding.code == "conventions.rows-far-off"
+    assert found.finding.data == {"count": 2, "rows": 20, "poses": ("4", "5")}
+    assert compare_conventions(robot_of("hexapod-42"), data).finding is None
 
 
 WITH_EVERY_KIND = ("3-prs",)
@@ -296,7 +316,7 @@ def test_true_data_of_robots_three_times_beyond_their_tolerances_pass() -> None:
         except LoopcalError:
             continue  # this kind has nothing to look at on this robot, or the robot cannot follow
         count += 1
-        assert not compare_conventions(robot_of(name), data).doubtful, (name, kind.name)
+        assert not compare_conventions(robot_of(name), data).is_doubtful, (name, kind.name)
     assert count >= len(KINDS) + 6
 
 
@@ -305,9 +325,10 @@ def test_true_data_of_a_robot_far_off_its_tolerances_are_not_refused(name) -> No
     """Forty tolerances off: implausible, all others are tried, and none fits far better."""
     data = measured(name, Position(), times=40.0)
     found = compare_conventions(robot_of(name), data)
-    assert found.doubtful
-    assert not found.refused
-    assert "no other unit, order, sign or column explains it; check the noise" in found.sentence
+    assert found.is_doubtful
+    assert not found.is_refused
+    assert found.finding is not None
+    assert found.finding.code == "conventions.unexplained"
 
 
 def test_heights_that_should_be_zero_are_no_evidence_of_a_unit() -> None:
@@ -330,8 +351,8 @@ def test_heights_that_should_be_zero_are_no_evidence_of_a_unit() -> None:
         controller=robot,
     )
     found = compare_conventions(robot, data)
-    assert found.doubtful
-    assert not found.refused, found
+    assert found.is_doubtful
+    assert not found.is_refused, found
 
 
 def test_data_of_nothing_are_noted_after_few_readings_were_judged(monkeypatch) -> None:
@@ -347,14 +368,14 @@ def test_data_of_nothing_are_noted_after_few_readings_were_judged(monkeypatch) -
     whole = InterpretedData.misfits
 
     def counted(self: InterpretedData):
-        if not self.quick:
+        if not self.is_quick:
             poses.append(self.data.n_poses)
         return whole(self)
 
     monkeypatch.setattr(InterpretedData, "misfits", counted)
     found = compare_conventions(robot_of("linear-delta"), data)
     assert found.misfit > 100.0
-    assert not found.refused
+    assert not found.is_refused
     assert (
         len(poses) <= 6
     )  # the stated reading before and after blunders were left out, and refined; sizes
@@ -366,7 +387,7 @@ def test_too_few_rows_say_nothing() -> None:
     )
     found = compare_conventions(robot_of("hexapod-42"), data)
     assert np.isnan(found.misfit)
-    assert not found.refused
+    assert not found.is_refused
 
 
 def test_of_two_joined_instruments_the_one_in_the_wrong_unit_is_named() -> None:
@@ -379,7 +400,8 @@ def test_of_two_joined_instruments_the_one_in_the_wrong_unit_is_named() -> None:
     tracker, level = data.observations
     level = replace(level, measured=level.measured * np.pi / 180.0)
     found = compare_conventions(robot, replace(data, observations=(tracker, level)))
-    assert found.other == "angles of kind 'inclination' 57.3 times larger (rad written as deg)"
+    expected = times("angles", pytest.approx(180.0 / np.pi), source="kind 'inclination'")
+    assert expected.items() <= slips(found)[0].items()
 
 
 def test_of_two_files_of_one_kind_the_one_that_is_written_otherwise_is_named() -> None:
@@ -390,17 +412,17 @@ def test_of_two_files_of_one_kind_the_one_that_is_written_otherwise_is_named() -
     found = compare_conventions(
         robot, replace(data, observations=(parts[0], inches)), ("a.csv", "b.csv")
     )
-    assert found.other == "lengths of b.csv 25.4 times larger (inches written as mm)"
+    assert times("lengths", 25.4, source="b.csv").items() <= slips(found)[0].items()
     readings = np.concatenate([data.readings[:8], 0.1 * data.readings[8:]])
     found = compare_conventions(
         robot, replace(data, observations=parts, readings=readings), ("a.csv", "b.csv")
     )
-    assert found.other == "readings of b.csv 10 times larger (cm written as mm)"
+    assert times("readings", 10.0, source="b.csv").items() <= slips(found)[0].items()
     unnamed = list_reading_interpretations(
         replace(data, observations=parts), ("q1", "q2", "q3"), (Dimension.LENGTH,) * 3
     )
-    assert "readings of part 2 of the data 10 times larger (cm written as mm)" in {
-        way.words for way in unnamed
+    assert ("part 2 of the data", 10.0) in {
+        (one.source, one.details.get("factor")) for one in unnamed
     }
 
 
@@ -422,8 +444,8 @@ def test_what_is_absent_fixed_or_unread_neither_hides_a_slip_nor_looks_like_one(
         (robot, replace(data, readings=readings, reading_sigma=sigma), False),
     ):
         found = compare_conventions(machine, some)
-        assert found.refused == slip
-        assert ("lengths 1000 times smaller" in (found.other or "")) == slip
+        assert found.is_refused == slip
+        assert has_slip(found, **times("lengths", 1e-3)) == slip
     for nothing in (data.with_weights(np.zeros(10)), replace(data, observations=())):
         assert np.isnan(compare_conventions(robot, nothing).misfit)
 
@@ -433,7 +455,7 @@ def test_large_data_are_judged_by_runs_of_neighbours_and_rows_one_off_are_seen_i
     found = compare_conventions(
         robot_of("linear-delta"), replace(data, readings=np.roll(data.readings, 1, axis=0))
     )
-    assert found.other == "every row belonging to the readings of the row below"
+    assert has_slip(found, "shifted-readings", neighbor="below")
 
 
 @pytest.mark.slow
@@ -442,10 +464,9 @@ def test_readings_that_the_robot_cannot_reach_are_explained() -> None:
     found = compare_conventions(
         robot_of("linear-delta"), replace(data, readings=data.readings * 1e3)
     )
-    assert (
-        "the robot reaches only 0 of 4 poses that were tried with these readings; with readings "
-        "1000 times" in found.sentence
-    )
+    assert found.finding is not None
+    assert (found.finding.data["reached"], found.finding.data["poses"]) == (0, 4)
+    assert has_slip(found, "unit", quantity="readings")
 
 
 @pytest.mark.slow
@@ -463,34 +484,30 @@ def test_the_published_table_names_its_own_euler_order() -> None:
     values = printed.measured_poses.values / TO_PRINTED
     sigma = printed.measured_poses.unit * np.array([MM] * 3 + [1.0] * 3) / np.sqrt(12.0)
     right = to_measurements(study, values, sigma)
-    assert not compare_conventions(robot, right).refused
+    assert not compare_conventions(robot, right).is_refused
     kind = Pose(f"euler-{printed.order}").with_tool(robot.tool)
     rows = Observations.from_sigma(
         kind, np.arange(len(values)), np.roll(values, 3, axis=1), np.roll(sigma, 3, axis=1)
     )
     found = compare_conventions(robot, replace(right, observations=(rows,)))
-    assert found.other == f"rotations read as euler-{ORDER}"
+    assert has_slip(found, "orientation-form", form=f"euler-{ORDER}")
     assert found.misfit > 100.0 * found.other_misfit
 
 
-def test_the_message_names_the_override_and_the_override_works() -> None:
+def test_the_error_has_the_code_of_the_finding_and_can_be_overridden() -> None:
     robot = robot_of("hexapod-42")
     data = changed(measured("hexapod-42", FULL), scaled([3, 4, 5], 1e3))
-    with pytest.raises(
-        DataError, match=r"correct the unit in the header, or use --allow-implausible$"
-    ):
-        check_conventions(robot, data, overrides=("--allow-still", "--allow-implausible"))
+    with pytest.raises(DataError, match="the unit in the header") as error:
+        check_conventions(robot, data)
+    assert error.value.code == "conventions.other-interpretation"
     assert np.isnan(check_conventions(robot, data, allow_implausible=True).misfit)
     still = changed(
         measured("hexapod-42", Position()),
         lambda values: values.__setitem__(slice(1, None), values[0]),
     )
-    with pytest.raises(
-        DataError,
-        match=r"never moves: its readings stay within 0 mm, but the robot moves it by "
-        r".*allow_still=True",
-    ):
+    with pytest.raises(DataError, match="never moves: its readings stay within 0 mm") as error:
         check_conventions(robot, still)
+    assert error.value.code == "conventions.target-never-moves"
 
 
 def test_every_hypothesis_is_another_reading_in_the_same_shape() -> None:
@@ -502,15 +519,15 @@ def test_every_hypothesis_is_another_reading_in_the_same_shape() -> None:
             except LoopcalError:
                 continue
             for way in list_interpretations(data):
-                rows = way.applied(data).observations[0]
+                rows = way.apply(data).observations[0]
                 assert rows.measured.shape == data.observations[0].measured.shape
                 assert not np.allclose(
                     rows.measured, data.observations[0].measured, rtol=1e-12, atol=0.0
                 )
-                assert way.shrinks == ("smaller" in way.words)
+                assert way.shrinks == (way.details.get("factor", 1.0) < 1.0)
             seen.add(kind.name)
     assert seen == set(KINDS)
     names, lengths = ("q1", "q2", "q3"), (Dimension.LENGTH,) * 3
     data = measured("linear-delta", Position(), n=5)
-    ways = [way.words for way in list_reading_interpretations(data, names, lengths)]
+    ways = [way.key for way in list_reading_interpretations(data, names, lengths)]
     assert len(set(ways)) == len(ways) == 6 + 1 + 3 + 3 + 1 + 2  # units, signs, pairs, order, rows

@@ -53,7 +53,8 @@ def test_a_machine_whose_lengths_alone_are_wrong_needs_no_other_parameters():
     assert [c.name for c in found.candidates] == ["nothing", "lengths", "ideal"]
     assert found.chosen.name == "lengths"
     assert len(found.chosen.parameters) == 6
-    assert "a simpler model is enough: lengths (6 parameters)" in found.sentence
+    assert found.finding.code == "model.simpler-suffices"
+    assert found.finding.data["parameters"] == 6
     assert int(found.robot.parameters.free.sum()) == 6
     assert "nothing" in str(found)
 
@@ -61,14 +62,14 @@ def test_a_machine_whose_lengths_alone_are_wrong_needs_no_other_parameters():
 def test_a_machine_with_all_errors_needs_all_parameters():
     found = choose_model(hexapod(), hexapod_data(30))
     assert found.chosen.name == "ideal"
-    assert "no simpler model is enough: all 42 parameters" in found.sentence
+    assert found.finding.code == "model.all-needed"
 
 
 def test_a_perfect_machine_seen_by_a_poor_instrument_is_left_alone():
     data = simulate(zoo.hexapod(), hexapod_poses(30), tracker(100 * UM, 500 * URAD), 1)
     found = choose_model(hexapod(), data, method=LeastSquares())
     assert found.chosen.name == "nothing"
-    assert "calibration gains nothing" in found.sentence
+    assert found.finding.code == "model.nothing-gained"
 
 
 def test_sets_of_the_shipped_names():

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Predict the gain of a calibration: expected pose errors by the tolerances and after the fit.
+
+With D the error model at a pose in units of tolerance, the covariance of the pose is D D' before
+and D C D' after calibration, C the covariance of z. A direction that the data do not determine
+keeps its tolerance, because its estimate is the nominal value. Where the noise is as large as the
+effect of the tolerances, the error after calibration is no smaller, and another instrument is
+needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from loopcal.estimate.result import Identification
+from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.measure import Measurements
+from loopcal.mechanism import Mechanism, Status, differentiate_pose, forward_trials
+from loopcal.typing import FloatArray
+from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
+
+GAIN = 1.1
+"""Factor by which an expected error must become smaller to count as an improvement."""
+
+MOST_POSES = 200
+"""Largest number of poses at which errors are predicted, evenly chosen."""
+
+
+@dataclass(frozen=True)
+class CalibrationGain:
+    """Expected errors of the platform at the measured poses.
+
+    Attributes
+    ----------
+    position_before, position_after : root mean square over poses of the expected position error
+        [m].
+    angle_before, angle_after : the same of the orientation [rad].
+    is_worthwhile : whether either becomes smaller; None where it cannot be predicted.
+    finding : the expected errors, or the reason why there are none.
+    """
+
+    position_before: float
+    position_after: float
+    angle_before: float
+    angle_after: float
+    is_worthwhile: bool | None
+    finding: Finding
+
+
+def estimate_calibration_gain(fit: Identification, data: Measurements) -> CalibrationGain:
+    """Compare the errors expected after calibration with those that the tolerances allow.
+
+    Parameters
+    ----------
+    fit : an identification; its tolerances must be stated. data : the measurements it was made
+        from, or other readings.
+    """
+    free = fit.free_parameters
+    if free.assumed.any():
+        return _unpredicted("model.gain-needs-tolerances", missing=int(free.assumed.sum()))
+    if fit.residual_test.failed:
+        return _unpredicted("model.gain-needs-consistent-noise")
+    readings = data.readings if fit.poses is None else fit.poses.readings[fit.poses.kept]
+    chosen = np.unique(
+        np.linspace(0, len(readings) - 1, min(MOST_POSES, len(readings))).astype(int)
+    )
+    readings, values = readings[None, chosen], fit.robot.values[None]
+    state = forward_trials(fit.robot, values, readings)
+    reached = np.asarray(state.status == Status.CONVERGED)[0]
+    parameters = differentiate_pose(fit.robot, values, readings, state).parameters
+    D = parameters[0, reached][..., free.places]
+    factor = _covariance_factor(fit)
+    if not reached.any() or np.isnan(factor).any():
+        return _unpredicted("model.gain-without-intervals")
+    angle_before, position_before = _rms_errors(D * free.tolerance)
+    angle_after, position_after = _rms_errors(D @ factor)
+    pairs = ((position_before, position_after), (angle_before, angle_after))
+    is_worthwhile = any(before > GAIN * after for before, after in pairs if before > 0.0)
+    finding = report_finding(
+        "model.expected-gain" if is_worthwhile else "model.no-expected-gain",
+        position=_quantities(fit.robot, Dimension.LENGTH, *pairs[0]),
+        orientation=_quantities(fit.robot, Dimension.ANGLE, *pairs[1]),
+    )
+    return CalibrationGain(
+        position_before, position_after, angle_before, angle_after, is_worthwhile, finding
+    )
+
+
+def _unpredicted(code: str, **data: Any) -> CalibrationGain:
+    """Return the reason why there is no prediction."""
+    nan = float("nan")
+    return CalibrationGain(nan, nan, nan, nan, None, report_finding(code, **data))
+
+
+def _covariance_factor(fit: Identification) -> FloatArray:
+    """S (p, p) [SI] with S S' the covariance of the estimate; the tolerance stays where a direction
+    is not determined.
+    """
+    posterior = fit.posterior
+    variance = np.where(np.isinf(posterior.variance), 1.0, posterior.variance)
+    return posterior.unit[:, None] * posterior.directions * np.sqrt(variance)
+
+
+def _rms_errors(factor: FloatArray) -> tuple[float, float]:
+    """Root mean squares over poses of orientation [rad] and position [m] from factors (n, 6, k)."""
+    square = (factor**2).sum(axis=2)
+    orientation = float(np.sqrt(square[:, :3].sum(axis=1).mean()))
+    return orientation, float(np.sqrt(square[:, 3:].sum(axis=1).mean()))
+
+
+def _quantities(
+    robot: Mechanism, dimension: Dimension, before: float, after: float
+) -> tuple[Quantity, Quantity] | None:
+    """Errors before and after in the unit of the robot's file; None where the robot has none."""
+    if not before > 0.0:
+        return None
+    symbol = robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol)
+    factor = find_unit(symbol).factor_to_si
+    return Quantity(before / factor, symbol), Quantity(after / factor, symbol)

@@ -1,0 +1,304 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Check the stated conventions of measurements against the robot, before anything is fitted.
+
+With the robot as given, unknown frames estimated and its parameters free within their tolerances,
+whitened rows cost
+
+    C = min_z |r + A z|^2 + |z|^2,    A = W G D diag(tolerance)
+
+which has a chi-square distribution with as many degrees of freedom as rows where tolerances and
+noise are true. The misfit sqrt(C / rows) is then 1, and at most k where all deviations are k
+tolerances large. A wrong unit, order, sign or column gives tens to millions. Only then are other
+interpretations of the data tested (`loopcal.diagnose.conventions.interpretations`), and the data
+are refused only where one of them fits far better: see docs/theory/arrival.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from loopcal.diagnose.conventions.interpretation_search import (
+    ALLOWED,
+    BETTER,
+    find_best_interpretation,
+    shares_poses,
+)
+from loopcal.diagnose.conventions.interpretations import Interpretation
+from loopcal.diagnose.conventions.interpreted_data import (
+    InterpretedData,
+    compute_quick_misfit,
+    refine_misfit,
+)
+from loopcal.diagnose.conventions.setup_parameters import Contradiction, find_contradiction
+from loopcal.errors import DataError
+from loopcal.estimate.free_parameters import select_free_parameters
+from loopcal.findings import Finding, Quantity, Severity, report_finding
+from loopcal.measure import Measurements, check_actuators, check_targets_move
+from loopcal.measure.data_checks import stays
+from loopcal.mechanism import Mechanism, forward
+from loopcal.typing import FloatArray
+from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
+
+IMPLAUSIBLE = 10.0
+"""Misfit above which conventions are in doubt. Tolerances exceeded three times, and a noise stated
+three times too small, give about 3 each.
+"""
+
+MOST_POSES, RUNS = 120, 4
+"""Number of poses of large data sets by which interpretations are judged, and number of runs of
+neighbors (rows may be shifted by one) that contain them.
+"""
+
+GROSS = 100.0
+"""Misfit above which data that contradict stated setup parameters are refused. Below it, robots far
+beyond their tolerances look the same, and it is a warning.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class ConventionCheck:
+    """The stated conventions of measurements against the robot, and the best other interpretation.
+
+    Attributes
+    ----------
+    misfit : root mean square of the residuals over what tolerances and noise allow [1]; NaN with
+        too few rows.
+    interpretation : another one that fits far better; None without one.
+    other_misfit : its misfit, or that without stated setup parameters which the data contradict;
+        NaN without either.
+    alternatives : other interpretations that fit as well.
+    finding : the result; None where the data agree with the stated conventions.
+    """
+
+    misfit: float
+    interpretation: Interpretation | None = None
+    other_misfit: float = float("nan")
+    alternatives: tuple[Interpretation, ...] = ()
+    finding: Finding | None = None
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether tolerances and noise do not explain the data as they are stated."""
+        return self.misfit > IMPLAUSIBLE
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether there is clear evidence that the stated conventions are wrong."""
+        return self.finding is not None and self.finding.severity is Severity.REFUSAL
+
+    def __repr__(self) -> str:
+        code = "agrees" if self.finding is None else self.finding.code
+        return f"<ConventionCheck: {code}, misfit {self.misfit:.3g}>"
+
+    def __str__(self) -> str:
+        return repr(self) if self.finding is None else str(self.finding)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return misfits and findings for JSON."""
+        other = self.interpretation
+        return {
+            "misfit": self.misfit,
+            "interpretation": None if other is None else other.finding,
+            "other_misfit": self.other_misfit,
+            "alternatives": [one.finding for one in self.alternatives],
+            "refused": self.is_refused,
+            "finding": self.finding,
+        }
+
+
+def check_conventions(
+    robot: Mechanism,
+    data: Measurements,
+    *,
+    allow_still: bool = False,
+    allow_implausible: bool = False,
+    sources: Sequence[str] = (),
+) -> ConventionCheck:
+    """Refuse measurements with clear evidence of a wrong convention, and targets that never move.
+
+    `loopcal.io.load_measurements` calls this for every file; call it for measurements that come
+    from elsewhere.
+
+    Parameters
+    ----------
+    robot, data, sources : see `compare_conventions`.
+    allow_still : accept targets that no pose moves. allow_implausible : accept any convention
+        without comparing others.
+
+    Returns
+    -------
+    ConventionCheck
+        Its finding, where there is one, is a warning: the data fit badly, but no tested
+        interpretation fits far better.
+
+    Raises
+    ------
+    DataError
+        With the evidence; its code is that of the finding.
+    """
+    if not allow_still and stays(data):
+        solution = forward(robot, data.readings)
+        if solution.converged.any():
+            check_targets_move(data.take(solution.converged), solution.T[solution.converged])
+    if allow_implausible:
+        return ConventionCheck(float("nan"))
+    check = compare_conventions(robot, data, sources)
+    if check.is_refused:
+        raise DataError(check.finding)
+    return check
+
+
+def compare_conventions(
+    robot: Mechanism, data: Measurements, sources: Sequence[str] = ()
+) -> ConventionCheck:
+    """Compare measurements with a robot under the stated conventions and, where these are
+    implausible, under others.
+
+    Parameters
+    ----------
+    robot : as given, before any fit: its values, and its tolerances (stated or default).
+    data : as read. sources : origin of the rows of each of its observations, such as files, for
+        the messages.
+
+    Raises
+    ------
+    DataError
+        The readings have another number of actuators.
+    """
+    check_actuators(data, robot)
+    free, known = select_free_parameters(robot), _with_known_readings(data)
+    if known is None:
+        return ConventionCheck(float("nan"))
+    sigma = data.reading_sigma
+    has_uncertain = sigma is not None and bool(np.any(np.isfinite(sigma) & (sigma > 0.0)))
+    misfit = compute_quick_misfit(free, known)
+    if misfit <= IMPLAUSIBLE:
+        return ConventionCheck(misfit)
+    stated = InterpretedData(free, _thin_out(known))
+    misfit = stated.misfit()
+    if not misfit > IMPLAUSIBLE:
+        return ConventionCheck(misfit)
+    stated.exclude_far_rows()
+    misfit = min(misfit, stated.misfit(), refine_misfit(stated))
+    if not misfit > IMPLAUSIBLE:
+        return ConventionCheck(misfit, finding=_report_far_rows(stated))
+    against = find_contradiction(free, stated, misfit, BETTER)
+    if against is not None and against.misfit <= ALLOWED:
+        return _contradict(misfit, against)
+    best = find_best_interpretation(free, stated, misfit, sources)
+    if best is not None:
+        return _refuse(stated, misfit, *best)
+    if against is not None:
+        return _contradict(misfit, against)
+    if has_uncertain:
+        return ConventionCheck(misfit)
+    finding = report_finding("conventions.unexplained", **_describe_stated(stated, misfit))
+    return ConventionCheck(misfit, finding=finding)
+
+
+def _with_known_readings(data: Measurements) -> Measurements | None:
+    """The poses all of whose readings exist and are believed; None where there is none."""
+    if data.reading_sigma is None:
+        return data
+    known = np.isfinite(data.reading_sigma).all(axis=1) & np.isfinite(data.readings).all(axis=1)
+    return replace(data.take(known), reading_sigma=None) if known.any() else None
+
+
+def _thin_out(data: Measurements) -> Measurements:
+    """At most `MOST_POSES` poses, in runs of neighbors spread over the data; all where rows share
+    more than their pose.
+    """
+    n = data.n_poses
+    if n <= MOST_POSES or shares_poses(data):
+        return data
+    first = np.linspace(0, n - MOST_POSES // RUNS, RUNS).astype(np.intp)
+    return data.take(np.unique(first[:, None] + np.arange(MOST_POSES // RUNS)))
+
+
+def _refuse(
+    stated: InterpretedData,
+    misfit: float,
+    best: InterpretedData,
+    least: float,
+    alternatives: tuple[Interpretation, ...],
+) -> ConventionCheck:
+    """Refuse data that fit far better in another interpretation."""
+    assert best.applied is not None
+    finding = report_finding(
+        "conventions.other-interpretation",
+        **_describe_stated(stated, misfit),
+        interpretation=_describe_slip(best.applied),
+        alternatives=tuple(_describe_slip(one) for one in alternatives),
+        other_misfit=least,
+        other_residuals=_rms_residuals(best),
+        is_consistent=least <= ALLOWED,
+    )
+    return ConventionCheck(misfit, best.applied, least, alternatives, finding)
+
+
+def _contradict(misfit: float, against: Contradiction) -> ConventionCheck:
+    """Report stated setup parameters without which the data fit: refused where they contradict the
+    data grossly, else a warning.
+    """
+    finding = report_finding(
+        "conventions.stated-values-contradicted",
+        Severity.REFUSAL if misfit > GROSS else Severity.WARNING,
+        values=against.values,
+        names=against.names,
+        misfit=misfit,
+        other_misfit=against.misfit,
+        residuals=_rms_residuals(against.freed),
+        is_consistent=against.misfit <= ALLOWED,
+    )
+    return ConventionCheck(misfit, other_misfit=against.misfit, finding=finding)
+
+
+def _report_far_rows(stated: InterpretedData) -> Finding:
+    """Report the rows that do not fit the others, which fit; they stay in the data."""
+    return report_finding(
+        "conventions.rows-far-off",
+        count=len(stated.excluded),
+        rows=sum(len(o) for o in stated.data.observations),
+        poses=tuple(dict.fromkeys(stated.excluded)),
+    )
+
+
+def _describe_slip(one: Interpretation) -> dict[str, Any]:
+    """Code and data of an interpretation, for the data of a finding."""
+    return {"code": one.code, "source": one.source, **one.details}
+
+
+def _describe_stated(stated: InterpretedData, misfit: float) -> dict[str, Any]:
+    """Misfit of the data as written, or how few poses are reached."""
+    is_reached = stated.has_enough
+    return {
+        "robot": stated.free.robot.name,
+        "misfit": misfit,
+        "residuals": _rms_residuals(stated) if is_reached else (),
+        "reached": None if is_reached else stated.n_reached,
+        "poses": stated.n_tested,
+    }
+
+
+def _rms_residuals(interpreted: InterpretedData) -> tuple[Quantity, ...]:
+    """Root mean squares of the first interpretation's residuals by dimension, in units of the
+    robot's file, without far rows.
+    """
+    square: dict[Dimension, list[FloatArray]] = {}
+    interpreted.misfits()
+    for s, r in zip(interpreted.problem.rows, interpreted.residuals(), strict=True):
+        present = np.einsum("rmm->rm", s.whitener[0]) != 0.0
+        for j, column in enumerate(s.kind.noise_columns):
+            square.setdefault(column.dimension, []).append(r.raw[0, present[:, j], j] ** 2)
+    residuals = []
+    for dimension, parts in square.items():
+        value = np.concatenate(parts)
+        if len(value):
+            symbol = interpreted.free.robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol)
+            rms = float(np.sqrt(value.mean())) / find_unit(symbol).factor_to_si
+            residuals.append(Quantity(rms, symbol))
+    return tuple(residuals)

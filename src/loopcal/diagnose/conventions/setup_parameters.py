@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Check setup parameters (frames, targets, surfaces): stated values, and values kept from a fit.
+
+Stated values. A coordinate of a frame that is fixed at a wrong value, or has a wrong prior, is
+compensated by the robot: all its dimensions change, and the fit looks good or diverges. When the
+parameter is estimated instead, the residuals vanish and the estimate shows the true value.
+
+Kept values. Whitened prediction errors have one size with the values of a fit, and another one when
+setup parameters are fitted to the same rows, which costs as many degrees of freedom. Where nothing
+was moved the two agree. A setup item was moved if keeping only this one brings the large size back.
+Where none does alone (a shift of the frame equals a shift of the target on a robot that does not
+turn), any of them may have been moved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from loopcal.diagnose.conventions.interpreted_data import InterpretedData, refine_misfit
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.parameters import Parameter
+from loopcal.units import DISPLAY_UNITS, find_unit
+
+MOST_SINGLE = 12
+"""Number of stated parameters up to which each is estimated alone, to find the wrong one."""
+
+SMALLER = 3.0
+"""Factor by which errors must decrease when a moved setup item is fitted again."""
+
+ABOVE = 3.0
+"""Standard deviations of the noise (rms) that the errors with kept values must exceed; below, noise
+may be the reason.
+"""
+
+FEWEST = 8
+"""Smallest number of equations beyond the fitted parameters that supports a result."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contradiction:
+    """Stated setup parameters that the data contradict.
+
+    Attributes
+    ----------
+    freed : the measurements with these parameters estimated. misfit : the remaining misfit.
+    names : of the parameters. values : for each its name, estimate, stated value and certainty.
+    """
+
+    freed: InterpretedData
+    misfit: float
+    names: tuple[str, ...]
+    values: tuple[dict[str, Any], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class MovedSetups:
+    """Frames, targets and surfaces that are no longer where a fit located them.
+
+    Attributes
+    ----------
+    names : of those that moved, or of all that may have moved. times : factor by which the errors
+        decrease when they are fitted again.
+    """
+
+    names: tuple[str, ...]
+    times: float
+
+
+def find_contradiction(
+    free: FreeParameters, stated: InterpretedData, misfit: float, better: float
+) -> Contradiction | None:
+    """Find stated setup parameters without which measurements fit far better.
+
+    Parameters
+    ----------
+    free, stated : the robot's parameters, and the measurements as written. misfit : of these.
+    better : factor by which the misfit must decrease.
+
+    Returns
+    -------
+    Contradiction or None
+        Of the parameter that alone explains the misfit, or else of all stated ones.
+    """
+    present = set(stated.nuisance.table.names)
+    names = tuple(one.name for one in stated.whole.stated_values if one.name in present)
+    if not names or not stated.has_enough:
+        return None
+    freed, least = _estimate_stated(free, stated, names)
+    if not least * better < misfit:
+        return None
+    options = [(names, freed, least)]
+    if 1 < len(names) <= MOST_SINGLE:
+        single = [((name,), *_estimate_stated(free, stated, (name,))) for name in names]
+        options += [one for one in single if one[2] * better < misfit]
+    chosen, freed, least = min(options, key=lambda one: (len(one[0]), one[2]))
+    table = stated.nuisance.table
+    values = freed.values
+    shown = [
+        _compare_value(
+            free, table.entries[table.index(name)], float(values[freed.nuisance.table.index(name)])
+        )
+        for name in chosen
+    ]
+    return Contradiction(freed, least, chosen, tuple(shown))
+
+
+def find_moved_setups(
+    names: Sequence[str], sizes: Callable[[tuple[str, ...]], tuple[float, int]]
+) -> MovedSetups | None:
+    """Find frames, targets and surfaces that were moved since a fit.
+
+    Parameters
+    ----------
+    names : of those whose values are kept.
+    sizes : from the names that are fitted again to the root mean square [1] of whitened errors,
+        with the lost degrees of freedom taken into account, and the number of equations left; NaN
+        and 0 where the rows do not determine them.
+    """
+    names = tuple(names)
+    if not names:
+        return None
+    kept, _ = sizes(())
+    fitted, left = sizes(names)
+    if left < FEWEST or not kept > ABOVE or not kept > SMALLER * fitted:
+        return None
+    moved = names
+    if len(names) > 1:
+        moved = tuple(
+            name
+            for name in names
+            if sizes(tuple(other for other in names if other != name))[0] > SMALLER * fitted
+        )
+    return MovedSetups(moved or names, kept / fitted)
+
+
+def _estimate_stated(
+    free: FreeParameters, stated: InterpretedData, names: tuple[str, ...]
+) -> tuple[InterpretedData, float]:
+    """The measurements with some stated parameters estimated, and their misfit."""
+    remaining = tuple(one for one in stated.whole.stated_values if one.name not in names)
+    freed = InterpretedData(free, replace(stated.whole, stated_values=remaining))
+    freed.misfits()
+    freed.exclude_far_rows()
+    return freed, min(freed.misfit(), refine_misfit(freed))
+
+
+def _compare_value(free: FreeParameters, entry: Parameter, value: float) -> dict[str, Any]:
+    """Estimate, stated value and certainty of a parameter, in the unit of the robot's file."""
+    symbol = free.robot.units.get(entry.dimension, DISPLAY_UNITS[entry.dimension].symbol)
+    factor = find_unit(symbol).factor_to_si
+    is_fixed = not entry.free or entry.tolerance is None
+    sd = "fixed" if is_fixed else f"sd {entry.tolerance / factor:.3g} {symbol}"
+    return {
+        "name": entry.name,
+        "estimated": f"{value / factor:.4g} {symbol}",
+        "stated": f"{entry.nominal / factor:.4g} {symbol}",
+        "certainty": sd,
+    }
