@@ -526,7 +526,9 @@ def report_identifiability(machine: Robot, data: Data, cures: bool = False) -> R
     if cures:
         told = suggest_measurements(found)
         result["cures"] = [[c.words for c in r.measurements] for r in told]
-        result["cures_left"] = {str(i): [c.left for c in r.measurements] for i, r in enumerate(told)}
+        result["cures_left"] = {
+            str(i): [c.left for c in r.measurements] for i, r in enumerate(told)
+        }
     return result
 
 

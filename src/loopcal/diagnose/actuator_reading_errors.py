@@ -63,7 +63,10 @@ def compute_reading_errors(
     """
     if fit.poses is None:
         return None
-    recorded, estimated = (exclude_poses(data, fit.options.excluded_poses).readings, fit.poses.readings)
+    recorded, estimated = (
+        exclude_poses(data, fit.options.excluded_poses).readings,
+        fit.poses.readings,
+    )
     sigma = fit.poses.sigma
     compared = np.isfinite(sigma) & (sigma > 0.0) & np.isfinite(recorded) & np.isfinite(estimated)
     reading = np.where(compared, recorded - estimated, np.nan)

@@ -161,9 +161,7 @@ def _same(one: Kind, other: Kind) -> bool:
     )
 
 
-def check_targets_move(
-    measurements: Measurements, T: FloatArray, *, allow: bool = False
-) -> None:
+def check_targets_move(measurements: Measurements, T: FloatArray, *, allow: bool = False) -> None:
     """Refuse a target that no pose moves: its readings stay within the noise, though the robot
     carried it about.
 

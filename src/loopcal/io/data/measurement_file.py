@@ -101,11 +101,7 @@ def load_measurements(
         check_strokes(data, robot, allow=allow_outside_stroke, override="--allow-outside-stroke")
         check_duplicates(data, allow=allow_duplicates, override="--allow-duplicates", places=places)
         check = check_conventions(
-            robot,
-            data,
-            allow_still=allow_still,
-            allow_implausible=allow_implausible,
-            sources=files,
+            robot, data, allow_still=allow_still, allow_implausible=allow_implausible, sources=files
         )
     except DataError as error:
         raise DataError(f"{parsed.names}: {error}") from error
