@@ -21,8 +21,8 @@ from loopcal.units import Dimension, Unit, find_unit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-FITTED, JUDGED, BOUND = COLOURS[0], COLOURS[1], COLOURS[2]
-"""Of fitted poses, of those to judge by, and of what no choice of poses can beat."""
+CALIBRATION, VALIDATION, BOUND = COLOURS[0], COLOURS[1], COLOURS[2]
+"""Colors of calibration poses, of validation poses, and of the bound."""
 
 
 def draw_plan(plan: Plan) -> Figure:
@@ -45,11 +45,11 @@ def draw_plan(plan: Plan) -> Figure:
         axes: Any = figure.add_subplot(1, len(pairs), place)
         x, y = (columns[i], columns[j]) if j is not None else (step, columns[i])
         first = (start[i], start[j]) if j is not None else (0.0, start[i])
-        axes.plot([first[0], *x], [first[1], *y], color="0.7", lw=0.8, zorder=1, label="way")
+        axes.plot([first[0], *x], [first[1], *y], color="0.7", lw=0.8, zorder=1, label="path")
         axes.plot(*first, "k+", ms=8.0, label="home", zorder=3)
         for chosen, colour, label in (
-            (~plan.poses.held_out, FITTED, "to fit"),
-            (plan.poses.held_out, JUDGED, "to judge by"),
+            (~plan.poses.held_out, CALIBRATION, "calibration"),
+            (plan.poses.held_out, VALIDATION, "validation"),
         ):
             axes.plot(x[chosen], y[chosen], "o", color=colour, ms=4.5, label=label, zorder=2)
         axes.set_xlabel(_label(plan.robot, names[i]) if j is not None else "step [1], home is 0")
@@ -64,7 +64,8 @@ def draw_plan(plan: Plan) -> Figure:
     )
     held = int(plan.poses.held_out.sum())
     figure.suptitle(
-        f"{plan.robot.name}: n = {plan.n_poses} poses to fit, {held} to judge by", fontsize=10
+        f"{plan.robot.name}: n = {plan.n_poses} poses for calibration, {held} for validation",
+        fontsize=10,
     )
     return figure
 
@@ -84,7 +85,7 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
         curve.numbers,
         curve.values / shown.factor_to_si,
         "o-",
-        color=FITTED,
+        color=CALIBRATION,
         label=f"planned {curve.counted}",
     )
     axes.plot(
@@ -97,7 +98,7 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
     if curve.goal is not None:
         axes.axhline(
             curve.goal / shown.factor_to_si,
-            color=JUDGED,
+            color=VALIDATION,
             lw=1.0,
             label=f"asked for: {curve.goal / shown.factor_to_si:.3g} {shown.symbol}",
         )
@@ -113,7 +114,7 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
     )
     ticks = np.geomspace(low, high, 5) / shown.factor_to_si
     axes.set_yticks(ticks, [f"{tick:.3g}" for tick in ticks])
-    axes.set_xlabel(f"{curve.counted} to fit [1]")
+    axes.set_xlabel(f"{curve.counted} for calibration [1]")
     words = "pose error, turns times size" if curve.target == "pose" else f"{curve.target} error"
     axes.set_ylabel(f"expected {words} (rms) [{shown.symbol}]")
     axes.grid(visible=True, which="both", lw=0.3)
