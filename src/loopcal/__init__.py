@@ -102,6 +102,7 @@ if TYPE_CHECKING:
     from loopcal.measure import sample_truth as sample_truth
     from loopcal.measure import simulate as simulate
     from loopcal.measure import simulate_trials as simulate_trials
+    from loopcal.mechanism import Jacobian as Jacobian
     from loopcal.mechanism import Mechanism as Mechanism
     from loopcal.mechanism import Solution as Solution
     from loopcal.mechanism import Status as Status
@@ -109,6 +110,7 @@ if TYPE_CHECKING:
     from loopcal.mechanism import find_working_modes as find_working_modes
     from loopcal.mechanism import forward as forward
     from loopcal.mechanism import inverse as inverse
+    from loopcal.mechanism import jacobian as jacobian
     from loopcal.mechanism import sample_workspace as sample_workspace
     from loopcal.mechanism import trace_singularity as trace_singularity
     from loopcal.planning import Constraints as Constraints
@@ -228,6 +230,7 @@ PUBLIC_NAMES: Mapping[str, tuple[str, ...]] = {
         "simulate_trials",
     ),
     "loopcal.mechanism": (
+        "Jacobian",
         "Mechanism",
         "Solution",
         "Status",
@@ -235,6 +238,7 @@ PUBLIC_NAMES: Mapping[str, tuple[str, ...]] = {
         "find_working_modes",
         "forward",
         "inverse",
+        "jacobian",
         "sample_workspace",
         "trace_singularity",
     ),

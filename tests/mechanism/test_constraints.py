@@ -111,25 +111,28 @@ def test_the_order_of_limbs_that_differ_in_rank_changes_nothing():
             for j, h in enumerate(g.locked)
             if h
         ]
-        (limb, joint), (note,) = held[0], robot.notes
+        (limb, joint), (finding,) = held[0], robot.findings
         assert len(held) == 1
-        assert note == (
-            "limb leg3 can spin about itself without moving the platform; "
-            f"its joint {robot.assembly.limbs[limb].joints[joint].name} is held at 0 rad, which "
-            "changes no pose"
-        )
+        assert finding.code == "mechanism.locked-joint"
+        assert finding.data == {
+            "limb": "leg3",
+            "joint": robot.assembly.limbs[limb].joints[joint].name,
+            "turns": True,
+            "value": (0.0, "rad"),
+        }
 
 
 def test_what_the_note_says_of_a_held_joint_is_true():
     limbs = [universal(i, loose=i == 2) for i in range(5)]
     robot = build(machine(limbs, ("x", "y", "z", "roll", "pitch")))
-    joint = robot.notes[0].split("its joint ")[1].split()[0]
+    joint = robot.findings[0].data["joint"]
     turned = replace(
         limbs[2],
         joints=tuple(replace(j, start=0.4) if j.name == joint else j for j in limbs[2].joints),
     )
     other = build(machine([*limbs[:2], turned, *limbs[3:]], ("x", "y", "z", "roll", "pitch")))
-    assert f"joint {joint} is held at 0.4 rad" in other.notes[0]
+    assert other.findings[0].data["joint"] == joint
+    assert other.findings[0].data["value"] == (0.4, "rad")
     q = inverse(robot, np.array([[0.012, -0.018, 0.252, 0.06, -0.07]])).q
     assert_allclose(forward(other, q).T, forward(robot, q).T, atol=1e-11)
 
@@ -157,13 +160,10 @@ def planar(freedoms):
 
 def test_a_planar_machine_with_all_six_freedoms_is_solved_like_one_with_three_and_told():
     whole, flat = planar(zoo.AXES), planar(("rz", "x", "y"))
-    assert flat.notes == ()
-    assert whole.notes == (
-        (
-            "6 closure equations repeat others: it closes only for exact geometry; state freedoms: "
-            "[rz, x, y] to leave them out"
-        ),
-    )
+    assert flat.findings == ()
+    (finding,) = whole.findings
+    assert finding.code == "mechanism.repeated-equations"
+    assert finding.data == {"count": 6, "freedoms": ("rz", "x", "y")}
     asked = np.random.default_rng(0).uniform((-0.06, -0.06, -0.45), (0.06, 0.06, 0.45), (300, 3))
     found = inverse(flat, asked)
     found = found.take(found.converged)
@@ -184,7 +184,9 @@ def test_equations_that_repeat_others_are_told_where_no_choice_of_freedoms_leave
     whole = planar(zoo.AXES)
     assembly = zoo.relocated(whole.assembly, turned)
     robot = build(replace(assembly, parameters=(), maps=(), controlled=("x", "y", "yaw")))
-    assert robot.notes == ("6 closure equations repeat others: it closes only for exact geometry",)
+    (finding,) = robot.findings
+    assert finding.code == "mechanism.repeated-equations"
+    assert finding.data == {"count": 6, "freedoms": ()}
 
 
 def spherical():

@@ -92,10 +92,10 @@ def test_angles_asked_for_are_compared_the_short_way_round():
 @pytest.mark.parametrize(
     ("names", "sentence"),
     [
-        (("x", "height"), "'height' is not a coordinate; allowed are x, y, z, roll"),
-        (("x", "x"), "a coordinate is named twice in x, x"),
+        (("x", "height"), "'height' is not a platform coordinate; allowed are x, y, z, roll"),
+        (("x", "x"), "duplicate coordinate in x, x"),
         (("roll", "psi"), "roll, psi mixes roll-pitch-yaw with phi-theta-psi"),
-        (("z", "theta"), "phi and theta are the direction of one normal; name both or neither"),
+        (("z", "theta"), "phi and theta give the direction of the normal together"),
     ],
 )
 def test_impossible_sets_of_coordinates_are_one_clear_sentence(names, sentence):

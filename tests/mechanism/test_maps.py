@@ -118,7 +118,7 @@ def test_an_actuator_without_period_has_no_harmonics():
 def test_values_are_checked_and_frozen():
     robot = zoo.hexapod()
     with pytest.raises(
-        MechanismError, match=r"hexapod has 42 parameters, but \(41,\) values were given"
+        MechanismError, match=r"hexapod has 42 parameters, but values of shape \(41,\)"
     ):
         robot.with_values(np.zeros(41))
     broken = np.array(robot.values)

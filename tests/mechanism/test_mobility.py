@@ -61,31 +61,26 @@ WRONG = {
     "five legs": (
         five_legs,
         (
-            r"hexapod: with every actuator held the platform can still move at home: (turn|shift) "
-            r".*5 "
-            r"of 6 freedoms"
+            r"hexapod: at home the platform can still move with every actuator locked "
+            r"\((rotation|translation) .*5 of 6 freedoms"
         ),
     ),
-    "similar base and platform": (regular, r"the platform can still move at home"),
+    "similar base and platform": (regular, r"at home the platform can still move"),
     "a rod too many": (
         a_rod_too_many,
-        (
-            r"hexapod: 6 actuators, but the limbs leave the platform only 5 of 6 freedoms at home; "
-            r"it "
-            r"cannot .*over-constrained"
-        ),
+        r"hexapod is over-constrained: it has 6 actuators, but .* only 5 of 6 freedoms",
     ),
     "a coordinate too few": (
         lambda: replace(PRS, controlled=("z",)),
-        r"3-PRS can be moved in 3 freedoms or more, but 1 controlled coordinates are named",
+        r"3-PRS can be moved in 3 freedoms or more, but names only 1 controlled coordinates",
     ),
     "a coordinate nobody moves": (
         lambda: replace(PRS, controlled=("z", "x", "psi")),
-        r"cannot all be chosen freely at home",
+        r"cannot be set independently at home",
     ),
     "an unknown coordinate": (
         lambda: replace(PRS, controlled=("z", "tilt", "x")),
-        r"'tilt' is not a coordinate; allowed are x, y, z",
+        r"'tilt' is not a platform coordinate; allowed are x, y, z",
     ),
     "an unknown freedom": (
         lambda: replace(PRS, freedoms=("x", "w")),
@@ -97,11 +92,11 @@ WRONG = {
     ),
     "a link too few": (
         lambda: with_limb(PRS, 0, links=PRS.limbs[0].links[:2]),
-        r"limb 'limb1' has 2 joints and 2 links; links are one more than joints",
+        r"limb 'limb1' has 2 joints and 2 links; give one link more than joints",
     ),
     "two limbs of one name": (
         lambda: with_limb(PRS, 1, name="limb1"),
-        r"two limbs are called 'limb1'; every limb needs its own name",
+        r"two limbs are called 'limb1'; give each its own name",
     ),
     "an actuator twice": (
         lambda: replace(HEXAPOD, actuators=HEXAPOD.actuators[:1] * 2),
@@ -111,7 +106,7 @@ WRONG = {
         lambda: replace(
             HEXAPOD, actuators=(*HEXAPOD.actuators, Actuator("spare", Dimension.LENGTH))
         ),
-        r"actuator 'spare' drives 0 joints; it must drive one",
+        r"actuator 'spare' drives 0 joints; let it drive one",
     ),
     "a joint driven by nobody": (
         lambda: with_limb(HEXAPOD, 2, actuator="q9"),
@@ -119,7 +114,7 @@ WRONG = {
     ),
     "an actuator that is not listed": (
         lambda: replace(HEXAPOD, actuators=HEXAPOD.actuators[:5]),
-        r"a joint is driven by 'q6', which is not among the actuators; add it or mend the name",
+        r"a joint is driven by 'q6', which is not among the actuators; add it or correct the name",
     ),
     "legs that are too short": (
         lambda: replace(
@@ -127,7 +122,7 @@ WRONG = {
             actuators=HEXAPOD.actuators[1:],
             controlled=("x", "y", "z", "phi", "theta"),
         ),
-        r"hexapod cannot close at its home pose: the loops stay .* mm open",
+        r"the loops of hexapod cannot be closed at its home pose: .* mm stay open",
     ),
 }
 

@@ -103,5 +103,5 @@ def test_a_driven_slide_does_not_make_the_joint_below_it_a_spinning_one():
     # once the slide was taken at zero, where a universal joint turns nothing, and both its axes
     # were held
     robot = ups()
-    assert robot.notes == ()
+    assert robot.findings == ()
     assert_array_equal([g.locked for g in robot.program.groups], [(False, False, False)])

@@ -55,13 +55,13 @@ def test_tilt_is_even_over_the_cap():
 def test_an_empty_workspace_is_said_with_its_reason():
     robot = with_workspace({"x": (5.0, 6.0), "y": (-0.08, 0.08), "z": (0.0, 0.2)})
     with pytest.raises(
-        MechanismError, match=r"workspace is empty: 0 of .* because the loops cannot be closed"
+        MechanismError, match=r"is empty: 0 of .* reason: the loops cannot be closed"
     ):
         sample_workspace(robot, 10)
     robot = with_workspace(
         {"x": (-0.08, 0.08), "y": (-0.08, 0.08), "z": (0.0, 0.2)}, stroke=(0.9, 1.0)
     )
-    with pytest.raises(MechanismError, match="because stroke of q1 is exceeded"):
+    with pytest.raises(MechanismError, match="reason: stroke of q1 is exceeded"):
         sample_workspace(robot, 10)
 
 

@@ -279,7 +279,7 @@ def _report_targets(
         failed = next((s for s in (best, uncorrected, final) if not s.converged[i]), None)
         if failed is not None:
             whose = "the controller's geometry: " if failed is uncorrected else ""
-            reason = whose + failed.explain(i).split(": ", 1)[1]
+            reason = whose + str(failed.explain(i))
             findings.append(report_finding("compensation.unreachable", reason=reason))
         elif not allowed[0, i]:
             findings.append(report_finding("compensation.outside-limits", limit=str(why[0, i])))

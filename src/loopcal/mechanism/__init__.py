@@ -20,52 +20,51 @@ from loopcal.mechanism.batch_kinematics import find_directly_reachable as find_d
 from loopcal.mechanism.batch_kinematics import forward_trials as forward_trials
 from loopcal.mechanism.batch_kinematics import inverse_trials as inverse_trials
 from loopcal.mechanism.compilation import build as build
-from loopcal.mechanism.coordinates import POSITION as POSITION
-from loopcal.mechanism.coordinates import TILT as TILT
-from loopcal.mechanism.coordinates import check_coordinates as check_coordinates
-from loopcal.mechanism.coordinates import compare_coordinates as compare_coordinates
-from loopcal.mechanism.coordinates import pose_from_coordinates as pose_from_coordinates
-from loopcal.mechanism.coordinates import read_coordinates as read_coordinates
 from loopcal.mechanism.families import FAMILIES as FAMILIES
-from loopcal.mechanism.frames import compute_limb_frames as compute_limb_frames
+from loopcal.mechanism.families.records import AngleTolerance as AngleTolerance
+from loopcal.mechanism.families.records import LengthTolerance as LengthTolerance
+from loopcal.mechanism.families.records import Point as Point
+from loopcal.mechanism.families.records import PoseRecord as PoseRecord
+from loopcal.mechanism.families.records import RatioTolerance as RatioTolerance
+from loopcal.mechanism.families.records import RobotRecord as RobotRecord
+from loopcal.mechanism.families.records import Workspace as Workspace
+from loopcal.mechanism.families.records import match_parameter_names as match_parameter_names
+from loopcal.mechanism.families.records import standard_deviation as standard_deviation
+from loopcal.mechanism.kinematics import Jacobian as Jacobian
 from loopcal.mechanism.kinematics import Solution as Solution
+from loopcal.mechanism.kinematics import (
+    differentiate_by_coordinates as differentiate_by_coordinates,
+)
 from loopcal.mechanism.kinematics import forward as forward
 from loopcal.mechanism.kinematics import inverse as inverse
+from loopcal.mechanism.kinematics import jacobian as jacobian
 from loopcal.mechanism.kinematics import make_solution as make_solution
-from loopcal.mechanism.limits import Limit as Limit
-from loopcal.mechanism.limits import check_limits as check_limits
-from loopcal.mechanism.limits import evaluate_limits as evaluate_limits
 from loopcal.mechanism.model import Mechanism as Mechanism
-from loopcal.mechanism.model import Status as Status
 from loopcal.mechanism.modes import Modes as Modes
 from loopcal.mechanism.modes import find_assembly_modes as find_assembly_modes
 from loopcal.mechanism.modes import find_working_modes as find_working_modes
-from loopcal.mechanism.passive_joints import PassiveSensitivity as PassiveSensitivity
-from loopcal.mechanism.passive_joints import (
+from loopcal.mechanism.platform_coordinates import POSITION as POSITION
+from loopcal.mechanism.platform_coordinates import TILT as TILT
+from loopcal.mechanism.platform_coordinates import check_coordinates as check_coordinates
+from loopcal.mechanism.platform_coordinates import compare_coordinates as compare_coordinates
+from loopcal.mechanism.platform_coordinates import pose_from_coordinates as pose_from_coordinates
+from loopcal.mechanism.platform_coordinates import read_coordinates as read_coordinates
+from loopcal.mechanism.redundant_actuation import PoseDrivenSensitivity as PoseDrivenSensitivity
+from loopcal.mechanism.redundant_actuation import differentiate_at_pose as differentiate_at_pose
+from loopcal.mechanism.redundant_actuation import solve_at_pose as solve_at_pose
+from loopcal.mechanism.sensitivity import PassiveSensitivity as PassiveSensitivity
+from loopcal.mechanism.sensitivity import PoseSensitivity as PoseSensitivity
+from loopcal.mechanism.sensitivity import (
     differentiate_passive_joints as differentiate_passive_joints,
 )
-from loopcal.mechanism.pose_driven import PoseDrivenSensitivity as PoseDrivenSensitivity
-from loopcal.mechanism.pose_driven import differentiate_at_pose as differentiate_at_pose
-from loopcal.mechanism.pose_driven import solve_at_pose as solve_at_pose
-from loopcal.mechanism.projection import (
-    differentiate_by_coordinates as differentiate_by_coordinates,
-)
-from loopcal.mechanism.records import AngleTolerance as AngleTolerance
-from loopcal.mechanism.records import LengthTolerance as LengthTolerance
-from loopcal.mechanism.records import Point as Point
-from loopcal.mechanism.records import PoseRecord as PoseRecord
-from loopcal.mechanism.records import RatioTolerance as RatioTolerance
-from loopcal.mechanism.records import RobotRecord as RobotRecord
-from loopcal.mechanism.records import Workspace as Workspace
-from loopcal.mechanism.records import match_parameter_names as match_parameter_names
-from loopcal.mechanism.records import standard_deviation as standard_deviation
-from loopcal.mechanism.sensitivity import PoseSensitivity as PoseSensitivity
 from loopcal.mechanism.sensitivity import differentiate_pose as differentiate_pose
 from loopcal.mechanism.singularities import NEAR_SHARE as NEAR_SHARE
 from loopcal.mechanism.singularities import Singularity as Singularity
 from loopcal.mechanism.singularities import analyze_singularity as analyze_singularity
 from loopcal.mechanism.singularities import compute_median_margins as compute_median_margins
 from loopcal.mechanism.singularities import trace_singularity as trace_singularity
+from loopcal.mechanism.states import Status as Status
+from loopcal.mechanism.states import compute_limb_frames as compute_limb_frames
 from loopcal.mechanism.states import driven_values as driven_values
 from loopcal.mechanism.states import select_poses as select_poses
 from loopcal.mechanism.transmission import TERMS as TERMS
@@ -77,7 +76,10 @@ from loopcal.mechanism.transmission import readings_from_joints as readings_from
 from loopcal.mechanism.transmission import term_derivatives as term_derivatives
 from loopcal.mechanism.workspace import MIN_DRAWS as MIN_DRAWS
 from loopcal.mechanism.workspace import MIN_REACHABLE_SHARE as MIN_REACHABLE_SHARE
+from loopcal.mechanism.workspace import Limit as Limit
 from loopcal.mechanism.workspace import WorkspaceSample as WorkspaceSample
+from loopcal.mechanism.workspace import check_limits as check_limits
 from loopcal.mechanism.workspace import draw_coordinates as draw_coordinates
+from loopcal.mechanism.workspace import evaluate_limits as evaluate_limits
 from loopcal.mechanism.workspace import sample_workspace as sample_workspace
 from loopcal.mechanism.workspace import workspace_ranges as workspace_ranges

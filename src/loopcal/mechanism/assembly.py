@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The generic description of a mechanism that every family expands into: limbs, actuators,
-parameters and their maps.
+"""The generic description of a mechanism: limbs, actuators, parameters and their maps.
+
+Every family expands into an `Assembly`; `loopcal.mechanism.build` compiles it for the engine.
 """
 
 from __future__ import annotations
@@ -11,19 +12,22 @@ from typing import Protocol
 
 import numpy as np
 
+from loopcal.errors import MechanismError
+from loopcal.mechanism.platform_coordinates import COORDINATES, check_coordinates
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
 AXES = ("rx", "ry", "rz", "x", "y", "z")
-"""Axes of a displacement in a link's own frame; `pitch` and `length` are the other two things that
-can move.
-"""
+"""Axes of a displacement in a link's own frame. `pitch` and `length` can be displaced too."""
+
+ENDINGS = {"rigid": 6, "ball": 3, "distance": 1}
+"""Endings of a limb, with the number of their closure equations."""
 
 
 @dataclass(frozen=True)
 class Link:
-    """A link transform: takes coordinates behind the link to those before it.
+    """A link transform, from coordinates behind the link to those before it.
 
     Attributes
     ----------
@@ -41,10 +45,9 @@ class Joint:
 
     Attributes
     ----------
-    name : unique in its limb. kind : R or P. actuator : name of what drives it, None if passive.
+    name : unique in its limb. kind : R or P. actuator : name of its drive, None if passive.
     pitch : advance per turn angle of a screw [m/rad], R only.
-    start : value to begin from when the home position is computed [m or rad]; it picks the working
-        mode.
+    start : first guess of the home position [m or rad]; it selects the working mode.
     limits : allowed values (low, high) [m or rad].
     """
 
@@ -58,10 +61,10 @@ class Joint:
 
 @dataclass(frozen=True)
 class Cone:
-    """How far a rod may lean at one of its ends: within `angle` [rad] of `axis` (3,).
+    """Allowed inclination of a rod at one of its ends: at most `angle` [rad] from `axis` (3,).
 
     `end` is `tip` (axis in the frame of the chain's tip, rod pointing to the platform) or
-    `attachment` (axis in the attachment's frame, rod pointing to the tip).
+    `attachment` (axis in the frame of the attachment, rod pointing to the tip).
     """
 
     end: str
@@ -71,16 +74,15 @@ class Cone:
 
 @dataclass(frozen=True)
 class Limb:
-    """A serial chain from the base to the platform: link, joint, link, ..., link, ending,
-    attachment.
+    """A serial chain from base to platform: link, joint, link, ..., link, ending, attachment.
 
     Attributes
     ----------
     links : one more than joints. ending : rigid, ball or distance. attachment : on the platform, in
         its frame.
     length : nominal length of the rod of a `distance` ending at joint value zero [m].
-    actuator : what drives that length, None for a rod of fixed length. cones : how far the rod may
-        lean.
+    actuator : drive of that length, None for a rod of fixed length.
+    cones : allowed inclinations of the rod.
     """
 
     name: str
@@ -92,11 +94,15 @@ class Limb:
     actuator: str | None = None
     cones: tuple[Cone, ...] = ()
 
+    @property
+    def drives(self) -> tuple[str, ...]:
+        """Names of the actuators that drive this limb."""
+        return tuple(name for name in (*(j.actuator for j in self.joints), self.actuator) if name)
+
 
 @dataclass(frozen=True)
 class Address:
-    """A number that parameters can move: a limb's link axis, pitch or rod length, or a term of an
-    actuator's transmission.
+    """A number that parameters can change.
 
     `owner` is a limb or an actuator; `element` a link or joint of the limb, `rod`, or
     `transmission`; `axis` one of AXES, `pitch`, `length`, or a term (see
@@ -113,7 +119,7 @@ class Address:
 
 @dataclass(frozen=True)
 class LinearMap:
-    """Map of one parameter onto one address: displacement += coefficient * (value - nominal)."""
+    """Map of a parameter onto an address: displacement += coefficient * (value - nominal)."""
 
     parameter: str
     address: Address
@@ -121,26 +127,24 @@ class LinearMap:
 
 
 class SharedMap(Protocol):
-    """Map of several parameters onto several addresses by a smooth function (delta radius, tower
-    angle).
-    """
+    """Smooth map of several parameters onto several addresses, such as delta radius and angle."""
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Parameter names, i of them."""
+        """Names of the i parameters."""
         ...
 
     @property
     def outputs(self) -> tuple[Address, ...]:
-        """Addresses, o of them."""
+        """The o addresses."""
         ...
 
     def value(self, inputs: FloatArray) -> FloatArray:
-        """(t, i) -> (t, o); what counts is the change from the value at nominal."""
+        """Map (t, i) to (t, o); its change from the nominal value is the displacement."""
         ...
 
     def jacobian(self, inputs: FloatArray) -> FloatArray:
-        """(t, i) -> (t, o, i)."""
+        """Return the derivative (t, o, i) at inputs (t, i)."""
         ...
 
 
@@ -152,11 +156,10 @@ class Actuator:
     ----------
     name : column of the readings. dimension : of the reading. stroke : allowed readings (low, high)
         [m or rad].
-    terms : nominal transmission, reading to joint value, by name of the term (default: joint value
-        = reading).
-    period : reading per turn of whatever makes the harmonics [m or rad], 0 where there are none.
-    sigma : standard deviation of the reading, used to weigh redundant readings against each other
-        [m or rad].
+    terms : nominal transmission from reading to joint value, by name of the term; without terms
+        the joint value is the reading.
+    period : reading per turn of the source of the harmonics [m or rad], 0 for none.
+    sigma : standard deviation of the reading, weighs redundant readings [m or rad].
     """
 
     name: str
@@ -169,16 +172,16 @@ class Actuator:
 
 @dataclass(frozen=True)
 class Assembly:
-    """A whole mechanism, as a family's `expand` returns it.
+    """A mechanism as the `expand` method of a family returns it.
 
     Attributes
     ----------
     name, source : for people. limbs, actuators : in the order of readings and tables.
-    freedoms : the platform's freedoms, of AXES in base axes. controlled : coordinates the machine
-        is commanded in.
+    freedoms : those of the platform, of AXES in base axes. controlled : coordinates in which the
+        machine is commanded.
     home : (4, 4) T_base_platform of the home pose; only its controlled coordinates must be exact.
     tool : (4, 4) T_platform_tool. workspace : coordinate -> (low, high) [m, rad].
-    parameters, maps, shared : the unknowns and how they enter.
+    parameters, maps, shared : the unknowns and their maps.
     """
 
     name: str
@@ -193,3 +196,103 @@ class Assembly:
     tool: FloatArray = field(default_factory=lambda: np.eye(4))
     workspace: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     source: str = ""
+
+
+def check_assembly(assembly: Assembly) -> None:
+    """Refuse inconsistent names, limbs, freedoms and ranges; raises MechanismError."""
+    _check_names(assembly)
+    for limb in assembly.limbs:
+        _check_limb(limb)
+    _check_freedoms(assembly)
+    _check_ranges(assembly)
+
+
+def _check_names(assembly: Assembly) -> None:
+    """Refuse duplicate names, and drives or actuators without their counterpart."""
+    limbs, actuators = [limb.name for limb in assembly.limbs], [a.name for a in assembly.actuators]
+    for kind, names in (("limb", limbs), ("actuator", actuators)):
+        for name in names:
+            if names.count(name) > 1:
+                raise MechanismError(f"two {kind}s are called {name!r}; give each its own name")
+    driven = [name for limb in assembly.limbs for name in limb.drives]
+    for name in actuators:
+        if name not in driven:
+            raise MechanismError(
+                f"actuator {name!r} drives 0 joints; let it drive one joint, or one in each of "
+                "several limbs"
+            )
+    unknown = sorted(set(driven) - set(actuators))
+    if unknown:
+        raise MechanismError(
+            f"a joint is driven by {unknown[0]!r}, which is not among the actuators; add it or "
+            "correct the name"
+        )
+
+
+def _check_limb(limb: Limb) -> None:
+    """Refuse duplicate names, two joints on a drive, an unknown ending or missing links."""
+    joints = [joint.name for joint in limb.joints]
+    if len(set(joints)) < len(joints):
+        raise MechanismError(
+            f"two joints of limb {limb.name!r} have the same name ({', '.join(joints)}); give each "
+            "its own name"
+        )
+    if len(set(limb.drives)) < len(limb.drives):
+        raise MechanismError(
+            f"actuator {limb.drives[0]!r} drives two joints of limb {limb.name!r}; an actuator "
+            "may drive one joint of a limb"
+        )
+    if limb.ending not in ENDINGS:
+        raise MechanismError(
+            f"limb {limb.name!r} ends in {limb.ending!r}; allowed endings are {', '.join(ENDINGS)}"
+        )
+    if len(limb.links) != len(limb.joints) + 1:
+        raise MechanismError(
+            f"limb {limb.name!r} has {len(limb.joints)} joints and {len(limb.links)} links; give "
+            "one link more than joints"
+        )
+
+
+def _check_freedoms(assembly: Assembly) -> None:
+    """Refuse missing, unknown or duplicate freedoms and controlled coordinates."""
+    freedoms = assembly.freedoms
+    unknown = [f for f in freedoms if f not in AXES]
+    if unknown:
+        raise MechanismError(
+            f"{unknown[0]!r} is not a freedom of a platform; allowed are {', '.join(AXES)}"
+        )
+    if not freedoms:
+        raise MechanismError(
+            f"{assembly.name} has no freedoms; state those of its platform, of {', '.join(AXES)}"
+        )
+    duplicates = [f for f in freedoms if freedoms.count(f) > 1]
+    if duplicates:
+        raise MechanismError(
+            f"duplicate freedom {duplicates[0]!r} in {', '.join(freedoms)}; name each once"
+        )
+    if not assembly.controlled:
+        raise MechanismError(
+            f"{assembly.name} names no controlled coordinate; state one for each freedom, of "
+            f"{', '.join(COORDINATES)}"
+        )
+    check_coordinates(assembly.controlled)
+
+
+def _check_ranges(assembly: Assembly) -> None:
+    """Refuse strokes and limits whose low end is not below the high one."""
+    units = {Dimension.LENGTH: "m", Dimension.ANGLE: "rad"}
+    ranges = [
+        (f"stroke of {a.name} runs", a.stroke, units.get(a.dimension, ""))
+        for a in assembly.actuators
+    ]
+    for limb in assembly.limbs:
+        ranges += [
+            (f"limits of {limb.name}.{j.name} run", j.limits, "rad" if j.kind == "R" else "m")
+            for j in limb.joints
+        ]
+    for what, bounds, symbol in ranges:
+        if bounds and not bounds[0] < bounds[1]:
+            raise MechanismError(
+                f"the {what} from {bounds[0]:g} to {bounds[1]:g} {symbol}; the first value must be "
+                "smaller"
+            )

@@ -1,6 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kinematics with the trial axis kept: what the layers above compute with. Shapes (t, n, ..), t or
-n = 1 broadcast.
+"""Kinematics of many trials: forward and inverse solutions as engine states (t, n).
+
+Arrays are (t, n, ..), where t or n may be 1 and then broadcast. The layers above compute with these
+functions; `loopcal.forward` and `loopcal.inverse` wrap them for a single robot.
+
+Where one actuator drives joints of several limbs, as a carriage with two rods does, the inverse
+solution cannot free each joint: they would part. It solves for the readings instead, by Newton's
+method on the coordinates of the forward solution, c(T(q)) = c*. It begins with the platform exactly
+as commanded in all its freedoms, which the limbs can reach one by one. Source:
+docs/theory/kinematics.md.
 """
 
 from __future__ import annotations
@@ -11,27 +19,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopcal import engine
-from loopcal.engine import State
-from loopcal.mechanism.coordinates import compare_coordinates, pose_from_coordinates
-from loopcal.mechanism.model import Mechanism, Status
-from loopcal.mechanism.redundant_actuation import count_shared_drives, inverse_with_shared_drives
-from loopcal.mechanism.sensitivity import PoseSensitivity, differentiate_pose, stack_platform_rows
-from loopcal.mechanism.states import driven_values, replace_rows, select_rows
+from loopcal.engine import Program, State
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import (
+    compare_coordinates,
+    pose_from_coordinates,
+    read_coordinates,
+)
+from loopcal.mechanism.sensitivity import differentiate_pose
+from loopcal.mechanism.states import Status, driven_values, replace_rows, reshape_rows, select_rows
 from loopcal.mechanism.transmission import joints_from_readings, readings_from_joints
 from loopcal.typing import BoolArray, FloatArray
 
-# fmt: off
-__all__ = ["PoseSensitivity", "forward_trials", "inverse_trials", "compute_closure_sign", "stack_platform_rows", "compute_readings", "differentiate_pose"]
-# fmt: on
-
-STEPS = (8, 64)
-"""Steps of the path from the start's readings along which a row is followed when the direct
-solution fails.
-"""
+PATH_STEPS = (8, 64)
+"""Steps of the path from the start's readings, tried in turn where the direct solution fails."""
 WIDE = 1e-2
-"""Share of the size: a pose that redundant readings leave open by more is not what their errors
-mean, but a wrong minimum.
+"""Gap, relative to the robot's size, that the errors of redundant readings do not explain.
+
+A pose that they leave open by more is a wrong minimum.
 """
+SHARED_DRIVE_STEPS = 20
+"""Newton steps on the readings where drives are shared."""
+CLOSE = 1e-12
+"""Distance from the target coordinates, relative to the robot's size, at which these steps end.
+
+A forward solution is known to 1e-13 of the size.
+"""
+ANGLES = {"rx": "roll", "ry": "pitch", "rz": "yaw"}
 
 
 def forward_trials(
@@ -41,36 +55,34 @@ def forward_trials(
     start: State | None = None,
     follow: bool = True,
 ) -> State:
-    """Poses of readings q (t | 1, n, a) under parameter values (t | 1, p).
+    """Solve forward kinematics for readings q (t | 1, n, a) and values (t | 1, p).
 
-    Newton from `start` (default: home); a row that fails, or ends on the far side of a singularity,
-    is followed along the straight path from the start's readings. Rows that still fail are marked,
-    see `Status`. Redundant readings contradict each other by their errors; a row that they leave
-    wide open is followed too, and marked where it stays open. Without `follow` all these rows are
-    marked at once, at a fraction of the time.
+    Newton's method begins at `start` (default: home). A row that fails, or ends beyond a
+    singularity, is solved again along the straight path from the start's readings. Rows that still
+    fail are marked, see `Status`. Redundant readings contradict each other by their errors; a row
+    that they leave wide open is solved again too, and marked if it stays open. Without `follow` all
+    these rows are marked at once, in a fraction of the time.
     """
     e, tau = robot.slots(values)
-    with np.errstate(
-        invalid="ignore"
-    ):  # an infinite reading turns into NaN, and the engine marks its row
+    with np.errstate(invalid="ignore"):
+        # an infinite reading turns into NaN, and the engine marks its row
         joints = joints_from_readings(q, tau, robot.slots.frequency)
-    begin = _signed(robot, robot.home_state if start is None else start)
-    state = _signed(robot, engine.solve(robot.program, e, joints, begin))
-    wrong = _astray(robot, state, begin)
+    begin = _clear_sign(robot, robot.home_state if start is None else start)
+    state = _clear_sign(robot, engine.solve(robot.program, e, joints, begin))
+    wrong = _find_wrong_rows(robot, state, begin)
     if not wrong.any():
         return state
     if not follow:
-        beside = wrong & (state.status == Status.CONVERGED)
-        return replace(state, status=np.where(beside, np.int8(Status.OTHER_MODE), state.status))
-    return _followed(robot, e, joints, begin, state, wrong)
+        beyond = wrong & (state.status == Status.CONVERGED)
+        return replace(state, status=np.where(beyond, np.int8(Status.OTHER_MODE), state.status))
+    return _follow_path(robot, e, joints, begin, state, wrong)
 
 
 def find_directly_reachable(robot: Mechanism, values: FloatArray, q: FloatArray) -> BoolArray:
-    """Which readings q (t | 1, n, a) Newton solves from home at once, on home's side of every
-    singularity, (t, n).
+    """Return which readings q (t | 1, n, a) are solved from home without following a path, (t, n).
 
-    What `forward_trials` would have to follow is not reached plainly; to find that out takes a
-    fraction of following it.
+    These solutions lie on home's side of every singularity. The test takes a fraction of the time
+    of following.
     """
     return forward_trials(robot, values, q, follow=False).status == Status.CONVERGED
 
@@ -78,105 +90,173 @@ def find_directly_reachable(robot: Mechanism, values: FloatArray, q: FloatArray)
 def inverse_trials(
     robot: Mechanism, values: FloatArray, target: FloatArray, start: State | None = None
 ) -> State:
-    """States at controlled coordinates (t | 1, n, c), every actuator free; `readings_at` gives
-    their readings.
+    """Solve inverse kinematics for controlled coordinates (t | 1, n, c), every actuator free.
+
+    `compute_readings` gives the readings of the states.
     """
+    begin = robot.home_state if start is None else start
     if count_shared_drives(robot.program):
-        return inverse_with_shared_drives(
-            robot, values, target, robot.home_state if start is None else start
-        )
+        return _inverse_with_shared_drives(robot, values, target, begin)
     e, _ = robot.slots(values)
     names, size = robot.controlled, robot.size
     t, n = max(len(values), len(target)), target.shape[1]
-    asked = np.broadcast_to(target, (t, n, target.shape[2])).reshape(t * n, -1)
+    wanted = np.broadcast_to(target, (t, n, target.shape[2]))
+    flat = wanted.reshape(t * n, -1)
 
-    def task(T: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
-        return compare_coordinates(T, asked[rows], names, size)
+    def command(T: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
+        return compare_coordinates(T, flat[rows], names, size)
 
-    begin = robot.home_state if start is None else start
     guess = np.broadcast_to(driven_values(robot.program, begin), (t, n, len(robot.actuators)))
-    T = pose_from_coordinates(np.broadcast_to(target, (t, n, target.shape[2])), names, robot.home)
+    T = pose_from_coordinates(wanted, names, robot.home)
     if start is not None:
         T = np.broadcast_to(start.T, T.shape)
-    state = engine.solve(robot.program, e, guess, replace(begin, T=T), task, free=True)
+    state = engine.solve(robot.program, e, guess, replace(begin, T=T), command, free=True)
     return replace(state, closure_sign=compute_closure_sign(robot, values, state))
 
 
 def compute_closure_sign(robot: Mechanism, values: FloatArray, state: State) -> NDArray[np.int8]:
-    """Sign of the determinant of closure with the actuators held (t, n): it changes only through a
-    singularity.
+    """Return the sign of the determinant of closure with locked actuators (t, n).
 
-    The orientation of a state with free actuators is another one. With more equations than freedoms
-    it is zero.
+    It changes only at a singularity. A state with free actuators has another sign. With more
+    equations than freedoms the sign is 0.
     """
-    if not _square(robot):
+    if not _is_square(robot):
         return np.zeros(state.status.shape, np.int8)
     e, _ = robot.slots(values)
-    return engine.solve(
-        robot.program, e, driven_values(robot.program, state), state, max_iterations=0
-    ).closure_sign
-
-
-def _square(robot: Mechanism) -> bool:
-    """Has closure with the actuators held as many equations as the platform has freedoms?"""
-    return sum(
-        len(g.limbs) * (len(g.rows) - len(g.unknown_joints(False))) for g in robot.program.groups
-    ) == len(robot.freedoms)
-
-
-def _signed(robot: Mechanism, state: State) -> State:
-    """The state, its orientation zero where closure is not square: the sign of a reduced matrix
-    then means nothing.
-    """
-    return (
-        state if _square(robot) else replace(state, closure_sign=np.zeros_like(state.closure_sign))
-    )
+    joints = driven_values(robot.program, state)
+    return engine.solve(robot.program, e, joints, state, max_iterations=0).closure_sign
 
 
 def compute_readings(robot: Mechanism, values: FloatArray, state: State) -> FloatArray:
-    """Readings (t, n, a) of a state."""
+    """Return the readings (t, n, a) of a state."""
     _, tau = robot.slots(values)
-    return readings_from_joints(driven_values(robot.program, state), tau, robot.slots.frequency)
+    joints = driven_values(robot.program, state)
+    return readings_from_joints(joints, tau, robot.slots.frequency)
 
 
-def _astray(robot: Mechanism, state: State, begin: State) -> np.ndarray:
-    """Rows that failed, ended on the other side of a singularity or left a wide gap."""
+def count_shared_drives(program: Program) -> int:
+    """Return the number of driven joints beyond one for each actuator."""
+    driven = sum(int((columns >= 0).sum()) for g in program.groups for columns in g.actuator)
+    return driven - program.n_joints
+
+
+def _is_square(robot: Mechanism) -> bool:
+    """Return whether closure with locked actuators has as many equations as freedoms."""
+    equations = sum(
+        len(g.limbs) * (len(g.rows) - len(g.unknown_joints(False))) for g in robot.program.groups
+    )
+    return equations == len(robot.freedoms)
+
+
+def _clear_sign(robot: Mechanism, state: State) -> State:
+    """Return the state with sign 0 if closure is not square: the sign means nothing there."""
+    if _is_square(robot):
+        return state
+    return replace(state, closure_sign=np.zeros_like(state.closure_sign))
+
+
+def _find_wrong_rows(robot: Mechanism, state: State, begin: State) -> BoolArray:
+    """Return the rows that failed, ended beyond a singularity or left a wide gap."""
     closed = state.status == Status.CONVERGED
-    beside = (state.closure_sign != begin.closure_sign) | (state.residual > WIDE * robot.size)
-    return ~closed & (state.status != Status.NOT_FINITE) | closed & beside
+    beyond = (state.closure_sign != begin.closure_sign) | (state.residual > WIDE * robot.size)
+    return ~closed & (state.status != Status.NOT_FINITE) | closed & beyond
 
 
-def _followed(
+def _follow_path(
     robot: Mechanism,
     e: FloatArray,
     joints: FloatArray,
     begin: State,
     state: State,
-    wrong: np.ndarray,
+    wrong: BoolArray,
 ) -> State:
-    """Follow the wrong rows along the straight path of joint values from the start, in ever smaller
-    steps.
+    """Solve the wrong rows along the straight path of joint values from the start.
+
+    The steps become smaller until a row arrives.
     """
     shape = state.T.shape[0], state.T.shape[1]
     trial, pose = np.nonzero(wrong)
-    own = np.broadcast_to(e, (shape[0], e.shape[1]))[trial]
+    displacements = np.broadcast_to(e, (shape[0], e.shape[1]))[trial]
     target = np.broadcast_to(joints, (*shape, joints.shape[2]))[trial, pose][:, None]
     first, result = select_rows(begin, shape, trial, pose), select_rows(state, shape, trial, pose)
     origin = driven_values(robot.program, first)
     alive = np.arange(len(trial))
-    for count in STEPS:
+    for count in PATH_STEPS:
         zero = np.zeros(len(alive), int)
-        here = begun = select_rows(first, (len(trial), 1), alive, zero)
+        current = begun = select_rows(first, (len(trial), 1), alive, zero)
         for step in range(1, count + 1):
-            part = origin[alive] + (target[alive] - origin[alive]) * (step / count)
-            here = _signed(robot, engine.solve(robot.program, own[alive], part, here))
-        result = replace_rows(result, alive, zero, here)
-        alive = alive[_astray(robot, here, begun)[:, 0]]
+            q = origin[alive] + (target[alive] - origin[alive]) * (step / count)
+            solved = engine.solve(robot.program, displacements[alive], q, current)
+            current = _clear_sign(robot, solved)
+        result = replace_rows(result, alive, zero, current)
+        alive = alive[_find_wrong_rows(robot, current, begun)[:, 0]]
         if not len(alive):
             break
-    lost = (result.status == Status.CONVERGED) & (result.closure_sign != first.closure_sign)
-    wide = (result.status == Status.CONVERGED) & (result.residual > WIDE * robot.size)
-    marked = np.where(
-        lost, np.int8(Status.OTHER_MODE), np.where(wide, np.int8(Status.UNREACHABLE), result.status)
+    closed = result.status == Status.CONVERGED
+    status = np.where(
+        closed & (result.residual > WIDE * robot.size), np.int8(Status.UNREACHABLE), result.status
     )
-    return replace_rows(state, trial, pose, replace(result, status=marked))
+    other = closed & (result.closure_sign != first.closure_sign)
+    status = np.where(other, np.int8(Status.OTHER_MODE), status)
+    return replace_rows(state, trial, pose, replace(result, status=status))
+
+
+def _inverse_with_shared_drives(
+    robot: Mechanism, values: FloatArray, target: FloatArray, begin: State
+) -> State:
+    """Return states (t, n) at controlled coordinates (t | 1, n, c); marks rows that fail.
+
+    Rows are independent of each other.
+    """
+    t, n = max(len(values), len(target)), target.shape[1]
+    trial, pose = (a.ravel() for a in np.indices((t, n)))
+    wanted = np.broadcast_to(target, (t, n, target.shape[2])).reshape(t * n, -1)
+    values = np.broadcast_to(values, (t, values.shape[1]))[trial]
+    state = _solve_as_commanded(robot, values, wanted, select_rows(begin, (t, n), trial, pose))
+    q = compute_readings(robot, values, state)
+    alive, zero = np.flatnonzero(state.status[:, 0] == Status.CONVERGED), np.zeros(t * n, int)
+    for _ in range(SHARED_DRIVE_STEPS):
+        if not len(alive):
+            break
+        e, tau = robot.slots(values[alive])
+        joints = joints_from_readings(q[alive], tau, robot.slots.frequency)
+        previous = select_rows(state, (t * n, 1), alive, zero[alive])
+        current = engine.solve(robot.program, e, joints, previous)
+        state = replace_rows(state, alive, zero[alive], current)
+        gap, step = _step_readings(robot, values[alive], q[alive], wanted[alive], current)
+        going = current.status[:, 0] == Status.CONVERGED
+        going &= np.abs(gap).max(axis=1) > CLOSE * robot.size
+        alive = alive[going]
+        q[alive, 0] -= step[going]
+    status = state.status.copy()
+    status[alive] = Status.NOT_CONVERGED
+    return reshape_rows(replace(state, status=status), t, n)
+
+
+def _solve_as_commanded(
+    robot: Mechanism, values: FloatArray, wanted: FloatArray, begin: State
+) -> State:
+    """Return states (rows, 1) with every joint free and the platform as commanded.
+
+    Coordinates that are not controlled are those of home.
+    """
+    e, _ = robot.slots(values)
+    names = tuple(ANGLES.get(freedom, freedom) for freedom in robot.freedoms)
+    T = pose_from_coordinates(wanted, robot.controlled, robot.home)
+    whole = read_coordinates(T, names)
+
+    def command(current: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
+        return compare_coordinates(current, whole[rows], names, robot.size)
+
+    guess, start = driven_values(robot.program, begin), replace(begin, T=T[:, None])
+    return engine.solve(robot.program, e, guess, start, command, free=True)
+
+
+def _step_readings(
+    robot: Mechanism, values: FloatArray, q: FloatArray, wanted: FloatArray, state: State
+) -> tuple[FloatArray, FloatArray]:
+    """Return the distance from the target (rows, c) [m] and the Newton step of readings."""
+    gap, columns = compare_coordinates(state.T[:, 0], wanted, robot.controlled, robot.size)
+    D = differentiate_pose(robot, values, q, state).readings[:, 0]
+    slope = np.nan_to_num(np.matmul(columns, D))
+    return gap, np.matmul(np.linalg.pinv(slope), gap[..., None])[..., 0]

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compile an assembly: group its limbs, lay out displacements and joint values, find home, check
-mobility.
-"""
+"""Compilation of an assembly: groups of limbs, places of displacements, home position, mobility."""
 
 from __future__ import annotations
 
@@ -14,24 +12,26 @@ import numpy as np
 from loopcal import engine
 from loopcal.engine import Group, Program, Slot, State
 from loopcal.errors import MechanismError
-from loopcal.mechanism import mobility
-from loopcal.mechanism.assembly import AXES, Address, Assembly, Limb
-from loopcal.mechanism.batch_kinematics import compute_closure_sign, inverse_trials
-from loopcal.mechanism.coordinates import COORDINATES, check_coordinates, read_coordinates
+from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.mechanism.assembly import AXES, Address, Assembly, Limb, check_assembly
+from loopcal.mechanism.batch_kinematics import (
+    compute_closure_sign,
+    count_shared_drives,
+    inverse_trials,
+)
+from loopcal.mechanism.mobility import check_mobility, find_idle_joints, refuse_uncontrolled
 from loopcal.mechanism.model import Mechanism, SlotMap
-from loopcal.mechanism.redundant_actuation import count_shared_drives
+from loopcal.mechanism.platform_coordinates import read_coordinates
 from loopcal.mechanism.transmission import TERMS, harmonic_frequencies, nominal_terms
 from loopcal.parameters import ParameterTable
+from loopcal.typing import IntArray
 from loopcal.units import Dimension
 
 DEFAULT_SIZE = 1.0
-"""Characteristic length [m] of a mechanism all of whose lengths are zero (a spherical one with
-every frame in its centre).
-"""
+"""Characteristic length [m] of a mechanism whose lengths are all zero (a spherical one)."""
 POINT = 1e-9
-"""Size over the longest link below which limbs leave and end in one point."""
+"""Ratio of size and longest link below which all limbs begin and end in one point."""
 DEFAULT_UNITS = {Dimension.LENGTH: "mm", Dimension.ANGLE: "deg", Dimension.RATIO: "1"}
-ROWS = {"rigid": 6, "ball": 3, "distance": 1}
 
 
 def build(
@@ -41,8 +41,8 @@ def build(
 
     Parameters
     ----------
-    assembly : what a family's `expand` returned.
-    units : display units of its file. record : the family record, kept for writing the file back.
+    assembly : as returned by the `expand` method of a family.
+    units : display units of the file. record : the family record, kept for writing the file.
 
     Returns
     -------
@@ -51,44 +51,43 @@ def build(
     Raises
     ------
     MechanismError
-        A name that is used twice or not known, a mechanism that cannot close at home, wrong
-        mobility (with the freedoms that are too many or too few), a coordinate nobody controls.
+        Duplicate or unknown names, loops that cannot be closed at home, wrong mobility (names the
+        freedoms that are too many or too few), coordinates that cannot be controlled.
     """
-    _check_names(assembly)
-    _check_freedoms(assembly)
-    _check_ranges(assembly)
+    check_assembly(assembly)
     table = ParameterTable(assembly.parameters)
     wanted = {m.address for m in assembly.maps} | {a for s in assembly.shared for a in s.outputs}
     _check_addresses(assembly, wanted)
     freedoms = tuple(AXES.index(f) for f in AXES if f in assembly.freedoms)
-    size = characteristic_length(assembly)
-    loose, _, count = _groups(assembly, wanted, {})
-    held = mobility.find_idle_joints(
-        Program(loose, freedoms, size, count, len(assembly.actuators)), _guess(assembly, loose)
+    size, a = compute_characteristic_length(assembly), len(assembly.actuators)
+    groups, _, count = _group_limbs(assembly, wanted, {})
+    idle = find_idle_joints(
+        Program(groups, freedoms, size, count, a), _make_first_guess(assembly, groups)
     )
-    _check_drives(assembly, held)
-    groups, places, count = _groups(assembly, wanted, held)
-    program = Program(
-        groups, freedoms, size, count, len(assembly.actuators), _weights(assembly, groups, freedoms)
-    )
-    guess = _guess(assembly, groups)
-    notes = tuple(
-        _spin_note(assembly, limb, joint) for limb in sorted(held) for joint in held[limb]
-    )
-    slots = _slot_map(assembly, table, places, count)
-    units = {**DEFAULT_UNITS, **(units or {})}
+    _check_drives(assembly, idle)
+    groups, places, count = _group_limbs(assembly, wanted, idle)
+    weights = _weigh_actuators(assembly, groups, freedoms)
     robot = Mechanism(
-        assembly, table, table.nominal, program, slots, size, guess, units, notes, record
+        assembly,
+        table,
+        table.nominal,
+        Program(groups, freedoms, size, count, a, weights),
+        _map_slots(assembly, table, places, count),
+        size,
+        _make_first_guess(assembly, groups),
+        {**DEFAULT_UNITS, **(units or {})},
+        tuple(_report_locked(assembly, i, j) for i in sorted(idle) for j in idle[i]),
+        record,
     )
-    return mobility.check_mobility(replace(robot, home_state=_home(robot)))
+    return check_mobility(replace(robot, home_state=_find_home(robot)))
 
 
-def characteristic_length(assembly: Assembly) -> float:
-    """Root mean square distance [m] between the points where limbs leave the base and those where
-    they meet the platform.
+def compute_characteristic_length(assembly: Assembly) -> float:
+    """Return the root mean square distance [m] between base points, platform points and each other.
 
-    Where these all lie in one point, the root mean square of links and rods; DEFAULT_SIZE where
-    every length is zero.
+    Base points are those where limbs leave the base, platform points those where they end. If all
+    coincide, the result is the root mean square of links and rods; DEFAULT_SIZE if every length is
+    zero.
     """
     home = assembly.home
     gaps = [
@@ -105,100 +104,13 @@ def characteristic_length(assembly: Assembly) -> float:
         for link in (*limb.links, limb.attachment)
     ]
     links += [limb.length for limb in assembly.limbs]
-    if size > POINT * max(links):  # else the points coincide but for rounding
+    if size > POINT * max(links):
         return size
     return float(np.sqrt(np.mean(np.square(links)))) or DEFAULT_SIZE
 
 
-def _check_names(assembly: Assembly) -> None:
-    names = [limb.name for limb in assembly.limbs]
-    for kind, found in (("limb", names), ("actuator", [a.name for a in assembly.actuators])):
-        for name in found:
-            if found.count(name) > 1:
-                raise MechanismError(
-                    f"two {kind}s are called {name!r}; every {kind} needs its own name"
-                )
-    driven = [
-        name
-        for limb in assembly.limbs
-        for name in (*(j.actuator for j in limb.joints), limb.actuator)
-        if name
-    ]
-    for actuator in assembly.actuators:
-        if actuator.name not in driven:
-            raise MechanismError(
-                f"actuator {actuator.name!r} drives 0 joints; it must drive one, or one in each of "
-                "several limbs"
-            )
-    unknown = sorted(set(driven) - {a.name for a in assembly.actuators})
-    if unknown:
-        raise MechanismError(
-            f"a joint is driven by {unknown[0]!r}, which is not among the actuators; add it or "
-            "mend the name"
-        )
-    for limb in assembly.limbs:
-        own = [name for name in (*(j.actuator for j in limb.joints), limb.actuator) if name]
-        if len(set(own)) < len(own):
-            raise MechanismError(
-                f"limb {limb.name!r} is driven twice by {own[0]!r}; a drive may move one joint of "
-                "a limb"
-            )
-        if limb.ending not in ROWS:
-            raise MechanismError(
-                f"limb {limb.name!r} ends in {limb.ending!r}; allowed endings are {', '.join(ROWS)}"
-            )
-        if len(limb.links) != len(limb.joints) + 1:
-            raise MechanismError(
-                f"limb {limb.name!r} has {len(limb.joints)} joints and {len(limb.links)} links; "
-                "links are one more than joints"
-            )
-
-
-def _check_freedoms(assembly: Assembly) -> None:
-    """Freedoms and controlled coordinates: there are some, all known, each named once."""
-    found = assembly.freedoms
-    wrong = [f for f in found if f not in AXES]
-    if wrong:
-        raise MechanismError(
-            f"{wrong[0]!r} is not a freedom of a platform; allowed are {', '.join(AXES)}"
-        )
-    if not found:
-        raise MechanismError(
-            f"{assembly.name} has no freedoms; state those its platform has, of {', '.join(AXES)}"
-        )
-    twice = [f for f in found if found.count(f) > 1]
-    if twice:
-        raise MechanismError(
-            f"the freedom {twice[0]!r} is named twice in {', '.join(found)}; name each once"
-        )
-    if not assembly.controlled:
-        raise MechanismError(
-            f"{assembly.name} names no controlled coordinate; state one for each freedom, of "
-            f"{', '.join(COORDINATES)}"
-        )
-    check_coordinates(assembly.controlled)
-
-
-def _check_ranges(assembly: Assembly) -> None:
-    """Strokes and limits run upwards."""
-    units = {Dimension.LENGTH: "m", Dimension.ANGLE: "rad"}
-    ranges = [
-        (f"stroke of {a.name} runs", a.stroke, units.get(a.dimension, ""))
-        for a in assembly.actuators
-    ]
-    for limb in assembly.limbs:
-        ranges += [
-            (f"limits of {limb.name}.{j.name} run", j.limits, "rad" if j.kind == "R" else "m")
-            for j in limb.joints
-        ]
-    for what, found, symbol in ranges:
-        if found and not found[0] < found[1]:
-            raise MechanismError(
-                f"the {what} from {found[0]:g} to {found[1]:g} {symbol}; the first must be smaller"
-            )
-
-
 def _check_addresses(assembly: Assembly, wanted: set[Address]) -> None:
+    """Refuse maps onto addresses that the mechanism does not have."""
     limbs = {limb.name: limb for limb in assembly.limbs}
     actuators = {a.name for a in assembly.actuators}
     for address in sorted(wanted, key=str):
@@ -208,16 +120,16 @@ def _check_addresses(assembly: Assembly, wanted: set[Address]) -> None:
             and address.axis in TERMS
         ):
             continue
-        if address.owner in limbs and _slot(limbs[address.owner], address) is not None:
+        if address.owner in limbs and _find_slot(limbs[address.owner], address) is not None:
             continue
         raise MechanismError(
-            f"a parameter is mapped onto {address}, which this mechanism does not have; mend the "
-            "map"
+            f"a parameter is mapped onto {address}, which this mechanism does not have; correct "
+            "the map"
         )
 
 
-def _slot(limb: Limb, address: Address) -> Slot | None:
-    """The slot of an address in a limb, None where there is none."""
+def _find_slot(limb: Limb, address: Address) -> Slot | None:
+    """Return the slot of an address in a limb, None if the limb does not have it."""
     joints = [j.name for j in limb.joints]
     if address.axis == "length":
         return (
@@ -236,96 +148,86 @@ def _slot(limb: Limb, address: Address) -> Slot | None:
     return Slot(links.index(address.element), AXES.index(address.axis))
 
 
-def _check_drives(assembly: Assembly, held: Mapping[int, tuple[int, ...]]) -> None:
+def _check_drives(assembly: Assembly, idle: Mapping[int, tuple[int, ...]]) -> None:
     """Refuse a limb whose drive moves nothing but the limb itself."""
     for i, limb in enumerate(assembly.limbs):
-        driven = sum(bool(j.actuator) for j in limb.joints) + bool(limb.actuator)
-        free, rows = (
-            len(limb.joints) + bool(limb.actuator) - len(held.get(i, ())),
-            len(_rows(limb.ending, assembly.freedoms)),
-        )
-        if driven and free > rows:
+        joints = len(limb.joints) + bool(limb.actuator) - len(idle.get(i, ()))
+        equations = len(_select_rows(limb.ending, assembly.freedoms))
+        if limb.drives and joints > equations:
+            excess = joints - equations
             raise MechanismError(
-                f"limb {limb.name!r} has {free} joints, but {rows} closure equations: its drive "
-                "moves the limb and not the "
-                f"platform; leave out {_joints(free - rows)}, or make their axes such that they "
-                "only spin the limb"
+                f"limb {limb.name!r} has {joints} joints, but {equations} closure equations: its "
+                f"drive moves the limb and not the platform; leave out {excess} "
+                f"joint{'s' if excess > 1 else ''}, or let their axes spin the limb only"
             )
 
 
-def _joints(count: int) -> str:
-    return f"{count} joint{'s' if count > 1 else ''}"
-
-
-def _groups(
-    assembly: Assembly, wanted: set[Address], held: Mapping[int, tuple[int, ...]]
+def _group_limbs(
+    assembly: Assembly, wanted: set[Address], locked: Mapping[int, tuple[int, ...]]
 ) -> tuple[tuple[Group, ...], dict[Address, int], int]:
-    """Group limbs of one structure, by what is held in them too; give every displacement its place
-    in e.
+    """Group limbs of one structure and of the same locked joints; place displacements in e.
+
+    Returns the groups, the place of each address and the length of e.
     """
-    column = {a.name: i for i, a in enumerate(assembly.actuators)}
     alike: dict[tuple, list[int]] = {}
     for i, limb in enumerate(assembly.limbs):
-        drive = tuple(bool(j.actuator) for j in limb.joints), bool(limb.actuator)
-        alike.setdefault(
-            (limb.ending, tuple(j.kind for j in limb.joints), drive, held.get(i, ())), []
-        ).append(i)
+        drives = tuple(bool(j.actuator) for j in limb.joints), bool(limb.actuator)
+        kinds = tuple(j.kind for j in limb.joints)
+        alike.setdefault((limb.ending, kinds, drives, locked.get(i, ())), []).append(i)
     groups, places, count = [], {}, 0
-    for (ending, kinds, _, still), members in alike.items():
+    for (ending, kinds, _, fixed), members in alike.items():
         limbs = [assembly.limbs[i] for i in members]
-        own = [{a: _slot(limb, a) for a in wanted if a.owner == limb.name} for limb in limbs]
-        slots = tuple(
-            sorted(
-                {s for found in own for s in found.values() if s}, key=lambda s: (s.element, s.axis)
-            )
-        )
-        for found in own:
+        by_limb = [{a: _find_slot(m, a) for a in wanted if a.owner == m.name} for m in limbs]
+        used = {slot for found in by_limb for slot in found.values() if slot}
+        slots = tuple(sorted(used, key=lambda s: (s.element, s.axis)))
+        first = count
+        for found in by_limb:
             places |= {a: count + slots.index(s) for a, s in found.items() if s}
             count += len(slots)
-        drives = [
-            [
-                *(column[j.actuator] if j.actuator else -1 for j in limb.joints),
-                column.get(limb.actuator or "", -1),
-            ]
-            for limb in limbs
-        ]
+        transforms = [[link.transform for link in (*m.links, m.attachment)] for m in limbs]
+        pitch = np.array([[j.pitch for j in m.joints] for m in limbs])
         groups.append(
             Group(
                 tuple(members),
                 "".join(kinds),
-                np.array(drives, dtype=np.int64).T.reshape(len(kinds) + 1, len(limbs)),
-                tuple(j in still for j in range(len(kinds))),
+                _number_actuators(assembly, limbs),
+                tuple(j in fixed for j in range(len(kinds))),
                 ending,
-                _rows(ending, assembly.freedoms),
-                np.array(
-                    [[link.transform for link in (*limb.links, limb.attachment)] for limb in limbs]
-                ),
-                np.array([[j.pitch for j in limb.joints] for limb in limbs]).reshape(
-                    len(limbs), len(kinds)
-                ),
-                np.array([limb.length for limb in limbs]),
+                _select_rows(ending, assembly.freedoms),
+                np.array(transforms),
+                pitch.reshape(len(limbs), len(kinds)),
+                np.array([m.length for m in limbs]),
                 slots,
-                slice(count - len(slots) * len(limbs), count),
+                slice(first, count),
             )
         )
     return tuple(groups), places, count
 
 
-def _rows(ending: str, freedoms: tuple[str, ...]) -> tuple[int, ...]:
-    """Rows of an ending that lie in the platform's freedoms: closure of a planar machine is asked
-    for in its plane.
-    """
+def _number_actuators(assembly: Assembly, limbs: list[Limb]) -> IntArray:
+    """Return the actuators (J + 1, k) of each joint and rod of limbs, -1 for passive ones."""
+    column = {a.name: i for i, a in enumerate(assembly.actuators)}
+    drives = [
+        [column[name] if name else -1 for name in (*(j.actuator for j in m.joints), m.actuator)]
+        for m in limbs
+    ]
+    return np.array(drives, dtype=np.int64).T.reshape(len(limbs[0].joints) + 1, len(limbs))
+
+
+def _select_rows(ending: str, freedoms: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the rows of an ending in the platform's freedoms, such as those of a plane."""
     if ending == "distance":
         return (0,)
     axes = AXES if ending == "rigid" else AXES[3:]
     return tuple(i for i, axis in enumerate(axes) if axis in freedoms)
 
 
-def _weights(
+def _weigh_actuators(
     assembly: Assembly, groups: tuple[Group, ...], freedoms: tuple[int, ...]
 ) -> tuple[float, ...] | None:
-    """Relative standard deviations of redundant actuators, the largest one 1; None where no
-    actuator is redundant.
+    """Return relative standard deviations of redundant actuators, the largest one 1.
+
+    None without redundant actuators.
     """
     if len(assembly.actuators) <= len(freedoms):
         return None
@@ -336,34 +238,34 @@ def _weights(
             limb = assembly.limbs[group.limbs[0]].name
             raise MechanismError(
                 f"{assembly.name} has {len(assembly.actuators)} actuators for {len(freedoms)} "
-                f"freedoms, and limb {limb!r} has "
-                f"{driven} of them and {rows} closure equations; redundant actuation needs limbs "
-                "with one of each"
+                f"freedoms, and limb {limb!r} has {driven} of them and {rows} closure equations; "
+                "redundant actuation needs limbs with one of each"
             )
     sigma = [a.sigma if a.sigma is not None else 1.0 for a in assembly.actuators]
     if len({a.sigma is None for a in assembly.actuators}) > 1 or min(sigma) <= 0:
         raise MechanismError(
-            f"{assembly.name} has more actuators than freedoms; state a positive sigma for each of "
-            "them, or for none"
+            f"{assembly.name} has more actuators than freedoms; state a positive sigma for every "
+            "actuator, or for none"
         )
     return tuple(s / max(sigma) for s in sigma)
 
 
-def _spin_note(assembly: Assembly, limb: int, joint: int) -> str:
-    """What is said of a joint that moves only its limb."""
-    owner = assembly.limbs[limb]
-    held = owner.joints[joint]
-    what, unit = ("spin about itself", "rad") if held.kind == "R" else ("slide along itself", "m")
-    return (
-        f"limb {owner.name} can {what} without moving the platform; "
-        f"its joint {held.name} is held at {held.start:g} {unit}, which changes no pose"
+def _report_locked(assembly: Assembly, limb: int, joint: int) -> Finding:
+    """Return the finding of a joint that moves nothing but its limb."""
+    owner, turns = assembly.limbs[limb], assembly.limbs[limb].joints[joint].kind == "R"
+    return report_finding(
+        "mechanism.locked-joint",
+        limb=owner.name,
+        joint=owner.joints[joint].name,
+        turns=turns,
+        value=Quantity(owner.joints[joint].start, "rad" if turns else "m"),
     )
 
 
-def _slot_map(
+def _map_slots(
     assembly: Assembly, table: ParameterTable, places: dict[Address, int], count: int
 ) -> SlotMap:
-    """The maps as one matrix and the shared functions with their places."""
+    """Return the linear maps as one matrix and the shared maps with their places."""
     actuators = {a.name: i for i, a in enumerate(assembly.actuators)}
 
     def place(address: Address) -> int:
@@ -382,8 +284,8 @@ def _slot_map(
     return SlotMap(matrix, shared, table.nominal, count, terms, w)
 
 
-def _guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
-    """The start of the search for home: the home pose with every joint at its `start`."""
+def _make_first_guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
+    """Return the start of the search for home: the home pose with every joint at its `start`."""
     joints = []
     for group in groups:
         limbs = [assembly.limbs[i] for i in group.limbs]
@@ -401,31 +303,34 @@ def _guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
     )
 
 
-def _home(robot: Mechanism) -> State:
-    """The closed state at the home pose's controlled coordinates; raises MechanismError where the
-    loops cannot close.
+def _find_home(robot: Mechanism) -> State:
+    """Return the closed state at the controlled coordinates of the home pose.
+
+    Raises
+    ------
+    MechanismError
+        Too few controlled coordinates, or loops that cannot be closed.
     """
-    values = robot.values[None]
-    target = read_coordinates(robot.assembly.home[None, None], robot.controlled)
-    program = robot.program
-    movable = len(program.freedoms) - sum(
+    program, values = robot.program, robot.values[None]
+    equations = sum(
         len(g.limbs) * (len(g.rows) - len(g.unknown_joints(True))) for g in program.groups
     )
-    movable -= count_shared_drives(program)
+    shared = count_shared_drives(program)
+    movable = len(program.freedoms) - equations - shared
     if len(robot.controlled) < movable:
         raise MechanismError(
-            f"{robot.name} can be moved in {movable} freedoms or more, but {len(robot.controlled)} "
-            "controlled coordinates are "
-            f"named ({', '.join(robot.controlled)}); name one for every freedom, or state fewer "
-            "`freedoms:`"
+            f"{robot.name} can be moved in {movable} freedoms or more, but names only "
+            f"{len(robot.controlled)} controlled coordinates ({', '.join(robot.controlled)}); name "
+            "one for every freedom, or state fewer `freedoms:`"
         )
+    target = read_coordinates(robot.assembly.home[None, None], robot.controlled)
     state = inverse_trials(robot, values, target)
     if state.status[0, 0] != engine.CONVERGED:
-        if not count_shared_drives(program):
-            mobility.refuse_uncontrolled(robot, robot.home_state)
+        if not shared:
+            refuse_uncontrolled(robot, robot.home_state)
         raise MechanismError(
-            f"{robot.name} cannot close at its home pose: the loops stay "
-            f"{state.residual[0, 0] * 1e3:.3g} mm open; "
-            "check the joint centres, lengths and home"
+            f"the loops of {robot.name} cannot be closed at its home pose: "
+            f"{state.residual[0, 0] * 1e3:.3g} mm stay open; check the joint centers, the lengths "
+            "and `home:`"
         )
     return replace(state, closure_sign=compute_closure_sign(robot, values, state))

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Forward and inverse kinematics of any mechanism: one solution type, a status for every row."""
+"""Forward and inverse kinematics and the Jacobian of a robot, with a status for every row.
+
+A full pose that a machine with fewer freedoms cannot take is projected: Gauss-Newton on
+|log(R R*')|^2 size^2 + |t - t*|^2 along the controlled coordinates, with slopes from closure
+linearized with every actuator free. Source: docs/theory/kinematics.md.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +14,34 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loopcal import engine, geometry
 from loopcal.engine import State
 from loopcal.errors import DataError
-from loopcal.mechanism.batch_kinematics import compute_readings, forward_trials, inverse_trials
-from loopcal.mechanism.model import Mechanism, Status
-from loopcal.mechanism.projection import find_nearest_reachable
-from loopcal.mechanism.states import select_poses
+from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.mechanism.assembly import AXES
+from loopcal.mechanism.batch_kinematics import (
+    compute_readings,
+    count_shared_drives,
+    forward_trials,
+    inverse_trials,
+)
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.platform_coordinates import compare_coordinates, read_coordinates
+from loopcal.mechanism.sensitivity import (
+    differentiate_pose,
+    name_passive_joints,
+    stack_platform_rows,
+)
+from loopcal.mechanism.states import Status, select_poses
 from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.units import Dimension
 
-APART = 1e-9
-"""Gap [m] above which a converged row, which then has redundant readings, is not called closed."""
-
-
+COMPROMISE = 1e-9
+"""Residual [m] of a converged row above which its redundant readings contradict each other."""
 ROTATION = 1e-6
-"""How far R'R may be from the identity: what a file with seven digits leaves."""
+"""Largest deviation of R'R from the identity: the rounding of a file with seven digits."""
+PROJECTION_STEPS = 12
+"""Gauss-Newton steps of a projection."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -34,7 +53,7 @@ class Solution:
     T : (n, 4, 4) platform in base [m]. q : (n, a) readings [m or rad].
     passive : (n, j) passive joint values, limb by limb [m or rad]; `passive_names` names them.
     status : (n,) members of Status. residual : (n,) closure residual [m]. iterations : (n,) Newton
-        steps.
+        steps. state : the same rows for the engine.
     """
 
     T: FloatArray
@@ -46,41 +65,53 @@ class Solution:
     iterations: IntArray
     state: State
 
+    def __len__(self) -> int:
+        return len(self.q)
+
     def __repr__(self) -> str:
-        lost = int((~self.converged).sum())
-        first = f"; {self.explain(int(np.flatnonzero(~self.converged)[0]))}" if lost else ""
+        """Return counts, the largest residual and the reason of the first failure."""
+        failed = np.flatnonzero(~self.converged)
         gap = self.residual[self.converged].max(initial=0.0)
-        return f"Solution of {len(self.q)} rows, {lost} not closed, the others to {gap * 1e3:.2g} mm{first}"
+        text = f"<Solution: {len(self) - len(failed)} of {len(self)} rows closed"
+        if len(failed) < len(self):
+            text += f", residual at most {Quantity(float(gap) * 1e3, 'mm')}"
+        if len(failed):
+            text += f"; row {failed[0]}: {self.explain(int(failed[0]))}"
+        return text + ">"
 
     @property
     def converged(self) -> BoolArray:
-        """(n,) True where the loops are closed in the mode of the start."""
+        """Rows (n,) that are closed in the mode of the start."""
         return self.status == Status.CONVERGED
 
     def take(self, rows: NDArray[Any]) -> Solution:
-        """These rows, by position or by a mask (n,)."""
-        cut = {
+        """Return these rows, by position or by a mask (n,)."""
+        chosen = {
             name: getattr(self, name)[rows]
             for name in ("T", "q", "passive", "status", "residual", "iterations")
         }
-        return replace(self, **cut, state=select_poses(self.state, rows))
+        return replace(self, **chosen, state=select_poses(self.state, rows))
 
-    def explain(self, row: int) -> str:
-        """What became of a row, in a sentence."""
-        status = Status(int(self.status[row]))
-        apart = status == Status.CONVERGED and self.residual[row] > APART
-        sentence = "as near as contradicting readings allow" if apart else status.sentence
-        return f"row {row}: {sentence} ({self.residual[row] * 1e3:.3g} mm open after {self.iterations[row]} steps)"
+    def explain(self, row: int) -> Finding:
+        """Return how a row ended."""
+        status, gap = Status(int(self.status[row])), float(self.residual[row])
+        is_compromise = status == Status.CONVERGED and gap > COMPROMISE
+        return report_finding(
+            "kinematics.compromise" if is_compromise else status.code,
+            row=row,
+            gap=Quantity(gap * 1e3, "mm"),
+            iterations=int(self.iterations[row]),
+        )
 
 
 def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> Solution:
-    """Poses that readings lead to, by Newton on the loop closure from `start` (default: home).
+    """Solve forward kinematics by Newton's method on the loop closure, beginning at `start`.
 
     Parameters
     ----------
     q : (n, a) readings [m or rad], or (n, 2 a) with their directions of approach (+1, -1, 0
         unknown) behind them.
-    start : a solution of one row or n rows that chooses the assembly mode.
+    start : a solution of one row or n rows that selects the assembly mode (default: home).
 
     Returns
     -------
@@ -89,47 +120,47 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
     Raises
     ------
     DataError
-        q has another number of columns than the robot has actuators.
+        Not numbers, or another number of columns than the robot has actuators.
     """
-    readings = np.atleast_2d(np.asarray(q, dtype=float))
-    if readings.ndim != 2 or readings.shape[1] not in (
-        len(robot.actuators),
-        2 * len(robot.actuators),
-    ):
+    _check_robot(robot, "forward")
+    a = len(robot.actuators)
+    readings = np.atleast_2d(_as_numbers(q, f"readings as numbers of shape (n, {a})"))
+    if readings.ndim != 2 or readings.shape[1] not in (a, 2 * a):
         raise DataError(
-            f"{readings.shape[-1]} readings a row were given, but {robot.name} has "
-            f"{len(robot.actuators)} actuators "
-            f"({', '.join(a.name for a in robot.actuators)})"
+            f"{readings.shape[-1]} readings a row were given, but {robot.name} has {a} actuators "
+            f"({', '.join(actuator.name for actuator in robot.actuators)}); give one reading for "
+            "each"
         )
-    state = forward_trials(
-        robot, robot.values[None], readings[None], None if start is None else start.state
-    )
-    return make_solution(robot, state, readings[:, : len(robot.actuators)])
+    begin = None if start is None else _check_start(start)
+    state = forward_trials(robot, robot.values[None], readings[None], begin)
+    return make_solution(robot, state, readings[:, :a])
 
 
 def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) -> Solution:
-    """Readings that lead to poses.
+    """Solve inverse kinematics: return the readings that lead to poses.
 
     Parameters
     ----------
     target : (n, 4, 4) platform in base, or (n, c) controlled coordinates in the order of
-        `robot.controlled` [m, rad]. A pose that the machine has too few freedoms for is projected:
-        of the reachable poses the one is taken that minimises |log(R R_target')|^2 size^2 + |t -
-        t_target|^2, with `robot.size`.
-    start : solution that chooses the working mode (default: home).
+        `robot.controlled` [m, rad]. A pose that the machine has too few freedoms for is projected
+        to the reachable pose that minimizes |log(R R_target')|^2 size^2 + |t - t_target|^2, with
+        `robot.size`.
+    start : solution that selects the working mode (default: home).
 
     Returns
     -------
-    Solution; rows that fail are marked in `status`.
+    Solution; rows that fail are marked in `status`, never raised.
 
     Raises
     ------
     DataError
-        The target has another shape.
+        Not numbers, another shape, or a matrix that is not a pose.
     """
-    wanted = np.asarray(target, dtype=float)
+    _check_robot(robot, "inverse")
     c = len(robot.controlled)
-    values, begin = robot.values[None], None if start is None else start.state
+    shapes = f"(n, 4, 4) poses or (n, {c}) coordinates ({', '.join(robot.controlled)})"
+    wanted = _as_numbers(target, shapes)
+    values, begin = robot.values[None], None if start is None else _check_start(start)
     if wanted.ndim >= 2 and wanted.shape[-2:] == (4, 4):
         T = wanted.reshape(-1, 4, 4)
         _check_poses(T)
@@ -137,20 +168,195 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
     elif wanted.ndim in (1, 2) and wanted.shape[-1] == c:
         state = inverse_trials(robot, values, np.atleast_2d(wanted)[None], begin)
     else:
-        raise DataError(
-            f"a target of shape {wanted.shape} was given; allowed are (n, 4, 4) poses or (n, {c}) "
-            "coordinates "
-            f"({', '.join(robot.controlled)})"
-        )
+        raise DataError(f"a target of shape {wanted.shape} was given; allowed are {shapes}")
     return make_solution(robot, state, compute_readings(robot, values, state)[0])
 
 
+def make_solution(robot: Mechanism, state: State, q: FloatArray) -> Solution:
+    """Return the solution of a state (1, n) with readings (n, a)."""
+    columns = {}
+    for group, joints in zip(robot.program.groups, state.joints, strict=True):
+        for k, i in enumerate(group.limbs):
+            limb = robot.assembly.limbs[i]
+            for j, joint in enumerate(limb.joints):
+                columns[f"{limb.name}.{joint.name}"] = joints[0, :, k, j]
+    names = name_passive_joints(robot)
+    passive = np.zeros((len(q), len(names)))
+    for i, name in enumerate(names):
+        passive[:, i] = columns[name]
+    return Solution(
+        state.T[0],
+        q,
+        passive,
+        names,
+        state.status[0],
+        state.residual[0],
+        state.iterations[0],
+        state,
+    )
+
+
+@dataclass(frozen=True, repr=False)
+class Jacobian:
+    """Derivatives of n poses in parameters and readings, labelled.
+
+    The platform's twist has the rows `components`: rotation (rx, ry, rz) [rad] about base axes,
+    then the translation (x, y, z) [m] of its origin.
+
+    Attributes
+    ----------
+    parameters : (n, 6, p) per unit of each parameter. parameter_names : (p,) parameter_units : (p,)
+        SI units, m, rad or 1.
+    readings : (n, 6, a) per unit of each reading. reading_names : (a,) reading_units : (a,).
+    solution : the poses.
+    """
+
+    parameters: FloatArray
+    parameter_names: tuple[str, ...]
+    parameter_units: tuple[str, ...]
+    readings: FloatArray
+    reading_names: tuple[str, ...]
+    reading_units: tuple[str, ...]
+    solution: Solution
+
+    components = AXES
+
+    def __repr__(self) -> str:
+        n, p, a = len(self.parameters), len(self.parameter_names), len(self.reading_names)
+        return (
+            f"<Jacobian of {n} poses: parameters {(n, 6, p)}, readings {(n, 6, a)}; rows "
+            f"{', '.join(self.components)} [rad, m] per unit of parameter or reading>"
+        )
+
+    def of(self, name: str) -> FloatArray:
+        """Return the columns (n, 6) of one parameter or reading, by name."""
+        for names, columns in (
+            (self.parameter_names, self.parameters),
+            (self.reading_names, self.readings),
+        ):
+            if name in names:
+                return columns[..., names.index(name)]
+        raise DataError(
+            f"the Jacobian has no column {name!r}; its columns are the parameters of the robot and "
+            f"the readings {', '.join(self.reading_names)}"
+        )
+
+
+def jacobian(robot: Mechanism, readings: ArrayLike, start: Solution | None = None) -> Jacobian:
+    """Differentiate the poses at readings (n, a) in every parameter and reading.
+
+    Parameters and raised errors as for `forward`. Rows that fail have NaN.
+    """
+    solution = forward(robot, readings, start)
+    values = robot.values[None]
+    found = differentiate_pose(robot, values, solution.q[None], solution.state)
+    units = {Dimension.LENGTH: "m", Dimension.ANGLE: "rad", Dimension.RATIO: "1"}
+    return Jacobian(
+        found.parameters[0],
+        robot.parameters.names,
+        tuple(units[d] for d in robot.parameters.dimensions),
+        found.readings[0],
+        tuple(a.name for a in robot.actuators),
+        tuple(units[a.dimension] for a in robot.actuators),
+        solution,
+    )
+
+
+def find_nearest_reachable(
+    robot: Mechanism, values: FloatArray, T: FloatArray, start: State | None = None
+) -> State:
+    """Return states (t, n) with the reachable pose nearest to T (t | 1, n, 4, 4)."""
+    state = inverse_trials(robot, values, read_coordinates(T, robot.controlled), start)
+    if len(robot.controlled) == 6 or set(robot.controlled) == set(robot.freedoms):
+        return state
+    weight = np.array([robot.size] * 3 + [1.0] * 3)
+    for _ in range(PROJECTION_STEPS):
+        gap = geometry.pose_difference(state.T, np.broadcast_to(T, state.T.shape))
+        slope = differentiate_by_coordinates(robot, values, state)
+        inverse_slope = np.linalg.pinv(slope * weight[:, None])
+        step = np.matmul(inverse_slope, (-gap * weight)[..., None])[..., 0]
+        step = np.where(np.isfinite(step), step, 0.0)
+        moved = geometry.apply_twist(state.T, np.matmul(slope, step[..., None])[..., 0])
+        target = read_coordinates(moved, robot.controlled)
+        state = inverse_trials(robot, values, target, state)
+        if np.abs(step).max(initial=0.0) < 1e-12 * robot.size:
+            break
+    return state
+
+
+def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: State) -> FloatArray:
+    """Return d twist / d coordinate (t, n, 6, c), every actuator free [1/m, 1].
+
+    Coordinates are in the units of `compare_coordinates`.
+    """
+    names, freedoms = robot.controlled, list(robot.program.freedoms)
+    t, n = state.T.shape[:2]
+    flat = state.T.reshape(-1, 4, 4)
+    _, columns = compare_coordinates(flat, read_coordinates(flat, names), names, robot.size)
+    columns = columns.reshape(t, n, len(names), 6)
+    if count_shared_drives(robot.program):
+        q = compute_readings(robot, values, state)
+        D = differentiate_pose(robot, values, q, state).readings
+        return np.matmul(D, np.linalg.pinv(np.nan_to_num(np.matmul(columns, D))))
+    e, _ = robot.slots(values)
+    unused = np.zeros((1, n, robot.program.n_joints))
+    rows = stack_platform_rows(engine.linearize(robot.program, e, unused, state, free=True))
+    both = np.concatenate([rows, columns[..., freedoms]], axis=2)
+    right = np.zeros((*both.shape[:3], len(names)))
+    right[:, :, rows.shape[2] :] = np.eye(len(names))
+    out = np.zeros((t, n, 6, len(names)))
+    good = np.asarray(np.isfinite(both).all(axis=(-1, -2)))
+    solved = np.matmul(np.linalg.pinv(both[good]), right[good])
+    out[good[..., None] & np.isin(np.arange(6), freedoms)] = solved.reshape(-1, len(names))
+    return out
+
+
+def _check_robot(robot: object, function: str) -> None:
+    """Refuse anything but a Mechanism as the robot."""
+    if not isinstance(robot, Mechanism):
+        raise DataError(
+            f"{function} needs a robot as returned by loopcal.load_robot, not "
+            f"{_describe_argument(robot)}"
+        )
+
+
+def _check_start(start: object) -> State:
+    """Return the state of a start; refuse anything but a Solution."""
+    if not isinstance(start, Solution):
+        raise DataError(
+            "start must be a Solution, as forward and inverse return it, not "
+            f"{_describe_argument(start)}"
+        )
+    return start.state
+
+
+def _as_numbers(values: Any, allowed: str) -> FloatArray:
+    """Return an argument as an array of floats; refuse what is not made of numbers."""
+    try:
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        hint = ""
+        if isinstance(values, str):
+            hint = "; if it is a file, load it with loopcal.load_measurements and pass its readings"
+        elif hasattr(values, "readings"):
+            hint = "; pass its attribute readings"
+        raise DataError(
+            f"{_describe_argument(values)} was given; allowed are {allowed}{hint}"
+        ) from None
+
+
+def _describe_argument(value: object) -> str:
+    """Return an argument for a message: a text with its type, anything else by type."""
+    kind = type(value).__name__
+    return f"the text {value!r}" if isinstance(value, str) else f"an object of type {kind}"
+
+
 def _check_poses(T: FloatArray) -> None:
-    """Refuse matrices that are no pose: the first bad row and why."""
+    """Refuse matrices that are not poses: name the first bad row and the reason."""
     R = T[:, :3, :3]
     finite = np.asarray(np.isfinite(T).all(axis=(1, 2)))
-    turned = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2)) <= ROTATION
-    proper = turned & (np.linalg.det(np.where(finite[:, None, None], R, np.eye(3))) > 0)
+    orthogonal = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2)) <= ROTATION
+    proper = orthogonal & (np.linalg.det(np.where(finite[:, None, None], R, np.eye(3))) > 0)
     bottom = np.abs(T[:, 3] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=1) <= ROTATION
     # a row of NaN is marked in the solution, like readings that are NaN
     wrong = np.flatnonzero(finite & ~(proper & bottom))
@@ -162,29 +368,6 @@ def _check_poses(T: FloatArray) -> None:
             else "its upper left 3 x 3 is not a rotation (R'R = I, det +1)"
         )
         raise DataError(
-            f"target {row} is no pose: {reason}; give T_base_platform as (n, 4, 4) homogeneous "
-            "matrices"
+            f"target {row} is not a valid pose: {reason}; give T_base_platform as (n, 4, 4) "
+            "homogeneous matrices"
         )
-
-
-def make_solution(robot: Mechanism, state: State, q: FloatArray) -> Solution:
-    """The solution of a state (1, n) and its readings (n, a)."""
-    names, columns = [], []
-    for group, joints in zip(robot.program.groups, state.joints, strict=True):
-        for k, limb in enumerate(group.limbs):
-            for j, joint in enumerate(robot.assembly.limbs[limb].joints):
-                if joint.actuator is None:
-                    names.append((limb, f"{robot.assembly.limbs[limb].name}.{joint.name}"))
-                    columns.append(joints[0, :, k, j])
-    order = sorted(range(len(names)), key=lambda i: names[i][0])
-    passive = np.stack([columns[i] for i in order], axis=-1) if order else np.zeros((len(q), 0))
-    return Solution(
-        state.T[0],
-        q,
-        passive,
-        tuple(names[i][1] for i in order),
-        state.status[0],
-        state.residual[0],
-        state.iterations[0],
-        state,
-    )

@@ -1,63 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A mechanism: its structure compiled for the engine, its parameters, and their maps onto
-displacements.
-"""
+"""The compiled mechanism: its structure, its parameters and their maps onto displacements."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.engine import Program, State
+from loopcal.engine import Group, Program, State
 from loopcal.errors import MechanismError
+from loopcal.findings import Finding
 from loopcal.mechanism.assembly import Actuator, Assembly, SharedMap
-from loopcal.mechanism.limb_maps import LimbMap, build_limb_maps
+from loopcal.mechanism.transmission import TERMS
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
+SHOWN_ACTUATORS = 8
+"""Actuators that `repr` names before it counts the others."""
 
-class Status(IntEnum):
-    """How a row of a solution ended."""
-
-    CONVERGED = 0
-    UNREACHABLE = 1
-    NOT_CONVERGED = 2
-    NOT_FINITE = 3
-    OTHER_MODE = 4
-
-    @property
-    def sentence(self) -> str:
-        """What it means, for people."""
-        return _SENTENCES[self]
-
-
-_SENTENCES = {
-    Status.CONVERGED: "closed",
-    Status.UNREACHABLE: "the loops cannot be closed there: the nearest position leaves a gap",
-    Status.NOT_CONVERGED: "no solution within the allowed number of steps; try another start",
-    Status.NOT_FINITE: "the row holds NaN or infinity, or the mechanism is singular there",
-    Status.OTHER_MODE: "closed, but in another assembly mode than the start",
-}
+Columns = slice | IntArray
 
 
 @dataclass(frozen=True)
 class SlotMap:
-    """From parameter values to displacements e and transmission terms tau.
+    """Map of parameter values onto displacements e and transmission terms tau.
 
-    slots(v) = M (v - nominal) + sum over shared maps of [g(v) - g(nominal)]; the first
+    slots(v) = M (v - nominal) + sum over shared maps of [g(v) - g(nominal)]. The first
     `n_displacements` slots are e, the others the terms of the actuators, (a, 8) row by row.
 
     Attributes
     ----------
-    matrix : (s, p). shared : with, for each, the positions of its inputs and outputs.
-        n_displacements : length of e.
+    matrix : (s, p) M. shared : the shared maps, each with the positions of its inputs and outputs.
+    nominal : (p,). n_displacements : length of e.
     terms : (a, 8) nominal transmission terms. frequency : (a,) of their harmonics.
     """
 
@@ -69,10 +48,10 @@ class SlotMap:
     frequency: FloatArray
 
     def __call__(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Values (t, p) -> e (t, n_displacements), tau (t, a, 8)."""
+        """Return e (t, n_displacements) and tau (t, a, 8) of values (t, p)."""
         slots = np.zeros((len(values), len(self.matrix)))
         change = values - self.nominal
-        # element by element, so that a trial's result does not depend on its neighbours
+        # element by element, so that a trial's result does not depend on its neighbors
         for places, columns, coefficients in self._layers:
             slots[:, places] += change[:, columns] * coefficients
         for shared, inputs, outputs in self.shared:
@@ -84,7 +63,7 @@ class SlotMap:
 
     @cached_property
     def _layers(self) -> list[tuple[IntArray, IntArray, FloatArray]]:
-        """The matrix as (slots, parameters, coefficients), each slot once in a layer."""
+        """Return the matrix as (slots, parameters, coefficients), each slot once in a layer."""
         rows, columns = np.nonzero(self.matrix)
         nth = np.arange(len(rows)) - np.searchsorted(rows, rows)
         layers = (nth == i for i in range(nth.max(initial=-1) + 1))
@@ -95,14 +74,14 @@ class SlotMap:
 
     @cached_property
     def touches(self) -> BoolArray:
-        """Which parameters may move which slots, (s, p)."""
+        """Return which parameters may move which slots, (s, p)."""
         touches = self.matrix != 0
         for _, inputs, outputs in self.shared:
             touches[np.ix_(outputs, inputs)] = True
         return touches
 
     def jacobian(self, values: FloatArray) -> FloatArray:
-        """d slots / d values, (t, s, p)."""
+        """Return d slots / d values, (t, s, p)."""
         J = np.repeat(self.matrix[None], len(values), axis=0)
         for shared, inputs, outputs in self.shared:
             slopes = shared.jacobian(values[:, inputs])
@@ -113,18 +92,40 @@ class SlotMap:
 
 
 @dataclass(frozen=True)
+class LimbMap:
+    """The parameters and readings in the equations of one limb.
+
+    Attributes
+    ----------
+    displacements : those of the limb in e. parameters : those in its equations, as columns.
+    is_plain : whether each of these parameters is exactly one displacement of the limb, in the same
+        order and with coefficient 1.
+    drives : for each driven joint: the joint, its actuator, and the transmission terms that
+        parameters move.
+    readings : the actuators, as columns.
+    """
+
+    displacements: slice
+    parameters: Columns
+    is_plain: bool
+    drives: tuple[tuple[int, int, tuple[int, ...]], ...]
+    readings: Columns
+
+
+@dataclass(frozen=True, repr=False)
 class Mechanism:
     """A robot with closed loops, ready to compute.
 
     Attributes
     ----------
-    assembly : the generic description it was compiled from. record : the family record (None if
-        built by hand).
+    assembly : the generic description that it was compiled from. record : the family record; None
+        if it was built in Python.
     parameters : the unknowns. values : (p,) their present values [SI], read-only.
-    size : characteristic length [m]; angles times size compare with lengths.
-    home : (4, 4) T_base_platform of the home pose; home_readings : (a,) [m or rad].
-    units : display unit of each dimension, as the robot's file states them.
-    notes : sentences worth telling (a rod that spins about itself, a held joint).
+    program, slots : structure and parameter maps for the engine.
+    size : characteristic length [m]; an angle times the size compares with a length.
+    home_state : engine state of the home pose.
+    units : display unit of each dimension, as the robot file states them.
+    findings : remarks about the structure, such as locked joints or redundant constraints.
     """
 
     assembly: Assembly
@@ -135,8 +136,26 @@ class Mechanism:
     size: float
     home_state: State
     units: Mapping[Dimension, str]
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     record: Any = None
+
+    def __repr__(self) -> str:
+        """Return name, family, actuators, freedoms and counts, on a few lines."""
+        family = getattr(self.record, "family", None)
+        names = [a.name for a in self.actuators]
+        if len(names) > SHOWN_ACTUATORS:
+            names = [*names[:SHOWN_ACTUATORS], f"and {len(names) - SHOWN_ACTUATORS} more"]
+        at = "nominal" if np.array_equal(self.values, self.parameters.nominal) else "changed"
+        free = int(self.parameters.free.sum())
+        return "\n".join(
+            (
+                f"<Mechanism {self.name}{f', family {family}' if family else ''}",
+                f"  actuators: {', '.join(names)}",
+                f"  platform freedoms: {', '.join(self.freedoms)}",
+                f"  commanded in: {', '.join(self.controlled)}",
+                f"  parameters: {len(self.parameters)} ({free} free), at {at} values>",
+            )
+        )
 
     @property
     def name(self) -> str:
@@ -150,12 +169,12 @@ class Mechanism:
 
     @property
     def freedoms(self) -> tuple[str, ...]:
-        """The platform's freedoms."""
+        """Freedoms of the platform."""
         return self.assembly.freedoms
 
     @property
     def controlled(self) -> tuple[str, ...]:
-        """Coordinates the machine is commanded in."""
+        """Coordinates in which the machine is commanded."""
         return self.assembly.controlled
 
     @property
@@ -170,8 +189,11 @@ class Mechanism:
 
     @cached_property
     def limb_maps(self) -> tuple[tuple[LimbMap, ...], ...]:
-        """What stands in the equations of each limb, group by group."""
-        return build_limb_maps(self.program, self.slots.matrix, self.slots.touches)
+        """Maps of each limb, group by group."""
+        return tuple(
+            tuple(_map_limb(self.program, g, k, self.slots) for k in range(len(g.limbs)))
+            for g in self.program.groups
+        )
 
     @property
     def nominal(self) -> Mechanism:
@@ -179,17 +201,52 @@ class Mechanism:
         return self.with_values(self.parameters.nominal)
 
     def with_values(self, values: ArrayLike) -> Mechanism:
-        """The same robot with other parameter values (p,) [SI]; raises MechanismError for a wrong
-        count or NaN.
+        """Return the same robot with other parameter values (p,) [SI].
+
+        Raises
+        ------
+        MechanismError
+            Wrong number of values, or one that is not finite.
         """
         new = np.array(values, dtype=float)
         if new.shape != (len(self.parameters),):
             raise MechanismError(
-                f"{self.name} has {len(self.parameters)} parameters, but {new.shape} values were "
-                "given"
+                f"{self.name} has {len(self.parameters)} parameters, but values of shape "
+                f"{new.shape} were given; give one value for each"
             )
         if not np.isfinite(new).all():
             bad = self.parameters.names[int(np.flatnonzero(~np.isfinite(new))[0])]
             raise MechanismError(f"the value of {bad} is not finite; give a number")
         new.setflags(write=False)
         return replace(self, values=new)
+
+
+def _map_limb(program: Program, group: Group, k: int, slots: SlotMap) -> LimbMap:
+    """Return the map of limb k of a group."""
+    width = len(group.slots)
+    first = group.columns.start + k * width
+    place = slice(first, first + width)
+    touched, drives = slots.touches[place].any(axis=0), []
+    for j, actuator in enumerate(group.actuator[:, k]):
+        if actuator >= 0:
+            a = int(actuator)
+            begin = program.n_displacements + len(TERMS) * a
+            terms = slots.touches[begin : begin + len(TERMS)]
+            touched = touched | terms.any(axis=0)
+            drives.append((j, a, tuple(int(i) for i in np.flatnonzero(terms.any(axis=1)))))
+    columns = np.flatnonzero(touched)
+    one_each = np.array_equal(
+        slots.touches[place][:, columns], np.eye(width, len(columns), dtype=bool)
+    )
+    unit = width == len(columns) and np.array_equal(slots.matrix[place][:, columns], np.eye(width))
+    actuators = np.array([a for _, a, _ in drives], dtype=np.int64)
+    return LimbMap(
+        place, _as_columns(columns), one_each and unit, tuple(drives), _as_columns(actuators)
+    )
+
+
+def _as_columns(places: IntArray) -> Columns:
+    """Return consecutive places as a slice, which selects a view in place of a copy."""
+    if len(places) and (np.diff(places) == 1).all():
+        return slice(int(places[0]), int(places[-1]) + 1)
+    return places

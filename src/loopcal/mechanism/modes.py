@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All poses that one set of readings allows (assembly modes), and all readings that one pose allows
-(working modes).
+"""Assembly modes (all poses for one set of readings) and working modes (all readings for one pose).
 
-Newton from many random starts at once, as rows of one batch; solutions that agree are merged. New
-starts are drawn until a stated number of them in a row has found nothing new. That is evidence, not
-proof: a mode that few starts lead to can be missed, so the result says how often each was reached.
-Derivation: docs/theory/kinematics.md.
+Newton's method runs from many random starts at once, as rows of one batch; solutions that agree are
+merged. The search ends after a stated number of starts in a row without a new solution. That is
+evidence, not proof: a mode that few starts lead to can be missed, so the result says how often each
+mode was reached. Derivation: docs/theory/kinematics.md.
 """
 
 from __future__ import annotations
@@ -25,33 +24,30 @@ from loopcal.mechanism.batch_kinematics import (
     inverse_trials,
 )
 from loopcal.mechanism.kinematics import Solution, make_solution
-from loopcal.mechanism.model import Mechanism, Status
-from loopcal.mechanism.states import driven_values, join_states, select_poses
+from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.states import Status, driven_values, join_states, select_poses
 from loopcal.mechanism.transmission import joints_from_readings
 from loopcal.typing import FloatArray, IntArray
+from loopcal.units import Dimension
 
 BATCH = 2048
 """Starts solved together."""
 SAME = 1e-6
-"""Largest difference of two solutions that count as one: positions and lengths over the robot's
-size, angles in rad.
-"""
+"""Largest difference of equal solutions: lengths relative to the robot's size, angles in rad."""
 SCALES = (0.1, 1.0)
-"""Starting positions stand off the middle of the base points by about the size times a factor from
-this range.
-"""
+"""Range of the distance of starting positions from the middle of the base points, per size."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Modes:
     """Solutions found from random starts.
 
     Attributes
     ----------
-    solution : one row a mode, the nearest to home first (its pose, or for working modes its
-        readings); with `start=` it chooses the mode elsewhere.
-    hits : (modes,) starts that led to each. starts : how many were tried. quiet : how many since
-        the last new mode.
+    solution : one row for each mode, ordered by the distance from home (of its pose, or for working
+        modes of its readings). As `start=` of `forward` or `inverse` it selects the mode.
+    hits : (modes,) starts that led to each mode. starts : number of starts.
+    starts_since_new : starts since the last new mode.
     """
 
     solution: Solution
@@ -63,9 +59,29 @@ class Modes:
         return len(self.hits)
 
     def __str__(self) -> str:
-        found = f"{len(self)} modes found" if len(self) != 1 else "1 mode found"
-        rarest = f"; the rarest was reached {self.hits.min()} times" if len(self) else ""
-        return f"{found} from {self.starts} random starts, the last {self.starts_since_new} without a new one{rarest}"
+        count = f"{len(self)} modes" if len(self) != 1 else "1 mode"
+        rarest = f"; rarest mode reached {self.hits.min()} times" if len(self) else ""
+        return (
+            f"{count} from {self.starts} random starts, none new in the last "
+            f"{self.starts_since_new}{rarest}"
+        )
+
+    def __repr__(self) -> str:
+        return f"<Modes: {self}>"
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """A search for modes.
+
+    solve : solve random starts. identify : numbers (n, k) that agree for equal solutions only.
+    measure : distance from home (n, k). read : readings (n, a) of solutions.
+    """
+
+    solve: Callable[[State], State]
+    identify: Callable[[State], FloatArray]
+    measure: Callable[[State], FloatArray]
+    read: Callable[[State], FloatArray]
 
 
 def find_assembly_modes(
@@ -75,64 +91,52 @@ def find_assembly_modes(
     max_starts: int = 200_000,
     seed: int = 0,
 ) -> Modes:
-    """All poses of the platform that readings q (a,) allow [m or rad].
+    """Find all platform poses for readings q (a,) [m or rad].
 
     Starts have orientations spread evenly over all rotations (about the machine's free axes),
     positions at random distances from the middle of the base points, and random passive joints.
-    Poses are told apart, not passive joints.
+    Modes differ in their poses; passive joints are not compared.
 
     Parameters
     ----------
-    quiet : stop when so many starts in a row have found no new mode. most : starts before the
-        search is given up.
-    seed : of the random starts.
+    patience : end the search after this number of starts without a new mode. max_starts : starts
+        before the search is given up. seed : of the random starts.
 
     Returns
     -------
-    Modes; none where the readings allow no pose.
+    Modes; none if the readings allow no pose.
 
     Raises
     ------
     DataError
         q has another number of readings than the robot has actuators.
     MechanismError
-        `max_starts` starts were not enough for a quiet end.
+        New modes were still found after `max_starts` starts.
     """
     readings = np.asarray(q, dtype=float).reshape(-1)
     if len(readings) != len(robot.actuators):
         raise DataError(
             f"{len(readings)} readings were given, but {robot.name} has {len(robot.actuators)} "
-            "actuators"
+            "actuators; give one reading for each"
         )
     values = robot.values[None]
     e, tau = robot.slots(values)
-    driven = joints_from_readings(readings[None, None], tau, robot.slots.frequency)
+    joints = joints_from_readings(readings[None, None], tau, robot.slots.frequency)
 
-    def solved(start: State) -> State:
-        state = engine.solve(robot.program, e, driven, start)
+    def solve(start: State) -> State:
+        state = engine.solve(robot.program, e, joints, start)
         return replace(state, closure_sign=compute_closure_sign(robot, values, state))
 
-    def key(state: State) -> FloatArray:
-        return np.concatenate(
-            [state.T[0, :, :3, 3] / robot.size, state.T[0, :, :3, :3].reshape(-1, 9)], axis=1
-        )
-
-    def far(state: State) -> FloatArray:
-        distance = geometry.pose_difference(
-            state.T[0], np.broadcast_to(robot.home, state.T[0].shape)
-        )
+    def measure(state: State) -> FloatArray:
+        home = np.broadcast_to(robot.home, state.T[0].shape)
+        distance = geometry.pose_difference(state.T[0], home)
         return distance * np.repeat([robot.size, 1.0], 3)
 
-    return _search(
-        robot,
-        solved,
-        key,
-        far,
-        lambda state: np.tile(readings, (state.T.shape[1], 1)),
-        patience,
-        max_starts,
-        seed,
-    )
+    def read(state: State) -> FloatArray:
+        return np.tile(readings, (state.T.shape[1], 1))
+
+    problem = _Problem(solve, lambda state: _flatten_poses(robot, state), measure, read)
+    return _search(robot, problem, patience, max_starts, seed)
 
 
 def find_working_modes(
@@ -142,13 +146,12 @@ def find_working_modes(
     max_starts: int = 200_000,
     seed: int = 0,
 ) -> Modes:
-    """All readings that lead to controlled coordinates (c,) [m, rad], whatever strokes and limits
-    say.
+    """Find all readings for controlled coordinates (c,) [m, rad], without regard to limits.
 
-    Starts have random joints and the platform near the target. Whole turns are taken off readings:
-    they lie within half a turn of the middle of the stroke, or of zero where none is stated.
-    Readings are told apart, and poses where the machine has fewer controlled coordinates than
-    freedoms. Parameters, result and errors as for `assembly_modes`.
+    Starts have random joints and the platform close to the target. Full turns are subtracted from
+    readings: they lie within half a turn of the middle of the stroke, or of zero without a stroke.
+    Modes differ in their readings, and in their poses if the machine has fewer controlled
+    coordinates than freedoms. Parameters, result and errors as for `find_assembly_modes`.
     """
     wanted = np.asarray(target, dtype=float).reshape(-1)
     if len(wanted) != len(robot.controlled):
@@ -157,48 +160,40 @@ def find_working_modes(
         )
     values = robot.values[None]
     begun = inverse_trials(robot, values, wanted[None, None])
-
-    def solved(start: State) -> State:
-        T = (
-            np.broadcast_to(begun.T, start.T.shape)
-            if begun.status[0, 0] == Status.CONVERGED
-            else start.T
-        )
-        target = np.broadcast_to(wanted, (1, T.shape[1], len(wanted)))
-        return _unwound(robot, inverse_trials(robot, values, target, replace(start, T=T)))
-
-    turning = [a.dimension.value == "angle" for a in robot.actuators]
+    turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
     home = compute_readings(robot, values, robot.home_state)[0]
 
-    def far(state: State) -> FloatArray:
-        return (compute_readings(robot, values, state)[0] - home) * np.where(
-            turning, robot.size, 1.0
+    def solve(start: State) -> State:
+        reached = begun.status[0, 0] == Status.CONVERGED
+        T = np.broadcast_to(begun.T, start.T.shape) if reached else start.T
+        everywhere = np.broadcast_to(wanted, (1, T.shape[1], len(wanted)))
+        state = inverse_trials(robot, values, everywhere, replace(start, T=T))
+        return _subtract_turns(robot, state)
+
+    def read(state: State) -> FloatArray:
+        return compute_readings(robot, values, state)[0]
+
+    def measure(state: State) -> FloatArray:
+        return (read(state) - home) * np.where(turning, robot.size, 1.0)
+
+    def identify(state: State) -> FloatArray:
+        q = read(state)
+        angles, lengths = q[:, turning], q[:, ~turning] / robot.size
+        return np.concatenate(
+            [lengths, np.cos(angles), np.sin(angles), _flatten_poses(robot, state)], axis=1
         )
 
-    def key(state: State) -> FloatArray:
-        q = compute_readings(robot, values, state)[0]
-        turns = np.concatenate([np.cos(q[:, turning]), np.sin(q[:, turning])], axis=1)
-        pose = np.concatenate(
-            [state.T[0, :, :3, 3] / robot.size, state.T[0, :, :3, :3].reshape(-1, 9)], axis=1
-        )
-        return np.concatenate([q[:, np.logical_not(turning)] / robot.size, turns, pose], axis=1)
-
-    return _search(
-        robot,
-        solved,
-        key,
-        far,
-        lambda state: compute_readings(robot, values, state)[0],
-        patience,
-        max_starts,
-        seed,
-    )
+    return _search(robot, _Problem(solve, identify, measure, read), patience, max_starts, seed)
 
 
-def _unwound(robot: Mechanism, state: State) -> State:
-    """The state with whole turns taken off its driven joints, as near as possible to the middle of
-    their strokes.
-    """
+def _flatten_poses(robot: Mechanism, state: State) -> FloatArray:
+    """Return position over size and rotation matrix of a state (1, n), as (n, 12)."""
+    T = state.T[0]
+    return np.concatenate([T[:, :3, 3] / robot.size, T[:, :3, :3].reshape(-1, 9)], axis=1)
+
+
+def _subtract_turns(robot: Mechanism, state: State) -> State:
+    """Return the state with driven joints moved by full turns to the middle of their strokes."""
     middle = np.array(
         [
             np.mean(a.stroke) if a.stroke and np.isfinite(a.stroke).all() else 0.0
@@ -206,11 +201,13 @@ def _unwound(robot: Mechanism, state: State) -> State:
         ]
     )
     _, tau = robot.slots(robot.values[None])
-    centre = joints_from_readings(middle[None, None], tau, robot.slots.frequency)[0, 0]
-    turns = np.round((driven_values(robot.program, state) - centre) / (2 * np.pi))
-    for group in robot.program.groups:  # a slide or a screw is elsewhere after a turn
+    center = joints_from_readings(middle[None, None], tau, robot.slots.frequency)[0, 0]
+    turns = np.round((driven_values(robot.program, state) - center) / (2 * np.pi))
+    for group in robot.program.groups:
         for j, columns in enumerate(group.actuator):
-            if columns[0] >= 0 and (group.joints[j : j + 1] != "R" or group.pitch[:, j].any()):
+            # a slide or a screw has moved after a full turn
+            repeats = group.joints[j : j + 1] == "R" and not group.pitch[:, j].any()
+            if columns[0] >= 0 and not repeats:
                 turns[..., columns] = 0.0
     joints = []
     for group, old in zip(robot.program.groups, state.joints, strict=True):
@@ -223,61 +220,53 @@ def _unwound(robot: Mechanism, state: State) -> State:
 
 
 def _search(
-    robot: Mechanism,
-    solved: Callable[[State], State],
-    key: Callable[[State], FloatArray],
-    far: Callable[[State], FloatArray],
-    readings: Callable[[State], FloatArray],
-    patience: int,
-    max_starts: int,
-    seed: int,
+    robot: Mechanism, problem: _Problem, patience: int, max_starts: int, seed: int
 ) -> Modes:
-    """Solve batches of random starts until `patience` of them have found nothing new."""
+    """Solve batches of random starts until `patience` of them give nothing new."""
     rng, tried, last = np.random.default_rng(seed), 0, 0
-    found, hits = select_poses(robot.home_state, np.arange(0)), np.zeros(0, np.int64)
+    modes, hits = select_poses(robot.home_state, np.arange(0)), np.zeros(0, np.int64)
     while tried - last < patience:
         if tried >= max_starts:
             raise MechanismError(
-                f"{robot.name}: {len(hits)} modes after {tried} random starts, and new ones keep "
-                "coming; allow more starts, "
-                "or the readings leave the platform free to move"
+                f"{robot.name}: {len(hits)} modes after {tried} random starts, and still new ones; "
+                "allow more starts, or check whether the readings leave the platform free to move"
             )
-        new = solved(_starts(robot, rng, BATCH))
+        new = problem.solve(_draw_starts(robot, rng, BATCH))
         new = select_poses(new, new.status[0] == Status.CONVERGED)
         before = len(hits)
-        found, hits = _merged(found, hits, new, key)
+        modes, hits = _merge(modes, hits, new, problem.identify)
         tried += BATCH
         last = tried if len(hits) > before else last
-    order = np.argsort(np.linalg.norm(far(found), axis=1))
-    found = select_poses(found, order)
-    return Modes(make_solution(robot, found, readings(found)), hits[order], tried, tried - last)
+    order = np.argsort(np.linalg.norm(problem.measure(modes), axis=1))
+    modes = select_poses(modes, order)
+    solution = make_solution(robot, modes, problem.read(modes))
+    return Modes(solution, hits[order], tried, tried - last)
 
 
-def _merged(
-    found: State, hits: IntArray, new: State, key: Callable[[State], FloatArray]
+def _merge(
+    modes: State, hits: IntArray, new: State, identify: Callable[[State], FloatArray]
 ) -> tuple[State, IntArray]:
-    """The modes with those of new solutions, and how often each was met."""
-    keys, known = key(new), key(found)
-    alone = np.arange(len(keys))
+    """Return the modes together with those of new solutions, and how often each was reached."""
+    keys, known = identify(new), identify(modes)
+    rest = np.arange(len(keys))
     for i, mode in enumerate(known):
-        same = np.abs(keys[alone] - mode).max(axis=1, initial=0.0) < SAME
+        same = np.abs(keys[rest] - mode).max(axis=1, initial=0.0) < SAME
         hits[i] += same.sum()
-        alone = alone[~same]
+        rest = rest[~same]
     first, counts = [], []
-    while len(alone):
-        same = np.abs(keys[alone] - keys[alone[0]]).max(axis=1) < SAME
-        first.append(alone[0])
+    while len(rest):
+        same = np.abs(keys[rest] - keys[rest[0]]).max(axis=1) < SAME
+        first.append(rest[0])
         counts.append(int(same.sum()))
-        alone = alone[~same]
+        rest = rest[~same]
     if not first:
-        return found, hits
-    return join_states(found, select_poses(new, np.array(first))), np.concatenate(
-        [hits, np.array(counts, np.int64)]
-    )
+        return modes, hits
+    whole = join_states(modes, select_poses(new, np.array(first)))
+    return whole, np.concatenate([hits, np.array(counts, np.int64)])
 
 
-def _starts(robot: Mechanism, rng: np.random.Generator, n: int) -> State:
-    """Random starts (1, n): free orientations and positions of the platform, and all joints."""
+def _draw_starts(robot: Mechanism, rng: np.random.Generator, n: int) -> State:
+    """Draw starts (1, n): free orientations and positions of the platform, and all joints."""
     free, size = robot.program.freedoms, robot.size
     turns = [f for f in free if f < 3]
     if len(turns) == 3:
@@ -288,11 +277,8 @@ def _starts(robot: Mechanism, rng: np.random.Generator, n: int) -> State:
         w[:, turns] = rng.uniform(-np.pi, np.pi, (n, len(turns)))
         R = geometry.exp_so3(w) @ robot.home[:3, :3]
     middle = np.mean([limb.links[0].transform[:3, 3] for limb in robot.assembly.limbs], axis=0)
-    shift = (
-        rng.normal(size=(n, 3))
-        * size
-        * np.exp(rng.uniform(np.log(SCALES[0]), np.log(SCALES[1]), (n, 1)))
-    )
+    direction = rng.normal(size=(n, 3)) * size
+    shift = direction * np.exp(rng.uniform(np.log(SCALES[0]), np.log(SCALES[1]), (n, 1)))
     position = np.tile(robot.home[:3, 3], (n, 1))
     axes = [f - 3 for f in free if f >= 3]
     position[:, axes] = (middle + shift)[:, axes]
@@ -307,11 +293,5 @@ def _starts(robot: Mechanism, rng: np.random.Generator, n: int) -> State:
         joints.append(values)
     zero = np.zeros((1, n))
     none = zero.astype(np.int8)
-    return State(
-        geometry.make_pose(R, position)[None],
-        tuple(joints),
-        none,
-        zero,
-        zero.astype(np.int64),
-        none,
-    )
+    T = geometry.make_pose(R, position)[None]
+    return State(T, tuple(joints), none, zero, zero.astype(np.int64), none)

@@ -1,34 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the platform moves with parameters and readings, by the implicit function theorem on the
-closure of all limbs.
+"""Derivatives of the platform pose and of passive joints in parameters and readings.
 
-Closure linearised, passive joints eliminated: A y + E de + Q dq = 0, so y = -A^-1 (E de/dp + Q
-dq/dp). A limb's rows are touched by its own displacements and actuators only, so its part of the
-right-hand side has few columns. Rows are worked on in blocks that fit the cache. Derivation:
+Linearized closure without passive joints reads A y + E de + Q dq = 0, so that the platform's twist
+is y = -A^-1 (E de/dp + Q dq/dp). The equations of a limb contain its own displacements and
+actuators only; its part of the right-hand side has few columns. Its eliminated joints follow from
+U dtheta + A y + E de + Q dq = 0. Rows are computed in blocks that fit the cache. Derivation:
 docs/theory/engine.md.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from loopcal import engine
 from loopcal.engine import Block, State
-from loopcal.mechanism.limb_maps import Columns, LimbMap
-from loopcal.mechanism.model import Mechanism, Status
+from loopcal.mechanism.model import Columns, LimbMap, Mechanism
+from loopcal.mechanism.states import is_closed, select_block
 from loopcal.mechanism.transmission import joint_slopes, joints_from_readings, term_derivatives
 from loopcal.typing import FloatArray
 
-ROWS = 512
-"""Rows linearised together."""
+BLOCK_ROWS = 512
+"""Rows linearized together."""
 
 
 @dataclass(frozen=True)
 class PoseSensitivity:
-    """How the platform moves with parameters and readings.
+    """Derivatives of the platform pose.
 
     Attributes
     ----------
@@ -44,8 +45,7 @@ class PoseSensitivity:
 def differentiate_pose(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> PoseSensitivity:
-    """Derivative of the platform's pose by the implicit function theorem, D = -A^-1 [E de/dp + Q
-    dq/dp].
+    """Differentiate the pose by the implicit function theorem, D = -A^-1 [E de/dp + Q dq/dp].
 
     Parameters
     ----------
@@ -53,143 +53,237 @@ def differentiate_pose(
 
     Returns
     -------
-    Sensitivity; failed rows hold NaN, rows of singular states infinities or NaN.
+    PoseSensitivity; failed rows have NaN, rows of singular states infinities or NaN.
     """
     t, n = state.T.shape[:2]
     freedoms = list(robot.program.freedoms)
-    out = PoseSensitivity(
-        np.zeros((t, n, 6, len(robot.parameters))), np.zeros((t, n, 6, len(robot.actuators)))
-    )
-    for rows in split_rows(t, n):
-        work = LinearizedLimbs(
-            robot,
-            select_block(values, rows[:1]),
-            select_block(q, rows),
-            select_state_block(state, rows),
-        )
-        by_parameter, by_reading = work.platform()
+    parameters = np.zeros((t, n, 6, len(robot.parameters)))
+    readings = np.zeros((t, n, 6, len(robot.actuators)))
+    for rows, limbs in linearize_limbs(robot, values, q, state):
+        by_parameter, by_reading = limbs.solve_platform()
         if len(freedoms) == 6:
-            out.parameters[rows], out.readings[rows] = by_parameter, by_reading
+            parameters[rows], readings[rows] = by_parameter, by_reading
         else:
-            out.parameters[rows][:, :, freedoms], out.readings[rows][:, :, freedoms] = (
-                by_parameter,
-                by_reading,
-            )
-    lost = (state.status != Status.CONVERGED) & (state.status != Status.OTHER_MODE)
-    out.parameters[lost], out.readings[lost] = np.nan, np.nan
+            parameters[rows][:, :, freedoms] = by_parameter
+            readings[rows][:, :, freedoms] = by_reading
+    lost = ~is_closed(state.status)
+    parameters[lost], readings[lost] = np.nan, np.nan
+    return PoseSensitivity(parameters, readings)
+
+
+@dataclass(frozen=True)
+class PassiveSensitivity:
+    """Derivatives of the passive joints.
+
+    Attributes
+    ----------
+    names : of the j passive joints, as in `Solution.passive_names`.
+    parameters : (t, n, j, p) change of each joint [m, rad] per unit of each parameter. readings :
+        (t, n, j, a).
+    """
+
+    names: tuple[str, ...]
+    parameters: FloatArray
+    readings: FloatArray
+
+
+def differentiate_passive_joints(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+) -> PassiveSensitivity:
+    """Differentiate every passive joint in every parameter and reading.
+
+    Parameters
+    ----------
+    values : (t | 1, p). q : (t | 1, n, a) readings. state : (t, n), converged rows.
+
+    Returns
+    -------
+    PassiveSensitivity; a locked joint (one that only spins its limb) has zeros, failed rows NaN.
+    """
+    names, (t, n) = name_passive_joints(robot), state.T.shape[:2]
+    parameters = np.zeros((t, n, len(names), len(robot.parameters)))
+    readings = np.zeros((t, n, len(names), len(robot.actuators)))
+    for rows, limbs in linearize_limbs(robot, values, q, state):
+        by_parameter, by_reading = limbs.solve_platform()
+        for places, U, limb in limbs.passive_joints(names):
+            moved, driven = np.matmul(limb.A, by_parameter), np.matmul(limb.A, by_reading)
+            moved[..., limb.parameters] += limb.by_parameter
+            driven[..., limb.readings] += limb.by_reading
+            both = solve_passive_motion(U, np.concatenate([moved, driven], axis=-1))
+            cut = moved.shape[-1]
+            parameters[rows][:, :, places] = both[..., :cut]
+            readings[rows][:, :, places] = both[..., cut:]
+    lost = ~is_closed(state.status)
+    parameters[lost], readings[lost] = np.nan, np.nan
+    return PassiveSensitivity(names, parameters, readings)
+
+
+def name_passive_joints(robot: Mechanism) -> tuple[str, ...]:
+    """Return the names `limb.joint` of all passive joints, limb by limb."""
+    return tuple(
+        f"{limb.name}.{joint.name}"
+        for limb in robot.assembly.limbs
+        for joint in limb.joints
+        if joint.actuator is None
+    )
+
+
+def solve_passive_motion(U: FloatArray, right: FloatArray) -> FloatArray:
+    """Return -U^-1 right for upper triangular U (t, n, u, u) and right (t, n, u, c).
+
+    A pivot of zero gives infinities or NaN.
+    """
+    out = np.empty_like(right)
+    with np.errstate(all="ignore"):
+        for i in range(U.shape[-1] - 1, -1, -1):
+            known = (U[..., i, i + 1 :, None] * out[..., i + 1 :, :]).sum(axis=-2)
+            out[..., i, :] = -(right[..., i, :] + known) / U[..., i, i, None]
     return out
 
 
-def split_rows(t: int, n: int) -> Iterator[tuple[slice, slice]]:
-    """Slices of trials and poses that cover (t, n) by at most ROWS rows each."""
-    poses = min(n, ROWS)
-    trials = max(1, ROWS // max(poses, 1))
+class LimbRows(NamedTuple):
+    """Linearized closure rows of one limb.
+
+    A : (t, n, r, m) against the platform's freedoms. by_parameter : (t, n, r, ..) against the
+    parameters in `parameters`. by_reading : (t, n, r, ..) against the actuators in `readings`.
+    """
+
+    A: FloatArray
+    parameters: Columns
+    by_parameter: FloatArray
+    readings: Columns
+    by_reading: FloatArray
+
+
+def linearize_limbs(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+) -> Iterator[tuple[tuple[slice, slice], LinearizedLimbs]]:
+    """Linearize all limbs at states (t, n), block by block; yields trials and poses of a block.
+
+    Parameters
+    ----------
+    values : (t | 1, p). q : (t | 1, n, a) readings.
+    """
+    t, n = state.T.shape[:2]
+    poses = max(min(n, BLOCK_ROWS), 1)
+    trials = max(1, BLOCK_ROWS // poses)
     for i in range(0, t, trials):
-        for j in range(0, n, max(poses, 1)):
-            yield slice(i, min(i + trials, t)), slice(j, min(j + poses, n))
+        for j in range(0, n, poses):
+            rows = slice(i, min(i + trials, t)), slice(j, min(j + poses, n))
+            chosen_values, chosen_q = _select(values, rows[:1]), _select(q, rows)
+            block = select_block(state, rows)
+            yield rows, LinearizedLimbs(robot, chosen_values, chosen_q, block)
 
 
-def select_block(array: FloatArray, rows: tuple[slice, ...]) -> FloatArray:
-    """A block of rows of an array whose leading axes may be 1 and then broadcast."""
-    return array[
-        tuple(
-            s if length > 1 else slice(None) for s, length in zip(rows, array.shape, strict=False)
-        )
-    ]
-
-
-def select_state_block(state: State, rows: tuple[slice, slice]) -> State:
-    """A block of rows of a state (t, n)."""
-    cut = {f.name: getattr(state, f.name)[rows] for f in fields(State) if f.name != "joints"}
-    return replace(state, **cut, joints=tuple(j[rows] for j in state.joints))
+def _select(array: FloatArray, rows: tuple[slice, ...]) -> FloatArray:
+    """Return a block of an array whose leading axes may be 1 and then broadcast."""
+    pairs = zip(rows, array.shape, strict=False)
+    return array[tuple(s if length > 1 else slice(None) for s, length in pairs)]
 
 
 class LinearizedLimbs:
-    """Closure of some rows, with the parameters and readings that each limb's equations hold."""
+    """Linearized closure of a block of rows, limb by limb."""
 
     def __init__(self, robot: Mechanism, values: FloatArray, q: FloatArray, state: State) -> None:
         slots, self.robot, self.shape = robot.slots, robot, state.T.shape[:2]
         e, tau = slots(values)
-        self.blocks = engine.linearize(
-            robot.program, e, joints_from_readings(q, tau, slots.frequency), state
-        )
+        joints = joints_from_readings(q, tau, slots.frequency)
+        self.blocks = engine.linearize(robot.program, e, joints, state)
         J = slots.jacobian(values)
-        self.of_slots = J[:, : slots.n_displacements]
-        self.of_terms = J[:, slots.n_displacements :].reshape(len(J), *slots.terms.shape, -1)
-        self.terms = term_derivatives(q, slots.frequency)
-        self.slope = joint_slopes(q, tau, slots.frequency)
+        self._of_slots = J[:, : slots.n_displacements]
+        self._of_terms = J[:, slots.n_displacements :].reshape(len(J), *slots.terms.shape, -1)
+        self._terms = term_derivatives(q, slots.frequency)
+        self._slope = joint_slopes(q, tau, slots.frequency)
 
-    def limbs(
-        self, parts: tuple[Block, ...]
-    ) -> Iterator[tuple[FloatArray, Columns, FloatArray, Columns, FloatArray]]:
-        """For each limb: its rows (t, n, r, m) against the platform, its parameters with their
-        columns (t, n, r, ..), its actuators with theirs.
-        """
-        for maps, block in zip(self.robot.limb_maps, parts, strict=True):
+    def rows(self, blocks: tuple[Block, ...]) -> Iterator[LimbRows]:
+        """Yield the rows of each limb in `blocks.closure` or `blocks.passive`."""
+        for maps, block in zip(self.robot.limb_maps, blocks, strict=True):
             for k, limb in enumerate(maps):
-                right = self._right(limb, block, k)
-                yield (
+                yield LimbRows(
                     block.A[:, :, k],
                     limb.parameters,
-                    right,
+                    self._differentiate_by_parameters(limb, block, k),
                     limb.readings,
-                    self._driven(limb, block, k),
+                    self._differentiate_by_readings(limb, block, k),
                 )
 
-    def platform(self) -> tuple[FloatArray, FloatArray]:
-        """d platform freedoms / d parameters (t, n, m, p), and / d readings (t, n, m, a)."""
+    def passive_joints(
+        self, names: tuple[str, ...]
+    ) -> Iterator[tuple[list[int], FloatArray, LimbRows]]:
+        """Yield, for each limb, the places of its joints in `names`, their U and their rows."""
+        limbs, blocks = self.robot.assembly.limbs, self.blocks
+        found = self.rows(blocks.passive)
+        for group, block, joints in zip(
+            self.robot.program.groups, blocks.passive, blocks.joints, strict=True
+        ):
+            for k, i in enumerate(group.limbs):
+                rows = next(found)
+                if joints:
+                    chosen = [f"{limbs[i].name}.{limbs[i].joints[j].name}" for j in joints]
+                    yield [names.index(name) for name in chosen], block.U[:, :, k], rows
+
+    def solve_platform(self) -> tuple[FloatArray, FloatArray]:
+        """Return d freedoms / d parameters (t, n, m, p) and / d readings (t, n, m, a)."""
         program = self.robot.program
-        inverse = _pseudo_inverse(
-            stack_platform_rows(self.blocks), _row_weights(program, self.blocks)
-        )
+        weights = _weigh_rows(program, self.blocks)
+        inverse = _invert(stack_platform_rows(self.blocks), weights)
         m = len(program.freedoms)
         by_parameter = np.zeros((*self.shape, m, len(self.robot.parameters)))
         by_reading = np.zeros((*self.shape, m, program.n_joints))
         first = 0
-        for A, parameters, of_parameters, drives, of_drives in self.limbs(self.blocks.closure):
-            for i in range(A.shape[2]):
+        for limb in self.rows(self.blocks.closure):
+            for i in range(limb.A.shape[2]):
                 column = inverse[..., first + i, None]
-                by_parameter[..., parameters] -= column * of_parameters[:, :, i, None]
-                by_reading[..., drives] -= column * of_drives[:, :, i, None]
-            first += A.shape[2]
+                by_parameter[..., limb.parameters] -= column * limb.by_parameter[:, :, i, None]
+                by_reading[..., limb.readings] -= column * limb.by_reading[:, :, i, None]
+            first += limb.A.shape[2]
         return by_parameter, by_reading
 
-    def _right(self, limb: LimbMap, block: Block, k: int) -> FloatArray:
-        """d rows / d parameters of limb k (t, n, r, ..)."""
+    def _differentiate_by_parameters(self, limb: LimbMap, block: Block, k: int) -> FloatArray:
+        """Return d rows / d parameters of limb k (t, n, r, ..)."""
         right = block.E[:, :, k]
-        if not limb.plain:
+        if not limb.is_plain:
             t, n, r, width = right.shape
-            of_slots = self.of_slots[:, limb.own, limb.parameters]
-            right = np.matmul(right.reshape(t, n * r, width), of_slots).reshape(
-                t, n, r, of_slots.shape[-1]
-            )
+            of_slots = self._of_slots[:, limb.displacements, limb.parameters]
+            product = np.matmul(right.reshape(t, n * r, width), of_slots)
+            right = product.reshape(t, n, r, of_slots.shape[-1])
         for j, a, terms in limb.drives:
             for i in terms:
-                slopes = self.of_terms[:, None, None, a, i, limb.parameters]
-                right = (
-                    right
-                    + (block.Q[:, :, k, :, j] * self.terms[i][:, :, a, None])[..., None] * slopes
-                )
+                slopes = self._of_terms[:, None, None, a, i, limb.parameters]
+                driven = block.Q[:, :, k, :, j] * self._terms[i][:, :, a, None]
+                right = right + driven[..., None] * slopes
         return right
 
-    def _driven(self, limb: LimbMap, block: Block, k: int) -> FloatArray:
-        """d rows / d readings of limb k (t, n, r, ..)."""
-        return (
-            block.Q[:, :, k][..., [j for j, *_ in limb.drives]]
-            * self.slope[:, :, None, limb.readings]
-        )
+    def _differentiate_by_readings(self, limb: LimbMap, block: Block, k: int) -> FloatArray:
+        """Return d rows / d readings of limb k (t, n, r, ..)."""
+        driven = block.Q[:, :, k][..., [j for j, *_ in limb.drives]]
+        return driven * self._slope[:, :, None, limb.readings]
 
 
 def stack_platform_rows(blocks: engine.ClosureBlocks) -> FloatArray:
-    """All closure rows against the platform's freedoms, (t, n, c, m)."""
+    """Return all closure rows against the platform's freedoms, (t, n, c, m)."""
     return np.concatenate(
         [b.A.reshape(*b.A.shape[:2], -1, b.A.shape[-1]) for b in blocks.closure], axis=2
     )
 
 
-def _row_weights(program: engine.Program, blocks: engine.ClosureBlocks) -> FloatArray | None:
-    """One over the standard deviation that a redundant actuator gives each row, (t, n, c); None
-    without redundancy.
+def stack_driven_columns(program: engine.Program, blocks: engine.ClosureBlocks) -> FloatArray:
+    """Return all closure rows against the actuated joints, (t, n, c, a)."""
+    parts = []
+    for group, block in zip(program.groups, blocks.closure, strict=True):
+        for k in range(len(group.limbs)):
+            Q = np.zeros((*block.Q.shape[:2], block.Q.shape[3], program.n_joints))
+            for j, columns in enumerate(group.actuator):
+                if columns[k] >= 0:
+                    Q[..., columns[k]] = block.Q[:, :, k, :, j]
+            parts.append(Q)
+    return np.concatenate(parts, axis=2)
+
+
+def _weigh_rows(program: engine.Program, blocks: engine.ClosureBlocks) -> FloatArray | None:
+    """Return one over the standard deviation that a redundant actuator gives each row (t, n, c).
+
+    None without redundancy.
     """
     if program.sigma is None:
         return None
@@ -201,9 +295,10 @@ def _row_weights(program: engine.Program, blocks: engine.ClosureBlocks) -> Float
     return np.concatenate(weights, axis=2)
 
 
-def _pseudo_inverse(A: FloatArray, weights: FloatArray | None) -> FloatArray:
-    """Inverse, or weighted pseudo-inverse, of A (t, n, c, m) -> (t, n, m, c); rows that cannot be
-    inverted are NaN.
+def _invert(A: FloatArray, weights: FloatArray | None) -> FloatArray:
+    """Return the inverse, or weighted pseudo-inverse, of A (t, n, c, m) as (t, n, m, c).
+
+    Matrices that are not finite give NaN.
     """
     if weights is not None:
         A = A * weights[..., None]

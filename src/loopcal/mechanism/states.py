@@ -1,61 +1,152 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of states: pick some, put them back."""
+"""Engine states: their status, selection of rows, driven joint values, frames along the limbs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields
+from enum import IntEnum
 
 import numpy as np
 
-from loopcal.engine import Program, State
-from loopcal.typing import FloatArray
+from loopcal import geometry
+from loopcal.engine import LENGTH, PITCH, Group, Program, State
+from loopcal.mechanism.model import Mechanism
+from loopcal.typing import BoolArray, FloatArray
 
 
-def _each(make: Callable[..., np.ndarray], *states: State) -> State:
-    """A state whose every array is made from the arrays of the given states."""
-    found = {}
+class Status(IntEnum):
+    """Status of a row of a solution; `code` names its entry in the catalog of findings."""
+
+    CONVERGED = 0
+    UNREACHABLE = 1
+    NOT_CONVERGED = 2
+    NOT_FINITE = 3
+    OTHER_MODE = 4
+
+    @property
+    def code(self) -> str:
+        """Return the code of the finding that explains this status."""
+        return _CODES[self]
+
+
+_CODES = {
+    Status.CONVERGED: "kinematics.closed",
+    Status.UNREACHABLE: "kinematics.unreachable",
+    Status.NOT_CONVERGED: "kinematics.not-converged",
+    Status.NOT_FINITE: "kinematics.not-finite",
+    Status.OTHER_MODE: "kinematics.other-mode",
+}
+
+
+def is_closed(status: np.ndarray) -> BoolArray:
+    """Return which rows close their loops, in whatever assembly mode."""
+    return (status == Status.CONVERGED) | (status == Status.OTHER_MODE)
+
+
+def _map_arrays(make: Callable[..., np.ndarray], *states: State) -> State:
+    """Return the state whose every array is made from the same array of the given states."""
+    made = {}
     for f in fields(State):
-        parts = [getattr(s, f.name) for s in states]
-        found[f.name] = (
-            tuple(make(*g) for g in zip(*parts, strict=True))
-            if f.name == "joints"
-            else make(*parts)
-        )
-    return State(**found)
+        arrays = [getattr(s, f.name) for s in states]
+        if f.name == "joints":
+            made[f.name] = tuple(make(*group) for group in zip(*arrays, strict=True))
+        else:
+            made[f.name] = make(*arrays)
+    return State(**made)
 
 
 def select_rows(state: State, shape: tuple[int, int], trial: np.ndarray, pose: np.ndarray) -> State:
-    """Rows (trial, pose) of a state that broadcasts to `shape` = (t, n), as (rows, 1)."""
-    return _each(lambda a: np.broadcast_to(a, (*shape, *a.shape[2:]))[trial, pose][:, None], state)
+    """Return rows (trial, pose) of a state that broadcasts to `shape` = (t, n), as (rows, 1)."""
+    return _map_arrays(
+        lambda a: np.broadcast_to(a, (*shape, *a.shape[2:]))[trial, pose][:, None], state
+    )
 
 
 def select_poses(state: State, rows: np.ndarray) -> State:
-    """Poses `rows` (positions or a mask) of a state (t, n), every trial."""
-    return _each(lambda a: a[:, rows], state)
+    """Return poses `rows` (positions or a mask) of a state (t, n), all trials."""
+    return _map_arrays(lambda a: a[:, rows], state)
 
 
-def join_states(*parts: State) -> State:
-    """States (t, n_i) one after the other, (t, sum n_i)."""
-    return _each(lambda *arrays: np.concatenate(arrays, axis=1), *parts)
+def select_block(state: State, rows: tuple[slice, slice]) -> State:
+    """Return a block of trials and poses of a state (t, n)."""
+    return _map_arrays(lambda a: a[rows], state)
+
+
+def join_states(*states: State) -> State:
+    """Return states (t, n_i) one after the other, (t, sum n_i)."""
+    return _map_arrays(lambda *arrays: np.concatenate(arrays, axis=1), *states)
 
 
 def replace_rows(state: State, trial: np.ndarray, pose: np.ndarray, new: State) -> State:
-    """A copy of a state (t, n) whose rows (trial, pose) are those of `new` (rows, 1)."""
+    """Return a state (t, n) whose rows (trial, pose) are those of `new` (rows, 1)."""
 
     def replaced(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         out = np.array(a)
         out[trial, pose] = b[:, 0]
         return out
 
-    return _each(replaced, state, new)
+    return _map_arrays(replaced, state, new)
+
+
+def reshape_rows(state: State, t: int, n: int) -> State:
+    """Return the rows of a state (t n, 1) as (t, n)."""
+    return _map_arrays(lambda a: a.reshape(t, n, *a.shape[2:]), state)
 
 
 def driven_values(program: Program, state: State) -> FloatArray:
-    """Values of the actuated joints (t, n, a) [m or rad]."""
+    """Return the values of the actuated joints (t, n, a) [m or rad]."""
     out = np.zeros((*state.T.shape[:2], program.n_joints))
     for group, joints in zip(program.groups, state.joints, strict=True):
         for j, columns in enumerate(group.actuator):
             if columns[0] >= 0:
                 out[..., columns] = joints[..., j]
     return out
+
+
+def compute_limb_frames(
+    robot: Mechanism, values: FloatArray, state: State
+) -> tuple[FloatArray, ...]:
+    """Return the frames along each limb, for limits and pictures.
+
+    Parameters
+    ----------
+    values : (t, p). state : (t, n).
+
+    Returns
+    -------
+    For each limb of the mechanism, in its order, an array (t, n, J + 2, 4, 4): T_base_link behind
+    each link 0..J (the last one is the tip), then the attachment.
+    """
+    e, _ = robot.slots(values)
+    frames: dict[int, FloatArray] = {}
+    for group, joints in zip(robot.program.groups, state.joints, strict=True):
+        displacements = e[:, group.columns].reshape(len(e), len(group.limbs), -1)
+        for k, limb in enumerate(group.limbs):
+            frames[limb] = _follow_limb(group, k, displacements[:, k], joints[:, :, k], state.T)
+    return tuple(frames[i] for i in sorted(frames))
+
+
+def _follow_limb(
+    group: Group, k: int, displacements: FloatArray, joints: FloatArray, T: FloatArray
+) -> FloatArray:
+    """Return the frames of limb k for displacements (t, s) and joint values (t, n, J + 1)."""
+    move = np.zeros((len(displacements), len(group.joints) + 2, 6))
+    pitch = np.broadcast_to(group.pitch[k], (len(displacements), len(group.joints))).copy()
+    for slot, value in zip(group.slots, displacements.T, strict=True):
+        if slot.axis == PITCH:
+            pitch[:, slot.element] += value
+        elif slot.axis != LENGTH:
+            move[:, slot.element, slot.axis] += value
+    placed = group.links[k] @ geometry.make_pose(geometry.exp_so3(move[..., :3]), move[..., 3:])
+    frames = [np.broadcast_to(placed[:, None, 0], T.shape)]
+    for j, letter in enumerate(group.joints):
+        value = joints[..., j]
+        if letter == "R":
+            angle, advance = value, pitch[:, None, j] * value
+        else:
+            angle, advance = np.zeros_like(value), value
+        z = np.stack([np.zeros_like(value), np.zeros_like(value), np.ones_like(value)], axis=-1)
+        motion = geometry.make_pose(geometry.exp_so3(angle[..., None] * z), advance[..., None] * z)
+        frames.append(frames[-1] @ motion @ placed[:, None, j + 1])
+    return np.stack([*frames, T @ placed[:, None, -1]], axis=2)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From an actuator's reading to the value of the joint it drives.
+"""Transmissions: the value of a joint from the reading of its actuator, and back.
 
-    joint = offset + gain r + curve r^2 + sin1 sin(w r) + cos1 cos(w r) + sin2 sin(2 w r) + cos2
-    cos(2 w r) + backlash d / 2
+    joint = offset + gain r + curve r^2 + sin1 sin(w r) + cos1 cos(w r)
+            + sin2 sin(2 w r) + cos2 cos(2 w r) + backlash d / 2
 
-with w = 2 pi / period and d = +1 or -1 the direction in which the reading was approached (0 where
-it is not known). A gear ratio or spool radius is a gain, a spool whose radius grows with what is
-wound on it a curve: r = r0 - b phi / 2 pays out r0 phi - b phi^2 / 4. Derivation:
+with w = 2 pi / period and d = +1 or -1 the direction from which the reading was approached (0 if
+unknown). A gear ratio or a spool radius is a gain. A spool whose radius changes with the line on it
+is a curve: radius r0 - b phi / (2 pi) pays out r0 phi - b phi^2 / (4 pi). Derivation:
 docs/theory/parameters.md.
 
 Readings are (t, n, a), or (t, n, 2 a) with the directions of approach behind them.
@@ -23,26 +23,31 @@ from loopcal.mechanism.assembly import Actuator
 from loopcal.typing import FloatArray
 
 TERMS = ("offset", "gain", "curve", "sin1", "cos1", "sin2", "cos2", "backlash")
-"""Terms in the order of the last axis of tau (t, a, 8), each in the joint's unit per power of the
-reading's unit.
+"""Terms in the order of the last axis of tau (t, a, 8).
+
+Each has the joint's unit, per power of the reading's unit.
 """
 
 
 def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
-    """Nominal transmission terms (a, 8); raises MechanismError for an unknown term or a gain of
-    zero.
+    """Return the nominal transmission terms (a, 8).
+
+    Raises
+    ------
+    MechanismError
+        Unknown term, or a gain of zero.
     """
     for actuator in actuators:
         wrong = sorted(set(actuator.terms) - set(TERMS))
         if wrong:
             raise MechanismError(
-                f"actuator {actuator.name!r} has a term {wrong[0]!r}; allowed are "
+                f"actuator {actuator.name!r} has an unknown term {wrong[0]!r}; allowed are "
                 f"{', '.join(TERMS)}"
             )
         if actuator.terms.get("gain", 1.0) == 0.0:
             raise MechanismError(
-                f"actuator {actuator.name!r} has a gain of zero, so its reading moves nothing; "
-                "give its gain"
+                f"actuator {actuator.name!r} has a gain of 0, so its reading moves nothing; "
+                "state a gain other than 0"
             )
     rows = [
         [a.terms.get(term, 1.0 if term == "gain" else 0.0) for term in TERMS] for a in actuators
@@ -51,12 +56,12 @@ def nominal_terms(actuators: Sequence[Actuator]) -> FloatArray:
 
 
 def harmonic_frequencies(actuators: Sequence[Actuator]) -> FloatArray:
-    """Angular frequency of the harmonics (a,) [rad per unit of reading], 0 where there are none."""
+    """Return the angular frequency of the harmonics (a,) [rad per unit of reading], 0 for none."""
     return np.array([2 * np.pi / a.period if a.period else 0.0 for a in actuators])
 
 
 def term_derivatives(q: FloatArray, w: FloatArray) -> list[FloatArray]:
-    """Derivative of the joint values in each term, eight arrays (t | 1, n, a)."""
+    """Return the derivative of the joint values in each of the 8 terms, arrays (t | 1, n, a)."""
     r, approach = split_readings(q, len(w))
     # with w = 0 the cosines would repeat the offset
     on = (w != 0).astype(float)
@@ -66,7 +71,7 @@ def term_derivatives(q: FloatArray, w: FloatArray) -> list[FloatArray]:
 
 
 def joints_from_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
-    """Joint values (t, n, a) of readings q under terms tau (t | 1, a, 8)."""
+    """Return the joint values (t, n, a) of readings q under terms tau (t | 1, a, 8)."""
     columns = term_derivatives(q, w)
     return sum(
         (columns[i] * tau[:, None, :, i] for i in range(1, len(TERMS))),
@@ -75,7 +80,7 @@ def joints_from_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> Float
 
 
 def joint_slopes(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
-    """d joint / d reading (t, n, a)."""
+    """Return d joint / d reading (t, n, a)."""
     r, _ = split_readings(q, len(w))
     turn = w * r
     _, gain, curve, sin1, cos1, sin2, cos2, _ = np.moveaxis(tau[:, None], -1, 0)
@@ -85,8 +90,9 @@ def joint_slopes(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
 
 
 def readings_from_joints(joints: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
-    """Readings (t, n, a) that give these joint values, approach not counted: the linear part, then
-    Newton on the rest.
+    """Return the readings (t, n, a) of joint values, without backlash.
+
+    The linear terms are inverted exactly; Newton's method adds the others.
     """
     readings = (joints - tau[:, None, :, 0]) / tau[:, None, :, 1]
     if not tau[..., 2:7].any():
@@ -100,5 +106,5 @@ def readings_from_joints(joints: FloatArray, tau: FloatArray, w: FloatArray) -> 
 
 
 def split_readings(q: FloatArray, a: int) -> tuple[FloatArray, FloatArray]:
-    """Readings and directions of approach (zero where none were given)."""
+    """Return readings and directions of approach, the latter 0 where none are given."""
     return q[..., :a], q[..., a:] if q.shape[-1] == 2 * a else np.zeros_like(q[..., :a])

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Positions spread evenly over the stated workspace, as far as the machine reaches them within its
-strokes and limits.
-"""
+"""Limits of strokes, joints and rods, and random positions within the stated workspace."""
 
 from __future__ import annotations
 
@@ -10,17 +8,112 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from loopcal.engine import State
 from loopcal.errors import MechanismError
+from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism.batch_kinematics import compute_closure_sign
 from loopcal.mechanism.kinematics import Solution, inverse
-from loopcal.mechanism.limits import evaluate_limits
 from loopcal.mechanism.model import Mechanism
+from loopcal.mechanism.states import compute_limb_frames
 from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import Dimension, find_unit
 
-MIN_DRAWS, MIN_REACHABLE_SHARE = 2000, 1e-3
-"""Positions drawn before a workspace is called empty, and the share of them that must be reachable.
-"""
+MIN_DRAWS = 2000
+"""Positions drawn before a workspace is called empty."""
+MIN_REACHABLE_SHARE = 1e-3
+"""Share of them that must be reachable."""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """A quantity that must stay between two bounds.
+
+    Attributes
+    ----------
+    name : e.g. `stroke of q3`. dimension : length or angle. low, high : bounds [m or rad].
+    value : (t, n) [m or rad].
+    """
+
+    name: str
+    dimension: Dimension
+    low: float
+    high: float
+    value: FloatArray
+
+    @property
+    def margin(self) -> FloatArray:
+        """Distance to the nearer bound (t, n), negative outside [m or rad]."""
+        return np.minimum(self.value - self.low, self.high - self.value)
+
+
+def evaluate_limits(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+) -> tuple[Limit, ...]:
+    """Return all limits of a machine at readings q (t | 1, n, a) and their states (t, n)."""
+    shape = state.status.shape
+    found = [
+        Limit(f"stroke of {a.name}", a.dimension, *a.stroke, np.broadcast_to(q[..., i], shape))
+        for i, a in enumerate(robot.actuators)
+        if a.stroke is not None
+    ]
+    for group, joints in zip(robot.program.groups, state.joints, strict=True):
+        for k, i in enumerate(group.limbs):
+            limb = robot.assembly.limbs[i]
+            for j, joint in enumerate(limb.joints):
+                if joint.limits is not None:
+                    dimension = Dimension.ANGLE if joint.kind == "R" else Dimension.LENGTH
+                    name, value = f"{limb.name}.{joint.name}", joints[:, :, k, j]
+                    found.append(Limit(name, dimension, *joint.limits, value))
+    if any(limb.cones for limb in robot.assembly.limbs):
+        found += _evaluate_cones(robot, values, state)
+    return tuple(found)
+
+
+def check_limits(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+) -> tuple[BoolArray, NDArray[np.object_]]:
+    """Return which rows are within all limits (t, n), and a finding where one is not (t, n).
+
+    The findings are None where everything is allowed. A row is explained by its first exceeded
+    limit.
+    """
+    allowed, findings = np.ones(state.status.shape, bool), np.full(state.status.shape, None)
+    for limit in evaluate_limits(robot, values, q, state):
+        # a bound itself is allowed, up to the rounding of its own number
+        outside = ~(limit.margin >= -1e-12 * max(abs(limit.low), abs(limit.high)))
+        for row in zip(*np.nonzero(outside & allowed), strict=True):
+            findings[row] = _report_exceeded(robot, limit, float(limit.value[row]))
+        allowed &= ~outside
+    return allowed, findings
+
+
+def _report_exceeded(robot: Mechanism, limit: Limit, value: float) -> Finding:
+    """Return the finding of an exceeded limit, in the robot's display unit."""
+    unit = find_unit(robot.units[limit.dimension])
+    numbers = {"value": value, "low": limit.low, "high": limit.high}
+    quantities = {
+        key: Quantity(number / unit.factor_to_si, unit.symbol) for key, number in numbers.items()
+    }
+    return report_finding("limits.exceeded", name=limit.name, **quantities)
+
+
+def _evaluate_cones(robot: Mechanism, values: FloatArray, state: State) -> list[Limit]:
+    """Return the angles between rods and the axes of their cones."""
+    found = []
+    all_frames = compute_limb_frames(robot, values, state)
+    for limb, frames in zip(robot.assembly.limbs, all_frames, strict=True):
+        rod = frames[:, :, -1, :3, 3] - frames[:, :, -2, :3, 3]
+        rod = rod / np.linalg.norm(rod, axis=-1, keepdims=True)
+        for cone in limb.cones:
+            frame, sign = (frames[:, :, -2], 1.0) if cone.end == "tip" else (frames[:, :, -1], -1.0)
+            axis = frame[..., :3, :3] @ (np.array(cone.axis) / np.linalg.norm(cone.axis))
+            sine = np.linalg.norm(np.cross(axis, rod), axis=-1)
+            angle = np.arctan2(sine, sign * (axis * rod).sum(axis=-1))
+            name = f"inclination of {limb.name} at its {cone.end}"
+            found.append(Limit(name, Dimension.ANGLE, 0.0, cone.angle, angle))
+    return found
 
 
 @dataclass(frozen=True)
@@ -29,10 +122,9 @@ class WorkspaceSample:
 
     Attributes
     ----------
-    coordinates : (n, c) controlled coordinates [m, rad]. solution : their readings and poses, n
-        rows.
-    reachable_share : share of the stated ranges that the machine reaches. rejected : what stops it elsewhere, in
-        words, with the count.
+    coordinates : (n, c) controlled coordinates [m, rad]. solution : their readings and poses.
+    reachable_share : share of the stated ranges that the machine reaches.
+    rejected : number of rejected positions by reason, the most frequent first.
     """
 
     coordinates: FloatArray
@@ -40,15 +132,19 @@ class WorkspaceSample:
     reachable_share: float
     rejected: Mapping[str, int]
 
+    def __repr__(self) -> str:
+        share = f"{100 * self.reachable_share:.3g} % of the stated workspace is reachable"
+        return f"<WorkspaceSample of {len(self.coordinates)} positions; {share}>"
+
 
 def sample_workspace(
     robot: Mechanism, n: int, seed: int | np.random.Generator = 0
 ) -> WorkspaceSample:
-    """Draw n positions evenly from the ranges of `workspace`, those out of reach drawn anew.
+    """Draw n positions evenly from the ranges of `workspace`; draw unreachable ones again.
 
     Coordinates are uniform in their ranges; phi and theta are uniform over the area of the sphere
-    that they enclose. Left out is what cannot be closed, exceeds a stroke, a joint's limits or a
-    cone, or lies beyond a singularity from home.
+    that they enclose. Positions are rejected if the loops cannot be closed, if a stroke, a joint
+    limit or a cone is exceeded, and beyond a singularity, seen from home.
 
     Parameters
     ----------
@@ -56,7 +152,7 @@ def sample_workspace(
 
     Returns
     -------
-    Sample; the same for the same robot, n and seed.
+    WorkspaceSample; the same for the same robot, n and seed.
 
     Raises
     ------
@@ -66,25 +162,29 @@ def sample_workspace(
     """
     rng = np.random.default_rng(seed)
     wanted = workspace_ranges(robot)
-    lost: Counter[str] = Counter()
-    parts: list[FloatArray] = []
+    rejected: Counter[str] = Counter()
+    batches: list[FloatArray] = []
     kept = tried = 0
     while kept < n or not tried:
         coordinates = draw_coordinates(rng, robot.controlled, wanted, max(n, MIN_DRAWS // 8))
-        good = _reached(robot, coordinates, lost)
-        parts.append(coordinates[good])
+        good = _find_reachable(robot, coordinates, rejected)
+        batches.append(coordinates[good])
         kept, tried = kept + int(good.sum()), tried + len(coordinates)
         if tried >= MIN_DRAWS and kept < MIN_REACHABLE_SHARE * tried:
-            raise MechanismError(_empty(robot, kept, tried, lost))
-    coordinates = np.concatenate(parts)[:n]
+            reason, count = rejected.most_common(1)[0]
+            raise MechanismError(
+                f"the workspace of {robot.name} is empty: {kept} of {tried} random positions are "
+                f"reachable; most frequent reason: {reason} ({count} positions); correct "
+                "`workspace:`, the strokes or the limits"
+            )
+    coordinates = np.concatenate(batches)[:n]
     return WorkspaceSample(
-        coordinates, inverse(robot, coordinates), kept / tried, dict((+lost).most_common())
+        coordinates, inverse(robot, coordinates), kept / tried, dict((+rejected).most_common())
     )
 
 
 def workspace_ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
-    """Range of every controlled coordinate [m, rad]; phi runs all the way round where it is not
-    stated.
+    """Return the range of every controlled coordinate [m, rad]; phi is a full turn by default.
 
     Raises
     ------
@@ -98,8 +198,7 @@ def workspace_ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
     if missing:
         raise MechanismError(
             f"{robot.name} states no workspace for {', '.join(missing)}; add `workspace:` with a "
-            "range for each of "
-            f"{', '.join(robot.controlled)} to its file"
+            f"range for each of {', '.join(robot.controlled)} to its file"
         )
     return {name: stated[name] for name in robot.controlled}
 
@@ -107,15 +206,13 @@ def workspace_ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
 def draw_coordinates(
     rng: np.random.Generator,
     names: tuple[str, ...],
-    within: Mapping[str, tuple[float, float]],
+    ranges: Mapping[str, tuple[float, float]],
     n: int,
 ) -> FloatArray:
-    """Coordinates (n, c) spread evenly over their ranges [m, rad], whether the machine reaches them
-    or not.
-    """
+    """Draw coordinates (n, c) evenly from their ranges [m, rad], reachable or not."""
     columns = []
     for name in names:
-        low, high = within[name]
+        low, high = ranges[name]
         if name == "theta":
             # the area of a cap grows with 1 - cos(theta)
             columns.append(np.arccos(rng.uniform(np.cos(high), np.cos(max(low, 0.0)), n)))
@@ -124,28 +221,16 @@ def draw_coordinates(
     return np.stack(columns, axis=-1)
 
 
-def _reached(robot: Mechanism, coordinates: FloatArray, lost: Counter[str]) -> BoolArray:
-    """Which rows the machine reaches (n,); why it does not reach the others is added to `lost`."""
-    values, found = robot.values[None], inverse(robot, coordinates)
-    good = np.array(found.converged)
-    lost["the loops cannot be closed"] += int((~good).sum())
-    for limit in evaluate_limits(robot, values, found.q[None], found.state):
+def _find_reachable(robot: Mechanism, coordinates: FloatArray, rejected: Counter[str]) -> BoolArray:
+    """Return which rows the machine reaches (n,); count the reasons of the others."""
+    values, solution = robot.values[None], inverse(robot, coordinates)
+    good = np.array(solution.converged)
+    rejected["the loops cannot be closed"] += int((~good).sum())
+    for limit in evaluate_limits(robot, values, solution.q[None], solution.state):
         outside = good & ~(limit.margin[0] >= 0)
-        lost[f"{limit.name} is exceeded"] += int(outside.sum())
+        rejected[f"{limit.name} is exceeded"] += int(outside.sum())
         good &= ~outside
-    beyond = good & (
-        compute_closure_sign(robot, values, found.state)[0]
-        != compute_closure_sign(robot, values, robot.home_state)[0, 0]
-    )
-    lost["a singularity lies between it and home"] += int(beyond.sum())
+    sign = compute_closure_sign(robot, values, solution.state)[0]
+    beyond = good & (sign != compute_closure_sign(robot, values, robot.home_state)[0, 0])
+    rejected["beyond a singularity, seen from home"] += int(beyond.sum())
     return good & ~beyond
-
-
-def _empty(robot: Mechanism, kept: int, drawn: int, lost: Counter[str]) -> str:
-    """The sentence for a workspace that cannot be reached."""
-    reason, count = lost.most_common(1)[0]
-    return (
-        f"{robot.name}: the workspace is empty: {kept} of {drawn} positions drawn from it can be "
-        "reached, most often because "
-        f"{reason} ({count} of them); correct `workspace:`, the strokes or the limits"
-    )

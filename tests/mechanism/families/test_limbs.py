@@ -272,8 +272,10 @@ def test_limits_and_cones_of_a_file_are_told() -> None:
     solution = inverse(machine, np.array([[-0.05, -0.05], [-0.05, 0.1], [0.02, -0.05]]))
     allowed, why = check_limits(machine, machine.values[None], solution.q[None], solution.state)
     assert allowed.tolist() == [[True, False, False]]
-    assert why[0, 1].startswith("rod1.P1 is 0.457071, allowed are -1 to 0.45")
-    assert why[0, 2].startswith("lean of rod1 at its tip is 0.97")
+    assert why[0, 1].data["name"] == "rod1.P1"
+    assert why[0, 1].data["value"] == (pytest.approx(457.071, abs=1e-3), "mm")
+    assert (why[0, 1].data["low"], why[0, 1].data["high"]) == ((-1e3, "mm"), (450.0, "mm"))
+    assert why[0, 2].data["name"] == "inclination of rod1 at its tip"
 
 
 CASES = {

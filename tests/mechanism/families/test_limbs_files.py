@@ -86,11 +86,11 @@ FREEDOMS = {
     ),
     "freedoms empty": (
         ("freedoms: [x, y]", "freedoms: []"),
-        "five-bar has no freedoms; state those its platform has, of rx,",
+        "five-bar has no freedoms; state those of its platform, of rx,",
     ),
     "freedoms twice": (
         ("freedoms: [x, y]", "freedoms: [x, x, y]"),
-        "the freedom 'x' is named twice in x, x, y; name each once",
+        "duplicate freedom 'x' in x, x, y; name each once",
     ),
 }
 
@@ -115,11 +115,11 @@ TYPED = {
     ),
     "stroke reversed": (
         ("stroke: [-45, 95]", "stroke: [90, 10]"),
-        "the stroke of q1 runs from 1.5708 to 0.174533 rad; the first must be smaller",
+        "the stroke of q1 runs from 1.5708 to 0.174533 rad; the first value must be smaller",
     ),
     "limits reversed": (
         ("start: 30}", "start: 30, limits: [95, -45]}"),
-        "the limits of arm1.motor run from 1.65806 to -0.785398 rad; the first must be smaller",
+        "the limits of arm1.motor run from 1.65806 to -0.785398 rad; the first value must be smaller",
     ),
     "drive mistyped": (
         ("actuated: q", "actuated: w"),

@@ -19,6 +19,7 @@ SUBJECTS: tuple[str, ...] = (
     "conventions",
     "residuals",
     "model",
+    "mechanism",
     "apply",
     "plan",
     "files",

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from loopcal.mechanism.families.gough import Gough
 from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.families.linear_delta import LinearDelta
+from loopcal.mechanism.families.records import RobotRecord
 from loopcal.mechanism.families.ru_pus_prs import RuPusPrs
 from loopcal.mechanism.families.three_prs import ThreePrs
-from loopcal.mechanism.records import RobotRecord
 
 FAMILIES: Mapping[str, type[RobotRecord]] = {
     "3-prs": ThreePrs,

@@ -13,9 +13,9 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import Actuator, Address, LinearMap
-from loopcal.mechanism.families.errors import Errors, quantity
+from loopcal.mechanism.families.error_models import Errors, quantity
 from loopcal.mechanism.families.limb_records import AngleDrive, Drive, LengthDrive, SpoolDrive
-from loopcal.mechanism.records import (
+from loopcal.mechanism.families.records import (
     AngleTolerance,
     LengthTolerance,
     RatioTolerance,

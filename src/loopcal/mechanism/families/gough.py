@@ -16,10 +16,16 @@ from typing import Literal
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly, Cone
 from loopcal.mechanism.families.chain import Placed, at, placed
-from loopcal.mechanism.families.errors import Errors, Spread, complete, offset, point, rod_length
+from loopcal.mechanism.families.error_models import (
+    Errors,
+    Spread,
+    complete,
+    offset,
+    point,
+    rod_length,
+)
 from loopcal.mechanism.families.prs import check_spherical
-from loopcal.mechanism.families.ups import Screw, ScrewLeg, screw_leg, ups_leg
-from loopcal.mechanism.records import (
+from loopcal.mechanism.families.records import (
     AngleTolerance,
     LengthTolerance,
     Point,
@@ -27,6 +33,7 @@ from loopcal.mechanism.records import (
     standard_deviation,
     values_per_leg,
 )
+from loopcal.mechanism.families.ups import Screw, ScrewLeg, screw_leg, ups_leg
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length
 

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from loopcal.errors import MechanismError
-from loopcal.mechanism.records import (
+from loopcal.mechanism.families.records import (
     AngleTolerance,
     LengthTolerance,
     Point,

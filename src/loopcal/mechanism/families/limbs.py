@@ -28,7 +28,7 @@ from loopcal.mechanism.families.chain import (
     turn_about,
 )
 from loopcal.mechanism.families.drives import actuator, drive_errors
-from loopcal.mechanism.families.errors import Errors, Spread, complete, offset, quantity
+from loopcal.mechanism.families.error_models import Errors, Spread, complete, offset, quantity
 from loopcal.mechanism.families.limb_records import (
     AngleDrive,
     Cylindrical,
@@ -51,7 +51,7 @@ from loopcal.mechanism.families.limb_records import (
     refuse_branch,
 )
 from loopcal.mechanism.families.map_units import check_units, dimension_of, engine_axis
-from loopcal.mechanism.records import RobotRecord, standard_deviation
+from loopcal.mechanism.families.records import RobotRecord, standard_deviation
 from loopcal.units import Dimension
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import Actuator, Address, Assembly, Joint, Limb, LinearMap, Link
-from loopcal.mechanism.records import (
+from loopcal.mechanism.families.records import (
     AngleTolerance,
     LengthTolerance,
     RobotRecord,

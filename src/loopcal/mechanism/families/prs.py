@@ -19,8 +19,8 @@ from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import Address, LinearMap
 from loopcal.mechanism.families.chain import EX, EY, EZ, Placed, Step, at, moved, placed, tilted
-from loopcal.mechanism.families.errors import Errors, quantity
-from loopcal.mechanism.records import AngleTolerance, LengthTolerance, standard_deviation
+from loopcal.mechanism.families.error_models import Errors, quantity
+from loopcal.mechanism.families.records import AngleTolerance, LengthTolerance, standard_deviation
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 

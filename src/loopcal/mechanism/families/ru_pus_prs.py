@@ -24,7 +24,7 @@ import numpy as np
 
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly
 from loopcal.mechanism.families.chain import EX, EY, Placed, Step, at, moved, placed
-from loopcal.mechanism.families.errors import Errors, Spread, complete, quantity
+from loopcal.mechanism.families.error_models import Errors, Spread, complete, quantity
 from loopcal.mechanism.families.prs import (
     Frames,
     TripodTolerances,
@@ -36,7 +36,7 @@ from loopcal.mechanism.families.prs import (
     prs_limb,
     pus_limb,
 )
-from loopcal.mechanism.records import RobotRecord
+from loopcal.mechanism.families.records import RobotRecord
 from loopcal.units import Dimension, Length
 
 POST_ANGLES = (

@@ -19,7 +19,7 @@ import numpy as np
 
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly
 from loopcal.mechanism.families.chain import Placed, at, turn_about
-from loopcal.mechanism.families.errors import Errors, Spread, complete
+from loopcal.mechanism.families.error_models import Errors, Spread, complete
 from loopcal.mechanism.families.prs import (
     Frames,
     TripodTolerances,
@@ -31,7 +31,7 @@ from loopcal.mechanism.families.prs import (
     joint_angles,
     prs_limb,
 )
-from loopcal.mechanism.records import RobotRecord
+from loopcal.mechanism.families.records import RobotRecord
 from loopcal.units import Dimension, Length
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.mechanism.families.chain import EX, EY, EZ, Placed, Step, at, placed
-from loopcal.mechanism.records import values_per_leg
+from loopcal.mechanism.families.records import values_per_leg
 from loopcal.typing import FloatArray
 from loopcal.units import Length, Ratio
 

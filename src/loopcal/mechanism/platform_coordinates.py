@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Coordinates a machine is commanded in, and their slopes in the platform's twist.
+"""Platform coordinates: the numbers in which a machine is commanded, and their derivatives.
 
-Names: `x y z` of the platform's origin in base; `phi theta psi` tilt-and-torsion, R = Rz(phi)
+Names: `x y z` of the platform's origin in the base; `phi theta psi` tilt-and-torsion, R = Rz(phi)
 Ry(theta) Rz(psi - phi); `roll pitch yaw`, R = Rz(yaw) Ry(pitch) Rx(roll). phi and theta together
-are asked for as a unit normal, which stays regular at zero tilt. Formulas:
+are compared as a unit normal, which stays regular at zero tilt. Formulas:
 docs/theory/conventions.md.
 """
 
@@ -26,34 +26,36 @@ def check_coordinates(names: tuple[str, ...]) -> None:
     wrong = [n for n in names if n not in COORDINATES]
     if wrong:
         raise MechanismError(
-            f"{wrong[0]!r} is not a coordinate; allowed are {', '.join(COORDINATES)}"
+            f"{wrong[0]!r} is not a platform coordinate; allowed are {', '.join(COORDINATES)}"
         )
     if len(set(names)) < len(names):
-        raise MechanismError(f"a coordinate is named twice in {', '.join(names)}; name each once")
+        raise MechanismError(f"duplicate coordinate in {', '.join(names)}; name each once")
     if set(names) & set(TILT) and set(names) & set(EULER):
         raise MechanismError(
             f"{', '.join(names)} mixes roll-pitch-yaw with phi-theta-psi; describe the orientation "
             "by one of the two"
         )
     if ("phi" in names) != ("theta" in names):
-        raise MechanismError("phi and theta are the direction of one normal; name both or neither")
+        raise MechanismError(
+            "phi and theta give the direction of the normal together; name both or neither"
+        )
 
 
 def read_coordinates(T: FloatArray, names: tuple[str, ...]) -> FloatArray:
-    """Values of these coordinates (.., c) at poses T (.., 4, 4) [m, rad]."""
-    found = {name: T[..., i, 3] for i, name in enumerate(POSITION)}
+    """Return these coordinates (.., c) of poses T (.., 4, 4) [m, rad]."""
+    values = {name: T[..., i, 3] for i, name in enumerate(POSITION)}
     if set(names) & set(TILT):
-        found |= dict(zip(TILT, geometry.matrix_to_tilt_torsion(T[..., :3, :3]), strict=True))
+        values |= dict(zip(TILT, geometry.matrix_to_tilt_torsion(T[..., :3, :3]), strict=True))
     if set(names) & set(EULER):
         angles = geometry.matrix_to_euler(T[..., :3, :3], "xyz")
-        found |= {name: angles[..., i] for i, name in enumerate(EULER)}
-    return np.stack([found[name] for name in names], axis=-1)
+        values |= {name: angles[..., i] for i, name in enumerate(EULER)}
+    return np.stack([values[name] for name in names], axis=-1)
 
 
 def pose_from_coordinates(
     values: FloatArray, names: tuple[str, ...], base: FloatArray
 ) -> FloatArray:
-    """Poses (.., 4, 4) with these coordinates; the coordinates not named stay as in `base` (4, 4)."""
+    """Return poses (.., 4, 4) with coordinates values (.., c); all others are those of `base`."""
     T = np.array(np.broadcast_to(base, (*values.shape[:-1], 4, 4)))
     given = {name: values[..., i] for i, name in enumerate(names)}
     for i, name in enumerate(POSITION):
@@ -71,7 +73,7 @@ def pose_from_coordinates(
 def compare_coordinates(
     T: FloatArray, target: FloatArray, names: tuple[str, ...], size: float
 ) -> tuple[FloatArray, FloatArray]:
-    """How far poses are from the coordinates asked for, and the slopes of that in the twist.
+    """Return how far poses are from target coordinates, with the derivative in the twist.
 
     Parameters
     ----------
@@ -91,32 +93,28 @@ def compare_coordinates(
     rotation, wanted = T[:, :3, :3], {name: target[:, i] for i, name in enumerate(names)}
     if "phi" in wanted:
         places = [names.index("phi"), names.index("theta")]
-        residual[:, places], columns[:, places, :3] = _normal(
+        residual[:, places], columns[:, places, :3] = _compare_normals(
             rotation, wanted["phi"], wanted["theta"], size
         )
     if "psi" in wanted:
-        place, angle, row = names.index("psi"), *_torsion(rotation)
-        residual[:, place], columns[:, place, :3] = (
-            size * geometry.wrap_angle(angle - wanted["psi"]),
-            size * row,
-        )
+        place, (angle, row) = names.index("psi"), _torsion(rotation)
+        residual[:, place] = size * geometry.wrap_angle(angle - wanted["psi"])
+        columns[:, place, :3] = size * row
     if set(EULER) & set(names):
         angles = geometry.matrix_to_euler(rotation, "xyz")
         rates = geometry.euler_rates_inverse(angles, "xyz")
         for i, name in enumerate(EULER):
             if name in wanted:
                 place = names.index(name)
-                residual[:, place], columns[:, place, :3] = (
-                    size * geometry.wrap_angle(angles[:, i] - wanted[name]),
-                    size * rates[:, i],
-                )
+                residual[:, place] = size * geometry.wrap_angle(angles[:, i] - wanted[name])
+                columns[:, place, :3] = size * rates[:, i]
     return residual, columns
 
 
-def _normal(
+def _compare_normals(
     rotation: FloatArray, phi: FloatArray, theta: FloatArray, size: float
 ) -> tuple[FloatArray, FloatArray]:
-    """The unit normal against the one asked for, in two directions across it."""
+    """Return the components of the platform normal across the target normal, and their slopes."""
     s, c = np.sin(theta), np.cos(theta)
     across = np.stack(
         [
@@ -132,9 +130,9 @@ def _normal(
 
 
 def _torsion(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """psi (N,) and its slope in the angular velocity (N, 3)."""
-    # d psi = (ez + n) . omega / (1 + cos theta): across everything that phi and theta turn about
+    """Return psi (N,) and its slope in the angular velocity (N, 3)."""
+    # d psi = (ez + n) . omega / (1 + cos theta): orthogonal to the axes that phi and theta turn
+    # about
     normal = rotation[:, :, 2]
-    return geometry.matrix_to_tilt_torsion(rotation)[2], (normal + np.array([0.0, 0.0, 1.0])) / (
-        1.0 + normal[:, 2:]
-    )
+    row = (normal + np.array([0.0, 0.0, 1.0])) / (1.0 + normal[:, 2:])
+    return geometry.matrix_to_tilt_torsion(rotation)[2], row
