@@ -89,14 +89,14 @@ def check_limits(
     return allowed, findings
 
 
-def _report_exceeded(robot: Mechanism, limit: Limit, value: float) -> Finding:
+def _report_exceeded(robot: Mechanism, limit: Limit, reached: float) -> Finding:
     """Return the finding of an exceeded limit, in the robot's display unit."""
     unit = find_unit(robot.units[limit.dimension])
-    numbers = {"value": value, "low": limit.low, "high": limit.high}
-    quantities = {
-        key: Quantity(number / unit.factor_to_si, unit.symbol) for key, number in numbers.items()
-    }
-    return report_finding("limits.exceeded", name=limit.name, **quantities)
+    value, low, high = (
+        Quantity(number / unit.factor_to_si, unit.symbol)
+        for number in (reached, limit.low, limit.high)
+    )
+    return report_finding("limits.exceeded", name=limit.name, value=value, low=low, high=high)
 
 
 def _evaluate_cones(robot: Mechanism, values: FloatArray, state: State) -> list[Limit]:

@@ -54,7 +54,7 @@ class RobotInspection:
                 }
                 for i, p in enumerate(table.entries)
             ],
-            "notes": robot.notes,
+            "notes": [str(finding) for finding in robot.findings],
             "findings": self.findings,
         }
 
@@ -64,10 +64,7 @@ def inspect_robot(robot: Mechanism) -> RobotInspection:
     solution = inverse(robot, robot.home[None])
     limits = evaluate_limits(robot, robot.values[None], solution.q[None], solution.state)
     exceeded = tuple(limit.name for limit in limits if limit.margin[0, 0] < -ROUNDING)
-    findings = [
-        note if isinstance(note, Finding) else report_finding("workflow.note", text=str(note))
-        for note in robot.notes
-    ]
+    findings = list(robot.findings)
     if exceeded:
         findings.append(report_finding("workflow.home-exceeds-limits", names=exceeded))
     return RobotInspection(robot, solution.q[0], tuple(findings))

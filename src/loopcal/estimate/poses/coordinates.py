@@ -30,10 +30,8 @@ from loopcal.estimate.poses.linearization import (
 )
 from loopcal.estimate.poses.states import PoseStates
 from loopcal.findings import report_finding
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism import Mechanism, differentiate_at_pose, forward_trials, solve_at_pose
 from loopcal.mechanism.assembly import Actuator
-from loopcal.mechanism.batch_kinematics import forward_trials
-from loopcal.mechanism.pose_driven import differentiate_at_pose, solve_at_pose
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 

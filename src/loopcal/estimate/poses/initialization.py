@@ -18,8 +18,7 @@ from loopcal.estimate.poses.coordinates import stroke_of
 from loopcal.estimate.poses.measured import measure_poses, sum_squares_at
 from loopcal.estimate.poses.states import PoseStates, map_states
 from loopcal.estimate.start import spread_states
-from loopcal.mechanism import Mechanism, Status, inverse
-from loopcal.mechanism.batch_kinematics import compute_readings, forward_trials
+from loopcal.mechanism import Mechanism, Status, compute_readings, forward_trials, inverse
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 TRIED = 9

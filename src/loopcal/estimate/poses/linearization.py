@@ -24,11 +24,13 @@ from loopcal import engine, geometry
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.measure import Evaluation, select_joint_values
-from loopcal.mechanism import Status
-from loopcal.mechanism.batch_kinematics import forward_trials
-from loopcal.mechanism.passive_joints import differentiate_passive_joints
-from loopcal.mechanism.sensitivity import differentiate_pose
-from loopcal.mechanism.transmission import joints_from_readings
+from loopcal.mechanism import (
+    Status,
+    differentiate_passive_joints,
+    differentiate_pose,
+    forward_trials,
+    joints_from_readings,
+)
 from loopcal.numerics.decomposition import without_rounding
 from loopcal.typing import BoolArray, FloatArray, IntArray
 

@@ -18,9 +18,13 @@ from loopcal import engine, geometry
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.poses.linearization import whiten
 from loopcal.estimate.poses.states import map_states
-from loopcal.mechanism import Mechanism, Status, read_coordinates
-from loopcal.mechanism.batch_kinematics import inverse_trials
-from loopcal.mechanism.projection import differentiate_by_coordinates
+from loopcal.mechanism import (
+    Mechanism,
+    Status,
+    differentiate_by_coordinates,
+    inverse_trials,
+    read_coordinates,
+)
 from loopcal.numerics.gauss_newton import DescentStatus, FixedFactors, minimize
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
