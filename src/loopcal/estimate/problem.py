@@ -55,6 +55,9 @@ from loopcal.numerics.triangular_factor import empty_factor, fold_rows
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
+POSE_CONTROL = Halving(attempts=10, stuck=1e-3)
+"""Control of the iteration to uncertain poses, which may lie at the end of their reach."""
+
 UNKNOWN_READING = 1e-3
 """Unit of a reading that was not taken: this share of the robot's size, or this many radians. It
 has no row."""
@@ -425,6 +428,7 @@ def make_problem(
         numbers,
         nuisance,
         data,
+        control=POSE_CONTROL,
         sigma=believed,
         member=member,
         coordinates=coordinates,

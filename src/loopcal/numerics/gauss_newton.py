@@ -30,12 +30,6 @@ from loopcal.typing import BoolArray, FloatArray, IntArray
 ROUNDING = 1e-12
 """Relative change of a sum of squares that is rounding and says nothing about a step."""
 
-STUCK = 1e-3
-"""Smallest share of the promised decrease, where it is as large a share of the sum of squares.
-
-A trial at the end of its reach gains nothing however often the step is halved.
-"""
-
 
 class DescentStatus(IntEnum):
     """How the iteration of one trial ended."""
@@ -222,12 +216,16 @@ class Halving:
     steps : at most. attempts : lengths that are tried for each step, each half the one before.
     relative, absolute : converged when a step changes the whitened residuals by less than this
         share of their norm, plus this many standard deviations.
+    stuck : a trial ends that gains less than this share of the promised decrease, where that is as
+        large a share of the sum of squares: at the end of its reach a pose gains nothing, however
+        often the step is halved. With 0 it ends when it gains nothing at all.
     """
 
     steps: int = 30
-    attempts: int = 10
+    attempts: int = 20
     relative: float = 1e-7
     absolute: float = 1e-5
+    stuck: float = 0.0
 
     def is_negligible(self, change: FloatArray, cost: FloatArray) -> BoolArray:
         """Return which squared changes (a,) of the residuals are negligible."""
@@ -297,7 +295,8 @@ def minimize_by_halving(
                 parts = parts & is_part_worse(point, candidate)
             share = np.where(parts, (0.5 if attempt < control.attempts - 1 else 0.0) * share, share)
         gained = point.cost - candidate.cost
-        stuck |= (step.change > STUCK * point.cost) & ~(gained > STUCK * step.change)
+        promised = step.change > control.stuck * point.cost
+        stuck |= promised & ~(gained > control.stuck * step.change)
         point = candidate
         if not share.any():
             break
