@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from loopcal import geometry
 from loopcal.estimate import MAP, LeastSquares, identify_trials
-from loopcal.estimate.descent import penalize
 from loopcal.estimate.identification import IdentifiedTrials
 from loopcal.estimate.methods.penalties import Method
+from loopcal.estimate.minimization.descent import penalize
 from loopcal.io import load_robot
 from loopcal.measure import (
     Component,

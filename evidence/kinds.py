@@ -27,7 +27,7 @@ from loopcal.estimate import (
     identify_trials,
 )
 from loopcal.estimate.identification import IdentifiedTrials
-from loopcal.estimate.nuisance_estimate import estimate_nuisance
+from loopcal.estimate.nuisance.estimate import estimate_nuisance
 from loopcal.estimate.problem import problem_of, problem_of_trials
 from loopcal.io import load_robot
 from loopcal.measure import (

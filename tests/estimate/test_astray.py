@@ -8,8 +8,8 @@ import pytest
 
 from loopcal.diagnose import StartVerdict, check_start_values
 from loopcal.estimate import MAP, FitOptions, LeastSquares, identify
-from loopcal.estimate.descent import StepControl
 from loopcal.estimate.inference.prior import prior_from
+from loopcal.estimate.minimization.descent import StepControl
 from tests.estimate.problems import hexapod, hexapod_data
 from tests.findings.reported import codes_of, one_of, refused
 

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from loopcal.estimate.descent import FunctionProblem, StepControl, descend
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Ridge
+from loopcal.estimate.minimization.descent import FunctionProblem, StepControl, descend
 from loopcal.numerics.gauss_newton import DescentStatus
 from tests.estimate.problems import folded
 

@@ -55,7 +55,13 @@ def trials(sigma: float | None) -> Problem:
     instrument = Instrument((sensor(TRACKER),))
     truth = sample_truth(hexapod(), 3, 2)
     data = simulate_trials(
-        hexapod(), truth, hexapod_poses(POSES), instrument, 1, nuisance_values=FRAME, reading_sigma=sigma
+        hexapod(),
+        truth,
+        hexapod_poses(POSES),
+        instrument,
+        1,
+        nuisance_values=FRAME,
+        reading_sigma=sigma,
     )
     return problem_of_trials(select_free_parameters(hexapod()), data)
 

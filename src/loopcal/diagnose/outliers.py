@@ -25,10 +25,10 @@ import numpy as np
 
 from loopcal.diagnose.influence import Influence, compute_influence
 from loopcal.estimate.fit_input import exclude_poses
+from loopcal.estimate.minimization.robust_descent import estimate_scale_of
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.problem import Problem, problem_of
 from loopcal.estimate.result import Identification
-from loopcal.estimate.robust_descent import estimate_scale_of
 from loopcal.estimate.start import Start
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Estimate the parameters of a robot from measurements."""
 
-from loopcal.estimate.descent import DescentStatus as DescentStatus
-from loopcal.estimate.descent import StepControl as StepControl
 from loopcal.estimate.identification import IdentifiedTrials as IdentifiedTrials
 from loopcal.estimate.identification import identify as identify
 from loopcal.estimate.identification import identify_trials as identify_trials
@@ -22,6 +20,8 @@ from loopcal.estimate.methods.prior_conflict import PriorConflict as PriorConfli
 from loopcal.estimate.methods.regularization_rules import GCV as GCV
 from loopcal.estimate.methods.regularization_rules import MarginalLikelihood as MarginalLikelihood
 from loopcal.estimate.methods.regularization_rules import TruncationGCV as TruncationGCV
+from loopcal.estimate.minimization.descent import DescentStatus as DescentStatus
+from loopcal.estimate.minimization.descent import StepControl as StepControl
 from loopcal.estimate.options import FitOptions as FitOptions
 from loopcal.estimate.recalibration import Change as Change
 from loopcal.estimate.recalibration import recalibrate as recalibrate

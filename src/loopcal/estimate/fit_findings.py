@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopcal.estimate.descent import DescentStatus
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import MAP, Method
+from loopcal.estimate.minimization.descent import DescentStatus
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements
 from loopcal.typing import FloatArray

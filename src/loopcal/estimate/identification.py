@@ -11,8 +11,6 @@ from functools import partial
 import numpy as np
 
 from loopcal.errors import EstimationError
-from loopcal.estimate.closure_start import descend_from_closure, report_unused_closure
-from loopcal.estimate.descent import Descent, DescentStatus, descend
 from loopcal.estimate.fit_findings import report_divergence, report_equations, report_weights
 from loopcal.estimate.fit_input import (
     check_count,
@@ -28,7 +26,10 @@ from loopcal.estimate.inference.residual_test import ResidualTest, run_residual_
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method, adapt_method
 from loopcal.estimate.methods.prior_conflict import PriorConflict, assess_prior_conflict
-from loopcal.estimate.nuisance_estimate import (
+from loopcal.estimate.minimization.closure_start import descend_from_closure, report_unused_closure
+from loopcal.estimate.minimization.descent import Descent, DescentStatus, descend
+from loopcal.estimate.minimization.robust_descent import Run, descend_robustly
+from loopcal.estimate.nuisance.estimate import (
     NuisanceEstimate,
     add_followers,
     empty_nuisance_estimate,
@@ -45,7 +46,6 @@ from loopcal.estimate.poses.estimate import (
 from loopcal.estimate.poses.solution import PoseSolution
 from loopcal.estimate.problem import Problem, problem_of, problem_of_trials
 from loopcal.estimate.result import History, Identification, KindResiduals, Spectrum
-from loopcal.estimate.robust_descent import Run, descend_robustly
 from loopcal.estimate.start import Start
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, Trials, fill_in_reading_sigma

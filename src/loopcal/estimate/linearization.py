@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.estimate.nuisance import EliminatedNuisance
+from loopcal.estimate.nuisance.elimination import EliminatedNuisance
 from loopcal.estimate.poses.solution import PoseEstimates
 from loopcal.estimate.start import Start
 from loopcal.typing import FloatArray, IntArray

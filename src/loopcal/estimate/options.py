@@ -11,10 +11,10 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from loopcal.errors import EstimationError
-from loopcal.estimate.descent import StepControl
 from loopcal.estimate.inference.prior import Prior
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import Method
+from loopcal.estimate.minimization.descent import StepControl
 from loopcal.measure import NuisanceParameters
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.typing import FloatArray

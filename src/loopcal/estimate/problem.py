@@ -6,11 +6,12 @@ nuisance parameters with its elimination tree, and how poses follow from reading
 `linearize(z, start)` depends on its arguments alone. Warm starts are passed in and returned.
 
 For a row with residual r = predicted - measured, whitener W, the kind's derivative G by the
-platform's twist, and the error model D = d twist / d parameter, the row is [W G D diag(tolerance) |
-W r]. FreeParameters of all scopes are eliminated from the innermost outwards: the coordinates of poses
-whose readings are uncertain (block by block, while rows are made), then groups, sessions and what
-all rows share. What is left is folded into one triangular factor, so that the memory of a fit is
-its parameters squared plus one block. See docs/theory/identification.md and docs/theory/latent.md.
+platform's twist, and the error model D = d twist / d parameter, the row is
+[W G D diag(tolerance) | W r]. Unknowns of all scopes are eliminated from the innermost outwards:
+the coordinates of poses whose readings are uncertain (block by block, while rows are made), then
+groups, sessions and what all rows share. What is left is folded into one triangular factor, so that
+the memory of a fit is its parameters squared plus one block. See docs/theory/identification.md and
+docs/theory/latent.md.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.linearization import LeverageRows, Linearization
-from loopcal.estimate.nuisance import (
+from loopcal.estimate.nuisance.elimination import (
     NodeMembers,
     NuisanceElimination,
     fold_node_rows,
@@ -127,7 +128,10 @@ class Problem:
 
     @property
     def equations(self) -> IntArray:
-        """(t,) equations, at least, once every pose is determined; nuisance parameters not counted."""
+        """(t,) equations, at least, once every pose is determined.
+
+        Nuisance parameters are not counted.
+        """
         count = self.component_count
         if self.coordinates is not None and self.member is not None:
             free = self.coordinates.is_free(np.arange(len(self.member))).sum(axis=1)
@@ -189,9 +193,9 @@ class Problem:
         """
         t = len(self)
         shared = None
-        if isinstance(self.poses, ExactPoses) and self.poses.is_single_block and t > 1:
-            if (deviation == deviation[0]).all():
-                shared = self.poses.solve_single_block(deviation[:1], self.trials, start)
+        can_share = isinstance(self.poses, ExactPoses) and self.poses.is_single_block and t > 1
+        if can_share and (deviation == deviation[0]).all():
+            shared = self.poses.solve_single_block(deviation[:1], self.trials, start)
         together = max(1, BLOCK // self.poses.block_size)
         parts = []
         for first in range(0, t, together):

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.estimate.descent import DescentStatus
 from loopcal.estimate.fit_findings import report_status
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import Combination
@@ -18,7 +17,8 @@ from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.inference.residual_test import LEVEL, ResidualTest, coverage_factor
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.methods.prior_conflict import PriorConflict
-from loopcal.estimate.nuisance_estimate import NuisanceEstimate
+from loopcal.estimate.minimization.descent import DescentStatus
+from loopcal.estimate.nuisance.estimate import NuisanceEstimate
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.poses.estimate import EstimatedPoses
 from loopcal.findings import Finding

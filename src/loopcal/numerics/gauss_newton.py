@@ -138,7 +138,7 @@ class Model(Protocol):
         ...
 
     def ending(self, point: Any, step: Any, candidate: Any, accepted: BoolArray) -> IntArray:
-        """Return the `DescentStatus` (a,) of every trial after this step, RUNNING where it goes on."""
+        """Return the status (a,) of every trial after this step, RUNNING where it goes on."""
         ...
 
 

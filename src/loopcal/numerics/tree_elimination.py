@@ -178,7 +178,10 @@ class TreeElimination:
 
         nodes = tuple(
             NodeSolution(
-                *(np.concatenate(arrays) for arrays in zip(*(vars(s).values() for s in one)))
+                *(
+                    np.concatenate(arrays)
+                    for arrays in zip(*(vars(s).values() for s in one), strict=True)
+                )
             )
             for one in zip(*(part.nodes for part in parts), strict=True)
         )

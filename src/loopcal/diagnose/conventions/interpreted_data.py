@@ -17,7 +17,7 @@ from loopcal.diagnose.conventions.interpretations import Interpretation
 from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.linearization import Linearization
-from loopcal.estimate.nuisance import plan_elimination
+from loopcal.estimate.nuisance.elimination import plan_elimination
 from loopcal.estimate.observation_rows import ObservationRows, Residuals
 from loopcal.estimate.problem import Problem, problem_of
 from loopcal.estimate.start import Start

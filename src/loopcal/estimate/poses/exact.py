@@ -10,7 +10,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.nuisance import (
+from loopcal.estimate.nuisance.elimination import (
     NodeMembers,
     NodeRows,
     NuisanceElimination,
@@ -46,7 +46,7 @@ class ExactPoses:
     blocks : of poses. members : of every block and kind, the rows by nodes.
     nuisance : nuisance parameters, if any.
     located : (t | 1, n, 4, 4) [m], optional. With it closure is linearized at these poses and not
-        solved, see `loopcal.estimate.closure_start`.
+        solved, see `loopcal.estimate.minimization.closure_start`.
     """
 
     free: FreeParameters

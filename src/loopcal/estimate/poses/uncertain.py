@@ -19,7 +19,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.nuisance import NodeRows, NuisanceElimination, fold_node_rows, spread_columns
+from loopcal.estimate.nuisance.elimination import (
+    NodeRows,
+    NuisanceElimination,
+    fold_node_rows,
+    spread_columns,
+)
 from loopcal.estimate.observation_rows import ObservationRows, PoseBlock
 from loopcal.estimate.poses.components import ComponentGroup, stack_rows
 from loopcal.estimate.poses.coordinates import PoseCoordinates

@@ -26,8 +26,8 @@ from typing import Literal, get_args
 import numpy as np
 
 from loopcal.engine import State
-from loopcal.estimate.descent import Descent, FunctionProblem, StepControl, descend
 from loopcal.estimate.methods.penalties import Method
+from loopcal.estimate.minimization.descent import Descent, FunctionProblem, StepControl, descend
 from loopcal.measure import make_random_stream
 from loopcal.mechanism import (
     POSITION,

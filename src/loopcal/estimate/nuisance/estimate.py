@@ -17,7 +17,7 @@ import numpy as np
 
 from loopcal.estimate.inference.null_space import Combination, sparsify_basis
 from loopcal.estimate.linearization import Linearization
-from loopcal.estimate.nuisance import NuisanceElimination
+from loopcal.estimate.nuisance.elimination import NuisanceElimination
 from loopcal.findings import Finding, report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition

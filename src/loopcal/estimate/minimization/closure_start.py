@@ -16,8 +16,8 @@ from dataclasses import replace
 import numpy as np
 
 from loopcal import geometry
-from loopcal.estimate.descent import Descent, StepControl, descend
 from loopcal.estimate.methods.penalties import Method
+from loopcal.estimate.minimization.descent import Descent, StepControl, descend
 from loopcal.estimate.problem import Problem
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.gauss_newton import DescentStatus

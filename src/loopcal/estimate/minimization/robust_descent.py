@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal.estimate.descent import Descent
 from loopcal.estimate.inference.prior import Prior
 from loopcal.estimate.methods.losses import Huber, Loss, Tukey
+from loopcal.estimate.minimization.descent import Descent
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.start import Start
 from loopcal.numerics.gauss_newton import DescentStatus
