@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -142,6 +141,7 @@ def import_(
       loopcal import samples.json --format hangprinter -o robot.yaml --data samples.csv
       loopcal import five-bar.urdf --closures five-bar-loops.yaml -o five-bar.yaml
     """  # noqa: D301
+    from loopcal.diagnose import compare_stored_geometry
     from loopcal.io.core.outputs import refuse_outputs, restore_on_failure
     from loopcal.io.formats.import_export import choose_format, save_imported
 
@@ -165,9 +165,10 @@ def import_(
     imported = source.read(file, _make_import_options(source, output.stem, settings))
     with restore_on_failure((output, data)):
         robot = save_imported(file, imported, output, data)
-        if source.judged is not None and imported.measurements is not None:
-            judged = source.judged(robot, imported.measurements)
-            imported = replace(imported, notes=(*imported.notes, *judged))
+        notes = [str(finding) for finding in imported.findings]
+        if source.stores_fit and imported.measurements is not None:
+            stored = compare_stored_geometry(robot, imported.measurements)
+            notes += [] if stored is None else [str(stored)]
         fit = changes = None
         if corrected is not None and data is not None:
             fit, changes = _correct_file(source, robot, file, data, corrected)
@@ -175,7 +176,8 @@ def import_(
         "robot": output,
         "data": data,
         "corrected": corrected,
-        "notes": imported.notes,
+        "notes": notes,
+        "findings": imported.findings,
     }
     if as_json:
         terminal.print_json({**document, "fit": fit, "changes": changes})
@@ -261,7 +263,7 @@ def _correct_file(
     fit = identify(robot, load_measurements(data, robot))
     written = export_robot(ExportSource(fit.robot), source, file)
     write_text(output, written.text)
-    return fit, written.notes
+    return fit, tuple(str(finding) for finding in written.findings)
 
 
 def _view_import(
@@ -329,7 +331,8 @@ def export(
     exported = export_robot(load_source(source), target, into)
     write_text(output, exported.text)
     if as_json:
-        document = {"output": output, "format": target.name, "notes": exported.notes}
+        notes = [str(finding) for finding in exported.findings]
+        document = {"output": output, "format": target.name, "notes": notes}
         terminal.print_json(document)
         return
-    terminal.print_page([*exported.notes, f"Written to {output}"])
+    terminal.print_page([*map(str, exported.findings), f"Written to {output}"])

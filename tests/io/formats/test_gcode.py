@@ -134,14 +134,14 @@ def test_a_word_that_is_not_there_is_added_before_the_comment(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "sentence"),
     [
-        ("reprap", "G28\n", "there is no M665 in this file"),
-        ("reprap", "M665 R1 H2\n", "M665 states no L"),
-        ("reprap", "G20\nM665 L2 R1 H2\n", r":1: G20 asks for inches"),
+        ("reprap", "G28\n", "no M665"),
+        ("reprap", "M665 R1 H2\n", "M665 has no L"),
+        ("reprap", "G20\nM665 L2 R1 H2\n", r":1: G20 selects inches"),
         ("reprap", "G28\nM665 L2:2:2:2 R1 H2\n", r":2: L of M665 has 4 lengths"),
         (
             "reprap",
             "M665 L250 R130 H2-3\n",
-            r":1: H of M665 is '2-3' where a finite number is needed",
+            r":1: H of M665 is '2-3', but a finite number is needed",
         ),
         ("reprap", "M665 L250 R130 H200\nM666 A0.3\n", r":2: M666 A tilts the bed"),
         (
@@ -153,22 +153,22 @@ def test_a_word_that_is_not_there_is_added_before_the_comment(tmp_path) -> None:
         (
             "reprap",
             "G28\nM665 L269 R130,25 H250\n",
-            r":2: R of M665 is '130,25' where a finite number is needed",
+            r":2: R of M665 is '130,25', but a finite number is needed",
         ),
         (
             "reprap",
             "M665 L269 R130 ,25 H250\n",
-            r":1: M665 has ',25 H250' where a letter and its number are needed",
+            r":1: M665 has ',25 H250', but a letter and its number are needed",
         ),
-        ("reprap", "M665 269 R130 H250\n", r":1: M665 has '269 R130 H250' where a letter"),
-        ("reprap", "M665 L269 R130 H250\nM666 X - 0.5\n", r":2: M666 has '0.5' where a letter"),
+        ("reprap", "M665 269 R130 H250\n", r":1: M665 has '269 R130 H250', but a letter"),
+        ("reprap", "M665 L269 R130 H250\nM666 X - 0.5\n", r":2: M666 has '0.5', but a letter"),
         (
             "reprap",
             "M665 L{var.rod} R130 H250\n",
-            r":1: L of M665 is '{var.rod}' where a finite number",
+            r":1: L of M665 is '{var.rod}', but a finite number",
         ),
         ("reprap", "M665 L269 R130 R131 H250\n", r":1: M665 has R twice"),
-        ("reprap", "G28 G20\nM665 L269 R130 H250\n", r":1: G20 asks for inches"),
+        ("reprap", "G28 G20\nM665 L269 R130 H250\n", r":1: G20 selects inches"),
         (
             "marlin",
             "M665 L269 R130 H250 M666 X-0.5\n",
@@ -177,7 +177,7 @@ def test_a_word_that_is_not_there_is_added_before_the_comment(tmp_path) -> None:
         (
             "marlin",
             "M665 L250 R130 H200\nM666 X0.1\n",
-            r":2: M666 X is 0.1, but Marlin takes none above zero",
+            r":2: M666 X is 0.1, but is never positive in Marlin",
         ),
     ],
 )

@@ -88,7 +88,7 @@ def test_anchors_start_exactly_from_known_poses_without_noise_and_buildup(tmp_pa
     gain = 60 * 18 / 240 * np.array([0.5, 0.5, 0.5, 0.25])
     path = tmp_path / "samples.json"
     path.write_text(json.dumps(found | {"motor_pos_samp": np.degrees(moved / gain).tolist()}))
-    made = hangprinter.anchors_from_known(hangprinter.parse(path), path)
+    made = hangprinter.estimate_anchors(hangprinter.parse(path), path)
     np.testing.assert_allclose(
         made, anchors, rtol=0, atol=1e-6
     )  # [mm], condition 1e3 of lengths of 1e3 mm
@@ -112,7 +112,7 @@ def test_with_stated_anchors_no_pose_need_be_known(tmp_path) -> None:
     assert again.n_poses == 45
     assert again.n_rows == 0
     assert again.labels[0] == "sample1"
-    assert "45 poses of 4 motor angles, 0 of them known" in imported.notes[0]
+    assert "45 poses of 4 motor angles, 0 of them known" in str(imported.findings[0])
     assert (
         identifiability(robot, imported.measurements).rank == 14
     )  # 21 less six of the frame and one of the scale
@@ -126,12 +126,12 @@ def test_what_a_robot_file_cannot_say_is_told(tmp_path) -> None:
         "colour": "red",
     }
     _, imported = read(tmp_path, example() | more | {"line_lengths_when_at_origin": [1, 2, 3, 4]})
-    notes = " | ".join(imported.notes)
+    notes = " | ".join(map(str, imported.findings))
     assert "41 rows of line forces are not read" in notes
-    assert "45 rows of motor angles go with them" in notes
-    for words in ("stiffness", "weight", "taped at the origin", "the key 'colour' is not known"):
+    assert "with 45 rows of motor angles" in notes
+    for words in ("stiffness", "weight", "taped lengths at the origin", "the key 'colour' is unknown"):
         assert words in notes
-    assert "line is taken to be known to 1 mm" in notes
+    assert "1 mm is assumed for lines" in notes
 
 
 @pytest.mark.parametrize(
@@ -144,11 +144,11 @@ def test_what_a_robot_file_cannot_say_is_told(tmp_path) -> None:
         ),
         (
             {"motor_pos_samp": [[1, 2]]},
-            "has 2 motors in a row; a point in space needs 3 lines or more",
+            "has 2 motors in a row",
         ),
         (
             {"motor_pos_samp": [[1, 2, 3, 4]]},
-            "'xyz_of_samp' has 9 poses and 'motor_pos_samp' only 1",
+            "'xyz_of_samp' has 9 poses, but 'motor_pos_samp' only 1",
         ),
         ({"xyz_of_samp": [[1, 2]]}, "'xyz_of_samp' is not a list of rows of numbers, 3 in each"),
         ({"xyz_of_samp": [[1, 2, float("inf")]]}, "'xyz_of_samp' is not a list of rows of numbers"),
@@ -156,11 +156,11 @@ def test_what_a_robot_file_cannot_say_is_told(tmp_path) -> None:
             {"mechanical_advantage": [2, 2, 2]},
             "'mechanical_advantage' is not a list of numbers, 4 in all",
         ),
-        ({"mechanical_advantage": [2, 2, 2, 0]}, "all of it must be above zero"),
+        ({"mechanical_advantage": [2, 2, 2, 0]}, "write positive numbers"),
         ({"spool_gear_teeth": "many"}, "'spool_gear_teeth' is not a number"),
-        ({"anchors": [[1, 2, 3]]}, "'anchors' has 1 rows for 4 lines"),
-        ({"xyz_of_samp": []}, "no pose is known; add poses to 'xyz_of_samp' (mm)"),
-        ({"xyz_of_samp": [[0, 0, 0]]}, "the 1 known poses do not tell where line A is anchored"),
+        ({"anchors": [[1, 2, 3]]}, "'anchors' has 1 rows, but there are 4 lines"),
+        ({"xyz_of_samp": []}, "no pose is known; add known poses"),
+        ({"xyz_of_samp": [[0, 0, 0]]}, "the 1 known poses do not determine the anchor of line A"),
     ],
 )
 def test_bad_samples_are_refused_in_one_sentence(tmp_path, change, sentence) -> None:
@@ -172,13 +172,13 @@ def test_bad_samples_are_refused_in_one_sentence(tmp_path, change, sentence) -> 
 def test_known_poses_in_the_plane_of_the_origin_are_refused_with_the_remedy(tmp_path) -> None:
     found = example()
     flat = [[x, y, 0.0] for x, y, _ in found["xyz_of_samp"][:8]]
-    with pytest.raises(FileError, match=r"know poses at several heights, or add the key 'anchors'"):
+    with pytest.raises(FileError, match=r"poses at several heights .*or add the key 'anchors'"):
         read(tmp_path, found | {"xyz_of_samp": flat})
 
 
 @pytest.mark.parametrize(
     ("text", "sentence"),
-    [("{\n  [", r"samples.json:2: this is no JSON"), ("[1]", "'motor_pos_samp'")],
+    [("{\n  [", r"samples.json:2: not valid JSON"), ("[1]", "'motor_pos_samp'")],
 )
 def test_what_is_no_file_of_samples_is_refused(tmp_path, text, sentence) -> None:
     path = tmp_path / "samples.json"

@@ -43,7 +43,7 @@ def read(folder, text: str):
 
 def test_defaults_are_those_of_klipper_and_the_main_part_hides_the_saved_one(tmp_path) -> None:
     (tmp_path / "printer.cfg").write_text(SHORT + SAVED)
-    found = klipper.geometry(printer_cfg.read(tmp_path / "printer.cfg"))
+    found = klipper.parse_geometry(printer_cfg.read(tmp_path / "printer.cfg"))
     assert found.radius == 130.0
     assert found.angles == (210.0, 330.5, 90.0)
     assert found.arms == (250.0, 250.0, 250.0)
@@ -100,10 +100,10 @@ def test_without_a_file_a_block_to_paste_is_written(tmp_path) -> None:
             ("delta_radius: 130", ""),
             r"option 'delta_radius' of \[printer\] is missing, and has no default|is missing",
         ),
-        (("delta_radius: 130", "[include geometry.cfg]"), "it may stand in geometry.cfg"),
+        (("delta_radius: 130", "[include geometry.cfg]"), "if geometry.cfg contains it"),
         (
             ("position_endstop: 300", "position_endstop: high"),
-            ":6: 'position_endstop' of .* is 'high' where a finite number",
+            ":6: 'position_endstop' of .* is 'high', but a finite number",
         ),
         (("position_endstop: 300", "position_endstop: inf"), ":6: "),
         (
@@ -119,7 +119,7 @@ def test_without_a_file_a_block_to_paste_is_written(tmp_path) -> None:
             ("[stepper_c]\n", "[delta_calibrate]\nheight0: 0\nheight0_pos: 1,2,3\n"),
             r"'rotation_distance' of \[stepper_b\] is missing",
         ),
-        (("[stepper_c]\n", SAVED + "[tmc]\n"), ":19: this line stands below SAVE_CONFIG"),
+        (("[stepper_c]\n", SAVED + "[tmc]\n"), ":19: this line below SAVE_CONFIG"),
     ],
 )
 def test_bad_files_are_refused_in_one_sentence(tmp_path, change, sentence) -> None:
@@ -133,12 +133,12 @@ def test_gear_ratios_that_are_none_are_refused(tmp_path, ratio) -> None:
         SHORT.replace("microsteps: 16", f"microsteps: 16\ngear_ratio: {ratio}")
     )
     with pytest.raises(FileError, match=":9: gear_ratio is"):
-        klipper.step_distance(printer_cfg.read(tmp_path / "printer.cfg"), "stepper_a")
+        klipper.get_step_distance(printer_cfg.read(tmp_path / "printer.cfg"), "stepper_a")
 
 
 def test_steps_of_geared_motors(tmp_path) -> None:
     (tmp_path / "printer.cfg").write_text(
         SHORT.replace("microsteps: 16", "microsteps: 16\ngear_ratio: 57:11, 2:1")
     )
-    found = klipper.step_distance(printer_cfg.read(tmp_path / "printer.cfg"), "stepper_a")
+    found = klipper.get_step_distance(printer_cfg.read(tmp_path / "printer.cfg"), "stepper_a")
     assert found == pytest.approx(40 / (200 * 16 * 57 / 11 * 2), rel=1e-15)

@@ -106,7 +106,7 @@ def test_a_calibrated_hexapod_reads_back_equal_and_nothing_else_changes(tmp_path
     )
     assert written.text.count("# as built") == text.count("# as built")
     # lengths have no pin, and that is said
-    said = [note for note in written.notes if note.startswith("not said by genhexkins: strut")]
+    said = [str(f) for f in written.findings if f.code == "files.strut-length"]
     assert len(said) == 6
     assert "HOME_OFFSET of [JOINT_0]" in said[0]
 
@@ -135,7 +135,7 @@ def test_a_pin_that_was_left_at_zero_is_added(tmp_path, geometry) -> None:
 
 def test_the_shipped_hexapod_says_that_its_lengths_have_no_pin() -> None:
     found = linuxcnc.write(ExportSource(load_robot("hexapod-42")), None)
-    assert "strut 0 is 233.238076 mm long at reading zero" in "\n".join(found.notes)
+    assert "strut 0 is 233.238076 mm long at reading zero" in "\n".join(map(str, found.findings))
 
 
 def test_screws_of_several_leads_are_refused(tmp_path, geometry) -> None:
@@ -152,12 +152,12 @@ def test_screws_of_several_leads_are_refused(tmp_path, geometry) -> None:
 @pytest.mark.parametrize(
     ("change", "options", "sentence"),
     [
-        (("genhexkins.", "hexkins."), {}, "there is no 'setp genhexkins...' in this file"),
-        (("setp genhexkins.base.0.x", "# setp"), {}, "there is no 'setp genhexkins.base.0.x ..'"),
+        (("genhexkins.", "hexkins."), {}, "this file has no 'setp genhexkins...'"),
+        (("setp genhexkins.base.0.x", "# setp"), {}, "'setp genhexkins.base.0.x ..' is missing"),
         (
             ("base.0.y 13.25", "base.0.y [HEX]B0Y"),
             {},
-            r":5: genhexkins.base.0.y is '\[HEX\]B0Y' where a finite number",
+            r":5: genhexkins.base.0.y is '\[HEX\]B0Y', but a finite number",
         ),
         (("", ""), {"length_unit": None}, "a HAL file states no unit of length"),
     ],

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from loopcal.errors import DataError, FileError, LoopcalError
-from loopcal.io.formats import urdf, urdf_limbs, urdf_loops, urdf_tree
+from loopcal.io.formats import urdf, urdf_closures, urdf_tree
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
 from loopcal.mechanism import Mechanism, forward, inverse
+from loopcal.mechanism.joint_graph import find_limb_paths
 
 FIVE_BAR, DELTA = "5bar_linkage", "robot_delta"
 FRAME = {FIVE_BAR: "effector", DELTA: "eff"}
@@ -38,7 +39,7 @@ def test_bodies_joints_loops_and_mobility_are_right_and_printed(files, read, nam
     bodies, joints, loops, mobility = COUNTS[name]
     assert 3 * (bodies - 1) - 2 * joints == mobility
     assert joints - (bodies - 1) == loops
-    first, second = read[name][0].notes[:2]
+    first, second = map(str, read[name][0].findings[:2])
     assert f"{bodies} rigid bodies with the base" in first
     assert f"{joints} joints ({loops} close loops), 2 motors, mobility {mobility}" in first
     assert float(re.findall(r"residual at home (\S+) m", second)[0]) < 1e-12  # [m]
@@ -59,9 +60,9 @@ def test_poses_are_those_of_the_tree_with_its_loops_closed(files, read, name) ->
     of the robot file.
     """
     robot, tree = read[name][1], urdf_tree.read(files[name])
-    body, frame = tree.body(FRAME[name]), tree.in_body(FRAME[name])
-    loops = urdf_loops.read(tree, files[name].with_name("robot.yaml"))
-    near = list(urdf_limbs.cut(loops, body).loops.nearby())
+    body, frame = tree.find_body(FRAME[name]), tree.place_in_body(FRAME[name])
+    loops = urdf_closures.read_joint_graph(tree, files[name].with_name("robot.yaml"))
+    near = list(find_limb_paths(loops, body).graph.list_nearby())
     assert len(near) > 2
     q = np.array([[one.values[motor] for motor in loops.motors] for one in near])
     found = forward(robot, q)
@@ -119,7 +120,7 @@ def test_a_limb_that_branches_is_refused_with_its_joints(files) -> None:
 
 
 def test_a_urdf_needs_a_file_to_be_corrected(read) -> None:
-    with pytest.raises(DataError, match=r"name the one to correct, as --into robot.urdf"):
+    with pytest.raises(DataError, match=r"name the URDF to correct"):
         urdf.write(ExportSource(read[FIVE_BAR][1]), None)
 
 
@@ -127,7 +128,7 @@ def test_another_machine_is_not_corrected(tmp_path, files, read) -> None:
     (tmp_path / "other.urdf").write_text(
         files[FIVE_BAR].read_text().replace('xyz="0.1000', 'xyz="0.2000')
     )
-    with pytest.raises(FileError, match="export into the URDF that it came from"):
+    with pytest.raises(FileError, match="export into the URDF it was read from"):
         urdf.write(ExportSource(read[FIVE_BAR][1]), tmp_path / "other.urdf")
 
 
@@ -137,8 +138,8 @@ JOINT = '<joint name="a" type="revolute"><origin xyz="0 0 1"/><parent link="base
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("<robot><link name='a'>", ":1: this is no XML"),
-        ("<!DOCTYPE robot><robot/>", ":1: a document type is no part of a URDF"),
+        ("<robot><link name='a'>", ":1: not valid XML"),
+        ("<!DOCTYPE robot><robot/>", ":1: a URDF has no document type"),
         (
             "<robot><link name='base'/><link name='arm'/>\n"
             + JOINT.replace("0 0 1", "0 1", 1)
@@ -153,19 +154,19 @@ JOINT = '<joint name="a" type="revolute"><origin xyz="0 0 1"/><parent link="base
         ),
         (
             "<robot><link name='base'/>\n" + JOINT + "</robot>",
-            ":2: joint 'a' names the link 'arm', which is not there",
+            ":2: joint 'a' names the link 'arm', which does not exist",
         ),
         (
             "<robot><link name='base'/><link name='arm'/></robot>",
-            "a URDF has one root link, this has 2",
+            "this URDF has 2 root links",
         ),
         (
             "<robot><link name='base'/><link name='arm'/>\n" + JOINT + JOINT + "</robot>",
-            ":2: joint 'a' stands here for the second time",
+            ":2: duplicate joint 'a'",
         ),
         (
             "<robot><link name='base'/><link name='arm'/>\n" + JOINT + "</robot>",
-            "name the file of closures, as --closures",
+            "name the file of its loop closures",
         ),
     ],
 )
@@ -180,12 +181,12 @@ def test_bad_files_are_refused_in_one_sentence(tmp_path, text, sentence) -> None
     [
         (
             "closed_loop: [[a, b]]\ntype: ['6d']\nname_mot: [a]\n",
-            ":1: the closure 'b' is no joint of a.urdf",
+            ":1: the closure 'b' is not a joint of a.urdf",
         ),
         ("closed_loop: []\ntype: []\nname_mot: []\n", "no motor is named"),
         ("closed_loop: [[a, a]]\ntype: ['3d']\nname_mot: []\n", ":2: closure 'a' is of type '3d'"),
         ("closed_loop: 1\n", "write 'closed_loop:' as a list of pairs"),
-        ("closed_loop: []\ntype: []\nname_mot: [z]\n", ":3: the motor 'z' is no movable joint"),
+        ("closed_loop: []\ntype: []\nname_mot: [z]\n", ":3: the motor 'z' is not a movable joint"),
     ],
 )
 def test_bad_closures_are_refused_in_one_sentence(tmp_path, closures, sentence) -> None:

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of other programs, one format in each module: read as a robot file and measurements,
-written corrected.
+"""Files of other programs: read as robot file and measurements, written corrected.
 
-A format is a `Format` with `read`, `write` or both; its line in `FORMATS` is all that the command
-line needs.
+A format is a `Format` with `read`, `write` or both, in a module of its own, and an entry here.
 """
 
 from collections.abc import Mapping
@@ -12,8 +10,8 @@ from loopcal.io.formats import hangprinter, klipper, linuxcnc, marlin, parameter
 from loopcal.io.formats.program_format import Format
 
 FORMATS: Mapping[str, Format] = {
-    found.name: found
-    for found in (
+    one.name: one
+    for one in (
         klipper.FORMAT,
         marlin.FORMAT,
         reprap.FORMAT,
@@ -24,3 +22,4 @@ FORMATS: Mapping[str, Format] = {
         parameter_table.CSV,
     )
 }
+"""Name -> format."""

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nine numbers of a linear delta, in the mm and degrees that printer firmware speaks, to and
-from a robot file.
-"""
+"""The geometry of a linear delta in the mm and degrees of printer firmware, and its robot file."""
 
 from __future__ import annotations
 
@@ -12,22 +10,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from loopcal.errors import FileError
-from loopcal.io.formats.program_format import ExportSource, record_of
+from loopcal.io.formats.program_format import ExportSource, get_record
 from loopcal.mechanism.families.linear_delta import LinearDelta
 
 DECIMALS = 6
-"""Decimals of what is written [mm, deg]: those that Klipper itself saves; a nanometre."""
+"""Decimals of written numbers [mm, deg]: those that Klipper itself saves, a nanometre."""
 
 NOMINAL_ANGLES = (210.0, 330.0, 90.0)
-"""Where firmware has its towers before any correction [deg]."""
+"""Angles of the towers in firmware, before any correction [deg]."""
 
 Three = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class DeltaNumbers:
-    """Radius, tower angles, arms and end stops [mm, deg]: the stop is the height of the nozzle over
-    the bed, in the centre, with this tower's carriage at its end stop.
+class DeltaGeometry:
+    """Radius, tower angles, arms and end stops [mm, deg].
+
+    A stop is the height of the nozzle over the bed, in the center, with the carriage of this tower
+    at its end stop.
     """
 
     radius: float
@@ -45,68 +45,67 @@ source: {source}
 units: {{length: mm, angle: deg}}
 
 radius: {radius}
-angles: {angles}     # of the towers; the third says where the x axis is and is never changed
+angles: {angles}     # of the towers; the third defines the x axis and stays fixed
 arms: {arms}
-stops: {stops}       # height of the nozzle, in the centre, with the carriage at its end stop
+stops: {stops}       # height of the nozzle, in the center, with the carriage at its end stop
 readings: drop       # carriage positions count down from the end stops
 home: {{z: 0}}
-workspace: {{x: {side}, y: {side}, z: [0, {top:g}]}}     # taken; say how far the nozzle really goes
+workspace: {{x: {side}, y: {side}, z: [0, {top:g}]}}     # assumed; replace by the real workspace
 {fixed}"""
-FIXED = (
-    "fixed: [arm*.length]     # heights alone cannot tell the arms from the rest; distances can\n"
-)
+FIXED = "fixed: [arm*.length]     # heights alone do not determine the arms; distances do\n"
 
 
-def robot_text(found: DeltaNumbers, name: str, path: Path, program: str, arms_known: bool) -> str:
-    """The robot file of a delta, with its arms fixed unless they can be identified."""
-    if not min(found.arms) > found.radius > 0:
-        raise FileError(
-            f"the delta radius is {found.radius:g} mm and the shortest arm {min(found.arms):g} mm; "
-            "the radius must be positive and every arm longer than it",
-            path,
-        )
+def format_robot(
+    geometry: DeltaGeometry, name: str, path: Path, program: str, has_distances: bool
+) -> str:
+    """Return the robot file of a delta, with fixed arms unless distances determine them."""
+    if not min(geometry.arms) > geometry.radius > 0:
+        sentence = f"the delta radius is {geometry.radius:g} mm and the shortest arm"
+        act = "the radius must be positive and every arm longer than it; correct them"
+        raise FileError(f"{sentence} {min(geometry.arms):g} mm; {act}", path)
+    half = round(0.5 * geometry.radius)
     return ROBOT.format(
         origin=path.name.replace("\n", " "),
         program=program,
         name=json.dumps(name),
         source=json.dumps(f"{path.name}, {program}"),
-        radius=found.radius,
-        angles=list(found.angles),
-        arms=list(found.arms),
-        stops=list(found.stops),
-        side=[-round(0.5 * found.radius), round(0.5 * found.radius)],
-        top=round(0.5 * found.radius),
-        fixed="" if arms_known else FIXED,
+        radius=geometry.radius,
+        angles=list(geometry.angles),
+        arms=list(geometry.arms),
+        stops=list(geometry.stops),
+        side=[-half, half],
+        top=half,
+        fixed="" if has_distances else FIXED,
     )
 
 
-def numbers_of(source: ExportSource, format_name: str) -> DeltaNumbers:
-    """The numbers of a robot of the family linear-delta; DataError for another."""
-    record_of(source, LinearDelta, format_name, "a robot of the family linear-delta")
-    value = source.values()
+def get_geometry(source: ExportSource, format_name: str) -> DeltaGeometry:
+    """Return the geometry of a robot of the family linear-delta; DataError for another."""
+    get_record(source, LinearDelta, format_name, "a robot of the family linear-delta")
+    values = source.values()
 
-    def towers(name: str, factor: float) -> Three:
-        return three([value[name.format(k)] * factor for k in (1, 2, 3)])
+    def list_towers(name: str, factor: float) -> Three:
+        return as_three([values[name.format(k)] * factor for k in (1, 2, 3)])
 
-    return DeltaNumbers(
-        value["radius"] * 1e3,
-        towers("tower{}.angle", math.degrees(1)),
-        towers("arm{}.length", 1e3),
-        towers("tower{}.stop", 1e3),
+    return DeltaGeometry(
+        values["radius"] * 1e3,
+        list_towers("tower{}.angle", math.degrees(1)),
+        list_towers("arm{}.length", 1e3),
+        list_towers("tower{}.stop", 1e3),
     )
 
 
-def written(value: float) -> str:
-    """A number as it is written."""
+def format_number(value: float) -> str:
+    """Return a number as it is written."""
     return f"{value:.{DECIMALS}f}"
 
 
-def same(one: float, other: float) -> bool:
-    """Whether two numbers are written alike."""
-    return written(one) == written(other)
+def is_same(*pairs: tuple[float, float]) -> bool:
+    """Return whether the two numbers of each pair are written alike."""
+    return all(format_number(a) == format_number(b) for a, b in pairs)
 
 
-def three(values: Sequence[float]) -> Three:
-    """Three numbers, one for each tower."""
+def as_three(values: Sequence[float]) -> Three:
+    """Return three numbers, one for each tower."""
     a, b, c = values
     return a, b, c

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a file of another program to a robot file and a measurement file, and from a run back to it."""
+"""From a file of another program to a robot file and a measurement file, and back."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from loopcal.errors import DataError, FileError, MechanismError
+from loopcal.findings import report_finding
 from loopcal.io.core.text_file import write_text
 from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.formats import FORMATS
@@ -21,31 +21,26 @@ if TYPE_CHECKING:
 
 
 def choose_format(path: Path, name: str | None) -> Format:
-    """The format by name, or by the ending of a file.
+    """Return the format of this name, or the one with the ending of a file.
 
     Raises
     ------
-    FileError
-        The ending tells no format.
+    FileError : no format has this ending.
     """
     if name is not None:
         return FORMATS[name]
-    for found in FORMATS.values():
-        if path.suffix.lower() in found.endings:
-            return found
-    raise FileError(
-        f"the name of this file tells no format; state one as --format, of {', '.join(FORMATS)}",
-        path,
-    )
+    for one in FORMATS.values():
+        if path.suffix.lower() in one.endings:
+            return one
+    raise FileError(report_finding("files.format-unknown", formats=tuple(FORMATS)), path)
 
 
 def build_imported_robot(path: Path, imported: Imported) -> Mechanism:
-    """Build the robot that was read, before anything is written.
+    """Build the imported robot before anything is written.
 
     Raises
     ------
-    MechanismError
-        It cannot be built; told with the name of the file it came from.
+    MechanismError : it cannot be built; with the name of the file that it came from.
     """
     with tempfile.TemporaryDirectory() as folder:
         robot_file = Path(folder) / "robot.yaml"
@@ -57,66 +52,46 @@ def build_imported_robot(path: Path, imported: Imported) -> Mechanism:
 
 
 def save_imported(path: Path, imported: Imported, output: Path, data: Path | None) -> Mechanism:
-    """Write the robot file, and the measurement file where one is asked for; return the robot.
+    """Write the robot file and, where `data` names one, the measurement file; return the robot.
 
     Raises
     ------
-    DataError
-        Measurements are asked for, but there are none.
-    FileError, MechanismError
-        A file cannot be written, or the robot cannot be built.
+    DataError : there are no measurements to write.
+    FileError, MechanismError : a file cannot be written, or the robot cannot be built.
     """
     robot = build_imported_robot(path, imported)
     if data is not None:
         if imported.measurements is None:
-            raise DataError(
-                f"{path}: there are no measurements in this file; leave out --data and "
-                "--corrected, or measure first"
-            )
+            raise DataError(report_finding("files.no-measurements", file=str(path)))
         save_measurements(imported.measurements, data, robot, f"read from {path.name}")
     write_text(output, imported.robot_text)
     return load_robot(output)
 
 
 def load_source(path: str | Path) -> ExportSource:
-    """What to export: a run folder, a robot file, or the name of a shipped robot.
-
-    Raises
-    ------
-    FileError
-        None of these.
-    """
+    """Return the robot of a run folder, a robot file, or a shipped robot by its name, to export."""
     run = load_run_or_robot(path)
     rows = run.result.get("fit", {}).get("parameters", [])
     nulls = run.result.get("nulls", {})
-    why = {
-        row["name"]: nulls.get(f"fit/parameters/{i}/plus_minus", "not known")
+    reasons = {
+        row["name"]: nulls.get(f"fit/parameters/{i}/plus_minus", "unknown")
         for i, row in enumerate(rows)
         if row["plus_minus"] is None
     }
-    return ExportSource(run.robot, {row["name"]: row["plus_minus"] for row in rows}, why)
+    return ExportSource(run.robot, {row["name"]: row["plus_minus"] for row in rows}, reasons)
 
 
 def export_robot(source: ExportSource, target: Format, into: Path | None) -> Exported:
-    """The text of a source in a format.
+    """Return the text of a source in a format.
 
     Raises
     ------
-    DataError
-        The format is read only, or holds no other robot's file to correct.
-    FileError
-        The file to correct cannot be read, or is of another kind.
+    DataError : the format is read only, or cannot correct an existing file.
+    FileError : the file to correct cannot be read, or is of another kind.
     """
     if target.write is None:
-        raise DataError(
-            f"loopcal reads the format {target.name}, but does not write it; known are "
-            f"{', '.join(names('write'))}"
-        )
+        writable = ", ".join(name for name, one in FORMATS.items() if one.write is not None)
+        raise DataError(f"loopcal cannot write the format {target.name}; it writes {writable}")
     if into is not None and not target.takes_file:
-        raise DataError(f"the format {target.name} is written whole; leave out --into")
+        raise DataError(report_finding("files.format-takes-no-file", format=target.name))
     return target.write(source, into)
-
-
-def names(what: str) -> Collection[str]:
-    """Names of the formats that can be read, or written."""
-    return [name for name, found in FORMATS.items() if getattr(found, what) is not None]

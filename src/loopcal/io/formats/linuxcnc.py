@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LinuxCNC's genhexkins: a hexapod's joints, and the lead of its screws, as `setp` lines of a HAL
-file.
+"""LinuxCNC's genhexkins: joints of a hexapod, and the lead of its screws, as `setp` lines of HAL.
 
-    setp genhexkins.base.N.x ..        centre of a joint on the base (platform.N: on the platform), N = 0..5
-    setp genhexkins.base-n.N.x ..      axis of that joint (platform-n.N likewise), used where screw-lead is not 0
-    setp genhexkins.screw-lead ..      change of a strut's length in one turn
+    setp genhexkins.base.N.x ..        center of a joint on the base (platform.N: on the platform)
+    setp genhexkins.base-n.N.x ..      axis of that joint (platform-n.N), used with a screw lead
+    setp genhexkins.screw-lead ..      change of a strut's length in one turn;  N = 0..5
 
-A strut's joint position is the distance between its centres (plus the screw's correction), so the
+A strut's joint position is the distance between its centers (plus the screw's correction), so the
 lengths of the robot file are zero, and what a calibration adds to them shifts the zero of the
-joint, which these pins cannot say. The correction is screw-lead * asin(sin a) / (2 pi) of the angle
-a about the strut between the two axes, where loopcal has the angle itself: the same for less than a
-quarter turn. A strut that stands beyond one at home is read as what the formula makes of it there,
-a screw of the other hand counted from the other side of its axis (-lead, -platform-n).
-`spindle-offset` and `tool-offset` are added to z of all centres. No unit is stated: it is the
+joint, which these pins cannot express. The correction is screw-lead * asin(sin a) / (2 pi) of the
+angle a about the strut between the two axes, where loopcal has the angle itself: the same below a
+quarter turn. A strut beyond a quarter turn at home is read as what the formula makes of it there, a
+screw of the other hand counted from the other side of its axis (-lead, -platform-n).
+`spindle-offset` and `tool-offset` are added to z of all centers. No unit is stated: it is the
 machine's. Source: the documentation of genhexkins (LinuxCNC, "Kinematics").
 """
 
@@ -21,36 +20,39 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from loopcal.errors import DataError, FileError
+from loopcal.findings import Finding, report_finding
 from loopcal.io.core.numbers import format_scaled
 from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.program_format import (
-    UNCHANGED,
     Exported,
     ExportSource,
     Format,
     Imported,
     ImportOptions,
-    byte_order_mark,
-    number,
-    record_of,
+    get_byte_order_mark,
+    get_record,
+    parse_number,
+    report_change,
+    report_changes,
 )
 from loopcal.mechanism.families.gough import Gough
 from loopcal.units import Dimension, find_unit
 
 SETP = re.compile(r"\s*setp\s+(genhexkins\.[\w.-]+)(\s*=\s*|\s+)([^\s#]+)")
 LEAD, OFFSETS = "genhexkins.screw-lead", ("genhexkins.spindle-offset", "genhexkins.tool-offset")
+SIDES = ("base", "platform")
 Point = tuple[float, float, float]
-CLOSE = 1e-12
-"""Relative difference of what counts as the same number."""
+ROUNDING = 1e-12
+"""Relative difference of numbers that count as the same."""
 
 ROBOT = """\
-# Read from {origin}, the genhexkins settings of LinuxCNC. Strut lengths are readings: lengths at
-# reading zero are 0.
+# Read from {origin}, the genhexkins settings of LinuxCNC. Readings are strut lengths, so the
+# lengths at reading zero are 0.
 format: 1
 family: gough
 name: {name}
@@ -77,7 +79,7 @@ screw:
 
 @dataclass(frozen=True)
 class _Pin:
-    """A pin's value, and where it stands: line (from 0) and column."""
+    """The value of a pin, with its line (from 0) and column."""
 
     text: str
     line: int
@@ -86,215 +88,191 @@ class _Pin:
 
 @dataclass(frozen=True)
 class _Hal:
+    """A HAL file: its lines and pins."""
+
     path: Path
     lines: tuple[str, ...]
     pins: Mapping[str, _Pin]
 
     def number(self, name: str, default: float | None = None) -> float:
-        found = self.pins.get(name)
-        if found is None:
+        """Return the number of a pin, or the default; FileError where there is neither."""
+        pin = self.pins.get(name)
+        if pin is None:
             if default is not None:
                 return default
-            raise FileError(
-                f"there is no 'setp {name} ..'; loopcal takes no other machine's numbers for "
-                "yours; add it",
-                self.path,
-            )
-        return number(found.text, name, self.path, found.line + 1)
+            sentence = f"'setp {name} ..' is missing, and loopcal assumes no default"
+            raise FileError(f"{sentence}; add it", self.path)
+        return parse_number(pin.text, name, self.path, pin.line + 1)
 
-    def point(self, kind: str, n: int) -> Point:
-        """Coordinates of a centre or axis; LinuxCNC has z at 0 where it is not set."""
-        x, y, z = (
-            self.number(f"genhexkins.{kind}.{n}.{axis}", 0.0 if axis == "z" else None)
-            for axis in "xyz"
-        )
-        return x, y, z
+    def points(self, kind: str) -> list[Point]:
+        """Return the six centers or axes; LinuxCNC has z at 0 where it is not set."""
+        names = [f"genhexkins.{kind}.{n}" for n in range(6)]
+        return [
+            (self.number(f"{n}.x"), self.number(f"{n}.y"), self.number(f"{n}.z", 0.0))
+            for n in names
+        ]
+
+    @property
+    def lift(self) -> float:
+        """Height that is added to all centers."""
+        return sum(self.number(name, 0.0) for name in OFFSETS)
 
 
-def read(path: Path, reading: ImportOptions) -> Imported:
-    """Read the pins; FileError for those that are missing or no number, or where no unit was
-    stated.
+def read(path: Path, options: ImportOptions) -> Imported:
+    """Read the pins.
+
+    Raises
+    ------
+    FileError : a pin is missing or not a number, or no unit of length is given.
     """
-    hal = _read(path)
-    if reading.length_unit is None:
-        raise FileError(
-            "a HAL file states no unit of length; say the machine's, as --unit mm or --unit in",
-            path,
-        )
-    symbol = find_unit(reading.length_unit, Dimension.LENGTH)
-    lift, lead = sum(hal.number(name, 0.0) for name in OFFSETS), hal.number(LEAD, 0.0)
-    centres = {
-        kind: [_lifted(hal.point(kind, n), lift) for n in range(6)] for kind in ("base", "platform")
-    }
-    notes = []
-    if reading.home_height is None:
-        home = sum((x * x + y * y) ** 0.5 for x, y, _ in centres["base"]) / 6
-        notes.append(
-            f"home is {home:g} {symbol} above the base, the radius of its joints; correct it, or "
-            "state --home-z"
-        )
+    hal = _read_hal(path)
+    if options.length_unit is None:
+        raise FileError(report_finding("files.unit-missing"), path)
+    unit = find_unit(options.length_unit, Dimension.LENGTH)
+    lift, lead = hal.lift, hal.number(LEAD, 0.0)
+    centers = {side: [(x, y, z + lift) for x, y, z in hal.points(side)] for side in SIDES}
+    findings: tuple[Finding, ...] = ()
+    if options.home_height is None:
+        home = sum(math.hypot(x, y) for x, y, _ in centers["base"]) / 6
+        findings = (report_finding("files.home-assumed", height=f"{home:g} {unit}"),)
     else:
-        home = reading.home_height / symbol.factor_to_si
+        home = options.home_height / unit.factor_to_si
     screw = ""
     if lead:
-        axes = {
-            kind: [hal.point(f"{kind}-n", n) for n in range(6)] for kind in ("base", "platform")
-        }
-        signs = [
-            _hand(
-                centres["base"][n],
-                centres["platform"][n],
-                axes["base"][n],
-                axes["platform"][n],
-                home,
-            )
-            for n in range(6)
-        ]
-        turned = [_scaled(axis, sign) for axis, sign in zip(axes["platform"], signs, strict=True)]
+        low, high = hal.points("base-n"), hal.points("platform-n")
+        struts = zip(centers["base"], centers["platform"], low, high, strict=True)
+        signs = [_get_hand(*strut, home) for strut in struts]
+        turned = [_flip(axis, sign) for axis, sign in zip(high, signs, strict=True)]
         leads = lead if min(signs) > 0 else [sign * lead for sign in signs]
-        screw = SCREW.format(lead=leads, base=_list(axes["base"], 4), platform=_list(turned, 4))
+        screw = SCREW.format(
+            lead=leads, base=_format_list(low, 4), platform=_format_list(turned, 4)
+        )
     text = ROBOT.format(
         origin=path.name,
-        name=json.dumps(reading.name),
+        name=json.dumps(options.name),
         source=json.dumps(f"{path.name}, genhexkins settings of LinuxCNC"),
-        unit=json.dumps(symbol.symbol),
+        unit=json.dumps(unit.symbol),
         legs="ups" if lead else "rod",
-        base=_list(centres["base"], 2),
-        platform=_list(centres["platform"], 2),
+        base=_format_list(centers["base"], 2),
+        platform=_format_list(centers["platform"], 2),
         home=home,
         screw=screw,
     )
-    return Imported(text, None, tuple(notes))
+    return Imported(text, None, findings)
 
 
 def write(source: ExportSource, into: Path | None) -> Exported:
-    """The corrected pins in a HAL file whose other bytes stay, or `setp` lines of their own."""
-    record: Gough = record_of(source, Gough, "linuxcnc", "a hexapod of the family gough")
-    symbol = find_unit(source.robot.units[Dimension.LENGTH])
-    hal = _Hal(Path("hexapod.hal"), (), {}) if into is None else _read(into)
-    lift = sum(hal.number(name, 0.0) for name in OFFSETS)
+    """Return the corrected pins in an existing HAL file, or `setp` lines of their own."""
+    record: Gough = get_record(source, Gough, "linuxcnc", "a hexapod of the family gough")
+    unit = find_unit(source.robot.units[Dimension.LENGTH])
+    hal = _Hal(Path("hexapod.hal"), (), {}) if into is None else _read_hal(into)
     lead = hal.number(LEAD) if LEAD in hal.pins else None
-    notes = (
-        []
-        if into is not None
-        else [f"numbers are in {symbol}; the machine's unit of length must be that"]
-    )
     lines, changes = list(hal.lines), []
-    if lines and not lines[-1].endswith("\n"):
+    has_end = not lines or lines[-1].endswith("\n")
+    if not has_end:
         lines[-1] += "\n"
-    for name, value in _pins(source, record, symbol.factor_to_si, lift, lead):
-        found = hal.pins.get(name)
-        present = None if found is None else hal.number(name)
-        if present is None and into is not None and value == 0.0:
+    for name, value in _list_pins(source, record, unit.factor_to_si, hal.lift, lead):
+        pin = hal.pins.get(name)
+        if pin is None:
+            if into is not None and value == 0.0:
+                continue
+            text = format_scaled(value, 1.0)
+            lines.append(f"setp {name} {text}\n")
+            changes.append(report_change(len(lines), name, None, text))
             continue
-        if present is not None and abs(present - value) <= CLOSE * max(1.0, abs(value)):
+        if abs(hal.number(name) - value) <= ROUNDING * max(1.0, abs(value)):
             continue
         text = format_scaled(value, 1.0)
-        if found is None:
-            lines.append(f"setp {name} {text}\n")
-            changes.append(f"line {len(lines)}: {name} added as {text}")
-            continue
-        line = lines[found.line]
-        lines[found.line] = line[: found.start] + text + line[found.start + len(found.text) :]
-        changes.append(f"line {found.line + 1}: {name} {found.text} -> {text}")
-    if lines and hal.lines and not hal.lines[-1].endswith("\n") and len(lines) == len(hal.lines):
+        line = lines[pin.line]
+        lines[pin.line] = line[: pin.start] + text + line[pin.start + len(pin.text) :]
+        changes.append(report_change(pin.line + 1, name, pin.text, text))
+    if not has_end and len(lines) == len(hal.lines):
         lines[-1] = lines[-1].removesuffix("\n")
-    notes += _unsaid(source, symbol.factor_to_si, symbol.symbol)
-    mark = "" if into is None else byte_order_mark(into)
-    return Exported(
-        mark + "".join(lines), (*(() if into is None else changes or (UNCHANGED,)), *notes)
-    )
+    first = report_changes(changes)
+    if into is None:
+        first = (report_finding("files.machine-unit", unit=unit.symbol),)
+    mark = "" if into is None else get_byte_order_mark(into)
+    rest = _report_inexpressible(source, unit.factor_to_si, unit.symbol)
+    return Exported(mark + "".join(lines), (*first, *rest))
 
 
-def _pins(
+def _list_pins(
     source: ExportSource, record: Gough, factor: float, lift: float, present: float | None
 ) -> Iterator[tuple[str, float]]:
-    """Pin -> value in the file's unit; `present` is the lead there, whose sign is kept."""
+    """Yield pin and value in the file's unit; `present` is the lead there, whose sign is kept."""
     values = source.values()
     for n in range(6):
-        for kind in ("base", "platform"):
+        for side in SIDES:
             for axis in "xyz":
-                value = values[f"leg{n + 1}.{kind}.{axis}"] / factor
-                yield (
-                    f"genhexkins.{kind}.{n}.{axis}",
-                    float(format_scaled(value - (lift if axis == "z" else 0.0), 1.0)),
-                )
+                value = values[f"leg{n + 1}.{side}.{axis}"] / factor
+                shifted = value - (lift if axis == "z" else 0.0)
+                yield f"genhexkins.{side}.{n}.{axis}", float(format_scaled(shifted, 1.0))
     if record.screw is None:
         return
     legs = record.screw.legs()
     lead = abs(legs[0].lead) if present is None else math.copysign(legs[0].lead, present)
-    if any(abs(abs(leg.lead) - abs(lead)) > CLOSE * abs(lead) for leg in legs):
-        raise DataError(
-            f"{source.robot.name} has screws of different lead, but genhexkins has one for all; "
-            "use json or csv"
-        )
+    if any(abs(abs(leg.lead) - abs(lead)) > ROUNDING * abs(lead) for leg in legs):
+        sentence = f"{source.robot.name} has screws of different lead, but genhexkins has one lead"
+        raise DataError(f"{sentence}; use json or csv")
     yield LEAD, lead / factor
     for n, leg in enumerate(legs):
-        upper = _scaled(leg.platform_axis, math.copysign(1.0, leg.lead * lead))
-        for kind, direction in (("base-n", leg.base_axis), ("platform-n", upper)):
+        upper = _flip(leg.platform_axis, math.copysign(1.0, leg.lead * lead))
+        for side, direction in (("base-n", leg.base_axis), ("platform-n", upper)):
             for axis, value in zip("xyz", direction, strict=True):
-                yield f"genhexkins.{kind}.{n}.{axis}", value
+                yield f"genhexkins.{side}.{n}.{axis}", value
 
 
-def _unsaid(source: ExportSource, factor: float, symbol: str) -> Iterator[str]:
-    """What has no pin: lengths at reading zero, and the other parameters of a complete model."""
+def _report_inexpressible(source: ExportSource, factor: float, symbol: str) -> Iterator[Finding]:
+    """Yield what has no pin: lengths at reading zero, and further parameters."""
     values = source.values()
     for n in range(6):
         length = values.pop(f"leg{n + 1}.length", 0.0) / factor
-        if abs(length) > CLOSE:
-            yield (
-                f"not said by genhexkins: strut {n} is {format_scaled(length, 1.0)} {symbol} long at "
-                "reading zero; "
-                f"add this to HOME_OFFSET of [JOINT_{n}] in the INI file"
-            )
-    said = re.compile(r"leg\d\.(base|platform)\.[xyz]$")
+        if abs(length) > ROUNDING:
+            text = f"{format_scaled(length, 1.0)} {symbol}"
+            yield report_finding("files.strut-length", strut=n, length=text)
+    expressed = re.compile(r"leg\d\.(base|platform)\.[xyz]$")
     table = source.robot.parameters
-    off = [name for i, name in enumerate(table.names) if source.robot.values[i] != table.nominal[i]]
-    others = [name for name in off if name in values and not said.match(name)]
+    changed = zip(table.names, source.robot.values, table.nominal, strict=True)
+    others = [name for name, value, nominal in changed if value != nominal and name in values]
+    others = [name for name in others if not expressed.match(name)]
     if others:
-        yield f"not said by genhexkins: {len(others)} parameters such as {others[0]}; use json or csv for them"
+        yield report_finding("files.not-expressed", format="genhexkins", names=tuple(others))
 
 
-def _read(path: Path) -> _Hal:
+def _read_hal(path: Path) -> _Hal:
+    """Read the pins of a file; FileError where it has none."""
     lines = tuple(read_text(path, "HAL file").splitlines(keepends=True))
-    pins = {}
-    for i, line in enumerate(lines):
-        if found := SETP.match(line):
-            pins[found.group(1)] = _Pin(found.group(3), i, found.start(3))
+    pins = {
+        match[1]: _Pin(match[3], i, match.start(3))
+        for i, line in enumerate(lines)
+        if (match := SETP.match(line))
+    }
     if not pins:
-        raise FileError(
-            "there is no 'setp genhexkins...' in this file; name the HAL file that sets the "
-            "geometry",
-            path,
-        )
+        sentence = "this file has no 'setp genhexkins...'"
+        raise FileError(f"{sentence}; name the HAL file that sets the geometry", path)
     return _Hal(path, lines, pins)
 
 
-def _hand(base: Point, top: Point, low: Point, high: Point, home: float) -> float:
-    """-1 where the axes stand beyond a quarter turn about the strut at home, else 1; home: height
-    of the platform.
+def _get_hand(base: Point, top: Point, low: Point, high: Point, home: float) -> float:
+    """Return -1 where the axes are beyond a quarter turn about the strut at home, else 1.
+
+    `home` is the height of the platform.
     """
     strut = (top[0] - base[0], top[1] - base[1], top[2] + home - base[2])
-    square = _dot(strut, strut)
-    across = _dot(low, high) * square - _dot(low, strut) * _dot(high, strut)
+    across = _dot(low, high) * _dot(strut, strut) - _dot(low, strut) * _dot(high, strut)
     return -1.0 if across < 0 else 1.0
 
 
-def _dot(one: Point, other: Point) -> float:
-    return sum(a * b for a, b in zip(one, other, strict=True))
+def _dot(a: Point, b: Point) -> float:
+    return sum(x * y for x, y in zip(a, b, strict=True))
 
 
-def _scaled(axis: Point, sign: float) -> Point:
-    return (
-        (axis[0], axis[1], axis[2]) if sign > 0 else (0.0 - axis[0], 0.0 - axis[1], 0.0 - axis[2])
-    )
+def _flip(axis: Sequence[float], sign: float) -> Point:
+    x, y, z = axis
+    return (x, y, z) if sign > 0 else (0.0 - x, 0.0 - y, 0.0 - z)
 
 
-def _lifted(point: Point, lift: float) -> Point:
-    return point[0], point[1], point[2] + lift
-
-
-def _list(points: list[Point], indent: int) -> str:
+def _format_list(points: list[Point], indent: int) -> str:
     return "\n".join(f"{' ' * indent}- [{', '.join(repr(v) for v in point)}]" for point in points)
 
 

@@ -1,51 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a format of another program gives and takes: imported text, exported text, and what could
-not be expressed.
-"""
+"""The interface of a format of another program: options, imported content, exported text."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import DataError, FileError
+from loopcal.findings import Finding, report_finding
+from loopcal.io.core.numbers import parse_finite
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements
     from loopcal.mechanism import Mechanism
 
 HEIGHT_SIGMA = 20e-6
-"""Standard deviation of a probed height where nothing is known of the probe [m]."""
-
-UNCHANGED = "every number was already this one; nothing was changed"
-
-LINE_SIGMA = POSITION_SIGMA = 1e-3
-"""Standard deviations of a line's length and of a known position of a cable robot, where nothing is
-known [m].
-"""
+"""Standard deviation of a probed height where the probe is unknown [m]."""
 
 DISTANCE_SIGMA = 0.1e-3
-"""Standard deviation of a distance by callipers on a printed part where nothing is known of them
-[m].
-"""
+"""Standard deviation of a distance on a printed part, by callipers [m]."""
+
+LINE_SIGMA = POSITION_SIGMA = 1e-3
+"""Standard deviations of line lengths and of known positions of a cable robot [m]."""
 
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """How to read a file.
+    """Options of reading a file.
 
     Attributes
     ----------
-    name : of the robot. sigma_height, sigma_distance : noise of measurements in the file [m], which
-        no format states.
-    length_unit : symbol of the unit of lengths, for formats that state none. home_height : z of the
-        home pose [m].
-    closures : the file of loop closures, for formats that keep them apart. platform : the link that
-        is the platform.
-    sigma_line, sigma_position : noise of lines and of known positions of a cable robot [m], which
-        no format states.
+    name : of the robot.
+    sigma_height, sigma_distance : noise of probed heights and distances [m], which no format
+        states. sigma_line, sigma_position : noise of lines and known positions of a cable robot
+        [m].
+    length_unit : symbol of the unit of lengths, for formats that state none.
+    home_height : z of the home pose [m].
+    closures : file of loop closures, for formats that keep them apart.
+    platform : the link that is the platform.
     """
 
     name: str
@@ -61,23 +55,27 @@ class ImportOptions:
 
 @dataclass(frozen=True)
 class Imported:
-    """A file as loopcal sees it.
+    """The content of a file of another program.
 
     Attributes
     ----------
-    robot_text : the robot file. measurements : what the file also holds, None where it holds none.
-    notes : sentences on what was assumed, and on what has no place in a robot file.
+    robot_text : text of the robot file. measurements : of the file; None where it has none.
+    findings : assumptions, and content that a robot file cannot express.
     """
 
     robot_text: str
     measurements: Measurements | None = None
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True)
 class ExportSource:
-    """What is exported: a robot, and where a run made it, half of the 95 % interval by parameter
-    (unit of the file).
+    """A robot to export, with intervals where a run provides them.
+
+    Attributes
+    ----------
+    plus_minus : parameter -> half of the 95 % interval, in the unit of the robot file; None where
+        there is none. nulls : parameter -> reason why there is none.
     """
 
     robot: Mechanism
@@ -85,16 +83,16 @@ class ExportSource:
     nulls: Mapping[str, str] = field(default_factory=dict)
 
     def values(self) -> dict[str, float]:
-        """Parameter -> value [SI]."""
+        """Return parameter -> value [SI]."""
         return dict(zip(self.robot.parameters.names, self.robot.values.tolist(), strict=True))
 
 
 @dataclass(frozen=True)
 class Exported:
-    """The text to write, and sentences on what was changed and on what the format cannot express."""
+    """The text of a file of another program, with changes and what it cannot express."""
 
     text: str
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -103,14 +101,13 @@ class Format:
 
     Attributes
     ----------
-    name, what : its name on the command line, and one line on it. endings : of file names that are
-        taken for it.
-    read : from a file. write : of a source, into the file given (all else in it stays as it is) or
-        as a text of its own.
-    takes_file : whether `write` can correct a file. reads : options of `ImportOptions` that `read` looks
-        at.
-    judged : sentences on what the other program stored, from the robot and the measurements that
-        were read.
+    name, what : name of the format, and a line about it. endings : of file names.
+    read : function that reads a file. write : function that writes a source, into an existing file
+        (everything else in it stays as it is) or as a text of its own.
+    takes_file : whether `write` can correct an existing file.
+    reads : options of `ImportOptions` that `read` uses.
+    stores_fit : whether a file contains a geometry together with the measurements that its firmware
+        fitted it to, so that `loopcal.diagnose` can compare the two.
     """
 
     name: str
@@ -120,35 +117,39 @@ class Format:
     write: Callable[[ExportSource, Path | None], Exported] | None = None
     takes_file: bool = True
     reads: tuple[str, ...] = ()
-    judged: Callable[[Mechanism, Measurements], tuple[str, ...]] | None = None
+    stores_fit: bool = False
 
 
-def record_of(source: ExportSource, family: type, format_name: str, words: str) -> Any:
-    """The family's record of a robot that came from a file; DataError where it is of another
-    family.
-    """
+def get_record(source: ExportSource, family: type, format_name: str, needed: str) -> Any:
+    """Return the family's record of a robot; DataError where it is not `needed`."""
     record = getattr(source.robot.record, "record", None)
     if not isinstance(record, family):
-        raise DataError(
-            f"{source.robot.name} is not {words}, which is all that the format {format_name} can "
-            "hold; use json or csv"
+        sentence = (
+            f"{source.robot.name} is not {needed}, and the format {format_name} holds no other"
         )
+        raise DataError(f"{sentence}; use json or csv")
     return record
 
 
-def number(text: str, what: str, path: Path, line: int) -> float:
-    """A finite number of a file; FileError with its line where it is none."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if value - value != 0.0 or "_" in text:
-        raise FileError(
-            f"{what} is {text!r} where a finite number is needed; correct it", path, line
-        )
+def parse_number(text: str, what: str, path: Path, line: int) -> float:
+    """Return a finite number of a file; FileError with its line for other text."""
+    value = parse_finite(text)
+    if value is None:
+        sentence = f"{what} is {text!r}, but a finite number is needed; correct it"
+        raise FileError(sentence, path, line)
     return value
 
 
-def byte_order_mark(path: Path) -> str:
-    """The byte order mark of a file that has one, to be kept where the file is written anew."""
+def report_changes(changes: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Return the changes of a file; the finding that nothing changed where there are none."""
+    return tuple(changes) or (report_finding("files.unchanged"),)
+
+
+def report_change(line: int, name: str, before: str | None, after: str) -> Finding:
+    """Return the finding that a value was changed, or added where `before` is None."""
+    return report_finding("files.value-changed", line=line, name=name, before=before, after=after)
+
+
+def get_byte_order_mark(path: Path) -> str:
+    """Return the byte order mark of a file that has one, to keep it in the corrected file."""
     return "\ufeff" if path.read_bytes().startswith(b"\xef\xbb\xbf") else ""

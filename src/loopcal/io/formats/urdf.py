@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""URDF with loop closures: read as a robot of the family limbs, and its joints' origins corrected
-in the text.
+"""URDF with loop closures: read as a robot of the family limbs; its joint origins are corrected.
 
-The platform is the body that carries a frame (a link on a fixed joint), or the one asked for; that
-frame becomes the platform frame. Unknowns are the shifts of each joint across its axis, in its own
-frame, and the zeros of the motors. Written back, a shift d changes the origin's xyz by R d, and a
-motor's zero turns its rpy about the axis; a slide's zero shifts xyz. Nothing else in the text
-changes.
+The platform is the body that carries a frame (a link on a fixed joint), or the one that the options
+name; that frame becomes the platform frame. Parameters are the shifts of each joint across its
+axis, in its own frame, and the zeros of the motors. Written back, a shift d changes the origin's
+xyz by R d, and a motor's zero turns its rpy about the axis; a slide's zero shifts xyz. The rest of
+the text stays as it is.
 """
 
 from __future__ import annotations
@@ -19,37 +18,46 @@ from typing import Any
 import numpy as np
 
 from loopcal import geometry
-from loopcal.errors import DataError, FileError
-from loopcal.io.formats import urdf_limbs, urdf_loops, urdf_tree
+from loopcal.errors import DataError, FileError, MechanismError
+from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.io.formats import urdf_tree
 from loopcal.io.formats.program_format import (
-    UNCHANGED,
     Exported,
     ExportSource,
     Format,
     Imported,
     ImportOptions,
-    byte_order_mark,
-    record_of,
+    get_byte_order_mark,
+    get_record,
+    report_changes,
 )
-from loopcal.io.formats.urdf_limbs import Cut, oriented, other_end
-from loopcal.io.formats.urdf_loops import Edge, Loops
+from loopcal.io.formats.urdf_closures import read_joint_graph
 from loopcal.io.formats.urdf_tree import Urdf
 from loopcal.mechanism.families.limb_records import Prismatic, Revolute, place_matrix
 from loopcal.mechanism.families.limbs import Limbs
+from loopcal.mechanism.joint_graph import (
+    GraphJoint,
+    JointGraph,
+    LimbPaths,
+    choose_coordinates,
+    find_limb_paths,
+    get_other_body,
+    orient_path,
+)
 from loopcal.typing import FloatArray
 
 ZERO = 1e-15
 """Numbers below this are rounding and written as 0 [m, rad]."""
 
 PLACED = 1e-9
-"""How far a joint may be from where the robot file has it [m, 1]."""
+"""Accepted difference between the places of a joint in URDF and robot file [m, 1]."""
 
 COORDINATES = {"rx": "roll", "ry": "pitch", "rz": "yaw", "x": "x", "y": "y", "z": "z"}
 POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 
 ROBOT = """\
-# Read from {origin}, a URDF with loop closures. Limbs are called by their first joint, joints as in
-# the URDF.
+# Read from {origin}, a URDF with loop closures. Limbs are named after their first joint, joints as
+# in the URDF.
 format: 1
 family: limbs
 name: {name}
@@ -76,235 +84,222 @@ LIMB = """\
 """
 
 
-def read(path: Path, reading: ImportOptions) -> Imported:
-    """Read a URDF and its closures; FileError for what is broken, does not close, or branches."""
+def read(path: Path, options: ImportOptions) -> Imported:
+    """Read a URDF and its closures.
+
+    Raises
+    ------
+    FileError : the file is not valid, its loops do not close, or its limbs branch.
+    """
     urdf = urdf_tree.read(path)
-    closures = reading.closures or path.with_suffix(".yaml")
+    closures = options.closures or path.with_suffix(".yaml")
     if not closures.exists():
-        raise FileError(
-            "a URDF is a tree and says nothing of its loops; name the file of closures, as "
-            "--closures loops.yaml",
-            path,
-        )
-    loops = urdf_loops.read(urdf, closures)
-    platform, frame = _platform(urdf, loops, reading.platform)
-    found = urdf_limbs.cut(loops, platform)
-    loops = found.loops
-    T_body_frame = geometry.invert_pose(urdf.in_body(platform)) @ urdf.in_body(frame)
-    motion = loops.motions()
-    turns = any(name.startswith("r") for name in found.freedoms)
-    home = loops.places[platform] @ T_body_frame
-    twists = loops.twists(platform, home[:3, 3]) @ motion
-    names = _chosen(twists, motion.shape[1])
+        raise FileError(report_finding("files.closures-missing"), path)
+    graph = read_joint_graph(urdf, closures)
+    platform, frame = _find_platform(urdf, graph, options.platform)
+    try:
+        paths = find_limb_paths(graph, platform)
+    except MechanismError as error:
+        finding = error.args[0]
+        joints = finding.data.get("joints", ("",))
+        raise urdf.error(finding, joints[-1]) from None
+    graph = paths.graph
+    T_body_frame = geometry.invert_pose(urdf.place_in_body(platform)) @ urdf.place_in_body(frame)
+    motion = graph.motions()
+    turns = any(name.startswith("r") for name in paths.freedoms)
+    home = graph.places[platform] @ T_body_frame
+    coordinates = choose_coordinates(graph.twists(platform, home[:3, 3]) @ motion)
+    drives = (f"  {json.dumps(name)}: {_format_drive(urdf, name)}" for name in graph.motors)
     text = ROBOT.format(
         origin=path.name,
-        name=json.dumps(reading.name),
+        name=json.dumps(options.name),
         source=json.dumps(f"{path.name} with {closures.name}"),
-        freedoms=", ".join(found.freedoms),
-        controlled=", ".join(COORDINATES[name] for name in names),
-        actuators="\n".join(
-            f"  {json.dumps(name)}: {_drive(loops, name)}" for name in loops.motors
-        ),
-        limbs="".join(_limb(loops, limb, T_body_frame, turns) for limb in found.limbs),
-        home=_pose(home),
+        freedoms=", ".join(paths.freedoms),
+        controlled=", ".join(COORDINATES[name] for name in coordinates),
+        actuators="\n".join(drives),
+        limbs="".join(_format_limb(graph, limb, T_body_frame, turns) for limb in paths.limbs),
+        home=_format_pose(home),
     )
-    return Imported(text, None, tuple(_notes(loops, found, motion.shape[1], frame)))
+    return Imported(text, None, tuple(_report_structure(urdf, paths, motion.shape[1], frame)))
 
 
 def write(source: ExportSource, into: Path | None) -> Exported:
-    """The URDF with corrected origins; DataError without one, FileError where its joints stand
-    elsewhere.
+    """Return the URDF with corrected origins.
+
+    Raises
+    ------
+    DataError : no URDF is given. FileError : its joints have other places than the robot's.
     """
-    record: Limbs = record_of(source, Limbs, "urdf", "a robot of the family limbs")
+    record: Limbs = get_record(source, Limbs, "urdf", "a robot of the family limbs")
     if into is None:
-        raise DataError(
-            "a URDF holds more than a robot file; name the one to correct, as --into robot.urdf"
-        )
-    urdf, notes, said = urdf_tree.read(into), [], set()
+        raise DataError(report_finding("files.urdf-needed"))
+    urdf, changes, expressed = urdf_tree.read(into), [], set()
     nominal = source.robot.parameters.nominal.tolist()
-    off = {
-        name: value - was
-        for (name, value), was in zip(source.values().items(), nominal, strict=True)
-    }
-    for name, names, motor in _places(record, urdf):
-        shift = np.array([off.get(parameter, 0.0) for parameter in names])
-        zero = off.get(f"{motor}.offset", 0.0)
-        said |= {*names, f"{motor}.offset"}
+    values = zip(source.values().items(), nominal, strict=True)
+    deviations = {name: value - before for (name, value), before in values}
+    for name, shifts, motor in _list_origins(record, urdf):
+        shift = np.array([deviations.get(parameter, 0.0) for parameter in shifts])
+        zero = deviations.get(f"{motor}.offset", 0.0)
+        expressed |= {*shifts, f"{motor}.offset"}
         if not shift.any() and zero == 0.0:
             continue
-        found = urdf.joints[name]
-        turn = zero if found.kind == "R" else 0.0
-        moved = found.origin @ geometry.make_pose(
-            geometry.exp_so3(turn * found.axis), shift + (zero - turn) * found.axis
-        )
+        joint = urdf.joints[name]
+        turn = zero if joint.kind == "R" else 0.0
+        R = geometry.exp_so3(turn * joint.axis)
+        moved = joint.origin @ geometry.make_pose(R, shift + (zero - turn) * joint.axis)
         urdf = urdf.with_origin(name, moved, turned=turn != 0.0)
-        size = float(np.linalg.norm(moved[:3, 3] - found.origin[:3, 3]))
-        words = f", turned by {turn:.6g} rad" if turn else ""
-        notes.append(f"line {found.line}: joint {name} moved by {size * 1e3:.6g} mm{words}")
-    others = [name for name, change in off.items() if change and name not in said]
-    if others:
-        notes.append(
-            f"not said by the URDF: {len(others)} parameters such as {others[0]}; use json or csv "
-            "for them"
+        distance = float(np.linalg.norm(moved[:3, 3] - joint.origin[:3, 3]))
+        changes.append(
+            report_finding(
+                "files.joint-moved",
+                line=joint.line,
+                joint=name,
+                distance=Quantity(distance * 1e3, "mm"),
+                turn=Quantity(turn, "rad"),
+            )
         )
-    return Exported(byte_order_mark(into) + urdf.text, tuple(notes or [UNCHANGED]))
+    others = tuple(name for name, d in deviations.items() if d and name not in expressed)
+    rest = (report_finding("files.not-expressed", format="the URDF", names=others),)
+    text = get_byte_order_mark(into) + urdf.text
+    return Exported(text, (*report_changes(changes), *(rest if others else ())))
 
 
-def _places(record: Limbs, urdf: Urdf) -> Iterator[tuple[str, list[str], str]]:
-    """URDF joint, names of the shifts along its axes, and its motor; FileError where a limb begins
-    elsewhere than here.
+def _list_origins(record: Limbs, urdf: Urdf) -> Iterator[tuple[str, list[str], str]]:
+    """Yield URDF joint, names of the shifts along its axes, and its motor.
+
+    Raises
+    ------
+    FileError : a limb begins at another place than in the robot file.
     """
     for limb in record.limbs:
         first = limb.chain[0]
         if first.name in urdf.joints:
-            found = urdf.joints[first.name]
-            if (
-                np.abs(urdf.in_body(found.parent) @ found.origin - place_matrix(first.at)).max()
-                > PLACED
-            ):
-                words = f"joint {first.name!r} stands elsewhere in the robot file; export into the URDF that it came from"
-                raise urdf.error(words, first.name)
-        motors = {
-            j.name: j.actuated
-            for j in limb.chain
-            if isinstance(j, Revolute | Prismatic) and j.actuated
-        }
-        for name in dict.fromkeys([entry.name or entry.of for entry in limb.errors] + list(motors)):
+            joint = urdf.joints[first.name]
+            place = urdf.place_in_body(joint.parent) @ joint.origin
+            if np.abs(place - place_matrix(first.at)).max() > PLACED:
+                sentence = f"joint {first.name!r} has another place in the robot file"
+                raise urdf.error(f"{sentence}; export into the URDF it was read from", first.name)
+        driven = (j for j in limb.chain if isinstance(j, Revolute | Prismatic))
+        motors = {joint.name: joint.actuated for joint in driven if joint.actuated}
+        names = [entry.name or entry.of for entry in limb.errors] + list(motors)
+        for name in dict.fromkeys(names):
             if name in urdf.joints:
-                yield name, [f"{limb.name}.{name}.{axis}" for axis in "xyz"], motors.get(name) or ""
+                shifts = [f"{limb.name}.{name}.{axis}" for axis in "xyz"]
+                yield name, shifts, motors.get(name) or ""
 
 
-def _platform(urdf: Urdf, loops: Loops, asked: str | None) -> tuple[str, str]:
-    """The platform's body, and the link whose frame is the platform frame."""
-    links = {*urdf.carrier, urdf.root}
-    if asked is not None:
-        if asked not in links or urdf.body(asked) not in loops.bodies[1:]:
-            raise FileError(
-                f"--platform {asked!r} is no moving link of this URDF; name one of "
-                f"{', '.join(loops.bodies[1:])}",
-                urdf.path,
-            )
-        return urdf.body(asked), asked
-    framed = [
-        j.child
-        for j in urdf.joints.values()
-        if not j.kind and urdf.body(j.parent) in loops.bodies[1:]
-    ]
-    if len(framed) != 1:
-        what = (
-            "no moving body carries a frame"
-            if not framed
-            else f"{', '.join(framed)} are frames on moving bodies"
-        )
-        raise FileError(
-            f"{what}, so the platform is not clear; name its link, as --platform {loops.bodies[-1]}",
-            urdf.path,
-        )
-    return urdf.body(framed[0]), framed[0]
+def _find_platform(urdf: Urdf, graph: JointGraph, name: str | None) -> tuple[str, str]:
+    """Return the platform's body, and the link whose frame is the platform frame."""
+    moving = graph.bodies[1:]
+    if name is not None:
+        body = urdf.find_body(name) if name in {*urdf.carrier, urdf.root} else None
+        if body not in moving:
+            finding = report_finding("files.platform-unknown", platform=name, links=moving)
+            raise FileError(finding, urdf.path)
+        return str(body), name
+    fixed = (joint for joint in urdf.joints.values() if not joint.kind)
+    frames = tuple(joint.child for joint in fixed if urdf.find_body(joint.parent) in moving)
+    if len(frames) != 1:
+        finding = report_finding("files.platform-unclear", frames=frames, links=moving)
+        raise FileError(finding, urdf.path)
+    return urdf.find_body(frames[0]), frames[0]
 
 
-def _chosen(twists: FloatArray, mobility: int) -> list[str]:
-    """Coordinates that move independently, positions first; chosen one by one by what they add."""
-    chosen: list[str] = []
-    for name in ("x", "y", "z", "rx", "ry", "rz"):
-        rows = twists[[urdf_limbs.FREEDOMS.index(n) for n in (*chosen, name)]]
-        s = np.linalg.svd(rows, compute_uv=False)
-        if len(chosen) < mobility and s[-1] > 1e-3 * np.abs(twists).max():
-            chosen.append(name)
-    return chosen
-
-
-def _drive(loops: Loops, name: str) -> str:
-    joint = loops.urdf.joints[name]
+def _format_drive(urdf: Urdf, name: str) -> str:
+    """Return one drive of the robot file."""
+    joint = urdf.joints[name]
     stroke = "" if joint.limits is None else f", stroke: [{joint.limits[0]!r}, {joint.limits[1]!r}]"
     return f"{{reads: {'angle' if joint.kind == 'R' else 'length'}, unknown: [offset]{stroke}}}"
 
 
-def _limb(loops: Loops, limb: tuple[Edge, ...], T_body_frame: FloatArray, turns: bool) -> str:
-    """One limb of the robot file; on a platform that does not turn its last joint is the point that
-    it turns about.
+def _format_limb(
+    graph: JointGraph, limb: tuple[GraphJoint, ...], T_body_frame: FloatArray, turns: bool
+) -> str:
+    """Return one limb of the robot file.
+
+    On a platform that does not turn, its last joint is the point that it turns about.
     """
-    chain, errors, body = [], [], loops.base
+    chain, errors, body = [], [], graph.base
     pending: FloatArray = np.eye(4)
     tip: FloatArray = np.eye(4)
-    path = oriented(limb, loops.base)
-    for edge in path:
-        forward = edge.one == body
-        place = pending @ (edge.T_one if forward else edge.T_other)
-        axis = edge.axis if forward else -edge.axis
-        ends = edge is path[-1] and not turns
-        if ends:
+    path = orient_path(limb, graph.base)
+    for joint in path:
+        forward = joint.one == body
+        place = pending @ (joint.T_one if forward else joint.T_other)
+        axis = joint.axis if forward else -joint.axis
+        is_tip = joint is path[-1] and not turns
+        if is_tip:
             tip = place
         else:
-            chain.append(_joint(loops, edge, place, axis))
+            chain.append(_format_joint(graph, joint, place, axis))
         if forward:
-            name = f"tip, name: {json.dumps(edge.name)}" if ends else json.dumps(edge.name)
-            errors.append(f"      - {{of: {name}, shift: [{', '.join(_across(axis))}]}}")
-        pending = geometry.invert_pose(edge.T_other if forward else edge.T_one)
-        body = other_end(edge, body)
+            name = f"tip, name: {json.dumps(joint.name)}" if is_tip else json.dumps(joint.name)
+            errors.append(f"      - {{of: {name}, shift: [{_list_across(axis)}]}}")
+        pending = geometry.invert_pose(joint.T_other if forward else joint.T_one)
+        body = get_other_body(joint, body)
     last = path[-1]
     attach: FloatArray = geometry.invert_pose(pending @ T_body_frame)
-    if last.pin:
+    if last.is_pin:
         # the far end of the pin, a joint of its own in the URDF
-        errors.append(
-            f"      - {{of: platform, name: {json.dumps(last.far)}, shift: "
-            f"[{', '.join(_across(last.axis))}]}}"
-        )
+        far = f"of: platform, name: {json.dumps(last.far)}"
+        errors.append(f"      - {{{far}, shift: [{_list_across(last.axis)}]}}")
     elif turns:
         tip, attach = pending @ T_body_frame, np.eye(4)
     return LIMB.format(
         name=json.dumps(limb[0].name),
         chain="\n".join(chain),
         ending="rigid" if turns else "ball",
-        tip=_pose(tip),
-        attach=_pose(attach),
+        tip=_format_pose(tip),
+        attach=_format_pose(attach),
         errors="\n".join(errors),
     )
 
 
-def _joint(loops: Loops, edge: Edge, place: FloatArray, axis: FloatArray) -> str:
-    value = float(loops.pin_value(edge) if edge.pin else loops.values[edge.name])
-    motor = f", actuated: {json.dumps(edge.name)}" if edge.name in loops.motors else ""
-    words = f"{{joint: {edge.kind}, name: {json.dumps(edge.name)}, at: {_pose(place)}, axis: {_list(axis)}"
-    return f"      - {words}, start: {value!r}{motor}}}"
+def _format_joint(graph: JointGraph, joint: GraphJoint, place: FloatArray, axis: FloatArray) -> str:
+    """Return one joint of a limb."""
+    start = float(graph.get_pin_angle(joint) if joint.is_pin else graph.values[joint.name])
+    motor = f", actuated: {json.dumps(joint.name)}" if joint.name in graph.motors else ""
+    head = f"joint: {joint.kind}, name: {json.dumps(joint.name)}"
+    where = f"at: {_format_pose(place)}, axis: {_format_list(axis)}"
+    return f"      - {{{head}, {where}, start: {start!r}{motor}}}"
 
 
-def _across(axis: FloatArray) -> list[str]:
-    """Axes of the joint's frame that are not the joint's."""
-    return [a for a, part in zip("xyz", axis, strict=True) if abs(part) < 1 - 1e-9]
+def _list_across(axis: FloatArray) -> str:
+    """Return the axes of the joint's frame that are not the joint's."""
+    return ", ".join(a for a, part in zip("xyz", axis, strict=True) if abs(part) < 1 - 1e-9)
 
 
-def _notes(loops: Loops, found: Cut, mobility: int, frame: str) -> Iterator[str]:
-    residual = np.abs(loops.closure()[0]).max(initial=0.0)
-    links = len(loops.urdf.carrier) + 1
-    yield (
-        f"{len(loops.bodies)} rigid bodies with the base (of {links} links), {len(loops.edges)} "
-        "joints "
-        f"({len(loops.pins)} close loops), {len(loops.motors)} motors, mobility {mobility}"
+def _report_structure(urdf: Urdf, paths: LimbPaths, mobility: int, frame: str) -> Iterator[Finding]:
+    """Yield the size of the mechanism, its home, and what the robot file does not express."""
+    graph = paths.graph
+    yield report_finding(
+        "files.urdf-structure",
+        bodies=len(graph.bodies),
+        links=len(urdf.carrier) + 1,
+        joints=len(graph.joints),
+        loops=len(graph.pins),
+        motors=len(graph.motors),
+        mobility=mobility,
     )
-    yield f"closure residual at home {residual:.1g} m; platform frame {frame}, which moves in {' '.join(found.freedoms)}"
-    if found.replaced:
-        yield (
-            f"joints {', '.join(found.replaced)} branch from the limbs; all they do is keep the "
-            "platform from turning, which "
-            "the freedoms say in their place, so their origins are not identified"
-        )
-    if mobility != len(loops.motors):
-        yield f"mobility {mobility} and {len(loops.motors)} motors differ"
+    residual = float(np.abs(graph.linearize_closure()[0]).max(initial=0.0))
+    yield report_finding(
+        "files.urdf-home", residual=f"{residual:.1g} m", frame=frame, freedoms=paths.freedoms
+    )
+    if paths.replaced:
+        yield report_finding("files.joints-replaced", joints=paths.replaced)
+    if mobility != len(graph.motors):
+        yield report_finding("files.motors-differ", mobility=mobility, motors=len(graph.motors))
 
 
-def _pose(T: FloatArray) -> str:
-    """A pose as a flow mapping; what is zero is left out."""
+def _format_pose(T: FloatArray) -> str:
+    """Return a pose as a flow mapping without zeros."""
     values = [*T[:3, 3], *geometry.matrix_to_euler(T[:3, :3], "xyz")]
-    shown = [
-        f"{name}: {float(value)!r}"
-        for name, value in zip(POSE, values, strict=True)
-        if abs(value) > ZERO
-    ]
+    pairs = zip(POSE, values, strict=True)
+    shown = [f"{name}: {float(value)!r}" for name, value in pairs if abs(value) > ZERO]
     return f"{{{', '.join(shown)}}}" if shown else "[0, 0, 0]"
 
 
-def _list(vector: Any) -> str:
+def _format_list(vector: Any) -> str:
     return f"[{', '.join(repr(float(v)) if abs(v) > ZERO else '0' for v in vector)}]"
 
 

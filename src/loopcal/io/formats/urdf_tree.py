@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A URDF file as a tree of links and joints that knows where each joint's origin stands in the
-text.
+"""A URDF file as a tree of links and joints that knows the origin of each joint in the text.
 
 A joint's frame is its parent link's frame moved by `<origin xyz rpy>`, rpy about fixed axes (R = Rz
 Ry Rx); the child turns about, or slides along, `<axis>` in that frame. Lengths are metres, angles
@@ -21,7 +20,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import FileError
 from loopcal.io.core.text_file import read_text
-from loopcal.io.formats.program_format import number
+from loopcal.io.formats.program_format import parse_number
 from loopcal.typing import FloatArray
 
 KINDS = {"revolute": "R", "continuous": "R", "prismatic": "P", "fixed": ""}
@@ -29,13 +28,13 @@ KINDS = {"revolute": "R", "continuous": "R", "prismatic": "P", "fixed": ""}
 
 @dataclass(frozen=True)
 class UrdfJoint:
-    """A joint; `origin` is (4, 4) T_parent_joint [m], `axis` (3,) a unit vector, `limits` [rad or
-    m].
+    """A joint.
 
     Attributes
     ----------
-    kind : R, P, or nothing for a fixed joint. line : of the joint, from 1. start, end : bytes of
-        its origin's tag, -1 without.
+    kind : R, P, or "" for a fixed joint. parent, child : links.
+    origin : (4, 4) T_parent_joint [m]. axis : (3,) unit vector. limits : [rad or m].
+    line : of the joint, from 1. start, end : bytes of its origin's tag, -1 without.
     """
 
     name: str
@@ -49,21 +48,10 @@ class UrdfJoint:
     start: int
     end: int
 
-    def moved(self, value: float) -> FloatArray:
-        """(4, 4) T_parent_child at a joint value [rad or m]."""
-        R, t = np.eye(3), np.zeros(3)
-        if self.kind == "R":
-            R = geometry.exp_so3(value * self.axis)
-        elif self.kind == "P":
-            t = value * self.axis
-        return self.origin @ geometry.make_pose(R, t)
-
 
 @dataclass(frozen=True)
 class Urdf:
-    """A file: its text, joints by name in its order, and its links with the joint that carries
-    each.
-    """
+    """A file: its text, joints by name, root link, and the joint that carries each other link."""
 
     path: Path
     text: str
@@ -71,213 +59,179 @@ class Urdf:
     root: str
     carrier: Mapping[str, UrdfJoint]
 
-    def error(self, sentence: str, joint: str) -> FileError:
-        """The error for a joint, with its line."""
-        return FileError(
-            sentence, self.path, self.joints[joint].line if joint in self.joints else None
-        )
+    def error(self, sentence: Any, joint: str) -> FileError:
+        """Return an error at the line of a joint."""
+        line = self.joints[joint].line if joint in self.joints else None
+        return FileError(sentence, self.path, line)
 
-    def body(self, link: str) -> str:
-        """The link that stands for a rigid body: of links joined by fixed joints the one nearest to
-        the root.
-        """
+    def find_body(self, link: str) -> str:
+        """Return the rigid body of a link: of links on fixed joints the one nearest to the root."""
         while link in self.carrier and not self.carrier[link].kind:
             link = self.carrier[link].parent
         return link
 
-    def in_body(self, link: str) -> FloatArray:
-        """(4, 4) T_body_link of a link in its rigid body."""
+    def place_in_body(self, link: str) -> FloatArray:
+        """Return T_body_link (4, 4) of a link in its rigid body."""
         T = np.eye(4)
         while link in self.carrier and not self.carrier[link].kind:
             T, link = self.carrier[link].origin @ T, self.carrier[link].parent
         return T
 
     def with_origin(self, joint: str, origin: FloatArray, turned: bool) -> Urdf:
-        """The same with another origin of a joint; its rpy is left alone unless it was turned.
+        """Return the file with another origin of a joint; its rpy changes only where it `turned`.
 
         Raises
         ------
-        FileError
-            The joint has no origin in the text, or it lacks the attribute.
+        FileError : the joint has no origin in the text, or the attribute is missing.
         """
-        found = self.joints[joint]
-        if found.start < 0:
-            raise self.error(
-                f"joint {joint!r} has no <origin> to correct; write one with xyz and rpy", joint
-            )
+        old = self.joints[joint]
+        if old.start < 0:
+            sentence = f"joint {joint!r} has no <origin>; add one with xyz and rpy"
+            raise self.error(sentence, joint)
         raw = self.text.encode()
-        tag = raw[found.start : found.end].decode()
-        tag = self._attribute(tag, "xyz", origin[:3, 3], joint)
+        tag = raw[old.start : old.end].decode()
+        tag = self._replace_attribute(tag, "xyz", origin[:3, 3], joint)
         if turned:
-            tag = self._attribute(
-                tag, "rpy", geometry.matrix_to_euler(origin[:3, :3], "xyz"), joint
-            )
-        return parse((raw[: found.start] + tag.encode() + raw[found.end :]).decode(), self.path)
+            rpy = geometry.matrix_to_euler(origin[:3, :3], "xyz")
+            tag = self._replace_attribute(tag, "rpy", rpy, joint)
+        return parse((raw[: old.start] + tag.encode() + raw[old.end :]).decode(), self.path)
 
-    def _attribute(self, tag: str, name: str, values: FloatArray, joint: str) -> str:
-        found = re.search(rf"""\s{name}\s*=\s*(["'])(.*?)\1""", tag, re.DOTALL)
-        if found is None:
-            raise self.error(
-                f"the origin of joint {joint!r} has no {name} to correct; write it out", joint
-            )
-        return (
-            tag[: found.start(2)] + " ".join(repr(float(v)) for v in values) + tag[found.end(2) :]
-        )
+    def _replace_attribute(self, tag: str, name: str, values: FloatArray, joint: str) -> str:
+        match = re.search(rf"""\s{name}\s*=\s*(["'])(.*?)\1""", tag, re.DOTALL)
+        if match is None:
+            raise self.error(f"the origin of joint {joint!r} has no {name}; add it", joint)
+        text = " ".join(repr(float(v)) for v in values)
+        return tag[: match.start(2)] + text + tag[match.end(2) :]
 
 
 @dataclass
-class _Open:
-    """A joint while it is read."""
+class _OpenJoint:
+    """A joint while it is parsed: attributes of its elements by name."""
 
     name: str
     kind: str
     line: int
-    found: dict[str, dict[str, str]] = field(default_factory=dict)
+    elements: dict[str, dict[str, str]] = field(default_factory=dict)
     start: int = -1
 
 
+class _Parser:
+    """Handlers of expat that collect links and joints."""
+
+    def __init__(self, raw: bytes, path: Path) -> None:
+        self.raw, self.path = raw, path
+        self.links: list[str] = []
+        self.joints: dict[str, UrdfJoint] = {}
+        self._stack: list[str] = []
+        self._joint: _OpenJoint | None = None
+        self._expat = expat.ParserCreate()
+        self._expat.StartElementHandler = self._start
+        self._expat.EndElementHandler = self._end
+        self._expat.StartDoctypeDeclHandler = self._refuse_doctype
+
+    def run(self) -> None:
+        """Parse the bytes; FileError for text that is not XML."""
+        try:
+            self._expat.Parse(self.raw, True)
+        except expat.ExpatError as error:
+            sentence = f"not valid XML ({expat.ErrorString(error.code)}); correct it"
+            raise FileError(sentence, self.path, error.lineno) from None
+
+    def _start(self, name: str, attributes: dict[str, str]) -> None:
+        self._stack.append(name)
+        line = self._expat.CurrentLineNumber
+        if self._stack == ["robot", "link"]:
+            self.links.append(attributes.get("name", ""))
+        elif self._stack == ["robot", "joint"]:
+            self._joint = _OpenJoint(attributes.get("name", ""), attributes.get("type", ""), line)
+        elif self._joint is not None and len(self._stack) == 3:
+            self._joint.elements[name] = attributes
+            if name == "origin":
+                self._joint.start = self._expat.CurrentByteIndex
+
+    def _end(self, name: str) -> None:
+        del name
+        if self._stack == ["robot", "joint"] and self._joint is not None:
+            joint, self._joint = self._joint, None
+            if joint.name in self.joints:
+                sentence = f"duplicate joint {joint.name!r}; rename one"
+                raise FileError(sentence, self.path, joint.line)
+            self.joints[joint.name] = _build_joint(joint, self.raw, self.path)
+        self._stack.pop()
+
+    def _refuse_doctype(self, *_: Any) -> None:
+        sentence = "a URDF has no document type; remove <!DOCTYPE ..>"
+        raise FileError(sentence, self.path, self._expat.CurrentLineNumber)
+
+
 def read(path: Path) -> Urdf:
-    """Read a URDF; FileError where it is none."""
+    """Read a URDF; FileError where it is not one."""
     return parse(read_text(path, "URDF file"), path)
 
 
 def parse(text: str, path: Path) -> Urdf:
-    """Find links and joints; FileError for broken XML, a joint of an unknown kind, or what is no
-    tree.
-    """
-    raw, links, joints = text.encode(), [], {}
-    parser, depth, current = expat.ParserCreate(), [], None
-
-    def start(name: str, attributes: dict[str, str]) -> None:
-        nonlocal current
-        depth.append(name)
-        line = parser.CurrentLineNumber
-        if depth == ["robot", "link"]:
-            links.append(attributes.get("name", ""))
-        elif depth == ["robot", "joint"]:
-            current = _Open(attributes.get("name", ""), attributes.get("type", ""), line)
-        elif current is not None and depth[:2] == ["robot", "joint"] and len(depth) == 3:
-            current.found[name] = attributes
-            if name == "origin":
-                current.start = parser.CurrentByteIndex
-
-    def end(name: str) -> None:
-        nonlocal current
-        if depth == ["robot", "joint"] and current is not None:
-            if current.name in joints:
-                raise FileError(
-                    f"joint {current.name!r} stands here for the second time; rename one",
-                    path,
-                    current.line,
-                )
-            joints[current.name] = _joint(current, raw, path)
-            current = None
-        del name
-        depth.pop()
-
-    def doctype(*_: Any) -> None:
-        raise FileError(
-            "a document type is no part of a URDF; leave out <!DOCTYPE ..>",
-            path,
-            parser.CurrentLineNumber,
-        )
-
-    parser.StartElementHandler, parser.EndElementHandler, parser.StartDoctypeDeclHandler = (
-        start,
-        end,
-        doctype,
-    )
-    try:
-        parser.Parse(raw, True)
-    except expat.ExpatError as error:
-        raise FileError(
-            f"this is no XML ({expat.ErrorString(error.code)}); correct it", path, error.lineno
-        ) from None
-    return _tree(text, path, links, joints)
+    """Find links and joints; FileError for bad XML, an unknown type of joint, or not one tree."""
+    parser = _Parser(text.encode(), path)
+    parser.run()
+    return _build_tree(text, path, parser.links, parser.joints)
 
 
-def _joint(read_so_far: _Open, raw: bytes, path: Path) -> UrdfJoint:
-    """A joint from its elements."""
-    name, found, line = read_so_far.name, read_so_far.found, read_so_far.line
-    if read_so_far.kind not in KINDS:
-        raise FileError(
-            f"joint {name!r} is of type {read_so_far.kind!r}; loopcal reads {', '.join(KINDS)}",
-            path,
-            line,
-        )
+def _build_joint(joint: _OpenJoint, raw: bytes, path: Path) -> UrdfJoint:
+    """Return a joint from its elements."""
+    name, elements, line = joint.name, joint.elements, joint.line
+    if joint.kind not in KINDS:
+        sentence = f"joint {name!r} is of type {joint.kind!r}; allowed: {', '.join(KINDS)}"
+        raise FileError(sentence, path, line)
     for needed in ("parent", "child"):
-        if not found.get(needed, {}).get("link"):
-            raise FileError(
-                f"joint {name!r} names no {needed} link; add <{needed} link=..>", path, line
-            )
-    xyz, rpy = (
-        _three(found.get("origin", {}).get(key, "0 0 0"), f"{key} of joint {name!r}", path, line)
-        for key in ("xyz", "rpy")
-    )
-    axis = _three(
-        found.get("axis", {}).get("xyz", "1 0 0"), f"the axis of joint {name!r}", path, line
-    )
-    kind = KINDS[read_so_far.kind]
-    if kind and not np.linalg.norm(axis) > 0:
-        raise FileError(f"joint {name!r} has the axis 0 0 0; give it a direction", path, line)
-    limit, limits = found.get("limit", {}), None
-    if kind and read_so_far.kind != "continuous" and {"lower", "upper"} <= limit.keys():
+        if not elements.get(needed, {}).get("link"):
+            sentence = f"joint {name!r} names no {needed} link; add <{needed} link=..>"
+            raise FileError(sentence, path, line)
+    origin, limit = elements.get("origin", {}), elements.get("limit", {})
+    xyz = _parse_three(origin.get("xyz", "0 0 0"), f"xyz of joint {name!r}", path, line)
+    rpy = _parse_three(origin.get("rpy", "0 0 0"), f"rpy of joint {name!r}", path, line)
+    direction = elements.get("axis", {}).get("xyz", "1 0 0")
+    axis = _parse_three(direction, f"the axis of joint {name!r}", path, line)
+    kind, length = KINDS[joint.kind], float(np.linalg.norm(axis))
+    if kind and not length > 0:
+        raise FileError(f"joint {name!r} has the axis 0 0 0; write a direction", path, line)
+    limits = None
+    if kind and joint.kind != "continuous" and {"lower", "upper"} <= limit.keys():
         low, high = (
-            number(limit[key], f"{key} of joint {name!r}", path, line) for key in ("lower", "upper")
+            parse_number(limit[key], f"{key} of joint {name!r}", path, line)
+            for key in ("lower", "upper")
         )
         limits = (low, high) if low < high else None
-    start, end = read_so_far.start, -1
-    if start >= 0:
-        end = raw.index(b">", start) + 1
-    length = float(np.linalg.norm(axis)) or 1.0
-    origin = geometry.make_pose(geometry.euler_to_matrix(rpy, "xyz"), xyz)
-    return UrdfJoint(
-        name,
-        kind,
-        found["parent"]["link"],
-        found["child"]["link"],
-        origin,
-        axis / length,
-        limits,
-        line,
-        start,
-        end,
-    )
+    end = raw.index(b">", joint.start) + 1 if joint.start >= 0 else -1
+    T = geometry.make_pose(geometry.euler_to_matrix(rpy, "xyz"), xyz)
+    parent, child = elements["parent"]["link"], elements["child"]["link"]
+    axis = axis / (length or 1.0)
+    return UrdfJoint(name, kind, parent, child, T, axis, limits, line, joint.start, end)
 
 
-def _three(text: str, what: str, path: Path, line: int) -> FloatArray:
+def _parse_three(text: str, what: str, path: Path, line: int) -> FloatArray:
+    """Return three numbers."""
     parts = text.split()
     if len(parts) != 3:
-        raise FileError(
-            f"{what} is {text!r} where three numbers are needed; correct it", path, line
-        )
-    return np.array([number(part, what, path, line) for part in parts])
+        sentence = f"{what} is {text!r}, but three numbers are needed; correct it"
+        raise FileError(sentence, path, line)
+    return np.array([parse_number(part, what, path, line) for part in parts])
 
 
-def _tree(text: str, path: Path, links: list[str], joints: dict[str, UrdfJoint]) -> Urdf:
-    """Check that links and joints make one tree."""
+def _build_tree(text: str, path: Path, links: list[str], joints: dict[str, UrdfJoint]) -> Urdf:
+    """Return the tree of links and joints; FileError where they are not one tree."""
     carrier: dict[str, UrdfJoint] = {}
     for joint in joints.values():
         for link in (joint.parent, joint.child):
             if link not in links:
-                raise FileError(
-                    f"joint {joint.name!r} names the link {link!r}, which is not there; correct it",
-                    path,
-                    joint.line,
-                )
+                sentence = f"joint {joint.name!r} names the link {link!r}, which does not exist"
+                raise FileError(f"{sentence}; correct it", path, joint.line)
         if joint.child in carrier:
             other = carrier[joint.child].name
-            raise FileError(
-                f"link {joint.child!r} is the child of {other!r} and of {joint.name!r}; a URDF is "
-                "a tree",
-                path,
-                joint.line,
-            )
+            sentence = f"link {joint.child!r} is the child of {other!r} and of {joint.name!r}"
+            raise FileError(f"{sentence}, but a URDF is a tree; correct it", path, joint.line)
         carrier[joint.child] = joint
     roots = [link for link in links if link not in carrier]
     if len(roots) != 1:
-        raise FileError(
-            f"a URDF has one root link, this has {len(roots)} ({', '.join(roots[:4])}); join them",
-            path,
-        )
+        sentence = f"this URDF has {len(roots)} root links ({', '.join(roots[:4])}), but one is"
+        raise FileError(f"{sentence} needed; join them", path)
     return Urdf(path, text, joints, roots[0], carrier)

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A mechanism as bodies and joints: a tree of joints from the base, and pins that close its loops.
+
+A pin turns about one axis that both bodies carry: T_one R(axis, q) = T_other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.errors import MechanismError
+from loopcal.typing import FloatArray
+
+RANK_TOLERANCE = 1e-8
+"""Singular value of the closures, relative to the largest, that counts as zero [1]."""
+
+CLOSED = 1e-13
+"""Largest closure residual of a home pose [m, 1]."""
+
+STARTS, STEPS, SPREAD = 24, 40, 0.6
+"""Tries to close the loops, Newton steps of each, and range of their first joint values [rad]."""
+
+NEAR, NEAR_RANGE = 4, 0.15
+"""Number of poses near a pose, and range of their motors [rad, m]."""
+
+
+@dataclass(frozen=True)
+class GraphJoint:
+    """A joint between two bodies: `T_one` moved by the joint is `T_other`, each (4, 4) in its body.
+
+    Attributes
+    ----------
+    kind : R or P. one, other : the bodies. axis : (3,) unit vector in the frame of the joint.
+    is_pin : whether it closes a loop; then `name` is its end on the first body, `far` on the other.
+    """
+
+    name: str
+    kind: str
+    one: str
+    other: str
+    T_one: FloatArray
+    T_other: FloatArray
+    axis: FloatArray
+    is_pin: bool = False
+    far: str = ""
+
+    def flip(self) -> GraphJoint:
+        """Return a pin as the other body carries it."""
+        ends = {"one": self.other, "other": self.one, "T_one": self.T_other, "T_other": self.T_one}
+        return replace(self, name=self.far, far=self.name, **ends)
+
+    def move(self, value: float) -> FloatArray:
+        """Return the joint frame of the other body (4, 4) in the first body."""
+        if self.kind == "P":
+            return self.T_one @ geometry.make_pose(np.eye(3), value * self.axis)
+        return self.T_one @ geometry.make_pose(geometry.exp_so3(value * self.axis), np.zeros(3))
+
+
+@dataclass(frozen=True)
+class JointGraph:
+    """A mechanism at joint values.
+
+    Attributes
+    ----------
+    base : the root body. tree : joints, each after the one that carries it. pins : close the loops.
+    motors : names of driven joints. values : joint -> value [rad or m].
+    homes : joint values that close the loops, those nearest to zero first.
+    """
+
+    base: str
+    tree: tuple[GraphJoint, ...]
+    pins: tuple[GraphJoint, ...]
+    motors: tuple[str, ...]
+    values: Mapping[str, float]
+    homes: tuple[Mapping[str, float], ...] = ()
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """All bodies, the base first."""
+        return (self.base, *(joint.other for joint in self.tree))
+
+    @property
+    def joints(self) -> tuple[GraphJoint, ...]:
+        """All joints."""
+        return self.tree + self.pins
+
+    @cached_property
+    def places(self) -> dict[str, FloatArray]:
+        """Body -> T_base_body (4, 4)."""
+        T = {self.base: np.eye(4)}
+        for joint in self.tree:
+            T[joint.other] = T[joint.one] @ joint.move(self.values[joint.name])
+        return T
+
+    def twists(self, body: str, point: FloatArray) -> FloatArray:
+        """Return twists (6, j) (omega, v of a point [m] of the body) of the joints of the tree."""
+        T, columns = self.places, np.zeros((6, len(self.tree)))
+        index = {joint.other: i for i, joint in enumerate(self.tree)}
+        while body in index:
+            i = index[body]
+            joint = self.tree[i]
+            frame = T[joint.one] @ joint.T_one
+            axis = frame[:3, :3] @ joint.axis
+            arm = np.cross(axis, point - frame[:3, 3])
+            columns[:, i] = np.concatenate(
+                [axis, arm] if joint.kind == "R" else [np.zeros(3), axis]
+            )
+            body = joint.one
+        return columns
+
+    def linearize_closure(self) -> tuple[FloatArray, FloatArray]:
+        """Return residuals (6 c,) [m, 1] of the c pins, and derivatives (6 c, j) by the tree."""
+        T, residual, rows = self.places, [], []
+        for pin in self.pins:
+            one, other = T[pin.one] @ pin.T_one, T[pin.other] @ pin.T_other
+            a, b = one[:3, :3] @ pin.axis, other[:3, :3] @ pin.axis
+            first, second = self.twists(pin.one, one[:3, 3]), self.twists(pin.other, other[:3, 3])
+            residual += [one[:3, 3] - other[:3, 3], a - b]
+            turn = -geometry.hat(a) @ first[:3] + geometry.hat(b) @ second[:3]
+            rows += [first[3:] - second[3:], turn]
+        if not rows:
+            return np.zeros(0), np.zeros((0, len(self.tree)))
+        return np.concatenate(residual), np.concatenate(rows)
+
+    def motions(self) -> FloatArray:
+        """Return joint rates (j, m) that keep the loops closed; m is the mobility."""
+        _, rows = self.linearize_closure()
+        if not len(rows):
+            return np.eye(len(self.tree))
+        _, s, V = np.linalg.svd(rows)
+        return V[int((s > RANK_TOLERANCE * s[0]).sum()) :].T
+
+    def measure_firmness(self, platform: str) -> float:
+        """Return how well the motors hold the passive joints and move the platform.
+
+        It is the product of two smallest singular values: of the closures by the passive joints,
+        and of the platform's twist by the joint rates that keep the loops closed.
+        """
+        _, rows = self.linearize_closure()
+        passive = rows[:, [joint.name not in self.motors for joint in self.tree]]
+        hold = 1.0
+        if passive.size:
+            hold = float(np.linalg.svd(passive, compute_uv=False)[passive.shape[1] - 1])
+        twists = self.twists(platform, self.places[platform][:3, 3]) @ self.motions()
+        return hold * float(np.linalg.svd(twists, compute_uv=False)[-1])
+
+    def close(self, start: Mapping[str, float], fixed: tuple[str, ...] = ()) -> JointGraph | None:
+        """Close the loops by Newton's method from joint values; None where it does not converge."""
+        free = np.array([joint.name not in fixed for joint in self.tree])
+        graph = replace(self, values=dict(start))
+        for _ in range(STEPS):
+            residual, rows = graph.linearize_closure()
+            if np.abs(residual).max(initial=0.0) < CLOSED:
+                return graph
+            step = np.zeros(len(free))
+            step[free] = np.linalg.lstsq(rows[:, free], -residual, rcond=RANK_TOLERANCE)[0]
+            step *= min(1.0, SPREAD / max(float(np.abs(step).max()), 1e-300))
+            values = {j.name: graph.values[j.name] + step[i] for i, j in enumerate(self.tree)}
+            graph = replace(graph, values=values)
+        return None
+
+    def list_nearby(self) -> Iterator[JointGraph]:
+        """Yield this pose, and others with the motors moved a little."""
+        yield self
+        for seed in range(NEAR):
+            rng = np.random.default_rng(seed)
+            start = {
+                name: value + (rng.uniform(-NEAR_RANGE, NEAR_RANGE) if name in self.motors else 0.0)
+                for name, value in self.values.items()
+            }
+            closed = self.close(start, self.motors)
+            if closed is not None:
+                yield closed
+
+    def get_pin_angle(self, pin: GraphJoint) -> float:
+        """Return the angle of a pin [rad]."""
+        T = self.places
+        between = geometry.invert_pose(T[pin.one] @ pin.T_one) @ T[pin.other] @ pin.T_other
+        return float(geometry.log_so3(between[:3, :3]) @ pin.axis)
+
+
+def find_home(graph: JointGraph) -> JointGraph:
+    """Return the mechanism at the closed pose nearest to zero, with further ones as `homes`.
+
+    Poses of larger mobility, from which a link could move either way, are left out.
+
+    Raises
+    ------
+    MechanismError : the loops do not close.
+    """
+    closed = []
+    for seed in range(STARTS):
+        rng = np.random.default_rng(seed)
+        spread = 0.0 if seed == 0 else SPREAD
+        one = graph.close({name: rng.uniform(-spread, spread) for name in graph.values})
+        if one is not None:
+            closed.append(one)
+    if not closed:
+        raise MechanismError("the loops do not close from any start; check the closures")
+    mobility = min(one.motions().shape[1] for one in closed)
+    regular = [one for one in closed if one.motions().shape[1] == mobility]
+    nearest = sorted(regular, key=lambda one: sum(value**2 for value in one.values.values()))
+    return replace(nearest[0], homes=tuple(one.values for one in nearest))
