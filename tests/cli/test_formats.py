@@ -163,7 +163,7 @@ def test_files_that_are_there_stay_without_force(folder, capsys, data_folder) ->
     ("command", "sentence"),
     [
         ("import no.cfg -o x.yaml", "no.cfg: this printer.cfg does not exist"),
-        ("import a.txt -o x.yaml", "the name of this file tells no format"),
+        ("import a.txt -o x.yaml", "the format of this file is not known by its ending"),
         ("import a.csv -o x.yaml", "loopcal writes the format csv, but cannot read it"),
         (
             "import a.cfg -o x.yaml --corrected y.cfg",
@@ -181,7 +181,7 @@ def test_files_that_are_there_stay_without_force(folder, capsys, data_folder) ->
         ("export linear-delta --format linuxcnc -o x.hal", "is not a hexapod of the family gough"),
         (
             "export linear-delta -o x.csv --into y.csv",
-            "the format csv is written whole; leave out --into",
+            "the format csv is written as a new file",
         ),
         (
             "export linear-delta --format klipper --into no.cfg -o x.cfg",

@@ -362,7 +362,7 @@ REFUSED = {
     ),
     "still": (
         (FRONT + re.sub(",20,.,2", ",20,1,2", ROWS)).encode(),
-        r"stay within 0 mm, but the robot moves it by [\d.]+ mm;",
+        r"stay within 0 mm, but the robot moves it by [\d.]+ mm",
     ),
 }
 
