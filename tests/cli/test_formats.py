@@ -179,10 +179,7 @@ def test_files_that_are_there_stay_without_force(folder, capsys, data_folder) ->
             "is not a robot of the family linear-delta",
         ),
         ("export linear-delta --format linuxcnc -o x.hal", "is not a hexapod of the family gough"),
-        (
-            "export linear-delta -o x.csv --into y.csv",
-            "the format csv is written as a new file",
-        ),
+        ("export linear-delta -o x.csv --into y.csv", "the format csv is written as a new file"),
         (
             "export linear-delta --format klipper --into no.cfg -o x.cfg",
             "no.cfg: this printer.cfg does not exist",

@@ -129,7 +129,12 @@ def test_what_a_robot_file_cannot_say_is_told(tmp_path) -> None:
     notes = " | ".join(map(str, imported.findings))
     assert "41 rows of line forces are not read" in notes
     assert "with 45 rows of motor angles" in notes
-    for words in ("stiffness", "weight", "taped lengths at the origin", "the key 'colour' is unknown"):
+    for words in (
+        "stiffness",
+        "weight",
+        "taped lengths at the origin",
+        "the key 'colour' is unknown",
+    ):
         assert words in notes
     assert "1 mm is assumed for lines" in notes
 
@@ -142,10 +147,7 @@ def test_what_a_robot_file_cannot_say_is_told(tmp_path) -> None:
             {"motor_pos_samp": [[1, 2, 3, 4], [1, 2, 3]]},
             "'motor_pos_samp' is not a list of rows of numbers",
         ),
-        (
-            {"motor_pos_samp": [[1, 2]]},
-            "has 2 motors in a row",
-        ),
+        ({"motor_pos_samp": [[1, 2]]}, "has 2 motors in a row"),
         (
             {"motor_pos_samp": [[1, 2, 3, 4]]},
             "'xyz_of_samp' has 9 poses, but 'motor_pos_samp' only 1",

@@ -156,10 +156,7 @@ JOINT = '<joint name="a" type="revolute"><origin xyz="0 0 1"/><parent link="base
             "<robot><link name='base'/>\n" + JOINT + "</robot>",
             ":2: joint 'a' names the link 'arm', which does not exist",
         ),
-        (
-            "<robot><link name='base'/><link name='arm'/></robot>",
-            "this URDF has 2 root links",
-        ),
+        ("<robot><link name='base'/><link name='arm'/></robot>", "this URDF has 2 root links"),
         (
             "<robot><link name='base'/><link name='arm'/>\n" + JOINT + JOINT + "</robot>",
             ":2: duplicate joint 'a'",
