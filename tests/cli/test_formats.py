@@ -190,7 +190,7 @@ def test_bad_use_is_one_sentence(folder, capsys, command, sentence) -> None:
     assert run(command) == 1
     error = capsys.readouterr().err
     assert sentence in error
-    assert error.count("\n") == 1
+    assert error.count("\n") == 1 + ("\nHint: " in error)
     assert list(folder.iterdir()) == []
 
 
