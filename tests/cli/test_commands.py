@@ -153,7 +153,7 @@ def test_poses_are_dropped_and_weighed_only_when_asked(run) -> None:
     assert "Tukey(c=4.685)" in out
     assert load_run("run").result["fit"]["dropped"] == ["3", "7"]
     assert (
-        "there is no pose '99'" in run("calibrate hexapod-42 measurements.csv -o run2 --drop 99")[2]
+        "no pose '99'" in run("calibrate hexapod-42 measurements.csv -o run2 --drop 99")[2]
     )
 
 
@@ -197,7 +197,7 @@ def test_identifiability_names_what_heights_alone_cannot_tell(run) -> None:
         "identifiability hexapod-42 --poses poses.csv --kind component --components z"
     )
     assert code == 0
-    assert "not identifiable: together" in out
+    assert "The data cannot determine a combination of parameters" in out
     code, _, err = run("identifiability hexapod-42 measurements.csv --poses poses.csv")
     assert code == 1
     assert "DATA and --poses exclude each other" in err
@@ -208,7 +208,7 @@ def test_identifiability_without_data_draws_poses_from_the_workspace(run, robot)
     code, out, _ = run(f"identifiability {robot} --draw 30 --seed 3")
     assert code == 0
     assert out.startswith(f"30 poses drawn from the workspace of {robot}, seed 3\n")
-    assert "parameter combinations can be identified from" in out
+    assert "parameter combinations" in out
 
 
 def test_check_shows_what_a_file_expands_into_in_its_units(run) -> None:

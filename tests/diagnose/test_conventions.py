@@ -135,7 +135,7 @@ def has_slip(check: ConventionCheck, slip: str, **details) -> bool:
     return any(wanted.items() <= one.items() for one in slips(check))
 
 
-def times(quantity: str, factor: float, **more) -> dict:
+def times(quantity: str, factor, **more) -> dict:
     return {"slip": "unit", "quantity": quantity, "factor": factor, **more}
 
 

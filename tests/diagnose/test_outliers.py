@@ -268,7 +268,7 @@ def test_with_one_degree_of_freedom_a_disagreement_is_told_and_nobody_is_blamed(
     assert fit.residual_test.failed
     (group,) = found.ambiguous
     assert len(group.poses) == 7
-    assert group.factor == pytest.approx(np.sqrt(fit.chi_square), rel=1e-3)  # not linear over 1 mm
+    assert group.times == pytest.approx(np.sqrt(fit.chi_square), rel=1e-3)  # not linear over 1 mm
     (summary,) = found.summary
     assert summary.code == "outliers.ambiguous"
     assert (summary.data["count"], summary.data["blocks"]) == (7, 7)

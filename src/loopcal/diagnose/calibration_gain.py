@@ -49,6 +49,12 @@ class CalibrationGain:
     is_worthwhile: bool | None
     finding: Finding
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the attributes for JSON; `is_worthwhile` is called `calibrate` there."""
+        content = dict(vars(self))
+        content["calibrate"] = content.pop("is_worthwhile")
+        return content
+
 
 def estimate_calibration_gain(fit: Identification, data: Measurements) -> CalibrationGain:
     """Compare the errors expected after calibration with those that the tolerances allow.

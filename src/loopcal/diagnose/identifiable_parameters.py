@@ -112,7 +112,7 @@ class Identifiability:
 
     def __str__(self) -> str:
         lines = [str(finding) for finding in self.findings]
-        shown = sorted(self.parameters, key=lambda p: (not p.partners, -p.left))
+        shown = sorted(self.parameters, key=lambda p: (not p.partners, -round(p.left, 6)))
         width = max(len(p.name) for p in shown[:MOST_ROWS])
         lines += ["", f"{'parameter':<{width}}  sd / tolerance  determined"]
         for p in shown[:MOST_ROWS]:

@@ -81,17 +81,17 @@ class Conflict:
 
     Attributes
     ----------
-    poses : labels of each block. factor : largest distance from a fit to all, in units of the
+    poses : labels of each block. times : largest distance from a fit to all, in units of the
         expected noise.
     """
 
     poses: tuple[tuple[str, ...], ...]
-    factor: float
+    times: float
 
     @property
     def finding(self) -> Finding:
         """The conflict as a finding."""
-        return report_finding("outliers.conflict", **vars(self))
+        return report_finding("outliers.conflict", poses=self.poses, factor=self.times)
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,7 +366,8 @@ def _join_groups(groups: list[BoolArray]) -> list[BoolArray]:
 def _suspected_in_turn(states: tuple[_State, ...]) -> list[BoolArray]:
     """Return the one group (u,) of the blocks that are suspected in some of the states only."""
     excluded = np.array([state.excluded for state in states])
-    return [excluded.any(axis=0) & ~excluded.all(axis=0)]
+    some: BoolArray = np.any(excluded, axis=0) & ~np.all(excluded, axis=0)
+    return [some]
 
 
 def _summarize(

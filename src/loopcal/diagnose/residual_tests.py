@@ -68,6 +68,12 @@ class LackOfFit:
     is_explained: bool | None
     findings: tuple[Finding, ...]
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the attributes for JSON; `is_explained` is called `explained` there."""
+        content = dict(vars(self))
+        content["explained"] = content.pop("is_explained")
+        return content
+
 
 class StartVerdict(Enum):
     """The start values of a fit, compared with the fit."""

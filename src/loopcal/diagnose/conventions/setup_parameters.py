@@ -150,11 +150,12 @@ def _compare_value(free: FreeParameters, entry: Parameter, value: float) -> dict
     """Estimate, stated value and certainty of a parameter, in the unit of the robot's file."""
     symbol = free.robot.units.get(entry.dimension, DISPLAY_UNITS[entry.dimension].symbol)
     factor = find_unit(symbol).factor_to_si
-    is_fixed = not entry.free or entry.tolerance is None
-    sd = "fixed" if is_fixed else f"sd {entry.tolerance / factor:.3g} {symbol}"
+    certainty = "fixed"
+    if entry.free and entry.tolerance is not None:
+        certainty = f"sd {entry.tolerance / factor:.3g} {symbol}"
     return {
         "name": entry.name,
         "estimated": f"{value / factor:.4g} {symbol}",
         "stated": f"{entry.nominal / factor:.4g} {symbol}",
-        "certainty": sd,
+        "certainty": certainty,
     }

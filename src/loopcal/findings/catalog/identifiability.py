@@ -106,7 +106,7 @@ ENTRIES = (
     Entry(
         "identifiability.more-weak-directions",
         Severity.INFO,
-        "{count:count more direction} known no better than the tolerances.",
+        "{count:count more direction is/more directions are} known no better than the tolerances.",
         when="More directions are weak than are listed.",
     ),
     Entry(
