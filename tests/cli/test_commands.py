@@ -152,9 +152,7 @@ def test_poses_are_dropped_and_weighed_only_when_asked(run) -> None:
     assert "from 38 poses" in out
     assert "Tukey(c=4.685)" in out
     assert load_run("run").result["fit"]["dropped"] == ["3", "7"]
-    assert (
-        "no pose '99'" in run("calibrate hexapod-42 measurements.csv -o run2 --drop 99")[2]
-    )
+    assert "no pose '99'" in run("calibrate hexapod-42 measurements.csv -o run2 --drop 99")[2]
 
 
 def test_the_result_says_how_far_the_fit_can_be_trusted(run) -> None:
