@@ -28,6 +28,7 @@ evidence: .venv/dev.stamp  ## statistics at full size: docs/evidence/*.json, the
 docs: .venv/dev.stamp  ## rewrite the tables in the documentation from docs/evidence/*.json and from the code
 	$(BIN)/python -m tools.evidence --tables
 	$(BIN)/python -m tools.file_reference
+	$(BIN)/python -m tools.findings_reference
 	$(BIN)/python -m tools.api_reference
 
 bench: .venv/dev.stamp  ## benchmarks against the committed baseline; fails when one got worse

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The input of a fit: exclude poses, and refuse what cannot be fitted, before and after the start."""
+"""The input of a fit: exclude poses, and refuse what cannot be fitted."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def exclude_poses(data: Measurements, excluded: Sequence[str]) -> Measurements:
     for label in excluded:
         if label not in data.labels:
             raise DataError(
-                f"no pose {label!r} to exclude{suggest_names(label, data.labels)}; give labels of poses "
-                "in the data"
+                f"no pose {label!r} to exclude{suggest_names(label, data.labels)}; give labels of "
+                "poses in the data"
             )
     kept = np.array([label not in excluded for label in data.labels])
     observations = tuple(

@@ -188,7 +188,7 @@ def identify_trials(
 
 
 def _descend(problem: Problem, z: FloatArray, start: Start | None, options: FitOptions) -> Descent:
-    """Descend from deviations z (t, p); the history includes the steps of the linearized closure."""
+    """Descend from deviations z (t, p); the history includes steps of the linearized closure."""
     method, control, tolerance = _method(options), options.control, options.rank_tolerance
     with_prior = problem if options.prior is None else options.prior.added(problem)
     if options.begin == "kinematics":

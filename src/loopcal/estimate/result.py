@@ -212,8 +212,10 @@ class Identification:
         return "\n".join(
             [
                 f"<Identification of {self.robot.name} by {type(self.method).__name__}",
-                f"  {len(self.names)} parameters, rank {self.rank}, {len(self.nuisance)} nuisance "
-                "parameters",
+                (
+                    f"  {len(self.names)} parameters, rank {self.rank}, "
+                    f"{len(self.nuisance)} nuisance parameters"
+                ),
                 f"  {self.status.name.lower()} after {self.history.iterations} steps",
                 f"  chi-square {test.chi_square:.5g} with {test.degrees:.4g} degrees of freedom",
                 f"  findings: {codes or 'none'}>",
@@ -243,8 +245,10 @@ class Identification:
         test = self.residual_test
         lines += [
             "",
-            f"{self.history.finding} Rank {self.rank} of {len(self.names)}. Chi-square "
-            f"{test.chi_square:.5g} with {test.degrees:.4g} degrees of freedom.",
+            (
+                f"{self.history.finding} Rank {self.rank} of {len(self.names)}. Chi-square "
+                f"{test.chi_square:.5g} with {test.degrees:.4g} degrees of freedom."
+            ),
         ]
         return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self._further_findings)])
 

@@ -178,7 +178,7 @@ def limb_parameters(robot: Mechanism, limb: str) -> tuple[str, ...]:
     if not names:
         limbs = list(dict.fromkeys(name.split(".")[0] for name in free if "." in name))
         raise EstimationError(
-            f"{robot.name} has no limb {limb!r} with free parameters{suggest_names(limb, limbs)}; limbs "
-            f"with free parameters are {', '.join(limbs)}"
+            f"{robot.name} has no limb {limb!r} with free parameters{suggest_names(limb, limbs)}; "
+            f"limbs with free parameters are {', '.join(limbs)}"
         )
     return names

@@ -53,7 +53,7 @@ class Method(Protocol):
         ...
 
     def penalty(self, decomposition: Decomposition) -> FloatArray:
-        """Return the penalty (t, p) of each direction; infinite for directions that are not used."""
+        """Return the penalty (t, p) of each direction; infinite where it is not used."""
         ...
 
 

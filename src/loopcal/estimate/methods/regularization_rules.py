@@ -26,7 +26,7 @@ PER_DECADE = 16
 """Grid points per factor of ten; around their minimum the criteria are flat over much more."""
 
 LOWEST, HIGHEST = 1e-12, 1e4
-"""Range of lam in units of the largest squared singular value: from no effect to hardly any data."""
+"""Range of lam in units of the largest squared singular value: no effect to hardly any data."""
 
 
 @dataclass(frozen=True)

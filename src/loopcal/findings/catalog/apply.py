@@ -72,6 +72,7 @@ ENTRIES = (
         _word_few_rows,
         "Fewer than five rows measure position or orientation.",
         "Measure more poses for validation.",
+        example={"count": 3, "quantity": "position"},
     ),
     Entry(
         "validation.setup-kept",
@@ -98,6 +99,7 @@ ENTRIES = (
         "Errors fall by a factor of three or more when a kept frame, target or surface is fitted "
         "again.",
         "Fit the named frame, target or surface again.",
+        example={"names": ("tracker",), "times": 5.2},
     ),
     Entry(
         "validation.rows-reused",
@@ -106,6 +108,7 @@ ENTRIES = (
         "Data for validation contain rows that the calibration used; half of them or more are "
         "refused.",
         "Validate with other measurements.",
+        example={"count": 8, "total": 8, "poses": ("1", "2", "3")},
     ),
     Entry(
         "validation.file-reused",
@@ -119,6 +122,7 @@ ENTRIES = (
         Severity.INFO,
         _word_frame,
         "Every statement of pose uncertainty: its point, axes and frame.",
+        example={"point": "tool", "axes": "base", "count": 6, "frames": ("base",)},
     ),
     Entry(
         "compensation.reached", Severity.INFO, "reached in full", "The machine reaches the target."

@@ -39,6 +39,7 @@ ENTRIES = (
         _word_not_converged,
         "The iteration of the fit ended without convergence.",
         "Check units, frames and outliers, or begin closer to the true geometry.",
+        example={"status": "out_of_iterations"},
     ),
     Entry(
         "gates.poses-unreachable",
@@ -62,6 +63,7 @@ ENTRIES = (
         _word_errors_grew,
         "The rms error on held-out poses grew by more than 10 %.",
         "Do not use the result. Measure more poses or free fewer parameters.",
+        example={"quantity": "position", "times": 1.4},
     ),
     Entry(
         "gates.limit-exceeded",

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from loopcal.findings.finding import Severity
-from loopcal.findings.wording import Entry, fill_template, list_names
+from loopcal.findings.wording import Entry, Quantity, fill_template, list_names
 
 SHOWN_REASONS = 3
 """Reasons that a sentence lists, most frequent first."""
@@ -161,16 +161,33 @@ def _target(data: Mapping[str, Any]) -> str:
     )
 
 
+_TILTED = ({"code": "tilt-exceeded", "max_tilt_deg": 12.0, "on_path": False, "count": 34},)
+"""Reasons of the examples."""
+
 INFO, SUGGESTION, REFUSAL = Severity.INFO, Severity.SUGGESTION, Severity.REFUSAL
 
 REPORTS = (
-    Entry("plan.poses", INFO, _poses, "Every plan: how many poses it has and for what."),
+    Entry(
+        "plan.poses",
+        INFO,
+        _poses,
+        "Every plan: how many poses it has and for what.",
+        example={
+            "counted": "poses",
+            "fitted": 30,
+            "held_out": 8,
+            "poses": 38,
+            "robot": "hexapod-42",
+            "kinds": ("pose",),
+        },
+    ),
     Entry(
         "plan.path",
         INFO,
         _path,
         "Every plan. A section goes via home where the straight path between two poses is not "
         "allowed.",
+        example={"length": Quantity(9.4, "m"), "via_home": 2},
     ),
     Entry(
         "plan.certificate",
@@ -178,6 +195,13 @@ REPORTS = (
         _certificate,
         "Every plan whose efficiency is at least 50 % by the bound of the relaxation. The number "
         "is rounded up.",
+        example={
+            "shortfall": 1.5,
+            "chosen": 30,
+            "considered": 800,
+            "counted": "poses",
+            "criterion": "I",
+        },
     ),
     Entry(
         "plan.weak-certificate",
@@ -193,12 +217,27 @@ REPORTS = (
         INFO,
         _errors,
         "Every plan: predicted errors over the workspace, from tolerances and noise.",
+        example={
+            "before": (Quantity(1.59, "mm"),),
+            "random": (Quantity(0.61, "mm"),),
+            "after": (Quantity(0.463, "mm"),),
+            "reduction": 0.24,
+            "target": "position",
+            "counted": "poses",
+        },
     ),
     Entry(
         "plan.error-curve",
         INFO,
         _curve,
         "A curve was requested: expected errors of good plans with fewer and more poses.",
+        example={
+            "counted": "poses",
+            "points": (
+                {"number": 20, "errors": (Quantity(0.61, "mm"),)},
+                {"number": 40, "errors": (Quantity(0.41, "mm"),)},
+            ),
+        },
     ),
     Entry(
         "plan.goal-reached",
@@ -206,6 +245,15 @@ REPORTS = (
         _goal,
         "A plan for an accuracy goal: the smallest number found, and a number below which no "
         "choice reaches the goal.",
+        example={
+            "number": 24,
+            "counted": "poses",
+            "target": "position",
+            "goal": Quantity(0.5, "mm"),
+            "decided_by_equations": False,
+            "at_least": 22,
+            "considered": 800,
+        },
     ),
     Entry(
         "plan.candidates",
@@ -213,6 +261,7 @@ REPORTS = (
         _candidates,
         "Every plan: poses that satisfy all constraints, and what excluded the others.",
         "Relax the constraint that excludes most where more poses are needed.",
+        example={"allowed": 766, "total": 800, "reasons": _TILTED},
     ),
     Entry(
         "plan.tolerances-missing",
@@ -227,6 +276,7 @@ REPORTS = (
         INFO,
         _frames,
         "The instrument cannot determine rigid motions of a frame.",
+        example={"frames": ("base", "platform")},
     ),
     Entry(
         "plan.unobservable",
@@ -237,7 +287,11 @@ REPORTS = (
         "Look at the identifiability for their names, or add a kind of measurement.",
     ),
     Entry(
-        "plan.surfaces", INFO, _surfaces, "Every plan of planes and lines: how many poses it has."
+        "plan.surfaces",
+        INFO,
+        _surfaces,
+        "Every plan of planes and lines: how many poses it has.",
+        example={"groups": 3, "points": 5, "poses": 24, "robot": "hexapod-42", "via_home": 0},
     ),
     Entry(
         "plan.surface-information",
@@ -277,6 +331,7 @@ REFUSALS = (
         _target,
         "The goal or target is an error that does not occur or cannot be predicted.",
         "Choose another target or another kind of measurement.",
+        example={"target": "orientation", "robot": "linear-delta"},
     ),
     Entry(
         "plan.prediction-unobservable",
@@ -291,6 +346,15 @@ REFUSALS = (
         _equations,
         "The requested poses give fewer equations than there are unknowns.",
         "Plan more poses, or fix parameters.",
+        example={
+            "poses": 5,
+            "equations": 30,
+            "earlier": 0,
+            "unknowns": 48,
+            "parameters": 42,
+            "robot": "hexapod-42",
+            "needed": 8,
+        },
     ),
     Entry(
         "plan.design-too-small",
@@ -382,6 +446,7 @@ REFUSALS = (
         ),
         "The constraints exclude every listed pose.",
         "Correct the poses, or relax a constraint.",
+        example={"total": 34, "robot": "hexapod-42", "reasons": _TILTED},
     ),
     Entry(
         "plan.home-excluded",
@@ -392,6 +457,7 @@ REFUSALS = (
         ),
         "Home itself violates a constraint.",
         "Choose another home, or relax the constraint.",
+        example={"robot": "hexapod-42", "reasons": _TILTED},
     ),
     Entry(
         "plan.home-isolated",
@@ -402,6 +468,7 @@ REFUSALS = (
         ),
         "Every straight path from home violates a constraint.",
         "Relax a constraint, or choose another home.",
+        example={"robot": "hexapod-42", "reasons": _TILTED},
     ),
     Entry(
         "plan.workspace-excluded",
@@ -412,6 +479,7 @@ REFUSALS = (
         ),
         "Hardly any pose of the workspace satisfies the constraints.",
         "Relax the constraint that excludes most.",
+        example={"robot": "hexapod-42", "allowed": 2, "total": 36, "reasons": _TILTED},
     ),
     Entry(
         "plan.measured-empty",
@@ -461,6 +529,7 @@ REFUSALS = (
         ),
         "The constraints exclude almost every group on a plane and a line.",
         "Relax a constraint, or ask for fewer points.",
+        example={"allowed": 1, "total": 35, "points": 5, "reasons": _TILTED},
     ),
     Entry(
         "plan.points-isolated",
@@ -471,6 +540,7 @@ REFUSALS = (
         ),
         "A planned point on a plane or line cannot be approached from home.",
         "Relax a constraint, or plan with another seed.",
+        example={"isolated": 3, "points": 5, "reasons": _TILTED},
     ),
 )
 

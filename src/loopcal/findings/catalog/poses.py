@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from loopcal.findings.finding import Severity
-from loopcal.findings.wording import Entry, fill_template, list_names
+from loopcal.findings.wording import Entry, Quantity, fill_template, list_names
 
 SHOWN_READINGS = 3
 """Readings that a sentence names before it counts the others."""
@@ -70,6 +70,7 @@ ENTRIES: tuple[Entry, ...] = (
         _word_outside_stroke,
         "The estimate of a reading that was not taken lies outside the stroke of its actuator.",
         "Measure more at these poses, or exclude them from the fit.",
+        example={"readings": ({"actuator": "q1", "pose": "7", "value": Quantity(612.5, "mm")},)},
     ),
     Entry(
         "poses.other-branch",
@@ -78,6 +79,7 @@ ENTRIES: tuple[Entry, ...] = (
         "The estimate of a reading that was not taken belongs to another branch than home's.",
         "If the machine was on the branch of home, state an approximate reading with infinite "
         "sigma as a start.",
+        example={"readings": ({"actuator": "q1", "pose": "7", "value": Quantity(12.5, "deg")},)},
     ),
     Entry(
         "poses.uneven-sigmas",
@@ -126,32 +128,6 @@ ENTRIES: tuple[Entry, ...] = (
         "Frames, targets, surfaces or offsets have a direction that no measurement determines, "
         "even for a known robot.",
         "Measure more different poses, or state where these setup parameters are.",
-    ),
-    Entry(
-        "descent.out-of-iterations",
-        Severity.FAILURE,
-        "The fit did not converge within the allowed iterations. Allow more iterations, or start "
-        "closer.",
-        "The descent reached its limit of iterations.",
-        "Allow more iterations, or start closer to the solution.",
-    ),
-    Entry(
-        "descent.no-descent",
-        Severity.FAILURE,
-        "The fit did not converge: no further step keeps the poses within reach. Start closer, or "
-        "check the measurements for gross errors.",
-        "No step of the descent lowers the sum of squares, however short.",
-        "Start closer to the solution, or check for gross errors.",
-    ),
-    Entry(
-        "descent.bad-start",
-        Severity.FAILURE,
-        "The fit has no finite residuals at its start because poses are out of reach. Check units "
-        "and readings.",
-        "The residuals at the start of the descent are not finite.",
-        "Check units and readings.",
-    ),
-    Entry(
-        "descent.running", Severity.INFO, "The fit is still running.", "A descent has not ended."
+        example={"names": ("tracker", "target")},
     ),
 )

@@ -72,6 +72,7 @@ ENTRIES = (
         _word_too_few_equations,
         "The data give fewer equations than there are free parameters, and no method was chosen.",
         "Measure more poses, fix parameters, or use a method with a prior (MAP).",
+        example={"equations": 30, "parameters": 42, "suggestions": ""},
     ),
     Entry(
         "workflow.no-parameter-chosen",
@@ -102,12 +103,14 @@ ENTRIES = (
         _word_undetermined,
         "The data leave parameter combinations open that move the platform relative to the base.",
         "Follow the suggested measurements, or fix one parameter of each combination.",
+        example={"count": 2, "names": ("leg1.length", "leg2.length")},
     ),
     Entry(
         "workflow.frame-freedoms",
         Severity.INFO,
         _word_frame_freedoms,
         "The only open parameter combinations are rigid motions of the base or platform frame.",
+        example={"count": 6, "frames": ("base",)},
     ),
     Entry(
         "workflow.home-exceeds-limits",

@@ -49,9 +49,10 @@ def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
             if parameter.scope == "group"
         ]
         if own and (apart or len({groups[row] for row in one.rows}) > 1):
-            code = "surfaces" if one.kind.name in ("plane", "line") else "groups"
+            is_surface = one.kind.name in {"plane", "line"}
+            code = "files.surfaces-in-plan" if is_surface else "files.groups-in-plan"
             raise table.settings.error(
-                report_finding(f"files.{code}-in-plan", kind=one.kind.name, parameters=tuple(own)),
+                report_finding(code, kind=one.kind.name, parameters=tuple(own)),
                 one.location,
             )
     return _build_instrument(table, kinds)

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The catalog and the code that reports from it agree."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import loopcal
+from loopcal.errors import EstimationError
+from loopcal.findings import Quantity, Severity, report_finding
+from loopcal.findings.catalog import CATALOG
+from loopcal.serialization import to_json
+from tools import findings_reference
+
+SOURCE = Path(loopcal.__file__).parent
+OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]+")
+
+PENDING = {
+    "diagnose/set_up_anew.py",
+    "io/data/measurement_file.py",
+    "io/formats/hangprinter.py",
+    "io/formats/import_export.py",
+    "io/formats/klipper.py",
+    "io/formats/linuxcnc.py",
+    "io/formats/marlin.py",
+    "io/formats/urdf.py",
+    "io/formats/urdf_limbs.py",
+}
+"""Modules whose messages still name options of the command line."""
+
+
+@cache
+def modules() -> dict[str, ast.Module]:
+    """Return the syntax trees of the package, but of the catalog, by path."""
+    paths = {p.relative_to(SOURCE).as_posix(): p for p in SOURCE.rglob("*.py")}
+    return {
+        name: ast.parse(path.read_text("utf-8"))
+        for name, path in sorted(paths.items())
+        if not name.startswith("findings/catalog/")
+    }
+
+
+def reports() -> Iterator[tuple[str, str, set[str | None]]]:
+    """Return place, code and names of data of every `report_finding` with a literal code."""
+    for name, tree in modules().items():
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.Call) or not node.args:
+                continue
+            called = getattr(node.func, "id", getattr(node.func, "attr", ""))
+            code = node.args[0]
+            if called == "report_finding" and isinstance(code, ast.Constant):
+                given = {keyword.arg for keyword in node.keywords} - {"severity"}
+                yield f"{name}:{node.lineno}", code.value, given
+
+
+def test_every_reported_code_is_in_the_catalog_with_exactly_its_data():
+    found = list(reports())
+    assert len(found) > 50
+    for place, code, given in found:
+        assert code in CATALOG, f"{place}: {code}"
+        if None not in given:  # with **data it is checked when it is reported
+            assert given == CATALOG[code].fields, f"{place}: {code}"
+
+
+def test_every_code_of_the_catalog_is_used():
+    used = {
+        node.value
+        for tree in modules().values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    assert sorted(set(CATALOG) - used) == []
+
+
+def test_codes_are_a_subject_and_a_name():
+    assert [code for code in CATALOG if not re.fullmatch(r"[a-z]+\.[a-z0-9-]+", code)] == []
+
+
+def test_entries_say_when_they_are_reported_and_refusals_what_to_do():
+    for entry in CATALOG.values():
+        assert entry.when.endswith("."), entry.code
+        if entry.severity in {Severity.REFUSAL, Severity.FAILURE}:
+            assert entry.action.endswith("."), entry.code
+
+
+def test_the_page_of_findings_is_up_to_date():
+    page = findings_reference.PAGE.read_text("utf-8")
+    assert page == findings_reference.page(), "run `make docs`"
+
+
+def test_no_message_of_the_library_names_an_option_of_the_command_line():
+    named = {
+        name
+        for name, tree in modules().items()
+        if not name.startswith("cli/")
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant)
+        and isinstance(node.value, str)
+        and OPTION.search(node.value)
+    }
+    assert named - PENDING == set()
+
+
+def test_a_finding_is_text_for_people_and_data_for_programs():
+    finding = report_finding(
+        "fit.default-tolerances", count=3, total=42, assumed=(Quantity(0.19, "mm"),)
+    )
+    assert str(finding) == "No tolerances given for 3 of 42 parameters: 0.19 mm assumed."
+    written = to_json(finding)
+    json.dumps(written, allow_nan=False)
+    assert written["code"] == "fit.default-tolerances"
+    assert written["severity"] == "info"
+    assert written["data"]["assumed"] == [{"value": 0.19, "unit": "mm"}]
+    assert written["text"] == str(finding)
+
+
+def test_a_finding_with_missing_data_or_an_unknown_code_is_our_mistake():
+    with pytest.raises(KeyError, match="total"):
+        report_finding("fit.default-tolerances", count=3, assumed=())
+    with pytest.raises(KeyError):
+        report_finding("fit.unheard-of")
+
+
+def test_an_error_made_from_a_finding_has_its_code_and_its_text():
+    error = EstimationError(report_finding("fit.no-measured-value"))
+    assert error.code == "fit.no-measured-value"
+    assert str(error).startswith("No measured value counts")
+    assert EstimationError("a sentence").code is None

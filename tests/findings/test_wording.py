@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The wording of all findings: the only test that pins sentences."""
+
+from __future__ import annotations
+
+from loopcal.findings.catalog import CATALOG
+from tools import findings_reference
+
+
+def test_every_text_of_the_catalog_is_the_pinned_one():
+    pinned = findings_reference.WORDING.read_text("utf-8").splitlines()
+    worded = findings_reference.wording().splitlines()
+    advice = "run `python -m tools.findings_reference --wording` and read its changes"
+    assert set(worded) - set(pinned) == set(), advice
+    assert worded == pinned, advice
+
+
+def test_every_text_that_is_a_function_has_an_example():
+    assert [e.code for e in CATALOG.values() if callable(e.text) and not e.example] == []
+
+
+def test_texts_are_one_paragraph_without_options_of_the_command_line():
+    for line in findings_reference.wording().splitlines():
+        code, _, text = line.partition("]: ")
+        assert text == " ".join(text.split()), code
+        assert "--" not in text, code

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write docs/findings.md from the catalog of findings: `python -m tools.findings_reference`.
+
+With `--wording` also write tests/findings/wording.txt, which pins every text of the catalog. Read
+its changes before you commit them.
+"""
+
+import re
+import sys
+from importlib import import_module
+from pathlib import Path
+
+from loopcal.findings import catalog
+from loopcal.findings.finding import Severity
+from loopcal.findings.wording import Entry
+from tools.file_reference import table
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / "docs" / "findings.md"
+WORDING = ROOT / "tests" / "findings" / "wording.txt"
+
+PLACEHOLDER = re.compile(r"\{(?P<name>\w+)[^{}]*\}")
+SEVERITIES = {
+    Severity.INFO: "worth knowing; nothing to do",
+    Severity.SUGGESTION: "a step that would improve the result",
+    Severity.WARNING: "the result is usable with care; the text says what to check",
+    Severity.FAILURE: "do not use the result as it is: a quality gate is not met",
+    Severity.REFUSAL: "the input was refused before anything was computed",
+}
+HEAD = """# Findings
+
+<!-- made by tools.findings_reference; `make docs` writes it anew -->
+
+Every note, warning, suggestion and refusal is a finding: a code, a severity, data and a text.
+Programs read code and data; the text is for people and may change. In Python, `fit.findings` and
+other results hold findings, `str(finding)` is the text, and an error made from a finding has its
+`code`. In JSON, a finding has the keys `code`, `severity`, `data` and `text`.
+
+In the texts below, words in *italics* are replaced by data. Where a text differs in more than its
+data, an example is shown in quotation marks.
+"""
+
+
+def entries_of(subject: str) -> tuple[Entry, ...]:
+    """Return the entries of a module of the catalog."""
+    return import_module(f"{catalog.__name__}.{subject}").ENTRIES
+
+
+def title_of(subject: str) -> str:
+    """Return the first line of the docstring of a module of the catalog, without the full stop."""
+    doc = import_module(f"{catalog.__name__}.{subject}").__doc__
+    assert doc, subject
+    return doc.strip().splitlines()[0].rstrip(".")
+
+
+def shown_text(entry: Entry) -> str:
+    """Return the text of an entry for the page: placeholders in italics, or an example."""
+    if callable(entry.text):
+        return f'"{entry.word(entry.example)}"'
+    return PLACEHOLDER.sub(lambda match: f"*{match['name'].replace('_', ' ')}*", entry.text)
+
+
+def page() -> str:
+    """Return docs/findings.md."""
+    severities = [(f"`{severity.value}`", words) for severity, words in SEVERITIES.items()]
+    parts = [HEAD, table(("severity", "meaning"), severities)]
+    for subject in catalog.SUBJECTS:
+        rows = [
+            (f"`{e.code}`", e.severity.value, shown_text(e), e.when, e.action)
+            for e in entries_of(subject)
+        ]
+        parts.append(f"## {title_of(subject)}\n")
+        parts.append(table(("code", "severity", "text", "when", "what to do"), rows))
+    return "\n".join(parts)
+
+
+def wording() -> str:
+    """Return every text of the catalog, one a line: templates as they are, functions by example."""
+    lines = [
+        f"{e.code} [{e.severity.value}]: {e.word(e.example) if callable(e.text) else e.text}"
+        for e in catalog.CATALOG.values()
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Write the page, and the wording where asked."""
+    PAGE.write_text(page(), "utf-8")
+    if "--wording" in sys.argv[1:]:
+        WORDING.write_text(wording(), "utf-8")
+
+
+if __name__ == "__main__":
+    main()
