@@ -52,8 +52,7 @@ def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
             is_surface = one.kind.name in {"plane", "line"}
             code = "files.surfaces-in-plan" if is_surface else "files.groups-in-plan"
             raise table.settings.error(
-                report_finding(code, kind=one.kind.name, parameters=tuple(own)),
-                one.location,
+                report_finding(code, kind=one.kind.name, parameters=tuple(own)), one.location
             )
     return _build_instrument(table, kinds)
 
