@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from loopcal.findings.finding import Severity
-from loopcal.findings.wording import Entry, fill_template
+from loopcal.findings.wording import Entry, Quantity, fill_template
 
 MOTIONS = {
     "rx": "rotation about x",
@@ -87,6 +87,9 @@ def _word_path_near(data: Mapping[str, Any]) -> str:
     )
 
 
+_DISTANCE = {"row": 7, "margin": 0.31, "ratio": 0.08, "motion": ("rz", "x")}
+"""Data of the examples."""
+
 ENTRIES = (
     Entry(
         "kinematics.closed",
@@ -141,12 +144,14 @@ ENTRIES = (
         "not reached: {reason}",
         "The distance from a singularity is unknown, since the loops do not close.",
         "Check the pose.",
+        example={"row": 3, "reason": "The loops cannot be closed"},
     ),
     Entry(
         "singularity.distance",
         Severity.INFO,
         _word_distance,
         "The distance of a pose from a parallel singularity.",
+        example=_DISTANCE | {"actuator": None},
     ),
     Entry(
         "singularity.weak-actuator",
@@ -154,6 +159,7 @@ ENTRIES = (
         _word_weak_actuator,
         "An actuator moves the platform by less than a tenth of the usual amount.",
         "Keep a distance from this pose: it is close to a serial singularity.",
+        example=_DISTANCE | {"actuator": "q2", "drive_margin": 0.021, "drive_ratio": 0.06},
     ),
     Entry(
         "singularity.path-crosses",
@@ -176,6 +182,7 @@ ENTRIES = (
         _word_path_near,
         "A margin along the path is less than a tenth of its median over the workspace.",
         "Change the path between these steps.",
+        example=_DISTANCE | {"actuator": None, "first": 4, "last": 9},
     ),
     Entry(
         "mechanism.free-platform",
@@ -183,6 +190,7 @@ ENTRIES = (
         _word_free_platform,
         "Locked actuators do not hold the platform at home.",
         "Add a limb or an actuator, or state fewer freedoms.",
+        example={"name": "hexapod", "motion": ("rz",), "equations": 5, "rank": 5, "freedoms": 6},
     ),
     Entry(
         "mechanism.over-constrained",
@@ -190,12 +198,25 @@ ENTRIES = (
         _word_over_constrained,
         "The limbs leave the platform fewer freedoms than there are actuators.",
         "Remove a constraint, make a joint passive or state other freedoms.",
+        example={
+            "name": "tripod",
+            "actuators": 3,
+            "movable": 2,
+            "freedoms": 3,
+            "motions": (("z",),),
+        },
     ),
     Entry(
         "mechanism.locked-joint",
         Severity.INFO,
         _word_idle_joint,
         "A limb can move while its two ends rest, such as the rod of an S-P-S leg.",
+        example={
+            "limb": "leg1",
+            "joint": "leg1.spin",
+            "turns": True,
+            "value": Quantity(0.0, "rad"),
+        },
     ),
     Entry(
         "mechanism.repeated-equations",
@@ -203,5 +224,6 @@ ENTRIES = (
         _word_repeated_equations,
         "The limbs constrain the platform more often than necessary.",
         "State the platform's freedoms in the robot file, if the redundant constraints are real.",
+        example={"count": 6, "freedoms": ("x", "y", "z")},
     ),
 )
