@@ -29,6 +29,7 @@ from loopcal.estimate import (
 from loopcal.estimate.identification import IdentifiedTrials
 from loopcal.estimate.nuisance.estimate import estimate_nuisance
 from loopcal.estimate.problem import problem_of, problem_of_trials
+from loopcal.geometry.alignment import align_point_sets, solve_hand_eye
 from loopcal.io import load_robot
 from loopcal.measure import (
     KINDS,
@@ -44,7 +45,6 @@ from loopcal.measure import (
     simulate,
     simulate_trials,
 )
-from loopcal.measure.closed_form import hand_eye, kabsch
 from loopcal.mechanism import Mechanism, build, forward, inverse, sample_workspace
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.typing import IntArray
@@ -256,10 +256,10 @@ def pose_error(
     if (
         not np.ptp(T[:, :3, :3], axis=0).max() > 1e-9
     ):  # a platform that does not turn has no tool frame of its own
-        turned = kabsch(T[:, :3, 3], true[:, :3, 3]) if frames else np.eye(4)
+        turned = align_point_sets(T[:, :3, 3], true[:, :3, 3]) if frames else np.eye(4)
         return float(np.abs((turned @ T)[:, :3, 3] - true[:, :3, 3]).max() / found.size)
     base, tool = (None if name in frames else np.eye(4) for name in ("base", "platform"))
-    F, X = hand_eye(T, true, base, tool) if frames else (np.eye(4), np.eye(4))
+    F, X = solve_hand_eye(T, true, base, tool) if frames else (np.eye(4), np.eye(4))
     off = geometry.pose_difference(geometry.invert_pose(F) @ T @ X, true)
     return float(np.abs(off / np.array([1.0] * 3 + [found.size] * 3)).max())
 

@@ -28,7 +28,7 @@ from loopcal.measure import (
     collect_nuisance_parameters,
     simulate,
 )
-from loopcal.measure.kinds import parts
+from loopcal.measure.kinds import setup_parameters
 from loopcal.mechanism import sample_workspace
 from tests import zoo
 from tests.estimate.problems import hexapod, hexapod_poses
@@ -99,10 +99,13 @@ def test_a_base_that_drifts_is_re_measured_in_every_session():
     free = identify(hexapod(), data, LeastSquares())
     assert free.rank == 36
     frames = [
-        parts.frame_at(
+        setup_parameters.place_frame(
             np.eye(4),
             np.array(
-                [free.nuisance.values[f"{s}.frame.{a}"] for a in parts.TURNS + parts.POSITION]
+                [
+                    free.nuisance.values[f"{s}.frame.{a}"]
+                    for a in setup_parameters.ROTATION_AXES + setup_parameters.POSITION_AXES
+                ]
             ),
         )
         for s in ("morning", "evening")

@@ -92,7 +92,7 @@ def test_taking_poses_renumbers_the_rows_and_drops_those_that_need_others():
 
 @pytest.mark.parametrize("poses", [[5], [-1], [1, 1], []])
 def test_taking_what_is_not_there_is_refused(poses):
-    with pytest.raises(DataError, match="name some of 0 to 4, each once"):
+    with pytest.raises(DataError, match="at least one of 0 to 4, each once"):
         heights(5).take(poses)
 
 
@@ -113,13 +113,13 @@ def test_weights_of_poses_reach_their_rows_in_the_same_shape():
             "readings: row 1, column 2 is nan; give a finite number",
         ),
         ({"readings": [1.0, 2.0]}, r"readings has shape \(2,\)"),
-        ({"readings": np.empty((0, 2))}, "there is no pose"),
+        ({"readings": np.empty((0, 2))}, "have no pose"),
         (
             {"readings": [[1.0, 2.0]]},
             "row 2 of kind 'component' refers to pose 1, but the 1 poses are 0 to 0",
         ),
         ({"block": np.array([1])}, "give one whole number for each pose"),
-        ({"labels": ("a",)}, "there are 1 labels for 2 poses"),
+        ({"labels": ("a",)}, "1 labels for 2 poses"),
     ],
 )
 def test_a_mistake_is_one_sentence(change, sentence):
@@ -144,9 +144,9 @@ def test_the_sigma_of_readings_follows_their_poses():
 @pytest.mark.parametrize(
     ("sigma", "readings", "words"),
     [
-        (-1e-6, np.ones((3, 2)), "no standard deviation"),
-        (np.nan, np.ones((3, 2)), "no standard deviation"),
-        (1e-6, [[1.0, np.nan], [1.0, 1.0], [1.0, 1.0]], "not there"),
+        (-1e-6, np.ones((3, 2)), "not a standard deviation"),
+        (np.nan, np.ones((3, 2)), "not a standard deviation"),
+        (1e-6, [[1.0, np.nan], [1.0, 1.0], [1.0, 1.0]], "missing reading"),
         (np.ones(3), np.ones((3, 2)), "one for each of the 2 actuators"),
         (None, [[1.0, np.nan], [1.0, 1.0], [1.0, 1.0]], "finite"),
         (np.inf, [[1.0, np.inf], [1.0, 1.0], [1.0, 1.0]], "finite"),

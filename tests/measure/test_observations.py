@@ -117,7 +117,7 @@ def test_arrays_are_copies_that_cannot_be_written():
             {"covariance": [[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]},
             "row 1 is not symmetric",
         ),
-        ({"weight": [1.0, -1.0]}, "weight of row 2 is -1; use 0 to leave a row out"),
+        ({"weight": [1.0, -1.0]}, "weight of row 2 is -1"),
         ({"weight": [1.0, np.nan]}, "the weight: row 2 is nan"),
         ({"covariance": np.eye(2)}, r"covariance has shape \(2, 2\); give \(2, 3, 3\) or \(3, 3\)"),
         (

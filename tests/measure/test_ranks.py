@@ -102,9 +102,12 @@ def singular_values(robot, poses, instrument):
     data = trials.trial(0)
     state = forward_trials(robot, robot.values[None], data.readings[None])
     D = differentiate_pose(robot, robot.values[None], data.readings[None], state).parameters
-    rows = whitened_rows(evaluate_all(data, state.T, trials.local.values()[None], trials.local), D)[
-        0
-    ]
+    rows = whitened_rows(
+        evaluate_all(
+            data, state.T, trials.nuisance_parameters.values()[None], trials.nuisance_parameters
+        ),
+        D,
+    )[0]
     p = len(robot.parameters)
     machine, own = rows[:, :p], rows[:, p:-1]
     if own.shape[1]:

@@ -148,7 +148,7 @@ def test_a_noise_of_the_wrong_length_names_the_columns():
 def test_a_pose_the_controller_cannot_reach_is_named(robot):
     far = COMMANDED.copy()
     far[2, 0, 3] = np.nan
-    with pytest.raises(DataError, match="cannot be commanded to pose '3'"):
+    with pytest.raises(DataError, match="does not reach commanded pose '3'"):
         simulate(robot, far, TRACKER, seed=1)
     labels = tuple("abcdefghijklmnopqrst"[: len(far)])
     with pytest.raises(DataError, match="pose 'c'"):
@@ -162,7 +162,7 @@ def test_a_machine_that_cannot_follow_is_absent_from_its_trial_only(robot):
     assert np.isfinite(trials.measured[0][0]).all()
     assert np.isnan(trials.measured[0][1]).all()
     assert trials.trial(1).n_rows == 0
-    with pytest.raises(DataError, match="the true machine cannot follow the readings of pose 1"):
+    with pytest.raises(DataError, match="the true machine does not reach pose 1"):
         simulate(robot.with_values(values[1]), COMMANDED, TRACKER, seed=1)
 
 
@@ -173,19 +173,23 @@ def test_readings_outside_the_stroke_are_refused_by_name_value_and_stroke(robot)
     readings = data.readings.copy()
     readings[3, 1] = high + 0.002
     outside = Measurements(robot.name, readings, data.observations)
-    with pytest.raises(
-        DataError, match=r"pose '4': .* reads .* mm, outside its stroke of .* mm; .* or use --here"
-    ):
-        check_strokes(outside, robot, override="--here")
+    with pytest.raises(DataError) as error:
+        check_strokes(outside, robot)
+    assert error.value.code == "data.outside-stroke"
+    found = error.value.args[0].data
+    assert (found["pose"], found["actuator"], found["count"]) == ("4", robot.actuators[1].name, 1)
+    assert float(found["reading"]) == pytest.approx(float(found["upper"]) + 2.0)  # [mm]
+    assert found["unit"] == "mm"
     check_strokes(outside, robot, allow=True)
 
 
 def test_readings_of_another_robot_are_refused_with_the_actuators(robot):
     data = Measurements("delta", np.zeros((2, 3)), ())
-    with pytest.raises(
-        DataError, match=f"3 columns, but '{robot.name}' has 6 actuators: {robot.actuators[0].name}"
-    ):
+    with pytest.raises(DataError) as error:
         check_actuators(data, robot)
+    assert error.value.code == "data.wrong-actuator-count"
+    assert error.value.args[0].data["columns"] == 3
+    assert error.value.args[0].data["actuators"] == tuple(a.name for a in robot.actuators)
 
 
 def test_a_row_given_twice_is_refused():
@@ -194,10 +198,10 @@ def test_a_row_given_twice_is_refused():
     once = Measurements("toy", np.array([[1.0], [1.0], [2.0]]), (rows,))
     check_duplicates(once)
     twice = Measurements("toy", np.ones((3, 1)), (rows,))
-    with pytest.raises(
-        DataError, match="poses '1' and '3' have the same readings and the same component values"
-    ):
+    with pytest.raises(DataError) as error:
         check_duplicates(twice)
+    assert error.value.code == "data.duplicate-rows"
+    assert error.value.args[0].data["poses"] == ("1", "3")
     check_duplicates(twice, allow=True)
 
 
@@ -212,10 +216,12 @@ def test_true_values_of_unknowns_are_seen_and_unknown_names_are_refused(robot):
     )  # turned by a quarter about z, one metre off
     assert_allclose(data.observations[0].measured, seen, atol=1e-8)
     trials = simulate_trials(robot, robot.values, COMMANDED, instrument, seed=1, nuisance_values=at)
-    assert trials.local.values()[trials.local.table.index("tracker.x")] == 1.0
+    assert (
+        trials.nuisance_parameters.values()[trials.nuisance_parameters.table.index("tracker.x")]
+        == 1.0
+    )
     with pytest.raises(
-        DataError,
-        match=r"no unknown of these measurements is called 'traker\.x'.*did you mean 'tracker\.x'",
+        DataError, match=r"no setup parameter 'traker\.x'.*did you mean 'tracker\.x'"
     ):
         simulate(robot, COMMANDED, instrument, seed=1, nuisance_values={"traker.x": 1.0})
 

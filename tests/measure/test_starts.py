@@ -20,6 +20,7 @@ from evidence.starts import (
 )
 from loopcal import geometry
 from loopcal.errors import DataError
+from loopcal.geometry.alignment import OCTAHEDRAL_ROTATIONS, solve_trilateration
 from loopcal.measure import (
     Direction,
     Distance,
@@ -29,7 +30,6 @@ from loopcal.measure import (
     collect_nuisance_parameters,
     guess_nuisance_values,
 )
-from loopcal.measure.closed_form import OCTAHEDRAL, trilateration
 
 N = 30
 
@@ -133,7 +133,8 @@ def test_points_in_one_plane_need_a_word_on_the_side():
     T[:, 2, 3] = 0.8
     data, local, truth = measured_at(Distance(places=NOWHERE, unknown=("anchor",)), T, rng)
     with pytest.raises(
-        DataError, match=r"'anchor' were all measured in one plane, so it can be on either side"
+        DataError,
+        match=r"'anchor' were measured from points in one plane, so it can be on either side",
     ):
         guess_nuisance_values(data, T, local)
     side = np.array([0.0, 0.0, 0.8 + np.sign(truth[2] - 0.8)])
@@ -150,28 +151,30 @@ def test_points_on_a_line_leave_a_turn_open_and_are_refused():
     T[:, :3, 3] = np.array([0.1, 0.2, 0.3]) * np.linspace(0, 1, N)[:, None]
     data, local, _ = measured_at(Position(places=NOWHERE, unknown=("frame",)), T, rng)
     with pytest.raises(
-        DataError, match=r"the 30 positions lie on a line, about which the frame 'frame' could turn"
+        DataError, match=r"the 30 positions are collinear, so the rotation of the frame 'frame'"
     ):
         guess_nuisance_values(data, T, local)
 
 
 def test_the_24_rotations_of_a_cube_leave_none_out():
-    assert OCTAHEDRAL.shape == (24, 3, 3)
+    assert OCTAHEDRAL_ROTATIONS.shape == (24, 3, 3)
     assert_allclose(
-        OCTAHEDRAL @ np.swapaxes(OCTAHEDRAL, 1, 2), np.broadcast_to(np.eye(3), (24, 3, 3)), atol=0.0
+        OCTAHEDRAL_ROTATIONS @ np.swapaxes(OCTAHEDRAL_ROTATIONS, 1, 2),
+        np.broadcast_to(np.eye(3), (24, 3, 3)),
+        atol=0.0,
     )
     quaternion = np.random.default_rng(0).normal(size=(2000, 4))
     R = geometry.quaternion_to_matrix(
         quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
     )
-    trace = np.einsum("nij,kij->nk", R, OCTAHEDRAL).max(axis=1)
+    trace = np.einsum("nij,kij->nk", R, OCTAHEDRAL_ROTATIONS).max(axis=1)
     assert np.rad2deg(np.arccos((trace.min() - 1.0) / 2.0)) < 63.0
 
 
 def test_trilateration_gives_both_sides_of_a_plane():
     flat = np.random.default_rng(0).uniform(-1, 1, (10, 3)) * [1, 1, 0]
     centre = np.array([0.3, -0.2, 0.7])
-    found, offsets = trilateration(
+    found, offsets = solve_trilateration(
         flat, np.linalg.norm(flat - centre, axis=1) + 0.1, with_offset=True
     )
     assert_allclose(np.sort(found[:, 2]), [-0.7, 0.7], atol=1e-9)

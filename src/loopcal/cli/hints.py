@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from loopcal.findings import Finding
 
 HINTS = {
+    "data.duplicate-rows": "use --allow-duplicates to accept them",
+    "data.outside-stroke": "use --allow-outside-stroke to accept it",
     "conventions.other-interpretation": "use --allow-implausible to accept the data as written",
     "conventions.stated-values-contradicted": "use --allow-implausible to accept the statement",
     "conventions.target-never-moves": "use --allow-still to accept it",

@@ -48,7 +48,6 @@ from loopcal.measure import (
     make_readings_kind,
     resolve_reading_sigma,
 )
-from loopcal.measure.simulation import rows_of as sensor_rows
 from loopcal.measure.whitening import whitener
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
@@ -389,7 +388,7 @@ def problem_of_trials(free: FreeParameters, trials: Trials) -> Problem:
         t, r, m = present.shape
         flat = np.broadcast_to(covariance, (t, r, m, m)).reshape(-1, m, m)
         white = whitener(flat, present.reshape(-1, m), np.ones(t * r)).reshape(t, r, m, m)
-        rows.append(ObservationRows(kind, sensor_rows(sensor), measured, white, places))
+        rows.append(ObservationRows(kind, sensor.assigned_rows, measured, white, places))
     recorded = trials.readings[None] if trials.recorded is None else trials.recorded
     return make_problem(
         free, recorded, trials.reading_sigma, tuple(rows), len(trials), local, trials.trial

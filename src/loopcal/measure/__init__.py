@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements: kinds, instruments, observations, their unknowns, and their simulation."""
+"""Measurements: kinds, instruments, observations, nuisance parameters, and their simulation."""
 
-from loopcal.measure.commanded_poses import solve_commanded_readings as solve_commanded_readings
 from loopcal.measure.data_checks import check_actuators as check_actuators
 from loopcal.measure.data_checks import check_duplicates as check_duplicates
 from loopcal.measure.data_checks import check_strokes as check_strokes
 from loopcal.measure.data_checks import check_targets_move as check_targets_move
+from loopcal.measure.data_checks import has_static_targets as has_static_targets
 from loopcal.measure.evaluation import KindRows as KindRows
 from loopcal.measure.evaluation import evaluate_all as evaluate_all
 from loopcal.measure.evaluation import whitened_rows as whitened_rows
 from loopcal.measure.initial_values import guess_nuisance_values as guess_nuisance_values
+from loopcal.measure.initial_values import (
+    guess_nuisance_values_batch as guess_nuisance_values_batch,
+)
 from loopcal.measure.instrument import Instrument as Instrument
 from loopcal.measure.instrument import Sensor as Sensor
-from loopcal.measure.joint_observation import list_sensed_joints as list_sensed_joints
-from loopcal.measure.joint_observation import select_joint_values as select_joint_values
 from loopcal.measure.kinds import KINDS as KINDS
+from loopcal.measure.kinds import ActuatorReadings as ActuatorReadings
 from loopcal.measure.kinds import Autocollimation as Autocollimation
 from loopcal.measure.kinds import Bearing as Bearing
 from loopcal.measure.kinds import Column as Column
@@ -33,6 +35,7 @@ from loopcal.measure.kinds import Position as Position
 from loopcal.measure.kinds import Separation as Separation
 from loopcal.measure.kinds import Sphere as Sphere
 from loopcal.measure.measurements import Measurements as Measurements
+from loopcal.measure.measurements import weight_reading_sigma as weight_reading_sigma
 from loopcal.measure.noise import Gaussian as Gaussian
 from loopcal.measure.noise import Noise as Noise
 from loopcal.measure.noise import Uniform as Uniform
@@ -41,11 +44,14 @@ from loopcal.measure.nuisance import NuisanceParameters as NuisanceParameters
 from loopcal.measure.nuisance import StatedValue as StatedValue
 from loopcal.measure.nuisance import collect_nuisance_parameters as collect_nuisance_parameters
 from loopcal.measure.observations import Observations as Observations
-from loopcal.measure.readings import Readings as Readings
 from loopcal.measure.readings import fill_in_reading_sigma as fill_in_reading_sigma
+from loopcal.measure.readings import list_sensed_joints as list_sensed_joints
 from loopcal.measure.readings import make_readings_kind as make_readings_kind
 from loopcal.measure.readings import resolve_reading_sigma as resolve_reading_sigma
-from loopcal.measure.simulation import Trials as Trials
-from loopcal.measure.simulation import sample_truth as sample_truth
+from loopcal.measure.readings import select_joint_values as select_joint_values
+from loopcal.measure.readings import solve_commanded_readings as solve_commanded_readings
+from loopcal.measure.simulation import replace_measured_values as replace_measured_values
 from loopcal.measure.simulation import simulate as simulate
-from loopcal.measure.simulation import simulate_trials as simulate_trials
+from loopcal.measure.trials import Trials as Trials
+from loopcal.measure.trials import sample_truth as sample_truth
+from loopcal.measure.trials import simulate_trials as simulate_trials

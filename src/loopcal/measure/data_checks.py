@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What measurements must satisfy beside their robot: refused with the evidence, unless the caller
-overrides it.
+"""Checks of measurements against their robot: readings, duplicates, targets that do not move.
+
+Each check raises a `DataError` made from a finding of the catalog, unless the caller passes
+`allow=True`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,9 +20,9 @@ from loopcal.mechanism import Mechanism
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import DISPLAY_UNITS, find_unit
 
-STILL, PLANNED = 10.0, 100.0
-"""Standard deviations of the noise within which readings stay that never move, and beyond which a
-target is moved.
+STATIC_SIGMAS, MOVING_SIGMAS = 10.0, 100.0
+"""Values within the first number of standard deviations count as static; the check refuses them if
+the robot moves the target by more than the second number.
 """
 
 
@@ -30,19 +32,23 @@ def check_actuators(measurements: Measurements, robot: Mechanism) -> None:
     Raises
     ------
     DataError
-        Naming the actuators.
+        `data.wrong-actuator-count`.
     """
-    found, names = measurements.readings.shape[1], [actuator.name for actuator in robot.actuators]
-    if found != len(names):
+    columns = measurements.readings.shape[1]
+    names = [actuator.name for actuator in robot.actuators]
+    if columns != len(names):
         raise DataError(
-            f"the readings have {found} columns, but {robot.name!r} has {len(names)} actuators: "
-            f"{', '.join(names)}"
+            report_finding(
+                "data.wrong-actuator-count",
+                columns=columns,
+                robot=robot.name,
+                actuators_count=len(names),
+                actuators=tuple(names),
+            )
         )
 
 
-def check_strokes(
-    measurements: Measurements, robot: Mechanism, *, allow: bool = False, override: str = ""
-) -> None:
+def check_strokes(measurements: Measurements, robot: Mechanism, *, allow: bool = False) -> None:
     """Refuse readings outside the stroke of their actuator.
 
     Parameters
@@ -51,13 +57,11 @@ def check_strokes(
     robot : Mechanism
     allow : bool
         True accepts them.
-    override : str
-        How a user of the caller says so (a flag or argument); closes the message.
 
     Raises
     ------
     DataError
-        Naming the pose, the actuator, the reading, the stroke and how many there are.
+        `data.outside-stroke`, with the first of these readings and their number.
     """
     check_actuators(measurements, robot)
     if allow:
@@ -69,188 +73,181 @@ def check_strokes(
         pose, column = (int(i) for i in outside[0])
         actuator = robot.actuators[column]
         shown = find_unit(robot.units[actuator.dimension])
-        value, least, most = (
+        reading, lower, upper = (
             f"{number / shown.factor_to_si:.7g}"
             for number in (measurements.readings[pose, column], *strokes[column])
         )
-        others = "" if len(outside) == 1 else f" ({len(outside)} readings are outside)"
         raise DataError(
-            f"pose {measurements.labels[pose]!r}: {actuator.name} reads {value} {shown}, outside "
-            "its stroke of"
-            f" {least} to {most} {shown}{others}; correct the reading, its unit or the stroke"
-            + _or_use(override)
+            report_finding(
+                "data.outside-stroke",
+                pose=measurements.labels[pose],
+                actuator=actuator.name,
+                reading=reading,
+                lower=lower,
+                upper=upper,
+                unit=str(shown),
+                count=len(outside),
+            )
         )
 
 
 def check_duplicates(
-    measurements: Measurements,
-    *,
-    allow: bool = False,
-    override: str = "",
-    places: Sequence[Sequence[str]] = (),
+    measurements: Measurements, *, allow: bool = False, places: Sequence[Sequence[str]] = ()
 ) -> None:
-    """Refuse a row that repeats another one to the last bit: the same readings, the same kind, the
-    same values.
+    """Refuse a row that repeats another one to the last bit: readings, kind and values.
 
-    Two rows of one measurement pretend to twice the information. True repeats differ in their
-    noise; a coarse instrument that shows the same number again is what `allow` is for.
+    Two copies of one measurement count as twice the information. True repeats differ by their
+    noise. `allow` is for coarse instruments, which show the same number again.
 
     Parameters
     ----------
     measurements : Measurements
     allow : bool
         True accepts them.
-    override : str
-        How a user of the caller says so; closes the message.
     places : sequence of sequence of str
-        Where each row of each of the observations stands, such as `data.csv:12`; for the message.
+        Place of each row of each of the observations, such as `data.csv:12`, for the message.
 
     Raises
     ------
     DataError
-        Naming the two poses, and where the rows stand.
+        `data.duplicate-rows`, with the two poses and their places.
     """
     if allow:
         return
-    stands = dict(zip(map(id, measurements.observations), places, strict=False))
-    for alike in _alike(measurements.observations):
-        rows = alike[0]
-        poses = np.concatenate([part.rows.reshape(len(part), -1) for part in alike])
+    places_of = dict(zip(map(id, measurements.observations), places, strict=False))
+    for alike in _group_equal_kinds(measurements.observations):
+        poses = np.concatenate([rows.rows.reshape(len(rows), -1) for rows in alike])
         texts = [
-            np.concatenate([getattr(part, name) for part in alike]) for name in ("session", "group")
+            np.concatenate([getattr(rows, name) for rows in alike]) for name in ("session", "group")
         ]
         owners = [np.unique(text, return_inverse=True)[1].reshape(-1, 1) for text in texts]
-        measured = np.concatenate([part.measured for part in alike])
+        measured = np.concatenate([rows.measured for rows in alike])
         content = np.concatenate(
             [measurements.readings[poses].reshape(len(poses), -1), measured, *owners], axis=1
         )
-        _, first, kinds = np.unique(
+        _, first, member = np.unique(
             np.nan_to_num(content, nan=1e300), axis=0, return_index=True, return_inverse=True
         )
-        again = np.flatnonzero(first[kinds.ravel()] != np.arange(len(poses)))
-        if len(again):
-            second = int(again[0])
-            pair = (int(first[kinds.ravel()[second]]), second)
-            names = [measurements.labels[poses[i, 0]] for i in pair]
-            lines = [place for part in alike for place in stands.get(id(part), ())]
-            where = f" ({lines[pair[0]]} and {lines[pair[1]]})" if lines else ""
+        repeated = np.flatnonzero(first[member.ravel()] != np.arange(len(poses)))
+        if len(repeated):
+            second = int(repeated[0])
+            pair = (int(first[member.ravel()[second]]), second)
+            lines = [place for rows in alike for place in places_of.get(id(rows), ())]
             raise DataError(
-                f"poses {names[0]!r} and {names[1]!r}{where} have the same readings and the same "
-                f"{rows.kind.name} values to"
-                " the last digit; remove one of them" + _or_use(override)
+                report_finding(
+                    "data.duplicate-rows",
+                    poses=tuple(measurements.labels[poses[i, 0]] for i in pair),
+                    kind=alike[0].kind.name,
+                    places=tuple(lines[i] for i in pair) if lines else (),
+                )
             )
 
 
-def _alike(observations: tuple[Observations, ...]) -> list[list[Observations]]:
-    """Observations in groups of equal kinds and settings, as two files of one instrument give them."""
-    found: list[list[Observations]] = []
-    for rows in observations:
-        there = next((group for group in found if _same(group[0].kind, rows.kind)), None)
-        if there is None:
-            found.append([rows])
-        else:
-            there.append(rows)
-    return found
-
-
-def _same(one: Kind, other: Kind) -> bool:
-    """Whether two kinds are of one class and all their settings are equal."""
-    settings = [field.name for field in fields(cast(Any, one)) if field.init]
-    return type(one) is type(other) and all(
-        np.array_equal(getattr(one, s), getattr(other, s)) for s in settings
-    )
-
-
 def check_targets_move(measurements: Measurements, T: FloatArray, *, allow: bool = False) -> None:
-    """Refuse a target that no pose moves: its readings stay within the noise, though the robot
-    carried it about.
+    """Refuse a target whose values stay within the noise, although the robot moves it.
 
-    A reflector that stands on the floor, a frozen display, a column of another target give such
-    readings, and whatever is fitted to them is wrong.
+    A reflector on the floor, a frozen display or the column of another target give such values. Any
+    fit to them is wrong.
 
     Parameters
     ----------
     measurements : Measurements
     T : (n, 4, 4)
-        T_base_platform of each pose, by the nominal robot.
+        T_base_platform of each pose, of the nominal robot.
     allow : bool
         True accepts them.
 
     Raises
     ------
     DataError
-        Naming the target, how far it moved and how far it should have.
+        `conventions.target-never-moves`, with the target, its range and the expected range.
     """
     if allow:
         return
-    for still in _stays(measurements):
-        rows, kind = still.rows, still.rows.kind
-        expected = kind.measure(
+    for static in _find_static_targets(measurements):
+        rows, kind = static.rows, static.rows.kind
+        predicted = kind.measure(
             T[None, rows.rows], np.zeros((1, len(rows), len(kind.noise_columns)))
         )[0]
-        planned = np.ptp(expected[still.here][:, still.places], axis=0)
-        if np.any(planned > PLANNED * still.noise):
-            worst = int(np.argmax(planned / still.noise))
-            shown = DISPLAY_UNITS[kind.columns[still.places[worst]].dimension]
-            moved, should = (
-                Quantity(float(range_[worst]) / shown.factor_to_si, str(shown))
-                for range_ in (still.moved, planned)
+        expected = np.ptp(predicted[static.present][:, static.columns], axis=0)
+        if np.any(expected > MOVING_SIGMAS * static.noise):
+            worst = int(np.argmax(expected / static.noise))
+            shown = DISPLAY_UNITS[kind.columns[static.columns[worst]].dimension]
+            moved, planned = (
+                Quantity(float(range_[worst]) / shown.factor_to_si, shown.symbol)
+                for range_ in (static.range, expected)
             )
             raise DataError(
                 report_finding(
                     "conventions.target-never-moves",
-                    target=still.target,
+                    target=static.target,
                     kind=kind.name,
                     moved=moved,
-                    expected=should,
+                    expected=planned,
                 )
             )
 
 
-def stays(measurements: Measurements) -> bool:
-    """Whether any target's readings stay within the noise, so that `check_targets_move` has something to
-    look at.
+def has_static_targets(measurements: Measurements) -> bool:
+    """Return whether the values of any target stay within the noise, so that `check_targets_move`
+    can refuse it.
     """
-    return any(True for _ in _stays(measurements))
+    return any(True for _ in _find_static_targets(measurements))
 
 
-class _Still(NamedTuple):
-    """A target whose readings stay within the noise: its rows (here), columns, range of each (k,)
-    and noise (k,) [SI].
+class _StaticTarget(NamedTuple):
+    """A target whose values stay within the noise: its present rows, columns, range of each column
+    (k,) and noise (k,) [SI].
     """
 
     rows: Observations
     target: str
-    here: BoolArray
-    places: list[int]
-    moved: FloatArray
+    present: BoolArray
+    columns: list[int]
+    range: FloatArray
     noise: FloatArray
 
 
-def _stays(measurements: Measurements) -> Iterator[_Still]:
+def _find_static_targets(measurements: Measurements) -> Iterator[_StaticTarget]:
     for rows in measurements.observations:
         kind = rows.kind
-        if (
-            not kind.changes_with_pose
-            or kind.poses_per_row > 1
-            or kind.sensed_joints
-            or len(rows) < 3
-        ):
+        comparable = kind.changes_with_pose and kind.poses_per_row == 1 and not kind.sensed_joints
+        if not comparable or len(rows) < 3:
             continue
         sigma = np.sqrt(np.einsum("rii->ri", rows.covariance)).max(axis=0)
-        each = sigma if len(sigma) == len(kind.columns) else np.full(len(kind.columns), sigma.max())
+        noise = (
+            sigma if len(sigma) == len(kind.columns) else np.full(len(kind.columns), sigma.max())
+        )
         for session in np.unique(rows.session):
-            for target, columns in kind.target_columns.items():
-                places = list(columns)
-                here = (rows.session == session) & ~np.any(
-                    np.isnan(rows.measured[:, places]), axis=1
+            for target, indices in kind.target_columns.items():
+                columns = list(indices)
+                present = (rows.session == session) & ~np.any(
+                    np.isnan(rows.measured[:, columns]), axis=1
                 )
-                if np.count_nonzero(here) < 3:
+                if np.count_nonzero(present) < 3:
                     continue
-                moved = np.ptp(rows.measured[here][:, places], axis=0)
-                if np.all(moved < STILL * each[places]):
-                    yield _Still(rows, target, here, places, moved, each[places])
+                range_ = np.ptp(rows.measured[present][:, columns], axis=0)
+                if np.all(range_ < STATIC_SIGMAS * noise[columns]):
+                    yield _StaticTarget(rows, target, present, columns, range_, noise[columns])
 
 
-def _or_use(override: str) -> str:
-    return f", or use {override}" if override else ""
+def _group_equal_kinds(observations: tuple[Observations, ...]) -> list[list[Observations]]:
+    """Return observations in groups of equal kinds and settings, as two files of one instrument
+    give them.
+    """
+    groups: list[list[Observations]] = []
+    for rows in observations:
+        group = next((g for g in groups if _have_equal_settings(g[0].kind, rows.kind)), None)
+        if group is None:
+            groups.append([rows])
+        else:
+            group.append(rows)
+    return groups
+
+
+def _have_equal_settings(one: Kind, other: Kind) -> bool:
+    """Return whether two kinds are of one class and all their settings are equal."""
+    settings = [field.name for field in fields(cast(Any, one)) if field.init]
+    return type(one) is type(other) and all(
+        np.array_equal(getattr(one, s), getattr(other, s)) for s in settings
+    )

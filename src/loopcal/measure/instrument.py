@@ -5,29 +5,27 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loopcal.errors import DataError
+from loopcal.measure.array_checks import check_type, describe
 from loopcal.measure.kinds import Kind
 from loopcal.measure.noise import Noise
-from loopcal.measure.observations import indices, labels
+from loopcal.measure.observations import TextArray, check_labels, check_rows
 from loopcal.mechanism import Mechanism
-
-Ints = NDArray[np.intp]
-Texts = NDArray[np.str_]
+from loopcal.typing import IntArray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Sensor:
-    """One kind (with its frame), the noise of its noise columns, and what it looks at.
+    """One kind (with its frame), the noise of its noise columns, and the poses that it measures.
 
     Parameters
     ----------
     kind : Kind
     noise : Noise
     rows : (r,) or (r, l) int, optional
-        Poses of each row. Default: every pose once; where rows link poses, each with the next and
-        the last with the first.
+        Poses of each row. Default: every pose once. Where a row compares poses: each pose with the
+        next one, and the last with the first.
     session, group : text or (r,) text, optional
         See `Observations`.
 
@@ -39,11 +37,13 @@ class Sensor:
 
     kind: Kind
     noise: Noise
-    rows: Ints | None = None
-    session: Texts = field(default_factory=lambda: np.array(""))
-    group: Texts = field(default_factory=lambda: np.array(""))
+    rows: IntArray | None = None
+    session: TextArray = field(default_factory=lambda: np.array(""))
+    group: TextArray = field(default_factory=lambda: np.array(""))
 
     def __post_init__(self) -> None:
+        check_type(self.kind, Kind, "kind", "such as loopcal.Pose()")
+        check_type(self.noise, Noise, "noise", "such as loopcal.Gaussian([...])")
         names = ", ".join(column.name for column in self.kind.noise_columns)
         if len(self.noise.sigma) != len(self.kind.noise_columns):
             raise DataError(
@@ -51,37 +51,50 @@ class Sensor:
                 f"one for each of {names}"
             )
 
+    def __repr__(self) -> str:
+        rows = "" if self.rows is None else f", {len(self.rows)} rows"
+        return f"Sensor({self.kind!r}, {self.noise!r}{rows})"
+
     def assign_rows(self, n_poses: int) -> Self:
-        """The sensor with its rows, sessions and groups spelt out for n poses; DataError where a
-        pose is not there.
+        """Return the sensor with explicit rows, sessions and groups for n poses; DataError where a
+        pose does not exist.
         """
         rows = self._rows(n_poses)
         if rows.size and (rows.min() < 0 or rows.max() >= n_poses):
             raise DataError(
-                f"the kind {self.kind.name!r} is to see poses up to {int(rows.max())} of 0 to "
-                f"{n_poses - 1}; correct it"
+                f"the rows of kind {self.kind.name!r} refer to pose {int(rows.max())}, but the "
+                f"{n_poses} poses are 0 to {n_poses - 1}; correct the rows"
             )
-        spread = {
-            name: labels(getattr(self, name), len(rows), name) for name in ("session", "group")
+        names = {
+            name: check_labels(getattr(self, name), len(rows), name)
+            for name in ("session", "group")
         }
-        return replace(self, rows=rows, **spread)
+        return replace(self, rows=rows, **names)
 
-    def _rows(self, n: int) -> Ints:
+    @property
+    def assigned_rows(self) -> IntArray:
+        """Rows of a sensor from `assign_rows`; DataError where they are still implicit."""
+        if self.rows is None:
+            raise DataError("the sensor has no rows yet; use sensor.assign_rows(n_poses)")
+        return self.rows
+
+    def _rows(self, n: int) -> IntArray:
         if self.rows is not None:
-            return indices(self.rows, self.kind)
+            return check_rows(self.rows, self.kind)
         if self.kind.poses_per_row == 1:
             return np.arange(n)
         if n < 2:
             raise DataError(
-                f"the kind {self.kind.name!r} compares poses, but there is {n}; give at least 2"
+                f"a row of kind {self.kind.name!r} compares two poses, but the number of poses is "
+                f"{n}; give at least 2"
             )
         first = np.arange(n if n > 2 else 1)
         return np.stack([first, (first + 1) % n], axis=-1)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Instrument:
-    """What looks at every pose.
+    """The sensors that measure every pose.
 
     Parameters
     ----------
@@ -90,18 +103,29 @@ class Instrument:
     Raises
     ------
     DataError
-        If there is no sensor.
+        If it has no sensor.
     """
 
     sensors: tuple[Sensor, ...]
 
     def __post_init__(self) -> None:
+        if isinstance(self.sensors, (str, Sensor)):
+            raise DataError(
+                f"sensors: got {describe(self.sensors)}; give a tuple of sensors, such as (sensor,)"
+            )
         object.__setattr__(self, "sensors", tuple(self.sensors))
         if not self.sensors:
             raise DataError("an instrument needs at least one sensor: a kind and its noise")
+        for sensor in self.sensors:
+            check_type(sensor, Sensor, "sensors", "such as loopcal.Sensor(kind, noise)")
+
+    def __repr__(self) -> str:
+        sensors = "".join(f"  {sensor!r},\n" for sensor in self.sensors[:8])
+        more = f"  and {len(self.sensors) - 8} more\n" if len(self.sensors) > 8 else ""
+        return f"Instrument((\n{sensors}{more}))"
 
     def with_tool(self, robot: Mechanism) -> Self:
-        """The instrument with the robot's tool, wherever a kind states none of its own."""
+        """Return the instrument with the robot's tool, wherever a kind does not state one."""
         return type(self)(
             tuple(replace(s, kind=s.kind.with_tool(robot.tool)) for s in self.sensors)
         )

@@ -1,23 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements: the readings of the actuators at n poses, and what the instruments saw there."""
+"""Measurements: the actuator readings at n poses, and the observations made at them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
-from loopcal.measure.arrays import stored
+from loopcal.measure.array_checks import check_array, check_type, describe
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
-from loopcal.typing import FloatArray
-
-Ints = NDArray[np.intp]
+from loopcal.typing import FloatArray, IntArray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Measurements:
     """Everything measured on one robot.
 
@@ -29,40 +27,37 @@ class Measurements:
     observations : tuple of Observations
         Their rows are indices of poses.
     block : (n,) int, optional
-        Poses of equal number belong together (a repeat, a shared covariance) and are never split.
-        Default: each alone.
+        Poses of equal number belong together (repeats, a shared covariance) and are never split.
+        Default: each pose is a block.
     labels : tuple of str, optional
         Names of the poses, for messages and tables. Default "1", "2", ...
-    reading_sigma : (n, a) or what spreads to it [SI], optional
-        Standard deviation of each reading: 0 is exact, infinite was not taken or is not believed. A
-        reading may be NaN exactly where this is infinite. Default None: exact, but where the robot
-        states the sigma of its actuators.
+    reading_sigma : (n, a) or an array that broadcasts to it [SI], optional
+        Standard deviation of each reading: 0 is exact, infinity is missing or ignored. A reading
+        may be NaN only where its sigma is infinite. Default None: exact, unless the robot states
+        the sigma of its actuators.
     stated_values : tuple of StatedValue, optional
-        Priors and fixed values of unknowns that the observations bring with them. Default: all are
-        left to the data.
+        Priors and fixed values of nuisance parameters. Default: all are estimated from the data.
 
     Raises
     ------
     DataError
-        If shapes differ, a reading is not finite though it has a sigma, a sigma is negative, or a
-        row refers to a pose that is not there.
+        If shapes differ, a reading is not finite though its sigma is, a sigma is negative, or a row
+        refers to a pose that does not exist.
     """
 
     robot_name: str
     readings: FloatArray
     observations: tuple[Observations, ...]
-    block: Ints = field(default_factory=lambda: np.empty(0, dtype=np.intp))
+    block: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.intp))
     labels: tuple[str, ...] = ()
     reading_sigma: FloatArray | None = None
     stated_values: tuple[StatedValue, ...] = ()
 
     def __post_init__(self) -> None:
-        readings = _readings(self.readings, self.reading_sigma is not None)
+        readings = _check_readings(self.readings, self.reading_sigma is not None)
         n = len(readings)
         if n == 0:
-            raise DataError(
-                "there is no pose in these measurements; give at least one row of readings"
-            )
+            raise DataError("the measurements have no pose; give at least one row of readings")
         block = np.array(self.block if len(self.block) else np.arange(n))
         if block.shape != (n,) or not np.issubdtype(block.dtype, np.integer):
             raise DataError(
@@ -72,9 +67,16 @@ class Measurements:
         block.setflags(write=False)
         labels = tuple(self.labels) or tuple(str(i + 1) for i in range(n))
         if len(labels) != n:
-            raise DataError(f"there are {len(labels)} labels for {n} poses; give one for each")
+            raise DataError(f"{len(labels)} labels for {n} poses; give one for each")
+        if isinstance(self.observations, Observations):
+            raise DataError(
+                "observations: got a single Observations; give a tuple, such as (observations,)"
+            )
         for rows in self.observations:
-            _check_rows(rows, n)
+            check_type(
+                rows, Observations, "observations", "such as loopcal.Observations.from_sigma(...)"
+            )
+            _check_poses(rows, n)
         values = {
             "readings": readings,
             "block": block,
@@ -82,9 +84,19 @@ class Measurements:
             "observations": tuple(self.observations),
         }
         if self.reading_sigma is not None:
-            values["reading_sigma"] = _reading_sigma(self.reading_sigma, readings, labels)
+            values["reading_sigma"] = _check_reading_sigma(self.reading_sigma, readings, labels)
         for name, value in values.items():
             object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        n, a = self.readings.shape
+        lines = [f"Measurements of {self.robot_name!r}: {n} poses, {a} actuator readings each"]
+        lines += [f"  {rows!r}" for rows in self.observations[:8]]
+        if len(self.observations) > 8:
+            lines.append(f"  and {len(self.observations) - 8} more")
+        if self.reading_sigma is not None:
+            lines.append("  with uncertain readings")
+        return "\n".join(lines)
 
     @property
     def n_poses(self) -> int:
@@ -98,32 +110,31 @@ class Measurements:
 
     @property
     def nuisance_parameters(self) -> NuisanceParameters:
-        """The unknowns that the observations bring with them, with what is known of them."""
+        """The nuisance parameters of the observations, with their stated values."""
         return collect_nuisance_parameters(self.observations, self.labels, self.stated_values)
 
     @property
     def context(self) -> Mapping[str, FloatArray]:
-        """Time [s] and temperatures [degC] by name, (n,): the mean over the rows that saw a pose,
-        NaN where none says.
+        """Time [s] and temperatures [degC] by name, (n,): the mean over the rows of a pose, NaN
+        where no row states one.
         """
-        found: dict[str, FloatArray] = {}
+        means: dict[str, FloatArray] = {}
         for name in dict.fromkeys(name for rows in self.observations for name in rows.context):
             total, count = np.zeros(self.n_poses), np.zeros(self.n_poses)
             for rows in (rows for rows in self.observations if name in rows.context):
                 values = np.broadcast_to(
                     rows.context[name][:, None], (len(rows), rows.kind.poses_per_row)
                 )
-                there = ~np.isnan(values)
-                np.add.at(total, rows.rows.reshape(values.shape)[there], values[there])
-                np.add.at(count, rows.rows.reshape(values.shape)[there], 1.0)
-            found[name] = np.divide(
+                present = ~np.isnan(values)
+                np.add.at(total, rows.rows.reshape(values.shape)[present], values[present])
+                np.add.at(count, rows.rows.reshape(values.shape)[present], 1.0)
+            means[name] = np.divide(
                 total, count, out=np.full(self.n_poses, np.nan), where=count > 0.0
             )
-        return found
+        return means
 
     def take(self, poses: ArrayLike) -> Self:
-        """Measurements of these poses alone, in this order; rows that need any other pose are left
-        out.
+        """Return the measurements of these poses, in this order, without rows of any other pose.
 
         Parameters
         ----------
@@ -136,112 +147,104 @@ class Measurements:
         Raises
         ------
         DataError
-            If a pose is not there, is named twice, or none is left.
+            If a pose does not exist, is named twice, or none is left.
         """
-        asked = np.asarray(poses)
-        chosen = np.flatnonzero(asked) if asked.dtype == bool else asked.astype(np.intp)
+        given = np.asarray(poses)
+        chosen = np.flatnonzero(given) if given.dtype == bool else given.astype(np.intp)
         outside = (chosen < 0) | (chosen >= self.n_poses)
         if np.any(outside) or len(np.unique(chosen)) < len(chosen) or not len(chosen):
             raise DataError(
-                f"cannot take poses {chosen.tolist()}: name some of 0 to {self.n_poses - 1}, each "
-                "once"
+                f"cannot take poses {chosen.tolist()}; give at least one of 0 to "
+                f"{self.n_poses - 1}, each once"
             )
         place = np.full(self.n_poses, -1)
         place[chosen] = np.arange(len(chosen))
         return replace(
             self,
             readings=self.readings[chosen],
-            observations=tuple(_moved(rows, place) for rows in self.observations),
+            observations=tuple(_renumber_poses(rows, place) for rows in self.observations),
             block=self.block[chosen],
             labels=tuple(self.labels[i] for i in chosen),
             reading_sigma=None if self.reading_sigma is None else self.reading_sigma[chosen],
         )
 
-    def split(self, fraction: float, seed: int) -> tuple[Self, Self]:
-        """Two parts, one to fit and one held out, by whole blocks drawn at random.
+    def split(self, share: float, seed: int) -> tuple[Self, Self]:
+        """Split the poses at random into a set to fit and a held-out set.
+
+        Blocks are not split. The poses of each set keep their order.
 
         Parameters
         ----------
-        fraction : float
-            Share of the poses in the first part, as nearly as whole blocks allow; both parts get at
-            least one block.
+        share : float
+            Share of the poses that is fitted (0.75 fits three poses of four), as nearly as whole
+            blocks allow; both sets get at least one block.
         seed : int
-            The same seed gives the same parts.
+            The same seed gives the same sets.
 
         Returns
         -------
-        fit, held_out : Measurements
-            Poses in their old order.
+        fitted, held_out : Measurements
 
         Raises
         ------
         DataError
-            If the fraction is not between 0 and 1, or there is only one block.
+            If the share is not between 0 and 1, or all poses are in one block.
         """
-        if not 0.0 < fraction < 1.0:
+        if not 0.0 < share < 1.0:
             raise DataError(
-                f"cannot split at {fraction}: give the share of the fit, above 0 and below 1, such "
-                "as 0.75"
+                f"cannot split at {share}; give the share of the poses that is fitted, above 0 and "
+                "below 1, such as 0.75"
             )
         names, member, sizes = np.unique(self.block, return_inverse=True, return_counts=True)
         if len(names) < 2:
             raise DataError(
-                "cannot split measurements of a single block; measure more poses, or state finer "
+                "cannot split measurements of a single block; measure more poses, or state smaller "
                 "blocks"
             )
         order = np.random.default_rng(np.random.SeedSequence(seed)).permutation(len(names))
-        missed = np.abs(np.cumsum(sizes[order])[:-1] - fraction * self.n_poses)
-        fit = np.isin(member, order[: int(np.argmin(missed)) + 1])
-        return self.take(fit), self.take(~fit)
+        error = np.abs(np.cumsum(sizes[order])[:-1] - share * self.n_poses)
+        fitted = np.isin(member, order[: int(np.argmin(error)) + 1])
+        return self.take(fitted), self.take(~fitted)
 
     def with_weights(self, weight: ArrayLike) -> Self:
-        """The same measurements with one weight (n,) for each pose; a row that links poses takes
-        their product.
+        """Return the same measurements with one weight (n,) for each pose.
 
-        Readings that have a sigma are weighted like the rows of their pose: sigma / sqrt(weight).
-        For a weight of each row use `Observations.with_weights`.
+        A row that compares poses gets the product of their weights. Uncertain readings are weighted
+        like the rows of their pose: sigma / sqrt(weight). `Observations.with_weights` weights
+        single rows.
 
         Raises
         ------
         DataError
-            If there is not one weight for each pose, or one is negative.
+            If the number of weights is not that of the poses, or one is negative.
         """
-        given = stored(weight, "the weight of the poses", (self.n_poses,))
-        parts = tuple(
+        given = check_array(weight, "the weight of the poses", (self.n_poses,))
+        observations = tuple(
             rows.with_weights(given[rows.rows].reshape(len(rows), -1).prod(axis=1))
             for rows in self.observations
         )
         return replace(
-            self, observations=parts, reading_sigma=weight_reading_sigma(self.reading_sigma, given)
+            self,
+            observations=observations,
+            reading_sigma=weight_reading_sigma(self.reading_sigma, given),
         )
 
 
-def _readings(readings: ArrayLike, uncertain: bool) -> FloatArray:
-    """Checked, read-only readings (n, a); NaN stands for one that was not taken, which needs a
-    sigma.
-    """
-    try:
-        return stored(readings, "readings", (None, None), allow_nan=uncertain)
-    except DataError as error:
-        if not uncertain and np.isnan(np.asarray(readings, dtype=float)).any():
-            raise DataError(f"{error}, or, where it was not taken, reading_sigma = inf") from None
-        raise
-
-
 def weight_reading_sigma(sigma: FloatArray | None, weight: FloatArray) -> FloatArray | None:
-    """Standard deviations (n, a) of readings whose squares count by a weight (n,): infinite for 0;
-    exact ones stay exact.
+    """Return standard deviations (n, a) of readings whose squares count by a weight (n,).
+
+    A weight of 0 makes them infinite; exact readings stay exact.
     """
     if sigma is None:
         return None
     root = np.sqrt(weight)[:, None]
-    apart = np.divide(sigma, root, out=np.full(sigma.shape, np.inf), where=root > 0.0)
-    return np.where(sigma == 0.0, 0.0, apart)
+    weighted = np.divide(sigma, root, out=np.full(sigma.shape, np.inf), where=root > 0.0)
+    return np.where(sigma == 0.0, 0.0, weighted)
 
 
 def broadcast_reading_sigma(sigma: ArrayLike, readings: FloatArray) -> FloatArray:
-    """Standard deviations (n, a) of readings (n, a) from what spreads to them; DataError where that
-    does not fit.
+    """Return standard deviations (n, a) of readings (n, a) from what broadcasts to them; DataError
+    where it does not fit.
     """
     try:
         if np.iscomplexobj(sigma):
@@ -256,49 +259,67 @@ def broadcast_reading_sigma(sigma: ArrayLike, readings: FloatArray) -> FloatArra
     except ValueError:
         raise DataError(
             f"reading_sigma has shape {given.shape}; give one number, or one for each of the "
-            f"{readings.shape[1]} actuators,"
-            f" or one for each of the {readings.shape[0]} x {readings.shape[1]} readings"
+            f"{readings.shape[1]} actuators, or one for each of the {readings.shape[0]} x "
+            f"{readings.shape[1]} readings"
         ) from None
 
 
-def _reading_sigma(sigma: ArrayLike, readings: FloatArray, labels: tuple[str, ...]) -> FloatArray:
-    """Checked, read-only standard deviations (n, a) of the readings."""
-    spread = broadcast_reading_sigma(sigma, readings)
+def _check_readings(readings: ArrayLike, uncertain: bool) -> FloatArray:
+    """Return checked, read-only readings (n, a); NaN stands for a missing one and needs a sigma."""
+    if isinstance(readings, str):
+        raise DataError(
+            f"readings: got {describe(readings)}; give an array (n, a) in SI units; "
+            "loopcal.load_measurements reads a file"
+        )
+    try:
+        return check_array(readings, "readings", (None, None), allow_nan=uncertain)
+    except DataError as error:
+        if not uncertain and np.isnan(np.asarray(readings, dtype=float)).any():
+            raise DataError(f"{error}, or reading_sigma = inf where it is missing") from None
+        raise
+
+
+def _check_reading_sigma(
+    sigma: ArrayLike, readings: FloatArray, labels: tuple[str, ...]
+) -> FloatArray:
+    """Return checked, read-only standard deviations (n, a) of the readings."""
+    checked = broadcast_reading_sigma(sigma, readings)
     for wrong, what in (
         (
-            ~(spread >= 0.0),
-            "is no standard deviation; give 0 (exact), a positive number, or infinity (not taken)",
+            ~(checked >= 0.0),
+            "is not a standard deviation; give 0 (exact), a positive number, or infinity (missing)",
         ),
         (
-            np.isnan(readings) & np.isfinite(spread),
-            "belongs to a reading that is not there; give the reading, or infinity",
+            np.isnan(readings) & np.isfinite(checked),
+            "belongs to a missing reading; give the reading, or infinity",
         ),
     ):
         if np.any(wrong):
             pose, column = (int(i) for i in np.argwhere(wrong)[0])
-            value = f"{spread[pose, column]:.6g}"
+            value = f"{checked[pose, column]:.6g}"
             raise DataError(
                 f"pose {labels[pose]!r}: the sigma {value} [m or rad] of reading {column + 1} "
                 f"{what}"
             )
-    spread.setflags(write=False)
-    return spread
+    checked.setflags(write=False)
+    return checked
 
 
-def _check_rows(rows: Observations, n: int) -> None:
+def _check_poses(rows: Observations, n: int) -> None:
     absent = (rows.rows < 0) | (rows.rows >= n)
     if np.any(absent):
         place = int(np.argwhere(absent)[0][0])
         index = int(rows.rows[absent][0])
         raise DataError(
             f"row {place + 1} of kind {rows.kind.name!r} refers to pose {index}, but the {n} poses "
-            f"are 0 to {n - 1};"
-            " correct the row or add the pose's readings"
+            f"are 0 to {n - 1}; correct the row, or add the readings of the pose"
         )
 
 
-def _moved(rows: Observations, place: Ints) -> Observations:
-    """Rows whose poses are all kept, with their new indices; `place` (n,) is -1 for poses that go."""
+def _renumber_poses(rows: Observations, place: IntArray) -> Observations:
+    """Return the rows whose poses are all kept, with their new indices; `place` (n,) is -1 for
+    poses that are dropped.
+    """
     target = place[rows.rows]
     kept = np.all(target.reshape(len(rows), -1) >= 0, axis=1)
     return replace(rows.take(kept), rows=target[kept])

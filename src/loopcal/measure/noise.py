@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
-from loopcal.measure.arrays import stored
+from loopcal.measure.array_checks import check_array
 from loopcal.typing import FloatArray
 
 
@@ -22,14 +22,14 @@ class Noise(ABC):
 
     @abstractmethod
     def draw(self, generator: np.random.Generator, n: int) -> FloatArray:
-        """Noise of n rows, (n, m) [SI]."""
+        """Return noise of n rows, (n, m) [SI]."""
 
 
-def _positive(value: ArrayLike, what: str) -> FloatArray:
-    array = stored(value, what, (None,))
+def _check_positive(value: ArrayLike, what: str) -> FloatArray:
+    array = check_array(value, what, (None,))
     if np.any(array <= 0.0):
         raise DataError(
-            f"{what} holds {float(np.min(array)):.6g}; give a number above 0 for each column"
+            f"{what} contains {float(np.min(array)):.6g}; give a number above 0 for each column"
         )
     return array
 
@@ -41,7 +41,10 @@ class Gaussian(Noise):
     sd: FloatArray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "sd", _positive(self.sd, "the sigma of the noise"))
+        object.__setattr__(self, "sd", _check_positive(self.sd, "the sigma of the noise"))
+
+    def __repr__(self) -> str:
+        return f"Gaussian({self.sd.tolist()})"
 
     @property
     def sigma(self) -> FloatArray:
@@ -49,20 +52,23 @@ class Gaussian(Noise):
         return self.sd
 
     def draw(self, generator: np.random.Generator, n: int) -> FloatArray:
-        """Noise of n rows, (n, m) [SI]."""
+        """Return noise of n rows, (n, m) [SI]."""
         return generator.standard_normal((n, len(self.sd))) * self.sd
 
 
 @dataclass(frozen=True, eq=False)
 class Uniform(Noise):
-    """Noise anywhere between -limit and +limit (m,) [SI]: sigma = limit / sqrt(3); DataError unless
-    each is above 0.
+    """Uniform noise between -limit and +limit (m,) [SI], with sigma = limit / sqrt(3); DataError
+    unless each is above 0.
     """
 
     limit: FloatArray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "limit", _positive(self.limit, "the limits of the noise"))
+        object.__setattr__(self, "limit", _check_positive(self.limit, "the limits of the noise"))
+
+    def __repr__(self) -> str:
+        return f"Uniform({self.limit.tolist()})"
 
     @property
     def sigma(self) -> FloatArray:
@@ -70,21 +76,21 @@ class Uniform(Noise):
         return self.limit / np.sqrt(3.0)
 
     def draw(self, generator: np.random.Generator, n: int) -> FloatArray:
-        """Noise of n rows, (n, m) [SI]."""
+        """Return noise of n rows, (n, m) [SI]."""
         return generator.uniform(-1.0, 1.0, (n, len(self.limit))) * self.limit
 
 
 def make_random_stream(seed: int, trial: int, purpose: int = 0) -> np.random.Generator:
-    """Generator of one trial of a study; depends on nothing but these three numbers.
+    """Return the generator of one trial of a study, a function of these three numbers only.
 
     Parameters
     ----------
     seed : int
         Of the study.
     trial : int
-        Counted from 0; a trial gets the same numbers however many others there are.
+        Counted from 0. A trial gets the same numbers for any number of trials.
     purpose : int
-        Keeps apart what one trial draws: 0 noise, 1 true values.
+        Separates what one trial draws: 0 noise, 1 true values, 2 noise of readings.
 
     Returns
     -------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of one kind: which pose each saw, what it read, and how far to believe it."""
+"""Observations: measured rows of one kind, with their poses and covariances."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -9,102 +9,104 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loopcal.errors import DataError
-from loopcal.measure.arrays import stored
+from loopcal.measure.array_checks import check_array, check_type, describe
 from loopcal.measure.kinds import Evaluation, Kind
 from loopcal.measure.whitening import whitener
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
-Ints = NDArray[np.intp]
-Bools = BoolArray
-Texts = NDArray[np.str_]
+TextArray = NDArray[np.str_]
+"""Names of sessions or groups."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Observations:
-    """Rows of one kind. Absence never changes a shape: a component that is NaN, or a row of weight
-    0, whitens to zero.
+    """Rows of one kind.
+
+    Missing values never change a shape: a component that is NaN, or a row of weight 0, has whitened
+    residuals of zero.
 
     Parameters
     ----------
     kind : Kind
-        Mounted on the robot's tool, see `Kind.with_tool`.
+        With the robot's tool, see `Kind.with_tool`.
     rows : (r,) int
-        Index of the pose each row saw ((r, l) for kinds that compare several poses).
+        Index of the pose of each row; (r, l) for kinds that compare l poses.
     measured : (r, c) [SI]
         NaN where not measured.
     covariance : (r, m, m) or (m, m) [SI]
-        Of the residuals, see `from_sigma` and `Kind.linearize_noise`; entries of absent components are
-        not looked at.
+        Of the residuals, see `from_sigma` and `Kind.linearize_noise`. Entries of missing components
+        are ignored.
     weight : (r,), optional
-        Factor of the squared whitened residual; 0 makes a row absent. Default 1.
+        Factor of the squared whitened residual; 0 excludes a row. Default 1.
     session, group : text or (r,) text, optional
-        Rows of one session share the kind's frames and targets, rows of one group its surface.
-        Default: one of each, without a name.
+        Rows of one session share frames and targets, rows of one group share a surface. Default:
+        one session and one group, without names.
     context : name -> (r,), optional
-        What stood beside each row and enters no equation: `time` [s], `temperature` and
-        `temperature.PLACE` [degC], NaN where it was not noted.
+        Notes to each row that enter no equation: `time` [s], `temperature` and `temperature.PLACE`
+        [degC], NaN where missing.
 
     Attributes
     ----------
     present : (r, m) bool
-        Residuals that can be formed; a row of weight 0 keeps its own here.
+        Residuals that exist; also those of rows of weight 0.
     whitener : (r, m, m)
-        Inverse lower Cholesky factor of the covariance of what is present, times the root of the
-        weight.
+        Inverse lower Cholesky factor of the covariance of the present components, times the root of
+        the weight.
 
     Raises
     ------
     DataError
         If shapes do not fit the kind, a number is infinite, a covariance is not positive definite,
-        a weight is negative, a row links a pose with itself, or the kind doubts a row.
+        a weight is negative, a row compares a pose with itself, or the kind finds a row invalid.
     """
 
     kind: Kind
-    rows: Ints
+    rows: IntArray
     measured: FloatArray
     covariance: FloatArray
     weight: FloatArray = field(default_factory=lambda: np.array(1.0))
-    session: Texts = field(default_factory=lambda: np.array(""))
-    group: Texts = field(default_factory=lambda: np.array(""))
+    session: TextArray = field(default_factory=lambda: np.array(""))
+    group: TextArray = field(default_factory=lambda: np.array(""))
     context: Mapping[str, FloatArray] = field(default_factory=dict)
-    present: Bools = field(init=False, repr=False)
-    whitener: FloatArray = field(init=False, repr=False)
+    present: BoolArray = field(init=False)
+    whitener: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         kind = self.kind
+        check_type(kind, Kind, "kind", "such as loopcal.Pose()")
         if not kind.has_tool:
-            raise DataError(
-                f"the kind {kind.name!r} has no tool yet; use kind.with_tool(robot.tool)"
-            )
-        rows = indices(self.rows, kind)
+            raise DataError(f"the kind {kind.name!r} has no tool; use kind.with_tool(robot.tool)")
+        rows = check_rows(self.rows, kind)
         c, m, r = len(kind.columns), len(kind.noise_columns), len(rows)
-        measured = stored(
+        measured = check_array(
             self.measured, f"measured values of kind {kind.name!r}", (r, c), allow_nan=True
         )
-        weight = stored(
-            _spread(self.weight, (r,), "the weight", f"one number for each of {r} rows"),
+        weight = check_array(
+            _broadcast(self.weight, (r,), "the weight", f"one number for each of {r} rows"),
             "the weight",
             (r,),
         )
         if np.any(weight < 0.0):
             i = int(np.flatnonzero(weight < 0.0)[0])
             raise DataError(
-                f"the weight of row {i + 1} is {weight[i]:.6g}; use 0 to leave a row out, or a "
-                "positive number"
+                f"the weight of row {i + 1} is {weight[i]:.6g}; give a positive number, or 0 to "
+                "exclude the row"
             )
-        for i, doubt in kind.find_invalid_rows(measured):
-            raise DataError(f"row {i + 1} of kind {kind.name!r} {doubt}")
+        for i, problem in kind.find_invalid_rows(measured):
+            raise DataError(f"row {i + 1} of kind {kind.name!r} {problem}")
         present = kind.detect_present(measured)
-        covariance = _spread(
+        covariance = _broadcast(
             self.covariance, (r, m, m), "covariance", f"({r}, {m}, {m}) or ({m}, {m})"
         )
         W = whitener(covariance, present, weight)
         for array in (rows, covariance, present, W):
             array.setflags(write=False)
         values = {"rows": rows, "measured": measured, "covariance": covariance, "weight": weight}
-        values |= {name: labels(getattr(self, name), r, name) for name in ("session", "group")}
+        values |= {
+            name: check_labels(getattr(self, name), r, name) for name in ("session", "group")
+        }
         context = {
-            name: stored(v, f"the context {name!r}", (r,), allow_nan=True)
+            name: check_array(v, f"the context {name!r}", (r,), allow_nan=True)
             for name, v in self.context.items()
         }
         for name, array in {
@@ -122,11 +124,12 @@ class Observations:
         rows: ArrayLike,
         measured: ArrayLike,
         sigma: ArrayLike,
-        session: str | Texts = "",
-        group: str | Texts = "",
+        session: str | TextArray = "",
+        group: str | TextArray = "",
     ) -> Self:
-        """Rows with independent noise of the kind's noise columns, mapped to the residuals by `N
-        diag(sigma^2) N'`.
+        """Return rows with independent noise of the kind's noise columns.
+
+        With N from `Kind.linearize_noise`, the covariance of the residuals is `N diag(sigma^2) N'`.
 
         Parameters
         ----------
@@ -146,12 +149,23 @@ class Observations:
         DataError
             As the class, and if sigma does not have one number for each noise column.
         """
-        values = np.asarray(measured, dtype=float)
+        check_type(kind, Kind, "kind", "such as loopcal.Pose()")
+        try:
+            values = np.asarray(measured, dtype=float)
+        except (TypeError, ValueError):
+            raise DataError(
+                f"measured: got {describe(measured)}; give an array of numbers (r, "
+                f"{len(kind.columns)}) in SI units; loopcal.load_measurements reads files"
+            ) from None
         names = ", ".join(column.name for column in kind.noise_columns)
-        shape = (len(values), len(kind.noise_columns))
-        sd = _spread(sigma, shape, "sigma", f"one number, or one for each of {names}")
         if values.ndim != 2 or values.shape[1] != len(kind.columns):
-            raise _wrong_columns(kind, values.shape)
+            columns = ", ".join(column.name for column in kind.columns)
+            raise DataError(
+                f"measured values of kind {kind.name!r} have shape {values.shape}; give (r, "
+                f"{len(kind.columns)}): {columns}"
+            )
+        shape = (len(values), len(kind.noise_columns))
+        sd = _broadcast(sigma, shape, "sigma", f"one number, or one for each of {names}")
         N = kind.linearize_noise(values)
         covariance = (N * (sd * sd)[:, None, :]) @ np.swapaxes(N, -1, -2)
         return cls(
@@ -166,31 +180,40 @@ class Observations:
     def __len__(self) -> int:
         return len(self.rows)
 
+    def __repr__(self) -> str:
+        counts = [f"{len(self)} rows", f"{self.n_residuals} residuals"]
+        for name in ("session", "group"):
+            names = [text for text in np.unique(getattr(self, name)).tolist() if text]
+            if names:
+                more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+                counts.append(f"{name} {', '.join(names[:4])}{more}")
+        return f"Observations({self.kind!r}: {'; '.join(counts)})"
+
     @property
     def n_residuals(self) -> int:
-        """How many residuals count: present, in rows of weight above 0."""
+        """Number of residuals that count: present, in rows of weight above 0."""
         return int(np.count_nonzero(self.present & (self.weight > 0.0)[:, None]))
 
     def evaluate(
-        self, T: FloatArray, unknowns: FloatArray | None = None, joints: FloatArray | None = None
+        self, T: FloatArray, nuisance: FloatArray | None = None, joints: FloatArray | None = None
     ) -> Evaluation:
-        """Residuals and derivatives of all rows at the poses of all n readings.
+        """Return residuals and derivatives of all rows at the poses of all n readings.
 
         Parameters
         ----------
         T : (t, n, 4, 4)
             T_base_platform of each pose.
-        unknowns : (t or 1, r or 1, u), optional
+        nuisance : (t or 1, r or 1, u), optional
         joints : (t, r, j), optional
 
         Returns
         -------
         Evaluation
         """
-        return self.kind.evaluate(T[:, self.rows], self.measured[None], unknowns, joints)
+        return self.kind.evaluate(T[:, self.rows], self.measured[None], nuisance, joints)
 
     def take(self, keep: ArrayLike) -> Self:
-        """The rows at these positions (or of this mask)."""
+        """Return the rows at these indices, or of this mask."""
         chosen = np.asarray(keep)
         return replace(
             self,
@@ -204,12 +227,12 @@ class Observations:
         )
 
     def with_weights(self, weight: ArrayLike) -> Self:
-        """The same rows with other weights (r,)."""
+        """Return the same rows with other weights (r,)."""
         return replace(self, weight=np.asarray(weight, dtype=float))
 
 
-def indices(rows: ArrayLike, kind: Kind) -> Ints:
-    """Checked copy of the pose indices (r,) or (r, l)."""
+def check_rows(rows: ArrayLike, kind: Kind) -> IntArray:
+    """Return a checked copy of the pose indices (r,) or (r, l)."""
     given = np.array(rows)
     wanted = 1 if kind.poses_per_row == 1 else 2
     whole = np.issubdtype(given.dtype, np.integer) or given.size == 0
@@ -217,44 +240,38 @@ def indices(rows: ArrayLike, kind: Kind) -> Ints:
         shape = "(r,)" if wanted == 1 else f"(r, {kind.poses_per_row})"
         raise DataError(
             f"rows of kind {kind.name!r} have shape {given.shape} and type {given.dtype}; give "
-            "whole numbers of shape"
-            f" {shape}: the index of the pose each row saw"
+            f"whole numbers of shape {shape}: the index of the pose of each row"
         )
     if wanted == 2:
         same = np.flatnonzero(given[:, 0] == given[:, 1])
         if len(same):
             raise DataError(
-                f"row {int(same[0]) + 1} of kind {kind.name!r} links pose {int(given[same[0], 0])} "
-                "with itself; name two poses"
+                f"row {int(same[0]) + 1} of kind {kind.name!r} compares pose "
+                f"{int(given[same[0], 0])} with itself; give two different poses"
             )
     return given.astype(np.intp)
 
 
-def labels(value: ArrayLike, r: int, what: str) -> Texts:
-    """Read-only labels (r,) from one text or one for each row."""
+def check_labels(value: ArrayLike, r: int, what: str) -> TextArray:
+    """Return read-only labels (r,) from one text or one for each row."""
     given = np.asarray(value)
     if given.dtype.kind != "U" or given.shape not in ((), (r,)):
         raise DataError(
             f"the {what} has shape {given.shape} and type {given.dtype}; give one text, or one for "
             f"each of {r} rows"
         )
-    spread = np.array(np.broadcast_to(given, (r,)))
-    spread.setflags(write=False)
-    return spread
+    labels = np.array(np.broadcast_to(given, (r,)))
+    labels.setflags(write=False)
+    return labels
 
 
-def _spread(value: ArrayLike, shape: tuple[int, ...], what: str, wanted: str) -> FloatArray:
-    """Copy of an array spread over a shape; DataError where it does not fit."""
-    given = np.asarray(value, dtype=float)
+def _broadcast(value: ArrayLike, shape: tuple[int, ...], what: str, wanted: str) -> FloatArray:
+    """Return a copy of an array, broadcast to a shape; DataError where it does not fit."""
+    try:
+        given = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise DataError(f"{what}: got {describe(value)}; give {wanted}") from None
     try:
         return np.array(np.broadcast_to(given, shape))
     except ValueError:
         raise DataError(f"{what} has shape {given.shape}; give {wanted}") from None
-
-
-def _wrong_columns(kind: Kind, shape: tuple[int, ...]) -> DataError:
-    names = ", ".join(column.name for column in kind.columns)
-    return DataError(
-        f"measured values of kind {kind.name!r} have shape {shape}; give (r, {len(kind.columns)}): "
-        f"{names}"
-    )

@@ -1,84 +1,146 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readings that are not exact: how far each is believed, and the recorded reading as a measurement
-of the true one.
+"""Actuator readings: from commanded poses, their standard deviations, and values of joints.
 
-An encoder is an instrument like any other: it shows the true reading and an error of stated sigma.
-Its kind is made from the robot and never written into a file, where a reading is a column of its
-pose.
+A reading may be exact or uncertain. An uncertain reading is a measurement of the true one, by the
+kind `ActuatorReadings`.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from loopcal.errors import DataError
-from loopcal.measure.kinds.kind import Column, Evaluation, Kind
+from loopcal.engine import State
+from loopcal.errors import DataError, suggest_names
+from loopcal.measure.kinds import ActuatorReadings, Kind
 from loopcal.measure.measurements import Measurements
-from loopcal.mechanism import Mechanism
+from loopcal.mechanism import Mechanism, Solution, inverse
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
-BEYOND = 1e6
-"""Sigma of a reading, in sizes of the robot or radians, that says no more than infinity does."""
+LARGEST_SIGMA = 1e6
+"""Largest finite sigma of a reading, in sizes of the robot or radians."""
 
 
-@dataclass(frozen=True, eq=False)
-class Readings(Kind):
-    """Readings of all actuators. Residual: `true - recorded`; a turn more is an error of a turn.
+# --- commanded poses
+
+
+def solve_commanded_readings(
+    controller: Mechanism, commanded: ArrayLike, labels: tuple[str, ...] = ()
+) -> FloatArray:
+    """Return the actuator readings that a controller computes for commanded poses.
 
     Parameters
     ----------
-    actuators : name -> dimension, in the order of the readings.
+    controller : Mechanism
+        The geometry that the controller uses, usually the nominal robot.
+    commanded : (n, 4, 4) T_base_platform, or (n, c) controlled coordinates [SI]
+    labels : tuple of str, optional
+        Names of the poses for messages; default "1", "2", ...
+
+    Returns
+    -------
+    readings : (n, a) [SI]
+
+    Raises
+    ------
+    DataError
+        If the controller's geometry does not reach a pose.
     """
-
-    name: ClassVar[str] = "readings"
-    description: ClassVar[str] = "the readings of the actuators"
-    actuators: Mapping[str, Dimension]
-
-    @classmethod
-    def examples(cls) -> tuple[Self, ...]:
-        """A slide and a motor."""
-        return (cls({"q1": Dimension.LENGTH, "q2": Dimension.ANGLE}),)
-
-    @property
-    def columns(self) -> tuple[Column, ...]:
-        """One for each actuator."""
-        return tuple(Column(name, dimension) for name, dimension in self.actuators.items())
-
-    @property
-    def sensed_joints(self) -> tuple[str, ...]:
-        """The actuators."""
-        return tuple(self.actuators)
-
-    def _evaluate(
-        self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
-    ) -> Evaluation:
-        residual = joints - measured
-        m = len(self.actuators)
-        slope = np.broadcast_to(np.eye(m), (*residual.shape, m))
-        return Evaluation(residual, np.zeros((*residual.shape, 6)), None, slope)
-
-    def measure(
-        self,
-        T: FloatArray,
-        noise: FloatArray,
-        unknowns: FloatArray | None = None,
-        joints: FloatArray | None = None,
-    ) -> FloatArray:
-        """Recorded readings (t, r, a)."""
-        return noise if joints is None else joints + noise
+    return solve_commanded_poses(controller, commanded, labels).q
 
 
-def make_readings_kind(robot: Mechanism) -> Readings:
-    """The kind of a robot's readings."""
-    return Readings({actuator.name: actuator.dimension for actuator in robot.actuators})
+def solve_commanded_poses(
+    controller: Mechanism, commanded: ArrayLike, labels: tuple[str, ...] = ()
+) -> Solution:
+    """Return readings, poses and passive joints for commanded poses, see
+    `solve_commanded_readings`.
+    """
+    solution = inverse(controller, commanded)
+    failed = np.flatnonzero(~solution.converged)
+    if len(failed):
+        first = int(failed[0])
+        name = labels[first] if labels else str(first + 1)
+        raise DataError(
+            f"{controller.name!r} does not reach commanded pose {name!r} ({len(failed)} of "
+            f"{len(solution.q)} fail): {solution.explain(first)}; correct the pose, or the "
+            "geometry of the controller"
+        )
+    return solution
+
+
+# --- values of joints
+
+
+def list_sensed_joints(kinds: Iterable[Kind]) -> tuple[str, ...]:
+    """Return the names of all joints that kinds sense, each once."""
+    return tuple(dict.fromkeys(name for kind in kinds for name in kind.sensed_joints))
+
+
+def select_joint_values(
+    robot: Mechanism, names: Iterable[str], readings: FloatArray, state: State
+) -> dict[str, FloatArray]:
+    """Return values of joints by name.
+
+    Parameters
+    ----------
+    robot : Mechanism
+    names : of actuators, whose value is their reading, or of passive joints as `limb.joint`.
+    readings : (t or 1, n, a) [SI]
+    state : of t trials and n poses
+
+    Returns
+    -------
+    values : name -> (t or 1, n) [SI]
+
+    Raises
+    ------
+    DataError
+        If the robot does not have a joint.
+    """
+    actuators = [actuator.name for actuator in robot.actuators]
+    passive = _index_passive_joints(robot)
+    values = {}
+    for name in names:
+        if name in actuators:
+            values[name] = readings[..., actuators.index(name)]
+        elif name in passive:
+            group, limb, joint = passive[name]
+            values[name] = state.joints[group][:, :, limb, joint]
+        else:
+            known = [*actuators, *passive]
+            raise DataError(
+                f"{robot.name!r} has no joint {name!r}{suggest_names(name, known)}; joints for a "
+                f"sensor are {', '.join(known)}"
+            )
+    return values
+
+
+def _index_passive_joints(robot: Mechanism) -> dict[str, tuple[int, int, int]]:
+    """Return the indices of passive joints by name: group, limb in the group, joint in the limb."""
+    limbs = robot.assembly.limbs
+    return {
+        f"{limbs[limb].name}.{joint.name}": (g, k, j)
+        for g, group in enumerate(robot.program.groups)
+        for k, limb in enumerate(group.limbs)
+        for j, joint in enumerate(limbs[limb].joints)
+        if joint.actuator is None
+    }
+
+
+# --- uncertain readings
+
+
+def make_readings_kind(robot: Mechanism) -> ActuatorReadings:
+    """Return the kind of a robot's readings."""
+    return ActuatorReadings({actuator.name: actuator.dimension for actuator in robot.actuators})
 
 
 def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) -> FloatArray | None:
-    """Standard deviations (n, a) [SI] of readings: those given, else those that the robot states;
-    None where all are exact.
+    """Return the standard deviations (n, a) [SI] of readings, or None where all are exact.
+
+    Given ones win over those that the robot states.
 
     Parameters
     ----------
@@ -87,9 +149,9 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
     Raises
     ------
     DataError
-        A sigma that is none, or so large that it says nothing; an exact reading of a robot with
-        more actuators than freedoms, whose poses are moved freely, readings following, so that none
-        can be held (docs/theory/latent.md).
+        If a sigma is negative, not a number, or finite but too large to mean anything; or if a
+        reading of a robot with redundant actuators is exact. The poses of such a robot are free
+        and readings follow from them, so that no reading can be kept (docs/theory/latent.md).
     """
     stated = [actuator.sigma for actuator in robot.actuators]
     if given is None:
@@ -101,18 +163,26 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
         name = robot.actuators[int(np.argwhere(given == 0.0)[0, 1])].name
         raise DataError(
             f"the readings of {name} are stated to be exact, but {robot.name!r} has {len(stated)} "
-            "actuators for"
-            f" {len(robot.freedoms)} freedoms, and with redundant actuators no reading can be held "
-            "exactly; state a sigma"
-            " above 0 for each, a small one where it is very good"
+            f"actuators for {len(robot.freedoms)} degrees of freedom; readings of redundant "
+            "actuators cannot be exact: state a sigma above 0 for each, a small one for very good "
+            "encoders"
         )
     return given if np.any(given != 0.0) else None
 
 
-def _check_sigma(robot: Mechanism, sigma: FloatArray) -> None:
-    """Refuse standard deviations (n, a) that are none or beyond what any reading can be off by,
-    naming the actuator.
+def fill_in_reading_sigma(robot: Mechanism, data: Measurements) -> Measurements:
+    """Return measurements that contain the standard deviations that the robot states.
+
+    It is the same object where all readings are exact.
     """
+    sigma = resolve_reading_sigma(robot, data.reading_sigma, data.n_poses)
+    return (
+        data if sigma is None or sigma is data.reading_sigma else replace(data, reading_sigma=sigma)
+    )
+
+
+def _check_sigma(robot: Mechanism, sigma: FloatArray) -> None:
+    """Refuse standard deviations (n, a) that are negative or too large, naming the actuator."""
     size = np.array(
         [
             robot.size if actuator.dimension is Dimension.LENGTH else 1.0
@@ -122,11 +192,11 @@ def _check_sigma(robot: Mechanism, sigma: FloatArray) -> None:
     for wrong, what in (
         (
             ~(sigma >= 0.0),
-            "is no standard deviation; give 0 (exact), a positive number, or infinity (not taken)",
+            "is not a standard deviation; give 0 (exact), a positive number, or infinity (missing)",
         ),
         (
-            np.isfinite(sigma) & (sigma / size > BEYOND),
-            "is beyond anything that such a reading can be off by; state inf instead",
+            np.isfinite(sigma) & (sigma / size > LARGEST_SIGMA),
+            "is larger than any possible error of a reading; give inf (missing) instead",
         ),
     ):
         if np.any(wrong):
@@ -139,13 +209,3 @@ def _check_sigma(robot: Mechanism, sigma: FloatArray) -> None:
             raise DataError(
                 f"the sigma {value} of the reading of {actuator.name} in row {pose + 1} {what}"
             )
-
-
-def fill_in_reading_sigma(robot: Mechanism, data: Measurements) -> Measurements:
-    """Measurements that say themselves how far their readings are believed; the same object where
-    all are exact.
-    """
-    sigma = resolve_reading_sigma(robot, data.reading_sigma, data.n_poses)
-    return (
-        data if sigma is None or sigma is data.reading_sigma else replace(data, reading_sigma=sigma)
-    )

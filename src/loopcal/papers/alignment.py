@@ -12,7 +12,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.measure.closed_form import hand_eye, kabsch, linear
+from loopcal.geometry.alignment import align_point_sets, solve_hand_eye, solve_least_squares
 from loopcal.typing import FloatArray
 
 
@@ -88,7 +88,7 @@ def align(
     if not base and not tool:
         return Alignment(one, one, SENTENCES[base, tool])
     # base T tool = reference, so base seen = reference tool^-1
-    found = hand_eye(reference, T, None if base else one, None if tool else one)
+    found = solve_hand_eye(reference, T, None if base else one, None if tool else one)
     frames = np.stack([found[0] if base else one, geometry.invert_pose(found[1]) if tool else one])
     open_ = np.repeat([base, tool], 6)
     weight = np.array([size, size, size, 1.0, 1.0, 1.0])
@@ -96,7 +96,7 @@ def align(
         error, slopes = _slopes(frames, T, reference)
         J = (weight[:, None] * slopes[..., open_]).reshape(-1, int(open_.sum()))
         step = np.zeros(12)
-        step[open_] = -linear(J, (weight * error).ravel())
+        step[open_] = -solve_least_squares(J, (weight * error).ravel())
         frames = geometry.apply_twist(frames, step.reshape(2, 6))
         if np.abs(step).max() < 1e-14:
             break
@@ -118,7 +118,7 @@ def align_points(points: FloatArray, reference: FloatArray) -> tuple[FloatArray,
             f"{len(points)} points on a line do not fix a frame; give three points that form a "
             "triangle"
         )
-    T = kabsch(points, reference)
+    T = align_point_sets(points, reference)
     return T, points @ T[:3, :3].T + T[:3, 3] - reference
 
 

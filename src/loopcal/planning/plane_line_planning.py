@@ -16,9 +16,7 @@ import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.findings import Finding, report_finding
-from loopcal.measure import Gaussian, Instrument, Sensor
-from loopcal.measure.kinds.line import Line
-from loopcal.measure.kinds.plane import Plane
+from loopcal.measure import Gaussian, Instrument, Line, Plane, Sensor
 from loopcal.mechanism import POSITION, Mechanism, inverse
 from loopcal.planning.constraints import ConstraintChecker, Constraints, build_checker, list_reasons
 from loopcal.planning.design import (

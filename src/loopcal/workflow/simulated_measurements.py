@@ -8,8 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopcal.measure import Instrument, Measurements, check_strokes, sample_truth, simulate
-from loopcal.measure.sheet_simulation import replace_measured_values
+from loopcal.measure import (
+    Instrument,
+    Measurements,
+    check_strokes,
+    replace_measured_values,
+    sample_truth,
+    simulate,
+)
 from loopcal.mechanism import Mechanism, sample_workspace
 
 

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.measure import Component, Observations, Pose
-from loopcal.measure.kinds.component import FLAT
+from loopcal.measure.kinds.poses.component import SMALL_TILT
 from tests.jacobians import check_jacobian
 
 FIVE = Component(("x", "y", "z", "phi", "theta"), "tilt-torsion", T_platform_tool=np.eye(4))
@@ -49,7 +49,9 @@ def test_azimuth_wraps_too():
     assert_allclose(FIVE.evaluate(T, measured).residual[0, 0, 3:], [-2e-3, 0.0], atol=1e-14)
 
 
-@pytest.mark.parametrize("theta", [0.0, 1e-9, pytest.param(0.9 * FLAT, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "theta", [0.0, 1e-9, pytest.param(0.9 * SMALL_TILT, marks=pytest.mark.slow)]
+)
 def test_near_zero_tilt_the_normal_stands_in_for_phi_and_theta(theta):
     T = poses_of(np.array([2.0]), np.array([theta]), np.array([0.4]))
     noise = np.array([[[0.0, 0.0, 0.0, 2e-4, -1e-4]]])
@@ -69,7 +71,10 @@ def test_near_zero_tilt_the_normal_stands_in_for_phi_and_theta(theta):
 def test_the_information_does_not_jump_where_the_normal_takes_over():
     covariance = np.diag([1e-10, 1e-10, 1e-10, 1e-12, 1e-12, 1e-12])[None]
     measured = np.array(
-        [[0.0, 0.0, 0.0, 0.7, FLAT * (1 - 1e-9)], [0.0, 0.0, 0.0, 0.7, FLAT * (1 + 1e-9)]]
+        [
+            [0.0, 0.0, 0.0, 0.7, SMALL_TILT * (1 - 1e-9)],
+            [0.0, 0.0, 0.0, 0.7, SMALL_TILT * (1 + 1e-9)],
+        ]
     )
     T = poses_of(measured[:, 3], measured[:, 4], np.zeros(2))
     data = Observations(
@@ -124,13 +129,13 @@ def test_all_six_components_carry_the_information_of_the_full_pose():
 @pytest.mark.parametrize(
     ("components", "orientation", "sentence"),
     [
-        (("w",), None, "the component 'w' is unknown: use some of x, y, z; declare an orientation"),
+        (("w",), None, "the component 'w' does not exist; use x, y, z; declare an orientation"),
         (("phi", "theta"), None, "declare an orientation to measure angles"),
-        (("a",), "tilt-torsion", "use some of phi, theta, psi, x, y, z"),
+        (("a",), "tilt-torsion", "use phi, theta, psi, x, y, z"),
         (("z", "z"), None, "each once"),
         ((), None, "name at least one"),
         (("phi",), "tilt-torsion", "phi is measured without theta"),
-        (("x",), "rotation-vector", "cannot be measured one by one"),
+        (("x",), "rotation-vector", "single components of a rotation-vector cannot be measured"),
         (("a",), "euler-xxy", "is not one of the 24"),
         (
             ("a",),
@@ -151,6 +156,6 @@ def test_what_cannot_be_measured_is_refused_with_what_can(components, orientatio
 def test_a_measured_gimbal_lock_is_refused_with_the_way_out():
     kind = Component(("a", "b"), "euler-xyz", T_platform_tool=np.eye(4))
     with pytest.raises(
-        DataError, match=r"row 2 .* b = 90 deg, where a and c of euler-xyz are the same turn"
+        DataError, match=r"row 2 .* b = 90 deg, where a and c of euler-xyz are the same rotation"
     ):
         Observations.from_sigma(kind, np.arange(2), np.array([[0.1, 0.2], [0.1, np.pi / 2]]), 1e-4)

@@ -58,7 +58,7 @@ def test_a_sigma_of_euler_angles_becomes_that_of_the_rotation_error():
 
 
 def test_half_an_orientation_is_refused():
-    with pytest.raises(DataError, match="row 2 of kind 'pose' has only a part of its orientation"):
+    with pytest.raises(DataError, match="row 2 of kind 'pose' has an incomplete orientation"):
         Observations.from_sigma(
             Pose(T_platform_tool=np.eye(4)),
             np.arange(2),
@@ -68,7 +68,7 @@ def test_half_an_orientation_is_refused():
 
 
 def test_a_quaternion_that_is_none_is_refused():
-    with pytest.raises(DataError, match="has a quaternion of length 0; it must be 1"):
+    with pytest.raises(DataError, match="has a quaternion of length 0; the length must be 1"):
         Observations.from_sigma(
             Pose("quaternion", T_platform_tool=np.eye(4)), [0], np.zeros((1, 7)), 1e-3
         )

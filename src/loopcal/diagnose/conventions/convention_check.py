@@ -37,8 +37,7 @@ from loopcal.diagnose.conventions.setup_parameters import Contradiction, find_co
 from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.findings import Finding, Quantity, Severity, report_finding
-from loopcal.measure import Measurements, check_actuators, check_targets_move
-from loopcal.measure.data_checks import stays
+from loopcal.measure import Measurements, check_actuators, check_targets_move, has_static_targets
 from loopcal.mechanism import Mechanism, forward
 from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
@@ -140,7 +139,7 @@ def check_conventions(
     DataError
         With the evidence; its code is that of the finding.
     """
-    if not allow_still and stays(data):
+    if not allow_still and has_static_targets(data):
         solution = forward(robot, data.readings)
         if solution.converged.any():
             check_targets_move(data.take(solution.converged), solution.T[solution.converged])

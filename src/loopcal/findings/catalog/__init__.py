@@ -20,6 +20,7 @@ SUBJECTS: tuple[str, ...] = (
     "residuals",
     "model",
     "mechanism",
+    "data",
     "apply",
     "plan",
     "files",

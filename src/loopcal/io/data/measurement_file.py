@@ -98,8 +98,8 @@ def load_measurements(
     data, places = parsed.data, parsed.places
     files = [next(iter(rows), "").rpartition(":")[0] for rows in places]
     try:
-        check_strokes(data, robot, allow=allow_outside_stroke, override="--allow-outside-stroke")
-        check_duplicates(data, allow=allow_duplicates, override="--allow-duplicates", places=places)
+        check_strokes(data, robot, allow=allow_outside_stroke)
+        check_duplicates(data, allow=allow_duplicates, places=places)
         check = check_conventions(
             robot, data, allow_still=allow_still, allow_implausible=allow_implausible, sources=files
         )

@@ -256,8 +256,7 @@ def _build_measurements(samples: Samples, options: ImportOptions) -> Measurement
 
     Without known poses all positions are NaN, to be filled in.
     """
-    from loopcal.measure import Measurements, Observations
-    from loopcal.measure.kinds.position import Position
+    from loopcal.measure import Measurements, Observations, Position
 
     n, k = len(samples.motors), len(samples.known)
     known = samples.known * MM if k else np.full((n, FREEDOMS), np.nan)

@@ -179,9 +179,7 @@ def _build_measurements(
     """Return heights as the component z, distances as separations of two poses."""
     import numpy as np
 
-    from loopcal.measure import Measurements, Observations
-    from loopcal.measure.kinds.component import Component
-    from loopcal.measure.kinds.separation import Separation
+    from loopcal.measure import Component, Measurements, Observations, Separation
 
     labels = tuple(probes.positions)
     readings = np.array([probes.positions[label] for label in labels]) * np.array(steps) * MM

@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a kind of measurement is: columns, and a residual with its derivatives.
+"""Base class of measurement kinds: columns, residuals and their derivatives.
 
-Adding a kind takes one file with one frozen dataclass, and its line in `KINDS`; files, templates,
-documentation and the contract tests follow from what this class asks for. A kind knows nothing of
-robots: it is given platform poses.
+A new kind is one file with one frozen dataclass, and one entry in `KINDS`. Files, templates,
+documentation and contract tests follow from the members of this class. A kind does not know the
+robot: it receives platform poses.
 
-Shapes: t trials, r rows, c columns as written in files, m residuals (often c), u unknowns of the
-kind, j joints it looks at. A kind with `poses_per_row` > 1 compares several poses in one row and has an
-axis l for them: T (t, r, l, 4, 4), jacobian (t, r, l, m, 6). Values of unknowns are plain numbers
-that add up; how a frame or a direction is written in them, see `loopcal.measure.kinds.parts`.
+Shapes: t trials, r rows, c columns as written in files, m residuals (often c), u nuisance
+parameters of the kind, j joints that it senses. A kind with `poses_per_row` l > 1 compares several
+poses in one row and has an axis l for them: T (t, r, l, 4, 4), jacobian (t, r, l, m, 6). Values of
+nuisance parameters are plain numbers that add up; `loopcal.measure.kinds.setup_parameters` says how
+a frame or a direction is written in them.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Self
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from typing import Any, ClassVar, NamedTuple, Self, cast
 
 import numpy as np
 
@@ -24,31 +25,34 @@ from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
-Bools = BoolArray
-
 
 @dataclass(frozen=True)
 class Column:
-    """A number in a row: its name in files, and what it measures."""
+    """A column of a measurement file: its name, and the dimension of its numbers."""
 
     name: str
     dimension: Dimension
 
 
+POSITION_COLUMNS = tuple(Column(name, Dimension.LENGTH) for name in ("x", "y", "z"))
+"""Columns of a position."""
+
+
 class Evaluation(NamedTuple):
-    """Residuals (predicted - measured) with their derivatives; rows and components not measured are
-    zero in all three.
+    """Residuals (predicted - measured) and their derivatives.
+
+    Components that were not measured are zero in all arrays.
 
     Attributes
     ----------
     residual : (t, r, m) [SI]
     jacobian : (t, r, m, 6)
-        By the platform twist (omega, v) in base axes; with an axis of links before m where there
-        are several.
+        By the platform twist (omega, v) in base axes; with an axis of poses before m where a row
+        compares several poses.
     nuisance : (t, r, m, u) or None
-        By the kind's own unknowns, None where it has none.
+        By the nuisance parameters of the kind; None where it has none.
     joints : (t, r, m, j) or None
-        By the values of the joints it looks at, None where it looks at poses only.
+        By the values of the joints that the kind senses; None where it senses poses only.
     """
 
     residual: FloatArray
@@ -58,26 +62,35 @@ class Evaluation(NamedTuple):
 
 
 class Kind(ABC):
-    """A kind of measurement with all that is fixed about it (frame, tool, form of orientation).
+    """A kind of measurement with its fixed settings (frame, tool, form of the orientation).
 
     Attributes
     ----------
     name : str
-        As files and `KINDS` call it.
+        Name in files and in `KINDS`.
     poses_per_row : int
-        How many poses one row compares.
+        Number of poses that one row compares.
     changes_with_pose : bool
-        Whether columns that stay the same while the robot moves are a mistake; touched surfaces and
-        locks stay at 0.
+        Whether columns that stay constant while the robot moves indicate a mistake. It is False for
+        touched surfaces and for locked joints, whose columns stay at 0.
     description : str
-        What is measured, for sentences that advise it with nothing unknown; "the" and the name
-        where empty.
+        What is measured, for suggestions to measure it with known setup; "the" and the name where
+        empty.
+    allowed_unknown : tuple of str
+        Setup items that `unknown` may list.
     """
 
     name: ClassVar[str]
     poses_per_row: ClassVar[int] = 1
     changes_with_pose: ClassVar[bool] = True
     description: ClassVar[str] = ""
+    allowed_unknown: ClassVar[tuple[str, ...]] = ()
+
+    def __repr__(self) -> str:
+        """Return the settings that differ from their defaults, on one line."""
+        return f"{type(self).__name__}({', '.join(self._changed_settings())})"
+
+    # --- what a kind states about itself
 
     @property
     @abstractmethod
@@ -86,28 +99,29 @@ class Kind(ABC):
 
     @property
     def noise_columns(self) -> tuple[Column, ...]:
-        """The m numbers a noise or sigma is stated for; one for each residual."""
+        """The m numbers for which a noise or sigma is stated, one for each residual."""
         return self.columns
 
     @property
     def setup_items(self) -> Mapping[str, tuple[Parameter, ...]]:
-        """The unknowns by what they describe (a frame, a target, a surface), in order."""
+        """The unknown frames, targets, surfaces and offsets with their parameters, in order."""
         return {}
 
     @property
     def nuisance_parameters(self) -> tuple[Parameter, ...]:
-        """The u unknowns the kind brings with it, each with the scope that shares one value of it."""
-        return tuple(parameter for part in self.setup_items.values() for parameter in part)
+        """The u parameters of all setup items, each with the scope that shares one value of it."""
+        return tuple(p for parameters in self.setup_items.values() for p in parameters)
 
     @property
     def target_columns(self) -> Mapping[str, tuple[int, ...]]:
-        """What is looked at, by name, with the places of its columns."""
+        """The measured objects by name, with the indices of their columns."""
         return {self.name: tuple(range(len(self.columns)))}
 
     @property
     def references(self) -> Mapping[str, FloatArray]:
-        """What unknowns of a name are counted from (a frame's stated orientation); kinds that share
-        the name must agree.
+        """The stated orientations or points that parameters are counted from, by name.
+
+        Kinds that share a name must agree on them.
         """
         return {}
 
@@ -119,50 +133,54 @@ class Kind(ABC):
     @classmethod
     @abstractmethod
     def examples(cls) -> "tuple[Kind, ...]":
-        """Instances that together show every setting; documentation, templates and contract tests
-        use them.
-        """
+        """Return instances that together show every setting, for documentation and tests."""
 
     def with_tool(self, T_platform_tool: FloatArray) -> Self:
-        """The kind for a robot with this tool (4, 4); the same object where the tool does not
-        matter or is stated.
+        """Return the kind for a robot with this tool (4, 4).
+
+        It is the same object where the tool does not matter or is stated.
         """
         del T_platform_tool
         return self
 
     @property
     def has_tool(self) -> bool:
-        """Whether the kind knows all it needs to be evaluated."""
+        """Whether the kind knows the tool, or does not need it."""
         return True
 
-    def detect_present(self, measured: FloatArray) -> Bools:
-        """Which residuals (..., m) can be formed from columns (..., c); NaN stands for what was not
-        measured.
-        """
+    # --- rows
+
+    def detect_present(self, measured: FloatArray) -> BoolArray:
+        """Return which residuals (..., m) exist for columns (..., c); NaN is not measured."""
         return ~np.isnan(measured)
 
     def find_invalid_rows(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
-        """Rows (index, sentence) of columns (r, c) that cannot mean what they say."""
+        """Return rows of columns (r, c) with impossible values: (index, end of a sentence)."""
         del measured
         return ()
+
+    @property
+    def placeholder(self) -> FloatArray:
+        """Values (c,) used where nothing was measured, so that no result is NaN."""
+        return np.zeros(len(self.columns))
 
     def evaluate(
         self,
         T: FloatArray,
         measured: FloatArray,
-        unknowns: FloatArray | None = None,
+        nuisance: FloatArray | None = None,
         joints: FloatArray | None = None,
     ) -> Evaluation:
-        """Residuals and derivatives at platform poses.
+        """Return residuals and derivatives at platform poses.
 
         Parameters
         ----------
         T : (t or 1, r, 4, 4)
-            T_base_platform of each row (with an axis of links where there are several).
+            T_base_platform of each row (with an axis of poses where a row compares several).
         measured : (t or 1, r, c) [SI]
             NaN where not measured.
-        unknowns : (t or 1, r or 1, u), optional
-            Values of the kind's unknowns that hold for each row; default: nominal.
+        nuisance : (t or 1, r or 1, u), optional
+            Values of the nuisance parameters of each row; default: nominal.
         joints : (t, r, j), optional
             Values of the joints in `sensed_joints`.
 
@@ -173,69 +191,65 @@ class Kind(ABC):
         Raises
         ------
         DataError
-            If the kind looks at joints and none are given.
+            If the kind senses joints and none are given.
         """
         if self.sensed_joints and joints is None:
             raise DataError(
-                f"the kind {self.name!r} needs the values of {', '.join(self.sensed_joints)}; hand them "
-                "over as joints"
+                f"the kind {self.name!r} needs the values of {', '.join(self.sensed_joints)}; pass "
+                "them as `joints`"
             )
         filled = np.where(np.isnan(measured), self.placeholder, measured)
-        values = self.values(unknowns)
+        values = self.values_or_nominal(nuisance)
         if len(values) > len(T):
             T = np.broadcast_to(T, (len(values), *T.shape[1:]))
-        result = self._seen(
+        result = self._drop_rounding(
             self._evaluate(T, filled, values, np.empty((1, 1, 0)) if joints is None else joints)
         )
         present = self.detect_present(measured)
         if np.all(present):
             return result
-        here = present[..., None]
-        links = present[..., None, :, None] if self.poses_per_row > 1 else here
-        own, moved = (
-            None if part is None else np.where(here, part, 0.0)
-            for part in (result.nuisance, result.joints)
+        by_row = present[..., None]
+        by_pose = present[..., None, :, None] if self.poses_per_row > 1 else by_row
+        by_nuisance, by_joints = (
+            None if derivative is None else np.where(by_row, derivative, 0.0)
+            for derivative in (result.nuisance, result.joints)
         )
         return Evaluation(
             np.where(present, result.residual, 0.0),
-            np.where(links, result.jacobian, 0.0),
-            own,
-            moved,
+            np.where(by_pose, result.jacobian, 0.0),
+            by_nuisance,
+            by_joints,
         )
 
-    def _seen(self, found: Evaluation) -> Evaluation:
-        """Derivatives by own unknowns with zeros where these cancel, as the place of a target does
-        between parallel poses.
+    def _drop_rounding(self, evaluation: Evaluation) -> Evaluation:
+        """Return the evaluation with zeros where derivatives by nuisance parameters cancel, as
+        those by the place of a target do between parallel poses.
 
-        They are compared with what a move of the platform does to the row. A metre stands beside a
-        radian there: the limit lies so far below all that counts that any length of machines would
-        do.
+        The derivatives are compared with those by the platform twist. A meter is compared with a
+        radian there; the tolerance is so far below all that counts that the size of a machine does
+        not matter.
         """
-        if found.nuisance is None:
-            return found
-        by_move = np.linalg.norm(found.jacobian, axis=-1)
-        by_move = by_move.sum(axis=-2) if self.poses_per_row > 1 else by_move
-        return found._replace(nuisance=without_rounding(found.nuisance, by_move[..., None]))
-
-    @property
-    def placeholder(self) -> FloatArray:
-        """Columns (c,) that stand where nothing was measured, so that nothing becomes NaN."""
-        return np.zeros(len(self.columns))
+        if evaluation.nuisance is None:
+            return evaluation
+        by_twist = np.linalg.norm(evaluation.jacobian, axis=-1)
+        by_twist = by_twist.sum(axis=-2) if self.poses_per_row > 1 else by_twist
+        return evaluation._replace(
+            nuisance=without_rounding(evaluation.nuisance, by_twist[..., None])
+        )
 
     @abstractmethod
     def _evaluate(
         self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
     ) -> Evaluation:
-        """`evaluate` with unknowns and measured values filled in; anything finite may come where
-        nothing was measured.
+        """Return `evaluate` for complete arrays; components that were not measured may have any
+        finite value.
         """
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
-        """Candidates (k, u) for the unknowns of rows that share them, from poses T (r, 4, 4) and
-        columns (r, c) alone.
+        """Return candidates (k, u) for the nuisance parameters that rows share.
 
-        Found in closed form where there is one; `loopcal.measure.initial_values` improves and
-        compares them.
+        They follow from poses T (r, 4, 4) and columns (r, c), in closed form where there is one.
+        `loopcal.measure.initial_values` refines and compares them.
         """
         del T, measured
         return self.nominal_values[None]
@@ -245,10 +259,10 @@ class Kind(ABC):
         self,
         T: FloatArray,
         noise: FloatArray,
-        unknowns: FloatArray | None = None,
+        nuisance: FloatArray | None = None,
         joints: FloatArray | None = None,
     ) -> FloatArray:
-        """Columns that an instrument with this noise would write.
+        """Return the columns that an instrument with this noise writes.
 
         Parameters
         ----------
@@ -256,7 +270,8 @@ class Kind(ABC):
             True T_base_platform.
         noise : (t, r, m)
             In the noise columns.
-        unknowns : (t or 1, r or 1, u), optional
+        nuisance : (t or 1, r or 1, u), optional
+            Default: nominal.
         joints : (t, r, j), optional
             Default: zero.
 
@@ -267,38 +282,49 @@ class Kind(ABC):
         """
 
     def linearize_noise(self, measured: FloatArray) -> FloatArray:
-        """Matrix (..., m, m) by which errors of the noise columns enter the residuals (up to sign)."""
+        """Return the derivative (..., m, m) of the residuals by errors of the noise columns, up to
+        its sign.
+        """
         m = len(self.noise_columns)
         return np.broadcast_to(np.eye(m), (*measured.shape[:-1], m, m))
 
     # --- for the kinds themselves
-    # ------------------------------------------------------------------------------------
 
     @property
     def nominal_values(self) -> FloatArray:
-        """Nominal values (u,) of the unknowns."""
+        """Nominal values (u,) of the nuisance parameters."""
         return np.array([parameter.nominal for parameter in self.nuisance_parameters])
 
-    def values(self, unknowns: FloatArray | None) -> FloatArray:
-        """The values given, or the nominal ones (1, 1, u)."""
-        return self.nominal_values[None, None] if unknowns is None else unknowns
+    def values_or_nominal(self, nuisance: FloatArray | None) -> FloatArray:
+        """Return the given values, or the nominal ones (1, 1, u)."""
+        return self.nominal_values[None, None] if nuisance is None else nuisance
 
     def item_values(self, values: FloatArray, name: str) -> FloatArray | None:
-        """Values (.., w) of one part, None where it is known."""
+        """Return the values (.., w) of one setup item, None where it is known."""
         first = 0
-        for part, parameters in self.setup_items.items():
-            if part == name:
+        for item, parameters in self.setup_items.items():
+            if item == name:
                 return values[..., first : first + len(parameters)]
             first += len(parameters)
         return None
 
-    def columns_of(self, blocks: Mapping[str, FloatArray], shape: tuple[int, ...]) -> FloatArray:
-        """Put derivatives side by side: the twist, then every part of the unknowns, zeros where a
-        block is missing.
+    def assemble_values(self, items: Mapping[str, FloatArray], count: int) -> FloatArray:
+        """Return candidates (count, u) from values (count, w) or (w,) of some setup items; the
+        other items stay nominal.
+        """
+        columns = []
+        for name, parameters in self.setup_items.items():
+            nominal = np.array([p.nominal for p in parameters])
+            columns.append(np.broadcast_to(items.get(name, nominal), (count, len(parameters))))
+        return np.concatenate(columns, axis=-1)
+
+    def join_columns(self, blocks: Mapping[str, FloatArray], shape: tuple[int, ...]) -> FloatArray:
+        """Return derivatives side by side: by the twist, then by each setup item.
 
         Parameters
         ----------
-        blocks : part or "twist" -> (.., w)
+        blocks : setup item or "twist" -> (.., w)
+            A missing block is zero.
         shape : tuple of int
             Leading axes of the result.
 
@@ -306,7 +332,7 @@ class Kind(ABC):
         -------
         rows : (*shape, 6 + u)
         """
-        widths = {"twist": 6} | {name: len(part) for name, part in self.setup_items.items()}
+        widths = {"twist": 6} | {name: len(item) for name, item in self.setup_items.items()}
         return np.concatenate(
             [
                 np.broadcast_to(blocks.get(name, np.zeros(w)), (*shape, w))
@@ -315,20 +341,41 @@ class Kind(ABC):
             axis=-1,
         )
 
-    def split(self, residual: FloatArray, rows: FloatArray) -> Evaluation:
-        """The evaluation of residuals (t, r, m) whose derivatives (t, r, m, 6 + u) stand side by
-        side.
+    def split_columns(self, residual: FloatArray, rows: FloatArray) -> Evaluation:
+        """Return the evaluation of residuals (t, r, m) with derivatives (t, r, m, 6 + u) from
+        `join_columns`.
         """
         return Evaluation(residual, rows[..., :6], rows[..., 6:] if self.setup_items else None)
 
+    def _changed_settings(self) -> list[str]:
+        if not is_dataclass(self):
+            return []
+        changed = []
+        for setting in fields(self):
+            value, usual = getattr(self, setting.name), setting.default
+            if setting.default_factory is not MISSING:
+                usual = setting.default_factory()
+            if setting.init and not np.array_equal(cast(Any, value), cast(Any, usual)):
+                text = shorten_array(value) if isinstance(value, np.ndarray) else repr(value)
+                changed.append(f"{setting.name}={text}")
+        return changed
 
-def chosen(unknown: tuple[str, ...], possible: tuple[str, ...], kind: str) -> tuple[str, ...]:
-    """What a kind is told is unknown, as a tuple; DataError names what can be."""
-    named = (unknown,) if isinstance(unknown, str) else tuple(unknown)
-    for name in named:
-        if name not in possible:
+
+def shorten_array(array: FloatArray) -> str:
+    """Return a small array as nested lists with six digits, a large one as its shape."""
+    if array.size > 16:
+        return f"<array {array.shape}>"
+    return str(np.round(array, 6).tolist())
+
+
+def check_unknown(unknown: tuple[str, ...], allowed: tuple[str, ...], kind: str) -> tuple[str, ...]:
+    """Return the setup items that are stated to be unknown as a tuple; DataError for a name that is
+    not allowed.
+    """
+    names = (unknown,) if isinstance(unknown, str) else tuple(unknown)
+    for name in names:
+        if name not in allowed:
             raise DataError(
-                f"{name!r} cannot be unknown in the kind {kind!r}; what can be is "
-                f"{', '.join(possible)}"
+                f"{name!r} cannot be unknown in the kind {kind!r}; allowed are {', '.join(allowed)}"
             )
-    return named
+    return names

@@ -8,41 +8,41 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from loopcal.measure.arrays import stored_pose
-from loopcal.measure.kinds.aim import AimKind
-from loopcal.measure.kinds.kind import Column, chosen
-from loopcal.measure.kinds.surface import stored_direction
+from loopcal.measure.array_checks import check_direction, check_pose
+from loopcal.measure.kinds.directions.direction_kind import DirectionKind
+from loopcal.measure.kinds.kind import Column, check_unknown
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Autocollimation(AimKind):
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Autocollimation(DirectionKind):
     """Angles of a mirror's normal. Residual: differences of `atan2(d_x, d_z)` and `atan2(d_y,
     d_z)`, wrapped.
 
-    d is the normal in the instrument, whose z axis is the optical one, pointing as the normal does
-    (towards the instrument). Angles are those of the mirror; one that states the angles of the
-    reflected beam states twice as much.
+    d is the normal of the mirror in the frame of the instrument. The z axis of that frame is the
+    optical axis and has the direction of the normal, towards the instrument. Angles are those of
+    the mirror. An instrument that states angles of the reflected beam states twice these values.
 
     Parameters
     ----------
     normal : (3,)
-        Normal of the mirror on the platform, of any length. Where unknown, the value it is counted
-        from.
+        Normal of the mirror on the platform, of any length. If the mirror is unknown, its nominal
+        value.
     mirror : str
-        Name of the mirror, after which its unknowns are called.
+        Name of the mirror; its parameters begin with it.
     T_base_frame : (4, 4)
-        Frame of the instrument in the base, of which only the orientation matters.
+        Frame of the instrument in the base; only its orientation matters.
     frame : str
-        Name of the frame; kinds that name the same one share its unknowns.
+        Name of the frame. Kinds that use the same name share its parameters.
     unknown : tuple of str
         Which of "frame" and "mirror" are unknown.
 
     Raises
     ------
     DataError
-        If the normal has no length, the frame is no pose, or something else is said to be unknown.
+        If the length of the normal is zero, the frame is not a pose, or `unknown` lists something
+        else.
     """
 
     normal: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
@@ -51,18 +51,18 @@ class Autocollimation(AimKind):
     frame: str = "frame"
 
     name: ClassVar[str] = "autocollimation"
-    allowed_unknown: ClassVar[tuple[str, str]] = ("frame", "mirror")
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "mirror")
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "normal", check_direction(self.normal, "the normal of the mirror"))
+        object.__setattr__(self, "T_base_frame", check_pose(self.T_base_frame, "T_base_frame"))
         object.__setattr__(
-            self, "normal", stored_direction(self.normal, "the normal of the mirror")
+            self, "unknown", check_unknown(self.unknown, self.allowed_unknown, self.name)
         )
-        object.__setattr__(self, "T_base_frame", stored_pose(self.T_base_frame, "T_base_frame"))
-        object.__setattr__(self, "unknown", chosen(self.unknown, self.allowed_unknown, self.name))
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
-        """A mirror seen along z, and an unknown one from an unknown side."""
+        """Return a mirror along z, and an unknown mirror in an unknown frame."""
         return (cls(), cls(unknown=("frame", "mirror"), frame="collimator", mirror="face"))
 
     @property
@@ -76,7 +76,7 @@ class Autocollimation(AimKind):
         return self.frame, self.T_base_frame[:3, :3], self.mirror, self.normal
 
     def predict(self, d: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Both angles (.., 2) and their slopes (.., 2, 3)."""
+        """Return both angles (.., 2) and their derivatives (.., 2, 3)."""
         x, y, z = d[..., 0], d[..., 1], d[..., 2]
         zero = np.zeros_like(x)
         flat, up = x * x + z * z, y * y + z * z
@@ -86,15 +86,18 @@ class Autocollimation(AimKind):
         ]
         return np.stack([np.arctan2(x, z), np.arctan2(y, z)], axis=-1), np.stack(slopes, axis=-2)
 
-    def directions(self, measured: FloatArray) -> FloatArray:
-        """Normals of two angles, in front of the instrument."""
+    def convert_to_directions(self, measured: FloatArray) -> FloatArray:
+        """Return the normals of two angles, towards the instrument."""
         x, y = np.tan(measured[..., 0]), np.tan(measured[..., 1])
         d = np.stack([x, y, np.ones_like(x)], axis=-1)
         return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
     def find_invalid_rows(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
-        """Rows whose mirror is turned away."""
+        """Return rows whose mirror faces away from the instrument."""
         with np.errstate(invalid="ignore"):
             away = np.argwhere(np.abs(measured) >= np.pi / 2)
-        sentence = "has an angle of {:.6g} deg, at which a mirror faces away; check the unit"
+        sentence = (
+            "has an angle of {:.6g} deg, at which the mirror faces away from the instrument; check "
+            "the unit"
+        )
         return tuple((int(i), sentence.format(np.rad2deg(measured[i, j]))) for i, j in away)

@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kind `locked`: joints that stand still over a group of rows, at values nobody knows."""
+"""Kind `locked`: joints that are fixed during a group of rows, at unknown values."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
-from loopcal.measure.kinds.joint import JointSensor
+from loopcal.measure.kinds.joints.joint_sensor import JointSensor
 from loopcal.measure.kinds.kind import Column
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Locked(JointSensor):
-    """Joints held fixed. Residual: `joint - constant - slip`, with one unknown constant for each
-    group of rows.
+    """Locked joints. Residual: `joint - constant - slip`, with one unknown constant for each group
+    of rows.
 
-    The column is the slip of the lock, 0 where nothing else is known; its noise is the play of the
-    lock.
+    The column is the slip of the lock, usually 0. Its noise is the play of the lock.
 
     Parameters
     ----------
@@ -29,7 +28,7 @@ class Locked(JointSensor):
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
-        """Two joints at once."""
+        """Return two joints at once."""
         return (cls(joints=("q1", "q4")),)
 
     @property

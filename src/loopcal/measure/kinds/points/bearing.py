@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kind `bearing`: two angles of a point from a station, by a theodolite or a camera."""
+"""Kind `bearing`: two angles of a point from a station, measured by a theodolite or a camera."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,21 +9,20 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.measure.closed_form import resection
-from loopcal.measure.kinds import parts
+from loopcal.geometry.alignment import solve_resection
+from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import Column
-from loopcal.measure.kinds.target import TargetKind, points_of
-from loopcal.measure.kinds.tool import stacked
+from loopcal.measure.kinds.points.target_kind import TargetKind
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Bearing(TargetKind):
     """Two angles of each target. Residual: differences of angles, wrapped.
 
-    theodolite: `azimuth = atan2(y, x)`, `elevation = atan2(z, hypot(x, y))`. camera, which looks
-    along its z axis: `azimuth = atan2(x, z)`, `elevation = atan2(y, z)`.
+    Theodolite: `azimuth = atan2(y, x)`, `elevation = atan2(z, hypot(x, y))`. Camera, whose optical
+    axis is z: `azimuth = atan2(x, z)`, `elevation = atan2(y, z)`.
 
     Parameters
     ----------
@@ -53,7 +52,7 @@ class Bearing(TargetKind):
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
-        """A theodolite, a camera at an unknown station, and two targets."""
+        """Return a theodolite, a camera at an unknown station, and two targets."""
         station = geometry.make_pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
         behind = geometry.make_pose(np.eye(3), np.array([0.1, -0.1, -2.5]))
         pair = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02]])
@@ -72,7 +71,7 @@ class Bearing(TargetKind):
     def predict(
         self, x: FloatArray, values: FloatArray
     ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
-        """Both angles of points x (.., k, 3) and their slopes."""
+        """Return both angles of points x (.., k, 3) and their derivatives."""
         a, b, c = x[..., 0], x[..., 1], x[..., 2]
         zero = np.zeros_like(a)
         if self.form == "camera":
@@ -88,12 +87,12 @@ class Bearing(TargetKind):
         slopes = np.stack([np.stack(first, axis=-1), np.stack(second, axis=-1)], axis=-2)
         return np.stack(angles, axis=-1), slopes, {}
 
-    def rays(self, measured: FloatArray) -> FloatArray:
-        """Unit vectors (.., 3) of measured angles (.., 2)."""
+    def convert_to_rays(self, measured: FloatArray) -> FloatArray:
+        """Return the unit vectors (.., 3) of measured angles (.., 2)."""
         azimuth, elevation = measured[..., 0], measured[..., 1]
         if self.form == "camera":
             ray = np.stack([np.tan(azimuth), np.tan(elevation), np.ones_like(azimuth)], axis=-1)
-            # behind the camera the tangents point ahead
+            # behind the camera the tangents belong to the opposite ray
             ray = np.where((np.cos(azimuth) < 0.0)[..., None], -ray, ray)
             return ray / np.linalg.norm(ray, axis=-1, keepdims=True)
         level = np.cos(elevation)
@@ -102,9 +101,10 @@ class Bearing(TargetKind):
         )
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
-        """The station by resection, targets where they are stated."""
-        _, _, points, seen = points_of(self, T, measured)
-        if "frame" not in self.unknown or len(seen) < 4:
+        """Return the station by resection, with the targets at their stated places."""
+        _, _, points, angles = self.collect_points(T, measured)
+        if "frame" not in self.unknown or len(angles) < 4:
             return self.nominal_values[None]
-        frames = resection(self.rays(seen), points)
-        return stacked(self, {"frame": parts.frame_values(self.T_base_frame, frames)}, len(frames))
+        frames = solve_resection(self.convert_to_rays(angles), points)
+        items = {"frame": setup.encode_frame(self.T_base_frame, frames)}
+        return self.assemble_values(items, len(frames))

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of arrays that measurements and kinds store: float64, read-only, of a stated shape."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from loopcal.errors import ArgumentTypeError, DataError
+from loopcal.typing import FloatArray
+
+
+def check_array(
+    value: ArrayLike, what: str, shape: Sequence[int | None], *, allow_nan: bool = False
+) -> FloatArray:
+    """Return a read-only float64 copy of an array after checking its shape and its numbers.
+
+    Parameters
+    ----------
+    value : array_like
+    what : str
+        Name of the array in error messages.
+    shape : sequence of int or None
+        Required shape; None allows any length.
+    allow_nan : bool
+        Whether NaN (not measured) is allowed; infinity never is.
+
+    Returns
+    -------
+    array : ndarray, read-only
+
+    Raises
+    ------
+    DataError
+        If the value is not numeric, the shape differs, or a number is not finite.
+    """
+    wanted = ", ".join("any" if n is None else str(n) for n in shape)
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        raise DataError(
+            f"{what}: got {describe(value)}; give an array of numbers of shape ({wanted})"
+        ) from None
+    if array.ndim != len(shape) or any(
+        n is not None and n != m for n, m in zip(shape, array.shape, strict=True)
+    ):
+        raise DataError(f"{what} has shape {array.shape}; give an array of shape ({wanted})")
+    wrong = np.isinf(array) if allow_nan else ~np.isfinite(array)
+    if np.any(wrong):
+        place = tuple(int(i) + 1 for i in np.argwhere(wrong)[0])
+        where = f"row {place[0]}" + (f", column {place[1]}" if len(place) > 1 else "")
+        value = array[tuple(i - 1 for i in place)]
+        raise DataError(
+            f"{what}: {where} is {value}; give a finite number" + (" or NaN" if allow_nan else "")
+        )
+    array.setflags(write=False)
+    return array
+
+
+def check_pose(value: ArrayLike, what: str) -> FloatArray:
+    """Return a read-only pose (4, 4) after checking that it is one.
+
+    Raises
+    ------
+    DataError
+        If it is not a rotation and a translation, to 1e-9.
+    """
+    T = check_array(value, what, (4, 4))
+    R = T[:3, :3]
+    error = float(np.max(np.abs(R @ R.T - np.eye(3))))
+    if error > 1e-9 or np.linalg.det(R) < 0.0 or not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
+        raise DataError(
+            f"{what} is not a pose: its rotation part deviates by {error:.2g} from a right-handed "
+            "rotation, or its last row is not 0 0 0 1; give R with R R' = 1 to 1e-9 and det R = 1, "
+            "and the translation [m] in the last column"
+        )
+    return T
+
+
+def check_direction(value: ArrayLike, what: str) -> FloatArray:
+    """Return the read-only unit vector (3,) along a vector; DataError where its length is zero."""
+    vector = check_array(value, what, (3,))
+    length = float(np.linalg.norm(vector))
+    if not length > 0.0:
+        raise DataError(f"{what} is 0, 0, 0; give a vector of any length above 0")
+    unit = vector / length
+    # a vector of length 1 is kept bit by bit, so that files are written as they were read
+    return vector if abs(length - 1.0) < 1e-15 else check_array(unit, what, (3,))
+
+
+def check_type(value: object, wanted: type, what: str, hint: str) -> None:
+    """Raise an ArgumentTypeError that says what to pass unless a value is an instance of a class.
+
+    Parameters
+    ----------
+    value : of the argument. wanted : its class. what : its name. hint : how to obtain one.
+    """
+    if not isinstance(value, wanted):
+        raise ArgumentTypeError(f"{what}: got {describe(value)}; give {wanted.__name__}, {hint}")
+
+
+def describe(value: object) -> str:
+    """Return a value as error messages show it: its text and its type."""
+    if isinstance(value, str):
+        return f"the text {value[:60]!r}"
+    name = type(value).__name__
+    return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"

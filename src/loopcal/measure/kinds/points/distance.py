@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kind `distance`: from a fixed point to points of the platform, by a wire, an interferometer or a
+ball bar.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar, Self
+
+import numpy as np
+
+from loopcal.errors import DataError
+from loopcal.geometry.alignment import FLATNESS, solve_trilateration
+from loopcal.measure.array_checks import check_array
+from loopcal.measure.kinds import setup_parameters as setup
+from loopcal.measure.kinds.kind import Column
+from loopcal.measure.kinds.points.target_kind import (
+    TargetKind,
+    evaluate_offset,
+    find_nonpositive_rows,
+    measure_lengths,
+)
+from loopcal.parameters import Parameter
+from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import Dimension
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Distance(TargetKind):
+    """Distance to a fixed point c. Residual: `|x - c| + offset - measured`, with slope `(x - c) /
+    |x - c|`.
+
+    Parameters
+    ----------
+    anchor : (3,) [m]
+        The fixed point in the frame. If the anchor is unknown, its nominal value.
+    anchor_name : str
+        Name of the fixed point. Kinds that use the same name share its parameters.
+    Others: see `TargetKind`; "anchor", "targets" and "offset" (the zero of a wire) may be unknown.
+
+    Raises
+    ------
+    DataError
+        As `TargetKind`.
+    """
+
+    anchor: FloatArray = field(default_factory=lambda: np.zeros(3))
+    anchor_name: str = "anchor"
+
+    name: ClassVar[str] = "distance"
+    per_target: ClassVar[tuple[Column, ...]] = (Column("distance", Dimension.LENGTH),)
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("anchor", "targets", "offset")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "anchor", check_array(self.anchor, "the anchor", (3,)))
+
+    @classmethod
+    def examples(cls) -> tuple[Self, ...]:
+        """Return a known point, an unknown one with a wire of unknown zero, and two targets."""
+        far = np.array([1.5, -0.8, 1.1])
+        pair = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02]])
+        return (
+            cls(anchor=far),
+            cls(anchor=far, unknown=("anchor", "offset"), anchor_name="wire1"),
+            cls(targets=("a", "b"), places=pair, anchor=far, unknown=("targets", "anchor")),
+        )
+
+    def make_item_parameters(self, name: str) -> tuple[Parameter, ...]:
+        """Return three parameters of the fixed point, or one of the offset."""
+        return (
+            setup.make_point_parameters(self.anchor_name, self.anchor)
+            if name == "anchor"
+            else self.make_offset_parameter()
+        )
+
+    def predict(
+        self, x: FloatArray, values: FloatArray
+    ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
+        """Return distances (.., k, 1) and unit vectors."""
+        anchor = self.item_values(values, "anchor")
+        offset, by_item = evaluate_offset(self, values)
+        reach = x - (self.anchor if anchor is None else anchor[..., None, :])
+        length, unit = measure_lengths(reach)
+        unit = unit[..., None, :]
+        if anchor is not None:
+            by_item["anchor"] = -unit
+        return length + offset, unit, by_item
+
+    def find_invalid_rows(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
+        """Return rows with a distance that is not above zero."""
+        return find_nonpositive_rows(measured)
+
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+        """Return the fixed point by trilateration, with the targets at their stated places.
+
+        Raises
+        ------
+        DataError
+            If all points are coplanar and the stated anchor does not say on which side it is.
+        """
+        _, _, points, distances = self.collect_points(T, measured)
+        if "anchor" not in self.unknown or len(distances) < 4:
+            return self.nominal_values[None]
+        inside = (points - self.T_base_frame[:3, 3]) @ self.T_base_frame[:3, :3]
+        with_offset = "offset" in self.unknown
+        solutions = [
+            solve_trilateration(inside, distances[:, 0], with_offset=flag)
+            for flag in {False, with_offset}
+        ]
+        centers, offsets = (np.concatenate(arrays) for arrays in zip(*solutions, strict=True))
+        side = self._is_on_stated_side(inside, centers)
+        return self.assemble_values(
+            {"anchor": centers[side], "offset": offsets[side, None]}, int(np.count_nonzero(side))
+        )
+
+    def _is_on_stated_side(self, points: FloatArray, centers: FloatArray) -> BoolArray:
+        """Return which centers (k,) are on the stated side of the plane of all points (q, 3); all
+        where the points are not coplanar.
+        """
+        middle = points.mean(axis=0)
+        _, s, axes = np.linalg.svd(points - middle, full_matrices=False)
+        if s[2] > FLATNESS * s[0] or "targets" in self.unknown:
+            return np.ones(len(centers), dtype=bool)
+        stated = (self.anchor - middle) @ axes[2]
+        if not self.anchor.any() or abs(stated) <= FLATNESS * s[0]:
+            raise DataError(
+                f"all distances to {self.anchor_name!r} were measured from points in one plane, so "
+                "it can be on either side of that plane; state an approximate 'anchor', or measure "
+                "poses off the plane"
+            )
+        return (centers - middle) @ axes[2] * stated >= 0.0

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Setup parameters: frames, points and directions as unknown numbers, and their derivatives.
+
+A frame has six numbers. `rx ry rz` is the rotation vector w from its stated orientation, about base
+axes: `R = exp(w) R_stated`. `x y z` is its position. A direction has two numbers, rotations about
+two axes B perpendicular to the stated direction: `n = exp(B (u, v)) n_stated`.
+
+All numbers add up like plain numbers. The derivatives contain the left Jacobian of the rotation
+group, so they are exact for rotations of any size. The only singular case is a direction rotated by
+exactly 180 degrees.
+"""
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.parameters import Parameter
+from loopcal.typing import FloatArray
+from loopcal.units import Dimension
+
+ROTATION_AXES, POSITION_AXES = ("rx", "ry", "rz"), ("x", "y", "z")
+
+
+# --- parameters
+
+
+def make_rotation_parameters(name: str, scope: str = "session") -> tuple[Parameter, ...]:
+    """Return three parameters of an orientation: `name.rx`, `name.ry`, `name.rz`."""
+    return tuple(
+        Parameter(f"{name}.{axis}", Dimension.ANGLE, 0.0, scope=scope) for axis in ROTATION_AXES
+    )
+
+
+def make_point_parameters(
+    name: str, place: FloatArray, scope: str = "session"
+) -> tuple[Parameter, ...]:
+    """Return three parameters of a point, `name.x` to `name.z`, nominally at `place` (3,)."""
+    pairs = zip(POSITION_AXES, place.tolist(), strict=True)
+    return tuple(
+        Parameter(f"{name}.{axis}", Dimension.LENGTH, value, scope=scope) for axis, value in pairs
+    )
+
+
+def make_frame_parameters(
+    name: str, T: FloatArray, scope: str = "session"
+) -> tuple[Parameter, ...]:
+    """Return six parameters of a frame that is stated as T (4, 4)."""
+    return make_rotation_parameters(name, scope) + make_point_parameters(name, T[:3, 3], scope)
+
+
+def make_direction_parameters(name: str, scope: str = "session") -> tuple[Parameter, ...]:
+    """Return two parameters of a direction: `name.u` and `name.v`."""
+    return tuple(
+        Parameter(f"{name}.{axis}", Dimension.ANGLE, 0.0, scope=scope) for axis in ("u", "v")
+    )
+
+
+# --- frames
+
+
+def place_frame(stated: FloatArray, values: FloatArray | None) -> FloatArray:
+    """Return the frame (.., 4, 4) at values (.., 6), or the stated one where values are None."""
+    if values is None:
+        return stated
+    return geometry.make_pose(geometry.exp_so3(values[..., :3]) @ stated[:3, :3], values[..., 3:])
+
+
+def encode_frame(stated: FloatArray, T: FloatArray) -> FloatArray:
+    """Return the values (.., 6) that bring a stated frame to T (.., 4, 4)."""
+    return np.concatenate([encode_rotation(stated[:3, :3], T[..., :3, :3]), T[..., :3, 3]], axis=-1)
+
+
+def encode_rotation(stated: FloatArray, rotation: FloatArray) -> FloatArray:
+    """Return the values (.., 3) that bring a stated orientation (3, 3) to a rotation (.., 3, 3)."""
+    return geometry.log_so3(rotation @ stated.T)
+
+
+def linearize_frame(values: FloatArray) -> FloatArray:
+    """Return the derivative (.., 6, 6) of a frame's twist by its values (.., 6).
+
+    It is the left Jacobian for the rotation and the identity for x y z.
+    """
+    rotation = geometry.left_jacobian_so3(values[..., :3])
+    zero, identity = np.zeros_like(rotation), np.broadcast_to(np.eye(3), rotation.shape)
+    top = np.concatenate([rotation, zero], axis=-1)
+    return np.concatenate([top, np.concatenate([zero, identity], axis=-1)], axis=-2)
+
+
+# --- directions
+
+
+def make_perpendicular_basis(direction: FloatArray) -> FloatArray:
+    """Return two unit vectors B (.., 3, 2) perpendicular to unit vectors (.., 3).
+
+    B is a smooth function of the direction, except where z changes its sign.
+
+    Source: Duff et al., Building an Orthonormal Basis, Revisited, Journal of Computer Graphics
+    Techniques 6(1), 2017.
+    """
+    x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
+    s = np.where(z >= 0.0, 1.0, -1.0)
+    a = -1.0 / (s + z)
+    b = x * y * a
+    first = np.stack([1.0 + s * x * x * a, s * b, -s * x], axis=-1)
+    return np.stack([first, np.stack([b, s + y * y * a, -y], axis=-1)], axis=-1)
+
+
+def rotate_basis(stated: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the rotation R (.., 3, 3) of a direction at values (.., 2), and its derivative.
+
+    The derivative S (.., 3, 2) satisfies `dR = hat(S d(u, v)) R`.
+    """
+    B = make_perpendicular_basis(stated)
+    rotation = (B @ values[..., None])[..., 0]
+    return geometry.exp_so3(rotation), geometry.left_jacobian_so3(rotation) @ B
+
+
+def place_direction(stated: FloatArray, values: FloatArray | None) -> FloatArray:
+    """Return the direction (.., 3) at values (.., 2), or the stated one where they are None."""
+    return stated if values is None else rotate_basis(stated, values)[0] @ stated
+
+
+def linearize_direction(stated: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the derivative (.., 3, 2) of a direction by its values: `dn = (S d(u, v)) x n`."""
+    R, S = rotate_basis(stated, values)
+    return -geometry.hat(R @ stated) @ S
+
+
+def encode_direction(stated: FloatArray, direction: FloatArray) -> FloatArray:
+    """Return the values (.., 2) that rotate a stated direction (3,) to another one (.., 3), by the
+    smallest angle.
+    """
+    axis = np.cross(stated, direction)
+    sine = np.linalg.norm(axis, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, (direction @ stated)[..., None])
+    B = make_perpendicular_basis(stated)
+    safe = np.where(sine > 0.0, axis / np.where(sine > 0.0, sine, 1.0), B[:, 0])
+    return (angle * safe) @ B
