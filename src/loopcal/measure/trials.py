@@ -26,9 +26,7 @@ from loopcal.measure.readings import (
     select_joint_values,
     solve_commanded_poses,
 )
-from loopcal.mechanism import Mechanism, Status
-from loopcal.mechanism.batch_kinematics import forward_trials
-from loopcal.mechanism.pose_driven import solve_at_pose
+from loopcal.mechanism import Mechanism, Status, forward_trials, solve_at_pose
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 NOISE, TRUTH, READING = 0, 1, 2  # purposes of a trial's random streams
