@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 
+from loopcal.estimate.fit_findings import report_status
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Ridge
 from loopcal.estimate.minimization.descent import FunctionProblem, StepControl, descend
 from loopcal.numerics.gauss_newton import DescentStatus
@@ -102,7 +103,8 @@ def test_too_few_iterations_are_said():
         StepControl(iterations=1),
     )
     assert fit.status[0] == DescentStatus.OUT_OF_ITERATIONS
-    assert "did not converge" in DescentStatus(fit.status[0]).sentence
+    finding = report_status(DescentStatus(fit.status[0]), int(fit.iterations[0]))
+    assert finding.code == "fit.out-of-iterations"
 
 
 def test_a_trial_that_fails_at_its_start_is_marked_and_the_others_go_on():
@@ -133,5 +135,6 @@ def test_noise_free_rows_converge_to_rounding():
     assert len(fit.cost_history) == fit.iterations[0] + 1
 
 
-def test_every_ending_has_a_sentence():
-    assert all(status.sentence for status in DescentStatus)
+def test_every_ending_has_a_finding():
+    endings = [status for status in DescentStatus if status is not DescentStatus.RUNNING]
+    assert len({report_status(status, 3).code for status in endings}) == len(endings)

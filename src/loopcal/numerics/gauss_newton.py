@@ -24,7 +24,6 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from loopcal.findings import Finding, report_finding
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 ROUNDING = 1e-12
@@ -39,18 +38,6 @@ class DescentStatus(IntEnum):
     NO_DESCENT = 2
     BAD_START = 3
     RUNNING = 4
-
-    @property
-    def finding(self) -> Finding | None:
-        """What to do about it; None for a trial that converged."""
-        if self is DescentStatus.CONVERGED:
-            return None
-        return report_finding(f"descent.{self.name.lower().replace('_', '-')}")
-
-    @property
-    def sentence(self) -> str:
-        """`converged`, or what to do about it."""
-        return str(self.finding or "converged")
 
 
 class Point(Protocol):
