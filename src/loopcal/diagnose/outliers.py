@@ -366,8 +366,8 @@ def _join_groups(groups: list[BoolArray]) -> list[BoolArray]:
 def _suspected_in_turn(states: tuple[_State, ...]) -> list[BoolArray]:
     """Return the one group (u,) of the blocks that are suspected in some of the states only."""
     excluded = np.array([state.excluded for state in states])
-    some: BoolArray = np.any(excluded, axis=0) & ~np.all(excluded, axis=0)
-    return [some]
+    group: BoolArray = np.any(excluded, axis=0) & ~np.all(excluded, axis=0)
+    return [group]
 
 
 def _summarize(

@@ -126,7 +126,7 @@ def suggest_measurements(
     B = sparsify_basis(identifiability.null_space())
     B = B / np.linalg.norm(B, axis=1, keepdims=True)
     leading = [free.names.index(c.names[0]) for c in combinations]
-    found: list[list[FurtherMeasurement]] = [[] for _ in leading]
+    measurements: list[list[FurtherMeasurement]] = [[] for _ in leading]
     # an observed direction must exceed the rounding of the existing rows, too
     floor, present = float(np.linalg.norm(factor, ord=2)), _remaining_sd(factor)
     joints = _passive_joints(free.robot)
@@ -141,9 +141,10 @@ def suggest_measurements(
             left = _remaining_sd(np.concatenate([factor, X]))
             better = determined & (left[leading] < IMPROVEMENT * present[leading])
             for i in np.flatnonzero(better):
-                found[i].append(FurtherMeasurement(words, kind.name, float(left[leading[i]])))
-    pairs = zip(combinations, found, strict=True)
-    return tuple(MeasurementSuggestion(combination, tuple(some)) for combination, some in pairs)
+                one = FurtherMeasurement(words, kind.name, float(left[leading[i]]))
+                measurements[i].append(one)
+    pairs = zip(combinations, measurements, strict=True)
+    return tuple(MeasurementSuggestion(combination, tuple(ones)) for combination, ones in pairs)
 
 
 def describe_missing_equations(robot: Mechanism, data: Measurements) -> Finding | None:
