@@ -147,6 +147,7 @@ def fifties(study: Study) -> list[list[Any]]:
     ]
 
 
+# size: a list of tables with their columns
 def collect() -> dict[str, Any]:
     """The 3 x 4 cells, the five starts, one plane against ten, the weights, readings of figure 5,
     and fifty points.

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+# size: one study of all kinds, with its tables
 """What every kind of measurement can do alone: rank, recovery of the machine up to its gauge, and
 true error bars.
 

@@ -13,7 +13,7 @@ def test_every_error_of_the_tree_is_a_loopcal_error() -> None:
     classes = [
         c for _, c in inspect.getmembers(errors, inspect.isclass) if issubclass(c, Exception)
     ]
-    assert len(classes) == 6
+    assert len(classes) == 7
     assert all(issubclass(c, LoopcalError) for c in classes)
 
 

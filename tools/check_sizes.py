@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Size check: no file over 400 lines and no function over 60, unless `# size: reason` stands beside
-it.
+"""Check the sizes of files and functions, unless `# size: reason` lifts a limit.
 
-For a file the comment stands in its first ten lines; for a function on its `def` line or on the
-line above.
+The comment is in the first ten lines of a file, or on the `def` line of a function or above it.
 """
 
 import ast
@@ -11,8 +9,12 @@ import re
 import sys
 from pathlib import Path
 
-FILE_LIMIT = 400
-FUNCTION_LIMIT = 60
+FILE_LIMIT, TEST_FILE_LIMIT = 400, 550
+"""Lines of a file. Tests are lists of cases, which read well at some length."""
+
+FUNCTION_LIMIT = 75
+"""Lines of a function with its docstring, at 100 columns."""
+
 FOLDERS = ("src", "tests", "tools", "benchmarks", "evidence")
 REASON = re.compile(r"#\s*size:\s*\S")
 
@@ -21,10 +23,10 @@ def check_text(name: str, text: str) -> list[str]:
     """List what is too long in one Python file, a sentence each."""
     lines = text.splitlines()
     problems = []
-    if len(lines) > FILE_LIMIT and not any(REASON.search(line) for line in lines[:10]):
+    limit = TEST_FILE_LIMIT if name.startswith("tests/") else FILE_LIMIT
+    if len(lines) > limit and not any(REASON.search(line) for line in lines[:10]):
         problems.append(
-            f"{name}: {len(lines)} lines, at most {FILE_LIMIT}; split it or give `# size: reason` "
-            "on top"
+            f"{name}: {len(lines)} lines, at most {limit}; split it or give `# size: reason` on top"
         )
     for node in ast.walk(ast.parse(text)):
         if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):

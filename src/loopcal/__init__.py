@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from loopcal.diagnose import find_outliers as find_outliers
     from loopcal.diagnose import identifiability as identifiability
     from loopcal.diagnose import suggest_measurements as suggest_measurements
+    from loopcal.errors import ArgumentTypeError as ArgumentTypeError
     from loopcal.errors import DataError as DataError
     from loopcal.errors import EstimationError as EstimationError
     from loopcal.errors import FileError as FileError
@@ -161,6 +162,7 @@ PUBLIC_NAMES: Mapping[str, tuple[str, ...]] = {
         "suggest_measurements",
     ),
     "loopcal.errors": (
+        "ArgumentTypeError",
         "DataError",
         "EstimationError",
         "FileError",

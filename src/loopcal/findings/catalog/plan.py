@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+# size: a table of messages, one entry after the other
 """Wording of findings about plans: content, certificate, expected errors, and refusals."""
 
 from __future__ import annotations

@@ -141,9 +141,7 @@ def save_run(
 
 
 def build_document(
-    report: CalibrationReport,
-    inputs: Mapping[str, Path] | None = None,
-    command: Sequence[str] = (),
+    report: CalibrationReport, inputs: Mapping[str, Path] | None = None, command: Sequence[str] = ()
 ) -> dict[str, Any]:
     """Return the content of result.json; see `save_run`."""
     files = {role: as_path(file, "input") for role, file in (inputs or {}).items()}

@@ -69,9 +69,7 @@ def format_surface_data(plan: SurfacePlan) -> str:
         assert one.rows is not None  # the plan states them
         gaps = np.zeros((len(one.rows), len(one.kind.columns)))
         sigma = one.noise.sigma
-        observations.append(
-            Observations.from_sigma(one.kind, one.rows, gaps, sigma, "", one.group)
-        )
+        observations.append(Observations.from_sigma(one.kind, one.rows, gaps, sigma, "", one.group))
     poses = plan.poses
     data = Measurements(robot.name, poses.readings, tuple(observations), labels=poses.labels)
     lines = format_measurements(data, robot).splitlines()
