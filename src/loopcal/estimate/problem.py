@@ -192,16 +192,17 @@ class Problem:
         """
         t = len(self)
         shared = None
-        can_share = isinstance(self.poses, ExactPoses) and self.poses.is_single_block and t > 1
-        if can_share and (deviation == deviation[0]).all():
-            shared = self.poses.solve_single_block(deviation[:1], self.trials, start)
+        exact = self.poses if isinstance(self.poses, ExactPoses) else None
+        is_equal = t > 1 and bool((deviation == deviation[0]).all())
+        if exact is not None and exact.is_single_block and is_equal:
+            shared = exact.solve_single_block(deviation[:1], self.trials, start)
         together = max(1, BLOCK // self.poses.block_size)
         parts = []
         for first in range(0, t, together):
             chosen = np.arange(first, min(first + together, t))
             z, trials, begin = deviation[chosen], self.trials[chosen], start.take(chosen)
-            if shared is not None and isinstance(self.poses, ExactPoses):
-                solution = self.poses.solve(z, trials, begin, self.control, shared=shared)
+            if shared is not None and exact is not None:
+                solution = exact.solve(z, trials, begin, self.control, shared=shared)
             else:
                 solution = self.poses.solve(z, trials, begin, self.control)
             parts.append(self._eliminate(solution, z, trials, begin))

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whitening: from covariances to matrices that give residuals unit variance, with zero rows for
-absent components.
-"""
+"""Whiteners: matrices that give residuals unit variance, with zero rows for absent components."""
 
 import numpy as np
 
@@ -16,8 +14,9 @@ _SMALLEST_PIVOT = 1e-7
 
 
 def whitener(covariance: FloatArray, present: Bools, weight: FloatArray) -> FloatArray:
-    """Matrices W with `W C W' = weight` on the present components, zero rows and columns for the
-    absent ones.
+    """Return matrices W with `W C W' = weight` on the present components.
+
+    Rows and columns of absent components are zero.
 
     W is the inverse lower Cholesky factor. Leaving a component out of a Gaussian drops its row and
     column of C; here they are put to those of the identity, which keeps the shape and gives the

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One triangular factor of any number of rows, and the one decomposition from which everything else
-is read.
+"""The decomposition of a triangular factor, from which everything about an estimate is read.
 
-Rows [A | b] of a linear least-squares problem are folded, block by block, into the triangular
-factor of their QR decomposition (`loopcal.numerics.triangular_factor`); the right-hand side is
-the last column, so that the norm of what no solution explains is the last diagonal entry. Singular
-values, rank, solutions, filters and covariances come from the singular value decomposition of that
-factor. The product A'A is never formed: it would turn null directions of 1e-14 into 1e-7. Every
-array has a leading trial axis t. See docs/theory/estimation.md.
+Rows [A | b] of a linear least-squares problem are folded, block by block, into one triangular
+factor (`loopcal.numerics.triangular_factor`). Singular values, rank, solutions, filters and
+covariances come from the singular value decomposition of that factor. The product A'A is never
+formed: it would turn null directions of 1e-14 into 1e-7. Every array has a leading trial axis t.
+See docs/theory/estimation.md.
 """
 
 from __future__ import annotations
@@ -48,12 +46,11 @@ units of the last place.
 
 
 def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:
-    """Return derivatives with zeros where they are rounding: at most ROUNDING of the size of the
-    terms they are sums of.
+    """Return derivatives with zeros where they are rounding.
 
-    A column that rows see by rounding alone must be one that they do not see BEFORE columns are
-    brought to length one: among such columns a few units of the last place are a direction like any
-    other, and lead a step to the end of the world.
+    They are rounding where they are at most ROUNDING of the size of the terms whose sum they are.
+    A column that is rounding must be set to zero BEFORE columns are scaled to length one: after
+    that, a few units of the last place look like any other direction and produce an unbounded step.
 
     Parameters
     ----------
@@ -81,15 +78,14 @@ class Decomposition:
     """Singular value decomposition A diag(scale) = U diag(s) V' of folded rows [A | b].
 
     A deviation z has the coordinates y = V' (z / scale); in them the least-squares sum is sum (s_i
-    y_i - c_i)^2 plus what lies outside the range. A `penalty` (t, p) adds penalty_i y_i^2: zero for
+    y_i - c_i)^2 plus the part outside the range. A `penalty` (t, p) adds penalty_i y_i^2: zero for
     plain least squares, infinite where a direction is not used at all. Its filter factors are f_i =
     s_i^2 / (s_i^2 + penalty_i).
 
-    Where some columns are never penalized, V holds two groups of columns: those of
-    unpenalized parameters alone, and those of the others, each with the change of the unpenalized ones that goes best
-    with it. U stays orthonormal and V'z of the second group depends on the penalised parameters
-    alone, so that all formulas stay as they are; V itself is oblique and its inverse is kept as
-    `dual`.
+    Where some columns are never penalized, V holds two groups of columns: those of unpenalized
+    parameters alone, and those of the others, each with the best change of the unpenalized ones.
+    U stays orthonormal, and V'z of the second group depends on the penalized parameters alone, so
+    that all formulas hold; V itself is oblique, and its inverse is kept as `dual`.
 
     Attributes
     ----------
@@ -101,7 +97,7 @@ class Decomposition:
     scale : (p,) by which the columns were multiplied.
     tolerance : singular values below tolerance * s_1 count as zero.
     dual : (t, p, p) inverse of V where V is oblique; None where it is V'.
-    unpenalized : (t, p) directions of parameters that are never penalized; None where there are none.
+    unpenalized : (t, p) directions of parameters that are never penalized; None without any.
     """
 
     singular_values: FloatArray
@@ -172,7 +168,7 @@ class Decomposition:
         return np.divide(square, total, out=np.zeros_like(total), where=total > 0.0)
 
     def solution(self, penalty: FloatArray) -> FloatArray:
-        """Return the coordinates y_i = f_i c_i / s_i, (t, p), that minimise sum (s_i y_i - c_i)^2 +
+        """Return the coordinates y_i = f_i c_i / s_i, (t, p), that minimize sum (s_i y_i - c_i)^2 +
         penalty_i y_i^2.
         """
         s = self.singular_values
@@ -190,7 +186,7 @@ class Decomposition:
         """Return the variance (t, p) of each coordinate: infinite where the direction is not used.
 
         For noise variance sigma^2 of the rows and a prior of variance 1 / penalty_i it is noise
-        plus what the penalty holds back: f_i^2 sigma^2 / s_i^2 + (1 - f_i)^2 / penalty_i, with
+        plus the bias of the penalty: f_i^2 sigma^2 / s_i^2 + (1 - f_i)^2 / penalty_i, with
         sigma = 1 equal to 1 / (s_i^2 + penalty_i), and with no penalty equal to sigma^2 / s_i^2.
         """
         square = self.singular_values**2
@@ -204,8 +200,8 @@ class Decomposition:
         """Return the covariance (t, p, p) of the deviation, in the units of the columns.
 
         A parameter that has a part in a direction that is not used has infinite variance, and its
-        covariances with all others are not defined (nan): the one rule of the project for what the
-        data cannot tell.
+        covariances with all others are not defined (nan): the one rule of the project for
+        directions that the data do not determine.
         """
         variances = self.variances(penalty, noise)
         infinite = np.isinf(variances)
@@ -252,8 +248,9 @@ class Decomposition:
         return self.directions[trial][:, ~self.used[trial]]
 
     def plain(self) -> Decomposition:
-        """Return the decomposition without unpenalized columns, which alone has the singular values of A
-        (itself where it has).
+        """Return the decomposition without unpenalized columns: that with the singular values of A.
+
+        It is this object where no columns are unpenalized.
         """
         if self.dual is None:
             return replace(self, unpenalized=None)
@@ -359,8 +356,9 @@ def _split(
     tolerance: float,
     unpenalized: BoolArray,
 ) -> Decomposition:
-    """Decompose [F G] with unpenalized columns F first: F = U1 S1 W', then what F cannot explain of G, (I
-    - U1 U1') G = U2 S2 V2'.
+    """Decompose [F G], unpenalized columns F first.
+
+    F = U1 S1 W', and the part of G that F does not explain is (I - U1 U1') G = U2 S2 V2'.
 
     With T = S1^+ U1'G the columns of V are (W, 0) and (-W T V2, V2), and its inverse is [[W', T],
     [0, V2']].
