@@ -1,21 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All rows of measurements at given poses and unknowns: what an estimator needs of them, and
-nothing of robots.
+"""Whitened rows of measurements at given poses and nuisance parameters, without any robot.
 
-    # U unknowns: frames, targets, surfaces
+    # U nuisance parameters: frames, targets, surfaces
     local = measurements.nuisance_parameters
     # (U,), or guess_nuisance_values(measurements, T, local)
     values = local.values()
     # one `KindRows` for each kind
     parts = evaluate_all(measurements, T, values[None], local)
-    # (t, M, p + U + 1): [machine | local | residual]
+    # (t, M, p + U + 1): [machine | nuisance | residual]
     rows = whitened_rows(parts, D)
 
-With D = d twist / d parameter (t, n, 6, p) of the mechanism, a Gauss-Newton step (machine, local)
-solves `rows[..., :-1] step = -rows[..., -1]` in the least-squares sense. Both halves add: values of
-unknowns are plain numbers, frames too (see `loopcal.measure.kinds.parts`). Local unknowns without
-tolerance may be eliminated by projecting the rows onto the complement of their columns. Rows and
-components that are absent are zero in the same shape.
+With D = d twist / d parameter (t, n, 6, p) of the mechanism, a Gauss-Newton step (machine,
+nuisance) solves `rows[..., :-1] step = -rows[..., -1]` in the least-squares sense. Both parts of
+the step are added: values of nuisance parameters are plain numbers, frames too (see
+`loopcal.measure.kinds.parts`). Rows and components that are absent are zero.
 """
 
 from collections.abc import Mapping
@@ -34,7 +32,7 @@ Ints = NDArray[np.intp]
 
 
 class KindRows(NamedTuple):
-    """Rows of one kind; l = 1 but where a row compares several poses.
+    """Rows of one kind; l poses per row, l = 1 unless rows compare poses.
 
     Attributes
     ----------
@@ -64,7 +62,7 @@ def evaluate_all(
     local: NuisanceParameters | None = None,
     joints: Mapping[str, FloatArray] | None = None,
 ) -> tuple[KindRows, ...]:
-    """Evaluate every kind.
+    """Evaluate every kind at poses.
 
     Parameters
     ----------
@@ -97,7 +95,7 @@ def evaluate_all(
 def whitened_rows(
     parts: tuple[KindRows, ...], twists: FloatArray, joints: Mapping[str, FloatArray] | None = None
 ) -> FloatArray:
-    """Whitened rows [machine | local | residual] of all kinds, one under the other.
+    """Return the whitened rows [machine | nuisance | residual] of all kinds, stacked.
 
     Parameters
     ----------

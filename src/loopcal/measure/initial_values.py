@@ -7,20 +7,18 @@ last descent uses all rows together. Parameters with a prior and fixed ones begi
 values.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.measure.evaluation import evaluate_all, whitened_rows
+from loopcal.measure.guess_descent import STEPS, descend
 from loopcal.measure.kinds import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations
 from loopcal.typing import BoolArray, FloatArray, IntArray
-
-STEPS = 60
-"""Steps of damped Gauss-Newton [1]; candidates in the right basin need fewer than ten."""
 
 
 def guess_nuisance_values(
@@ -152,7 +150,7 @@ def _refine_best_candidate(
         cost = _sum_squares(whiten(candidates, sets)[0]).reshape(t, k)
         chosen = (np.argsort(cost, axis=1)[:, :most] + k * np.arange(t)[:, None]).ravel()
         candidates, sets, k = candidates[chosen], sets[chosen], most
-    refined, cost = descend(lambda x: whiten(x, sets), candidates, steps)
+    refined, cost = descend(lambda x, which: whiten(x, sets[which]), candidates, steps)
     return refined.reshape(t, k, -1)[np.arange(t), np.argmin(cost.reshape(t, k), axis=1)]
 
 
@@ -185,7 +183,8 @@ def _refine_together(
     weight = np.where(nuisance.table.free, 1.0 / nuisance.table.tolerance, 0.0)
     prior = np.diag(np.nan_to_num(weight, nan=0.0))
 
-    def whiten(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def whiten(x: FloatArray, which: IntArray) -> tuple[FloatArray, FloatArray]:
+        del which
         rows = whitened_rows(evaluate_all(measurements, T[None], x, nuisance, joints), no_motion)
         e = np.concatenate([rows[..., -1], (x - nuisance.table.nominal) @ prior], axis=1)
         return e, np.concatenate(
@@ -193,49 +192,6 @@ def _refine_together(
         )
 
     return descend(whiten, values[None])[0][0]
-
-
-def descend(
-    whiten: Callable[[FloatArray], tuple[FloatArray, FloatArray]], x: FloatArray, steps: int = STEPS
-) -> tuple[FloatArray, FloatArray]:
-    """Minimize sums of squares from several initial values at once, by damped Gauss-Newton.
-
-    Parameters
-    ----------
-    whiten : from (c, u) to residuals (c, M) and Jacobians (c, M, u)
-    x : (c, u) initial values
-    steps : at most
-
-    Returns
-    -------
-    x : (c, u)
-    cost : (c,) sums of squares; infinite where the initial values cannot be evaluated.
-    """
-    e, J = whiten(x)
-    cost = _sum_squares(e)
-    damping = np.full(len(x), 1e-4)
-    for _ in range(steps):
-        norm = np.linalg.norm(J, axis=1)
-        scale = np.where(norm > 0.0, norm, 1.0)
-        # a triangular factor first, so that the decomposition does not grow with the rows
-        stack = np.nan_to_num(np.concatenate([J / scale[:, None, :], e[..., None]], axis=-1))
-        R = np.asarray(np.linalg.qr(stack, mode="r"), dtype=float)
-        U, s, V = np.linalg.svd(R[..., :-1], full_matrices=False)
-        rhs = np.einsum("cmk,cm->ck", U, R[..., -1])
-        gain = np.where(s > 1e-12, s / (s * s + damping[:, None] ** 2 + 1e-24), 0.0)
-        step = np.where(norm > 0.0, -np.einsum("cku,ck->cu", V, gain * rhs) / scale, 0.0)
-        trial = x + step
-        e_new, J_new = whiten(trial)
-        new = _sum_squares(e_new)
-        better = new < cost
-        # converged: the step changes the residuals by a millionth of their sigma, or of themselves
-        converged = np.linalg.norm(step * scale, axis=1) <= 1e-6 * (1.0 + np.sqrt(new))
-        x, e = np.where(better[:, None], trial, x), np.where(better[:, None], e_new, e)
-        J, cost = np.where(better[:, None, None], J_new, J), np.where(better, new, cost)
-        if np.all(converged | (damping > 1e4)):
-            break
-        damping = np.where(better, 0.1 * damping, 10.0 * damping)
-    return x, cost
 
 
 def _sum_squares(e: FloatArray) -> FloatArray:
