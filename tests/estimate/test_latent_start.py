@@ -75,7 +75,7 @@ def counted(monkeypatch):
         monkeypatch.setattr(owner, attribute, wrapped)
 
     counting(UncertainPoses, "_evaluate", "looks")
-    counting(trials_module, "_followed", "followed")
+    counting(trials_module, "_follow_path", "followed")
     return count
 
 

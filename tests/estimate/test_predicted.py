@@ -68,7 +68,7 @@ def test_a_pose_that_too_few_believed_lines_hold_is_left_out_and_named(cable):
     assert found.poses == ("1", "2", "4", "5", "6", "7", "8")
     assert found.unreachable == ()
     (missing,) = [f for f in found.findings if f.code == "validation.missing-readings"]
-    assert tuple(missing.data["names"]) == ("3",)
+    assert tuple(missing.data["names"]) == ("pose 3",)
 
 
 def test_equal_sigmas_predict_as_the_robot_does(cable):
@@ -96,5 +96,5 @@ def test_where_no_pose_has_its_readings_it_is_they_that_are_missed(name):
         readings=np.full(data.readings.shape, np.nan),
         reading_sigma=np.full(data.readings.shape, np.inf),
     )
-    with pytest.raises(DataError, match="none of the 3 poses has all the readings"):
+    with pytest.raises(DataError, match="None of the 3 poses"):
         validate(robot, none)
