@@ -41,7 +41,7 @@ def descend(
     x : (c, u). cost : (c,) sums of squares; infinite where a start cannot be evaluated.
     """
     residual, jacobian = whiten(x, np.arange(len(x)))
-    start = _Point(x, residual, jacobian, _sum_squares(residual))
+    start = _Point(x, residual, jacobian, sum_squares(residual))
     damping = FixedFactors(np.full(len(x), FIRST_DAMPING))
     point = minimize(_Candidates(whiten), start, damping, steps).point
     return point.x, point.cost
@@ -115,7 +115,7 @@ class _Candidates:
         """Return the points to which steps lead."""
         x = point.x + step.x
         residual, jacobian = self.whiten(x, trials)
-        return _Point(x, residual, jacobian, _sum_squares(residual))
+        return _Point(x, residual, jacobian, sum_squares(residual))
 
     def judge(self, point: _Point, step: _Step, candidate: _Point) -> tuple[BoolArray, FloatArray]:
         """Accept every decrease."""
@@ -134,6 +134,7 @@ class _Candidates:
         return np.where(is_small, DescentStatus.CONVERGED, stuck)
 
 
-def _sum_squares(e: FloatArray) -> FloatArray:
+def sum_squares(e: FloatArray) -> FloatArray:
+    """Return sums of squares (c,) of residuals (c, M); infinite where they are not finite."""
     total = np.sum(e * e, axis=1)
     return np.where(np.isfinite(total), total, np.inf)

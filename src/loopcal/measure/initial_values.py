@@ -13,7 +13,7 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.measure.evaluation import evaluate_all, whitened_rows
-from loopcal.measure.guess_descent import STEPS, descend
+from loopcal.measure.guess_descent import STEPS, descend, sum_squares
 from loopcal.measure.kinds import Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
@@ -147,7 +147,7 @@ def _refine_best_candidate(
 
     sets = np.repeat(np.arange(t), k)
     if most is not None and most < k:
-        cost = _sum_squares(whiten(candidates, sets)[0]).reshape(t, k)
+        cost = sum_squares(whiten(candidates, sets)[0]).reshape(t, k)
         chosen = (np.argsort(cost, axis=1)[:, :most] + k * np.arange(t)[:, None]).ravel()
         candidates, sets, k = candidates[chosen], sets[chosen], most
     refined, cost = descend(lambda x, which: whiten(x, sets[which]), candidates, steps)
@@ -192,8 +192,3 @@ def _refine_together(
         )
 
     return descend(whiten, values[None])[0][0]
-
-
-def _sum_squares(e: FloatArray) -> FloatArray:
-    total = np.sum(e * e, axis=1)
-    return np.where(np.isfinite(total), total, np.inf)
