@@ -16,7 +16,6 @@ import numpy as np
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.fit import MOST_PARTS, MOST_WEAK_PARTS, list_changes
-from loopcal.findings.wording import list_names
 from loopcal.typing import FloatArray
 
 NEGLIGIBLE = 1e-6
@@ -25,8 +24,6 @@ NEGLIGIBLE = 1e-6
 
 MINOR = 0.1
 """The same for a weak direction, which has a small part of nearly every parameter."""
-
-SHOWN = MOST_PARTS
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,11 +84,6 @@ class Combination:
             "nuisance": self.nuisance,
             "sentence": str(self),
         }
-
-
-def listed(words: list[str] | tuple[str, ...], most: int = SHOWN) -> str:
-    """Return `a, b and c`; names beyond `most` are counted."""
-    return list_names(words, most)
 
 
 def describe_null_space(free: FreeParameters, null_space: FloatArray) -> tuple[Combination, ...]:

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options, arguments and rows that make no sense are refused with what is allowed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from loopcal.errors import EstimationError
+from loopcal.estimate import (
+    MAP,
+    FitOptions,
+    Huber,
+    LeastSquares,
+    StepControl,
+    TruncatedSVD,
+    identify,
+    identify_trials,
+    recalibrate,
+)
+from loopcal.measure import sample_truth, simulate_trials
+from tests.estimate.problems import hexapod, hexapod_data, hexapod_poses, tracker
+from tests.findings.reported import one_of, refused
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("relative", 0.0),
+        ("relative", np.nan),
+        ("absolute", -1.0),
+        ("absolute", np.inf),
+        ("iterations", -1),
+        ("damping", -1.0),
+    ],
+)
+def test_step_control(name, value) -> None:
+    with pytest.raises(EstimationError, match=name):
+        StepControl(**{name: value})
+
+
+def test_truncation_at_no_integer() -> None:
+    with pytest.raises(EstimationError, match="integer"):
+        TruncatedSVD(2.5)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("method", ["ls", LeastSquares])
+def test_a_method_that_is_no_instance(method) -> None:
+    with pytest.raises(EstimationError, match=r"LeastSquares\(\)"):
+        identify(hexapod(), hexapod_data(), method)
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1.0, np.nan])
+def test_rank_tolerance(tolerance) -> None:
+    with pytest.raises(EstimationError, match="above 0 and below 1"):
+        identify(hexapod(), hexapod_data(), options=FitOptions(rank_tolerance=tolerance))
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_huge_reading_is_named() -> None:
+    data = hexapod_data()
+    (pose,) = data.observations
+    values = pose.measured.copy()
+    values[3, 5] = 1e300
+    with refused("fit.residuals-not-finite", poses=(data.labels[3],)):
+        identify(hexapod(), replace(data, observations=(replace(pose, measured=values),)))
+
+
+def test_fewer_equations_than_parameters_say_what_rests_on_tolerances() -> None:
+    fit = identify(hexapod(), hexapod_data(5))
+    few = one_of(fit.findings, "fit.few-equations")
+    assert few.data == {"equations": 30, "parameters": 42, "directions": 12}
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"noise": "guessed"}, "'given' or 'estimated'"),
+        ({"begin": "anywhere"}, "'kinematics' or 'closure'"),
+        ({"loss": Huber}, r"Huber\(\) or Tukey\(\)"),
+        ({"prior": "run"}, r"prior_from\(fit.posterior\)"),
+        ({"excluded_poses": "12"}, r"sequence of labels, such as \['12'\]"),
+        ({"rank_tolerance": 2.0}, "above 0 and below 1"),
+    ],
+)
+def test_options_are_checked_when_they_are_made(given, words) -> None:
+    with pytest.raises(EstimationError, match=words):
+        FitOptions(**given)
+
+
+def test_options_show_what_differs_from_the_default_and_keep_copies() -> None:
+    start = np.zeros(3)
+    options = FitOptions(LeastSquares(), noise="estimated", excluded_poses=["6"], start=start)
+    start[0] = 1.0
+    assert repr(options) == (
+        "FitOptions(method=LeastSquares(), noise='estimated', start=<(3,) array>, "
+        "excluded_poses=('6',))"
+    )
+    assert np.array_equal(np.asarray(options.start), np.zeros(3))
+    assert repr(FitOptions()) == "FitOptions()"
+
+
+def test_method_and_loss_override_the_options() -> None:
+    data, options = hexapod_data(), FitOptions(method=MAP(), loss=Huber(), noise="estimated")
+    fit = identify(hexapod(), data, LeastSquares(), options=options)
+    assert fit.method == LeastSquares()
+    assert fit.options.loss == Huber()
+    assert fit.options.noise == "estimated"
+    assert options.method == MAP()
+    with pytest.raises(EstimationError, match="must be FitOptions"):
+        identify(hexapod(), data, options={"noise": "given"})  # pyright: ignore[reportArgumentType]
+
+
+def test_a_wrong_type_of_robot_or_data_says_what_to_pass() -> None:
+    with pytest.raises(EstimationError, match=r"the text 'hexapod-42'; pass a robot"):
+        identify("hexapod-42", hexapod_data())  # pyright: ignore[reportArgumentType]
+    with pytest.raises(EstimationError, match=r"the text 'a.csv'; pass .* load_measurements"):
+        identify(hexapod(), "a.csv")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(EstimationError, match=r"a Measurements; pass .* simulate_trials"):
+        identify_trials(hexapod(), hexapod_data())  # pyright: ignore[reportArgumentType]
+
+
+def test_trials_and_recalibration_refuse_options_that_they_do_not_support() -> None:
+    robot = hexapod()
+    trials = simulate_trials(robot, sample_truth(robot, 2, 1), hexapod_poses(15), tracker(), 2)
+    with pytest.raises(EstimationError, match="does not support the option loss"):
+        identify_trials(robot, trials, options=FitOptions(loss=Huber()))
+    fit = identify(robot, hexapod_data(), LeastSquares())
+    with pytest.raises(EstimationError, match="uses LeastSquares"):
+        recalibrate(robot, hexapod_data(), fit.posterior, options=FitOptions(method=MAP()))
+    with pytest.raises(EstimationError, match="takes no loss"):
+        recalibrate(robot, hexapod_data(), fit.posterior, options=FitOptions(loss=Huber()))
+
+
+def test_results_have_short_representations() -> None:
+    fit = identify(hexapod(), hexapod_data(), LeastSquares())
+    for shown in (fit, fit.posterior, fit.history, fit.residuals[0], fit.free_parameters):
+        assert len(repr(shown)) < 600
+    assert "fit.converged" not in repr(fit)
+    assert "noise.consistent" in repr(fit)
+    (row,) = (line for line in str(fit).splitlines() if line.startswith("leg1.length"))
+    assert row.endswith(" mm")
