@@ -114,7 +114,7 @@ def test_validate_uses_the_frame_that_the_run_found(here) -> None:
     assert "is called 'tracker'; the data have: frame" in err
 
 
-def test_a_frame_that_was_moved_since_the_fit_is_named_and_both_errors_are_taken_with_the_frame_that_the_run_found(
+def test_a_frame_that_was_moved_since_the_fit_is_named_and_kept_for_both_errors(
     here,
 ) -> None:
     folder, run = here

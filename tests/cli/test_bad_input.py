@@ -47,7 +47,7 @@ def refused(tmp_path, monkeypatch, capsys):
         assert code == 1
         assert out == ""
         assert err.startswith("loopcal: ")
-        sentence, *hint = err.splitlines()
+        _, *hint = err.splitlines()
         assert len(hint) <= 1, err
         assert all(line.startswith("Hint: ") for line in hint)
         assert err.endswith("\n")

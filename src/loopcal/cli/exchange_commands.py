@@ -272,11 +272,9 @@ def _view_import(
     """Return what was read, what was identified, and which lines were changed."""
     from loopcal.report.calibration_view import view_fit
 
-    free = int(robot.parameters.free.sum())
-    page: list[Block] = [
-        f"{document['robot']}: {len(robot.actuators)} actuators, {len(robot.parameters)} "
-        f"parameters, {free} free"
-    ]
+    n, free = len(robot.parameters), int(robot.parameters.free.sum())
+    counts = f"{len(robot.actuators)} actuators, {n} parameters, {free} free"
+    page: list[Block] = [f"{document['robot']}: {counts}"]
     if document["data"] is not None:
         page.append(f"{document['data']}: the measurements of the file")
     page += [f"note: {note}" for note in document["notes"]]

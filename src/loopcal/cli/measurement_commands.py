@@ -243,12 +243,9 @@ def simulate(
     if as_json:
         terminal.print_json({"output": output, "truth": truth, **counts})
         return
-    terminal.print_page(
-        [
-            f"{output}: {counts['n_poses']} poses of {machine.name}, {counts['n_rows']} measured "
-            f"values, seed {seed}"
-        ]
-    )
+    n_poses, n_rows = counts["n_poses"], counts["n_rows"]
+    summary = f"{n_poses} poses of {machine.name}, {n_rows} measured values, seed {seed}"
+    terminal.print_page([f"{output}: {summary}"])
 
 
 def _fill_in(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import shutil
 import sys
-import time
+import threading
 from collections.abc import Iterable
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -64,17 +64,22 @@ def print_failures(failures: Iterable[Finding | str], shown: bool = False) -> in
 class ProgressBar:
     """The progress callback of the command line: a bar on standard error.
 
-    It is drawn only where standard error is a terminal, and only after two seconds of work.
+    It is drawn only where standard error is a terminal, and only after two seconds of work. A timer
+    draws it, so that a long step without further reports shows, too.
     """
 
     def __init__(self) -> None:
-        self._started = time.monotonic()
+        self._lock = threading.Lock()
+        self._timer = threading.Timer(DELAY, self._start)
+        self._timer.daemon = True
         self._bar: Any = None
         self._task: Any = None
-        self._what = ""
+        self._state: tuple[int, int, str] | None = None
+        self._shown = ""
 
     def __enter__(self) -> Self:
-        self._started = time.monotonic()
+        if sys.stderr.isatty():
+            self._timer.start()
         return self
 
     def __exit__(
@@ -83,21 +88,35 @@ class ProgressBar:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
+        self._timer.cancel()
+        with self._lock:
+            self._state = None
+            if self._bar is not None:
+                self._bar.stop()
+                self._bar = None
 
     def __call__(self, done: int, total: int, what: str, /) -> None:
         """Draw `done` of `total` steps of `what`."""
-        if not sys.stderr.isatty() or time.monotonic() - self._started < DELAY:
-            return
-        if self._bar is None:
+        with self._lock:
+            self._state = (done, total, what)
+            if self._bar is not None:
+                self._draw(*self._state)
+
+    def _start(self) -> None:
+        """Begin to draw, after the delay."""
+        with self._lock:
+            if self._state is None:
+                return
             self._bar = _make_bar()
             self._bar.start()
-        if what != self._what:
+            self._draw(*self._state)
+
+    def _draw(self, done: int, total: int, what: str) -> None:
+        """Update the bar; work of another name begins a bar of its own."""
+        if what != self._shown:
             if self._task is not None:
                 self._bar.remove_task(self._task)
-            self._task, self._what = self._bar.add_task(what, total=total), what
+            self._task, self._shown = self._bar.add_task(what, total=total), what
         self._bar.update(self._task, completed=done, total=total)
 
 

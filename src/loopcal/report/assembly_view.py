@@ -43,12 +43,14 @@ def _build_link_table(robot: Mechanism, units: Units) -> Table:
     """Return the transforms of links, attachments, platform and tool."""
     rows = []
     for limb in robot.assembly.limbs:
-        for link in limb.links:
-            rows.append((limb.name, link.name, *_place(link.transform, units)))
-        attachment = limb.attachment
-        rows.append((limb.name, attachment.name, *_place(attachment.transform, units)))
-    rows.append(("platform", "home", *_place(robot.assembly.home, units)))
-    rows.append(("platform", "tool", *_place(robot.assembly.tool, units)))
+        rows += [
+            (limb.name, link.name, *_place(link.transform, units))
+            for link in (*limb.links, limb.attachment)
+        ]
+    rows += [
+        ("platform", "home", *_place(robot.assembly.home, units)),
+        ("platform", "tool", *_place(robot.assembly.tool, units)),
+    ]
     columns = (word_column("limb"), word_column("link"), *(Column(title) for title in PLACE))
     length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
     return Table(f"Links, from base to platform [{length}, {angle}]", columns, tuple(rows))

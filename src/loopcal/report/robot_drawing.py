@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A picture of a mechanism: its limbs, joints, rods, platform and tool, in space and from above.
 
-One limb has one colour in both views. A short line through a point is the axis of a turning joint,
-a dashed one the guide of a sliding joint; a filled point is driven. Nothing here decides anything:
-where links are is `mechanism.frames`.
+A limb has the same color in both views. A short line through a point is the axis of a revolute
+joint, a dashed line is the guide of a sliding joint, and a filled point is driven. The placement of
+links comes from `mechanism.frames`.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8
 out).
 """
 AXIS, GUIDE = 0.06, 0.12
-"""Half the length of a turning joint's axis, and how far a guide is drawn beyond what slides, over
-the robot's size.
+"""Half the length of the axis of a revolute joint, and the length of a guide beyond its slide, both
+as a share of the robot's size.
 """
 DPI = 150
 FORMATS = (".png", ".svg", ".pdf")
@@ -37,18 +37,14 @@ FORMATS = (".png", ".svg", ".pdf")
 
 @dataclass(frozen=True)
 class Stroke:
-    """A line (n, 3) [m] of the picture, or points where it has no style, with what matplotlib shall
-    make of it.
-    """
+    """A line or points (n, 3) [m] of the picture, with the arguments of matplotlib's `plot`."""
 
     points: FloatArray
     style: dict[str, Any]
 
 
 def draw(robot: Mechanism, solution: Solution | None = None, row: int = 0) -> Figure:
-    """Draw a robot at a row of a solution (default: home), with the axes in the length unit of its
-    file.
-    """
+    """Draw a robot at home, or at a row of a solution, in the length unit of its file."""
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -181,9 +177,16 @@ def _label(space: Any, above: Any, limb: Stroke, name: str, middle: FloatArray) 
     place = tuple(np.array([20.0, 13.0]) * (away / distance if distance > 0 else [1.0, 1.0]))
     back = {"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.7}
     above.annotate(
-        name, foot[:2], xytext=place, textcoords="offset points", ha="center", va="center", fontsize=8,
-        color=limb.style["color"], bbox=back,
-    )  # fmt: skip
+        name,
+        foot[:2],
+        xytext=place,
+        textcoords="offset points",
+        ha="center",
+        va="center",
+        fontsize=8,
+        color=limb.style["color"],
+        bbox=back,
+    )
     space.text(*foot, f" {name}", fontsize=8, color=limb.style["color"])
 
 

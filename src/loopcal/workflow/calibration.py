@@ -40,8 +40,8 @@ from loopcal.workflow.fit_adapter import findings_of, fit_robot
 GREW = 1.1
 """Factor by which an error on held-out poses must grow to be a failure; less is their noise."""
 
-STEPS = 5
-"""Steps that the progress callback counts: model, fit, validation, examination, suggestions."""
+STEPS = 4
+"""Steps that the progress callback counts: model, fit, examination, suggestions."""
 
 
 def calibrate(

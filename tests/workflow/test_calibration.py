@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The calibration workflow: one call gives what the command prints."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.cli import main
+from loopcal.errors import DataError
+from loopcal.estimate import MAP
+from loopcal.findings import Severity, report_finding
+from loopcal.io.core.json_text import to_json
+from loopcal.measure import Gaussian, Instrument, Pose, Sensor, simulate
+from loopcal.workflow import CalibrationOptions, Verdict, calibrate, split_data
+from loopcal.workflow.verdict import choose_next_step, decide_verdict
+from tests.estimate.problems import hexapod, hexapod_data
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42" / "measurements.csv"
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return lc.load_robot("hexapod-42")
+
+
+@pytest.fixture(scope="module")
+def data(robot):
+    return lc.load_measurements(EXAMPLE, robot)
+
+
+@pytest.fixture(scope="module")
+def report(robot, data):
+    return calibrate(robot, data, CalibrationOptions(hold_out=0.25))
+
+
+def test_a_good_calibration_has_a_verdict_errors_at_the_noise_floor_and_a_next_step(report):
+    assert report.verdict is Verdict.CALIBRATED
+    assert (report.exit_code, report.failures) == (0, ())
+    assert report.next_step.code == "workflow.next-use-result"
+    validation = report.validation
+    assert validation is not None
+    for quantity in ("position", "orientation"):
+        floor = getattr(validation.noise_floor, quantity)
+        assert 0.7 * floor < validation.after.statistics(quantity).rms < 2.0 * floor
+    assert report.robot is report.identification.robot
+    assert report.fitted_errors is None
+
+
+def test_text_and_repr_fit_on_a_screen(report):
+    for text in (str(report), repr(report)):
+        assert len(text.splitlines()) < 20
+        assert text.startswith("Calibrated: hexapod-42, 42 parameters from 30 poses.")
+
+
+def test_the_json_document_holds_the_verdict_and_every_finding(report):
+    document = json.loads(to_json(report.to_dict()))
+    assert document["verdict"] == "calibrated"
+    assert len(document["findings"]) == len(report.findings)
+    assert all(set(f) == {"code", "severity", "data", "text"} for f in document["findings"])
+    assert len(document["split"]["held_out"]) == 10
+    assert document["passed"] is True
+
+
+def test_python_and_command_line_hold_out_the_same_poses(data, tmp_path, monkeypatch, capsys):
+    """`--hold-out 0.25`, `hold_out=0.25` and `data.split(0.75, seed)` are the same sets."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(EXAMPLE, tmp_path / "data.csv")
+    words = "calibrate hexapod-42 data.csv -o run --hold-out 0.25 --seed 3 --json"
+    assert main(words.split()) == 0
+    document = json.loads(capsys.readouterr().out)
+    fitted, held_out = data.split(0.75, seed=3)
+    split = split_data(data, hold_out=0.25, seed=3)
+    assert split.held_out is not None
+    assert split.fitted.labels == fitted.labels
+    assert split.held_out.labels == held_out.labels
+    assert document["split"] == {"hold_out": 0.25, "seed": 3, "held_out": list(held_out.labels)}
+
+
+def test_poses_can_be_held_out_by_name(data):
+    split = split_data(data, held_out=("2", "7"))
+    assert split.held_out is not None
+    assert split.held_out.labels == ("2", "7")
+    assert split.fitted.n_poses == data.n_poses - 2
+    with pytest.raises(DataError, match="held_out names the pose '99'"):
+        split_data(data, held_out=("99",))
+    with pytest.raises(DataError, match="all poses of the data are held out"):
+        split_data(data, held_out=data.labels)
+
+
+def test_without_held_out_poses_the_verdict_is_undecided(robot, data):
+    report = calibrate(robot, data)
+    assert report.verdict is Verdict.UNDECIDED
+    assert report.exit_code == 0
+    assert report.top_findings[0].code == "workflow.no-held-out-poses"
+    assert report.next_step.code == "workflow.next-hold-out"
+    assert report.validation is None
+    assert report.fitted_errors is not None
+
+
+def test_too_few_held_out_poses_leave_it_undecided(robot, data):
+    report = calibrate(robot, data, CalibrationOptions(held_out=("1", "2", "3")))
+    assert report.verdict is Verdict.UNDECIDED
+    few = next(f for f in report.findings if f.code == "workflow.few-held-out-poses")
+    assert few.data == {"count": 3, "needed": 5}
+
+
+def test_an_exceeded_limit_is_a_failure(robot, data):
+    report = calibrate(robot, data, CalibrationOptions(hold_out=0.25, limit_position=1e-7))
+    assert report.verdict is Verdict.NOT_CALIBRATED
+    assert report.exit_code == 2
+    assert [f.code for f in report.failures] == ["gates.limit-exceeded"]
+    assert report.next_step.code == "workflow.next-measure-more"
+
+
+def test_an_outlier_gives_a_failure_of_the_noise_and_is_the_next_thing_to_check(robot, data):
+    rows = data.observations[0]
+    measured = np.array(rows.measured)
+    measured[4, 3] += 1e-3  # [m], 1000 sigma
+    wrong = replace(data, observations=(replace(rows, measured=measured),))
+    report = calibrate(robot, wrong, CalibrationOptions(held_out=data.labels[10:20]))
+    assert report.verdict is Verdict.NOT_CALIBRATED
+    assert report.next_step.code == "workflow.next-check-outliers"
+    assert report.next_step.data["poses"] == (f"pose {data.labels[4]}",)
+
+
+def test_motions_of_frames_are_one_harmless_finding():
+    sensor = Sensor(Pose(unknown=("frame",)), Gaussian(np.array([5e-6] * 3 + [1e-6] * 3)))
+    robot = hexapod()
+    data = simulate(robot, _poses(robot, 30), Instrument((sensor,)), 1)
+    report = calibrate(robot, data, CalibrationOptions(hold_out=0.25))
+    (freedom,) = [f for f in report.findings if f.code == "workflow.frame-freedoms"]
+    assert freedom.severity is Severity.INFO
+    assert freedom.data == {"count": 6, "frames": ("base",)}
+    assert not any(f.code == "workflow.undetermined-combinations" for f in report.findings)
+
+
+def test_combinations_that_change_poses_are_a_reservation(robot, data):
+    rows = data.observations[0]
+    measured = np.array(rows.measured)
+    measured[:, :] = np.nan
+    measured[:, 5] = rows.measured[:, 5]  # heights alone
+    heights = replace(data, observations=(replace(rows, measured=measured),))
+    fit = replace(CalibrationOptions().fit, method=MAP())
+    report = calibrate(robot, heights, CalibrationOptions(fit=fit, hold_out=0.25))
+    (open_,) = [f for f in report.findings if f.code == "workflow.undetermined-combinations"]
+    assert open_.severity is Severity.WARNING
+    (frames,) = [f for f in report.findings if f.code == "workflow.frame-freedoms"]
+    assert open_.data["count"] + frames.data["count"] == 42 - 30
+    assert report.verdict in (Verdict.RESERVATIONS, Verdict.NOT_CALIBRATED)
+
+
+def test_progress_is_reported_from_nothing_to_all(robot, data):
+    steps = []
+    calibrate(robot, data, progress=lambda done, total, what: steps.append((done, total, what)))
+    assert steps[0][0] == 0
+    assert steps[-1][0] == steps[-1][1]
+    assert all(what for *_, what in steps)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (("hexapod.yaml", "data.csv"), "load_robot"),
+        ((hexapod(), "data.csv"), "load_measurements"),
+        ((hexapod(), hexapod_data(4), 0.25), "CalibrationOptions"),
+    ],
+)
+def test_a_wrong_argument_says_what_to_pass(arguments, word):
+    with pytest.raises(DataError, match=word):
+        calibrate(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("options", "code"),
+    [
+        ({"limit_position": 1e-3}, "workflow.limit-needs-held-out-poses"),
+        ({"free_limb": "leg3"}, "workflow.free-limb-needs-prior"),
+        ({"hold_out": 1.0}, None),
+        ({"hold_out": 0.25, "held_out": ("1",)}, None),
+        ({"held_out": "1"}, None),
+    ],
+)
+def test_options_that_contradict_each_other_are_refused(options, code):
+    with pytest.raises(DataError) as refused:
+        CalibrationOptions(**options)
+    assert refused.value.code == code
+
+
+def test_the_first_rule_of_the_verdict_decides():
+    failure = report_finding("gates.limit-not-measured", quantity="position")
+    undecided = report_finding("workflow.no-held-out-poses")
+    warning = report_finding("workflow.undetermined-combinations", count=1, names=("leg1.length",))
+    info = report_finding("workflow.frame-freedoms", count=6, frames=("base",))
+    assert decide_verdict((info, warning, undecided, failure)) is Verdict.NOT_CALIBRATED
+    assert decide_verdict((info, warning, undecided)) is Verdict.UNDECIDED
+    assert decide_verdict((info, warning)) is Verdict.RESERVATIONS
+    assert decide_verdict((info,)) is Verdict.CALIBRATED
+    assert [v.exit_code for v in Verdict] == [0, 0, 2, 0]
+    step = choose_next_step(Verdict.RESERVATIONS, (warning,), ())
+    assert step.code == "workflow.next-resolve-warnings"
+
+
+def _poses(robot, n):
+    return lc.sample_workspace(lc.load_robot("hexapod-42"), n, 3).coordinates
