@@ -114,9 +114,7 @@ def test_validate_uses_the_frame_that_the_run_found(here) -> None:
     assert "is called 'tracker'; the data have: frame" in err
 
 
-def test_a_frame_that_was_moved_since_the_fit_is_named_and_kept_for_both_errors(
-    here,
-) -> None:
+def test_a_frame_that_was_moved_since_the_fit_is_named_and_kept_for_both_errors(here) -> None:
     folder, run = here
     placed = {"frame.x": 0.1, "frame.rz": 0.5}
     saved(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)

@@ -141,10 +141,7 @@ def test_bad_targets_are_refused_in_a_sentence(run, made, text, sentence) -> Non
             "calibrate hexapod-42 later.csv -o new --prior run --method map",
             "Hint: leave out --method",
         ),
-        (
-            "calibrate hexapod-42 later.csv -o new --prior run --free-limb leg9",
-            "no free parameter of hexapod-42 belongs to 'leg9'",
-        ),
+        ("calibrate hexapod-42 later.csv -o new --prior run --free-limb leg9", "no limb 'leg9'"),
     ],
 )
 def test_requests_that_make_no_sense_are_refused_in_a_sentence(

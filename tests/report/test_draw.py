@@ -61,5 +61,7 @@ def test_check_writes_the_picture(tmp_path, capsys):
 
 
 def test_a_format_that_cannot_be_written_is_refused(tmp_path):
-    with pytest.raises(FileError, match=r"written as '.docx'; end its name in .png, .svg, .pdf"):
+    with pytest.raises(
+        FileError, match=r"written as '.docx'; use a name that ends in .png, .svg, .pdf"
+    ):
         save_picture(tmp_path / "robot.docx", zoo.hexapod())

@@ -96,6 +96,7 @@ def test_the_factory_default_is_flagged_as_not_calibrated(records):
         if "factory" in name:
             assert found.improvement() > 3.0
             refused = validate(printer(record), data, limit_position=0.2 * MM)
-            assert "position error 0.2617 mm" in refused.reasons[0]
+            assert refused.failures[0].code == "gates.limit-exceeded"
+            assert refused.failures[0].data["error"].value == pytest.approx(0.2617, abs=5e-5)
         else:
             assert found.improvement() == pytest.approx(1.0, abs=1e-3)

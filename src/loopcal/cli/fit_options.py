@@ -13,7 +13,7 @@ import click
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
-    from loopcal.workflow.fit_adapter import FitOptions
+    from loopcal.estimate import FitOptions
 
 METHODS = ("auto", "map", "ls", "ridge", "tsvd")
 LOSSES = ("none", "huber", "tukey")
@@ -41,6 +41,7 @@ class FitArguments:
         from loopcal.estimate import (
             GCV,
             MAP,
+            FitOptions,
             Huber,
             LeastSquares,
             Ridge,
@@ -48,7 +49,6 @@ class FitArguments:
             TruncationGCV,
             Tukey,
         )
-        from loopcal.workflow.fit_adapter import FitOptions
 
         for option, value, needs in (("--lam", self.lam, "ridge"), ("--keep", self.keep, "tsvd")):
             if value is not None and self.method != needs:

@@ -15,13 +15,13 @@ from loopcal.planning.path import locate_home
 from loopcal.planning.problem import DIMENSIONS
 from loopcal.planning.result import Plan
 from loopcal.planning.sample_size import ErrorCurve
-from loopcal.report.robot_drawing import COLOURS, DPI
+from loopcal.report.robot_drawing import COLORS, DPI
 from loopcal.units import Dimension, Unit, find_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CALIBRATION, VALIDATION, BOUND = COLOURS[0], COLOURS[1], COLOURS[2]
+CALIBRATION, VALIDATION, BOUND = COLORS[0], COLORS[1], COLORS[2]
 """Colors of calibration poses, of validation poses, and of the bound."""
 
 
@@ -47,11 +47,11 @@ def draw_plan(plan: Plan) -> Figure:
         first = (start[i], start[j]) if j is not None else (0.0, start[i])
         axes.plot([first[0], *x], [first[1], *y], color="0.7", lw=0.8, zorder=1, label="path")
         axes.plot(*first, "k+", ms=8.0, label="home", zorder=3)
-        for chosen, colour, label in (
+        for chosen, color, label in (
             (~plan.poses.held_out, CALIBRATION, "calibration"),
             (plan.poses.held_out, VALIDATION, "validation"),
         ):
-            axes.plot(x[chosen], y[chosen], "o", color=colour, ms=4.5, label=label, zorder=2)
+            axes.plot(x[chosen], y[chosen], "o", color=color, ms=4.5, label=label, zorder=2)
         axes.set_xlabel(_label(plan.robot, names[i]) if j is not None else "step [1], home is 0")
         axes.set_ylabel(_label(plan.robot, names[i if j is None else j]))
         axes.grid(visible=True, lw=0.3)

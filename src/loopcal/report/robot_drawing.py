@@ -23,8 +23,8 @@ from loopcal.units import Dimension, find_unit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f")
-"""Of the limbs in turn; told apart by colour-blind readers too (Okabe and Ito, the yellow left
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f")
+"""Of the limbs in turn; color-blind readers can distinguish them, too (Okabe and Ito, the yellow left
 out).
 """
 AXIS, GUIDE = 0.06, 0.12
@@ -81,12 +81,15 @@ def draw(robot: Mechanism, solution: Solution | None = None, row: int = 0) -> Fi
 def save_picture(
     path: Path, robot: Mechanism, solution: Solution | None = None, row: int = 0
 ) -> None:
-    """Write the picture to a file whose ending says the format; raises FileError for one that is
-    not in FORMATS.
+    """Write the picture of a robot to a file.
+
+    Raises
+    ------
+    FileError : the ending of the name is not one of `FORMATS`.
     """
     if path.suffix.lower() not in FORMATS:
         raise FileError(
-            f"a picture cannot be written as {path.suffix or 'no format'!r}; end its name in "
+            f"a picture cannot be written as {path.suffix or 'no format'!r}; use a name that ends in "
             f"{', '.join(FORMATS)}",
             path,
         )
@@ -94,24 +97,23 @@ def save_picture(
 
 
 def _strokes(robot: Mechanism, limbs: list[FloatArray], T: FloatArray) -> Iterator[Stroke]:
-    """Everything drawn [m]: first one line a limb, then its parts, then platform, base and tool."""
+    """Yield everything to draw [m]: a line for each limb, then joints, platform, base and tool."""
     for i, frames in enumerate(limbs):
         chain = frames[:-1, :3, 3]
         yield Stroke(
-            chain, {"color": COLOURS[i % len(COLOURS)], "lw": 2.5, "solid_capstyle": "round"}
+            chain, {"color": COLORS[i % len(COLORS)], "lw": 2.5, "solid_capstyle": "round"}
         )
     for i, (limb, frames) in enumerate(zip(robot.assembly.limbs, limbs, strict=True)):
-        colour, points = COLOURS[i % len(COLOURS)], frames[:, :3, 3]
+        color, points = COLORS[i % len(COLORS)], frames[:, :3, 3]
         for j, joint in enumerate(limb.joints):
-            axis, face = frames[j, :3, 2], colour if joint.actuator else "white"
+            axis, face = frames[j, :3, 2], color if joint.actuator else "white"
             if joint.kind == "P":
                 slid = (points[j + 1] - points[j]) @ axis
                 ends = np.array(
                     [min(slid, 0.0) - GUIDE * robot.size, max(slid, 0.0) + GUIDE * robot.size]
                 )
                 yield Stroke(
-                    points[j] + ends[:, None] * axis,
-                    {"color": colour, "lw": 1.0, "ls": (0, (4, 3))},
+                    points[j] + ends[:, None] * axis, {"color": color, "lw": 1.0, "ls": (0, (4, 3))}
                 )
                 at = points[j] + slid * axis
             else:
@@ -123,40 +125,38 @@ def _strokes(robot: Mechanism, limbs: list[FloatArray], T: FloatArray) -> Iterat
             yield Stroke(
                 at[None],
                 _dot(
-                    "s" if joint.kind == "P" else "o", colour, face, 8.0 if joint.actuator else 5.0
+                    "s" if joint.kind == "P" else "o", color, face, 8.0 if joint.actuator else 5.0
                 ),
             )
         if limb.ending == "distance":
-            face = colour if limb.actuator else "white"
-            yield Stroke(points[-2:], {"color": colour, "lw": 1.6})
+            face = color if limb.actuator else "white"
+            yield Stroke(points[-2:], {"color": color, "lw": 1.6})
             yield Stroke(
                 points[-2:].mean(axis=0)[None] if limb.actuator else points[-2:-1],
-                _dot("D", colour, face),
+                _dot("D", color, face),
             )
         if limb.ending != "rigid":
-            yield Stroke(points[-1:], _dot("o", colour, "white"))
+            yield Stroke(points[-1:], _dot("o", color, "white"))
     yield from _bodies(
         robot, np.array([f[-1, :3, 3] for f in limbs]), np.array([f[0, :3, 3] for f in limbs]), T
     )
 
 
 def _bodies(robot: Mechanism, top: FloatArray, foot: FloatArray, T: FloatArray) -> Iterator[Stroke]:
-    """Platform, base, their frames, and the tool."""
+    """Yield platform, base, their frames, and the tool."""
     yield Stroke(_outline(foot), {"color": "0.6", "lw": 1.0, "ls": ":"})
     yield Stroke(_outline(top), {"color": "0.25", "lw": 2.0})
     tool = T @ robot.tool
     yield Stroke(np.stack([T[:3, 3], tool[:3, 3]]), {"color": "0.25", "lw": 1.0})
     for frame in (np.eye(4), tool):
-        for axis, colour in enumerate(("#b22222", "#228b22", "#1e3fae")):
+        for axis, color in enumerate(("#b22222", "#228b22", "#1e3fae")):
             end = frame[:3, 3] + 2 * AXIS * robot.size * frame[:3, axis]
-            yield Stroke(np.stack([frame[:3, 3], end]), {"color": colour, "lw": 1.4})
+            yield Stroke(np.stack([frame[:3, 3], end]), {"color": color, "lw": 1.4})
     yield Stroke(tool[None, :3, 3], _dot("*", "black", "black", 8.0))
 
 
 def _outline(points: FloatArray) -> FloatArray:
-    """Points (n, 3) in the order of their angle about the middle, closed; as they are where they
-    lie on a line.
-    """
+    """Return points (n, 3) sorted by angle about their center and closed; unchanged on a line."""
     offset = points - points.mean(axis=0)
     _, s, V = np.linalg.svd(offset, full_matrices=True)
     if len(points) < 3 or s[1] < 1e-6 * max(s[0], 1e-300):
@@ -170,7 +170,7 @@ def _dot(marker: str, edge: str, face: str, size: float = 5.0) -> dict[str, Any]
 
 
 def _label(space: Any, above: Any, limb: Stroke, name: str, middle: FloatArray) -> None:
-    """The limb's name beside its foot, away from the middle of the picture."""
+    """Write the name of a limb beside its foot, away from the center of the picture."""
     foot = limb.points[0]
     away = foot[:2] - middle[:2]
     distance = float(np.linalg.norm(away))
@@ -191,7 +191,7 @@ def _label(space: Any, above: Any, limb: Stroke, name: str, middle: FloatArray) 
 
 
 def _finish(space: Any, above: Any, low: FloatArray, high: FloatArray, symbol: str) -> None:
-    """Equal scales, and units on all axes."""
+    """Set equal scales, and units on all axes."""
     middle, reach = (low + high) / 2, np.maximum(high - low, 0.15 * (high - low).max()) * 0.55
     for axis, m, r in zip("xyz", middle, reach, strict=True):
         getattr(space, f"set_{axis}lim")(m - r, m + r)
@@ -206,12 +206,12 @@ def _finish(space: Any, above: Any, low: FloatArray, high: FloatArray, symbol: s
     above.set_ylabel(f"y [{symbol}]", fontsize=8)
     above.tick_params(labelsize=7)
     above.grid(visible=True, lw=0.3)
-    space.set_title("in space", fontsize=9)
+    space.set_title("perspective", fontsize=9)
     above.set_title("from above", fontsize=9)
 
 
 def _caption(robot: Mechanism, where: str, symbol: str) -> str:
-    """What is seen, with its numbers."""
+    """Return name and counts."""
     limbs = robot.assembly.limbs
     counts = {
         "limb": len(limbs),
@@ -227,7 +227,7 @@ def _legend() -> list[Any]:
     from matplotlib.lines import Line2D
 
     rows: list[tuple[str, dict[str, Any]]] = [
-        ("axis of a turning joint", {"color": "black", "lw": 1.2}),
+        ("axis of a revolute joint", {"color": "black", "lw": 1.2}),
         ("guide of a sliding joint", {"color": "0.4", "lw": 1.0, "ls": (0, (4, 3))}),
         ("rod", {"color": "0.4", "lw": 1.6}),
         ("driven joint, filled", _dot("s", "0.4", "0.4")),

@@ -7,8 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from loopcal.apply import Validation, validate
 from loopcal.apply.validation_findings import FEW_ROWS
 from loopcal.diagnose import (
@@ -24,7 +22,7 @@ from loopcal.diagnose import (
     suggest_measurements,
 )
 from loopcal.errors import DataError
-from loopcal.estimate import Change, FitOptions, Identification, recalibrate
+from loopcal.estimate import Change, FitOptions, Identification, identify, recalibrate
 from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.information import count_equations
 from loopcal.findings import Finding, Severity, report_finding
@@ -35,7 +33,7 @@ from loopcal.typing import Progress, report_no_progress
 from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.calibration_report import CalibrationReport, describe_provenance
 from loopcal.workflow.data_split import split_data
-from loopcal.workflow.fit_adapter import findings_of, fit_robot
+from loopcal.workflow.fit_adapter import findings_of
 
 GREW = 1.1
 """Factor by which an error on held-out poses must grow to be a failure; less is their noise."""
@@ -165,7 +163,7 @@ def _fit(
             data,
             options.prior,
             options.free_limb,
-            options=FitOptions(noise=fit_options.noise),
+            options=FitOptions(noise=fit_options.noise, excluded_poses=excluded),
         )
         return _FitResult(fit, change=change)
     choice = None
@@ -187,7 +185,7 @@ def _fit(
             )
         )
     count(f"fitting {free} parameters")
-    return _FitResult(fit_robot(chosen, data, fit_options), choice=choice)
+    return _FitResult(identify(chosen, data, options=fit_options), choice=choice)
 
 
 def _validate(
@@ -208,17 +206,10 @@ def _suggest(fit: Identification, data: Measurements) -> tuple[MeasurementSugges
 
 
 def _report_fit(fit: Identification) -> list[Finding]:
-    """Return the findings of the fit; a contradiction with the noise is a failure."""
-    findings = findings_of(fit)
-    codes = {f.code for f in findings}
-    if not fit.converged and not any(code.startswith("fit.") for code in codes):
-        findings.append(report_finding("gates.not-converged", status=fit.status.name.lower()))
-    if fit.residual_test.failed and "noise.residuals-too-large" not in codes:
-        ratio = float(np.sqrt(fit.residual_test.chi_square / fit.residual_test.degrees))
-        findings.append(report_finding("gates.residuals-exceed-noise", ratio=ratio))
+    """Return the findings of the fit; a contradiction with the stated noise is a failure."""
     return [
         replace(f, severity=Severity.FAILURE) if f.code == "noise.residuals-too-large" else f
-        for f in findings
+        for f in fit.findings
     ]
 
 

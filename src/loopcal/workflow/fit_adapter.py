@@ -5,15 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from loopcal.estimate import FitOptions, Identification, identify
 from loopcal.findings import Finding, report_finding
-from loopcal.measure import Measurements
-from loopcal.mechanism import Mechanism
-
-
-def fit_robot(robot: Mechanism, data: Measurements, options: FitOptions) -> Identification:
-    """Identify with options."""
-    return identify(robot, data, options=options)
 
 
 def findings_of(*sources: Any) -> list[Finding]:
