@@ -33,7 +33,6 @@ from loopcal.typing import Progress, report_no_progress
 from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.calibration_report import CalibrationReport, describe_provenance
 from loopcal.workflow.data_split import split_data
-from loopcal.workflow.fit_adapter import findings_of
 
 GREW = 1.1
 """Factor by which an error on held-out poses must grow to be a failure; less is their noise."""
@@ -96,7 +95,9 @@ def calibrate(
         *impossible,
         *_report_validation(errors, held_out is not None),
         *_report_freedoms(fit),
-        *findings_of(start, examination, result.choice),
+        start.finding,
+        *(() if examination is None else examination.findings),
+        *(() if result.choice is None else (result.choice.finding,)),
     ]
     count("done")
     return CalibrationReport(
