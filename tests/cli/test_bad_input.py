@@ -118,7 +118,8 @@ def test_wrong_mobility_names_the_freedoms(refused) -> None:
     text = "\n".join([*lines[: start + 1], *["  - [0, 0, 0]"] * 6, *lines[end:]])
     text = text.replace("lengths: 233.238076", "lengths: 234.07")
     found = refused("check robot.yaml", robot_yaml=text)
-    assert "with every actuator held the platform can still move at home: turn about" in found
+    assert "the platform can still move with every actuator locked" in found
+    assert "rotation about" in found
 
 
 def test_too_few_freedoms_are_named_as_well(refused) -> None:
@@ -141,10 +142,9 @@ def test_too_few_freedoms_are_named_as_well(refused) -> None:
         "limbs:",
     ]
     found = refused("check robot.yaml", robot_yaml="\n".join([*head, *limbs]))
-    assert (
-        "2 actuators, but the limbs leave the platform only 1 of 2 freedoms at home; it cannot "
-        "shift along y" in found
-    )
+    assert "2 actuators" in found
+    assert "only 1 of 2 freedoms" in found
+    assert "translation along y" in found
 
 
 def test_a_home_outside_the_strokes_is_noted(tmp_path, capsys) -> None:

@@ -162,7 +162,7 @@ def test_the_result_says_how_far_the_fit_can_be_trusted(run) -> None:
     found = load_run("run").result
     assert found["examination"]["outliers"]["blocks"] == 40
     assert len(found["examination"]["outliers"]["outliers"]) <= 1  # right data: one in 5 % of cases
-    assert found["examination"]["worth"]["is_worthwhile"] is True
+    assert found["examination"]["worth"]["calibrate"] is True
     assert found["fit"]["prior_conflict"]["conflict"] is False
 
 
