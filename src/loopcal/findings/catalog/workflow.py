@@ -41,7 +41,6 @@ def _word_too_few_equations(data: Mapping[str, Any]) -> str:
 
 
 ENTRIES = (
-    Entry("workflow.note", Severity.INFO, "{text}", "A remark that has no code yet."),
     Entry(
         "workflow.limit-needs-held-out-poses",
         Severity.REFUSAL,
