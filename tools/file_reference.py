@@ -101,7 +101,7 @@ def kinds() -> str:
         rows = dict.fromkeys(_example(one) for one in kind.examples())
         columns = table(("settings", "columns", "noise is stated for"), rows)
         meanings = file_reference.collect_meanings(kind)
-        if possible := getattr(kind, "allowed_unknown", ()):
+        if len(possible := kind.allowed_unknown) > 1:
             meanings["unknown"] = (
                 f"Which of {', '.join(f'`{p}`' for p in possible)} are unknown, and identified "
                 "with the robot"

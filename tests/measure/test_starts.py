@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starts for unknown frames, targets and surfaces are found from any orientation, without a guess."""
+"""Initial values of unknown frames, targets and surfaces: any orientation, no guess."""
 
 import json
 from dataclasses import replace

@@ -10,7 +10,7 @@ from loopcal.errors import DataError
 from loopcal.measure import Observations, Pose
 
 
-def test_the_residual_is_the_logarithm_of_predicted_times_measured_transposed_and_predicted_minus_measured():
+def test_the_residual_is_a_rotation_vector_and_a_difference_of_positions():
     T = geometry.apply_twist(np.eye(4), np.array([0.2, 0.0, 0.0, 1.0, 2.0, 3.0]))[None, None]
     measured = np.array([[[0.1, 0.0, 0.0, 1.0, 2.0, 2.5]]])
     residual = Pose(T_platform_tool=np.eye(4)).evaluate(T, measured).residual

@@ -26,7 +26,7 @@ def _word_duplicate(data: Mapping[str, Any]) -> str:
     where = f" ({places[0]} and {places[1]})" if places else ""
     return fill_template(
         f"poses {{poses[0]!r}} and {{poses[1]!r}}{where} have the same readings and the same "
-        "{{kind}} values to the last digit; remove one of them",
+        "{kind} values to the last digit; remove one of them",
         **data,
     )
 

@@ -27,7 +27,7 @@ class ToolKind(Kind):
         Instrument frame in the base; default: the base itself. If the frame is unknown, this is its
         nominal value.
     T_platform_tool : (4, 4), optional
-        Tool on the platform; default: the tool of the robot, see `with_tool`.
+        Tool on the platform; default: the tool of the robot.
     unknown : tuple of str
         Which of "frame" and "tool" are unknown, six numbers each. One value holds for a session.
     frame : str

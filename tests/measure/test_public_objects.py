@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What public objects print, and what they say of an argument of the wrong type."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from loopcal.errors import ArgumentTypeError, DataError
+from loopcal.measure import (
+    KINDS,
+    Gaussian,
+    Instrument,
+    Measurements,
+    Observations,
+    Pose,
+    Position,
+    Sensor,
+    Uniform,
+    sample_truth,
+    simulate,
+    simulate_trials,
+)
+from tests import zoo
+
+LINES, CHARACTERS = 20, 1600  # of a screen
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return zoo.hexapod()
+
+
+@pytest.fixture(scope="module")
+def instrument():
+    tracker = Position(targets=("ball",), unknown=("frame", "targets"), frame="tracker")
+    pose = Sensor(Pose(), Gaussian(np.full(6, 1e-5)))
+    return Instrument((Sensor(tracker, Uniform(np.full(3, 1e-5))), pose))
+
+
+@pytest.fixture(scope="module")
+def poses():
+    middle = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
+    return zoo.poses_of(np.random.default_rng(0).uniform(-0.02, 0.02, (40, 6)) + middle)
+
+
+def test_every_public_object_prints_on_a_screen(robot, instrument, poses):
+    data = simulate(robot, poses, instrument, seed=1)
+    trials = simulate_trials(robot, robot.values[None], poses, instrument, seed=1)
+    many = Measurements("many", np.zeros((2, 1)), data.take([0, 1]).observations * 30)
+    for value in (
+        data,
+        trials,
+        many,
+        many.nuisance_parameters,
+        instrument,
+        *instrument.sensors,
+        *data.observations,
+        *(kind for cls in KINDS.values() for kind in cls.examples()),
+    ):
+        text = repr(value)
+        assert type(value).__name__ in text
+        assert len(text) < CHARACTERS
+        assert text.count("\n") < LINES
+
+
+def test_the_text_of_a_kind_names_what_differs_from_the_default():
+    assert repr(Pose()) == "Pose()"
+    assert repr(Position(unknown=("frame",), frame="tracker")) == (
+        "Position(unknown=('frame',), frame='tracker')"
+    )
+
+
+def test_the_text_of_measurements_counts_poses_and_rows(robot, instrument, poses):
+    text = repr(simulate(robot, poses, instrument, seed=1))
+    assert "40 poses, 6 actuator readings each" in text
+    assert "40 rows; 240 residuals" in text
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda: Measurements("r", "data.csv", ()), DataError, "'data.csv'.*load_measurements"),
+        (
+            lambda: Measurements("r", np.zeros((1, 1)), ("rows.csv",)),  # type: ignore[arg-type]
+            ArgumentTypeError,
+            "observations: got the text 'rows.csv'; give Observations",
+        ),
+        (
+            lambda: Observations("pose", [0], [[0.0]], 1.0),  # type: ignore[arg-type]
+            ArgumentTypeError,
+            "kind: got the text 'pose'; give Kind, such as",
+        ),
+        (
+            lambda: Observations.from_sigma(Position(), [0], "data.csv", 1.0),  # type: ignore[arg-type]
+            DataError,
+            "measured: got the text 'data.csv'; give an array",
+        ),
+        (
+            lambda: Sensor(Pose(), 1e-5),  # type: ignore[arg-type]
+            ArgumentTypeError,
+            "noise: got a float; give Noise, such as",
+        ),
+        (lambda: Instrument(Sensor(Pose(), Gaussian(np.ones(6)))), DataError, "give a tuple"),  # type: ignore[arg-type]
+        (
+            lambda: sample_truth("hexapod-42", 1, 0),  # type: ignore[arg-type]
+            ArgumentTypeError,
+            "robot: got the text 'hexapod-42'; give Mechanism, from loopcal.load_robot",
+        ),
+        (
+            lambda: simulate(zoo.hexapod(), zoo.poses_of(np.zeros((1, 6))), "pose", 1),  # type: ignore[arg-type]
+            ArgumentTypeError,
+            "instrument: got the text 'pose'; give Instrument",
+        ),
+        (lambda: Gaussian("1 um"), DataError, "got the text '1 um'; give an array"),  # type: ignore[arg-type]
+    ],
+)
+def test_an_argument_of_the_wrong_type_says_what_to_pass(call, error, words):
+    with pytest.raises(error, match=words):
+        call()
+
+
+def test_the_share_of_a_split_is_the_share_that_is_fitted():
+    data = Measurements("toy", np.arange(8.0)[:, None], ())
+    fitted, held_out = data.split(0.75, seed=1)
+    assert (fitted.n_poses, held_out.n_poses) == (6, 2)
