@@ -40,14 +40,14 @@ def test_no_file_and_no_function_is_too_long(root: Path) -> None:
 
 
 def test_a_long_function_is_reported_unless_a_reason_stands_beside_it() -> None:
-    body = "    x = 1\n" * 60
+    body = "    x = 1\n" * check_sizes.FUNCTION_LIMIT
     assert len(check_sizes.check_text("a.py", "def f():\n" + body)) == 1
     assert check_sizes.check_text("a.py", "# size: a table\ndef f():\n" + body) == []
     assert check_sizes.check_text("a.py", "def f():  # size: a table\n" + body) == []
 
 
 def test_a_long_file_is_reported_unless_a_reason_stands_on_top() -> None:
-    lines = "x = 1\n" * 401
+    lines = "x = 1\n" * (check_sizes.FILE_LIMIT + 1)
     assert len(check_sizes.check_text("a.py", lines)) == 1
     assert check_sizes.check_text("a.py", "# size: generated\n" + lines) == []
 

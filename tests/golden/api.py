@@ -537,7 +537,9 @@ def report_validation(found: Fit, data: Data) -> Report:
     checked = apply.validate(found, data)
     errors = {
         name.replace(" ", "_"): {
-            index: getattr(e, index) for index in ("position", "orientation", "integrated")
+            "position": e.position,
+            "orientation": e.orientation,
+            "integrated": e.position / 1e-3 + e.orientation,  # mm + rad, which core has no more
         }
         for name, e in checked.errors().items()
         if name.startswith("predicted")

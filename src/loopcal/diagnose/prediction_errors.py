@@ -6,7 +6,6 @@ measured. With the components (dx, dy, dz) and (da, db, dc) of one measured row:
 
     position     dQ1 = sqrt(dx^2 + dy^2 + dz^2)          [m]
     orientation  dQ2 = sqrt(da^2 + db^2 + dc^2)          [rad]
-    integrated   dQint = dQ1 + dQ2, millimetres and radians added as they are
     balance      largest minus smallest component of one group
 
 Source: "Numerical simulation of the calibration algorithm for a 6-DOF parallel mechanism", section
@@ -42,8 +41,7 @@ from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
-MILLIMETRE = 1e-3
-INDICES = ("position", "orientation", "integrated", "position_balance", "orientation_balance")
+INDICES = ("position", "orientation", "position_balance", "orientation_balance")
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +64,12 @@ class PoseErrors:
 
     Attributes
     ----------
-    position, orientation : (r,) [m], [rad]. integrated : (r,) [mm + rad].
+    position, orientation : (r,) [m], [rad].
     position_balance, orientation_balance : (r,) [m], [rad].
     """
 
     position: FloatArray
     orientation: FloatArray
-    integrated: FloatArray
     position_balance: FloatArray
     orientation_balance: FloatArray
 
@@ -87,7 +84,7 @@ class PoseErrors:
         return Statistics(float(values.max()), rms, float(values.mean()), sd, len(values))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return statistics and rows of every index, SI (integrated: mm + rad)."""
+        """Return statistics and rows of every index, SI."""
         return {i: {**vars(self.statistics(i)), "rows": getattr(self, i)} for i in INDICES}
 
 
@@ -295,8 +292,7 @@ def compute_pose_errors(position: FloatArray, orientation: FloatArray) -> PoseEr
         declared angles.
     """
     first, second = _length(position), _length(orientation)
-    integrated = first / MILLIMETRE + second
-    return PoseErrors(first, second, integrated, _balance(position), _balance(orientation))
+    return PoseErrors(first, second, _balance(position), _balance(orientation))
 
 
 def join_errors(parts: Sequence[PoseErrors]) -> PoseErrors:
