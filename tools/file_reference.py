@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from loopcal.io.core import file_reference
+from loopcal.io.data.columns import RULES
 from loopcal.io.data.kind_rows import SETTINGS
 from loopcal.io.data.kind_settings import list_kind_settings
 from loopcal.io.exports.profile import ColumnSource, ProfileRecord
@@ -91,7 +92,8 @@ def families() -> str:
 
 
 def _nested(record: type) -> str:
-    return f"**{file_reference.name_record(record)}**: {file_reference.summarize(record)}\n\n{record_table(record)}"
+    name, summary = file_reference.name_record(record), file_reference.summarize(record)
+    return f"**{name}**: {summary}\n\n{record_table(record)}"
 
 
 def kinds() -> str:
@@ -147,7 +149,13 @@ def settings() -> str:
     return table(("setting", "meaning"), [(f"`{key}`", words) for key, words in SETTINGS.items()])
 
 
-def collect_provenance() -> str:
+def columns() -> str:
+    """Return the columns of a measurement file."""
+    rows = [(f"`{rule.pattern}`", rule.unit, rule.meaning) for rule in RULES]
+    return table(("column", "unit", "meaning"), rows)
+
+
+def provenance_keys() -> str:
     """Return the keys of `made_by`."""
     return table(("key", "meaning"), [(f"`{key}`", words) for key, words in MADE_BY.items()])
 
@@ -172,7 +180,8 @@ BLOCKS = {
     "families": families,
     "kinds": kinds,
     "settings": settings,
-    "made-by": collect_provenance,
+    "columns": columns,
+    "made-by": provenance_keys,
 }
 OF_EXPORTS = {"profile": profile, "profile-columns": profile_columns} | {
     name: profile_example(f"{name}.yaml") for name in ("tracker-points", "six-dof", "cmm-spheres")

@@ -60,7 +60,7 @@ class FileError(LoopcalError):
         Line number, counted from 1; None where the whole file is meant.
     """
 
-    def __init__(self, sentence: str, path: str | Path, line: int | None = None) -> None:
+    def __init__(self, sentence: object, path: str | Path, line: int | None = None) -> None:
         super().__init__(sentence, path, line)
         self.sentence = sentence
         self.path = Path(path)

@@ -105,11 +105,13 @@ class NumberColumn:
         """Return the values [SI], NaN where a cell is empty."""
         import numpy as np
 
-        cells = np.array(table.text(self.name))
-        infinite = (cells == "inf") & self.allows_infinity
-        finite = np.where(infinite, "", cells)
+        if not self.allows_infinity:
+            return table.numbers(self.name, self.dimension)
+        cells = table.text(self.name)
+        infinite = np.array([cell == "inf" for cell in cells])
+        finite = ["" if cell == "inf" else cell for cell in cells]
         factor = table.factor(self.name, self.dimension)
-        return np.where(infinite, np.inf, table.scaled(self.name, factor, finite.tolist()))
+        return np.where(infinite, np.inf, table.scaled(self.name, factor, finite))
 
     def format(self, value: Any) -> str:
         """Return a number [SI] in the unit; nothing for NaN."""

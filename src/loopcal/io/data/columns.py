@@ -119,7 +119,10 @@ RULES: tuple[ColumnRule, ...] = (
         _always(TextColumn("use", (FIT, HELD_OUT))),
     ),
     ColumnRule(
-        "block", "", "poses with the same name are never split", _always(TextColumn("block"))
+        "block",
+        "",
+        "poses of a block are never split between fit and validation",
+        _always(TextColumn("block")),
     ),
     ColumnRule(
         "kind", "", "label of the kind, in files with several kinds", _always(TextColumn("kind"))
@@ -130,7 +133,12 @@ RULES: tuple[ColumnRule, ...] = (
         "rows of a session share unknown frames and targets",
         _always(TextColumn("session")),
     ),
-    ColumnRule("group", "", "rows of a group share a surface", _always(TextColumn("group"))),
+    ColumnRule(
+        "group",
+        "",
+        "rows of a group share a surface or the constant of a lock",
+        _always(TextColumn("group")),
+    ),
     ColumnRule("ACTUATOR", "[mm] or [deg]", "reading of the actuator", _readings),
     ColumnRule(
         f"{COMMANDED}COORDINATE",

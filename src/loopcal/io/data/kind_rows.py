@@ -23,6 +23,9 @@ from loopcal.io.data.kind_settings import list_kind_settings, read_kind, read_no
 from loopcal.units import EXAMPLES
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from loopcal.measure import Kind, Observations
     from loopcal.mechanism import Mechanism
     from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -205,7 +208,7 @@ def _read_values(table: Table, robot: Mechanism, one: KindRows) -> tuple[FloatAr
     return measured, N @ covariance @ np.swapaxes(N, -1, -2)
 
 
-def _read_names(table: Table, name: str, rows: IntArray) -> FloatArray:
+def _read_names(table: Table, name: str, rows: IntArray) -> NDArray[np.str_]:
     """Return the sessions or groups (r,) of rows: of their cells, else of the setting, else ''."""
     import numpy as np
 

@@ -39,8 +39,9 @@ NOISE_UNITS = {
     Dimension.RATIO: ("1", 1.0),
 }
 SI_SYMBOLS = {Dimension.LENGTH: "m", Dimension.ANGLE: "rad", Dimension.RATIO: "1"}
-LENGTHS = Annotated[list[Any], Dimension.LENGTH]
-NUMBERS = Annotated[list[Any], Dimension.RATIO]
+LENGTHS = Annotated[list[Any] | None, Dimension.LENGTH]
+LENGTH = Annotated[float | None, Dimension.LENGTH]
+NUMBERS = Annotated[list[Any] | None, Dimension.RATIO]
 
 
 @dataclass(frozen=True)
@@ -177,9 +178,9 @@ def _setting_type(name: str, annotation: Any) -> Any:
     if "ndarray" in text:
         if name.startswith("T_"):
             return PlacedFrame | None
-        return (NUMBERS if name in DIRECTIONS else LENGTHS) | None
+        return NUMBERS if name in DIRECTIONS else LENGTHS
     if annotation is float:
-        return Length | None
+        return LENGTH
     return tuple[str, ...] | str | None if "tuple" in text else str | None
 
 

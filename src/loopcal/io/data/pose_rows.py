@@ -284,7 +284,8 @@ def _read_setting(table: Table, robot: Mechanism) -> dict[str, float]:
     dimensions = {actuator.name: actuator.dimension for actuator in robot.actuators}
     places: dict[str, Location] = {name: (READING_NOISE, name) for name in dimensions}
     if not isinstance(node, dict):
-        node, places = dict.fromkeys(dimensions, node), dict.fromkeys(places, (READING_NOISE,))
+        node = dict.fromkeys(dimensions, node)
+        places = {name: (READING_NOISE,) for name in dimensions}
     refuse_unknown_keys(file, list(node), list(dimensions), (READING_NOISE,))
     stated = {}
     for name, text in node.items():

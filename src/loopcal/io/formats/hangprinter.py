@@ -160,7 +160,7 @@ def parse(path: Path) -> Samples:
         sentence = f"{POSITIONS!r} has {len(known)} poses, but {SAMPLES!r} only {len(motors)}"
         raise FileError(f"{sentence}; remove the others", path)
     motor_teeth, spool_teeth = (_parse_positive(content, key, path, 0) for key in TEETH)
-    spools = (_parse_positive(content, key, path, 1, lines) for key in SPOOLS)
+    radius, advantage, per_spool = (_parse_positive(content, key, path, 1, lines) for key in SPOOLS)
     anchors = None
     if ANCHORS in content:
         anchors = _parse_numbers(content, ANCHORS, path, 2, FREEDOMS)
@@ -168,7 +168,7 @@ def parse(path: Path) -> Samples:
             sentence = f"{ANCHORS!r} has {len(anchors)} rows, but there are {lines} lines"
             raise FileError(f"{sentence}; write one row for each", path)
     gear, findings = float(motor_teeth / spool_teeth), tuple(_report_ignored(content))
-    return Samples(*spools, gear, motors * DEG, known, anchors, findings)
+    return Samples(radius, advantage, per_spool, gear, motors * DEG, known, anchors, findings)
 
 
 def estimate_anchors(samples: Samples, path: Path) -> FloatArray:

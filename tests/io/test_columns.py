@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every column of the registry reads back what it writes."""
+
+import numpy as np
+import pytest
+
+from loopcal.io import load_robot
+from loopcal.io.core.csv_table import read_table
+from loopcal.io.data.column_types import TextColumn
+from loopcal.io.data.columns import find_open_column, is_context, list_columns
+from loopcal.measure import Component, Pose
+
+ROBOT = load_robot("hexapod-42")
+COLUMNS = list_columns(ROBOT, [Component(("z",)), Pose("quaternion")])
+OPEN = ("temperature.bed", "note of the day")
+
+
+@pytest.mark.parametrize("name", [*COLUMNS, *OPEN])
+def test_a_column_reads_back_what_it_writes(tmp_path, name) -> None:
+    column = COLUMNS.get(name) or find_open_column(name)
+    assert column is not None
+    is_text = isinstance(column, TextColumn)
+    values = (column.choices or ("a", 'b,"c"')) if is_text else (0.1, 1 / 3)
+    rows = "\n".join(f"p{i},{column.format(value)}" for i, value in enumerate(values))
+    (tmp_path / "data.csv").write_text(f"first,{column.header}\n{rows}\n")
+    read = column.parse(read_table(tmp_path / "data.csv"))
+    if is_text:
+        assert read == values
+    else:
+        np.testing.assert_allclose(read, values, rtol=3e-16)
+
+
+def test_open_ended_columns_are_recognized_by_their_names() -> None:
+    assert is_context("temperature.bed")
+    assert not is_context("temperature.")
+    assert find_open_column("temperatures") is None

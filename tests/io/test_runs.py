@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run is a value that continues where the calibration ended; wrong arguments say what to pass."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import loopcal as lc
+from loopcal.errors import ArgumentTypeError, FileError
+
+DATA = Path("examples/hexapod-42/measurements.csv").resolve()
+
+
+@pytest.fixture(scope="module")
+def calibrated():
+    robot = lc.load_robot("hexapod-42")
+    data = lc.load_measurements(DATA, robot)
+    return robot, lc.calibrate(robot, data, lc.CalibrationOptions(hold_out=0.25))
+
+
+def test_a_saved_report_is_read_back_as_a_run(tmp_path, calibrated) -> None:
+    robot, report = calibrated
+    lc.save_run(tmp_path / "run", report, {"data": DATA}, ["a test"])
+    run = lc.load_run(tmp_path / "run")
+    np.testing.assert_allclose(run.robot.values, report.robot.values, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(run.initial_robot.values, robot.values, rtol=0, atol=1e-15)
+    assert run.result["verdict"] == report.verdict.name.lower()
+    assert run.result["made_by"]["command"] == ["a test"]
+    assert run.load_posterior().names == report.identification.names
+    fitted, held_out = run.load_measurements()
+    assert fitted.labels == report.split.fitted.labels
+    assert report.split.held_out is not None
+    assert held_out is not None
+    assert held_out.labels == report.split.held_out.labels == run.held_out
+    with pytest.raises(FileError) as caught:
+        lc.save_run(tmp_path / "run", report)
+    assert caught.value.code == "files.folder-in-use"
+
+
+def test_measurements_of_a_run_are_refused_after_a_change_and_without_files(
+    tmp_path, calibrated
+) -> None:
+    _, report = calibrated
+    copy = tmp_path / "data.csv"
+    copy.write_bytes(DATA.read_bytes())
+    lc.save_run(tmp_path / "run", report, {"data": copy})
+    copy.write_bytes(DATA.read_bytes() + b"\n")
+    with pytest.raises(FileError, match="was changed since the run"):
+        lc.load_run(tmp_path / "run").load_measurements()
+    lc.save_run(tmp_path / "bare", report)
+    with pytest.raises(FileError, match="names no measurement files"):
+        lc.load_run(tmp_path / "bare").load_measurements()
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lc.load_robot, "path of a robot file .* not a Mechanism"),
+        (lambda robot: lc.load_measurements(robot, robot), "path of a measurement file"),
+        (lambda _: lc.load_measurements(DATA, "hexapod-42"), r"robot is needed .*load_robot"),
+        (lambda _: lc.save_robot("robot.yaml", "out.yaml"), r"robot is needed .*load_robot"),
+        (lc.load_run, "path of a run folder"),
+    ],
+)
+def test_an_argument_of_a_wrong_type_says_what_to_pass(calibrated, call, words) -> None:
+    with pytest.raises(ArgumentTypeError, match=words):
+        call(calibrated[0])
