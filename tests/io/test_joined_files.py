@@ -182,8 +182,7 @@ REFUSED = {
     ),
     "the same rows in two files": (
         {"poses": POSES, "heights": HEIGHTS, "copy": "## a copy\n" + HEIGHTS},
-        (r"'b' and 'b' \(.*heights.csv:5 and .*copy.csv:6\) have the same readings and the same "
-        r"component values"),
+        (r"'b' and 'b' \(.*heights.csv:5 and .*copy.csv:6\) have the same readings and the same component"),
     ),
     "an empty cell of the readings": (
         {"poses": POSES.replace("b,1,", "b,,"), "heights": HEIGHTS},
