@@ -228,15 +228,11 @@ def test_a_mistake_is_one_sentence_with_its_line(tmp_path, robot, old, new, line
 
 def test_readings_outside_the_stroke_and_duplicates_need_to_be_allowed(tmp_path, robot) -> None:
     path = write(tmp_path, GOOD.replace("b,1,", "b,90,"))
-    with pytest.raises(
-        DataError, match=r"data.csv: pose 'b': q1 reads 90 mm"
-    ):
+    with pytest.raises(DataError, match=r"data.csv: pose 'b': q1 reads 90 mm"):
         load_measurements(path, robot)
     assert load_measurements(path, robot, allow_outside_stroke=True).n_poses == 2
     path = write(tmp_path, GOOD.replace("b,1,1,1,1,1,1,201.1", "b,0,0,0,0,0,0,200"))
-    with pytest.raises(
-        DataError, match=r"'a' and 'b' \(.*:5 and .*:6\) have the same"
-    ):
+    with pytest.raises(DataError, match=r"'a' and 'b' \(.*:5 and .*:6\) have the same"):
         load_measurements(path, robot)
     assert load_measurements(path, robot, allow_duplicates=True).n_poses == 2
 
