@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one tree of errors: every mistake of a user raises a `LoopcalError` whose text is one clear
-sentence.
+"""Errors that a user can cause and repair: one tree, `LoopcalError`.
 
-The sentence says what was found, what is allowed and what to do next. The command line prints it
-and exits with 1; anything that is not a `LoopcalError` is a mistake of our own.
+The text of an error says what was found, what is allowed and what to do next. The command line
+prints it and exits with 1. Any other exception is a defect of loopcal.
 """
 
 from __future__ import annotations
@@ -72,8 +71,9 @@ class FileError(LoopcalError):
 
 
 def suggest_names(name: str, allowed: Iterable[str], n: int = 3) -> str:
-    """Return ` (did you mean 'a' or 'b'?)` with the allowed names closest to `name`, or nothing
-    where none is close.
+    """Return ` (did you mean 'a' or 'b'?)` with the allowed names closest to `name`.
+
+    The text is empty if no name is similar.
     """
     close = difflib.get_close_matches(name, list(allowed), n=n, cutoff=0.6)
     return f" (did you mean {' or '.join(repr(c) for c in close)}?)" if close else ""

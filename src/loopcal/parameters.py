@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of unknowns: every number that calibration may change, by name."""
+"""The table of parameters: every number that calibration may change, by name."""
 
 from __future__ import annotations
 
@@ -18,17 +18,16 @@ SCOPES = ("machine", "session", "group", "pose")
 
 @dataclass(frozen=True)
 class Parameter:
-    """One unknown.
+    """One parameter.
 
     Attributes
     ----------
     name : e.g. `leg3.base.x`.
     dimension : length [m], angle [rad] or ratio [1].
     nominal : value by design [SI].
-    tolerance : standard deviation of the true value about the nominal one [SI]; None where nothing
-        is known.
+    tolerance : standard deviation of the true value about the nominal one [SI]; None if unknown.
     free : False keeps it at its nominal value.
-    scope : what shares one value: the machine, a session, a group of rows or a single pose.
+    scope : the rows that share a value: those of the machine, a session, a group or a pose.
     """
 
     name: str
@@ -51,7 +50,7 @@ class ParameterTable:
         for i, entry in enumerate(self.entries):
             if entry.name in places:
                 raise MechanismError(
-                    f"parameter {entry.name!r} is defined twice; every parameter needs its own name"
+                    f"duplicate parameter {entry.name!r}; give every parameter its own name"
                 )
             places[entry.name] = i
         object.__setattr__(self, "_places", places)
@@ -76,27 +75,25 @@ class ParameterTable:
 
     @property
     def tolerance(self) -> FloatArray:
-        """Tolerances (p,) as standard deviations [SI], NaN where none is stated."""
+        """Tolerances (p,) as standard deviations [SI], NaN if none is stated."""
         return _frozen(np.nan if p.tolerance is None else p.tolerance for p in self.entries)
 
     @property
     def free(self) -> BoolArray:
-        """Which are to be identified (p,)."""
+        """Parameters (p,) to be identified."""
         free = np.array([p.free for p in self.entries], dtype=bool)
         free.setflags(write=False)
         return free
 
     def index(self, name: str) -> int:
-        """Position of a parameter; raises MechanismError naming the nearest ones."""
+        """Return the position of a parameter; raises MechanismError with similar names."""
         if name in self._places:
             return self._places[name]
         near = difflib.get_close_matches(name, self.names, n=3) or self.names[:3]
-        raise MechanismError(
-            f"no parameter is called {name!r}; the nearest names are {', '.join(near)}"
-        )
+        raise MechanismError(f"unknown parameter {name!r}; similar names are {', '.join(near)}")
 
     def with_free(self, names: Iterable[str]) -> ParameterTable:
-        """The same table with just these parameters free."""
+        """Return the same table with only these parameters free."""
         chosen = {self.names[self.index(name)] for name in names}
         return ParameterTable(tuple(replace(p, free=p.name in chosen) for p in self.entries))
 

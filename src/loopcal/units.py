@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Units exist at the edge of files and tables only; inside, everything is in SI (metre, radian).
+"""Units of files and tables. Inside loopcal everything is in SI (metre, radian).
 
 A record annotates its numbers with `Length`, `Angle` or `Ratio`; the reader of files multiplies
-them by the factor of the unit that the file states, the writer divides by it.
+them by the factor of the stated unit, the writer divides by it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from loopcal.errors import UnitError, suggest_names
 
 
 class Dimension(Enum):
-    """What a number measures."""
+    """Dimension of a number."""
 
     LENGTH = "length"
     ANGLE = "angle"
@@ -69,14 +69,14 @@ UNITS: Mapping[str, Unit] = {
     )
 }
 
-# What tables show where a robot's file does not say otherwise.
+# Units of tables if the robot file states no others.
 DISPLAY_UNITS: Mapping[Dimension, Unit] = {
     Dimension.LENGTH: UNITS["mm"],
     Dimension.ANGLE: UNITS["deg"],
     Dimension.RATIO: UNITS["1"],
 }
 
-# How a quantity is written, for messages.
+# Examples of quantities, for messages.
 EXAMPLES: Mapping[Dimension, str] = {
     Dimension.LENGTH: "0.02mm",
     Dimension.ANGLE: "0.01deg",
@@ -107,19 +107,19 @@ def find_unit(symbol: str, dimension: Dimension | None = None) -> Unit:
     UnitError
         Unknown symbol, or a unit of another dimension; the text lists the allowed ones.
     """
-    found = UNITS.get(symbol)
+    known = UNITS.get(symbol)
     allowed = list_symbols(dimension)
-    if found is None:
+    if known is None:
         raise UnitError(
-            f"unknown unit {symbol!r}{suggest_names(symbol, allowed)}; allowed are {', '.join(allowed)}"
+            f"unknown unit {symbol!r}{suggest_names(symbol, allowed)}; allowed are "
+            f"{', '.join(allowed)}"
         )
-    if dimension is not None and found.dimension is not dimension:
+    if dimension is not None and known.dimension is not dimension:
         raise UnitError(
-            f"{symbol!r} is a unit of {found.dimension.value}, but {ARTICLES[dimension]} is "
-            "needed; "
-            f"allowed are {', '.join(allowed)}"
+            f"{symbol!r} is a unit of {known.dimension.value}, but {ARTICLES[dimension]} is "
+            f"needed; allowed are {', '.join(allowed)}"
         )
-    return found
+    return known
 
 
 def parse_quantity(text: str, dimension: Dimension | None = None) -> float:
@@ -151,7 +151,7 @@ def parse_quantity(text: str, dimension: Dimension | None = None) -> float:
 
 
 def _is_number(text: str) -> bool:
-    """Tell whether Python reads `text` as a float."""
+    """Return whether Python reads `text` as a float."""
     try:
         float(text)
     except ValueError:

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal import engine, geometry
-from loopcal.errors import DataError
+from loopcal.errors import ArgumentTypeError, DataError
 from loopcal.findings.catalog import CATALOG
-from loopcal.mechanism import Status, build, forward, forward_trials, inverse
+from loopcal.mechanism import Status, build, forward, forward_trials, inverse, jacobian
 from tests import zoo
 from tests.engine.cases import driven, spread
 
@@ -241,3 +241,44 @@ def test_readings_do_not_depend_on_where_the_base_stands(twist):
 def test_a_matrix_that_is_no_pose_is_refused(matrix, words):
     with pytest.raises(DataError, match=words):
         inverse(zoo.hexapod(), matrix[None])
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda robot: forward("hexapod", np.zeros(6)), "load_robot"),
+        (lambda robot: forward(robot, "rows.csv"), "load_measurements"),
+        (lambda robot: inverse(robot, robot), "n, 4, 4"),
+        (lambda robot: forward(robot, np.zeros(6), start=np.zeros(6)), "Solution"),
+    ],
+)
+def test_an_argument_of_a_wrong_type_is_refused_with_what_to_pass(call, words):
+    with pytest.raises(ArgumentTypeError, match=words):
+        call(zoo.hexapod())
+
+
+def test_the_jacobian_is_labelled_and_is_the_derivative_of_the_poses():
+    robot = zoo.hexapod()
+    q = np.array([[0.01, -0.02, 0.0, 0.015, 0.0, 0.01], [0.0, 0.01, 0.0, 0.0, -0.01, 0.0]])
+    found = jacobian(robot, q)
+    assert found.components == ("rx", "ry", "rz", "x", "y", "z")
+    step = 1e-6
+    for name in ("q2", "leg3.length", "leg5.base.y"):
+        if name in found.reading_names:
+            moved = forward(robot, q + step * (np.array(found.reading_names) == name))
+        else:
+            change = step * (np.array(found.parameter_names) == name)
+            moved = forward(robot.with_values(robot.values + change), q)
+        slope = geometry.pose_difference(moved.T, found.solution.T) / step
+        assert_allclose(found.of(name), slope, atol=1e-5)  # [rad/m, m/m] of a forward difference
+    with pytest.raises(DataError, match="no column 'leg9'"):
+        found.of("leg9")
+
+
+def test_robots_and_results_print_on_a_screen():
+    robot = zoo.hexapod()
+    solution = forward(robot, np.zeros((3, 6)))
+    for text in (repr(robot), repr(solution), repr(jacobian(robot, np.zeros((3, 6))))):
+        assert len(text) < 600
+    assert "42" in repr(robot)
+    assert "3 of 3 rows" in repr(solution)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rotations, poses and twists, batched over any leading axes; numpy only."""
+"""Rotations, poses and twists, batched over any leading axes. NumPy only."""
 
 from loopcal.geometry.euler_angles import EULER_ORDERS as EULER_ORDERS
 from loopcal.geometry.euler_angles import euler_rates as euler_rates

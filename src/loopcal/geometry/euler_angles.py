@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Three-angle descriptions of a rotation: the 24 Euler conventions, and tilt and torsion.
+"""Orientation by three angles: the 24 Euler conventions, and tilt and torsion.
 
-Each comes as three functions: to a matrix, from a matrix, and `rates`, the matrix E with `omega = E
-d(angles)`. Order names follow scipy: lower case turns about fixed axes ("xyz": first about x, then
-y, then z of the base, `R = Rz Ry Rx`), upper case about the moving ones ("XYZ": `R = Rx Ry Rz`).
-Angles stand in the order of the letters.
+Each has functions to and from a matrix and `rates`, the matrix E with `omega = E d(angles)`. Order
+names follow scipy: lower case turns about fixed axes ("xyz": first about x, then y, then z of the
+base, `R = Rz Ry Rx`), upper case about the moving ones ("XYZ": `R = Rx Ry Rz`). Angles are in the
+order of the letters.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ _GIMBAL = 1e-15
 
 
 def wrap_angle(angle: FloatArray | float) -> FloatArray:
-    """Angle moved by whole turns into (-pi, pi].
+    """Return the angle plus full turns that lies in (-pi, pi].
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def wrap_angle(angle: FloatArray | float) -> FloatArray:
 
 
 def rotation_about_axis(angle: FloatArray | float, axis: int) -> FloatArray:
-    """Rotation about coordinate axis 0, 1 or 2.
+    """Return the rotation about coordinate axis 0, 1 or 2.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def rotation_about_axis(angle: FloatArray | float, axis: int) -> FloatArray:
 
 
 def _moving_axes(order: str) -> tuple[tuple[int, int, int], bool]:
-    """Axes as a moving sequence, and whether the angles have to be read backwards (fixed axes).
+    """Return the axes as a moving sequence, and whether the angles are in reverse (fixed axes).
 
     `Rz(c) Ry(b) Rx(a)` about fixed axes "xyz" is the same product as "ZYX" about moving ones.
 
@@ -68,8 +68,8 @@ def _moving_axes(order: str) -> tuple[tuple[int, int, int], bool]:
     if order not in EULER_ORDERS:
         raise DataError(
             f"the Euler order {order!r} is not one of the 24: use {', '.join(_SEQUENCES)} for "
-            "turns about fixed axes,"
-            " or the same in capitals for turns about the moving axes"
+            "rotations about fixed "
+            "axes, or the same in capitals for rotations about the moving axes"
         )
     axes = tuple("xyz".index(letter) for letter in order.lower())
     fixed = order.islower()
@@ -78,7 +78,7 @@ def _moving_axes(order: str) -> tuple[tuple[int, int, int], bool]:
 
 
 def euler_to_matrix(angles: FloatArray, order: str) -> FloatArray:
-    """Rotation of three Euler angles, e.g. `R = Rz(c) Ry(b) Rx(a)` for "xyz".
+    """Return the rotation of three Euler angles, e.g. `R = Rz(c) Ry(b) Rx(a)` for "xyz".
 
     Parameters
     ----------
@@ -104,11 +104,11 @@ def euler_to_matrix(angles: FloatArray, order: str) -> FloatArray:
 
 
 def matrix_to_euler(rotation: FloatArray, order: str) -> FloatArray:
-    """Euler angles of a rotation, the inverse of `euler_to_matrix`.
+    """Return the Euler angles of a rotation, the inverse of `euler_to_matrix`.
 
     With `R = Ri(a1) Rj(a2) Rk(a3)` about moving axes, a1 and a2 come from arc tangents of entries
-    of R, and a3 from `Ri(a1)' R = Rj(a2) Rk(a3)`: so the angles give R back to rounding even where
-    the middle angle makes two axes parallel. There the first moving angle is zero.
+    of R, and a3 from `Ri(a1)' R = Rj(a2) Rk(a3)`. The angles reproduce R to rounding even if the
+    middle angle makes two axes parallel; the first moving angle is zero then.
 
     Parameters
     ----------
@@ -154,9 +154,9 @@ def matrix_to_euler(rotation: FloatArray, order: str) -> FloatArray:
 
 
 def euler_rates(angles: FloatArray, order: str) -> FloatArray:
-    """Matrix E with `omega = E d(angles)`, omega in the axes the rotation maps to.
+    """Return E with `omega = E d(angles)`, omega in the axes that the rotation maps to.
 
-    About moving axes the columns are `ei`, `Ri(a1) ej`, `Ri(a1) Rj(a2) ek`. Singular where two axes
+    About moving axes the columns are `ei`, `Ri(a1) ej`, `Ri(a1) Rj(a2) ek`. Singular if two axes
     are parallel.
 
     Parameters
@@ -187,18 +187,16 @@ def euler_rates(angles: FloatArray, order: str) -> FloatArray:
 
 
 def _nonzero(divisor: FloatArray) -> FloatArray:
-    """A divisor with exact zeros replaced, so that singular rows of a batch become huge and the
-    others stay right.
-    """
+    """Return a divisor without exact zeros: singular rows become huge, others stay correct."""
     return np.where(divisor == 0.0, 1e-100, divisor)
 
 
 def tilt_torsion_to_matrix(
     phi: FloatArray | float, theta: FloatArray | float, psi: FloatArray | float
 ) -> FloatArray:
-    """Rotation of azimuth, tilt and torsion: `R = Rz(phi) Ry(theta) Rz(psi - phi)`.
+    """Return the rotation of azimuth, tilt and torsion: `R = Rz(phi) Ry(theta) Rz(psi - phi)`.
 
-    The platform normal leans by theta towards the azimuth phi; psi turns about the normal.
+    The platform normal leans by theta towards the azimuth phi; psi rotates about the normal.
 
     Parameters
     ----------
@@ -221,9 +219,9 @@ def tilt_torsion_to_matrix(
 
 
 def matrix_to_tilt_torsion(rotation: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Azimuth, tilt and torsion of a rotation, the inverse of `tilt_torsion_to_matrix`.
+    """Return azimuth, tilt and torsion of a rotation, the inverse of `tilt_torsion_to_matrix`.
 
-    At zero tilt phi is not defined and is given as zero; psi is defined there.
+    At zero tilt phi is undefined and returned as zero; psi is defined.
 
     Parameters
     ----------
@@ -240,8 +238,7 @@ def matrix_to_tilt_torsion(rotation: FloatArray) -> tuple[FloatArray, FloatArray
 
 
 def euler_rates_inverse(angles: FloatArray, order: str) -> FloatArray:
-    """Matrix with `d(angles) = E^-1 omega`, the inverse of `euler_rates`; huge where two axes are
-    parallel.
+    """Return the inverse of `euler_rates`, `d(angles) = E^-1 omega`; huge if two axes are parallel.
 
     The rows are cross products of the columns of E over its determinant, +-cos(a2) or +-sin(a2).
 
@@ -271,14 +268,14 @@ def euler_rates_inverse(angles: FloatArray, order: str) -> FloatArray:
 def tilt_torsion_rates(
     phi: FloatArray | float, theta: FloatArray | float, psi: FloatArray | float
 ) -> FloatArray:
-    """Matrix E with `omega = E d(phi, theta, psi)`: columns `ez - R ez`, `Rz(phi) ey`, `R ez`.
-    Singular at zero tilt.
+    """Return E with `omega = E d(phi, theta, psi)`; singular at zero tilt.
+
+    Its columns are `ez - R ez`, `Rz(phi) ey`, `R ez`.
 
     Parameters
     ----------
     phi, theta, psi : (...) [rad]
-        psi does not enter, since the torsion comes first; it is asked for so that all rates are
-        called alike.
+        psi has no effect, since the torsion comes first; it makes all rates have equal arguments.
 
     Returns
     -------
@@ -292,7 +289,7 @@ def tilt_torsion_rates(
 def tilt_torsion_rates_inverse(
     phi: FloatArray | float, theta: FloatArray | float, psi: FloatArray | float
 ) -> FloatArray:
-    """Matrix with `d(phi, theta, psi) = E^-1 omega`.
+    """Return the inverse of `tilt_torsion_rates`, `d(phi, theta, psi) = E^-1 omega`.
 
     With the normal n and its derivative e in theta, which with `Rz(phi) ey` are three orthogonal
     directions: `dphi = -e . omega / sin(theta)`, `dtheta = Rz(phi) ey . omega`, `dpsi = (n -
@@ -301,7 +298,7 @@ def tilt_torsion_rates_inverse(
     Parameters
     ----------
     phi, theta, psi : (...) [rad]
-        psi does not enter, as in `tilt_torsion_rates`.
+        psi has no effect, as in `tilt_torsion_rates`.
 
     Returns
     -------

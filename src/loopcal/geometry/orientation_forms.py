@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How an orientation is written in columns: rotation vector, quaternion, tilt and torsion, or any
-Euler angles.
+"""Forms of orientation in columns: rotation vector, quaternion, tilt and torsion, Euler angles.
 
 Each form converts both ways and gives `rates`, the matrix E by which errors of its columns become a
-rotation error, `omega = E d(columns)`. A rotation vector and a quaternion have no errors of their
-own columns: their noise is stated as a rotation error about the axes of the frame, so E is the
-identity.
+rotation error, `omega = E d(columns)`. The noise of a rotation vector or a quaternion is stated as
+a rotation error about the axes of the frame, so E is the identity there.
 """
 
 from abc import ABC, abstractmethod
@@ -21,12 +19,12 @@ from loopcal.units import Dimension
 
 
 class OrientationForm(ABC):
-    """One way to write a rotation.
+    """A form in which a rotation is written.
 
     Attributes
     ----------
     name : str
-        As files call it.
+        Its name in files.
     columns : tuple of str
         Names of its c columns.
     dimension : Dimension
@@ -46,25 +44,26 @@ class OrientationForm(ABC):
 
     @property
     def name(self) -> str:
-        """As files call it."""
+        """Name in files."""
         return self._name
 
     @abstractmethod
     def to_matrix(self, values: FloatArray) -> FloatArray:
-        """Rotations (..., 3, 3) of columns (..., c)."""
+        """Return rotations (..., 3, 3) of columns (..., c)."""
 
     @abstractmethod
     def from_matrix(self, rotation: FloatArray) -> FloatArray:
-        """Columns (..., c) of rotations (..., 3, 3)."""
+        """Return columns (..., c) of rotations (..., 3, 3)."""
 
     def rates(self, values: FloatArray) -> FloatArray:
-        """E (..., 3, 3) with `omega = E d(columns)`, or the identity where noise is a rotation
-        error already.
+        """Return E (..., 3, 3) with `omega = E d(columns)`.
+
+        It is the identity if the noise is stated as a rotation error.
         """
         return np.broadcast_to(np.eye(3), (*values.shape[:-1], 3, 3))
 
     def rates_inverse(self, values: FloatArray) -> FloatArray:
-        """The inverse of `rates`, (..., 3, 3)."""
+        """Return the inverse of `rates`, (..., 3, 3)."""
         return np.broadcast_to(np.eye(3), (*values.shape[:-1], 3, 3))
 
 
@@ -75,11 +74,11 @@ class RotationVector(OrientationForm):
     _name = "rotation-vector"
 
     def to_matrix(self, values: FloatArray) -> FloatArray:
-        """Rotations (..., 3, 3) of rotation vectors (..., 3) [rad]."""
+        """Return rotations (..., 3, 3) of rotation vectors (..., 3) [rad]."""
         return geometry.exp_so3(values)
 
     def from_matrix(self, rotation: FloatArray) -> FloatArray:
-        """Rotation vectors (..., 3) [rad], at most pi long."""
+        """Return rotation vectors (..., 3) [rad], of length at most pi."""
         return geometry.log_so3(rotation)
 
 
@@ -92,11 +91,11 @@ class Quaternion(OrientationForm):
     dimension = Dimension.RATIO
 
     def to_matrix(self, values: FloatArray) -> FloatArray:
-        """Rotations (..., 3, 3) of quaternions (..., 4)."""
+        """Return rotations (..., 3, 3) of quaternions (..., 4)."""
         return geometry.quaternion_to_matrix(values)
 
     def from_matrix(self, rotation: FloatArray) -> FloatArray:
-        """Unit quaternions (..., 4), scalar not negative."""
+        """Return unit quaternions (..., 4), scalar not negative."""
         return geometry.matrix_to_quaternion(rotation)
 
 
@@ -110,25 +109,25 @@ class TiltTorsion(OrientationForm):
     angles = True
 
     def to_matrix(self, values: FloatArray) -> FloatArray:
-        """Rotations (..., 3, 3) of azimuth, tilt and torsion (..., 3) [rad]."""
+        """Return rotations (..., 3, 3) of azimuth, tilt and torsion (..., 3) [rad]."""
         return geometry.tilt_torsion_to_matrix(values[..., 0], values[..., 1], values[..., 2])
 
     def from_matrix(self, rotation: FloatArray) -> FloatArray:
-        """Azimuth, tilt and torsion (..., 3) [rad]."""
+        """Return azimuth, tilt and torsion (..., 3) [rad]."""
         return np.stack(geometry.matrix_to_tilt_torsion(rotation), axis=-1)
 
     def rates(self, values: FloatArray) -> FloatArray:
-        """E (..., 3, 3), singular at zero tilt."""
+        """Return E (..., 3, 3), singular at zero tilt."""
         return geometry.tilt_torsion_rates(values[..., 0], values[..., 1], values[..., 2])
 
     def rates_inverse(self, values: FloatArray) -> FloatArray:
-        """E^-1 (..., 3, 3), its first row huge at zero tilt."""
+        """Return E^-1 (..., 3, 3), its first row huge at zero tilt."""
         return geometry.tilt_torsion_rates_inverse(values[..., 0], values[..., 1], values[..., 2])
 
 
 @dataclass(frozen=True)
 class Euler(OrientationForm):
-    """Three turns a, b, c about the axes named by the order, see `geometry.euler_to_matrix`.
+    """Three rotations a, b, c about the axes of the order, see `geometry.euler_to_matrix`.
 
     Parameters
     ----------
@@ -147,23 +146,23 @@ class Euler(OrientationForm):
 
     @property
     def name(self) -> str:
-        """As files call it, e.g. "euler-xyz"."""
+        """Name in files, e.g. "euler-xyz"."""
         return f"euler-{self.order}"
 
     def to_matrix(self, values: FloatArray) -> FloatArray:
-        """Rotations (..., 3, 3) of angles (..., 3) [rad]."""
+        """Return rotations (..., 3, 3) of angles (..., 3) [rad]."""
         return geometry.euler_to_matrix(values, self.order)
 
     def from_matrix(self, rotation: FloatArray) -> FloatArray:
-        """Angles (..., 3) [rad]."""
+        """Return angles (..., 3) [rad]."""
         return geometry.matrix_to_euler(rotation, self.order)
 
     def rates(self, values: FloatArray) -> FloatArray:
-        """E (..., 3, 3), singular where two axes are parallel."""
+        """Return E (..., 3, 3), singular if two axes are parallel."""
         return geometry.euler_rates(values, self.order)
 
     def rates_inverse(self, values: FloatArray) -> FloatArray:
-        """E^-1 (..., 3, 3), huge where two axes are parallel."""
+        """Return E^-1 (..., 3, 3), huge if two axes are parallel."""
         return geometry.euler_rates_inverse(values, self.order)
 
 
@@ -173,28 +172,28 @@ _SIMPLE: dict[str, OrientationForm] = {
 
 
 def parse_orientation(name: str) -> OrientationForm:
-    """Form of orientation by its name in files.
+    """Return the form of orientation with this name.
 
     Parameters
     ----------
     name : str
-        "rotation-vector", "quaternion" (scalar first), "tilt-torsion", or "euler-" and one of the
-        24 orders.
+        "rotation-vector", "quaternion" (scalar first), "tilt-torsion", or "euler-" and one of
+        the 24 orders.
 
     Returns
     -------
-    form : Orientation
+    form : OrientationForm
 
     Raises
     ------
     DataError
-        If no form is called so.
+        Unknown name.
     """
     if name in _SIMPLE:
         return _SIMPLE[name]
     if name.startswith("euler-"):
         return Euler(name.removeprefix("euler-"))
     raise DataError(
-        f"the orientation {name!r} is unknown: use {', '.join(_SIMPLE)}, or euler- and an order "
+        f"unknown orientation form {name!r}; use {', '.join(_SIMPLE)}, or euler- and an order "
         "such as euler-xyz"
     )

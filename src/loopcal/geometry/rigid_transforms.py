@@ -2,8 +2,9 @@
 """Poses as 4x4 matrices, and the twist by which loopcal updates and compares them.
 
 The twist of a platform is (omega, v): omega in base axes, v the velocity of the platform ORIGIN in
-base axes. An update is `R <- exp(omega) R, t <- t + v`; `difference` is its inverse. `adjoint`
-belongs to the other, spatial, convention and is kept for files and programs that use it.
+base axes. An update is `R <- exp(omega) R, t <- t + v`; `pose_difference` is its inverse.
+`adjoint_matrix` belongs to the other, spatial, convention; it serves files and programs that use
+that one.
 """
 
 import numpy as np
@@ -13,7 +14,7 @@ from loopcal.typing import FloatArray
 
 
 def make_pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    """Homogeneous matrix `T = [R t; 0 1]`.
+    """Return the homogeneous matrix `T = [R t; 0 1]`.
 
     Parameters
     ----------
@@ -33,7 +34,7 @@ def make_pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
 
 
 def compose_poses(*poses: FloatArray) -> FloatArray:
-    """Product of poses from left to right: `T_a_c = compose(T_a_b, T_b_c)`.
+    """Multiply poses from left to right: `T_a_c = compose_poses(T_a_b, T_b_c)`.
 
     Parameters
     ----------
@@ -50,7 +51,7 @@ def compose_poses(*poses: FloatArray) -> FloatArray:
 
 
 def invert_pose(T: FloatArray) -> FloatArray:
-    """Inverse pose `[R' -R't; 0 1]`: `inverse(T_a_b) = T_b_a`.
+    """Return the inverse pose `[R' -R't; 0 1]`: `invert_pose(T_a_b) = T_b_a`.
 
     Parameters
     ----------
@@ -81,8 +82,9 @@ def apply_twist(T: FloatArray, twist: FloatArray) -> FloatArray:
 
 
 def pose_difference(T_a: FloatArray, T_b: FloatArray) -> FloatArray:
-    """Twist that takes b to a: `(log(R_a R_b'), t_a - t_b)`, so that `exp_update(T_b,
-    difference(T_a, T_b)) = T_a`.
+    """Return the twist from pose b to pose a: `(log(R_a R_b'), t_a - t_b)`.
+
+    It satisfies `apply_twist(T_b, pose_difference(T_a, T_b)) = T_a`.
 
     Parameters
     ----------
@@ -98,11 +100,12 @@ def pose_difference(T_a: FloatArray, T_b: FloatArray) -> FloatArray:
 
 
 def adjoint_matrix(T: FloatArray) -> FloatArray:
-    """Map of SPATIAL twists between frames: `V_a = adjoint(T_a_b) V_b`, `[[R, 0], [hat(t) R, R]]`.
+    """Return the map of SPATIAL twists between frames: `V_a = adjoint_matrix(T_a_b) V_b`.
 
-    In a spatial twist the translation part is the velocity of the body's point that is just then at
-    the origin of the frame the twist is written in; this is not the twist of `exp_update`. It holds
-    `expm(V_a^) T_a_b = T_a_b expm(V_b^)` with `V^` the 4x4 matrix of the twist.
+    The matrix is `[[R, 0], [hat(t) R, R]]`. In a spatial twist the translation part is the velocity
+    of the body's point that coincides with the origin of the frame in which the twist is written;
+    this is not the twist of `apply_twist`. With `V^` the 4x4 matrix of the twist, `expm(V_a^) T_a_b
+    = T_a_b expm(V_b^)`.
 
     Parameters
     ----------
@@ -118,7 +121,7 @@ def adjoint_matrix(T: FloatArray) -> FloatArray:
 
 
 def transport_matrix(arm: FloatArray, rotation: FloatArray | None = None) -> FloatArray:
-    """Map of platform twists to another point of the platform, written in other axes.
+    """Return the map of platform twists to another point of the platform, written in other axes.
 
     `omega' = Q omega`, `v' = Q (v + omega x arm)`: a 6x6 matrix `[[Q, 0], [-Q hat(arm), Q]]`.
 
@@ -127,7 +130,7 @@ def transport_matrix(arm: FloatArray, rotation: FloatArray | None = None) -> Flo
     arm : (..., 3) [m]
         From the platform origin to the point, in base axes.
     rotation : (..., 3, 3), optional
-        Q, from base axes to the new axes (default: base axes are kept).
+        Q, from base axes to the new axes (default: base axes).
 
     Returns
     -------
@@ -141,6 +144,6 @@ def transport_matrix(arm: FloatArray, rotation: FloatArray | None = None) -> Flo
 
 
 def _blocks(first: FloatArray, lower: FloatArray, second: FloatArray) -> FloatArray:
-    """The 6x6 matrices `[[first, 0], [lower, second]]` of 3x3 blocks with equal leading axes."""
+    """Return the 6x6 matrices `[[first, 0], [lower, second]]` of 3x3 blocks."""
     top = np.concatenate([first, np.zeros_like(first)], axis=-1)
     return np.concatenate([top, np.concatenate([lower, second], axis=-1)], axis=-2)

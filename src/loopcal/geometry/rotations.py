@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rotation group: exponential, logarithm and the Jacobians that join them.
+"""Rotations: exponential, logarithm, their derivatives, and quaternions.
 
-Every function is elementwise over any leading axes. Half angles and the offset `_TINY` keep each
-formula free of 0/0, so one expression serves from zero to pi: no branches, no series.
+All functions work elementwise over leading axes. Half angles and the offset `_TINY` keep each
+formula free of 0/0, so that one expression is valid from zero to pi, without branches or series.
 """
 
 import numpy as np
@@ -31,7 +31,7 @@ def stack_matrix(rows: tuple[tuple[FloatArray | float, ...], ...]) -> FloatArray
 
 
 def hat(vector: FloatArray) -> FloatArray:
-    """Skew matrix of a vector: `hat(a) @ b = a x b`.
+    """Return the skew matrix of a vector: `hat(a) @ b = a x b`.
 
     Parameters
     ----------
@@ -46,8 +46,9 @@ def hat(vector: FloatArray) -> FloatArray:
 
 
 def _polynomial(vector: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
-    """`I + first hat(w) + second hat(w)^2`, written out: three times faster than products of 3x3
-    matrices.
+    """Return `I + first hat(w) + second hat(w)^2`.
+
+    Written out, it is three times faster than products of 3x3 matrices.
     """
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
     xy, xz, yz = second * x * y, second * x * z, second * y * z
@@ -63,16 +64,16 @@ def _polynomial(vector: FloatArray, first: FloatArray, second: FloatArray) -> Fl
 
 
 def _angle(vector: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Length of vectors (..., 3) and its square, never exactly zero."""
+    """Return the length of vectors (..., 3) and its square, never exactly zero."""
     square = vector[..., 0] ** 2 + vector[..., 1] ** 2 + vector[..., 2] ** 2 + _TINY
     return np.sqrt(square), square
 
 
 def exp_so3(vector: FloatArray) -> FloatArray:
-    """Rotation about `w` by its length.
+    """Return the rotation about `w` by its length.
 
     `exp(w) = I + (sin t / t) hat(w) + (1 - cos t) / t^2 hat(w)^2`, `t = |w|`; the last factor is
-    taken as `(sin(t/2) / (t/2))^2 / 2`, which does not cancel.
+    computed as `(sin(t/2) / (t/2))^2 / 2`, which does not cancel.
 
     Parameters
     ----------
@@ -88,10 +89,10 @@ def exp_so3(vector: FloatArray) -> FloatArray:
 
 
 def log_so3(rotation: FloatArray) -> FloatArray:
-    """Rotation vector of length at most pi, the inverse of `exp_so3`.
+    """Return the rotation vector of length at most pi, the inverse of `exp_so3`.
 
-    Taken through the quaternion `(w, v)`: `log = 2 atan2(|v|, w) v / |v|`, as accurate near pi as
-    near zero. At exactly pi both signs of the axis are right; one of them is returned.
+    With the quaternion `(w, v)`, `log = 2 atan2(|v|, w) v / |v|` is as accurate near pi as near
+    zero. At exactly pi both signs of the axis are correct; one of them is returned.
 
     Parameters
     ----------
@@ -108,8 +109,9 @@ def log_so3(rotation: FloatArray) -> FloatArray:
 
 
 def left_jacobian_so3(vector: FloatArray) -> FloatArray:
-    """Derivative of the exponential: `exp(w + d) = exp(J(w) d) exp(w)` to first order in `d`.
+    """Return the derivative of the exponential.
 
+    To first order in `d`, `exp(w + d) = exp(J(w) d) exp(w)` with
     `J(w) = I + (1 - cos t) / t^2 hat(w) + (1 - sin t / t) / t^2 hat(w)^2`.
 
     Parameters
@@ -126,8 +128,9 @@ def left_jacobian_so3(vector: FloatArray) -> FloatArray:
 
 
 def left_jacobian_inverse_so3(vector: FloatArray) -> FloatArray:
-    """Derivative of the logarithm: `log(exp(d) R) = log(R) + J^-1(log R) d` to first order in `d`.
+    """Return the derivative of the logarithm.
 
+    To first order in `d`, `log(exp(d) R) = log(R) + J^-1(log R) d` with
     `J^-1(w) = I - hat(w) / 2 + (1 - (t/2) cot(t/2)) / t^2 hat(w)^2`, regular for t < 2 pi.
 
     Parameters
@@ -146,7 +149,7 @@ def left_jacobian_inverse_so3(vector: FloatArray) -> FloatArray:
 
 
 def quaternion_to_matrix(quaternion: FloatArray) -> FloatArray:
-    """Rotation of a quaternion, which is normalised first.
+    """Return the rotation of a quaternion; the quaternion is normalized first.
 
     Parameters
     ----------
@@ -169,10 +172,10 @@ def quaternion_to_matrix(quaternion: FloatArray) -> FloatArray:
 
 
 def matrix_to_quaternion(rotation: FloatArray) -> FloatArray:
-    """Unit quaternion of a rotation, scalar first and not negative.
+    """Return the unit quaternion of a rotation, scalar first and not negative.
 
     The entries of `4 q q'` are sums of entries of R. The row with the largest diagonal is `q` times
-    a number that is never small; normalising it gives `q`.
+    a number that is never small; normalizing it gives `q`.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from loopcal import engine, geometry
 from loopcal.engine import State
-from loopcal.errors import DataError
+from loopcal.errors import ArgumentTypeError, DataError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.batch_kinematics import (
@@ -120,11 +120,13 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
     Raises
     ------
     DataError
-        Not numbers, or another number of columns than the robot has actuators.
+        Another number of columns than the robot has actuators.
+    ArgumentTypeError
+        Not a robot, not numbers, or not a Solution.
     """
     _check_robot(robot, "forward")
     a = len(robot.actuators)
-    readings = np.atleast_2d(_as_numbers(q, f"readings as numbers of shape (n, {a})"))
+    readings = np.atleast_2d(_as_numbers(q, f"readings, numbers of shape (n, {a})"))
     if readings.ndim != 2 or readings.shape[1] not in (a, 2 * a):
         raise DataError(
             f"{readings.shape[-1]} readings a row were given, but {robot.name} has {a} actuators "
@@ -154,7 +156,9 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
     Raises
     ------
     DataError
-        Not numbers, another shape, or a matrix that is not a pose.
+        Another shape, or a matrix that is not a pose.
+    ArgumentTypeError
+        Not a robot, not numbers, or not a Solution.
     """
     _check_robot(robot, "inverse")
     c = len(robot.controlled)
@@ -314,7 +318,7 @@ def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: St
 def _check_robot(robot: object, function: str) -> None:
     """Refuse anything but a Mechanism as the robot."""
     if not isinstance(robot, Mechanism):
-        raise DataError(
+        raise ArgumentTypeError(
             f"{function} needs a robot as returned by loopcal.load_robot, not "
             f"{_describe_argument(robot)}"
         )
@@ -323,7 +327,7 @@ def _check_robot(robot: object, function: str) -> None:
 def _check_start(start: object) -> State:
     """Return the state of a start; refuse anything but a Solution."""
     if not isinstance(start, Solution):
-        raise DataError(
+        raise ArgumentTypeError(
             "start must be a Solution, as forward and inverse return it, not "
             f"{_describe_argument(start)}"
         )
@@ -340,8 +344,8 @@ def _as_numbers(values: Any, allowed: str) -> FloatArray:
             hint = "; if it is a file, load it with loopcal.load_measurements and pass its readings"
         elif hasattr(values, "readings"):
             hint = "; pass its attribute readings"
-        raise DataError(
-            f"{_describe_argument(values)} was given; allowed are {allowed}{hint}"
+        raise ArgumentTypeError(
+            f"{_describe_argument(values)} was given in place of {allowed}{hint}"
         ) from None
 
 

@@ -141,7 +141,9 @@ class Mechanism:
 
     def __repr__(self) -> str:
         """Return name, family, actuators, freedoms and counts, on a few lines."""
-        family = getattr(self.record, "family", None)
+        # a loaded robot keeps its family record inside the record of its file
+        record = getattr(self.record, "record", self.record)
+        family = getattr(record, "family", None)
         names = [a.name for a in self.actuators]
         if len(names) > SHOWN_ACTUATORS:
             names = [*names[:SHOWN_ACTUATORS], f"and {len(names) - SHOWN_ACTUATORS} more"]

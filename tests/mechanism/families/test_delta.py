@@ -24,8 +24,8 @@ from loopcal.mechanism.families.limb_records import (
     Copies,
     LengthDrive,
     LimbRecord,
+    MapEntry,
     NamedLength,
-    Onto,
     Prismatic,
     Shifts,
 )
@@ -96,7 +96,7 @@ def exact() -> tuple[Mechanism, Mechanism]:
         )
         for name, y in (("left", 0.03), ("right", -0.03))
     )
-    radius = tuple(Onto(limb=name, element="carriage", axis="x") for name in ("left", "right"))
+    radius = tuple(MapEntry(limb=name, element="carriage", axis="x") for name in ("left", "right"))
     six = Limbs(
         name="six",
         controlled=("x", "y", "z"),

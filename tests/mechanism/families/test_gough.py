@@ -26,7 +26,7 @@ from loopcal.mechanism import (
     inverse,
 )
 from loopcal.mechanism.families.gough import Gough, GoughCones
-from loopcal.mechanism.families.ups import Screw
+from loopcal.mechanism.families.hexapod_legs import Screw
 from tests import zoo
 from tests.mechanism.families.ranks import (
     perturbed,
@@ -213,7 +213,7 @@ def test_the_complete_model_moves_the_42_parameters_along() -> None:
             replace(CHAIN, screw=Screw(0.004, ((0, 0, 0),) * 6, ((1, 0, 0),) * 6)),
             r"joint axis of leg1 is \[0, 0, 0\]",
         ),
-        (replace(ROD, base=ROD.base[:5]), "5 base and 6 platform centres"),
+        (replace(ROD, base=ROD.base[:5]), "5 base and 6 platform centers"),
         (
             replace(ROD, tolerances=replace(ROD.tolerances, base=LengthTolerance())),
             "state either sd or limits",

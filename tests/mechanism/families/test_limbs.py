@@ -27,9 +27,9 @@ from loopcal.mechanism.families.limb_records import (
     Copies,
     LengthDrive,
     LimbRecord,
+    MapEntry,
     NamedAngle,
     NamedLength,
-    Onto,
     Prismatic,
     Revolute,
     RodCone,
@@ -214,8 +214,10 @@ def test_a_named_parameter_moves_all_that_it_is_mapped_onto() -> None:
     """A radius common to both slides, and a turn of the frame that they stand on: 0.3 m arm along y
     of the placed frame.
     """
-    radius = NamedLength("radius", 0.3, (Onto("rod", "P1", "x"),), LengthTolerance(sd=1e-4))
-    turn = NamedAngle("turn", 0.0, (Onto("rod", "P1", "y", arm=0.3), Onto("rod", "P1", "rz")))
+    radius = NamedLength("radius", 0.3, (MapEntry("rod", "P1", "x"),), LengthTolerance(sd=1e-4))
+    turn = NamedAngle(
+        "turn", 0.0, (MapEntry("rod", "P1", "y", arm=0.3), MapEntry("rod", "P1", "rz"))
+    )
     machine = build(replace(SLIDER, parameters=(radius, turn)).expand())
     assert machine.parameters.names[-2:] == ("radius", "turn")
     values = machine.values.copy()
@@ -321,15 +323,15 @@ CASES = {
     ),
     "tilt alone": (
         with_limb(chain=(Revolute("R"),), actuated="q", errors=(Tilts("R1", ("rx",), alone=True),)),
-        "which only a sliding joint allows",
+        "which only a slide allows",
     ),
     "axis zero": (
         with_limb(chain=(Prismatic("P", axis=(0.0, 0.0, 0.0), actuated="q"),)),
-        "give it a direction",
+        "state a direction",
     ),
     "no copies": (with_limb(copies=Copies(0)), "has 0 copies"),
     "unknown owner": (
-        replace(SLIDER, parameters=(NamedLength("r", 0.1, (Onto("arm", "P1", "x"),)),)),
+        replace(SLIDER, parameters=(NamedLength("r", 0.1, (MapEntry("arm", "P1", "x"),)),)),
         "'r' is mapped onto 'arm', which is not there; known are rod, q1, q2",
     ),
 }

@@ -33,7 +33,7 @@ from loopcal.io.formats.program_format import (
 )
 from loopcal.io.formats.urdf_closures import read_joint_graph
 from loopcal.io.formats.urdf_tree import Urdf
-from loopcal.mechanism.families.limb_records import Prismatic, Revolute, place_matrix
+from loopcal.mechanism.families.limb_records import Prismatic, Revolute, matrix_from_place
 from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.joint_graph import (
     GraphJoint,
@@ -176,7 +176,7 @@ def _list_origins(record: Limbs, urdf: Urdf) -> Iterator[tuple[str, list[str], s
         if first.name in urdf.joints:
             joint = urdf.joints[first.name]
             place = urdf.place_in_body(joint.parent) @ joint.origin
-            if np.abs(place - place_matrix(first.at)).max() > PLACED:
+            if np.abs(place - matrix_from_place(first.at)).max() > PLACED:
                 sentence = f"joint {first.name!r} has another place in the robot file"
                 raise urdf.error(f"{sentence}; export into the URDF it was read from", first.name)
         driven = (j for j in limb.chain if isinstance(j, Revolute | Prismatic))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing a limb as people see it: joints placed in the frame carried so far, about any axis.
+"""Limbs with joints about any axis, placed one after the other, in the form of the engine.
 
-The engine's joints all move along the z axis of the frame they stand in, so a link takes in two
-turns, T_j = A_{j-1}^-1 P_j A_j: P_j places the joint in the carried frame, A_j turns z onto its
-axis. At joint values zero the carried frame is the base frame displaced by the placements alone.
-Derivation: docs/theory/parameters.md.
+The joints of the engine move along the z axis of their link frame, so a link takes in two
+rotations, T_j = A_{j-1}^-1 P_j A_j: P_j places the joint in the carried frame, A_j rotates z onto
+its axis. At joint values of zero the carried frame is the base frame displaced by the placements
+alone. Derivation: docs/theory/parameters.md.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ EX, EY, EZ = np.eye(3)
 
 
 @dataclass(frozen=True)
-class Step:
-    """A joint of a limb, as people place it.
+class JointPlacement:
+    """A joint of a limb and its placement.
 
     Attributes
     ----------
     name : of the joint and of the link before it. kind : R or P.
-    place : (4, 4) of the joint in the frame carried so far [m].
+    place : (4, 4) of the joint in the frame carried up to it [m].
     axis : (3,) in the placed frame, of any length but zero.
     actuator, pitch, start, limits : as in `loopcal.mechanism.assembly.Joint`.
     """
@@ -45,19 +45,18 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Placed:
-    """A limb for the engine, with the frames that its file speaks of.
+class PlacedLimb:
+    """A limb for the engine, with the frames in which its file is written.
 
     Attributes
     ----------
-    turns : name of a link -> (3, 3) R_carried_link, the rotation that takes the link's own axes to
-        the carried ones.
-    places : name of a link -> (4, 4) its placement in the frame carried before it [m].
+    rotations : name of a link -> (3, 3) R_carried_link, from the link's axes to the carried ones.
+    placements : name of a link -> (4, 4) its placement in the frame carried before it [m].
     """
 
     limb: Limb
-    turns: Mapping[str, FloatArray]
-    places: Mapping[str, FloatArray]
+    rotations: Mapping[str, FloatArray]
+    placements: Mapping[str, FloatArray]
 
     @property
     def name(self) -> str:
@@ -66,34 +65,34 @@ class Placed:
 
     @property
     def elements(self) -> tuple[str, ...]:
-        """Links from base to tip, then the attachment."""
+        """Names of the links from base to tip, then of the attachment."""
         return (*(link.name for link in self.limb.links), self.limb.attachment.name)
 
 
-def placed(
+def place_limb(
     name: str,
-    steps: tuple[Step, ...],
+    steps: tuple[JointPlacement, ...],
     tip: FloatArray,
     ending: str,
     attachment: FloatArray,
     length: float = 0.0,
     actuator: str | None = None,
     cones: tuple[Cone, ...] = (),
-) -> Placed:
-    """A limb from its joints, its tip and its attachment.
+) -> PlacedLimb:
+    """Return a limb made of its joints, its tip and its attachment.
 
     Parameters
     ----------
     steps : the joints from base to tip; the first placement is in the base frame.
-    tip : (4, 4) of the tip in the frame carried last [m]; the link is called `tip`, or `base` in a
-        limb without joints.
-    attachment : (4, 4) in the platform frame [m]; the link is called `platform`.
+    tip : (4, 4) of the tip in the last carried frame [m]; its link is called `tip`, or `base` if
+        the limb has no joints.
+    attachment : (4, 4) in the platform frame [m]; its link is called `platform`.
     length, actuator, cones : of the rod of a `distance` ending [m].
     """
     back, links, joints = np.eye(4), [], []
     turns, places = {}, {}
     for step in steps:
-        turn = axis_frame(step.axis, step.name)
+        turn = frame_from_axis(step.axis, step.name)
         links.append(Link(step.name, back @ step.place @ _turned(turn)))
         joints.append(
             Joint(step.name, step.kind, step.actuator, step.pitch, step.start, step.limits)
@@ -114,12 +113,13 @@ def placed(
         actuator,
         cones,
     )
-    return Placed(limb, turns, places)
+    return PlacedLimb(limb, turns, places)
 
 
-def axis_frame(axis: FloatArray, name: str) -> FloatArray:
-    """A rotation (3, 3) whose third column is along `axis`; x, y and z give a cyclic change of
-    axes.
+def frame_from_axis(axis: FloatArray, name: str) -> FloatArray:
+    """Return a rotation (3, 3) whose third column is along `axis`.
+
+    The axes x, y and z give a cyclic permutation.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def axis_frame(axis: FloatArray, name: str) -> FloatArray:
     """
     length = float(np.linalg.norm(axis))
     if not length > 0:
-        raise MechanismError(f"joint {name!r} has the axis [0, 0, 0]; give it a direction")
+        raise MechanismError(f"joint {name!r} has the axis [0, 0, 0]; state a direction")
     z = np.asarray(axis, dtype=float) / length
     # the cyclic successor of the largest component is never parallel to the axis
     across = np.eye(3)[(int(np.argmax(np.abs(z))) + 1) % 3]
@@ -137,69 +137,74 @@ def axis_frame(axis: FloatArray, name: str) -> FloatArray:
     return np.array([x, np.cross(z, x), z], dtype=float).T
 
 
-def moved(
-    parameter: str, limb: Placed, element: str, axis: str, coefficient: float = 1.0
+def map_displacement(
+    parameter: str, limb: PlacedLimb, element: str, axis: str, coefficient: float = 1.0
 ) -> tuple[LinearMap, ...]:
-    """Maps of a parameter that moves an element along, or turns it about, an axis of the frame
-    carried there.
+    """Map a parameter onto a translation along, or a rotation about, an axis of the carried frame.
 
-    A move along x is a move along up to three axes of the link's own frame: the components of
+    A translation along x acts along up to three axes of the link's own frame: the components of
     R_carried_link' e_x.
     """
-    return towards(
+    return map_direction(
         parameter, limb, element, axis in AXES[:3], coefficient * np.eye(3)[AXES.index(axis) % 3]
     )
 
 
-def towards(
-    parameter: str, limb: Placed, element: str, turns: bool, direction: FloatArray
+def map_direction(
+    parameter: str, limb: PlacedLimb, element: str, turns: bool, direction: FloatArray
 ) -> tuple[LinearMap, ...]:
-    """Maps of a parameter that turns an element about (or moves it along) `direction`, in the frame
-    carried there.
+    """Map a parameter onto a rotation about (or translation along) `direction`.
+
+    The direction is in the carried frame.
     """
-    own = limb.turns[element].T @ direction
+    components = limb.rotations[element].T @ direction
     axes = AXES[:3] if turns else AXES[3:]
     # what is below rounding of a direction is no component
     return tuple(
         LinearMap(parameter, Address(limb.name, element, axis), float(part))
-        for axis, part in zip(axes, own, strict=True)
-        if abs(part) > 1e-12 * np.abs(own).max()
+        for axis, part in zip(axes, components, strict=True)
+        if abs(part) > 1e-12 * np.abs(components).max()
     )
 
 
-def tilted(parameter: str, limb: Placed, element: str, axis: str) -> tuple[LinearMap, ...]:
-    """Maps of a parameter that turns the axis of a sliding joint and leaves what slides on it
-    unturned.
+def map_slide_tilt(
+    parameter: str, limb: PlacedLimb, element: str, axis: str
+) -> tuple[LinearMap, ...]:
+    """Map a parameter onto the tilt of a slide's axis that does not rotate what slides on it.
 
-    exp(w) A_j [slide] A_j^-1 P A_k exp(w') keeps the orientation P A_k where w' = -(P A_k)' w; the
-    shift of what is placed off the slide is undone to first order.
+    exp(w) A_j [slide] A_j^-1 P A_k exp(w') keeps the orientation P A_k if w' = -(P A_k)' w. The
+    translation of what is placed off the slide is compensated to first order.
 
     Raises
     ------
     MechanismError
-        The joint is not a sliding one.
+        The joint is not a slide.
     """
     names = limb.elements
     place = names.index(element)
     if place >= len(limb.limb.joints) or limb.limb.joints[place].kind != "P":
         raise MechanismError(
-            f"{parameter} tilts {element!r} of {limb.name!r} alone, which only a sliding joint "
-            "allows; let it turn what follows"
+            f"{parameter} tilts {element!r} of {limb.name!r} alone, which only a slide allows; "
+            "leave out `alone: true`"
         )
-    w, behind = np.eye(3)[AXES.index(axis)], limb.places[names[place + 1]]
-    undo = towards(parameter, limb, names[place + 1], True, -behind[:3, :3].T @ w)
+    w, behind = np.eye(3)[AXES.index(axis)], limb.placements[names[place + 1]]
+    undo = map_direction(parameter, limb, names[place + 1], True, -behind[:3, :3].T @ w)
     shift = -behind[:3, :3].T @ np.cross(w, behind[:3, 3])
-    back = towards(parameter, limb, names[place + 1], False, shift) if np.abs(shift).any() else ()
-    return (*moved(parameter, limb, element, axis), *undo, *back)
+    back = (
+        map_direction(parameter, limb, names[place + 1], False, shift)
+        if np.abs(shift).any()
+        else ()
+    )
+    return (*map_displacement(parameter, limb, element, axis), *undo, *back)
 
 
-def at(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> FloatArray:
-    """(4, 4) translation [m]."""
+def translate(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> FloatArray:
+    """Return a translation (4, 4) [m]."""
     return geometry.make_pose(np.eye(3), np.array([x, y, z]))
 
 
-def turn_about(axis: str, angle: float) -> FloatArray:
-    """(4, 4) rotation about x, y or z [rad]."""
+def rotate_about(axis: str, angle: float) -> FloatArray:
+    """Return a rotation (4, 4) about x, y or z [rad]."""
     return _turned(geometry.exp_so3(angle * np.eye(3)["xyz".index(axis)]))
 
 

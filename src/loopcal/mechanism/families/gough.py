@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gough-Stewart platforms: six legs of variable length between joint centres on the base and on the
-platform.
+"""Gough-Stewart platforms: six legs of variable length between joint centers on base and platform.
 
-With `legs: rod` a leg is the distance between its two centres, l_i = |t + R p_i - b_i| = length_i +
-reading_i: seven parameters a leg, 42 in all. With `legs: ups` it is the chain that is really there
-(see `ups.py`), which can carry the complete error model and a screw that turns with the joints.
+With `legs: rod` a leg is the distance between its two centers, l_i = |t + R p_i - b_i| = length_i +
+reading_i: seven parameters a leg, 42 in all. With `legs: ups` it is a chain of joints (see
+`hexapod_legs.py`), which can carry the complete error model and a screw that turns with the joints.
 Derivation: docs/theory/hexapod.md.
 """
 
@@ -15,15 +14,16 @@ from typing import Literal
 
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly, Cone
-from loopcal.mechanism.families.chain import Placed, at, placed
+from loopcal.mechanism.families.chain import PlacedLimb, place_limb, translate
 from loopcal.mechanism.families.error_models import (
-    Errors,
-    Spread,
-    complete,
-    offset,
-    point,
-    rod_length,
+    ErrorModel,
+    ErrorTolerances,
+    complete_errors,
+    offset_error,
+    point_errors,
+    rod_length_error,
 )
+from loopcal.mechanism.families.hexapod_legs import Screw, ScrewLeg, build_screw_leg, build_ups_leg
 from loopcal.mechanism.families.prs import check_spherical
 from loopcal.mechanism.families.records import (
     AngleTolerance,
@@ -33,15 +33,15 @@ from loopcal.mechanism.families.records import (
     standard_deviation,
     values_per_leg,
 )
-from loopcal.mechanism.families.ups import Screw, ScrewLeg, screw_leg, ups_leg
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Dimension, Length
 
 
 @dataclass(frozen=True)
 class GoughTolerances:
-    """Tolerances of joint centres on base and platform, of the leg lengths, and of link angles in
-    the complete model.
+    """Tolerances of joint centers on base and platform and of leg lengths.
+
+    `links` and `angles` are those of the complete model.
     """
 
     base: LengthTolerance | None = None
@@ -53,7 +53,7 @@ class GoughTolerances:
 
 @dataclass(frozen=True)
 class GoughCones:
-    """How far a rod may lean at its base and platform joints from its direction at home."""
+    """Allowed inclination of a rod at its base and platform joints from its direction at home."""
 
     base: Angle | None = None
     platform: Angle | None = None
@@ -61,11 +61,11 @@ class GoughCones:
 
 @dataclass(frozen=True)
 class Gough(RobotRecord):
-    """A hexapod's file.
+    """The file of a hexapod.
 
     Attributes
     ----------
-    base, platform : centres of the joints, leg by leg, in the base and the platform frame [m].
+    base, platform : centers of the joints, leg by leg, in the base and the platform frame [m].
     lengths : length of a leg at reading zero [m], one for all or one each.
     stroke : allowed readings (low, high) [m]. cones : of the joints of rods.
     legs : form of the legs, a `rod` or the chain `ups`.
@@ -74,8 +74,10 @@ class Gough(RobotRecord):
     screw : with `ups`, a screw in every leg; its nut turns with the lower joint, its spindle with
         the upper one.
     error_model : `ideal`, 42 parameters, or `complete`, which needs `ups`.
-    tolerances : of the parameters; `links` and `angles` are of the complete model.
+    tolerances : of the parameters.
     """
+
+    family = "gough"
 
     base: tuple[Point, ...] = ()
     platform: tuple[Point, ...] = ()
@@ -89,13 +91,17 @@ class Gough(RobotRecord):
     tolerances: GoughTolerances = field(default_factory=GoughTolerances)
 
     def expand(self) -> Assembly:
-        """Six legs in the form stated; raises MechanismError for other than six, or a model the
-        form cannot carry.
+        """Return six legs in the stated form.
+
+        Raises
+        ------
+        MechanismError
+            Another number of legs, or a model that this form cannot carry.
         """
         self._check()
         lengths = values_per_leg(self.lengths, 6, "lengths")
         screws = self.screw.legs() if self.screw else (None,) * 6
-        legs, actuators, errors = [], [], Errors()
+        legs, actuators, errors = [], [], ErrorModel()
         for i, length in enumerate(lengths):
             leg, motor = self._leg(i, length, screws[i]), f"q{i + 1}"
             legs.append(leg)
@@ -124,25 +130,25 @@ class Gough(RobotRecord):
     def _check(self) -> None:
         if len(self.base) != 6 or len(self.platform) != 6:
             raise MechanismError(
-                f"{self.name} has {len(self.base)} base and {len(self.platform)} platform centres; "
+                f"{self.name} has {len(self.base)} base and {len(self.platform)} platform centers; "
                 "a hexapod has six of each"
             )
         asked = [
             words
-            for words, found in (
+            for words, is_stated in (
                 ("error_model: complete", self.error_model == "complete"),
                 ("spherical: axes", self.spherical == "axes"),
                 ("a screw", self.screw is not None),
             )
-            if found
+            if is_stated
         ]
         check_spherical(
             self.name, self.spherical, "complete" if self.legs == "rod" else self.error_model
         )
         if self.legs == "ups" and self.cones != GoughCones():
             raise MechanismError(
-                f"{self.name} states cones with legs: ups, whose joints are not told as cones; "
-                "state legs: rod"
+                f"{self.name} states cones with legs: ups, whose joints have no cones; state legs: "
+                "rod"
             )
         if self.legs == "rod" and asked:
             raise MechanismError(
@@ -150,20 +156,24 @@ class Gough(RobotRecord):
                 "carry it; state legs: ups"
             )
 
-    def _leg(self, i: int, length: float, screw: ScrewLeg | None) -> Placed:
-        """Leg i in its form."""
+    def _leg(self, i: int, length: float, screw: ScrewLeg | None) -> PlacedLimb:
+        """Return leg i in its form."""
         leg, motor = f"leg{i + 1}", f"q{i + 1}"
         if self.legs == "rod":
-            ends = at(*self.base[i]), at(*self.platform[i])
-            return placed(leg, (), ends[0], "distance", ends[1], length, motor, self._cones(*ends))
+            ends = translate(*self.base[i]), translate(*self.platform[i])
+            return place_limb(
+                leg, (), ends[0], "distance", ends[1], length, motor, self._cones(*ends)
+            )
         if screw:
-            return screw_leg(leg, motor, self.base[i], self.platform[i], self.home.matrix, screw)
-        return ups_leg(
+            return build_screw_leg(
+                leg, motor, self.base[i], self.platform[i], self.home.matrix, screw
+            )
+        return build_ups_leg(
             leg, motor, self.base[i], self.platform[i], self.home.matrix, self.spherical == "axes"
         )
 
     def _cones(self, base: FloatArray, top: FloatArray) -> tuple[Cone, ...]:
-        """The cones of a rod between these centres (4, 4), about its direction at home."""
+        """Return the cones of a rod between these centers (4, 4), about its direction at home."""
         home = self.home.matrix
         rod = (home @ top)[:3, 3] - base[:3, 3]
         ends = (
@@ -176,26 +186,32 @@ class Gough(RobotRecord):
             if angle is not None
         )
 
-    def _ideal(self, leg: Placed, motor: str, length: float) -> Errors:
-        """Two centres and a length, the same in both forms."""
+    def _ideal(self, leg: PlacedLimb, motor: str, length: float) -> ErrorModel:
+        """Return two centers and a length, the same in both forms."""
         sd = self.tolerances
-        base = point(
-            leg, leg.elements[0], "xyz", standard_deviation(sd.base, "the base centres"), "base"
+        base = point_errors(
+            leg, leg.elements[0], "xyz", standard_deviation(sd.base, "the base centers"), "base"
         )
-        top = point(leg, "platform", "xyz", standard_deviation(sd.platform, "the platform centres"))
-        own = standard_deviation(sd.length, "the leg lengths")
+        top = point_errors(
+            leg, "platform", "xyz", standard_deviation(sd.platform, "the platform centers")
+        )
+        length_sd = standard_deviation(sd.length, "the leg lengths")
         if self.legs == "rod":
-            return base + top + rod_length(leg, own)
-        return base + top + offset(f"{leg.name}.length", motor, Dimension.LENGTH, length, own)
+            return base + top + rod_length_error(leg, length_sd)
+        return (
+            base
+            + top
+            + offset_error(f"{leg.name}.length", motor, Dimension.LENGTH, length, length_sd)
+        )
 
-    def _complete(self, leg: Placed, motor: str, length: float) -> Errors:
-        """Every link, and the length."""
+    def _complete(self, leg: PlacedLimb, motor: str, length: float) -> ErrorModel:
+        """Return the errors of every link, and the length."""
         sd = self.tolerances
-        spread = Spread(
+        spread = ErrorTolerances(
             standard_deviation(sd.links, "the links"),
             standard_deviation(sd.angles, "the link angles"),
         )
-        own = standard_deviation(sd.length, "the leg lengths")
-        return complete(leg, spread, offsets=False) + offset(
-            f"{leg.name}.length", motor, Dimension.LENGTH, length, own
+        length_sd = standard_deviation(sd.length, "the leg lengths")
+        return complete_errors(leg, spread, offsets=False) + offset_error(
+            f"{leg.name}.length", motor, Dimension.LENGTH, length, length_sd
         )

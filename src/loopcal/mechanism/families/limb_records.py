@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a file of the family `limbs` may say: joints, limbs, drives and named parameters, as plain
-records.
+"""Records of `limbs` files: joints, limbs, drives and named parameters.
 
 Frames: a limb carries a frame from the base to its tip. `at:` places a joint in it, as [x, y, z] or
-as a whole pose, and `axis:` is a direction in the frame so placed. With all joints at zero and no
-placement turned, all axes are those of the base (of a copy: turned with it).
+as a full pose, and `axis:` is a direction in the placed frame. With all joints at zero and no
+rotated placement, all axes are those of the base (of a copy: rotated with it).
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from loopcal.mechanism.families.records import (
     Point,
     PoseRecord,
     RatioTolerance,
-    translation,
+    translation_matrix,
 )
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Length, Ratio
@@ -34,24 +33,24 @@ Moving = Literal["x", "y", "z", "length"]
 Turning = Literal["rx", "ry", "rz"]
 
 
-def direction(axis: Axis) -> FloatArray:
-    """An axis as a vector (3,)."""
+def axis_vector(axis: Axis) -> FloatArray:
+    """Return an axis as a vector (3,)."""
     if isinstance(axis, str):
         return (-1.0 if axis.startswith("-") else 1.0) * np.eye(3)["xyz".index(axis[-1])]
     return np.array(axis, dtype=float)
 
 
-def place_matrix(place: Place) -> FloatArray:
-    """A placement as (4, 4)."""
-    return place.matrix if isinstance(place, PoseRecord) else translation(place)
+def matrix_from_place(place: Place) -> FloatArray:
+    """Return a placement as (4, 4)."""
+    return place.matrix if isinstance(place, PoseRecord) else translation_matrix(place)
 
 
 @dataclass(frozen=True)
 class Revolute:
-    """A turning joint; `lead` is its advance along the axis in one turn (a screw), `start` its
-    angle near home.
+    """A rotary joint.
 
-    `limits` are its allowed values (low, high).
+    `lead` is its advance along the axis in one turn (a screw), `start` its angle near home,
+    `limits` its allowed values (low, high).
     """
 
     joint: Literal["R"]
@@ -66,7 +65,7 @@ class Revolute:
 
 @dataclass(frozen=True)
 class Prismatic:
-    """A sliding joint."""
+    """A slide."""
 
     joint: Literal["P"]
     name: str = ""
@@ -79,7 +78,7 @@ class Prismatic:
 
 @dataclass(frozen=True)
 class Universal:
-    """Two turning joints whose axes meet."""
+    """Two rotary joints whose axes intersect."""
 
     joint: Literal["U"]
     name: str = ""
@@ -90,7 +89,7 @@ class Universal:
 
 @dataclass(frozen=True)
 class Cylindrical:
-    """A turn about and a slide along the same axis."""
+    """A rotation about and a slide along the same axis."""
 
     joint: Literal["C"]
     name: str = ""
@@ -102,8 +101,9 @@ class Cylindrical:
 
 @dataclass(frozen=True)
 class Spherical:
-    """Three turning joints about z, then y, then x through one point (singular where the second is
-    at 90 degrees).
+    """Three rotary joints about z, then y, then x through one point.
+
+    It is singular with the second joint at 90 degrees.
     """
 
     joint: Literal["S"]
@@ -117,10 +117,10 @@ JointRecord = Revolute | Prismatic | Universal | Cylindrical | Spherical
 
 @dataclass(frozen=True)
 class Copies:
-    """The same limb several times, turned about an axis of base and platform; numbers 1, 2, .. are
-    added to its names.
+    """Copies of a limb, rotated about an axis of base and platform.
 
-    Copy i is turned by start + (i - 1) step; a step that is not given divides the full turn.
+    The numbers 1, 2, .. are appended to its names. Copy i is rotated by start + (i - 1) step;
+    without a step the copies divide the full turn.
     """
 
     count: int
@@ -131,11 +131,10 @@ class Copies:
 
 @dataclass(frozen=True)
 class Shifts:
-    """Unknown lengths of a limb: where an element is in the frame placed there, or the rod's
-    length.
+    """Unknown lengths of a limb: positions of an element in its placed frame, or the rod's length.
 
-    `of` is a joint, `tip` (`base` in a limb without joints), `platform` or `rod`; parameters are
-    called `limb.NAME.axis`, or `limb.NAME` for a rod's length, with NAME = `of` where no `name` is
+    `of` is a joint, `tip` (`base` in a limb without joints), `platform` or `rod`. Parameters are
+    called `limb.NAME.axis`, or `limb.NAME` for a rod's length, with NAME = `of` unless `name` is
     given.
     """
 
@@ -147,8 +146,9 @@ class Shifts:
 
 @dataclass(frozen=True)
 class Tilts:
-    """Unknown angles of a limb: turns of a joint's axis, with what follows; or of a slide's axis
-    alone (`alone: true`).
+    """Unknown angles of a limb: rotations of a joint's axis together with all that follows.
+
+    `alone: true` rotates the axis of a slide alone.
     """
 
     of: str
@@ -168,8 +168,9 @@ class LinkTolerances:
 
 @dataclass(frozen=True)
 class RodCone:
-    """How far a rod may lean from an axis at its `tip` (rod towards the platform) or `attachment`
-    (rod towards the tip).
+    """Allowed inclination of a rod from an axis at one end.
+
+    `end` is `tip` (rod towards the platform) or `attachment` (rod towards the tip).
     """
 
     end: Literal["tip", "attachment"]
@@ -179,19 +180,19 @@ class RodCone:
 
 @dataclass(frozen=True)
 class LimbRecord:
-    """A limb: joints from the base on, then how it is tied to the platform.
+    """A limb: joints from the base on, then its ending on the platform.
 
     Attributes
     ----------
-    on, to : what it starts from and ends on; only `base` and `platform` exist.
-    chain : its joints. tip : its end, in the frame carried last; of a limb without joints, its
-        point on the base.
-    ending : `rigid`, `ball` (tip and attachment meet in a point), `distance` (a rod of `length`
-        lies between them).
-    attach : the attachment in the platform frame. actuated : the drive of a `distance` of changing
+    on, to : where it begins and ends; only `base` and `platform` exist.
+    chain : its joints. tip : its end, in the last carried frame; in a limb without joints its point
+        on the base.
+    ending : `rigid`, `ball` (tip and attachment meet in a point) or `distance` (a rod of `length`
+        between them).
+    attach : the attachment in the platform frame. actuated : the drive of a `distance` of variable
         length.
-    cones : how far that rod may lean. copies : repeat it around an axis. errors : its unknowns in
-        the ideal model.
+    cones : allowed inclinations of that rod. copies : repeat the limb around an axis. errors : its
+        unknowns in the ideal model.
     """
 
     name: str
@@ -210,11 +211,11 @@ class LimbRecord:
 
 @dataclass(frozen=True)
 class LengthDrive:
-    """A drive whose reading is a length. joint value = offset + gain * reading + harmonics of the
-    period.
+    """A drive whose reading is a length.
 
-    `unknown` names terms to identify (offset, gain, backlash, and with a period sin1, cos1, sin2,
-    cos2), with the tolerances `length` and, of the gain, `ratio`.
+    joint value = offset + gain * reading + harmonics of the period. `unknown` names terms to
+    identify (offset, gain, backlash, and with a period sin1, cos1, sin2, cos2), with the tolerances
+    `length` and, for the gain, `ratio`.
     """
 
     reads: Literal["length"]
@@ -230,8 +231,9 @@ class LengthDrive:
 
 @dataclass(frozen=True)
 class AngleDrive:
-    """A drive whose reading is an angle and turns a joint. joint value = offset + gain * reading +
-    harmonics.
+    """A drive whose reading is an angle, on a rotary joint.
+
+    joint value = offset + gain * reading + harmonics.
     """
 
     reads: Literal["angle"]
@@ -250,9 +252,9 @@ class SpoolDrive:
     """A drive whose reading is an angle and moves a length.
 
     joint value = offset + radius * reading + buildup * reading^2 / (4 pi) + harmonics. `radius` is
-    the length paid out per radian of the reading (spool radius with gears and tackle; a spindle's
-    lead / 2 pi), negative where a growing reading shortens; `buildup` is how much it grows in one
-    turn of the reading.
+    the length paid out per radian of the reading (spool radius with gears and tackle; lead / (2 pi)
+    of a spindle), negative if a growing reading shortens; `buildup` is its growth in one turn of
+    the reading.
     """
 
     reads: Literal["angle"]
@@ -272,14 +274,14 @@ Drive = LengthDrive | AngleDrive | SpoolDrive
 
 
 @dataclass(frozen=True)
-class Onto:
-    """Where a named parameter enters: axis `axis` of the frame placed at `element` of `limb` (of
-    all its copies).
+class MapEntry:
+    """A number that a named parameter changes.
 
-    With `limb` the name of a drive, `element` is `transmission` and `axis` one of its terms. The
-    displacement is coefficient * change, or arm * change for an angle or ratio that moves a length
-    [arm per radian]. `lead` is a screw's advance in one turn (`pitch`, the engine's advance in a
-    radian, is refused); a `curve` counts per radian or metre.
+    It is axis `axis` of the frame placed at `element` of `limb` (of all its copies). With `limb`
+    the name of a drive, `element` is `transmission` and `axis` one of its terms. The displacement
+    is coefficient * change, or arm * change for an angle or ratio that moves a length [arm per
+    radian]. `lead` is a screw's advance in one turn (`pitch`, the advance in a radian, is refused);
+    a `curve` counts per radian or metre.
     """
 
     limb: str
@@ -309,7 +311,7 @@ class NamedLength:
 
     name: str
     length: Length
-    maps: tuple[Onto, ...]
+    maps: tuple[MapEntry, ...]
     tolerance: LengthTolerance | None = None
 
 
@@ -319,7 +321,7 @@ class NamedAngle:
 
     name: str
     angle: Angle
-    maps: tuple[Onto, ...]
+    maps: tuple[MapEntry, ...]
     tolerance: AngleTolerance | None = None
 
 
@@ -329,16 +331,16 @@ class NamedRatio:
 
     name: str
     ratio: Ratio
-    maps: tuple[Onto, ...]
+    maps: tuple[MapEntry, ...]
     tolerance: RatioTolerance | None = None
 
 
-Named = NamedLength | NamedAngle | NamedRatio
+NamedParameter = NamedLength | NamedAngle | NamedRatio
 
 
 @dataclass(frozen=True)
 class LimbsFile:
-    """The fields of a `limbs` file beside those that every robot has; see `Limbs`."""
+    """The fields of a `limbs` file in addition to those of every robot; see `Limbs`."""
 
     freedoms: tuple[Literal["rx", "ry", "rz", "x", "y", "z"], ...] = (
         "rx",
@@ -352,21 +354,17 @@ class LimbsFile:
     actuators: Mapping[str, Drive] = field(default_factory=dict)
     limbs: tuple[LimbRecord, ...] = ()
     error_model: Literal["ideal", "complete"] = "ideal"
-    parameters: tuple[Named, ...] = ()
+    parameters: tuple[NamedParameter, ...] = ()
     tolerances: LinkTolerances = field(default_factory=LinkTolerances)
 
 
 def refuse_branch(limb: LimbRecord, names: tuple[str, ...]) -> None:
-    """Refuse a limb that does not join base and platform; raises MechanismError naming what it
-    hangs on.
-    """
-    for key, found, allowed in (("starts on", limb.on, "base"), ("ends on", limb.to, "platform")):
-        if found == allowed:
+    """Refuse a limb that does not join base and platform; raises MechanismError."""
+    for key, stated, allowed in (("starts on", limb.on, "base"), ("ends on", limb.to, "platform")):
+        if stated == allowed:
             continue
-        what = f"limb {found!r}" if found in names else f"{found!r}"
+        what = f"limb {stated!r}" if stated in names else f"{stated!r}"
         raise MechanismError(
-            f"limb {limb.name!r} {key} {what}: loopcal has no limbs that branch from limbs; every "
-            "limb must join the base "
-            f"to the platform, so let it {key.replace('s on', ' on')} the {allowed}, or model the "
-            "branch as limbs of its own"
+            f"limb {limb.name!r} {key} {what}: loopcal has no limbs that branch from limbs; let it "
+            f"{key.replace('s on', ' on')} the {allowed}, or model the branch as separate limbs"
         )

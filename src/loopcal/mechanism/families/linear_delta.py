@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linear deltas as printer firmware sees them: three carriages on vertical towers, three rods that
-meet in one point.
+"""Linear deltas in the terms of printer firmware: three carriages on vertical towers, three rods.
 
-Tower k stands at radius (cos angle_k, sin angle_k); with the carriage at reading r its rod ends at
-the height z_k = stop_k + sqrt(arm_k^2 - radius^2) - r (`readings: drop`, counted down from the end
-stop) or z_k = stop_k + sqrt(arm_k^2 - radius^2) + r (`readings: height`); the nozzle is the lower
+Tower k is at radius (cos angle_k, sin angle_k). With the carriage at reading r its rod ends at the
+height z_k = stop_k + sqrt(arm_k^2 - radius^2) - r (`readings: drop`, counted down from the end
+stop) or z_k = stop_k + sqrt(arm_k^2 - radius^2) + r (`readings: height`). The nozzle is the lower
 point at distance arm_k from all three. Radius and angles are shared parameters
 (docs/theory/delta.md).
 """
@@ -23,7 +22,7 @@ from loopcal.mechanism.families.records import (
     LengthTolerance,
     RobotRecord,
     standard_deviation,
-    translation,
+    translation_matrix,
     values_per_leg,
 )
 from loopcal.parameters import Parameter
@@ -43,8 +42,7 @@ class DeltaTolerances:
 
 @dataclass(frozen=True)
 class TowerMap:
-    """(radius, angle, arm, stop) -> displacement of the tower in x and y, and offset of the
-    carriage.
+    """Map (radius, angle, arm, stop) to the tower's displacement and the carriage's offset.
 
     x = radius cos angle, y = radius sin angle, offset = stop + sqrt(arm^2 - radius^2).
     """
@@ -53,7 +51,7 @@ class TowerMap:
     outputs: tuple[Address, ...]
 
     def value(self, inputs: FloatArray) -> FloatArray:
-        """(t, 4) [m, rad, m, m] -> (t, 3) [m]."""
+        """Map (t, 4) [m, rad, m, m] to (t, 3) [m]."""
         radius, angle, arm, stop = inputs.T
         return np.stack(
             [radius * np.cos(angle), radius * np.sin(angle), stop + np.sqrt(arm**2 - radius**2)],
@@ -61,7 +59,7 @@ class TowerMap:
         )
 
     def jacobian(self, inputs: FloatArray) -> FloatArray:
-        """(t, 4) -> (t, 3, 4)."""
+        """Return the derivative (t, 3, 4) at (t, 4)."""
         radius, angle, arm, _ = inputs.T
         c, s, zero = np.cos(angle), np.sin(angle), np.zeros_like(radius)
         height = np.sqrt(arm**2 - radius**2)
@@ -75,18 +73,18 @@ class TowerMap:
 
 @dataclass(frozen=True)
 class LinearDelta(RobotRecord):
-    """A linear delta's file.
+    """The file of a linear delta.
 
     Attributes
     ----------
-    radius : horizontal distance from a rod's upper to its lower end with the nozzle in the centre
-        [m].
-    angles : of the towers [rad]; the third fixes what the base frame's x axis is and stays as it
-        is.
+    radius : horizontal distance of a rod's ends with the nozzle in the center [m].
+    angles : of the towers [rad]; the third one defines the base frame's x axis and is fixed.
     arms : lengths of the rods [m], one or three. stops : end-stop heights [m], one or three.
     readings : `drop` below the end stop or `height` above the lowest carriage position. stroke :
         allowed readings [m].
     """
+
+    family = "linear-delta"
 
     radius: Length = 0.0
     angles: tuple[Angle, ...] = ()
@@ -97,12 +95,10 @@ class LinearDelta(RobotRecord):
     tolerances: DeltaTolerances = field(default_factory=DeltaTolerances)
 
     def expand(self) -> Assembly:
-        """Three limbs: a driven carriage on a tower, then a rod; the platform keeps x, y and z."""
+        """Return three limbs, a driven carriage and a rod each; the platform keeps x, y and z."""
         arms, stops = values_per_leg(self.arms, 3, "arms"), values_per_leg(self.stops, 3, "stops")
         if len(self.angles) != 3:
-            raise MechanismError(
-                f"{self.name} has {len(self.angles)} tower angles; a linear delta has three"
-            )
+            raise MechanismError(f"{self.name} has {len(self.angles)} tower angles; state three")
         if not min(arms) > self.radius > 0:
             raise MechanismError(
                 f"{self.name} has a radius of {self.radius * 1e3:g} mm and an arm of "
@@ -121,7 +117,7 @@ class LinearDelta(RobotRecord):
             # above the nozzle: the other side is the mirrored working mode
             height = self.home.z + float(np.sqrt(arm**2 - self.radius**2))
             joints = (Joint("carriage", "P", motor, start=height),)
-            links = (Link("tower", translation(foot)), Link("hinge", np.eye(4)))
+            links = (Link("tower", translation_matrix(foot)), Link("hinge", np.eye(4)))
             limbs.append(Limb(limb, links, joints, "distance", Link("nozzle", np.eye(4)), arm))
             sign = -1.0 if self.readings == "drop" else 1.0
             offset = stop + np.sqrt(arm**2 - self.radius**2)

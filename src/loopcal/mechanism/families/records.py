@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pieces that robot files of every family share: pose, tolerance, workspace, and the base of all
-family records.
+"""Records that the robot files of all families share: pose, tolerances, workspace, base record.
 
-Numbers are in SI; `loopcal.io` converts them from the units that the file states, by the
-annotations here.
+Numbers are in SI; `loopcal.io` converts them from the units of the file, by the annotations here.
 """
 
 from __future__ import annotations
@@ -11,6 +9,7 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,9 +24,7 @@ Point = tuple[Length, Length, Length]
 
 @dataclass(frozen=True)
 class PoseRecord:
-    """Position and orientation R = Rz(yaw) Ry(pitch) Rx(roll), or tilt-and-torsion phi, theta, psi
-    in its place.
-    """
+    """Position and orientation R = Rz(yaw) Ry(pitch) Rx(roll), as a robot file states them."""
 
     x: Length = 0.0
     y: Length = 0.0
@@ -38,16 +35,14 @@ class PoseRecord:
 
     @property
     def matrix(self) -> FloatArray:
-        """(4, 4) homogeneous matrix."""
+        """Homogeneous matrix (4, 4)."""
         R = geometry.euler_to_matrix(np.array([self.roll, self.pitch, self.yaw]), "xyz")
         return geometry.make_pose(R, np.array([self.x, self.y, self.z]))
 
 
 @dataclass(frozen=True)
 class LengthTolerance:
-    """How far a length may be from nominal: a standard deviation, or limits taken as uniform (sd =
-    limits / sqrt 3).
-    """
+    """Tolerance of a length: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
 
     sd: Length | None = None
     limits: Length | None = None
@@ -55,9 +50,7 @@ class LengthTolerance:
 
 @dataclass(frozen=True)
 class AngleTolerance:
-    """How far an angle may be from nominal: a standard deviation, or limits taken as uniform (sd =
-    limits / sqrt 3).
-    """
+    """Tolerance of an angle: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
 
     sd: Angle | None = None
     limits: Angle | None = None
@@ -65,9 +58,7 @@ class AngleTolerance:
 
 @dataclass(frozen=True)
 class RatioTolerance:
-    """How far a ratio may be from nominal: a standard deviation, or limits taken as uniform (sd =
-    limits / sqrt 3).
-    """
+    """Tolerance of a ratio: sd, or limits of a uniform error (sd = limits / sqrt 3)."""
 
     sd: Ratio | None = None
     limits: Ratio | None = None
@@ -76,14 +67,18 @@ class RatioTolerance:
 def standard_deviation(
     tolerance: LengthTolerance | AngleTolerance | RatioTolerance | None, name: str
 ) -> float | None:
-    """The standard deviation of a tolerance [SI], None where nothing is stated; raises
-    MechanismError for an unclear one.
+    """Return the standard deviation of a tolerance [SI], None if none is stated.
+
+    Raises
+    ------
+    MechanismError
+        Both or neither of sd and limits, or a value that is not positive.
     """
     if tolerance is None:
         return None
     if (tolerance.sd is None) == (tolerance.limits is None):
         raise MechanismError(
-            f"the tolerance of {name} must state either sd or limits, and not both"
+            f"the tolerance of {name} must state either sd or limits, not both or neither"
         )
     stated = tolerance.sd if tolerance.sd is not None else tolerance.limits or 0.0
     if not stated > 0:
@@ -103,7 +98,7 @@ def standard_deviation(
 
 @dataclass(frozen=True)
 class Workspace:
-    """Ranges of the controlled coordinates in which the machine works (low, high)."""
+    """Ranges (low, high) of the controlled coordinates in which the machine works."""
 
     x: tuple[Length, Length] | None = None
     y: tuple[Length, Length] | None = None
@@ -117,36 +112,34 @@ class Workspace:
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
-        """Coordinate -> (low, high), the stated ones only; raises MechanismError where low is not
-        below high.
-        """
-        found = {
+        """Stated ranges, coordinate -> (low, high); raises MechanismError unless low < high."""
+        stated = {
             f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None
         }
-        for name, (low, high) in found.items():
+        for name, (low, high) in stated.items():
             if not low < high:
                 unit = "m" if name in ("x", "y", "z") else "rad"
                 raise MechanismError(
                     f"the workspace of {name} runs from {low:g} {unit} to {high:g} {unit}; the "
-                    "first must be smaller"
+                    "first value must be smaller"
                 )
-        return found
+        return stated
 
 
 @dataclass(frozen=True)
 class RobotRecord:
-    """What every robot file may say, whatever its family. A family adds its own fields and
-    `expand`.
+    """The fields of every robot file; a family adds its own fields and `expand`.
 
     Attributes
     ----------
-    name : what the robot is called. source : where its numbers come from.
-    home : the platform's pose, in the base, at which loops are closed first; what is not said is
-        zero.
-    tool : the tool's pose on the platform. workspace : where the machine works; poses are drawn
-        from it.
-    fixed : parameters that are not to be identified, by name or pattern, such as `arm*.length`.
+    name : of the robot. source : of its numbers.
+    home : platform pose in the base at which the loops are closed first; zero by default.
+    tool : tool pose on the platform. workspace : where the machine works; poses are drawn from it.
+    fixed : parameters that are not identified, by name or pattern, such as `arm*.length`.
     """
+
+    family: ClassVar[str] = ""
+    """Name of the family in robot files."""
 
     name: str
     source: str = ""
@@ -156,43 +149,44 @@ class RobotRecord:
     fixed: tuple[str, ...] = ()
 
     def expand(self) -> Assembly:
-        """The generic description of this robot."""
+        """Return the generic description of this robot."""
         raise TypeError("a record of no family cannot be expanded")
 
     def assembly(self) -> Assembly:
-        """`expand`, with the parameters that `fixed` calls by name or pattern (arm*) kept at their
-        nominal values.
+        """Return the expanded robot, with the parameters of `fixed` kept at their nominal values.
 
         Raises
         ------
         MechanismError
-            A name that calls no parameter.
+            A name or pattern that matches no parameter.
         """
         expanded = self.expand()
         names = [parameter.name for parameter in expanded.parameters]
-        held = {name for pattern in self.fixed for name in match_parameter_names(pattern, names)}
+        fixed = {name for pattern in self.fixed for name in match_parameter_names(pattern, names)}
         parameters = tuple(
-            replace(p, free=False) if p.name in held else p for p in expanded.parameters
+            replace(p, free=False) if p.name in fixed else p for p in expanded.parameters
         )
         return replace(expanded, parameters=parameters)
 
 
 def match_parameter_names(pattern: str, names: Sequence[str]) -> list[str]:
-    """The parameters that a name or pattern calls; raises MechanismError where there is none."""
-    found = fnmatch.filter(names, pattern)
-    if not found:
+    """Return the parameters that match a name or pattern; raises MechanismError if none does."""
+    matching = fnmatch.filter(names, pattern)
+    if not matching:
         hint = suggest_names(pattern, names) or f"; its parameters are {', '.join(names)}"
-        raise MechanismError(f"{pattern!r} fixes no parameter of this robot{hint}; correct it")
-    return found
+        raise MechanismError(
+            f"{pattern!r} under `fixed` matches no parameter of this robot{hint}; correct it"
+        )
+    return matching
 
 
-def translation(point: tuple[float, float, float]) -> FloatArray:
-    """(4, 4) pure translation [m]."""
+def translation_matrix(point: tuple[float, float, float]) -> FloatArray:
+    """Return a translation (4, 4) [m]."""
     return geometry.make_pose(np.eye(3), np.array(point, dtype=float))
 
 
 def values_per_leg(value: float | tuple[float, ...], count: int, name: str) -> tuple[float, ...]:
-    """One value for all legs, or one each; raises MechanismError for another count."""
+    """Return one value for each leg; raises MechanismError for another number of values."""
     values = (value,) * count if isinstance(value, (int, float)) else tuple(value)
     if len(values) != count:
         raise MechanismError(

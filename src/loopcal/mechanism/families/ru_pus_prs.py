@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""RU-PUS-PRS solar trackers: a platform on a post, turned in two angles by two carriages.
+"""RU-PUS-PRS solar trackers: a platform on a post, tilted about two axes by two carriages.
 
 Chain 1 (PUS) ends at (-a1, 0, 0) of the platform with its guide at (-b1, 0), chain 2 (PRS) at (0,
 a2, 0) with its guide at (0, b2) and its revolute joint along x; both guides are vertical. Chain 3
 (RU) is the post: a revolute joint along y in the base's origin, a link of length r to the
 platform's origin, there a universal joint with its first axis along x on the link and its second
-along y of the platform. So the platform's origin stays where it is and only phi and theta are free.
+along y of the platform. The platform's origin stays fixed; only phi and theta are free.
 
-Parameters: those of doi:10.1177/1687814016667908, which prints twenty-five without listing them
+Parameters: those of doi:10.1177/1687814016667908, which counts twenty-five without listing them
 all. Chain 1 has a1x a1y a1z b1x b1y q1 l1 thB1x thB1y, chain 2 the same and thC2y thC2z, chain 3 r
-and turns of its three axes, thOx thOz (revolute joint), thU1y thU1z (first axis) and thU2x thU2z
-(second). That is `twenty-seven`, of rank 26: thOz turns post and first axis together, just as thU1z
-does. `twenty-five` leaves out thOz, and thU1z, which thU2z nearly repeats: our choice. Derivation:
-docs/theory/tripods.md.
+and rotations of its three axes, thOx thOz (revolute joint), thU1y thU1z (first axis) and thU2x
+thU2z (second). These are `twenty-seven`, of rank 26: thOz rotates post and first axis together, and
+so does thU1z. `twenty-five` leaves out thOz, and thU1z, which thU2z nearly repeats: our choice.
+Derivation: docs/theory/tripods.md.
 """
 
 from __future__ import annotations
@@ -23,18 +23,31 @@ from typing import Literal
 import numpy as np
 
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly
-from loopcal.mechanism.families.chain import EX, EY, Placed, Step, at, moved, placed
-from loopcal.mechanism.families.error_models import Errors, Spread, complete, quantity
+from loopcal.mechanism.families.chain import (
+    EX,
+    EY,
+    JointPlacement,
+    PlacedLimb,
+    map_displacement,
+    place_limb,
+    translate,
+)
+from loopcal.mechanism.families.error_models import (
+    ErrorModel,
+    ErrorTolerances,
+    complete_errors,
+    single_error,
+)
 from loopcal.mechanism.families.prs import (
-    Frames,
+    ChainFrames,
     TripodTolerances,
+    build_prs_limb,
+    build_pus_limb,
     check_spherical,
-    drive_and_rod,
-    ends,
-    guide_angles,
-    joint_angles,
-    prs_limb,
-    pus_limb,
+    drive_and_rod_errors,
+    end_errors,
+    guide_angle_errors,
+    joint_angle_errors,
 )
 from loopcal.mechanism.families.records import RobotRecord
 from loopcal.units import Dimension, Length
@@ -47,28 +60,28 @@ POST_ANGLES = (
     ("thU2x", "platform", "rx"),
     ("thU2z", "platform", "rz"),
 )
-"""Turns of the post's axes: name, element, axis in the frame carried there (that of the base, or of
-the platform).
-"""
+"""Rotations of the post's axes: name, element, axis of the carried frame (base or platform)."""
 
 LEFT_OUT = ("thOz", "thU1z")
-"""What the twenty-five leave out of the twenty-seven."""
+"""Parameters of the twenty-seven that the twenty-five leave out."""
 
 
 @dataclass(frozen=True)
 class RuPusPrs(RobotRecord):
-    """An RU-PUS-PRS tracker's file.
+    """The file of an RU-PUS-PRS tracker.
 
     Attributes
     ----------
     platform_radius, base_radius, rod, post : a, b, l and r [m]. stroke : allowed readings (low,
         high) [m].
-    error_model : `ideal`, the named parameters, or `complete`. parameters : with `ideal`, which set
+    error_model : `ideal`, the named parameters, or `complete`. parameters : with `ideal`, the set
         (see the module).
     spherical : joints at the rods' ends as perfect `point`s, or with `complete` as `axes` with
         errors of their own.
     tolerances : of lengths and angles.
     """
+
+    family = "ru-pus-prs"
 
     platform_radius: Length = 0.0
     base_radius: Length = 0.0
@@ -81,7 +94,7 @@ class RuPusPrs(RobotRecord):
     tolerances: TripodTolerances = field(default_factory=TripodTolerances)
 
     def expand(self) -> Assembly:
-        """Three limbs under a free platform."""
+        """Return three limbs under a free platform."""
         check_spherical(self.name, self.spherical, self.error_model)
         a, b, axes, home = (
             self.platform_radius,
@@ -89,28 +102,31 @@ class RuPusPrs(RobotRecord):
             self.spherical == "axes",
             self.home.matrix,
         )
-        first = Frames(at(-b), at(-a), self.rod, home)
-        second = Frames(at(0.0, b), at(0.0, a), self.rod, home)
+        first = ChainFrames(translate(-b), translate(-a), self.rod, home)
+        second = ChainFrames(translate(0.0, b), translate(0.0, a), self.rod, home)
         rod, tripod = (
-            pus_limb("chain1", "q1", first, axes),
-            prs_limb("chain2", "q2", second, "x", axes),
+            build_pus_limb("chain1", "q1", first, axes),
+            build_prs_limb("chain2", "q2", second, "x", axes),
         )
         post = self._post()
         length, angle = self.tolerances.length, self.tolerances.angle
         if self.error_model == "complete":
             errors = sum(
-                (complete(limb, Spread(length, angle)) for limb in (rod, tripod, post)),
-                start=Errors(),
+                (
+                    complete_errors(limb, ErrorTolerances(length, angle))
+                    for limb in (rod, tripod, post)
+                ),
+                start=ErrorModel(),
             )
         else:
             errors = (
-                ends(rod, 1, first, length)
-                + drive_and_rod(rod, "q1", 1, first, length)
-                + guide_angles(rod, 1, "xy", angle)
-                + ends(tripod, 2, second, length)
-                + drive_and_rod(tripod, "q2", 2, second, length)
-                + guide_angles(tripod, 2, "xy", angle)
-                + joint_angles(tripod, 2, "yz", angle)
+                end_errors(rod, 1, first, length)
+                + drive_and_rod_errors(rod, "q1", 1, first, length)
+                + guide_angle_errors(rod, 1, "xy", angle)
+                + end_errors(tripod, 2, second, length)
+                + drive_and_rod_errors(tripod, "q2", 2, second, length)
+                + guide_angle_errors(tripod, 2, "xy", angle)
+                + joint_angle_errors(tripod, 2, "yz", angle)
                 + self._post_errors(post, length, angle)
             )
         return Assembly(
@@ -127,23 +143,29 @@ class RuPusPrs(RobotRecord):
             maps=errors.maps,
         )
 
-    def _post(self) -> Placed:
-        """Revolute joint, link, universal joint; at home all frames are parallel to the base."""
+    def _post(self) -> PlacedLimb:
+        """Return revolute joint, link and universal joint; at home all frames are parallel."""
         steps = (
-            Step("pivot", "R", np.eye(4), EY),
-            Step("universal1", "R", at(0.0, 0.0, self.post), EX),
-            Step("universal2", "R", np.eye(4), EY),
+            JointPlacement("pivot", "R", np.eye(4), EY),
+            JointPlacement("universal1", "R", translate(0.0, 0.0, self.post), EX),
+            JointPlacement("universal2", "R", np.eye(4), EY),
         )
-        return placed("chain3", steps, np.eye(4), "rigid", np.eye(4))
+        return place_limb("chain3", steps, np.eye(4), "rigid", np.eye(4))
 
-    def _post_errors(self, post: Placed, length: float | None, angle: float | None) -> Errors:
-        """r and the angles of the post."""
-        found = quantity(
-            "r", Dimension.LENGTH, self.post, length, *moved("r", post, "universal1", "z")
+    def _post_errors(
+        self, post: PlacedLimb, length: float | None, angle: float | None
+    ) -> ErrorModel:
+        """Return r and the angles of the post."""
+        errors = single_error(
+            "r",
+            Dimension.LENGTH,
+            self.post,
+            length,
+            *map_displacement("r", post, "universal1", "z"),
         )
         for name, element, axis in POST_ANGLES:
             if self.parameters == "twenty-seven" or name not in LEFT_OUT:
-                found += quantity(
-                    name, Dimension.ANGLE, 0.0, angle, *moved(name, post, element, axis)
+                errors += single_error(
+                    name, Dimension.ANGLE, 0.0, angle, *map_displacement(name, post, element, axis)
                 )
-        return found
+        return errors

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""3-PRS tripods: three carriages on vertical guides, rods that swing in vertical planes, balls on
-the platform.
+"""3-PRS tripods: three carriages on vertical guides, rods that swing in vertical planes, balls.
 
-Chain i stands at the angle 120 (i - 1) degrees, with the chain frame Rz(angle): guide along z,
-revolute joint along y, foot of the guide at x = base_radius, ball at x = platform_radius. The
-machine moves in z and tilts (phi, theta); x, y and psi follow. Parameters: the eleven a chain of
-doi:10.1177/1687814016667908 (a.x a.y a.z b.x b.y q l thB.x thB.y thC.x thC.z, the point standing
-for the chain's number), or fourteen natural ones: of the three more, b.z repeats q, and thB.z and
-thC.y turn an axis about itself. Derivation: docs/theory/tripods.md.
+Chain i is at the angle 120 (i - 1) degrees, with the chain frame Rz(angle): guide along z, revolute
+joint along y, foot of the guide at x = base_radius, ball at x = platform_radius. The machine moves
+in z and tilts (phi, theta); x, y and psi follow. Parameters: the eleven of each chain of
+doi:10.1177/1687814016667908 (a.x a.y a.z b.x b.y q l thB.x thB.y thC.x thC.z, with the number of
+the chain in place of the point), or fourteen: of the three more, b.z repeats q, and thB.z and thC.y
+rotate an axis about itself. Derivation: docs/theory/tripods.md.
 """
 
 from __future__ import annotations
@@ -18,18 +17,18 @@ from typing import Literal
 import numpy as np
 
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly
-from loopcal.mechanism.families.chain import Placed, at, turn_about
-from loopcal.mechanism.families.error_models import Errors, Spread, complete
+from loopcal.mechanism.families.chain import PlacedLimb, rotate_about, translate
+from loopcal.mechanism.families.error_models import ErrorModel, ErrorTolerances, complete_errors
 from loopcal.mechanism.families.prs import (
-    Frames,
+    ChainFrames,
     TripodTolerances,
+    build_prs_limb,
     check_spherical,
-    drive_and_rod,
-    ends,
-    foot_height,
-    guide_angles,
-    joint_angles,
-    prs_limb,
+    drive_and_rod_errors,
+    end_errors,
+    foot_height_error,
+    guide_angle_errors,
+    joint_angle_errors,
 )
 from loopcal.mechanism.families.records import RobotRecord
 from loopcal.units import Dimension, Length
@@ -37,17 +36,19 @@ from loopcal.units import Dimension, Length
 
 @dataclass(frozen=True)
 class ThreePrs(RobotRecord):
-    """A 3-PRS tripod's file.
+    """The file of a 3-PRS tripod.
 
     Attributes
     ----------
     platform_radius, base_radius, rod : a, b and l [m]. stroke : allowed readings (low, high) [m].
     error_model : `ideal`, the named parameters, or `complete`.
-    parameters : with `ideal`, the `eleven` a chain that can be told apart, or all `fourteen`.
+    parameters : with `ideal`, the `eleven` identifiable ones of each chain, or all `fourteen`.
     spherical : upper joints as perfect `point`s, or with `complete` as three `axes` with errors of
         their own.
     tolerances : of lengths and angles.
     """
+
+    family = "3-prs"
 
     platform_radius: Length = 0.0
     base_radius: Length = 0.0
@@ -59,18 +60,20 @@ class ThreePrs(RobotRecord):
     tolerances: TripodTolerances = field(default_factory=TripodTolerances)
 
     def expand(self) -> Assembly:
-        """Three PRS limbs under a free platform."""
+        """Return three PRS limbs under a free platform."""
         check_spherical(self.name, self.spherical, self.error_model)
-        limbs, errors = [], Errors()
+        limbs, errors = [], ErrorModel()
         for number in (1, 2, 3):
-            turn = turn_about("z", 2 * np.pi / 3 * (number - 1))
-            frames = Frames(
-                turn @ at(self.base_radius),
-                turn @ at(self.platform_radius),
+            turn = rotate_about("z", 2 * np.pi / 3 * (number - 1))
+            frames = ChainFrames(
+                turn @ translate(self.base_radius),
+                turn @ translate(self.platform_radius),
                 self.rod,
                 self.home.matrix,
             )
-            limb = prs_limb(f"chain{number}", f"q{number}", frames, "y", self.spherical == "axes")
+            limb = build_prs_limb(
+                f"chain{number}", f"q{number}", frames, "y", self.spherical == "axes"
+            )
             limbs.append(limb)
             errors += self._errors(limb, number, frames)
         return Assembly(
@@ -89,16 +92,16 @@ class ThreePrs(RobotRecord):
             maps=errors.maps,
         )
 
-    def _errors(self, limb: Placed, number: int, frames: Frames) -> Errors:
-        """The error model of one chain."""
+    def _errors(self, limb: PlacedLimb, number: int, frames: ChainFrames) -> ErrorModel:
+        """Return the error model of one chain."""
         length, angle = self.tolerances.length, self.tolerances.angle
         if self.error_model == "complete":
-            return complete(limb, Spread(length, angle))
+            return complete_errors(limb, ErrorTolerances(length, angle))
         all_of_them = self.parameters == "fourteen"
         return (
-            ends(limb, number, frames, length)
-            + (foot_height(limb, number, length) if all_of_them else Errors())
-            + drive_and_rod(limb, f"q{number}", number, frames, length)
-            + guide_angles(limb, number, "xyz" if all_of_them else "xy", angle)
-            + joint_angles(limb, number, "xyz" if all_of_them else "xz", angle)
+            end_errors(limb, number, frames, length)
+            + (foot_height_error(limb, number, length) if all_of_them else ErrorModel())
+            + drive_and_rod_errors(limb, f"q{number}", number, frames, length)
+            + guide_angle_errors(limb, number, "xyz" if all_of_them else "xy", angle)
+            + joint_angle_errors(limb, number, "xyz" if all_of_them else "xz", angle)
         )

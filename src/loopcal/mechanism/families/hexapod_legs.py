@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A hexapod's leg as the chain that it is: universal joint, driven slide, then a ball or a screw
-and a second universal joint.
+"""Legs of a hexapod as chains: universal joint, driven slide, then a ball or a screw and a second
+universal joint.
 
-Two turning joints across the leg point its slide at the upper centre; a `ball` closes the chain, or
-three axes through that centre and a `rigid` ending where they shall have errors of their own.
+Two rotary joints across the leg point its slide at the upper center. A `ball` closes the chain, or
+three axes through that center and a `rigid` ending if they have errors of their own.
 
 In a leg with a screw the nut is carried by the lower universal joint and the spindle by the upper
-one, so the length follows |t + R p - b| = length + reading - lead a / (2 pi), where a is the angle
-about the leg from the lower joint's axis to the upper one's, both seen along the leg and zero where
-they are parallel. This is the correction of LinuxCNC's genhexkins, which takes asin(sin a) in the
-place of a. Derivation: docs/theory/hexapod.md.
+one, so that |t + R p - b| = length + reading - lead a / (2 pi). The angle a about the leg, from the
+lower joint's axis to the upper one's, both seen along the leg, is zero where they are parallel.
+This is the correction of LinuxCNC's genhexkins, which takes asin(sin a) in place of a. Derivation:
+docs/theory/hexapod.md.
 """
 
 from __future__ import annotations
@@ -20,7 +20,15 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
-from loopcal.mechanism.families.chain import EX, EY, EZ, Placed, Step, at, placed
+from loopcal.mechanism.families.chain import (
+    EX,
+    EY,
+    EZ,
+    JointPlacement,
+    PlacedLimb,
+    place_limb,
+    translate,
+)
 from loopcal.mechanism.families.records import values_per_leg
 from loopcal.typing import FloatArray
 from loopcal.units import Length, Ratio
@@ -30,7 +38,7 @@ Direction = tuple[Ratio, Ratio, Ratio]
 
 @dataclass(frozen=True)
 class ScrewLeg:
-    """The screw of one leg: lead [m per turn], and the joint axes fixed to base and platform (3,)."""
+    """Screw of one leg: lead [m per turn], joint axes fixed to base and platform (3,)."""
 
     lead: float
     base_axis: Direction
@@ -45,8 +53,7 @@ class Screw:
     ----------
     lead : change of length in one turn [m], one for all legs or one each; negative for a
         left-handed screw.
-    base_axes, platform_axes : direction of the joint axis that is fixed to the base (platform), leg
-        by leg.
+    base_axes, platform_axes : direction of the joint axis fixed to the base (platform), leg by leg.
     """
 
     lead: Length | tuple[Length, ...] = 0.0
@@ -54,7 +61,7 @@ class Screw:
     platform_axes: tuple[Direction, ...] = ()
 
     def legs(self) -> tuple[ScrewLeg, ...]:
-        """The six screws; raises MechanismError for another number."""
+        """Return the six screws; raises MechanismError for another number."""
         if len(self.base_axes) != 6 or len(self.platform_axes) != 6:
             raise MechanismError(
                 f"the screw names {len(self.base_axes)} base_axes and {len(self.platform_axes)} "
@@ -62,18 +69,18 @@ class Screw:
             )
         leads = values_per_leg(self.lead, 6, "the screw's lead")
         return tuple(
-            ScrewLeg(*one) for one in zip(leads, self.base_axes, self.platform_axes, strict=True)
+            ScrewLeg(*leg) for leg in zip(leads, self.base_axes, self.platform_axes, strict=True)
         )
 
 
-def ups_leg(
+def build_ups_leg(
     name: str, motor: str, base: Direction, top: Direction, home: FloatArray, axes: bool
-) -> Placed:
-    """A leg whose joints are all at zero in the home pose.
+) -> PlacedLimb:
+    """Return a leg whose joints are all at zero in the home pose.
 
     Parameters
     ----------
-    base, top : centres in base and platform frame [m]. home : (4, 4) T_base_platform of the home
+    base, top : centers in base and platform frame [m]. home : (4, 4) T_base_platform of the home
         pose.
     axes : True for an upper joint of three axes, False for a ball.
     """
@@ -83,25 +90,29 @@ def ups_leg(
     first = _across(s, EZ)
     # the axes in the base frame, which is the carried frame while every joint is at zero
     steps = (
-        Step("universal1", "R", at(*b), first),
-        Step("universal2", "R", np.eye(4), np.cross(s, first)),
-        Step("slide", "P", np.eye(4), s, motor, start=length),
+        JointPlacement("universal1", "R", translate(*b), first),
+        JointPlacement("universal2", "R", np.eye(4), np.cross(s, first)),
+        JointPlacement("slide", "P", np.eye(4), s, motor, start=length),
     )
     if not axes:
-        return placed(name, steps, np.eye(4), "ball", at(*top))
+        return place_limb(name, steps, np.eye(4), "ball", translate(*top))
     turned = geometry.make_pose(home[:3, :3], np.zeros(3))
     ball = tuple(
-        Step(f"ball{i + 1}", "R", turned if i == 0 else np.eye(4), axis)
+        JointPlacement(f"ball{i + 1}", "R", turned if i == 0 else np.eye(4), axis)
         for i, axis in enumerate((EZ, EY, EX))
     )
-    return placed(name, (*steps, *ball), np.eye(4), "rigid", at(*top))
+    return place_limb(name, (*steps, *ball), np.eye(4), "rigid", translate(*top))
 
 
-def screw_leg(
+def build_screw_leg(
     name: str, motor: str, base: Direction, top: Direction, home: FloatArray, screw: ScrewLeg
-) -> Placed:
-    """A leg with a screw, in which the reading alone drives the slide; raises MechanismError for an
-    axis along the leg.
+) -> PlacedLimb:
+    """Return a leg with a screw, in which the reading alone drives the slide.
+
+    Raises
+    ------
+    MechanismError
+        A joint axis lies along the leg at home.
     """
     b, gap = _along(name, base, top, home)
     length = float(np.linalg.norm(gap))
@@ -120,29 +131,33 @@ def screw_leg(
     # at zero the spindle stands turned back by the angle that it has at home
     back = geometry.make_pose(geometry.exp_so3(-turned * s), np.zeros(3))
     steps = (
-        Step("universal1", "R", at(*b), lower),
-        Step("universal2", "R", np.eye(4), np.cross(s, low)),
-        Step("slide", "P", np.eye(4), s, motor, start=length + screw.lead * turned / (2 * np.pi)),
-        Step("screw", "R", np.eye(4), s, pitch=-screw.lead / (2 * np.pi), start=turned),
-        Step("universal3", "R", back, np.cross(s, high)),
-        Step("universal4", "R", np.eye(4), upper),
+        JointPlacement("universal1", "R", translate(*b), lower),
+        JointPlacement("universal2", "R", np.eye(4), np.cross(s, low)),
+        JointPlacement(
+            "slide", "P", np.eye(4), s, motor, start=length + screw.lead * turned / (2 * np.pi)
+        ),
+        JointPlacement("screw", "R", np.eye(4), s, pitch=-screw.lead / (2 * np.pi), start=turned),
+        JointPlacement("universal3", "R", back, np.cross(s, high)),
+        JointPlacement("universal4", "R", np.eye(4), upper),
     )
-    return placed(name, steps, geometry.make_pose(home[:3, :3], np.zeros(3)), "rigid", at(*top))
+    return place_limb(
+        name, steps, geometry.make_pose(home[:3, :3], np.zeros(3)), "rigid", translate(*top)
+    )
 
 
 def _along(
     name: str, base: Direction, top: Direction, home: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Lower centre and the way to the upper one at home [m]."""
+    """Return the lower center and the vector to the upper one at home [m]."""
     b = np.array(base, dtype=float)
     gap = home[:3, :3] @ np.array(top, dtype=float) + home[:3, 3] - b
     if not np.linalg.norm(gap) > 0:
-        raise MechanismError(f"{name} has length zero at home; move its centres or the home pose")
+        raise MechanismError(f"{name} has length zero at home; move its centers or the home pose")
     return b, gap
 
 
 def _across(s: FloatArray, axis: FloatArray) -> FloatArray:
-    """The unit vector across s nearest to `axis`, or any where they are parallel."""
+    """Return the unit vector across s nearest to `axis`, or any if they are parallel."""
     part = axis - float(axis @ s) * s
     if np.linalg.norm(part) < 1e-6 * np.linalg.norm(axis):
         part = np.cross(s, np.eye(3)[int(np.argmin(np.abs(s)))])
@@ -150,8 +165,8 @@ def _across(s: FloatArray, axis: FloatArray) -> FloatArray:
 
 
 def _direction(name: str, axis: Direction) -> FloatArray:
-    """A unit vector (3,); raises MechanismError where it is zero."""
+    """Return a unit vector (3,); raises MechanismError for zero."""
     length = float(np.linalg.norm(axis))
     if not length > 0:
-        raise MechanismError(f"a joint axis of {name} is [0, 0, 0]; give it a direction")
+        raise MechanismError(f"a joint axis of {name} is [0, 0, 0]; state a direction")
     return np.array(axis) / length

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of `limbs` files: unknown terms of drives, and units of named parameters.
+
+Every unknown is a named quantity in a unit that people measure: the radius and build-up of a spool
+stand for gain and curve. Formulas: docs/theory/parameters.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from loopcal.errors import MechanismError
+from loopcal.mechanism.assembly import AXES, Actuator, Address, LinearMap
+from loopcal.mechanism.families.error_models import ErrorModel, single_error
+from loopcal.mechanism.families.limb_records import (
+    AngleDrive,
+    Drive,
+    LengthDrive,
+    MapEntry,
+    NamedAngle,
+    NamedLength,
+    NamedParameter,
+    SpoolDrive,
+)
+from loopcal.mechanism.families.records import (
+    AngleTolerance,
+    LengthTolerance,
+    RatioTolerance,
+    standard_deviation,
+)
+from loopcal.units import Dimension
+
+HARMONICS = ("sin1", "cos1", "sin2", "cos2")
+CURVE_OF_BUILDUP = 1 / (4 * np.pi)
+"""Term `curve` per unit of build-up: radius + buildup * reading / (2 pi), integrated over the
+reading.
+"""
+
+Tolerance = LengthTolerance | AngleTolerance | RatioTolerance | None
+
+
+def build_actuator(name: str, drive: Drive) -> Actuator:
+    """Return the actuator of a drive."""
+    if isinstance(drive, SpoolDrive):
+        terms = {"gain": drive.radius, "curve": CURVE_OF_BUILDUP * drive.buildup}
+    else:
+        terms = {"gain": drive.gain}
+    dimension = Dimension.LENGTH if isinstance(drive, LengthDrive) else Dimension.ANGLE
+    return Actuator(
+        name, dimension, drive.stroke, {"offset": drive.offset, **terms}, drive.period, drive.sigma
+    )
+
+
+def drive_errors(name: str, drive: Drive, turns: bool) -> ErrorModel:
+    """Return the unknown terms of a drive, `q1.offset` and so on.
+
+    `turns` is True if its joint is rotary.
+
+    Raises
+    ------
+    MechanismError
+        A term that the drive does not have, or a harmonic without a period.
+    """
+    known, errors = _terms(drive, Dimension.ANGLE if turns else Dimension.LENGTH), ErrorModel()
+    for term in drive.unknown:
+        if term not in known:
+            raise MechanismError(
+                f"actuator {name!r} has no term {term!r}; allowed are {', '.join(known)}"
+            )
+        if term in HARMONICS and not drive.period:
+            raise MechanismError(
+                f"actuator {name!r} has an unknown {term}, but no period; state the reading's "
+                "period"
+            )
+        dimension, nominal, tolerance, axis, coefficient = known[term]
+        full = f"{name}.{term}"
+        sd = standard_deviation(tolerance, full)
+        errors += single_error(
+            full,
+            dimension,
+            nominal,
+            sd,
+            LinearMap(full, Address(name, "transmission", axis), coefficient),
+        )
+    return errors
+
+
+def _terms(
+    drive: Drive, joint_dimension: Dimension
+) -> Mapping[str, tuple[Dimension, float, Tolerance, str, float]]:
+    """Return the terms of a drive by name.
+
+    Each has dimension, nominal value, tolerance, transmission term and the change of it per unit.
+    """
+    tolerance = drive.angle if isinstance(drive, AngleDrive) else drive.length
+    known: dict[str, tuple[Dimension, float, Tolerance, str, float]] = {
+        "offset": (joint_dimension, drive.offset, tolerance, "offset", 1.0)
+    }
+    if isinstance(drive, SpoolDrive):
+        known["radius"] = (Dimension.LENGTH, drive.radius, drive.radii, "gain", 1.0)
+        known["buildup"] = (
+            Dimension.LENGTH,
+            drive.buildup,
+            drive.buildups,
+            "curve",
+            CURVE_OF_BUILDUP,
+        )
+    else:
+        known["gain"] = (Dimension.RATIO, drive.gain, drive.ratio, "gain", 1.0)
+    for term in ("backlash", *HARMONICS):
+        known[term] = (joint_dimension, 0.0, tolerance, term, 1.0)
+    return known
+
+
+DIMENSION_WORDS = {
+    Dimension.LENGTH: "a length",
+    Dimension.ANGLE: "an angle",
+    Dimension.RATIO: "a ratio",
+}
+
+
+def find_dimension(named: NamedParameter) -> Dimension:
+    """Return the dimension of a named parameter."""
+    if isinstance(named, NamedLength):
+        return Dimension.LENGTH
+    return Dimension.ANGLE if isinstance(named, NamedAngle) else Dimension.RATIO
+
+
+def find_engine_axis(name: str, entry: MapEntry) -> tuple[str, float]:
+    """Return the engine's axis of a map entry and the change of it per unit of the parameter.
+
+    A file states a lead per turn, the engine a pitch per radian.
+
+    Raises
+    ------
+    MechanismError
+        The axis `pitch`, for which a file states the lead.
+    """
+    if entry.axis == "pitch":
+        raise MechanismError(
+            f"parameter {name!r} is mapped onto 'pitch'; use lead, the advance in one turn"
+        )
+    coefficient = entry.coefficient * (1.0 if entry.arm is None else entry.arm)
+    return (
+        ("pitch", coefficient * (1 / (2 * np.pi)))
+        if entry.axis == "lead"
+        else (entry.axis, coefficient)
+    )
+
+
+def check_units(named: NamedParameter, entry: MapEntry, drive: tuple[Drive, bool] | None) -> None:
+    """Refuse a map between unlike units; raises MechanismError with what to state.
+
+    `drive` is the drive that the entry names, with whether its joint is rotary. A ratio is a slope
+    for an angle.
+    """
+    dimension, needed = find_dimension(named), _find_needed_dimension(entry.axis, drive)
+    what = f"parameter {named.name!r} is {DIMENSION_WORDS[dimension]}"
+    onto = f"{entry.axis} of {entry.limb!r} {DIMENSION_WORDS[needed]}"
+    if entry.arm is not None:
+        if dimension is Dimension.LENGTH:
+            raise MechanismError(
+                f"{what} with an arm; leave the arm out, which turns an angle into a length"
+            )
+        if needed is not Dimension.LENGTH:
+            raise MechanismError(f"{what} with an arm and {onto}; leave the arm out")
+        return
+    slope = dimension is Dimension.RATIO and needed is Dimension.ANGLE
+    if dimension is needed or slope:
+        return
+    if needed is Dimension.LENGTH:
+        raise MechanismError(
+            f"{what} and {onto}; state an `arm:` [length per radian], or the parameter as a length"
+        )
+    raise MechanismError(f"{what} and {onto}; state it as {DIMENSION_WORDS[needed]}")
+
+
+def _find_needed_dimension(axis: str, drive: tuple[Drive, bool] | None) -> Dimension:
+    """Return the dimension of what an entry moves; gain and curve count per unit of the reading."""
+    if drive is None or axis not in ("offset", "backlash", "gain", "curve"):
+        return Dimension.ANGLE if axis in AXES[:3] else Dimension.LENGTH
+    how, turns = drive
+    if axis in ("gain", "curve"):
+        return Dimension.LENGTH if isinstance(how, SpoolDrive) else Dimension.RATIO
+    return Dimension.ANGLE if turns else Dimension.LENGTH
