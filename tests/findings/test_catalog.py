@@ -22,19 +22,6 @@ from tools import findings_reference
 SOURCE = Path(loopcal.__file__).parent
 OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]+")
 
-PENDING = {
-    "diagnose/set_up_anew.py",
-    "io/data/measurement_file.py",
-    "io/formats/hangprinter.py",
-    "io/formats/import_export.py",
-    "io/formats/klipper.py",
-    "io/formats/linuxcnc.py",
-    "io/formats/marlin.py",
-    "io/formats/urdf.py",
-    "io/formats/urdf_limbs.py",
-}
-"""Modules whose messages still name options of the command line."""
-
 
 @cache
 def modules() -> dict[str, ast.Module]:
@@ -109,7 +96,7 @@ def test_no_message_of_the_library_names_an_option_of_the_command_line():
         and isinstance(node.value, str)
         and OPTION.search(node.value)
     }
-    assert named - PENDING == set()
+    assert named == set()
 
 
 def test_a_finding_is_text_for_people_and_data_for_programs():

@@ -46,6 +46,15 @@ ENTRIES = (
         _word_outside_stroke,
         "A reading is outside the stroke that the robot file states for its actuator.",
         "Correct the reading, its unit or the stroke.",
+        example={
+            "pose": "7",
+            "actuator": "q2",
+            "reading": "612.5",
+            "lower": "300",
+            "upper": "600",
+            "unit": "mm",
+            "count": 3,
+        },
     ),
     Entry(
         "data.duplicate-rows",
@@ -53,5 +62,6 @@ ENTRIES = (
         _word_duplicate,
         "A row repeats another row to the last digit: readings, kind and values are the same.",
         "Remove one of the two rows.",
+        example={"poses": ("3", "7"), "kind": "pose", "places": ("a.csv:4", "a.csv:8")},
     ),
 )

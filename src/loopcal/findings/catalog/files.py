@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from loopcal.findings.finding import Severity
-from loopcal.findings.wording import Entry, fill_template
+from loopcal.findings.wording import Entry, Quantity, fill_template
 
 IGNORED_KEYS = {
     "springKPerUnitLength": "the stiffness of the lines is not read, so stretch stays in the "
@@ -149,6 +149,7 @@ ENTRIES: tuple[Entry, ...] = (
         Severity.INFO,
         _word_change,
         "A value of a controller's file was corrected or added.",
+        example={"line": 12, "name": "radius", "before": "125.0", "after": "124.871"},
     ),
     Entry(
         "files.not-expressed",
@@ -183,6 +184,12 @@ ENTRIES: tuple[Entry, ...] = (
         _word_probe_noise,
         "Heights and distances of a printer.cfg are imported.",
         "State the noise of the probe and of the distances.",
+        example={
+            "heights": 37,
+            "distances": 0,
+            "sigma_height": Quantity(0.02, "mm"),
+            "sigma_distance": Quantity(0.1, "mm"),
+        },
     ),
     Entry(
         "files.saved-block",
@@ -260,6 +267,7 @@ ENTRIES: tuple[Entry, ...] = (
         Severity.INFO,
         _word_ignored_key,
         "Samples of a hanging printer contain a key that a robot file cannot express.",
+        example={"key": next(iter(IGNORED_KEYS))},
     ),
     Entry(
         "files.key-unknown",
@@ -288,6 +296,7 @@ ENTRIES: tuple[Entry, ...] = (
         _word_platform,
         "A URDF has no frame, or several, on moving bodies.",
         "Name the link that is the platform.",
+        example={"frames": ("tool", "camera"), "links": ("plate", "rod1")},
     ),
     Entry(
         "files.limb-branches",
@@ -316,6 +325,12 @@ ENTRIES: tuple[Entry, ...] = (
         Severity.INFO,
         _word_joint,
         "The origin of a joint of a URDF was corrected.",
+        example={
+            "line": 40,
+            "joint": "a1",
+            "distance": Quantity(0.31, "mm"),
+            "turn": Quantity(0.002, "rad"),
+        },
     ),
     Entry(
         "files.urdf-structure",
