@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from loopcal.errors import FileError
-from loopcal.io.formats import klipper, printer_cfg
 from loopcal.io.formats.import_export import build_imported_robot
+from loopcal.io.formats.printers import klipper, printer_cfg
 from loopcal.io.formats.program_format import ExportSource, ImportOptions
 
 SHORT = """\

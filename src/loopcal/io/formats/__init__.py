@@ -6,7 +6,8 @@ A format is a `Format` with `read`, `write` or both, in a module of its own, and
 
 from collections.abc import Mapping
 
-from loopcal.io.formats import hangprinter, klipper, linuxcnc, marlin, parameter_table, reprap, urdf
+from loopcal.io.formats import hangprinter, linuxcnc, parameter_table, urdf
+from loopcal.io.formats.printers import klipper, marlin, reprap
 from loopcal.io.formats.program_format import Format
 
 FORMATS: Mapping[str, Format] = {

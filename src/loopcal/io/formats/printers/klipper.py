@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.io.core.numbers import parse_finite
-from loopcal.io.formats import printer_cfg
-from loopcal.io.formats.delta_geometry import (
+from loopcal.io.formats.printers import printer_cfg
+from loopcal.io.formats.printers.delta_geometry import (
     NOMINAL_ANGLES,
     DeltaGeometry,
     Three,
@@ -30,7 +30,7 @@ from loopcal.io.formats.delta_geometry import (
     get_geometry,
     is_same,
 )
-from loopcal.io.formats.printer_cfg import PrinterConfig
+from loopcal.io.formats.printers.printer_cfg import PrinterConfig
 from loopcal.io.formats.program_format import (
     Exported,
     ExportSource,

@@ -16,8 +16,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from loopcal.findings import report_finding
-from loopcal.io.formats import gcode
-from loopcal.io.formats.delta_geometry import (
+from loopcal.io.formats.printers import gcode
+from loopcal.io.formats.printers.delta_geometry import (
     NOMINAL_ANGLES,
     DeltaGeometry,
     Three,

@@ -20,7 +20,7 @@ from pathlib import Path
 from loopcal.errors import FileError
 from loopcal.findings import Finding
 from loopcal.io.core.text_file import read_text
-from loopcal.io.formats.delta_geometry import format_number, is_same
+from loopcal.io.formats.printers.delta_geometry import format_number, is_same
 from loopcal.io.formats.program_format import parse_number, report_change
 
 COMMAND = re.compile(r"\s*([GM]\d+)(?![\d.])")
