@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/cable-robots.md: its commands run on the example and print what it says; and what it says of
-a real machine.
+"""docs/cable-robots.md: its commands run on the example and give its numbers, and so does a real
+machine.
 """
 
 import json
@@ -14,6 +14,7 @@ import pytest
 from loopcal.cli import main
 from loopcal.io import load_measurements, load_robot
 from tests.cable_robot import NAMES, TRUTH, real, samples_text
+from tests.cli.printed_tables import read_table_rows
 
 REAL = "import hp.json --format hangprinter -o robot.yaml --data samples.csv --sigma-line 0.6mm --sigma-position 0.6mm"
 CALIBRATE = "calibrate robot.yaml samples.csv -o run --method ls"
@@ -36,17 +37,25 @@ def folder(data_folder, tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def test_the_commands_print_what_the_page_says_and_find_the_truth(page, capsys) -> None:
+def test_the_commands_print_the_numbers_of_the_page_and_estimate_the_truth(page, capsys) -> None:
     commands = re.findall(r"^loopcal (.*)$", page, re.MULTILINE)
     assert [command.split()[0] for command in commands] == ["import", "calibrate"]
     for command in commands:
         capsys.readouterr()
-        assert main(command.split()) == 0
-    printed = re.search(
-        r"the commands and compares -->\n```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL
-    )
-    assert printed
-    assert capsys.readouterr().out.strip() == printed[1].strip()
+        assert main([*command.split(), *["--verbose"] * command.startswith("calibrate")]) == 0
+    printed = read_table_rows(capsys.readouterr().out)
+    assert len(printed) == 28  # errors, 21 parameters, 4 motors, 2 statistics
+    assert [
+        row
+        for block in re.findall(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+        for row in read_table_rows(block)
+    ] == printed
+    result = json.loads(Path("run/result.json").read_text())
+    assert result["verdict"] == "undecided"
+    codes = {finding["code"] for finding in result["findings"]}
+    assert {"workflow.no-held-out-poses", "noise.consistent", "outliers.none"} <= codes
+    chi_square, degrees = result["fit"]["chi_square"], result["fit"]["degrees"]
+    assert f"chi-square ({chi_square:.2f} with {degrees:.0f} degrees of freedom)" in page
     kept = np.load("run/arrays.npz")
     found = load_robot("run/robot.yaml")
     off = (found.values - load_robot("truth.yaml").values) / kept["sd"]

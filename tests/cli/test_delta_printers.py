@@ -7,6 +7,7 @@ heights of equal weight.
 """
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ import pytest
 
 from loopcal.cli import main
 from tests.cli.delta_printers import every_record, heights_only, stored, write_files
+from tests.cli.printed_tables import read_table_rows
 from tests.io.formats.printers import printer_cfg
 
 # The heights-only records of the folder; a test below holds this list against it.
@@ -149,17 +151,21 @@ def test_import_says_where_a_stored_geometry_is_not_the_optimum_of_the_firmwares
 
 def test_the_page_quotes_what_is_printed_of_the_real_printer(imported, capsys, root) -> None:
     page = (root / "docs" / "delta-printers.md").read_text("utf-8")
-    quoted = page.split("holds these lines against the program -->\n```text\n")[1].split("```")[0]
+    quoted = page.split("compares the numbers of these lines -->\n```text\n")[1].split("```")[0]
     printed = imported(WITH_DISTANCES, " --sigma-height 0.05mm --sigma-distance 0.3mm")
-    assert " ".join(quoted.split()) in printed
+    numbers = re.findall(r"\d+\.\d{4}", quoted)
+    assert len(numbers) == 6
+    assert re.findall(r"\d+\.\d{4}", printed) == numbers
     words = "calibrate printer.yaml probes.csv -o run --method ls --verbose"
     assert main(words.split()) == 0
     out = capsys.readouterr().out
-    # the mixture of heights and distances as millimetres grows, though chi-square falls from 18.9
+    # heights and distances mixed in millimeters increase, though chi-square decreases from 18.9
     assert "larger after calibration" not in out
     assert "Error divided by sigma (rms): 1.21 times smaller after calibration" in out
-    rows = [line.split() for line in out.splitlines()]
-    assert ["component", "1.36", "0.859", "1", "sigma"] in rows
+    rows = read_table_rows(out)
+    table = read_table_rows(page.split("for each kind and for all:")[1].split("\n## ")[0])
+    assert len(table) == 3
+    assert all(row in rows for row in table)
     result = json.loads(Path("run/result.json").read_text())
     assert result["fit"]["chi_square"] == pytest.approx(12.909, abs=5e-4)
     assert result["fit"]["degrees"] == pytest.approx(10.0, abs=1e-6)
