@@ -15,7 +15,7 @@ from loopcal.errors import DataError
 from loopcal.estimate import MAP
 from loopcal.findings import Severity, report_finding
 from loopcal.io.core.json_text import to_json
-from loopcal.measure import Gaussian, Instrument, Pose, Sensor, simulate
+from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate
 from loopcal.workflow import CalibrationOptions, Verdict, calibrate, split_data
 from loopcal.workflow.verdict import choose_next_step, decide_verdict
 from tests.estimate.problems import hexapod, hexapod_data
@@ -128,15 +128,17 @@ def test_an_outlier_gives_a_failure_of_the_noise_and_is_the_next_thing_to_check(
     assert report.next_step.data["poses"] == (f"pose {data.labels[4]}",)
 
 
-def test_motions_of_frames_are_one_harmless_finding():
+def test_motions_of_frames_are_one_harmless_finding(robot):
     sensor = Sensor(Pose(unknown=("frame",)), Gaussian(np.array([5e-6] * 3 + [1e-6] * 3)))
-    robot = hexapod()
-    data = simulate(robot, _poses(robot, 30), Instrument((sensor,)), 1)
+    truth = robot.with_values(sample_truth(robot, 1, 5)[0])
+    poses = lc.sample_workspace(robot, 40, 3).coordinates
+    data = simulate(truth, poses, Instrument((sensor,)), 1)
     report = calibrate(robot, data, CalibrationOptions(hold_out=0.25))
     (freedom,) = [f for f in report.findings if f.code == "workflow.frame-freedoms"]
     assert freedom.severity is Severity.INFO
     assert freedom.data == {"count": 6, "frames": ("base",)}
     assert not any(f.code == "workflow.undetermined-combinations" for f in report.findings)
+    assert report.verdict is Verdict.CALIBRATED
 
 
 def test_combinations_that_change_poses_are_a_reservation(robot, data):
@@ -203,7 +205,3 @@ def test_the_first_rule_of_the_verdict_decides():
     assert [v.exit_code for v in Verdict] == [0, 0, 2, 0]
     step = choose_next_step(Verdict.RESERVATIONS, (warning,), ())
     assert step.code == "workflow.next-resolve-warnings"
-
-
-def _poses(robot, n):
-    return lc.sample_workspace(lc.load_robot("hexapod-42"), n, 3).coordinates

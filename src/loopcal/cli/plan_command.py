@@ -297,7 +297,8 @@ def plan(
         )
         from loopcal.planning import plan as plan_poses
 
-        result = plan_poses(machine, instrument, options=plan_options)
+        with terminal.ProgressBar() as progress:
+            result = plan_poses(machine, instrument, options=plan_options, progress=progress)
         files = _write_plan(output, result, _list_inputs(robot, like, allowed, measured), force)
         document = {"format": FORMAT, **result.to_dict()}
     if as_json:
@@ -452,16 +453,15 @@ def _plan_surfaces(
     """Plan groups of points on planes and lines."""
     from loopcal.planning import SurfaceOptions, plan_surfaces
 
-    return plan_surfaces(
-        robot,
-        SurfaceOptions(
-            GROUPS if groups is None else groups,
-            POINTS if points is None else points,
-            sigma,
-            constraint_arguments.to_constraints(),
-            seed,
-        ),
+    options = SurfaceOptions(
+        GROUPS if groups is None else groups,
+        POINTS if points is None else points,
+        sigma,
+        constraint_arguments.to_constraints(),
+        seed,
     )
+    with terminal.ProgressBar() as progress:
+        return plan_surfaces(robot, options, progress)
 
 
 def _write_surface_plan(

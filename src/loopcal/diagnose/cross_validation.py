@@ -34,7 +34,7 @@ from loopcal.estimate.problem import problem_of
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition, decompose
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +133,7 @@ def cross_validate(
     seed: int = 1,
     noise: Literal["given", "estimated"] = "given",
     loss: Loss | None = None,
+    progress: Progress = report_no_progress,
 ) -> CrossValidation:
     """Fit `count` times without one fold, and predict the held-out fold.
 
@@ -140,7 +141,7 @@ def cross_validate(
     ----------
     robot, data, method, noise, loss : as for `identify`. A robot without free parameters is only
         used to predict.
-    count : number of folds. seed : of their choice.
+    count : number of folds. seed : of their choice. progress : receives the folds that are done.
 
     Raises
     ------
@@ -149,7 +150,8 @@ def cross_validate(
     """
     labels: list[str] = []
     before, after, scores, scores_before, converged = [], [], [], [], True
-    for places in draw_folds(data, count, seed):
+    for done, places in enumerate(draw_folds(data, count, seed)):
+        progress(done, count, "cross-validating")
         held_out = data.take(places)
         fitted = robot
         if robot.parameters.free.any():

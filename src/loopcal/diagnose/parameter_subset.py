@@ -34,7 +34,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.model import word_effect
 from loopcal.measure import Measurements
 from loopcal.mechanism import LinearMap, Mechanism
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 from loopcal.units import Dimension
 
 SETTABLE, NONZERO = 0.1, 0.3
@@ -248,6 +248,7 @@ def choose_model(
     seed: int = 1,
     noise: Literal["given", "estimated"] = "given",
     loss: Loss | None = None,
+    progress: Progress = report_no_progress,
 ) -> ModelChoice:
     """Choose the simplest set of free parameters that predicts held-out poses as well as any.
 
@@ -257,7 +258,8 @@ def choose_model(
         parameters.
     nested : name -> parameters, each set within the next; default `nest_parameter_sets`. The set
         "nothing" is always compared as well.
-    count, seed : of the folds, which are the same for all sets.
+    count, seed : of the folds, which are the same for all sets. progress : receives the fits that
+        are done.
 
     Raises
     ------
@@ -274,11 +276,18 @@ def choose_model(
                 "the next"
             )
 
-    def validated(names: Sequence[str]) -> CrossValidation:
-        only = _free_only(robot, names)
-        return cross_validate(only, data, method, count=count, seed=seed, noise=noise, loss=loss)
+    def validate_set(place: int, names: Sequence[str]) -> CrossValidation:
+        def count_fits(done: int, _total: int, _what: str) -> None:
+            progress(place * count + done, len(named) * count, "comparing parameter sets")
 
-    candidates = tuple(Candidate(name, names, validated(names)) for name, names in named)
+        only = _free_only(robot, names)
+        return cross_validate(
+            only, data, method, count=count, seed=seed, noise=noise, loss=loss, progress=count_fits
+        )
+
+    candidates = tuple(
+        Candidate(name, names, validate_set(i, names)) for i, (name, names) in enumerate(named)
+    )
     best = min(candidates, key=lambda c: c.validation.score)
     limit = best.validation.score + best.validation.standard_error
     chosen = next(c for c in candidates if c.validation.score <= limit)

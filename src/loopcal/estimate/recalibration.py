@@ -30,7 +30,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.serialization import json_fields
-from loopcal.typing import FloatArray
+from loopcal.typing import FloatArray, Progress, report_no_progress
 
 MOST_TRIED = 60
 """Number of parameters up to which each is tried alone as the explanation of a change."""
@@ -93,6 +93,7 @@ def recalibrate(
     free_limb: str | None = None,
     *,
     options: FitOptions | None = None,
+    progress: Progress = report_no_progress,
 ) -> tuple[Identification, Change]:
     """Identify a robot from new measurements and an earlier calibration.
 
@@ -103,6 +104,7 @@ def recalibrate(
     free_limb : a limb that was repaired. Its parameters get the tolerances of the robot file about
         nominal again; the others keep what the earlier calibration knows of them.
     options : see `FitOptions`. The method is least squares: the prior replaces the tolerances.
+    progress : receives the fits that are done where the machine has changed.
 
     Returns
     -------
@@ -118,7 +120,7 @@ def recalibrate(
     prior = prior_from(earlier)
     _check_names(robot, prior)
     names = prior.names if free_limb is None else limb_parameters(robot, free_limb)
-    change = assess_change(robot, data, prior, names, free_limb or MACHINE, options)
+    change = assess_change(robot, data, prior, names, free_limb or MACHINE, options, progress)
     used = _used_prior(robot, prior, free_limb, names)
     fit = identify(robot, data, LeastSquares(), options=replace(options, prior=used))
     return replace(fit, findings=(*fit.findings, change.finding)), change
@@ -131,6 +133,7 @@ def assess_change(
     names: tuple[str, ...],
     subject: str,
     options: FitOptions | None = None,
+    progress: Progress = report_no_progress,
 ) -> Change:
     """Test whether these parameters are still those of an earlier calibration.
 
@@ -157,7 +160,7 @@ def assess_change(
     moved = p_value < SIGNIFICANCE
     result = {"subject": subject, "chi_square": gain, "degrees": degrees, "p_value": p_value}
     if moved:
-        single = _explain_by_one(robot, data, prior, names, kept.chi_square, options)
+        single = _explain_by_one(robot, data, prior, names, kept.chi_square, options, progress)
         finding = report_finding("prior.machine-changed", **result, **single)
     else:
         finding = report_finding("prior.machine-unchanged", **result)
@@ -171,15 +174,16 @@ def _explain_by_one(
     names: tuple[str, ...],
     kept: float,
     options: FitOptions,
+    progress: Progress,
 ) -> dict[str, Any]:
     """Return which single parameter explains most of a change: `tried`, `parameter`, `change`."""
     unexplained = {"tried": len(names) <= MOST_TRIED, "parameter": "", "change": ""}
     if len(names) > MOST_TRIED:
         return unexplained
-    fits = [
-        identify(robot, data, options=replace(options, prior=prior.without((name,))))
-        for name in names
-    ]
+    fits = []
+    for done, name in enumerate(names):
+        progress(done, len(names), "trying each parameter as the change")
+        fits.append(identify(robot, data, options=replace(options, prior=prior.without((name,)))))
     values = [fit.chi_square if fit.converged else np.inf for fit in fits]
     best = int(np.argmin(values))
     fit, name = fits[best], names[best]

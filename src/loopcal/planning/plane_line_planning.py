@@ -30,7 +30,7 @@ from loopcal.planning.path import check_paths, locate_home
 from loopcal.planning.plane_line_groups import AXIS, PlaneLineGroups
 from loopcal.planning.result import PlannedPoses
 from loopcal.serialization import to_json
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 SWEEPS = 3
 """Sweeps over all coordinates: one more gains a few per cent."""
@@ -174,12 +174,15 @@ class SurfacePlan:
         }
 
 
-def plan_surfaces(robot: Mechanism, options: SurfaceOptions | None = None) -> SurfacePlan:
+def plan_surfaces(
+    robot: Mechanism, options: SurfaceOptions | None = None, progress: Progress = report_no_progress
+) -> SurfacePlan:
     """Plan points on planes and perpendicular lines.
 
     Parameters
     ----------
     robot : at its present values. options : number of groups and points, constraints, seed.
+    progress : receives the steps of the exchange that are done.
 
     Raises
     ------
@@ -216,6 +219,7 @@ def plan_surfaces(robot: Mechanism, options: SurfaceOptions | None = None) -> Su
         D(),
         prior,
         SWEEPS,
+        progress,
     )
     poses, positions = _arrange_points(groups, checker, best.design)
     return SurfacePlan(

@@ -31,7 +31,7 @@ from loopcal.planning.path import order_poses
 from loopcal.planning.problem import ExpectedErrors, PlanningProblem, prepare_problem
 from loopcal.planning.result import DesignQuality, ErrorForecast, Plan, PlannedPoses
 from loopcal.planning.sample_size import compute_error_curve, find_sample_size
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 from loopcal.units import Dimension, find_unit
 
 PERTURBATIONS = 10
@@ -54,6 +54,7 @@ def plan(
     n_poses: int | None = None,
     criterion: str | None = None,
     options: PlanOptions | None = None,
+    progress: Progress = report_no_progress,
 ) -> Plan:
     """Plan the poses to measure.
 
@@ -62,6 +63,7 @@ def plan(
     robot : at its present values. instrument : what will measure, with its noise.
     n_poses, criterion : short for these options.
     options : constraints, candidates, goal, earlier measurements, seed; see `PlanOptions`.
+    progress : receives the steps that are done.
 
     Returns
     -------
@@ -80,20 +82,22 @@ def plan(
         options = replace(options, n_poses=n_poses)
     if criterion is not None:
         options = replace(options, criterion=criterion)
-    return plan_poses(prepare_problem(robot, instrument, options))
+    return plan_poses(prepare_problem(robot, instrument, options), progress)
 
 
-def plan_poses(problem: PlanningProblem) -> Plan:
+def plan_poses(problem: PlanningProblem, progress: Progress = report_no_progress) -> Plan:
     """Plan the poses of a prepared problem; see `plan`."""
     options = problem.options
     if options.goal is not None:
-        return _plan_for_goal(problem)
+        return _plan_for_goal(problem, progress)
     number = N_POSES if options.n_poses is None else options.n_poses
-    result = _plan_number(problem, number)
-    return replace(result, curve=compute_error_curve(problem)) if options.curve else result
+    result = _plan_number(problem, number, progress)
+    if not options.curve:
+        return result
+    return replace(result, curve=compute_error_curve(problem, progress))
 
 
-def _plan_for_goal(problem: PlanningProblem) -> Plan:
+def _plan_for_goal(problem: PlanningProblem, progress: Progress) -> Plan:
     """Plan the smallest number of poses whose expected error reaches the goal.
 
     Raises
@@ -101,14 +105,15 @@ def _plan_for_goal(problem: PlanningProblem) -> Plan:
     EstimationError
         No number of poses reaches it.
     """
-    options, k, curve = problem.options, problem.poses_per_group, find_sample_size(problem)
+    options, k = problem.options, problem.poses_per_group
+    curve = find_sample_size(problem, progress)
     assert curve.enough is not None, "a goal was given"
     assert options.goal is not None, "a goal was given"
     n = curve.enough
     # Validation poses are taken from the candidates, and D is not what the goal counts: both can
     # cost some more poses.
     for _ in range(EXTENSIONS):
-        result = _plan_number(problem, n * k)
+        result = _plan_number(problem, n * k, progress)
         if result.errors.after.select(options.target, problem.prediction.size) <= options.goal:
             return replace(result, curve=replace(curve, enough=n))
         n += max(n // 20, 1)
@@ -123,7 +128,7 @@ def _plan_for_goal(problem: PlanningProblem) -> Plan:
     )
 
 
-def _plan_number(problem: PlanningProblem, n_poses: int) -> Plan:
+def _plan_number(problem: PlanningProblem, n_poses: int, progress: Progress) -> Plan:
     """Plan a number of poses."""
     k, robot, options = problem.poses_per_group, problem.robot, problem.options
     n_held_out = _require_numbers(problem, n_poses)
@@ -135,7 +140,9 @@ def _plan_number(problem: PlanningProblem, n_poses: int) -> Plan:
     rows, members = np.array(problem.groups.rows), problem.groups.members
     rows[np.isin(members, members[held_out]).any(axis=1)] = np.nan
     _require_candidates(problem, rows, n)
-    best = choose_design(rows, n, criterion, problem.prior, options.seed, PERTURBATIONS, gap=GAP)
+    best = choose_design(
+        rows, n, criterion, problem.prior, options.seed, PERTURBATIONS, gap=GAP, progress=progress
+    )
     chosen = best.design.chosen
     after = problem.predict_errors(chosen)
     assert after is not None, "the exchange determines every direction"

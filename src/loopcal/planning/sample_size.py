@@ -25,7 +25,7 @@ from loopcal.planning.problem import (
     name_groups,
     to_quantity,
 )
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
 SIZES = 6
 """Numbers of poses on a curve."""
@@ -107,7 +107,9 @@ class ErrorCurve:
         }
 
 
-def compute_error_curve(problem: PlanningProblem) -> ErrorCurve:
+def compute_error_curve(
+    problem: PlanningProblem, progress: Progress = report_no_progress
+) -> ErrorCurve:
     """Return expected errors from the smallest number of poses to RANGE times the requested one."""
     k, count, options = problem.poses_per_group, problem.n_candidates, problem.options
     requested = options.n_poses or N_POSES
@@ -116,11 +118,15 @@ def compute_error_curve(problem: PlanningProblem) -> ErrorCurve:
     sizes = np.geomspace(first, last, SIZES).round().astype(int)
     sizes = np.unique(np.append(sizes, min(max(requested // k, first), last))).tolist()
     rows, criterion, prior = problem.groups.rows, problem.build_criterion("I"), problem.prior
-    designs = compute_design_curve(rows, sizes, criterion, prior, options.seed, PERTURBATIONS)
+    designs = compute_design_curve(
+        rows, sizes, criterion, prior, options.seed, PERTURBATIONS, progress=progress
+    )
     return _convert_curve(problem, designs)
 
 
-def find_sample_size(problem: PlanningProblem) -> ErrorCurve:
+def find_sample_size(
+    problem: PlanningProblem, progress: Progress = report_no_progress
+) -> ErrorCurve:
     """Return the smallest number of poses that reaches the goal of the options.
 
     The curve covers the expected errors from the smallest number to twice that one.
@@ -162,7 +168,9 @@ def find_sample_size(problem: PlanningProblem) -> ErrorCurve:
     n = max(smallest.n, problem.min_groups)
     others = np.geomspace(problem.min_groups, min(2 * n, count), SIZES - 1).round().astype(int)
     sizes = np.unique(np.append(others, n)).tolist()
-    curve = compute_design_curve(rows, sizes, criterion, prior, options.seed, PERTURBATIONS)
+    curve = compute_design_curve(
+        rows, sizes, criterion, prior, options.seed, PERTURBATIONS, progress=progress
+    )
     if n == smallest.n:  # the design of the search, where that of the curve is less good
         place = sizes.index(n)
         designs = (*curve.designs[:place], smallest.certified, *curve.designs[place + 1 :])

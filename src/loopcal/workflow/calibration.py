@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,7 +21,7 @@ from loopcal.diagnose import (
     suggest_measurements,
 )
 from loopcal.errors import DataError
-from loopcal.estimate import Change, FitOptions, Identification, identify, recalibrate
+from loopcal.estimate import Change, Identification, identify, recalibrate
 from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.information import count_equations
 from loopcal.findings import Finding, Severity, report_finding
@@ -133,11 +132,11 @@ class _StepCounter:
     """Reports the steps of a calibration to the callback, one after the other."""
 
     def __init__(self, progress: Progress) -> None:
-        self._progress = progress
+        self.progress = progress
         self._done = 0
 
     def __call__(self, what: str) -> None:
-        self._progress(self._done, STEPS, what)
+        self.progress(self._done, STEPS, what)
         self._done += 1
 
 
@@ -151,7 +150,7 @@ class _FitResult:
 
 
 def _fit(
-    robot: Mechanism, data: Measurements, options: CalibrationOptions, count: Callable[[str], None]
+    robot: Mechanism, data: Measurements, options: CalibrationOptions, count: _StepCounter
 ) -> _FitResult:
     """Identify from the tolerances, or again with an earlier calibration as the prior."""
     excluded = tuple(p for p in options.fit.excluded_poses if p in data.labels)
@@ -164,13 +163,19 @@ def _fit(
             data,
             options.prior,
             options.free_limb,
-            options=FitOptions(noise=fit_options.noise, excluded_poses=excluded),
+            options=fit_options,
+            progress=count.progress,
         )
         return _FitResult(fit, change=change)
     choice = None
     if options.choose_model:
         choice = choose_model(
-            robot, data, method=fit_options.method, noise=fit_options.noise, loss=fit_options.loss
+            robot,
+            data,
+            method=fit_options.method,
+            noise=fit_options.noise,
+            loss=fit_options.loss,
+            progress=count.progress,
         )
         if not choice.chosen.parameters:
             raise DataError(report_finding("workflow.no-parameter-chosen"))
@@ -207,11 +212,16 @@ def _suggest(fit: Identification, data: Measurements) -> tuple[MeasurementSugges
 
 
 def _report_fit(fit: Identification) -> list[Finding]:
-    """Return the findings of the fit; a contradiction with the stated noise is a failure."""
-    return [
-        replace(f, severity=Severity.FAILURE) if f.code == "noise.residuals-too-large" else f
-        for f in fit.findings
-    ]
+    """Return the findings of the fit, with the severity that they have for a calibration.
+
+    A contradiction with the stated noise is a failure. Single open combinations are worth knowing;
+    whether they affect accuracy is reported once for all of them, see `_report_freedoms`.
+    """
+    severities = {
+        "noise.residuals-too-large": Severity.FAILURE,
+        "fit.unidentifiable": Severity.INFO,
+    }
+    return [replace(f, severity=severities.get(f.code, f.severity)) for f in fit.findings]
 
 
 def _report_validation(errors: Validation | None, is_held_out: bool) -> list[Finding]:

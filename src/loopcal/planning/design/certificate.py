@@ -27,7 +27,7 @@ from loopcal.planning.design.exchange import (
 )
 from loopcal.planning.design.relaxation import RelaxedDesign, relax_design
 from loopcal.planning.design.scoring import Scoring, build_scoring, is_determined
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
 PERTURBATIONS, LEAST_PERTURBATIONS = 1600, 20
 """Default number of perturbations: the first over the number of groups, at least the second."""
@@ -69,6 +69,7 @@ def choose_design(
     repeats: bool = False,
     gap: float = 1e-3,
     first: Iterable[IntArray] = (),
+    progress: Progress = report_no_progress,
 ) -> CertifiedDesign:
     """Choose n of N groups, with a certificate.
 
@@ -76,7 +77,7 @@ def choose_design(
     ----------
     rows, n, criterion, prior, seed, repeats, first : see `fedorov_exchange`.
     perturbations : their number; default PERTURBATIONS / n.
-    gap : of the relaxation.
+    gap : of the relaxation. progress : receives the perturbations that are done.
 
     Raises
     ------
@@ -106,7 +107,9 @@ def choose_design(
     begin = np.searchsorted(among, chosen)
     if relaxed.efficiency(scoring.value(history[-1])) >= GOOD:
         times = 0
-    best, scores = _perturb(scoring, scaled[among], begin, weights[among], times, random, repeats)
+    best, scores = _perturb(
+        scoring, scaled[among], begin, weights[among], times, random, repeats, progress
+    )
     chosen, last = exchange_groups(scoring, scaled, among[best], random, repeats)
     values = tuple(scoring.value(score) for score in (*history, *scores, *last[1:]))
     ends = tuple(scoring.value(score) for score in (history[-1], last[-1]))
@@ -122,6 +125,7 @@ def _perturb(
     times: int,
     random: np.random.Generator,
     repeats: bool,
+    progress: Progress,
 ) -> tuple[IntArray, list[float]]:
     """Perturb a design and exchange it among scaled groups (N, r, Q).
 
@@ -132,7 +136,8 @@ def _perturb(
     n = len(best)
     scores = [scoring.score(scoring.factor(scaled[best]))]
     count = min(n, max(2, round(PERTURBED * n)))
-    for _ in range(times if len(scaled) > n or repeats else 0):
+    for done in range(times if len(scaled) > n or repeats else 0):
+        progress(done, times, "exchanging poses")
         kept = random.permutation(best)[count:]
         new = draw_groups(random, len(scaled), n, repeats, weights)
         trial = np.concatenate(

@@ -38,7 +38,7 @@ from loopcal.planning.design.scoring import (
     score_additions,
     score_swaps,
 )
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
 LinearizeGroups = Callable[[IntArray, FloatArray], FloatArray]
 """(b,) indices of groups, (b, c) coordinates -> rows (b, r, o + p), NaN where not allowed."""
@@ -241,6 +241,7 @@ def coordinate_exchange(
     criterion: Criterion,
     prior: PriorInformation,
     sweeps: int = 10,
+    progress: Progress = report_no_progress,
 ) -> MovedDesign:
     """Improve a design by moving one coordinate of one group at a time.
 
@@ -253,7 +254,8 @@ def coordinate_exchange(
     design0 : (u, c) coordinates to start from.
     levels : for each of the c coordinates its allowed values (k,); none for one that stays.
     criterion : D, I or A. prior : information that exists before.
-    sweeps : largest number of passes over all coordinates.
+    sweeps : largest number of passes over all coordinates. progress : receives the coordinates
+        that are done.
 
     Returns
     -------
@@ -275,9 +277,10 @@ def coordinate_exchange(
     weight = len(design) / int(allowed.sum())
     scoring = build_scoring(probes[allowed], weight, criterion, prior, space)
     history, evaluated = [_score_design(scoring, rows)], len(probes)
-    for _ in range(sweeps):
+    for sweep in range(sweeps):
         used = scoring if np.isfinite(history[-1]) else scoring.with_ridge(RIDGE)
         for c, values in enumerate(levels):
+            progress(sweep * len(levels) + c, sweeps * len(levels), "moving points")
             moved = np.repeat(design[:, None], len(values), axis=1)
             moved[:, :, c] = values
             which, flat = np.repeat(indices, len(values)), moved.reshape(-1, design.shape[1])

@@ -25,7 +25,7 @@ from loopcal.planning.design.design_space import (
     require_enough,
 )
 from loopcal.planning.design.relaxation import relax_design
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
 PERTURBATIONS = 10
 """Number of perturbations of each design of a curve."""
@@ -76,8 +76,11 @@ def compute_design_curve(
     seed: int = 0,
     perturbations: int = PERTURBATIONS,
     repeats: bool = False,
+    progress: Progress = report_no_progress,
 ) -> DesignCurve:
     """Return designs of several sizes with their values and bounds; arguments as `choose_design`.
+
+    `progress` receives the sizes that are done.
 
     Raises
     ------
@@ -86,7 +89,8 @@ def compute_design_curve(
         largest.
     """
     designs: list[CertifiedDesign] = []
-    for n in sorted(set(sizes)):
+    for done, n in enumerate(sorted(set(sizes))):
+        progress(done, len(set(sizes)), "computing the error by the number of poses")
         first = [designs[-1].design.chosen] if designs else []
         designs.append(
             choose_design(rows, n, criterion, prior, seed, perturbations, repeats, first=first)

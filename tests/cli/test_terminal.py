@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hints and importance name codes of the catalog; progress is shown late, and on terminals only."""
+
+import os
+import pty
+import subprocess
+import sys
+
+from loopcal.cli import terminal
+from loopcal.cli.hints import HINTS, hint_for
+from loopcal.findings import report_finding
+from loopcal.findings.catalog import CATALOG
+from loopcal.findings.importance import IMPORTANCE, sort_by_importance
+
+WORK = """
+import sys, time
+from loopcal.cli import terminal
+terminal.DELAY = 0.2
+with terminal.ProgressBar() as progress:
+    for i in range(int(sys.argv[1])):
+        progress(i, 10, "fitting")
+        time.sleep(0.1)
+print("end")
+"""
+
+
+def test_hints_and_importance_name_codes_of_the_catalog():
+    assert [code for code in (*HINTS, *IMPORTANCE) if code not in CATALOG] == []
+
+
+def test_a_hint_names_the_poses_of_its_finding():
+    step = report_finding("workflow.next-check-outliers", poses=("pose 6", "pose 9"))
+    assert hint_for(step) == "exclude them with --drop 6 --drop 9, or use --loss huber"
+    assert hint_for(report_finding("workflow.next-use-result")) is None
+
+
+def test_failures_come_first_and_infos_last():
+    info = report_finding("workflow.frame-freedoms", count=6, frames=("base",))
+    warning = report_finding("workflow.no-held-out-poses")
+    failure = report_finding("gates.limit-not-measured", quantity="position")
+    assert sort_by_importance((info, warning, failure)) == (failure, warning, info)
+
+
+def _run_on_terminal(steps: int) -> str:
+    """Return what a program writes to a terminal."""
+    parent, child = pty.openpty()
+    words = [sys.executable, "-c", WORK, str(steps)]
+    with subprocess.Popen(words, stdout=child, stderr=child) as process:
+        os.close(child)
+        text = b""
+        while True:
+            try:
+                block = os.read(parent, 4096)
+            except OSError:  # the program closed the terminal
+                break
+            if not block:
+                break
+            text += block
+        assert process.wait() == 0
+    os.close(parent)
+    return text.decode("utf-8", "replace")
+
+
+def test_long_work_shows_percentage_and_remaining_time_on_a_terminal():
+    shown = _run_on_terminal(8)
+    assert "fitting" in shown
+    assert "%" in shown
+    assert "0:00" in shown
+
+
+def test_short_work_and_work_without_a_terminal_shows_nothing():
+    assert _run_on_terminal(1).split() == ["end"]
+    words = [sys.executable, "-c", WORK, "8"]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("end\n", "")
+
+
+def test_the_width_without_a_terminal_is_80(monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    monkeypatch.setattr(sys, "__stdout__", None)
+    assert terminal.width() == 80

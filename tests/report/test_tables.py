@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables and pages: one description, rendered as text, CSV and HTML, within the width."""
+
+import pytest
+
+from loopcal.report.numbers import format_number, format_uncertainty, format_with_uncertainty
+from loopcal.report.tables import Column, Table, word_column
+from loopcal.report.text_page import render_text, wrap_text
+
+TABLE = Table(
+    "Errors",
+    (word_column("of", wraps=True), Column("rms", "mm"), Column("largest", "mm")),
+    (("position of the platform", "0.05", "1.25"), ("x & y", "12.5", "-")),
+)
+
+
+def test_text_aligns_words_left_and_numbers_right():
+    assert TABLE.to_text().split("\n") == [
+        "Errors",
+        "of                        rms [mm]  largest [mm]",
+        "─" * 48,
+        "position of the platform      0.05          1.25",
+        "x & y                         12.5             -",
+    ]
+
+
+@pytest.mark.parametrize("width", [40, 30])
+def test_a_narrow_page_breaks_headings_and_words_but_no_number(width):
+    lines = TABLE.to_text(width).split("\n")
+    assert max(map(len, lines)) <= width
+    text = " ".join(" ".join(lines).split())
+    assert all(cell in text for cell in ("0.05", "1.25", "12.5", "[mm]"))
+
+
+def test_csv_and_html_hold_the_same_cells():
+    assert TABLE.to_csv().splitlines()[0] == "of,rms [mm],largest [mm]"
+    assert TABLE.to_csv().splitlines()[2] == "x & y,12.5,-"
+    page = TABLE.to_html()
+    assert "<caption>Errors</caption>" in page
+    assert '<td class="words">x &amp; y</td><td class="numbers">12.5</td>' in page
+    assert page.count("<tr>") == 3
+
+
+def test_paragraphs_wrap_and_keep_the_column_of_their_text():
+    wrapped = wrap_text("  warning  one two three four five six seven", 28)
+    assert wrapped.split("\n")[1].startswith(" " * 11 + "four")
+    command = "Next: loopcal calibrate a-long-name.yaml another-long-name.csv -o run"
+    assert wrap_text(command, 30) == command  # to be copied
+    assert render_text(["a", TABLE, "", "b"], 80).split("\n")[:2] == ["a", ""]
+    assert "\n\n\n" not in render_text(["a", TABLE, "", "b", "", TABLE, "c"], 80)
+
+
+@pytest.mark.parametrize(
+    ("value", "uncertainty", "shown"),
+    [
+        (120.02291, 0.00512, "120.02291"),
+        (-139.9606, 0.0165, "-139.9606"),
+        (4.923e-15, 0.02, "0.0000"),
+        (1e-4, 0.02, "0.0000"),
+        (12345.678, 250.0, "12346"),
+        (5.0, float("inf"), "5"),
+        (1.0, 0.009996, "1.0000"),
+    ],
+)
+def test_three_digits_of_the_uncertainty_decide_those_of_the_value(value, uncertainty, shown):
+    assert format_with_uncertainty(value, uncertainty) == shown
+
+
+def test_uncertainties_and_plain_numbers():
+    assert format_uncertainty(0.0051234) == "0.00512"
+    assert format_uncertainty(float("inf")) == "unknown"
+    assert format_uncertainty(float("nan")) == "not given"
+    assert format_uncertainty(0.0) == "0"
+    assert format_number(float("nan")) == "-"
+    assert format_number(4.9e-15) == "0"
