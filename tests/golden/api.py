@@ -245,7 +245,7 @@ def one_trial(trials: Data, i: int) -> Data:
 
 
 def own_truth(machine: Robot, sensors: Iterable[Any], n: int, seed: int) -> dict[str, float]:
-    """Draw true values of what the sensors do not know, within 20 mm and 0.3 rad of what is stated."""
+    """Draw true setup values within 20 mm and 0.3 rad of the stated ones."""
     reach = {Dimension.LENGTH: 0.02, Dimension.ANGLE: 0.3}
     seeing = [s.assign_rows(n) for s in Instrument(tuple(sensors)).with_tool(machine).sensors]
     table = collect_nuisance_parameters(seeing, tuple(map(str, range(n)))).table  # pyright: ignore[reportArgumentType]

@@ -47,7 +47,6 @@ def add(
 
 
 # --- shared set-ups
-# --------------------------------------------------------------------------------------------------
 
 
 @cache
@@ -75,7 +74,6 @@ def usual_fit(how: str = "map", name: str = HEXAPOD) -> Any:
 
 
 # --- 1. every shipped robot
-# ------------------------------------------------------------------------------------------
 
 
 SECOND_ORDER = ("linear-delta-6", "ls")
@@ -113,7 +111,6 @@ for _name in api.robot_names():
 
 
 # --- 2. every kind of measurement
-# ------------------------------------------------------------------------------------
 
 
 LEAN = ("length",)
@@ -123,7 +120,7 @@ ill-conditioned.
 
 
 def one_kind(kind: Any, n: int = 30, machine: Any = None, lean: bool = False) -> dict[str, Any]:
-    """Calibrate a hexapod from one kind, whose own unknowns are off; by least squares and by MAP."""
+    """Calibrate a hexapod from one kind, whose own unknowns are off, by LS and MAP."""
     robot = machine or api.robot(HEXAPOD)
     values = api.true_values(robot, 3)[0]
     sensors = (api.sensor_of_pairs(kind, n),)
@@ -287,7 +284,6 @@ for _names in COMBINED:
 
 
 # --- 3. every method and loss, stacked trials
-# ------------------------------------------------------------------------
 
 
 def by_method(how: str, value: Any, weak: bool, **options: Any) -> dict[str, Any]:
@@ -422,7 +418,6 @@ add("methods/per-leg", lambda: api.report_per_leg(api.robot(HEXAPOD), measured(H
 
 
 # --- 4. uncertain readings, sessions, priors
-# -------------------------------------------------------------------------
 
 
 def uncertain(name: str, sigma: float, how: str, *sensors: Any, n: int = 20) -> dict[str, Any]:
@@ -542,7 +537,7 @@ add("unknowns/stations", stations)
 
 
 def prior_of_unknowns(stated: bool) -> dict[str, Any]:
-    """Hold a frame with a prior, stated in the data or given to the fit; fix one coordinate of it."""
+    """Hold a frame with a prior from the data or the fit, and fix one coordinate of it."""
     seen = api.kind("pose", unknown=("frame",), frame="tracker")
     true = {"tracker.x": 300 * UM, "tracker.ry": 5e-4}
     data = measured(HEXAPOD, 24, api.sensor(seen), unknowns=true)
@@ -600,7 +595,6 @@ add("recalibration/prior-from-earlier", earlier_as_prior, "ls")
 
 
 # --- 5. plans
-# --------------------------------------------------------------------------------------------------------
 
 
 def plan(name: str, kind: str, n: int, criterion: str, **options: Any) -> dict[str, Any]:
@@ -682,7 +676,6 @@ add(
 
 
 # --- 6. papers
-# -------------------------------------------------------------------------------------------------------
 
 add("papers/hexapod-42/exact", api.report_hexapod_42, None, 3)
 add("papers/hexapod-42/presumed-noise", api.report_hexapod_42, (1e-6, 1e-9), 3)
@@ -697,7 +690,6 @@ add("papers/cmm-constraint-2011/surfaces", api.report_cmm_constraint_2011_surfac
 
 
 # --- 7. validation, accuracy, what is wrong
-# --------------------------------------------------------------------------
 
 
 def validation(name: str, how: str, *kinds: str) -> dict[str, Any]:

@@ -5,15 +5,18 @@ A result is a nested dict; it is stored flat, `part/part/name` -> value. Strings
 truth values must be equal. Numbers are compared by where they stand, all with one relative
 tolerance (1e-9) but for kinematics:
 
-    .../estimate       difference over the `sd` beside it; where that is infinite, none or zero, over the `scale` beside it
+    .../estimate       difference over the `sd` beside it, or over the `scale` beside it where the
+                       sd is infinite, missing or zero
     .../sd             element by element
     .../p_value        difference
-    .../unseen         as all others, but 1e-5: combinations are told without parts below 1e-6
-    .../squares/...    as all others, but 1e-6: how residuals are shared among kinds moves first order with the estimate
+    .../unseen         as all others, but 1e-5: combinations omit parts below 1e-6
+    .../squares/...    as all others, but 1e-6: the shares of kinds change to first order with the
+                       estimate
     .../kinematic/...  difference over the largest of all there, at least 1 (lengths are shares of
-    the robot's size): 1e-12
+                       the robot's size): 1e-12
     .../condition      as all others, but 1e-8: it divides by the smallest singular value
-    .../local/...      ten times what is said of estimate and sd: own unknowns are found by an iteration of their own
+    .../local/...      ten times the tolerances of estimate and sd: nuisance parameters have an
+                       iteration of their own
     change/change      as all others, but 1e-6: a difference of two fits
     all others         difference over the largest of the array, such as the largest singular value
 """
