@@ -63,12 +63,10 @@ def describe_name(name: str) -> str:
         raise SystemExit(f"{name} has no docstring of its own")
     paragraph = " ".join(text.split("\n\n")[0].split())
     sentence = re.split(r"(?<=[.!?]) (?=[A-Z`])", paragraph)[0]
-    members = f" ({', '.join(m.name for m in value)})" if _is_enum(value) else ""
+    members = ""
+    if isinstance(value, enum.EnumMeta):
+        members = f" ({', '.join(value.__members__)})"
     return sentence.replace("|", "\\|").rstrip(".") + members + "."
-
-
-def _is_enum(value: Any) -> bool:
-    return isinstance(value, type) and issubclass(value, enum.Enum)
 
 
 def main() -> int:

@@ -111,7 +111,7 @@ def compute_ranks(study: Study, seed: int) -> tuple[GroupRank, ...]:
         planned = PlaneLineGroups(study.robot, points, MM, AXES)
         rows = planned.linearize(planned.draw(groups, seed))
         rows = rows.reshape(-1, len(planned.free))
-        s = np.linalg.svd(rows, compute_uv=False)
+        s: FloatArray = np.asarray(np.linalg.svd(rows, compute_uv=False), dtype=np.float64)
         ranks.append(GroupRank(groups, points, len(rows), int((s > 1e-10 * s[0]).sum()), s))
     return tuple(ranks)
 

@@ -92,7 +92,7 @@ def _judge_three_quarters(words: Wording, results: Results) -> Verdict:
     share = quiet.errors[LS][:, PARAMETERS] / quiet.errors[BEFORE][:, PARAMETERS]
     return words.judge(
         "three_quarters",
-        np.mean(share) <= 0.25,
+        bool(np.mean(share) <= 0.25),
         chance=100.0 * float(beta.cdf(0.25**2, 4.5, 16.5)),
         noise=quiet.noise / MM,
         mean=100.0 * (1.0 - share.mean()),

@@ -19,7 +19,7 @@ from loopcal.papers.tsvd_2016.tables import (
     name_file,
 )
 from loopcal.papers.wording import read_wording
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 NUMBERS = {("RU-PUS-PRS", 6): 6, ("RU-PUS-PRS", 5): 8, ("3-PRS", 6): 10, ("3-PRS", 5): 11}
 HISTORIES = {6: 7, 5: 9}
@@ -69,7 +69,7 @@ def _draw_medians(draws: Draws, algorithm: str) -> Figure:
     curve = draws.compute_curve(algorithm)[-len(settings) :]
     figure = read_wording(__file__).figure(
         "medians",
-        _make_series(settings, curve, np.isfinite(curve).all(axis=1)),
+        _make_series(settings, curve, np.asarray(np.isfinite(curve).all(axis=1))),
         _mark_prior(draws.compute_median(PRIOR)),
         f"medians_{write_file_name(draws.name)}_{algorithm.lower()}",
         algorithm=algorithm,
@@ -126,7 +126,9 @@ def _draw_steps(results: Results) -> Figure:
     return read_wording(__file__).figure("convergence", lines, {"end of the iteration": 1e-6})
 
 
-def _make_series(settings: FloatArray, errors: FloatArray, usable: BoolArray) -> list[Series]:
+def _make_series(
+    settings: FloatArray | IntArray, errors: FloatArray, usable: BoolArray
+) -> list[Series]:
     """Return position and angle errors (s, ..) over the usable settings (s,)."""
     x = tuple(map(float, np.asarray(settings, dtype=np.float64)[usable]))
     return [

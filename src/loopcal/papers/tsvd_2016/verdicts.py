@@ -225,7 +225,7 @@ def _judge_lambda(words: Wording, results: Results) -> tuple[Verdict, ...]:
         ),
         words.judge(
             "no_rule",
-            np.min(list(ratios.values())) >= 1.0,
+            bool(np.min(list(ratios.values())) >= 1.0),
             chosen=", ".join(chosen),
             ratios="; ".join(f"{name} {_format_pair(ratio)}" for name, ratio in ratios.items()),
         ),
