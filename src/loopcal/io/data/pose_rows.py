@@ -285,7 +285,7 @@ def _read_setting(table: Table, robot: Mechanism) -> dict[str, float]:
     places: dict[str, Location] = {name: (READING_NOISE, name) for name in dimensions}
     if not isinstance(node, dict):
         node = dict.fromkeys(dimensions, node)
-        places = {name: (READING_NOISE,) for name in dimensions}
+        places = dict.fromkeys(dimensions, (READING_NOISE,))
     refuse_unknown_keys(file, list(node), list(dimensions), (READING_NOISE,))
     stated = {}
     for name, text in node.items():

@@ -2,8 +2,8 @@
 """Limbs of a mechanism of bodies and joints: paths from base to platform that share nothing else.
 
 Other bodies that branch from the limbs cannot be expressed, with one exception: where they only
-keep the platform from turning (the parallelograms of a delta), the freedoms of the platform express the
-same, and one path for each motor is left.
+keep the platform from turning (the parallelograms of a delta), the freedoms of the platform express
+the same, and one path for each motor is left.
 """
 
 from __future__ import annotations

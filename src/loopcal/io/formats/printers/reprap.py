@@ -6,8 +6,8 @@
     M666 X.. Y.. Z.. A.. B..        end-stop adjustments, tilt of the bed in percent
 
 Towers X, Y and Z are at 210 + X, 330 + Y and 90 + Z degrees, counterclockwise from above. A
-positive adjustment means a higher end stop: stop_k = H + adjustment_k, and the firmware keeps the mean
-adjustment at zero. Source: Duet's G-code dictionary (M665, M666) and LinearDeltaKinematics of
+positive adjustment means a higher end stop: stop_k = H + adjustment_k, and the firmware keeps the
+mean adjustment at zero. Source: Duet's G-code dictionary (M665, M666) and LinearDeltaKinematics of
 RepRapFirmware.
 """
 
