@@ -34,9 +34,9 @@ from loopcal.measure import (
     Separation,
     Sphere,
     collect_nuisance_parameters,
-    evaluate_all,
+    evaluate_measurements,
     guess_nuisance_values,
-    whitened_rows,
+    whiten_rows,
 )
 
 Array = NDArray[np.float64]
@@ -153,8 +153,8 @@ def measured_at(
 
 def residuals(data: Measurements, T: Array, local: NuisanceParameters, values: Array) -> Array:
     """Whitened residuals of all rows at poses T (n, 4, 4)."""
-    return whitened_rows(
-        evaluate_all(data, T[None], values[None], local), np.zeros((1, len(T), 6, 0))
+    return whiten_rows(
+        evaluate_measurements(data, T[None], values[None], local), np.zeros((1, len(T), 6, 0))
     )[0, :, -1]
 
 

@@ -12,7 +12,7 @@ from loopcal.cli import main
 from loopcal.errors import FileError
 from loopcal.io import load_measurements, load_robot
 from loopcal.io.exports import convert_export, read_profile
-from loopcal.measure import evaluate_all, guess_nuisance_values, whitened_rows
+from loopcal.measure import evaluate_measurements, guess_nuisance_values, whiten_rows
 from loopcal.mechanism import forward
 
 EXAMPLES = Path("examples/exports").resolve()
@@ -49,9 +49,9 @@ def test_the_examples_are_imported_and_fit_the_robot_they_were_invented_for_with
     data = load_measurements("data.csv", robot)
     T = forward(robot, data.readings).T
     values = guess_nuisance_values(data, T)
-    white = whitened_rows(evaluate_all(data, T[None], values[None]), np.zeros((1, len(T), 6, 0)))[
-        0, :, -1
-    ]
+    white = whiten_rows(
+        evaluate_measurements(data, T[None], values[None]), np.zeros((1, len(T), 6, 0))
+    )[0, :, -1]
     degrees = data.n_rows - len(data.nuisance_parameters)
     assert white @ white < 2.5 * degrees  # chi-square, 11 degrees or more: above once in 400
     assert white @ white > 0.2 * degrees

@@ -80,7 +80,11 @@ def test_the_text_of_measurements_counts_poses_and_rows(robot, instrument, poses
 @pytest.mark.parametrize(
     ("call", "error", "words"),
     [
-        (lambda: Measurements("r", "data.csv", ()), DataError, "'data.csv'.*load_measurements"),
+        (
+            lambda: Measurements("r", "data.csv", ()),  # type: ignore[arg-type]
+            DataError,
+            "'data.csv'.*load_measurements",
+        ),
         (
             lambda: Measurements("r", np.zeros((1, 1)), ("rows.csv",)),  # type: ignore[arg-type]
             ArgumentTypeError,

@@ -25,9 +25,9 @@ from loopcal.measure import (
     Sensor,
     Separation,
     Sphere,
-    evaluate_all,
+    evaluate_measurements,
     simulate_trials,
-    whitened_rows,
+    whiten_rows,
 )
 from loopcal.mechanism import differentiate_pose, forward_trials
 from tests import zoo
@@ -102,8 +102,8 @@ def singular_values(robot, poses, instrument):
     data = trials.trial(0)
     state = forward_trials(robot, robot.values[None], data.readings[None])
     D = differentiate_pose(robot, robot.values[None], data.readings[None], state).parameters
-    rows = whitened_rows(
-        evaluate_all(
+    rows = whiten_rows(
+        evaluate_measurements(
             data, state.T, trials.nuisance_parameters.values()[None], trials.nuisance_parameters
         ),
         D,

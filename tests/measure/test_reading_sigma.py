@@ -95,5 +95,5 @@ def test_sigmas_that_drown_others_in_rounding_are_noted():
     usual = identify(robot, data, LeastSquares())
     assert not any("standard deviations differ" in note for note in map(str, usual.findings))
     extreme = identify(robot, replace(data, reading_sigma=1e-15), LeastSquares())
-    note = next(note for note in map(str, extreme.findings) if "standard deviations differ" in note)
-    assert f"check the smallest, of readings {robot.actuators[0].name}" in note
+    note = next(str(f) for f in extreme.findings if "standard deviations differ" in str(f))
+    assert f"that of readings {robot.actuators[0].name}" in note

@@ -16,8 +16,8 @@ from loopcal.measure import (
     Position,
     Separation,
     collect_nuisance_parameters,
-    evaluate_all,
-    whitened_rows,
+    evaluate_measurements,
+    whiten_rows,
 )
 
 TRACKER = Position(
@@ -129,12 +129,14 @@ def test_all_rows_stand_in_one_matrix_with_every_unknown_in_its_column():
 
     def white(machine, step):
         moved = geometry.apply_twist(T, (D @ machine)[..., :])
-        return whitened_rows(evaluate_all(data, moved, (values + step)[None], local), D)
+        return whiten_rows(evaluate_measurements(data, moved, (values + step)[None], local), D)
 
     found = white(np.zeros(5), np.zeros(len(local)))
     M = 4 * (3 + 1 + 2)
     assert found.shape == (2, M, 5 + len(local) + 1)
-    assert np.array_equal(found, whitened_rows(evaluate_all(data, T, values[None], local), D))
+    assert np.array_equal(
+        found, whiten_rows(evaluate_measurements(data, T, values[None], local), D)
+    )
     for column in range(5 + len(local)):
         step = np.zeros(5 + len(local))
         step[column] = 1e-6
@@ -153,8 +155,10 @@ def test_rows_of_weight_zero_and_absent_components_are_zero_in_the_same_shape():
     )
     data = Measurements("toy", np.zeros((4, 1)), (part,))
     T = np.broadcast_to(np.eye(4), (1, 4, 4, 4))
-    found = whitened_rows(
-        evaluate_all(data, T, collect_nuisance_parameters([part], data.labels).values()[None]),
+    found = whiten_rows(
+        evaluate_measurements(
+            data, T, collect_nuisance_parameters([part], data.labels).values()[None]
+        ),
         np.zeros((1, 4, 6, 2)),
     )
     empty = ~found[0].any(axis=1)
@@ -164,6 +168,6 @@ def test_rows_of_weight_zero_and_absent_components_are_zero_in_the_same_shape():
 
 def test_kinds_without_unknowns_and_joints_need_neither():
     data = Measurements("toy", np.zeros((4, 1)), (rows(Component(T_platform_tool=np.eye(4))),))
-    found = evaluate_all(data, np.broadcast_to(np.eye(4), (1, 4, 4, 4)), np.zeros((1, 0)))
-    assert found[0].own.shape == (1, 4, 1, 0)
+    found = evaluate_measurements(data, np.broadcast_to(np.eye(4), (1, 4, 4, 4)), np.zeros((1, 0)))
+    assert found[0].nuisance.shape == (1, 4, 1, 0)
     assert found[0].jacobian.shape == (1, 4, 1, 1, 6)

@@ -20,9 +20,9 @@ from loopcal.estimate.problem import problem_of
 from loopcal.measure import (
     Measurements,
     NuisanceParameters,
-    evaluate_all,
+    evaluate_measurements,
     resolve_reading_sigma,
-    whitened_rows,
+    whiten_rows,
 )
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.elimination import eliminate_from_factor
@@ -82,8 +82,8 @@ def observe_rows(
     `values` (U,) are those of the nuisance parameters `local`.
     """
     at = poses.linearized
-    parts = evaluate_all(measured, at.T, values[None], local, at.joints)
-    rows = whitened_rows(parts, at.by_parameters, at.joints_by_parameters)
+    parts = evaluate_measurements(measured, at.T, values[None], local, at.joints)
+    rows = whiten_rows(parts, at.by_parameters, at.joints_by_parameters)
     p, own = len(poses.free), len(local)
     return np.concatenate([rows[..., p : p + own], rows[..., :p], rows[..., p + own :]], axis=-1)
 

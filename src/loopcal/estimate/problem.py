@@ -48,7 +48,7 @@ from loopcal.measure import (
     make_readings_kind,
     resolve_reading_sigma,
 )
-from loopcal.measure.whitening import whitener
+from loopcal.measure.whitening import compute_whitener
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
 from loopcal.numerics.triangular_factor import empty_factor, fold_rows
@@ -388,7 +388,7 @@ def problem_of_trials(free: FreeParameters, trials: Trials) -> Problem:
         covariance = (N * np.asarray(sensor.noise.sigma) ** 2) @ np.swapaxes(N, -1, -2)
         t, r, m = present.shape
         flat = np.broadcast_to(covariance, (t, r, m, m)).reshape(-1, m, m)
-        white = whitener(flat, present.reshape(-1, m), np.ones(t * r)).reshape(t, r, m, m)
+        white = compute_whitener(flat, present.reshape(-1, m), np.ones(t * r)).reshape(t, r, m, m)
         rows.append(ObservationRows(kind, sensor.assigned_rows, measured, white, places))
     recorded = trials.readings[None] if trials.recorded is None else trials.recorded
     return make_problem(

@@ -6,9 +6,9 @@ from loopcal.measure.data_checks import check_duplicates as check_duplicates
 from loopcal.measure.data_checks import check_strokes as check_strokes
 from loopcal.measure.data_checks import check_targets_move as check_targets_move
 from loopcal.measure.data_checks import has_static_targets as has_static_targets
-from loopcal.measure.evaluation import KindRows as KindRows
-from loopcal.measure.evaluation import evaluate_all as evaluate_all
-from loopcal.measure.evaluation import whitened_rows as whitened_rows
+from loopcal.measure.evaluation import EvaluatedRows as EvaluatedRows
+from loopcal.measure.evaluation import evaluate_measurements as evaluate_measurements
+from loopcal.measure.evaluation import whiten_rows as whiten_rows
 from loopcal.measure.initial_values import guess_nuisance_values as guess_nuisance_values
 from loopcal.measure.initial_values import (
     guess_nuisance_values_batch as guess_nuisance_values_batch,

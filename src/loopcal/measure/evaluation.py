@@ -2,66 +2,63 @@
 """Whitened rows of measurements at given poses and nuisance parameters, without any robot.
 
     # U nuisance parameters: frames, targets, surfaces
-    local = measurements.nuisance_parameters
-    # (U,), or guess_nuisance_values(measurements, T, local)
-    values = local.values()
-    # one `KindRows` for each kind
-    parts = evaluate_all(measurements, T, values[None], local)
+    nuisance = measurements.nuisance_parameters
+    # (U,), or guess_nuisance_values(measurements, T, nuisance)
+    values = nuisance.values()
+    # one `EvaluatedRows` for each kind
+    evaluated = evaluate_measurements(measurements, T, values[None], nuisance)
     # (t, M, p + U + 1): [machine | nuisance | residual]
-    rows = whitened_rows(parts, D)
+    rows = whiten_rows(evaluated, D)
 
 With D = d twist / d parameter (t, n, 6, p) of the mechanism, a Gauss-Newton step (machine,
 nuisance) solves `rows[..., :-1] step = -rows[..., -1]` in the least-squares sense. Both parts of
 the step are added: values of nuisance parameters are plain numbers, frames too (see
-`loopcal.measure.kinds.parts`). Rows and components that are absent are zero.
+`loopcal.measure.kinds.setup_parameters`). Rows and components that are absent are zero.
 """
 
 from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loopcal.errors import DataError
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations
-from loopcal.typing import FloatArray
-
-Ints = NDArray[np.intp]
+from loopcal.typing import FloatArray, IntArray
 
 
-class KindRows(NamedTuple):
-    """Rows of one kind; l poses per row, l = 1 unless rows compare poses.
+class EvaluatedRows(NamedTuple):
+    """Residuals and derivatives of one kind; l poses per row, l = 1 unless rows compare poses.
 
     Attributes
     ----------
-    poses : (r, l) the poses each row saw.
+    poses : (r, l) the poses of each row.
     residual : (t, r, m) predicted - measured [SI].
     jacobian : (t, r, l, m, 6) by the platform twists.
-    own : (t, r, m, U) by all local unknowns of the measurements; zero where a row does not use one,
-        or it is fixed.
+    nuisance : (t, r, m, U) by all nuisance parameters of the measurements; zero where a row does
+        not use one, or it is fixed.
     joints : (t, r, m, j) by the values of the joints `sensed_joints`, at the row's pose.
     sensed_joints : names of these joints.
     whitener : (r, m, m), zero where absent.
     """
 
-    poses: Ints
+    poses: IntArray
     residual: FloatArray
     jacobian: FloatArray
-    own: FloatArray
+    nuisance: FloatArray
     joints: FloatArray
     sensed_joints: tuple[str, ...]
     whitener: FloatArray
 
 
-def evaluate_all(
+def evaluate_measurements(
     measurements: Measurements,
     T: FloatArray,
     values: FloatArray,
-    local: NuisanceParameters | None = None,
+    nuisance: NuisanceParameters | None = None,
     joints: Mapping[str, FloatArray] | None = None,
-) -> tuple[KindRows, ...]:
+) -> tuple[EvaluatedRows, ...]:
     """Evaluate every kind at poses.
 
     Parameters
@@ -70,101 +67,105 @@ def evaluate_all(
     T : (t, n, 4, 4)
         T_base_platform of each pose.
     values : (t or 1, U)
-        Of the local unknowns.
-    local : NuisanceParameters, optional
-        Default: gathered from the measurements; gather them once where this is called often.
+        Of the nuisance parameters.
+    nuisance : NuisanceParameters, optional
+        Default: collected from the measurements; collect them once for repeated calls.
     joints : name -> (t or 1, n), optional
-        Values of the joints that kinds look at, see `loopcal.measure.joint_observation`.
+        Values of the joints that kinds sense, see `loopcal.measure.select_joint_values`.
 
     Returns
     -------
-    parts : one `KindRows` for each kind, in order
+    evaluated : one `EvaluatedRows` for each kind, in order
 
     Raises
     ------
     DataError
         If a joint's values are missing.
     """
-    gathered = measurements.nuisance_parameters if local is None else local
+    collected = measurements.nuisance_parameters if nuisance is None else nuisance
     return tuple(
-        _kind_rows(rows, T, gathered.select(i, values), gathered.indices[i], gathered, joints or {})
+        _evaluate_kind(
+            rows, T, collected.select(i, values), collected.indices[i], collected, joints or {}
+        )
         for i, rows in enumerate(measurements.observations)
     )
 
 
-def whitened_rows(
-    parts: tuple[KindRows, ...], twists: FloatArray, joints: Mapping[str, FloatArray] | None = None
+def whiten_rows(
+    evaluated: tuple[EvaluatedRows, ...],
+    twists: FloatArray,
+    joints: Mapping[str, FloatArray] | None = None,
 ) -> FloatArray:
     """Return the whitened rows [machine | nuisance | residual] of all kinds, stacked.
 
     Parameters
     ----------
-    parts : from `evaluate_all`
+    evaluated : from `evaluate_measurements`
     twists : (t or 1, n, 6, p)
-        How the platform's twist depends on the machine's unknowns; p = 0 for local unknowns alone.
+        Derivative of the platform's twist by the machine's parameters; p = 0 for nuisance
+        parameters alone.
     joints : name -> (t or 1, n, p), optional
-        How the joints' values depend on them; default: not at all.
+        Derivatives of the joints' values by these parameters; default: zero.
 
     Returns
     -------
     rows : (t, M, p + U + 1)
     """
     p = twists.shape[-1]
-    found = []
-    for part in parts:
-        t = np.broadcast_shapes(part.residual.shape[:1], twists.shape[:1])[0]
+    whitened = []
+    for rows in evaluated:
+        t = np.broadcast_shapes(rows.residual.shape[:1], twists.shape[:1])[0]
         machine = (
-            np.sum(part.jacobian @ twists[:, part.poses], axis=2)
+            np.sum(rows.jacobian @ twists[:, rows.poses], axis=2)
             if p
-            else np.zeros((*part.residual.shape, 0))
+            else np.zeros((*rows.residual.shape, 0))
         )
-        for j, name in enumerate(part.sensed_joints):
+        for j, name in enumerate(rows.sensed_joints):
             if joints is not None and name in joints:
                 machine = (
-                    machine + part.joints[..., j, None] * joints[name][:, part.poses[:, 0], None, :]
+                    machine + rows.joints[..., j, None] * joints[name][:, rows.poses[:, 0], None, :]
                 )
-        blocks = (machine, part.own, part.residual[..., None])
+        blocks = (machine, rows.nuisance, rows.residual[..., None])
         raw = np.concatenate([np.broadcast_to(b, (t, *b.shape[1:])) for b in blocks], axis=-1)
-        white = part.whitener @ raw
-        found.append(white.reshape(t, -1, white.shape[-1]))
-    return np.concatenate(found, axis=1)
+        white = rows.whitener @ raw
+        whitened.append(white.reshape(t, -1, white.shape[-1]))
+    return np.concatenate(whitened, axis=1)
 
 
-def _kind_rows(
+def _evaluate_kind(
     rows: Observations,
     T: FloatArray,
     values: FloatArray,
-    places: Ints,
-    local: NuisanceParameters,
+    indices: IntArray,
+    nuisance: NuisanceParameters,
     joints: Mapping[str, FloatArray],
-) -> KindRows:
+) -> EvaluatedRows:
     kind = rows.kind
     for name in kind.sensed_joints:
         if name not in joints:
             raise DataError(
-                f"the kind {kind.name!r} needs the values of joint {name!r}; hand them over as "
-                "joints"
+                f"the kind {kind.name!r} needs the values of joint {name!r}; pass them as `joints`"
             )
-    seen = (
+    joint_values = (
         np.stack([joints[name][:, rows.rows] for name in kind.sensed_joints], axis=-1)
         if kind.sensed_joints
         else None
     )
-    found = rows.evaluate(T, values, seen)
-    t, r, m = found.residual.shape
-    jacobian = found.jacobian[:, :, None] if kind.poses_per_row == 1 else found.jacobian
-    own = np.zeros((t, r, m, len(local)))
-    if found.nuisance is not None:
-        free = local.table.free[places]
-        each = np.broadcast_to(found.nuisance * free[:, None, :], (t, r, m, places.shape[1]))
-        np.put_along_axis(own, np.broadcast_to(places[:, None, :], each.shape), each, axis=-1)
-    moved = np.zeros((t, r, m, 0)) if found.joints is None else found.joints
-    return KindRows(
+    evaluation = rows.evaluate(T, values, joint_values)
+    t, r, m = evaluation.residual.shape
+    jacobian = evaluation.jacobian
+    by_nuisance = np.zeros((t, r, m, len(nuisance)))
+    if evaluation.nuisance is not None:
+        free = nuisance.table.free[indices]
+        used = np.broadcast_to(evaluation.nuisance * free[:, None, :], (t, r, m, indices.shape[1]))
+        columns = np.broadcast_to(indices[:, None, :], used.shape)
+        np.put_along_axis(by_nuisance, columns, used, axis=-1)
+    return EvaluatedRows(
         rows.rows.reshape(r, -1),
-        found.residual,
-        jacobian,
-        own,
-        moved,
+        evaluation.residual,
+        jacobian[:, :, None] if kind.poses_per_row == 1 else jacobian,
+        by_nuisance,
+        np.zeros((t, r, m, 0)) if evaluation.joints is None else evaluation.joints,
         kind.sensed_joints,
         rows.whitener,
     )

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.measure.evaluation import evaluate_all, whitened_rows
+from loopcal.measure.evaluation import evaluate_measurements, whiten_rows
 from loopcal.measure.guess_descent import STEPS, descend, sum_squares
 from loopcal.measure.kinds import Kind
 from loopcal.measure.measurements import Measurements
@@ -185,7 +185,9 @@ def _refine_together(
 
     def whiten(x: FloatArray, which: IntArray) -> tuple[FloatArray, FloatArray]:
         del which
-        rows = whitened_rows(evaluate_all(measurements, T[None], x, nuisance, joints), no_motion)
+        rows = whiten_rows(
+            evaluate_measurements(measurements, T[None], x, nuisance, joints), no_motion
+        )
         e = np.concatenate([rows[..., -1], (x - nuisance.table.nominal) @ prior], axis=1)
         return e, np.concatenate(
             [rows[..., :-1], np.broadcast_to(prior, (len(x), *prior.shape))], axis=1

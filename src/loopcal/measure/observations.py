@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_array, check_type, describe
 from loopcal.measure.kinds import Evaluation, Kind
-from loopcal.measure.whitening import whitener
+from loopcal.measure.whitening import compute_whitener
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 TextArray = NDArray[np.str_]
@@ -98,7 +98,7 @@ class Observations:
         covariance = _broadcast(
             self.covariance, (r, m, m), "covariance", f"({r}, {m}, {m}) or ({m}, {m})"
         )
-        W = whitener(covariance, present, weight)
+        W = compute_whitener(covariance, present, weight)
         for array in (rows, covariance, present, W):
             array.setflags(write=False)
         values = {"rows": rows, "measured": measured, "covariance": covariance, "weight": weight}

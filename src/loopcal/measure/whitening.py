@@ -6,29 +6,28 @@ import numpy as np
 from loopcal.errors import DataError
 from loopcal.typing import BoolArray, FloatArray
 
-Bools = BoolArray
-
-# Smallest pivot [1] of a correlation matrix: below it a component repeats the others to seven
-# digits, and the inverse keeps fewer digits than a measurement has.
 _SMALLEST_PIVOT = 1e-7
+"""Smallest pivot [1] of a correlation matrix. Below it a component equals a combination of
+the others to seven digits, and the inverse has fewer digits than a measurement.
+"""
 
 
-def whitener(covariance: FloatArray, present: Bools, weight: FloatArray) -> FloatArray:
+def compute_whitener(covariance: FloatArray, present: BoolArray, weight: FloatArray) -> FloatArray:
     """Return matrices W with `W C W' = weight` on the present components.
 
     Rows and columns of absent components are zero.
 
-    W is the inverse lower Cholesky factor. Leaving a component out of a Gaussian drops its row and
-    column of C; here they are put to those of the identity, which keeps the shape and gives the
-    same factor for the rest.
+    W is the inverse lower Cholesky factor. Without a component, a Gaussian loses its row and column
+    of C. Here they are replaced by those of the identity, which keeps the shape and gives the same
+    factor for the other components.
 
     Parameters
     ----------
     covariance : (r, m, m) [SI]
-        Entries of absent components are not looked at.
+        Entries of absent components are ignored.
     present : (r, m) bool
     weight : (r,)
-        Factor of the squared residuals, not negative; 0 makes a whole row absent.
+        Factor of the squared residuals, not negative; 0 excludes a row.
 
     Returns
     -------
@@ -40,8 +39,8 @@ def whitener(covariance: FloatArray, present: Bools, weight: FloatArray) -> Floa
         If a covariance is not symmetric or not positive definite; rows are counted from 1.
     """
     both = present[:, :, None] & present[:, None, :]
-    own = np.eye(present.shape[1], dtype=bool)
-    C = np.where(both, covariance, 0.0) + (own & ~both)
+    diagonal = np.eye(present.shape[1], dtype=bool)
+    C = np.where(both, covariance, 0.0) + (diagonal & ~both)
     variance = np.einsum("rii->ri", C)
     _refuse(
         ~np.all(np.isfinite(C), axis=(1, 2)) | ~np.all(variance > 0.0, axis=1),
@@ -65,11 +64,10 @@ def whitener(covariance: FloatArray, present: Bools, weight: FloatArray) -> Floa
     return np.where(both, W, 0.0) * np.sqrt(weight)[:, None, None]
 
 
-def _refuse(wrong: Bools, what: str) -> None:
+def _refuse(wrong: BoolArray, what: str) -> None:
     if np.any(wrong):
         row = int(np.flatnonzero(wrong)[0]) + 1
         raise DataError(
             f"the covariance of row {row} {what}; give each component a standard deviation above 0 "
-            "and correlations"
-            " between -1 and 1 that fit together"
+            "and correlations between -1 and 1 that are consistent"
         )

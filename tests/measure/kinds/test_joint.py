@@ -12,10 +12,10 @@ from loopcal.measure import (
     JointSensor,
     Locked,
     Sensor,
-    evaluate_all,
+    evaluate_measurements,
     select_joint_values,
     simulate,
-    whitened_rows,
+    whiten_rows,
 )
 from loopcal.mechanism import forward_trials, inverse
 from tests import zoo
@@ -70,8 +70,8 @@ def test_rows_of_joints_follow_the_joints(robot):
     state = forward_trials(robot, robot.values[None], data.readings[None])
     values = select_joint_values(robot, kind.sensed_joints, data.readings[None], state)
     slopes = {name: np.random.default_rng(5).normal(size=(1, 8, 4)) for name in kind.sensed_joints}
-    parts = evaluate_all(data, state.T, np.zeros((1, 0)), joints=values)
-    rows = whitened_rows(parts, np.ones((1, 8, 6, 4)), slopes)
+    parts = evaluate_measurements(data, state.T, np.zeros((1, 0)), joints=values)
+    rows = whiten_rows(parts, np.ones((1, 8, 6, 4)), slopes)
     assert rows.shape == (1, 16, 5)
     assert_allclose(
         rows[0, :, :4] * TINY,
@@ -79,7 +79,7 @@ def test_rows_of_joints_follow_the_joints(robot):
         rtol=1e-12,
     )
     with pytest.raises(DataError, match=r"needs the values of joint 'limb1\.pin'"):
-        evaluate_all(data, state.T, np.zeros((1, 0)))
+        evaluate_measurements(data, state.T, np.zeros((1, 0)))
 
 
 def test_a_joint_that_is_not_there_is_named_with_those_that_are(robot):

@@ -284,7 +284,7 @@ def _parameter_columns(
     if not _is_every_pose(rows, D.shape[1]):
         D = D[:, rows.poses]
     if len(at.jacobian) == 1:
-        # rounded as in `measure.whitened_rows`: null directions of equal parameters are ties
+        # rounded as in `measure.whiten_rows`: null directions of equal parameters are ties
         columns = np.matmul(white, np.matmul(at.jacobian, D))
     else:  # half the products
         columns = np.matmul(np.matmul(white, at.jacobian), D)
