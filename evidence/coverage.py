@@ -15,7 +15,7 @@ from loopcal import geometry
 from loopcal.estimate import MAP, LeastSquares, identify_trials
 from loopcal.estimate.identification import IdentifiedTrials
 from loopcal.estimate.methods.penalties import Method
-from loopcal.estimate.minimization.descent import penalize
+from loopcal.estimate.minimization.filtered_step import penalize
 from loopcal.io import load_robot
 from loopcal.measure import (
     Component,

@@ -37,7 +37,7 @@ from loopcal.estimate.poses.initialization import first_poses
 from loopcal.estimate.poses.linearization import evaluate_rows, whiten
 from loopcal.estimate.poses.solution import PoseSolution
 from loopcal.estimate.poses.states import PoseStates
-from loopcal.estimate.poses.uncertain import UncertainPoses, groups_of_nodes
+from loopcal.estimate.poses.uncertain import UncertainPoses
 from loopcal.estimate.start import Start
 from loopcal.measure import (
     Measurements,

@@ -22,6 +22,7 @@ import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.estimate.methods.penalties import Method
+from loopcal.estimate.minimization.filtered_step import FilteredStep, penalize, propose_step
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, decompose
 from loopcal.numerics.gauss_newton import ROUNDING, Damping, DescentStatus, minimize
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -324,31 +325,6 @@ class _Candidate:
         )
 
 
-@dataclass(frozen=True)
-class FilteredStep:
-    """A step of some trials towards the filtered solution.
-
-    Attributes
-    ----------
-    deviation : (a, p) total deviation to which it leads. target : (a, p) that of the full step.
-    length, full_length : (a,) of this step and of the full one, in tolerances.
-    predicted : (a,) decrease of sum of squares plus penalty by the linear model.
-    change : (a,) squared length of the full step measured in the whitened residuals and the
-        penalty.
-    """
-
-    deviation: FloatArray
-    target: FloatArray
-    length: FloatArray
-    full_length: FloatArray
-    predicted: FloatArray
-    change: FloatArray
-
-    def take(self, trials: np.ndarray) -> FilteredStep:
-        """Return some trials."""
-        return FilteredStep(*(array[trials] for array in vars(self).values()))
-
-
 @dataclass(frozen=True, eq=False)
 class _FilteredDescent:
     """The rules of the descent for `loopcal.numerics.gauss_newton.minimize`."""
@@ -413,56 +389,3 @@ class _FilteredDescent:
         converged = good & (step.full_length <= SMALL_STEP * spread)
         ending = np.where(converged, DescentStatus.CONVERGED, DescentStatus.NO_DESCENT)
         return np.where(is_stuck, ending, DescentStatus.RUNNING)
-
-
-def propose_step(
-    deviation: FloatArray, decomposition: Decomposition, penalty: FloatArray, damping: FloatArray
-) -> FilteredStep:
-    """Return the step from `deviation` (a, p) to the filtered solution, damped by mu (a,)."""
-    s, c = decomposition.singular_values, decomposition.projections
-    now = decomposition.coordinates(deviation)
-    solution = decomposition.solution(penalty)
-    full = solution - now
-    curvature = _curvature(s, penalty)
-    new = now + curvature / (curvature + damping[:, None]) * full
-    # differences of squares as products, so that a small decrease is not lost in a large sum
-    data = s * (now - new) * (s * (now + new) - 2.0 * c)
-    prior = _finite(penalty) * (now - new) * (now + new)
-    reached = decomposition.deviation(new)
-    return FilteredStep(
-        deviation=reached,
-        target=decomposition.deviation(solution),
-        length=np.linalg.norm(reached - deviation, axis=1),
-        full_length=np.linalg.norm(decomposition.deviation(full), axis=1),
-        predicted=(data + prior).sum(axis=1),
-        change=(curvature * full**2).sum(axis=1),
-    )
-
-
-def penalize(
-    decomposition: Decomposition, penalty: FloatArray, deviation: FloatArray
-) -> FloatArray:
-    """Return what the penalty adds to the sum of squares at `deviation` (a, p).
-
-    It is the sum of penalty_i (v_i'z)^2, (a,), without directions that are not used.
-    """
-    weight = _finite(penalty)
-    if not weight.any():
-        return np.zeros(len(deviation))
-    return (weight * decomposition.coordinates(deviation) ** 2).sum(axis=1)
-
-
-def _finite(penalty: FloatArray) -> FloatArray:
-    """Return the penalty with zero for directions that are not used."""
-    return np.where(np.isfinite(penalty), penalty, 0.0)
-
-
-def _curvature(s: FloatArray, penalty: FloatArray) -> FloatArray:
-    """Return the curvature h (a, p) of each direction.
-
-    A direction that is not used is as stiff as the weakest one that is.
-    """
-    used = np.isfinite(penalty)
-    h = s**2 + _finite(penalty)
-    weakest = np.where(used, h, np.inf).min(axis=1, initial=np.inf)
-    return np.where(used, h, np.where(np.isfinite(weakest), weakest, 1.0)[:, None])

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.errors import EstimationError
+from loopcal.estimate.nuisance.elimination import NuisanceElimination
 from loopcal.estimate.observation_rows import (
     ObservationRows,
     PoseBlock,
@@ -176,3 +177,20 @@ def stack_rows(
             where = (slice(None), component[:, None, None], at[2][:, :, None], columns)
             out[where] = kind.by_coordinates[:, rows, i]
     return out
+
+
+def groups_of_nodes(
+    rows: Sequence[ObservationRows], member: IntArray, nuisance: NuisanceElimination | None
+) -> tuple[IntArray, IntArray]:
+    """Return the innermost node of nuisance parameters of each component, and its structure.
+
+    Both are -1 for components whose rows use none.
+    """
+    count = int(member.max()) + 1
+    nodes, structures = np.full(count, -1), np.full(count, -1)
+    if nuisance is not None:
+        for r in (r for r in rows if r.nuisance.shape[1]):
+            innermost = nuisance.tree.node[r.nuisance].max(axis=1)
+            np.maximum.at(nodes, member[r.first_poses], innermost)
+        structures[nodes >= 0] = nuisance.tree.structure[nodes[nodes >= 0]]
+    return nodes, structures

@@ -25,7 +25,7 @@ from loopcal.estimate.nuisance.elimination import (
     fold_node_rows,
     spread_columns,
 )
-from loopcal.estimate.observation_rows import ObservationRows, PoseBlock
+from loopcal.estimate.observation_rows import PoseBlock
 from loopcal.estimate.poses.components import ComponentGroup, stack_rows
 from loopcal.estimate.poses.coordinates import PoseCoordinates
 from loopcal.estimate.poses.linearization import KindRows, LinearizedPoses, linearize_rows
@@ -418,20 +418,3 @@ def _keep_still(solved: PoseStates, before: PoseStates, is_still: BoolArray) -> 
         return solved
     state = map_states(lambda array: array[chosen], before.state)
     return solved.put(chosen, PoseStates(state, before.q[chosen]))
-
-
-def groups_of_nodes(
-    rows: Sequence[ObservationRows], member: IntArray, nuisance: NuisanceElimination | None
-) -> tuple[IntArray, IntArray]:
-    """Return the innermost node of nuisance parameters of each component, and its structure.
-
-    Both are -1 for components whose rows use none.
-    """
-    count = int(member.max()) + 1
-    nodes, structures = np.full(count, -1), np.full(count, -1)
-    if nuisance is not None:
-        for r in (r for r in rows if r.nuisance.shape[1]):
-            innermost = nuisance.tree.node[r.nuisance].max(axis=1)
-            np.maximum.at(nodes, member[r.first_poses], innermost)
-        structures[nodes >= 0] = nuisance.tree.structure[nodes[nodes >= 0]]
-    return nodes, structures
