@@ -30,7 +30,12 @@ from loopcal.estimate.nuisance.elimination import (
     plan_elimination,
 )
 from loopcal.estimate.observation_rows import BLOCK, ObservationRows, Residuals, divide_poses
-from loopcal.estimate.poses.components import divide_components, find_components, group_components
+from loopcal.estimate.poses.components import (
+    divide_components,
+    find_components,
+    group_components,
+    groups_of_nodes,
+)
 from loopcal.estimate.poses.coordinates import PoseCoordinates, ReadingCoordinates, TwistCoordinates
 from loopcal.estimate.poses.exact import ExactPoses
 from loopcal.estimate.poses.initialization import first_poses
@@ -64,7 +69,7 @@ has no row."""
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class Problem:  # size: the problem and how it is made from measurements
     """Whitened rows of t machines that share readings and kinds.
 
     Attributes
