@@ -323,8 +323,8 @@ def _estimate_nuisance(
     """Return the nuisance parameters at the estimate, linearized there once more."""
     if problem.nuisance is None:
         return empty_nuisance_estimate(problem.parameters)
-    at = problem.linearize(fit.deviation, fit.start)
-    return estimate_nuisance(problem.nuisance, at, robot, d, penalty, variance)
+    linearization = problem.linearize(fit.deviation, fit.start)
+    return estimate_nuisance(problem.nuisance, linearization, robot, d, penalty, variance)
 
 
 def _report_closure(problem: Problem, options: FitOptions) -> list[Finding]:

@@ -15,7 +15,6 @@ import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.findings import Finding, report_finding
-from loopcal.findings.catalog.fit import MOST_PARTS, MOST_WEAK_PARTS, list_changes
 from loopcal.typing import FloatArray
 
 NEGLIGIBLE = 1e-6
@@ -65,12 +64,6 @@ class Combination:
     def __str__(self) -> str:
         """Return the text of the finding."""
         return str(self.finding)
-
-    @property
-    def parts(self) -> str:
-        """The parameters, each with its change."""
-        most = MOST_PARTS if self.singular_value == 0.0 else MOST_WEAK_PARTS
-        return list_changes(self.names, self.changes.tolist(), self.units, most)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for JSON, with the sentence."""

@@ -115,20 +115,20 @@ class WithPrior:
 
     def linearize(self, deviation: FloatArray, start: Start) -> Linearization:
         """Linearize the measurements and append the rows of the prior."""
-        at = self.measured.linearize(deviation, start)
+        measured = self.measured.linearize(deviation, start)
         if not len(self.slope):
-            return at
+            return measured
         slope = np.broadcast_to(self.slope, (len(deviation), *self.slope.shape))
         if self.unknown.shape[1]:
-            triangles = at.factor[:, :-1, :-1]
+            triangles = measured.factor[:, :-1, :-1]
             slope = np.stack([self._consistent_slope(triangle) for triangle in triangles])
         residual = np.matmul(slope, (deviation - self.center)[..., None])[..., 0] + self.constant
         rows = np.concatenate([slope, residual[..., None]], axis=2)
         return replace(
-            at,
-            factor=fold_rows(at.factor, rows),
-            cost=at.cost + (residual**2).sum(axis=1),
-            equations=at.equations + len(self.slope),
+            measured,
+            factor=fold_rows(measured.factor, rows),
+            cost=measured.cost + (residual**2).sum(axis=1),
+            equations=measured.equations + len(self.slope),
         )
 
     def _consistent_slope(self, triangle: FloatArray) -> FloatArray:
