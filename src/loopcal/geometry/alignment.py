@@ -35,6 +35,11 @@ descent refines the result anyway.
 RANK_TOLERANCE = 1e-9
 """Singular values below this share of the largest count as zero [1]."""
 
+ANCHOR_TOLERANCE, ANCHOR_RANK = 1e-6, 4
+"""Relative singular value [1] below which positions do not determine the anchor of a line, and the
+rank that determines it.
+"""
+
 
 def solve_least_squares(A: FloatArray, b: FloatArray) -> FloatArray:
     """Return the least-squares solution of `A x = b`, the shortest one where it is not unique.
@@ -249,6 +254,31 @@ def solve_trilateration(
     if s[2] > FLATNESS * s[0]:
         centers = np.concatenate([center[None], centers])
     return middle + centers, np.full(len(centers), offset)
+
+
+def solve_line_anchor(
+    positions: FloatArray, extensions: FloatArray
+) -> tuple[FloatArray, int, FloatArray]:
+    """Return the anchor a of a line from positions x and the extensions d of the line at them.
+
+    A line from a to x is d longer than at the origin: `|x - a| = |a| + d`, and therefore `x'a + d
+    |a| = (x'x - d^2) / 2`, which is linear in a and |a|.
+
+    Parameters
+    ----------
+    positions : (k, 3) x. extensions : (k,) d, in the same unit.
+
+    Returns
+    -------
+    anchor : (3,) a.
+    rank : of the equations. Below `ANCHOR_RANK` the positions are too few, or in a plane through
+        the origin, and the anchor is not determined.
+    singular_values : of the equations.
+    """
+    rows = np.column_stack([positions, extensions])
+    target = 0.5 * ((positions * positions).sum(axis=1) - extensions * extensions)
+    solution, _, rank, s = np.linalg.lstsq(rows, target, rcond=ANCHOR_TOLERANCE)
+    return solution[:3], int(rank), s
 
 
 def solve_directions(

@@ -50,8 +50,8 @@ from loopcal.measure.readings import make_readings_kind as make_readings_kind
 from loopcal.measure.readings import resolve_reading_sigma as resolve_reading_sigma
 from loopcal.measure.readings import select_joint_values as select_joint_values
 from loopcal.measure.readings import solve_commanded_readings as solve_commanded_readings
+from loopcal.measure.simulation import Trials as Trials
 from loopcal.measure.simulation import replace_measured_values as replace_measured_values
+from loopcal.measure.simulation import sample_truth as sample_truth
 from loopcal.measure.simulation import simulate as simulate
-from loopcal.measure.trials import Trials as Trials
-from loopcal.measure.trials import sample_truth as sample_truth
-from loopcal.measure.trials import simulate_trials as simulate_trials
+from loopcal.measure.simulation import simulate_trials as simulate_trials

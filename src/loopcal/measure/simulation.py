@@ -1,18 +1,199 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated measurements of one machine, for studies and for trials before a measurement."""
+"""Simulated measurements of one machine or of many at once.
+
+The controller's inverse kinematics turns commanded poses into readings. The forward kinematics of
+the true machine turns readings into true poses. The instrument measures these poses with noise.
+"""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from loopcal.engine import State
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import check_type
+from loopcal.measure.array_checks import check_array, check_type
 from loopcal.measure.instrument import Instrument
-from loopcal.measure.measurements import Measurements
-from loopcal.measure.trials import simulate_trials
-from loopcal.mechanism import Mechanism, forward
+from loopcal.measure.kinds import Kind
+from loopcal.measure.measurements import Measurements, broadcast_reading_sigma
+from loopcal.measure.noise import make_random_stream
+from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters
+from loopcal.measure.observations import Observations, TextArray
+from loopcal.measure.readings import (
+    list_sensed_joints,
+    resolve_reading_sigma,
+    select_joint_values,
+    solve_commanded_poses,
+)
+from loopcal.mechanism import Mechanism, Status, forward, forward_trials, solve_at_pose
+from loopcal.typing import BoolArray, FloatArray, IntArray
+
+NOISE, TRUTH, READING = 0, 1, 2  # purposes of a trial's random streams
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Trials:
+    """The same measurements of t machines, as stacked arrays.
+
+    Attributes
+    ----------
+    instrument : Instrument
+        With the robot's tool, and with explicit rows of every sensor.
+    robot_name : str
+    readings : (n, a) [SI]
+        Of the controller, equal in all trials.
+    measured : tuple of (t, r, c) [SI]
+        Columns of each sensor; NaN in rows that the true machine cannot reach.
+    truth : (t, p) [SI]
+        True parameter values of each trial.
+    T : (t, n, 4, 4)
+        True T_base_platform.
+    reached : (t, n) bool
+        Poses that the true machine reaches.
+    nuisance_parameters : NuisanceParameters
+        Of the kinds, with their true values as nominal ones.
+    recorded : (t, n, a) [SI], optional
+        Recorded readings with their noise; None where they equal those of the controller.
+    reading_sigma : (n, a) [SI], optional
+        As in `Measurements`.
+    """
+
+    instrument: Instrument
+    robot_name: str
+    readings: FloatArray
+    measured: tuple[FloatArray, ...]
+    truth: FloatArray
+    T: FloatArray
+    reached: BoolArray
+    nuisance_parameters: NuisanceParameters
+    recorded: FloatArray | None = None
+    reading_sigma: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.truth)
+
+    def __repr__(self) -> str:
+        t, n = self.reached.shape
+        missed = int(np.count_nonzero(~self.reached))
+        note = f", {missed} of {self.reached.size} poses not reached" if missed else ""
+        return (
+            f"Trials of {self.robot_name!r}: {t} trials, {n} poses each{note}\n{self.instrument!r}"
+        )
+
+    def trial(self, i: int) -> Measurements:
+        """Return the measurements of one trial."""
+        observations = tuple(
+            Observations.from_sigma(
+                s.kind, s.assigned_rows, measured[i], s.noise.sigma, s.session, s.group
+            )
+            for s, measured in zip(self.instrument.sensors, self.measured, strict=True)
+        )
+        readings = self.readings if self.recorded is None else self.recorded[i]
+        return Measurements(
+            self.robot_name, readings, observations, reading_sigma=self.reading_sigma
+        )
+
+
+def sample_truth(robot: Mechanism, n_trials: int, seed: int) -> FloatArray:
+    """Draw true parameter values from the tolerances: `nominal + tolerance * standard normal`.
+
+    Parameters
+    ----------
+    robot : Mechanism
+        Parameters that are fixed or have no tolerance stay nominal.
+    n_trials : int
+    seed : int
+        Trial i gets the same values for any number of trials.
+
+    Returns
+    -------
+    truth : (t, p) [SI]
+    """
+    check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
+    table = robot.parameters
+    tolerance = np.where(table.free, np.nan_to_num(table.tolerance, nan=0.0), 0.0)
+    draws = [
+        make_random_stream(seed, trial, TRUTH).standard_normal(len(table))
+        for trial in range(n_trials)
+    ]
+    return table.nominal + tolerance * np.array(draws).reshape(n_trials, len(table))
+
+
+def simulate_trials(
+    robot: Mechanism,
+    truth: ArrayLike,
+    poses: ArrayLike,
+    instrument: Instrument,
+    seed: int,
+    controller: Mechanism | None = None,
+    nuisance_values: Mapping[str, float] | None = None,
+    reading_sigma: ArrayLike | None = None,
+) -> Trials:
+    """Measure the same commanded poses on t machines.
+
+    Parameters
+    ----------
+    robot : Mechanism
+        Structure and tool of all machines; its own values do not matter.
+    truth : (t, p) [SI]
+        True parameter values of each machine, see `sample_truth`.
+    poses : (n, 4, 4) T_base_platform, or (n, c) controlled coordinates [SI]
+        As commanded.
+    instrument : Instrument
+    seed : int
+        Trial i draws the same noise for any number of trials.
+    controller : Mechanism, optional
+        The geometry that turns poses into readings; default: the robot at its nominal values.
+    nuisance_values : name -> value [SI], optional
+        True values of setup parameters, such as `tracker.x`; default: nominal.
+    reading_sigma : number, (a,) or (n, a) [SI], optional
+        Standard deviation of the recorded readings, which are the true ones plus normal noise; 0 is
+        exact, infinity is missing. Default: as the robot states for its actuators.
+
+    Returns
+    -------
+    trials : Trials
+
+    Raises
+    ------
+    DataError
+        If the controller cannot reach a pose, or a setup parameter does not exist.
+    """
+    check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
+    check_type(instrument, Instrument, "instrument", "such as loopcal.Instrument((sensor,))")
+    values = check_array(np.atleast_2d(np.asarray(truth)), "truth", (None, None))
+    commanded = solve_commanded_poses(robot.nominal if controller is None else controller, poses)
+    readings, n = commanded.q, len(commanded.q)
+    assigned = Instrument(tuple(s.assign_rows(n) for s in instrument.with_tool(robot).sensors))
+    rows = [_RowsToMeasure(s.kind, s.assigned_rows, s.session, s.group) for s in assigned.sensors]
+    nuisance = collect_nuisance_parameters(rows, tuple(str(i + 1) for i in range(n)))
+    nuisance = nuisance.with_nominal(nuisance.values(nuisance_values))
+    # Starting at the commanded pose keeps the true machine in the assembly mode of its controller.
+    state = forward_trials(robot, values, readings[None], commanded.state)
+    T = np.broadcast_to(state.T, (len(values), *state.T.shape[1:]))
+    reached = np.zeros(T.shape[:2], dtype=np.bool_)
+    reached[:] = state.status == Status.CONVERGED
+    # Redundant actuators of a wrong geometry contradict each other: their true readings are those
+    # of the reached pose.
+    true = (
+        readings[None]
+        if robot.program.sigma is None
+        else _close_all_limbs(robot, values, readings, state)
+    )
+    joints = select_joint_values(
+        robot, list_sensed_joints(s.kind for s in assigned.sensors), true, state
+    )
+    noise = [_draw_noise(assigned, make_random_stream(seed, i, NOISE)) for i in range(len(values))]
+    measured = tuple(
+        _measure_sensor(k, of_sensor, T, reached, joints, noise, nuisance)
+        for k, of_sensor in enumerate(rows)
+    )
+    recorded, sigma = _record_readings(robot, true, reading_sigma, len(values), seed)
+    return Trials(
+        assigned, robot.name, readings, measured, values, T, reached, nuisance, recorded, sigma
+    )
 
 
 def simulate(
@@ -109,3 +290,74 @@ def replace_measured_values(
     )
     measured = simulate(robot, nominal.T, Instrument(sensors), seed, controller=robot.nominal)
     return replace(data, observations=measured.observations)
+
+
+class _RowsToMeasure(NamedTuple):
+    """A kind and its rows, before anything is measured."""
+
+    kind: Kind
+    rows: IntArray
+    session: TextArray
+    group: TextArray
+
+
+def _measure_sensor(
+    k: int,
+    of_sensor: _RowsToMeasure,
+    T: FloatArray,
+    reached: BoolArray,
+    joints: Mapping[str, FloatArray],
+    noise: list[list[FloatArray]],
+    nuisance: NuisanceParameters,
+) -> FloatArray:
+    """Return columns (t, r, c) of sensor k at true poses; NaN where these were not reached."""
+    kind, rows = of_sensor.kind, of_sensor.rows
+    safe = np.where(reached[..., None, None], T, np.eye(4))
+    joint_values = (
+        np.stack([joints[name][:, rows] for name in kind.sensed_joints], axis=-1)
+        if kind.sensed_joints
+        else None
+    )
+    values = nuisance.select(k, nuisance.table.nominal[None]) if kind.nuisance_parameters else None
+    drawn = np.stack([of_trial[k] for of_trial in noise])
+    measured = kind.measure(safe[:, rows], drawn, values, joint_values)
+    complete = np.asarray(np.all(reached[:, rows].reshape(len(reached), len(rows), -1), axis=-1))
+    return np.where(complete[..., None], measured, np.nan)
+
+
+def _close_all_limbs(
+    robot: Mechanism, values: FloatArray, readings: FloatArray, state: State
+) -> FloatArray:
+    """Return readings (t, n, a) that close every limb at the poses of a state; the commanded ones
+    where they do not exist.
+    """
+    closed = solve_at_pose(robot, values, state.T, state)[1]
+    return np.where(np.isfinite(closed), closed, readings)
+
+
+def _record_readings(
+    robot: Mechanism, true: FloatArray, sigma: ArrayLike | None, trials: int, seed: int
+) -> tuple[FloatArray | None, FloatArray | None]:
+    """Return recorded readings (t, n, a) of true ones (t | 1, n, a), and their sigma (n, a); None
+    for the readings where all are exact.
+    """
+    given = None if sigma is None else broadcast_reading_sigma(sigma, true[0])
+    resolved = resolve_reading_sigma(robot, given, true.shape[1])
+    if resolved is None:
+        return None, given
+    draws = np.stack(
+        [
+            make_random_stream(seed, trial, READING).standard_normal(resolved.shape)
+            for trial in range(trials)
+        ]
+    )
+    present = np.isfinite(resolved)
+    noise = np.where(present, resolved, 0.0) * draws
+    return np.where(present, true + noise, np.nan), resolved
+
+
+def _draw_noise(instrument: Instrument, generator: np.random.Generator) -> list[FloatArray]:
+    """Return noise (r, m) of each sensor, in order from one stream."""
+    return [
+        sensor.noise.draw(generator, len(sensor.assigned_rows)) for sensor in instrument.sensors
+    ]

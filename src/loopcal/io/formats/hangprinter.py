@@ -178,7 +178,7 @@ def estimate_anchors(samples: Samples, path: Path) -> FloatArray:
     ------
     FileError : no pose is known, or the known poses do not determine an anchor.
     """
-    from loopcal.measure.line_anchors import NEEDED_RANK, solve_line_anchor
+    from loopcal.geometry.alignment import ANCHOR_RANK, solve_line_anchor
 
     act = (
         f"add known poses at several heights to {POSITIONS!r} (mm), or add the key {ANCHORS!r} (mm)"
@@ -189,10 +189,10 @@ def estimate_anchors(samples: Samples, path: Path) -> FloatArray:
     anchors = []
     for name, extension in zip(samples.names, extensions.T, strict=True):
         anchor, rank, s = solve_line_anchor(samples.known, extension)
-        if rank < NEEDED_RANK:
+        if rank < ANCHOR_RANK:
             sentence = f"the {len(samples.known)} known poses do not determine the anchor of line"
             values = ", ".join(f"{value:.3g}" for value in s)
-            reason = f"rank {rank} of {NEEDED_RANK}, singular values {values}"
+            reason = f"rank {rank} of {ANCHOR_RANK}, singular values {values}"
             raise FileError(f"{sentence} {name} ({reason}); {act}", path)
         anchors.append(anchor)
     return np.array(anchors)
