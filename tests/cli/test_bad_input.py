@@ -384,11 +384,11 @@ def test_tolerances_and_workspaces_are_told_with_their_units(number) -> None:
     with pytest.raises(MechanismError, match=r"the tolerance of tilt is 0 rad; it must"):
         standard_deviation(AngleTolerance(sd=0.0), "tilt")
     with pytest.raises(
-        MechanismError, match=r"the workspace of z runs from 0.3 m to 0.2 m; the first must"
+        MechanismError, match=r"the workspace of z runs from 0.3 m to 0.2 m; the first"
     ):
         _ = Workspace(z=(0.3, 0.2)).ranges
     with pytest.raises(
-        MechanismError, match=r"the workspace of yaw runs from 1 rad to -1 rad; the first must"
+        MechanismError, match=r"the workspace of yaw runs from 1 rad to -1 rad; the first"
     ):
         _ = Workspace(yaw=(1.0, -1.0)).ranges
 

@@ -72,7 +72,7 @@ def test_the_json_holds_all_of_it(run):
             "3-prs --measure x,y --components z",
             "--measure is short for --kind component --components",
         ),
-        ("3-prs --measure x,y,w", "the component 'w' is unknown"),
+        ("3-prs --measure x,y,w", "the component 'w'"),
         (
             "3-prs --frames floor",
             "'floor' is not a frame that can be unknown; allowed are base, tool",

@@ -30,7 +30,7 @@ def test_hints_and_importance_name_codes_of_the_catalog():
 
 def test_a_hint_names_the_poses_of_its_finding():
     step = report_finding("workflow.next-check-outliers", poses=("pose 6", "pose 9"))
-    assert hint_for(step) == "exclude them with --drop 6 --drop 9, or use --loss huber"
+    assert hint_for(step) == "use --drop 6 --drop 9, or --loss huber"
     assert hint_for(report_finding("workflow.next-use-result")) is None
 
 

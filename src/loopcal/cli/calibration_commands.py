@@ -92,7 +92,8 @@ def calibrate(
       calibrated with reservations  usable; a warning affects its accuracy
       undecided                     no held-out poses, or too few
       not calibrated                exit code 2; the run folder is written all the same
-    "Not calibrated" means: the fit did not converge, the residuals contradict the stated noise,
+
+    "Not calibrated" means that the fit did not converge, the residuals contradict the stated noise,
     errors on held-out poses grew, or a limit is exceeded.
 
     \b
@@ -114,17 +115,10 @@ def calibrate(
     held_out = read_held_out_poses(data)
     _refuse_two_choices(held_out, hold_out)
     inputs = _list_inputs(robot, data, prior)
-    options = CalibrationOptions(
-        fit=fit_arguments.to_options(),
-        hold_out=hold_out,
-        held_out=held_out,
-        seed=seed,
-        limit_position=limit_position,
-        limit_angle=limit_angle,
-        choose_model=choose_model,
-        prior=None if prior is None else load_prior(prior, data),
-        free_limb=free_limb,
-    )
+    fit, earlier = fit_arguments.to_options(), None if prior is None else load_prior(prior, data)
+    limits = {"limit_position": limit_position, "limit_angle": limit_angle}
+    choices = {"choose_model": choose_model, "prior": earlier, "free_limb": free_limb}
+    options = CalibrationOptions(fit, hold_out, held_out, seed, **limits, **choices)
     machine = load_robot(robot)
     refuse_run_folder(output, list(inputs.values()), force)
     measurements = read_measurements(data, machine, **allowed)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ from loopcal.units import Dimension, list_symbols
 
 if TYPE_CHECKING:
     from loopcal.estimate import Identification
-    from loopcal.io.formats.program_format import Format, ImportOptions
+    from loopcal.io.formats.program_format import Format, Imported, ImportOptions
     from loopcal.mechanism import Mechanism
     from loopcal.report.text_page import Block
 
@@ -149,11 +150,7 @@ def import_(
         _convert_export(file, profile, output, force, as_json)
         return 0
     source = choose_format(file, format_name)
-    if source.read is None:
-        raise DataError(
-            f"loopcal writes the format {source.name}, but cannot read it; it reads "
-            f"{', '.join(READ_FORMATS)}"
-        )
+    read = _find_reader(source)
     if corrected is not None and data is None:
         raise DataError(
             "--corrected calibrates with the measurements in the file; state where to write them, "
@@ -162,7 +159,7 @@ def import_(
     beside = file.with_suffix(".yaml") if source.name == "urdf" else None
     refuse_outputs((output, data), (file, settings["closures"] or beside), force)
     refuse_outputs((output, data, corrected), (), force)  # FILE itself may be corrected
-    imported = source.read(file, _make_import_options(source, output.stem, settings))
+    imported = read(file, _make_import_options(source, output.stem, settings))
     with restore_on_failure((output, data)):
         robot = save_imported(file, imported, output, data)
         notes = [str(finding) for finding in imported.findings]
@@ -188,6 +185,16 @@ def import_(
     return terminal.print_failures(
         [f"the calibration did not converge ({fit.status.name.lower()})"]
     )
+
+
+def _find_reader(source: Format) -> Callable[[Path, ImportOptions], Imported]:
+    """Return the function that reads a format; DataError where loopcal only writes it."""
+    if source.read is None:
+        raise DataError(
+            f"loopcal writes the format {source.name}, but cannot read it; it reads "
+            f"{', '.join(READ_FORMATS)}"
+        )
+    return source.read
 
 
 def _convert_export(file: Path, profile: Path, output: Path, force: bool, as_json: bool) -> None:

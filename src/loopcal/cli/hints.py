@@ -90,7 +90,7 @@ def hint_for(finding: Finding) -> str | None:
     """Return the hint for a finding, with the names it contains."""
     if finding.code == "workflow.next-check-outliers":
         poses = [str(label).removeprefix("pose ") for label in finding.data["poses"]]
-        return f"exclude them with {' '.join(f'--drop {p}' for p in poses)}, or use --loss huber"
+        return f"use {' '.join(f'--drop {pose}' for pose in poses)}, or --loss huber"
     if finding.code == "validation.setup-moved":
         return f"use {' '.join(f'--refit {name}' for name in finding.data['names'])}"
     return find_hint(finding.code)
