@@ -3,6 +3,8 @@
 never an exception.
 """
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -243,13 +245,16 @@ def test_a_matrix_that_is_no_pose_is_refused(matrix, words):
         inverse(zoo.hexapod(), matrix[None])
 
 
+NO_ROBOT: Any = "hexapod"
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda robot: forward("hexapod", np.zeros(6)), "load_robot"),
+        (lambda robot: forward(NO_ROBOT, np.zeros(6)), "load_robot"),
         (lambda robot: forward(robot, "rows.csv"), "load_measurements"),
         (lambda robot: inverse(robot, robot), "n, 4, 4"),
-        (lambda robot: forward(robot, np.zeros(6), start=np.zeros(6)), "Solution"),
+        (lambda robot: forward(robot, np.zeros(6), start=NO_ROBOT), "Solution"),
     ],
 )
 def test_an_argument_of_a_wrong_type_is_refused_with_what_to_pass(call, words):

@@ -99,13 +99,13 @@ def solve(
     ]
     T = np.broadcast_to(start.T, (t, n, 4, 4))[:, :, :3]
     begin = np.concatenate([a.reshape(t * n, -1) for a in (T, *joints)], axis=1).T
-    parts = []
+    chunks = []
     for first in range(0, t * n, CHUNK):
         rows = np.arange(first, min(first + CHUNK, t * n))
         placed = [p.select(rows // n) for p in links]
         equations = _Equations(program, unknown, redundant, placed, task, rows)
-        parts.append(_iterate(equations, begin[:, rows], max_iterations))
-    whole = Solved(*(np.concatenate(arrays, axis=-1) for arrays in zip(*parts, strict=True)))
+        chunks.append(_iterate(equations, begin[:, rows], max_iterations))
+    whole = Solved(*(np.concatenate(arrays, axis=-1) for arrays in zip(*chunks, strict=True)))
     return _pack(program, whole, (t, n))
 
 
@@ -185,8 +185,10 @@ class _Equations:
         """
         program, m, N = self.program, len(self.program.freedoms), coordinates.shape[1]
         T, limbs = coordinates[:12].reshape(3, 4, N), _split_joints(program, coordinates)
-        parts = zip(*(self._eliminate(i, T, theta) for i, theta in enumerate(limbs)), strict=True)
-        tops, lows, signs, pivots = (list(part) for part in parts)
+        limb_parts = zip(
+            *(self._eliminate(i, T, theta) for i, theta in enumerate(limbs)), strict=True
+        )
+        tops, lows, signs, pivots = (list(limb_part) for limb_part in limb_parts)
         if self.task is not None:
             residual, slopes = self.task(T.transpose(2, 0, 1), self.rows)
             demand = [slopes[..., list(program.freedoms)], residual[..., None]]

@@ -178,11 +178,11 @@ def _group_limbs(
     for (ending, kinds, _, fixed), members in alike.items():
         limbs = [assembly.limbs[i] for i in members]
         by_limb = [{a: _find_slot(m, a) for a in wanted if a.owner == m.name} for m in limbs]
-        used = {slot for found in by_limb for slot in found.values() if slot}
+        used = {slot for slots_of_limb in by_limb for slot in slots_of_limb.values() if slot}
         slots = tuple(sorted(used, key=lambda s: (s.element, s.axis)))
         first = count
-        for found in by_limb:
-            places |= {a: count + slots.index(s) for a, s in found.items() if s}
+        for slots_of_limb in by_limb:
+            places |= {a: count + slots.index(s) for a, s in slots_of_limb.items() if s}
             count += len(slots)
         transforms = [[link.transform for link in (*m.links, m.attachment)] for m in limbs]
         pitch = np.array([[j.pitch for j in m.joints] for m in limbs])

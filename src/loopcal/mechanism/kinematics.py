@@ -253,13 +253,13 @@ def jacobian(robot: Mechanism, readings: ArrayLike, start: Solution | None = Non
     """
     solution = forward(robot, readings, start)
     values = robot.values[None]
-    found = differentiate_pose(robot, values, solution.q[None], solution.state)
+    derivatives = differentiate_pose(robot, values, solution.q[None], solution.state)
     units = {Dimension.LENGTH: "m", Dimension.ANGLE: "rad", Dimension.RATIO: "1"}
     return Jacobian(
-        found.parameters[0],
+        derivatives.parameters[0],
         robot.parameters.names,
         tuple(units[d] for d in robot.parameters.dimensions),
-        found.readings[0],
+        derivatives.readings[0],
         tuple(a.name for a in robot.actuators),
         tuple(units[a.dimension] for a in robot.actuators),
         solution,

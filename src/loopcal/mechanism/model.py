@@ -147,7 +147,7 @@ class Mechanism:
         names = [a.name for a in self.actuators]
         if len(names) > SHOWN_ACTUATORS:
             names = [*names[:SHOWN_ACTUATORS], f"and {len(names) - SHOWN_ACTUATORS} more"]
-        at = "nominal" if np.array_equal(self.values, self.parameters.nominal) else "changed"
+        label = "nominal" if np.array_equal(self.values, self.parameters.nominal) else "changed"
         free = int(self.parameters.free.sum())
         return "\n".join(
             (
@@ -155,7 +155,7 @@ class Mechanism:
                 f"  actuators: {', '.join(names)}",
                 f"  platform freedoms: {', '.join(self.freedoms)}",
                 f"  commanded in: {', '.join(self.controlled)}",
-                f"  parameters: {len(self.parameters)} ({free} free), at {at} values>",
+                f"  parameters: {len(self.parameters)} ({free} free), at {label} values>",
             )
         )
 

@@ -212,12 +212,12 @@ class LinearizedLimbs:
     ) -> Iterator[tuple[list[int], FloatArray, LimbRows]]:
         """Yield, for each limb, the places of its joints in `names`, their U and their rows."""
         limbs, blocks = self.robot.assembly.limbs, self.blocks
-        found = self.rows(blocks.passive)
+        limb_rows = self.rows(blocks.passive)
         for group, block, joints in zip(
             self.robot.program.groups, blocks.passive, blocks.joints, strict=True
         ):
             for k, i in enumerate(group.limbs):
-                rows = next(found)
+                rows = next(limb_rows)
                 if joints:
                     chosen = [f"{limbs[i].name}.{limbs[i].joints[j].name}" for j in joints]
                     yield [names.index(name) for name in chosen], block.U[:, :, k], rows
@@ -269,15 +269,15 @@ def stack_platform_rows(blocks: engine.ClosureBlocks) -> FloatArray:
 
 def stack_driven_columns(program: engine.Program, blocks: engine.ClosureBlocks) -> FloatArray:
     """Return all closure rows against the actuated joints, (t, n, c, a)."""
-    parts = []
+    columns_of_limbs = []
     for group, block in zip(program.groups, blocks.closure, strict=True):
         for k in range(len(group.limbs)):
             Q = np.zeros((*block.Q.shape[:2], block.Q.shape[3], program.n_joints))
             for j, columns in enumerate(group.actuator):
                 if columns[k] >= 0:
                     Q[..., columns[k]] = block.Q[:, :, k, :, j]
-            parts.append(Q)
-    return np.concatenate(parts, axis=2)
+            columns_of_limbs.append(Q)
+    return np.concatenate(columns_of_limbs, axis=2)
 
 
 def _weigh_rows(program: engine.Program, blocks: engine.ClosureBlocks) -> FloatArray | None:

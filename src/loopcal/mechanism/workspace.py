@@ -53,7 +53,7 @@ def evaluate_limits(
 ) -> tuple[Limit, ...]:
     """Return all limits of a machine at readings q (t | 1, n, a) and their states (t, n)."""
     shape = state.status.shape
-    found = [
+    limits = [
         Limit(f"stroke of {a.name}", a.dimension, *a.stroke, np.broadcast_to(q[..., i], shape))
         for i, a in enumerate(robot.actuators)
         if a.stroke is not None
@@ -65,10 +65,10 @@ def evaluate_limits(
                 if joint.limits is not None:
                     dimension = Dimension.ANGLE if joint.kind == "R" else Dimension.LENGTH
                     name, value = f"{limb.name}.{joint.name}", joints[:, :, k, j]
-                    found.append(Limit(name, dimension, *joint.limits, value))
+                    limits.append(Limit(name, dimension, *joint.limits, value))
     if any(limb.cones for limb in robot.assembly.limbs):
-        found += _evaluate_cones(robot, values, state)
-    return tuple(found)
+        limits += _evaluate_cones(robot, values, state)
+    return tuple(limits)
 
 
 def check_limits(
@@ -101,7 +101,7 @@ def _report_exceeded(robot: Mechanism, limit: Limit, reached: float) -> Finding:
 
 def _evaluate_cones(robot: Mechanism, values: FloatArray, state: State) -> list[Limit]:
     """Return the angles between rods and the axes of their cones."""
-    found = []
+    limits = []
     all_frames = compute_limb_frames(robot, values, state)
     for limb, frames in zip(robot.assembly.limbs, all_frames, strict=True):
         rod = frames[:, :, -1, :3, 3] - frames[:, :, -2, :3, 3]
@@ -112,8 +112,8 @@ def _evaluate_cones(robot: Mechanism, values: FloatArray, state: State) -> list[
             sine = np.linalg.norm(np.cross(axis, rod), axis=-1)
             angle = np.arctan2(sine, sign * (axis * rod).sum(axis=-1))
             name = f"inclination of {limb.name} at its {cone.end}"
-            found.append(Limit(name, Dimension.ANGLE, 0.0, cone.angle, angle))
-    return found
+            limits.append(Limit(name, Dimension.ANGLE, 0.0, cone.angle, angle))
+    return limits
 
 
 @dataclass(frozen=True)
