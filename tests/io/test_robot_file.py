@@ -151,7 +151,7 @@ def test_parameters_are_fixed_by_name_or_pattern(tmp_path) -> None:
     record = load_robot(tmp_path / "robot.yaml").record.record
     assert build(record.assembly()).parameters == table  # the same robot without its file
     with pytest.raises(
-        FileError, match=r"'leg1.base.q' fixes no parameter of this robot .did you mean 'leg1.base"
+        FileError, match=r"'leg1.base.q' under .fixed. matches no parameter of this robot .did you mean 'leg1.base"
     ):
         load_robot(write(tmp_path, HEXAPOD + "fixed: [leg1.base.q]\n"))
 
@@ -159,7 +159,7 @@ def test_parameters_are_fixed_by_name_or_pattern(tmp_path) -> None:
 def test_a_robot_that_cannot_be_built_names_its_file(tmp_path) -> None:
     path = write(tmp_path, HEXAPOD.replace("  - [120, 140, 0]\n", ""))
     with pytest.raises(
-        LoopcalError, match=r"robot.yaml: hexapod-42 has 5 base and 6 platform centres"
+        LoopcalError, match=r"robot.yaml: hexapod-42 has 5 base and 6 platform centers"
     ):
         load_robot(path)
 

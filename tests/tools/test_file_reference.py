@@ -39,7 +39,7 @@ def test_keys_come_with_what_they_hold_and_what_it_means() -> None:
         "radius",
         "length",
         "0",
-        "horizontal distance from a rod's upper to its lower end with the nozzle in the centre",
+        "horizontal distance of a rod's ends with the nozzle in the center",
     )
     assert found["readings"].holds == "`drop` or `height`"
     assert found["arms"].holds == "length or list of length"

@@ -24,7 +24,10 @@ Point = tuple[Length, Length, Length]
 
 @dataclass(frozen=True)
 class PoseRecord:
-    """Position and orientation R = Rz(yaw) Ry(pitch) Rx(roll), as a robot file states them."""
+    """Position and orientation R = Rz(yaw) Ry(pitch) Rx(roll), as a robot file states them.
+
+    A file may state tilt-and-torsion phi, theta, psi in place of roll, pitch, yaw.
+    """
 
     x: Length = 0.0
     y: Length = 0.0
@@ -132,7 +135,7 @@ class RobotRecord:
 
     Attributes
     ----------
-    name : of the robot. source : of its numbers.
+    name : name of the robot. source : origin of its numbers.
     home : platform pose in the base at which the loops are closed first; zero by default.
     tool : tool pose on the platform. workspace : where the machine works; poses are drawn from it.
     fixed : parameters that are not identified, by name or pattern, such as `arm*.length`.
