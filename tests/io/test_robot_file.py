@@ -151,7 +151,8 @@ def test_parameters_are_fixed_by_name_or_pattern(tmp_path) -> None:
     record = load_robot(tmp_path / "robot.yaml").record.record
     assert build(record.assembly()).parameters == table  # the same robot without its file
     with pytest.raises(
-        FileError, match=r"'leg1.base.q' under .fixed. matches no parameter of this robot .did you mean 'leg1.base"
+        FileError,
+        match=r"'leg1.base.q' under .fixed. matches no parameter of this robot .did you mean 'leg1.base",
     ):
         load_robot(write(tmp_path, HEXAPOD + "fixed: [leg1.base.q]\n"))
 

@@ -36,10 +36,7 @@ def test_every_family_and_kind_is_there() -> None:
 def test_keys_come_with_what_they_hold_and_what_it_means() -> None:
     found = {key.name: key for key in reference.list_keys(LinearDelta)}
     assert found["radius"] == reference.Key(
-        "radius",
-        "length",
-        "0",
-        "horizontal distance of a rod's ends with the nozzle in the center",
+        "radius", "length", "0", "horizontal distance of a rod's ends with the nozzle in the center"
     )
     assert found["readings"].holds == "`drop` or `height`"
     assert found["arms"].holds == "length or list of length"
