@@ -16,7 +16,10 @@ from loopcal.io import load_measurements, load_robot
 from tests.cable_robot import NAMES, TRUTH, real, samples_text
 from tests.cli.printed_tables import read_table_rows
 
-REAL = "import hp.json --format hangprinter -o robot.yaml --data samples.csv --sigma-line 0.6mm --sigma-position 0.6mm"
+REAL = (
+    "import hp.json --format hangprinter -o robot.yaml --data samples.csv --sigma-line 0.6mm "
+    "--sigma-position 0.6mm"
+)
 CALIBRATE = "calibrate robot.yaml samples.csv -o run --method ls"
 
 
@@ -60,7 +63,7 @@ def test_the_commands_print_the_numbers_of_the_page_and_estimate_the_truth(page,
     found = load_robot("run/robot.yaml")
     off = (found.values - load_robot("truth.yaml").values) / kept["sd"]
     assert np.abs(off).max() < 1.5
-    # where the machine stood and what its motor angles were is kept
+    # the run folder has the estimated poses and motor angles
     assert kept["pose_estimate"].shape == (45, 4, 4)
     assert kept["reading_estimate"].shape == (45, 4)
 
@@ -71,7 +74,9 @@ def test_the_truth_of_the_example_is_that_of_its_program(root) -> None:
     np.testing.assert_allclose(robot.values * 1e3, TRUTH, rtol=0, atol=1e-9)  # [mm]
 
 
-def test_import_writes_known_and_unknown_poses_and_says_what_it_leaves_out(folder, capsys) -> None:
+def test_import_writes_known_and_unknown_poses_and_reports_what_it_does_not_read(
+    folder, capsys
+) -> None:
     assert main(REAL.split()) == 0
     out = " ".join(capsys.readouterr().out.split())
     assert "robot.yaml: 4 actuators, 21 parameters, 21 free" in out
@@ -88,7 +93,7 @@ def test_import_writes_known_and_unknown_poses_and_says_what_it_leaves_out(folde
     ]
 
 
-def test_a_real_machine_in_two_commands_gives_what_the_page_says(folder, capsys, root) -> None:
+def test_two_commands_give_the_numbers_of_the_page_for_a_real_machine(folder, capsys, root) -> None:
     assert main(REAL.split()) == 0
     assert main(CALIBRATE.split()) == 0
     capsys.readouterr()

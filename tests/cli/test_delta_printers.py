@@ -2,8 +2,8 @@
 """Real delta printers as their owners would calibrate them: a robot file, a file of probed heights,
 one command.
 
-What is compared with is the answer that the printers' own firmware stored, made from the same
-heights of equal weight.
+The reference is the geometry that the printers' own firmware stored. It was fitted to the same
+heights with equal weights.
 """
 
 import json
@@ -19,7 +19,7 @@ from tests.cli.delta_printers import every_record, heights_only, stored, write_f
 from tests.cli.printed_tables import read_table_rows
 from tests.io.formats.printers import printer_cfg
 
-# The heights-only records of the folder; a test below holds this list against it.
+# The heights-only records of the folder; a test below compares this list with the folder.
 CALIBRATED = (
     "cupsster/FLSUN-SR---Klipper-Config Configuration/printer.cfg",
     "danorder/Flsun-super-racer-Full-klipper-config- printer.cfg",
@@ -47,13 +47,13 @@ def calibrate(tmp_path, monkeypatch, capsys, data_folder):
     return run
 
 
-def test_every_record_of_heights_alone_is_tried_here(data_folder) -> None:
+def test_every_record_of_heights_alone_is_in_the_list(data_folder) -> None:
     assert sorted(heights_only(data_folder)) == sorted([*CALIBRATED, FACTORY_DEFAULT])
 
 
 @pytest.mark.parametrize("stop_off", [0.0, 40.0, -40.0])
 @pytest.mark.parametrize("name", CALIBRATED)
-def test_the_answer_of_the_firmware_comes_back_from_stops_far_off(
+def test_wrong_stops_lead_back_to_the_answer_of_the_firmware(
     calibrate, data_folder, name, stop_off
 ) -> None:
     out, result = calibrate(name, "--noise estimated", stop_off=stop_off)
@@ -72,8 +72,7 @@ def test_the_command_works_as_typed_into_a_shell(tmp_path, data_folder) -> None:
     done = subprocess.run(
         command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60
     )
-    # one degree of freedom left at 10 times the stated noise: the residual does not fit it, so the
-    # exit code is 2
+    # residuals of 10 times the stated noise at one degree of freedom: exit code 2
     assert done.returncode == 2
     assert "quality gate not met" in done.stderr
     assert done.stdout.startswith("Not calibrated: printer, 6 parameters")
@@ -95,7 +94,7 @@ def test_a_factory_default_is_flagged_as_not_calibrated(calibrate, capsys) -> No
     assert main(["validate", "run/robot.yaml", "heights.csv", "--limit-position", "0.1mm"]) == 0
 
 
-def test_a_probe_of_unknown_sigma_leaves_that_open_and_says_so(calibrate) -> None:
+def test_a_probe_of_unknown_sigma_gives_no_verdict_on_the_nominal_geometry(calibrate) -> None:
     _, result = calibrate(FACTORY_DEFAULT, "--noise estimated")
     assert result["start"]["verdict"] == "open"
 
@@ -114,9 +113,7 @@ def test_one_degree_of_freedom_gives_intervals_only_with_the_sigma_of_the_probe(
 
 
 def test_a_geometry_from_heights_and_distances_is_not_the_best_for_heights_alone(calibrate) -> None:
-    """RazorCopter's firmware weighed 12 distances as well; its heights alone ask for something
-    else.
-    """
+    """RazorCopter's firmware also used 12 distances; its heights alone give another geometry."""
     _, result = calibrate(WITH_DISTANCES, "--noise estimated")
     assert result["fit"]["rank"] == 6
     assert result["start"]["verdict"] == "open"
@@ -137,10 +134,10 @@ def imported(tmp_path, monkeypatch, capsys, data_folder):
     return run
 
 
-def test_import_says_where_a_stored_geometry_is_not_the_optimum_of_the_firmwares_own_cost(
+def test_import_reports_a_stored_geometry_that_is_not_the_optimum_of_the_firmwares_cost(
     imported,
 ) -> None:
-    """Two arms of this record were stored otherwise than its heights and distances ask for."""
+    """Two stored arms of this record differ from the optimum for its heights and distances."""
     out = imported(WITH_DISTANCES)
     assert "the optimum of the firmware's" in out
     assert "0.6477 mm^2" in out
@@ -149,7 +146,7 @@ def test_import_says_where_a_stored_geometry_is_not_the_optimum_of_the_firmwares
     assert "arm3.length 215.7964 -> 215.6702" in out
 
 
-def test_the_page_quotes_what_is_printed_of_the_real_printer(imported, capsys, root) -> None:
+def test_the_page_has_the_numbers_of_the_real_printer(imported, capsys, root) -> None:
     page = (root / "docs" / "delta-printers.md").read_text("utf-8")
     quoted = page.split("compares the numbers of these lines -->\n```text\n")[1].split("```")[0]
     printed = imported(WITH_DISTANCES, " --sigma-height 0.05mm --sigma-distance 0.3mm")
@@ -175,9 +172,7 @@ def test_the_page_quotes_what_is_printed_of_the_real_printer(imported, capsys, r
     assert half["radius"] == pytest.approx(0.53, abs=0.005)
 
 
-def test_import_says_the_same_of_a_factory_default_and_not_of_printers_that_were_calibrated(
-    imported,
-) -> None:
+def test_import_reports_a_factory_default_but_no_calibrated_printer(imported) -> None:
     out = imported(FACTORY_DEFAULT)
     assert "0.1179 mm^2" in out
     assert "0.0019 mm^2" in out
@@ -186,13 +181,20 @@ def test_import_says_the_same_of_a_factory_default_and_not_of_printers_that_were
         assert "tored geometry is the optimum of the firmware's" in imported(name), name
 
 
-@pytest.mark.parametrize(("name", "height", "times"), [(CALIBRATED[0], None, 10.0), (CALIBRATED[1], None, 4.39),
-                                                        (CALIBRATED[2], 1, 3.51), (CALIBRATED[2], 2, 5.72),
-                                                        (CALIBRATED[2], 6, 7.0)])  # fmt: skip
-def test_seven_heights_that_disagree_get_no_all_clear_and_no_height_is_blamed(
+@pytest.mark.parametrize(
+    ("name", "height", "times"),
+    [
+        (CALIBRATED[0], None, 10.0),
+        (CALIBRATED[1], None, 4.39),
+        (CALIBRATED[2], 1, 3.51),
+        (CALIBRATED[2], 2, 5.72),
+        (CALIBRATED[2], 6, 7.0),
+    ],
+)
+def test_seven_heights_that_contradict_each_other_fail_and_no_height_is_named(
     imported, capsys, name, height, times
 ) -> None:
-    """Two printers as they were probed; and one with 0.3 mm, 15 times the noise, added to a height."""
+    """Two printers as probed, and one with 0.3 mm, 15 times the noise, added to a height."""
     imported(name)
     lines = Path("probes.csv").read_text().split("\n")
     for i, line in enumerate(lines):
@@ -210,7 +212,7 @@ def test_seven_heights_that_disagree_get_no_all_clear_and_no_height_is_blamed(
 
 
 @pytest.mark.parametrize("name", [*CALIBRATED, FACTORY_DEFAULT, WITH_DISTANCES])
-def test_nine_parameters_from_heights_alone_are_flagged_with_the_combination_and_the_remedy(
+def test_nine_parameters_from_heights_alone_are_refused_with_a_suggested_measurement(
     imported, capsys, tmp_path, data_folder, name
 ) -> None:
     imported(name)
@@ -222,14 +224,14 @@ def test_nine_parameters_from_heights_alone_are_flagged_with_the_combination_and
     assert main(["identifiability", "nine.yaml", "heights.csv", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert (document["rank"], document["n_parameters"], document["n_equations"]) == (7, 9, 7)
-    remedy = "distances between two poses (ball bar; callipers on a printed part)"
+    suggestion = "distances between two poses (ball bar; callipers on a printed part)"
     assert len(document["unidentifiable"]) == 2
-    assert [cure["cures"][0]["words"] for cure in document["remedies"]] == [remedy, remedy]
+    assert [cure["cures"][0]["words"] for cure in document["remedies"]] == [suggestion, suggestion]
     # calibrate refuses by default, and says the same
     assert main(["calibrate", "nine.yaml", "heights.csv", "-o", "run"]) == 1
     error = capsys.readouterr().err
     assert "7 equations cannot determine 9 parameters" in error
-    assert remedy in error
+    assert suggestion in error
     assert "Hint: use --method map" in error
     # where stated tolerances fill the gap, the note is printed and kept in the run
     (tmp_path / "nine.yaml").write_text((tmp_path / "nine.yaml").read_text() + TOLERANCES)
@@ -237,4 +239,4 @@ def test_nine_parameters_from_heights_alone_are_flagged_with_the_combination_and
     assert "Suggested measurement" not in capsys.readouterr().out  # only with --verbose
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["fit"]["rank"] == 7
-    assert [cure["cures"][0]["words"] for cure in result["remedies"]] == [remedy, remedy]
+    assert [cure["cures"][0]["words"] for cure in result["remedies"]] == [suggestion, suggestion]
