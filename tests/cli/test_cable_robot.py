@@ -74,9 +74,7 @@ def test_the_truth_of_the_example_is_that_of_its_program(root) -> None:
     np.testing.assert_allclose(robot.values * 1e3, TRUTH, rtol=0, atol=1e-9)  # [mm]
 
 
-def test_import_writes_known_and_unknown_poses_and_reports_what_it_does_not_read(
-    folder, capsys
-) -> None:
+def test_import_writes_all_poses_and_reports_what_it_does_not_read(folder, capsys) -> None:
     assert main(REAL.split()) == 0
     out = " ".join(capsys.readouterr().out.split())
     assert "robot.yaml: 4 actuators, 21 parameters, 21 free" in out
