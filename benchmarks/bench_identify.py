@@ -74,7 +74,7 @@ def bench_fit() -> Metric:
 
 
 def bench_map() -> Metric:
-    """MAP with its covariance, conflict test and widening by rule, against the least-squares fit."""
+    """Time MAP with covariance, prior conflict test and inflation, against least squares."""
     robot = load_robot("hexapod-42")
     data = _measured(robot, 50)
     return measure_ratio(

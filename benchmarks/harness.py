@@ -120,7 +120,7 @@ def read_baseline(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def write_baseline(path: Path, metrics: Sequence[Metric], machine: dict[str, str]) -> None:
-    """Merge metrics into the baseline file, which also says on which machine it was last written."""
+    """Merge metrics into the baseline file, which names the machine that wrote it last."""
     merged = read_baseline(path)
     merged |= {
         metric.name: {k: v for k, v in asdict(metric).items() if k != "name"} for metric in metrics

@@ -224,7 +224,8 @@ def collect() -> dict:
         "tables": {
             "found": {
                 "columns": [
-                    "unknown", "draws", "found", "largest residual / that of the truth", "largest error of orientation [mrad]",
+                    "unknown", "draws", "found", "largest residual / that of the truth",
+                    "largest error of orientation [mrad]",
                 ],
                 "formats": ["", "d", "d", ".2f", ".1f"],
                 "rows": rows,

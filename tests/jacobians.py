@@ -166,7 +166,7 @@ def automatic_derivative(
         try:
             return np.asarray(jax.jit(slope)(point))
         except (jax.errors.TracerBoolConversionError, jax.errors.NonConcreteBooleanIndexError,
-                jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):  # fmt: skip
+                jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):  # fmt: skip  # noqa: E501
             return np.asarray(slope(point))
 
 

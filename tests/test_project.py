@@ -122,3 +122,16 @@ def test_every_python_file_states_its_licence_first(root: Path, tracked: list[Pa
     assert [
         str(f.relative_to(root)) for f in files if not f.read_text("utf-8").startswith(spdx)
     ] == []
+
+
+def test_every_path_of_the_architecture_exists(root: Path) -> None:
+    text = (root / "ARCHITECTURE.md").read_text("utf-8")
+    task_table = text[text.index("| task | place |") :]
+    named = set(re.findall(r"`([\w/]+(?:\.py|/))`", task_table))
+    named |= set(re.findall(r"`([\w/]+(?:\.py|/))`", text[text.index("| package |") :]))
+    assert len(named) > 25
+    places = (root, root / "src" / "loopcal", root / "src" / "loopcal" / "estimate")
+    places += (root / "src" / "loopcal" / "measure", root / "src" / "loopcal" / "mechanism")
+    places += (root / "src" / "loopcal" / "diagnose",)
+    missing = {name for name in named if not any((place / name).exists() for place in places)}
+    assert missing <= {"measure/kinds/GROUP/", "evidence/NAME.py", "findings/catalog/SUBJECT.py"}

@@ -170,7 +170,7 @@ def gough(
 
 
 def gough_values(base: Array, platform: Array, lengths: Array) -> Array:
-    """Values (42,) in the order of a hexapod's parameters: base, platform and length, leg by leg."""
+    """Values (42,) in the order of a hexapod's parameters: base, platform and length, leg by leg."""  # noqa: E501
     return np.column_stack([base, platform, lengths]).ravel()
 
 
@@ -329,7 +329,7 @@ def menagerie() -> Mechanism:
 
 @cache
 def menagerie_assembly(seed: int = 7) -> Assembly:
-    """Axes and offsets are random about the legs of a hexapod, so that nothing is zero by symmetry."""
+    """Axes and offsets are random about the legs of a hexapod, so that nothing is zero by symmetry."""  # noqa: E501
     rng = np.random.default_rng(seed)
     home = geometry.make_pose(
         geometry.exp_so3(np.array([0.05, -0.08, 0.1])), np.array([0.01, -0.02, 0.25])

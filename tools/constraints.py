@@ -32,7 +32,7 @@ def find_python(minor: str) -> str | None:
 
 
 def freeze(python: str) -> list[str]:
-    """Install loopcal[dev] into a fresh environment and return the versions of what came with it."""
+    """Install loopcal[dev] into a fresh environment and return the installed versions."""
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([python, "-m", "venv", folder], check=True)
         pip = [
@@ -53,7 +53,7 @@ def main() -> int:
     """Write the constraints of every Python found; exit 1 when there is none."""
     found = {minor: python for minor in MINORS if (python := find_python(minor))}
     for minor, python in found.items():
-        header = f"# One complete install of loopcal[dev] on Python {minor}, frozen by `make constraints`."
+        header = f"# Versions of loopcal[dev] on Python {minor}, frozen by `make constraints`."
         path = ROOT / "constraints" / f"python{minor}.txt"
         path.write_text("\n".join([header, *freeze(python), ""]), encoding="utf-8")
         print(f"constraints: wrote {path.relative_to(ROOT)}")

@@ -142,7 +142,7 @@ def find_outdated(root: Path) -> dict[Path, str]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the scripts, then write the tables; 1 where a page asks for evidence that is not there."""
+    """Run the scripts and write the tables; return 1 if a page asks for missing evidence."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

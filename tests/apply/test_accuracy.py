@@ -125,7 +125,7 @@ def test_the_turn_about_the_normal_is_a_turn_of_the_platform_frame_and_left_out_
 
 
 def base_motion_unknown(fit, extra=None):
-    """The fit's posterior, but nothing known of where the base is (nor of the parameter `extra`)."""
+    """The fit's posterior, but nothing known of where the base is (nor of the parameter `extra`)."""  # noqa: E501
     base = fit.estimate.reshape(6, 7)[:, :3]
     known = np.zeros((42, 6))
     for leg, b in enumerate(base):

@@ -290,7 +290,8 @@ def test_an_export_of_which_no_line_fits_the_profile_is_refused(refused) -> None
     }
     found = refused("import export.txt --profile cmm.yaml -o data.csv", **files)
     assert (
-        "export.txt:2: no line of this export fits cmm.yaml; reason for the first one: the name 'A1' "
+        "export.txt:2: no line of this export fits cmm.yaml; reason for the first one: the name "
+        "'A1' "
         "does not match K_" in found
     )
 

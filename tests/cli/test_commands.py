@@ -16,7 +16,7 @@ from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.io.runs.calibration_run import load_run
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
-SIMULATE = "simulate truth.yaml --poses poses.csv --sigma-position 0.001mm --sigma-angle 5urad --seed 3 -o again.csv"
+SIMULATE = "simulate truth.yaml --poses poses.csv --sigma-position 0.001mm --sigma-angle 5urad --seed 3 -o again.csv"  # noqa: E501
 
 
 @pytest.fixture

@@ -90,7 +90,7 @@ def test_options_that_contradict_each_other_are_one_sentence(run, words, sentenc
 
 
 def test_noisy_encoders_are_assumed_for_an_instrument_and_weaken_what_is_known(run):
-    """Readings of 1 mm beside positions of 10 um: every parameter is known worse, and none better."""
+    """Readings of 1 mm beside positions of 10 um: every parameter is known worse, and none better."""  # noqa: E501
     words = "linear-delta --draw 20 --kind position --json"
     exact, noisy = (
         json.loads(run(words + more)[1])["singular_values"] for more in ("", " --sigma-reading 1mm")

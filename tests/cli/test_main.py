@@ -38,7 +38,7 @@ def test_python_m_loopcal_is_the_command_line() -> None:
 
 
 def test_nothing_heavy_is_imported_before_a_command_runs() -> None:
-    code = "import sys, loopcal, loopcal.cli; print(*{'numpy', 'scipy', 'pydantic', 'ruamel', 'rich'} & set(sys.modules))"
+    code = "import sys, loopcal, loopcal.cli; print(*{'numpy', 'scipy', 'pydantic', 'ruamel', 'rich'} & set(sys.modules))"  # noqa: E501
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
 

@@ -31,7 +31,7 @@ def test_a_name_that_yaml_would_read_as_a_number_is_quoted() -> None:
 
 
 def test_the_template_lacks_nothing_but_rows(tmp_path, capsys) -> None:
-    words = "new linear-delta -o printer.yaml --measurements heights.csv --kind component --components z --sigma-position 20um"
+    words = "new linear-delta -o printer.yaml --measurements heights.csv --kind component --components z --sigma-position 20um"  # noqa: E501
     assert main(words.split()) == 0
     template = tmp_path / "heights.csv"
     assert (
@@ -58,7 +58,7 @@ def test_the_template_lacks_nothing_but_rows(tmp_path, capsys) -> None:
 
 
 def test_a_template_of_several_kinds_is_accepted_once_it_is_filled_in(tmp_path, capsys) -> None:
-    words = "new gough -o robot.yaml --measurements data.csv --kind position,inclination --sigma-position 5um"
+    words = "new gough -o robot.yaml --measurements data.csv --kind position,inclination --sigma-position 5um"  # noqa: E501
     assert main(words.split()) == 0
     text = (tmp_path / "data.csv").read_text()
     assert "#   'position': {kind: position, noise: {x: 5 um" in text

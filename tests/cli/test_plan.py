@@ -86,7 +86,7 @@ def test_the_sheet_says_what_to_command_and_agrees_with_the_data_file(here):
 
 @pytest.mark.slow
 def test_planes_and_lines_are_planned_held_filled_in_and_calibrated(here, capsys):
-    ask = "plan hexapod-nategh-agheli -o plan --measure plane-line --groups 9 --points 6 --sigma-position 1um"
+    ask = "plan hexapod-nategh-agheli -o plan --measure plane-line --groups 9 --points 6 --sigma-position 1um"  # noqa: E501
     assert run(ask) == 0
     assert "determine 33 parameter combinations" in capsys.readouterr().out
     sheet = rows_of(here / "plan" / "plan.csv")
@@ -166,7 +166,7 @@ def test_an_earlier_data_file_describes_the_instrument_and_counts_as_measured(he
 
 
 def test_surfaces_that_each_group_has_of_its_own_describe_no_instrument_to_plan_with(here, capsys):
-    settings = "# kind: plane\n# unknown: [surface]\n# noise: {gap: 1 um}\npose,group,q1 [mm],q2 [mm],q3 [mm],gap [mm]\n"
+    settings = "# kind: plane\n# unknown: [surface]\n# noise: {gap: 1 um}\npose,group,q1 [mm],q2 [mm],q3 [mm],gap [mm]\n"  # noqa: E501
     for groups, code in ((("a", "b"), 1), (("a", "a"), 0)):
         text = settings + "".join(f"{i},{group},1,1,1,0\n" for i, group in enumerate(groups))
         (here / "groups.csv").write_text(text)

@@ -80,7 +80,7 @@ def ups_hexapod() -> Mechanism:
 def measured_hexapod(
     n: int, sigma: ArrayLike | None, seed: int = 0, sensors: tuple[Sensor, ...] = ()
 ) -> Measurements:
-    """The true hexapod at n poses, its readings noisy; measured in full, or by the sensors given."""
+    """The true hexapod at n poses, its readings noisy; measured in full, or by the sensors given."""  # noqa: E501
     truth = zoo.hexapod().with_values(zoo.hexapod_truth())
     tracker = (Sensor(Pose(), noise(*[5e-6] * 3, *[UM] * 3)),)
     return simulate(

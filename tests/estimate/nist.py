@@ -130,6 +130,6 @@ def residual_and_jacobian(certified: Certified, b: np.ndarray) -> tuple[np.ndarr
 
 
 def matching_digits(computed: np.ndarray, certified: np.ndarray) -> float:
-    """Return -log10 of the largest relative difference, at most 11 (the digits that NIST prints)."""
+    """Return -log10 of the largest relative difference, at most 11 (the digits that NIST prints)."""  # noqa: E501
     worst = np.max(np.abs(computed - certified) / np.abs(certified))
     return 11.0 if worst == 0.0 else min(11.0, float(-np.log10(worst)))

@@ -183,7 +183,7 @@ def test_what_the_leaves_take_up_whole_is_not_taken_for_seen():
     F = np.zeros((5 * G, G + 1))
     F[np.arange(5 * G), np.repeat(np.arange(G), 5)] = F[:, G] = 1.0
     sets = [[i, G] for i in range(G)]
-    problem = Problem(np.ones(G + 1, dtype=bool), ["group"] * G + ["machine"], sets, F, rng.normal(size=(5 * G, 3)),
+    problem = Problem(np.ones(G + 1, dtype=bool), ["group"] * G + ["machine"], sets, F, rng.normal(size=(5 * G, 3)),  # noqa: E501
                       np.repeat(np.arange(G), 5))  # fmt: skip
     found, rest = eliminate_tree(folded(problem, problem.tree))
     assert found.rank[0] == G

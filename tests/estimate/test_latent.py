@@ -280,12 +280,12 @@ def coverage(robot, trials):
     return int((square <= chi2.ppf(0.95, len(places))).sum())
 
 
-def test_ellipsoids_cover_as_stated_with_noisy_readings_and_far_too_little_if_the_noise_is_ignored():
+def test_ellipsoids_cover_as_stated_with_noisy_readings_and_far_too_little_if_the_noise_is_ignored():  # noqa: E501
     robot = load_robot("linear-delta")
     n = 100
     trials = simulate_trials(
         robot, sample_truth(robot, n, 4), sample_workspace(robot, 12, 4).coordinates,
-        Instrument((Sensor(Position(), noise(10 * UM, 10 * UM, 10 * UM)),)), 4, reading_sigma=20 * UM,
+        Instrument((Sensor(Position(), noise(10 * UM, 10 * UM, 10 * UM)),)), 4, reading_sigma=20 * UM,  # noqa: E501
     )  # fmt: skip
     inside = coverage(robot, trials)
     assert binom.ppf(0.0005, n, 0.95) <= inside <= binom.ppf(0.9995, n, 0.95)
@@ -360,7 +360,7 @@ def test_a_pose_whose_position_alone_is_known_adds_nothing_and_is_named():
     data = measured_hexapod(12, 2 * UM)
     known = identify(hexapod(), data.take(np.arange(11)), LeastSquares())
     seen = replace(data.observations[0], measured=np.where(
-        (np.arange(12) == 11)[:, None] & (np.arange(6) < 3), np.nan, data.observations[0].measured))  # fmt: skip
+        (np.arange(12) == 11)[:, None] & (np.arange(6) < 3), np.nan, data.observations[0].measured))  # fmt: skip  # noqa: E501
     unread = (np.arange(12) == 11)[:, None]
     lost = replace(data, observations=(seen,), readings=np.where(unread, np.nan, data.readings),
                    reading_sigma=np.where(unread, np.inf, sigma_of(data)))  # fmt: skip

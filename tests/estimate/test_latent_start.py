@@ -33,7 +33,7 @@ from tests.estimate.problems import UM, noise
 
 
 def measured(name, sensors, n, seed, share=0.0, sigma=20 * UM):
-    """A robot, a true one, and measurements of n poses with this share of the readings not taken."""
+    """A robot, a true one, and measurements of n poses with this share of the readings not taken."""  # noqa: E501
     robot = load_robot(name)
     truth = robot.with_values(sample_truth(robot, 1, seed)[0])
     data = simulate(

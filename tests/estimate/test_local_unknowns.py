@@ -42,7 +42,7 @@ NAMES = ("frame", "a", "b", "c")
 STATION = geometry.make_pose(np.eye(3), np.array([-2.5, -1.8, 0.1]))
 TRACKER = Position(targets=("a", "b", "c"), places=THREE, unknown=("frame", "targets"))
 TRUE = {
-    "frame.rx": 0.3, "frame.ry": -0.2, "frame.rz": 1.0, "frame.x": 0.4, "frame.y": -0.7, "anchor.x": 0.5, "anchor.y": -0.9,
+    "frame.rx": 0.3, "frame.ry": -0.2, "frame.rz": 1.0, "frame.x": 0.4, "frame.y": -0.7, "anchor.x": 0.5, "anchor.y": -0.9,  # noqa: E501
     "anchor.z": 0.1, "distance.offset": 1e-3, "separation.offset": 2e-3, "a.x": 0.11, "b.z": 0.04,
 }  # fmt: skip
 
@@ -320,7 +320,7 @@ def test_starts_are_sought_once_for_all_trials_that_an_instrument_looks_at(monke
     robot = lc.load_robot("linear-delta")
     kind = Position(places=POINT, unknown=("frame",))
     trials = simulate_trials(
-        robot, sample_truth(robot, 5, 1), sample_workspace(robot, 20, 1).coordinates, Instrument((seen_by(kind, Gaussian),)), 1,
+        robot, sample_truth(robot, 5, 1), sample_workspace(robot, 20, 1).coordinates, Instrument((seen_by(kind, Gaussian),)), 1,  # noqa: E501
         nuisance_values=true_of(kind),
     )  # fmt: skip
     assert identify_trials(robot, trials, MAP()).converged.all()

@@ -141,7 +141,7 @@ def printed():
         + np.where(robot.parameters.free, 0.5, 0.0) * np.nan_to_num(robot.parameters.tolerance)
     )
     data = simulate(
-        truth, sample_workspace(robot, 40, 5).coordinates, Instrument((sensor(Position(places=POINT, unknown=("frame",))),)), 1,
+        truth, sample_workspace(robot, 40, 5).coordinates, Instrument((sensor(Position(places=POINT, unknown=("frame",))),)), 1,  # noqa: E501
         nuisance_values={"frame.x": 60 * UM},
     )  # fmt: skip
     return robot, truth, data

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Unknowns that rows see by rounding alone are not seen: nothing moves them, and they move nothing."""
+"""Unknowns that rows see by rounding alone are not seen: nothing moves them, and they move nothing."""  # noqa: E501
 
 from dataclasses import replace
 

@@ -176,7 +176,7 @@ def test_a_target_without_a_line_needs_no_sigma(tmp_path) -> None:
 
 def test_a_target_that_gives_the_pose_another_reading_is_no_row(tmp_path) -> None:
     profile = TARGETS.replace("MORE", "").replace("settings:", READINGS)
-    lines = ["P1_a;1;2;3;7,0;0;0;0;0;0", "P1_b;1;2;3;7,00;0;0;0;0;0", "P2_a;1;2;3;8;0;0;0;0;0", "P2_b;1;2;3;9;0;0;0;0;0",
+    lines = ["P1_a;1;2;3;7,0;0;0;0;0;0", "P1_b;1;2;3;7,00;0;0;0;0;0", "P2_a;1;2;3;8;0;0;0;0;0", "P2_b;1;2;3;9;0;0;0;0;0",  # noqa: E501
              "P1_b;1;2;4;6;0;0;0;0;0"]  # fmt: skip
     found = converted(tmp_path, "Name;X;Y;Z;J1;J2;J3;J4;J5;J6\n" + "\n".join(lines), profile)
     assert found.misfits == (
@@ -235,7 +235,7 @@ missing: -999
 matrix: [2, 3, 4, 5, 6, 7, 8, 9, 10]
 columns: {pose: {from: 1}, x: {from: 11, unit: mm}, y: {from: 12, unit: mm}, z: {from: 13, unit: mm}}
 settings: {kind: pose, orientation: quaternion}
-"""
+"""  # noqa: E501
     found = converted(tmp_path, "P1;" + "-999.0;" * 9 + "1;2;3\n", profile)
     assert table(found.text)[1:] == ["P1,,,,,1,2,3"]
 
@@ -264,17 +264,21 @@ BAD = {
     "hex": ("delimiter", "encoding: hex\ndelimiter", 2, "'hex' is not a known encoding"),
     "rot13": ("delimiter", "encoding: rot13\ndelimiter", 2, "'rot13' is not a known encoding"),
     "a newer format": ("format: 1", "format: 7", 1, "this file has format 7"),
-    "an angle for a length": ("from: X, unit: mm", "from: X, unit: deg", 5, "'deg' is not a unit of 'x'"),
-    "one unit for a covariance": ("  z:", "  cov.x.y: {from: C, unit: mm}\n  z:", 7, "'mm' is not a unit"),
+    "an angle for a length": ("from: X, unit: mm", "from: X, unit: deg", 5, ("'deg' is not a unit "
+                                                                            "of 'x'")),
+    "one unit for a covariance": ("  z:", "  cov.x.y: {from: C, unit: mm}\n  z:", 7, ("'mm' is not "
+                                                                                     "a unit")),
     "a sigma of nothing": ("  z:", "  sigma.w: {from: C, unit: mm}\n  z:", 7, ("'sigma.w' is not a "
                                                                               "column .*did you "
                                                                               "mean 'sigma")),
-    "another unit in the header": ("from: X, unit: mm", '"from": "X [m]", unit: mm', 5, "header is 'X .m.', but"),
+    "another unit in the header": ("from: X, unit: mm", '"from": "X [m]", unit: mm', 5, ("header is "
+                                                                                        "'X .m.', but")),  # noqa: E501
     "degrees in the header": ("from: X, unit: mm", '"from": "X (°)", unit: mm', 5, ("write the "
                                                                                     "unit "
                                                                                    "deg")),
     "readings of nothing": ("settings", "readings:\nsettings", 8, "'readings' is empty"),
-    "nothing for missing": ("delimiter", "missing: [null]\ndelimiter", 2, "'missing entry 1' is empty"),
+    "nothing for missing": ("delimiter", "missing: [null]\ndelimiter", 2, ("'missing entry 1' is "
+                                                                          "empty")),
 }  # fmt: skip
 
 

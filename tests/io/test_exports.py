@@ -136,8 +136,8 @@ def test_lines_that_do_not_fit_are_listed_and_named_in_the_file(tmp_path) -> Non
     assert found.rows == 3
     assert [line for line, _ in found.misfits] == [6, 7, 8, 9, 10]
     reasons = " / ".join(reason for _, reason in found.misfits)
-    for part in ("it has 3 columns, but 'Z' is column 4", "'two' is not a number for 'y'", "'' is not a name of a pose",
-                 "'1.234,5' is not a number for 'x'", "it has 5 cells, but the header has 4 columns"):  # fmt: skip
+    for part in ("it has 3 columns, but 'Z' is column 4", "'two' is not a number for 'y'", "'' is not a name of a pose",  # noqa: E501
+                 "'1.234,5' is not a number for 'x'", "it has 5 cells, but the header has 4 columns"):  # fmt: skip  # noqa: E501
         assert part in reasons
     assert "## lines that do not fit: 6, 7, 8, 9, 10\n" in found.text
     assert found.passed + found.rows + len(found.misfits) == sum(
@@ -156,7 +156,7 @@ def test_rotation_matrices_become_quaternions(tmp_path) -> None:
 matrix: [2, 3, 4, 5, 6, 7, 8, 9, 10]
 columns: {pose: {from: 1}, x: {from: 11, unit: mm}, y: {from: 12, unit: mm}, z: {from: 13, unit: mm}}
 settings: {kind: pose, orientation: quaternion}
-"""
+"""  # noqa: E501
     found = converted(tmp_path, "\n".join([*lines, broken]), profile)
     assert [reason for _, reason in found.misfits] == [
         "the nine numbers are not a rotation matrix (error 3)"
@@ -187,7 +187,8 @@ BAD_EXPORTS = {
     "other separators": (EXPORT.replace(";", "\t"), "no line names the columns"),
     "numbers of another country": (
         "Name;X;Y;Z\nP1;1.5;2.5;3\n",
-        ("export.txt:2: no line of this export fits .*profile.yaml; reason for the first one: '1.5' is "
+        ("export.txt:2: no line of this export fits .*profile.yaml; reason for the first one: "
+         "'1.5' is "
         "not a number for 'x'"),
     ),
     "a header alone": ("Name;X;Y;Z\n", "the profile skips every line"),

@@ -159,10 +159,13 @@ REFUSED = {
         {"poses": POSES, "tilts": TILTS.replace("b,.001", "b,.0011")},
         (r"tilts.csv:4: pose 'b' has other readings here than in .*poses.csv:3"),
     ),
-    "readings nowhere": ({"poses": POSES, "heights": HEIGHTS.replace("λ1", "e")}, (r"heights.csv:8: "
-                                                                                  r"unknown pose 'e'")),
-    "no names": ({"poses": POSES, "heights": HEIGHTS.replace("pose,z", "note,z")}, "this file names none"),
-    "no kind at all": ({"poses": POSES, "more": POSES.replace("a,0", "f,0")}, "no file states a kind"),
+    "readings nowhere": ({"poses": POSES, "heights": HEIGHTS.replace("λ1", "e")}, (r"heights.csv:8: "  # noqa: E501
+                                                                                  r"unknown pose "
+                                                                                  r"'e'")),
+    "no names": ({"poses": POSES, "heights": HEIGHTS.replace("pose,z", "note,z")}, ("this file "
+                                                                                   "names none")),
+    "no kind at all": ({"poses": POSES, "more": POSES.replace("a,0", "f,0")}, ("no file states a "
+                                                                              "kind")),
     "a kind forgotten": (
         {"poses": POSES, "heights": HEIGHTS.replace("# kind: component\n# components: [z]\n# "
                                                     "noise: {z: 1 um}\n", "")},
@@ -182,25 +185,27 @@ REFUSED = {
     ),
     "the same rows in two files": (
         {"poses": POSES, "heights": HEIGHTS, "copy": "## a copy\n" + HEIGHTS},
-        (r"'b' and 'b' \(.*heights.csv:5 and .*copy.csv:6\) have the same readings and the same component"),
+        (r"'b' and 'b' \(.*heights.csv:5 and .*copy.csv:6\) have the same readings and the same "
+         r"component"),
     ),
     "an empty cell of the readings": (
         {"poses": POSES.replace("b,1,", "b,,"), "heights": HEIGHTS},
         ("poses.csv:3: column 'q1' is empty; write its value, or state 'reading_noise'"),
     ),
-    "another block": (IN_BLOCKS, (r"tilts.csv:4: pose 'b' is in block '2' here and '1' in .*poses.csv:3")),
+    "another block": (IN_BLOCKS, (r"tilts.csv:4: pose 'b' is in block '2' here and '1' in "
+                                  r".*poses.csv:3")),
     "other noise of readings": (
         {"poses": "# reading_noise: 5 um\n" + POSES, "tilts": "# reading_noise: 6 um\n" + TILTS},
         r"tilts.csv:5: pose 'b' has other sigma here than in .*poses.csv:4",
     ),
     "an empty file": ({"poses": POSES, "heights": "\n"}, ("heights.csv: this measurement file is "
                                                          "empty")),
-    "a header alone": ({"poses": POSES, "heights": HEIGHTS[: HEIGHTS.index("b,")]}, "heights.csv:4: .* a header but no rows"),
+    "a header alone": ({"poses": POSES, "heights": HEIGHTS[: HEIGHTS.index("b,")]}, "heights.csv:4: .* a header but no rows"),  # noqa: E501
     "a table of poses that is not there": (NO_POSES, (r"heights.csv:1: 'poses' names .*p.csv")),
     "a frame stated twice": (
         {"poses": POSES,
-         "mo": SPLIT.format("x").replace("# frame", "# unknowns: {x.tracker.x: fixed}\n# frame") + "a,200\nb,201\n",
-         "tu": SPLIT.format("x").replace("# frame", "# unknowns: {x.tracker.x: {sd: 1 mm}}\n# frame") + "λ1,203.3\n"},
+         "mo": SPLIT.format("x").replace("# frame", "# unknowns: {x.tracker.x: fixed}\n# frame") + "a,200\nb,201\n",  # noqa: E501
+         "tu": SPLIT.format("x").replace("# frame", "# unknowns: {x.tracker.x: {sd: 1 mm}}\n# frame") + "λ1,203.3\n"},  # noqa: E501
         r"tu.csv:5: parameter 'x.tracker.x' is stated differently in .*mo.csv:5",
     ),
 }  # fmt: skip

@@ -65,8 +65,8 @@ def random_measurements(robot, seed: int) -> Measurements:
         height, np.arange(4), draw.normal(size=(4, 1)), 1e-6, group=np.array(list("xxyy"))
     )
     time = np.array([1.7e9 + 1 / 3, np.nan, *draw.uniform(0, 1e5, 3)])
-    first = Observations(first.kind, first.rows, first.measured, first.covariance, session=first.session,
-                         context={"time": time, "temperature.frame": 20 + draw.normal(size=5)})  # fmt: skip
+    first = Observations(first.kind, first.rows, first.measured, first.covariance, session=first.session,  # noqa: E501
+                         context={"time": time, "temperature.frame": 20 + draw.normal(size=5)})  # fmt: skip  # noqa: E501
     readings, sigma = (
         draw.uniform(-0.05, 0.05, (5, 6)),
         np.tile([0.0, 5e-6, 0.0, 0.0, 1e-5 / 3, 0.0], (5, 1)),
@@ -229,7 +229,7 @@ pose,time,temperature [degC],temperature.frame [K],q1 [mm],q2 [mm],q3 [mm],q4 [m
 a,2026-05-04T10:22:31.5,20.5,293.15,0,0,0,0,0,0,200
 a,2026-05-04T12:22:32+02:00,21.5,,,,,,,,200.1
 b,,,,1,1,1,1,1,1,201.1
-"""
+"""  # noqa: E501
 
 
 def test_times_and_temperatures_are_kept_through_every_part(tmp_path, robot) -> None:
@@ -258,7 +258,7 @@ def test_what_stands_beside_a_pose_is_taken_by_its_rows_in_other_files(tmp_path,
     (tmp_path / "poses.csv").write_text(
         f"pose,temperature [degC],{','.join(f'q{i} [mm]' for i in range(1, 7))}\n{rows}\n"
     )
-    text = "# kind: separation\n# noise: {separation: 2 um}\n# poses: poses.csv\npose,separation [mm]\na;b,1.2\nb;c,1.3\n"
+    text = "# kind: separation\n# noise: {separation: 2 um}\n# poses: poses.csv\npose,separation [mm]\na;b,1.2\nb;c,1.3\n"  # noqa: E501
     data = load_measurements(write(tmp_path, text), robot)
     np.testing.assert_array_equal(data.observations[0].context["temperature"], [21.0, np.nan])
 

@@ -175,7 +175,7 @@ def write(folder, text: str):
 
 
 def test_commanded_coordinates_become_readings_of_the_controller(tmp_path, robot) -> None:
-    names = "commanded.x [mm],commanded.y [mm],commanded.z [mm],commanded.roll [deg],commanded.pitch [deg],commanded.yaw [deg]"
+    names = "commanded.x [mm],commanded.y [mm],commanded.z [mm],commanded.roll [deg],commanded.pitch [deg],commanded.yaw [deg]"  # noqa: E501
     text = GOOD.replace(HEADER, f"pose,{names},z [mm]").replace("a,0,0,0,0,0,0", "a,0,0,200,0,0,0")
     text = text.replace("b,1,1,1,1,1,1", "b,0,0,200,0,0,5")
     data = load_measurements(write(tmp_path, text), robot.with_values(robot.values + 1e-3))

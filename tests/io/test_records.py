@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""YAML files and records: SI out, and one sentence with the line for everything that does not fit."""
+"""YAML files and records: SI out, and one sentence with the line for everything that does not fit."""  # noqa: E501
 
 import math
 from dataclasses import dataclass

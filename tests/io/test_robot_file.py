@@ -63,7 +63,7 @@ def test_identified_values_are_applied_and_deleting_the_table_restores_the_nomin
 
 
 def test_a_table_in_the_middle_of_a_file_is_replaced_not_repeated(tmp_path, robot) -> None:
-    table = "identified:\n  - {name: leg1.base.x, value: 121, +/-: null, unit: mm}\n# the legs\nlegs: rod\n"
+    table = "identified:\n  - {name: leg1.base.x, value: 121, +/-: null, unit: mm}\n# the legs\nlegs: rod\n"  # noqa: E501
     loaded = load_robot(write(tmp_path, HEXAPOD.replace("legs: rod\n", table)))
     assert loaded.values[0] == pytest.approx(0.121, rel=2e-16)
     save_robot(loaded, tmp_path / "again.yaml")
@@ -152,7 +152,8 @@ def test_parameters_are_fixed_by_name_or_pattern(tmp_path) -> None:
     assert build(record.assembly()).parameters == table  # the same robot without its file
     with pytest.raises(
         FileError,
-        match=r"'leg1.base.q' under .fixed. matches no parameter of this robot .did you mean 'leg1.base",
+        match=r"'leg1.base.q' under .fixed. matches no parameter of this robot .did you mean "
+        r"'leg1.base",
     ):
         load_robot(write(tmp_path, HEXAPOD + "fixed: [leg1.base.q]\n"))
 

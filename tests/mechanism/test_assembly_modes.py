@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All modes: 40 of Dietmaier's hexapod, those of known machines, and the choice of one by `start`."""
+"""All modes: 40 of Dietmaier's hexapod, those of known machines, and the choice of one by `start`."""  # noqa: E501
 
 from dataclasses import replace
 

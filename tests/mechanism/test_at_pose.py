@@ -30,7 +30,7 @@ def planar_with_four_arms():
     limbs = []
     for i, angle in enumerate(np.deg2rad((80.0, 170.0, 260.0, 350.0)), start=1):
         axis = np.array((np.cos(angle), np.sin(angle), 0.0))
-        links = (Link("base", zoo.place(0.3 * axis, (0, 0, angle))), Link("crank", zoo.place((0.15, 0, 0))),
+        links = (Link("base", zoo.place(0.3 * axis, (0, 0, angle))), Link("crank", zoo.place((0.15, 0, 0))),  # noqa: E501
                  Link("rod", zoo.place((0.17, 0, 0))))  # fmt: skip
         joints = (Joint("motor", "R", f"q{i}", start=2.2), Joint("elbow", "R", start=1.7))
         limbs.append(Limb(f"arm{i}", links, joints, "ball", Link("corner", zoo.place(0.06 * axis))))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limbs judged one by one, closure equations that repeat others, and mechanisms without a length."""
+"""Limbs judged one by one, closure equations that repeat others, and mechanisms without a length."""  # noqa: E501
 
 from dataclasses import replace
 from itertools import pairwise

@@ -44,7 +44,7 @@ def inside(machine: Mechanism, q: Array) -> NDArray[np.bool_]:
 
 
 def rows_inside(machine: Mechanism, seed: int) -> Iterator[Solution]:
-    """Blocks of solutions inside strokes, 1e5 rows in all; at least half of the workspace must be."""
+    """Blocks of solutions inside strokes, 1e5 rows in all; at least half of the workspace must be."""  # noqa: E501
     rng, found, tried = np.random.default_rng(seed), 0, 0
     while found < ROWS:
         there = inverse(machine, drawn(machine, rng, BLOCK))

@@ -45,7 +45,7 @@ def sampled(name, n, seed=7):
 
 
 def gap_of(robot, T, reference):
-    """Distance of poses as a fraction of the robot's size, a rotation vector counting as such (n,)."""
+    """Distance of poses as a fraction of the robot's size, a rotation vector counting as such (n,)."""  # noqa: E501
     return np.linalg.norm(
         geometry.pose_difference(T, reference) / np.array([1.0] * 3 + [robot.size] * 3), axis=1
     )

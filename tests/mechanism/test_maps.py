@@ -81,7 +81,7 @@ READINGS = np.random.default_rng(4).uniform(-0.1, 0.1, (1, 6, 3))
 def test_transmission_has_the_slopes_it_says():
     tau, w = nominal_terms(ACTUATORS)[None], harmonic_frequencies(ACTUATORS)
     check_jacobian(
-        lambda x: joints_from_readings(READINGS + x[0], tau, w), joint_slopes(READINGS, tau, w)[..., None], np.zeros(1), scale=0.0005,
+        lambda x: joints_from_readings(READINGS + x[0], tau, w), joint_slopes(READINGS, tau, w)[..., None], np.zeros(1), scale=0.0005,  # noqa: E501
         automatic=lambda x: joints_from_readings(READINGS + x[0], tau, w),
     )  # fmt: skip
     for i in range(len(TERMS)):

@@ -152,8 +152,8 @@ def test_a_parameter_mapped_onto_nothing_is_refused():
 
 def test_a_serial_arm_alone_is_a_mechanism_too():
     limb = Limb(
-        "arm", (Link("base", np.eye(4)), Link("upper", zoo.place((0.3, 0, 0))), Link("lower", zoo.place((0.2, 0, 0)))),
-        (Joint("a", "R", "q1", start=0.3), Joint("b", "R", "q2", start=0.8)), "ball", Link("hand", np.eye(4)),
+        "arm", (Link("base", np.eye(4)), Link("upper", zoo.place((0.3, 0, 0))), Link("lower", zoo.place((0.2, 0, 0)))),  # noqa: E501
+        (Joint("a", "R", "q1", start=0.3), Joint("b", "R", "q2", start=0.8)), "ball", Link("hand", np.eye(4)),  # noqa: E501
     )  # fmt: skip
     robot = build(
         zoo.assembled("arm", (limb,), ("x", "y"), ("x", "y"), zoo.place((0.35, 0.25, 0.0)))

@@ -67,7 +67,7 @@ def test_lineardeltakins_gives_the_same_carriages_and_poses(oracles):
     # its carriages are counted upwards; R 130.25 and L 269 are its defaults, towers at 90, 210 and
     # 330 degrees
     record = LinearDelta(
-        name="lineardeltakins", radius=130.25, angles=tuple(np.deg2rad((90.0, 210.0, 330.0)).tolist()), arms=269.0,
+        name="lineardeltakins", radius=130.25, angles=tuple(np.deg2rad((90.0, 210.0, 330.0)).tolist()), arms=269.0,  # noqa: E501
         stops=-float(np.sqrt(269.0**2 - 130.25**2)), readings="height", home=PoseRecord(z=50.0),
     )  # fmt: skip
     robot, path = build(record.expand()), oracles / "lineardeltakins_default_200poses.csv"

@@ -66,7 +66,7 @@ def test_passive_joints_follow_parameters_and_readings_as_differences_say(name):
     both = np.concatenate([found.parameters, found.readings], axis=-1)[0, 0] * unit
     check_jacobian(
         joints, both.T[..., None], np.zeros(1), scale=0.1,
-        atol=1e-6, atol_reason="closure to 1e-13, condition of platform and limb 30 each, step 1e-4",
+        atol=1e-6, atol_reason="closure to 1e-13, condition of platform and limb 30 each, step 1e-4",  # noqa: E501
     )  # fmt: skip
 
 

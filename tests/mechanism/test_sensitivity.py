@@ -207,7 +207,7 @@ def scaled_matrix(name, n=40):
 
 
 def rank_beside(matrix, *unknown):
-    """Rank of the parameters once the unknown columns are projected out, and all singular values."""
+    """Rank of the parameters once the unknown columns are projected out, and all singular values."""  # noqa: E501
     flat = matrix.reshape(-1, matrix.shape[-1])
     if unknown:
         basis, _ = np.linalg.qr(np.concatenate([u.reshape(len(flat), -1) for u in unknown], axis=1))

@@ -23,7 +23,7 @@ def rows() -> np.ndarray:
 
 
 def deficient(rank: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows (1, M, P + 1) whose A has this rank, and an orthonormal basis of its null space."""
+    """Return rows (1, M, P + 1) whose A has this rank, and an orthonormal basis of its null space."""  # noqa: E501
     q, _ = np.linalg.qr(rng.standard_normal((P, P)))
     a = rng.standard_normal((M, rank)) @ q[:, :rank].T
     return np.concatenate([a, rng.standard_normal((M, 1))], axis=1)[None], q[:, rank:]

@@ -84,7 +84,7 @@ def results(study) -> Results:
     placed = tuple(evaluate_arrangement(name, s, 0, DRAWS) for name, s in drawn.items())
     fifties = tuple(calibrate_fifty(study, groups, 0, DRAWS) for groups in LINES)
     return Results(
-        read_published(), study, cells, placed, rank_candidates(placed, 0, DRAWS), compare_weights(study, 0, DRAWS), fifties,
+        read_published(), study, cells, placed, rank_candidates(placed, 0, DRAWS), compare_weights(study, 0, DRAWS), fifties,  # noqa: E501
         compare_forms(study, 0), compute_ranks(study, 0),
     )  # fmt: skip
 
@@ -365,7 +365,7 @@ def test_evidence_the_covariance_of_the_rows_is_worth_a_sixth_and_independence_n
 
 
 @pytest.mark.evidence
-def test_evidence_absolute_errors_of_least_squares_hang_on_the_gauge_and_aligned_ones_on_the_data() -> (
+def test_evidence_absolute_errors_of_least_squares_hang_on_the_gauge_and_aligned_ones_on_the_data() -> (  # noqa: E501
     None
 ):
     tables = evidence()["tables"]
@@ -403,7 +403,7 @@ def test_evidence_absolute_errors_of_least_squares_hang_on_the_gauge_and_aligned
 
 
 @pytest.mark.evidence
-def test_evidence_figure_5_comes_near_where_the_gauge_is_out_and_parameters_do_not_where_it_is_in() -> (
+def test_evidence_figure_5_comes_near_where_the_gauge_is_out_and_parameters_do_not_where_it_is_in() -> (  # noqa: E501
     None
 ):
     rows = evidence()["tables"]["readings"]["rows"]

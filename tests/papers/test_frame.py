@@ -72,8 +72,8 @@ def test_the_page_shows_published_beside_computed_and_marks_what_differs() -> No
         "**2.0e+00** | 0 |" in text
     )
     assert (
-        "**Not confirmed:** It holds. (our own check, not a statement of the paper)\n   It does not."
-        in text
+        "**Not confirmed:** It holds. (our own check, not a statement of the paper)\n   It does "
+        "not." in text
     )
     assert "| q | - |" in text
     assert "The first 2 of 3 rows" in text

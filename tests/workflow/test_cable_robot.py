@@ -207,7 +207,7 @@ def test_no_row_is_doubted_and_a_wrong_motor_angle_is(printer, fit):
 
 
 def test_rows_of_a_file_in_which_nothing_was_measured_are_no_degrees_of_freedom(printer, fit):
-    """A file has a row for every pose, with empty cells where nobody measured: they count nowhere."""
+    """A file has a row for every pose, with empty cells where nobody measured: they count nowhere."""  # noqa: E501
     robot, data = printer
     (seen,) = data.observations
     cells = np.full((44, 3), np.nan)

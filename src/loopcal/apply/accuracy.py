@@ -4,9 +4,10 @@
     covariance = D C D' + J_q S_q J_q'        expanded uncertainty U = k sqrt(diag), k = 2
 
 with the error model D = d twist / d parameter, the covariance C of the parameters, and the
-variances S_q of the readings where the actuators have a sigma. A direction that the data do not determine
-makes those components infinite that it moves, and no others. Directions that only move a frame as a
-whole are excluded, and the result says so. JCGM 100; derivation: docs/theory/uncertainty.md.
+variances S_q of the readings where the actuators have a sigma. A direction that the data do not
+determine makes those components infinite that it moves, and no others. Directions that only move a
+frame as a whole are excluded, and the result says so. JCGM 100; derivation:
+docs/theory/uncertainty.md.
 """
 
 from __future__ import annotations

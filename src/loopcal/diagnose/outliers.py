@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+# size: one search with its two levels and its result
 """Detect poses that do not fit the others, at a false-alarm rate for the whole data set.
 
 Rows that belong together form an observation block: a pose, or several poses that share rows. Each

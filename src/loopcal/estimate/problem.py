@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+# size: the problem and how it is made from measurements
 """The least-squares problem of an identification, linearized by a pure function.
 
 A problem holds the free parameters of a robot, the whitened rows of every kind, the table of
@@ -69,7 +70,7 @@ has no row."""
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:  # size: the problem and how it is made from measurements
+class Problem:
     """Whitened rows of t machines that share readings and kinds.
 
     Attributes

@@ -32,7 +32,7 @@ ROTATION_CHANGE = 1e-6
 descent refines the result anyway.
 """
 
-RANK_TOLERANCE = 1e-9
+ALIGNMENT_TOLERANCE = 1e-9
 """Singular values below this share of the largest count as zero [1]."""
 
 ANCHOR_TOLERANCE, ANCHOR_RANK = 1e-6, 4
@@ -44,9 +44,9 @@ rank that determines it.
 def solve_least_squares(A: FloatArray, b: FloatArray) -> FloatArray:
     """Return the least-squares solution of `A x = b`, the shortest one where it is not unique.
 
-    Singular values below `RANK_TOLERANCE` times the largest count as zero.
+    Singular values below `ALIGNMENT_TOLERANCE` times the largest count as zero.
     """
-    return np.asarray(np.linalg.lstsq(A, b, rcond=RANK_TOLERANCE)[0], dtype=float)
+    return np.asarray(np.linalg.lstsq(A, b, rcond=ALIGNMENT_TOLERANCE)[0], dtype=float)
 
 
 def project_to_rotations(M: FloatArray) -> FloatArray:
@@ -332,4 +332,4 @@ def _square_root(H: FloatArray) -> FloatArray:
 def _column_space(C: FloatArray) -> FloatArray:
     """Return an orthonormal basis of the columns of C."""
     U, s, _ = np.linalg.svd(C, full_matrices=False)
-    return U[:, s > RANK_TOLERANCE * s[0]]
+    return U[:, s > ALIGNMENT_TOLERANCE * s[0]]

@@ -78,8 +78,11 @@ def _view_details(report: CalibrationReport, rows: Mapping[str, Any]) -> list[Bl
         blocks.append(build_parameter_table("Setup parameters", rows["local"]))
     blocks += [
         "",
-        f"Iteration: {fit.status.name.lower().replace('_', ' ')} after {fit.history.iterations} steps; "
-        f"rank {fit.rank} of {len(fit.names)}.",
+        (
+            f"Iteration: {fit.status.name.lower().replace('_', ' ')} after "
+            f"{fit.history.iterations} steps; "
+            f"rank {fit.rank} of {len(fit.names)}."
+        ),
         f"Chi-square {fit.chi_square:.5g} with {rows['degrees']:.4g} degrees of freedom.",
     ]
     for suggestion in report.suggestions or ():
@@ -166,6 +169,8 @@ def view_fit(fit: Identification) -> list[Block]:
     rows = fit.to_dict()
     return [
         build_parameter_table(f"{fit.robot.name}: {len(fit.names)} parameters", rows["parameters"]),
-        f"Iteration: {fit.status.name.lower().replace('_', ' ')}; rank {fit.rank} of "
-        f"{len(fit.names)}; chi-square {fit.chi_square:.5g}.",
+        (
+            f"Iteration: {fit.status.name.lower().replace('_', ' ')}; rank {fit.rank} of "
+            f"{len(fit.names)}; chi-square {fit.chi_square:.5g}."
+        ),
     ]

@@ -26,7 +26,7 @@ CALIBRATION, VALIDATION, BOUND = COLORS[0], COLORS[1], COLORS[2]
 
 
 def draw_plan(plan: Plan) -> Figure:
-    """Draw the poses of a plan in pairs of controlled coordinates, with the way from pose to pose."""
+    """Draw the poses of a plan in pairs of controlled coordinates, with the path between them."""
     from matplotlib.figure import Figure
 
     names = plan.robot.controlled

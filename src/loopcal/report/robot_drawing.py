@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f")
-"""Of the limbs in turn; color-blind readers can distinguish them, too (Okabe and Ito, the yellow left
-out).
+"""Of the limbs in turn; color-blind readers can distinguish them, too (Okabe and Ito, the yellow
+left out).
 """
 AXIS, GUIDE = 0.06, 0.12
 """Half the length of the axis of a revolute joint, and the length of a guide beyond its slide, both
@@ -89,7 +89,8 @@ def save_picture(
     """
     if path.suffix.lower() not in FORMATS:
         raise FileError(
-            f"a picture cannot be written as {path.suffix or 'no format'!r}; use a name that ends in "
+            f"a picture cannot be written as {path.suffix or 'no format'!r}; use a name that ends "
+            "in "
             f"{', '.join(FORMATS)}",
             path,
         )

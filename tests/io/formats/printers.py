@@ -52,7 +52,7 @@ def printer_cfg(record: dict[str, Any], stop_off: float = 0.0) -> str:
             f"step_distance = {found['stepdist'][k]!r}",
         ][k % 2]
         if k == 2:
-            step = f"rotation_distance: {rotation!r}\nmicrosteps: 4\nfull_steps_per_rotation: 400\ngear_ratio: 80:40"
+            step = f"rotation_distance: {rotation!r}\nmicrosteps: 4\nfull_steps_per_rotation: 400\ngear_ratio: 80:40"  # noqa: E501
         text += STEPPER.format(axis=axis, k=k, step=step)
         stop = f"position_endstop = {found['endstops'][k] + stop_off:.6f}"
         lines = [f"angle = {found['angles'][k]:.6f}", f"arm_length = {found['arms'][k]:.6f}", stop]

@@ -132,7 +132,7 @@ def test_another_machine_is_not_corrected(tmp_path, files, read) -> None:
         urdf.write(ExportSource(read[FIVE_BAR][1]), tmp_path / "other.urdf")
 
 
-JOINT = '<joint name="a" type="revolute"><origin xyz="0 0 1"/><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/></joint>'
+JOINT = '<joint name="a" type="revolute"><origin xyz="0 0 1"/><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/></joint>'  # noqa: E501
 
 
 @pytest.mark.parametrize(

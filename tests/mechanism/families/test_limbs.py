@@ -73,8 +73,8 @@ TWIN = ThreePrs(
     name="3-prs", platform_radius=0.2, base_radius=0.35, rod=0.5, home=PoseRecord(z=0.7)
 )
 NAMES = {
-    "guide.x": "b{}x", "guide.y": "b{}y", "guide.rx": "thB{}x", "guide.ry": "thB{}y", "hinge.rx": "thC{}x",
-    "hinge.rz": "thC{}z", "tip.z": "l{}", "platform.x": "a{}x", "platform.y": "a{}y", "platform.z": "a{}z",
+    "guide.x": "b{}x", "guide.y": "b{}y", "guide.rx": "thB{}x", "guide.ry": "thB{}y", "hinge.rx": "thC{}x",  # noqa: E501
+    "hinge.rz": "thC{}z", "tip.z": "l{}", "platform.x": "a{}x", "platform.y": "a{}y", "platform.z": "a{}z",  # noqa: E501
 }  # fmt: skip
 
 

@@ -106,7 +106,7 @@ def test_freedoms_and_coordinates_are_named_once_and_not_left_out(
 TYPED = {
     "rod without length": (
         ("    length: 480\n", ""),
-        "limb 'arm' ends in a rod that no drive moves, of length 0 m; it needs a positive `length:`",
+        "limb 'arm' ends in a rod that no drive moves, of length 0 m; it needs a positive `length:`",  # noqa: E501
     ),
     "rod of no length": (("length: 480", "length: 0"), "it needs a positive `length:`"),
     "rod of negative length": (
@@ -119,7 +119,10 @@ TYPED = {
     ),
     "limits reversed": (
         ("start: 30}", "start: 30, limits: [95, -45]}"),
-        "the limits of arm1.motor run from 1.65806 to -0.785398 rad; the first value must be smaller",
+        (
+            "the limits of arm1.motor run from 1.65806 to -0.785398 rad; the first value must be "
+            "smaller"
+        ),
     ),
     "drive mistyped": (
         ("actuated: q", "actuated: w"),

@@ -406,7 +406,7 @@ def test_a_tilted_guide_does_not_turn_the_joint_on_the_carriage() -> None:
     )
 
 
-def test_twenty_seven_parameters_of_the_tracker_have_rank_26_because_pivot_and_first_axis_turn_alike() -> (
+def test_twenty_seven_parameters_of_the_tracker_have_rank_26_because_pivot_and_first_axis_turn_alike() -> (  # noqa: E501
     None
 ):
     machine = robot(CASES["RU-PUS-PRS, 27"][0])

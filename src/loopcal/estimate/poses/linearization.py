@@ -283,11 +283,8 @@ def _parameter_columns(
         return np.matmul(white, sum(linked, start=np.zeros(1)))
     if not _is_every_pose(rows, D.shape[1]):
         D = D[:, rows.poses]
-    if len(at.jacobian) == 1:
-        # rounded as in `measure.whiten_rows`: null directions of equal parameters are ties
-        columns = np.matmul(white, np.matmul(at.jacobian, D))
-    else:  # half the products
-        columns = np.matmul(np.matmul(white, at.jacobian), D)
+    # one order of the products for any number of trials: each trial equals its own fit bit for bit
+    columns = np.matmul(white, np.matmul(at.jacobian, D))
     for j, name in enumerate(rows.kind.sensed_joints):
         if name in poses.joints_by_parameters and at.joints is not None:
             slope = poses.joints_by_parameters[name][:, rows.poses, None, :]

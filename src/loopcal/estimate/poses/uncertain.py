@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+# size: the poses of uncertain readings, one algorithm
 """Poses at uncertain readings: errors in variables, every pose is estimated.
 
 A reading of stated sigma is a row like any other, (true - recorded) / sigma, and closure ties pose

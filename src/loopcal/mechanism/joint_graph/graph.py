@@ -16,7 +16,7 @@ from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.typing import FloatArray
 
-RANK_TOLERANCE = 1e-8
+CLOSURE_RANK_TOLERANCE = 1e-8
 """Singular value of the closures, relative to the largest, that counts as zero [1]."""
 
 CLOSED = 1e-13
@@ -133,7 +133,7 @@ class JointGraph:
         if not len(rows):
             return np.eye(len(self.tree))
         _, s, V = np.linalg.svd(rows)
-        return V[int((s > RANK_TOLERANCE * s[0]).sum()) :].T
+        return V[int((s > CLOSURE_RANK_TOLERANCE * s[0]).sum()) :].T
 
     def measure_firmness(self, platform: str) -> float:
         """Return how well the motors hold the passive joints and move the platform.
@@ -158,7 +158,7 @@ class JointGraph:
             if np.abs(residual).max(initial=0.0) < CLOSED:
                 return graph
             step = np.zeros(len(free))
-            step[free] = np.linalg.lstsq(rows[:, free], -residual, rcond=RANK_TOLERANCE)[0]
+            step[free] = np.linalg.lstsq(rows[:, free], -residual, rcond=CLOSURE_RANK_TOLERANCE)[0]
             step *= min(1.0, SPREAD / max(float(np.abs(step).max()), 1e-300))
             values = {j.name: graph.values[j.name] + step[i] for i, j in enumerate(self.tree)}
             graph = replace(graph, values=values)

@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's equations (9) to (18), many machines at once.
 
-    (14) (p_i - p_0)'(p_1 - p_0) = 0            points i on a plane, the line from p_0 to p_1 perpendicular to it
-    (17) a_i e = c_i                            a_i = d_i'(J_1 - J_0) + d_1'(J_i - J_0),  c_i = -d_i'd_1
+    (14) (p_i - p_0)'(p_1 - p_0) = 0
+         points i on a plane, the line from p_0 to p_1 perpendicular to it
+    (17) a_i e = c_i
+         a_i = d_i'(J_1 - J_0) + d_1'(J_i - J_0),  c_i = -d_i'd_1
     (18) e = (A'A)^-1 A'c, again and again
 
 with d_i = p_i - p_0 by forward kinematics at the present parameters and J_i their slopes. The frame
-of the coordinate measuring machine has dropped out. Points of a group share p_0 and p_1, so their
+of the coordinate measuring machine cancels. Points of a group share p_0 and p_1, so their
 rows are correlated: noise dp of the points moves row i by B dp,
 
     d(d_i'd_1) = d_1'dp_i + d_i'dp_1 - (d_1 + d_i)'dp_0
 
 and the covariance of the rows is B S B'. The paper gives every row weight one. A'A is singular, see
-gauge.py: least squares here is that of `loopcal.calibrate`, which takes the smallest deviation
-along what no row tells. Derivation, and why this equals surfaces as unknowns:
+gauge.py: least squares here takes the smallest deviation along unobservable directions. Derivation, and why this equals surfaces as unknowns:
 docs/theory/constraint.md.
 """
 
