@@ -187,8 +187,8 @@ def own_truth(
 ) -> dict[str, float]:
     """True values of the unknowns of an instrument, drawn evenly about the stated ones."""
     sensors = [sensor.assign_rows(poses) for sensor in looking.with_tool(robot).sensors]
-    # type: ignore[arg-type]
-    table = collect_nuisance_parameters(sensors, tuple(map(str, range(poses)))).table
+    labels = tuple(map(str, range(poses)))
+    table = collect_nuisance_parameters(sensors, labels).table  # type: ignore[arg-type]
     reach = np.array([REACH[p.dimension] for p in table.entries])
     drawn = rng.uniform(-reach, reach)
     drawn = np.where(
@@ -321,7 +321,7 @@ class Coverage:
 def cover(
     case: Case, fits: int = FITS, noise: type[Gaussian] = Gaussian, seed: int = SEED
 ) -> Coverage:
-    """Simulate machines drawn from their tolerances, identify by MAP, and compare with the truth."""
+    """Simulate machines drawn from their tolerances, identify by MAP and compare with the truth."""
     robot, rng = machine(case), np.random.default_rng(seed)
     coordinates = _commanded(case.robot, seed)[:POSES]
     looking = instrument(case.kind, POSES, noise)
@@ -377,7 +377,7 @@ def with_most_unknowns(robots: tuple[str, ...] = ROBOTS) -> tuple[Case, ...]:
 
 
 def _recovery_rows() -> list[list[object]]:
-    """Return a row for each setting: rank and largest error on each robot, or neither if refused."""
+    """Return a row for each setting: rank and largest error on each robot, none if refused."""
     rows: dict[int, list[object]] = {}
     each = len(cases(ROBOTS[:1]))
     for i, case in enumerate(cases()):

@@ -16,14 +16,10 @@ from loopcal.io import load_measurements, load_robot
 from tests.cable_robot import NAMES, TRUTH, real, samples_text
 from tests.cli.printed_tables import read_table_rows
 
-<<<<<<< HEAD
 REAL = (
     "import hp.json --format hangprinter -o robot.yaml --data samples.csv --sigma-line 0.6mm "
     "--sigma-position 0.6mm"
 )
-=======
-REAL = "import hp.json --format hangprinter -o robot.yaml --data samples.csv --sigma-line 0.6mm --sigma-position 0.6mm"  # noqa: E501
->>>>>>> 6e5a5c0 (Lines, sizes and names of tolerances; one order of products for any number of trials)
 CALIBRATE = "calibrate robot.yaml samples.csv -o run --method ls"
 
 

@@ -282,6 +282,7 @@ def test_planes_that_share_a_probe_cost_twice_as_much_where_there_are_twice_as_m
         # three numbers of a plane, three of the probe, the machine, the residual; dense it were 3 *
         # groups + 46
         assert counted["widest"] == 3 + 3 + 42 + 1
+        assert own is not None
         assert int(own.elimination.tree.width.max()) == 6
         found.append((counted["rows"], counted["kept"]))
     one, two, four = np.array(found)

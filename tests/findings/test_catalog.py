@@ -34,7 +34,7 @@ def modules() -> dict[str, ast.Module]:
     }
 
 
-def reports() -> Iterator[tuple[str, str, set[str | None]]]:
+def reports() -> Iterator[tuple[str, str, set[str]]]:
     """Return place, code and names of data of every `report_finding` with a literal code."""
     for name, tree in modules().items():
         for node in ast.walk(tree):
@@ -43,8 +43,8 @@ def reports() -> Iterator[tuple[str, str, set[str | None]]]:
             called = getattr(node.func, "id", getattr(node.func, "attr", ""))
             code = node.args[0]
             if called == "report_finding" and isinstance(code, ast.Constant):
-                given = {keyword.arg for keyword in node.keywords} - {"severity"}
-                yield f"{name}:{node.lineno}", code.value, given
+                given = {keyword.arg or "" for keyword in node.keywords} - {"severity"}
+                yield f"{name}:{node.lineno}", str(code.value), given
 
 
 def test_every_reported_code_is_in_the_catalog_with_exactly_its_data():

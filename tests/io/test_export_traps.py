@@ -271,7 +271,7 @@ BAD = {
     "a sigma of nothing": ("  z:", "  sigma.w: {from: C, unit: mm}\n  z:", 7, ("'sigma.w' is not a "
                                                                               "column .*did you "
                                                                               "mean 'sigma")),
-    "another unit in the header": ("from: X, unit: mm", '"from": "X [m]", unit: mm', 5, ("header is "
+    "another unit in the header": ("from: X, unit: mm", '"from": "X [m]", unit: mm', 5, ("header is "  # noqa: E501
                                                                                         "'X .m.', but")),  # noqa: E501
     "degrees in the header": ("from: X, unit: mm", '"from": "X (°)", unit: mm', 5, ("write the "
                                                                                     "unit "

@@ -20,9 +20,9 @@ from loopcal.estimate.methods.prior_conflict import PriorConflict as PriorConfli
 from loopcal.estimate.methods.regularization_rules import GCV as GCV
 from loopcal.estimate.methods.regularization_rules import MarginalLikelihood as MarginalLikelihood
 from loopcal.estimate.methods.regularization_rules import TruncationGCV as TruncationGCV
-from loopcal.estimate.minimization.descent import DescentStatus as DescentStatus
 from loopcal.estimate.minimization.descent import StepControl as StepControl
 from loopcal.estimate.options import FitOptions as FitOptions
 from loopcal.estimate.recalibration import Change as Change
 from loopcal.estimate.recalibration import recalibrate as recalibrate
 from loopcal.estimate.result import Identification as Identification
+from loopcal.numerics.gauss_newton import DescentStatus as DescentStatus

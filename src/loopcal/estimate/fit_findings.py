@@ -8,9 +8,9 @@ import numpy as np
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import MAP, Method
-from loopcal.estimate.minimization.descent import DescentStatus
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements
+from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.typing import FloatArray
 
 FAR = 10.0

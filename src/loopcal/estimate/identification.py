@@ -27,7 +27,7 @@ from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method, adapt_method
 from loopcal.estimate.methods.prior_conflict import PriorConflict, assess_prior_conflict
 from loopcal.estimate.minimization.closure_start import descend_from_closure, report_unused_closure
-from loopcal.estimate.minimization.descent import Descent, DescentStatus, descend
+from loopcal.estimate.minimization.descent import Descent, descend
 from loopcal.estimate.minimization.robust_descent import Run, descend_robustly
 from loopcal.estimate.nuisance.estimate import (
     NuisanceEstimate,
@@ -51,6 +51,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, Trials, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition
+from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 

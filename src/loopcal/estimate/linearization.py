@@ -56,11 +56,13 @@ class Linearization:
         """Return the trials of all parts, one after the other."""
         if len(parts) == 1:
             return parts[0]
-        names = ("deviation", "factor", "cost", "equations")
         nuisance = [part.nuisance for part in parts if part.nuisance is not None]
         poses = [part.poses for part in parts if part.poses is not None]
         return Linearization(
-            *(np.concatenate([getattr(part, name) for part in parts]) for name in names),
+            np.concatenate([part.deviation for part in parts]),
+            np.concatenate([part.factor for part in parts]),
+            np.concatenate([part.cost for part in parts]),
+            np.concatenate([part.equations for part in parts]),
             Start.join([part.next_start for part in parts]),
             EliminatedNuisance.join(nuisance) if nuisance else None,
             PoseEstimates.join(poses) if poses else None,

@@ -17,12 +17,12 @@ from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.inference.residual_test import LEVEL, ResidualTest, coverage_factor
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.methods.prior_conflict import PriorConflict
-from loopcal.estimate.minimization.descent import DescentStatus
 from loopcal.estimate.nuisance.estimate import NuisanceEstimate
 from loopcal.estimate.options import FitOptions
 from loopcal.estimate.poses.estimate import EstimatedPoses
 from loopcal.findings import Finding
 from loopcal.mechanism import Mechanism
+from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.typing import FloatArray
 
 

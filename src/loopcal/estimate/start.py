@@ -108,9 +108,11 @@ class Start:
             return parts[0]
         poses = [part.poses for part in parts if part.poses is not None]
         motions = [part.motion for part in parts if part.motion is not None]
-        names = ("deviation", "nuisance", "slope", "first_nuisance")
         return Start(
-            *(np.concatenate([getattr(part, name) for part in parts]) for name in names),
+            np.concatenate([part.deviation for part in parts]),
+            np.concatenate([part.nuisance for part in parts]),
+            np.concatenate([part.slope for part in parts]),
+            np.concatenate([part.first_nuisance for part in parts]),
             PoseStates.join(poses, 0) if poses else None,
             np.concatenate(motions) if motions else None,
         )

@@ -163,9 +163,14 @@ class TreeElimination:
 
     def take(self, trials: IntArray) -> TreeElimination:
         """Return some trials."""
-        arrays = (self.slope, self.shift, self.rank, self.is_unobservable)
-        nodes = tuple(node.take(trials) for node in self.nodes)
-        return TreeElimination(self.tree, *(array[trials] for array in arrays), nodes)
+        return TreeElimination(
+            self.tree,
+            self.slope[trials],
+            self.shift[trials],
+            self.rank[trials],
+            self.is_unobservable[trials],
+            tuple(node.take(trials) for node in self.nodes),
+        )
 
     @staticmethod
     def join(parts: Sequence[TreeElimination]) -> TreeElimination:
@@ -185,8 +190,14 @@ class TreeElimination:
             )
             for one in zip(*(part.nodes for part in parts), strict=True)
         )
-        names = ("slope", "shift", "rank", "is_unobservable")
-        return TreeElimination(parts[0].tree, *(joined(name) for name in names), nodes)
+        return TreeElimination(
+            parts[0].tree,
+            joined("slope"),
+            joined("shift"),
+            joined("rank"),
+            joined("is_unobservable"),
+            nodes,
+        )
 
 
 def eliminate_tree(factors: NodeFactors) -> tuple[TreeElimination, FloatArray]:

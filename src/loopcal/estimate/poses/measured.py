@@ -89,8 +89,9 @@ class _Point:
     def take(self, chosen: IntArray) -> _Point:
         """Return some poses."""
         state = self.state and map_states(lambda array: array[:, chosen], self.state)
-        arrays = (self.T, self.trial, self.number, self.cost)
-        return _Point(*(array[chosen] for array in arrays), state)
+        return _Point(
+            self.T[chosen], self.trial[chosen], self.number[chosen], self.cost[chosen], state
+        )
 
     def put(self, chosen: IntArray, other: _Point) -> _Point:
         """Return these poses with some taken from another value."""
@@ -113,9 +114,15 @@ class _FullStep:
 
     def take(self, chosen: np.ndarray) -> _FullStep:
         """Return some poses."""
-        arrays = (self.T, self.twist, self.length, self.is_full, self.is_closed)
         state = self.state and map_states(lambda array: array[:, chosen], self.state)
-        return _FullStep(*(array[chosen] for array in arrays), state)
+        return _FullStep(
+            self.T[chosen],
+            self.twist[chosen],
+            self.length[chosen],
+            self.is_full[chosen],
+            self.is_closed[chosen],
+            state,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,8 +34,13 @@ class PoseEstimates:
 
     def take(self, trials: IntArray) -> PoseEstimates:
         """Return some trials."""
-        arrays = (self.is_reached, self.rank, self.is_undetermined, self.is_converged)
-        return PoseEstimates(self.states.take(trials), *(array[trials] for array in arrays))
+        return PoseEstimates(
+            self.states.take(trials),
+            self.is_reached[trials],
+            self.rank[trials],
+            self.is_undetermined[trials],
+            self.is_converged[trials],
+        )
 
     @staticmethod
     def join(parts: Sequence[PoseEstimates]) -> PoseEstimates:

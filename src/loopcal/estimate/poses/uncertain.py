@@ -414,8 +414,9 @@ def _keep_still(solved: PoseStates, before: PoseStates, is_still: BoolArray) -> 
 
     Solved again, they could end on another branch.
     """
-    chosen = np.nonzero(is_still)
-    if not len(chosen[0]):
+    rows, poses = np.nonzero(is_still)
+    if not len(rows):
         return solved
+    chosen = (rows, poses)
     state = map_states(lambda array: array[chosen], before.state)
     return solved.put(chosen, PoseStates(state, before.q[chosen]))
