@@ -49,7 +49,7 @@ def test_unknown_frames_of_the_hexapod(run, frames, rank):
 def test_the_reduced_file_is_written_and_whole(run, tmp_path):
     code, out, _ = run("hexapod-42 --frames base --reduce -o smaller.yaml")
     assert code == 0
-    assert "36 of 42 parameters carry all information" in out
+    assert "36 of 42 parameters contain all information" in out
     assert out.count("Fix leg") == 6
     assert load_robot(tmp_path / "smaller.yaml").parameters.free.sum() == 36
     assert json.loads(run("smaller.yaml --frames base --json")[1])["rank"] == 36

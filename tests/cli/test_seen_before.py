@@ -26,12 +26,10 @@ def test_validate_refuses_fitted_rows_in_another_file_and_accepts_held_out_ones(
     assert main(["validate", "run", "part.csv"]) == 1
     out, err = capsys.readouterr()
     assert out == ""
-    assert err.startswith("loopcal: 8 of 8 rows belong to the data of this calibration (poses ")
+    assert err.startswith("loopcal: The calibration used 8 of 8 rows (poses ")
     assert "--allow-fitted-data" in err
     assert main(["validate", "run", "part.csv", "--allow-fitted-data"]) == 0
     assert main(["validate", "run", "rest.csv"]) == 0
     assert capsys.readouterr().err == ""
     assert main(["validate", "run", "mixed.csv"]) == 0
-    assert capsys.readouterr().err.startswith(
-        "loopcal: note: 2 of 12 rows belong to the data of this calibration"
-    )
+    assert capsys.readouterr().err.startswith("loopcal: note: The calibration used 2 of 12 rows")

@@ -7,10 +7,13 @@ import subprocess
 import sys
 
 from loopcal.cli import terminal
-from loopcal.cli.hints import HINTS, hint_for
+from loopcal.cli.calibration_commands import calibrate, validate
+from loopcal.cli.hints import HINTS, find_hint, hint_for
 from loopcal.findings import report_finding
 from loopcal.findings.catalog import CATALOG
+from loopcal.findings.catalog.prior import MACHINE
 from loopcal.findings.importance import IMPORTANCE, sort_by_importance
+from loopcal.report.calibration_view import no_hint, with_hint
 
 WORK = """
 import sys, time
@@ -32,6 +35,30 @@ def test_a_hint_names_the_poses_of_its_finding():
     step = report_finding("workflow.next-check-outliers", poses=("pose 6", "pose 9"))
     assert hint_for(step) == "use --drop 6 --drop 9, or --loss huber"
     assert hint_for(report_finding("workflow.next-use-result")) is None
+
+
+def test_a_hint_is_only_for_commands_that_have_its_options():
+    code = "outliers.some"
+    assert find_hint(code, calibrate) == "use --drop POSE, or --loss huber"
+    assert find_hint(code, validate) is None
+    assert find_hint("workflow.next-check-data", validate) is not None
+
+
+def test_a_change_of_a_freed_limb_has_no_hint_to_free_it():
+    data = {"chi_square": 99.0, "degrees": 7.0, "p_value": 1e-9, "tried": False}
+    data |= {"parameter": None, "change": None}
+    machine, limb = (
+        report_finding("prior.machine-changed", subject=subject, **data)
+        for subject in (MACHINE, "leg3")
+    )
+    assert hint_for(machine) == "use --free-limb LIMB"
+    assert hint_for(limb) is None
+
+
+def test_a_hint_stands_behind_its_finding():
+    finding = report_finding("workflow.no-held-out-poses")
+    assert with_hint(finding, hint_for).endswith(" (Hint: use --hold-out 0.25)")
+    assert with_hint(finding, no_hint) == str(finding)
 
 
 def test_failures_come_first_and_infos_last():

@@ -122,5 +122,5 @@ def test_a_finding_with_missing_data_or_an_unknown_code_is_our_mistake():
 def test_an_error_made_from_a_finding_has_its_code_and_its_text():
     error = EstimationError(report_finding("fit.no-measured-value"))
     assert error.code == "fit.no-measured-value"
-    assert str(error).startswith("No measured value counts")
+    assert str(error).startswith("The data contain no usable measured value")
     assert EstimationError("a sentence").code is None

@@ -28,7 +28,7 @@ from loopcal.cli.options import (
 from loopcal.errors import DataError
 
 
-@click.command(short_help="Identify the parameters of a robot, validate and judge them.")
+@click.command(short_help="Identify the parameters of a robot and validate them.")
 @robot_argument
 @data_argument
 @click.option("-o", "--output", required=True, type=FILE, help="Run folder to make.")
@@ -51,12 +51,13 @@ from loopcal.errors import DataError
     "--prior",
     type=FILE,
     metavar="RUN",
-    help="Run folder of an earlier calibration of this machine, whose knowledge is kept.",
+    help="Run folder of an earlier calibration of this machine, which is used as the prior.",
 )
 @click.option(
     "--free-limb",
     metavar="LIMB",
-    help="With --prior: a limb that was repaired, such as leg3, which starts again.",
+    help="With --prior: a limb that was repaired, such as leg3, whose parameters return to nominal "
+    "with their tolerances.",
 )
 @limit_options
 @seed_option("the choice of held-out poses")
@@ -268,8 +269,8 @@ def compensate(
     force: bool,
     as_json: bool,
 ) -> int:
-    """Compute what to tell the machine of RUN so that it reaches TARGETS, a CSV file of controlled
-    coordinates.
+    """Compute readings or commands with which the machine of RUN reaches TARGETS, a CSV file of
+    controlled coordinates.
 
     RUN is a run folder, or a robot file (then no uncertainty is known). Each target states the
     error before and after compensation, what no actuator can correct, and its uncertainty.
@@ -288,6 +289,7 @@ def compensate(
     from loopcal.io.runs.calibration_run import load_posterior_or_robot
     from loopcal.io.runs.compensation_file import format_compensation, load_targets
     from loopcal.mechanism import Mechanism
+    from loopcal.report.calibration_view import with_hint
     from loopcal.report.compensation_view import view_compensation
 
     inputs = (run, targets, None if controller is None else Path(controller))
@@ -307,7 +309,7 @@ def compensate(
     else:
         terminal.print_page([*view_compensation(result), "", f"Written to {output}"])
     return terminal.print_failures(
-        f"target {label!r} {result.findings[i]}"
+        f"target {label!r} {with_hint(result.findings[i], hint_for)}"
         for i, label in enumerate(labels)
         if not result.usable[i]
     )

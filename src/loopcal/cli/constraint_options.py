@@ -59,8 +59,8 @@ class ConstraintArguments:
             for name in ("facing", "cone", "nearest", "farthest"):
                 if is_given(name):
                     raise DataError(
-                        f"--{name} belongs to a line of sight; state where the instrument stands, "
-                        "with --seen-from"
+                        f"--{name} belongs to a line of sight; state the position of the "
+                        "instrument with --seen-from"
                     )
             return Constraints(self.min_margin, self.max_tilt)
         sight = LineOfSight(

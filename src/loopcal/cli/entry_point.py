@@ -84,10 +84,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # these variables decides.
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    command = commands.commands.get(words[0]) if words else None
     notes, logger = _NoteHandler(), logging.getLogger("loopcal")
     logger.addHandler(notes)
     try:
-        code = commands.main(arguments, prog_name="loopcal", standalone_mode=False)
+        code = commands.main(words, prog_name="loopcal", standalone_mode=False)
         sys.stdout.flush()
         return code if isinstance(code, int) else 0
     except click.exceptions.NoArgsIsHelpError as error:
@@ -96,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except click.ClickException as error:
         return _refuse(error.format_message())
     except LoopcalError as error:
-        return _refuse(str(error), find_hint(error.code))
+        return _refuse(str(error), find_hint(error.code, command))
     except (KeyboardInterrupt, click.exceptions.Abort):
         return _refuse("stopped before the end; no result was written.")
     except BrokenPipeError:

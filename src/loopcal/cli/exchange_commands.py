@@ -3,19 +3,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from loopcal.cli import terminal
+from loopcal.cli.hints import hint_for
 from loopcal.cli.options import FILE, LENGTH, force_option, json_option
 from loopcal.errors import DataError
 from loopcal.units import Dimension, list_symbols
 
 if TYPE_CHECKING:
     from loopcal.estimate import Identification
+    from loopcal.findings import Finding
     from loopcal.io.formats.program_format import Format, Imported, ImportOptions
     from loopcal.mechanism import Mechanism
     from loopcal.report.text_page import Block
@@ -162,10 +164,10 @@ def import_(
     imported = read(file, _make_import_options(source, output.stem, settings))
     with restore_on_failure((output, data)):
         robot = save_imported(file, imported, output, data)
-        notes = [str(finding) for finding in imported.findings]
+        noted = list(imported.findings)
         if source.stores_fit and imported.measurements is not None:
             stored = compare_stored_geometry(robot, imported.measurements)
-            notes += [] if stored is None else [str(stored)]
+            noted += [] if stored is None else [stored.finding]
         fit = changes = None
         if corrected is not None and data is not None:
             fit, changes = _correct_file(source, robot, file, data, corrected)
@@ -173,13 +175,13 @@ def import_(
         "robot": output,
         "data": data,
         "corrected": corrected,
-        "notes": notes,
+        "notes": [str(finding) for finding in noted],
         "findings": imported.findings,
     }
     if as_json:
         terminal.print_json({**document, "fit": fit, "changes": changes})
     else:
-        terminal.print_page(_view_import(robot, document, fit, changes or ()))
+        terminal.print_page(_view_import(robot, document, noted, fit, changes or ()))
     if fit is None or fit.converged:
         return 0
     return terminal.print_failures(
@@ -202,6 +204,7 @@ def _convert_export(file: Path, profile: Path, output: Path, force: bool, as_jso
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
     from loopcal.io.exports import convert_export, read_profile
+    from loopcal.report.calibration_view import with_hint
 
     common = {"file", "profile", "output", "force", "as_json"}
     for parameter in click.get_current_context().command.params:
@@ -232,7 +235,7 @@ def _convert_export(file: Path, profile: Path, output: Path, force: bool, as_jso
         return
     page = [
         f"{output}: {converted.rows} rows; {converted.passed} lines skipped as the profile states",
-        *(f"note: {finding}" for finding in converted.findings),
+        *(f"note: {with_hint(finding, hint_for)}" for finding in converted.findings),
         *(
             f"note: {file}:{line} does not match: {reason}"
             for line, reason in converted.misfits[:SHOWN]
@@ -274,17 +277,21 @@ def _correct_file(
 
 
 def _view_import(
-    robot: Mechanism, document: dict[str, Any], fit: Identification | None, changes: tuple[str, ...]
+    robot: Mechanism,
+    document: dict[str, Any],
+    noted: Sequence[Finding],
+    fit: Identification | None,
+    changes: tuple[str, ...],
 ) -> list[Block]:
     """Return what was read, what was identified, and which lines were changed."""
-    from loopcal.report.calibration_view import view_fit
+    from loopcal.report.calibration_view import view_fit, with_hint
 
     n, free = len(robot.parameters), int(robot.parameters.free.sum())
     counts = f"{len(robot.actuators)} actuators, {n} parameters, {free} free"
     page: list[Block] = [f"{document['robot']}: {counts}"]
     if document["data"] is not None:
         page.append(f"{document['data']}: the measurements of the file")
-    page += [f"note: {note}" for note in document["notes"]]
+    page += [f"note: {with_hint(finding, hint_for)}" for finding in noted]
     if fit is None:
         data = document["data"] or "DATA"
         return [*page, f"Next: loopcal calibrate {document['robot']} {data} -o run"]
@@ -330,6 +337,7 @@ def export(
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
     from loopcal.io.formats.import_export import choose_format, export_robot, load_source
+    from loopcal.report.calibration_view import with_hint
 
     target = choose_format(output, format_name)
     refuse_outputs((output,), (Path(source),), force)  # the file of --into may be corrected
@@ -340,4 +348,5 @@ def export(
         document = {"output": output, "format": target.name, "notes": notes}
         terminal.print_json(document)
         return
-    terminal.print_page([*map(str, exported.findings), f"Written to {output}"])
+    noted = [with_hint(finding, hint_for) for finding in exported.findings]
+    terminal.print_page([*noted, f"Written to {output}"])

@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the code of a finding or an error to the command-line option that helps.
 
-Messages of the library do not know the command line. `main` and the views add these hints.
+Messages of the library do not know the command line. `main` and the views add these hints. A hint
+that names an option is only for commands that have the option.
 """
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
+
+import click
 
 if TYPE_CHECKING:
     from loopcal.findings import Finding
@@ -20,7 +24,7 @@ HINTS = {
     "outliers.some": "use --drop POSE, or --loss huber",
     "files.output-exists": "use --force to replace it",
     "files.folder-in-use": "use --force to replace it",
-    "files.noise-missing": "calibrate with --noise estimated",
+    "files.groups-in-plan": "use --kind and the sigmas instead of --like",
     "files.format-unknown": "use --format NAME",
     "files.format-takes-no-file": "leave out --into",
     "files.no-measurements": "leave out --data and --corrected",
@@ -59,10 +63,12 @@ HINTS = {
     "plan.too-few-equations": "use more --poses",
     "plan.too-few-groups": "use more --groups or --points",
     "plan.too-few-held-out": "use a smaller --hold-out, or more --candidates",
+    "plan.weak-certificate": "use another --seed, or more --poses",
     "plan.workspace-excluded": "relax --min-margin, --max-tilt or --seen-from",
     "workflow.limit-needs-held-out-poses": "add --hold-out 0.25",
     "workflow.next-hold-out": "use --hold-out 0.25, or loopcal validate RUN OTHER-DATA",
     "workflow.no-held-out-poses": "use --hold-out 0.25",
+    "workflow.undetermined-combinations": "see loopcal identifiability ROBOT DATA",
     "workflow.few-held-out-poses": "use a larger --hold-out",
     "workflow.free-limb-needs-prior": "add --prior RUN",
     "workflow.option-excludes-prior": "leave out --method, --loss and --choose-model",
@@ -74,23 +80,48 @@ HINTS = {
     "workflow.next-measure-more": "use --choose-model to free fewer parameters, or loopcal plan",
     "workflow.next-resolve-warnings": "use --verbose for all findings, loopcal validate for other "
     "data",
+    "compensation.not-converged": "use more --steps, or --mode readings",
     "validation.rows-reused": "use --allow-fitted-data to accept them",
     "validation.file-reused": "use --allow-fitted-data to accept it",
     "validation.setup-moved": "use --refit NAME",
 }
 """Code -> advice, in the imperative."""
 
+OPTION = re.compile(r"--[a-z][a-z-]*")
+"""An option in a hint."""
 
-def find_hint(code: str | None) -> str | None:
-    """Return the hint for a code; None where there is none."""
-    return None if code is None else HINTS.get(code)
+
+def find_hint(code: str | None, command: click.Command | None) -> str | None:
+    """Return the hint for a code; None where there is none for this command."""
+    hint = None if code is None else HINTS.get(code)
+    return hint if hint is not None and _has_options(command, hint) else None
 
 
 def hint_for(finding: Finding) -> str | None:
-    """Return the hint for a finding, with the names it contains."""
+    """Return the hint for a finding, with the names it contains, for the command that runs."""
+    context = click.get_current_context(silent=True)
+    command = None if context is None else context.command
+    hint = find_hint(finding.code, command)
+    if hint is None or _is_limb_freed(finding):
+        return None
     if finding.code == "workflow.next-check-outliers":
         poses = [str(label).removeprefix("pose ") for label in finding.data["poses"]]
         return f"use {' '.join(f'--drop {pose}' for pose in poses)}, or --loss huber"
     if finding.code == "validation.setup-moved":
         return f"use {' '.join(f'--refit {name}' for name in finding.data['names'])}"
-    return find_hint(finding.code)
+    return hint
+
+
+def _is_limb_freed(finding: Finding) -> bool:
+    """Return whether a finding reports a change of a limb that the fit has freed already."""
+    from loopcal.findings.catalog.prior import MACHINE
+
+    return finding.code == "prior.machine-changed" and finding.data["subject"] != MACHINE
+
+
+def _has_options(command: click.Command | None, hint: str) -> bool:
+    """Return whether a command has every option in a hint; True where no command is known."""
+    if command is None:
+        return True
+    known = {name for parameter in command.params for name in parameter.opts}
+    return known.issuperset(OPTION.findall(hint))

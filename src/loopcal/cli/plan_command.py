@@ -14,6 +14,7 @@ import click
 
 from loopcal.cli import terminal
 from loopcal.cli.constraint_options import ConstraintArguments, Goal, constraint_options
+from loopcal.cli.hints import hint_for
 from loopcal.cli.instrument_options import (
     DESCRIPTION,
     instrument_options,
@@ -73,7 +74,7 @@ EXCLUDED_BY_PLANE_LINE = {
     type=click.Choice(("I", "D")),
     default="I",
     show_default=True,
-    help="What the plan makes small: I the mean predicted variance of poses, D the uncertainty of "
+    help="What the plan minimizes: I the mean predicted variance of poses, D the uncertainty of "
     "the parameters.",
 )
 @click.option(
@@ -191,6 +192,7 @@ def plan(
     terminal.print_page(
         [
             str(result),
+            *(f"Hint: {hint}" for finding in result.findings if (hint := hint_for(finding))),
             "",
             f"Written to {output}: {files}",
             f"Next: loopcal calibrate {shlex.quote(robot)} {data} -o run",
@@ -321,7 +323,8 @@ def _refuse_beside_plane_line() -> None:
         reason = EXCLUDED_BY_PLANE_LINE.get(option.name or "")
         if reason is not None and is_given(option.name or ""):
             raise DataError(
-                f"{option.opts[-1]} does not go with --measure plane-line, {reason}; leave it out"
+                f"{option.opts[-1]} cannot be combined with --measure plane-line, {reason}; "
+                "leave it out"
             )
 
 

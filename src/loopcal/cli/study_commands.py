@@ -32,7 +32,7 @@ HEADING = 18
     metavar="FOLDER",
     help="Folder for a page, all tables (CSV, JSON) and figures (PNG).",
 )
-@click.option("--seed", default=0, show_default=True, help="Seed of everything random.")
+@click.option("--seed", default=0, show_default=True, help="Seed of all random choices.")
 @click.option(
     "--trials",
     type=int,

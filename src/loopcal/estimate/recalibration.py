@@ -27,6 +27,7 @@ from loopcal.estimate.methods.penalties import LeastSquares
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
+from loopcal.findings.catalog.prior import MACHINE
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.serialization import json_fields
@@ -37,9 +38,6 @@ MOST_TRIED = 60
 
 EXPLAINED = 0.5
 """A single parameter explains a change if freeing it leaves less than this share of chi-square."""
-
-MACHINE = "the machine"
-"""Subject of a change where no limb is in question."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +203,7 @@ def _used_prior(robot: Mechanism, prior: Prior, limb: str | None, names: tuple[s
 
 
 def _check_options(options: FitOptions) -> FitOptions:
-    """Return options for fits with an earlier calibration; refuse what does not go with it."""
+    """Return options for fits with an earlier calibration; refuse those that contradict it."""
     if options.method is not None and not isinstance(options.method, LeastSquares):
         raise EstimationError(
             f"method is {options.method!r}; recalibration uses LeastSquares(), because the earlier "

@@ -34,6 +34,12 @@ def no_hint(_: Finding) -> None:
     """Return no advice."""
 
 
+def with_hint(finding: Finding, hint: Hint) -> str:
+    """Return the text of a finding, with its advice in parentheses where there is any."""
+    advice = hint(finding)
+    return str(finding) if advice is None else f"{finding} (Hint: {advice})"
+
+
 def view_calibration(
     report: CalibrationReport, verbose: bool = False, hint: Hint = no_hint
 ) -> list[Block]:
@@ -46,7 +52,7 @@ def view_calibration(
     rows = fit.to_dict()
     blocks: list[Block] = [report.headline, *_view_errors(report)]
     shown = report.findings if verbose else report.top_findings
-    blocks += ["", *format_list([(f.severity.value, str(f)) for f in shown])]
+    blocks += ["", *format_list([(f.severity.value, with_hint(f, hint)) for f in shown])]
     if len(shown) < len(report.findings):
         blocks.append(f"  ({len(report.findings) - len(shown)} more findings in the full report)")
     blocks += ["", f"Next: {report.next_step}"]

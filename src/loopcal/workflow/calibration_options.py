@@ -67,7 +67,7 @@ class CalibrationOptions:
             self._check_prior()
 
     def _check_prior(self) -> None:
-        """Refuse options that do not go with an earlier calibration."""
+        """Refuse options that cannot be combined with an earlier calibration."""
         chosen = {
             "method": self.fit.method is not None,
             "loss": self.fit.loss is not None,

@@ -25,14 +25,15 @@ def _word_setup_moved(data: Mapping[str, Any]) -> str:
 def _word_few_rows(data: Mapping[str, Any]) -> str:
     measure = "measures" if data["count"] == 1 else "measure"
     return fill_template(
-        f"Only {{count:count row}} {measure} {{quantity}}: too few to judge its error.", **data
+        f"Only {{count:count row}} {measure} {{quantity}}: too few to estimate its error.", **data
     )
 
 
 def _word_reused_rows(data: Mapping[str, Any]) -> str:
+    poses = "pose" if len(data["poses"]) == 1 else "poses"
     return fill_template(
-        "{count} of {total:count row} belong to the data of this calibration (poses {poses:list}). "
-        "They are no independent validation.",
+        f"The calibration used {{count}} of {{total:count row}} ({poses} {{poses:list}}), so this "
+        "is not an independent validation. Validate with other measurements.",
         **data,
     )
 
@@ -56,7 +57,8 @@ ENTRIES = (
     Entry(
         "validation.unreachable-poses",
         Severity.WARNING,
-        "{names:list} not validated: one of the two geometries cannot reach this pose.",
+        "Not validated: {names:list}. With these readings the geometry before or after calibration "
+        "cannot be assembled. Check the readings.",
         "Some poses are outside the reach of the geometry before or after calibration.",
         "Check the readings of these poses.",
     ),
@@ -113,7 +115,8 @@ ENTRIES = (
     Entry(
         "validation.file-reused",
         Severity.REFUSAL,
-        "{file} contains the measurements of this calibration. They are no independent validation.",
+        "{file} contains the measurements of this calibration, so this is not an independent "
+        "validation. Validate with other measurements.",
         "A file for validation is one of the files that the calibration used.",
         "Validate with other measurements.",
     ),
@@ -130,13 +133,15 @@ ENTRIES = (
     Entry(
         "compensation.reached-in-part",
         Severity.INFO,
-        "{names:list} reached; no actuator removes {position} and {orientation}",
+        "{names:list} reached; the actuators cannot correct the remaining {position} and "
+        "{orientation}",
         "The machine has fewer actuators than the target has coordinates.",
     ),
     Entry(
         "compensation.not-converged",
         Severity.FAILURE,
-        "the shifted commands did not converge; allow more steps or set readings",
+        "the shifted commands did not converge; allow more steps, or use readings in place of "
+        "commands",
         "The fixed-point iteration of the commands did not reduce the distance tenfold.",
         "Allow more steps, or use readings instead of commands.",
     ),

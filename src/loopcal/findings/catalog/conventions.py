@@ -42,7 +42,7 @@ SLIPS: Mapping[str, tuple[str, str, Mapping[str, Any]]] = {
     "scalar-last": ("quaternions{of} with the scalar last", "Write the scalar first.", {}),
     "orientation-form": (
         "rotations{of} read as {form}",
-        "State 'orientation: {form}'.",
+        "Write 'orientation: {form}' in the settings of the data file.",
         {"form": "euler-zyx"},
     ),
     "inverted-rotations": (
@@ -281,9 +281,11 @@ ENTRIES = (
         "conventions.target-never-moves",
         Severity.REFUSAL,
         "{target!r} of kind {kind!r} never moves: its readings stay within {moved}, but the robot "
-        "moves it by {expected}. Check that the target is on the platform and the column its own.",
+        "moves it by {expected}. Check that the target is mounted on the platform and that the "
+        "column contains its readings.",
         when="The readings of a target stay within the noise although the robot moves it.",
-        action="Check that the target is on the platform, and that the column is its own.",
+        action="Check that the target is mounted on the platform and that the column contains its "
+        "readings.",
     ),
     *(_slip_entry(slip) for slip in SLIPS),
 )

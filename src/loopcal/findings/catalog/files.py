@@ -12,9 +12,9 @@ from loopcal.findings.wording import Entry, Quantity, fill_template
 IGNORED_KEYS = {
     "springKPerUnitLength": "the stiffness of the lines is not read, so stretch stays in the "
     "residuals",
-    "mover_weight": "the weight of the platform is not read, because forces play no part",
-    "line_lengths_when_at_origin": "the taped lengths at the origin are not read; anchors start "
-    "from the known poses",
+    "mover_weight": "the weight of the platform is not read, because the model contains no forces",
+    "line_lengths_when_at_origin": "the tape-measured lengths at the origin are not read; anchors "
+    "start from the known poses",
 }
 """Keys of samples of a hanging printer that a robot file cannot express."""
 
@@ -80,8 +80,9 @@ ENTRIES: tuple[Entry, ...] = (
     Entry(
         "files.noise-missing",
         Severity.REFUSAL,
-        "no noise is stated for {column!r}; add '{example}' to the settings, or a column {sigma!r} "
-        "(if it is unknown, state a guess and have the noise estimated)",
+        "no noise is stated for {column!r}; add '{example}' to the settings, or a column "
+        "{sigma!r}. If it is unknown, state a guess there and calibrate with the noise "
+        "estimated from the residuals",
         "A measurement file states no standard deviation of a measured value.",
         "State the standard deviation in the settings or in a column.",
     ),
@@ -200,14 +201,14 @@ ENTRIES: tuple[Entry, ...] = (
     Entry(
         "files.probe-offset",
         Severity.INFO,
-        "M851 Z{offset:g}: the height at home is H less this probe offset",
+        "M851 Z{offset:g} is the probe offset; the height at home is H minus this offset",
         "Marlin's file has a probe offset.",
     ),
     Entry(
         "files.marlin-rod-trims",
         Severity.WARNING,
         "rod trims (M665 A, B, C) need Marlin 2.0.6 or later; older versions have one rod length "
-        "and take B for a radius",
+        "and interpret B as a radius",
         "Arms of different length are exported for Marlin.",
         "Use Marlin 2.0.6 or later.",
     ),

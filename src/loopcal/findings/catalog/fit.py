@@ -55,13 +55,23 @@ def _hardly_observable(data: Mapping[str, Any]) -> str:
 
 def _too_few_equations(data: Mapping[str, Any]) -> str:
     kind = "parameters without a tolerance" if data["has_prior"] else "parameters"
-    setup = "{nuisance} of them in frames, targets and the like"
+    setup = "a setup parameter" if data["nuisance"] == 1 else "setup parameters"
+    setup = f", {{nuisance}} of them {setup} (frames, targets, surfaces, offsets)"
     return fill_template(
-        "{equations} equations from {poses:count pose} cannot determine {unknowns} "
+        "{equations:count equation} from {poses:count pose} cannot determine {unknowns} "
         + kind
-        + (f" ({setup})" if data["nuisance"] else "")
+        + (setup if data["nuisance"] else "")
         + ". Measure at least {poses_needed} poses like these (better twice as many), fix "
         "parameters, or state their tolerances and use a method with a prior (MAP).",
+        **data,
+    )
+
+
+def _low_weights(data: Mapping[str, Any]) -> str:
+    which = "this pose" if data["count"] == 1 else "these poses"
+    return fill_template(
+        "{loss} reduced the weight of {count} of {total} poses to less than half: {poses:list}. "
+        f"Check {which}.",
         **data,
     )
 
@@ -141,10 +151,10 @@ ENTRIES = (
     Entry(
         "fit.low-weights",
         Severity.WARNING,
-        "{loss}: {count} of {total} poses have less than half of their weight: {poses:list}. "
-        "Check these poses.",
+        _low_weights,
         when="A loss reduced the weight of poses that lie far from the others.",
         action="Check what went wrong at these poses; correct or exclude them.",
+        example={"loss": "Huber(k=1.345)", "count": 2, "total": 30, "poses": ("6", "9")},
     ),
     Entry(
         "fit.excluded-poses",
@@ -187,7 +197,8 @@ ENTRIES = (
     Entry(
         "fit.no-measured-value",
         Severity.REFUSAL,
-        "No measured value counts: every row is absent or has weight 0. Give at least one.",
+        "The data contain no usable measured value: every row is absent or has weight 0. Fill in "
+        "values, or exclude fewer poses.",
         when="The data contain no usable row.",
         action="Fill in the measured values, or exclude fewer poses.",
     ),
@@ -209,9 +220,9 @@ ENTRIES = (
     Entry(
         "fit.no-equation-left",
         Severity.REFUSAL,
-        "The measured values only determine where the {poses:count pose} were, so nothing is left "
-        "for {unknowns:count parameter}. Measure more at each pose, or state readings that are "
-        "exact (sigma 0).",
+        "The measured values are all needed to determine {poses:count pose}, because the readings "
+        "are uncertain. No equation remains for {unknowns:count parameter}. Measure more values at "
+        "each pose, or state exact readings (sigma 0).",
         when="Readings have a sigma and each pose has no more measured values than coordinates.",
         action="Measure more at each pose, or state readings that can be trusted as exact.",
     ),

@@ -8,6 +8,7 @@ failure.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,9 +18,11 @@ from loopcal.findings.wording import Entry, fill_template
 
 def _word_errors_grew(data: Mapping[str, Any]) -> str:
     template = (
-        "The {quantity} error on held-out poses is {times} times larger after calibration (rms). "
-        "The fit does not generalize: do not use it."
+        "The {quantity} error on held-out poses grew by a factor of {times} (rms). Do not use this "
+        "calibration. Measure more poses, or free fewer parameters."
     )
+    if math.isinf(data["times"]):
+        template = template.replace("by a factor of {times}", "from zero")
     if data["quantity"] == "weighted":
         template = template.replace("{quantity} error", "error divided by sigma")
     return fill_template(template, **data)

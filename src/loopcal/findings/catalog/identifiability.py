@@ -99,8 +99,8 @@ ENTRIES = (
     Entry(
         "identifiability.gap",
         Severity.INFO,
-        "Singular values around the cut: {counted:list} | {cut:list} ({gap:.1e} times below the "
-        "next).",
+        "Smallest singular values that count: {counted:list}. Largest that count as zero: "
+        "{cut:list}, smaller by a factor of {gap:.1e}.",
         when="The data do not determine all parameter combinations.",
     ),
     Entry(
@@ -120,7 +120,7 @@ ENTRIES = (
         "identifiability.frame-moves",
         Severity.INFO,
         _frame_moves,
-        when="A combination of parameters moves a frame as a whole and changes no dimension.",
+        when="A combination of parameters moves a frame rigidly and changes no dimension.",
         action="Nothing, if accuracy relative to that frame matters.",
         example=_MOTION,
     ),
@@ -128,7 +128,7 @@ ENTRIES = (
         "identifiability.both-frames-move",
         Severity.INFO,
         "Equivalent to moving the base and platform frames (gauge freedom)",
-        when="A combination of parameters moves both frames as wholes.",
+        when="A combination of parameters is a rigid motion of both frames.",
         action="Nothing, if accuracy relative to these frames matters.",
     ),
     Entry(
@@ -142,7 +142,7 @@ ENTRIES = (
         "identifiability.measure-also",
         Severity.SUGGESTION,
         _suggestion,
-        when="A further kind of measurement determines a combination that the data leave open.",
+        when="A further kind of measurement determines a combination that these data do not.",
         action="Add this measurement.",
         example={"names": ("a1y", "a2y"), "measurements": _MEASUREMENTS, "poses": 24},
     ),
@@ -150,7 +150,7 @@ ENTRIES = (
         "identifiability.fix-one",
         Severity.SUGGESTION,
         _no_suggestion,
-        when="No tested kind of measurement determines a combination that the data leave open.",
+        when="No tested kind of measurement determines a combination that these data do not.",
         action="Fix one of the parameters at its nominal value.",
         example={"names": ("thB1z",)},
     ),

@@ -65,8 +65,8 @@ def _word_repeated_equations(data: Mapping[str, Any]) -> str:
 
 def _word_distance(data: Mapping[str, Any]) -> str:
     return fill_template(
-        "smallest singular value of closure {margin} m/m, {ratio} of the median; the platform is "
-        f"least constrained in {describe_motion(data['motion'])}",
+        "the smallest singular value of the closure is {margin} m/m, {ratio} of the median; the "
+        f"platform is least constrained in {describe_motion(data['motion'])}",
         **data,
     )
 
@@ -113,7 +113,7 @@ ENTRIES = (
     Entry(
         "kinematics.not-converged",
         Severity.WARNING,
-        "no solution after {iterations:count step}, {gap} open",
+        "no solution after {iterations:count step}: the loops still have a gap of {gap}",
         "Newton's method ran out of steps.",
         "Choose a start closer to the solution.",
     ),
@@ -128,7 +128,7 @@ ENTRIES = (
         "kinematics.other-mode",
         Severity.WARNING,
         "closed, but in another assembly mode than the start",
-        "The solution lies beyond a singularity, seen from the start.",
+        "The solution lies on the other side of a singularity than the start.",
         "Check the row, or choose a start in this mode.",
     ),
     Entry(

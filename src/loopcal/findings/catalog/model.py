@@ -80,7 +80,8 @@ ENTRIES = (
     Entry(
         "model.gain-needs-tolerances",
         Severity.INFO,
-        f"{NOT_COMPARED}: {{missing:count parameter}} have no tolerance. State the tolerances.",
+        f"{NOT_COMPARED}: {{missing:count parameter has/parameters have}} no tolerance. State the "
+        "tolerances in the robot file.",
         when="Parameters without a tolerance have no expected error before calibration.",
         action="State the tolerances in the robot file.",
     ),
@@ -124,7 +125,7 @@ ENTRIES = (
     Entry(
         "model.reduced",
         Severity.INFO,
-        "{kept} of {total} parameters carry all information of these measurements (condition "
+        "{kept} of {total} parameters contain all information of these measurements (condition "
         "{condition}).",
         when="Some parameters have the same effect as combinations of others.",
         action="Fix the others at their nominal values.",

@@ -17,12 +17,16 @@ NOUN = "{blocks:count pose}"
 """Blocks are called poses where each block is one pose, and sets of poses otherwise."""
 
 
-def _blocks(template: str) -> Any:
-    """Return a template in which `poses` means poses, or sets of poses that share rows."""
+def _blocks(template: str, one: str | None = None) -> Any:
+    """Return a template in which `poses` means poses, or sets of poses that share rows.
+
+    `one` is the template for a `count` of 1, where it differs.
+    """
 
     def word(data: Mapping[str, Any]) -> str:
         sets = not data["single_poses"]
-        text = template.replace(
+        chosen = one if one is not None and data["count"] == 1 else template
+        text = chosen.replace(
             ":count pose}", ":count set of poses/sets of poses}" if sets else ":count pose}"
         )
         return fill_template(text.replace("<poses>", "sets of poses" if sets else "poses"), **data)
@@ -49,8 +53,8 @@ def _conflict(data: Mapping[str, Any]) -> str:
         str(block[0]) if len(block) == 1 else f"({list_names(block)})" for block in data["poses"]
     ]
     return fill_template(
-        "Poses {names:list} contradict each other by {factor} times the noise, and the data cannot "
-        "tell which of them is wrong. Measure more poses.",
+        "Poses {names:list} contradict each other by {factor} times the noise. The data cannot "
+        "determine which of them is wrong. Measure more poses, or repeat these.",
         names=names,
         factor=data["factor"],
     )
@@ -73,7 +77,7 @@ ENTRIES = (
             "None of {blocks:count pose} is an outlier, although the residuals exceed the noise: "
             "the misfit is spread over all of them. Check the stated noise and the model."
         ),
-        when="The residuals contradict the stated noise, but no single pose stands out.",
+        when="The residuals contradict the stated noise, but no single pose exceeds its limit.",
         action="Check the stated noise, and whether the model has all necessary parameters.",
         example=_ALL,
     ),
@@ -81,8 +85,10 @@ ENTRIES = (
         "outliers.some",
         Severity.WARNING,
         _blocks(
-            "{count} of {blocks:count pose} do not fit the others (false-alarm rate "
-            "{level:percent}). Check them; then exclude them from the fit or use a robust loss."
+            "Outliers: {count} of {blocks:count pose} (false-alarm rate {level:percent}). Check "
+            "them; then exclude them from the fit or use a robust loss.",
+            one="Outliers: {count} of {blocks:count pose} (false-alarm rate {level:percent}). "
+            "Check it; then exclude it from the fit or use a robust loss.",
         ),
         when="At least one pose does not fit what the others predict.",
         action="Check these poses; then exclude them from the fit or use a robust loss.",
@@ -92,8 +98,8 @@ ENTRIES = (
         "outliers.ambiguous",
         Severity.WARNING,
         _blocks(
-            "{count} of {blocks:count pose} contradict each other, and the data cannot tell which "
-            "of them are wrong. Measure more poses."
+            "{count} of {blocks:count pose} contradict each other. The data cannot determine which "
+            "of them are wrong. Measure more poses, or repeat these."
         ),
         when="Excluding one pose resolves a contradiction as well as excluding another.",
         action="Measure more poses, or repeat the contradicting ones.",
@@ -103,8 +109,10 @@ ENTRIES = (
         "outliers.search-not-converged",
         Severity.WARNING,
         _blocks(
-            "The search for outliers did not converge: {count} of {blocks:count pose} are "
-            "suspected in turn. Measure more poses."
+            "The search for outliers did not converge: suspicion alternates among {count} of "
+            "{blocks:count pose}. Check these <poses>, or measure more.",
+            one="The search for outliers did not converge: {count} of {blocks:count pose} is "
+            "suspected in every other step. Check it, or measure more <poses>.",
         ),
         when="Outliers hide each other, so that the search returns to an earlier state.",
         action="Measure more poses, or check the suspected ones.",

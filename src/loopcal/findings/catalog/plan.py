@@ -304,8 +304,9 @@ REPORTS = (
     Entry(
         "plan.readings-are-measured",
         INFO,
-        "The actuator readings are the measurement: move each point until the held coordinates "
-        "agree, then write down the readings.",
+        "The actuator readings are the measurement: at each point, move the machine until the "
+        "coordinates in the sheet's column 'hold' agree with the sheet. Then record the readings "
+        "in the data file.",
         "Every plan of planes and lines.",
     ),
 )
@@ -368,8 +369,9 @@ REFUSALS = (
     Entry(
         "plan.design-singular",
         REFUSAL,
-        "no {chosen} of the {available} allowed candidates were found that determine all "
-        "{unknowns} unknowns; ask for more poses, or state tolerances as prior knowledge",
+        "the search found no choice of {chosen} of the {available} allowed candidates that "
+        "determines all {unknowns} unknowns; ask for more poses, or state tolerances in the robot "
+        "file",
         "Every design that the search tried leaves directions undetermined.",
         "Ask for more poses, or state tolerances.",
     ),
@@ -415,26 +417,27 @@ REFUSALS = (
     Entry(
         "plan.goal-missed",
         REFUSAL,
-        "{number} {counted} chosen by criterion {criterion} do not reach the error that {expected} "
-        "could; hold out fewer, or use criterion I",
+        "{number} {counted} chosen by criterion {criterion} do not reach the goal, although "
+        "{expected} would suffice by criterion I without held-out poses; hold out fewer, or use "
+        "criterion I",
         "Validation poses or criterion D cost so much that the goal is not reached.",
         "Hold out fewer poses, or use criterion I.",
     ),
     Entry(
         "plan.target-impossible",
         REFUSAL,
-        "no {size} of the {available} allowed candidates bring criterion {criterion} to "
-        "{target:.6g}: the best possible value is {best:.6g}; allow more groups, a less demanding "
-        "target or a better instrument",
+        "no choice of {size} of the {available} allowed candidates reaches {target:.6g} in "
+        "criterion {criterion}: the best possible value is {best:.6g}; allow more groups, a less "
+        "demanding target or a better instrument",
         "The bound of the relaxation shows that no design meets the target.",
         "Allow more groups, or relax the target.",
     ),
     Entry(
         "plan.target-not-reached",
         REFUSAL,
-        "no {size} of the {available} allowed candidates were found that bring criterion "
-        "{criterion} to {target:.6g}: the best has {best:.6g}; allow more groups or a less "
-        "demanding target",
+        "the search found no choice of {size} of the {available} allowed candidates that reaches "
+        "{target:.6g} in criterion {criterion}: the best has {best:.6g}; allow more groups or a "
+        "less demanding target",
         "The search found no design that meets the target, although the bound does not exclude it.",
         "Allow more groups, or relax the target.",
     ),
@@ -525,7 +528,7 @@ REFUSALS = (
         "plan.groups-excluded",
         REFUSAL,
         _with_reasons(
-            "only {allowed} of {total} groups of {points} points satisfy the constraints ({why}); "
+            "the constraints allow only {allowed} of {total} groups of {points} points ({why}); "
             "relax one, narrow the workspace in the robot file, or ask for fewer points"
         ),
         "The constraints exclude almost every group on a plane and a line.",

@@ -37,13 +37,13 @@ def _word_other_branch(data: Mapping[str, Any]) -> str:
 
 
 def _word_unobservable(data: Mapping[str, Any]) -> str:
-    together = " individually, at most together" if len(data["names"]) > 1 else ""
+    one = len(data["names"]) == 1
     return fill_template(
-        "Not identifiable, whatever the robot: {names:list}. The measurements do not determine "
-        "{pronoun}{together}.",
+        "The measurements cannot determine {names:list}{separately}, even for a known robot. "
+        "Measure more different poses, or state {which} in the data file.",
         names=data["names"],
-        pronoun="them" if len(data["names"]) > 1 else "it",
-        together=together,
+        separately="" if one else " separately",
+        which="this setup parameter" if one else "these setup parameters",
     )
 
 
@@ -127,7 +127,7 @@ ENTRIES: tuple[Entry, ...] = (
         _word_unobservable,
         "Frames, targets, surfaces or offsets have a direction that no measurement determines, "
         "even for a known robot.",
-        "Measure more different poses, or state where these setup parameters are.",
+        "Measure more different poses, or state these setup parameters in the data file.",
         example={"names": ("tracker", "target")},
     ),
 )

@@ -9,6 +9,9 @@ from typing import Any
 from loopcal.findings.finding import Severity
 from loopcal.findings.wording import Entry, fill_template
 
+MACHINE = "the machine"
+"""Subject of a change where no limb is freed."""
+
 
 def _conflict(data: Mapping[str, Any]) -> str:
     text = fill_template(
@@ -35,14 +38,18 @@ def _too_narrow(data: Mapping[str, Any]) -> str:
 
 def _changed(data: Mapping[str, Any]) -> str:
     text = fill_template(
-        "Since the earlier calibration {subject} has changed: chi-square {chi_square:.4g}, where "
-        "noise explains {degrees:.0f}.",
+        "Since the earlier calibration {subject} has changed: chi-square {chi_square:.4g}, "
+        "compared with {degrees:.0f} expected from noise.",
         **data,
     )
-    if data["tried"] and not data["parameter"]:
-        return f"{text} No single parameter explains the change."
-    alone = " A change of {parameter} alone, by {change}, explains most of it."
-    return text + (fill_template(alone, **data) if data["parameter"] else "")
+    if data["parameter"]:
+        alone = " A change of {parameter} alone, by {change}, explains most of it."
+        text += fill_template(alone, **data)
+    elif data["tried"]:
+        text += " No single parameter explains the change."
+    if data["subject"] != MACHINE:
+        return text
+    return f"{text} Free the limb that was repaired, or calibrate without the earlier run."
 
 
 _CONFLICT = {
@@ -52,7 +59,7 @@ _CONFLICT = {
     "inflation": 4.3,
     "p_value": 1e-12,
 }
-_CHANGE = {"subject": "leg3", "chi_square": 312.4, "degrees": 7.0, "p_value": 1e-12}
+_CHANGE = {"subject": MACHINE, "chi_square": 312.4, "degrees": 7.0, "p_value": 1e-12}
 
 ENTRIES = (
     Entry(
@@ -97,7 +104,7 @@ ENTRIES = (
         "prior.machine-unchanged",
         Severity.INFO,
         "Since the earlier calibration {subject} has not changed beyond the noise: chi-square "
-        "{chi_square:.4g}, where noise explains {degrees:.0f}.",
+        "{chi_square:.4g}, compared with {degrees:.0f} expected from noise.",
         when="New data agree with an earlier calibration.",
         example=_CHANGE | {"chi_square": 6.2, "p_value": 0.5},
     ),

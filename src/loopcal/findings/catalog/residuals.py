@@ -122,7 +122,7 @@ ENTRIES = (
     Entry(
         "residuals.start-not-calibrated",
         Severity.INFO,
-        _start("The nominal geometry does not match these data: {ratio}, far beyond the noise."),
+        _start("The nominal geometry does not match these data within the noise: {ratio}."),
         when="The fit reduced the residuals by more than the noise explains.",
         action="Use the calibrated geometry.",
         example=_RATIO,
@@ -131,8 +131,9 @@ ENTRIES = (
         "residuals.start-needs-sigma",
         Severity.INFO,
         _start(
-            "The nominal geometry: {ratio}. Whether noise explains that needs the true sigma; "
-            "state it or measure more poses."
+            "The nominal geometry cannot be compared with the fit ({ratio}): too few degrees of "
+            "freedom remain to estimate the noise. State the sigma of the instrument, or measure "
+            "more poses."
         ),
         when="Too few degrees of freedom estimate the noise.",
         action="State the sigma of the instrument, or measure more poses.",
@@ -142,8 +143,8 @@ ENTRIES = (
         "residuals.start-undecided",
         Severity.INFO,
         _start(
-            "The nominal geometry: {ratio}. Neither geometry is consistent with the stated noise, "
-            "so this comparison does not decide which one is better."
+            "The nominal geometry cannot be compared with the fit ({ratio}): the residuals of both "
+            "contradict the stated noise. Check the stated noise and outliers first."
         ),
         when="The residuals of the fit contradict the stated noise.",
         action="Resolve the contradiction with the noise first.",
@@ -175,7 +176,8 @@ ENTRIES = (
     Entry(
         "residuals.no-rows-to-predict",
         Severity.REFUSAL,
-        "No row to validate with: every row is absent or has weight 0. Give measured values.",
+        "The held-out data contain no usable row: every row is absent or has weight 0. Fill in the "
+        "measured values.",
         when="The held-out data contain no usable row.",
         action="Fill in the measured values.",
     ),
@@ -197,10 +199,9 @@ ENTRIES = (
     Entry(
         "residuals.calibrated-out-of-reach",
         Severity.REFUSAL,
-        "The calibrated geometry of {robot} does not reach the poses of the geometry before: with "
-        "these readings the one before reaches {before} of {poses:count pose}, the calibrated one "
-        "{after}, and no pose is reached by both. Do not use this calibration; check the stated "
-        "frames and the noise.",
+        "No pose of {robot} is reached by both geometries. With these readings the geometry before "
+        "calibration reaches {before} of {poses:count pose}, the calibrated one {after}. Do not "
+        "use this calibration; check the stated frames and the noise.",
         when="No pose is reached by both geometries.",
         action="Do not use this calibration; check the stated frames and the noise.",
     ),

@@ -22,11 +22,13 @@ def _word_frame_freedoms(data: Mapping[str, Any]) -> str:
 
 
 def _word_undetermined(data: Mapping[str, Any]) -> str:
-    keep = "It keeps its" if data["count"] == 1 else "They keep their"
+    one = data["count"] == 1
+    keep = "It keeps its prior value" if one else "They keep their prior values"
+    fix = "it, or fix one of its parameters" if one else "them, or fix one parameter of each"
     return fill_template(
         "These data cannot determine {count:count parameter combination} that "
-        f"{'changes' if data['count'] == 1 else 'change'} poses (of {{names:list}}). {keep} "
-        "prior value, so other poses may be less accurate.",
+        f"{'changes' if one else 'change'} poses (of {{names:list}}). {keep}, so other poses may "
+        f"be less accurate. Measure what determines {fix}.",
         **data,
     )
 
@@ -52,16 +54,16 @@ ENTRIES = (
     Entry(
         "workflow.free-limb-needs-prior",
         Severity.REFUSAL,
-        "{limb} can only be freed with an earlier calibration that knows the other limbs: give it "
-        "as the prior.",
+        "{limb} can only be freed with an earlier calibration that determines the other limbs. "
+        "State that calibration as the prior.",
         "A limb is to be freed without a prior.",
         "Give the earlier calibration.",
     ),
     Entry(
         "workflow.option-excludes-prior",
         Severity.REFUSAL,
-        "{option} does not go with an earlier calibration as the prior, which is combined with the "
-        "data by least squares: remove one of the two.",
+        "{option} cannot be combined with an earlier calibration as the prior. Remove one of the "
+        "two.",
         "A method, loss or choice of parameters is stated beside a prior.",
         "Remove the option or the prior.",
     ),
@@ -100,7 +102,8 @@ ENTRIES = (
         "workflow.undetermined-combinations",
         Severity.WARNING,
         _word_undetermined,
-        "The data leave parameter combinations open that move the platform relative to the base.",
+        "The data do not determine parameter combinations that move the platform relative to the "
+        "base.",
         "Follow the suggested measurements, or fix one parameter of each combination.",
         example={"count": 2, "names": ("leg1.length", "leg2.length")},
     ),
@@ -108,7 +111,8 @@ ENTRIES = (
         "workflow.frame-freedoms",
         Severity.INFO,
         _word_frame_freedoms,
-        "The only open parameter combinations are rigid motions of the base or platform frame.",
+        "The only undetermined parameter combinations are rigid motions of the base or platform "
+        "frame.",
         example={"count": 6, "frames": ("base",)},
     ),
     Entry(
@@ -148,7 +152,8 @@ ENTRIES = (
     Entry(
         "workflow.next-check-outliers",
         Severity.SUGGESTION,
-        "Check the measurement of {poses:list}. Correct it, exclude it, or fit with a robust loss.",
+        "Check the measurements of {poses:list}. Correct or exclude them, or fit with a robust "
+        "loss.",
         "The verdict is not calibrated, and outliers were found.",
     ),
     Entry(
