@@ -469,7 +469,9 @@ def test_exact_readings_of_redundant_actuators_are_refused(cable):
         simulate(truth, positions[:9], Instrument((Sensor(Position(), noise(UM, UM, UM)),)), 1),
         reading_sigma=0.0,
     )
-    with pytest.raises(DataError, match="no reading can be held exactly; state a sigma above 0"):
+    with pytest.raises(
+        DataError, match="redundant actuators cannot be exact: state a sigma above 0"
+    ):
         identify(robot, data, LeastSquares())
 
 
