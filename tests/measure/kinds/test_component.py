@@ -141,7 +141,7 @@ def test_all_six_components_carry_the_information_of_the_full_pose():
             ("a",),
             "rpy",
             (
-                "the orientation 'rpy' is unknown: use rotation-vector, quaternion, tilt-torsion, "
+                "unknown orientation form 'rpy'; use rotation-vector, quaternion, tilt-torsion, "
                 "or "
                 "euler-"
             ),
