@@ -107,7 +107,7 @@ def test_any_division_into_files_gives_the_same_calibration(folder, capsys) -> N
     assert (
         main(["validate", "both", "poses.csv", "values.csv"]) == 1
     )  # the same rows under another name
-    assert "20 of 20 rows belong to the data of this calibration" in capsys.readouterr().err
+    assert "The calibration used 20 of 20 rows" in capsys.readouterr().err
     assert main(["validate", "both", "poses.csv", "values.csv", "--allow-fitted-data"]) == 0
 
 

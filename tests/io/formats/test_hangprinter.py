@@ -129,12 +129,7 @@ def test_what_a_robot_file_cannot_say_is_told(tmp_path) -> None:
     notes = " | ".join(map(str, imported.findings))
     assert "41 rows of line forces are not read" in notes
     assert "with 45 rows of motor angles" in notes
-    for words in (
-        "stiffness",
-        "weight",
-        "taped lengths at the origin",
-        "the key 'colour' is unknown",
-    ):
+    for words in ("stiffness", "weight", "lengths at the origin", "the key 'colour' is unknown"):
         assert words in notes
     assert "1 mm is assumed for lines" in notes
 
