@@ -35,7 +35,7 @@ def tracker_in_frame() -> Instrument:
 
 @pytest.fixture(scope="module")
 def parts():
-    return hexapod_data(40).split(0.75, seed=1)
+    return hexapod_data(40).split(hold_out=0.25, seed=1)
 
 
 @pytest.fixture(scope="module")

@@ -159,7 +159,7 @@ def test_what_is_known_survives_splits_and_the_file(data, tmp_path) -> None:
         data,
         stated_values=(StatedValue("monday.tracker.x", 1e-3), StatedValue("tuesday.tracker.rz")),
     )
-    fit, held_out = known.split(0.5, seed=2)
+    fit, held_out = known.split(hold_out=0.5, seed=2)
     assert fit.stated_values == held_out.stated_values == known.stated_values
     save_measurements(known.take(np.arange(11)), tmp_path / "monday.csv", robot)
     assert '# unknowns: {"monday.tracker.x": {sd: 1 mm}}' in (tmp_path / "monday.csv").read_text()

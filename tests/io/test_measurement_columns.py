@@ -243,7 +243,7 @@ def test_times_and_temperatures_are_kept_through_every_part(tmp_path, robot) -> 
     np.testing.assert_array_equal(
         data.take([0]).observations[0].context["temperature"], [20.5, 21.5]
     )
-    assert data.split(0.5, seed=1)[0].observations[0].context.keys() == {
+    assert data.split(hold_out=0.5, seed=1)[0].observations[0].context.keys() == {
         "time",
         "temperature",
         "temperature.frame",

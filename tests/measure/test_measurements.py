@@ -48,8 +48,8 @@ def test_numbers_of_poses_and_residuals():
     assert np.array_equal(both.block, np.arange(7))
 
 
-def test_a_split_at_three_quarters_gives_thirty_and_ten_of_forty():
-    fit, held_out = heights(40).split(0.75, seed=1)
+def test_holding_out_a_quarter_gives_thirty_and_ten_of_forty():
+    fit, held_out = heights(40).split(hold_out=0.25, seed=1)
     assert (fit.n_poses, held_out.n_poses) == (30, 10)
     assert sorted([*poses_of(fit), *poses_of(held_out)]) == list(range(40))
     assert list(poses_of(fit)) == sorted(poses_of(fit))
@@ -62,9 +62,9 @@ def test_a_split_keeps_blocks_whole_and_loses_nothing(block, fraction, seed):
     data = heights(len(block), block)
     if len(set(block)) == 1:
         with pytest.raises(DataError, match="single block"):
-            data.split(fraction, seed)
+            data.split(hold_out=fraction, seed=seed)
         return
-    fit, held_out = data.split(fraction, seed)
+    fit, held_out = data.split(hold_out=fraction, seed=seed)
     assert not set(fit.block) & set(held_out.block)
     assert sorted([*poses_of(fit), *poses_of(held_out)]) == list(range(len(block)))
     assert fit.n_poses > 0
@@ -72,14 +72,14 @@ def test_a_split_keeps_blocks_whole_and_loses_nothing(block, fraction, seed):
 
 
 def test_a_split_is_repeatable_and_changes_with_the_seed():
-    parts = [poses_of(heights(40).split(0.5, seed)[0]).tolist() for seed in (3, 3, 4)]
+    parts = [poses_of(heights(40).split(hold_out=0.5, seed=seed)[0]).tolist() for seed in (3, 3, 4)]
     assert parts[0] == parts[1] != parts[2]
 
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0, 75.0, -0.1, np.nan])
 def test_a_fraction_that_is_none_is_refused(fraction):
-    with pytest.raises(DataError, match=r"above 0 and below 1, such as 0\.75"):
-        heights(4).split(fraction, seed=0)
+    with pytest.raises(DataError, match=r"above 0 and below 1, such as 0\.25"):
+        heights(4).split(hold_out=fraction, seed=0)
 
 
 def test_taking_poses_renumbers_the_rows_and_drops_those_that_need_others():
@@ -134,7 +134,7 @@ def test_the_sigma_of_readings_follows_their_poses():
         [[1e-6, np.inf], [0.0, 2e-6], [3e-6, 3e-6]], [[1.0, np.nan], [2.0, 2.0], [3.0, 3.0]]
     )
     assert of_readings(data.take([2, 0])).tolist() == [[3e-6, 3e-6], [1e-6, np.inf]]
-    fit, held = data.split(0.6, seed=1)
+    fit, held = data.split(hold_out=0.4, seed=1)
     assert len(of_readings(fit)) + len(of_readings(held)) == 3
     weighted = data.with_weights([4.0, 1.0, 0.0])
     assert of_readings(weighted).tolist() == [[5e-7, np.inf], [0.0, 2e-6], [np.inf, np.inf]]

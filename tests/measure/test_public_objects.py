@@ -126,5 +126,5 @@ def test_an_argument_of_the_wrong_type_says_what_to_pass(call, error, words):
 
 def test_the_share_of_a_split_is_the_share_that_is_fitted():
     data = Measurements("toy", np.arange(8.0)[:, None], ())
-    fitted, held_out = data.split(0.75, seed=1)
+    fitted, held_out = data.split(hold_out=0.25, seed=1)
     assert (fitted.n_poses, held_out.n_poses) == (6, 2)

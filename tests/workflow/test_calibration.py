@@ -67,13 +67,13 @@ def test_the_json_document_holds_the_verdict_and_every_finding(report):
 
 
 def test_python_and_command_line_hold_out_the_same_poses(data, tmp_path, monkeypatch, capsys):
-    """`--hold-out 0.25`, `hold_out=0.25` and `data.split(0.75, seed)` are the same sets."""
+    """`--hold-out 0.25`, `hold_out=0.25` and `data.split(hold_out=0.25, seed=seed)` are the same sets."""
     monkeypatch.chdir(tmp_path)
     shutil.copy(EXAMPLE, tmp_path / "data.csv")
     words = "calibrate hexapod-42 data.csv -o run --hold-out 0.25 --seed 3 --json"
     assert main(words.split()) == 0
     document = json.loads(capsys.readouterr().out)
-    fitted, held_out = data.split(0.75, seed=3)
+    fitted, held_out = data.split(hold_out=0.25, seed=3)
     split = split_data(data, hold_out=0.25, seed=3)
     assert split.held_out is not None
     assert split.fitted.labels == fitted.labels

@@ -38,7 +38,7 @@ from loopcal.errors import DataError
     default=0.0,
     metavar="SHARE",
     help="Share of the poses to keep out of the fit for validation, such as 0.25. The poses are "
-    "those of data.split(1 - SHARE, seed) in Python.",
+    "those of data.split(hold_out=SHARE, seed=SEED) in Python.",
 )
 @fit_options
 @click.option(

@@ -168,16 +168,17 @@ class Measurements:
             reading_sigma=None if self.reading_sigma is None else self.reading_sigma[chosen],
         )
 
-    def split(self, share: float, seed: int) -> tuple[Self, Self]:
+    def split(self, *, hold_out: float, seed: int) -> tuple[Self, Self]:
         """Split the poses at random into a set to fit and a held-out set.
 
         Blocks are not split. The poses of each set keep their order.
 
         Parameters
         ----------
-        share : float
-            Share of the poses that is fitted (0.75 fits three poses of four), as nearly as whole
-            blocks allow; both sets get at least one block.
+        hold_out : float
+            Share of the poses that is not fitted (0.25 fits three poses of four), as nearly as
+            whole blocks allow; both sets get at least one block. The command line's `--hold-out`
+            is the same share.
         seed : int
             The same seed gives the same sets.
 
@@ -190,10 +191,10 @@ class Measurements:
         DataError
             If the share is not between 0 and 1, or all poses are in one block.
         """
-        if not 0.0 < share < 1.0:
+        if not 0.0 < hold_out < 1.0:
             raise DataError(
-                f"cannot split at {share}; give the share of the poses that is fitted, above 0 and "
-                "below 1, such as 0.75"
+                f"cannot hold out a share of {hold_out}; give the share of the poses that is not "
+                "fitted, above 0 and below 1, such as 0.25"
             )
         names, member, sizes = np.unique(self.block, return_inverse=True, return_counts=True)
         if len(names) < 2:
@@ -202,7 +203,7 @@ class Measurements:
                 "blocks"
             )
         order = np.random.default_rng(np.random.SeedSequence(seed)).permutation(len(names))
-        error = np.abs(np.cumsum(sizes[order])[:-1] - share * self.n_poses)
+        error = np.abs(np.cumsum(sizes[order])[:-1] - (1.0 - hold_out) * self.n_poses)
         fitted = np.isin(member, order[: int(np.argmin(error)) + 1])
         return self.take(fitted), self.take(~fitted)
 

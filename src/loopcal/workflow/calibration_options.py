@@ -19,7 +19,7 @@ class CalibrationOptions:
     ----------
     fit : how parameters are estimated, and which poses are excluded.
     hold_out : share of the poses to keep out of the fit for validation, from 0 to below 1. The
-        sets are those of `data.split(1 - hold_out, seed)`.
+        sets are those of `data.split(hold_out=hold_out, seed=seed)`.
     held_out : labels of the poses to keep out, instead of a share.
     seed : of the random choice of held-out poses.
     limit_position, limit_angle : largest allowed errors [m], [rad] on held-out poses.

@@ -41,8 +41,8 @@ def split_data(
 
     Parameters
     ----------
-    hold_out : share of the poses to hold out; the sets are those of `data.split(1 - hold_out,
-        seed)`, drawn by whole blocks. 0 holds nothing out.
+    hold_out : share of the poses to hold out, drawn by whole blocks as `data.split` does. 0 holds
+        nothing out.
     held_out : labels of the poses to hold out, instead of a share.
 
     Raises
@@ -65,5 +65,5 @@ def split_data(
         return DataSplit(fitted, data.take(is_held_out), 0.0, seed)
     if not hold_out:
         return DataSplit(data, None, 0.0, seed)
-    fitted, validation = data.split(1.0 - hold_out, seed)
+    fitted, validation = data.split(hold_out=hold_out, seed=seed)
     return DataSplit(fitted, validation, hold_out, seed)
