@@ -4,6 +4,25 @@
 Other packages import from here; the modules inside may be rearranged.
 """
 
+from loopcal.mechanism.analysis.modes import Modes as Modes
+from loopcal.mechanism.analysis.modes import find_assembly_modes as find_assembly_modes
+from loopcal.mechanism.analysis.modes import find_working_modes as find_working_modes
+from loopcal.mechanism.analysis.singularities import NEAR_SHARE as NEAR_SHARE
+from loopcal.mechanism.analysis.singularities import Singularity as Singularity
+from loopcal.mechanism.analysis.singularities import analyze_singularity as analyze_singularity
+from loopcal.mechanism.analysis.singularities import (
+    compute_median_margins as compute_median_margins,
+)
+from loopcal.mechanism.analysis.singularities import trace_singularity as trace_singularity
+from loopcal.mechanism.analysis.workspace import MIN_DRAWS as MIN_DRAWS
+from loopcal.mechanism.analysis.workspace import MIN_REACHABLE_SHARE as MIN_REACHABLE_SHARE
+from loopcal.mechanism.analysis.workspace import Limit as Limit
+from loopcal.mechanism.analysis.workspace import WorkspaceSample as WorkspaceSample
+from loopcal.mechanism.analysis.workspace import check_limits as check_limits
+from loopcal.mechanism.analysis.workspace import draw_coordinates as draw_coordinates
+from loopcal.mechanism.analysis.workspace import evaluate_limits as evaluate_limits
+from loopcal.mechanism.analysis.workspace import sample_workspace as sample_workspace
+from loopcal.mechanism.analysis.workspace import workspace_ranges as workspace_ranges
 from loopcal.mechanism.assembly import AXES as AXES
 from loopcal.mechanism.assembly import Actuator as Actuator
 from loopcal.mechanism.assembly import Address as Address
@@ -40,9 +59,6 @@ from loopcal.mechanism.kinematics import inverse as inverse
 from loopcal.mechanism.kinematics import jacobian as jacobian
 from loopcal.mechanism.kinematics import make_solution as make_solution
 from loopcal.mechanism.model import Mechanism as Mechanism
-from loopcal.mechanism.modes import Modes as Modes
-from loopcal.mechanism.modes import find_assembly_modes as find_assembly_modes
-from loopcal.mechanism.modes import find_working_modes as find_working_modes
 from loopcal.mechanism.platform_coordinates import POSITION as POSITION
 from loopcal.mechanism.platform_coordinates import TILT as TILT
 from loopcal.mechanism.platform_coordinates import check_coordinates as check_coordinates
@@ -58,11 +74,6 @@ from loopcal.mechanism.sensitivity import (
     differentiate_passive_joints as differentiate_passive_joints,
 )
 from loopcal.mechanism.sensitivity import differentiate_pose as differentiate_pose
-from loopcal.mechanism.singularities import NEAR_SHARE as NEAR_SHARE
-from loopcal.mechanism.singularities import Singularity as Singularity
-from loopcal.mechanism.singularities import analyze_singularity as analyze_singularity
-from loopcal.mechanism.singularities import compute_median_margins as compute_median_margins
-from loopcal.mechanism.singularities import trace_singularity as trace_singularity
 from loopcal.mechanism.states import Status as Status
 from loopcal.mechanism.states import compute_limb_frames as compute_limb_frames
 from loopcal.mechanism.states import driven_values as driven_values
@@ -74,12 +85,3 @@ from loopcal.mechanism.transmission import joints_from_readings as joints_from_r
 from loopcal.mechanism.transmission import nominal_terms as nominal_terms
 from loopcal.mechanism.transmission import readings_from_joints as readings_from_joints
 from loopcal.mechanism.transmission import term_derivatives as term_derivatives
-from loopcal.mechanism.workspace import MIN_DRAWS as MIN_DRAWS
-from loopcal.mechanism.workspace import MIN_REACHABLE_SHARE as MIN_REACHABLE_SHARE
-from loopcal.mechanism.workspace import Limit as Limit
-from loopcal.mechanism.workspace import WorkspaceSample as WorkspaceSample
-from loopcal.mechanism.workspace import check_limits as check_limits
-from loopcal.mechanism.workspace import draw_coordinates as draw_coordinates
-from loopcal.mechanism.workspace import evaluate_limits as evaluate_limits
-from loopcal.mechanism.workspace import sample_workspace as sample_workspace
-from loopcal.mechanism.workspace import workspace_ranges as workspace_ranges

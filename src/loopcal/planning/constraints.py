@@ -2,7 +2,7 @@
 """Constraints on planned poses: machine limits, margin from singularities, tilt and line of sight.
 
 Many poses are checked at once; a violation is a code with numbers. Margins are those of
-`loopcal.mechanism.singularities`, as shares of their medians over the workspace.
+`loopcal.mechanism.analysis.singularities`, as shares of their medians over the workspace.
 """
 
 from __future__ import annotations

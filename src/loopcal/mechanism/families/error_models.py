@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopcal.mechanism.assembly import AXES, Address, LinearMap
-from loopcal.mechanism.families.chain import PlacedLimb, map_displacement
+from loopcal.mechanism.families.limb_placement import PlacedLimb, map_displacement
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 

@@ -14,7 +14,6 @@ from typing import Literal
 
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly, Cone
-from loopcal.mechanism.families.chain import PlacedLimb, place_limb, translate
 from loopcal.mechanism.families.error_models import (
     ErrorModel,
     ErrorTolerances,
@@ -24,6 +23,7 @@ from loopcal.mechanism.families.error_models import (
     rod_length_error,
 )
 from loopcal.mechanism.families.hexapod_legs import Screw, ScrewLeg, build_screw_leg, build_ups_leg
+from loopcal.mechanism.families.limb_placement import PlacedLimb, place_limb, translate
 from loopcal.mechanism.families.prs import check_spherical
 from loopcal.mechanism.families.records import (
     AngleTolerance,

@@ -20,7 +20,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
-from loopcal.mechanism.families.chain import (
+from loopcal.mechanism.families.limb_placement import (
     EX,
     EY,
     EZ,

@@ -15,17 +15,6 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES, Address, Assembly, Cone, LinearMap
-from loopcal.mechanism.families.chain import (
-    EX,
-    EY,
-    EZ,
-    JointPlacement,
-    PlacedLimb,
-    map_displacement,
-    map_slide_tilt,
-    place_limb,
-    rotate_about,
-)
 from loopcal.mechanism.families.error_models import (
     ErrorModel,
     ErrorTolerances,
@@ -39,6 +28,17 @@ from loopcal.mechanism.families.limb_parameters import (
     drive_errors,
     find_dimension,
     find_engine_axis,
+)
+from loopcal.mechanism.families.limb_placement import (
+    EX,
+    EY,
+    EZ,
+    JointPlacement,
+    PlacedLimb,
+    map_displacement,
+    map_slide_tilt,
+    place_limb,
+    rotate_about,
 )
 from loopcal.mechanism.families.limb_records import (
     AngleDrive,

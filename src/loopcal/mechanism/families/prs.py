@@ -18,7 +18,8 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import Address, LinearMap
-from loopcal.mechanism.families.chain import (
+from loopcal.mechanism.families.error_models import ErrorModel, single_error
+from loopcal.mechanism.families.limb_placement import (
     EX,
     EY,
     EZ,
@@ -29,7 +30,6 @@ from loopcal.mechanism.families.chain import (
     place_limb,
     translate,
 )
-from loopcal.mechanism.families.error_models import ErrorModel, single_error
 from loopcal.mechanism.families.records import AngleTolerance, LengthTolerance, standard_deviation
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension

@@ -23,7 +23,13 @@ from typing import Literal
 import numpy as np
 
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly
-from loopcal.mechanism.families.chain import (
+from loopcal.mechanism.families.error_models import (
+    ErrorModel,
+    ErrorTolerances,
+    complete_errors,
+    single_error,
+)
+from loopcal.mechanism.families.limb_placement import (
     EX,
     EY,
     JointPlacement,
@@ -31,12 +37,6 @@ from loopcal.mechanism.families.chain import (
     map_displacement,
     place_limb,
     translate,
-)
-from loopcal.mechanism.families.error_models import (
-    ErrorModel,
-    ErrorTolerances,
-    complete_errors,
-    single_error,
 )
 from loopcal.mechanism.families.prs import (
     ChainFrames,

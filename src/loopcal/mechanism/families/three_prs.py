@@ -17,8 +17,8 @@ from typing import Literal
 import numpy as np
 
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly
-from loopcal.mechanism.families.chain import PlacedLimb, rotate_about, translate
 from loopcal.mechanism.families.error_models import ErrorModel, ErrorTolerances, complete_errors
+from loopcal.mechanism.families.limb_placement import PlacedLimb, rotate_about, translate
 from loopcal.mechanism.families.prs import (
     ChainFrames,
     TripodTolerances,

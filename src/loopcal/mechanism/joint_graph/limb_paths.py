@@ -15,7 +15,7 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.findings import report_finding
-from loopcal.mechanism.joint_graph.graph import GraphJoint, JointGraph
+from loopcal.mechanism.joint_graph.loop_closure import GraphJoint, JointGraph
 from loopcal.typing import FloatArray
 
 FREEDOMS = ("rx", "ry", "rz", "x", "y", "z")

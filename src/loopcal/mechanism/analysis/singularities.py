@@ -23,6 +23,7 @@ from loopcal import engine
 from loopcal.engine import State
 from loopcal.errors import DataError
 from loopcal.findings import Finding, report_finding
+from loopcal.mechanism.analysis.workspace import sample_workspace
 from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.batch_kinematics import compute_closure_sign
 from loopcal.mechanism.kinematics import Solution, forward, inverse, make_solution
@@ -30,7 +31,6 @@ from loopcal.mechanism.mobility import list_main_freedoms
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.sensitivity import stack_driven_columns, stack_platform_rows
 from loopcal.mechanism.states import driven_values, is_closed, join_states
-from loopcal.mechanism.workspace import sample_workspace
 from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
