@@ -250,7 +250,9 @@ def test_at_full_size_no_true_data_are_refused_and_slips_are_named_wherever_they
     """Slips that leave the data plausible change what the robot does not do: the orientation of a
     delta.
     """
-    tables = json.loads((root / "docs" / "evidence" / "arrival.json").read_text("utf-8"))["tables"]
+    tables = json.loads((root / "docs" / "evidence" / "conventions.json").read_text("utf-8"))[
+        "tables"
+    ]
     for times, count, silent, _, doubted, refused in tables["false_alarms"]["rows"]:
         assert count - silent >= 40
         assert refused == 0

@@ -9,7 +9,7 @@ the kinematics close the pose:
     more actuators than freedoms     u moves the pose,     y = diag(s) u,   dq = -Q^-1 (A y + E de)
 
 An exact reading has s = 0: it has no direction, and nothing is divided by it. See
-docs/theory/latent.md.
+docs/theory/uncertain-readings.md.
 """
 
 from __future__ import annotations

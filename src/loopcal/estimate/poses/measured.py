@@ -4,7 +4,7 @@
 A robot with m freedoms stands where the rows of a pose fit best, if these rows determine m
 directions: a position determines a delta robot, two coordinates determine a planar one.
 Gauss-Newton begins at home and uses all rows that need nothing but the pose. See
-docs/theory/latent.md.
+docs/theory/uncertain-readings.md.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ on many trials at once: every pose is closed by the kinematics, the rows of its 
 stacked, the coordinates of the component's poses are eliminated by projection, and what is left
 determines the nuisance parameters; the best coordinates follow. A step is no longer than closure is
 about linear, and one that does not lower the sum of squares is halved. An exact reading has no
-coordinate: its row is not a heavy one, it does not exist. See docs/theory/latent.md.
+coordinate: its row is not a heavy one, it does not exist. See docs/theory/uncertain-readings.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Conventions tested on arrival: how often true data are doubted or refused, and which slips are
-refused and named.
+"""Convention checks: how often true data are doubted or refused, and which slips are refused and
+named.
 """
 
 from __future__ import annotations

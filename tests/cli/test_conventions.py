@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""At the command line: slips of convention are refused with the flag that overrides them; frames of
-a run are used again.
+"""Convention checks at the command line: slips are refused with the flag that overrides them, and
+frames of a run are used again.
 """
 
 import json
