@@ -409,16 +409,15 @@ def test_of_two_joined_instruments_the_one_in_the_wrong_unit_is_named() -> None:
 def test_of_two_files_of_one_kind_the_one_that_is_written_otherwise_is_named() -> None:
     robot, data = robot_of("linear-delta"), measured("linear-delta", Position(), n=16)
     rows = data.observations[0]
-    parts = rows.take(np.arange(8)), rows.take(np.arange(8, 16))
-    inches = replace(parts[1], measured=parts[1].measured / 25.4)
-    found = compare_conventions(
-        robot, replace(data, observations=(parts[0], inches)), ("a.csv", "b.csv")
+    parts = (
+        replace(rows.take(np.arange(8)), source="a.csv"),
+        replace(rows.take(np.arange(8, 16)), source="b.csv"),
     )
+    inches = replace(parts[1], measured=parts[1].measured / 25.4)
+    found = compare_conventions(robot, replace(data, observations=(parts[0], inches)))
     assert times("lengths", 25.4, source="b.csv").items() <= slips(found)[0].items()
     readings = np.concatenate([data.readings[:8], 0.1 * data.readings[8:]])
-    found = compare_conventions(
-        robot, replace(data, observations=parts, readings=readings), ("a.csv", "b.csv")
-    )
+    found = compare_conventions(robot, replace(data, observations=parts, readings=readings))
     assert times("readings", 10.0, source="b.csv").items() <= slips(found)[0].items()
     unnamed = list_reading_interpretations(
         replace(data, observations=parts), ("q1", "q2", "q3"), (Dimension.LENGTH,) * 3

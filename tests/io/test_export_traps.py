@@ -9,6 +9,7 @@ import re
 import pytest
 
 from loopcal.cli import main
+from loopcal.diagnose import check_conventions
 from loopcal.errors import FileError, LoopcalError
 from loopcal.io import load_measurements, load_robot
 from loopcal.io.exports import convert_export, read_profile
@@ -138,9 +139,7 @@ def test_sigma_covariance_and_remarks_of_each_target_stay_with_it_and_calibrate_
     assert (cells[0]["cov.a.x.a.y [um*um]"], cells[0]["cov.b.x.b.y [um*um]"]) == ("1", "2")
     assert (cells[0]["note rms a"], cells[0]["note rms b"]) == ("r1", "r2")
     (tmp_path / "data.csv").write_text(found.text)
-    data = load_measurements(
-        tmp_path / "data.csv", load_robot("hexapod-42"), allow_still=True, allow_implausible=True
-    )
+    data = load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"))
     sigma = data.observations[0].covariance.diagonal(axis1=1, axis2=2) ** 0.5
     assert sigma[0] == pytest.approx([4e-6, 2e-6, 2e-6, 5e-6, 2e-6, 2e-6])  # [m]
 
@@ -156,9 +155,7 @@ def test_a_target_without_a_line_needs_no_sigma(tmp_path) -> None:
     (tmp_path / "data.csv").write_text(
         converted(tmp_path, "Name;X;Y;Z;S;J1;J2;J3;J4;J5;J6\n" + "\n".join(lines), profile).text
     )
-    data = load_measurements(
-        tmp_path / "data.csv", load_robot("hexapod-42"), allow_still=True, allow_implausible=True
-    )
+    data = load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"))
     rows = data.observations[0]
     assert rows.present.tolist() == [[True] * 6, [False] * 3 + [True] * 3]
     assert rows.covariance[1, 3, 3] ** 0.5 == pytest.approx(6e-6)  # [m]
@@ -166,12 +163,7 @@ def test_a_target_without_a_line_needs_no_sigma(tmp_path) -> None:
         (tmp_path / "data.csv").read_text().replace(",6,1,", ",,1,").replace(",6\n", ",\n")
     )
     with pytest.raises(LoopcalError, match=r"column 'sigma.b.x' is not positive"):
-        load_measurements(
-            tmp_path / "data.csv",
-            load_robot("hexapod-42"),
-            allow_still=True,
-            allow_implausible=True,
-        )
+        load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"))
 
 
 def test_a_target_that_gives_the_pose_another_reading_is_no_row(tmp_path) -> None:
@@ -298,9 +290,7 @@ def test_settings_that_yaml_would_take_for_something_else_are_quoted(tmp_path, w
         "pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm]\n1,0,0,0,0,0,0\n"
     )
     (tmp_path / "data.csv").write_text(converted(tmp_path, "Name,X,Y,Z\n1,1,2,3\n", profile).text)
-    data = load_measurements(
-        tmp_path / "data.csv", load_robot("hexapod-42"), allow_still=True, allow_implausible=True
-    )
+    data = load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"))
     assert data.observations[0].session.tolist() == [word]
 
 
@@ -375,8 +365,9 @@ REFUSED = {
 def test_a_measurement_file_of_another_program_is_refused_with_what_helps(tmp_path, case) -> None:
     content, message = REFUSED[case]
     (tmp_path / "data.csv").write_bytes(content)
+    robot = load_robot("hexapod-42")
     with pytest.raises(LoopcalError, match=message) as caught:
-        load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"))
+        check_conventions(robot, load_measurements(tmp_path / "data.csv", robot))
     assert "\n" not in str(caught.value)
 
 
@@ -384,9 +375,7 @@ def test_zero_kelvin_is_cold_enough(tmp_path) -> None:
     (tmp_path / "data.csv").write_text(
         FRONT + ROWS.replace("[degC]", "[degF]").replace(",20,2,", ",-459.67,2,")
     )
-    data = load_measurements(
-        tmp_path / "data.csv", load_robot("hexapod-42"), allow_still=True, allow_implausible=True
-    )
+    data = load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"))
     assert data.observations[0].context["temperature"][2] == pytest.approx(
         -273.15, abs=1e-9
     )  # [degC], rounding

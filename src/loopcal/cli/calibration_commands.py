@@ -20,6 +20,8 @@ from loopcal.cli.options import (
     force_option,
     json_option,
     limit_options,
+    print_convention_note,
+    read_checked_measurements,
     read_measurements,
     robot_argument,
     seed_option,
@@ -119,12 +121,18 @@ def calibrate(
     fit, earlier = fit_arguments.to_options(), None if prior is None else load_prior(prior, data)
     limits = {"limit_position": limit_position, "limit_angle": limit_angle}
     choices = {"choose_model": choose_model, "prior": earlier, "free_limb": free_limb}
-    options = CalibrationOptions(fit, hold_out, held_out, seed, **limits, **choices)
+    files = {name: allowed[name] for name in ("allow_outside_stroke", "allow_duplicates")}
+    checks = {
+        "check_conventions": not allowed["allow_implausible"],
+        "allow_still": allowed["allow_still"],
+    }
+    options = CalibrationOptions(fit, hold_out, held_out, seed, **limits, **choices, **checks)
     machine = load_robot(robot)
     refuse_run_folder(output, list(inputs.values()), force)
-    measurements = read_measurements(data, machine, **allowed)
+    measurements = read_measurements(data, machine, **files)
     with terminal.ProgressBar() as progress:
         report = calibrate_robot(machine, measurements, options, progress)
+    print_convention_note(report.conventions, data)
     save_run(output, report, inputs, sys.argv, force)
     if as_json:
         terminal.print_json(build_document(report, inputs, sys.argv))
@@ -202,14 +210,16 @@ def validate(
       loopcal validate run more.csv --limit-position 0.02mm --limit-angle 0.01deg
       loopcal validate robot.yaml measurements.csv --limit-position 0.1mm
     """  # noqa: D301
+    from loopcal.apply import find_reused_rows
     from loopcal.apply import validate as validate_robot
-    from loopcal.io.runs.calibration_run import check_reused_data, load_run_or_robot
+    from loopcal.io.runs.calibration_run import load_run_or_robot, refuse_fitted_files
     from loopcal.report.validation_view import view_validation
 
     calibrated = load_run_or_robot(run)
-    measurements = read_measurements(data, calibrated.robot, **allowed)
+    measurements = read_checked_measurements(data, calibrated.robot, **allowed)
     if not allow_fitted_data:
-        reused = check_reused_data(calibrated, data, measurements)
+        refuse_fitted_files(calibrated, data)
+        reused = find_reused_rows(calibrated.arrays, measurements)
         if reused is not None:
             terminal.print_note(str(reused))
     validation = validate_robot(

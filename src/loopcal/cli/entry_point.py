@@ -8,14 +8,12 @@ click is imported before a command runs, so that `loopcal --help` answers at onc
 
 from __future__ import annotations
 
-import logging
 import os
 import sys
 from collections.abc import Sequence
 
 import click
 
-from loopcal.cli import terminal
 from loopcal.cli.calibration_commands import calibrate, compensate, validate
 from loopcal.cli.exchange_commands import export, import_
 from loopcal.cli.hints import find_hint
@@ -86,8 +84,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.environ.setdefault(name, "1")
     words = list(sys.argv[1:] if arguments is None else arguments)
     command = commands.commands.get(words[0]) if words else None
-    notes, logger = _NoteHandler(), logging.getLogger("loopcal")
-    logger.addHandler(notes)
     try:
         code = commands.main(words, prog_name="loopcal", standalone_mode=False)
         sys.stdout.flush()
@@ -114,15 +110,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     except MemoryError:
         return _refuse("there is not enough memory for this; use fewer poses at a time.")
-    finally:
-        logger.removeHandler(notes)
-
-
-class _NoteHandler(logging.Handler):
-    """Prints warnings of the library as lines on standard error."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        terminal.print_note(record.getMessage())
 
 
 def _refuse(sentence: str, hint: str | None = None) -> int:

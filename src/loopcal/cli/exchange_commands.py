@@ -11,7 +11,7 @@ import click
 
 from loopcal.cli import terminal
 from loopcal.cli.hints import hint_for
-from loopcal.cli.options import FILE, LENGTH, force_option, json_option
+from loopcal.cli.options import FILE, LENGTH, force_option, json_option, read_checked_measurements
 from loopcal.errors import DataError
 from loopcal.units import Dimension, list_symbols
 
@@ -265,12 +265,11 @@ def _correct_file(
 ) -> tuple[Identification, tuple[str, ...]]:
     """Calibrate with the imported measurements, and write the corrected file."""
     from loopcal.estimate import identify
-    from loopcal.io import load_measurements
     from loopcal.io.core.text_file import write_text
     from loopcal.io.formats.import_export import export_robot
     from loopcal.io.formats.program_format import ExportSource
 
-    fit = identify(robot, load_measurements(data, robot))
+    fit = identify(robot, read_checked_measurements([data], robot))
     written = export_robot(ExportSource(fit.robot), source, file)
     write_text(output, written.text)
     return fit, tuple(str(finding) for finding in written.findings)

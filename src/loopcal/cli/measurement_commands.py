@@ -27,7 +27,7 @@ from loopcal.cli.options import (
     force_option,
     is_given,
     json_option,
-    read_measurements,
+    read_checked_measurements,
     refuse_given,
     robot_argument,
     seed_option,
@@ -110,7 +110,7 @@ def identifiability(
     refuse_outputs((output,), (find_robot_file(robot), *data, poses), force)
     machine, drawn = load_robot(robot), []
     if data:
-        measurements = read_measurements(data, machine, **allowed)
+        measurements = read_checked_measurements(data, machine, **allowed)
     else:
         if poses is None:
             drawn = [_name_drawn_poses(machine, draw, seed)]

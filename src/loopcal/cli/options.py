@@ -14,6 +14,7 @@ from loopcal.errors import DataError, UnitError
 from loopcal.units import Dimension, parse_quantity
 
 if TYPE_CHECKING:
+    from loopcal.diagnose import ConventionCheck
     from loopcal.measure import Measurements
     from loopcal.mechanism import Mechanism
 
@@ -115,6 +116,39 @@ def refuse_given(names: Iterable[str], reason: str) -> None:
     for name in names:
         if is_given(name):
             raise DataError(f"--{name.replace('_', '-')} has no effect {reason}; leave it out")
+
+
+def read_checked_measurements(
+    paths: Sequence[Path],
+    robot: Mechanism,
+    *,
+    allow_still: bool = False,
+    allow_implausible: bool = False,
+    **allowed: bool,
+) -> Measurements:
+    """Read measurement files as `read_measurements`, and check their conventions.
+
+    Raises
+    ------
+    LoopcalError
+        See `loopcal.io.load_measurements` and `loopcal.check_conventions`.
+    """
+    from loopcal.diagnose import check_conventions
+
+    data = read_measurements(paths, robot, **allowed)
+    check = check_conventions(
+        robot, data, allow_still=allow_still, allow_implausible=allow_implausible
+    )
+    print_convention_note(check, paths)
+    return data
+
+
+def print_convention_note(check: ConventionCheck, paths: Sequence[Path]) -> None:
+    """Print a note where a check of these files leaves a doubt."""
+    from loopcal.cli import terminal
+
+    if check.finding is not None:
+        terminal.print_note(f"{' and '.join(map(str, paths))}: {check.finding}")
 
 
 def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) -> Measurements:

@@ -26,7 +26,7 @@ from loopcal.cli.options import (
     force_option,
     is_given,
     json_option,
-    read_measurements,
+    read_checked_measurements,
     robot_argument,
     seed_option,
 )
@@ -264,7 +264,7 @@ def _read_earlier(
     """Return the fitted poses of earlier files, and the names of all their poses."""
     from loopcal.io.data.pose_use import read_held_out_poses
 
-    data = read_measurements(measured, robot)
+    data = read_checked_measurements(measured, robot)
     files = " ".join(map(str, measured))
     if not data.n_rows:
         raise DataError(

@@ -44,6 +44,8 @@ class Observations:
     context : name -> (r,), optional
         Notes to each row that enter no equation: `time` [s], `temperature` and `temperature.PLACE`
         [degC], NaN where missing.
+    source : text, optional
+        Where the rows come from, such as the name of a file; for messages.
 
     Attributes
     ----------
@@ -68,6 +70,7 @@ class Observations:
     session: TextArray = field(default_factory=lambda: np.array(""))
     group: TextArray = field(default_factory=lambda: np.array(""))
     context: Mapping[str, FloatArray] = field(default_factory=dict)
+    source: str = ""
     present: BoolArray = field(init=False)
     whitener: FloatArray = field(init=False)
 

@@ -9,8 +9,10 @@ from typing import Any
 from loopcal.apply import Validation, validate
 from loopcal.apply.validation_findings import FEW_ROWS
 from loopcal.diagnose import (
+    ConventionCheck,
     MeasurementSuggestion,
     ModelChoice,
+    check_conventions,
     check_start_values,
     choose_model,
     compute_reading_errors,
@@ -61,7 +63,8 @@ def calibrate(
     Raises
     ------
     DataError, EstimationError
-        The data belong to another robot, contain too few values, or the options contradict them.
+        The data belong to another robot, contain too few values, fit far better in another unit,
+        order, sign or column, or the options contradict them.
 
     Examples
     --------
@@ -74,6 +77,12 @@ def calibrate(
     """
     options = CalibrationOptions() if options is None else options
     _check_arguments(robot, data, options)
+    conventions = check_conventions(
+        robot,
+        data,
+        allow_still=options.allow_still,
+        allow_implausible=not options.check_conventions,
+    )
     kept = exclude_poses(data, options.fit.excluded_poses)
     split = split_data(kept, options.hold_out, options.seed, options.held_out)
     fitted = split.fitted
@@ -90,6 +99,7 @@ def calibrate(
     suggestions = _suggest(fit, fitted)
     start = check_start_values(fit)
     findings = [
+        *_report_conventions(conventions),
         *_report_fit(fit),
         *impossible,
         *_report_validation(errors, held_out is not None),
@@ -104,6 +114,7 @@ def calibrate(
         split=split,
         identification=fit,
         start=start,
+        conventions=conventions,
         validation=None if held_out is None else errors,
         fitted_errors=errors if held_out is None else None,
         findings=sort_by_importance(findings),
@@ -209,6 +220,11 @@ def _suggest(fit: Identification, data: Measurements) -> tuple[MeasurementSugges
     if not fit.converged or not fit.unidentifiable:
         return None
     return suggest_measurements(identifiability(fit.robot, data))
+
+
+def _report_conventions(check: ConventionCheck) -> list[Finding]:
+    """Return doubts about conventions, which fit and validation answer: worth knowing."""
+    return [] if check.finding is None else [replace(check.finding, severity=Severity.INFO)]
 
 
 def _report_fit(fit: Identification) -> list[Finding]:

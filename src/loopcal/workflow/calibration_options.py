@@ -26,6 +26,8 @@ class CalibrationOptions:
     choose_model : free only as many parameters as held-out predictions justify.
     prior : the posterior of an earlier calibration of this machine; its knowledge is kept.
     free_limb : with `prior`: a limb that was repaired, which starts again from its tolerances.
+    check_conventions : refuse data that fit far better in another unit, order, sign or column; see
+        `loopcal.check_conventions`. allow_still : accept targets that no pose moves.
 
     Raises
     ------
@@ -41,6 +43,8 @@ class CalibrationOptions:
     choose_model: bool = False
     prior: Posterior | None = None
     free_limb: str | None = None
+    check_conventions: bool = True
+    allow_still: bool = False
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.hold_out < 1.0:

@@ -10,8 +10,9 @@ from functools import cached_property
 from importlib.metadata import version
 from typing import Any
 
-from loopcal.apply import Validation
+from loopcal.apply import Validation, collect_fitted_rows
 from loopcal.diagnose import (
+    ConventionCheck,
     FitExamination,
     MeasurementSuggestion,
     ModelChoice,
@@ -21,6 +22,7 @@ from loopcal.diagnose import (
 from loopcal.estimate import Change, Identification
 from loopcal.findings import Finding, Severity
 from loopcal.mechanism import Mechanism
+from loopcal.typing import FloatArray
 from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.data_split import DataSplit
 from loopcal.workflow.verdict import Verdict, choose_next_step, decide_verdict
@@ -62,6 +64,7 @@ class CalibrationReport:
     ----------
     options : as given. split : which poses were fitted, and which were held out.
     identification : the fit. start : the geometry before calibration against the fit.
+    conventions : units, signs and columns of the data against the robot.
     validation : errors on held-out poses; None without held-out poses, or where they could not be
         predicted.
     fitted_errors : errors on the fitted poses where no pose was held out; they are optimistic.
@@ -79,6 +82,7 @@ class CalibrationReport:
     split: DataSplit
     identification: Identification
     start: StartCheck
+    conventions: ConventionCheck
     validation: Validation | None
     fitted_errors: Validation | None
     findings: tuple[Finding, ...]
@@ -141,6 +145,14 @@ class CalibrationReport:
         return "\n".join([*lines, f"Next: {self.next_step}"])
 
     __repr__ = __str__
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Return arrays to store: those of the fit, `initial` (values of all parameters before the
+        calibration [SI]), and the fitted rows, see `loopcal.apply.collect_fitted_rows`.
+        """
+        fit = self.identification
+        rows = collect_fitted_rows(self.split.fitted, fit.excluded_poses)
+        return {**fit.arrays(), "initial": fit.initial.values, **rows}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result by name for JSON, SI."""

@@ -15,7 +15,6 @@ are refused only where one of them fits far better: see docs/theory/convention-c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -115,16 +114,14 @@ def check_conventions(
     *,
     allow_still: bool = False,
     allow_implausible: bool = False,
-    sources: Sequence[str] = (),
 ) -> ConventionCheck:
     """Refuse measurements with clear evidence of a wrong convention, and targets that never move.
 
-    `loopcal.io.load_measurements` calls this for every file; call it for measurements that come
-    from elsewhere.
+    `loopcal.calibrate` begins with this check, and so does every command that reads measured data.
 
     Parameters
     ----------
-    robot, data, sources : see `compare_conventions`.
+    robot, data : see `compare_conventions`.
     allow_still : accept targets that no pose moves. allow_implausible : accept any convention
         without comparing others.
 
@@ -137,31 +134,41 @@ def check_conventions(
     Raises
     ------
     DataError
-        With the evidence; its code is that of the finding.
+        With the files of the data and the evidence; its code is that of the finding.
     """
+    try:
+        return _check_conventions(robot, data, allow_still, allow_implausible)
+    except DataError as error:
+        files = " and ".join(dict.fromkeys(o.source for o in data.observations if o.source))
+        if not files:
+            raise
+        raise DataError(f"{files}: {error}") from error
+
+
+def _check_conventions(
+    robot: Mechanism, data: Measurements, allow_still: bool, allow_implausible: bool
+) -> ConventionCheck:
+    """Check as `check_conventions`; its errors name no files."""
     if not allow_still and has_static_targets(data):
         solution = forward(robot, data.readings)
         if solution.converged.any():
             check_targets_move(data.take(solution.converged), solution.T[solution.converged])
     if allow_implausible:
         return ConventionCheck(float("nan"))
-    check = compare_conventions(robot, data, sources)
+    check = compare_conventions(robot, data)
     if check.is_refused:
         raise DataError(check.finding)
     return check
 
 
-def compare_conventions(
-    robot: Mechanism, data: Measurements, sources: Sequence[str] = ()
-) -> ConventionCheck:
+def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck:
     """Compare measurements with a robot under the stated conventions and, where these are
     implausible, under others.
 
     Parameters
     ----------
     robot : as given, before any fit: its values, and its tolerances (stated or default).
-    data : as read. sources : origin of the rows of each of its observations, such as files, for
-        the messages.
+    data : as read. The `source` of its observations, such as a file, appears in the messages.
 
     Raises
     ------
@@ -188,6 +195,7 @@ def compare_conventions(
     against = find_contradiction(free, stated, misfit, BETTER)
     if against is not None and against.misfit <= ALLOWED:
         return _contradict(misfit, against)
+    sources = [rows.source for rows in data.observations if rows.source]
     best = find_best_interpretation(free, stated, misfit, sources)
     if best is not None:
         return _refuse(stated, misfit, *best)

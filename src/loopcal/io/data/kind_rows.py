@@ -131,6 +131,7 @@ def read_observations(
             session=_read_names(table, "session", rows),
             group=_read_names(table, "group", rows),
             context=beside,
+            source=str(table.path),
         )
     except DataError as error:
         raise DataError(f"{table.path}: {error}") from None

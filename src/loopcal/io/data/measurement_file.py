@@ -15,7 +15,6 @@ Files are only parsed here. `load_measurements` passes what it parsed to the che
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,10 +66,11 @@ def load_measurements(
     *,
     allow_outside_stroke: bool = False,
     allow_duplicates: bool = False,
-    allow_still: bool = False,
-    allow_implausible: bool = False,
 ) -> Measurements:
-    """Read a measurement file, or several as one set of measurements, and check their plausibility.
+    """Read a measurement file, or several as one set of measurements.
+
+    Whether their units, signs and columns agree with the robot is checked later, by
+    `loopcal.calibrate` or `loopcal.check_conventions`.
 
     Parameters
     ----------
@@ -78,8 +78,6 @@ def load_measurements(
     robot : the measured robot; its actuators name the columns of the readings.
     allow_outside_stroke, allow_duplicates : accept readings outside the stroke, and rows that
         repeat another row to the last digit.
-    allow_still, allow_implausible : accept targets that no pose moves, and values that fit far
-        better in another unit, order, sign or column; see `loopcal.diagnose.check_conventions`.
 
     Returns
     -------
@@ -91,22 +89,15 @@ def load_measurements(
     DataError : a check fails; with the file.
     ArgumentTypeError : `path` is not a path, or `robot` is not a robot.
     """
-    from loopcal.diagnose import check_conventions
     from loopcal.measure import check_duplicates, check_strokes, solve_commanded_readings
 
     parsed = read_measurements(path, robot, solve_commanded_readings)
-    data, places = parsed.data, parsed.places
-    files = [next(iter(rows), "").rpartition(":")[0] for rows in places]
+    data = parsed.data
     try:
         check_strokes(data, robot, allow=allow_outside_stroke)
-        check_duplicates(data, allow=allow_duplicates, places=places)
-        check = check_conventions(
-            robot, data, allow_still=allow_still, allow_implausible=allow_implausible, sources=files
-        )
+        check_duplicates(data, allow=allow_duplicates, places=parsed.places)
     except DataError as error:
         raise DataError(f"{parsed.names}: {error}") from error
-    if check.finding is not None:
-        logging.getLogger(__name__).warning("%s: %s", parsed.names, check.finding)
     return data
 
 

@@ -4,8 +4,8 @@
 result.json    made_by    see `run_folder.MADE_BY`
 others     `CalibrationReport.to_dict()`: `fit`, `start`, `split`, `validation`
 and more; parameters in the units of the robot file, the rest in SI
-arrays.npz     `Identification.arrays()`, `initial` (values of all parameters before the
-calibration [SI]) and the fitted rows (`loopcal.apply.reused_rows`)
+arrays.npz     `CalibrationReport.arrays()`: estimates, the geometry before the calibration, and
+the fitted rows
 robot.yaml     the corrected robot file
 """
 
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import DataError, FileError
-from loopcal.findings import Finding, report_finding
+from loopcal.findings import report_finding
 from loopcal.io.core.text_file import as_path, sha256
 from loopcal.io.data.measurement_file import Paths, list_measurement_files, load_measurements
 from loopcal.io.robot.robot_file import format_robot, list_shipped_robots, load_robot
@@ -131,13 +131,9 @@ def save_run(
     FileError : the folder is in use, or cannot be written; an input cannot be read.
     MechanismError : the robot was not loaded from a file.
     """
-    from loopcal.apply.reused_rows import collect_fitted_rows
-
-    fit = report.identification
-    rows = collect_fitted_rows(report.split.fitted, fit.excluded_poses)
-    arrays = {**fit.arrays(), "initial": fit.initial.values, **rows}
-    text = format_robot(fit.robot, fit.plus_minus)
-    return write_run_folder(path, build_document(report, inputs, command), arrays, text, force)
+    document = build_document(report, inputs, command)
+    text = format_robot(report.robot, report.identification.plus_minus)
+    return write_run_folder(path, document, report.arrays(), text, force)
 
 
 def build_document(
@@ -209,20 +205,11 @@ def load_posterior_or_robot(path: str | Path) -> Mechanism | Posterior:
     return load_posterior(path) if Path(path).is_dir() else load_run_or_robot(path).robot
 
 
-def check_reused_data(run: Run, data: Paths, measured: Measurements) -> Finding | None:
-    """Refuse data for validation that the run was fitted to, as files or row by row.
+def refuse_fitted_files(run: Run, data: Paths) -> None:
+    """Raise DataError where a file for validation is one that the run was fitted to.
 
-    Returns
-    -------
-    A finding where fewer than half of the rows were fitted; None without such rows.
-
-    Raises
-    ------
-    DataError : a file is one of the run's inputs, or half of the rows or more were fitted.
+    `loopcal.apply.find_reused_rows` recognizes rows in other files.
     """
-    from loopcal.apply.reused_rows import find_reused_rows
-
     reused = find_fitted_file(run.result, list_measurement_files(data))
     if reused is not None:
         raise DataError(report_finding("validation.file-reused", file=str(reused)))
-    return find_reused_rows(run.arrays, measured)
