@@ -8,7 +8,8 @@ import pytest
 
 from loopcal.errors import FileError
 from loopcal.io.formats.import_export import build_imported_robot
-from loopcal.io.formats.printers import klipper, printer_cfg
+from loopcal.io.formats.printers import klipper
+from loopcal.io.formats.printers.klipper_config import read_config
 from loopcal.io.formats.program_format import ExportSource, ImportOptions
 
 SHORT = """\
@@ -43,7 +44,7 @@ def read(folder, text: str):
 
 def test_defaults_are_those_of_klipper_and_the_main_part_hides_the_saved_one(tmp_path) -> None:
     (tmp_path / "printer.cfg").write_text(SHORT + SAVED)
-    found = klipper.parse_geometry(printer_cfg.read(tmp_path / "printer.cfg"))
+    found = klipper.parse_geometry(read_config(tmp_path / "printer.cfg"))
     assert found.radius == 130.0
     assert found.angles == (210.0, 330.5, 90.0)
     assert found.arms == (250.0, 250.0, 250.0)
@@ -133,12 +134,12 @@ def test_gear_ratios_that_are_none_are_refused(tmp_path, ratio) -> None:
         SHORT.replace("microsteps: 16", f"microsteps: 16\ngear_ratio: {ratio}")
     )
     with pytest.raises(FileError, match=":9: gear_ratio is"):
-        klipper.get_step_distance(printer_cfg.read(tmp_path / "printer.cfg"), "stepper_a")
+        klipper.get_step_distance(read_config(tmp_path / "printer.cfg"), "stepper_a")
 
 
 def test_steps_of_geared_motors(tmp_path) -> None:
     (tmp_path / "printer.cfg").write_text(
         SHORT.replace("microsteps: 16", "microsteps: 16\ngear_ratio: 57:11, 2:1")
     )
-    found = klipper.get_step_distance(printer_cfg.read(tmp_path / "printer.cfg"), "stepper_a")
+    found = klipper.get_step_distance(read_config(tmp_path / "printer.cfg"), "stepper_a")
     assert found == pytest.approx(40 / (200 * 16 * 57 / 11 * 2), rel=1e-15)

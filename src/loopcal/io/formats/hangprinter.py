@@ -27,7 +27,7 @@ import numpy as np
 from loopcal.errors import FileError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.io.core.text_file import read_text
-from loopcal.io.formats.program_format import Format, Imported, ImportOptions
+from loopcal.io.formats.program_format import Format, Imported, ImportOptions, format_head
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements
@@ -48,15 +48,8 @@ IGNORED = (FORCES, "springKPerUnitLength", "mover_weight", "line_lengths_when_at
 SILENT = ("_source", "abc_axis_min_force_limit", "abc_axis_max_force_limit")
 """Keys without effect on the geometry."""
 
+REMARK = "Readings are motor angles, zero at the origin; growing readings pay out line."
 ROBOT = """\
-# Read from {origin}, samples of a hanging printer. Readings are motor angles, zero at the origin;
-# growing readings pay out line.
-format: 1
-family: limbs
-name: {name}
-source: {source}
-units: {{length: mm, angle: deg}}
-
 freedoms: [x, y, z]
 controlled: [x, y, z]
 # radius: line paid out per radian of the motor; sigma: the motor angle of {sigma:g} mm of line
@@ -217,10 +210,8 @@ def format_robot(samples: Samples, anchors: FloatArray, path: Path, options: Imp
         for name, anchor, length in zip(samples.names, anchors, lengths, strict=True)
     ]
     side = round(0.25 * lengths.min())
-    return ROBOT.format(
-        origin=path.name.replace("\n", " "),
-        name=json.dumps(options.name),
-        source=json.dumps(f"{path.name}, samples of a hanging printer"),
+    what, units = "samples of a hanging printer", ("mm", "deg")
+    return format_head(path, what, "limbs", options.name, units, REMARK) + ROBOT.format(
         sigma=sigma,
         drives="\n".join(drives),
         limbs="\n".join(limbs),

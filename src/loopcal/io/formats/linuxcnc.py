@@ -17,12 +17,13 @@ machine's. Source: the documentation of genhexkins (LinuxCNC, "Kinematics").
 
 from __future__ import annotations
 
-import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
@@ -34,31 +35,23 @@ from loopcal.io.formats.program_format import (
     Format,
     Imported,
     ImportOptions,
-    get_byte_order_mark,
+    format_head,
     get_record,
-    parse_number,
-    report_change,
-    report_changes,
 )
+from loopcal.io.formats.value_file import Name, Value, ValueFile
 from loopcal.mechanism.families.gough import Gough
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
 
-SETP = re.compile(r"\s*setp\s+(genhexkins\.[\w.-]+)(\s*=\s*|\s+)([^\s#]+)")
-LEAD, OFFSETS = "genhexkins.screw-lead", ("genhexkins.spindle-offset", "genhexkins.tool-offset")
-SIDES = ("base", "platform")
-Point = tuple[float, float, float]
+COMPONENT = "genhexkins"
+SETP = re.compile(rf"\s*setp\s+{COMPONENT}\.([\w.-]+)(\s*=\s*|\s+)([^\s#]+)")
+LEAD, OFFSETS = "screw-lead", ("spindle-offset", "tool-offset")
+SIDES, UP = ("base", "platform"), np.array([0.0, 0.0, 1.0])
 ROUNDING = 1e-12
 """Relative difference of numbers that count as the same."""
 
+REMARK = "Readings are strut lengths, so the lengths at reading zero are 0."
 ROBOT = """\
-# Read from {origin}, the genhexkins settings of LinuxCNC. Readings are strut lengths, so the
-# lengths at reading zero are 0.
-format: 1
-family: gough
-name: {name}
-source: {source}
-units: {{length: {unit}, angle: deg}}
-
 legs: {legs}
 base:
 {base}
@@ -78,44 +71,45 @@ screw:
 
 
 @dataclass(frozen=True)
-class _Pin:
-    """The value of a pin, with its line (from 0) and column."""
+class HalFile(ValueFile):
+    """A HAL file, whose values are pins of genhexkins."""
 
-    text: str
-    line: int
-    start: int
+    title = phrase = "{0}.{1}"
 
+    def describe_missing(self, group: str, name: str) -> str:
+        """Return the sentence about a pin that is not set."""
+        return f"'setp {group}.{name} ..' is missing, and loopcal assumes no default; add it"
 
-@dataclass(frozen=True)
-class _Hal:
-    """A HAL file: its lines and pins."""
+    def with_lines(self, lines: Sequence[str]) -> HalFile:
+        """Return the file with other lines."""
+        return _parse_hal(lines, self.path)
 
-    path: Path
-    lines: tuple[str, ...]
-    pins: Mapping[str, _Pin]
+    def insert(self, lines: list[str], name: Name, text: str) -> None:
+        """Insert a line for a new pin at the end."""
+        lines.append(f"setp {'.'.join(name)} {text}{self.line_end}")
 
-    def number(self, name: str, default: float | None = None) -> float:
+    def format(self, number: float) -> str:
+        """Return a number with the fewest digits that read back equal."""
+        return format_scaled(number, 1.0)
+
+    def is_same(self, a: float, b: float) -> bool:
+        """Return whether two numbers differ by rounding only."""
+        return abs(a - b) <= ROUNDING * max(1.0, abs(b))
+
+    def pin(self, name: str, default: float | None = None) -> float:
         """Return the number of a pin, or the default; FileError where there is neither."""
-        pin = self.pins.get(name)
-        if pin is None:
-            if default is not None:
-                return default
-            sentence = f"'setp {name} ..' is missing, and loopcal assumes no default"
-            raise FileError(f"{sentence}; add it", self.path)
-        return parse_number(pin.text, name, self.path, pin.line + 1)
+        return self.number(COMPONENT, name, default)
 
-    def points(self, kind: str) -> list[Point]:
-        """Return the six centers or axes; LinuxCNC has z at 0 where it is not set."""
-        names = [f"genhexkins.{kind}.{n}" for n in range(6)]
-        return [
-            (self.number(f"{n}.x"), self.number(f"{n}.y"), self.number(f"{n}.z", 0.0))
-            for n in names
-        ]
+    def points(self, kind: str) -> FloatArray:
+        """Return the six centers or axes (6, 3); LinuxCNC has z at 0 where it is not set."""
+        names = [f"{kind}.{n}" for n in range(6)]
+        xyz = [(self.pin(f"{n}.x"), self.pin(f"{n}.y"), self.pin(f"{n}.z", 0.0)) for n in names]
+        return np.array(xyz)
 
     @property
     def lift(self) -> float:
         """Height that is added to all centers."""
-        return sum(self.number(name, 0.0) for name in OFFSETS)
+        return sum(self.pin(name, 0.0) for name in OFFSETS)
 
 
 def read(path: Path, options: ImportOptions) -> Imported:
@@ -129,32 +123,29 @@ def read(path: Path, options: ImportOptions) -> Imported:
     if options.length_unit is None:
         raise FileError(report_finding("files.unit-missing"), path)
     unit = find_unit(options.length_unit, Dimension.LENGTH)
-    lift, lead = hal.lift, hal.number(LEAD, 0.0)
-    centers = {side: [(x, y, z + lift) for x, y, z in hal.points(side)] for side in SIDES}
+    lift, lead = hal.lift, hal.pin(LEAD, 0.0)
+    base, platform = (hal.points(side) + lift * UP for side in SIDES)
     findings: tuple[Finding, ...] = ()
     if options.home_height is None:
-        home = sum(math.hypot(x, y) for x, y, _ in centers["base"]) / 6
+        home = sum(math.hypot(x, y) for x, y, _ in base.tolist()) / 6
         findings = (report_finding("files.home-assumed", height=f"{home:g} {unit}"),)
     else:
         home = options.home_height / unit.factor_to_si
     screw = ""
     if lead:
         low, high = hal.points("base-n"), hal.points("platform-n")
-        struts = zip(centers["base"], centers["platform"], low, high, strict=True)
-        signs = [_get_hand(*strut, home) for strut in struts]
-        turned = [_flip(axis, sign) for axis, sign in zip(high, signs, strict=True)]
-        leads = lead if min(signs) > 0 else [sign * lead for sign in signs]
+        hands = _get_hands(platform + home * UP - base, low, high)
+        leads = lead if min(hands) > 0 else (hands * lead).tolist()
+        turned = hands[:, None] * high
         screw = SCREW.format(
             lead=leads, base=_format_list(low, 4), platform=_format_list(turned, 4)
         )
-    text = ROBOT.format(
-        origin=path.name,
-        name=json.dumps(options.name),
-        source=json.dumps(f"{path.name}, genhexkins settings of LinuxCNC"),
-        unit=json.dumps(unit.symbol),
+    what, units = "genhexkins settings of LinuxCNC", (unit.symbol, "deg")
+    head = format_head(path, what, "gough", options.name, units, REMARK)
+    text = head + ROBOT.format(
         legs="ups" if lead else "rod",
-        base=_format_list(centers["base"], 2),
-        platform=_format_list(centers["platform"], 2),
+        base=_format_list(base, 2),
+        platform=_format_list(platform, 2),
         home=home,
         screw=screw,
     )
@@ -165,61 +156,40 @@ def write(source: ExportSource, into: Path | None) -> Exported:
     """Return the corrected pins in an existing HAL file, or `setp` lines of their own."""
     record: Gough = get_record(source, Gough, "linuxcnc", "a hexapod of the family gough")
     unit = find_unit(source.robot.units[Dimension.LENGTH])
-    hal = _Hal(Path("hexapod.hal"), (), {}) if into is None else _read_hal(into)
-    lead = hal.number(LEAD) if LEAD in hal.pins else None
-    lines, changes = list(hal.lines), []
-    has_end = not lines or lines[-1].endswith("\n")
-    if not has_end:
-        lines[-1] += "\n"
-    for name, value in _list_pins(source, record, unit.factor_to_si, hal.lift, lead):
-        pin = hal.pins.get(name)
-        if pin is None:
-            if into is not None and value == 0.0:
-                continue
-            text = format_scaled(value, 1.0)
-            lines.append(f"setp {name} {text}\n")
-            changes.append(report_change(len(lines), name, None, text))
-            continue
-        if abs(hal.number(name) - value) <= ROUNDING * max(1.0, abs(value)):
-            continue
-        text = format_scaled(value, 1.0)
-        line = lines[pin.line]
-        lines[pin.line] = line[: pin.start] + text + line[pin.start + len(pin.text) :]
-        changes.append(report_change(pin.line + 1, name, pin.text, text))
-    if not has_end and len(lines) == len(hal.lines):
-        lines[-1] = lines[-1].removesuffix("\n")
-    first = report_changes(changes)
+    hal = _parse_hal((), Path("hexapod.hal")) if into is None else _read_hal(into)
+    lead = hal.pin(LEAD) if hal.has(COMPONENT, LEAD) else None
+    wanted = _list_pins(source, record, unit.factor_to_si, hal.lift, lead)
+    findings = _report_inexpressible(source, unit.factor_to_si, unit.symbol)
     if into is None:
-        first = (report_finding("files.machine-unit", unit=unit.symbol),)
-    mark = "" if into is None else get_byte_order_mark(into)
-    rest = _report_inexpressible(source, unit.factor_to_si, unit.symbol)
-    return Exported(mark + "".join(lines), (*first, *rest))
+        findings = (report_finding("files.machine-unit", unit=unit.symbol), *findings)
+    return hal.export(into, wanted, dict.fromkeys(wanted, 0.0), tuple(findings))
 
 
 def _list_pins(
     source: ExportSource, record: Gough, factor: float, lift: float, present: float | None
-) -> Iterator[tuple[str, float]]:
-    """Yield pin and value in the file's unit; `present` is the lead there, whose sign is kept."""
-    values = source.values()
+) -> dict[Name, float | str]:
+    """Return pin -> value in the file's unit; `present` is the lead there, whose sign is kept."""
+    values, pins = source.values(), {}
     for n in range(6):
         for side in SIDES:
             for axis in "xyz":
                 value = values[f"leg{n + 1}.{side}.{axis}"] / factor
                 shifted = value - (lift if axis == "z" else 0.0)
-                yield f"genhexkins.{side}.{n}.{axis}", float(format_scaled(shifted, 1.0))
-    if record.screw is None:
-        return
-    legs = record.screw.legs()
-    lead = abs(legs[0].lead) if present is None else math.copysign(legs[0].lead, present)
-    if any(abs(abs(leg.lead) - abs(lead)) > ROUNDING * abs(lead) for leg in legs):
-        sentence = f"{source.robot.name} has screws of different lead, but genhexkins has one lead"
-        raise DataError(f"{sentence}; use json or csv")
-    yield LEAD, lead / factor
-    for n, leg in enumerate(legs):
-        upper = _flip(leg.platform_axis, math.copysign(1.0, leg.lead * lead))
-        for side, direction in (("base-n", leg.base_axis), ("platform-n", upper)):
-            for axis, value in zip("xyz", direction, strict=True):
-                yield f"genhexkins.{side}.{n}.{axis}", value
+                pins[f"{side}.{n}.{axis}"] = float(format_scaled(shifted, 1.0))
+    if record.screw is not None:
+        legs = record.screw.legs()
+        lead = abs(legs[0].lead) if present is None else math.copysign(legs[0].lead, present)
+        if any(abs(abs(leg.lead) - abs(lead)) > ROUNDING * abs(lead) for leg in legs):
+            sentence = f"{source.robot.name} has screws of different lead, but genhexkins has one"
+            raise DataError(f"{sentence} lead; use json or csv")
+        pins[LEAD] = lead / factor
+        for n, leg in enumerate(legs):
+            sign = math.copysign(1.0, leg.lead * lead)
+            for i, axis in enumerate("xyz"):
+                pins[f"base-n.{n}.{axis}"] = leg.base_axis[i]
+            for i, axis in enumerate("xyz"):
+                pins[f"platform-n.{n}.{axis}"] = 0.0 + sign * leg.platform_axis[i]
+    return {(COMPONENT, pin): value for pin, value in pins.items()}
 
 
 def _report_inexpressible(source: ExportSource, factor: float, symbol: str) -> Iterator[Finding]:
@@ -239,41 +209,31 @@ def _report_inexpressible(source: ExportSource, factor: float, symbol: str) -> I
         yield report_finding("files.not-expressed", format="genhexkins", names=tuple(others))
 
 
-def _read_hal(path: Path) -> _Hal:
+def _read_hal(path: Path) -> HalFile:
     """Read the pins of a file; FileError where it has none."""
-    lines = tuple(read_text(path, "HAL file").splitlines(keepends=True))
-    pins = {
-        match[1]: _Pin(match[3], i, match.start(3))
-        for i, line in enumerate(lines)
-        if (match := SETP.match(line))
-    }
-    if not pins:
-        sentence = "this file has no 'setp genhexkins...'"
+    hal = _parse_hal(read_text(path, "HAL file").splitlines(keepends=True), path)
+    if not hal.values:
+        sentence = f"this file has no 'setp {COMPONENT}...'"
         raise FileError(f"{sentence}; name the HAL file that sets the geometry", path)
-    return _Hal(path, lines, pins)
+    return hal
 
 
-def _get_hand(base: Point, top: Point, low: Point, high: Point, home: float) -> float:
-    """Return -1 where the axes are beyond a quarter turn about the strut at home, else 1.
-
-    `home` is the height of the platform.
-    """
-    strut = (top[0] - base[0], top[1] - base[1], top[2] + home - base[2])
-    across = _dot(low, high) * _dot(strut, strut) - _dot(low, strut) * _dot(high, strut)
-    return -1.0 if across < 0 else 1.0
+def _parse_hal(lines: Sequence[str], path: Path) -> HalFile:
+    """Find the pins."""
+    matches = ((i, SETP.match(line)) for i, line in enumerate(lines))
+    pins = {(COMPONENT, m[1]): Value(m[3], i, m.start(3)) for i, m in matches if m is not None}
+    return HalFile(path, tuple(lines), pins)
 
 
-def _dot(a: Point, b: Point) -> float:
-    return sum(x * y for x, y in zip(a, b, strict=True))
+def _get_hands(struts: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return (6,) -1 where the axes are beyond a quarter turn about the strut at home, else 1."""
+    across = (low * high).sum(1) * (struts * struts).sum(1)
+    across -= (low * struts).sum(1) * (high * struts).sum(1)
+    return np.where(across < 0, -1.0, 1.0)
 
 
-def _flip(axis: Sequence[float], sign: float) -> Point:
-    x, y, z = axis
-    return (x, y, z) if sign > 0 else (0.0 - x, 0.0 - y, 0.0 - z)
-
-
-def _format_list(points: list[Point], indent: int) -> str:
-    return "\n".join(f"{' ' * indent}- [{', '.join(repr(v) for v in point)}]" for point in points)
+def _format_list(points: FloatArray, indent: int) -> str:
+    return "\n".join(f"{' ' * indent}- {point}" for point in (0.0 + points).tolist())
 
 
 FORMAT = Format(

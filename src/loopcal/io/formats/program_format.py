@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import json
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -131,6 +133,28 @@ def get_record(source: ExportSource, family: type, format_name: str, needed: str
     return record
 
 
+def format_head(
+    path: Path, what: str, family: str, name: str, units: tuple[str, str], remark: str = ""
+) -> str:
+    """Return the first lines of a robot file that is read from `path`.
+
+    Parameters
+    ----------
+    what : the content of that file. units : of length and angle. remark : for people.
+    """
+    origin = " ".join(f"{path.name}, {what}".split())
+    return "\n".join(
+        [
+            *(f"# {line}" for line in textwrap.wrap(f"Read from {origin}. {remark}", 98)),
+            "format: 1",
+            f"family: {family}",
+            f"name: {json.dumps(name)}",
+            f"source: {json.dumps(origin)}",
+            f"units: {{length: {units[0]}, angle: {units[1]}}}\n\n",
+        ]
+    )
+
+
 def parse_number(text: str, what: str, path: Path, line: int) -> float:
     """Return a finite number of a file; FileError with its line for other text."""
     value = parse_finite(text)
@@ -143,11 +167,6 @@ def parse_number(text: str, what: str, path: Path, line: int) -> float:
 def report_changes(changes: Sequence[Finding]) -> tuple[Finding, ...]:
     """Return the changes of a file; the finding that nothing changed where there are none."""
     return tuple(changes) or (report_finding("files.unchanged"),)
-
-
-def report_change(line: int, name: str, before: str | None, after: str) -> Finding:
-    """Return the finding that a value was changed, or added where `before` is None."""
-    return report_finding("files.value-changed", line=line, name=name, before=before, after=after)
 
 
 def get_byte_order_mark(path: Path) -> str:

@@ -27,6 +27,7 @@ from loopcal.io.formats.program_format import (
     Format,
     Imported,
     ImportOptions,
+    format_head,
     get_byte_order_mark,
     get_record,
     report_changes,
@@ -55,15 +56,8 @@ PLACED = 1e-9
 COORDINATES = {"rx": "roll", "ry": "pitch", "rz": "yaw", "x": "x", "y": "y", "z": "z"}
 POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 
+REMARK = "Limbs are named after their first joint, joints as in the URDF."
 ROBOT = """\
-# Read from {origin}, a URDF with loop closures. Limbs are named after their first joint, joints as
-# in the URDF.
-format: 1
-family: limbs
-name: {name}
-source: {source}
-units: {{length: m, angle: rad}}
-
 freedoms: [{freedoms}]
 controlled: [{controlled}]
 actuators:
@@ -110,10 +104,9 @@ def read(path: Path, options: ImportOptions) -> Imported:
     home = graph.places[platform] @ T_body_frame
     coordinates = choose_coordinates(graph.twists(platform, home[:3, 3]) @ motion)
     drives = (f"  {json.dumps(name)}: {_format_drive(urdf, name)}" for name in graph.motors)
-    text = ROBOT.format(
-        origin=path.name,
-        name=json.dumps(options.name),
-        source=json.dumps(f"{path.name} with {closures.name}"),
+    what = f"a URDF with loop closures in {closures.name}"
+    head = format_head(path, what, "limbs", options.name, ("m", "rad"), REMARK)
+    text = head + ROBOT.format(
         freedoms=", ".join(paths.freedoms),
         controlled=", ".join(COORDINATES[name] for name in coordinates),
         actuators="\n".join(drives),

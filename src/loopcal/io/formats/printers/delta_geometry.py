@@ -3,23 +3,16 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from loopcal.errors import FileError
-from loopcal.io.formats.program_format import ExportSource, get_record
+from loopcal.io.formats.program_format import ExportSource, format_head, get_record
 from loopcal.mechanism.families.linear_delta import LinearDelta
-
-DECIMALS = 6
-"""Decimals of written numbers [mm, deg]: those that Klipper itself saves, a nanometre."""
 
 NOMINAL_ANGLES = (210.0, 330.0, 90.0)
 """Angles of the towers in firmware, before any correction [deg]."""
-
-Three = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -31,19 +24,12 @@ class DeltaGeometry:
     """
 
     radius: float
-    angles: Three
-    arms: Three
-    stops: Three
+    angles: tuple[float, ...]
+    arms: tuple[float, ...]
+    stops: tuple[float, ...]
 
 
 ROBOT = """\
-# Read from {origin}, {program}.
-format: 1
-family: linear-delta
-name: {name}
-source: {source}
-units: {{length: mm, angle: deg}}
-
 radius: {radius}
 angles: {angles}     # of the towers; the third defines the x axis and stays fixed
 arms: {arms}
@@ -64,11 +50,8 @@ def format_robot(
         act = "the radius must be positive and every arm longer than it; correct them"
         raise FileError(f"{sentence} {min(geometry.arms):g} mm; {act}", path)
     half = round(0.5 * geometry.radius)
-    return ROBOT.format(
-        origin=path.name.replace("\n", " "),
-        program=program,
-        name=json.dumps(name),
-        source=json.dumps(f"{path.name}, {program}"),
+    head = format_head(path, program, "linear-delta", name, ("mm", "deg"))
+    return head + ROBOT.format(
         radius=geometry.radius,
         angles=list(geometry.angles),
         arms=list(geometry.arms),
@@ -84,8 +67,8 @@ def get_geometry(source: ExportSource, format_name: str) -> DeltaGeometry:
     get_record(source, LinearDelta, format_name, "a robot of the family linear-delta")
     values = source.values()
 
-    def list_towers(name: str, factor: float) -> Three:
-        return as_three([values[name.format(k)] * factor for k in (1, 2, 3)])
+    def list_towers(name: str, factor: float) -> tuple[float, ...]:
+        return tuple(values[name.format(k)] * factor for k in (1, 2, 3))
 
     return DeltaGeometry(
         values["radius"] * 1e3,
@@ -93,19 +76,3 @@ def get_geometry(source: ExportSource, format_name: str) -> DeltaGeometry:
         list_towers("arm{}.length", 1e3),
         list_towers("tower{}.stop", 1e3),
     )
-
-
-def format_number(value: float) -> str:
-    """Return a number as it is written."""
-    return f"{value:.{DECIMALS}f}"
-
-
-def is_same(*pairs: tuple[float, float]) -> bool:
-    """Return whether the two numbers of each pair are written alike."""
-    return all(format_number(a) == format_number(b) for a, b in pairs)
-
-
-def as_three(values: Sequence[float]) -> Three:
-    """Return three numbers, one for each tower."""
-    a, b, c = values
-    return a, b, c

@@ -11,36 +11,28 @@ full_steps_per_rotation * gear_ratio), or older `step_distance`. [delta_calibrat
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.findings import Quantity, report_finding
 from loopcal.io.core.numbers import parse_finite
-from loopcal.io.formats.printers import printer_cfg
 from loopcal.io.formats.printers.delta_geometry import (
     NOMINAL_ANGLES,
     DeltaGeometry,
-    Three,
-    as_three,
-    format_number,
     format_robot,
     get_geometry,
-    is_same,
 )
-from loopcal.io.formats.printers.printer_cfg import PrinterConfig
+from loopcal.io.formats.printers.klipper_config import KlipperConfig, parse_config, read_config
 from loopcal.io.formats.program_format import (
     Exported,
     ExportSource,
     Format,
     Imported,
     ImportOptions,
-    get_byte_order_mark,
-    report_change,
-    report_changes,
 )
+from loopcal.io.formats.value_file import Name
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements
@@ -57,7 +49,7 @@ class _Probes:
     in mm.
     """
 
-    positions: dict[str, Three]
+    positions: dict[str, tuple[float, ...]]
     heights: list[tuple[str, float]]
     distances: list[tuple[str, str, float]]
 
@@ -69,7 +61,7 @@ def read(path: Path, options: ImportOptions) -> Imported:
     ------
     FileError : an option is missing or not a number, or the printer is not a delta.
     """
-    cfg = printer_cfg.read(path)
+    cfg = read_config(path)
     if (kinematics := cfg.text("printer", "kinematics")) != "delta":
         sentence = f"kinematics is {kinematics!r}, but loopcal only reads Klipper's delta printers"
         raise cfg.error(f"{sentence} (kinematics: delta)", "printer", "kinematics")
@@ -89,20 +81,20 @@ def read(path: Path, options: ImportOptions) -> Imported:
     return Imported(text, _build_measurements(probes, steps, options), (finding,))
 
 
-def parse_geometry(cfg: PrinterConfig) -> DeltaGeometry:
+def parse_geometry(cfg: KlipperConfig) -> DeltaGeometry:
     """Return the geometry with Klipper's defaults: arm and stop of tower a, angles 210, 330, 90."""
     angles = zip(STEPPERS, NOMINAL_ANGLES, strict=True)
     arm = cfg.number(STEPPERS[0], "arm_length")
     stop = cfg.number(STEPPERS[0], "position_endstop")
     return DeltaGeometry(
         cfg.number("printer", "delta_radius"),
-        as_three([cfg.number(s, "angle", nominal) for s, nominal in angles]),
-        as_three([cfg.number(s, "arm_length", arm) for s in STEPPERS]),
-        as_three([cfg.number(s, "position_endstop", stop) for s in STEPPERS]),
+        tuple(cfg.number(s, "angle", nominal) for s, nominal in angles),
+        tuple(cfg.number(s, "arm_length", arm) for s in STEPPERS),
+        tuple(cfg.number(s, "position_endstop", stop) for s in STEPPERS),
     )
 
 
-def get_step_distance(cfg: PrinterConfig, section: str) -> float:
+def get_step_distance(cfg: KlipperConfig, section: str) -> float:
     """Return the length of one motor step [mm]."""
     has_rotation = cfg.has(section, "rotation_distance")
     if not has_rotation and cfg.has(section, "step_distance"):
@@ -116,61 +108,48 @@ def get_step_distance(cfg: PrinterConfig, section: str) -> float:
 def write(source: ExportSource, into: Path | None) -> Exported:
     """Return the corrected numbers in an existing printer.cfg, or a saved block to paste."""
     geometry = get_geometry(source, "klipper")
-    if into is None:
-        cfg = printer_cfg.parse((), Path("printer.cfg"))
-        for section, option, value in _list_options(geometry):
-            cfg = cfg.replace(section, option, format_number(value))
-        text = "".join(cfg.lines).lstrip("\n")
-        return Exported(text, (report_finding("files.saved-block"),))
-    cfg = printer_cfg.read(into)
-    changes: list[Finding] = []
-    for section, option, value in _list_options(geometry):
-        present = _get_present(cfg, section, option)
-        if present is not None and is_same((present, value)):
-            continue
-        text = format_number(value)
-        cfg = cfg.replace(section, option, text)
-        line = cfg.options[section, option].line + 1
-        before = None if present is None else format_number(present)
-        changes.append(report_change(line, f"[{section}] {option}", before, text))
-    return Exported(get_byte_order_mark(into) + "".join(cfg.lines), report_changes(changes))
-
-
-def _list_options(geometry: DeltaGeometry) -> Iterator[tuple[str, str, float]]:
-    """Yield section, option and value of the geometry."""
-    yield "printer", "delta_radius", geometry.radius
+    wanted: dict[Name, float | str] = {("printer", "delta_radius"): geometry.radius}
+    defaults: dict[Name, float] = {}
     for k, section in enumerate(STEPPERS):
-        yield section, "angle", geometry.angles[k]
-        yield section, "arm_length", geometry.arms[k]
-        yield section, "position_endstop", geometry.stops[k]
+        wanted[section, "angle"] = geometry.angles[k]
+        defaults[section, "angle"] = NOMINAL_ANGLES[k]
+        for option, values in (("arm_length", geometry.arms), ("position_endstop", geometry.stops)):
+            wanted[section, option] = values[k]
+            if k:  # left out, it is that of tower a
+                defaults[section, option] = values[0]
+    if into is not None:
+        return read_config(into).export(into, wanted, defaults)
+    new = parse_config((), Path("printer.cfg"))
+    written = new.export(None, wanted, defaults, (report_finding("files.saved-block"),))
+    return replace(written, text=written.text.lstrip("\n"))
 
 
-def _get_present(cfg: PrinterConfig, section: str, option: str) -> float | None:
-    """Return the number that counts now, by Klipper's defaults; None where there is none."""
-    if cfg.has(section, option):
-        return cfg.number(section, option)
-    if option == "angle" and section in STEPPERS:
-        return NOMINAL_ANGLES[STEPPERS.index(section)]
-    return cfg.number(STEPPERS[0], option) if cfg.has(STEPPERS[0], option) else None
-
-
-def _parse_probes(cfg: PrinterConfig) -> _Probes:
+def _parse_probes(cfg: KlipperConfig) -> _Probes:
     """Return the probes of [delta_calibrate]; like Klipper, up to the first missing number."""
     probes = _Probes({}, [], [])
     for name in ("height", "manual_height"):
         for i in count():
             if not cfg.has(PROBED, f"{name}{i}"):
                 break
-            probes.positions[f"{name}{i}"] = cfg.three(PROBED, f"{name}{i}_pos")
+            probes.positions[f"{name}{i}"] = _parse_steps(cfg, f"{name}{i}_pos")
             probes.heights.append((f"{name}{i}", cfg.number(PROBED, f"{name}{i}")))
     for i in count():
         if not cfg.has(PROBED, f"distance{i}"):
             break
         ends = (f"distance{i}_pos1", f"distance{i}_pos2")
         for end in ends:
-            probes.positions[end] = cfg.three(PROBED, end)
+            probes.positions[end] = _parse_steps(cfg, end)
         probes.distances.append((*ends, cfg.number(PROBED, f"distance{i}")))
     return probes
+
+
+def _parse_steps(cfg: KlipperConfig, option: str) -> tuple[float, ...]:
+    """Return the steps of the towers, separated by commas."""
+    steps = cfg.numbers(PROBED, option, ",")
+    if len(steps) != len(STEPPERS):
+        sentence = f"{option!r} of [{PROBED}] has {len(steps)} numbers, but three are needed"
+        raise cfg.error(f"{sentence}, the steps of the towers; correct it", PROBED, option)
+    return steps
 
 
 def _build_measurements(
@@ -197,7 +176,7 @@ def _build_measurements(
     return Measurements(options.name, readings, tuple(observations), labels=labels)
 
 
-def _parse_gear_ratio(cfg: PrinterConfig, section: str) -> float:
+def _parse_gear_ratio(cfg: KlipperConfig, section: str) -> float:
     """Return the turns of the motor for one of the last gear: `57:11, 2:1` is 57 / 11 * 2."""
     if not cfg.has(section, "gear_ratio"):
         return 1.0
