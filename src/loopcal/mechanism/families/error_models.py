@@ -13,11 +13,12 @@ Derivation: docs/theory/parameters.md.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal.mechanism.assembly import AXES, Address, LinearMap
+from loopcal.mechanism.assembly import AXES, Address, LinearMap, SharedMap
 from loopcal.mechanism.families.limb_placement import PlacedLimb, map_displacement
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
@@ -32,52 +33,50 @@ class ErrorModel:
 
     parameters: tuple[Parameter, ...] = ()
     maps: tuple[LinearMap, ...] = ()
+    shared: tuple[SharedMap, ...] = ()
 
     def __add__(self, other: ErrorModel) -> ErrorModel:
-        return ErrorModel(self.parameters + other.parameters, self.maps + other.maps)
+        return join_errors((self, other))
 
     def without_effects_of(self, named: ErrorModel) -> ErrorModel:
         """Return these parameters without those whose effect `named` or earlier ones have already.
 
         A parameter whose name is taken gets the suffix `.own`.
         """
-        place = {
-            address: i
-            for i, address in enumerate(dict.fromkeys(m.address for m in (*named.maps, *self.maps)))
-        }
-        taken, left, basis = (
-            {p.name for p in named.parameters},
-            ErrorModel(),
-            np.zeros((0, len(place))),
-        )
+        addresses = dict.fromkeys(entry.address for entry in named.maps + self.maps)
+        place = {address: i for i, address in enumerate(addresses)}
+        taken, left = {p.name for p in named.parameters}, []
+        basis = np.zeros((0, len(place)))
         for errors in (named, self):
-            rows = dict.fromkeys((p.name for p in errors.parameters), np.zeros(len(place)))
+            effects = {p.name: np.zeros(len(place)) for p in errors.parameters}
             for entry in errors.maps:
-                rows[entry.parameter] = (
-                    rows[entry.parameter]
-                    + entry.coefficient * np.eye(len(place))[place[entry.address]]
-                )
+                effects[entry.parameter][place[entry.address]] += entry.coefficient
             for parameter in errors.parameters:
-                row = rows[parameter.name]
-                rest = row - (basis @ row) @ basis
-                if np.linalg.norm(rest) <= 1e-9 * np.linalg.norm(row):
+                effect = effects[parameter.name]
+                rest = effect - (basis @ effect) @ basis
+                if np.linalg.norm(rest) <= 1e-9 * np.linalg.norm(effect):
                     continue
                 basis = np.vstack([basis, rest / np.linalg.norm(rest)])
                 if errors is self:
-                    left += self._rename(
-                        parameter,
-                        f"{parameter.name}.own" if parameter.name in taken else parameter.name,
-                    )
-        return left
+                    suffix = ".own" if parameter.name in taken else ""
+                    left.append(self._rename(parameter, parameter.name + suffix))
+        return join_errors(left)
 
     def _rename(self, parameter: Parameter, name: str) -> ErrorModel:
         """Return one of the parameters, with its maps, under another name."""
-        maps = tuple(
-            replace(entry, parameter=name)
-            for entry in self.maps
-            if entry.parameter == parameter.name
-        )
-        return ErrorModel((replace(parameter, name=name),), maps)
+        maps = (entry for entry in self.maps if entry.parameter == parameter.name)
+        renamed = tuple(replace(entry, parameter=name) for entry in maps)
+        return ErrorModel((replace(parameter, name=name),), renamed)
+
+
+def join_errors(models: Iterable[ErrorModel]) -> ErrorModel:
+    """Return all parameters and maps of error models."""
+    parts = tuple(models)
+    return ErrorModel(
+        tuple(parameter for part in parts for parameter in part.parameters),
+        tuple(entry for part in parts for entry in part.maps),
+        tuple(entry for part in parts for entry in part.shared),
+    )
 
 
 @dataclass(frozen=True)
@@ -87,61 +86,52 @@ class ErrorTolerances:
     length: float | None = None
     angle: float | None = None
 
-    def of(self, axis: str) -> float | None:
-        """Return the standard deviation for a displacement axis."""
-        return self.angle if axis in AXES[:3] else self.length
-
 
 def single_error(
-    name: str,
-    dimension: Dimension,
-    nominal: float,
-    tolerance: float | None,
-    *maps: LinearMap,
-    free: bool = True,
+    name: str, dimension: Dimension, nominal: float, tolerance: float | None, *maps: LinearMap
 ) -> ErrorModel:
     """Return an error model of one named parameter."""
-    return ErrorModel((Parameter(name, dimension, float(nominal), tolerance, free),), maps)
+    return ErrorModel((Parameter(name, dimension, float(nominal), tolerance),), maps)
 
 
-def point_errors(
-    limb: PlacedLimb, element: str, axes: str, tolerance: float | None, label: str = ""
+def displacement_error(
+    name: str,
+    limb: PlacedLimb,
+    element: str,
+    axis: str,
+    tolerance: float | None,
+    nominal: float = 0.0,
 ) -> ErrorModel:
-    """Return the coordinates of a link's origin as parameters `limb.element.x` and so on.
+    """Return a displacement of a link, of AXES in its carried frame, as a parameter."""
+    maps = map_displacement(name, limb, element, axis)
+    return single_error(name, get_axis_dimension(axis), nominal, tolerance, *maps)
+
+
+def point_errors(limb: PlacedLimb, element: str, tolerance: float | None, label: str) -> ErrorModel:
+    """Return the coordinates of a link's origin as parameters `limb.label.x`, `.y` and `.z`.
 
     They are coordinates in the frame carried before the link; nominal values are those of its
-    placement.
+    placement, which is not rotated.
     """
-    errors = ErrorModel()
-    for axis in axes:
-        name = f"{limb.name}.{label or element}.{axis}"
-        nominal = limb.placements[element][:3, 3]["xyz".index(axis)]
-        # the displacement acts in the placed frame, the coordinate is one of the frame before it
-        maps = _in_frame_before(name, limb, element, axis)
-        errors += single_error(name, Dimension.LENGTH, nominal, tolerance, *maps)
-    return errors
-
-
-def rod_length_error(limb: PlacedLimb, tolerance: float | None) -> ErrorModel:
-    """Return the length of the rod of a `distance` ending at reading zero, `limb.length`."""
-    name = f"{limb.name}.length"
-    address = Address(limb.name, "rod", "length")
-    return single_error(
-        name, Dimension.LENGTH, limb.limb.length, tolerance, LinearMap(name, address)
+    point = limb.placements[element][:3, 3]
+    return join_errors(
+        displacement_error(f"{limb.name}.{label}.{axis}", limb, element, axis, tolerance, nominal)
+        for axis, nominal in zip(AXES[3:], point, strict=True)
     )
+
+
+def rod_length_error(limb: PlacedLimb, name: str, tolerance: float | None) -> ErrorModel:
+    """Return the length of the rod of a `distance` ending at reading zero as a parameter."""
+    rod = LinearMap(name, Address(limb.name, "rod", "length"))
+    return single_error(name, Dimension.LENGTH, limb.limb.length, tolerance, rod)
 
 
 def offset_error(
     name: str, actuator: str, dimension: Dimension, nominal: float, tolerance: float | None
 ) -> ErrorModel:
     """Return the value of a driven joint at reading zero as a parameter."""
-    return single_error(
-        name,
-        dimension,
-        nominal,
-        tolerance,
-        LinearMap(name, Address(actuator, "transmission", "offset")),
-    )
+    offset = LinearMap(name, Address(actuator, "transmission", "offset"))
+    return single_error(name, dimension, nominal, tolerance, offset)
 
 
 def complete_errors(limb: PlacedLimb, spread: ErrorTolerances, offsets: bool = True) -> ErrorModel:
@@ -149,43 +139,32 @@ def complete_errors(limb: PlacedLimb, spread: ErrorTolerances, offsets: bool = T
 
     Without `offsets` the family names the offsets of the actuators itself.
     """
-    errors = ErrorModel()
+    errors: list[ErrorModel] = []
+
+    def add_displacements(element: str, axes: Iterable[str]) -> None:
+        for axis in axes:
+            name, dimension = f"{limb.name}.{element}.{axis}", get_axis_dimension(axis)
+            sd = spread.angle if dimension is Dimension.ANGLE else spread.length
+            address = Address(limb.name, element, axis)
+            errors.append(single_error(name, dimension, 0.0, sd, LinearMap(name, address)))
+
+    def add_offset(drive: str | None, dimension: Dimension) -> None:
+        if drive and offsets:
+            sd = spread.angle if dimension is Dimension.ANGLE else spread.length
+            errors.append(offset_error(f"{drive}.offset", drive, dimension, 0.0, sd))
+
     for joint in limb.limb.joints:
-        for axis in KEPT_AXES[joint.kind]:
-            errors += _displacement(limb, joint.name, axis, spread)
-        if joint.actuator and offsets:
-            dimension = Dimension.ANGLE if joint.kind == "R" else Dimension.LENGTH
-            sd = spread.angle if joint.kind == "R" else spread.length
-            errors += offset_error(f"{joint.actuator}.offset", joint.actuator, dimension, 0.0, sd)
+        add_displacements(joint.name, KEPT_AXES[joint.kind])
+        add_offset(joint.actuator, Dimension.ANGLE if joint.kind == "R" else Dimension.LENGTH)
     if limb.limb.ending != "rigid":
-        for axis in AXES[3:]:
-            errors += _displacement(limb, limb.limb.links[-1].name, axis, spread)
-    for axis in AXES if limb.limb.ending == "rigid" else AXES[3:]:
-        errors += _displacement(limb, "platform", axis, spread)
-    if limb.limb.ending == "distance" and limb.limb.actuator and offsets:
-        name = limb.limb.actuator
-        errors += offset_error(f"{name}.offset", name, Dimension.LENGTH, 0.0, spread.length)
-    elif limb.limb.ending == "distance" and not limb.limb.actuator:
-        errors += rod_length_error(limb, spread.length)
-    return errors
+        add_displacements(limb.limb.links[-1].name, AXES[3:])
+    add_displacements("platform", AXES if limb.limb.ending == "rigid" else AXES[3:])
+    add_offset(limb.limb.actuator, Dimension.LENGTH)
+    if limb.limb.ending == "distance" and not limb.limb.actuator:
+        errors.append(rod_length_error(limb, f"{limb.name}.length", spread.length))
+    return join_errors(errors)
 
 
-def _displacement(limb: PlacedLimb, element: str, axis: str, spread: ErrorTolerances) -> ErrorModel:
-    """Return one displacement of a link in its own frame, nominally zero."""
-    name = f"{limb.name}.{element}.{axis}"
-    dimension = Dimension.ANGLE if axis in AXES[:3] else Dimension.LENGTH
-    return single_error(
-        name, dimension, 0.0, spread.of(axis), LinearMap(name, Address(limb.name, element, axis))
-    )
-
-
-def _in_frame_before(name: str, limb: PlacedLimb, element: str, axis: str) -> tuple[LinearMap, ...]:
-    """Return the maps of a translation along an axis of the frame before the placement."""
-    turn = limb.placements[element][:3, :3]
-    components = turn.T @ [float(a == axis) for a in "xyz"]
-    return tuple(
-        linear
-        for a, part in zip(AXES[3:], components, strict=True)
-        if abs(part) > 1e-12
-        for linear in map_displacement(name, limb, element, a, float(part))
-    )
+def get_axis_dimension(axis: str) -> Dimension:
+    """Return the dimension of a displacement along or about one of AXES."""
+    return Dimension.ANGLE if axis in AXES[:3] else Dimension.LENGTH

@@ -22,7 +22,7 @@ from loopcal.mechanism.families.error_models import (
     point_errors,
     rod_length_error,
 )
-from loopcal.mechanism.families.hexapod_legs import Screw, ScrewLeg, build_screw_leg, build_ups_leg
+from loopcal.mechanism.families.hexapod_legs import Screw, build_screw_leg, build_ups_leg
 from loopcal.mechanism.families.limb_placement import PlacedLimb, place_limb, translate
 from loopcal.mechanism.families.prs import check_spherical
 from loopcal.mechanism.families.records import (
@@ -99,32 +99,20 @@ class Gough(RobotRecord):
             Another number of legs, or a model that this form cannot carry.
         """
         self._check()
-        lengths = values_per_leg(self.lengths, 6, "lengths")
-        screws = self.screw.legs() if self.screw else (None,) * 6
         legs, actuators, errors = [], [], ErrorModel()
-        for i, length in enumerate(lengths):
-            leg, motor = self._leg(i, length, screws[i]), f"q{i + 1}"
-            legs.append(leg)
+        for i, length in enumerate(values_per_leg(self.lengths, 6, "lengths")):
+            leg, motor = self._leg(i, length), f"q{i + 1}"
+            legs.append(leg.limb)
             # a rod has its length in the ending, a chain in the offset of its sliding joint
             terms = {} if self.legs == "rod" else {"offset": length}
             actuators.append(Actuator(motor, Dimension.LENGTH, self.stroke, terms))
-            errors += (
-                self._complete(leg, motor, length)
-                if self.error_model == "complete"
-                else self._ideal(leg, motor, length)
-            )
-        return Assembly(
-            name=self.name,
-            source=self.source,
-            limbs=tuple(leg.limb for leg in legs),
-            actuators=tuple(actuators),
+            errors += self._errors(leg, motor, length)
+        return self.assemble(
+            legs,
+            actuators,
+            errors,
             freedoms=AXES,
             controlled=("x", "y", "z", "roll", "pitch", "yaw"),
-            home=self.home.matrix,
-            tool=self.tool.matrix,
-            workspace=self.workspace.ranges,
-            parameters=errors.parameters,
-            maps=errors.maps,
         )
 
     def _check(self) -> None:
@@ -133,18 +121,14 @@ class Gough(RobotRecord):
                 f"{self.name} has {len(self.base)} base and {len(self.platform)} platform centers; "
                 "a hexapod has six of each"
             )
-        asked = [
-            words
-            for words, is_stated in (
-                ("error_model: complete", self.error_model == "complete"),
-                ("spherical: axes", self.spherical == "axes"),
-                ("a screw", self.screw is not None),
-            )
-            if is_stated
-        ]
-        check_spherical(
-            self.name, self.spherical, "complete" if self.legs == "rod" else self.error_model
-        )
+        stated = {
+            "error_model: complete": self.error_model == "complete",
+            "spherical: axes": self.spherical == "axes",
+            "a screw": self.screw is not None,
+        }
+        asked = [words for words, is_stated in stated.items() if is_stated]
+        model = "complete" if self.legs == "rod" else self.error_model
+        check_spherical(self.name, self.spherical, model)
         if self.legs == "ups" and self.cones != GoughCones():
             raise MechanismError(
                 f"{self.name} states cones with legs: ups, whose joints have no cones; state legs: "
@@ -156,21 +140,17 @@ class Gough(RobotRecord):
                 "carry it; state legs: ups"
             )
 
-    def _leg(self, i: int, length: float, screw: ScrewLeg | None) -> PlacedLimb:
+    def _leg(self, i: int, length: float) -> PlacedLimb:
         """Return leg i in its form."""
-        leg, motor = f"leg{i + 1}", f"q{i + 1}"
+        leg, motor, base, top = f"leg{i + 1}", f"q{i + 1}", self.base[i], self.platform[i]
         if self.legs == "rod":
-            ends = translate(*self.base[i]), translate(*self.platform[i])
-            return place_limb(
-                leg, (), ends[0], "distance", ends[1], length, motor, self._cones(*ends)
-            )
-        if screw:
-            return build_screw_leg(
-                leg, motor, self.base[i], self.platform[i], self.home.matrix, screw
-            )
-        return build_ups_leg(
-            leg, motor, self.base[i], self.platform[i], self.home.matrix, self.spherical == "axes"
-        )
+            ends = translate(*base), translate(*top)
+            cones = self._cones(*ends)
+            return place_limb(leg, (), ends[0], "distance", ends[1], length, motor, cones)
+        home = self.home.matrix
+        if self.screw:
+            return build_screw_leg(leg, motor, base, top, home, self.screw.legs()[i])
+        return build_ups_leg(leg, motor, base, top, home, self.spherical == "axes")
 
     def _cones(self, base: FloatArray, top: FloatArray) -> tuple[Cone, ...]:
         """Return the cones of a rod between these centers (4, 4), about its direction at home."""
@@ -186,32 +166,21 @@ class Gough(RobotRecord):
             if angle is not None
         )
 
-    def _ideal(self, leg: PlacedLimb, motor: str, length: float) -> ErrorModel:
-        """Return two centers and a length, the same in both forms."""
-        sd = self.tolerances
-        base = point_errors(
-            leg, leg.elements[0], "xyz", standard_deviation(sd.base, "the base centers"), "base"
-        )
-        top = point_errors(
-            leg, "platform", "xyz", standard_deviation(sd.platform, "the platform centers")
-        )
+    def _errors(self, leg: PlacedLimb, motor: str, length: float) -> ErrorModel:
+        """Return two centers (or the errors of every link) and a length, the same in both forms."""
+        sd, name = self.tolerances, f"{leg.name}.length"
         length_sd = standard_deviation(sd.length, "the leg lengths")
+        if self.error_model == "complete":
+            spread = ErrorTolerances(
+                standard_deviation(sd.links, "the links"),
+                standard_deviation(sd.angles, "the link angles"),
+            )
+            errors = complete_errors(leg, spread, offsets=False)
+        else:
+            base_sd = standard_deviation(sd.base, "the base centers")
+            platform_sd = standard_deviation(sd.platform, "the platform centers")
+            errors = point_errors(leg, leg.elements[0], base_sd, "base")
+            errors += point_errors(leg, "platform", platform_sd, "platform")
         if self.legs == "rod":
-            return base + top + rod_length_error(leg, length_sd)
-        return (
-            base
-            + top
-            + offset_error(f"{leg.name}.length", motor, Dimension.LENGTH, length, length_sd)
-        )
-
-    def _complete(self, leg: PlacedLimb, motor: str, length: float) -> ErrorModel:
-        """Return the errors of every link, and the length."""
-        sd = self.tolerances
-        spread = ErrorTolerances(
-            standard_deviation(sd.links, "the links"),
-            standard_deviation(sd.angles, "the link angles"),
-        )
-        length_sd = standard_deviation(sd.length, "the leg lengths")
-        return complete_errors(leg, spread, offsets=False) + offset_error(
-            f"{leg.name}.length", motor, Dimension.LENGTH, length, length_sd
-        )
+            return errors + rod_length_error(leg, name, length_sd)
+        return errors + offset_error(name, motor, Dimension.LENGTH, length, length_sd)

@@ -20,13 +20,14 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
+from loopcal.mechanism.assembly import Joint
 from loopcal.mechanism.families.limb_placement import (
-    EX,
-    EY,
     EZ,
     JointPlacement,
     PlacedLimb,
     place_limb,
+    place_limb_with_ball,
+    rotation_matrix,
     translate,
 )
 from loopcal.mechanism.families.records import values_per_leg
@@ -84,24 +85,17 @@ def build_ups_leg(
         pose.
     axes : True for an upper joint of three axes, False for a ball.
     """
-    b, gap = _along(name, base, top, home)
-    length = float(np.linalg.norm(gap))
-    s = gap / length
+    s, length = _find_direction(name, base, top, home)
     first = _across(s, EZ)
     # the axes in the base frame, which is the carried frame while every joint is at zero
     steps = (
-        JointPlacement("universal1", "R", translate(*b), first),
-        JointPlacement("universal2", "R", np.eye(4), np.cross(s, first)),
-        JointPlacement("slide", "P", np.eye(4), s, motor, start=length),
+        JointPlacement(Joint("universal1", "R"), translate(*base), first),
+        JointPlacement(Joint("universal2", "R"), np.eye(4), np.cross(s, first)),
+        JointPlacement(Joint("slide", "P", motor, start=length), np.eye(4), s),
     )
-    if not axes:
-        return place_limb(name, steps, np.eye(4), "ball", translate(*top))
-    turned = geometry.make_pose(home[:3, :3], np.zeros(3))
-    ball = tuple(
-        JointPlacement(f"ball{i + 1}", "R", turned if i == 0 else np.eye(4), axis)
-        for i, axis in enumerate((EZ, EY, EX))
+    return place_limb_with_ball(
+        name, steps, np.zeros(3), translate(*top), home[:3, :3] if axes else None
     )
-    return place_limb(name, (*steps, *ball), np.eye(4), "rigid", translate(*top))
 
 
 def build_screw_leg(
@@ -114,13 +108,9 @@ def build_screw_leg(
     MechanismError
         A joint axis lies along the leg at home.
     """
-    b, gap = _along(name, base, top, home)
-    length = float(np.linalg.norm(gap))
-    s = gap / length
-    lower, upper = (
-        _direction(name, screw.base_axis),
-        home[:3, :3] @ _direction(name, screw.platform_axis),
-    )
+    s, length = _find_direction(name, base, top, home)
+    lower = _normalize(name, screw.base_axis)
+    upper = home[:3, :3] @ _normalize(name, screw.platform_axis)
     for axis in (lower, upper):
         if np.linalg.norm(np.cross(axis, s)) < 1e-6:
             raise MechanismError(
@@ -129,31 +119,30 @@ def build_screw_leg(
     low, high = _across(s, lower), _across(s, upper)
     turned = float(np.arctan2(np.cross(low, high) @ s, low @ high))
     # at zero the spindle stands turned back by the angle that it has at home
-    back = geometry.make_pose(geometry.exp_so3(-turned * s), np.zeros(3))
+    back = rotation_matrix(geometry.exp_so3(-turned * s))
+    pitch = screw.lead / (2 * np.pi)
+    slide = Joint("slide", "P", motor, start=length + pitch * turned)
+    thread = Joint("screw", "R", pitch=-pitch, start=turned)
     steps = (
-        JointPlacement("universal1", "R", translate(*b), lower),
-        JointPlacement("universal2", "R", np.eye(4), np.cross(s, low)),
-        JointPlacement(
-            "slide", "P", np.eye(4), s, motor, start=length + screw.lead * turned / (2 * np.pi)
-        ),
-        JointPlacement("screw", "R", np.eye(4), s, pitch=-screw.lead / (2 * np.pi), start=turned),
-        JointPlacement("universal3", "R", back, np.cross(s, high)),
-        JointPlacement("universal4", "R", np.eye(4), upper),
+        JointPlacement(Joint("universal1", "R"), translate(*base), lower),
+        JointPlacement(Joint("universal2", "R"), np.eye(4), np.cross(s, low)),
+        JointPlacement(slide, np.eye(4), s),
+        JointPlacement(thread, np.eye(4), s),
+        JointPlacement(Joint("universal3", "R"), back, np.cross(s, high)),
+        JointPlacement(Joint("universal4", "R"), np.eye(4), upper),
     )
-    return place_limb(
-        name, steps, geometry.make_pose(home[:3, :3], np.zeros(3)), "rigid", translate(*top)
-    )
+    return place_limb(name, steps, rotation_matrix(home[:3, :3]), "rigid", translate(*top))
 
 
-def _along(
+def _find_direction(
     name: str, base: Direction, top: Direction, home: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the lower center and the vector to the upper one at home [m]."""
-    b = np.array(base, dtype=float)
-    gap = home[:3, :3] @ np.array(top, dtype=float) + home[:3, 3] - b
-    if not np.linalg.norm(gap) > 0:
+) -> tuple[FloatArray, float]:
+    """Return the unit vector from the lower center to the upper one at home, and the distance."""
+    gap = home[:3, :3] @ np.array(top, dtype=float) + home[:3, 3] - np.array(base, dtype=float)
+    length = float(np.linalg.norm(gap))
+    if not length > 0:
         raise MechanismError(f"{name} has length zero at home; move its centers or the home pose")
-    return b, gap
+    return gap / length, length
 
 
 def _across(s: FloatArray, axis: FloatArray) -> FloatArray:
@@ -164,7 +153,7 @@ def _across(s: FloatArray, axis: FloatArray) -> FloatArray:
     return np.array(part / np.linalg.norm(part), dtype=float)
 
 
-def _direction(name: str, axis: Direction) -> FloatArray:
+def _normalize(name: str, axis: Direction) -> FloatArray:
     """Return a unit vector (3,); raises MechanismError for zero."""
     length = float(np.linalg.norm(axis))
     if not length > 0:

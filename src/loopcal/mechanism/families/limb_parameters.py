@@ -13,7 +13,7 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import AXES, Actuator, Address, LinearMap
-from loopcal.mechanism.families.error_models import ErrorModel, single_error
+from loopcal.mechanism.families.error_models import ErrorModel, join_errors, single_error
 from loopcal.mechanism.families.limb_records import (
     AngleDrive,
     Drive,
@@ -30,7 +30,7 @@ from loopcal.mechanism.families.records import (
     RatioTolerance,
     standard_deviation,
 )
-from loopcal.units import Dimension
+from loopcal.units import ARTICLES, Dimension
 
 HARMONICS = ("sin1", "cos1", "sin2", "cos2")
 CURVE_OF_BUILDUP = 1 / (4 * np.pi)
@@ -63,7 +63,8 @@ def drive_errors(name: str, drive: Drive, turns: bool) -> ErrorModel:
     MechanismError
         A term that the drive does not have, or a harmonic without a period.
     """
-    known, errors = _terms(drive, Dimension.ANGLE if turns else Dimension.LENGTH), ErrorModel()
+    known = _terms(drive, Dimension.ANGLE if turns else Dimension.LENGTH)
+    errors = []
     for term in drive.unknown:
         if term not in known:
             raise MechanismError(
@@ -75,16 +76,11 @@ def drive_errors(name: str, drive: Drive, turns: bool) -> ErrorModel:
                 "period"
             )
         dimension, nominal, tolerance, axis, coefficient = known[term]
-        full = f"{name}.{term}"
-        sd = standard_deviation(tolerance, full)
-        errors += single_error(
-            full,
-            dimension,
-            nominal,
-            sd,
-            LinearMap(full, Address(name, "transmission", axis), coefficient),
-        )
-    return errors
+        parameter, address = f"{name}.{term}", Address(name, "transmission", axis)
+        sd = standard_deviation(tolerance, parameter)
+        entry = LinearMap(parameter, address, coefficient)
+        errors.append(single_error(parameter, dimension, nominal, sd, entry))
+    return join_errors(errors)
 
 
 def _terms(
@@ -95,37 +91,26 @@ def _terms(
     Each has dimension, nominal value, tolerance, transmission term and the change of it per unit.
     """
     tolerance = drive.angle if isinstance(drive, AngleDrive) else drive.length
-    known: dict[str, tuple[Dimension, float, Tolerance, str, float]] = {
-        "offset": (joint_dimension, drive.offset, tolerance, "offset", 1.0)
-    }
+    own: dict[str, tuple[Dimension, float, Tolerance, str, float]]
     if isinstance(drive, SpoolDrive):
-        known["radius"] = (Dimension.LENGTH, drive.radius, drive.radii, "gain", 1.0)
-        known["buildup"] = (
-            Dimension.LENGTH,
-            drive.buildup,
-            drive.buildups,
-            "curve",
-            CURVE_OF_BUILDUP,
-        )
+        own = {
+            "radius": (Dimension.LENGTH, drive.radius, drive.radii, "gain", 1.0),
+            "buildup": (Dimension.LENGTH, drive.buildup, drive.buildups, "curve", CURVE_OF_BUILDUP),
+        }
     else:
-        known["gain"] = (Dimension.RATIO, drive.gain, drive.ratio, "gain", 1.0)
-    for term in ("backlash", *HARMONICS):
-        known[term] = (joint_dimension, 0.0, tolerance, term, 1.0)
-    return known
+        own = {"gain": (Dimension.RATIO, drive.gain, drive.ratio, "gain", 1.0)}
+    offset = {"offset": (joint_dimension, drive.offset, tolerance, "offset", 1.0)}
+    periodic = ("backlash", *HARMONICS)
+    return offset | own | {term: (joint_dimension, 0.0, tolerance, term, 1.0) for term in periodic}
 
 
-DIMENSION_WORDS = {
-    Dimension.LENGTH: "a length",
-    Dimension.ANGLE: "an angle",
-    Dimension.RATIO: "a ratio",
-}
-
-
-def find_dimension(named: NamedParameter) -> Dimension:
-    """Return the dimension of a named parameter."""
+def get_quantity(named: NamedParameter) -> tuple[Dimension, float]:
+    """Return the dimension and the nominal value [SI] of a named parameter."""
     if isinstance(named, NamedLength):
-        return Dimension.LENGTH
-    return Dimension.ANGLE if isinstance(named, NamedAngle) else Dimension.RATIO
+        return Dimension.LENGTH, named.length
+    if isinstance(named, NamedAngle):
+        return Dimension.ANGLE, named.angle
+    return Dimension.RATIO, named.ratio
 
 
 def find_engine_axis(name: str, entry: MapEntry) -> tuple[str, float]:
@@ -143,11 +128,9 @@ def find_engine_axis(name: str, entry: MapEntry) -> tuple[str, float]:
             f"parameter {name!r} is mapped onto 'pitch'; use lead, the advance in one turn"
         )
     coefficient = entry.coefficient * (1.0 if entry.arm is None else entry.arm)
-    return (
-        ("pitch", coefficient * (1 / (2 * np.pi)))
-        if entry.axis == "lead"
-        else (entry.axis, coefficient)
-    )
+    if entry.axis == "lead":
+        return "pitch", coefficient * (1 / (2 * np.pi))
+    return entry.axis, coefficient
 
 
 def check_units(named: NamedParameter, entry: MapEntry, drive: tuple[Drive, bool] | None) -> None:
@@ -156,9 +139,9 @@ def check_units(named: NamedParameter, entry: MapEntry, drive: tuple[Drive, bool
     `drive` is the drive that the entry names, with whether its joint is rotary. A ratio is a slope
     for an angle.
     """
-    dimension, needed = find_dimension(named), _find_needed_dimension(entry.axis, drive)
-    what = f"parameter {named.name!r} is {DIMENSION_WORDS[dimension]}"
-    onto = f"{entry.axis} of {entry.limb!r} {DIMENSION_WORDS[needed]}"
+    (dimension, _), needed = get_quantity(named), _find_needed_dimension(entry.axis, drive)
+    what = f"parameter {named.name!r} is {ARTICLES[dimension]}"
+    onto = f"{entry.axis} of {entry.limb!r} {ARTICLES[needed]}"
     if entry.arm is not None:
         if dimension is Dimension.LENGTH:
             raise MechanismError(
@@ -174,7 +157,7 @@ def check_units(named: NamedParameter, entry: MapEntry, drive: tuple[Drive, bool
         raise MechanismError(
             f"{what} and {onto}; state an `arm:` [length per radian], or the parameter as a length"
         )
-    raise MechanismError(f"{what} and {onto}; state it as {DIMENSION_WORDS[needed]}")
+    raise MechanismError(f"{what} and {onto}; state it as {ARTICLES[needed]}")
 
 
 def _find_needed_dimension(axis: str, drive: tuple[Drive, bool] | None) -> Dimension:

@@ -24,24 +24,17 @@ EX, EY, EZ = np.eye(3)
 
 @dataclass(frozen=True)
 class JointPlacement:
-    """A joint of a limb and its placement.
+    """A joint of a limb, and where it is; the link before it has its name.
 
     Attributes
     ----------
-    name : of the joint and of the link before it. kind : R or P.
     place : (4, 4) of the joint in the frame carried up to it [m].
     axis : (3,) in the placed frame, of any length but zero.
-    actuator, pitch, start, limits : as in `loopcal.mechanism.assembly.Joint`.
     """
 
-    name: str
-    kind: str
+    joint: Joint
     place: FloatArray
     axis: FloatArray
-    actuator: str | None = None
-    pitch: float = 0.0
-    start: float = 0.0
-    limits: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -89,31 +82,45 @@ def place_limb(
     attachment : (4, 4) in the platform frame [m]; its link is called `platform`.
     length, actuator, cones : of the rod of a `distance` ending [m].
     """
-    back, links, joints = np.eye(4), [], []
-    turns, places = {}, {}
+    back, links, rotations, placements = np.eye(4), [], {}, {}
     for step in steps:
-        turn = frame_from_axis(step.axis, step.name)
-        links.append(Link(step.name, back @ step.place @ _turned(turn)))
-        joints.append(
-            Joint(step.name, step.kind, step.actuator, step.pitch, step.start, step.limits)
-        )
-        turns[step.name], places[step.name] = turn, step.place
-        back = _turned(turn.T)
+        link, turn = step.joint.name, frame_from_axis(step.axis, step.joint.name)
+        links.append(Link(link, back @ step.place @ rotation_matrix(turn)))
+        rotations[link], placements[link] = turn, step.place
+        back = rotation_matrix(turn.T)
     last = "tip" if steps else "base"
     links.append(Link(last, back @ tip))
-    turns |= {last: np.eye(3), "platform": np.eye(3)}
-    places |= {last: tip, "platform": attachment}
-    limb = Limb(
-        name,
-        tuple(links),
-        tuple(joints),
-        ending,
-        Link("platform", attachment),
-        length,
-        actuator,
-        cones,
+    rotations |= {last: np.eye(3), "platform": np.eye(3)}
+    placements |= {last: tip, "platform": attachment}
+    joints, end = tuple(step.joint for step in steps), Link("platform", attachment)
+    limb = Limb(name, tuple(links), joints, ending, end, length, actuator, cones)
+    return PlacedLimb(limb, rotations, placements)
+
+
+def place_limb_with_ball(
+    name: str,
+    steps: tuple[JointPlacement, ...],
+    center: FloatArray,
+    attachment: FloatArray,
+    axes: FloatArray | None,
+) -> PlacedLimb:
+    """Return a limb that ends in a ball joint on the platform.
+
+    Parameters
+    ----------
+    center : (3,) of the ball in the last carried frame [m]. attachment : (4, 4) in the platform.
+    axes : None for a perfect ball. A ball of three rotary joints z, y, x through its center, with
+        errors of their own, has the orientation (3, 3) at which they are all at zero.
+    """
+    if axes is None:
+        return place_limb(name, steps, translate(*center), "ball", attachment)
+    ball = tuple(
+        JointPlacement(Joint(f"ball{i + 1}", "R"), place, axis)
+        for i, (place, axis) in enumerate(
+            ((geometry.make_pose(axes, center), EZ), (np.eye(4), EY), (np.eye(4), EX))
+        )
     )
-    return PlacedLimb(limb, turns, places)
+    return place_limb(name, (*steps, *ball), np.eye(4), "rigid", attachment)
 
 
 def frame_from_axis(axis: FloatArray, name: str) -> FloatArray:
@@ -145,15 +152,14 @@ def map_displacement(
     A translation along x acts along up to three axes of the link's own frame: the components of
     R_carried_link' e_x.
     """
-    return map_direction(
-        parameter, limb, element, axis in AXES[:3], coefficient * np.eye(3)[AXES.index(axis) % 3]
-    )
+    direction = coefficient * np.eye(3)[AXES.index(axis) % 3]
+    return map_direction(parameter, limb, element, direction, turns=axis in AXES[:3])
 
 
 def map_direction(
-    parameter: str, limb: PlacedLimb, element: str, turns: bool, direction: FloatArray
+    parameter: str, limb: PlacedLimb, element: str, direction: FloatArray, *, turns: bool
 ) -> tuple[LinearMap, ...]:
-    """Map a parameter onto a rotation about (or translation along) `direction`.
+    """Map a parameter onto a rotation about (or translation along) `direction` (3,).
 
     The direction is in the carried frame.
     """
@@ -187,26 +193,26 @@ def map_slide_tilt(
             f"{parameter} tilts {element!r} of {limb.name!r} alone, which only a slide allows; "
             "leave out `alone: true`"
         )
-    w, behind = np.eye(3)[AXES.index(axis)], limb.placements[names[place + 1]]
-    undo = map_direction(parameter, limb, names[place + 1], True, -behind[:3, :3].T @ w)
+    w, after = np.eye(3)[AXES.index(axis)], names[place + 1]
+    behind = limb.placements[after]
+    maps = map_displacement(parameter, limb, element, axis)
+    maps += map_direction(parameter, limb, after, -behind[:3, :3].T @ w, turns=True)
     shift = -behind[:3, :3].T @ np.cross(w, behind[:3, 3])
-    back = (
-        map_direction(parameter, limb, names[place + 1], False, shift)
-        if np.abs(shift).any()
-        else ()
-    )
-    return (*map_displacement(parameter, limb, element, axis), *undo, *back)
+    if shift.any():
+        maps += map_direction(parameter, limb, after, shift, turns=False)
+    return maps
 
 
 def translate(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> FloatArray:
     """Return a translation (4, 4) [m]."""
-    return geometry.make_pose(np.eye(3), np.array([x, y, z]))
+    return geometry.make_pose(np.eye(3), np.array([x, y, z], dtype=float))
+
+
+def rotation_matrix(rotation: FloatArray) -> FloatArray:
+    """Return a rotation (3, 3) as (4, 4)."""
+    return geometry.make_pose(rotation, np.zeros(3))
 
 
 def rotate_about(axis: str, angle: float) -> FloatArray:
     """Return a rotation (4, 4) about x, y or z [rad]."""
-    return _turned(geometry.exp_so3(angle * np.eye(3)["xyz".index(axis)]))
-
-
-def _turned(R: FloatArray) -> FloatArray:
-    return geometry.make_pose(R, np.zeros(3))
+    return rotation_matrix(geometry.exp_so3(angle * np.eye(3)["xyz".index(axis)]))

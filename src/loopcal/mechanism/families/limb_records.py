@@ -15,13 +15,13 @@ from typing import Literal
 import numpy as np
 
 from loopcal.errors import MechanismError
+from loopcal.mechanism.families.limb_placement import translate
 from loopcal.mechanism.families.records import (
     AngleTolerance,
     LengthTolerance,
     Point,
     PoseRecord,
     RatioTolerance,
-    translation_matrix,
 )
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Length, Ratio
@@ -31,6 +31,9 @@ Place = Point | PoseRecord
 ORIGIN: Point = (0.0, 0.0, 0.0)
 Moving = Literal["x", "y", "z", "length"]
 Turning = Literal["rx", "ry", "rz"]
+Freedom = Literal["rx", "ry", "rz", "x", "y", "z"]
+Movable = Literal["length", "lead", "pitch", "offset", "gain", "curve", "backlash"]
+MapAxis = Literal[Freedom, Movable]
 
 
 def axis_vector(axis: Axis) -> FloatArray:
@@ -42,7 +45,7 @@ def axis_vector(axis: Axis) -> FloatArray:
 
 def matrix_from_place(place: Place) -> FloatArray:
     """Return a placement as (4, 4)."""
-    return place.matrix if isinstance(place, PoseRecord) else translation_matrix(place)
+    return place.matrix if isinstance(place, PoseRecord) else translate(*place)
 
 
 @dataclass(frozen=True)
@@ -286,21 +289,7 @@ class MapEntry:
 
     limb: str
     element: str
-    axis: Literal[
-        "rx",
-        "ry",
-        "rz",
-        "x",
-        "y",
-        "z",
-        "length",
-        "lead",
-        "pitch",
-        "offset",
-        "gain",
-        "curve",
-        "backlash",
-    ]
+    axis: MapAxis
     coefficient: Ratio = 1.0
     arm: Length | None = None
 
@@ -342,14 +331,7 @@ NamedParameter = NamedLength | NamedAngle | NamedRatio
 class LimbsFile:
     """The fields of a `limbs` file in addition to those of every robot; see `Limbs`."""
 
-    freedoms: tuple[Literal["rx", "ry", "rz", "x", "y", "z"], ...] = (
-        "rx",
-        "ry",
-        "rz",
-        "x",
-        "y",
-        "z",
-    )
+    freedoms: tuple[Freedom, ...] = ("rx", "ry", "rz", "x", "y", "z")
     controlled: tuple[str, ...] = ()
     actuators: Mapping[str, Drive] = field(default_factory=dict)
     limbs: tuple[LimbRecord, ...] = ()

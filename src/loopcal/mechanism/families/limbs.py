@@ -14,20 +14,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopcal.errors import MechanismError
-from loopcal.mechanism.assembly import AXES, Address, Assembly, Cone, LinearMap
+from loopcal.mechanism.assembly import AXES, Address, Assembly, Cone, Joint, LinearMap
 from loopcal.mechanism.families.error_models import (
     ErrorModel,
     ErrorTolerances,
     complete_errors,
+    displacement_error,
+    join_errors,
     offset_error,
+    rod_length_error,
     single_error,
 )
 from loopcal.mechanism.families.limb_parameters import (
     build_actuator,
     check_units,
     drive_errors,
-    find_dimension,
     find_engine_axis,
+    get_quantity,
 )
 from loopcal.mechanism.families.limb_placement import (
     EX,
@@ -49,8 +52,6 @@ from loopcal.mechanism.families.limb_records import (
     LimbRecord,
     LimbsFile,
     MapEntry,
-    NamedAngle,
-    NamedLength,
     NamedParameter,
     Prismatic,
     Revolute,
@@ -62,6 +63,7 @@ from loopcal.mechanism.families.limb_records import (
     refuse_branch,
 )
 from loopcal.mechanism.families.records import RobotRecord, standard_deviation
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
 
@@ -90,34 +92,27 @@ class Limbs(LimbsFile, RobotRecord):
         for limb in self.limbs:
             refuse_branch(limb, names)
         members = {limb.name: tuple(_copies(limb)) for limb in self.limbs}
-        copies = [member for limb in self.limbs for member in members[limb.name]]
+        copies = [member for group in members.values() for member in group]
         # a drive that several limbs name is one drive
-        drives = tuple(
-            {drive[0]: drive for member in copies for drive in self._drives(member)}.values()
-        )
-        errors = sum((_limb_errors(member) for member in copies), start=ErrorModel())
-        errors += sum(
-            (drive_errors(name, drive, turns) for name, drive, turns in drives), start=ErrorModel()
-        )
-        by_name = {name: (drive, turns) for name, drive, turns in drives}
-        errors += sum(
-            (_named(named, members, by_name) for named in self.parameters), start=ErrorModel()
+        drives = {
+            name: (drive, turns) for copy in copies for name, drive, turns in self._drives(copy)
+        }
+        errors = join_errors(
+            (
+                *(_limb_errors(member) for member in copies),
+                *(drive_errors(name, *drive) for name, drive in drives.items()),
+                *(_named(named, members, drives) for named in self.parameters),
+            )
         )
         if self.error_model == "complete":
             errors = self._complete(copies, drives).without_effects_of(errors) + errors
-        self._check(errors, tuple(by_name))
-        return Assembly(
-            name=self.name,
-            source=self.source,
-            limbs=tuple(member.placed.limb for member in copies),
-            actuators=tuple(build_actuator(name, drive) for name, drive, _ in drives),
+        self._check(errors, tuple(drives))
+        return self.assemble(
+            (member.placed.limb for member in copies),
+            (build_actuator(name, drive) for name, (drive, _) in drives.items()),
+            errors,
             freedoms=self.freedoms,
             controlled=self.controlled,
-            home=self.home.matrix,
-            tool=self.tool.matrix,
-            workspace=self.workspace.ranges,
-            parameters=errors.parameters,
-            maps=errors.maps,
         )
 
     def _check(self, errors: ErrorModel, drives: tuple[str, ...]) -> None:
@@ -141,42 +136,35 @@ class Limbs(LimbsFile, RobotRecord):
         """Yield the names of a limb's drives, the drives, and whether their joints are rotary."""
         limb = member.placed.limb
         driven = [(j.actuator, j.kind == "R") for j in limb.joints if j.actuator]
-        for name, turns in (*driven, *([(limb.actuator, False)] if limb.actuator else [])):
+        if limb.actuator:
+            driven.append((limb.actuator, False))
+        for name, turns in driven:
             plain = AngleDrive("angle") if turns else LengthDrive("length")
-            drive = (
-                self.actuators.get(name)
-                or self.actuators.get(name.removesuffix(member.suffix))
-                or plain
-            )
+            shared_name = name.removesuffix(member.suffix)
+            drive = self.actuators.get(name) or self.actuators.get(shared_name) or plain
             if turns != isinstance(drive, AngleDrive):
-                motion = "turns" if turns else "slides"
+                motion, allowed = (
+                    ("turns", "reads: angle without a radius")
+                    if turns
+                    else ("slides", "reads: length, or reads: angle with a radius")
+                )
                 raise MechanismError(
-                    f"actuator {name!r} drives a joint that {motion}; state "
-                    + (
-                        "reads: angle without a radius"
-                        if turns
-                        else "reads: length, or reads: angle with a radius"
-                    )
+                    f"actuator {name!r} drives a joint that {motion}; state {allowed}"
                 )
             yield name, drive, turns
 
-    def _complete(
-        self, copies: list[_Member], drives: tuple[tuple[str, Drive, bool], ...]
-    ) -> ErrorModel:
+    def _complete(self, copies: list[_Member], drives: Drives) -> ErrorModel:
         """Return all errors of all limbs, and the offset of every drive once."""
-        length = standard_deviation(self.tolerances.lengths, "the lengths")
-        angle = standard_deviation(self.tolerances.angles, "the angles")
-        errors = sum(
-            (
-                complete_errors(member.placed, ErrorTolerances(length, angle), offsets=False)
-                for member in copies
-            ),
-            start=ErrorModel(),
+        spread = ErrorTolerances(
+            standard_deviation(self.tolerances.lengths, "the lengths"),
+            standard_deviation(self.tolerances.angles, "the angles"),
         )
-        for name, drive, turns in drives:
-            dimension, sd = (Dimension.ANGLE, angle) if turns else (Dimension.LENGTH, length)
-            errors += offset_error(f"{name}.offset", name, dimension, drive.offset, sd)
-        return errors
+        errors = [complete_errors(member.placed, spread, offsets=False) for member in copies]
+        for name, (drive, turns) in drives.items():
+            dimension = Dimension.ANGLE if turns else Dimension.LENGTH
+            sd = spread.angle if turns else spread.length
+            errors.append(offset_error(f"{name}.offset", name, dimension, drive.offset, sd))
+        return join_errors(errors)
 
 
 @dataclass(frozen=True)
@@ -188,30 +176,27 @@ class _Member:
     suffix: str
 
 
+Members = Mapping[str, tuple[_Member, ...]]
+"""The copies of each limb of the file."""
+Drives = Mapping[str, tuple[Drive, bool]]
+"""Drives by name, with whether their joints are rotary."""
+
+
 def _copies(limb: LimbRecord) -> Iterator[_Member]:
     """Yield the copies of a limb."""
     if limb.copies is None:
-        yield _Member(limb, _place_copy(limb, limb.name, "", np.eye(4)), "")
+        yield _Member(limb, _place_copy(limb, "", np.eye(4)), "")
         return
     if limb.copies.count < 1:
         raise MechanismError(f"limb {limb.name!r} has {limb.copies.count} copies; give one or more")
     step = limb.copies.step if limb.copies.step is not None else 2 * np.pi / limb.copies.count
     for i in range(limb.copies.count):
-        turn = rotate_about(limb.copies.about, limb.copies.start + i * step)
-        yield _Member(limb, _place_copy(limb, f"{limb.name}{i + 1}", str(i + 1), turn), str(i + 1))
+        turn, suffix = rotate_about(limb.copies.about, limb.copies.start + i * step), str(i + 1)
+        yield _Member(limb, _place_copy(limb, suffix, turn), suffix)
 
 
-def _place_copy(limb: LimbRecord, name: str, suffix: str, turn: np.ndarray) -> PlacedLimb:
-    """Return one copy of a limb, rotated."""
-    steps: list[JointPlacement] = []
-    for i, joint in enumerate(limb.chain):
-        number = 1 + sum(other.joint == joint.joint for other in limb.chain[:i])
-        steps += _steps(joint, joint.name or f"{joint.joint}{number}", suffix)
-    tip = matrix_from_place(limb.tip)
-    if steps:
-        steps[0] = replace(steps[0], place=turn @ steps[0].place)
-    else:
-        tip = turn @ tip
+def _place_copy(limb: LimbRecord, suffix: str, turn: FloatArray) -> PlacedLimb:
+    """Return one copy of a limb, rotated, with the suffix on its names."""
     if limb.ending != "distance" and (limb.length or limb.actuated or limb.cones):
         raise MechanismError(
             f"limb {limb.name!r} ends {limb.ending} and states a length, drive or cone of a rod; "
@@ -222,80 +207,65 @@ def _place_copy(limb: LimbRecord, name: str, suffix: str, turn: np.ndarray) -> P
             f"limb {limb.name!r} ends in a rod that no drive moves, of length {limb.length:g} m; "
             "it needs a positive `length:`"
         )
+    steps: list[JointPlacement] = []
+    for i, joint in enumerate(limb.chain):
+        number = 1 + sum(other.joint == joint.joint for other in limb.chain[:i])
+        steps += _place_joint(joint, joint.name or f"{joint.joint}{number}", suffix)
+    tip, attachment = matrix_from_place(limb.tip), turn @ matrix_from_place(limb.attach)
+    if steps:
+        steps[0] = replace(steps[0], place=turn @ steps[0].place)
+    else:
+        tip = turn @ tip
     drive = limb.actuated + suffix if limb.actuated else None
     cones = tuple(Cone(cone.end, _plain(axis_vector(cone.axis)), cone.angle) for cone in limb.cones)
-    return place_limb(
-        name,
-        tuple(steps),
-        tip,
-        limb.ending,
-        turn @ matrix_from_place(limb.attach),
-        limb.length,
-        drive,
-        cones,
-    )
+    name, ending, length = limb.name + suffix, limb.ending, limb.length
+    return place_limb(name, tuple(steps), tip, ending, attachment, length, drive, cones)
 
 
-def _steps(joint: JointRecord, name: str, suffix: str) -> list[JointPlacement]:
-    """Return a joint as R and P joints."""
-    place, unmoved = matrix_from_place(joint.at), np.eye(4)
-    if isinstance(joint, Revolute):
-        motor = joint.actuated + suffix if joint.actuated else None
-        pitch = joint.lead / (2 * np.pi)
-        return [
-            JointPlacement(
-                name, "R", place, axis_vector(joint.axis), motor, pitch, joint.start, joint.limits
-            )
+def _place_joint(record: JointRecord, name: str, suffix: str) -> list[JointPlacement]:
+    """Return a joint as R and P joints, the first one where the record places it."""
+    if isinstance(record, Revolute | Prismatic):
+        drive = record.actuated + suffix if record.actuated else None
+        pitch = record.lead / (2 * np.pi) if isinstance(record, Revolute) else 0.0
+        joints = [Joint(name, record.joint, drive, pitch, record.start, record.limits)]
+        axes = [axis_vector(record.axis)]
+    elif isinstance(record, Cylindrical):
+        joints = [
+            Joint(f"{name}.turn", "R", start=record.start),
+            Joint(f"{name}.slide", "P", start=record.slide_start),
         ]
-    if isinstance(joint, Prismatic):
-        motor = joint.actuated + suffix if joint.actuated else None
-        return [
-            JointPlacement(
-                name, "P", place, axis_vector(joint.axis), motor, 0.0, joint.start, joint.limits
-            )
-        ]
-    if isinstance(joint, Cylindrical):
-        axis = axis_vector(joint.axis)
-        turn = JointPlacement(f"{name}.turn", "R", place, axis, start=joint.start)
-        return [turn, JointPlacement(f"{name}.slide", "P", unmoved, axis, start=joint.slide_start)]
-    axes = (
-        [axis_vector(axis) for axis in joint.axes] if isinstance(joint, Universal) else [EZ, EY, EX]
-    )
-    return [
-        JointPlacement(f"{name}.{i + 1}", "R", place if i == 0 else unmoved, axis, start=start)
-        for i, (axis, start) in enumerate(zip(axes, joint.start, strict=True))
-    ]
+        axes = [axis_vector(record.axis)] * 2
+    else:
+        joints = [Joint(f"{name}.{i + 1}", "R", start=s) for i, s in enumerate(record.start)]
+        is_universal = isinstance(record, Universal)
+        axes = [axis_vector(axis) for axis in record.axes] if is_universal else [EZ, EY, EX]
+    places = [matrix_from_place(record.at), np.eye(4), np.eye(4)]
+    return [JointPlacement(*step) for step in zip(joints, places, axes, strict=False)]
 
 
 def _limb_errors(member: _Member) -> ErrorModel:
     """Return the unknowns that a limb's record names."""
-    errors = (
-        _shifts(member.placed, e) if isinstance(e, Shifts) else _tilts(member.placed, e)
-        for e in member.record.errors
+    return join_errors(
+        _shifts(member.placed, entry) if isinstance(entry, Shifts) else _tilts(member.placed, entry)
+        for entry in member.record.errors
     )
-    return sum(errors, start=ErrorModel())
 
 
 def _shifts(limb: PlacedLimb, entry: Shifts) -> ErrorModel:
     """Return the unknown lengths of a limb."""
-    sd, errors = standard_deviation(entry.tolerance, f"{limb.name} {entry.of}"), ErrorModel()
+    sd, errors = standard_deviation(entry.tolerance, f"{limb.name} {entry.of}"), []
+    label = f"{limb.name}.{entry.name or entry.of}"
     for axis in entry.shift:
-        label = f"{limb.name}.{entry.name or entry.of}"
         if axis == "length":
             _check_rod(limb, entry)
             name = label if entry.name else f"{limb.name}.length"
-            address = Address(limb.name, "rod", "length")
-            errors += single_error(
-                name, Dimension.LENGTH, limb.limb.length, sd, LinearMap(name, address)
-            )
+            errors.append(rod_length_error(limb, name, sd))
             continue
-        element = _element(limb, entry.of)
-        place, name = limb.placements[element], f"{label}.{axis}"
-        nominal = float((place[:3, :3].T @ place[:3, 3])["xyz".index(axis)])
-        errors += single_error(
-            name, Dimension.LENGTH, nominal, sd, *map_displacement(name, limb, element, axis)
-        )
-    return errors
+        element = _find_element(limb, entry.of)
+        place = limb.placements[element]
+        nominal = (place[:3, :3].T @ place[:3, 3])["xyz".index(axis)]
+        errors.append(displacement_error(f"{label}.{axis}", limb, element, axis, sd, nominal))
+    return join_errors(errors)
 
 
 def _check_rod(limb: PlacedLimb, entry: Shifts) -> None:
@@ -308,20 +278,19 @@ def _check_rod(limb: PlacedLimb, entry: Shifts) -> None:
 
 def _tilts(limb: PlacedLimb, entry: Tilts) -> ErrorModel:
     """Return the unknown angles of a limb."""
-    sd, errors = standard_deviation(entry.tolerance, f"{limb.name} {entry.of}"), ErrorModel()
-    element = _element(limb, entry.of)
-    for axis in entry.tilt:
-        name = f"{limb.name}.{entry.name or entry.of}.{axis}"
-        maps = (
-            map_slide_tilt(name, limb, element, axis)
-            if entry.alone
-            else map_displacement(name, limb, element, axis)
-        )
-        errors += single_error(name, Dimension.ANGLE, 0.0, sd, *maps)
-    return errors
+    sd = standard_deviation(entry.tolerance, f"{limb.name} {entry.of}")
+    element, tilt = (
+        _find_element(limb, entry.of),
+        map_slide_tilt if entry.alone else map_displacement,
+    )
+    names = {axis: f"{limb.name}.{entry.name or entry.of}.{axis}" for axis in entry.tilt}
+    return join_errors(
+        single_error(name, Dimension.ANGLE, 0.0, sd, *tilt(name, limb, element, axis))
+        for axis, name in names.items()
+    )
 
 
-def _element(limb: PlacedLimb, name: str) -> str:
+def _find_element(limb: PlacedLimb, name: str) -> str:
     """Return the link of a limb by name; a joint of several axes means its first.
 
     Raises
@@ -335,52 +304,38 @@ def _element(limb: PlacedLimb, name: str) -> str:
     raise MechanismError(f"limb {limb.name!r} has no {name!r}; it has {', '.join(limb.elements)}")
 
 
-def _named(
-    named: NamedParameter,
-    members: dict[str, tuple[_Member, ...]],
-    drives: Mapping[str, tuple[Drive, bool]],
-) -> ErrorModel:
+def _named(named: NamedParameter, members: Members, drives: Drives) -> ErrorModel:
     """Return a named parameter with its maps."""
-    if isinstance(named, NamedLength):
-        nominal = named.length
-    else:
-        nominal = named.angle if isinstance(named, NamedAngle) else named.ratio
-    maps = [linear for entry in named.maps for linear in _map_entry(named, entry, members, drives)]
+    dimension, nominal = get_quantity(named)
     sd = standard_deviation(named.tolerance, named.name)
-    return single_error(named.name, find_dimension(named), nominal, sd, *maps)
+    maps = [m for entry in named.maps for m in _map_entry(named, entry, members, drives)]
+    return single_error(named.name, dimension, nominal, sd, *maps)
 
 
 def _map_entry(
-    named: NamedParameter,
-    entry: MapEntry,
-    members: dict[str, tuple[_Member, ...]],
-    drives: Mapping[str, tuple[Drive, bool]],
+    named: NamedParameter, entry: MapEntry, members: Members, drives: Drives
 ) -> Iterator[LinearMap]:
     """Yield the maps of one entry, for every copy that it means."""
     name, (axis, coefficient) = named.name, find_engine_axis(named.name, entry)
+    check_units(named, entry, drives.get(entry.limb))
     if entry.limb in drives:
-        check_units(named, entry, drives[entry.limb])
         yield LinearMap(name, Address(entry.limb, entry.element, axis), coefficient)
         return
-    chosen = members.get(entry.limb) or tuple(
-        m for ms in members.values() for m in ms if m.placed.name == entry.limb
-    )
+    copies = [member for group in members.values() for member in group]
+    chosen = members.get(entry.limb) or [m for m in copies if m.placed.name == entry.limb]
     if not chosen:
-        known = ", ".join((*members, *sorted(drives)))
         raise MechanismError(
             f"parameter {name!r} is mapped onto {entry.limb!r}, which is not there; known are "
-            f"{known}"
+            f"{', '.join((*members, *sorted(drives)))}"
         )
-    check_units(named, entry, None)
-    for member in chosen:
+    for limb in (member.placed for member in chosen):
         if axis in AXES:
-            yield from map_displacement(
-                name, member.placed, _element(member.placed, entry.element), axis, coefficient
-            )
+            element = _find_element(limb, entry.element)
+            yield from map_displacement(name, limb, element, axis, coefficient)
         else:
-            yield LinearMap(name, Address(member.placed.name, entry.element, axis), coefficient)
+            yield LinearMap(name, Address(limb.name, entry.element, axis), coefficient)
 
 
-def _plain(vector: np.ndarray) -> tuple[float, float, float]:
+def _plain(vector: FloatArray) -> tuple[float, float, float]:
     x, y, z = (float(v) for v in vector)
     return x, y, z

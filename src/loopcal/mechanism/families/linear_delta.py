@@ -17,12 +17,13 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.mechanism.assembly import Actuator, Address, Assembly, Joint, Limb, LinearMap, Link
+from loopcal.mechanism.families.error_models import ErrorModel, single_error
+from loopcal.mechanism.families.limb_placement import translate
 from loopcal.mechanism.families.records import (
     AngleTolerance,
     LengthTolerance,
     RobotRecord,
     standard_deviation,
-    translation_matrix,
     values_per_leg,
 )
 from loopcal.parameters import Parameter
@@ -102,55 +103,34 @@ class LinearDelta(RobotRecord):
         if not min(arms) > self.radius > 0:
             raise MechanismError(
                 f"{self.name} has a radius of {self.radius * 1e3:g} mm and an arm of "
-                f"{min(arms) * 1e3:g} mm; "
-                "the radius must be positive and every arm longer than it"
+                f"{min(arms) * 1e3:g} mm; the radius must be positive and every arm longer than it"
             )
         sd = {
             name: standard_deviation(getattr(self.tolerances, name), f"the {name}")
             for name in ("radius", "angles", "arms", "stops")
         }
-        parameters = [Parameter("radius", Dimension.LENGTH, self.radius, sd["radius"])]
-        limbs, actuators, maps, shared = [], [], [], []
+        errors = single_error("radius", Dimension.LENGTH, self.radius, sd["radius"])
+        limbs, actuators = [], []
         for k, (angle, arm, stop) in enumerate(zip(self.angles, arms, stops, strict=True), start=1):
             limb, motor = f"arm{k}", f"q{k}"
-            foot = (self.radius * np.cos(angle), self.radius * np.sin(angle), 0.0)
             # above the nozzle: the other side is the mirrored working mode
-            height = self.home.z + float(np.sqrt(arm**2 - self.radius**2))
-            joints = (Joint("carriage", "P", motor, start=height),)
-            links = (Link("tower", translation_matrix(foot)), Link("hinge", np.eye(4)))
-            limbs.append(Limb(limb, links, joints, "distance", Link("nozzle", np.eye(4)), arm))
-            sign = -1.0 if self.readings == "drop" else 1.0
-            offset = stop + np.sqrt(arm**2 - self.radius**2)
-            actuators.append(
-                Actuator(motor, Dimension.LENGTH, self.stroke, {"offset": offset, "gain": sign})
+            rise = float(np.sqrt(arm**2 - self.radius**2))
+            carriage = Joint("carriage", "P", motor, start=self.home.z + rise)
+            foot = translate(self.radius * np.cos(angle), self.radius * np.sin(angle))
+            links = (Link("tower", foot), Link("hinge", np.eye(4)))
+            end = Link("nozzle", np.eye(4))
+            limbs.append(Limb(limb, links, (carriage,), "distance", end, arm))
+            terms = {"offset": stop + rise, "gain": -1.0 if self.readings == "drop" else 1.0}
+            actuators.append(Actuator(motor, Dimension.LENGTH, self.stroke, terms))
+            names = (f"tower{k}.angle", f"arm{k}.length", f"tower{k}.stop")
+            parameters = (
+                Parameter(names[0], Dimension.ANGLE, angle, sd["angles"], free=k < 3),
+                Parameter(names[1], Dimension.LENGTH, arm, sd["arms"]),
+                Parameter(names[2], Dimension.LENGTH, stop, sd["stops"]),
             )
-            parameters += [
-                Parameter(f"tower{k}.angle", Dimension.ANGLE, angle, sd["angles"], free=k < 3),
-                Parameter(f"arm{k}.length", Dimension.LENGTH, arm, sd["arms"]),
-                Parameter(f"tower{k}.stop", Dimension.LENGTH, stop, sd["stops"]),
-            ]
-            maps.append(LinearMap(f"arm{k}.length", Address(limb, "rod", "length")))
-            shared.append(
-                TowerMap(
-                    ("radius", f"tower{k}.angle", f"arm{k}.length", f"tower{k}.stop"),
-                    (
-                        Address(limb, "tower", "x"),
-                        Address(limb, "tower", "y"),
-                        Address(motor, "transmission", "offset"),
-                    ),
-                )
-            )
-        return Assembly(
-            name=self.name,
-            source=self.source,
-            limbs=tuple(limbs),
-            actuators=tuple(actuators),
-            freedoms=("x", "y", "z"),
-            controlled=("x", "y", "z"),
-            home=self.home.matrix,
-            tool=self.tool.matrix,
-            workspace=self.workspace.ranges,
-            parameters=tuple(parameters),
-            maps=tuple(maps),
-            shared=tuple(shared),
-        )
+            rod = LinearMap(names[1], Address(limb, "rod", "length"))
+            x, y = (Address(limb, "tower", axis) for axis in "xy")
+            tower = TowerMap(("radius", *names), (x, y, Address(motor, "transmission", "offset")))
+            errors += ErrorModel(parameters, (rod,), (tower,))
+        axes = ("x", "y", "z")
+        return self.assemble(limbs, actuators, errors, freedoms=axes, controlled=axes)

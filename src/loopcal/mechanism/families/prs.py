@@ -17,18 +17,25 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError
-from loopcal.mechanism.assembly import Address, LinearMap
-from loopcal.mechanism.families.error_models import ErrorModel, single_error
+from loopcal.mechanism.assembly import Joint
+from loopcal.mechanism.families.error_models import (
+    ErrorModel,
+    ErrorTolerances,
+    displacement_error,
+    join_errors,
+    offset_error,
+    rod_length_error,
+    single_error,
+)
 from loopcal.mechanism.families.limb_placement import (
     EX,
     EY,
     EZ,
     JointPlacement,
     PlacedLimb,
-    map_displacement,
     map_slide_tilt,
     place_limb,
-    translate,
+    place_limb_with_ball,
 )
 from loopcal.mechanism.families.records import AngleTolerance, LengthTolerance, standard_deviation
 from loopcal.typing import FloatArray
@@ -43,14 +50,12 @@ class TripodTolerances:
     angles: AngleTolerance | None = None
 
     @property
-    def length(self) -> float | None:
-        """Standard deviation of the lengths [m]."""
-        return standard_deviation(self.lengths, "the lengths")
-
-    @property
-    def angle(self) -> float | None:
-        """Standard deviation of the angles [rad]."""
-        return standard_deviation(self.angles, "the angles")
+    def deviations(self) -> ErrorTolerances:
+        """Standard deviations [m, rad]."""
+        return ErrorTolerances(
+            standard_deviation(self.lengths, "the lengths"),
+            standard_deviation(self.angles, "the angles"),
+        )
 
 
 @dataclass(frozen=True)
@@ -69,14 +74,19 @@ class ChainFrames:
     length: float
     home: FloatArray
 
+    @property
+    def orientation(self) -> FloatArray:
+        """Orientation (3, 3) of the platform's chain frame in that of the base, at home."""
+        return self.base[:3, :3].T @ self.home[:3, :3] @ self.platform[:3, :3]
+
     def gap(self, name: str) -> FloatArray:
         """Return the vector from the foot of the guide to the ball at home (3,) [m]."""
         gap = (geometry.invert_pose(self.base) @ self.home @ self.platform)[:3, 3]
-        if not np.hypot(gap[0], gap[1]) < self.length:
+        aside = float(np.hypot(gap[0], gap[1]))
+        if not aside < self.length:
             raise MechanismError(
                 f"the rod of {name} is {self.length * 1e3:g} mm long, but its ball is "
-                f"{np.hypot(gap[0], gap[1]) * 1e3:.6g} mm "
-                "beside the guide at home; state a longer rod"
+                f"{aside * 1e3:.6g} mm beside the guide at home; state a longer rod"
             )
         return gap
 
@@ -86,23 +96,17 @@ def build_prs_limb(name: str, motor: str, frames: ChainFrames, axis: str, axes: 
 
     `axes` replaces the ball by three axes.
     """
-    gap = frames.gap(name)
+    gap, length = frames.gap(name), frames.length
     # the rod points along z at joint angle zero and leans towards the ball at home
-    lean = float(np.arcsin(gap[0] / frames.length if axis == "y" else -gap[1] / frames.length))
+    lean = float(np.arcsin(gap[0] / length if axis == "y" else -gap[1] / length))
     turn = EY if axis == "y" else EX
+    guide = Joint("guide", "P", motor, start=float(gap[2] - length * np.cos(lean)))
     steps = (
-        JointPlacement(
-            "guide", "P", frames.base, EZ, motor, start=float(gap[2] - frames.length * np.cos(lean))
-        ),
-        JointPlacement("joint", "R", np.eye(4), turn, start=lean),
+        JointPlacement(guide, frames.base, EZ),
+        JointPlacement(Joint("joint", "R", start=lean), np.eye(4), turn),
     )
-    end = translate(0.0, 0.0, frames.length)
-    if not axes:
-        return place_limb(name, steps, end, "ball", frames.platform)
-    upright = geometry.make_pose(
-        geometry.exp_so3(-lean * turn), np.array([0.0, 0.0, frames.length])
-    )
-    return place_limb(name, (*steps, *_ball(upright, frames)), np.eye(4), "rigid", frames.platform)
+    upright = geometry.exp_so3(-lean * turn) @ frames.orientation if axes else None
+    return place_limb_with_ball(name, steps, length * EZ, frames.platform, upright)
 
 
 def build_pus_limb(name: str, motor: str, frames: ChainFrames, axes: bool) -> PlacedLimb:
@@ -112,108 +116,65 @@ def build_pus_limb(name: str, motor: str, frames: ChainFrames, axes: bool) -> Pl
     """
     gap = frames.gap(name)
     height = float(np.sqrt(frames.length**2 - gap[0] ** 2 - gap[1] ** 2))
-    guide = JointPlacement("guide", "P", frames.base, EZ, motor, start=float(gap[2] - height))
+    slide = Joint("guide", "P", motor, start=float(gap[2] - height))
+    guide = JointPlacement(slide, frames.base, EZ)
     if not axes:
         return place_limb(name, (guide,), np.eye(4), "distance", frames.platform, frames.length)
     rod = np.array([gap[0], gap[1], height])
     first = np.cross(rod, EY)
     steps = (
         guide,
-        JointPlacement("universal1", "R", np.eye(4), first),
-        JointPlacement("universal2", "R", np.eye(4), np.cross(rod, first)),
+        JointPlacement(Joint("universal1", "R"), np.eye(4), first),
+        JointPlacement(Joint("universal2", "R"), np.eye(4), np.cross(rod, first)),
     )
-    return place_limb(
-        name, (*steps, *_ball(translate(*rod), frames)), np.eye(4), "rigid", frames.platform
-    )
+    return place_limb_with_ball(name, steps, rod, frames.platform, frames.orientation)
 
 
-def _ball(place: FloatArray, frames: ChainFrames) -> tuple[JointPlacement, ...]:
-    """Return three axes through the ball's center, at zero in the home pose."""
-    relative = frames.base[:3, :3].T @ frames.home[:3, :3] @ frames.platform[:3, :3]
-    place = place @ geometry.make_pose(relative, np.zeros(3))
-    return tuple(
-        JointPlacement(f"ball{i + 1}", "R", place if i == 0 else np.eye(4), axis)
-        for i, axis in enumerate((EZ, EY, EX))
-    )
-
-
-def end_errors(
-    limb: PlacedLimb, number: int, frames: ChainFrames, tolerance: float | None
+def carriage_errors(
+    limb: PlacedLimb,
+    number: int,
+    frames: ChainFrames,
+    spread: ErrorTolerances,
+    *,
+    foot: str = "xy",
+    guide: str = "xy",
+    joint: str = "",
 ) -> ErrorModel:
-    """Return a.., the center on the platform (three), and b.., the foot of the guide (two).
+    """Return the named parameters of a limb with a carriage, `number` in their names.
 
-    Each is written in its chain frame.
+    They are a.. (all three axes), b.., q, l, thB.. and thC.., see the module.
+
+    Parameters
+    ----------
+    foot, guide, joint : axes of b, thB and thC. The z coordinate of b has the same effect as q.
     """
-    errors = ErrorModel()
-    for letter, element, axes in (("a", "platform", "xyz"), ("b", "guide", "xy")):
-        frame = frames.platform if letter == "a" else frames.base
+    length, angle = spread.length, spread.angle
+    errors = []
+    for letter, element, frame, axes in (
+        ("a", "platform", frames.platform, "xyz"),
+        ("b", "guide", frames.base, foot),
+    ):
+        point = frame[:3, :3].T @ frame[:3, 3]
         for axis in axes:
-            name = f"{letter}{number}{axis}"
-            nominal = (frame[:3, :3].T @ frame[:3, 3])["xyz".index(axis)]
-            errors += single_error(
-                name,
-                Dimension.LENGTH,
-                nominal,
-                tolerance,
-                *map_displacement(name, limb, element, axis),
-            )
-    return errors
-
-
-def foot_height_error(limb: PlacedLimb, number: int, tolerance: float | None) -> ErrorModel:
-    """Return b.z, which has the same effect as the offset along the guide."""
-    name = f"b{number}z"
-    return single_error(
-        name, Dimension.LENGTH, 0.0, tolerance, *map_displacement(name, limb, "guide", "z")
+            name, nominal = f"{letter}{number}{axis}", point["xyz".index(axis)]
+            errors.append(displacement_error(name, limb, element, axis, length, nominal))
+    (motor,), rod = limb.limb.drives, f"l{number}"
+    errors.append(offset_error(f"q{number}", motor, Dimension.LENGTH, 0.0, length))
+    if limb.limb.ending == "distance":
+        errors.append(rod_length_error(limb, rod, length))
+    else:
+        errors.append(displacement_error(rod, limb, "tip", "z", length, frames.length))
+    for axis in guide:
+        name, has_joint = f"thB{number}{axis}", len(limb.limb.joints) > 1
+        if has_joint:
+            maps = map_slide_tilt(name, limb, "guide", f"r{axis}")
+            errors.append(single_error(name, Dimension.ANGLE, 0.0, angle, *maps))
+        else:
+            errors.append(displacement_error(name, limb, "guide", f"r{axis}", angle))
+    errors += (
+        displacement_error(f"thC{number}{axis}", limb, "joint", f"r{axis}", angle) for axis in joint
     )
-
-
-def drive_and_rod_errors(
-    limb: PlacedLimb, motor: str, number: int, frames: ChainFrames, tolerance: float | None
-) -> ErrorModel:
-    """Return q., the carriage's position at reading zero, and l., the rod's length."""
-    q, rod = f"q{number}", f"l{number}"
-    rods = (
-        (LinearMap(rod, Address(limb.name, "rod", "length")),)
-        if limb.limb.ending == "distance"
-        else map_displacement(rod, limb, "tip", "z")
-    )
-    return single_error(
-        q, Dimension.LENGTH, 0.0, tolerance, LinearMap(q, Address(motor, "transmission", "offset"))
-    ) + single_error(rod, Dimension.LENGTH, frames.length, tolerance, *rods)
-
-
-def guide_angle_errors(
-    limb: PlacedLimb, number: int, axes: str, tolerance: float | None
-) -> ErrorModel:
-    """Return thB.., rotations of the guide about axes of the chain frame."""
-    errors = ErrorModel()
-    for axis in axes:
-        name = f"thB{number}{axis}"
-        maps = (
-            map_slide_tilt(name, limb, "guide", f"r{axis}")
-            if limb.limb.joints[1:]
-            else map_displacement(name, limb, "guide", f"r{axis}")
-        )
-        errors += single_error(name, Dimension.ANGLE, 0.0, tolerance, *maps)
-    return errors
-
-
-def joint_angle_errors(
-    limb: PlacedLimb, number: int, axes: str, tolerance: float | None
-) -> ErrorModel:
-    """Return thC.., rotations of the revolute joint about axes of the chain frame."""
-    errors = ErrorModel()
-    for axis in axes:
-        name = f"thC{number}{axis}"
-        errors += single_error(
-            name,
-            Dimension.ANGLE,
-            0.0,
-            tolerance,
-            *map_displacement(name, limb, "joint", f"r{axis}"),
-        )
-    return errors
+    return join_errors(errors)
 
 
 def check_spherical(name: str, spherical: str, error_model: str) -> None:

@@ -7,7 +7,7 @@ Numbers are in SI; `loopcal.io` converts them from the units of the file, by the
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar
 
@@ -15,7 +15,8 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import MechanismError, suggest_names
-from loopcal.mechanism.assembly import Assembly
+from loopcal.mechanism.assembly import Actuator, Assembly, Limb
+from loopcal.mechanism.families.error_models import ErrorModel
 from loopcal.typing import FloatArray
 from loopcal.units import Angle, Length, Ratio
 
@@ -85,13 +86,7 @@ def standard_deviation(
         )
     stated = tolerance.sd if tolerance.sd is not None else tolerance.limits or 0.0
     if not stated > 0:
-        unit = (
-            " m"
-            if isinstance(tolerance, LengthTolerance)
-            else " rad"
-            if isinstance(tolerance, AngleTolerance)
-            else ""
-        )
+        unit = {LengthTolerance: " m", AngleTolerance: " rad", RatioTolerance: ""}[type(tolerance)]
         raise MechanismError(
             f"the tolerance of {name} is {stated:g}{unit}; it must be greater than zero, or left "
             "out"
@@ -116,9 +111,8 @@ class Workspace:
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
         """Stated ranges, coordinate -> (low, high); raises MechanismError unless low < high."""
-        stated = {
-            f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None
-        }
+        ranges = {f.name: getattr(self, f.name) for f in fields(self)}
+        stated = {name: pair for name, pair in ranges.items() if pair is not None}
         for name, (low, high) in stated.items():
             if not low < high:
                 unit = "m" if name in ("x", "y", "z") else "rad"
@@ -155,6 +149,31 @@ class RobotRecord:
         """Return the generic description of this robot."""
         raise TypeError("a record of no family cannot be expanded")
 
+    def assemble(
+        self,
+        limbs: Iterable[Limb],
+        actuators: Iterable[Actuator],
+        errors: ErrorModel,
+        *,
+        freedoms: tuple[str, ...],
+        controlled: tuple[str, ...],
+    ) -> Assembly:
+        """Return the assembly of limbs, drives and errors at the home pose of this record."""
+        return Assembly(
+            self.name,
+            tuple(limbs),
+            tuple(actuators),
+            freedoms,
+            controlled,
+            self.home.matrix,
+            errors.parameters,
+            errors.maps,
+            errors.shared,
+            self.tool.matrix,
+            self.workspace.ranges,
+            self.source,
+        )
+
     def assembly(self) -> Assembly:
         """Return the expanded robot, with the parameters of `fixed` kept at their nominal values.
 
@@ -181,11 +200,6 @@ def match_parameter_names(pattern: str, names: Sequence[str]) -> list[str]:
             f"{pattern!r} under `fixed` matches no parameter of this robot{hint}; correct it"
         )
     return matching
-
-
-def translation_matrix(point: tuple[float, float, float]) -> FloatArray:
-    """Return a translation (4, 4) [m]."""
-    return geometry.make_pose(np.eye(3), np.array(point, dtype=float))
 
 
 def values_per_leg(value: float | tuple[float, ...], count: int, name: str) -> tuple[float, ...]:

@@ -22,19 +22,19 @@ from typing import Literal
 
 import numpy as np
 
-from loopcal.mechanism.assembly import AXES, Actuator, Assembly
+from loopcal.mechanism.assembly import AXES, Actuator, Assembly, Joint
 from loopcal.mechanism.families.error_models import (
     ErrorModel,
     ErrorTolerances,
     complete_errors,
-    single_error,
+    displacement_error,
+    join_errors,
 )
 from loopcal.mechanism.families.limb_placement import (
     EX,
     EY,
     JointPlacement,
     PlacedLimb,
-    map_displacement,
     place_limb,
     translate,
 )
@@ -43,11 +43,8 @@ from loopcal.mechanism.families.prs import (
     TripodTolerances,
     build_prs_limb,
     build_pus_limb,
+    carriage_errors,
     check_spherical,
-    drive_and_rod_errors,
-    end_errors,
-    guide_angle_errors,
-    joint_angle_errors,
 )
 from loopcal.mechanism.families.records import RobotRecord
 from loopcal.units import Dimension, Length
@@ -96,76 +93,47 @@ class RuPusPrs(RobotRecord):
     def expand(self) -> Assembly:
         """Return three limbs under a free platform."""
         check_spherical(self.name, self.spherical, self.error_model)
-        a, b, axes, home = (
-            self.platform_radius,
-            self.base_radius,
-            self.spherical == "axes",
-            self.home.matrix,
-        )
+        a, b, axes = self.platform_radius, self.base_radius, self.spherical == "axes"
+        home, spread = self.home.matrix, self.tolerances.deviations
         first = ChainFrames(translate(-b), translate(-a), self.rod, home)
         second = ChainFrames(translate(0.0, b), translate(0.0, a), self.rod, home)
-        rod, tripod = (
+        limbs = (
             build_pus_limb("chain1", "q1", first, axes),
             build_prs_limb("chain2", "q2", second, "x", axes),
+            self._post(),
         )
-        post = self._post()
-        length, angle = self.tolerances.length, self.tolerances.angle
         if self.error_model == "complete":
-            errors = sum(
-                (
-                    complete_errors(limb, ErrorTolerances(length, angle))
-                    for limb in (rod, tripod, post)
-                ),
-                start=ErrorModel(),
-            )
+            errors = join_errors(complete_errors(limb, spread) for limb in limbs)
         else:
             errors = (
-                end_errors(rod, 1, first, length)
-                + drive_and_rod_errors(rod, "q1", 1, first, length)
-                + guide_angle_errors(rod, 1, "xy", angle)
-                + end_errors(tripod, 2, second, length)
-                + drive_and_rod_errors(tripod, "q2", 2, second, length)
-                + guide_angle_errors(tripod, 2, "xy", angle)
-                + joint_angle_errors(tripod, 2, "yz", angle)
-                + self._post_errors(post, length, angle)
+                carriage_errors(limbs[0], 1, first, spread)
+                + carriage_errors(limbs[1], 2, second, spread, joint="yz")
+                + self._post_errors(limbs[2], spread)
             )
-        return Assembly(
-            name=self.name,
-            source=self.source,
-            limbs=(rod.limb, tripod.limb, post.limb),
-            actuators=tuple(Actuator(q, Dimension.LENGTH, self.stroke) for q in ("q1", "q2")),
+        return self.assemble(
+            (limb.limb for limb in limbs),
+            (Actuator(q, Dimension.LENGTH, self.stroke) for q in ("q1", "q2")),
+            errors,
             freedoms=AXES,
             controlled=("phi", "theta"),
-            home=home,
-            tool=self.tool.matrix,
-            workspace=self.workspace.ranges,
-            parameters=errors.parameters,
-            maps=errors.maps,
         )
 
     def _post(self) -> PlacedLimb:
         """Return revolute joint, link and universal joint; at home all frames are parallel."""
         steps = (
-            JointPlacement("pivot", "R", np.eye(4), EY),
-            JointPlacement("universal1", "R", translate(0.0, 0.0, self.post), EX),
-            JointPlacement("universal2", "R", np.eye(4), EY),
+            JointPlacement(Joint("pivot", "R"), np.eye(4), EY),
+            JointPlacement(Joint("universal1", "R"), translate(0.0, 0.0, self.post), EX),
+            JointPlacement(Joint("universal2", "R"), np.eye(4), EY),
         )
         return place_limb("chain3", steps, np.eye(4), "rigid", np.eye(4))
 
-    def _post_errors(
-        self, post: PlacedLimb, length: float | None, angle: float | None
-    ) -> ErrorModel:
+    def _post_errors(self, post: PlacedLimb, spread: ErrorTolerances) -> ErrorModel:
         """Return r and the angles of the post."""
-        errors = single_error(
-            "r",
-            Dimension.LENGTH,
-            self.post,
-            length,
-            *map_displacement("r", post, "universal1", "z"),
+        left_out = LEFT_OUT if self.parameters == "twenty-five" else ()
+        return displacement_error(
+            "r", post, "universal1", "z", spread.length, self.post
+        ) + join_errors(
+            displacement_error(name, post, element, axis, spread.angle)
+            for name, element, axis in POST_ANGLES
+            if name not in left_out
         )
-        for name, element, axis in POST_ANGLES:
-            if self.parameters == "twenty-seven" or name not in LEFT_OUT:
-                errors += single_error(
-                    name, Dimension.ANGLE, 0.0, angle, *map_displacement(name, post, element, axis)
-                )
-        return errors

@@ -17,18 +17,14 @@ from typing import Literal
 import numpy as np
 
 from loopcal.mechanism.assembly import AXES, Actuator, Assembly
-from loopcal.mechanism.families.error_models import ErrorModel, ErrorTolerances, complete_errors
+from loopcal.mechanism.families.error_models import ErrorModel, complete_errors
 from loopcal.mechanism.families.limb_placement import PlacedLimb, rotate_about, translate
 from loopcal.mechanism.families.prs import (
     ChainFrames,
     TripodTolerances,
     build_prs_limb,
+    carriage_errors,
     check_spherical,
-    drive_and_rod_errors,
-    end_errors,
-    foot_height_error,
-    guide_angle_errors,
-    joint_angle_errors,
 )
 from loopcal.mechanism.families.records import RobotRecord
 from loopcal.units import Dimension, Length
@@ -65,43 +61,25 @@ class ThreePrs(RobotRecord):
         limbs, errors = [], ErrorModel()
         for number in (1, 2, 3):
             turn = rotate_about("z", 2 * np.pi / 3 * (number - 1))
-            frames = ChainFrames(
-                turn @ translate(self.base_radius),
-                turn @ translate(self.platform_radius),
-                self.rod,
-                self.home.matrix,
-            )
-            limb = build_prs_limb(
-                f"chain{number}", f"q{number}", frames, "y", self.spherical == "axes"
-            )
-            limbs.append(limb)
+            base, platform = translate(self.base_radius), translate(self.platform_radius)
+            frames = ChainFrames(turn @ base, turn @ platform, self.rod, self.home.matrix)
+            axes = self.spherical == "axes"
+            limb = build_prs_limb(f"chain{number}", f"q{number}", frames, "y", axes)
+            limbs.append(limb.limb)
             errors += self._errors(limb, number, frames)
-        return Assembly(
-            name=self.name,
-            source=self.source,
-            limbs=tuple(limb.limb for limb in limbs),
-            actuators=tuple(
-                Actuator(f"q{number}", Dimension.LENGTH, self.stroke) for number in (1, 2, 3)
-            ),
+        return self.assemble(
+            limbs,
+            (Actuator(f"q{number}", Dimension.LENGTH, self.stroke) for number in (1, 2, 3)),
+            errors,
             freedoms=AXES,
             controlled=("z", "phi", "theta"),
-            home=self.home.matrix,
-            tool=self.tool.matrix,
-            workspace=self.workspace.ranges,
-            parameters=errors.parameters,
-            maps=errors.maps,
         )
 
     def _errors(self, limb: PlacedLimb, number: int, frames: ChainFrames) -> ErrorModel:
         """Return the error model of one chain."""
-        length, angle = self.tolerances.length, self.tolerances.angle
+        spread = self.tolerances.deviations
         if self.error_model == "complete":
-            return complete_errors(limb, ErrorTolerances(length, angle))
-        all_of_them = self.parameters == "fourteen"
-        return (
-            end_errors(limb, number, frames, length)
-            + (foot_height_error(limb, number, length) if all_of_them else ErrorModel())
-            + drive_and_rod_errors(limb, f"q{number}", number, frames, length)
-            + guide_angle_errors(limb, number, "xyz" if all_of_them else "xy", angle)
-            + joint_angle_errors(limb, number, "xyz" if all_of_them else "xz", angle)
-        )
+            return complete_errors(limb, spread)
+        if self.parameters == "eleven":
+            return carriage_errors(limb, number, frames, spread, joint="xz")
+        return carriage_errors(limb, number, frames, spread, foot="xyz", guide="xyz", joint="xyz")
