@@ -134,4 +134,4 @@ def test_every_path_of_the_architecture_exists(root: Path) -> None:
     places += (root / "src" / "loopcal" / "measure", root / "src" / "loopcal" / "mechanism")
     places += (root / "src" / "loopcal" / "diagnose",)
     missing = {name for name in named if not any((place / name).exists() for place in places)}
-    assert missing <= {"measure/kinds/GROUP/", "evidence/NAME.py", "findings/catalog/SUBJECT.py"}
+    assert missing <= {"measure/kinds/GROUP/", "evidence/NAME.py", "findings/catalog/SUBJECT.toml"}

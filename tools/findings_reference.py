@@ -7,12 +7,12 @@ its changes before you commit them.
 
 import re
 import sys
-from importlib import import_module
 from pathlib import Path
 
 from loopcal.findings import catalog
+from loopcal.findings.catalog import Entry
 from loopcal.findings.finding import Severity
-from loopcal.findings.wording import Entry
+from loopcal.findings.wording import depends_on_data, fill_template
 from tools.file_reference import table
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -37,26 +37,14 @@ other results hold findings, `str(finding)` is the text, and an error made from 
 `code`. In JSON, a finding has the keys `code`, `severity`, `data` and `text`.
 
 In the texts below, words in *italics* are replaced by data. Where a text differs in more than its
-data, an example is shown in quotation marks.
+data, an example is shown in quotation marks. The last columns are empty where the text says it.
 """
-
-
-def entries_of(subject: str) -> tuple[Entry, ...]:
-    """Return the entries of a module of the catalog."""
-    return import_module(f"{catalog.__name__}.{subject}").ENTRIES
-
-
-def title_of(subject: str) -> str:
-    """Return the first line of the docstring of a module of the catalog, without the full stop."""
-    doc = import_module(f"{catalog.__name__}.{subject}").__doc__
-    assert doc, subject
-    return doc.strip().splitlines()[0].rstrip(".")
 
 
 def shown_text(entry: Entry) -> str:
     """Return the text of an entry for the page: placeholders in italics, or an example."""
-    if callable(entry.text):
-        return f'"{entry.word(entry.example)}"'
+    if depends_on_data(entry.text):
+        return f'"{entry.word_example()}"'
     return PLACEHOLDER.sub(lambda match: f"*{match['name'].replace('_', ' ')}*", entry.text)
 
 
@@ -64,12 +52,18 @@ def page() -> str:
     """Return docs/findings.md."""
     severities = [(f"`{severity.value}`", words) for severity, words in SEVERITIES.items()]
     parts = [HEAD, table(("severity", "meaning"), severities)]
-    for subject in catalog.SUBJECTS:
+    for file in catalog.FILES:
         rows = [
-            (f"`{e.code}`", e.severity.value, shown_text(e), e.when, e.action)
-            for e in entries_of(subject)
+            (
+                f"`{e.code}`",
+                e.severity.value,
+                shown_text(e),
+                e.when,
+                fill_template(e.action, **e.example),
+            )
+            for e in catalog.read_entries(file).values()
         ]
-        parts.append(f"## {title_of(subject)}\n")
+        parts.append(f"## {catalog.read_document(file)['title']}\n")
         parts.append(table(("code", "severity", "text", "when", "what to do"), rows))
     return "\n".join(parts)
 
@@ -77,8 +71,8 @@ def page() -> str:
 def wording() -> str:
     """Return every text of the catalog, one a line: templates as they are, functions by example."""
     lines = [
-        f"{e.code} [{e.severity.value}]: {e.word(e.example) if callable(e.text) else e.text}"
-        for e in catalog.CATALOG.values()
+        f"{e.code} [{e.severity.value}]: {e.word_example()}"
+        for e in catalog.load_catalog().values()
     ]
     return "\n".join(lines) + "\n"
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import json
 import re
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ import pytest
 import loopcal
 from loopcal.errors import EstimationError
 from loopcal.findings import Quantity, Severity, report_finding
-from loopcal.findings.catalog import CATALOG
+from loopcal.findings.catalog import FILES, load_catalog, phrases, read_document
 from loopcal.serialization import to_json
 from tools import findings_reference
 
@@ -47,6 +48,9 @@ def reports() -> Iterator[tuple[str, str, set[str]]]:
                 yield f"{name}:{node.lineno}", str(code.value), given
 
 
+CATALOG = load_catalog()
+
+
 def test_every_reported_code_is_in_the_catalog_with_exactly_its_data():
     found = list(reports())
     assert len(found) > 50
@@ -74,11 +78,23 @@ def test_codes_are_a_subject_and_a_name():
     assert [code for code in CATALOG if not re.fullmatch(r"[a-z]+\.[a-z0-9-]+", code)] == []
 
 
-def test_entries_say_when_they_are_reported_and_refusals_what_to_do():
+def test_refusals_and_failures_say_what_to_do_in_their_text_or_beside_it():
     for entry in CATALOG.values():
-        assert entry.when.endswith("."), entry.code
+        assert all(t.endswith(".") for t in (entry.when, entry.action) if t), entry.code
         if entry.severity in {Severity.REFUSAL, Severity.FAILURE}:
-            assert entry.action.endswith("."), entry.code
+            assert entry.action or re.search(r"[.:;,] \w", entry.text), entry.code
+
+
+def test_the_subjects_of_a_file_are_those_of_its_codes():
+    for file, subjects in FILES.items():
+        assert read_document(file).keys() == {"title", *subjects}
+
+
+def test_every_phrase_is_used():
+    texts = " ".join(entry.text for entry in CATALOG.values())
+    functions = (name for name, value in vars(phrases).items() if inspect.isfunction(value))
+    own = [name for name in functions if getattr(phrases, name).__module__ == phrases.__name__]
+    assert [n for n in own if not n.startswith("_") and f"{{{n}()}}" not in texts] == []
 
 
 def test_the_page_of_findings_is_up_to_date():

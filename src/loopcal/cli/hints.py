@@ -114,7 +114,7 @@ def hint_for(finding: Finding) -> str | None:
 
 def _is_limb_freed(finding: Finding) -> bool:
     """Return whether a finding reports a change of a limb that the fit has freed already."""
-    from loopcal.findings.catalog.prior import MACHINE
+    from loopcal.findings.catalog.phrases import MACHINE
 
     return finding.code == "prior.machine-changed" and finding.data["subject"] != MACHINE
 

@@ -31,7 +31,7 @@ from loopcal.estimate.inference.null_space import NEGLIGIBLE
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import Method
 from loopcal.findings import Finding, report_finding
-from loopcal.findings.catalog.model import word_effect
+from loopcal.findings.catalog.phrases import effect
 from loopcal.measure import Measurements
 from loopcal.mechanism import LinearMap, Mechanism
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
@@ -81,7 +81,7 @@ class MergedParameter:
 
     def describe_effect(self, most: int = 8) -> str:
         """Return the effect in terms of at most `most` of the kept parameters."""
-        return word_effect(vars(self), most)
+        return effect(vars(self), most)
 
     def __str__(self) -> str:
         return str(self.finding)

@@ -27,7 +27,7 @@ from loopcal.estimate.methods.penalties import LeastSquares
 from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
-from loopcal.findings.catalog.prior import MACHINE
+from loopcal.findings.catalog.phrases import MACHINE
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.serialization import json_fields

@@ -22,9 +22,9 @@ def report_finding(code: str, severity: Severity | None = None, **data: Any) -> 
     ------
     KeyError : the code is not in the catalog, or `data` lacks one of its fields.
     """
-    from loopcal.findings.catalog import CATALOG
+    from loopcal.findings.catalog import find_entry
 
-    entry = CATALOG[code]
+    entry = find_entry(code)
     if missing := entry.fields - data.keys():
         raise KeyError(f"{code} needs {', '.join(sorted(missing))}")
     return Finding(code, entry.severity if severity is None else severity, data)

@@ -49,9 +49,9 @@ class Finding:
 
     def __str__(self) -> str:
         """Return the sentence of the catalog."""
-        from loopcal.findings.catalog import CATALOG
+        from loopcal.findings.catalog import find_entry
 
-        return CATALOG[self.code].word(self.data)
+        return find_entry(self.code).word(self.data)
 
     def to_dict(self) -> dict[str, Any]:
         """Return code, severity, data and text, for `loopcal.serialization.to_json`."""

@@ -1,18 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How catalog entries become sentences: templates with a few formats for numbers and names."""
+"""Templates of sentences: `str.format` with formats for names, numbers and optional parts.
+
+In addition to the formats of Python, where `...` is a template again:
+
+| field | words |
+| --- | --- |
+| `{names:list}` | `a, b and c`; of many names the first ones `and 3 more` |
+| `{n:count pose}`, `{n:count axis/axes}` | a number with its noun: 1 pose, 3 poses; 2 axes |
+| `{share:percent}`, `{ratio:factor}` | a share as per cent; a factor, in full where it is large |
+| `{clause:sentence}` | a clause as a sentence, with a capital letter and a full stop |
+| `{value:if|...|...}` | the first part where there is a value other than zero, else the second |
+| `{n:plural|...|...}` | the first part for one (a number, or a sequence of one), else the second |
+| `{key:choose|a=...|b=...|...}` | the part of this key; the last part for any other |
+| `{rows:each|...}` | a part for each row (fields: its keys, or `item`), joined like names |
+| `{rows:each 3|...}`, `{rows:each; |...}` | the same, for the first 3 rows; joined by `; ` |
+| `{name()}`, `{subject.code()}` | a phrase of `catalog/phrases.py`; the text of another finding |
+
+A number without a format has three significant digits; a `Quantity` also its unit.
+"""
 
 from __future__ import annotations
 
 import math
 import string
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence, Sized
+from functools import cache
 from typing import Any, NamedTuple
-
-from loopcal.findings.finding import Severity
 
 SHOWN_NAMES = 10
 """Names that a sentence lists before it counts the others."""
+
+_PYTHON = string.Formatter()
 
 
 class Quantity(NamedTuple):
@@ -45,68 +63,115 @@ def list_names(names: Sequence[Any], shown: int = SHOWN_NAMES) -> str:
     return f"{', '.join(words[:-1])} and {words[-1]}"
 
 
-class _Formatter(string.Formatter):
-    """`str.format` with four more formats.
-
-    `{names:list}` lists names. `{n:count pose}` counts with the right number: 1 pose, 3 poses;
-    `{n:count axis/axes}` states the plural. `{share:percent}` is a share as per cent. A number
-    without a format has three significant digits; a `Quantity` also its unit.
-    """
-
-    def format_field(self, value: Any, format_spec: str) -> str:
-        if format_spec == "list":
-            return list_names(value)
-        if format_spec == "percent":
-            return f"{round_to_digits(100.0 * value)} %"
-        if format_spec.startswith("count "):
-            one, _, many = format_spec.removeprefix("count ").partition("/")
-            return f"{value} {one if value == 1 else many or one + 's'}"
-        if isinstance(value, Quantity):
-            return str(value)
-        if format_spec == "" and isinstance(value, float):
-            return round_to_digits(value)
-        return super().format_field(value, format_spec)
+def fill_template(template: str, /, **data: Any) -> str:
+    """Return a template filled with data."""
+    return _fill(template, data)
 
 
-_FORMATTER = _Formatter()
+def list_fields(template: str) -> frozenset[str]:
+    """Return the names of the data that a template shows, those of optional parts included."""
+    return frozenset(_find_fields(template))
 
 
-@dataclass(frozen=True)
-class Entry:
-    """One message of the catalog.
-
-    Parameters
-    ----------
-    code : `subject.what`. severity : how much it matters.
-    text : the sentence, a template over the data; or a function of the data, for sentences that
-        differ in more than their numbers.
-    when : one sentence for docs/findings.md: when it is reported.
-    action : one sentence for docs/findings.md: what to do next. Empty where there is nothing to do.
-    example : data of one case, for tests and documentation. Needed where `text` is a function, and
-        where the data hold more than the sentence shows.
-    """
-
-    code: str
-    severity: Severity
-    text: str | Callable[[Mapping[str, Any]], str]
-    when: str
-    action: str = ""
-    example: Mapping[str, Any] = field(default_factory=dict)
-
-    def word(self, data: Mapping[str, Any]) -> str:
-        """Return the sentence for these data."""
-        if callable(self.text):
-            return self.text(data)
-        return _FORMATTER.vformat(self.text, (), data)
-
-    @property
-    def fields(self) -> frozenset[str]:
-        """Names of the data: those of the template and of the example."""
-        parts = [] if callable(self.text) else string.Formatter().parse(self.text)
-        shown = {name.split(".")[0].split("[")[0] for _, name, _, _ in parts if name}
-        return frozenset(shown | self.example.keys())
+def depends_on_data(template: str) -> bool:
+    """Return whether the sentences of a template differ in more than names and numbers."""
+    return any(
+        name is not None and ("|" in spec or name.endswith("()"))
+        for _, name, spec, _ in _parse(template)
+    )
 
 
-def fill_template(template: str, **data: Any) -> str:
-    """Return a template of the catalog filled with data, for entries whose text is a function."""
-    return _FORMATTER.vformat(template, (), data)
+@cache
+def _parse(template: str) -> tuple[tuple[str, str | None, str, str | None], ...]:
+    """Return literal text, name, format and conversion of each field."""
+    parsed = string.Formatter().parse(template)
+    return tuple((text, name, spec or "", conversion) for text, name, spec, conversion in parsed)
+
+
+@cache
+def _split(parts: str) -> tuple[str, ...]:
+    """Return the parts between bars that are outside of braces."""
+    found, depth = [""], 0
+    for character in parts:
+        depth += {"{": 1, "}": -1}.get(character, 0)
+        if character == "|" and depth == 0:
+            found.append("")
+        else:
+            found[-1] += character
+    return tuple(found)
+
+
+def _find_fields(template: str) -> Iterator[str]:
+    for _, name, spec, _ in _parse(template):
+        if name and not name.endswith("()"):
+            yield name.split(".")[0].split("[")[0]
+        if "|" in spec and not spec.startswith("each"):
+            yield from _find_fields(spec)
+
+
+def _fill(template: str, data: Mapping[str, Any]) -> str:
+    words = []
+    for text, name, spec, conversion in _parse(template):
+        words.append(text)
+        if name is not None:
+            value = _PYTHON.convert_field(_look_up(name, data), conversion)
+            words.append(_word_parts(value, spec, data) if "|" in spec else _word(value, spec))
+    return "".join(words)
+
+
+def _look_up(name: str, data: Mapping[str, Any]) -> Any:
+    """Return the value of a field: data, a phrase, or the text of another finding."""
+    if not name.endswith("()"):
+        return _PYTHON.get_field(name, (), data)[0]
+    from loopcal.findings.catalog import find_entry, phrases
+
+    name = name.removesuffix("()")
+    return find_entry(name).word(data) if "." in name else getattr(phrases, name)(data)
+
+
+def _word_parts(value: Any, spec: str, data: Mapping[str, Any]) -> str:
+    """Word a field that chooses or repeats templates."""
+    rule, _, rest = spec.partition("|")
+    parts = _split(rest)
+    if rule.startswith("each"):
+        return _word_rows(value, rule.removeprefix("each"), rest, data)
+    if rule == "choose":
+        named = dict(part.split("=", 1) for part in parts[:-1])
+        return _fill(named.get(str(value), parts[-1]), data)
+    if rule == "plural":
+        is_first = (len(value) if isinstance(value, Sized) else value) == 1
+    else:
+        assert rule == "if", spec
+        is_first = bool(value)
+    return _fill((*parts, "")[0 if is_first else 1], data)
+
+
+def _word_rows(rows: Sequence[Any], joint: str, template: str, data: Mapping[str, Any]) -> str:
+    """Word each row, and join the words as a list or with a joint of their own."""
+    words = [
+        _fill(template, {**data, **(row if isinstance(row, Mapping) else {"item": row})})
+        for row in rows
+    ]
+    if joint and not joint.strip().isdigit():
+        return joint.join(words)
+    return list_names(words, int(joint or SHOWN_NAMES))
+
+
+def _word(value: Any, spec: str) -> str:
+    """Word a value in one of the formats, or in one of Python's."""
+    if spec == "list":
+        return list_names(value)
+    if spec == "percent":
+        return f"{round_to_digits(100.0 * value)} %"
+    if spec == "factor":
+        return f"{value:.0f}" if 100.0 <= value < 1e6 else f"{value:.2g}"
+    if spec == "sentence":
+        return f"{value[0].upper()}{value[1:].rstrip('.')}."
+    if spec.startswith("count "):
+        one, _, many = spec.removeprefix("count ").partition("/")
+        return f"{value} {one if value == 1 else many or one + 's'}"
+    if isinstance(value, Quantity):
+        return str(value)
+    if spec == "" and isinstance(value, float):
+        return round_to_digits(value)
+    return format(value, spec)

@@ -134,7 +134,7 @@ class Violation:
 
     Attributes
     ----------
-    code : of the reason; worded in `loopcal.findings.catalog.plan`.
+    code : of the reason; worded in `loopcal.findings.catalog.phrases`.
     data : names and numbers of the reason.
     on_path : whether it occurs on the straight path from home, not at the pose itself.
     """

@@ -1,41 +1,127 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The catalog: the only place where findings are worded, one module for each subject."""
+"""The catalog: the only place where findings are worded, one TOML file for each subject.
+
+    [fit.no-descent]                   # the code
+    failure = "The iteration ..."      # severity = text, a template (`loopcal.findings.wording`)
+    when = "Every shortened step ..."  # when it is reported, if the text does not say it
+    action = "Check for wrong rows."   # what to do next, if the text does not say it
+    example = { iterations = 12 }      # data of one case, for tests and documentation
+
+An example is needed where the text depends on its data, and where the data have more than the text
+shows. In it, `{ value, unit }` is a `Quantity`, and absent data are empty. A file is read when its
+first finding is reported.
+"""
 
 from __future__ import annotations
 
-from importlib import import_module
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
 
-from loopcal.findings.wording import Entry
+from loopcal.findings.finding import Severity
+from loopcal.findings.wording import Quantity, depends_on_data, fill_template, list_fields
 
-SUBJECTS: tuple[str, ...] = (
-    "gates",
-    "workflow",
-    "fit",
-    "noise",
-    "prior",
-    "poses",
-    "identifiability",
-    "outliers",
-    "conventions",
-    "residuals",
-    "model",
-    "mechanism",
-    "data",
-    "apply",
-    "plan",
-    "files",
-)
-"""Modules of this package, in the order of docs/findings.md. Each defines `ENTRIES`."""
+FILES: Mapping[str, tuple[str, ...]] = {
+    "workflow": ("gates", "workflow"),
+    "fit": ("fit", "prior", "poses", "setup"),
+    "residuals": ("noise", "residuals"),
+    "identifiability": ("identifiability", "model"),
+    "outliers": ("outliers",),
+    "data": ("conventions", "data"),
+    "mechanism": ("kinematics", "limits", "singularity", "mechanism"),
+    "apply": ("validation", "accuracy", "compensation"),
+    "plan": ("plan",),
+    "files": ("files",),
+}
+"""Files of this folder, in the order of docs/findings.md, and the subjects of their codes."""
 
-
-def _collect() -> dict[str, Entry]:
-    catalog: dict[str, Entry] = {}
-    for subject in SUBJECTS:
-        for entry in import_module(f"{__name__}.{subject}").ENTRIES:
-            assert entry.code not in catalog, f"{entry.code} is worded twice"
-            catalog[entry.code] = entry
-    return catalog
+_FILE_OF = {subject: file for file, subjects in FILES.items() for subject in subjects}
 
 
-CATALOG = _collect()
-"""From a code to its entry."""
+@dataclass(frozen=True)
+class Entry:
+    """One message of the catalog.
+
+    Parameters
+    ----------
+    code : `subject.what`. severity : how much it matters. text : the sentence, a template.
+    when : when it is reported. action : what to do next. Both are empty where the text says it.
+    example : data of one case.
+    """
+
+    code: str
+    severity: Severity
+    text: str
+    when: str = ""
+    action: str = ""
+    example: Mapping[str, Any] = field(default_factory=dict)
+
+    def word(self, data: Mapping[str, Any]) -> str:
+        """Return the sentence for these data."""
+        return fill_template(self.text, **data)
+
+    def word_example(self) -> str:
+        """Return the sentence of the example, or the template where data only fill it."""
+        if not depends_on_data(self.text):
+            return self.text
+        return self.word({**dict.fromkeys(self.fields), **self.example})
+
+    @property
+    def fields(self) -> frozenset[str]:
+        """Names of the data: those of the text and of the example."""
+        return list_fields(self.text) | self.example.keys()
+
+
+def find_entry(code: str) -> Entry:
+    """Return the entry of a code.
+
+    Raises
+    ------
+    KeyError : the code is not in the catalog.
+    """
+    return read_entries(_FILE_OF[code.partition(".")[0]])[code]
+
+
+def load_catalog() -> dict[str, Entry]:
+    """Return all entries by code."""
+    return {code: entry for file in FILES for code, entry in read_entries(file).items()}
+
+
+@cache
+def read_entries(file: str) -> dict[str, Entry]:
+    """Return the entries of a file by code."""
+    subjects = read_document(file)
+    codes = {
+        f"{subject}.{name}": keys
+        for subject in FILES[file]
+        for name, keys in subjects[subject].items()
+    }
+    return {code: _make_entry(code, keys) for code, keys in codes.items()}
+
+
+def read_document(file: str) -> dict[str, Any]:
+    """Return the content of a file: its title, and tables of entries by subject."""
+    path = Path(__file__).with_name(f"{file}.toml")
+    return tomllib.loads(path.read_text("utf-8"))
+
+
+def _make_entry(code: str, keys: Mapping[str, Any]) -> Entry:
+    texts = {k: " ".join(v.strip().split("\n")) for k, v in keys.items() if isinstance(v, str)}
+    (severity,) = texts.keys() - {"when", "action"}
+    text = texts.pop(severity)
+    example = _convert(keys.get("example", {}))
+    return Entry(code, Severity(severity), text, **texts, example=example)
+
+
+def _convert(value: Any) -> Any:
+    """Return tuples in place of lists, and quantities in place of tables of value and unit."""
+    if isinstance(value, list):
+        return tuple(_convert(item) for item in value)
+    if isinstance(value, dict):
+        if value.keys() == {"value", "unit"}:
+            return Quantity(value["value"], value["unit"])
+        return {name: _convert(item) for name, item in value.items()}
+    return value
