@@ -177,7 +177,7 @@ class Measurements:
         ----------
         hold_out : float
             Share of the poses that is not fitted (0.25 fits three poses of four), as nearly as
-            whole blocks allow; both sets get at least one block. The command line's `--hold-out`
+            whole blocks allow; both sets get at least one block. The `hold_out` of a calibration
             is the same share.
         seed : int
             The same seed gives the same sets.
