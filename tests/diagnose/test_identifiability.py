@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from loopcal.diagnose import identifiability
-from loopcal.diagnose.observability import compute_observability
+from loopcal.diagnose.identifiable_parameters import compute_observability
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.inference.null_space import Combination, describe_null_space
@@ -49,7 +49,6 @@ def test_ranks_of_the_hexapod_are_those_of_the_measured_freedoms(instrument, ran
     if rank < 42:
         assert found.singular_values[rank] < 1e-13 * found.singular_values[0]
         assert found.gap > 1e8
-        assert list(found.cut) == list(found.singular_values[rank:])
 
 
 @pytest.mark.parametrize(("unknown", "rank"), FRAMES.items())

@@ -10,8 +10,13 @@ import pytest
 from scipy.stats import binom, chi2
 
 from loopcal.diagnose import examine_fit, find_outliers
-from loopcal.diagnose.influence import Influence, compute_influence
-from loopcal.diagnose.outliers import _search, _State, _summarize, _suspected_in_turn
+from loopcal.diagnose.fit_checks.influence import Influence, compute_influence
+from loopcal.diagnose.fit_checks.outlier_search import (
+    PartialFit,
+    list_suspected_in_turn,
+    search_suspects,
+)
+from loopcal.diagnose.fit_checks.outliers import _summarize
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import MAP, FitOptions, Huber, LeastSquares, Tukey, identify
 from loopcal.estimate.free_parameters import select_free_parameters
@@ -312,16 +317,16 @@ def test_noise_that_is_spread_over_all_rows_is_no_all_clear():
 def test_a_search_that_comes_back_to_where_it_was_is_not_settled_and_says_who_was_doubted():
     """Blocks 0 and 1 hide each other: each is doubted while the other is set aside."""
 
-    def ask(aside: np.ndarray) -> _State:
+    def ask(aside: np.ndarray) -> PartialFit:
         distance = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
         distance[0 if aside[1] else 1] = 100.0
         one = np.ones(6, dtype=np.int64)
-        return _State(aside, Influence(np.full(6, 0.1), one, distance, one, distance), 1.0, 4)
+        return PartialFit(aside, Influence(np.full(6, 0.1), one, distance, one, distance), 1.0, 4)
 
     whole = ask(np.zeros(6, dtype=bool))
-    visited = _search(ask, whole, whole, 0.01, 3)
+    visited = search_suspects(ask, whole, whole, 0.01, 3)
     assert [np.flatnonzero(state.excluded).tolist() for state in visited] == [[1], [0]]
-    (group,) = _suspected_in_turn(visited)
+    (group,) = list_suspected_in_turn(visited)
     assert np.flatnonzero(group).tolist() == [0, 1]
     fit = identify(*probed(12, {}))
     counts = {"outliers": 0, "ambiguous": 2, "blocks": 6}

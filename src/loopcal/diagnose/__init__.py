@@ -1,12 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Diagnose what data can determine, and whether they agree with themselves and with a fit."""
 
-from loopcal.diagnose.actuator_reading_errors import ReadingError as ReadingError
-from loopcal.diagnose.actuator_reading_errors import (
-    compute_reading_errors as compute_reading_errors,
-)
-from loopcal.diagnose.calibration_gain import CalibrationGain as CalibrationGain
-from loopcal.diagnose.calibration_gain import estimate_calibration_gain as estimate_calibration_gain
 from loopcal.diagnose.conventions import IMPLAUSIBLE as IMPLAUSIBLE
 from loopcal.diagnose.conventions import ConventionCheck as ConventionCheck
 from loopcal.diagnose.conventions import Interpretation as Interpretation
@@ -19,25 +13,42 @@ from loopcal.diagnose.cross_validation import LeaveOneOut as LeaveOneOut
 from loopcal.diagnose.cross_validation import build_regularization_path as build_regularization_path
 from loopcal.diagnose.cross_validation import cross_validate as cross_validate
 from loopcal.diagnose.cross_validation import score_leave_one_out as score_leave_one_out
-from loopcal.diagnose.fit_examination import CorrelatedGroup as CorrelatedGroup
-from loopcal.diagnose.fit_examination import FitExamination as FitExamination
-from loopcal.diagnose.fit_examination import examine_fit as examine_fit
-from loopcal.diagnose.fit_examination import find_correlated_groups as find_correlated_groups
+from loopcal.diagnose.fit_checks.all_checks import FitExamination as FitExamination
+from loopcal.diagnose.fit_checks.all_checks import examine_fit as examine_fit
+from loopcal.diagnose.fit_checks.correlations import CorrelatedGroup as CorrelatedGroup
+from loopcal.diagnose.fit_checks.correlations import (
+    find_correlated_groups as find_correlated_groups,
+)
+from loopcal.diagnose.fit_checks.expected_errors import CalibrationGain as CalibrationGain
+from loopcal.diagnose.fit_checks.expected_errors import (
+    estimate_calibration_gain as estimate_calibration_gain,
+)
+from loopcal.diagnose.fit_checks.outliers import Conflict as Conflict
+from loopcal.diagnose.fit_checks.outliers import Outlier as Outlier
+from loopcal.diagnose.fit_checks.outliers import OutlierCheck as OutlierCheck
+from loopcal.diagnose.fit_checks.outliers import find_outliers as find_outliers
+from loopcal.diagnose.fit_checks.reading_errors import ReadingError as ReadingError
+from loopcal.diagnose.fit_checks.reading_errors import (
+    compute_reading_errors as compute_reading_errors,
+)
+from loopcal.diagnose.fit_checks.repeated_poses import LackOfFit as LackOfFit
+from loopcal.diagnose.fit_checks.repeated_poses import check_lack_of_fit as check_lack_of_fit
+from loopcal.diagnose.fit_checks.start_values import StartCheck as StartCheck
+from loopcal.diagnose.fit_checks.start_values import StartVerdict as StartVerdict
+from loopcal.diagnose.fit_checks.start_values import StoredAnswer as StoredAnswer
+from loopcal.diagnose.fit_checks.start_values import check_start_values as check_start_values
+from loopcal.diagnose.fit_checks.start_values import (
+    compare_stored_geometry as compare_stored_geometry,
+)
+from loopcal.diagnose.frame_motions import NO_MOTION as NO_MOTION
+from loopcal.diagnose.frame_motions import FrameMotions as FrameMotions
+from loopcal.diagnose.frame_motions import find_frame_motions as find_frame_motions
+from loopcal.diagnose.frame_motions import twist_weights as twist_weights
 from loopcal.diagnose.identifiable_parameters import Identifiability as Identifiability
 from loopcal.diagnose.identifiable_parameters import (
     ParameterIdentifiability as ParameterIdentifiability,
 )
 from loopcal.diagnose.identifiable_parameters import identifiability as identifiability
-from loopcal.diagnose.null_space import NO_MOTION as NO_MOTION
-from loopcal.diagnose.null_space import FrameMotions as FrameMotions
-from loopcal.diagnose.null_space import TruthComparison as TruthComparison
-from loopcal.diagnose.null_space import compare_with_truth as compare_with_truth
-from loopcal.diagnose.null_space import find_frame_motions as find_frame_motions
-from loopcal.diagnose.null_space import twist_weights as twist_weights
-from loopcal.diagnose.outliers import Conflict as Conflict
-from loopcal.diagnose.outliers import Outlier as Outlier
-from loopcal.diagnose.outliers import OutlierCheck as OutlierCheck
-from loopcal.diagnose.outliers import find_outliers as find_outliers
 from loopcal.diagnose.parameter_subset import IdentifiableSubset as IdentifiableSubset
 from loopcal.diagnose.parameter_subset import MergedParameter as MergedParameter
 from loopcal.diagnose.parameter_subset import ModelChoice as ModelChoice
@@ -56,14 +67,9 @@ from loopcal.diagnose.prediction_errors import compute_kind_errors as compute_ki
 from loopcal.diagnose.prediction_errors import compute_pose_errors as compute_pose_errors
 from loopcal.diagnose.prediction_errors import compute_row_errors as compute_row_errors
 from loopcal.diagnose.prediction_errors import predict_poses as predict_poses
-from loopcal.diagnose.residual_tests import LackOfFit as LackOfFit
-from loopcal.diagnose.residual_tests import StartCheck as StartCheck
-from loopcal.diagnose.residual_tests import StartVerdict as StartVerdict
-from loopcal.diagnose.residual_tests import check_lack_of_fit as check_lack_of_fit
-from loopcal.diagnose.residual_tests import check_start_values as check_start_values
-from loopcal.diagnose.stored_geometry import StoredAnswer as StoredAnswer
-from loopcal.diagnose.stored_geometry import compare_stored_geometry as compare_stored_geometry
 from loopcal.diagnose.suggestions import FurtherMeasurement as FurtherMeasurement
 from loopcal.diagnose.suggestions import MeasurementSuggestion as MeasurementSuggestion
 from loopcal.diagnose.suggestions import describe_missing_equations as describe_missing_equations
 from loopcal.diagnose.suggestions import suggest_measurements as suggest_measurements
+from loopcal.diagnose.truth_comparison import TruthComparison as TruthComparison
+from loopcal.diagnose.truth_comparison import compare_with_truth as compare_with_truth

@@ -12,8 +12,8 @@ exactly for a linear problem.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -24,16 +24,16 @@ from loopcal.diagnose.prediction_errors import (
     join_errors,
 )
 from loopcal.errors import DataError, EstimationError
+from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.identification import identify
-from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import Method, Ridge, TruncatedSVD, adapt_method
 from loopcal.estimate.observation_rows import linked_blocks
-from loopcal.estimate.options import FitOptions
+from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.estimate.problem import problem_of
-from loopcal.measure import Measurements
+from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism
-from loopcal.numerics.decomposition import Decomposition, decompose
+from loopcal.numerics.decomposition import decompose
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
 
@@ -129,25 +129,33 @@ def cross_validate(
     data: Measurements,
     method: Method | None = None,
     *,
+    options: FitOptions | None = None,
     count: int = 5,
     seed: int = 1,
-    noise: Literal["given", "estimated"] = "given",
-    loss: Loss | None = None,
     progress: Progress = report_no_progress,
 ) -> CrossValidation:
     """Fit `count` times without one fold, and predict the held-out fold.
 
     Parameters
     ----------
-    robot, data, method, noise, loss : as for `identify`. A robot without free parameters is only
-        used to predict.
+    robot, data, method, options : as for `identify`. A robot without free parameters is only used
+        to predict. Excluded poses are neither fitted nor predicted.
     count : number of folds. seed : of their choice. progress : receives the folds that are done.
 
     Raises
     ------
     DataError, EstimationError
-        As `draw_folds` and `identify`.
+        As `draw_folds` and `identify`; or the options have nuisance parameters, which belong to all
+        rows together.
     """
+    options = merge_options(options, method)
+    if options.nuisance is not None:
+        raise EstimationError(
+            "cross_validate does not support the option nuisance; state known frames and targets "
+            "in the measurements"
+        )
+    data = exclude_poses(fill_in_reading_sigma(robot, data), options.excluded_poses)
+    options = replace(options, excluded_poses=())
     labels: list[str] = []
     before, after, scores, scores_before, converged = [], [], [], [], True
     for done, places in enumerate(draw_folds(data, count, seed)):
@@ -156,7 +164,6 @@ def cross_validate(
         fitted = robot
         if robot.parameters.free.any():
             remaining = data.take(np.setdiff1d(np.arange(data.n_poses), places))
-            options = FitOptions(method=method, noise=noise, loss=loss)
             fit = identify(robot, remaining, options=options)
             fitted, converged = fit.robot, converged and fit.converged
         if held_out.n_rows:  # readings alone, of redundant actuators, have a score but no errors
@@ -206,7 +213,11 @@ def score_leave_one_out(
         adapt_method(method, np.zeros(len(free), dtype=bool), "given") for method in methods
     )
     penalty = np.concatenate([method.penalty(d) for method in used])
-    weight, y = _solutions(d, penalty)
+    # 1 / (s^2 + penalty) and the coordinates y, both (k, p); zero for unused directions
+    s, total = d.singular_values[0], d.singular_values[0] ** 2 + penalty
+    used = (total > 0.0) & np.isfinite(total)
+    weight = np.divide(1.0, total, out=np.zeros_like(total), where=used)
+    y = weight * (s * d.projections[0])
     member = np.unique(linked_blocks(data), return_inverse=True)[1]
     parts = [part for block in problem.leverage_rows(at) for part in block]
     block_of_row = np.concatenate(
@@ -215,7 +226,7 @@ def score_leave_one_out(
     A = np.concatenate([part.rows.reshape(-1, part.rows.shape[2]) for part in parts])
     B, b = A[:, :-1] @ d.directions[0], A[:, :-1] @ z[0] - A[:, -1]
     residual = b - y @ B.T
-    total = np.zeros(len(penalty))
+    square = np.zeros(len(penalty))
     for places in _blocks_by_size(block_of_row):
         B_j = B[places]  # (u, m, p)
         H = np.matmul(B_j[None] * weight[:, None, None, :], B_j.swapaxes(-1, -2)[None])
@@ -223,10 +234,10 @@ def score_leave_one_out(
         singular = np.linalg.det(remaining) <= 1e-12
         remaining = np.where(singular[..., None, None], np.eye(places.shape[1]), remaining)
         deleted = np.linalg.solve(remaining, residual[:, places][..., None])[..., 0]
-        total += np.where(singular, np.inf, (deleted**2).sum(axis=2)).sum(axis=1)
+        square += np.where(singular, np.inf, (deleted**2).sum(axis=2)).sum(axis=1)
     dof = np.stack([d.filter_factors(row[None])[0].sum() for row in penalty])
     estimate = free.nominal + free.tolerance * (y @ d.directions[0].T)
-    return LeaveOneOut(tuple(methods), total / int(at.equations[0]), dof, estimate)
+    return LeaveOneOut(tuple(methods), square / int(at.equations[0]), dof, estimate)
 
 
 def build_regularization_path(data_scale: float, count: int, parameters: int) -> tuple[Method, ...]:
@@ -250,16 +261,6 @@ def _mean_square(robot: Mechanism, data: Measurements) -> float:
     for rows, residuals in zip(problem.rows, problem.residuals(z, solution), strict=True):
         total += float(np.where(rows.is_present[0], residuals.whitened[0] ** 2, 0.0).sum())
     return total / equations if np.isfinite(total) and equations else np.inf
-
-
-def _solutions(d: Decomposition, penalty: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return 1 / (s^2 + penalty) and the coordinates y, both (k, p); zero for unused directions."""
-    s, c = d.singular_values[0], d.projections[0]
-    total = s**2 + penalty
-    weight = np.divide(
-        1.0, total, out=np.zeros_like(total), where=(total > 0.0) & np.isfinite(total)
-    )
-    return weight, weight * (s * c)
 
 
 def _blocks_by_size(block_of_row: IntArray) -> list[IntArray]:

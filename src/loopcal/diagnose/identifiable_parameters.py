@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Determine what measurements identify, before or without a fit: rank, condition, null space."""
+"""Determine what measurements identify, before or without a fit: rank, condition, null space.
+
+Singular values are those of whitened rows in units of tolerance. Formulas and sources of the
+observability indices O1 to O5: docs/theory/observability.md.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from loopcal.diagnose.null_space import interpret_combinations
-from loopcal.diagnose.observability import SCALING, Observability, compute_observability
+from loopcal.diagnose.frame_motions import interpret_combinations
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.inference.null_space import (
@@ -23,6 +26,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.measure import Instrument, Measurements, check_actuators, simulate
 from loopcal.mechanism import Mechanism, sample_workspace
 from loopcal.numerics.decomposition import NULL_COMPONENT, RANK_TOLERANCE, Decomposition, decompose
+from loopcal.serialization import json_fields
 from loopcal.typing import FloatArray
 
 MOST_WEAK = 5
@@ -33,6 +37,49 @@ AROUND = 3
 
 MOST_ROWS = 12
 """Number of parameters in the printed table; the others are counted."""
+
+SCALING = "rows divided by sigma, columns multiplied by tolerance"
+"""Units of the singular values; every index depends on them."""
+
+MEANING = {
+    "o1": "(product of s)^(1/L) / sqrt(m): a small uncertainty ellipsoid",
+    "o2": "smallest / largest: 1 / condition",
+    "o3": "smallest: the worst direction",
+    "o4": "smallest^2 / largest: noise amplification",
+    "o5": "1 / sum(1/s): a small sum of semi-axes",
+}
+
+
+@dataclass(frozen=True)
+class Observability:
+    """The five indices over the L observable directions.
+
+    Attributes
+    ----------
+    o1, o2, o3, o4, o5 : the larger the better. directions : L. left_out : number of null
+        directions, which would make all five zero.
+    equations : m. scaling : of rows and columns.
+    """
+
+    o1: float
+    o2: float
+    o3: float
+    o4: float
+    o5: float
+    directions: int
+    left_out: int
+    equations: int
+    scaling: str = SCALING
+
+    def rows(self) -> list[tuple[str, float, str]]:
+        """Return index, value and meaning, for a table."""
+        return [(name.upper(), getattr(self, name), meaning) for name, meaning in MEANING.items()]
+
+    def __str__(self) -> str:
+        values = ", ".join(f"{name} {value:.3g}" for name, value, _ in self.rows())
+        without = f", without {self.left_out} null directions" if self.left_out else ""
+        counts = f"m = {self.equations}, L = {self.directions}{without}"
+        return f"Observability: {values} ({self.scaling}; {counts})"
 
 
 @dataclass(frozen=True)
@@ -74,36 +121,67 @@ class Identifiability:
 
     Attributes
     ----------
-    n_parameters, n_equations : numbers of free parameters and of equations.
-    rank : number of independent combinations that the data determine.
-    condition : largest over smallest singular value that counts.
-    gap : smallest singular value that counts over the largest that does not; infinite where none
-        was cut.
-    singular_values : (p,) descending. tolerance : share of the largest below which one counts as
-        zero.
-    improved : number of directions known better than their tolerance (singular value above 1).
+    free_parameters : the free parameters.
+    factor : (p, p) triangular factor of the rows. decomposition : of that factor (one trial).
     unidentifiable : combinations of parameters that change no measured value.
     weak : the weakest directions known no better than the tolerances, weakest first.
     indices : observability O1 to O5. parameters : the result for each parameter.
-    notes : findings on assumptions.
-    free_parameters, factor : the free parameters, and the triangular factor (p, p) of the rows.
     """
 
-    n_parameters: int
-    n_equations: int
-    rank: int
-    condition: float
-    gap: float
-    singular_values: FloatArray
-    tolerance: float
-    improved: int
+    free_parameters: FreeParameters
+    factor: FloatArray
+    decomposition: Decomposition
     unidentifiable: tuple[Combination, ...]
     weak: tuple[Combination, ...]
     indices: Observability
     parameters: tuple[ParameterIdentifiability, ...]
-    notes: tuple[Finding, ...]
-    free_parameters: FreeParameters
-    factor: FloatArray
+
+    JSON_FIELDS: ClassVar[tuple[str, ...]] = (
+        *("n_parameters", "n_equations", "rank", "condition", "gap", "singular_values"),
+        *("tolerance", "improved", "unidentifiable", "weak", "indices", "parameters", "findings"),
+    )
+
+    @property
+    def n_parameters(self) -> int:
+        """Number p of free parameters."""
+        return len(self.free_parameters)
+
+    @property
+    def n_equations(self) -> int:
+        """Number of equations."""
+        return int(self.decomposition.rows[0])
+
+    @property
+    def rank(self) -> int:
+        """Number of independent combinations that the data determine."""
+        return int(self.decomposition.rank[0])
+
+    @property
+    def condition(self) -> float:
+        """Largest over smallest singular value that counts."""
+        return float(self.decomposition.condition[0])
+
+    @property
+    def gap(self) -> float:
+        """Smallest singular value that counts over the largest that does not; infinite where none
+        was cut.
+        """
+        return float(self.decomposition.gap[0])
+
+    @property
+    def singular_values(self) -> FloatArray:
+        """(p,) descending."""
+        return self.decomposition.singular_values[0]
+
+    @property
+    def tolerance(self) -> float:
+        """Share of the largest singular value below which one counts as zero."""
+        return self.decomposition.tolerance
+
+    @property
+    def improved(self) -> int:
+        """Number of directions known better than their tolerance (singular value above 1)."""
+        return int((self.singular_values[: self.rank] > 1.0).sum())
 
     def __repr__(self) -> str:
         name, rank = self.free_parameters.robot.name, f"rank {self.rank} of {self.n_parameters}"
@@ -125,58 +203,39 @@ class Identifiability:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What the data determine and what they leave open, without the indices."""
+        p, rank, s = self.n_parameters, self.rank, self.singular_values
         findings = [
             report_finding(
-                "identifiability.rank",
-                rank=self.rank,
-                parameters=self.n_parameters,
-                equations=self.n_equations,
+                "identifiability.rank", rank=rank, parameters=p, equations=self.n_equations
             ),
             report_finding(
                 "identifiability.spectrum",
                 condition=self.condition,
-                largest=float(self.singular_values[0]),
-                smallest=float(self.singular_values[max(self.rank - 1, 0)]),
+                largest=float(s[0]),
+                smallest=float(s[max(rank - 1, 0)]),
                 scaling=SCALING,
                 tolerance=self.tolerance,
             ),
-            report_finding(
-                "identifiability.improved", improved=self.improved, parameters=self.n_parameters
-            ),
+            report_finding("identifiability.improved", improved=self.improved, parameters=p),
         ]
         if self.unidentifiable:
+            counted = tuple(f"{value:.2g}" for value in s[max(rank - AROUND, 0) : rank])
+            cut = tuple(f"{value:.2g}" for value in s[rank:])
             findings.append(
-                report_finding(
-                    "identifiability.gap",
-                    counted=tuple(f"{value:.2g}" for value in self.counted),
-                    cut=tuple(f"{value:.2g}" for value in self.cut),
-                    gap=self.gap,
-                )
+                report_finding("identifiability.gap", counted=counted, cut=cut, gap=self.gap)
             )
         findings += [one.finding for one in (*self.unidentifiable, *self.weak)]
-        if (more := self.rank - self.improved - len(self.weak)) > 0:
+        if (more := rank - self.improved - len(self.weak)) > 0:
             findings.append(report_finding("identifiability.more-weak-directions", count=more))
-        return (*findings, *self.notes)
-
-    @property
-    def counted(self) -> FloatArray:
-        """The last singular values that count."""
-        return self.singular_values[max(self.rank - AROUND, 0) : self.rank]
-
-    @property
-    def cut(self) -> FloatArray:
-        """All singular values that do not count."""
-        return self.singular_values[self.rank :]
+        return (*findings, *self.free_parameters.findings())
 
     def null_space(self) -> FloatArray:
         """Return (p, d) orthonormal deviations in tolerances that change no measured value."""
-        return np.linalg.svd(self.factor)[2].T[:, self.rank :]
+        return self.decomposition.null_space()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the attributes for JSON, without the matrices, and the findings."""
-        omitted = {"notes", "free_parameters", "factor"}
-        content = {k: v for k, v in vars(self).items() if k not in omitted}
-        return {**content, "scaling": SCALING, "findings": self.findings}
+        """Return what the data determine for JSON, without the matrices."""
+        return {**json_fields(self), "scaling": SCALING}
 
 
 def identifiability(
@@ -208,11 +267,11 @@ def identifiability(
         data = simulate(robot, coordinates, data, seed=0, controller=robot)
     check_actuators(data, robot)
     free = select_free_parameters(robot)
-    count = count_equations(robot, data)
     if not len(free):
         total = len(robot.parameters)
         finding = report_finding("fit.no-free-parameter", robot=robot.name, total=total)
         raise EstimationError(finding)
+    count = count_equations(robot, data)
     if not count:
         raise EstimationError(report_finding("fit.no-measured-value"))
     factor, reached = collect_information(free, data)
@@ -224,52 +283,78 @@ def identifiability(
             )
         )
     decomposition = decompose(factor, np.full(1, count), tolerance=rank_tolerance)
-    return summarize_identifiability(free, decomposition, factor[0, :-1, :-1])
+    return _summarize(free, decomposition, factor[0, :-1, :-1])
 
 
-def summarize_identifiability(
+def compute_remaining_sd(rows: FloatArray) -> FloatArray:
+    """Return the standard deviations (p,) over tolerances by rows (m, p) and the tolerances as a
+    prior.
+    """
+    _, s, vt = np.linalg.svd(rows, full_matrices=False)
+    return np.sqrt((vt**2 / (1.0 + s[:, None] ** 2)).sum(axis=0))
+
+
+def compute_observability(singular_values: FloatArray, rank: int, equations: int) -> Observability:
+    """Return the indices of the singular values of whitened rows in units of tolerance.
+
+    Parameters
+    ----------
+    singular_values : (p,), descending. rank : how many of them count. equations : m, number of
+        rows.
+
+    Returns
+    -------
+    Observability; all indices are zero where the rank is zero.
+    """
+    s = singular_values[:rank]
+    left_out = len(singular_values) - rank
+    if rank == 0 or equations == 0:
+        return Observability(0.0, 0.0, 0.0, 0.0, 0.0, 0, left_out, equations)
+    return Observability(
+        o1=float(np.exp(np.log(s).mean()) / np.sqrt(equations)),
+        o2=float(s[-1] / s[0]),
+        o3=float(s[-1]),
+        o4=float(s[-1] ** 2 / s[0]),
+        o5=float(1.0 / (1.0 / s).sum()),
+        directions=rank,
+        left_out=left_out,
+        equations=equations,
+    )
+
+
+def _summarize(
     free: FreeParameters, decomposition: Decomposition, factor: FloatArray
 ) -> Identifiability:
     """Return the identifiability by a decomposition (t = 1) of a factor (p, p)."""
     s, V = decomposition.singular_values[0], decomposition.directions[0]
     rank, equations = int(decomposition.rank[0]), int(decomposition.rows[0])
-    null = decomposition.null_space()
-    improved = int((s[:rank] > 1.0).sum())
-    weakest = range(rank - 1, max(improved, rank - MOST_WEAK) - 1, -1)
+    null, n_improved = decomposition.null_space(), int((s[:rank] > 1.0).sum())
+    weakest = range(rank - 1, max(n_improved, rank - MOST_WEAK) - 1, -1)
     combinations = describe_null_space(free, null)
     return Identifiability(
-        n_parameters=len(free),
-        n_equations=equations,
-        rank=rank,
-        condition=float(decomposition.condition[0]),
-        gap=float(decomposition.gap[0]),
-        singular_values=s,
-        tolerance=decomposition.tolerance,
-        improved=improved,
+        free,
+        factor,
+        decomposition,
         unidentifiable=interpret_combinations(free, combinations, sparsify_basis(null)),
         weak=tuple(describe_direction(free, V[:, i], float(s[i])) for i in weakest),
         indices=compute_observability(s, rank, equations),
-        parameters=_identify_parameters(free, null, V, s),
-        notes=free.findings(),
-        free_parameters=free,
-        factor=factor,
+        parameters=_judge_parameters(free, null, compute_remaining_sd(factor)),
     )
 
 
-def _identify_parameters(
-    free: FreeParameters, null: FloatArray, V: FloatArray, s: FloatArray
+def _judge_parameters(
+    free: FreeParameters, null: FloatArray, remaining: FloatArray
 ) -> tuple[ParameterIdentifiability, ...]:
     """Judge each parameter by the projector onto the null space (p, d).
 
     A parameter is determined where its unit vector has no part in the null space, not at all where
     it lies in it, and otherwise together with those to which the projector ties it.
     """
-    left = np.sqrt((V**2 / (1.0 + s**2)).sum(axis=1))
     projector = null @ null.T
     parameters = []
     for i, name in enumerate(free.names):
         part = np.sqrt(projector[i, i])
         tied = np.flatnonzero(np.abs(projector[i]) > NULL_COMPONENT * max(part, NULL_COMPONENT))
         partners = tuple(free.names[j] for j in tied) if part > NULL_COMPONENT else ()
-        parameters.append(ParameterIdentifiability(name, partners, float(left[i])))
+        parameters.append(ParameterIdentifiability(name, partners, float(remaining[i])))
     return tuple(parameters)

@@ -19,7 +19,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -28,8 +28,8 @@ from loopcal.diagnose.identifiable_parameters import Identifiability
 from loopcal.errors import EstimationError
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import NEGLIGIBLE
-from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import Method
+from loopcal.estimate.options import FitOptions, merge_options
 from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.phrases import effect
 from loopcal.measure import Measurements
@@ -135,6 +135,13 @@ class Candidate:
     parameters: tuple[str, ...]
     validation: CrossValidation
 
+    JSON_FIELDS: ClassVar[Mapping[str, str]] = {
+        "name": "name",
+        "parameters": "parameters",
+        "score": "validation.score",
+        "standard_error": "validation.standard_error",
+    }
+
 
 @dataclass(frozen=True, eq=False)
 class ModelChoice:
@@ -181,15 +188,7 @@ class ModelChoice:
     def to_dict(self) -> dict[str, Any]:
         """Return scores, choice and finding for JSON."""
         return {
-            "candidates": [
-                {
-                    "name": c.name,
-                    "parameters": c.parameters,
-                    "score": c.validation.score,
-                    "standard_error": c.validation.standard_error,
-                }
-                for c in self.candidates
-            ],
+            "candidates": self.candidates,
             "chosen": self.chosen.name,
             "best": self.best.name,
             "finding": self.finding,
@@ -223,15 +222,11 @@ def nest_parameter_sets(robot: Mechanism) -> dict[str, tuple[str, ...]]:
     offsets = {p.name for p in free if OFFSETS.search(p.name)}
     lengths = offsets | {p.name for p in free if LENGTHS.search(p.name)}
     ideal = lengths | {p.name for p in free if p.dimension is not Dimension.ANGLE}
-    complete = {p.name for p in free}
+    nested = {"offsets": offsets, "lengths": lengths, "ideal": ideal}
+    nested["complete"] = {p.name for p in free}
     sets: dict[str, tuple[str, ...]] = {}
     size = 0
-    for name, chosen in (
-        ("offsets", offsets),
-        ("lengths", lengths),
-        ("ideal", ideal),
-        ("complete", complete),
-    ):
+    for name, chosen in nested.items():
         if len(chosen) > size:
             sets[name] = tuple(p.name for p in free if p.name in chosen)
             size = len(chosen)
@@ -244,22 +239,20 @@ def choose_model(
     nested: Mapping[str, Sequence[str]] | None = None,
     method: Method | None = None,
     *,
+    options: FitOptions | None = None,
     count: int = 5,
     seed: int = 1,
-    noise: Literal["given", "estimated"] = "given",
-    loss: Loss | None = None,
     progress: Progress = report_no_progress,
 ) -> ModelChoice:
     """Choose the simplest set of free parameters that predicts held-out poses as well as any.
 
     Parameters
     ----------
-    robot, data, method, noise, loss : as for `identify`; all candidates are subsets of the free
-        parameters.
+    robot, data, method, options, count, seed : as for `cross_validate`; all candidates are subsets
+        of the free parameters and have the same folds.
     nested : name -> parameters, each set within the next; default `nest_parameter_sets`. The set
         "nothing" is always compared as well.
-    count, seed : of the folds, which are the same for all sets. progress : receives the fits that
-        are done.
+    progress : receives the fits that are done.
 
     Raises
     ------
@@ -275,6 +268,7 @@ def choose_model(
                 f"the set {small!r} is not within {large!r}, or equal to it; give each set within "
                 "the next"
             )
+    options = merge_options(options, method)
 
     def validate_set(place: int, names: Sequence[str]) -> CrossValidation:
         def count_fits(done: int, _total: int, _what: str) -> None:
@@ -282,7 +276,7 @@ def choose_model(
 
         only = _free_only(robot, names)
         return cross_validate(
-            only, data, method, count=count, seed=seed, noise=noise, loss=loss, progress=count_fits
+            only, data, options=options, count=count, seed=seed, progress=count_fits
         )
 
     candidates = tuple(

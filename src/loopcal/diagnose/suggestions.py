@@ -13,8 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.diagnose.identifiable_parameters import Identifiability, identifiability
-from loopcal.diagnose.null_space import probe_workspace
+from loopcal.diagnose.frame_motions import probe_workspace
+from loopcal.diagnose.identifiable_parameters import (
+    Identifiability,
+    compute_remaining_sd,
+    identifiability,
+)
 from loopcal.errors import DataError, MechanismError
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.null_space import Combination, sparsify_basis
@@ -128,7 +132,7 @@ def suggest_measurements(
     leading = [free.names.index(c.names[0]) for c in combinations]
     measurements: list[list[FurtherMeasurement]] = [[] for _ in leading]
     # an observed direction must exceed the rounding of the existing rows, too
-    floor, present = float(np.linalg.norm(factor, ord=2)), _remaining_sd(factor)
+    floor, present = float(np.linalg.norm(factor, ord=2)), compute_remaining_sd(factor)
     joints = _passive_joints(free.robot)
     at = _draw_scene(free, [name for name, _ in joints])
     for words, kind in _list_candidates(free.robot, joints):
@@ -138,7 +142,7 @@ def suggest_measurements(
             continue  # this kind has nothing to measure on this robot
         determined = _find_determined(X, B, floor)
         if determined.any():
-            left = _remaining_sd(np.concatenate([factor, X]))
+            left = compute_remaining_sd(np.concatenate([factor, X]))
             better = determined & (left[leading] < IMPROVEMENT * present[leading])
             for i in np.flatnonzero(better):
                 one = FurtherMeasurement(words, kind.name, float(left[leading[i]]))
@@ -253,9 +257,3 @@ def _find_determined(X: FloatArray, B: FloatArray, floor: float) -> BoolArray:
     largest = max(float(np.linalg.norm(X, ord=2)), floor)
     still_open = vt[s <= OBSERVED * largest] if largest > 0.0 else vt
     return np.asarray(np.linalg.norm(still_open, axis=0) <= np.sqrt(OBSERVED))
-
-
-def _remaining_sd(rows: FloatArray) -> FloatArray:
-    """Standard deviations (p,) over tolerances, with the tolerances as a prior."""
-    _, s, vt = np.linalg.svd(rows, full_matrices=False)
-    return np.sqrt((vt**2 / (1.0 + s[:, None] ** 2)).sum(axis=0))

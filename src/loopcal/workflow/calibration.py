@@ -94,7 +94,7 @@ def calibrate(
     held_out = split.held_out
     errors, impossible = _validate(fit, fitted if held_out is None else held_out, options)
     count("examining the residuals")
-    examination = examine_fit(fit, fitted) if fit.converged else None
+    examination = examine_fit(fit, fitted, progress) if fit.converged else None
     count("looking for further measurements")
     suggestions = _suggest(fit, fitted)
     start = check_start_values(fit)
@@ -180,14 +180,7 @@ def _fit(
         return _FitResult(fit, change=change)
     choice = None
     if options.choose_model:
-        choice = choose_model(
-            robot,
-            data,
-            method=fit_options.method,
-            noise=fit_options.noise,
-            loss=fit_options.loss,
-            progress=count.progress,
-        )
+        choice = choose_model(robot, data, options=fit_options, progress=count.progress)
         if not choice.chosen.parameters:
             raise DataError(report_finding("workflow.no-parameter-chosen"))
     chosen = robot if choice is None else choice.robot

@@ -61,7 +61,7 @@ def compute_influence(
     decomposition: Decomposition,
     penalty: FloatArray,
     weight: FloatArray,
-    at: FloatArray | None = None,
+    solved: FloatArray | None = None,
 ) -> Influence:
     """Return the influence of every block (one trial).
 
@@ -70,14 +70,14 @@ def compute_influence(
     problem : unweighted. linearization : of the weighted problem.
     member : (n,) block 0..u-1 of each pose. weight : (u,) weight of each block in the fit.
     decomposition, penalty : of the weighted fit.
-    at : (1, p), optional. Deviation at which the residuals are evaluated, to first order; default
-        that of the linearization.
+    solved : (1, p), optional. Deviation at which the residuals are evaluated, to first order;
+        default that of the linearization.
     """
     d = decomposition
     variance = d.variances(penalty)[0]
     sd = np.sqrt(np.where(np.isfinite(variance), variance, UNDETERMINED**2))
     covariance_factor = d.scale[:, None] * d.directions[0] * sd
-    change = np.zeros(d.scale.shape) if at is None else (at - linearization.deviation)[0]
+    change = np.zeros(d.scale.shape) if solved is None else (solved - linearization.deviation)[0]
     u, p = len(weight), len(sd)
     leverage, distance, deleted = np.zeros(u), np.zeros(u), np.zeros(u)
     residuals, degrees = np.zeros(u, np.int64), np.zeros(u, np.int64)

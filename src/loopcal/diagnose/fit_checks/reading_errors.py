@@ -10,7 +10,6 @@ g(estimated).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -43,14 +42,6 @@ class ReadingError:
     largest: float
     pose: str
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the attributes by name for JSON, SI."""
-        dimensions = {
-            "reading_dimension": self.reading_dimension.value,
-            "joint_dimension": self.joint_dimension.value,
-        }
-        return {**vars(self), **dimensions}
-
 
 def compute_reading_errors(
     fit: Identification, data: Measurements
@@ -63,17 +54,17 @@ def compute_reading_errors(
     """
     if fit.poses is None:
         return None
-    recorded, estimated = (
-        exclude_poses(data, fit.options.excluded_poses).readings,
-        fit.poses.readings,
-    )
-    sigma = fit.poses.sigma
+    robot, estimated, sigma = fit.robot, fit.poses.readings, fit.poses.sigma
+    recorded = exclude_poses(data, fit.options.excluded_poses).readings
     compared = np.isfinite(sigma) & (sigma > 0.0) & np.isfinite(recorded) & np.isfinite(estimated)
     reading = np.where(compared, recorded - estimated, np.nan)
-    joints = _joint_values(fit.robot, recorded) - _joint_values(fit.robot, estimated)
-    joint = np.where(compared, joints, np.nan)
-    driven, labels, errors = _driven_dimensions(fit.robot), fit.poses.labels, []
-    for i, actuator in enumerate(fit.robot.actuators):
+    joint = np.where(
+        compared, _joint_values(robot, recorded) - _joint_values(robot, estimated), np.nan
+    )
+    limbs = robot.assembly.limbs
+    turning = {joint.actuator for limb in limbs for joint in limb.joints if joint.kind == "R"}
+    errors = []
+    for i, actuator in enumerate(robot.actuators):
         if not compared[:, i].any():
             continue
         worst = int(np.nanargmax(np.abs(joint[:, i])))
@@ -84,24 +75,15 @@ def compute_reading_errors(
                 reading=float(np.sqrt(np.nanmean(reading[:, i] ** 2))),
                 reading_dimension=actuator.dimension,
                 joint=float(np.sqrt(np.nanmean(joint[:, i] ** 2))),
-                joint_dimension=driven[actuator.name],
+                joint_dimension=Dimension.ANGLE if actuator.name in turning else Dimension.LENGTH,
                 largest=float(joint[worst, i]),
-                pose=labels[worst],
+                pose=fit.poses.labels[worst],
             )
         )
     return tuple(errors) or None
 
 
 def _joint_values(robot: Mechanism, readings: FloatArray) -> FloatArray:
-    """Values (n, a) of the driven joints at these readings."""
+    """Return the values (n, a) of the driven joints at these readings."""
     _, tau = robot.slots(robot.values[None])
     return joints_from_readings(readings[None], tau, robot.slots.frequency)[0]
-
-
-def _driven_dimensions(robot: Mechanism) -> dict[str, Dimension]:
-    """Dimension of what each actuator moves: an angle of a revolute joint, else a length."""
-    limbs = robot.assembly.limbs
-    turning = {joint.actuator for limb in limbs for joint in limb.joints if joint.kind == "R"}
-    return {
-        a.name: Dimension.ANGLE if a.name in turning else Dimension.LENGTH for a in robot.actuators
-    }

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Predict the gain of a calibration: expected pose errors by the tolerances and after the fit.
+"""Predict the gain of a calibration: pose errors expected from the tolerances, and after the fit.
 
 With D the error model at a pose in units of tolerance, the covariance of the pose is D D' before
 and D C D' after calibration, C the covariance of z. A direction that the data do not determine
@@ -70,15 +70,16 @@ def estimate_calibration_gain(fit: Identification, data: Measurements) -> Calibr
     if fit.residual_test.failed:
         return _unpredicted("model.gain-needs-consistent-noise")
     readings = data.readings if fit.poses is None else fit.poses.readings[fit.poses.kept]
-    chosen = np.unique(
-        np.linspace(0, len(readings) - 1, min(MOST_POSES, len(readings))).astype(int)
-    )
-    readings, values = readings[None, chosen], fit.robot.values[None]
+    chosen = np.linspace(0, len(readings) - 1, min(MOST_POSES, len(readings))).astype(int)
+    readings, values = readings[None, np.unique(chosen)], fit.robot.values[None]
     state = forward_trials(fit.robot, values, readings)
     reached = np.asarray(state.status == Status.CONVERGED)[0]
     parameters = differentiate_pose(fit.robot, values, readings, state).parameters
     D = parameters[0, reached][..., free.places]
-    factor = _covariance_factor(fit)
+    # S with S S' the covariance of the estimate; undetermined directions keep their tolerance
+    posterior = fit.posterior
+    variance = np.where(np.isinf(posterior.variance), 1.0, posterior.variance)
+    factor = posterior.unit[:, None] * posterior.directions * np.sqrt(variance)
     if not reached.any() or np.isnan(factor).any():
         return _unpredicted("model.gain-without-intervals")
     angle_before, position_before = _rms_errors(D * free.tolerance)
@@ -101,17 +102,8 @@ def _unpredicted(code: str, **data: Any) -> CalibrationGain:
     return CalibrationGain(nan, nan, nan, nan, None, report_finding(code, **data))
 
 
-def _covariance_factor(fit: Identification) -> FloatArray:
-    """S (p, p) [SI] with S S' the covariance of the estimate; the tolerance stays where a direction
-    is not determined.
-    """
-    posterior = fit.posterior
-    variance = np.where(np.isinf(posterior.variance), 1.0, posterior.variance)
-    return posterior.unit[:, None] * posterior.directions * np.sqrt(variance)
-
-
 def _rms_errors(factor: FloatArray) -> tuple[float, float]:
-    """Root mean squares over poses of orientation [rad] and position [m] from factors (n, 6, k)."""
+    """Return root mean squares of orientation [rad] and position [m] from factors (n, 6, k)."""
     square = (factor**2).sum(axis=2)
     orientation = float(np.sqrt(square[:, :3].sum(axis=1).mean()))
     return orientation, float(np.sqrt(square[:, 3:].sum(axis=1).mean()))
@@ -120,7 +112,7 @@ def _rms_errors(factor: FloatArray) -> tuple[float, float]:
 def _quantities(
     robot: Mechanism, dimension: Dimension, before: float, after: float
 ) -> tuple[Quantity, Quantity] | None:
-    """Errors before and after in the unit of the robot's file; None where the robot has none."""
+    """Return errors before and after in the unit of the robot's file; None where they are zero."""
     if not before > 0.0:
         return None
     symbol = robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol)

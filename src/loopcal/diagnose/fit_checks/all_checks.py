@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Examine a fit in one call: outliers, lack of fit, correlated parameters and expected gain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from loopcal.diagnose.fit_checks.correlations import CorrelatedGroup, find_correlated_groups
+from loopcal.diagnose.fit_checks.expected_errors import CalibrationGain, estimate_calibration_gain
+from loopcal.diagnose.fit_checks.outliers import OutlierCheck, find_outliers
+from loopcal.diagnose.fit_checks.repeated_poses import LackOfFit, check_lack_of_fit
+from loopcal.estimate.result import Identification
+from loopcal.findings import Finding
+from loopcal.measure import Measurements
+from loopcal.typing import Progress, report_no_progress
+
+
+@dataclass(frozen=True, eq=False)
+class FitExamination:
+    """The results of all examinations of a fit by its own data.
+
+    Attributes
+    ----------
+    outliers : poses that do not fit the others. lack_of_fit : the test against repeated poses.
+    correlated : groups of strongly correlated parameters. gain : expected errors before and after.
+    """
+
+    outliers: OutlierCheck
+    lack_of_fit: LackOfFit
+    correlated: tuple[CorrelatedGroup, ...]
+    gain: CalibrationGain
+
+    JSON_FIELDS = {  # noqa: RUF012
+        "outliers": "outliers",
+        "lack_of_fit": "lack_of_fit",
+        "correlated": "correlated",
+        "worth": "gain",
+        "findings": "findings",
+    }
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """All findings, the most important ones first."""
+        findings = list(self.outliers.findings)
+        if self.gain.is_worthwhile is not None:
+            findings.insert(len(findings) if self.gain.is_worthwhile else 0, self.gain.finding)
+        if self.lack_of_fit.groups:
+            findings += self.lack_of_fit.findings
+        return (*findings, *(group.finding for group in self.correlated))
+
+
+def examine_fit(
+    fit: Identification, data: Measurements, progress: Progress = report_no_progress
+) -> FitExamination:
+    """Examine a fit with the data it was made from.
+
+    Parameters
+    ----------
+    fit : an identification. data : the measurements it was made from.
+    progress : receives the progress of the search for outliers, which takes longest.
+    """
+    return FitExamination(
+        find_outliers(fit, data, progress=progress),
+        check_lack_of_fit(fit, data),
+        find_correlated_groups(fit),
+        estimate_calibration_gain(fit, data),
+    )

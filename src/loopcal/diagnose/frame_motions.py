@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Interpret directions that the data do not determine as motions of the base or platform frame.
+
+A direction n moves the platform by the twist D(x) n at the pose x. It is a motion of the base frame
+where it equals (w, c + w x t) for one w and c at all poses, and one of the platform frame where it
+equals (R w, R c). Such a direction is a gauge freedom: it changes no dimension of the machine, only
+where its frames are placed. See docs/theory/gauge.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from loopcal import geometry
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.inference.null_space import Combination
+from loopcal.estimate.inference.posterior import Posterior
+from loopcal.estimate.information import ObservedPoses, observe_poses
+from loopcal.findings import Finding, report_finding
+from loopcal.mechanism import (
+    Mechanism,
+    Status,
+    compute_readings,
+    differentiate_pose,
+    forward_trials,
+)
+from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import Dimension
+
+PROBES = 24
+"""Poses at which motions are compared: 144 equations for the 12 numbers of two frames and the
+directions in question.
+"""
+
+SPREAD_LENGTH, SPREAD_ANGLE = 0.05, 0.1
+"""Range of the readings of these poses to each side of home, in robot sizes and radians."""
+
+NO_MOTION = 1e-8
+"""Share of the motion by all parameters below which a motion counts as none: the square root of
+double rounding.
+"""
+
+SAME_MOTION = 1e-6
+"""Relative difference below which two motions count as equal."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameMotions:
+    """The d unobservable directions, and the frames that their combinations move.
+
+    Attributes
+    ----------
+    kept : (p, d) the directions without the combinations that move frames; columns are zero where
+        nothing else remains.
+    frames : names of the moved frames: (), ("base",), ("platform",) or both. count : number of
+        independent combinations that move frames.
+    """
+
+    kept: FloatArray
+    frames: tuple[str, ...]
+    count: int
+
+
+def find_frame_motions(posterior: Posterior) -> FrameMotions:
+    """Separate motions of frames from the directions that the data of a fit do not determine."""
+    null = posterior.directions[:, ~posterior.determined]
+    if null.shape[1] == 0:
+        return FrameMotions(null, (), 0)
+    robot, readings, values = (
+        posterior.robot,
+        _probe_readings(posterior.robot),
+        posterior.robot.values,
+    )
+    state = forward_trials(robot, values[None], readings[None])
+    D = differentiate_pose(robot, values[None], readings[None], state).parameters[0]
+    usable = (state.status[0] == Status.CONVERGED) & np.isfinite(D).all(axis=(1, 2))
+    twists = D[usable][:, :, posterior.places] * posterior.unit
+    motions, base, platform = _weigh_motions(robot, state.T[0, usable], twists)
+    limit = NO_MOTION * float(np.linalg.norm(motions))
+    moved = motions @ null
+    _, s, vt = np.linalg.svd(_without_span([base, platform], moved), full_matrices=False)
+    gauge = vt[s <= limit].T
+    moving = moved @ gauge
+    count = int((np.linalg.svd(moving, compute_uv=False) > limit).sum()) if gauge.shape[1] else 0
+    frames: tuple[str, ...] = ("base", "platform") if count else ()
+    for name, frame in (("base", base), ("platform", platform)):
+        if len(frames) == 2 and np.linalg.norm(_without_span([frame], moving)) <= limit:
+            frames = (name,)  # only one where it suffices
+    infinite = np.isinf(posterior.variance[~posterior.determined])
+    return FrameMotions(null @ _gauge_projector(gauge, infinite), frames, count)
+
+
+def twist_weights(robot: Mechanism) -> FloatArray:
+    """Return (6,) factors that make rotations [rad] comparable with displacements [m]: the robot's
+    size, and one.
+    """
+    return np.array([robot.size] * 3 + [1.0] * 3)
+
+
+def probe_workspace(free: FreeParameters, joints: Iterable[str] = ()) -> ObservedPoses:
+    """Return poses about home with evenly spread readings, without those out of reach."""
+    at = observe_poses(free, _probe_readings(free.robot), joints)
+    return observe_poses(free, at.readings[at.is_reached], joints)
+
+
+def interpret_combinations(
+    free: FreeParameters, combinations: tuple[Combination, ...], directions: FloatArray
+) -> tuple[Combination, ...]:
+    """Return combinations with the motion of the robot that each of them stands for.
+
+    Parameters
+    ----------
+    directions : (d, p) the combinations in tolerances.
+    """
+    if not combinations:
+        return combinations
+    at = probe_workspace(free)
+    if not len(at.readings):
+        return combinations
+    motions, base, platform = _weigh_motions(free.robot, at.T[0], at.twists[0])
+    frames = {"platform": platform, "base": base}
+    limit = NO_MOTION * float(np.linalg.norm(motions))
+    interpreted = []
+    for combination, n in zip(combinations, directions, strict=True):
+        moved = motions @ (n / np.linalg.norm(n))
+        motion = _describe_motion(moved, frames, limit, free.robot.size)
+        interpreted.append(replace(combination, meaning="" if motion is None else motion))
+    return tuple(interpreted)
+
+
+def _gauge_projector(gauge: FloatArray, infinite: BoolArray) -> FloatArray:
+    """Return the projector (d, d) along `gauge` (d, g); coordinates of infinite variance go first.
+
+    The choice of the frame that is fitted is a convention; this one leaves nothing infinite that a
+    motion of a frame can remove.
+    """
+    d = len(gauge)
+    u, s, vt = np.linalg.svd(gauge[infinite], full_matrices=True)
+    rank = int((s > NO_MOTION).sum())
+    first, second = gauge @ vt[:rank].T, gauge @ vt[rank:].T
+    projector = np.eye(d)
+    projector[:, infinite] -= (first / s[:rank]) @ u[:, :rank].T
+    basis = np.linalg.qr(second)[0]
+    return projector - basis @ (basis.T @ projector)
+
+
+def _probe_readings(robot: Mechanism) -> FloatArray:
+    """Return readings (PROBES, a) about those of home."""
+    home = compute_readings(robot, robot.values[None], robot.home_state)[0, 0]
+    spread = [
+        SPREAD_LENGTH * robot.size if a.dimension is Dimension.LENGTH else SPREAD_ANGLE
+        for a in robot.actuators
+    ]
+    return home + np.random.default_rng(0).uniform(-1.0, 1.0, (PROBES, len(home))) * spread
+
+
+def _weigh_motions(
+    robot: Mechanism, T: FloatArray, twists: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return weighted motions at poses (n, 4, 4): (6 n, p) by `twists` (n, 6, p), (6 n, 6) by the
+    base frame and (6 n, 6) by the platform frame.
+    """
+    R, t = T[:, :3, :3], T[:, :3, 3]
+    zero, eye = np.zeros_like(R), np.broadcast_to(np.eye(3), R.shape)
+    base = np.block([[eye, zero], [-geometry.hat(t), eye]])
+    platform = np.block([[R, zero], [zero, R]])
+    weight = twist_weights(robot)[:, None]
+    motions, base, platform = (
+        (weight * D).reshape(-1, D.shape[-1]) for D in (twists, base, platform)
+    )
+    return motions, base, platform
+
+
+def _without_span(frames: Sequence[FloatArray], moved: FloatArray) -> FloatArray:
+    """Return the part of the motions `moved` that no motion of the frames explains."""
+    u, s, _ = np.linalg.svd(np.concatenate(frames, axis=1), full_matrices=False)
+    basis = u[:, s > NO_MOTION * s[0]]
+    return moved - basis @ (basis.T @ moved)
+
+
+def _describe_motion(
+    moved: FloatArray, frames: dict[str, FloatArray], limit: float, size: float
+) -> Finding | None:
+    """Return a finding on a motion (6 n,); None where it is not rigid."""
+    length = np.linalg.norm(moved)
+    if length <= limit:
+        return report_finding("identifiability.no-motion")
+    for name, frame in frames.items():
+        if np.linalg.norm(_without_span([frame], moved)) <= SAME_MOTION * length:
+            motion = np.linalg.lstsq(frame, moved, rcond=NO_MOTION)[0]
+            return _describe_frame_motion(name, motion, size)
+    if np.linalg.norm(_without_span(list(frames.values()), moved)) <= SAME_MOTION * length:
+        return report_finding("identifiability.both-frames-move")
+    return None
+
+
+def _describe_frame_motion(frame: str, motion: FloatArray, size: float) -> Finding:
+    """Return a finding on a twist (6,): a translation, a rotation about an axis, or both.
+
+    Data: `frame`; `motion`, a translation, rotation or screw; `axis`, its direction;
+    `through_origin`, whether the axis of a rotation passes through the origin of the frame.
+    """
+    w, c = motion[:3], motion[3:]
+    turn = float(np.linalg.norm(w))
+    if turn * size <= SAME_MOTION * np.linalg.norm(c):
+        kind, axis, through_origin = "translation", c, True
+    else:
+        along = abs(float(w @ c)) / turn**2
+        kind, axis = "rotation" if along <= SAME_MOTION * size else "screw", w
+        through_origin = float(np.linalg.norm(np.cross(w, c))) / turn**2 <= SAME_MOTION * size
+    return report_finding(
+        "identifiability.frame-moves",
+        frame=frame,
+        motion=kind,
+        axis=_axis_name(axis),
+        through_origin=through_origin,
+    )
+
+
+def _axis_name(vector: FloatArray) -> str:
+    """Return a direction as x, y or z, or by its components."""
+    unit = vector / np.linalg.norm(vector)
+    largest = int(np.argmax(np.abs(unit)))
+    if np.linalg.norm(np.delete(unit, largest)) <= SAME_MOTION:
+        return "xyz"[largest]
+    shown = np.where(np.abs(unit) <= SAME_MOTION, 0.0, unit * np.sign(unit[largest]))
+    return "(" + ", ".join(f"{x:.3g}" for x in shown) + ")"
