@@ -196,7 +196,7 @@ def test_the_map_shows_extrapolation():
     for share in (1.0, 0.2):  # poses all over the workspace, and in the middle fifth of it
         data = simulate(truth, middle + share * (everywhere - middle), tracker(), 1)
         maps.append(
-            accuracy_map(identify(robot, data, LeastSquares()), data.readings, where=200, seed=2)
+            accuracy_map(identify(robot, data, LeastSquares()), data.readings, poses=200, seed=2)
         )
     wide, narrow = maps
     assert np.median(narrow.position_ratio) > 3
@@ -229,7 +229,18 @@ def test_predicted_errors_of_pose_are_those_of_simulated_calibrations(name, meth
     measured, judged = (
         sample_workspace(robot, n, seed).coordinates for n, seed in ((40, 1), (6, 9))
     )
-    found = simulate_accuracy(robot, measured, tracker(), judged, method, trials, seed=3)
+    reports = []
+    found = simulate_accuracy(
+        robot,
+        measured,
+        tracker(),
+        judged,
+        method,
+        trials,
+        3,
+        lambda *report: reports.append(report),
+    )
+    assert [(done, total) for done, total, _ in reports] == [(0, trials), (250, trials)]
     ratio = found.ratio[np.isfinite(found.ratio)]
     low, high = bounds(found.trials, len(ratio))
     assert (found.trials, found.failed) == (trials, 0)

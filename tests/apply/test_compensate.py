@@ -140,3 +140,11 @@ def test_bad_requests_are_refused():
         compensate(robot, [[0.7, 0, 0]], "commands", steps=0)
     with pytest.raises(DataError, match="a target of shape"):
         compensate(robot, [[0.7, 0.0]])
+
+
+@pytest.mark.parametrize(("mode", "passes"), [("readings", 4), ("commands", 7)])
+def test_progress_counts_the_passes_over_all_targets(mode, passes) -> None:
+    reports = []
+    robot = hexapod()
+    compensate(robot, robot.home[None], mode, progress=lambda *report: reports.append(report))
+    assert [(done, total) for done, total, _ in reports] == [(i, passes) for i in range(passes)]

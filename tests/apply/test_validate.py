@@ -190,8 +190,10 @@ def test_what_is_not_known_of_the_geometry_before_is_noted_as_found_from_these_r
     more = hexapod_data(8, 1, instrument)
     known = dict(fit.nuisance.values)
     before = "validation.setup-fitted-before"
-    assert before in {f.code for f in validate(fit.robot, more, known=known).findings}
-    alike = validate(fit.robot, more, known=known, known_before=fit.nuisance.starts)
+    assert before in {f.code for f in validate(fit.robot, more, nuisance_values=known).findings}
+    alike = validate(
+        fit.robot, more, nuisance_values=known, nuisance_values_before=fit.nuisance.starts
+    )
     assert before not in {f.code for f in alike.findings}
     own = validate(fit, more)
     np.testing.assert_allclose(alike.before.position, own.before.position, rtol=1e-9)

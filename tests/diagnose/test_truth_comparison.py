@@ -84,7 +84,7 @@ def test_validation_keeps_the_frame_of_the_fit_or_says_after_which_best_fit_it_c
     others = in_unknown_frame(8, seed=5)
     kept = validate(fit, others)
     assert kept.alignment == {"kept": ("frame",), "fitted": ()}
-    by_name = validate(fit.robot, others, before=fit.initial, known=fit.nuisance.values)
+    by_name = validate(fit.robot, others, before=fit.initial, nuisance_values=fit.nuisance.values)
     np.testing.assert_allclose(by_name.after.position, kept.after.position, rtol=1e-9)
     anew = validate(fit, others, refit=("fra*",))
     assert anew.alignment == {"kept": (), "fitted": ("frame",)}

@@ -67,7 +67,7 @@ def test_the_json_document_holds_the_verdict_and_every_finding(report):
 
 
 def test_python_and_command_line_hold_out_the_same_poses(data, tmp_path, monkeypatch, capsys):
-    """`--hold-out 0.25`, `hold_out=0.25` and `data.split(hold_out=0.25, seed=seed)` are the same sets."""
+    """`--hold-out 0.25`, `hold_out=0.25` and `data.split(hold_out=0.25)` are the same sets."""
     monkeypatch.chdir(tmp_path)
     shutil.copy(EXAMPLE, tmp_path / "data.csv")
     words = "calibrate hexapod-42 data.csv -o run --hold-out 0.25 --seed 3 --json"
@@ -205,3 +205,28 @@ def test_the_first_rule_of_the_verdict_decides():
     assert [v.exit_code for v in Verdict] == [0, 0, 2, 0]
     step = choose_next_step(Verdict.RESERVATIONS, (warning,), ())
     assert step.code == "workflow.next-resolve-warnings"
+
+
+def test_measurements_made_in_python_are_checked_for_wrong_conventions(robot, data) -> None:
+    rows = data.observations[0]
+    inches = rows.measured.copy()
+    inches[:, 3:] /= 25.4
+    wrong = replace(data, observations=(replace(rows, measured=inches, source=""),))
+    with pytest.raises(DataError) as error:
+        calibrate(robot, wrong)
+    assert error.value.code == "conventions.other-interpretation"
+    report = calibrate(robot, data)
+    assert report.conventions.finding is None
+    assert report.conventions.misfit < 3.0
+    unchecked = calibrate(robot, data, CalibrationOptions(check_conventions=False))
+    assert np.isnan(unchecked.conventions.misfit)
+
+
+def test_poses_out_of_reach_are_listed_without_held_out_poses(robot, data) -> None:
+    readings = data.readings.copy()
+    readings[3] += np.array([0.9, -0.4, 0.9, -0.4, 0.9, -0.4])  # [m]
+    fit = lc.FitOptions(excluded_poses=[data.labels[3]])
+    report = calibrate(robot, replace(data, readings=readings), CalibrationOptions(fit))
+    (finding,) = [f for f in report.findings if f.code == "validation.unreachable-poses"]
+    assert finding.data["names"] == (f"pose {data.labels[3]}",)
+    assert report.verdict is Verdict.UNDECIDED

@@ -293,7 +293,7 @@ class AccuracyMap:
 def accuracy_map(
     fit: Identification | Posterior,
     measured: ArrayLike,
-    where: ArrayLike | int = 400,
+    poses: ArrayLike | int = 400,
     seed: int = 0,
     frame: Axes = "base",
 ) -> AccuracyMap:
@@ -303,7 +303,7 @@ def accuracy_map(
     ----------
     fit : the identification, or the posterior of a run folder.
     measured : (m, a) readings of the measured poses, as in `Measurements.readings` [m, rad].
-    where : (n, c) controlled coordinates, for instance a grid, or the number of poses to draw from
+    poses : (n, c) controlled coordinates, for instance a grid, or the number of poses to draw from
         the robot's workspace.
     seed : of that draw. frame : axes of the components.
 
@@ -313,10 +313,10 @@ def accuracy_map(
         Poses are to be drawn, and the robot states no workspace.
     """
     robot = (fit.posterior if isinstance(fit, Identification) else fit).robot
-    if isinstance(where, int):
-        coordinates = sample_workspace(robot, where, seed).coordinates
+    if isinstance(poses, int):
+        coordinates = sample_workspace(robot, poses, seed).coordinates
     else:
-        coordinates = np.asarray(where, dtype=np.float64)
+        coordinates = np.asarray(poses, dtype=np.float64)
     return AccuracyMap(
         names=robot.controlled,
         coordinates=coordinates,

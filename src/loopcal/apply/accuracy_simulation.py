@@ -8,19 +8,23 @@ identified and the true machine at the same readings. JCGM 101; see docs/theory/
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal import geometry
 from loopcal.apply.accuracy import PoseUncertainty, pose_uncertainty
-from loopcal.estimate.identification import identify_trials
+from loopcal.errors import EstimationError
+from loopcal.estimate.identification import IdentifiedTrials, identify_trials
 from loopcal.estimate.inference.posterior import compute_posterior
 from loopcal.estimate.methods.penalties import LeastSquares, Method
-from loopcal.measure import Instrument, sample_truth, simulate_trials
-from loopcal.mechanism import Mechanism, Status, forward, forward_trials, inverse
-from loopcal.typing import FloatArray
+from loopcal.measure import Instrument, Trials, sample_truth, simulate_trials
+from loopcal.mechanism import Mechanism, Solution, Status, forward, forward_trials, inverse
+from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
+
+BATCH = 250
+"""Trials that are identified at once; progress is reported between them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +55,11 @@ def simulate_accuracy(
     robot: Mechanism,
     commanded: ArrayLike,
     instrument: Instrument,
-    where: ArrayLike,
+    poses: ArrayLike,
     method: Method | None = None,
     trials: int = 2000,
     seed: int = 0,
+    progress: Progress = report_no_progress,
 ) -> AccuracySimulation:
     """Compare predicted with observed errors of poses.
 
@@ -62,28 +67,68 @@ def simulate_accuracy(
     ----------
     robot : its tolerances are those of the true errors, which each trial draws anew.
     commanded : measured poses, (m, 4, 4) or (m, c). instrument : with what they are measured.
-    where : compared poses, (n, 4, 4) or (n, c), at the readings of the nominal robot.
+    poses : compared poses, (n, 4, 4) or (n, c), at the readings of the nominal robot.
     method : default least squares. trials : their number. seed : of all random streams.
+    progress : receives the trials that are done.
+
+    Raises
+    ------
+    EstimationError : no trial converged.
     """
     truth = sample_truth(robot, trials, seed)
     measured = simulate_trials(robot, truth, commanded, instrument, seed)
-    fits = identify_trials(robot, measured, method or LeastSquares())
-    compared = inverse(robot.nominal, where)
+    compared = inverse(robot.nominal, poses)
+    method = method or LeastSquares()
+    predicted, squares, converged = None, np.zeros((len(compared.q), 6)), 0
+    for first in range(0, trials, BATCH):
+        progress(first, trials, "calibrating simulated machines")
+        fits = identify_trials(robot, _take_trials(measured, slice(first, first + BATCH)), method)
+        valid, errors = _compare_with_truth(fits, truth[first : first + BATCH], compared)
+        squares += (errors**2).sum(axis=0)
+        converged += len(errors)
+        if predicted is None and valid.any():
+            predicted = _predict_errors(fits, int(np.flatnonzero(valid)[0]), compared)
+    if predicted is None:
+        raise EstimationError(f"none of the {trials} trials converged; check poses and method")
+    observed = np.sqrt(squares / converged)
+    return AccuracySimulation(predicted, observed, converged, trials - converged)
+
+
+def _take_trials(trials: Trials, chosen: slice) -> Trials:
+    """Return some of the trials."""
+    return replace(
+        trials,
+        measured=tuple(values[chosen] for values in trials.measured),
+        truth=trials.truth[chosen],
+        T=trials.T[chosen],
+        reached=trials.reached[chosen],
+        recorded=None if trials.recorded is None else trials.recorded[chosen],
+    )
+
+
+def _compare_with_truth(
+    fits: IdentifiedTrials, truth: FloatArray, compared: Solution
+) -> tuple[BoolArray, FloatArray]:
+    """Return which trials (t,) have a fit and all poses, and their pose errors (v, n, 6)."""
     states = [
-        forward_trials(robot, values, compared.q[None], compared.state)
+        forward_trials(fits.free_parameters.robot, values, compared.q[None], compared.state)
         for values in (fits.values, truth)
     ]
-    closed = [(state.status == Status.CONVERGED).all(axis=1) for state in states]
-    valid = fits.converged & closed[0] & closed[1]
-    errors = geometry.pose_difference(states[0].T[valid], states[1].T[valid])
-    free, first = fits.free_parameters, int(np.flatnonzero(valid)[0])
-    trial = np.array([first])
-    identified = robot.with_values(fits.values[first])
-    known = compute_posterior(
-        identified, free.places, free.tolerance, fits.decomposition.take(trial), fits.penalty[trial]
+    is_closed = [(state.status == Status.CONVERGED).all(axis=1) for state in states]
+    valid = fits.converged & is_closed[0] & is_closed[1]
+    return valid, geometry.pose_difference(states[0].T[valid], states[1].T[valid])
+
+
+def _predict_errors(fits: IdentifiedTrials, trial: int, compared: Solution) -> PoseUncertainty:
+    """Return the uncertainty of the poses by the fit of one trial."""
+    free, chosen = fits.free_parameters, np.array([trial])
+    identified = free.robot.with_values(fits.values[trial])
+    posterior = compute_posterior(
+        identified,
+        free.places,
+        free.tolerance,
+        fits.decomposition.take(chosen),
+        fits.penalty[chosen],
     )
-    predicted = pose_uncertainty(
-        known, forward(identified, compared.q), gauge="infinite", point="platform"
-    )
-    observed = np.sqrt((errors**2).mean(axis=0))
-    return AccuracySimulation(predicted, observed, int(valid.sum()), int((~valid).sum()))
+    solution = forward(identified, compared.q)
+    return pose_uncertainty(posterior, solution, gauge="infinite", point="platform")

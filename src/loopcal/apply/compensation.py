@@ -10,6 +10,7 @@ part remains, and the result states it for each target. See docs/theory/accuracy
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Literal, get_args
@@ -25,7 +26,7 @@ from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism import Mechanism, Solution, check_limits, forward, inverse, read_coordinates
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
 from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 Mode = Literal["readings", "commands"]
@@ -35,6 +36,10 @@ SHOWN = 5
 
 ROUNDING = 1e-9
 """An error below this share of the robot's size (or this many radians) is rounding."""
+
+PASSES = 4
+"""Passes over all targets: the controller's answer, the best poses, the errors before, and the
+uncertainty."""
 
 REDUCED = 0.1
 """Share of its first value below which the fixed-point iteration must bring the distance to the
@@ -152,6 +157,7 @@ def compensate(
     controller: Mechanism | None = None,
     steps: int = 3,
     labels: tuple[str, ...] = (),
+    progress: Progress = report_no_progress,
 ) -> Compensation:
     """Compute readings or shifted commands for targets.
 
@@ -165,7 +171,8 @@ def compensate(
     mode : "readings" to set the actuators, "commands" for a controller whose geometry cannot be
         changed.
     controller : that geometry; default: the nominal robot. steps : fixed-point steps of "commands".
-    labels : of the targets; default "1", "2", ...
+    labels : of the targets; default "1", "2", ... progress : receives the passes over all targets
+        that are done.
 
     Returns
     -------
@@ -180,16 +187,20 @@ def compensate(
     known = fit.posterior if isinstance(fit, Identification) else fit
     robot = known if isinstance(known, Mechanism) else known.robot
     old = controller or robot.nominal
+    count = _PassCounter(progress, PASSES + (steps if mode == "commands" else 0))
     uncorrected = inverse(old, targets)
+    count()
     is_pose = np.shape(targets)[-2:] == (4, 4)
     wanted = np.reshape(targets, (-1, 4, 4)) if is_pose else uncorrected.T
     best = inverse(robot, targets)
+    count()
     start = _forward_start(robot, best)
     before = geometry.pose_difference(forward(robot, uncorrected.q, start).T, wanted)
+    count()
     if mode == "readings":
         result = _Iteration(best, None, np.zeros((1, len(wanted), 6)))
     else:
-        result = _shift_commands(robot, old, uncorrected, best, steps)
+        result = _shift_commands(robot, old, uncorrected, best, steps, count)
     final = result.final
     not_compensable = geometry.pose_difference(best.T, wanted)
     return Compensation(
@@ -234,17 +245,34 @@ class _Iteration:
     distances: FloatArray
 
 
+class _PassCounter:
+    """Reports how many passes over all targets are done."""
+
+    def __init__(self, progress: Progress, total: int) -> None:
+        self._progress, self._total, self._done = progress, total, -1
+        self()
+
+    def __call__(self) -> None:
+        self._done += 1
+        self._progress(self._done, self._total, "computing compensation")
+
+
 def _forward_start(robot: Mechanism, best: Solution) -> Solution | None:
     """Return the start of forward solutions: the best poses where all converged, else home."""
     return best if best.converged.all() and robot.program.sigma is None else None
 
 
 def _shift_commands(
-    robot: Mechanism, controller: Mechanism, uncorrected: Solution, best: Solution, steps: int
+    robot: Mechanism,
+    controller: Mechanism,
+    uncorrected: Solution,
+    best: Solution,
+    steps: int,
+    count: Callable[[], None],
 ) -> _Iteration:
     """Shift commands until the machine goes to the best poses.
 
-    The shift is a twist, so no choice of angles is singular.
+    The shift is a twist, so no choice of angles is singular. `count` is called after each step.
     """
     start = _forward_start(robot, best)
     solution = uncorrected
@@ -257,6 +285,7 @@ def _shift_commands(
         solution = inverse(controller, commands, solution if solution.converged.all() else None)
         final = forward(robot, solution.q, start)
         distances.append(geometry.pose_difference(final.T, best.T))
+        count()
     return _Iteration(final, commands, np.stack(distances))
 
 

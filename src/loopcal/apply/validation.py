@@ -179,9 +179,9 @@ def validate(
     limit_position: float | None = None,
     limit_angle: float | None = None,
     before: Mechanism | None = None,
-    known: Mapping[str, float] | None = None,
+    nuisance_values: Mapping[str, float] | None = None,
     refit: Sequence[str] = (),
-    known_before: Mapping[str, float] | None = None,
+    nuisance_values_before: Mapping[str, float] | None = None,
 ) -> Validation:
     """Compare a calibrated robot with measurements, best with some that were not fitted.
 
@@ -191,10 +191,11 @@ def validate(
     limit_position, limit_angle : largest allowed prediction errors [m], [rad].
     before : the geometry to compare with, which is also that of the controller; default: the one
         that `fit` started from (of a robot: its nominal values).
-    known : values [SI] by name of frames, targets and surfaces to keep; default: those of `fit`.
+    nuisance_values : values [SI] by name of frames, targets and surfaces to keep; default: those of
+        `fit`.
     refit : names of some of them, such as `tracker*`, to fit to these rows instead.
-    known_before : the same for the geometry before calibration; default: the values with which
-        `fit` began.
+    nuisance_values_before : the same for the geometry before calibration; default: the values with
+        which `fit` began.
 
     Raises
     ------
@@ -204,7 +205,9 @@ def validate(
     robot = fit.robot if isinstance(fit, Identification) else fit
     old = before or (fit.initial if isinstance(fit, Identification) else fit.nominal)
     check_actuators(data, robot)
-    kept_before, kept = _kept_setup(fit, before, (known_before, known), refit, data)
+    values_before, values = _choose_setup(fit, before, nuisance_values_before, nuisance_values)
+    _check_refit(refit, data)
+    kept_before, kept = _keep_setup(values_before, refit), _keep_setup(values, refit)
     compared = compare_predictions(old, robot, data, kept_before, kept)
     rows = compared.data.observations
     errors_before = compared.before.residuals(rows)
@@ -240,26 +243,27 @@ def validate(
     )
 
 
-def _kept_setup(
+def _choose_setup(
     fit: Identification | Mechanism,
     before: Mechanism | None,
-    known: tuple[Mapping[str, float] | None, Mapping[str, float] | None],
-    refit: Sequence[str],
-    data: Measurements,
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the setup parameters [SI] to keep for the geometry before, and for the calibrated one.
+    values_before: Mapping[str, float] | None,
+    values: Mapping[str, float] | None,
+) -> tuple[Mapping[str, float], Mapping[str, float]]:
+    """Return setup parameters [SI] for the geometry before and for the calibrated one.
 
-    Raises
-    ------
-    DataError : a name in `refit` belongs to nothing in the data.
+    Those that are not given are those of the fit; a robot has none.
     """
-    local = fit.nuisance if isinstance(fit, Identification) else None
-    known_before, known_after = known
-    if known_before is None:
-        is_own = local is not None and before is None and known_after is None
-        known_before = local.starts if is_own and local is not None else {}
-    if known_after is None:
-        known_after = {} if local is None else local.values
+    nuisance = fit.nuisance if isinstance(fit, Identification) else None
+    if values_before is None:
+        started = before is None and values is None and nuisance is not None
+        values_before = nuisance.starts if started and nuisance is not None else {}
+    if values is None:
+        values = {} if nuisance is None else nuisance.values
+    return values_before, values
+
+
+def _check_refit(refit: Sequence[str], data: Measurements) -> None:
+    """Raise DataError for a name in `refit` that belongs to nothing in the data."""
     owners = {owner_of(name) for name in data.nuisance_parameters.table.names}
     for pattern in refit:
         if not any(fnmatchcase(owner, pattern) for owner in owners):
@@ -268,15 +272,15 @@ def _kept_setup(
                 f"no frame, target or surface of these data is called {pattern!r}"
                 f"{suggest_names(pattern, owners)}; the data have: {listed}"
             )
-    before_, after = (
-        {
-            name: value
-            for name, value in values.items()
-            if not any(fnmatchcase(owner_of(name), pattern) for pattern in refit)
-        }
-        for values in (known_before, known_after)
-    )
-    return before_, after
+
+
+def _keep_setup(values: Mapping[str, float], refit: Sequence[str]) -> dict[str, float]:
+    """Return the setup parameters that are not to be fitted again."""
+    return {
+        name: value
+        for name, value in values.items()
+        if not any(fnmatchcase(owner_of(name), pattern) for pattern in refit)
+    }
 
 
 def _display_units(robot: Mechanism) -> tuple[str, str]:

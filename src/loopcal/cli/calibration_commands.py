@@ -228,8 +228,8 @@ def validate(
         limit_position,
         limit_angle,
         calibrated.initial_robot,
-        known=calibrated.nuisance_values,
-        known_before=calibrated.initial_nuisance_values,
+        nuisance_values=calibrated.nuisance_values,
+        nuisance_values_before=calibrated.initial_nuisance_values,
         refit=refit,
     )
     if as_json:
@@ -308,7 +308,8 @@ def compensate(
     robot = known if isinstance(known, Mechanism) else known.robot
     coordinates, labels = load_targets(targets, robot)
     old = None if controller is None else load_robot(controller)
-    result = compensate_targets(known, coordinates, mode, old, steps, labels)
+    with terminal.ProgressBar() as progress:
+        result = compensate_targets(known, coordinates, mode, old, steps, labels, progress)
     text = format_compensation(result)
     if output is not None:
         write_text(output, text)

@@ -234,9 +234,14 @@ def _report_fit(fit: Identification) -> list[Finding]:
 
 
 def _report_validation(errors: Validation | None, is_held_out: bool) -> list[Finding]:
-    """Return the findings of the validation, and whether it supports a verdict."""
+    """Return the findings of the validation, and whether it supports a verdict.
+
+    Errors on fitted poses prove nothing; of these only the poses that are out of reach are listed.
+    """
     if not is_held_out:
-        return [report_finding("workflow.no-held-out-poses")]
+        missed = () if errors is None else errors.findings
+        unreachable = [f for f in missed if f.code == "validation.unreachable-poses"]
+        return [report_finding("workflow.no-held-out-poses"), *unreachable]
     if errors is None:
         return []
     findings = list(errors.findings)

@@ -157,11 +157,8 @@ def prior_from(earlier: Posterior) -> Prior:
     if np.isnan(earlier.variance).any():
         raise EstimationError(report_finding("prior.no-uncertainty"))
     known = np.isfinite(earlier.variance)
-    rows = (
-        np.linalg.inv(earlier.directions)[known]
-        / np.sqrt(earlier.variance[known])[:, None]
-        / earlier.unit
-    )
+    whitening = np.diag(1.0 / np.sqrt(np.where(known, earlier.variance, 1.0)))[known]
+    rows = np.linalg.solve(earlier.directions.T, whitening.T).T / earlier.unit
     return Prior(earlier.names, np.array(earlier.estimate), earlier.unit, rows)
 
 
