@@ -16,16 +16,15 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from loopcal.errors import FileError, UnitError, suggest_names
 from loopcal.io.core.numbers import parse_exact
 from loopcal.io.core.text_file import as_path, read_text
 from loopcal.io.core.yaml_file import YamlFile, parse_yaml, read_yaml
+from loopcal.typing import FloatArray
 from loopcal.units import Dimension, find_unit
-
-if TYPE_CHECKING:
-    from loopcal.typing import FloatArray
 
 WHAT = "measurement file"
 CONVERT_HINT = ", or convert an instrument's export by means of a profile (docs/exports.md)"
@@ -93,8 +92,6 @@ class Table:
         self, name: str, factor: float, cells: Sequence[str], empty: bool = True
     ) -> FloatArray:
         """Return cells (n,) of a column times `factor`; see `numbers`."""
-        import numpy as np
-
         values = [self.number(name, i, cell, empty) for i, cell in enumerate(cells)]
         return np.array(
             [

@@ -8,14 +8,14 @@ import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
+
+import numpy as np
 
 from loopcal.io.core.csv_table import Table, quote_cell
 from loopcal.io.core.numbers import format_exact, format_scaled, parse_exact
+from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
-
-if TYPE_CHECKING:
-    from loopcal.typing import FloatArray
 
 TIME = "time"
 TIME_UNITS: Mapping[str, tuple[float, float]] = {
@@ -103,8 +103,6 @@ class NumberColumn:
 
     def parse(self, table: Table) -> FloatArray:
         """Return the values [SI], NaN where a cell is empty."""
-        import numpy as np
-
         if not self.allows_infinity:
             return table.numbers(self.name, self.dimension)
         cells = table.text(self.name)
@@ -140,8 +138,6 @@ class ProductColumn:
 
     def parse(self, table: Table) -> FloatArray:
         """Return the values [SI]; every row needs one."""
-        import numpy as np
-
         symbols = (table.units[self.name] or "").split("*")
         if len(symbols) != 2:
             sentence = f"column {self.name!r} needs two units, as in '{self.name} [mm*mrad]'"
@@ -181,8 +177,6 @@ class ContextColumn:
 
     def parse(self, table: Table) -> FloatArray:
         """Return the values [s] or [degC], NaN where a cell is empty."""
-        import numpy as np
-
         symbol, cells = table.units[self.name], table.text(self.name)
         if self.name == TIME and symbol is None:
             return np.array([_parse_date(table, row, cell) for row, cell in enumerate(cells)])

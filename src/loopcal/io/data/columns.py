@@ -21,12 +21,12 @@ from loopcal.io.data.column_types import (
     ProductColumn,
     TextColumn,
 )
+from loopcal.mechanism import Mechanism
+from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension
 
 if TYPE_CHECKING:
     from loopcal.measure import Kind
-    from loopcal.mechanism import Mechanism
-    from loopcal.typing import FloatArray
 
 LINK = ";"
 """Separates the names of poses that one row compares."""

@@ -7,15 +7,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from loopcal.errors import FileError
 from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import Table, read_table
 from loopcal.io.data.kind_rows import KindRows, read_kinds
+from loopcal.mechanism import Mechanism
 from loopcal.units import EXAMPLES
 
 if TYPE_CHECKING:
     from loopcal.measure import Instrument
-    from loopcal.mechanism import Mechanism
 
 
 def load_instrument(path: str | Path, robot: Mechanism) -> Instrument:
@@ -69,8 +71,6 @@ def refuse_empty_readings(path: str | Path, robot: Mechanism) -> None:
 
 def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
     """Return the instrument with the noise that the settings of a table state."""
-    import numpy as np
-
     from loopcal.measure import Gaussian, Instrument, Sensor
 
     sensors = []

@@ -8,6 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from loopcal.errors import DataError
 from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import Table, require_columns
@@ -20,15 +23,12 @@ from loopcal.io.data.columns import (
     refuse_unknown_columns,
 )
 from loopcal.io.data.kind_settings import list_kind_settings, read_kind, read_noise
+from loopcal.mechanism import Mechanism
+from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import EXAMPLES
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from loopcal.measure import Kind, Observations
-    from loopcal.mechanism import Mechanism
-    from loopcal.typing import BoolArray, FloatArray, IntArray
 
 SETTINGS: Mapping[str, str] = {
     "format": "1",
@@ -107,8 +107,6 @@ def read_observations(
     FileError : a cell that does not fit, at its line.
     DataError : noise that is not a covariance; with the file.
     """
-    import numpy as np
-
     from loopcal.measure import Observations
 
     one = _select_rows(table, one, members)
@@ -140,8 +138,6 @@ def read_observations(
 
 def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
     """Read the settings `kind` or `kinds`, and the column `kind`."""
-    import numpy as np
-
     file, content = table.settings, table.settings.content
     several = content.get("kinds")
     if several is None:
@@ -184,8 +180,6 @@ def _select_rows(table: Table, one: KindRows, members: Sequence[tuple[int, ...]]
 
 def _read_values(table: Table, robot: Mechanism, one: KindRows) -> tuple[FloatArray, FloatArray]:
     """Return measured values (r, c) and the covariance (r, m, m) of their residuals [SI]."""
-    import numpy as np
-
     kind, rows = one.kind, one.rows
     known = list_columns(robot, [kind])
     names = [name_measured(column.name, robot) for column in kind.columns]
@@ -211,8 +205,6 @@ def _read_values(table: Table, robot: Mechanism, one: KindRows) -> tuple[FloatAr
 
 def _read_names(table: Table, name: str, rows: IntArray) -> NDArray[np.str_]:
     """Return the sessions or groups (r,) of rows: of their cells, else of the setting, else ''."""
-    import numpy as np
-
     stated = table.settings.content.get(name, "")
     if isinstance(stated, dict | list):
         sentence = f"{name!r} names the {name} of all rows; write a name or a number"
@@ -230,8 +222,6 @@ def _read_sigma(
 
     An empty cell of a value that is `absent` (r,) gets the sigma of another row, without effect.
     """
-    import numpy as np
-
     column = one.kind.noise_columns[place]
     name = SIGMA + name_measured(column.name, robot)
     if name not in table.units:

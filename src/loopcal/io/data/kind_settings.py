@@ -22,15 +22,18 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
+
+from loopcal import geometry
 from loopcal.errors import DataError, suggest_names
 from loopcal.io.core.numbers import format_scaled
 from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
+from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, EXAMPLES, Angle, Dimension, Length
 
 if TYPE_CHECKING:
     from loopcal.measure import Kind
-    from loopcal.typing import FloatArray
 
 DIRECTIONS = ("along", "axis", "normal", "up")
 NOISE_UNITS = {
@@ -57,10 +60,6 @@ class PlacedFrame:
 
     def to_matrix(self) -> FloatArray:
         """Return T (4, 4)."""
-        import numpy as np
-
-        from loopcal import geometry
-
         angles = np.array([self.roll, self.pitch, self.yaw])
         R = geometry.euler_to_matrix(angles, "xyz")
         return geometry.make_pose(R, np.array([self.x, self.y, self.z]))
@@ -138,8 +137,6 @@ def format_kind(kind: Kind, noise: Mapping[str, float], tool: FloatArray) -> dic
 
     Keyword-only settings are left out where they are the default, or the robot's `tool`.
     """
-    import numpy as np
-
     texts = {"kind": kind.name}
     for field in dataclasses.fields(typing.cast(Any, kind)):
         if not field.init or (value := getattr(kind, field.name)) is None:
@@ -215,8 +212,6 @@ def _format_setting(key: str, value: Any) -> str:
 
 def _format_frame(T: FloatArray) -> str:
     """Return a pose (4, 4) as text of a `PlacedFrame`."""
-    from loopcal import geometry
-
     lengths = zip("xyz", T[:3, 3], strict=True)
     turns = zip(("roll", "pitch", "yaw"), geometry.matrix_to_euler(T[:3, :3], "xyz"), strict=True)
     texts = [f"{k}: {format_quantity(float(v) + 0.0, Dimension.LENGTH)}" for k, v in lengths]

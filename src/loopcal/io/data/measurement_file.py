@@ -20,6 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from loopcal.errors import DataError, FileError
 from loopcal.io.core.csv_table import Table, read_table, require_columns
 from loopcal.io.core.text_file import as_path
@@ -34,11 +36,11 @@ from loopcal.io.data.kind_rows import (
 from loopcal.io.data.nuisance_settings import read_known
 from loopcal.io.data.pose_rows import Solver, read_pose_rows
 from loopcal.io.robot.robot_file import check_format, require_robot
+from loopcal.mechanism import Mechanism
+from loopcal.typing import FloatArray
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements
-    from loopcal.mechanism import Mechanism
-    from loopcal.typing import FloatArray
 
 FORMAT = 1
 WHAT = "measurement file"
@@ -175,8 +177,6 @@ def load_poses(path: str | Path, robot: Mechanism) -> FloatArray:
     ------
     FileError : a value that does not fit, at its line.
     """
-    import numpy as np
-
     table = read_table(path)
     require_columns(table, robot.controlled, f"a coordinate of {robot.name}")
     return np.column_stack(
@@ -227,8 +227,6 @@ def _collect_pose_context(
     n: int,
 ) -> dict[str, FloatArray]:
     """Return name -> (n,) times and temperatures of rows that only hold readings, else NaN."""
-    import numpy as np
-
     of_poses: dict[str, FloatArray] = {}
     for table, own, of_rows, beside in zip(tables, kinds, members, context, strict=True):
         measuring = {

@@ -7,6 +7,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from loopcal.errors import DataError
 from loopcal.io.core.text_file import write_text
 from loopcal.io.data.column_types import Column, ContextColumn
@@ -15,12 +18,10 @@ from loopcal.io.data.kind_settings import format_kind, format_quantity
 from loopcal.io.data.measurement_file import FORMAT
 from loopcal.io.data.nuisance_settings import format_known
 from loopcal.io.robot.robot_file import require_robot
+from loopcal.mechanism import Mechanism
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from loopcal.measure import Instrument, Kind, Measurements, Observations
-    from loopcal.mechanism import Mechanism
 
 EQUAL = 1e-9
 """Relative difference up to which the standard deviations of all rows are written as one number,
@@ -142,8 +143,6 @@ def format_data_sheet(
     ------
     DataError : the instrument measures a pose that does not exist, or the number of names is wrong.
     """
-    import numpy as np
-
     from loopcal.measure import Measurements, Observations
 
     sensors = instrument.with_tool(robot).sensors
@@ -192,8 +191,6 @@ def _split_reading_noise(data: Measurements, robot: Mechanism) -> tuple[str, lis
 
     An actuator whose noise is the same in all poses is in the setting.
     """
-    import numpy as np
-
     if data.reading_sigma is None:
         return "", []
     stated, own = [], []
@@ -223,8 +220,6 @@ class _Part:
     """Rows of one kind; noise that is `common` to all rows goes to the settings."""
 
     def __init__(self, label: str, rows: Observations, robot: Mechanism) -> None:
-        import numpy as np
-
         self.label, self.rows = label, rows
         kind = rows.kind
         self.names = [name_measured(column.name, robot) for column in kind.columns]
@@ -257,8 +252,6 @@ class _Part:
 
     def cells(self) -> Iterator[tuple[tuple[int, ...], Cells]]:
         """Yield poses and cells of each row that counts; rows of weight 0 are not written."""
-        import numpy as np
-
         rows = self.rows
         for i, poses in enumerate(rows.rows):
             if rows.weight[i] == 0.0:

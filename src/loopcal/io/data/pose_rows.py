@@ -15,7 +15,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from loopcal.errors import DataError, suggest_names
 from loopcal.io.core.csv_table import Table, require_columns
@@ -23,10 +24,8 @@ from loopcal.io.core.yaml_file import Location, refuse_unknown_keys
 from loopcal.io.data.column_types import NumberColumn, TextColumn
 from loopcal.io.data.columns import COMMANDED, LINK, SIGMA, list_columns
 from loopcal.io.robot.robot_file import load_robot
-
-if TYPE_CHECKING:
-    from loopcal.mechanism import Mechanism
-    from loopcal.typing import FloatArray, IntArray
+from loopcal.mechanism import Mechanism
+from loopcal.typing import FloatArray, IntArray
 
 READING_NOISE = "reading_noise"
 RELATIVE_ROUNDING, ABSOLUTE_ROUNDING = 1e-12, 1e-12
@@ -118,8 +117,6 @@ def has_readings(table: Table, robot: Mechanism) -> bool:
 
 def _read_file(table: Table, robot: Mechanism, solve: Solver, several: bool) -> _FilePoses:
     """Read the poses of one file."""
-    import numpy as np
-
     if several and "pose" not in table.units:
         sentence = "files are joined by the names of poses, and this file names none"
         raise table.header_error(f"{sentence}; add a column 'pose'")
@@ -224,8 +221,6 @@ def _solve_commanded(
     solve: Solver,
 ) -> FloatArray:
     """Return readings (rows, a) of the commanded coordinates (rows, c) of `rows`: row -> pose."""
-    import numpy as np
-
     readings = np.full((len(coordinates), len(robot.actuators)), np.nan)
     if rows:
         try:
@@ -253,8 +248,6 @@ def read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) -> 
         An unknown actuator, a missing or wrong unit, a negative number, or an empty cell where no
         setting and no robot file states the noise.
     """
-    import numpy as np
-
     if not states_reading_noise(table, robot):
         return None
     stated = _read_setting(table, robot)
@@ -298,8 +291,6 @@ def _read_setting(table: Table, robot: Mechanism) -> dict[str, float]:
 
 def _refuse_contradiction(file: _FilePoses, row: int, other: _FilePoses, other_row: int) -> None:
     """Raise FileError where two files state different readings, or sigmas, of one pose."""
-    import numpy as np
-
     for what, here, there in (
         ("readings", file.readings, other.readings),
         ("sigma", file.sigma, other.sigma),
@@ -323,8 +314,6 @@ def _gather(
 
     `origin` is file and row of each pose; sigma is None where no file states any.
     """
-    import numpy as np
-
     blank = np.full(len(robot.actuators), np.nan)
     readings = np.stack(
         [blank if (r := files[i].readings) is None else r[row] for i, row in origin]
@@ -338,8 +327,6 @@ def _gather(
 
 def _number_blocks(files: Sequence[_FilePoses], labels: Sequence[str]) -> IntArray:
     """Return block numbers (n,): by the column `block` of a pose's first row, else each alone."""
-    import numpy as np
-
     named: dict[str, tuple[str, str]] = {}
     for file in (file for file in files if "block" in file.table.units):
         cells = file.table.text("block")

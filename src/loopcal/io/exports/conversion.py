@@ -15,6 +15,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from loopcal import geometry
 from loopcal.errors import FileError
 from loopcal.findings import Finding
 from loopcal.io.core.csv_table import quote_cell
@@ -161,10 +164,6 @@ def _parse_time(text: str, source: ColumnSource) -> str:
 
 def _to_quaternion(cells: Sequence[str]) -> Row:
     """Return the quaternion of a rotation matrix, row by row; empty where the matrix is missing."""
-    import numpy as np
-
-    from loopcal import geometry
-
     if not all(cells):
         if any(cells):
             raise Misfit("part of the rotation matrix is missing")

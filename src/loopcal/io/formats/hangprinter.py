@@ -28,10 +28,10 @@ from loopcal.errors import FileError
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.io.core.text_file import read_text
 from loopcal.io.formats.program_format import Format, Imported, ImportOptions, format_head
+from loopcal.typing import FloatArray
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements
-    from loopcal.typing import FloatArray
 
 MM, DEG = 1e-3, math.pi / 180.0
 FREEDOMS, MOST_LINES = 3, 26

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from loopcal.errors import DataError, FileError, MechanismError
 from loopcal.findings import report_finding
@@ -15,9 +14,7 @@ from loopcal.io.formats import FORMATS
 from loopcal.io.formats.program_format import Exported, ExportSource, Format, Imported
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.io.runs.calibration_run import load_run_or_robot
-
-if TYPE_CHECKING:
-    from loopcal.mechanism import Mechanism
+from loopcal.mechanism import Mechanism
 
 
 def choose_format(path: Path, name: str | None) -> Format:

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 from loopcal.errors import DataError, FileError
 from loopcal.findings import Finding, report_finding
 from loopcal.io.core.numbers import parse_finite
+from loopcal.mechanism import Mechanism
 
 if TYPE_CHECKING:
     from loopcal.measure import Measurements
-    from loopcal.mechanism import Mechanism
 
 HEIGHT_SIGMA = 20e-6
 """Standard deviation of a probed height where the probe is unknown [m]."""

@@ -5,16 +5,13 @@ from __future__ import annotations
 
 import json
 import math
-from typing import TYPE_CHECKING
 
 from loopcal.errors import UnitError, suggest_names
 from loopcal.io.core.numbers import format_scaled
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
+from loopcal.mechanism import Mechanism
+from loopcal.typing import FloatArray
 from loopcal.units import find_unit
-
-if TYPE_CHECKING:
-    from loopcal.mechanism import Mechanism
-    from loopcal.typing import FloatArray
 
 TABLE = "identified"
 PLUS_MINUS = "+/-"

@@ -11,6 +11,7 @@ from loopcal.errors import MechanismError, suggest_names
 from loopcal.io.core import file_reference
 from loopcal.io.core.yaml_file import read_yaml
 from loopcal.io.robot.robot_file import list_shipped_robots
+from loopcal.mechanism import FAMILIES
 
 EXAMPLES = {"gough": "hexapod-42", "limbs": "five-bar"}
 """The shipped robot of a family that does not have the name of the family."""
@@ -32,8 +33,6 @@ def format_new_robot(family: str, name: str) -> str:
     ------
     MechanismError : neither a family nor a shipped robot.
     """
-    from loopcal.mechanism import FAMILIES
-
     shipped = list_shipped_robots()
     example = EXAMPLES.get(family, family)
     if example not in shipped:

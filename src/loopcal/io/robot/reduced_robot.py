@@ -6,13 +6,10 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 from loopcal.io.robot.identified_table import format_table
 from loopcal.io.robot.robot_file import get_source
-
-if TYPE_CHECKING:
-    from loopcal.mechanism import Mechanism
+from loopcal.mechanism import Mechanism
 
 FIXED = re.compile(r"^fixed:.*\n(?:(?:[ \t]+.*|-.*)\n)*", re.MULTILINE)
 """The list in a file, in one line or in several."""

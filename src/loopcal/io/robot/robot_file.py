@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from loopcal.errors import ArgumentTypeError, FileError, LoopcalError, MechanismError, suggest_names
 from loopcal.io.core.records import read_record, read_units
@@ -30,10 +30,15 @@ from loopcal.io.robot.identified_table import (
     read_identified_values,
     remove_table,
 )
-
-if TYPE_CHECKING:
-    from loopcal.mechanism import Assembly, Mechanism, RobotRecord
-    from loopcal.typing import FloatArray
+from loopcal.mechanism import (
+    FAMILIES,
+    Assembly,
+    Mechanism,
+    RobotRecord,
+    build,
+    match_parameter_names,
+)
+from loopcal.typing import FloatArray
 
 FORMAT = 1
 HEADER = ("format", "units", "family", TABLE)
@@ -68,8 +73,6 @@ def load_robot(source: str | Path) -> Mechanism:
     MechanismError : the described robot cannot be built; with its file.
     ArgumentTypeError : `source` is not a path or a name.
     """
-    from loopcal.mechanism import FAMILIES, build
-
     file = read_yaml(find_robot_file(source), WHAT)
     check_format(file, FORMAT)
     units = read_units(file)
@@ -116,8 +119,6 @@ def get_source(robot: Mechanism) -> RobotSource:
 
 def require_robot(robot: Any) -> None:
     """Raise ArgumentTypeError where a robot is needed, but something else is given."""
-    from loopcal.mechanism import Mechanism
-
     if not isinstance(robot, Mechanism):
         sentence = f"a robot is needed here, not a {type(robot).__name__}"
         raise ArgumentTypeError(f"{sentence}; pass the result of load_robot(path)")
@@ -174,8 +175,6 @@ def _read_family(file: YamlFile, known: Sequence[str]) -> str:
 
 def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
     """Return the assembly of a record; an unknown name under `fixed` is refused at its line."""
-    from loopcal.mechanism import match_parameter_names
-
     names = [parameter.name for parameter in record.expand().parameters] if record.fixed else []
     for i, pattern in enumerate(record.fixed):
         try:

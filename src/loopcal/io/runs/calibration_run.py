@@ -16,6 +16,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from loopcal.errors import DataError, FileError
 from loopcal.findings import report_finding
 from loopcal.io.core.text_file import as_path, sha256
@@ -28,13 +30,11 @@ from loopcal.io.runs.run_folder import (
     read_run_folder,
     write_run_folder,
 )
+from loopcal.mechanism import Mechanism
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from loopcal.estimate import Posterior
     from loopcal.measure import Measurements
-    from loopcal.mechanism import Mechanism
     from loopcal.workflow import CalibrationReport
 
 

@@ -15,16 +15,18 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from loopcal.errors import suggest_names
 from loopcal.io.core.csv_table import read_table, require_columns
 from loopcal.io.core.numbers import format_scaled
 from loopcal.io.data.columns import COMMANDED, NOTE, get_dimension
+from loopcal.mechanism import Mechanism
+from loopcal.typing import FloatArray
 from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
 
 if TYPE_CHECKING:
     from loopcal.apply.compensation import Compensation
-    from loopcal.mechanism import Mechanism
-    from loopcal.typing import FloatArray
 
 NAMES = ("rx", "ry", "rz", "x", "y", "z")
 DIGITS = 6
@@ -43,8 +45,6 @@ def load_targets(path: str | Path, robot: Mechanism) -> tuple[FloatArray, tuple[
     ------
     FileError : a value that does not fit, at its line.
     """
-    import numpy as np
-
     table = read_table(path)
     known = ("pose", *robot.controlled)
     require_columns(table, robot.controlled, f"a commanded coordinate of {robot.name}")

@@ -28,10 +28,10 @@ from loopcal.io.core.text_file import sha256
 from loopcal.io.data.columns import FIT, HELD_OUT, get_dimension
 from loopcal.io.data.measurement_writer import format_data_sheet
 from loopcal.io.data.pose_use import USE, insert_use_column
+from loopcal.mechanism import Mechanism
 from loopcal.units import Dimension, find_unit
 
 if TYPE_CHECKING:
-    from loopcal.mechanism import Mechanism
     from loopcal.planning.result import Plan, Stop
 
 FORMAT = 1

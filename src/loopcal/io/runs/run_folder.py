@@ -13,15 +13,14 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from loopcal.errors import FileError
 from loopcal.io.core.folders import refuse_folder_in_use, replace_folder
 from loopcal.io.core.json_text import to_json
 from loopcal.io.core.text_file import as_path, read_text, sha256
-
-if TYPE_CHECKING:
-    import numpy as np
 
 FORMAT = 1
 RESULT, ARRAYS, ROBOT = "result.json", "arrays.npz", "robot.yaml"
@@ -126,8 +125,6 @@ def write_run_folder(
     ------
     FileError : the folder is in use, or cannot be written.
     """
-    import numpy as np
-
     path = as_path(path, "run folder")
     refuse_used_folder(path, force)
     text = to_json({"format": FORMAT, **result})
@@ -146,8 +143,6 @@ def read_run_folder(path: str | Path) -> RunFolder:
     ------
     FileError : not a run folder, made by a newer loopcal, or damaged.
     """
-    import numpy as np
-
     path = as_path(path, "run folder")
     if not (path / RESULT).is_file():
         sentence = f"this is not a run folder (it has no {RESULT})"

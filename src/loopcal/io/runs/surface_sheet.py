@@ -11,6 +11,7 @@ from loopcal.io.core.csv_table import quote_cell
 from loopcal.io.data.columns import get_dimension
 from loopcal.io.data.measurement_writer import format_measurements
 from loopcal.io.runs.plan_folder import DIGITS, VIA, get_unit
+from loopcal.mechanism import POSITION
 from loopcal.units import Dimension
 
 if TYPE_CHECKING:
@@ -29,8 +30,6 @@ INSTRUCTIONS = """\
 
 def format_surface_sheet(plan: SurfacePlan) -> str:
     """Return the operator's sheet: coordinates to hold, tolerance and command of each point."""
-    from loopcal.mechanism import POSITION
-
     robot = plan.robot
     symbol, length = get_unit(robot, Dimension.LENGTH)
     commanded = [get_unit(robot, get_dimension(name)) for name in robot.controlled]

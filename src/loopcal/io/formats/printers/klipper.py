@@ -16,6 +16,8 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from loopcal.findings import Quantity, report_finding
 from loopcal.io.core.numbers import parse_finite
 from loopcal.io.formats.printers.delta_geometry import (
@@ -156,8 +158,6 @@ def _build_measurements(
     probes: _Probes, steps: list[float], options: ImportOptions
 ) -> Measurements:
     """Return heights as the component z, distances as separations of two poses."""
-    import numpy as np
-
     from loopcal.measure import Component, Measurements, Observations, Separation
 
     labels = tuple(probes.positions)
