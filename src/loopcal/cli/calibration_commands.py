@@ -108,7 +108,7 @@ def calibrate(
       loopcal calibrate hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
     """  # noqa: D301
     from loopcal.io import load_robot
-    from loopcal.io.data.pose_use import read_held_out_poses
+    from loopcal.io.data.measurement_file import read_held_out_poses
     from loopcal.io.runs.calibration_run import build_document, load_prior, save_run
     from loopcal.io.runs.run_folder import refuse_run_folder
     from loopcal.report.calibration_view import view_calibration
@@ -147,11 +147,9 @@ def calibrate(
 
 def _refuse_two_choices(held_out: Sequence[str], hold_out: float) -> None:
     """Raise DataError where both the data and an option choose the held-out poses."""
-    from loopcal.io.data.pose_use import USE
-
     if held_out and hold_out:
         raise DataError(
-            f"the column {USE!r} of the data already holds out {len(held_out)} poses; leave out "
+            f"the column 'use' of the data already holds out {len(held_out)} poses; leave out "
             "--hold-out, or remove the column"
         )
 

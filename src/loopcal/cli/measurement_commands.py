@@ -254,8 +254,8 @@ def _fill_in(
     """Return the filled-in data file of a plan."""
     from loopcal.io import load_measurements
     from loopcal.io.data.instrument_file import load_instrument, refuse_empty_readings
+    from loopcal.io.data.measurement_file import read_pose_use
     from loopcal.io.data.measurement_writer import format_measurements
-    from loopcal.io.data.pose_use import insert_use_column, read_pose_use
     from loopcal.workflow.simulated_measurements import fill_in_measurements
 
     refuse_given(
@@ -271,6 +271,4 @@ def _fill_in(
         seed=seed,
     )
     title = f"simulated by loopcal: {sheet.name}, seed {seed}"
-    text = format_measurements(result.data, result.truth, title)
-    use = read_pose_use([sheet])
-    return result, insert_use_column(text, use) if use else text
+    return result, format_measurements(result.data, result.truth, title, read_pose_use([sheet]))

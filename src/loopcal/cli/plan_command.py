@@ -262,7 +262,7 @@ def _read_earlier(
     measured: Sequence[Path], robot: Mechanism
 ) -> tuple[Measurements, tuple[str, ...]]:
     """Return the fitted poses of earlier files, and the names of all their poses."""
-    from loopcal.io.data.pose_use import read_held_out_poses
+    from loopcal.io.data.measurement_file import read_held_out_poses
 
     data = read_checked_measurements(measured, robot)
     files = " ".join(map(str, measured))

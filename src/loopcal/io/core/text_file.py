@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from loopcal.errors import ArgumentTypeError, FileError
+from loopcal.errors import ArgumentTypeError, FileError, LoopcalError
 
 
 def as_path(path: Any, what: str) -> Path:
@@ -122,6 +122,17 @@ def write_text(path: str | Path, text: str) -> None:
             temporary.replace(target)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def name_files(*paths: str | Path) -> Iterator[None]:
+    """Put files in front of the text of an error of the body that does not name its file."""
+    try:
+        yield
+    except FileError:
+        raise
+    except LoopcalError as error:
+        raise type(error)(f"{' and '.join(map(str, paths))}: {error}") from error
 
 
 @contextmanager

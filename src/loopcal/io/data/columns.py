@@ -34,7 +34,10 @@ LINK = ";"
 COMMANDED, MEASURED, SIGMA, COVARIANCE = "commanded.", "measured.", "sigma.", "cov."
 TEMPERATURE, NOTE = "temperature", "note"
 FIT, HELD_OUT = "fit", "held-out"
-"""Cells of the column `use`."""
+USE_COLUMN = TextColumn("use", (FIT, HELD_OUT))
+"""What a pose is for; a plan fills it in before anything is measured, so that the choice does not
+depend on the results. A row that compares poses is held out with any of its poses.
+"""
 
 
 @dataclass(frozen=True)
@@ -116,7 +119,7 @@ RULES: tuple[ColumnRule, ...] = (
         "use",
         "",
         f"`{FIT}` or `{HELD_OUT}`: what the pose is for; an empty cell means `{FIT}`",
-        _always(TextColumn("use", (FIT, HELD_OUT))),
+        _always(USE_COLUMN),
     ),
     ColumnRule(
         "block",

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from loopcal.errors import DataError
 from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import Table, require_columns
+from loopcal.io.core.text_file import name_files
 from loopcal.io.core.yaml_file import Location, refuse_unknown_keys
 from loopcal.io.data.columns import (
     SIGMA,
@@ -120,7 +120,7 @@ def read_observations(
             values = np.where(np.isnan(values), pose_context[name][poses].mean(axis=1), values)
         if not np.isnan(values).all():
             beside[name] = values
-    try:
+    with name_files(table.path):
         observations = Observations(
             one.kind,
             poses[:, 0] if links == 1 else poses,
@@ -131,8 +131,6 @@ def read_observations(
             context=beside,
             source=str(table.path),
         )
-    except DataError as error:
-        raise DataError(f"{table.path}: {error}") from None
     return observations, tuple(table.place(int(row)) for row in rows)
 
 

@@ -9,14 +9,11 @@ Several kinds share a file under `kinds: {label: {kind: ..}}`; the column `kind`
 label. Several files are one set of measurements, joined by the names of poses: a file without a
 kind only holds readings, a file without readings refers to the poses of others, and a pose in two
 files has the same readings in both.
-
-Files are only parsed here. `load_measurements` passes what it parsed to the checks of lower layers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,8 +21,8 @@ import numpy as np
 
 from loopcal.errors import DataError, FileError
 from loopcal.io.core.csv_table import Table, read_table, require_columns
-from loopcal.io.core.text_file import as_path
-from loopcal.io.data.columns import get_dimension, read_context
+from loopcal.io.core.text_file import as_path, name_files
+from loopcal.io.data.columns import HELD_OUT, USE_COLUMN, get_dimension, read_context
 from loopcal.io.data.kind_rows import (
     KindRows,
     check_pose_file,
@@ -34,7 +31,7 @@ from loopcal.io.data.kind_rows import (
     read_observations,
 )
 from loopcal.io.data.nuisance_settings import read_known
-from loopcal.io.data.pose_rows import Solver, read_pose_rows
+from loopcal.io.data.pose_rows import read_pose_rows
 from loopcal.io.robot.robot_file import check_format, require_robot
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
@@ -45,21 +42,6 @@ if TYPE_CHECKING:
 FORMAT = 1
 WHAT = "measurement file"
 Paths = str | Path | Sequence[str | Path]
-
-
-@dataclass(frozen=True)
-class ParsedFiles:
-    """Measurements as files state them.
-
-    Parameters
-    ----------
-    data : in SI, unchecked. names : of the files, for messages.
-    places : file and line of each row of each of the observations, such as `data.csv:12`.
-    """
-
-    data: Measurements
-    names: str
-    places: tuple[tuple[str, ...], ...]
 
 
 def load_measurements(
@@ -88,45 +70,18 @@ def load_measurements(
     Raises
     ------
     FileError : a value that does not fit, at its line.
-    DataError : a check fails; with the file.
+    DataError : a check fails, noise is not a covariance, or a commanded pose cannot be reached.
     ArgumentTypeError : `path` is not a path, or `robot` is not a robot.
     """
-    from loopcal.measure import check_duplicates, check_strokes, solve_commanded_readings
-
-    parsed = read_measurements(path, robot, solve_commanded_readings)
-    data = parsed.data
-    try:
-        check_strokes(data, robot, allow=allow_outside_stroke)
-        check_duplicates(data, allow=allow_duplicates, places=parsed.places)
-    except DataError as error:
-        raise DataError(f"{parsed.names}: {error}") from error
-    return data
-
-
-def read_measurements(path: Paths, robot: Mechanism, solve: Solver) -> ParsedFiles:
-    """Parse measurement files as one set of measurements, without any check of plausibility.
-
-    Parameters
-    ----------
-    path, robot : see `load_measurements`.
-    solve : returns the readings with which a controller answers commanded coordinates, such as
-        `loopcal.measure.solve_commanded_readings`.
-
-    Raises
-    ------
-    FileError : a value that does not fit, at its line.
-    DataError : noise that is not a covariance, or a commanded pose that cannot be reached.
-    """
-    from loopcal.measure import Measurements
+    from loopcal.measure import Measurements, check_duplicates, check_strokes
 
     require_robot(robot)
     tables = _read_tables(path)
-    names = " and ".join(str(table.path) for table in tables)
     kinds = [_read_kinds(table, robot, len(tables) > 1) for table in tables]
     if not any(kinds):
         sentence = "no file states a kind of measurement; write '# kind: ..' at the top of one"
         raise FileError(sentence, tables[0].path)
-    poses = read_pose_rows(tables, robot, solve)
+    poses = read_pose_rows(tables, robot)
     context = [read_context(table) for table in tables]
     of_poses = _collect_pose_context(tables, kinds, poses.members, context, len(poses.labels))
     read = [
@@ -136,7 +91,7 @@ def read_measurements(path: Paths, robot: Mechanism, solve: Solver) -> ParsedFil
     settings = [
         (table.settings, [rows for rows, _ in own]) for table, own in zip(tables, read, strict=True)
     ]
-    try:
+    with name_files(*(table.path for table in tables)):
         data = Measurements(
             robot.name,
             poses.readings,
@@ -146,9 +101,32 @@ def read_measurements(path: Paths, robot: Mechanism, solve: Solver) -> ParsedFil
             poses.sigma,
             read_known(settings, poses.labels),
         )
-    except DataError as error:
-        raise DataError(f"{names}: {error}") from None
-    return ParsedFiles(data, names, tuple(places for own in read for _, places in own))
+        check_strokes(data, robot, allow=allow_outside_stroke)
+        places = [places for own in read for _, places in own]
+        check_duplicates(data, allow=allow_duplicates, places=places)
+    return data
+
+
+def read_pose_use(paths: Sequence[Path]) -> dict[str, str]:
+    """Return pose -> `fit` or `held-out`, for the poses whose use is stated, in order.
+
+    Raises
+    ------
+    FileError : another cell, or two different uses of one pose.
+    """
+    uses: dict[str, str] = {}
+    for table in map(read_table, paths):
+        cells = USE_COLUMN.parse(table)
+        for row, (name, cell) in enumerate(zip(table.pose_names(), cells, strict=True)):
+            if cell and uses.setdefault(name, cell) != cell:
+                sentence = f"pose {name!r} is {cell} here and {uses[name]} in another row"
+                raise table.row_error(row, f"{sentence}; correct one")
+    return uses
+
+
+def read_held_out_poses(paths: Sequence[Path]) -> tuple[str, ...]:
+    """Return the names of the poses that files hold out; raise as `read_pose_use`."""
+    return tuple(name for name, use in read_pose_use(paths).items() if use == HELD_OUT)
 
 
 def list_measurement_files(path: Paths) -> dict[str, Path]:

@@ -13,7 +13,14 @@ from numpy.typing import ArrayLike
 from loopcal.errors import DataError
 from loopcal.io.core.text_file import write_text
 from loopcal.io.data.column_types import Column, ContextColumn
-from loopcal.io.data.columns import LINK, SIGMA, list_columns, name_covariance, name_measured
+from loopcal.io.data.columns import (
+    LINK,
+    SIGMA,
+    USE_COLUMN,
+    list_columns,
+    name_covariance,
+    name_measured,
+)
 from loopcal.io.data.kind_settings import format_kind, format_quantity
 from loopcal.io.data.measurement_file import FORMAT
 from loopcal.io.data.nuisance_settings import format_known
@@ -61,8 +68,15 @@ def save_measurements(
     write_text(path, format_measurements(data, robot, remark))
 
 
-def format_measurements(data: Measurements, robot: Mechanism, remark: str = "") -> str:
-    """Return the text of a measurement file; see `save_measurements`."""
+def format_measurements(
+    data: Measurements, robot: Mechanism, remark: str = "", uses: Mapping[str, str] | None = None
+) -> str:
+    """Return the text of a measurement file; see `save_measurements`.
+
+    Parameters
+    ----------
+    uses : pose -> cell of the column `use`, which the file has only where there are any.
+    """
     require_robot(robot)
     _refuse_names(data)
     known = list_columns(robot, [rows.kind for rows in data.observations])
@@ -74,7 +88,8 @@ def format_measurements(data: Measurements, robot: Mechanism, remark: str = "") 
     for key, text in (("unknowns", knowledge), ("reading_noise", common)):
         lines += [f"# {key}: {text}"] if text else []
 
-    names = ["pose", *(["block"] if len(set(data.block.tolist())) < data.n_poses else [])]
+    names = ["pose", *([USE_COLUMN.name] if uses else [])]
+    names += [*(["block"] if len(set(data.block.tolist())) < data.n_poses else [])]
     for name in ("session", "group"):
         names += [name] if any((getattr(p.rows, name) != "").any() for p in parts) else []
     names += ["kind"] if len(parts) > 1 else []
@@ -95,7 +110,8 @@ def format_measurements(data: Measurements, robot: Mechanism, remark: str = "") 
     ]
     rows += [(poses, {"kind": p.label, **cells}) for p in parts for poses, cells in p.cells()]
     for poses, values in rows:
-        cells = {"pose": LINK.join(data.labels[pose] for pose in poses), **values}
+        pose = LINK.join(data.labels[pose] for pose in poses)
+        cells = {"pose": pose, USE_COLUMN.name: (uses or {}).get(pose, ""), **values}
         if len(poses) == 1:
             cells |= _reading_cells(data, robot, poses[0], own)
         lines.append(",".join(c.format(cells[c.name]) if c.name in cells else "" for c in columns))
@@ -128,7 +144,11 @@ def format_template(robot: Mechanism, instrument: Instrument) -> str:
 
 
 def format_data_sheet(
-    robot: Mechanism, instrument: Instrument, readings: ArrayLike, labels: Sequence[str] = ()
+    robot: Mechanism,
+    instrument: Instrument,
+    readings: ArrayLike,
+    labels: Sequence[str] = (),
+    uses: Mapping[str, str] | None = None,
 ) -> str:
     """Return a measurement file with poses and empty measured values, to be filled in.
 
@@ -137,7 +157,7 @@ def format_data_sheet(
     robot : its actuators become columns.
     instrument : states the poses, session and group of each kind.
     readings : (n, a) [SI] of the poses to be measured.
-    labels : names of the poses; default "1", "2", ...
+    labels : names of the poses; default "1", "2", ... uses : see `format_measurements`.
 
     Raises
     ------
@@ -156,7 +176,7 @@ def format_data_sheet(
             Observations.from_sigma(one.kind, one.rows, empty, sigma, one.session, one.group)
         )
     data = Measurements(robot.name, np.asarray(readings), tuple(rows), labels=tuple(labels))
-    return format_measurements(data, robot)
+    return format_measurements(data, robot, uses=uses)
 
 
 def _label_kinds(kinds: Sequence[Kind]) -> list[str]:

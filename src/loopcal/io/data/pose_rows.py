@@ -13,13 +13,14 @@ otherwise it is refused.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.errors import DataError, suggest_names
+from loopcal.errors import suggest_names
 from loopcal.io.core.csv_table import Table, require_columns
+from loopcal.io.core.text_file import name_files
 from loopcal.io.core.yaml_file import Location, refuse_unknown_keys
 from loopcal.io.data.column_types import NumberColumn, TextColumn
 from loopcal.io.data.columns import COMMANDED, LINK, SIGMA, list_columns
@@ -30,9 +31,6 @@ from loopcal.typing import FloatArray, IntArray
 READING_NOISE = "reading_noise"
 RELATIVE_ROUNDING, ABSOLUTE_ROUNDING = 1e-12, 1e-12
 """Differences [1] and [m or rad] up to which readings in different units are the same."""
-
-Solver = Callable[["Mechanism", "FloatArray", tuple[str, ...]], "FloatArray"]
-"""Readings (n, a) of a controller for commanded coordinates (n, c) of named poses."""
 
 
 @dataclass(frozen=True)
@@ -73,20 +71,19 @@ class _FilePoses:
     unread: frozenset[str]
 
 
-def read_pose_rows(tables: Sequence[Table], robot: Mechanism, solve: Solver) -> PoseRows:
+def read_pose_rows(tables: Sequence[Table], robot: Mechanism) -> PoseRows:
     """Read the columns `pose` and `block`, and those of readings or commanded coordinates.
 
     Parameters
     ----------
     tables : of all files. robot : its actuators name the readings.
-    solve : returns the readings with which a controller answers commanded coordinates.
 
     Raises
     ------
     FileError : a pose without readings or with contradicting ones, an unknown pose in a comparison.
     DataError : a commanded pose that the controller cannot reach.
     """
-    files = [_read_file(table, robot, solve, several=len(tables) > 1) for table in tables]
+    files = [_read_file(table, robot, several=len(tables) > 1) for table in tables]
     read = frozenset().union(*(file.read for file in files))
     origin: dict[str, tuple[int, int]] = {}
     for i, file in enumerate(files):
@@ -115,7 +112,7 @@ def has_readings(table: Table, robot: Mechanism) -> bool:
     return any(column in names or column.startswith(COMMANDED) for column in table.names)
 
 
-def _read_file(table: Table, robot: Mechanism, solve: Solver, several: bool) -> _FilePoses:
+def _read_file(table: Table, robot: Mechanism, several: bool) -> _FilePoses:
     """Read the poses of one file."""
     if several and "pose" not in table.units:
         sentence = "files are joined by the names of poses, and this file names none"
@@ -149,7 +146,7 @@ def _read_file(table: Table, robot: Mechanism, solve: Solver, several: bool) -> 
     read = frozenset(first) - unread
     if controller is not None:
         chosen = {row: name for name, row in first.items() if name in read}
-        rows = _solve_commanded(table, controller, robot, rows, chosen, solve)
+        rows = _solve_commanded(table, controller, robot, rows, chosen)
     sigma = read_reading_sigma(table, robot, rows)
     return _FilePoses(
         table, names, first, rows, sigma, read, unread if may_be_absent else frozenset()
@@ -218,15 +215,15 @@ def _solve_commanded(
     robot: Mechanism,
     coordinates: FloatArray,
     rows: Mapping[int, str],
-    solve: Solver,
 ) -> FloatArray:
     """Return readings (rows, a) of the commanded coordinates (rows, c) of `rows`: row -> pose."""
+    from loopcal.measure import solve_commanded_readings
+
     readings = np.full((len(coordinates), len(robot.actuators)), np.nan)
     if rows:
-        try:
-            readings[list(rows)] = solve(controller, coordinates[list(rows)], tuple(rows.values()))
-        except DataError as error:
-            raise DataError(f"{table.path}: {error}") from None
+        given, names = coordinates[list(rows)], tuple(rows.values())
+        with name_files(table.path):
+            readings[list(rows)] = solve_commanded_readings(controller, given, names)
     return readings
 
 

@@ -13,16 +13,15 @@ A loaded robot keeps the text of its file, so that writing it back changes only 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from loopcal.errors import ArgumentTypeError, FileError, LoopcalError, MechanismError, suggest_names
+from loopcal.errors import ArgumentTypeError, FileError, MechanismError, suggest_names
 from loopcal.io.core.records import read_record, read_units
-from loopcal.io.core.text_file import as_path, write_text
+from loopcal.io.core.text_file import as_path, name_files, write_text
 from loopcal.io.core.yaml_file import YamlFile, read_yaml
 from loopcal.io.robot.identified_table import (
     TABLE,
@@ -78,7 +77,7 @@ def load_robot(source: str | Path) -> Mechanism:
     units = read_units(file)
     family = FAMILIES[_read_family(file, sorted(FAMILIES))]
     content = {key: value for key, value in file.content.items() if key not in HEADER}
-    with _prefix_errors(file):
+    with name_files(file.path):
         record = read_record(file, content, family, units)
         symbols = {dimension: one.symbol for dimension, one in units.items()}
         origin = RobotSource(file.path, remove_table(file), record)
@@ -182,14 +181,3 @@ def _assemble(record: RobotRecord, file: YamlFile) -> Assembly:
         except MechanismError as error:
             raise file.error(str(error), ("fixed", i)) from None
     return record.assembly()
-
-
-@contextmanager
-def _prefix_errors(file: YamlFile) -> Iterator[None]:
-    """Put the file in front of the text of an error that does not name it."""
-    try:
-        yield
-    except FileError:
-        raise
-    except LoopcalError as error:
-        raise type(error)(f"{file.path}: {error}") from error

@@ -25,9 +25,8 @@ from loopcal.io.core.folders import refuse_folder_in_use, replace_folder
 from loopcal.io.core.json_text import to_json
 from loopcal.io.core.numbers import parse_exact
 from loopcal.io.core.text_file import sha256
-from loopcal.io.data.columns import FIT, HELD_OUT, get_dimension
+from loopcal.io.data.columns import FIT, HELD_OUT, USE_COLUMN, get_dimension
 from loopcal.io.data.measurement_writer import format_data_sheet
-from loopcal.io.data.pose_use import USE, insert_use_column
 from loopcal.mechanism import Mechanism
 from loopcal.units import Dimension, find_unit
 
@@ -58,7 +57,7 @@ def format_sheet(plan: Plan, stops: Sequence[Stop]) -> str:
         f"## Poses of {robot.name} to measure in this order, starting from home.",
         f"## Between two poses move straight in {path}. Measure {FIT} and",
         f"## {HELD_OUT} poses alike; only pass through {VIA} poses.",
-        ",".join(["step", "pose", USE, *headers]),
+        ",".join(["step", "pose", USE_COLUMN.name, *headers]),
     ]
     factors = [factor for _, factor in (*commanded, *readings)]
     for step, stop in enumerate(stops, 1):
@@ -81,9 +80,10 @@ def format_plan_data(plan: Plan) -> str:
         for row in plan.poses.readings.tolist()
     ]
     instrument = replace(plan.instrument, sensors=sensors)
-    text = format_data_sheet(plan.robot, instrument, readings, plan.poses.labels)
-    held_out = zip(plan.poses.labels, plan.poses.held_out, strict=True)
-    return insert_use_column(text, {label: HELD_OUT if held else FIT for label, held in held_out})
+    labels = plan.poses.labels
+    held_out = zip(labels, plan.poses.held_out, strict=True)
+    uses = {label: HELD_OUT if is_held_out else FIT for label, is_held_out in held_out}
+    return format_data_sheet(plan.robot, instrument, readings, labels, uses)
 
 
 def refuse_plan_folder(path: Path, force: bool) -> None:
