@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from loopcal.planning.design import A, Criterion, D, PriorInformation
-from loopcal.planning.design.size_curve import (
+from loopcal.planning.design.certified_design import (
     compute_design_curve,
     find_smallest_design,
     search_size,

@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Choose n of N groups of rows by a criterion of optimal design; nothing here knows a robot."""
 
-from loopcal.planning.design.certificate import CertifiedDesign as CertifiedDesign
-from loopcal.planning.design.certificate import choose_design as choose_design
+from loopcal.planning.design.certified_design import CertifiedDesign as CertifiedDesign
+from loopcal.planning.design.certified_design import DesignCurve as DesignCurve
+from loopcal.planning.design.certified_design import SmallestDesign as SmallestDesign
+from loopcal.planning.design.certified_design import choose_design as choose_design
+from loopcal.planning.design.certified_design import compute_design_curve as compute_design_curve
+from loopcal.planning.design.certified_design import find_smallest_design as find_smallest_design
 from loopcal.planning.design.criteria import A as A
 from loopcal.planning.design.criteria import Criterion as Criterion
 from loopcal.planning.design.criteria import D as D
@@ -22,7 +26,3 @@ from loopcal.planning.design.exchange import coordinate_exchange as coordinate_e
 from loopcal.planning.design.exchange import fedorov_exchange as fedorov_exchange
 from loopcal.planning.design.relaxation import RelaxedDesign as RelaxedDesign
 from loopcal.planning.design.relaxation import relax_design as relax_design
-from loopcal.planning.design.size_curve import DesignCurve as DesignCurve
-from loopcal.planning.design.size_curve import SmallestDesign as SmallestDesign
-from loopcal.planning.design.size_curve import compute_design_curve as compute_design_curve
-from loopcal.planning.design.size_curve import find_smallest_design as find_smallest_design

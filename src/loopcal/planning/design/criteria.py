@@ -16,6 +16,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from loopcal.planning.design.design_space import divide_by_factor
 from loopcal.typing import FloatArray
 
 
@@ -85,7 +86,7 @@ def evaluate_criterion(criterion: Criterion, factor: FloatArray, machine: FloatA
         case E():
             return float(1.0 / s[-1] ** 2) if s.size else 0.0
         case I():
-            projected = np.linalg.solve(factor.T, (criterion.weights @ machine).T)
+            projected = divide_by_factor(criterion.weights @ machine, factor)
             return float((projected**2).sum() / criterion.count)
 
 

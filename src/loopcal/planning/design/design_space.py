@@ -114,6 +114,15 @@ def factor_rows(rows: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
+def divide_by_factor(rows: FloatArray, R: FloatArray) -> FloatArray:
+    """Return X R^-1 for rows X (..., q) and a nonsingular triangular factor R (q, q)."""
+    from scipy.linalg.blas import dtrsm
+
+    flat = rows.reshape(-1, rows.shape[-1])
+    # R' is lower triangular, and both transposes are already in the order of BLAS
+    return np.asarray(dtrsm(1.0, R.T, flat.T, lower=1).T, dtype=np.float64).reshape(rows.shape)
+
+
 def is_allowed(rows: FloatArray) -> BoolArray:
     """Return for rows (N, r, c) of N groups which groups (N,) contain no NaN."""
     return np.asarray(np.isfinite(rows).all(axis=(1, 2)))

@@ -12,7 +12,7 @@ exchange only if the new score is larger. Sources and derivations: docs/theory/p
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,10 +31,12 @@ from loopcal.planning.design.relaxation import RelaxedDesign
 from loopcal.planning.design.scoring import (
     GAIN,
     RIDGE,
+    ScaledCandidates,
     Scoring,
     build_scoring,
     compute_swap_terms,
     is_determined,
+    scale_candidates,
     score_additions,
     score_swaps,
 )
@@ -86,32 +88,39 @@ def fedorov_exchange(
         n groups cannot determine the unknowns, fewer are allowed than requested, or there is no
         start.
     """
-    space = find_observable_space(rows, prior) if relaxed is None else relaxed.space
-    require_enough(n, rows, prior, space, repeats)
-    usable = np.flatnonzero(is_allowed(rows))
-    scoring = build_scoring(rows[usable], n / len(usable), criterion, prior, space)
-    scaled = scoring.scale_rows(rows[usable])
-    weights = None if relaxed is None else relaxed.weights[usable]
-    begins = [] if weights is None else [round_weights(weights, n, repeats)]
-    begins += [
-        complete_design(scoring, scaled, np.searchsorted(usable, chosen), n, repeats)
-        for chosen in first
-    ]
+    candidates, weights = (
+        (scale_candidates(rows, n, criterion, prior, repeats), None)
+        if relaxed is None
+        else (relaxed.candidates, relaxed.weights[relaxed.candidates.indices])
+    )
+    begins = list_starts(candidates, n, weights, first)
     if not begins and starts < 1:
         raise EstimationError(f"exchange needs a start; {starts} were requested, give 1 or more")
-    streams = np.random.default_rng(seed).spawn(len(begins) + starts)
     ends = []
-    for i, stream in enumerate(streams):
-        chosen = (
-            begins[i] if i < len(begins) else draw_groups(stream, len(usable), n, repeats, weights)
-        )
-        ends.append(exchange_from_start(scoring, scaled, chosen, stream, repeats))
-    scores = [history[-1] for _, history in ends]
+    for i, stream in enumerate(np.random.default_rng(seed).spawn(len(begins) + starts)):
+        begin = begins[i] if i < len(begins) else draw_groups(candidates, stream, n, weights)
+        ends.append(exchange_from_start(candidates, begin, stream))
+    scoring, scores = candidates.scoring, [history[-1] for _, history in ends]
     chosen, history = ends[int(np.argmax(scores))]
-    require_determined(history[-1], n, len(usable), space)
+    require_determined(history[-1], n, len(candidates), scoring.space)
     values = tuple(scoring.value(score) for score in history)
     final = tuple(scoring.value(score) for score in scores)
-    return Design(np.sort(usable[chosen]), values[-1], values, final, space)
+    chosen = np.sort(candidates.indices[chosen])
+    return Design(chosen, values[-1], values, final, scoring.space)
+
+
+def list_starts(
+    candidates: ScaledCandidates, n: int, weights: FloatArray | None, first: Iterable[IntArray]
+) -> list[IntArray]:
+    """Return the rounding of weights (N,), where given, and the completed first designs.
+
+    Parameters
+    ----------
+    first : designs by the indices of their groups among all.
+    """
+    rounded = [] if weights is None else [round_weights(weights, n, candidates.repeats)]
+    places = (np.searchsorted(candidates.indices, chosen) for chosen in first)
+    return rounded + [complete_design(candidates, chosen, n) for chosen in places]
 
 
 def require_determined(score: float, n: int, count: int, space: ObservableSpace) -> None:
@@ -131,76 +140,69 @@ def require_determined(score: float, n: int, count: int, space: ObservableSpace)
 
 
 def exchange_from_start(
-    scoring: Scoring,
-    scaled: FloatArray,
-    chosen: IntArray,
-    stream: np.random.Generator,
-    repeats: bool,
+    candidates: ScaledCandidates, chosen: IntArray, stream: np.random.Generator
 ) -> tuple[IntArray, list[float]]:
     """Exchange from one start; a singular start is first exchanged with a ridge."""
-    if not is_determined(scoring.factor(scaled[chosen])):
-        chosen, _ = exchange_groups(scoring.with_ridge(RIDGE), scaled, chosen, stream, repeats)
-        if not is_determined(scoring.factor(scaled[chosen])):
+    if not candidates.is_determined(chosen):
+        ridged = replace(candidates, scoring=candidates.scoring.with_ridge(RIDGE))
+        chosen, _ = exchange_groups(ridged, chosen, stream)
+        if not candidates.is_determined(chosen):
             return chosen, [-np.inf]
-    return exchange_groups(scoring, scaled, chosen, stream, repeats)
+    return exchange_groups(candidates, chosen, stream)
 
 
 def exchange_groups(
-    scoring: Scoring,
-    scaled: FloatArray,
-    chosen: IntArray,
-    stream: np.random.Generator,
-    repeats: bool,
+    candidates: ScaledCandidates, chosen: IntArray, stream: np.random.Generator
 ) -> tuple[IntArray, list[float]]:
-    """Exchange the chosen groups (n,) of scaled rows (N, r, Q) until no single swap gains.
-
-    The chosen groups must be nonsingular.
+    """Exchange the chosen groups (n,) until no single swap gains; they must be nonsingular.
 
     Returns
     -------
     chosen : (n,). history : scores at the beginning and after each exchange.
     """
+    scoring, rows = candidates.scoring, candidates.rows
     chosen, n = chosen.copy(), len(chosen)
-    R = scoring.factor(scaled[chosen])
-    history, terms, idle = [scoring.score(R)], compute_swap_terms(scoring, R, scaled), 0
+    R = candidates.factor(chosen)
+    history, terms, idle = [scoring.score(R)], compute_swap_terms(scoring, R, rows), 0
     while idle < n:
         for j in stream.permutation(n):
             gain = score_swaps(terms, int(chosen[j]))
-            if not repeats:
+            if not candidates.repeats:
                 gain[chosen] = -np.inf
             idle += 1
             if gain.max() > GAIN * scoring.height:
                 trial = chosen.copy()
                 trial[j] = int(np.argmax(gain))
-                R = scoring.factor(scaled[trial])
+                R = candidates.factor(trial)
                 score = scoring.score(R)
                 if score > history[-1]:
-                    chosen, terms, idle = trial, compute_swap_terms(scoring, R, scaled), 0
+                    chosen, terms, idle = trial, compute_swap_terms(scoring, R, rows), 0
                     history.append(score)
             if idle >= n:
                 break
     return chosen, history
 
 
-def complete_design(
-    scoring: Scoring, scaled: FloatArray, chosen: IntArray, n: int, repeats: bool
-) -> IntArray:
+def complete_design(candidates: ScaledCandidates, chosen: IntArray, n: int) -> IntArray:
     """Return a design (n,): the chosen groups, and one after another the groups that gain most."""
-    ridged = scoring if is_determined(scoring.factor(scaled[chosen])) else scoring.with_ridge(RIDGE)
+    scoring = candidates.scoring
+    scoring = scoring if candidates.is_determined(chosen) else scoring.with_ridge(RIDGE)
     while len(chosen) < n:
-        gain = score_additions(compute_swap_terms(ridged, ridged.factor(scaled[chosen]), scaled))
-        if not repeats:
+        R = scoring.factor(candidates.rows[chosen])
+        gain = score_additions(compute_swap_terms(scoring, R, candidates.rows))
+        if not candidates.repeats:
             gain[chosen] = -np.inf
         chosen = np.append(chosen, np.argmax(gain))
     return chosen
 
 
 def draw_groups(
-    stream: np.random.Generator, N: int, n: int, repeats: bool, weights: FloatArray | None
+    candidates: ScaledCandidates, stream: np.random.Generator, n: int, weights: FloatArray | None
 ) -> IntArray:
     """Draw n of N groups, evenly or by weights; every group has a small weight, so that n exist."""
+    N = len(candidates)
     share = None if weights is None else (weights + 1e-3 * n / N) / (weights + 1e-3 * n / N).sum()
-    return stream.choice(N, n, replace=repeats, p=share)
+    return stream.choice(N, n, replace=candidates.repeats, p=share)
 
 
 def round_weights(weights: FloatArray, n: int, repeats: bool) -> IntArray:

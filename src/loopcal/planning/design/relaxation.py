@@ -29,14 +29,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.planning.design.criteria import Criterion, compute_efficiency
-from loopcal.planning.design.design_space import (
-    ObservableSpace,
-    PriorInformation,
-    find_observable_space,
-    is_allowed,
-    require_enough,
-)
-from loopcal.planning.design.scoring import Scoring, build_scoring, is_determined
+from loopcal.planning.design.design_space import ObservableSpace, PriorInformation, divide_by_factor
+from loopcal.planning.design.scoring import ScaledCandidates, Scoring, scale_candidates
 from loopcal.typing import FloatArray, IntArray
 
 ROUNDS = 40
@@ -62,7 +56,7 @@ class RelaxedDesign:
     slopes : (N,) derivatives of the score by the weights; 0 where a group is not allowed.
     value : of the criterion at these weights.
     bound : no design of n groups is better than this value.
-    criterion, space : what is optimized, and the directions in which it counts.
+    criterion : what is optimized. candidates : the allowed groups.
     iterations : number of times that candidates entered.
     converged : whether value and bound agree within the requested gap.
     """
@@ -72,9 +66,14 @@ class RelaxedDesign:
     value: float
     bound: float
     criterion: Criterion
-    space: ObservableSpace
+    candidates: ScaledCandidates
     iterations: int
     converged: bool
+
+    @property
+    def space(self) -> ObservableSpace:
+        """The directions in which designs count."""
+        return self.candidates.scoring.space
 
     def efficiency(self, value: float) -> float:
         """Return a lower bound on the efficiency of a design with this value, 0 to 1."""
@@ -108,17 +107,15 @@ def relax_design(
     EstimationError
         n groups cannot determine the unknowns, or fewer are allowed than requested.
     """
-    space = find_observable_space(rows, prior)
-    require_enough(n, rows, prior, space, repeats)
-    usable = np.flatnonzero(is_allowed(rows))
-    scoring = build_scoring(rows[usable], n / len(usable), criterion, prior, space)
-    solution = _solve(scoring, scoring.scale_rows(rows[usable]), n, gap, repeats)
+    candidates = scale_candidates(rows, n, criterion, prior, repeats)
+    scoring, solution = candidates.scoring, _solve(candidates, n, gap)
     weights, slopes = np.zeros(len(rows)), np.zeros(len(rows))
-    weights[usable], slopes[usable] = solution.weights, solution.slopes
+    weights[candidates.indices] = solution.weights
+    slopes[candidates.indices] = solution.slopes
     value, bound = scoring.value(solution.score), scoring.value(solution.bound)
     converged = bool(solution.score >= solution.bound + scoring.height * np.log1p(-gap))
     return RelaxedDesign(
-        weights, slopes, value, bound, criterion, space, solution.rounds, converged
+        weights, slopes, value, bound, criterion, candidates, solution.rounds, converged
     )
 
 
@@ -133,9 +130,10 @@ class _Solution:
     rounds: int
 
 
-def _solve(scoring: Scoring, scaled: FloatArray, n: int, gap: float, repeats: bool) -> _Solution:
+def _solve(candidates: ScaledCandidates, n: int, gap: float) -> _Solution:
     """Maximize by barrier over the candidates that matter, adding others while they could help."""
-    N = len(scaled)
+    scoring, scaled, repeats = candidates.scoring, candidates.rows, candidates.repeats
+    N, cap = len(scaled), np.inf if repeats else 1.0
     w, bound = np.full(N, n / N), np.inf
     if n == N and not repeats:
         d, _, score = _slopes(scoring, scaled, w)
@@ -147,19 +145,19 @@ def _solve(scoring: Scoring, scaled: FloatArray, n: int, gap: float, repeats: bo
         if not w.sum() > 0.0:  # no group adds information to the prior: all designs are equal
             return _Solution(np.full(N, n / N), d, score, score, 0)
         w *= n / w.sum()
-    chosen = _select_first(scoring, scaled, w, n)
+    chosen = _select_first(candidates, w, n)
     inside = np.full(len(chosen), n / len(chosen))
     target, rounds = 0.2 * gap, 0
     while True:
         rounds += 1
-        inside = maximize_weights(scoring, scaled[chosen], inside, None if repeats else 1.0, target)
+        inside = maximize_weights(scoring, scaled[chosen], inside, cap, target)
         w = np.zeros(N)
         w[chosen] = inside
         d, d0, score = _slopes(scoring, scaled, w)
         bound = min(bound, _bound(scoring, d, d0, score, n, repeats))
         if rounds == ROUNDS or score >= bound + scoring.height * np.log1p(-gap):
             return _Solution(w, d, score, bound, rounds)
-        price = _price(d, w, repeats)
+        price = _price(d, w, cap)
         outside = np.setdiff1d(np.flatnonzero(d > price), chosen)
         if not len(outside):
             target *= 0.2
@@ -169,13 +167,10 @@ def _solve(scoring: Scoring, scaled: FloatArray, n: int, gap: float, repeats: bo
             np.concatenate([chosen[keep], entering]),
             np.concatenate([inside[keep], np.zeros(len(entering))]),
         )
-        inside = _move_inside(inside, n, repeats)
-
-
-def _move_inside(w: FloatArray, n: int, repeats: bool) -> FloatArray:
-    """Return weights of sum n, mixed with a tenth of equal ones, so that all are inside limits."""
-    w = 0.9 * w * (n / w.sum()) + 0.1 * n / len(w)
-    return w if repeats or w.max() < 1.0 else np.full(len(w), n / len(w))
+        # a tenth of equal weights moves all of them inside the limits
+        inside = 0.9 * inside * (n / inside.sum()) + 0.1 * n / len(inside)
+        if inside.max() >= cap:
+            inside = np.full(len(inside), n / len(inside))
 
 
 def _factor(scoring: Scoring, scaled: FloatArray, w: FloatArray) -> FloatArray:
@@ -188,9 +183,9 @@ def _slopes(scoring: Scoring, scaled: FloatArray, w: FloatArray) -> tuple[FloatA
     """Return derivatives d (N,) of the score by the weights, d_0 by a multiple of the prior, and
     the score.
     """
-    R = _factor(scoring, scaled, w)
-    inverse, o = np.linalg.inv(R), scoring.n_nuisance
-    Y, Y0, scale = (scaled @ inverse)[:, :, o:], (scoring.prior_rows @ inverse)[:, o:], 1.0
+    R, o, scale = _factor(scoring, scaled, w), scoring.n_nuisance, 1.0
+    Y = divide_by_factor(scaled, R)[:, :, o:]
+    Y0 = divide_by_factor(scoring.prior_rows, R)[:, o:]
     if scoring.prediction is not None:
         P = scoring.predict(R)
         Y, Y0, scale = Y @ P.T, Y0 @ P.T, float((P**2).sum())
@@ -205,27 +200,27 @@ def _bound(
     return score + scoring.height * float(np.log((d0 + most) / scoring.height))
 
 
-def _select_first(scoring: Scoring, scaled: FloatArray, w: FloatArray, n: int) -> IntArray:
+def _select_first(candidates: ScaledCandidates, w: FloatArray, n: int) -> IntArray:
     """Return the candidates of the largest weights: more than n, and enough to determine all
     directions.
     """
     order, count = np.argsort(-w, kind="stable"), max(2 * n, 40)
-    while count < len(w) and not is_determined(scoring.factor(scaled[order[:count]])):
+    while count < len(w) and not candidates.is_determined(order[:count]):
         count *= 2
     return order[:count]
 
 
-def _price(d: FloatArray, w: FloatArray, repeats: bool) -> float:
+def _price(d: FloatArray, w: FloatArray, cap: float) -> float:
     """Return the slope that a group must exceed to deserve a weight.
 
     This is the mean slope of the groups that are partly used, weighted by how free they are.
     """
-    free = w if repeats else w * np.maximum(1.0 - w, 0.0)
+    free = w * np.clip(cap - w, 0.0, 1.0)
     return float((free * d).sum() / free.sum()) if free.sum() > 0.0 else float(d[w > 0.0].min())
 
 
 def maximize_weights(
-    scoring: Scoring, scaled: FloatArray, w: FloatArray, cap: float | None, gap: float
+    scoring: Scoring, scaled: FloatArray, w: FloatArray, cap: float, gap: float
 ) -> FloatArray:
     """Return weights (s,) with the same sum whose score is within `gap` of the best, as a share of
     the efficiency.
@@ -233,86 +228,72 @@ def maximize_weights(
     Parameters
     ----------
     scaled : (s, r, Q) of a nonsingular set of groups. w : (s,) inside all constraints.
-    cap : c, the largest weight; None without.
+    cap : c, the largest weight; infinite without.
     """
-    constraints = len(w) * (1 if cap is None else 2)
+    constraints = len(w) * (2 if np.isfinite(cap) else 1)
     last = constraints / (gap * scoring.height)
     t = min(constraints / scoring.height, last)
     while True:
-        w = _center(scoring, scaled, w, cap, t)
+        w = _Barrier(scoring, scaled, cap, t).maximize(w)
         if t >= last:
             return w
         t = min(GROWTH * t, last)
 
 
-def _center(
-    scoring: Scoring, scaled: FloatArray, w: FloatArray, cap: float | None, t: float
-) -> FloatArray:
-    """Maximize the barrier function for one t by Newton's method."""
-    for _ in range(NEWTON_STEPS):
-        slope, curvature = differentiate_score(scoring, scaled, w)
-        gradient, bend = t * slope + 1.0 / w, 1.0 / w**2
-        if cap is not None:
-            gradient, bend = gradient - 1.0 / (cap - w), bend + 1.0 / (cap - w) ** 2
-        # In units of each weight's own barrier, so that the system is well scaled however small a
-        # weight is.
-        unit = 1.0 / np.sqrt(bend)
-        system = np.eye(len(w)) - t * unit[:, None] * curvature * unit
-        right = np.stack([unit * gradient, unit], axis=1)
-        solved = np.linalg.solve(system, right)
-        step = unit * (solved[:, 0] - solved[:, 1] * (unit @ solved[:, 0]) / (unit @ solved[:, 1]))
-        decrement = float(gradient @ step)
-        if decrement < 1e-2:
-            return w + step if _is_inside(w + step, cap) else w
-        w = _search(scoring, scaled, w, cap, t, step, decrement)
-    return w
+@dataclass(frozen=True, eq=False)
+class _Barrier:
+    """The barrier function of one t for weights w (s,) of scaled rows (s, r, Q), 0 < w < cap."""
 
+    scoring: Scoring
+    scaled: FloatArray
+    cap: float
+    t: float
 
-def _search(
-    scoring: Scoring,
-    scaled: FloatArray,
-    w: FloatArray,
-    cap: float | None,
-    t: float,
-    step: FloatArray,
-    decrement: float,
-) -> FloatArray:
-    """Return the point along a step, inside the limits, where the barrier function has grown by at
-    least a tenth of the predicted gain.
-    """
-    room = np.where(step < 0.0, -w / np.where(step < 0.0, step, -1.0), np.inf)
-    if cap is not None:
-        room = np.minimum(
-            room, np.where(step > 0.0, (cap - w) / np.where(step > 0.0, step, 1.0), np.inf)
-        )
-    length, before = min(1.0, 0.95 * float(room.min())), _barrier(scoring, scaled, w, cap, t)
-    while length > 1e-8:
-        trial = w + length * step
-        if _barrier(scoring, scaled, trial, cap, t) >= before + 0.1 * length * decrement:
-            return trial
-        length *= 0.5
-    return w
+    def evaluate(self, w: FloatArray) -> float:
+        """Return the value of the function."""
+        walls = np.log(w).sum() + (np.log(self.cap - w).sum() if np.isfinite(self.cap) else 0.0)
+        return self.t * self.scoring.score(_factor(self.scoring, self.scaled, w)) + float(walls)
 
+    def maximize(self, w: FloatArray) -> FloatArray:
+        """Return the maximum by Newton's method from w."""
+        for _ in range(NEWTON_STEPS):
+            slope, curvature = differentiate_score(self.scoring, self.scaled, w)
+            gradient = self.t * slope + 1.0 / w - 1.0 / (self.cap - w)
+            # In units of each weight's own barrier, so that the system is well scaled however
+            # small a weight is.
+            unit = 1.0 / np.sqrt(1.0 / w**2 + 1.0 / (self.cap - w) ** 2)
+            system = np.eye(len(w)) - self.t * unit[:, None] * curvature * unit
+            x, y = np.linalg.solve(system, np.stack([unit * gradient, unit], axis=1)).T
+            step = unit * (x - y * (unit @ x) / (unit @ y))
+            decrement = float(gradient @ step)
+            if decrement < 1e-2:
+                moved = w + step
+                return moved if (moved > 0.0).all() and (moved < self.cap).all() else w
+            w = self.search(w, step, decrement)
+        return w
 
-def _is_inside(w: FloatArray, cap: float | None) -> bool:
-    """Return whether all weights are strictly inside their limits."""
-    return bool((w > 0.0).all() and (cap is None or (w < cap).all()))
-
-
-def _barrier(
-    scoring: Scoring, scaled: FloatArray, w: FloatArray, cap: float | None, t: float
-) -> float:
-    """Return the value of the barrier function."""
-    walls = np.log(w).sum() + (0.0 if cap is None else np.log(cap - w).sum())
-    return t * scoring.score(scoring.factor(np.sqrt(w)[:, None, None] * scaled)) + float(walls)
+    def search(self, w: FloatArray, step: FloatArray, decrement: float) -> FloatArray:
+        """Return the point along a step, inside the limits, where the function has grown by at
+        least a tenth of the predicted gain.
+        """
+        room = np.full(len(w), np.inf)
+        np.divide(-w, step, out=room, where=step < 0.0)
+        np.divide(self.cap - w, step, out=room, where=step > 0.0)
+        length, before = min(1.0, 0.95 * float(room.min())), self.evaluate(w)
+        while length > 1e-8:
+            trial = w + length * step
+            if self.evaluate(trial) >= before + 0.1 * length * decrement:
+                return trial
+            length *= 0.5
+        return w
 
 
 def differentiate_score(
     scoring: Scoring, scaled: FloatArray, w: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return first (s,) and second (s, s) derivatives of the score by the weights."""
-    R, o = scoring.factor(np.sqrt(w)[:, None, None] * scaled), scoring.n_nuisance
-    Y = scaled @ np.linalg.inv(R)
+    R, o = _factor(scoring, scaled, w), scoring.n_nuisance
+    Y = divide_by_factor(scaled, R)
     if scoring.prediction is None:
         curvature = -_sum_blocks(_products(Y) ** 2, len(w))
         if o:

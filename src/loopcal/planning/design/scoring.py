@@ -35,8 +35,16 @@ import numpy as np
 from loopcal.errors import EstimationError
 from loopcal.findings import report_finding
 from loopcal.planning.design.criteria import Criterion, D, E, I
-from loopcal.planning.design.design_space import ObservableSpace, PriorInformation, factor_rows
-from loopcal.typing import FloatArray
+from loopcal.planning.design.design_space import (
+    ObservableSpace,
+    PriorInformation,
+    divide_by_factor,
+    factor_rows,
+    find_observable_space,
+    is_allowed,
+    require_enough,
+)
+from loopcal.typing import FloatArray, IntArray
 
 SINGULAR = 1e-6
 """A design is singular where it determines a direction with less than this share of the mean
@@ -120,11 +128,6 @@ class Scoring:
         return replace(self, prior_rows=rows)
 
 
-def divide_by_factor(rows: FloatArray, R: FloatArray) -> FloatArray:
-    """Return X R^-1 for rows X (k, q) and a factor R (q, q)."""
-    return np.asarray(np.linalg.solve(R.T, rows.T).T, dtype=np.float64)
-
-
 def is_determined(R: FloatArray) -> bool:
     """Return whether a design with factor R determines all directions; see SINGULAR."""
     return bool(np.linalg.svd(R, compute_uv=False)[-1] > SINGULAR)
@@ -172,6 +175,54 @@ def build_scoring(
 
 
 @dataclass(frozen=True, eq=False)
+class ScaledCandidates:
+    """The allowed groups of a problem in the coordinates of its scoring.
+
+    Attributes
+    ----------
+    scoring : of designs. rows : (N, r, Q) scaled. indices : (N,) of the groups among all.
+    repeats : whether a group may be chosen more than once.
+    """
+
+    scoring: Scoring
+    rows: FloatArray
+    indices: IntArray
+    repeats: bool
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def take(self, chosen: IntArray) -> ScaledCandidates:
+        """Return some of the groups."""
+        return replace(self, rows=self.rows[chosen], indices=self.indices[chosen])
+
+    def factor(self, chosen: IntArray) -> FloatArray:
+        """Return the factor (Q, Q) of the prior and the chosen groups (n,)."""
+        return self.scoring.factor(self.rows[chosen])
+
+    def is_determined(self, chosen: IntArray) -> bool:
+        """Return whether the chosen groups (n,) determine all directions."""
+        return is_determined(self.factor(chosen))
+
+
+def scale_candidates(
+    rows: FloatArray, n: int, criterion: Criterion, prior: PriorInformation, repeats: bool
+) -> ScaledCandidates:
+    """Return the allowed groups scaled by the mean design of n of them.
+
+    Raises
+    ------
+    EstimationError
+        See `require_enough` and `build_scoring`.
+    """
+    space = find_observable_space(rows, prior)
+    require_enough(n, rows, prior, space, repeats)
+    usable = np.flatnonzero(is_allowed(rows))
+    scoring = build_scoring(rows[usable], n / len(usable), criterion, prior, space)
+    return ScaledCandidates(scoring, scoring.scale_rows(rows[usable]), usable, repeats)
+
+
+@dataclass(frozen=True, eq=False)
 class SwapTerms:
     """Terms of the swap formulas for all groups at the present design.
 
@@ -196,7 +247,7 @@ class SwapTerms:
 
 def compute_swap_terms(scoring: Scoring, R: FloatArray, scaled: FloatArray) -> SwapTerms:
     """Return the swap terms of scaled rows (N, r, Q) for a nonsingular factor R (Q, Q)."""
-    Y = scaled @ np.linalg.inv(R)
+    Y = divide_by_factor(scaled, R)
     if scoring.prediction is None:
         return _determinant_terms(Y, scoring.n_nuisance)
     P = scoring.predict(R)

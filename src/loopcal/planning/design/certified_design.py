@@ -1,37 +1,159 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Designs by their size: the value of good designs, and the smallest size that meets a target.
+"""A good design with its certificate: relaxation, rounding, exchange and perturbation.
 
-Each design also starts from the smaller one with the best groups added, and more rows never hurt,
-so the curve is monotone. The bound of the relaxation says below which size no design can meet the
-target.
+The relaxed design shows which candidates matter (those of the steepest slopes) and how good any
+design can be. Its rounding is exchanged among these candidates. Then a few groups are replaced
+again and again by others, drawn with the relaxed weights, the design is exchanged anew, and the
+result is kept where it is better. The last exchange is among all candidates. See
+docs/theory/planning.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from loopcal.errors import EstimationError
 from loopcal.findings import report_finding
-from loopcal.planning.design.certificate import CertifiedDesign, choose_design
 from loopcal.planning.design.criteria import Criterion, D
 from loopcal.planning.design.design_space import (
+    Design,
     PriorInformation,
     count_groups_needed,
     find_observable_space,
     is_allowed,
     require_enough,
 )
-from loopcal.planning.design.relaxation import relax_design
+from loopcal.planning.design.exchange import (
+    draw_groups,
+    exchange_from_start,
+    exchange_groups,
+    list_starts,
+    require_determined,
+)
+from loopcal.planning.design.relaxation import RelaxedDesign, relax_design
+from loopcal.planning.design.scoring import ScaledCandidates
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
-PERTURBATIONS = 10
+PERTURBATIONS, LEAST_PERTURBATIONS = 1600, 20
+"""Default number of perturbations: the first over the number of groups, at least the second."""
+
+GOOD = 0.99
+"""Efficiency from which a design is not perturbed: the remaining gain is not worth the time."""
+
+PERTURBED = 0.15
+"""Share of the groups that a perturbation replaces; at least two groups."""
+
+AMONG, FEWEST = 6, 100
+"""Candidates of the exchange after a perturbation: the first times the size of the design, at least
+the second.
+"""
+
+CURVE_PERTURBATIONS = 10
 """Number of perturbations of each design of a curve."""
 
 BOUND_GAP = 3e-3
 """Gap of the relaxation where only the size is needed."""
+
+
+@dataclass(frozen=True, eq=False)
+class CertifiedDesign:
+    """A design and its certificate.
+
+    Attributes
+    ----------
+    design : the chosen groups. relaxed : weights and bound.
+    efficiency : lower bound on the efficiency relative to the best possible design.
+    """
+
+    design: Design
+    relaxed: RelaxedDesign
+    efficiency: float
+
+
+def choose_design(
+    rows: FloatArray,
+    n: int,
+    criterion: Criterion,
+    prior: PriorInformation,
+    seed: int = 0,
+    perturbations: int | None = None,
+    repeats: bool = False,
+    gap: float = 1e-3,
+    first: Iterable[IntArray] = (),
+    progress: Progress = report_no_progress,
+) -> CertifiedDesign:
+    """Choose n of N groups, with a certificate.
+
+    Parameters
+    ----------
+    rows, n, criterion, prior, seed, repeats, first : see `fedorov_exchange`.
+    perturbations : their number; default PERTURBATIONS / n.
+    gap : of the relaxation. progress : receives the perturbations that are done.
+
+    Raises
+    ------
+    EstimationError
+        n groups cannot determine the unknowns, or fewer are allowed than requested.
+    """
+    relaxed = relax_design(rows, n, criterion, prior, gap, repeats)
+    candidates, random = relaxed.candidates, np.random.default_rng(seed)
+    scoring, usable = candidates.scoring, candidates.indices
+    weights, slopes = relaxed.weights[usable], relaxed.slopes[usable]
+    chosen, history = max(
+        (
+            exchange_from_start(candidates, begin, random)
+            for begin in list_starts(candidates, n, weights, first)
+        ),
+        key=lambda end: end[1][-1],
+    )
+    require_determined(history[-1], n, len(usable), scoring.space)
+    steep = np.argsort(-slopes, kind="stable")[: max(AMONG * n, FEWEST)]
+    among = np.union1d(steep, chosen)
+    times = max(PERTURBATIONS // n, LEAST_PERTURBATIONS) if perturbations is None else perturbations
+    begin = np.searchsorted(among, chosen)
+    if relaxed.efficiency(scoring.value(history[-1])) >= GOOD:
+        times = 0
+    best, scores = _perturb(candidates.take(among), begin, weights[among], times, random, progress)
+    chosen, last = exchange_groups(candidates, among[best], random)
+    values = tuple(scoring.value(score) for score in (*history, *scores, *last[1:]))
+    ends = tuple(scoring.value(score) for score in (history[-1], last[-1]))
+    design = Design(np.sort(usable[chosen]), values[-1], values, ends, scoring.space)
+    return CertifiedDesign(design, relaxed, relaxed.efficiency(design.value))
+
+
+def _perturb(
+    candidates: ScaledCandidates,
+    best: IntArray,
+    weights: FloatArray,
+    times: int,
+    random: np.random.Generator,
+    progress: Progress,
+) -> tuple[IntArray, list[float]]:
+    """Perturb a design and exchange it among the candidates (N).
+
+    Returns
+    -------
+    best : (n,) the best groups. scores : those that were better than all before.
+    """
+    n, repeats = len(best), candidates.repeats
+    scores = [candidates.scoring.score(candidates.factor(best))]
+    count = min(n, max(2, round(PERTURBED * n)))
+    for done in range(times if len(candidates) > n or repeats else 0):
+        progress(done, times, "exchanging poses")
+        kept = random.permutation(best)[count:]
+        new = draw_groups(candidates, random, n, weights)
+        new = new if repeats else np.setdiff1d(new, kept, assume_unique=True)
+        trial = np.concatenate([kept, new[:count]])
+        if not candidates.is_determined(trial):
+            continue
+        trial, history = exchange_groups(candidates, trial, random)
+        if history[-1] >= scores[-1]:
+            best = trial
+            scores.append(history[-1])
+    return best, scores[1:]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +196,7 @@ def compute_design_curve(
     criterion: Criterion,
     prior: PriorInformation,
     seed: int = 0,
-    perturbations: int = PERTURBATIONS,
+    perturbations: int = CURVE_PERTURBATIONS,
     repeats: bool = False,
     progress: Progress = report_no_progress,
 ) -> DesignCurve:
@@ -105,7 +227,7 @@ def find_smallest_design(
     prior: PriorInformation,
     most: int | None = None,
     seed: int = 0,
-    perturbations: int = PERTURBATIONS,
+    perturbations: int = CURVE_PERTURBATIONS,
     repeats: bool = False,
 ) -> SmallestDesign:
     """Return the smallest design found whose criterion is at least as good as a target.
