@@ -7,10 +7,10 @@ import sys
 import click
 import pytest
 
-from loopcal.cli import commands, main
+from loopcal.cli import commands, main, robot_commands
 from loopcal.errors import MechanismError
 
-NAMES = sorted(commands.commands)
+NAMES = sorted(commands.list_commands(click.Context(commands)))
 
 
 def test_help_lists_every_command(capsys) -> None:
@@ -66,7 +66,7 @@ def test_an_error_of_the_user_becomes_one_sentence_and_exit_code_1(
     def fail(*_args, **_kwargs):
         raise error
 
-    monkeypatch.setattr(commands.commands["check"], "callback", fail)
+    monkeypatch.setattr(robot_commands.check, "callback", fail)
     assert main(["check", "hexapod-42"]) == 1
     out, err = capsys.readouterr()
     assert out == ""
@@ -75,7 +75,7 @@ def test_an_error_of_the_user_becomes_one_sentence_and_exit_code_1(
 
 
 def test_a_mistake_of_our_own_is_not_hidden(monkeypatch) -> None:
-    monkeypatch.setattr(commands.commands["check"], "callback", lambda **_: 1 / 0)
+    monkeypatch.setattr(robot_commands.check, "callback", lambda **_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(["check", "hexapod-42"])
 

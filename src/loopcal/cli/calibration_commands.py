@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import click
 
 from loopcal.cli import terminal
-from loopcal.cli.fit_options import FitArguments, fit_options
+from loopcal.cli.fit_options import fit_options, make_fit_options
 from loopcal.cli.hints import hint_for
 from loopcal.cli.options import (
     FILE,
@@ -30,7 +30,7 @@ from loopcal.cli.options import (
 from loopcal.errors import DataError
 
 
-@click.command(short_help="Identify the parameters of a robot and validate them.")
+@click.command()
 @robot_argument
 @data_argument
 @click.option("-o", "--output", required=True, type=FILE, help="Run folder to make.")
@@ -72,17 +72,16 @@ def calibrate(
     data: tuple[Path, ...],
     output: Path,
     hold_out: float,
-    fit_arguments: FitArguments,
     choose_model: bool,
     prior: Path | None,
     free_limb: str | None,
     limit_position: float | None,
     limit_angle: float | None,
     seed: int,
-    allowed: Mapping[str, bool],
     force: bool,
     verbose: bool,
     as_json: bool,
+    **options: Any,
 ) -> int:
     """Identify the free parameters of ROBOT from DATA, validate them on held-out poses, and write a
     run folder with the corrected robot file.
@@ -118,20 +117,29 @@ def calibrate(
     held_out = read_held_out_poses(data)
     _refuse_two_choices(held_out, hold_out)
     inputs = _list_inputs(robot, data, prior)
-    fit, earlier = fit_arguments.to_options(), None if prior is None else load_prior(prior, data)
-    limits = {"limit_position": limit_position, "limit_angle": limit_angle}
-    choices = {"choose_model": choose_model, "prior": earlier, "free_limb": free_limb}
-    files = {name: allowed[name] for name in ("allow_outside_stroke", "allow_duplicates")}
-    checks = {
-        "check_conventions": not allowed["allow_implausible"],
-        "allow_still": allowed["allow_still"],
-    }
-    options = CalibrationOptions(fit, hold_out, held_out, seed, **limits, **choices, **checks)
+    settings = CalibrationOptions(
+        make_fit_options(options),
+        hold_out,
+        held_out,
+        seed,
+        limit_position=limit_position,
+        limit_angle=limit_angle,
+        choose_model=choose_model,
+        prior=None if prior is None else load_prior(prior, data),
+        free_limb=free_limb,
+        check_conventions=not options["allow_implausible"],
+        allow_still=options["allow_still"],
+    )
     machine = load_robot(robot)
     refuse_run_folder(output, list(inputs.values()), force)
-    measurements = read_measurements(data, machine, **files)
+    measurements = read_measurements(
+        data,
+        machine,
+        allow_outside_stroke=options["allow_outside_stroke"],
+        allow_duplicates=options["allow_duplicates"],
+    )
     with terminal.ProgressBar() as progress:
-        report = calibrate_robot(machine, measurements, options, progress)
+        report = calibrate_robot(machine, measurements, settings, progress)
     print_convention_note(report.conventions, data)
     save_run(output, report, inputs, sys.argv, force)
     if as_json:
@@ -164,7 +172,7 @@ def _list_inputs(robot: str, data: Sequence[Path], prior: Path | None) -> dict[s
     return inputs if prior is None else {**inputs, "prior": prior / RESULT}
 
 
-@click.command(short_help="Validate a calibration, or a robot file, with measurements.")
+@click.command()
 @click.argument("run", metavar="RUN", type=FILE)
 @data_argument
 @limit_options
@@ -186,11 +194,11 @@ def validate(
     data: tuple[Path, ...],
     limit_position: float | None,
     limit_angle: float | None,
-    allowed: Mapping[str, bool],
     refit: tuple[str, ...],
     allow_fitted_data: bool,
     verbose: bool,
     as_json: bool,
+    **flags: bool,
 ) -> int:
     """Compare the robot of RUN, a run folder or a robot file, with DATA, one file or several.
 
@@ -214,7 +222,7 @@ def validate(
     from loopcal.report.validation_view import view_validation
 
     calibrated = load_run_or_robot(run)
-    measurements = read_checked_measurements(data, calibrated.robot, **allowed)
+    measurements = read_checked_measurements(data, calibrated.robot, **flags)
     if not allow_fitted_data:
         refuse_fitted_files(calibrated, data)
         reused = find_reused_rows(calibrated.arrays, measurements)
@@ -240,7 +248,7 @@ def validate(
     return terminal.print_failures(validation.failures)
 
 
-@click.command(short_help="Compute readings or commands that reach targets.")
+@click.command()
 @click.argument("run", metavar="RUN", type=FILE)
 @click.argument("targets", metavar="TARGETS", type=FILE)
 @click.option(
@@ -250,7 +258,6 @@ def validate(
     "--mode",
     type=click.Choice(("readings", "commands")),
     default="readings",
-    show_default=True,
     help="Actuator readings to set, or shifted commands for a controller that cannot be changed.",
 )
 @click.option(
@@ -259,11 +266,7 @@ def validate(
     help="Robot file with the geometry of the controller; by default the nominal robot.",
 )
 @click.option(
-    "--steps",
-    type=click.IntRange(min=1),
-    default=3,
-    show_default=True,
-    help="Iterations of the shifted commands.",
+    "--steps", type=click.IntRange(min=1), default=3, help="Iterations of the shifted commands."
 )
 @force_option("the output file")
 @json_option

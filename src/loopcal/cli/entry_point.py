@@ -8,44 +8,83 @@ click is imported before a command runs, so that `loopcal --help` answers at onc
 
 from __future__ import annotations
 
+import keyword
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 
 import click
 
-from loopcal.cli.calibration_commands import calibrate, compensate, validate
-from loopcal.cli.exchange_commands import export, import_
 from loopcal.cli.hints import find_hint
-from loopcal.cli.measurement_commands import identifiability, simulate
-from loopcal.cli.plan_command import plan
-from loopcal.cli.robot_commands import check, new
-from loopcal.cli.study_commands import reproduce
 from loopcal.errors import LoopcalError
 
 SECTIONS = {
-    "Describe the robot": (new, check, import_, export),
-    "Prepare measurements": (identifiability, plan, simulate),
-    "Calibrate": (calibrate, validate, compensate),
-    "Published studies": (reproduce,),
+    "Describe the robot": {
+        "new": "Write a robot file, and a measurement file, to fill in.",
+        "check": "Read a robot file and show what it contains.",
+        "import": "Read the file of a controller as a robot file.",
+        "export": "Write identified numbers into the file of a controller.",
+    },
+    "Prepare measurements": {
+        "identifiability": "Show which parameters measurements determine.",
+        "plan": "Plan which poses to measure, and write a sheet for them.",
+        "simulate": "Write a measurement file of a simulated machine.",
+    },
+    "Calibrate": {
+        "calibrate": "Identify the parameters of a robot and validate them.",
+        "validate": "Validate a calibration, or a robot file, with measurements.",
+        "compensate": "Compute readings or commands that reach targets.",
+    },
+    "Published studies": {"reproduce": "Repeat a published study and compare its numbers."},
 }
 """Headings of the help, and the commands below each."""
+
+MODULES = {
+    "robot_commands": ("new", "check"),
+    "exchange_commands": ("import", "export"),
+    "measurement_commands": ("identifiability", "simulate"),
+    "plan_command": ("plan",),
+    "calibration_commands": ("calibrate", "validate", "compensate"),
+    "study_commands": ("reproduce",),
+}
+"""Modules of this package, and the commands in each; they are imported when they run."""
 
 
 class SectionedGroup(click.Group):
     """A group whose help lists its commands below headings, in the order of the work."""
 
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of all commands."""
+        return [name for members in SECTIONS.values() for name in members]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import a command; None where there is none of this name."""
+        return find_command(cmd_name)
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the sections."""
         for heading, members in SECTIONS.items():
             with formatter.section(heading):
-                rows = [(str(command.name), command.get_short_help_str(70)) for command in members]
-                formatter.write_dl(rows)
+                formatter.write_dl(list(members.items()))
+
+
+def find_command(name: str) -> click.Command | None:
+    """Import a command; None where there is none of this name."""
+    module = next((module for module, names in MODULES.items() if name in names), None)
+    if module is None:
+        return None
+    function = name + "_" * keyword.iskeyword(name)
+    return getattr(import_module(f"loopcal.cli.{module}"), function)
 
 
 @click.group(
     cls=SectionedGroup,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    context_settings={
+        "help_option_names": ["-h", "--help"],
+        "max_content_width": 100,
+        "show_default": True,
+    },
 )
 @click.version_option(package_name="loopcal", message="loopcal %(version)s")
 def commands() -> None:
@@ -65,11 +104,6 @@ def commands() -> None:
     """  # noqa: D301
 
 
-for _members in SECTIONS.values():
-    for _command in _members:
-        commands.add_command(_command)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code.
 
@@ -83,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     words = list(sys.argv[1:] if arguments is None else arguments)
-    command = commands.commands.get(words[0]) if words else None
+    command = find_command(words[0]) if words else None
     try:
         code = commands.main(words, prog_name="loopcal", standalone_mode=False)
         sys.stdout.flush()

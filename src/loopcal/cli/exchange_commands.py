@@ -11,7 +11,17 @@ import click
 
 from loopcal.cli import terminal
 from loopcal.cli.hints import hint_for
-from loopcal.cli.options import FILE, LENGTH, force_option, json_option, read_checked_measurements
+from loopcal.cli.options import (
+    FILE,
+    LENGTH,
+    add_options,
+    force_option,
+    format_option,
+    json_option,
+    name_option,
+    read_checked_measurements,
+    refuse_given,
+)
 from loopcal.errors import DataError
 from loopcal.units import Dimension, list_symbols
 
@@ -27,27 +37,10 @@ WRITTEN_FORMATS = ("klipper", "marlin", "reprap", "linuxcnc", "urdf", "json", "c
 SHOWN = 20
 """Lines that do not match a profile that are listed."""
 
-OPTION_OF = {
-    "sigma_height": "--sigma-height",
-    "sigma_distance": "--sigma-distance",
-    "sigma_line": "--sigma-line",
-    "sigma_position": "--sigma-position",
-    "length_unit": "--unit",
-    "home_height": "--home-z",
-    "closures": "--closures",
-    "platform": "--platform",
-}
-"""Setting of a format -> its option."""
 
-
-@click.command("import", short_help="Read the file of a controller as a robot file.")
+@click.command("import")
 @click.argument("file", metavar="FILE", type=FILE)
-@click.option(
-    "--format",
-    "format_name",
-    type=click.Choice(READ_FORMATS),
-    help="Format of FILE; by default chosen by the ending of its name.",
-)
+@format_option(READ_FORMATS, "Format of FILE; by default chosen by the ending of its name.")
 @click.option(
     "--profile",
     type=FILE,
@@ -66,29 +59,16 @@ OPTION_OF = {
     type=FILE,
     help="Also calibrate with them, and write FILE with the corrected numbers.",
 )
-@click.option(
-    "--sigma-height",
-    type=LENGTH,
-    metavar="QUANTITY",
-    help="Noise of the probe (klipper).  [default: 0.02mm]",
-)
-@click.option(
-    "--sigma-distance",
-    type=LENGTH,
-    metavar="QUANTITY",
-    help="Noise of distances (klipper).  [default: 0.1mm]",
-)
-@click.option(
-    "--sigma-line",
-    type=LENGTH,
-    metavar="QUANTITY",
-    help="Noise of lines (hangprinter).  [default: 1mm]",
-)
-@click.option(
-    "--sigma-position",
-    type=LENGTH,
-    metavar="QUANTITY",
-    help="Noise of known positions (hangprinter).  [default: 1mm]",
+@add_options(
+    *(
+        click.option(f"--sigma-{of}", type=LENGTH, help=f"Noise of {what}.  [default: {default}]")
+        for of, what, default in (
+            ("height", "the probe (klipper)", "0.02mm"),
+            ("distance", "distances (klipper)", "0.1mm"),
+            ("line", "lines (hangprinter)", "1mm"),
+            ("position", "known positions (hangprinter)", "1mm"),
+        )
+    )
 )
 @click.option(
     "--unit",
@@ -96,13 +76,7 @@ OPTION_OF = {
     type=click.Choice(list_symbols(Dimension.LENGTH)),
     help="Unit of lengths (linuxcnc).",
 )
-@click.option(
-    "--home-z",
-    "home_height",
-    type=LENGTH,
-    metavar="QUANTITY",
-    help="Height of the home pose (linuxcnc).",
-)
+@click.option("--home-z", "home_height", type=LENGTH, help="Height of the home pose (linuxcnc).")
 @click.option(
     "--closures",
     type=FILE,
@@ -206,18 +180,12 @@ def _convert_export(file: Path, profile: Path, output: Path, force: bool, as_jso
     from loopcal.io.exports import convert_export, read_profile
     from loopcal.report.calibration_view import with_hint
 
-    common = {"file", "profile", "output", "force", "as_json"}
-    for parameter in click.get_current_context().command.params:
-        if parameter.name and parameter.name not in common:
-            name = parameter.opts[0].removeprefix("--")
-            if (
-                click.get_current_context().get_parameter_source(parameter.name)
-                is click.core.ParameterSource.COMMANDLINE
-            ):
-                raise DataError(
-                    f"--{name} has no effect with --profile, which states how the file is read; "
-                    "leave it out"
-                )
+    used = {"file", "profile", "output", "force", "as_json"}
+    names = (option.name or "" for option in click.get_current_context().command.params)
+    refuse_given(
+        (name for name in names if name not in used),
+        "with --profile, which states how the file is read",
+    )
     refuse_outputs((output,), (file, profile), force)
     converted = convert_export(file, read_profile(profile))
     write_text(output, converted.text)
@@ -255,7 +223,7 @@ def _make_import_options(source: Format, name: str, settings: dict[str, Any]) ->
     for key in given:
         if key not in source.reads:
             raise DataError(
-                f"{OPTION_OF[key]} does not belong to the format {source.name}; leave it out"
+                f"{name_option(key)} does not belong to the format {source.name}; leave it out"
             )
     return ImportOptions(name, **given)
 
@@ -298,14 +266,9 @@ def _view_import(
     return [*page, f"Written to {document['corrected']}; the rest of the file is unchanged"]
 
 
-@click.command(short_help="Write identified numbers into the file of a controller.")
+@click.command()
 @click.argument("source", metavar="RUN|ROBOT")
-@click.option(
-    "--format",
-    "format_name",
-    type=click.Choice(WRITTEN_FORMATS),
-    help="Format to write; by default chosen by the ending of -o.",
-)
+@format_option(WRITTEN_FORMATS, "Format to write; by default chosen by the ending of -o.")
 @click.option(
     "--into",
     type=FILE,

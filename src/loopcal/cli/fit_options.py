@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that say how parameters are estimated, packed into one value."""
+"""Options that choose the method, the loss and the noise of a fit."""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from loopcal.cli.options import add_options
 from loopcal.errors import DataError
 
 if TYPE_CHECKING:
@@ -18,106 +17,86 @@ if TYPE_CHECKING:
 METHODS = ("auto", "map", "ls", "ridge", "tsvd")
 LOSSES = ("none", "huber", "tukey")
 
-
-@dataclass(frozen=True)
-class FitArguments:
-    """The options of `fit_options` as the user gave them."""
-
-    method: str
-    lam: float | None
-    keep: int | None
-    noise: Literal["given", "estimated"]
-    loss: str
-    drop: tuple[str, ...]
-
-    def to_options(self) -> FitOptions:
-        """Return the options of the library.
-
-        Raises
-        ------
-        DataError
-            A number that belongs to another method.
-        """
-        from loopcal.estimate import (
-            GCV,
-            MAP,
-            FitOptions,
-            Huber,
-            LeastSquares,
-            Ridge,
-            TruncatedSVD,
-            TruncationGCV,
-            Tukey,
-        )
-
-        for option, value, needs in (("--lam", self.lam, "ridge"), ("--keep", self.keep, "tsvd")):
-            if value is not None and self.method != needs:
-                raise DataError(
-                    f"{option} belongs to --method {needs}, not to {self.method}; leave it out, or "
-                    "change the method"
-                )
-        method = {
-            "auto": lambda: None,
-            "map": MAP,
-            "ls": LeastSquares,
-            "ridge": lambda: Ridge(GCV() if self.lam is None else self.lam),
-            "tsvd": lambda: TruncatedSVD(TruncationGCV() if self.keep is None else self.keep),
-        }[self.method]()
-        loss = {"none": lambda: None, "huber": Huber, "tukey": Tukey}[self.loss]()
-        return FitOptions(method=method, loss=loss, noise=self.noise, excluded_poses=self.drop)
+fit_options = add_options(
+    click.option(
+        "--method",
+        type=click.Choice(METHODS),
+        default=METHODS[0],
+        help="map: the tolerances are a prior. auto: map, with tolerances inflated where the "
+        "data contradict them. ls: least squares. ridge, tsvd: regularized least squares.",
+    ),
+    click.option(
+        "--lam",
+        type=click.FloatRange(min=0),
+        help="For ridge: weight of the penalty; by default chosen by cross-validation.",
+    ),
+    click.option(
+        "--keep",
+        type=click.IntRange(min=0),
+        metavar="K",
+        help="For tsvd: number of directions; by default chosen by cross-validation.",
+    ),
+    click.option(
+        "--noise",
+        type=click.Choice(("given", "estimated")),
+        default="given",
+        help="Take the stated sigmas as true, or as true up to one common factor that is "
+        "estimated.",
+    ),
+    click.option(
+        "--loss",
+        type=click.Choice(LOSSES),
+        default=LOSSES[0],
+        help="Reduce the weight of poses that are far from the fit.",
+    ),
+    click.option(
+        "--drop",
+        multiple=True,
+        metavar="POSE",
+        help="Exclude this pose from fit and validation. May be given several times.",
+    ),
+)
+"""Decorator of a command that fits; `make_fit_options` takes their values."""
 
 
-def fit_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options; the command gets them as `fit_arguments`."""
-    names = [f.name for f in fields(FitArguments)]
+def make_fit_options(options: Mapping[str, Any]) -> FitOptions:
+    """Return the options of the library from those of `fit_options`.
 
-    @functools.wraps(command)
-    def packed(**given: Any) -> Any:
-        arguments = FitArguments(**{name: given.pop(name) for name in names})
-        return command(**given, fit_arguments=arguments)
-
-    options = (
-        click.option(
-            "--drop",
-            multiple=True,
-            metavar="POSE",
-            help="Exclude this pose from fit and validation. May be given several times.",
-        ),
-        click.option(
-            "--loss",
-            type=click.Choice(LOSSES),
-            default=LOSSES[0],
-            show_default=True,
-            help="Reduce the weight of poses that are far from the fit.",
-        ),
-        click.option(
-            "--noise",
-            type=click.Choice(("given", "estimated")),
-            default="given",
-            show_default=True,
-            help="Take the stated sigmas as true, or as true up to one common factor that is "
-            "estimated.",
-        ),
-        click.option(
-            "--keep",
-            type=click.IntRange(min=0),
-            metavar="K",
-            help="For tsvd: number of directions; by default chosen by cross-validation.",
-        ),
-        click.option(
-            "--lam",
-            type=click.FloatRange(min=0),
-            help="For ridge: weight of the penalty; by default chosen by cross-validation.",
-        ),
-        click.option(
-            "--method",
-            type=click.Choice(METHODS),
-            default=METHODS[0],
-            show_default=True,
-            help="map: the tolerances are a prior. auto: map, with tolerances inflated where the "
-            "data contradict them. ls: least squares. ridge, tsvd: regularized least squares.",
-        ),
+    Raises
+    ------
+    DataError
+        A number that belongs to another method.
+    """
+    from loopcal.estimate import (
+        GCV,
+        MAP,
+        FitOptions,
+        Huber,
+        LeastSquares,
+        Ridge,
+        TruncatedSVD,
+        TruncationGCV,
+        Tukey,
     )
-    for option in options:
-        packed = option(packed)
-    return packed
+
+    name, lam, keep = options["method"], options["lam"], options["keep"]
+    for option, value, needed in (("--lam", lam, "ridge"), ("--keep", keep, "tsvd")):
+        if value is not None and name != needed:
+            raise DataError(
+                f"{option} belongs to --method {needed}, not to {name}; leave it out, or change "
+                "the method"
+            )
+    methods: dict[str, Callable[[], Any]] = {
+        "auto": lambda: None,
+        "map": MAP,
+        "ls": LeastSquares,
+        "ridge": lambda: Ridge(GCV() if lam is None else lam),
+        "tsvd": lambda: TruncatedSVD(TruncationGCV() if keep is None else keep),
+    }
+    losses: dict[str, Callable[[], Any]] = {"none": lambda: None, "huber": Huber, "tukey": Tukey}
+    return FitOptions(
+        method=methods[name](),
+        loss=losses[options["loss"]](),
+        noise=options["noise"],
+        excluded_poses=options["drop"],
+    )

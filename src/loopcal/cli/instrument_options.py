@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from loopcal.cli.options import ANGLE, LENGTH
+from loopcal.cli.options import ANGLE, LENGTH, add_options
 from loopcal.errors import DataError, UnitError, suggest_names
 from loopcal.units import parse_quantity
 
@@ -33,80 +33,59 @@ DESCRIPTION = (
 """Names of the options that describe an instrument."""
 
 
-def instrument_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the kind of measurement and its noise; `make_instrument` makes an instrument of them."""
-    options = (
-        click.option(
-            "--sigma-angle",
-            type=ANGLE,
-            default="50urad",
-            show_default=True,
-            metavar="QUANTITY",
-            help="Standard deviation of each measured angle.",
-        ),
-        click.option(
-            "--sigma-position",
-            type=LENGTH,
-            default="0.01mm",
-            show_default=True,
-            metavar="QUANTITY",
-            help="Standard deviation of each measured length.",
-        ),
-        click.option(
-            "--orientation",
-            metavar="FORM",
-            help="Form of measured angles: rotation-vector, quaternion, tilt-torsion, euler-xyz, "
-            "...",
-        ),
-        click.option(
-            "--components",
-            metavar="NAMES",
-            help="Coordinates that the kind 'component' measures, such as z or x,y,z.",
-        ),
-        click.option(
-            "--kind",
-            default="pose",
-            show_default=True,
-            help="Kind of measurement: pose, component, position, bearing, ...; or several, such "
-            "as position,inclination.",
-        ),
-    )
-    for option in options:
-        command = option(command)
-    return command
+instrument_options = add_options(
+    click.option(
+        "--kind",
+        default="pose",
+        help="Kind of measurement: pose, component, position, bearing, ...; or several, such "
+        "as position,inclination.",
+    ),
+    click.option(
+        "--components",
+        metavar="NAMES",
+        help="Coordinates that the kind 'component' measures, such as z or x,y,z.",
+    ),
+    click.option(
+        "--orientation",
+        metavar="FORM",
+        help="Form of measured angles: rotation-vector, quaternion, tilt-torsion, euler-xyz, ...",
+    ),
+    click.option(
+        "--sigma-position",
+        type=LENGTH,
+        default="0.01mm",
+        help="Standard deviation of each measured length.",
+    ),
+    click.option(
+        "--sigma-angle",
+        type=ANGLE,
+        default="50urad",
+        help="Standard deviation of each measured angle.",
+    ),
+)
+"""Decorator for the kind of measurement and its noise; `make_instrument` takes their values."""
 
+unknown_options = add_options(
+    click.option(
+        "--measure",
+        metavar="NAMES",
+        help="Short for --kind component --components NAMES: some of x,y,z,phi,theta,psi.",
+    ),
+    click.option(
+        "--frames",
+        metavar="NAMES",
+        help="Unknown frames: base (the frame of the instrument in the base), tool, or base,tool.",
+    ),
+)
+"""Decorator for the short form of components, and for the unknown frames of an instrument."""
 
-def unknown_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the short form of components, and which frames are unknown."""
-    options = (
-        click.option(
-            "--frames",
-            metavar="NAMES",
-            help="Unknown frames: base (the frame of the instrument in the base), tool, or "
-            "base,tool.",
-        ),
-        click.option(
-            "--measure",
-            metavar="NAMES",
-            help="Short for --kind component --components NAMES: some of x,y,z,phi,theta,psi.",
-        ),
-    )
-    for option in options:
-        command = option(command)
-    return command
-
-
-def draw_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add how many poses are drawn where none are given."""
-    return click.option(
-        "--draw",
-        type=click.IntRange(min=1),
-        default=40,
-        show_default=True,
-        metavar="N",
-        help="Number of poses to draw evenly from the workspace where no poses are given.",
-    )(command)
-
+draw_option = click.option(
+    "--draw",
+    type=click.IntRange(min=1),
+    default=40,
+    metavar="N",
+    help="Number of poses to draw evenly from the workspace where no poses are given.",
+)
 
 sigma_reading_option = click.option(
     "--sigma-reading",
@@ -117,7 +96,7 @@ sigma_reading_option = click.option(
 
 
 def make_instrument(options: Mapping[str, Any]) -> Instrument:
-    """Return the instrument of `instrument_options`, and of `unknown_options` where they are there.
+    """Return the instrument of `instrument_options`, and of `unknown_options` if there are any.
 
     Raises
     ------

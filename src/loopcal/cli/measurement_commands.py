@@ -5,7 +5,6 @@ ones.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +30,7 @@ from loopcal.cli.options import (
     refuse_given,
     robot_argument,
     seed_option,
+    take_flags,
 )
 from loopcal.errors import DataError
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from loopcal.workflow.simulated_measurements import SimulatedMeasurements
 
 
-@click.command(short_help="Show which parameters measurements determine.")
+@click.command()
 @robot_argument
 @click.argument("data", metavar="[DATA]...", type=FILE, nargs=-1)
 @click.option(
@@ -76,7 +76,6 @@ def identifiability(
     output: Path | None,
     force: bool,
     sigma_reading: str | None,
-    allowed: Mapping[str, bool],
     as_json: bool,
     **options: Any,
 ) -> None:
@@ -110,7 +109,7 @@ def identifiability(
     refuse_outputs((output,), (find_robot_file(robot), *data, poses), force)
     machine, drawn = load_robot(robot), []
     if data:
-        measurements = read_checked_measurements(data, machine, **allowed)
+        measurements = read_checked_measurements(data, machine, **take_flags(options))
     else:
         if poses is None:
             drawn = [_name_drawn_poses(machine, draw, seed)]
@@ -162,7 +161,7 @@ def _write_subset(output: Path, subset: IdentifiableSubset) -> None:
     write_text(output, format_reduced_robot(subset.robot, words))
 
 
-@click.command(short_help="Write a measurement file of a simulated machine.")
+@click.command()
 @robot_argument
 @click.option("--poses", type=FILE, help="CSV file of commanded poses, one column per coordinate.")
 @draw_option

@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +17,9 @@ if TYPE_CHECKING:
     from loopcal.measure import Measurements
     from loopcal.mechanism import Mechanism
 
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+"""Adds an option to the function of a command."""
+
 FILE = click.Path(path_type=Path)
 
 robot_argument = click.argument("robot", metavar="ROBOT")
@@ -30,7 +32,7 @@ verbose_option = click.option(
 )
 
 
-class Quantity(click.ParamType):
+class Quantity(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
     """A number with its unit on the command line, such as 0.02mm; its value is in SI."""
 
     name = "quantity"
@@ -54,50 +56,69 @@ LENGTH = Quantity(Dimension.LENGTH)
 ANGLE = Quantity(Dimension.ANGLE)
 
 
-def force_option(what: str) -> Callable[..., Any]:
+def add_options(*options: Decorator) -> Decorator:
+    """Return a decorator that adds options to a command, in the order of its help."""
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+def force_option(what: str) -> Decorator:
     """Return the option that lets a command replace what exists."""
     return click.option("--force", is_flag=True, help=f"Replace {what} if it exists.")
 
 
-def seed_option(what: str) -> Callable[..., Any]:
+def seed_option(what: str) -> Decorator:
     """Return the option for the seed of something random."""
-    kind = click.IntRange(min=0)
-    text = f"Seed of {what}."
-    return click.option("--seed", type=kind, default=1, show_default=True, help=text)
+    return click.option("--seed", type=click.IntRange(min=0), default=1, help=f"Seed of {what}.")
 
 
-def limit_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add limits on the errors: where one is exceeded, the exit code is 2."""
-    for name, kind, quantity, example in (
-        ("--limit-angle", ANGLE, "orientation", "0.01deg"),
-        ("--limit-position", LENGTH, "position", "0.02mm"),
-    ):
-        text = (
-            f"Largest allowed {quantity} error on poses that were not fitted, such as {example}; "
-            "above it the exit code is 2."
-        )
-        command = click.option(name, type=kind, metavar="QUANTITY", help=text)(command)
-    return command
+def format_option(names: Sequence[str], help_text: str) -> Decorator:
+    """Return the option for the format of a file of another program."""
+    return click.option("--format", "format_name", type=click.Choice(names), help=help_text)
 
 
-def data_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the flags that accept suspicious measurements; the command gets them as `allowed`."""
-    flags = {
-        "allow_duplicates": "Accept rows that repeat another row to the last digit.",
-        "allow_implausible": "Accept values that fit far better in another unit, order, sign or "
-        "column.",
-        "allow_outside_stroke": "Accept readings outside the stroke of their actuator.",
-        "allow_still": "Accept a target that does not move from pose to pose.",
-    }
+def _limit_option(name: str, kind: Quantity, quantity: str, example: str) -> Decorator:
+    text = f"Largest allowed {quantity} error on poses that were not fitted, such as {example}"
+    return click.option(name, type=kind, help=f"{text}; above it the exit code is 2.")
 
-    @functools.wraps(command)
-    def packed(**given: Any) -> Any:
-        allowed = {name: given.pop(name) for name in flags}
-        return command(**given, allowed=allowed)
 
-    for name, what in flags.items():
-        packed = click.option("--" + name.replace("_", "-"), is_flag=True, help=what)(packed)
-    return packed
+limit_options = add_options(
+    _limit_option("--limit-position", LENGTH, "position", "0.02mm"),
+    _limit_option("--limit-angle", ANGLE, "orientation", "0.01deg"),
+)
+"""Decorator for limits on the errors."""
+
+DATA_FLAGS = {
+    "allow_still": "Accept a target that does not move from pose to pose.",
+    "allow_outside_stroke": "Accept readings outside the stroke of their actuator.",
+    "allow_implausible": "Accept values that fit far better in another unit, order, sign or "
+    "column.",
+    "allow_duplicates": "Accept rows that repeat another row to the last digit.",
+}
+
+data_options = add_options(
+    *(
+        click.option("--" + name.replace("_", "-"), is_flag=True, help=text)
+        for name, text in DATA_FLAGS.items()
+    )
+)
+"""Decorator for the flags that accept suspicious measurements; `take_flags` takes their values."""
+
+
+def take_flags(options: Mapping[str, Any]) -> dict[str, bool]:
+    """Return the values of `data_options`, for `read_checked_measurements`."""
+    return {name: options[name] for name in DATA_FLAGS}
+
+
+def name_option(name: str) -> str:
+    """Return the option of the running command that has this name in its function."""
+    parameters = click.get_current_context().command.params
+    return next(option.opts[-1] for option in parameters if option.name == name)
 
 
 def is_given(name: str) -> bool:
@@ -111,11 +132,11 @@ def refuse_given(names: Iterable[str], reason: str) -> None:
 
     Parameters
     ----------
-    reason : a clause that begins with "because".
+    reason : a clause such as "because ..." or "with --profile".
     """
     for name in names:
         if is_given(name):
-            raise DataError(f"--{name.replace('_', '-')} has no effect {reason}; leave it out")
+            raise DataError(f"{name_option(name)} has no effect {reason}; leave it out")
 
 
 def read_checked_measurements(

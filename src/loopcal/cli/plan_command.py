@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from loopcal.cli import terminal
-from loopcal.cli.constraint_options import ConstraintArguments, Goal, constraint_options
+from loopcal.cli.constraint_options import Goal, constraint_options, make_constraints
 from loopcal.cli.hints import hint_for
 from loopcal.cli.instrument_options import (
     DESCRIPTION,
@@ -26,6 +26,7 @@ from loopcal.cli.options import (
     force_option,
     is_given,
     json_option,
+    name_option,
     read_checked_measurements,
     robot_argument,
     seed_option,
@@ -35,7 +36,7 @@ from loopcal.errors import DataError
 if TYPE_CHECKING:
     from loopcal.measure import Instrument, Measurements
     from loopcal.mechanism import Mechanism
-    from loopcal.planning import Plan, PlanOptions, SurfacePlan
+    from loopcal.planning import Constraints, Plan, PlanOptions, SurfacePlan
 
 PLANE_LINE = "plane-line"
 """Word of --measure for points on planes and lines that a coordinate measuring machine holds."""
@@ -57,7 +58,7 @@ EXCLUDED_BY_PLANE_LINE = {
 """Options that have no effect with --measure plane-line, and why."""
 
 
-@click.command(short_help="Plan which poses to measure, and write a sheet for them.")
+@click.command()
 @robot_argument
 @click.option("-o", "--output", required=True, type=FILE, help="Folder to make.")
 @click.option(
@@ -66,14 +67,12 @@ EXCLUDED_BY_PLANE_LINE = {
 @click.option(
     "--accuracy",
     type=Goal(),
-    metavar="QUANTITY",
     help="Instead of --poses: expected error to reach, such as 20um or 10urad.",
 )
 @click.option(
     "--criterion",
     type=click.Choice(("I", "D")),
     default="I",
-    show_default=True,
     help="What the plan minimizes: I the mean predicted variance of poses, D the uncertainty of "
     "the parameters.",
 )
@@ -121,7 +120,6 @@ EXCLUDED_BY_PLANE_LINE = {
     "--candidates",
     type=click.IntRange(min=10),
     default=1000,
-    show_default=True,
     help="Number of candidate poses to draw.",
 )
 @click.option(
@@ -141,7 +139,6 @@ def plan(
     seed: int,
     force: bool,
     as_json: bool,
-    constraint_arguments: ConstraintArguments,
     **options: Any,
 ) -> None:
     """Plan which poses of ROBOT to measure with an instrument. Write a folder with a sheet for the
@@ -168,7 +165,7 @@ def plan(
     if options["measure"] == PLANE_LINE:
         _refuse_beside_plane_line()
         result = _plan_surfaces(
-            machine, groups, points, options["sigma_position"], constraint_arguments, seed
+            machine, groups, points, options["sigma_position"], make_constraints(options), seed
         )
         files = _write_surface_plan(output, result, _list_inputs(robot), seed, force)
         document = result.to_dict()
@@ -176,9 +173,7 @@ def plan(
         if groups is not None or points is not None:
             raise DataError("--groups and --points belong to --measure plane-line; leave them out")
         instrument = _find_instrument(machine, like, options)
-        plan_options = _make_plan_options(
-            machine, allowed, measured, seed, constraint_arguments, options
-        )
+        plan_options = _make_plan_options(machine, allowed, measured, seed, options)
         from loopcal.planning import plan as plan_poses
 
         with terminal.ProgressBar() as progress:
@@ -214,8 +209,7 @@ def _find_instrument(robot: Mechanism, like: Path | None, options: Mapping[str, 
     for name in DESCRIPTION:
         if is_given(name):
             raise DataError(
-                f"--like {like} describes the instrument; leave out --{name.replace('_', '-')}, or "
-                "--like"
+                f"--like {like} describes the instrument; leave out {name_option(name)}, or --like"
             )
     return load_instrument_to_plan(like, robot)
 
@@ -225,7 +219,6 @@ def _make_plan_options(
     allowed: Path | None,
     measured: tuple[Path, ...],
     seed: int,
-    constraint_arguments: ConstraintArguments,
     options: Mapping[str, Any],
 ) -> PlanOptions:
     """Return the options of the library."""
@@ -248,7 +241,7 @@ def _make_plan_options(
         target=target,
         goal=goal,
         hold_out=options["hold_out"],
-        constraints=constraint_arguments.to_constraints(),
+        constraints=make_constraints(options),
         allowed_poses=None if allowed is None else load_poses(allowed, robot),
         n_candidates=options["candidates"],
         measured=earlier,
@@ -319,11 +312,10 @@ def _write_plan(output: Path, result: Plan, inputs: Mapping[str, Path], force: b
 
 def _refuse_beside_plane_line() -> None:
     """Raise DataError for the first option that has no effect with --measure plane-line."""
-    for option in click.get_current_context().command.params:
-        reason = EXCLUDED_BY_PLANE_LINE.get(option.name or "")
-        if reason is not None and is_given(option.name or ""):
+    for name, reason in EXCLUDED_BY_PLANE_LINE.items():
+        if is_given(name):
             raise DataError(
-                f"{option.opts[-1]} cannot be combined with --measure plane-line, {reason}; "
+                f"{name_option(name)} cannot be combined with --measure plane-line, {reason}; "
                 "leave it out"
             )
 
@@ -333,7 +325,7 @@ def _plan_surfaces(
     groups: int | None,
     points: int | None,
     sigma: float,
-    constraint_arguments: ConstraintArguments,
+    constraints: Constraints,
     seed: int,
 ) -> SurfacePlan:
     """Plan groups of points on planes and lines."""
@@ -343,7 +335,7 @@ def _plan_surfaces(
         GROUPS if groups is None else groups,
         POINTS if points is None else points,
         sigma,
-        constraint_arguments.to_constraints(),
+        constraints,
         seed,
     )
     with terminal.ProgressBar() as progress:

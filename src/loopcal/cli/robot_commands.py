@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from loopcal.measure import Instrument
 
 
-@click.command(short_help="Write a robot file, and a measurement file, to fill in.")
+@click.command()
 @click.argument("family", metavar="FAMILY")
 @click.option(
     "-o", "--output", required=True, type=FILE, help="Robot file to write; the robot gets its name."
@@ -80,7 +80,7 @@ def _format_template(robot_text: str, instrument: Instrument) -> str:
         return format_template(load_robot(path), instrument)
 
 
-@click.command(short_help="Read a robot file and show what it contains.")
+@click.command()
 @robot_argument
 @click.option(
     "--plot",

@@ -23,7 +23,7 @@ HEADING = 18
 """Characters of a line of a heading."""
 
 
-@click.command(short_help="Repeat a published study and compare its numbers.")
+@click.command()
 @click.argument("paper", metavar="[PAPER]", required=False)
 @click.option(
     "-o",
@@ -32,7 +32,7 @@ HEADING = 18
     metavar="FOLDER",
     help="Folder for a page, all tables (CSV, JSON) and figures (PNG).",
 )
-@click.option("--seed", default=0, show_default=True, help="Seed of all random choices.")
+@click.option("--seed", default=0, help="Seed of all random choices.")
 @click.option(
     "--trials",
     type=int,
