@@ -5,13 +5,18 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loopcal.errors import MechanismError
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
+
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 SCOPES = ("machine", "session", "group", "pose")
 
@@ -43,47 +48,46 @@ class ParameterTable:
     """Parameters in a fixed order; arrays over it are (p,) and read-only."""
 
     entries: tuple[Parameter, ...]
-    _places: dict[str, int] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        places: dict[str, int] = {}
-        for i, entry in enumerate(self.entries):
-            if entry.name in places:
-                raise MechanismError(
-                    f"duplicate parameter {entry.name!r}; give every parameter its own name"
-                )
-            places[entry.name] = i
-        object.__setattr__(self, "_places", places)
+        if len(self._places) < len(self.entries):
+            duplicate = next(name for name in self.names if self.names.count(name) > 1)
+            raise MechanismError(
+                f"duplicate parameter {duplicate!r}; give every parameter its own name"
+            )
 
     def __len__(self) -> int:
         return len(self.entries)
 
-    @property
+    @cached_property
+    def _places(self) -> dict[str, int]:
+        return {entry.name: i for i, entry in enumerate(self.entries)}
+
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Names in order."""
         return tuple(p.name for p in self.entries)
 
-    @property
+    @cached_property
     def dimensions(self) -> tuple[Dimension, ...]:
         """Dimensions in order."""
         return tuple(p.dimension for p in self.entries)
 
-    @property
+    @cached_property
     def nominal(self) -> FloatArray:
         """Nominal values (p,) [SI]."""
-        return _frozen(p.nominal for p in self.entries)
+        return _freeze(np.array([p.nominal for p in self.entries], dtype=float))
 
-    @property
+    @cached_property
     def tolerance(self) -> FloatArray:
         """Tolerances (p,) as standard deviations [SI], NaN if none is stated."""
-        return _frozen(np.nan if p.tolerance is None else p.tolerance for p in self.entries)
+        # None becomes NaN
+        return _freeze(np.array([p.tolerance for p in self.entries], dtype=float))
 
-    @property
+    @cached_property
     def free(self) -> BoolArray:
         """Parameters (p,) to be identified."""
-        free = np.array([p.free for p in self.entries], dtype=bool)
-        free.setflags(write=False)
-        return free
+        return _freeze(np.array([p.free for p in self.entries], dtype=bool))
 
     def index(self, name: str) -> int:
         """Return the position of a parameter; raises MechanismError with similar names."""
@@ -98,7 +102,7 @@ class ParameterTable:
         return ParameterTable(tuple(replace(p, free=p.name in chosen) for p in self.entries))
 
 
-def _frozen(values: Iterable[float]) -> FloatArray:
-    array = np.array(list(values), dtype=float)
+def _freeze(array: NDArray[Scalar]) -> NDArray[Scalar]:
+    """Return the array, made read-only."""
     array.setflags(write=False)
     return array

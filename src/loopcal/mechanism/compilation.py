@@ -22,6 +22,7 @@ from loopcal.mechanism.batch_kinematics import (
 from loopcal.mechanism.mobility import check_mobility, find_idle_joints, refuse_uncontrolled
 from loopcal.mechanism.model import Mechanism, SlotMap
 from loopcal.mechanism.platform_coordinates import read_coordinates
+from loopcal.mechanism.states import make_start
 from loopcal.mechanism.transmission import TERMS, harmonic_frequencies, nominal_terms
 from loopcal.parameters import ParameterTable
 from loopcal.typing import IntArray
@@ -56,16 +57,16 @@ def build(
     """
     check_assembly(assembly)
     table = ParameterTable(assembly.parameters)
-    wanted = {m.address for m in assembly.maps} | {a for s in assembly.shared for a in s.outputs}
-    _check_addresses(assembly, wanted)
+    slots = _find_slots(assembly)
     freedoms = tuple(AXES.index(f) for f in AXES if f in assembly.freedoms)
     size, a = compute_characteristic_length(assembly), len(assembly.actuators)
-    groups, _, count = _group_limbs(assembly, wanted, {})
-    idle = find_idle_joints(
-        Program(groups, freedoms, size, count, a), _make_first_guess(assembly, groups)
-    )
+    groups, places, count = _group_limbs(assembly, slots, {})
+    guess = _make_first_guess(assembly, groups)
+    idle = find_idle_joints(Program(groups, freedoms, size, count, a), guess)
     _check_drives(assembly, idle)
-    groups, places, count = _group_limbs(assembly, wanted, idle)
+    if idle:
+        groups, places, count = _group_limbs(assembly, slots, idle)
+        guess = _make_first_guess(assembly, groups)
     weights = _weigh_actuators(assembly, groups, freedoms)
     robot = Mechanism(
         assembly,
@@ -74,9 +75,9 @@ def build(
         Program(groups, freedoms, size, count, a, weights),
         _map_slots(assembly, table, places, count),
         size,
-        _make_first_guess(assembly, groups),
+        guess,
         {**DEFAULT_UNITS, **(units or {})},
-        tuple(_report_locked(assembly, i, j) for i in sorted(idle) for j in idle[i]),
+        tuple(_report_locked(assembly.limbs[i], j) for i in sorted(idle) for j in idle[i]),
         record,
     )
     return check_mobility(replace(robot, home_state=_find_home(robot)))
@@ -98,50 +99,53 @@ def compute_characteristic_length(assembly: Assembly) -> float:
     feet = [limb.links[0].transform[:3, 3] for limb in assembly.limbs]
     spread = np.concatenate([gaps, reach, np.subtract(feet, np.mean(feet, axis=0))])
     size = float(np.sqrt((spread**2).sum() / len(gaps)))
-    links = [
-        float(np.linalg.norm(link.transform[:3, 3]))
-        for limb in assembly.limbs
-        for link in (*limb.links, limb.attachment)
+    ends = [
+        link.transform[:3, 3] for limb in assembly.limbs for link in (*limb.links, limb.attachment)
     ]
-    links += [limb.length for limb in assembly.limbs]
-    if size > POINT * max(links):
+    lengths = [*np.linalg.norm(ends, axis=1), *(limb.length for limb in assembly.limbs)]
+    if size > POINT * max(lengths):
         return size
-    return float(np.sqrt(np.mean(np.square(links)))) or DEFAULT_SIZE
+    return float(np.sqrt(np.mean(np.square(lengths)))) or DEFAULT_SIZE
 
 
-def _check_addresses(assembly: Assembly, wanted: set[Address]) -> None:
-    """Refuse maps onto addresses that the mechanism does not have."""
+def _find_slots(assembly: Assembly) -> dict[str, dict[Address, Slot]]:
+    """Return the slots of the addresses that parameters change, limb by limb.
+
+    Refuses maps onto addresses that the mechanism does not have.
+    """
     limbs = {limb.name: limb for limb in assembly.limbs}
     actuators = {a.name for a in assembly.actuators}
-    for address in sorted(wanted, key=str):
-        if (
-            address.owner in actuators
-            and address.element == "transmission"
-            and address.axis in TERMS
-        ):
+    slots: dict[str, dict[Address, Slot]] = {name: {} for name in limbs}
+    addresses = dict.fromkeys(m.address for m in assembly.maps)
+    addresses |= dict.fromkeys(a for s in assembly.shared for a in s.outputs)
+    unknown = []
+    for address in addresses:
+        is_term = address.element == "transmission" and address.axis in TERMS
+        if is_term and address.owner in actuators:
             continue
-        if address.owner in limbs and _find_slot(limbs[address.owner], address) is not None:
-            continue
+        slot = _find_slot(limbs[address.owner], address) if address.owner in limbs else None
+        if slot is None:
+            unknown.append(str(address))
+        else:
+            slots[address.owner][address] = slot
+    if unknown:
         raise MechanismError(
-            f"a parameter is mapped onto {address}, which this mechanism does not have; correct "
-            "the map"
+            f"a parameter is mapped onto {min(unknown)}, which this mechanism does not have; "
+            "correct the map"
         )
+    return slots
 
 
 def _find_slot(limb: Limb, address: Address) -> Slot | None:
     """Return the slot of an address in a limb, None if the limb does not have it."""
     joints = [j.name for j in limb.joints]
     if address.axis == "length":
-        return (
-            Slot(len(joints), engine.LENGTH)
-            if limb.ending == "distance" and address.element == "rod"
-            else None
-        )
+        is_rod = limb.ending == "distance" and address.element == "rod"
+        return Slot(len(joints), engine.LENGTH) if is_rod else None
     if address.axis == "pitch":
-        turning = (
-            address.element in joints and limb.joints[joints.index(address.element)].kind == "R"
-        )
-        return Slot(joints.index(address.element), engine.PITCH) if turning else None
+        turning = [j.name if j.kind == "R" else None for j in limb.joints]
+        is_screw = address.element in turning
+        return Slot(turning.index(address.element), engine.PITCH) if is_screw else None
     links = [*(link.name for link in limb.links), limb.attachment.name]
     if address.element not in links or address.axis not in AXES:
         return None
@@ -163,33 +167,35 @@ def _check_drives(assembly: Assembly, idle: Mapping[int, tuple[int, ...]]) -> No
 
 
 def _group_limbs(
-    assembly: Assembly, wanted: set[Address], locked: Mapping[int, tuple[int, ...]]
+    assembly: Assembly,
+    slots_by_limb: Mapping[str, Mapping[Address, Slot]],
+    locked: Mapping[int, tuple[int, ...]],
 ) -> tuple[tuple[Group, ...], dict[Address, int], int]:
     """Group limbs of one structure and of the same locked joints; place displacements in e.
 
     Returns the groups, the place of each address and the length of e.
     """
-    alike: dict[tuple, list[int]] = {}
+    alike: dict[tuple[Any, ...], list[int]] = {}
     for i, limb in enumerate(assembly.limbs):
-        drives = tuple(bool(j.actuator) for j in limb.joints), bool(limb.actuator)
-        kinds = tuple(j.kind for j in limb.joints)
-        alike.setdefault((limb.ending, kinds, drives, locked.get(i, ())), []).append(i)
+        structure = tuple((j.kind, bool(j.actuator)) for j in limb.joints), bool(limb.actuator)
+        alike.setdefault((limb.ending, structure, locked.get(i, ())), []).append(i)
     groups, places, count = [], {}, 0
-    for (ending, kinds, _, fixed), members in alike.items():
-        limbs = [assembly.limbs[i] for i in members]
-        by_limb = [{a: _find_slot(m, a) for a in wanted if a.owner == m.name} for m in limbs]
-        used = {slot for slots_of_limb in by_limb for slot in slots_of_limb.values() if slot}
+    for members in alike.values():
+        limbs, fixed = [assembly.limbs[i] for i in members], locked.get(members[0], ())
+        kinds, ending = "".join(j.kind for j in limbs[0].joints), limbs[0].ending
+        used = {slot for m in limbs for slot in slots_by_limb[m.name].values()}
         slots = tuple(sorted(used, key=lambda s: (s.element, s.axis)))
+        column = {slot: i for i, slot in enumerate(slots)}
         first = count
-        for slots_of_limb in by_limb:
-            places |= {a: count + slots.index(s) for a, s in slots_of_limb.items() if s}
+        for m in limbs:
+            places |= {a: count + column[slot] for a, slot in slots_by_limb[m.name].items()}
             count += len(slots)
         transforms = [[link.transform for link in (*m.links, m.attachment)] for m in limbs]
         pitch = np.array([[j.pitch for j in m.joints] for m in limbs])
         groups.append(
             Group(
                 tuple(members),
-                "".join(kinds),
+                kinds,
                 _number_actuators(assembly, limbs),
                 tuple(j in fixed for j in range(len(kinds))),
                 ending,
@@ -250,15 +256,13 @@ def _weigh_actuators(
     return tuple(s / max(sigma) for s in sigma)
 
 
-def _report_locked(assembly: Assembly, limb: int, joint: int) -> Finding:
+def _report_locked(limb: Limb, place: int) -> Finding:
     """Return the finding of a joint that moves nothing but its limb."""
-    owner, turns = assembly.limbs[limb], assembly.limbs[limb].joints[joint].kind == "R"
+    joint = limb.joints[place]
+    turns = joint.kind == "R"
+    value = Quantity(joint.start, "rad" if turns else "m")
     return report_finding(
-        "mechanism.locked-joint",
-        limb=owner.name,
-        joint=owner.joints[joint].name,
-        turns=turns,
-        value=Quantity(owner.joints[joint].start, "rad" if turns else "m"),
+        "mechanism.locked-joint", limb=limb.name, joint=joint.name, turns=turns, value=value
     )
 
 
@@ -286,21 +290,11 @@ def _map_slots(
 
 def _make_first_guess(assembly: Assembly, groups: tuple[Group, ...]) -> State:
     """Return the start of the search for home: the home pose with every joint at its `start`."""
-    joints = []
-    for group in groups:
-        limbs = [assembly.limbs[i] for i in group.limbs]
-        joints.append(
-            np.array([[*(j.start for j in limb.joints), 0.0] for limb in limbs])[None, None]
-        )
-    zero = np.zeros((1, 1))
-    return State(
-        assembly.home[None, None],
-        tuple(joints),
-        zero.astype(np.int8),
-        zero,
-        zero.astype(np.int64),
-        zero.astype(np.int8),
+    joints = (
+        [[*(j.start for j in assembly.limbs[i].joints), 0.0] for i in group.limbs]
+        for group in groups
     )
+    return make_start(assembly.home[None, None], tuple(np.array([[rows]]) for rows in joints))
 
 
 def _find_home(robot: Mechanism) -> State:
@@ -333,4 +327,6 @@ def _find_home(robot: Mechanism) -> State:
             f"{state.residual[0, 0] * 1e3:.3g} mm stay open; check the joint centers, the lengths "
             "and `home:`"
         )
-    return replace(state, closure_sign=compute_closure_sign(robot, values, state))
+    if shared:
+        return replace(state, closure_sign=compute_closure_sign(robot, values, state))
+    return state

@@ -4,7 +4,8 @@
 Linearized closure reads A y + E de + Q dq = 0. With more actuators than freedoms each limb has one
 actuator and one equation, so Q is diagonal and dq = -Q^-1 (A y + E de); the passive joints of the
 limb follow. Pose and parameters are independent here. `differentiate_pose` answers the other
-question, in which readings are given and contradict each other. Derivation: docs/theory/uncertain-readings.md.
+question, in which readings are given and contradict each other. Derivation:
+docs/theory/uncertain-readings.md.
 """
 
 from __future__ import annotations

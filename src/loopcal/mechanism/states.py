@@ -44,6 +44,13 @@ def is_closed(status: np.ndarray) -> BoolArray:
     return (status == Status.CONVERGED) | (status == Status.OTHER_MODE)
 
 
+def make_start(T: FloatArray, joints: tuple[FloatArray, ...]) -> State:
+    """Return the state (t, n) of platforms and joints from which an iteration starts."""
+    zero = np.zeros(T.shape[:2])
+    none = zero.astype(np.int8)
+    return State(T, joints, none, zero, zero.astype(np.int64), none)
+
+
 def _map_arrays(make: Callable[..., np.ndarray], *states: State) -> State:
     """Return the state whose every array is made from the same array of the given states."""
     made = {}

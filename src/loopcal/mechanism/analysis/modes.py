@@ -25,7 +25,7 @@ from loopcal.mechanism.batch_kinematics import (
 )
 from loopcal.mechanism.kinematics import Solution, make_solution
 from loopcal.mechanism.model import Mechanism
-from loopcal.mechanism.states import Status, driven_values, join_states, select_poses
+from loopcal.mechanism.states import Status, driven_values, join_states, make_start, select_poses
 from loopcal.mechanism.transmission import joints_from_readings
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
@@ -291,7 +291,4 @@ def _draw_starts(robot: Mechanism, rng: np.random.Generator, n: int) -> State:
             elif letter == "P":
                 values[..., j] += size * rng.normal(size=values.shape[:-1])
         joints.append(values)
-    zero = np.zeros((1, n))
-    none = zero.astype(np.int8)
-    T = geometry.make_pose(R, position)[None]
-    return State(T, tuple(joints), none, zero, zero.astype(np.int64), none)
+    return make_start(geometry.make_pose(R, position)[None], tuple(joints))
