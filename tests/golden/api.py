@@ -734,7 +734,7 @@ def report_plan(
         "efficiency": plan.quality.efficiency,
         "expected": [errors.after.position, errors.after.orientation],
         "length": poses.path_length,
-        "considered": plan.quality.considered,
+        "considered": plan.quality.n_candidates,
     }
     if errors.random is not None:
         result["even"] = [errors.random.position, errors.random.orientation]
@@ -767,7 +767,12 @@ def report_coordinate_exchange(
     wanted = {"D": D(), "A": A()}[criterion]
     start = PriorInformation.none(len(planned.free))
     found = coordinate_exchange(
-        planned.linearize_indexed, first, planned.list_levels(), wanted, start, sweeps=sweeps
+        lambda _, design: planned.linearize(design),
+        first,
+        planned.list_levels(),
+        wanted,
+        start,
+        sweeps=sweeps,
     )
     return {
         "first": first,

@@ -164,7 +164,7 @@ def test_one_sweep_of_coordinate_exchange_makes_the_sd_at_least_three_times_smal
     planned = PlaneLineGroups(robot, 10, MM, ("z",))
     first = planned.draw(10, 3)
     found = coordinate_exchange(
-        planned.linearize_indexed,
+        lambda _, design: planned.linearize(design),
         first,
         planned.list_levels(),
         D(),

@@ -246,9 +246,9 @@ def test_kinds_that_compare_poses_are_planned_in_pairs(callipers):
     content = {"fitted": 12, "held_out": 2, "counted": "pairs", "poses": len(found.poses)}
     assert content.items() <= by_code["plan.poses"].items()
     assert by_code["plan.certificate"]["counted"] == "pairs"
-    assert by_code["plan.certificate"]["considered"] == found.quality.considered
+    assert by_code["plan.certificate"]["candidates"] == found.quality.n_candidates
     assert by_code["plan.frames-undetermined"]["frames"] == ("base",)
-    assert found.quality.considered == comb(len(callipers.candidates) - len(judged), 2)
+    assert found.quality.n_candidates == comb(len(callipers.candidates) - len(judged), 2)
     assert groups.shape[1] == 2
     held = held_out[groups]
     assert (held.all(axis=1) | ~held.any(axis=1)).all()
@@ -273,14 +273,14 @@ def test_no_choice_of_pairs_beats_what_is_said_of_pairs_not_even_all_pairs_of_fe
     assert 12 < 2 * needed.at_least <= 2 * pairs == 132
     finding = needed.report(callipers.robot)
     assert finding.code == "plan.goal-reached"
-    numbers = {"number": needed.enough, "at_least": needed.at_least, "considered": len(members)}
+    numbers = {"number": needed.enough, "at_least": needed.at_least, "candidates": len(members)}
     assert ({"counted": "pairs", "decided_by_equations": False} | numbers).items() <= (
         finding.data.items()
     )
     assert needed.to_dict()["counted"] == "pairs"
 
 
-def test_of_many_poses_the_pairs_considered_are_different_and_tell_more_than_as_many_drawn():
+def test_of_many_poses_the_candidate_pairs_are_different_and_tell_more_than_as_many_drawn():
     robot, seen_by = load_robot("linear-delta"), instrument_of("separation")
     free, q = select_free_parameters(robot), sample_workspace(robot, 400, seed=2).solution.q
     mounted = seen_by.with_tool(robot)

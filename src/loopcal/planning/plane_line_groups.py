@@ -33,16 +33,15 @@ from loopcal.findings import report_finding
 from loopcal.mechanism import (
     POSITION,
     Mechanism,
-    Status,
     compute_closure_sign,
-    compute_readings,
     differentiate_pose,
     evaluate_limits,
-    inverse_trials,
+    inverse,
     pose_from_coordinates,
     workspace_ranges,
 )
 from loopcal.numerics.elimination import eliminate_columns
+from loopcal.planning.constraints import ConstraintChecker
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 AXIS = 3
@@ -132,13 +131,6 @@ class PlaneLineGroups:
             names += [f"p{i}.a", f"p{i}.b", *(f"p{i}.{n}" for n in turns)]
         return tuple(names)
 
-    @cached_property
-    def _home_sign(self) -> int:
-        """Sign of the determinant at home: another one is beyond a singularity."""
-        return int(
-            compute_closure_sign(self.robot, self.robot.values[None], self.robot.home_state)[0, 0]
-        )
-
     def list_levels(self, fractions: Sequence[float] = LEVELS) -> tuple[FloatArray, ...]:
         """Return the levels to try, coordinate by coordinate."""
         axis = np.array([POSITION.index(name) for name in self.axes], dtype=np.float64)
@@ -197,21 +189,22 @@ class PlaneLineGroups:
         order = [names.index(name) for name in self.robot.controlled]
         return self._shift_to_platform(coordinates[:, :, order])
 
-    def linearize(self, design: FloatArray) -> FloatArray:
+    def linearize(self, design: FloatArray, checker: ConstraintChecker | None = None) -> FloatArray:
         """Return the rows of groups for the machine, the surfaces eliminated.
 
         Parameters
         ----------
-        design : (u, c).
+        design : (u, c). checker : further constraints on the poses.
 
         Returns
         -------
         rows : (u, k - 2, p) divided by sigma, by deviations in tolerances; NaN for a group with a
-            pose out of reach, too short a line, or points that do not determine the surfaces.
+            pose that is out of reach or not allowed, too short a line, or points that do not
+            determine the surfaces.
         """
         x = self.place_points(design)
         different, back = np.unique(x.reshape(-1, x.shape[2]), axis=0, return_inverse=True)
-        T, J, reached = self._linearize_points(different)
+        T, J, reached = self._linearize_points(different, checker)
         back = back.reshape(x.shape[:2])
         points = (T[:, :3, :3] @ self.robot.tool[:3, 3] + T[:, :3, 3])[back]
         F, A = linearize_surfaces(points, J[back], self._axis(design))
@@ -219,13 +212,6 @@ class PlaneLineGroups:
         allowed = determined & reached[back].all(axis=1)
         allowed &= self._line_length(design) >= self.shortest
         return np.where(allowed[:, None, None], rows / self.sigma, np.nan)
-
-    def linearize_indexed(self, indices: IntArray, design: FloatArray) -> FloatArray:
-        """Return `linearize(design)`, as `coordinate_exchange` asks for it: all groups are alike,
-        whatever their indices.
-        """
-        del indices
-        return self.linearize(design)
 
     def _axis(self, design: FloatArray) -> IntArray:
         return np.rint(design[:, AXIS]).astype(np.int64)
@@ -262,24 +248,25 @@ class PlaneLineGroups:
         moved[..., [names.index(name) for name in POSITION]] -= offset
         return moved
 
-    def _linearize_points(self, x: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def _linearize_points(
+        self, x: FloatArray, checker: ConstraintChecker | None = None
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return poses (n, 4, 4), derivatives (n, 3, p) of the origin of the tool by deviations in
-        tolerances, and which rows of x (n, c) are reached.
+        tolerances, and which rows of x (n, c) are reached and allowed.
         """
-        robot, free = self.robot, self.free
-        values = robot.values[None]
-        state = inverse_trials(robot, values, x[None])
-        q = compute_readings(robot, values, state)
-        reached = (state.status == Status.CONVERGED) & (state.closure_sign == self._home_sign)
+        robot, free, values = self.robot, self.free, self.robot.values[None]
+        solution = inverse(robot, x)
+        state, q = solution.state, solution.q[None]
+        home_sign = compute_closure_sign(robot, values, robot.home_state)
+        reached = solution.converged & (state.closure_sign == home_sign)[0]
         for limit in evaluate_limits(robot, values, q, state):
-            reached = reached & (limit.margin >= 0.0)
-        D = (
-            differentiate_pose(robot, values, q, state).parameters[0][..., free.places]
-            * free.tolerance
-        )
-        reached = reached[0] & np.isfinite(D).all(axis=(1, 2))
-        T = np.where(reached[:, None, None], state.T[0], np.eye(4))
-        D = np.where(reached[:, None, None], D, 0.0)
+            reached = reached & (limit.margin[0] >= 0.0)
+        if checker is not None:
+            reached = reached & checker.check_poses(solution).allowed
+        D = differentiate_pose(robot, values, q, state).parameters[0][..., free.places]
+        reached = reached & np.isfinite(D).all(axis=(1, 2))
+        T = np.where(reached[:, None, None], solution.T, np.eye(4))
+        D = np.where(reached[:, None, None], D * free.tolerance, 0.0)
         arm = T[:, :3, :3] @ robot.tool[:3, 3]
         return T, D[:, 3:] - geometry.hat(arm) @ D[:, :3], reached
 

@@ -88,8 +88,8 @@ class SurfacePlan:
         """Return the role of each point of a group: on both, on the line, in the plane."""
         return ("p0", "p1", *["plane"] * (self.poses.groups.shape[1] - 2))
 
-    def list_held(self, group: int, point: int) -> tuple[str, ...]:
-        """Return the coordinates in which a point must agree with p0 of its group."""
+    def list_fixed_coordinates(self, group: int, point: int) -> tuple[str, ...]:
+        """Return the coordinates that a point must share with p0 of its group."""
         along = POSITION[self.axis[group]]
         across = tuple(name for name in POSITION if name != along)
         return {0: POSITION, 1: across}.get(point, (along,))
@@ -155,7 +155,7 @@ class SurfacePlan:
                 "name": row["name"],
                 "group": f"group{i // k + 1}",
                 "role": roles[i % k],
-                "hold": list(self.list_held(i // k, i % k)),
+                "hold": list(self.list_fixed_coordinates(i // k, i % k)),
                 **{name: row[name] for name in ("via_home", "commanded", "readings")},
             }
             for i, row in enumerate(rows)
@@ -213,7 +213,7 @@ def plan_surfaces(
             )
         )
     best = coordinate_exchange(
-        lambda _, design: _linearize_allowed(groups, checker, design),
+        lambda _, design: groups.linearize(design, checker),
         designs[: options.groups],
         groups.list_levels(),
         D(),
@@ -274,7 +274,7 @@ def _draw_allowed(
     total = 0
     while sum(map(len, designs)) < enough:
         new = groups.draw(enough, rng)
-        new_rows = _linearize_allowed(groups, checker, new)
+        new_rows = groups.linearize(new, checker)
         allowed = is_allowed(new_rows)
         designs.append(new[allowed])
         rows.append(new_rows[allowed])
@@ -292,19 +292,6 @@ def _draw_allowed(
                 )
             )
     return np.concatenate(designs), np.concatenate(rows)
-
-
-def _linearize_allowed(
-    groups: PlaneLineGroups, checker: ConstraintChecker, design: FloatArray
-) -> FloatArray:
-    """Return rows (u, k - 2, p) of groups, NaN where a pose violates a constraint."""
-    rows = groups.linearize(design)
-    finite = np.flatnonzero(is_allowed(rows))
-    x = groups.place_points(design[finite])
-    check = checker.check_poses(inverse(groups.robot, x.reshape(-1, x.shape[2])))
-    allowed = check.allowed.reshape(x.shape[:2]).all(axis=1)
-    rows[finite[~allowed]] = np.nan
-    return rows
 
 
 def _require_paths(checker: ConstraintChecker, x: FloatArray) -> BoolArray:

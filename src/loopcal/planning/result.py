@@ -98,12 +98,12 @@ class DesignQuality:
     figures : D, I, A and E, in tolerances.
     efficiency : lower bound on the efficiency relative to the best possible choice: (ratio of
         determinants)^(1/p) for D, ratio of variances for I.
-    considered : number of candidate groups; the efficiency holds among them.
+    n_candidates : number of candidate groups; the efficiency holds among them.
     """
 
     figures: Mapping[str, float]
     efficiency: float
-    considered: int
+    n_candidates: int
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ class Plan:
             shortfall=round_shortfall(efficiency),
             chosen=self.n_groups,
             counted=name_groups(self.poses.groups.shape[1]),
-            considered=self.quality.considered,
+            candidates=self.quality.n_candidates,
             criterion=self.options.criterion,
         )
 
@@ -244,7 +244,7 @@ class Plan:
             "target": self.options.target,
             "figures": dict(self.quality.figures),
             "efficiency": self.quality.efficiency,
-            "considered": self.quality.considered,
+            "n_candidates": self.quality.n_candidates,
             "expected": {k: None if e is None else dict(vars(e)) for k, e in forecast.items()},
             "path_length": poses.path_length,
             "seed": self.options.seed,

@@ -52,7 +52,7 @@ class ErrorCurve:
     enough : smallest of the numbers that reaches the goal.
     at_least : no smaller number of candidates reaches the goal.
     poses_per_group : 1 where each pose counts alone.
-    considered : number of candidate poses or pairs.
+    n_candidates : number of candidate poses or pairs.
     """
 
     numbers: IntArray
@@ -64,7 +64,7 @@ class ErrorCurve:
     enough: int | None = None
     at_least: int | None = None
     poses_per_group: int = 1
-    considered: int = 0
+    n_candidates: int = 0
 
     @property
     def counted(self) -> str:
@@ -86,7 +86,7 @@ class ErrorCurve:
             target=self.target,
             goal=to_quantity(robot, self.goal, DIMENSIONS[self.target]),
             at_least=self.at_least,
-            considered=self.considered,
+            candidates=self.n_candidates,
             decided_by_equations=bool(self.enough == self.numbers[0]),
         )
 
@@ -95,7 +95,7 @@ class ErrorCurve:
         return {
             "target": self.target,
             "counted": self.counted,
-            "considered": self.considered,
+            "n_candidates": self.n_candidates,
             "numbers": self.numbers.tolist(),
             "position": [e.position for e in self.expected],
             "orientation": [e.orientation for e in self.expected],
@@ -160,7 +160,7 @@ def find_sample_size(
                 goal=to_quantity(robot, goal, dimension),
                 number=most,
                 counted=problem.group_name,
-                considered=count,
+                candidates=count,
                 best=to_quantity(robot, float(np.sqrt(best.values[0])), dimension),
                 bound=to_quantity(robot, float(np.sqrt(best.bounds[0])), dimension),
             )
@@ -190,5 +190,5 @@ def _convert_curve(problem: PlanningProblem, curve: DesignCurve) -> ErrorCurve:
         np.sqrt(curve.values),
         np.sqrt(np.maximum(curve.bounds, 0.0)),
         poses_per_group=problem.poses_per_group,
-        considered=problem.n_candidates,
+        n_candidates=problem.n_candidates,
     )

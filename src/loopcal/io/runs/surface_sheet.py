@@ -43,7 +43,7 @@ def format_surface_sheet(plan: SurfacePlan) -> str:
     poses = plan.poses
     for g, members in enumerate(poses.groups):
         for i, (role, row) in enumerate(zip(plan.list_roles(), members, strict=True)):
-            hold = plan.list_held(g, i)
+            hold = plan.list_fixed_coordinates(g, i)
             via = f" ({VIA} home)" if poses.via_home[row] else ""
             cells = [str(row + 1), poses.labels[row], f"group{g + 1}", role]
             cells += [f"{' '.join(hold) if i else FREE}{via}"]

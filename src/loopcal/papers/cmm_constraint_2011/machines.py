@@ -146,7 +146,7 @@ def plan_points(
     planned = PlaneLineGroups(robot, points, MM, axes)
     first = planned.draw(groups, seed)
     exchange = coordinate_exchange(
-        planned.linearize_indexed,
+        lambda _, design: planned.linearize(design),
         first,
         planned.list_levels(),
         D(),
