@@ -7,7 +7,7 @@ used, so that `import loopcal` costs nothing. docs/api.md lists them with their 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -129,132 +129,47 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0.dev0"
 
-PUBLIC_NAMES: Mapping[str, tuple[str, ...]] = {
-    "loopcal.apply": (
-        "AccuracyMap",
-        "AccuracySimulation",
-        "Compensation",
-        "PoseUncertainty",
-        "Validation",
-        "accuracy_map",
-        "compensate",
-        "pose_uncertainty",
-        "simulate_accuracy",
-        "validate",
-    ),
-    "loopcal.diagnose": (
-        "ConventionCheck",
-        "CrossValidation",
-        "FitExamination",
-        "Identifiability",
-        "ModelChoice",
-        "OutlierCheck",
-        "TruthComparison",
-        "check_conventions",
-        "choose_identifiable_subset",
-        "choose_model",
-        "compare_conventions",
-        "compare_with_truth",
-        "cross_validate",
-        "examine_fit",
-        "find_outliers",
-        "identifiability",
-        "suggest_measurements",
-    ),
-    "loopcal.errors": (
-        "ArgumentTypeError",
-        "DataError",
-        "EstimationError",
-        "FileError",
-        "LoopcalError",
-        "MechanismError",
-        "UnitError",
-    ),
-    "loopcal.estimate": (
-        "Combination",
-        "DescentStatus",
-        "FitOptions",
-        "GCV",
-        "Huber",
-        "Identification",
-        "IdentifiedTrials",
-        "InflatedTolerances",
-        "LeastSquares",
-        "MAP",
-        "MarginalLikelihood",
-        "Prior",
-        "Ridge",
-        "StepControl",
-        "TruncatedSVD",
-        "TruncationGCV",
-        "Tukey",
-        "identify",
-        "identify_trials",
-        "prior_from",
-        "recalibrate",
-    ),
-    "loopcal.findings": ("Finding", "Quantity", "Severity"),
-    "loopcal.io": (
-        "Run",
-        "load_measurements",
-        "load_robot",
-        "load_run",
-        "save_measurements",
-        "save_robot",
-        "save_run",
-    ),
-    "loopcal.measure": (
-        "Autocollimation",
-        "Bearing",
-        "Component",
-        "Direction",
-        "Distance",
-        "Gaussian",
-        "Inclination",
-        "Instrument",
-        "JointSensor",
-        "KINDS",
-        "Line",
-        "Locked",
-        "Measurements",
-        "Observations",
-        "Plane",
-        "Pose",
-        "Position",
-        "Sensor",
-        "Separation",
-        "Sphere",
-        "StatedValue",
-        "Trials",
-        "Uniform",
-        "sample_truth",
-        "simulate",
-        "simulate_trials",
-    ),
-    "loopcal.mechanism": (
-        "Jacobian",
-        "Mechanism",
-        "Solution",
-        "Status",
-        "find_assembly_modes",
-        "find_working_modes",
-        "forward",
-        "inverse",
-        "jacobian",
-        "sample_workspace",
-        "trace_singularity",
-    ),
-    "loopcal.planning": (
-        "Constraints",
-        "LineOfSight",
-        "Plan",
-        "PlanOptions",
-        "SurfaceOptions",
-        "SurfacePlan",
-        "plan",
-        "plan_surfaces",
-    ),
-    "loopcal.workflow": ("CalibrationOptions", "CalibrationReport", "Verdict", "calibrate"),
+PUBLIC_NAMES: Mapping[str, Sequence[str]] = {
+    package: names.split()
+    for package, names in {
+        "loopcal.apply": """
+            AccuracyMap AccuracySimulation Compensation PoseUncertainty Validation accuracy_map
+            compensate pose_uncertainty simulate_accuracy validate
+        """,
+        "loopcal.diagnose": """
+            ConventionCheck CrossValidation FitExamination Identifiability ModelChoice
+            OutlierCheck TruthComparison check_conventions choose_identifiable_subset
+            choose_model compare_conventions compare_with_truth cross_validate examine_fit
+            find_outliers identifiability suggest_measurements
+        """,
+        "loopcal.errors": """
+            ArgumentTypeError DataError EstimationError FileError LoopcalError MechanismError
+            UnitError
+        """,
+        "loopcal.estimate": """
+            Combination DescentStatus FitOptions GCV Huber Identification IdentifiedTrials
+            InflatedTolerances LeastSquares MAP MarginalLikelihood Prior Ridge StepControl
+            TruncatedSVD TruncationGCV Tukey identify identify_trials prior_from recalibrate
+        """,
+        "loopcal.findings": "Finding Quantity Severity",
+        "loopcal.io": """
+            Run load_measurements load_robot load_run save_measurements save_robot save_run
+        """,
+        "loopcal.measure": """
+            Autocollimation Bearing Component Direction Distance Gaussian Inclination Instrument
+            JointSensor KINDS Line Locked Measurements Observations Plane Pose Position Sensor
+            Separation Sphere StatedValue Trials Uniform sample_truth simulate simulate_trials
+        """,
+        "loopcal.mechanism": """
+            Jacobian Mechanism Solution Status find_assembly_modes find_working_modes forward
+            inverse jacobian sample_workspace trace_singularity
+        """,
+        "loopcal.planning": """
+            Constraints LineOfSight Plan PlanOptions SurfaceOptions SurfacePlan plan
+            plan_surfaces
+        """,
+        "loopcal.workflow": "CalibrationOptions CalibrationReport Verdict calibrate",
+    }.items()
 }
 """Public names by the package that defines them."""
 

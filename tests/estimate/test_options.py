@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopcal.errors import EstimationError
+from loopcal.errors import ArgumentTypeError, EstimationError
 from loopcal.estimate import (
     MAP,
     FitOptions,
@@ -78,7 +78,6 @@ def test_fewer_equations_than_parameters_say_what_rests_on_tolerances() -> None:
         ({"noise": "guessed"}, "'given' or 'estimated'"),
         ({"begin": "anywhere"}, "'kinematics' or 'closure'"),
         ({"loss": Huber}, r"Huber\(\) or Tukey\(\)"),
-        ({"prior": "run"}, r"prior_from\(fit.posterior\)"),
         ({"excluded_poses": "12"}, r"sequence of labels, such as \['12'\]"),
         ({"rank_tolerance": 2.0}, "above 0 and below 1"),
     ],
@@ -107,17 +106,19 @@ def test_method_and_loss_override_the_options() -> None:
     assert fit.options.loss == Huber()
     assert fit.options.noise == "estimated"
     assert options.method == MAP()
-    with pytest.raises(EstimationError, match="must be FitOptions"):
+    with pytest.raises(ArgumentTypeError, match="give FitOptions"):
         identify(hexapod(), data, options={"noise": "given"})  # pyright: ignore[reportArgumentType]
 
 
 def test_a_wrong_type_of_robot_or_data_says_what_to_pass() -> None:
-    with pytest.raises(EstimationError, match=r"the text 'hexapod-42'; pass a robot"):
+    with pytest.raises(ArgumentTypeError, match=r"robot: got the text 'hexapod-42'; .*load_robot"):
         identify("hexapod-42", hexapod_data())  # pyright: ignore[reportArgumentType]
-    with pytest.raises(EstimationError, match=r"the text 'a.csv'; pass .* load_measurements"):
+    with pytest.raises(ArgumentTypeError, match=r"data: got the text 'a.csv'; .*load_measurements"):
         identify(hexapod(), "a.csv")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(EstimationError, match=r"a Measurements; pass .* simulate_trials"):
+    with pytest.raises(ArgumentTypeError, match=r"trials: got a Measurements; .*simulate_trials"):
         identify_trials(hexapod(), hexapod_data())  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ArgumentTypeError, match=r"prior: got the text 'run'; .*prior_from"):
+        FitOptions(prior="run")  # pyright: ignore[reportArgumentType]
 
 
 def test_trials_and_recalibration_refuse_options_that_they_do_not_support() -> None:

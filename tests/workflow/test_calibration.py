@@ -173,7 +173,7 @@ def test_progress_is_reported_from_nothing_to_all(robot, data):
     ],
 )
 def test_a_wrong_argument_says_what_to_pass(arguments, word):
-    with pytest.raises(DataError, match=word):
+    with pytest.raises(lc.ArgumentTypeError, match=word):
         calibrate(*arguments)
 
 

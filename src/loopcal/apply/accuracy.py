@@ -137,8 +137,7 @@ def pose_uncertainty(
 
     Raises
     ------
-    EstimationError
-        An option that is not allowed.
+    EstimationError : an option that is not allowed.
     """
     for name, value, allowed in (
         ("frame", frame, Axes),
@@ -309,8 +308,7 @@ def accuracy_map(
 
     Raises
     ------
-    MechanismError
-        Poses are to be drawn, and the robot states no workspace.
+    MechanismError : poses are to be drawn, and the robot states no workspace.
     """
     robot = (fit.posterior if isinstance(fit, Identification) else fit).robot
     if isinstance(poses, int):

@@ -180,8 +180,7 @@ def compensate(
 
     Raises
     ------
-    DataError
-        Unknown mode, no step, targets of another shape.
+    DataError : unknown mode, no step, targets of another shape.
     """
     _check_settings(mode, steps)
     known = fit.posterior if isinstance(fit, Identification) else fit

@@ -61,8 +61,7 @@ def find_reused_rows(stored: Mapping[str, np.ndarray], data: Measurements) -> Fi
 
     Raises
     ------
-    DataError
-        Half of the rows or more belong to it.
+    DataError : half of the rows or more belong to it.
     """
     labels, total = [], 0
     for o in data.observations:

@@ -199,8 +199,7 @@ def validate(
 
     Raises
     ------
-    DataError
-        The data belong to another robot, contain no row, or every pose is unreachable.
+    DataError : the data belong to another robot, contain no row, or every pose is unreachable.
     """
     robot = fit.robot if isinstance(fit, Identification) else fit
     old = before or (fit.initial if isinstance(fit, Identification) else fit.nominal)

@@ -13,6 +13,7 @@ from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.problem import Problem
 from loopcal.findings import report_finding
 from loopcal.measure import Measurements, check_actuators
+from loopcal.measure.array_checks import check_type
 from loopcal.measure.measurements import weight_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
@@ -21,22 +22,10 @@ HUGE = 1e150
 """Residuals, in units of sigma, whose squares cannot be summed."""
 
 
-def check_types(robot: object, data: object, measurements: type = Measurements) -> None:
-    """Refuse arguments of another type, such as file names.
-
-    Raises
-    ------
-    EstimationError
-        What to pass instead.
-    """
-    if not isinstance(robot, Mechanism):
-        raise EstimationError(
-            f"robot is {_shorten(robot)}; pass a robot, such as load_robot('hexapod-42')"
-        )
-    if not isinstance(data, measurements):
-        maker = "simulate_trials(...)" if measurements is not Measurements else "load_measurements"
-        example = maker if "(" in maker else f"{maker}('measurements.csv', robot)"
-        raise EstimationError(f"data is {_shorten(data)}; pass measurements, such as {example}")
+def check_types(robot: object, data: object) -> None:
+    """Raise ArgumentTypeError for anything but a robot and measurements, such as file names."""
+    check_type(robot, Mechanism, "robot", "as from load_robot('hexapod-42')")
+    check_type(data, Measurements, "data", "as from load_measurements('data.csv', robot)")
 
 
 def exclude_poses(data: Measurements, excluded: Sequence[str]) -> Measurements:
@@ -50,8 +39,7 @@ def exclude_poses(data: Measurements, excluded: Sequence[str]) -> Measurements:
 
     Raises
     ------
-    DataError
-        The data have no such pose, or a text was given instead of a sequence of labels.
+    DataError : the data have no such pose, or a text was given instead of a sequence of labels.
     """
     if isinstance(excluded, str):
         raise DataError(
@@ -83,10 +71,8 @@ def check_rows(problem: Problem, data: Measurements, robot: Mechanism) -> None:
 
     Raises
     ------
-    DataError
-        Wrong number of actuators.
-    EstimationError
-        `fit.no-free-parameter` or `fit.no-measured-value`.
+    DataError : wrong number of actuators.
+    EstimationError : `fit.no-free-parameter` or `fit.no-measured-value`.
     """
     check_actuators(data, robot)
     if problem.parameters == 0:
@@ -102,8 +88,7 @@ def check_count(problem: Problem, data: Measurements, method: Method, allow_fewe
 
     Raises
     ------
-    EstimationError
-        `fit.too-few-equations`, with the number of poses that would be enough, or
+    EstimationError : `fit.too-few-equations`, with the number of poses that would be enough, or
         `fit.no-equation-left`.
     """
     nuisance = 0 if problem.nuisance is None else problem.nuisance.unpenalized_count
@@ -135,8 +120,7 @@ def check_start(
 
     Raises
     ------
-    EstimationError
-        `fit.poses-out-of-reach` or `fit.residuals-not-finite`, with the poses.
+    EstimationError : `fit.poses-out-of-reach` or `fit.residuals-not-finite`, with the poses.
     """
     if np.isfinite(cost[0]):
         return
@@ -161,8 +145,3 @@ def check_start(
     raise EstimationError(
         report_finding("fit.residuals-not-finite", poses=tuple(data.labels[i] for i in sorted(bad)))
     )
-
-
-def _shorten(value: object) -> str:
-    """Return a text as it is, and the type of any other value."""
-    return f"the text {value!r}" if isinstance(value, str) else f"a {type(value).__name__}"

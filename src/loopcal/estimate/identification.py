@@ -49,6 +49,7 @@ from loopcal.estimate.result import History, Identification, KindResiduals, Spec
 from loopcal.estimate.start import Start
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, Trials, fill_in_reading_sigma
+from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.numerics.gauss_newton import DescentStatus
@@ -162,7 +163,8 @@ def identify_trials(
     ------
     EstimationError : an option that is not supported.
     """
-    check_types(robot, trials, Trials)
+    check_type(robot, Mechanism, "robot", "as from load_robot('hexapod-42')")
+    check_type(trials, Trials, "trials", "as from simulate_trials(...)")
     options = merge_options(options, method)
     for name in ("loss", "prior", "nuisance", "excluded_poses"):
         value = getattr(options, name)

@@ -16,6 +16,7 @@ from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.minimization.descent import StepControl
 from loopcal.measure import NuisanceParameters
+from loopcal.measure.array_checks import check_type
 from loopcal.numerics.decomposition import RANK_TOLERANCE
 from loopcal.typing import FloatArray
 
@@ -87,11 +88,8 @@ class FitOptions:
             raise EstimationError(
                 f"loss is {self.loss!r}; it must be an instance such as Huber() or Tukey()"
             )
-        if self.prior is not None and not isinstance(self.prior, Prior):
-            raise EstimationError(
-                f"prior is a {type(self.prior).__name__}; it must be a Prior, as from "
-                "prior_from(fit.posterior)"
-            )
+        if self.prior is not None:
+            check_type(self.prior, Prior, "prior", "as from prior_from(fit.posterior)")
         if not 0.0 < self.rank_tolerance < 1.0:
             raise EstimationError(
                 f"rank_tolerance is {self.rank_tolerance}; it must be above 0 and below 1"
@@ -125,15 +123,12 @@ def merge_options(
 
     Raises
     ------
-    EstimationError : `options` is no `FitOptions`, or the merged options are not allowed.
+    ArgumentTypeError : `options` is no `FitOptions`.
+    EstimationError : the merged options are not allowed.
     """
     if options is None:
         return FitOptions(method=method, loss=loss)
-    if not isinstance(options, FitOptions):
-        raise EstimationError(
-            f"options is a {type(options).__name__}; it must be FitOptions, such as "
-            "FitOptions(noise='estimated')"
-        )
+    check_type(options, FitOptions, "options", "such as FitOptions(noise='estimated')")
     shortcuts = {"method": method, "loss": loss}
     given = {name: value for name, value in shortcuts.items() if value is not None}
     return dataclasses.replace(options, **given) if given else options

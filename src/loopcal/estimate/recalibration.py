@@ -30,7 +30,6 @@ from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.phrases import MACHINE
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
-from loopcal.serialization import json_fields
 from loopcal.typing import FloatArray, Progress, report_no_progress
 
 MOST_TRIED = 60
@@ -78,10 +77,6 @@ class Change:
     def sentence(self) -> str:
         """The text of the finding."""
         return str(self.finding)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content for JSON, SI."""
-        return json_fields(self)
 
 
 def recalibrate(

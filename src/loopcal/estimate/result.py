@@ -283,23 +283,21 @@ class Identification:
             "condition": self.spectrum.condition,
             "singular_values": self.spectrum.singular_values,
             "rank_tolerance": self.spectrum.tolerance,
-            "unidentifiable": [c.to_dict() for c in self.unidentifiable],
+            "unidentifiable": self.unidentifiable,
             "dof": test.dof,
             "chi_square": test.chi_square,
             "degrees": test.degrees,
             "p_value": test.p_value,
             "noise": test.noise,
             "sigma_scale": test.sigma_scale,
-            "prior_conflict": None
-            if self.prior_conflict is None
-            else self.prior_conflict.to_dict(),
+            "prior_conflict": self.prior_conflict,
             "dropped": self.excluded_poses,
-            "readings": None if self.poses is None else self.poses.to_dict(),
+            "readings": self.poses,
             "status": self.status.name.lower(),
             "iterations": self.history.iterations,
             "cost_history": self.history.cost,
             "notes": [str(finding) for finding in self.findings],
-            "findings": [finding.to_dict() for finding in self.findings],
+            "findings": self.findings,
         }
 
     def arrays(self) -> dict[str, FloatArray]:

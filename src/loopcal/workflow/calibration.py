@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 from loopcal.apply import Validation, validate
 from loopcal.apply.validation_findings import FEW_ROWS
@@ -24,11 +23,12 @@ from loopcal.diagnose import (
 )
 from loopcal.errors import DataError
 from loopcal.estimate import Change, Identification, identify, recalibrate
-from loopcal.estimate.fit_input import exclude_poses
+from loopcal.estimate.fit_input import check_types, exclude_poses
 from loopcal.estimate.information import count_equations
 from loopcal.findings import Finding, Severity, report_finding
 from loopcal.findings.importance import sort_by_importance
 from loopcal.measure import Measurements
+from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism
 from loopcal.typing import Progress, report_no_progress
 from loopcal.workflow.calibration_options import CalibrationOptions
@@ -62,9 +62,8 @@ def calibrate(
 
     Raises
     ------
-    DataError, EstimationError
-        The data belong to another robot, contain too few values, fit far better in another unit,
-        order, sign or column, or the options contradict them.
+    DataError, EstimationError : the data belong to another robot, contain too few values, fit far
+        better in another unit, order, sign or column, or the options contradict them.
 
     Examples
     --------
@@ -76,7 +75,8 @@ def calibrate(
     <Verdict.CALIBRATED: 'calibrated'>
     """
     options = CalibrationOptions() if options is None else options
-    _check_arguments(robot, data, options)
+    check_types(robot, data)
+    check_type(options, CalibrationOptions, "options", "such as CalibrationOptions(hold_out=0.25)")
     conventions = check_conventions(
         robot,
         data,
@@ -125,18 +125,6 @@ def calibrate(
         change=result.change,
         provenance=describe_provenance(options),
     )
-
-
-def _check_arguments(robot: Any, data: Any, options: Any) -> None:
-    """Refuse arguments of another type, with what to pass instead."""
-    wanted = (
-        ("robot", robot, Mechanism, "a robot, as from load_robot('robot.yaml')"),
-        ("data", data, Measurements, "measurements, as from load_measurements('data.csv', robot)"),
-        ("options", options, CalibrationOptions, "CalibrationOptions(hold_out=0.25), or nothing"),
-    )
-    for name, value, kind, advice in wanted:
-        if not isinstance(value, kind):
-            raise DataError(f"{name} is a {type(value).__name__}; pass {advice}")
 
 
 class _StepCounter:

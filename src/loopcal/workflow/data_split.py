@@ -47,8 +47,7 @@ def split_data(
 
     Raises
     ------
-    DataError
-        A label that the data do not have, or no pose is left to fit.
+    DataError : a label that the data do not have, or no pose is left to fit.
     """
     if held_out:
         for label in held_out:

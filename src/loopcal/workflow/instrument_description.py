@@ -43,8 +43,7 @@ def build_instrument(description: InstrumentDescription) -> Instrument:
 
     Raises
     ------
-    DataError
-        An unknown kind, frame or component, or a setting that belongs to none of the kinds.
+    DataError : an unknown kind, frame or component, or a setting that belongs to none of the kinds.
     """
     given = {"components": tuple(description.components), "orientation": description.orientation}
     settings = {name: value for name, value in given.items() if value}

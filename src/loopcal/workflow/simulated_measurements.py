@@ -48,8 +48,8 @@ def simulate_measurements(
 
     Raises
     ------
-    MechanismError, DataError
-        The robot states no workspace, or a pose is outside its reach or strokes.
+    MechanismError, DataError : the robot states no workspace, or a pose is outside its reach or
+        strokes.
     """
     truth = draw_true_machine(robot, seed) if draw_errors else robot
     if isinstance(poses, int):

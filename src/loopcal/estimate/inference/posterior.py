@@ -105,8 +105,7 @@ def posterior_from_arrays(robot: Mechanism, arrays: Mapping[str, np.ndarray]) ->
 
     Raises
     ------
-    EstimationError
-        The run has no posterior, or its robot now has other free parameters.
+    EstimationError : the run has no posterior, or its robot now has other free parameters.
     """
     missing = [PREFIX + name for name in STORED if PREFIX + name not in arrays]
     if missing:

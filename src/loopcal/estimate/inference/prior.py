@@ -151,8 +151,7 @@ def prior_from(earlier: Posterior) -> Prior:
 
     Raises
     ------
-    EstimationError
-        The earlier calibration has no intervals.
+    EstimationError : the earlier calibration has no intervals.
     """
     if np.isnan(earlier.variance).any():
         raise EstimationError(report_finding("prior.no-uncertainty"))
@@ -167,8 +166,7 @@ def limb_parameters(robot: Mechanism, limb: str) -> tuple[str, ...]:
 
     Raises
     ------
-    EstimationError
-        The limb has no free parameter; the text names the limbs that have.
+    EstimationError : the limb has no free parameter; the text names the limbs that have.
     """
     free = [p.name for p in robot.parameters.entries if p.free]
     names = tuple(name for name in free if name.startswith(f"{limb}."))

@@ -42,8 +42,7 @@ class Huber:
 
     Raises
     ------
-    EstimationError
-        k is not above 0, or too large.
+    EstimationError : k is not above 0, or too large.
     """
 
     k: float = 1.345
@@ -69,8 +68,7 @@ class Tukey:
 
     Raises
     ------
-    EstimationError
-        c is not above 0, or too large.
+    EstimationError : c is not above 0, or too large.
     """
 
     c: float = 4.685

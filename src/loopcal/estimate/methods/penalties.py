@@ -38,7 +38,7 @@ Rule = Callable[[Decomposition], FloatArray | IntArray]
 
 
 class Method(Protocol):
-    """The interface of a method."""
+    """The interface of a method, with what most methods do."""
 
     def required_equations(self, parameters: int) -> int:
         """Return how many equations the method needs for this many parameters."""
@@ -46,11 +46,11 @@ class Method(Protocol):
 
     def unpenalized(self, parameters: int) -> BoolArray | None:
         """Return which parameters (p,) are never penalized; None where all are treated alike."""
-        ...
+        return None
 
     def scale(self, parameters: int) -> FloatArray | None:
         """Return factors (p,) for the tolerance-scaled columns; None for ones."""
-        ...
+        return None
 
     def penalty(self, decomposition: Decomposition) -> FloatArray:
         """Return the penalty (t, p) of each direction; infinite where it is not used."""
@@ -58,7 +58,7 @@ class Method(Protocol):
 
 
 @dataclass(frozen=True)
-class LeastSquares:
+class LeastSquares(Method):
     """Least squares with rank detection.
 
     Null directions get the smallest total deviation, in tolerances.
@@ -73,19 +73,13 @@ class LeastSquares:
         """Return the number of parameters."""
         return parameters
 
-    def unpenalized(self, parameters: int) -> None:
-        """Return None: all parameters are treated alike."""
-
-    def scale(self, parameters: int) -> None:
-        """Return None: the columns stay scaled by tolerance."""
-
     def penalty(self, decomposition: Decomposition) -> FloatArray:
         """Return 0 for singular values within the numerical rank, infinity for the others."""
         return np.where(decomposition.used, 0.0, np.inf)
 
 
 @dataclass(frozen=True)
-class TruncatedSVD:
+class TruncatedSVD(Method):
     """Least squares over the k strongest directions; the others keep their nominal value.
 
     Parameters
@@ -95,8 +89,7 @@ class TruncatedSVD:
 
     Raises
     ------
-    EstimationError
-        k is negative or no integer.
+    EstimationError : k is negative or no integer.
     """
 
     k: int | Rule
@@ -112,12 +105,6 @@ class TruncatedSVD:
         """Return 0: directions without data keep their nominal value."""
         return 0
 
-    def unpenalized(self, parameters: int) -> None:
-        """Return None: all parameters are treated alike."""
-
-    def scale(self, parameters: int) -> None:
-        """Return None: the columns stay scaled by tolerance."""
-
     def penalty(self, decomposition: Decomposition) -> FloatArray:
         """Return 0 for the first k directions within the rank, infinity for the others."""
         k = np.atleast_1d(np.asarray(self.k(decomposition) if callable(self.k) else self.k))
@@ -126,7 +113,7 @@ class TruncatedSVD:
 
 
 @dataclass(frozen=True)
-class Ridge:
+class Ridge(Method):
     """Tikhonov regularization: the sum of squares plus lam |z|^2.
 
     z is the total deviation from nominal in tolerances.
@@ -138,8 +125,7 @@ class Ridge:
 
     Raises
     ------
-    EstimationError
-        lam is negative or not finite.
+    EstimationError : lam is negative or not finite.
     """
 
     lam: float | tuple[float, ...] | Rule
@@ -193,7 +179,7 @@ class Ridge:
 
 
 @dataclass(frozen=True)
-class MAP:
+class MAP(Method):
     """Maximum a posteriori: each tolerance is the standard deviation of a Gaussian prior.
 
     This is ridge with lam = 1. Directions that the data do not determine keep their prior. A
@@ -210,8 +196,7 @@ class MAP:
 
     Raises
     ------
-    EstimationError
-        inflation is not positive and finite.
+    EstimationError : inflation is not positive and finite.
     """
 
     inflation: float | Rule = 1.0
@@ -232,9 +217,6 @@ class MAP:
     def unpenalized(self, parameters: int) -> BoolArray | None:
         """Return which parameters are not penalized."""
         return np.array(self.free) if any(self.free) else None
-
-    def scale(self, parameters: int) -> None:
-        """Return None: the columns stay scaled by tolerance."""
 
     def penalty(self, decomposition: Decomposition) -> FloatArray:
         """Return sigma^2 / inflation^2, with sigma = 1 where the noise is given."""

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,7 +26,6 @@ from loopcal.estimate.inference.residual_test import SIGNIFICANCE
 from loopcal.estimate.methods.regularization_rules import MarginalLikelihood
 from loopcal.findings import Finding, report_finding
 from loopcal.numerics.decomposition import Decomposition
-from loopcal.serialization import json_fields
 from loopcal.typing import FloatArray
 
 FAR = 2.0
@@ -108,10 +107,6 @@ class PriorConflict:
     def sentence(self) -> str:
         """The text of the finding."""
         return str(self.finding)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content for JSON."""
-        return json_fields(self)
 
 
 def assess_prior_conflict(

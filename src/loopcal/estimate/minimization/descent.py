@@ -4,25 +4,22 @@
 At every accepted point the whitened, scaled rows are one triangular factor and that factor one
 decomposition. The first step tried is the full one to the filtered solution for the TOTAL deviation
 z from nominal. Where it does not lower the sum of squares plus penalty, Levenberg-Marquardt damping
-shortens it.
-
-In the coordinates y = V'z the target of the method is y*, and the curvature of direction i is
-h_i = s_i^2 + penalty_i. Damping adds mu |dz|^2, z in tolerances, and so moves direction i by the
-share h_i / (h_i + mu) of y*_i - y_i. It acts on the singular values, so that a damped step costs no
-new decomposition. See docs/theory/estimation.md.
+shortens it (`filtered_step`). See docs/theory/estimation.md.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Protocol, Self
 
 import numpy as np
 
 from loopcal.errors import EstimationError
+from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.minimization.filtered_step import FilteredStep, penalize, propose_step
+from loopcal.estimate.start import Start
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, decompose
 from loopcal.numerics.gauss_newton import ROUNDING, Damping, DescentStatus, minimize
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -39,30 +36,6 @@ FIRST_DAMPING = 1e-6
 """Damping after the first rejected step, in units of the largest squared singular value."""
 
 
-class Linearized(Protocol):
-    """What the descent reads from a linearization of a trials; see `Linearization`."""
-
-    @property
-    def factor(self) -> FloatArray:
-        """(a, p + 1, p + 1) triangular factor of rows [A | residual]."""
-        ...
-
-    @property
-    def cost(self) -> FloatArray:
-        """(a,) sum of squares; infinite or NaN where it cannot be evaluated."""
-        ...
-
-    @property
-    def equations(self) -> IntArray:
-        """(a,) number of equations, those of weight zero not counted."""
-        ...
-
-    @property
-    def next_start(self) -> Any:
-        """Warm start for the next linearization."""
-        ...
-
-
 class LeastSquaresProblem(Protocol):
     """A least-squares problem of t trials: whitened rows, columns scaled by tolerance."""
 
@@ -71,41 +44,17 @@ class LeastSquaresProblem(Protocol):
         """Number of unknowns p."""
         ...
 
-    def start(self, deviation: FloatArray) -> Any:
-        """Return the warm start, with `take` and `put`, of a descent from deviations (t, p)."""
+    def start(self, deviation: FloatArray) -> Start:
+        """Return the warm start of a descent from deviations (t, p)."""
         ...
 
-    def linearize(self, deviation: FloatArray, start: Any) -> Linearized:
+    def linearize(self, deviation: FloatArray, start: Start) -> Linearization:
         """Linearize at deviations (t, p)."""
         ...
 
     def take(self, trials: IntArray) -> Self:
         """Return the problem of some trials."""
         ...
-
-
-class FunctionStart(NamedTuple):
-    """The warm start of a `FunctionProblem`: there is nothing to begin with."""
-
-    trials: int
-
-    def take(self, trials: IntArray) -> FunctionStart:
-        """Return some trials."""
-        return FunctionStart(len(trials))
-
-    def put(self, trials: IntArray, other: FunctionStart) -> FunctionStart:
-        """Return this start with some trials taken from another one."""
-        del trials, other
-        return self
-
-
-class FunctionLinearization(NamedTuple):
-    """A linearization of a `FunctionProblem`; see `Linearized`."""
-
-    factor: FloatArray
-    cost: FloatArray
-    equations: IntArray
-    next_start: FunctionStart
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,20 +73,24 @@ class FunctionProblem:
     equations: IntArray
     trials: IntArray | None = None
 
-    def start(self, deviation: FloatArray) -> FunctionStart:
-        """Return an empty start."""
-        return FunctionStart(len(deviation))
+    def start(self, deviation: FloatArray) -> Start:
+        """Return a start without nuisance parameters and poses."""
+        t, p = deviation.shape
+        return Start(deviation, np.zeros((t, 0)), np.zeros((t, 0, p)), np.zeros((t, 0)))
 
-    def linearize(self, deviation: FloatArray, start: FunctionStart) -> FunctionLinearization:
+    def linearize(self, deviation: FloatArray, start: Start) -> Linearization:
         """Evaluate the function."""
-        trials = np.arange(len(self.equations)) if self.trials is None else self.trials
-        factor, cost = self.evaluate(deviation, trials)
-        return FunctionLinearization(factor, cost, self.equations, start)
+        factor, cost = self.evaluate(deviation, self._numbers)
+        return Linearization(deviation, factor, cost, self.equations, start)
 
     def take(self, trials: IntArray) -> FunctionProblem:
         """Return the problem of some trials."""
-        numbers = np.arange(len(self.equations)) if self.trials is None else self.trials
-        return replace(self, equations=self.equations[trials], trials=numbers[trials])
+        return replace(self, equations=self.equations[trials], trials=self._numbers[trials])
+
+    @property
+    def _numbers(self) -> IntArray:
+        """(t,) numbers of the trials."""
+        return np.arange(len(self.equations)) if self.trials is None else self.trials
 
 
 @dataclass(frozen=True)
@@ -156,8 +109,7 @@ class StepControl:
 
     Raises
     ------
-    EstimationError
-        A setting is out of its range.
+    EstimationError : a setting is out of its range.
     """
 
     iterations: int = 50
@@ -199,7 +151,7 @@ class Descent:
     cost: FloatArray
     status: IntArray
     iterations: IntArray
-    start: Any
+    start: Start
     deviation_history: FloatArray
     cost_history: FloatArray
 
@@ -219,7 +171,7 @@ def descend(
     method: Method,
     control: StepControl | None = None,
     tolerance: float = RANK_TOLERANCE,
-    start: Any = None,
+    start: Start | None = None,
 ) -> Descent:
     """Minimize the whitened sum of squares, filtered by the method.
 
@@ -279,7 +231,7 @@ class _Point:
     cost: FloatArray
     decomposition: Decomposition
     penalty: FloatArray
-    start: Any
+    start: Start
 
     @property
     def spread(self) -> FloatArray:
@@ -310,7 +262,7 @@ class _Candidate:
 
     model: _FilteredDescent
     z: FloatArray
-    linearized: Linearized
+    linearized: Linearization
     is_valid: BoolArray
 
     def take(self, trials: IntArray) -> _Point:
@@ -335,7 +287,7 @@ class _FilteredDescent:
     control: StepControl
 
     def decompose(
-        self, z: FloatArray, factor: FloatArray, cost: FloatArray, equations: IntArray, start: Any
+        self, z: FloatArray, factor: FloatArray, cost: FloatArray, equations: IntArray, start: Start
     ) -> _Point:
         """Return the points of a linearization."""
         p, method = self.problem.parameters, self.method
