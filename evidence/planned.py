@@ -29,7 +29,7 @@ from loopcal.measure import (
 )
 from loopcal.mechanism import Mechanism, forward_trials, sample_workspace
 from loopcal.planning import PlanOptions, Target
-from loopcal.planning.information import linearize_groups
+from loopcal.planning.pose_groups import linearize_groups
 from loopcal.planning.pose_planning import plan_poses
 from loopcal.planning.problem import PlanningProblem, prepare_problem
 

@@ -19,8 +19,13 @@ from loopcal.measure import KINDS, sample_truth
 from loopcal.mechanism import sample_workspace
 from loopcal.planning import PlanOptions
 from loopcal.planning.design import D, PriorInformation, choose_design, factor_design
-from loopcal.planning.information import combine_prior, linearize_candidate_groups, linearize_groups
-from loopcal.planning.pose_combinations import MOST, list_groups
+from loopcal.planning.pose_groups import (
+    MOST,
+    combine_prior,
+    linearize_candidate_groups,
+    linearize_groups,
+    list_groups,
+)
 from loopcal.planning.pose_planning import plan_poses
 from loopcal.planning.problem import prepare_problem
 from loopcal.planning.sample_size import find_sample_size

@@ -28,7 +28,8 @@ from loopcal.planning.design import (
 )
 from loopcal.planning.options import N_POSES, PlanOptions
 from loopcal.planning.path import order_poses
-from loopcal.planning.problem import ExpectedErrors, PlanningProblem, prepare_problem
+from loopcal.planning.prediction import ExpectedErrors
+from loopcal.planning.problem import PlanningProblem, prepare_problem
 from loopcal.planning.result import DesignQuality, ErrorForecast, Plan, PlannedPoses
 from loopcal.planning.sample_size import compute_error_curve, find_sample_size
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress

@@ -12,7 +12,7 @@ import numpy as np
 from loopcal.errors import DataError, EstimationError
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.information import collect_information, count_equations
-from loopcal.findings import Quantity, report_finding
+from loopcal.findings import report_finding
 from loopcal.measure import Instrument, Measurements, check_actuators
 from loopcal.mechanism import Mechanism, Solution, inverse, sample_workspace
 from loopcal.numerics.decomposition import Decomposition
@@ -24,22 +24,21 @@ from loopcal.planning.design import (
     I,
     ObservableSpace,
     PriorInformation,
+    divide_by_factor,
     factor_design,
     factor_rows,
     find_observable_space,
     is_allowed,
 )
-from loopcal.planning.information import (
+from loopcal.planning.options import PlanOptions, Target
+from loopcal.planning.pose_groups import (
     GroupRows,
-    Prediction,
     combine_prior,
     decompose_information,
     linearize_candidate_groups,
-    linearize_prediction,
 )
-from loopcal.planning.options import PlanOptions, Target
+from loopcal.planning.prediction import ExpectedErrors, Prediction, linearize_prediction
 from loopcal.typing import FloatArray, IntArray
-from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 PREDICTED = 200
 """Poses of the workspace whose errors are predicted."""
@@ -51,38 +50,6 @@ NO_MOTION = 1e-9
 """Share of a pose's error up to which its position or orientation does not change at all: the rest
 is rounding.
 """
-DIMENSIONS: dict[Target, Dimension] = {
-    "pose": Dimension.LENGTH,
-    "position": Dimension.LENGTH,
-    "orientation": Dimension.ANGLE,
-}
-"""Dimension of the error of each target."""
-
-
-@dataclass(frozen=True, eq=False)
-class ExpectedErrors:
-    """Predicted errors of the tool, root mean square over the workspace.
-
-    Attributes
-    ----------
-    position [m], orientation [rad].
-    """
-
-    position: float
-    orientation: float
-
-    def select(self, target: Target, size: float) -> float:
-        """Return the error of a target [m, rad]; of a pose with rotations times `size` [m]."""
-        if target == "pose":
-            return float(np.hypot(self.position, size * self.orientation))
-        return self.position if target == "position" else self.orientation
-
-    def to_quantities(self, robot: Mechanism) -> tuple[Quantity, ...]:
-        """Return the errors above 0 in the units of the robot's file."""
-        pairs = ((self.position, Dimension.LENGTH), (self.orientation, Dimension.ANGLE))
-        return tuple(
-            to_quantity(robot, value, dimension) for value, dimension in pairs if value > 0.0
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +169,7 @@ class PlanningProblem:
             return None
         k = len(self.prediction)
         rms = [
-            float(np.sqrt((np.linalg.solve(factor.T, (L @ self.space.machine).T) ** 2).sum() / k))
+            float(np.sqrt((divide_by_factor(L @ self.space.machine, factor) ** 2).sum() / k))
             for L in (self.prediction.position, self.prediction.orientation)
         ]
         return ExpectedErrors(*rms)
@@ -303,12 +270,6 @@ def _list_candidates(
 def name_groups(poses_per_group: int) -> str:
     """Return the plural noun for groups of so many poses."""
     return {1: "poses", 2: "pairs"}.get(poses_per_group, f"sets of {poses_per_group} poses")
-
-
-def to_quantity(robot: Mechanism, value: float, dimension: Dimension) -> Quantity:
-    """Return a number [SI] in the unit of the robot's file."""
-    symbol = robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol)
-    return Quantity(value / find_unit(symbol).factor_to_si, symbol)
 
 
 def _require_plain_sensors(instrument: Instrument) -> None:

@@ -14,7 +14,8 @@ from loopcal.measure import Instrument
 from loopcal.mechanism import Mechanism, inverse
 from loopcal.planning.options import PlanOptions
 from loopcal.planning.path import locate_home
-from loopcal.planning.problem import ExpectedErrors, name_groups
+from loopcal.planning.prediction import ExpectedErrors
+from loopcal.planning.problem import name_groups
 from loopcal.planning.sample_size import ErrorCurve
 from loopcal.serialization import to_json
 from loopcal.typing import BoolArray, FloatArray, IntArray

@@ -18,13 +18,8 @@ from loopcal.findings import Finding, report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.planning.design import DesignCurve, compute_design_curve, find_smallest_design
 from loopcal.planning.options import N_POSES, Target
-from loopcal.planning.problem import (
-    DIMENSIONS,
-    ExpectedErrors,
-    PlanningProblem,
-    name_groups,
-    to_quantity,
-)
+from loopcal.planning.prediction import DIMENSIONS, ExpectedErrors, to_quantity
+from loopcal.planning.problem import PlanningProblem, name_groups
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
 SIZES = 6

@@ -12,7 +12,7 @@ import numpy as np
 
 from loopcal.mechanism import POSITION, Mechanism
 from loopcal.planning.path import locate_home
-from loopcal.planning.problem import DIMENSIONS
+from loopcal.planning.prediction import DIMENSIONS
 from loopcal.planning.result import Plan
 from loopcal.planning.sample_size import ErrorCurve
 from loopcal.report.robot_drawing import COLORS, DPI

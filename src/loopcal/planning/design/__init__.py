@@ -17,6 +17,7 @@ from loopcal.planning.design.criteria import evaluate_criterion as evaluate_crit
 from loopcal.planning.design.design_space import Design as Design
 from loopcal.planning.design.design_space import ObservableSpace as ObservableSpace
 from loopcal.planning.design.design_space import PriorInformation as PriorInformation
+from loopcal.planning.design.design_space import divide_by_factor as divide_by_factor
 from loopcal.planning.design.design_space import factor_design as factor_design
 from loopcal.planning.design.design_space import factor_rows as factor_rows
 from loopcal.planning.design.design_space import find_observable_space as find_observable_space

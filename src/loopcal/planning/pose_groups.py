@@ -1,53 +1,52 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Information of measurements not yet made: whitened rows of pose groups, prior, and prediction.
+"""Pose groups that a plan chooses from: whitened rows of measurements not yet made, and the prior.
 
 A group is what is measured together: one pose, or the poses that one row of the instrument
 compares. Its rows are in tolerances of the machine's free parameters, behind the columns of the
-nuisance parameters of the instrument, which all groups share (frames, targets, one surface). The
-prediction is the pose of the tool all over the workspace,
+nuisance parameters of the instrument, which all groups share (frames, targets, one surface).
 
-    d tool = (size * rotation, displacement)      [m]
+N poses make N (N - 1) / 2 pairs, too many to linearize where there are hundreds of poses. Then half
+of the candidate pairs are drawn from all of them. The other half is made of the poses whose pairs
+of the first half are most informative, by
 
-without the rigid motions of a frame that no measurement of this instrument determines: the frame
-then is the one that the estimate defines. Derivations: docs/theory/identification.md,
-docs/theory/gauge.md.
+    d = |x R^-1|^2,   R'R = sum x'x + 1,
+
+the slope of log det for a row x where all rows count alike. A certificate then holds among the
+candidate pairs. Derivations: docs/theory/identification.md, docs/theory/planning.md.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 from math import comb
 
 import numpy as np
 
-from loopcal.apply.accuracy import transport
-from loopcal.diagnose import find_frame_motions
+from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.information import observe_poses, observe_rows
 from loopcal.measure import (
     Instrument,
     Measurements,
     NuisanceParameters,
     Observations,
+    Sensor,
     collect_nuisance_parameters,
     list_sensed_joints,
 )
-from loopcal.mechanism import Solution
 from loopcal.numerics.decomposition import Decomposition, decompose
 from loopcal.numerics.elimination import eliminate_from_factor
 from loopcal.numerics.triangular_factor import empty_factor, fold_rows
-from loopcal.planning.design import PriorInformation, is_allowed
-from loopcal.planning.pose_combinations import (
-    MOST,
-    add_informative_groups,
-    count_poses_per_group,
-    list_groups,
-)
-from loopcal.typing import FloatArray, IntArray
+from loopcal.planning.design import PriorInformation, divide_by_factor, factor_rows, is_allowed
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 BLOCK = 256
 """Groups whose rows are computed at once."""
+MOST = 5000
+"""Largest number of candidate combinations: as many rows are computed in some seconds."""
+DENSE = 20
+"""Up to this many times the requested number all combinations are enumerated before drawing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,63 +158,6 @@ def decompose_information(
     return decompose(factor, np.full(1, len(flat)))
 
 
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """Derivatives of the tool's pose at k poses of the workspace.
-
-    Attributes
-    ----------
-    rotations, displacements : (k, 3, p) derivatives of its rotation [rad] and displacement [m] by
-        the parameters in tolerances.
-    size : makes rotations comparable with displacements [m].
-    frames : names of the frames whose rigid motions are left out.
-    """
-
-    rotations: FloatArray
-    displacements: FloatArray
-    size: float
-    frames: tuple[str, ...]
-
-    def __len__(self) -> int:
-        return len(self.displacements)
-
-    @property
-    def position(self) -> FloatArray:
-        """Rows (3 k, p) of positions [m]."""
-        return self.displacements.reshape(-1, self.displacements.shape[2])
-
-    @property
-    def orientation(self) -> FloatArray:
-        """Rows (3 k, p) of orientations [rad]."""
-        return self.rotations.reshape(-1, self.rotations.shape[2])
-
-    @property
-    def pose(self) -> FloatArray:
-        """Rows (6 k, p) of poses [m], rotations times size."""
-        return np.concatenate([self.size * self.orientation, self.position])
-
-
-def linearize_prediction(
-    free: FreeParameters, solution: Solution, observable: Decomposition
-) -> Prediction:
-    """Return how the tool's pose depends on the parameters.
-
-    Parameters
-    ----------
-    solution : the poses to predict. observable : of `decompose_information`.
-    """
-    poses = observe_poses(free, solution.q)
-    tool_twists = transport(free.robot, poses.T[0], "base", "tool") @ poses.twists[0]
-    used, V = observable.used[0], observable.directions[0]
-    variance = np.where(used, 1.0, np.where(free.assumed.any(), np.inf, 1.0))
-    posterior = Posterior(free.robot, free.places, free.tolerance, V, variance, used)
-    motions = find_frame_motions(posterior)
-    # P removes rigid motions of frames from a deviation and leaves the rest as it is
-    P = V[:, used] @ V[:, used].T + motions.kept @ V[:, ~used].T
-    kept = tool_twists[poses.is_reached] @ P
-    return Prediction(kept[:, :3], kept[:, 3:], free.robot.size, motions.frames)
-
-
 def _list_nuisance(mounted: Instrument, members: IntArray) -> NuisanceParameters:
     """Return the nuisance parameters of the instrument."""
     count = int(members.max()) + 1
@@ -226,7 +168,7 @@ def _list_nuisance(mounted: Instrument, members: IntArray) -> NuisanceParameters
     return collect_nuisance_parameters(sensors, tuple(str(i) for i in range(count)))  # pyright: ignore[reportArgumentType]
 
 
-def _assign_poses(mounted: Instrument, members: IntArray) -> list[tuple]:
+def _assign_poses(mounted: Instrument, members: IntArray) -> list[tuple[Sensor, IntArray]]:
     """Return each sensor with the poses of its rows, group by group."""
     return [(s, members.ravel() if s.kind.poses_per_row == 1 else members) for s in mounted.sensors]
 
@@ -270,3 +212,86 @@ def _linearize_block(
     )
     rows[unusable | ~observed.is_reached[places].all(axis=1)] = np.nan
     return rows
+
+
+def count_poses_per_group(instrument: Instrument) -> int:
+    """Return how many poses are measured together.
+
+    Raises
+    ------
+    DataError
+        The instrument has kinds that compare different numbers of poses.
+    """
+    links = sorted({sensor.kind.poses_per_row for sensor in instrument.sensors} - {1})
+    if len(links) > 1:
+        raise DataError(
+            f"kinds that compare {links[0]} and {links[1]} poses cannot be planned together; plan "
+            "one of them"
+        )
+    return links[0] if links else 1
+
+
+def list_groups(
+    poses: int, instrument: Instrument, rng: np.random.Generator, most: int = MOST
+) -> IntArray:
+    """Return the members (N, k) of groups: each pose alone, or combinations, all or `most` drawn.
+
+    Raises
+    ------
+    DataError
+        The instrument compares more poses than there are.
+    """
+    k = count_poses_per_group(instrument)
+    if k == 1:
+        return np.arange(poses)[:, None]
+    if poses < k:
+        raise DataError(
+            f"this instrument compares {k} poses, but only {poses} are allowed; relax a constraint"
+        )
+    return draw_combinations(np.arange(poses), k, most, rng)
+
+
+def add_informative_groups(
+    rows: FloatArray, members: IntArray, poses: int, most: int, rng: np.random.Generator
+) -> IntArray:
+    """Return members (M, k) of at most `most` further groups of the most informative poses.
+
+    Parameters
+    ----------
+    rows : (N, r, c) of groups, whitened and in tolerances; NaN where not allowed. members : (N, k)
+        their poses.
+    poses : number of candidate poses.
+    """
+    good, k, c = is_allowed(rows), members.shape[1], rows.shape[2]
+    if not good.any():
+        return members[:0]
+    R = factor_rows(np.concatenate([np.eye(c), rows[good].reshape(-1, c)]))
+    slopes = (divide_by_factor(rows[good], R) ** 2).sum(axis=(1, 2))
+    best = np.zeros(poses)
+    np.maximum.at(best, members[good].ravel(), np.repeat(slopes, k))
+    count = k
+    while count < poses and comb(count + 1, k) <= most:
+        count += 1
+    # in the order of their numbers, so that a combination is written in one way only
+    informative = np.sort(np.argsort(-best, kind="stable")[:count])
+    further = draw_combinations(informative, k, most, rng)
+    return further[~_is_member(further, members, poses)]
+
+
+def draw_combinations(poses: IntArray, k: int, most: int, rng: np.random.Generator) -> IntArray:
+    """Return combinations (N, k) of k of the poses (n,): all, or `most` different ones."""
+    n = len(poses)
+    if comb(n, k) <= DENSE * most:
+        indices = np.array(list(combinations(range(n), k)), dtype=np.int64).reshape(-1, k)
+        if len(indices) > most:
+            indices = indices[np.sort(rng.choice(len(indices), most, replace=False))]
+        return poses[indices]
+    draws = np.sort(rng.integers(0, n, (2 * most, k)), axis=1)
+    draws = np.unique(draws[(np.diff(draws, axis=1) > 0).all(axis=1)], axis=0)
+    return poses[draws[np.sort(rng.permutation(len(draws))[:most])]]
+
+
+def _is_member(members: IntArray, others: IntArray, poses: int) -> BoolArray:
+    """Return which of members (M, k) occur among others (N, k)."""
+    places = float(poses) ** np.arange(members.shape[1])
+    return np.isin(members @ places, others @ places)
