@@ -14,8 +14,8 @@ import pytest
 
 from loopcal.diagnose import identifiability, suggest_measurements
 from loopcal.estimate import LeastSquares, identify
+from loopcal.io.formats import klipper
 from loopcal.io.formats.import_export import build_imported_robot
-from loopcal.io.formats.printers import klipper
 from loopcal.io.formats.program_format import Imported, ImportOptions
 from loopcal.measure import Measurements, Observations
 from loopcal.mechanism import Mechanism

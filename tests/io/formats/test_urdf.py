@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from loopcal.errors import DataError, FileError, LoopcalError
-from loopcal.io.formats import urdf, urdf_closures, urdf_tree
+from loopcal.io.formats import urdf, urdf_tree
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ExportSource, Imported, ImportOptions
 from loopcal.mechanism import Mechanism, forward, inverse
@@ -61,7 +61,7 @@ def test_poses_are_those_of_the_tree_with_its_loops_closed(files, read, name) ->
     """
     robot, tree = read[name][1], urdf_tree.read(files[name])
     body, frame = tree.find_body(FRAME[name]), tree.place_in_body(FRAME[name])
-    loops = urdf_closures.read_joint_graph(tree, files[name].with_name("robot.yaml"))
+    loops = urdf_tree.read_joint_graph(tree, files[name].with_name("robot.yaml"))
     near = list(find_limb_paths(loops, body).graph.list_nearby())
     assert len(near) > 2
     q = np.array([[one.values[motor] for motor in loops.motors] for one in near])

@@ -6,16 +6,15 @@ A format is a `Format` with `read`, `write` or both, in a module of its own, and
 
 from collections.abc import Mapping
 
-from loopcal.io.formats import hangprinter, linuxcnc, parameter_table, urdf
-from loopcal.io.formats.printers import delta_commands, klipper
+from loopcal.io.formats import delta_gcode, hangprinter, klipper, linuxcnc, parameter_table, urdf
 from loopcal.io.formats.program_format import Format
 
 FORMATS: Mapping[str, Format] = {
     one.name: one
     for one in (
         klipper.FORMAT,
-        delta_commands.MARLIN,
-        delta_commands.REPRAP,
+        delta_gcode.MARLIN,
+        delta_gcode.REPRAP,
         linuxcnc.FORMAT,
         urdf.FORMAT,
         hangprinter.FORMAT,

@@ -32,8 +32,7 @@ from loopcal.io.formats.program_format import (
     get_record,
     report_changes,
 )
-from loopcal.io.formats.urdf_closures import read_joint_graph
-from loopcal.io.formats.urdf_tree import Urdf
+from loopcal.io.formats.urdf_tree import Urdf, read_joint_graph
 from loopcal.mechanism.families.limb_records import Prismatic, Revolute, matrix_from_place
 from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.joint_graph import (
