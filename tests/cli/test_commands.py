@@ -13,7 +13,7 @@ import pytest
 from loopcal.cli import main
 from loopcal.io import load_measurements, load_robot
 from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.io.runs.calibration_run import load_run
+from loopcal.io.runs.run_folder import load_run
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 SIMULATE = "simulate truth.yaml --poses poses.csv --sigma-position 0.001mm --sigma-angle 5urad --seed 3 -o again.csv"  # noqa: E501

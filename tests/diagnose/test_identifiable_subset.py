@@ -14,7 +14,7 @@ from loopcal.estimate.information import observe_poses
 from loopcal.findings import Finding
 from loopcal.io import load_robot
 from loopcal.io.core.json_text import to_json
-from loopcal.io.robot.reduced_robot import format_reduced_robot
+from loopcal.io.robot.derived_robots import format_reduced_robot
 from loopcal.io.robot.robot_file import list_shipped_robots
 from loopcal.measure import Instrument, Pose, Sensor
 from tests.estimate.problems import five_dof, hexapod, hexapod_data, tracker

@@ -23,10 +23,11 @@ def write(folder, force: bool = False, value: float = 1.5):
 
 
 def test_what_is_written_is_read_back(tmp_path) -> None:
-    run = read_run_folder(write(tmp_path / "deep" / "run"))
-    assert run.result == {"format": 1, "value": 1.5}
-    assert run.arrays["a"].tolist() == [0.0, 1.0, 2.0]
-    assert run.robot_path.read_text() == "name: h\n"
+    folder = write(tmp_path / "deep" / "run")
+    result, arrays = read_run_folder(folder)
+    assert result == {"format": 1, "value": 1.5}
+    assert arrays["a"].tolist() == [0.0, 1.0, 2.0]
+    assert (folder / "robot.yaml").read_text() == "name: h\n"
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["run"]
 
 
@@ -34,9 +35,9 @@ def test_a_run_is_replaced_only_with_force(tmp_path) -> None:
     write(tmp_path / "run")
     with pytest.raises(FileError, match="not empty"):
         write(tmp_path / "run", value=2.5)
-    assert read_run_folder(tmp_path / "run").result["value"] == 1.5
+    assert read_run_folder(tmp_path / "run")[0]["value"] == 1.5
     write(tmp_path / "run", force=True, value=2.5)
-    assert read_run_folder(tmp_path / "run").result["value"] == 2.5
+    assert read_run_folder(tmp_path / "run")[0]["value"] == 2.5
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
 
 
@@ -50,7 +51,7 @@ def test_force_does_not_replace_what_is_not_a_run(tmp_path) -> None:
 
 def test_an_empty_folder_is_used(tmp_path) -> None:
     (tmp_path / "run").mkdir()
-    assert read_run_folder(write(tmp_path / "run")).result["value"] == 1.5
+    assert read_run_folder(write(tmp_path / "run"))[0]["value"] == 1.5
 
 
 def test_nothing_is_left_when_writing_fails(tmp_path) -> None:

@@ -108,8 +108,7 @@ def calibrate(
     """  # noqa: D301
     from loopcal.io import load_robot
     from loopcal.io.data.measurement_file import read_held_out_poses
-    from loopcal.io.runs.calibration_run import build_document, load_prior, save_run
-    from loopcal.io.runs.run_folder import refuse_run_folder
+    from loopcal.io.runs.run_folder import build_document, load_prior, refuse_run_folder, save_run
     from loopcal.report.calibration_view import view_calibration
     from loopcal.workflow import CalibrationOptions
     from loopcal.workflow import calibrate as calibrate_robot
@@ -218,7 +217,7 @@ def validate(
     """  # noqa: D301
     from loopcal.apply import find_reused_rows
     from loopcal.apply import validate as validate_robot
-    from loopcal.io.runs.calibration_run import load_run_or_robot, refuse_fitted_files
+    from loopcal.io.runs.run_folder import load_run_or_robot, refuse_fitted_files
     from loopcal.report.validation_view import view_validation
 
     calibrated = load_run_or_robot(run)
@@ -297,8 +296,8 @@ def compensate(
     from loopcal.io import load_robot
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
-    from loopcal.io.runs.calibration_run import load_posterior_or_robot
     from loopcal.io.runs.compensation_file import format_compensation, load_targets
+    from loopcal.io.runs.run_folder import load_posterior_or_robot
     from loopcal.mechanism import Mechanism
     from loopcal.report.calibration_view import with_hint
     from loopcal.report.compensation_view import view_compensation

@@ -155,7 +155,7 @@ def _name_drawn_poses(robot: Mechanism, count: int, seed: int) -> str:
 def _write_subset(output: Path, subset: IdentifiableSubset) -> None:
     """Write the robot file with the parameters fixed that are left out."""
     from loopcal.io.core.text_file import write_text
-    from loopcal.io.robot.reduced_robot import format_reduced_robot
+    from loopcal.io.robot.derived_robots import format_reduced_robot
 
     words = {merged.name: merged.describe_effect(most=3) for merged in subset.dropped}
     write_text(output, format_reduced_robot(subset.robot, words))
@@ -252,8 +252,11 @@ def _fill_in(
 ) -> tuple[SimulatedMeasurements, str]:
     """Return the filled-in data file of a plan."""
     from loopcal.io import load_measurements
-    from loopcal.io.data.instrument_file import load_instrument, refuse_empty_readings
-    from loopcal.io.data.measurement_file import read_pose_use
+    from loopcal.io.data.measurement_file import (
+        load_instrument,
+        read_pose_use,
+        refuse_empty_readings,
+    )
     from loopcal.io.data.measurement_writer import format_measurements
     from loopcal.workflow.simulated_measurements import fill_in_measurements
 

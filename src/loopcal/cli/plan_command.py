@@ -197,7 +197,7 @@ def plan(
 
 def _find_instrument(robot: Mechanism, like: Path | None, options: Mapping[str, Any]) -> Instrument:
     """Return the instrument that the options, or the settings of a file, describe."""
-    from loopcal.io.data.instrument_file import load_instrument_to_plan
+    from loopcal.io.data.measurement_file import load_instrument_to_plan
 
     if like is None:
         return make_instrument(options)
@@ -346,9 +346,14 @@ def _write_surface_plan(
     output: Path, result: SurfacePlan, inputs: Mapping[str, Path], seed: int, force: bool
 ) -> str:
     """Write the folder of a plan of surfaces; return its files in words."""
-    from loopcal.io.runs.plan_folder import DATA, SHEET, write_plan_folder
+    from loopcal.io.runs.plan_folder import (
+        DATA,
+        SHEET,
+        format_surface_data,
+        format_surface_sheet,
+        write_plan_folder,
+    )
     from loopcal.io.runs.run_folder import collect_provenance
-    from loopcal.io.runs.surface_sheet import format_surface_data, format_surface_sheet
 
     texts = {SHEET: format_surface_sheet(result), DATA: format_surface_data(result)}
     document = result.to_dict() | {"made_by": collect_provenance(sys.argv, inputs, {"plan": seed})}

@@ -45,7 +45,7 @@ def new(
     """  # noqa: D301
     from loopcal.io.core.outputs import refuse_outputs
     from loopcal.io.core.text_file import write_text
-    from loopcal.io.robot.new_robot import format_new_robot
+    from loopcal.io.robot.derived_robots import format_new_robot
 
     instrument = make_instrument(options)
     refuse_outputs((output, measurements), (), force)

@@ -13,7 +13,7 @@ from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.program_format import Exported, ExportSource, Format, Imported
 from loopcal.io.robot.robot_file import load_robot
-from loopcal.io.runs.calibration_run import load_run_or_robot
+from loopcal.io.runs.run_folder import load_run_or_robot
 from loopcal.mechanism import Mechanism
 
 

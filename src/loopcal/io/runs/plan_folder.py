@@ -8,7 +8,8 @@
     curve.png          expected errors by the number of poses
 
 `loopcal calibrate` reads measurements.csv when it is filled in, and holds out the poses that the
-plan holds out.
+plan holds out. A plan of points on planes and lines has other sheets, because its readings are
+measured.
 """
 
 from __future__ import annotations
@@ -19,18 +20,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from loopcal.errors import FileError
 from loopcal.io.core.csv_table import quote_cell
-from loopcal.io.core.folders import refuse_folder_in_use, replace_folder
 from loopcal.io.core.json_text import to_json
 from loopcal.io.core.numbers import parse_exact
+from loopcal.io.core.outputs import refuse_folder_in_use, replace_folder
 from loopcal.io.core.text_file import sha256
 from loopcal.io.data.columns import FIT, HELD_OUT, USE_COLUMN, get_dimension
-from loopcal.io.data.measurement_writer import format_data_sheet
-from loopcal.mechanism import Mechanism
+from loopcal.io.data.measurement_writer import format_data_sheet, format_measurements
+from loopcal.mechanism import POSITION, Mechanism
 from loopcal.units import Dimension, find_unit
 
 if TYPE_CHECKING:
+    from loopcal.planning.plane_line_planning import SurfacePlan
     from loopcal.planning.result import Plan, Stop
 
 FORMAT = 1
@@ -42,16 +46,24 @@ DIGITS = 12
 """Significant digits of a number: more than it was rounded to, fewer than a double has."""
 
 
+FREE = "free"
+"""Cell of `hold` at the first point of a group, which sets the coordinates of the others."""
+
+INSTRUCTIONS = """\
+## Points of the tool of {robot}, in this order. Point p0 of a group is free: move close to its row,
+## stop, and note the position that the measuring machine shows. Move to each other point of the
+## group until the coordinates under hold equal those noted for p0 within the tolerance. Then write
+## the readings into the data file; those of p0 belong into both of its rows, because it is on the
+## plane and on the line. All numbers here are nominal values."""
+
+
 def format_sheet(plan: Plan, stops: Sequence[Stop]) -> str:
     """Return the operator's sheet: the stops in order, with home where a straight path is blocked.
 
     `stops` are those of `loopcal.planning.result.list_stops`.
     """
     robot = plan.robot
-    commanded = [get_unit(robot, get_dimension(name)) for name in robot.controlled]
-    readings = [get_unit(robot, actuator.dimension) for actuator in robot.actuators]
-    headers = [f"{n} [{s}]" for n, (s, _) in zip(robot.controlled, commanded, strict=True)]
-    headers += [f"{a.name} [{s}]" for a, (s, _) in zip(robot.actuators, readings, strict=True)]
+    headers, factors = _list_columns(robot)
     path = _list_path_coordinates(robot)
     lines = [
         f"## Poses of {robot.name} to measure in this order, starting from home.",
@@ -59,12 +71,10 @@ def format_sheet(plan: Plan, stops: Sequence[Stop]) -> str:
         f"## {HELD_OUT} poses alike; only pass through {VIA} poses.",
         ",".join(["step", "pose", USE_COLUMN.name, *headers]),
     ]
-    factors = [factor for _, factor in (*commanded, *readings)]
     for step, stop in enumerate(stops, 1):
         use = VIA if stop.is_via else HELD_OUT if stop.is_held_out else FIT
-        numbers = zip((*stop.coordinates, *stop.readings), factors, strict=True)
-        cells = [str(step), quote_cell(stop.label), use, *(_format(v, f) for v, f in numbers)]
-        lines.append(",".join(cells))
+        numbers = map(_format, (*stop.coordinates, *stop.readings), factors)
+        lines.append(",".join([str(step), quote_cell(stop.label), use, *numbers]))
     return "\n".join(lines) + "\n"
 
 
@@ -74,7 +84,7 @@ def format_plan_data(plan: Plan) -> str:
         replace(s, rows=plan.poses.groups) if s.kind.poses_per_row > 1 else s
         for s in plan.instrument.sensors
     )
-    factors = [get_unit(plan.robot, actuator.dimension)[1] for actuator in plan.robot.actuators]
+    factors = _list_columns(plan.robot)[1][-len(plan.robot.actuators) :]
     readings = [
         [parse_exact(_format(q, f), f) for q, f in zip(row, factors, strict=True)]
         for row in plan.poses.readings.tolist()
@@ -138,10 +148,13 @@ def write_plan_folder(
             save(folder / name)
 
 
-def get_unit(robot: Mechanism, dimension: Dimension) -> tuple[str, float]:
-    """Return symbol and factor of the unit of a dimension in the robot file."""
-    unit = find_unit(robot.units[dimension])
-    return unit.symbol, unit.factor_to_si
+def _list_columns(robot: Mechanism) -> tuple[list[str], list[float]]:
+    """Return headers and units [SI] of the commanded coordinates and of the readings."""
+    dimensions = {name: get_dimension(name) for name in robot.controlled}
+    dimensions |= {actuator.name: actuator.dimension for actuator in robot.actuators}
+    units = {name: find_unit(robot.units[dimension]) for name, dimension in dimensions.items()}
+    headers = [f"{name} [{unit.symbol}]" for name, unit in units.items()]
+    return headers, [unit.factor_to_si for unit in units.values()]
 
 
 def _list_path_coordinates(robot: Mechanism) -> str:
@@ -163,3 +176,50 @@ def _read_digests(path: Path) -> Mapping[str, str]:
         return {str(name): str(digest) for name, digest in files.items()}
     except (ValueError, KeyError, TypeError, AttributeError):
         return {}
+
+
+def format_surface_sheet(plan: SurfacePlan) -> str:
+    """Return the operator's sheet: coordinates to hold, tolerance and command of each point."""
+    robot = plan.robot
+    length = find_unit(robot.units[Dimension.LENGTH])
+    columns, factors = _list_columns(robot)
+    headers = ["step", "pose", "group", "role", "hold", f"tolerance [{length.symbol}]"]
+    headers += [*(f"hold.{name} [{length.symbol}]" for name in POSITION), *columns]
+    lines, poses = [INSTRUCTIONS.format(robot=robot.name), ",".join(headers)], plan.poses
+    for g, members in enumerate(poses.groups):
+        for i, (role, row) in enumerate(zip(plan.list_roles(), members, strict=True)):
+            hold = plan.list_fixed_coordinates(g, i)
+            via = f" ({VIA} home)" if poses.via_home[row] else ""
+            cells = [str(row + 1), poses.labels[row], f"group{g + 1}", role]
+            cells += [f"{' '.join(hold) if i else FREE}{via}"]
+            cells += [_format(plan.options.sigma, length.factor_to_si) if i else ""]
+            cells += [
+                _format(position, length.factor_to_si) if name in hold else ""
+                for name, position in zip(POSITION, plan.positions[g, 0], strict=True)
+            ]
+            cells += map(_format, (*poses.coordinates[row], *poses.readings[row]), factors)
+            lines.append(",".join(quote_cell(cell) for cell in cells))
+    return "\n".join(lines) + "\n"
+
+
+def format_surface_data(plan: SurfacePlan) -> str:
+    """Return the data file to fill in: gaps are zero, readings empty, rows in pose order."""
+    from loopcal.measure import Measurements, Observations
+
+    robot = plan.robot
+    observations = []
+    for one in plan.instrument.sensors:
+        assert one.rows is not None  # the plan states them
+        gaps = np.zeros((len(one.rows), len(one.kind.columns)))
+        sigma = one.noise.sigma
+        observations.append(Observations.from_sigma(one.kind, one.rows, gaps, sigma, "", one.group))
+    poses = plan.poses
+    data = Measurements(robot.name, poses.readings, tuple(observations), labels=poses.labels)
+    lines = format_measurements(data, robot).splitlines()
+    first = next(i for i, line in enumerate(lines) if not line.startswith("#"))
+    names = _list_columns(robot)[0][-len(robot.actuators) :]
+    is_reading = [name in names for name in lines[first].split(",")]
+    order = {label: i for i, label in enumerate(poses.labels)}
+    rows = sorted((line.split(",") for line in lines[first + 1 :]), key=lambda row: order[row[0]])
+    empty = [["" if is_reading[i] else cell for i, cell in enumerate(row)] for row in rows]
+    return "\n".join([*lines[: first + 1], *(",".join(row) for row in empty)]) + "\n"

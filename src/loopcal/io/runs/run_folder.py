@@ -1,26 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run folders: one result with its numbers, arrays, corrected robot file and provenance.
+"""Run folders of calibrations: the report with its numbers, arrays, robot file and provenance.
 
-result.json    the result, and under `made_by` its provenance (see MADE_BY); a number that is
-not finite is null, with the reason under `nulls`
-arrays.npz     the arrays of the result, by name, SI (no pickles)
+result.json    `CalibrationReport.to_dict()`: `fit`, `start`, `split`, `validation` and more, and
+               under `made_by` its provenance (see MADE_BY); parameters in the units of the robot
+               file, the rest in SI; a number that is not finite is null, with the reason under
+               `nulls`
+arrays.npz     `Identification.arrays()`, `initial` (values of all parameters before the
+               calibration) and the fitted rows, by name, SI (no pickles)
 robot.yaml     the corrected robot file: the nominal file plus its `identified:` table
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from loopcal.errors import FileError
-from loopcal.io.core.folders import refuse_folder_in_use, replace_folder
+from loopcal.errors import DataError, FileError
+from loopcal.findings import report_finding
 from loopcal.io.core.json_text import to_json
+from loopcal.io.core.outputs import refuse_folder_in_use, replace_folder
 from loopcal.io.core.text_file import as_path, read_text, sha256
+from loopcal.io.data.measurement_file import Paths, list_measurement_files, load_measurements
+from loopcal.io.robot.robot_file import format_robot, list_shipped_robots, load_robot
+from loopcal.mechanism import Mechanism
+
+if TYPE_CHECKING:
+    from loopcal.estimate import Posterior
+    from loopcal.measure import Measurements
+    from loopcal.workflow import CalibrationReport
 
 FORMAT = 1
 RESULT, ARRAYS, ROBOT = "result.json", "arrays.npz", "robot.yaml"
@@ -32,25 +44,6 @@ MADE_BY: Mapping[str, str] = {
     "inputs": "each input file: its name as given, and its sha256",
 }
 """Keys of `made_by` and their meanings, for the file reference."""
-
-
-@dataclass(frozen=True)
-class RunFolder:
-    """The content of a run folder.
-
-    Parameters
-    ----------
-    path : of the folder. result : content of result.json. arrays : content of arrays.npz, SI.
-    """
-
-    path: Path
-    result: dict[str, Any]
-    arrays: dict[str, np.ndarray]
-
-    @property
-    def robot_path(self) -> Path:
-        """The corrected robot file."""
-        return self.path / ROBOT
 
 
 def collect_provenance(
@@ -78,18 +71,6 @@ def collect_provenance(
 def list_inputs(result: Mapping[str, Any]) -> dict[str, Mapping[str, str]]:
     """Return role -> `path` and `sha256` of the input files of a result."""
     return dict(result.get("made_by", {}).get("inputs", {}))
-
-
-def find_fitted_file(result: Mapping[str, Any], inputs: Mapping[str, Path]) -> Path | None:
-    """Return the first data file (by its role in `inputs`) that a result was made from, or None.
-
-    Raises
-    ------
-    FileError : a file cannot be read.
-    """
-    used = {f.get("sha256") for role, f in list_inputs(result).items() if _is_data(role)}
-    given = (path for role, path in inputs.items() if _is_data(role))
-    return next((path for path in given if sha256(path) in used), None)
 
 
 def refuse_used_folder(path: str | Path, force: bool) -> None:
@@ -136,8 +117,8 @@ def write_run_folder(
     return path
 
 
-def read_run_folder(path: str | Path) -> RunFolder:
-    """Read a run folder.
+def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return the contents of result.json and arrays.npz of a run folder.
 
     Raises
     ------
@@ -156,8 +137,192 @@ def read_run_folder(path: str | Path) -> RunFolder:
     if not isinstance(result, dict) or result.get("format", 0) > FORMAT:
         sentence = f"this run has a newer format than {FORMAT}"
         raise FileError(f"{sentence}; use a newer loopcal, or repeat the run", path)
-    return RunFolder(path, result, arrays)
+    return result, arrays
 
 
-def _is_data(role: str) -> bool:
-    return role.partition("-")[0] == "data"
+@dataclass(frozen=True)
+class Run:
+    """A calibration read from its run folder, or a robot file as if it were one.
+
+    Parameters
+    ----------
+    path : of the folder or file. result : content of result.json, empty for a robot file.
+    robot : the corrected robot. initial_robot : the robot before the calibration.
+    nuisance_values : name -> estimate of frames, targets and surfaces, such as `tracker.x` [SI].
+    initial_nuisance_values : the same with the geometry before the calibration.
+    arrays : content of arrays.npz, SI.
+    """
+
+    path: Path
+    result: dict[str, Any]
+    robot: Mechanism
+    initial_robot: Mechanism
+    nuisance_values: Mapping[str, float] = field(default_factory=dict)
+    initial_nuisance_values: Mapping[str, float] = field(default_factory=dict)
+    arrays: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+
+    @property
+    def held_out(self) -> tuple[str, ...]:
+        """Labels of the poses that were held out for validation."""
+        return tuple((self.result.get("split") or {}).get("held_out", ()))
+
+    @property
+    def excluded(self) -> tuple[str, ...]:
+        """Labels of the poses that were excluded from the fit."""
+        return tuple(self.result.get("fit", {}).get("dropped") or ())
+
+    def load_posterior(self) -> Posterior:
+        """Return estimates and uncertainties, as a prior for new data or for `accuracy_map`.
+
+        Raises
+        ------
+        EstimationError : the run does not contain them, or its robot file was changed.
+        """
+        from loopcal.estimate.inference.posterior import posterior_from_arrays
+
+        return posterior_from_arrays(self.robot, self.arrays)
+
+    def load_measurements(self, **allowed: bool) -> tuple[Measurements, Measurements | None]:
+        """Return the fitted and the held-out measurements, from the unchanged input files.
+
+        Parameters
+        ----------
+        allowed : see `loopcal.load_measurements`.
+
+        Returns
+        -------
+        fitted : without excluded poses. held_out : None where no pose was held out.
+
+        Raises
+        ------
+        FileError : the run names no data, or a file is missing or was changed since.
+        """
+        roles = ("data", "poses")
+        files = {r: f for r, f in list_inputs(self.result).items() if r.partition("-")[0] in roles}
+        if not files:
+            sentence = "this run names no measurement files; load them by load_measurements"
+            raise FileError(sentence, self.path)
+        for file in files.values():
+            if sha256(file["path"]) != file["sha256"]:
+                sentence = f"this file was changed since the run in {self.path}; restore it"
+                raise FileError(sentence, file["path"])
+        data = load_measurements([f["path"] for f in files.values()], self.robot, **allowed)
+        fitted = [label not in (*self.held_out, *self.excluded) for label in data.labels]
+        held_out = [label in self.held_out for label in data.labels]
+        return data.take(fitted), data.take(held_out) if any(held_out) else None
+
+
+def save_run(
+    path: str | Path,
+    report: CalibrationReport,
+    inputs: Mapping[str, Path] | None = None,
+    command: Sequence[str] = (),
+    force: bool = False,
+) -> Path:
+    """Write the run folder of a calibration, and return it.
+
+    Parameters
+    ----------
+    path : the folder to make. report : of `loopcal.calibrate`, with a robot from `load_robot`.
+    inputs : role -> file, such as `{"robot": .., "data": ..}`; their names and digests are kept.
+    command : the command line that made the report.
+    force : replace an older run.
+
+    Raises
+    ------
+    FileError : the folder is in use, or cannot be written; an input cannot be read.
+    MechanismError : the robot was not loaded from a file.
+    """
+    document = build_document(report, inputs, command)
+    text = format_robot(report.robot, report.identification.plus_minus)
+    return write_run_folder(path, document, report.arrays(), text, force)
+
+
+def build_document(
+    report: CalibrationReport, inputs: Mapping[str, Path] | None = None, command: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return the content of result.json; see `save_run`."""
+    files = {role: as_path(file, "input") for role, file in (inputs or {}).items()}
+    provenance = collect_provenance(command, files, report.provenance.seeds)
+    return {"made_by": provenance, **report.to_dict()}
+
+
+def load_run(path: str | Path) -> Run:
+    """Read the run folder of a calibration.
+
+    Raises
+    ------
+    FileError : not a run folder, damaged, or made by a newer loopcal.
+    """
+    path = as_path(path, "run folder")
+    result, arrays = read_run_folder(path)
+    robot = load_robot(path / ROBOT)
+    initial = robot.with_values(arrays.get("initial", robot.parameters.nominal))
+    names = [row["name"] for row in result.get("fit", {}).get("local") or ()]
+    values, initial_values = (
+        dict(zip(names, array.tolist(), strict=True))
+        if (array := arrays.get(key)) is not None and len(array) == len(names)
+        else {}
+        for key in ("local_estimate", "local_start")
+    )
+    return Run(path, result, robot, initial, values, initial_values, arrays)
+
+
+def load_run_or_robot(path: str | Path) -> Run:
+    """Read a run folder, or a robot file (or a shipped robot by its name) as if it were a run.
+
+    Raises
+    ------
+    FileError : neither of them.
+    """
+    path = as_path(path, "run folder or robot file")
+    if path.is_dir() or (not path.exists() and str(path) not in list_shipped_robots()):
+        return load_run(path)
+    robot = load_robot(path)
+    return Run(path, {}, robot, robot.nominal)
+
+
+def load_posterior(path: str | Path) -> Posterior:
+    """Read estimates and uncertainties of a run; raise as `load_run`, `Run.load_posterior`."""
+    return load_run(path).load_posterior()
+
+
+def load_prior(path: str | Path, data: Paths) -> Posterior:
+    """Read the posterior of an earlier run, as a prior for new measurements.
+
+    Raises
+    ------
+    FileError, EstimationError : see `load_posterior`.
+    DataError : the run was fitted to these measurements, which would count twice.
+    """
+    run = load_run(path)
+    _refuse_fitted_files(run, data, "files.prior-data-reused")
+    return run.load_posterior()
+
+
+def load_posterior_or_robot(path: str | Path) -> Mechanism | Posterior:
+    """Read a run folder with its uncertainties, or a robot file (or shipped robot) without any."""
+    return load_posterior(path) if Path(path).is_dir() else load_run_or_robot(path).robot
+
+
+def refuse_fitted_files(run: Run, data: Paths) -> None:
+    """Raise DataError where a file for validation is one that the run was fitted to.
+
+    `loopcal.apply.find_reused_rows` recognizes rows in other files.
+    """
+    _refuse_fitted_files(run, data, "validation.file-reused")
+
+
+def _refuse_fitted_files(run: Run, data: Paths, code: str) -> None:
+    """Raise DataError with the finding `code` for a file of measurements that a run was made from.
+
+    Files of other names are recognized by their content.
+    """
+
+    def list_data(files: Mapping[str, Any]) -> Iterator[Any]:
+        return (file for role, file in files.items() if role.partition("-")[0] == "data")
+
+    used = {file.get("sha256") for file in list_data(list_inputs(run.result))}
+    for file in list_data(list_measurement_files(data)):
+        if sha256(file) in used:
+            raise DataError(report_finding(code, file=str(file)))

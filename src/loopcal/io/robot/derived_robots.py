@@ -1,22 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot file to start from: a shipped robot of a family, with the keys of the family above it."""
+"""Robot files made from others: a new robot of a family, and a robot with more parameters fixed."""
 
 from __future__ import annotations
 
 import json
 import re
 import textwrap
+from collections.abc import Mapping
 
 from loopcal.errors import MechanismError, suggest_names
 from loopcal.io.core import file_reference
 from loopcal.io.core.yaml_file import read_yaml
-from loopcal.io.robot.robot_file import list_shipped_robots
-from loopcal.mechanism import FAMILIES
+from loopcal.io.robot.identified_table import format_table
+from loopcal.io.robot.robot_file import get_source, list_shipped_robots
+from loopcal.mechanism import FAMILIES, Mechanism
 
 EXAMPLES = {"gough": "hexapod-42", "limbs": "five-bar"}
 """The shipped robot of a family that does not have the name of the family."""
 
 WIDTH = 120
+
+FIXED = re.compile(r"^fixed:.*\n(?:(?:[ \t]+.*|-.*)\n)*", re.MULTILINE)
+"""The list in a file, in one line or in several."""
 
 PLAIN = re.compile(r"(?!(?:true|false|null)$)[A-Za-z][\w.-]*$")
 """Names that YAML reads as text without quotes."""
@@ -43,7 +48,7 @@ def format_new_robot(family: str, name: str) -> str:
         raise MechanismError(f"{sentence}; allowed: {', '.join(known)}")
     text = shipped[example].read_text("utf-8")
     record = str(read_yaml(shipped[example], "robot file").content["family"])
-    new = {"name": name if PLAIN.match(name) else json.dumps(name)}
+    new = {"name": _quote(name)}
     new["source"] = "where these numbers come from"
     for key, value in new.items():
         line = f"{key}: {value}"
@@ -62,3 +67,35 @@ def format_new_robot(family: str, name: str) -> str:
     body = text.split("\n")
     first = next(i for i, line in enumerate(body) if not line.startswith("#"))
     return "\n".join([*lines, "", *body[first:]])
+
+
+def format_reduced_robot(robot: Mechanism, dropped: Mapping[str, str]) -> str:
+    """Return the text of a robot's file with further parameters fixed.
+
+    Parameters
+    ----------
+    robot : from `load_robot`, with any values.
+    dropped : parameter to fix -> comment that is written after it.
+
+    Raises
+    ------
+    MechanismError : the robot was not loaded from a file.
+    """
+    source = get_source(robot)
+    entries = dict.fromkeys(source.record.fixed, "") | dict(dropped)
+    if not entries:
+        return source.text + format_table(robot)
+    names = {name: _quote(name) for name in entries}
+    width = max(len(text) for text in names.values())
+    lines = [
+        f"  - {names[name]:<{width}}  # {comment}" if comment else f"  - {names[name]}"
+        for name, comment in entries.items()
+    ]
+    text = FIXED.sub("", source.text)
+    text = text if text.endswith("\n") else text + "\n"
+    return text + "\n".join(["fixed:", *lines]) + "\n" + format_table(robot)
+
+
+def _quote(name: str) -> str:
+    """Return a name as YAML, in quotes where it needs them."""
+    return name if PLAIN.match(name) else json.dumps(name)
