@@ -99,6 +99,12 @@ def check_type(value: object, wanted: type, what: str, hint: str) -> None:
         raise ArgumentTypeError(f"{what}: got {describe(value)}; give {wanted.__name__}, {hint}")
 
 
+def set_fields(instance: object, **values: object) -> None:
+    """Set fields of a frozen dataclass to their checked values; for its `__post_init__` alone."""
+    for name, value in values.items():
+        object.__setattr__(instance, name, value)
+
+
 def describe(value: object) -> str:
     """Return a value as error messages show it: its text and its type."""
     if isinstance(value, str):

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from loopcal.io.core.records import get_field_types
 from loopcal.units import Dimension
 
-SECTION = re.compile(r"^(Attributes|Parameters|Raises|Returns)\n-{3,}\n", re.MULTILINE)
+SECTION = re.compile(r"^(Attributes|Examples|Parameters|Raises|Returns)\n-{3,}\n", re.MULTILINE)
 SHORT = re.compile(r"(?:^ *|(?<=[.;] ))((?:\w+, )*\w+) :\s", re.MULTILINE)
 LONG = re.compile(
     r"^(?P<names>(?:\w+, )*\w+)(?: : [^\n]{0,48})?\n(?P<phrase>(?: {4}[^\n]*(?:\n|$))+)",

@@ -3,7 +3,16 @@
 
 A new kind is one file with one frozen dataclass, and one entry in `KINDS`. Files, templates,
 documentation and contract tests follow from the members of this class. A kind does not know the
-robot: it receives platform poses.
+robot: it receives platform poses. It states
+
+* `columns`, as written in files;
+* `possible_setup`: frames, targets, surfaces and offsets that `unknown` may name, with their
+  parameters;
+* `_predict`: columns without noise, and their derivatives. A kind whose noise is more than an
+  addition to its columns overrides `_evaluate` and `_measure` instead;
+* `guess_values`, if its parameters follow from data in closed form.
+
+`loopcal.measure.kinds.points.distance` is a short example, with three setup items.
 
 Shapes: t trials, r rows, c columns as written in files, m residuals (often c), u nuisance
 parameters of the kind, j joints that it senses. A kind with `poses_per_row` l > 1 compares several
@@ -13,52 +22,22 @@ a frame or a direction is written in them.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields, is_dataclass
-from typing import Any, ClassVar, NamedTuple, Self, cast
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, fields
+from functools import cached_property
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
+from loopcal import geometry
 from loopcal.errors import DataError
+from loopcal.measure.array_checks import set_fields
+from loopcal.measure.kinds.rows import Column, Evaluation, InvalidRows
+from loopcal.measure.kinds.setup_parameters import SetupItem
 from loopcal.numerics.decomposition import without_rounding
 from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
-
-
-@dataclass(frozen=True)
-class Column:
-    """A column of a measurement file: its name, and the dimension of its numbers."""
-
-    name: str
-    dimension: Dimension
-
-
-POSITION_COLUMNS = tuple(Column(name, Dimension.LENGTH) for name in ("x", "y", "z"))
-"""Columns of a position."""
-
-
-class Evaluation(NamedTuple):
-    """Residuals (predicted - measured) and their derivatives.
-
-    Components that were not measured are zero in all arrays.
-
-    Attributes
-    ----------
-    residual : (t, r, m) [SI]
-    jacobian : (t, r, m, 6)
-        By the platform twist (omega, v) in base axes; with an axis of poses before m where a row
-        compares several poses.
-    nuisance : (t, r, m, u) or None
-        By the nuisance parameters of the kind; None where it has none.
-    joints : (t, r, m, j) or None
-        By the values of the joints that the kind senses; None where it senses poses only.
-    """
-
-    residual: FloatArray
-    jacobian: FloatArray
-    nuisance: FloatArray | None = None
-    joints: FloatArray | None = None
 
 
 class Kind(ABC):
@@ -73,18 +52,34 @@ class Kind(ABC):
     changes_with_pose : bool
         Whether columns that stay constant while the robot moves indicate a mistake. It is False for
         touched surfaces and for locked joints, whose columns stay at 0.
+    wraps_angles : bool
+        Whether differences of angles are wrapped into (-pi, pi].
     description : str
         What is measured, for suggestions to measure it with known setup; "the" and the name where
         empty.
     allowed_unknown : tuple of str
         Setup items that `unknown` may list.
+    unknown : tuple of str
+        Setup items that are unknown.
     """
 
     name: ClassVar[str]
     poses_per_row: ClassVar[int] = 1
     changes_with_pose: ClassVar[bool] = True
+    wraps_angles: ClassVar[bool] = True
     description: ClassVar[str] = ""
     allowed_unknown: ClassVar[tuple[str, ...]] = ()
+    unknown: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        names = (self.unknown,) if isinstance(self.unknown, str) else tuple(self.unknown)
+        for name in names:
+            if name not in self.allowed_unknown:
+                raise DataError(
+                    f"{name!r} cannot be unknown in the kind {self.name!r}; allowed are "
+                    f"{', '.join(self.allowed_unknown)}"
+                )
+        set_fields(self, unknown=names)
 
     def __repr__(self) -> str:
         """Return the settings that differ from their defaults, on one line."""
@@ -103,27 +98,14 @@ class Kind(ABC):
         return self.columns
 
     @property
-    def setup_items(self) -> Mapping[str, tuple[Parameter, ...]]:
-        """The unknown frames, targets, surfaces and offsets with their parameters, in order."""
+    def possible_setup(self) -> Mapping[str, SetupItem]:
+        """The frames, targets, surfaces and offsets that may be unknown, by name."""
         return {}
-
-    @property
-    def nuisance_parameters(self) -> tuple[Parameter, ...]:
-        """The u parameters of all setup items, each with the scope that shares one value of it."""
-        return tuple(p for parameters in self.setup_items.values() for p in parameters)
 
     @property
     def target_columns(self) -> Mapping[str, tuple[int, ...]]:
         """The measured objects by name, with the indices of their columns."""
         return {self.name: tuple(range(len(self.columns)))}
-
-    @property
-    def references(self) -> Mapping[str, FloatArray]:
-        """The stated orientations or points that parameters are counted from, by name.
-
-        Kinds that share a name must agree on them.
-        """
-        return {}
 
     @property
     def sensed_joints(self) -> tuple[str, ...]:
@@ -148,21 +130,79 @@ class Kind(ABC):
         """Whether the kind knows the tool, or does not need it."""
         return True
 
+    # --- setup items and their parameters, computed once
+
+    @cached_property
+    def setup_items(self) -> Mapping[str, SetupItem]:
+        """The setup items that are unknown, in order."""
+        possible = self.possible_setup
+        return {name: possible[name] for name in self.unknown}
+
+    @cached_property
+    def nuisance_parameters(self) -> tuple[Parameter, ...]:
+        """The u parameters of all unknown items; rows of one scope share a value."""
+        return tuple(p for item in self.setup_items.values() for p in item.parameters)
+
+    @property
+    def references(self) -> Mapping[str, FloatArray]:
+        """The stated orientations or points that parameters are counted from, by name.
+
+        Kinds that share a name must agree on them.
+        """
+        return {k: v for item in self.setup_items.values() for k, v in item.references.items()}
+
+    @cached_property
+    def _slices(self) -> Mapping[str, slice]:
+        """Where the values of each unknown item are among the u values."""
+        slices, first = {}, 0
+        for name, item in self.setup_items.items():
+            slices[name] = slice(first, first := first + len(item.parameters))
+        return slices
+
+    @property
+    def nominal_values(self) -> FloatArray:
+        """Nominal values (u,) of the nuisance parameters."""
+        return np.array([parameter.nominal for parameter in self.nuisance_parameters])
+
+    def item_values(self, values: FloatArray, name: str) -> FloatArray | None:
+        """Return the values (.., w) of one setup item, None where it is known."""
+        return values[..., self._slices[name]] if name in self._slices else None
+
+    def assemble_values(self, items: Mapping[str, FloatArray]) -> FloatArray:
+        """Return candidates (k, u) from values (k, w) or (w,) of some setup items; the other items
+        stay nominal.
+        """
+        nominal = self.nominal_values
+        columns = [
+            np.atleast_2d(items.get(name, nominal[used])) for name, used in self._slices.items()
+        ]
+        count = max(len(values) for values in columns)
+        return np.concatenate([np.broadcast_to(v, (count, v.shape[1])) for v in columns], axis=-1)
+
+    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
+        """Return candidates (k, u) for the nuisance parameters that rows share.
+
+        They follow from poses T (r, 4, 4) and columns (r, c), in closed form where there is one.
+        `loopcal.measure.initial_values` refines and compares them.
+        """
+        del T, measured
+        return self.nominal_values[None]
+
     # --- rows
 
     def detect_present(self, measured: FloatArray) -> BoolArray:
         """Return which residuals (..., m) exist for columns (..., c); NaN is not measured."""
         return ~np.isnan(measured)
 
-    def find_invalid_rows(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
+    def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
         """Return rows of columns (r, c) with impossible values: (index, end of a sentence)."""
         del measured
         return ()
 
     @property
     def placeholder(self) -> FloatArray:
-        """Values (c,) used where nothing was measured, so that no result is NaN."""
-        return np.zeros(len(self.columns))
+        """Values (c,), or one for all columns (1,), in place of those that were not measured."""
+        return np.zeros(1)
 
     def evaluate(
         self,
@@ -193,18 +233,18 @@ class Kind(ABC):
         DataError
             If the kind senses joints and none are given.
         """
-        if self.sensed_joints and joints is None:
-            raise DataError(
-                f"the kind {self.name!r} needs the values of {', '.join(self.sensed_joints)}; pass "
-                "them as `joints`"
-            )
+        if joints is None:
+            if self.sensed_joints:
+                raise DataError(
+                    f"the kind {self.name!r} needs the values of {', '.join(self.sensed_joints)}; "
+                    "pass them as `joints`"
+                )
+            joints = np.empty((1, 1, 0))
         filled = np.where(np.isnan(measured), self.placeholder, measured)
-        values = self.values_or_nominal(nuisance)
+        values = self._values_or_nominal(nuisance)
         if len(values) > len(T):
             T = np.broadcast_to(T, (len(values), *T.shape[1:]))
-        result = self._drop_rounding(
-            self._evaluate(T, filled, values, np.empty((1, 1, 0)) if joints is None else joints)
-        )
+        result = self._drop_rounding(self._evaluate(T, filled, values, joints))
         present = self.detect_present(measured)
         if np.all(present):
             return result
@@ -221,40 +261,6 @@ class Kind(ABC):
             by_joints,
         )
 
-    def _drop_rounding(self, evaluation: Evaluation) -> Evaluation:
-        """Return the evaluation with zeros where derivatives by nuisance parameters cancel, as
-        those by the place of a target do between parallel poses.
-
-        The derivatives are compared with those by the platform twist. A meter is compared with a
-        radian there; the tolerance is so far below all that counts that the size of a machine does
-        not matter.
-        """
-        if evaluation.nuisance is None:
-            return evaluation
-        by_twist = np.linalg.norm(evaluation.jacobian, axis=-1)
-        by_twist = by_twist.sum(axis=-2) if self.poses_per_row > 1 else by_twist
-        return evaluation._replace(
-            nuisance=without_rounding(evaluation.nuisance, by_twist[..., None])
-        )
-
-    @abstractmethod
-    def _evaluate(
-        self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
-    ) -> Evaluation:
-        """Return `evaluate` for complete arrays; components that were not measured may have any
-        finite value.
-        """
-
-    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
-        """Return candidates (k, u) for the nuisance parameters that rows share.
-
-        They follow from poses T (r, 4, 4) and columns (r, c), in closed form where there is one.
-        `loopcal.measure.initial_values` refines and compares them.
-        """
-        del T, measured
-        return self.nominal_values[None]
-
-    @abstractmethod
     def measure(
         self,
         T: FloatArray,
@@ -280,6 +286,8 @@ class Kind(ABC):
         measured : (t, r, c) [SI]
             With `evaluate(T, measured).residual = -linearize_noise(measured) noise` to first order.
         """
+        values = self._values_or_nominal(nuisance)
+        return self._measure(T, noise, values, np.zeros_like(noise) if joints is None else joints)
 
     def linearize_noise(self, measured: FloatArray) -> FloatArray:
         """Return the derivative (..., m, m) of the residuals by errors of the noise columns, up to
@@ -290,36 +298,59 @@ class Kind(ABC):
 
     # --- for the kinds themselves
 
-    @property
-    def nominal_values(self) -> FloatArray:
-        """Nominal values (u,) of the nuisance parameters."""
-        return np.array([parameter.nominal for parameter in self.nuisance_parameters])
+    def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
+        """Return columns without noise in place of residuals, and their derivatives."""
+        raise NotImplementedError
 
-    def values_or_nominal(self, nuisance: FloatArray | None) -> FloatArray:
+    def _evaluate(
+        self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
+    ) -> Evaluation:
+        """Return `evaluate` for complete arrays; components that were not measured may have any
+        finite value.
+        """
+        predicted = self._predict(T, values, joints)
+        return predicted._replace(residual=self._subtract(predicted.residual, measured))
+
+    def _measure(
+        self, T: FloatArray, noise: FloatArray, values: FloatArray, joints: FloatArray
+    ) -> FloatArray:
+        """Return `measure` for complete arrays."""
+        return self._predict(T, values, joints).residual + noise
+
+    def _subtract(self, predicted: FloatArray, measured: FloatArray) -> FloatArray:
+        """Return the difference of columns (.., c), angles wrapped."""
+        difference = predicted - measured
+        if not self.wraps_angles or not any(self._angle_columns):
+            return difference
+        return np.where(np.array(self._angle_columns), geometry.wrap_angle(difference), difference)
+
+    @cached_property
+    def _angle_columns(self) -> tuple[bool, ...]:
+        """Which columns are angles."""
+        return tuple(column.dimension is Dimension.ANGLE for column in self.columns)
+
+    def _values_or_nominal(self, nuisance: FloatArray | None) -> FloatArray:
         """Return the given values, or the nominal ones (1, 1, u)."""
         return self.nominal_values[None, None] if nuisance is None else nuisance
 
-    def item_values(self, values: FloatArray, name: str) -> FloatArray | None:
-        """Return the values (.., w) of one setup item, None where it is known."""
-        first = 0
-        for item, parameters in self.setup_items.items():
-            if item == name:
-                return values[..., first : first + len(parameters)]
-            first += len(parameters)
-        return None
+    def _drop_rounding(self, evaluation: Evaluation) -> Evaluation:
+        """Return the evaluation with zeros where derivatives by nuisance parameters cancel, as
+        those by the place of a target do between parallel poses.
 
-    def assemble_values(self, items: Mapping[str, FloatArray], count: int) -> FloatArray:
-        """Return candidates (count, u) from values (count, w) or (w,) of some setup items; the
-        other items stay nominal.
+        The derivatives are compared with those by the platform twist. A meter is compared with a
+        radian there; the tolerance is so far below all that counts that the size of a machine does
+        not matter.
         """
-        columns = []
-        for name, parameters in self.setup_items.items():
-            nominal = np.array([p.nominal for p in parameters])
-            columns.append(np.broadcast_to(items.get(name, nominal), (count, len(parameters))))
-        return np.concatenate(columns, axis=-1)
+        if evaluation.nuisance is None:
+            return evaluation
+        by_twist = np.linalg.norm(evaluation.jacobian, axis=-1)
+        by_twist = by_twist.sum(axis=-2) if self.poses_per_row > 1 else by_twist
+        return evaluation._replace(
+            nuisance=without_rounding(evaluation.nuisance, by_twist[..., None])
+        )
 
     def join_columns(self, blocks: Mapping[str, FloatArray], shape: tuple[int, ...]) -> FloatArray:
-        """Return derivatives side by side: by the twist, then by each setup item.
+        """Return derivatives side by side: by the twist, then by each unknown setup item.
 
         Parameters
         ----------
@@ -332,14 +363,12 @@ class Kind(ABC):
         -------
         rows : (*shape, 6 + u)
         """
-        widths = {"twist": 6} | {name: len(item) for name, item in self.setup_items.items()}
-        return np.concatenate(
-            [
-                np.broadcast_to(blocks.get(name, np.zeros(w)), (*shape, w))
-                for name, w in widths.items()
-            ],
-            axis=-1,
-        )
+        widths = {"twist": 6} | {k: len(item.parameters) for k, item in self.setup_items.items()}
+        columns = [
+            np.broadcast_to(blocks.get(name, np.zeros(w)), (*shape, w))
+            for name, w in widths.items()
+        ]
+        return columns[0] if len(columns) == 1 else np.concatenate(columns, axis=-1)
 
     def split_columns(self, residual: FloatArray, rows: FloatArray) -> Evaluation:
         """Return the evaluation of residuals (t, r, m) with derivatives (t, r, m, 6 + u) from
@@ -347,35 +376,16 @@ class Kind(ABC):
         """
         return Evaluation(residual, rows[..., :6], rows[..., 6:] if self.setup_items else None)
 
-    def _changed_settings(self) -> list[str]:
-        if not is_dataclass(self):
-            return []
-        changed = []
-        for setting in fields(self):
+    def _changed_settings(self) -> Iterator[str]:
+        for setting in fields(cast(Any, self)):
             value, usual = getattr(self, setting.name), setting.default
             if setting.default_factory is not MISSING:
                 usual = setting.default_factory()
-            if setting.init and not np.array_equal(cast(Any, value), cast(Any, usual)):
-                text = shorten_array(value) if isinstance(value, np.ndarray) else repr(value)
-                changed.append(f"{setting.name}={text}")
-        return changed
-
-
-def shorten_array(array: FloatArray) -> str:
-    """Return a small array as nested lists with six digits, a large one as its shape."""
-    if array.size > 16:
-        return f"<array {array.shape}>"
-    return str(np.round(array, 6).tolist())
-
-
-def check_unknown(unknown: tuple[str, ...], allowed: tuple[str, ...], kind: str) -> tuple[str, ...]:
-    """Return the setup items that are stated to be unknown as a tuple; DataError for a name that is
-    not allowed.
-    """
-    names = (unknown,) if isinstance(unknown, str) else tuple(unknown)
-    for name in names:
-        if name not in allowed:
-            raise DataError(
-                f"{name!r} cannot be unknown in the kind {kind!r}; allowed are {', '.join(allowed)}"
-            )
-    return names
+            if setting.init and not np.array_equal(value, cast(Any, usual)):
+                text = repr(value)
+                if isinstance(value, np.ndarray):
+                    is_small = value.size <= 16
+                    text = (
+                        f"{np.round(value, 6).tolist() if is_small else f'<array {value.shape}>'}"
+                    )
+                yield f"{setting.name}={text}"

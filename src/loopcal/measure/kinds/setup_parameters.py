@@ -10,6 +10,9 @@ group, so they are exact for rotations of any size. The only singular case is a 
 exactly 180 degrees.
 """
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from loopcal import geometry
@@ -17,41 +20,70 @@ from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
-ROTATION_AXES, POSITION_AXES = ("rx", "ry", "rz"), ("x", "y", "z")
+ROTATION_AXES, POSITION_AXES, DIRECTION_AXES = ("rx", "ry", "rz"), ("x", "y", "z"), ("u", "v")
 
 
-# --- parameters
+# --- items and their parameters
 
 
-def make_rotation_parameters(name: str, scope: str = "session") -> tuple[Parameter, ...]:
-    """Return three parameters of an orientation: `name.rx`, `name.ry`, `name.rz`."""
-    return tuple(
-        Parameter(f"{name}.{axis}", Dimension.ANGLE, 0.0, scope=scope) for axis in ROTATION_AXES
-    )
+@dataclass(frozen=True, eq=False)
+class SetupItem:
+    """A frame, direction, target, surface or offset that may be unknown.
+
+    Attributes
+    ----------
+    parameters : its nuisance parameters, with nominal values and scope.
+    references : name -> array, the stated orientations or points that they are counted from.
+    """
+
+    parameters: tuple[Parameter, ...]
+    references: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
-def make_point_parameters(
-    name: str, place: FloatArray, scope: str = "session"
+def make_parameters(
+    name: str,
+    axes: Sequence[str],
+    dimension: Dimension,
+    nominal: FloatArray | None = None,
+    scope: str = "session",
 ) -> tuple[Parameter, ...]:
-    """Return three parameters of a point, `name.x` to `name.z`, nominally at `place` (3,)."""
-    pairs = zip(POSITION_AXES, place.tolist(), strict=True)
+    """Return one parameter `name.axis` for each axis; nominal values (w,) default to 0."""
+    values = [0.0] * len(axes) if nominal is None else nominal.tolist()
     return tuple(
-        Parameter(f"{name}.{axis}", Dimension.LENGTH, value, scope=scope) for axis, value in pairs
+        Parameter(f"{name}.{axis}", dimension, value, scope=scope)
+        for axis, value in zip(axes, values, strict=True)
     )
 
 
-def make_frame_parameters(
-    name: str, T: FloatArray, scope: str = "session"
-) -> tuple[Parameter, ...]:
-    """Return six parameters of a frame that is stated as T (4, 4)."""
-    return make_rotation_parameters(name, scope) + make_point_parameters(name, T[:3, 3], scope)
+def make_frame_item(name: str, T: FloatArray) -> SetupItem:
+    """Return a frame that is stated as T (4, 4): three rotations and a position."""
+    position = make_parameters(name, POSITION_AXES, Dimension.LENGTH, T[:3, 3])
+    orientation = make_orientation_item(name, T[:3, :3])
+    return SetupItem(orientation.parameters + position, orientation.references)
 
 
-def make_direction_parameters(name: str, scope: str = "session") -> tuple[Parameter, ...]:
-    """Return two parameters of a direction: `name.u` and `name.v`."""
-    return tuple(
-        Parameter(f"{name}.{axis}", Dimension.ANGLE, 0.0, scope=scope) for axis in ("u", "v")
+def make_orientation_item(name: str, R: FloatArray) -> SetupItem:
+    """Return an orientation that is stated as R (3, 3): three rotations."""
+    return SetupItem(make_parameters(name, ROTATION_AXES, Dimension.ANGLE), {name: R})
+
+
+def make_direction_item(name: str, direction: FloatArray) -> SetupItem:
+    """Return a direction that is stated as a unit vector (3,): two rotations."""
+    return SetupItem(make_parameters(name, DIRECTION_AXES, Dimension.ANGLE), {name: direction})
+
+
+def make_points_item(names: Sequence[str], points: FloatArray) -> SetupItem:
+    """Return points that are stated as (k, 3): three coordinates of each."""
+    of_each = (
+        make_parameters(name, POSITION_AXES, Dimension.LENGTH, point)
+        for name, point in zip(names, points, strict=True)
     )
+    return SetupItem(tuple(parameter for parameters in of_each for parameter in parameters))
+
+
+def make_offset_item(name: str) -> SetupItem:
+    """Return an offset of all readings of a session: one length."""
+    return SetupItem((Parameter(name, Dimension.LENGTH, 0.0, scope="session"),))
 
 
 # --- frames
@@ -80,9 +112,14 @@ def linearize_frame(values: FloatArray) -> FloatArray:
     It is the left Jacobian for the rotation and the identity for x y z.
     """
     rotation = geometry.left_jacobian_so3(values[..., :3])
-    zero, identity = np.zeros_like(rotation), np.broadcast_to(np.eye(3), rotation.shape)
-    top = np.concatenate([rotation, zero], axis=-1)
-    return np.concatenate([top, np.concatenate([zero, identity], axis=-1)], axis=-2)
+    return stack_diagonally(rotation, np.broadcast_to(np.eye(3), rotation.shape))
+
+
+def stack_diagonally(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return matrices (.., 6, 6) with two blocks (.., 3, 3) on their diagonal."""
+    zero = np.zeros_like(first)
+    top, bottom = (np.concatenate(row, axis=-1) for row in ((first, zero), (zero, second)))
+    return np.concatenate([top, bottom], axis=-2)
 
 
 # --- directions

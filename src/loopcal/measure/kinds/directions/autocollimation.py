@@ -8,15 +8,15 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from loopcal.measure.array_checks import check_direction, check_pose
-from loopcal.measure.kinds.directions.direction_kind import DirectionKind
-from loopcal.measure.kinds.kind import Column, check_unknown
+from loopcal.measure.array_checks import check_direction, set_fields
+from loopcal.measure.kinds.directions.direction_kind import AxisKind
+from loopcal.measure.kinds.rows import Column, InvalidRows
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Autocollimation(DirectionKind):
+class Autocollimation(AxisKind):
     """Angles of a mirror's normal. Residual: differences of `atan2(d_x, d_z)` and `atan2(d_y,
     d_z)`, wrapped.
 
@@ -31,12 +31,7 @@ class Autocollimation(DirectionKind):
         value.
     mirror : str
         Name of the mirror; its parameters begin with it.
-    T_base_frame : (4, 4)
-        Frame of the instrument in the base; only its orientation matters.
-    frame : str
-        Name of the frame. Kinds that use the same name share its parameters.
-    unknown : tuple of str
-        Which of "frame" and "mirror" are unknown.
+    Others: see `AxisKind`; "frame" and "mirror" may be unknown.
 
     Raises
     ------
@@ -47,18 +42,13 @@ class Autocollimation(DirectionKind):
 
     normal: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     mirror: str = "mirror"
-    T_base_frame: FloatArray = field(default_factory=lambda: np.eye(4))
-    frame: str = "frame"
 
     name: ClassVar[str] = "autocollimation"
     allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "mirror")
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "normal", check_direction(self.normal, "the normal of the mirror"))
-        object.__setattr__(self, "T_base_frame", check_pose(self.T_base_frame, "T_base_frame"))
-        object.__setattr__(
-            self, "unknown", check_unknown(self.unknown, self.allowed_unknown, self.name)
-        )
+        super().__post_init__()
+        set_fields(self, normal=check_direction(self.normal, "the normal of the mirror"))
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
@@ -86,16 +76,15 @@ class Autocollimation(DirectionKind):
         ]
         return np.stack([np.arctan2(x, z), np.arctan2(y, z)], axis=-1), np.stack(slopes, axis=-2)
 
-    def convert_to_directions(self, measured: FloatArray) -> FloatArray:
+    def convert_to_directions(self, measured: FloatArray) -> tuple[FloatArray, ...]:
         """Return the normals of two angles, towards the instrument."""
         x, y = np.tan(measured[..., 0]), np.tan(measured[..., 1])
         d = np.stack([x, y, np.ones_like(x)], axis=-1)
-        return d / np.linalg.norm(d, axis=-1, keepdims=True)
+        return (d / np.linalg.norm(d, axis=-1, keepdims=True),)
 
-    def find_invalid_rows(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
+    def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
         """Return rows whose mirror faces away from the instrument."""
-        with np.errstate(invalid="ignore"):
-            away = np.argwhere(np.abs(measured) >= np.pi / 2)
+        away = np.argwhere(np.abs(measured) >= np.pi / 2)
         sentence = (
             "has an angle of {:.6g} deg, at which the mirror faces away from the instrument; check "
             "the unit"

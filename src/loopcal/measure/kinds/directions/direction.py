@@ -9,16 +9,16 @@ from typing import ClassVar, Self
 import numpy as np
 
 from loopcal import geometry
-from loopcal.measure.array_checks import check_direction, check_pose
-from loopcal.measure.kinds.directions.direction_kind import DirectionKind
-from loopcal.measure.kinds.kind import Column, Evaluation, check_unknown
+from loopcal.measure.array_checks import check_direction, set_fields
+from loopcal.measure.kinds.directions.direction_kind import AxisKind
+from loopcal.measure.kinds.rows import Column, Evaluation, InvalidRows, is_incomplete, list_rows
 from loopcal.measure.kinds.setup_parameters import make_perpendicular_basis
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Direction(DirectionKind):
+class Direction(AxisKind):
     """Direction of an axis. Residual: `2 B'd / (1 + m'd)`, with B two unit vectors perpendicular to
     the measured direction m.
 
@@ -32,12 +32,7 @@ class Direction(DirectionKind):
         The axis on the platform, of any length. If the axis is unknown, its nominal value.
     axis_name : str
         Name of the axis; its parameters begin with it.
-    T_base_frame : (4, 4)
-        Frame of the instrument in the base; only its orientation matters.
-    frame : str
-        Name of the frame. Kinds that use the same name share its parameters.
-    unknown : tuple of str
-        Which of "frame" and "axis" are unknown.
+    Others: see `AxisKind`; "frame" and "axis" may be unknown.
 
     Raises
     ------
@@ -48,17 +43,13 @@ class Direction(DirectionKind):
 
     axis: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     axis_name: str = "axis"
-    T_base_frame: FloatArray = field(default_factory=lambda: np.eye(4))
-    frame: str = "frame"
 
     name: ClassVar[str] = "direction"
+    allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "axis")
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "axis", check_direction(self.axis, "the axis"))
-        object.__setattr__(self, "T_base_frame", check_pose(self.T_base_frame, "T_base_frame"))
-        object.__setattr__(
-            self, "unknown", check_unknown(self.unknown, self.allowed_unknown, self.name)
-        )
+        super().__post_init__()
+        set_fields(self, axis=check_direction(self.axis, "the axis"))
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
@@ -97,27 +88,24 @@ class Direction(DirectionKind):
         """Return both residuals as present, or none where a component is missing."""
         return np.repeat(~np.any(np.isnan(measured), axis=-1, keepdims=True), 2, axis=-1)
 
-    def find_invalid_rows(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
+    def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
         """Return rows with an incomplete direction, or one whose length is not 1."""
         length = np.linalg.norm(measured, axis=-1)
-        missing = np.isnan(measured)
-        incomplete = np.any(missing, axis=-1) & ~np.all(missing, axis=-1)
-        invalid = [
-            (int(i), "has an incomplete direction; give i, j and k, or none of them")
-            for i in np.flatnonzero(incomplete)
-        ]
-        return tuple(invalid) + tuple(
-            (int(i), f"has a direction of length {length[i]:.6g}; the length must be 1 to 1e-3")
-            for i in np.flatnonzero(np.abs(length - 1.0) > 1e-3)
+        return list_rows(
+            is_incomplete(measured),
+            lambda _: "has an incomplete direction; give i, j and k, or none of them",
+        ) + list_rows(
+            np.abs(length - 1.0) > 1e-3,
+            lambda i: f"has a direction of length {length[i]:.6g}; the length must be 1 to 1e-3",
         )
 
     def predict(self, d: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the direction itself."""
         return d, np.eye(3)
 
-    def convert_to_directions(self, measured: FloatArray) -> FloatArray:
+    def convert_to_directions(self, measured: FloatArray) -> tuple[FloatArray, ...]:
         """Return the columns, scaled to length one."""
-        return measured / np.linalg.norm(measured, axis=-1, keepdims=True)
+        return (measured / np.linalg.norm(measured, axis=-1, keepdims=True),)
 
     def _evaluate(
         self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
@@ -134,15 +122,10 @@ class Direction(DirectionKind):
         slopes = scale[..., None] * (Bt - 0.5 * residual[..., None] * m[..., None, :])
         return self.split_columns(residual, slopes @ rows)
 
-    def measure(
-        self,
-        T: FloatArray,
-        noise: FloatArray,
-        nuisance: FloatArray | None = None,
-        joints: FloatArray | None = None,
+    def _measure(
+        self, T: FloatArray, noise: FloatArray, values: FloatArray, joints: FloatArray
     ) -> FloatArray:
         """Return columns (t, r, 3), rotated by noise (t, r, 2) perpendicular to the direction."""
-        d = self.locate_direction(T, self.values_or_nominal(nuisance))[0]
-        B = make_perpendicular_basis(d)
-        rotation = np.cross(d, (B @ noise[..., None])[..., 0])
+        d, _ = self.locate_direction(T, values)
+        rotation = np.cross(d, (make_perpendicular_basis(d) @ noise[..., None])[..., 0])
         return (geometry.exp_so3(rotation) @ d[..., None])[..., 0]

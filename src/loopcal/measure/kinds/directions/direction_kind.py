@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Base of the kinds that measure directions: an axis of the platform from a frame, or gravity on
+"""Bases of the kinds that measure directions: an axis of the platform from a frame, or gravity on
 the platform.
 """
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
 
 from loopcal import geometry
 from loopcal.geometry.alignment import solve_directions
+from loopcal.measure.array_checks import check_pose, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import Evaluation, Kind
-from loopcal.parameters import Parameter
+from loopcal.measure.kinds.kind import Kind
+from loopcal.measure.kinds.rows import Evaluation
 from loopcal.typing import FloatArray
 
 
@@ -37,7 +38,6 @@ class DirectionKind(Kind):
 
     unknown: tuple[str, ...] = ()
 
-    allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "axis")
     inward: ClassVar[bool] = False
 
     @property
@@ -46,28 +46,18 @@ class DirectionKind(Kind):
         """Name and rotation (3, 3) of the orientation; name and unit vector of the direction."""
 
     @property
-    def setup_items(self) -> Mapping[str, tuple[Parameter, ...]]:
-        """Orientation and direction, if unknown."""
-        orientation, _, direction, _ = self.stated
-        items = {
-            self.allowed_unknown[0]: setup.make_rotation_parameters(orientation),
-            self.allowed_unknown[1]: setup.make_direction_parameters(direction),
-        }
-        return {name: items[name] for name in self.unknown}
-
-    @property
-    def references(self) -> Mapping[str, FloatArray]:
-        """The stated orientation and direction."""
+    def possible_setup(self) -> Mapping[str, setup.SetupItem]:
+        """Orientation and direction."""
         orientation, S, direction, a = self.stated
-        stated = {
-            self.allowed_unknown[0]: (orientation, S),
-            self.allowed_unknown[1]: (direction, a),
-        }
-        return dict(stated[name] for name in self.unknown)
+        items = (
+            setup.make_orientation_item(orientation, S),
+            setup.make_direction_item(direction, a),
+        )
+        return dict(zip(self.allowed_unknown, items, strict=True))
 
     def locate_direction(self, T: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the direction d (.., 3) and its derivative (.., 3, 6 + u)."""
-        _, S, _, a = self.stated
+        _, S, _, stated = self.stated
         of_orientation, of_direction = self.allowed_unknown
         rotation, angles = (self.item_values(values, name) for name in self.allowed_unknown)
         R = T[..., :3, :3]
@@ -75,17 +65,15 @@ class DirectionKind(Kind):
         if rotation is not None:
             S = geometry.exp_so3(rotation) @ S
         St = np.swapaxes(S, -1, -2)
-        a = setup.place_direction(a, angles)
+        a = setup.place_direction(stated, angles)
         rotated = (Q @ a[..., None])[..., 0]
-        by_omega = Q @ geometry.hat(a) if self.inward else -geometry.hat(rotated)
-        by_omega = St @ by_omega
+        by_omega = St @ (Q @ geometry.hat(a) if self.inward else -geometry.hat(rotated))
         blocks = {"twist": np.concatenate([by_omega, np.zeros_like(by_omega)], axis=-1)}
         if rotation is not None:
-            blocks[of_orientation] = (
-                St @ geometry.hat(rotated) @ geometry.left_jacobian_so3(rotation)
-            )
+            by_rotation = geometry.left_jacobian_so3(rotation)
+            blocks[of_orientation] = St @ geometry.hat(rotated) @ by_rotation
         if angles is not None:
-            blocks[of_direction] = St @ Q @ setup.linearize_direction(self.stated[3], angles)
+            blocks[of_direction] = St @ Q @ setup.linearize_direction(stated, angles)
         d = (St @ rotated[..., None])[..., 0]
         return d, self.join_columns(blocks, d.shape)
 
@@ -93,53 +81,32 @@ class DirectionKind(Kind):
     def predict(self, d: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the columns (.., m) of directions d (.., 3), and their derivatives (.., m, 3)."""
 
-    @abstractmethod
-    def convert_to_directions(self, measured: FloatArray) -> FloatArray:
-        """Return the unit vectors d (.., 3) of columns (.., c)."""
-
-    def _evaluate(
-        self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
-    ) -> Evaluation:
+    def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
         d, rows = self.locate_direction(T, values)
         predicted, slopes = self.predict(d)
-        return self.split_columns(geometry.wrap_angle(predicted - measured), slopes @ rows)
+        return self.split_columns(predicted, slopes @ rows)
 
-    def measure(
-        self,
-        T: FloatArray,
-        noise: FloatArray,
-        nuisance: FloatArray | None = None,
-        joints: FloatArray | None = None,
-    ) -> FloatArray:
-        """Return columns (t, r, c) with noise added."""
-        return (
-            self.predict(self.locate_direction(T, self.values_or_nominal(nuisance))[0])[0] + noise
-        )
+    @abstractmethod
+    def convert_to_directions(self, measured: FloatArray) -> tuple[FloatArray, ...]:
+        """Return the unit vectors d (.., 3) that columns (.., c) can stand for, usually one."""
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Return orientation and direction in closed form, from the whole rotation group."""
         complete = ~np.any(np.isnan(measured), axis=-1)
         if not self.unknown or np.count_nonzero(complete) < 3:
             return self.nominal_values[None]
-        Q = T[complete, :3, :3]
-        if self.inward:
-            Q = np.swapaxes(Q, -1, -2)
-        return np.concatenate(
-            [self._solve(Q, d) for d in self.interpret_columns(measured[complete])]
-        )
-
-    def interpret_columns(self, measured: FloatArray) -> tuple[FloatArray, ...]:
-        """Return all directions (r, 3) that columns (r, c) can stand for."""
-        return (self.convert_to_directions(measured),)
+        R = T[complete, :3, :3]
+        Q = np.swapaxes(R, -1, -2) if self.inward else R
+        directions = self.convert_to_directions(measured[complete])
+        return np.concatenate([self._solve(Q, d) for d in directions])
 
     def _solve(self, Q: FloatArray, d: FloatArray) -> FloatArray:
         """Return candidates (k, u) from measured directions d (r, 3)."""
         _, S, _, a = self.stated
         of_orientation, of_direction = self.allowed_unknown
         if of_orientation in self.unknown:
-            rotations, directions = solve_directions(
-                d, Q, None if of_direction in self.unknown else a
-            )
+            known = None if of_direction in self.unknown else a
+            rotations, directions = solve_directions(d, Q, known)
         else:
             mean = np.einsum("rji,jk,rk->i", Q, S, d)
             rotations, directions = S[None], (mean / np.linalg.norm(mean))[None]
@@ -147,4 +114,25 @@ class DirectionKind(Kind):
             of_orientation: setup.encode_rotation(S, rotations),
             of_direction: setup.encode_direction(a, directions),
         }
-        return self.assemble_values(items, len(rotations))
+        return self.assemble_values(items)
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class AxisKind(DirectionKind):
+    """A kind that measures an axis of the platform in the frame of an instrument.
+
+    Parameters
+    ----------
+    T_base_frame : (4, 4)
+        Frame of the instrument in the base; only its orientation matters.
+    frame : str
+        Name of the frame. Kinds that use the same name share its parameters.
+    Others: see `DirectionKind`.
+    """
+
+    T_base_frame: FloatArray = field(default_factory=lambda: np.eye(4))
+    frame: str = "frame"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        set_fields(self, T_base_frame=check_pose(self.T_base_frame, "T_base_frame"))

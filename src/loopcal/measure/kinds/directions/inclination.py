@@ -6,9 +6,9 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from loopcal.measure.array_checks import check_direction, check_pose
+from loopcal.measure.array_checks import check_direction, check_pose, set_fields
 from loopcal.measure.kinds.directions.direction_kind import DirectionKind
-from loopcal.measure.kinds.kind import Column, check_unknown
+from loopcal.measure.kinds.rows import Column, InvalidRows, list_rows
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
@@ -47,13 +47,9 @@ class Inclination(DirectionKind):
     inward: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "up", check_direction(self.up, "the vertical"))
-        object.__setattr__(
-            self, "T_platform_sensor", check_pose(self.T_platform_sensor, "T_platform_sensor")
-        )
-        object.__setattr__(
-            self, "unknown", check_unknown(self.unknown, self.allowed_unknown, self.name)
-        )
+        super().__post_init__()
+        mounting = check_pose(self.T_platform_sensor, "T_platform_sensor")
+        set_fields(self, up=check_direction(self.up, "the vertical"), T_platform_sensor=mounting)
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
@@ -84,33 +80,25 @@ class Inclination(DirectionKind):
         second = np.stack([-x * y / level_y, level_y, -y * z / level_y], axis=-1)
         return angles, np.stack([first, second], axis=-2)
 
-    def convert_to_directions(self, measured: FloatArray) -> FloatArray:
-        """Return the upward vertical in an upright sensor."""
+    def convert_to_directions(self, measured: FloatArray) -> tuple[FloatArray, ...]:
+        """Return the vertical in an upright sensor; with an unknown mounting, also in one that
+        hangs upside down, which shows the same tilts.
+        """
         side = np.sin(measured)
         rest = np.sqrt(np.maximum(1.0 - np.sum(side * side, axis=-1, keepdims=True), 0.0))
         d = np.concatenate([side, rest], axis=-1)
-        return d / np.linalg.norm(d, axis=-1, keepdims=True)
+        upright = d / np.linalg.norm(d, axis=-1, keepdims=True)
+        upside_down = upright * np.array([1.0, 1.0, -1.0])
+        return (upright, upside_down) if "mounting" in self.unknown else (upright,)
 
-    def interpret_columns(self, measured: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the vertical in an upright sensor and in one that hangs upside down, which shows
-        the same tilts.
-        """
-        upright = self.convert_to_directions(measured)
-        return (
-            (upright, upright * np.array([1.0, 1.0, -1.0]))
-            if "mounting" in self.unknown
-            else (upright,)
-        )
-
-    def find_invalid_rows(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
+    def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
         """Return rows whose two tilts are impossible together."""
-        with np.errstate(invalid="ignore"):
-            wrong = np.flatnonzero(
-                (np.sum(np.sin(measured) ** 2, axis=-1) > 1.0)
-                | np.any(np.abs(measured) > np.pi / 2, axis=-1)
-            )
         sentence = (
             "has tilts of {:.6g} and {:.6g} deg, which are impossible together: elevations of two "
             "perpendicular axes add up to at most 90 deg; check the unit"
         )
-        return tuple((int(i), sentence.format(*np.rad2deg(measured[i]))) for i in wrong)
+        is_beyond_vertical = np.any(np.abs(measured) > np.pi / 2, axis=-1)
+        return list_rows(
+            is_beyond_vertical | (np.sum(np.sin(measured) ** 2, axis=-1) > 1.0),
+            lambda i: sentence.format(*np.rad2deg(measured[i])),
+        )

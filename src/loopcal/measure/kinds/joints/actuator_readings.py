@@ -11,7 +11,8 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from loopcal.measure.kinds.kind import Column, Evaluation, Kind
+from loopcal.measure.kinds.kind import Kind
+from loopcal.measure.kinds.rows import Column, Evaluation
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
@@ -28,6 +29,7 @@ class ActuatorReadings(Kind):
 
     name: ClassVar[str] = "readings"
     description: ClassVar[str] = "the readings of the actuators"
+    wraps_angles: ClassVar[bool] = False
     actuators: Mapping[str, Dimension]
 
     @classmethod
@@ -45,20 +47,7 @@ class ActuatorReadings(Kind):
         """The actuators."""
         return tuple(self.actuators)
 
-    def _evaluate(
-        self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
-    ) -> Evaluation:
-        residual = joints - measured
+    def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
         m = len(self.actuators)
-        by_joint = np.broadcast_to(np.eye(m), (*residual.shape, m))
-        return Evaluation(residual, np.zeros((*residual.shape, 6)), None, by_joint)
-
-    def measure(
-        self,
-        T: FloatArray,
-        noise: FloatArray,
-        nuisance: FloatArray | None = None,
-        joints: FloatArray | None = None,
-    ) -> FloatArray:
-        """Return recorded readings (t, r, a)."""
-        return noise if joints is None else joints + noise
+        by_joint = np.broadcast_to(np.eye(m), (*joints.shape, m))
+        return Evaluation(joints, np.zeros((*joints.shape, 6)), None, by_joint)

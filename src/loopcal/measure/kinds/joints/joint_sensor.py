@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kind `joint`: sensors on passive or driven joints; on a driven joint it is a noisy encoder."""
+"""Kinds `joint` and `locked`: sensors on joints, and joints that are fixed at unknown values.
+
+The residual depends on the values of joints, not on the pose. The mechanism gives these values and
+their derivatives by the robot's parameters. The value of a driven joint is its actuator reading. If
+readings are uncertain, true readings are unknowns of their pose, and these kinds relate them to the
+value that the encoder showed.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,10 +13,11 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.measure.kinds.kind import Column, Evaluation, Kind, check_unknown
-from loopcal.parameters import Parameter
+from loopcal.measure.array_checks import set_fields
+from loopcal.measure.kinds import setup_parameters as setup
+from loopcal.measure.kinds.kind import Kind
+from loopcal.measure.kinds.rows import Column, Evaluation
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
@@ -19,10 +26,7 @@ from loopcal.units import Dimension
 class JointSensor(Kind):
     """Values of joints. Residual: `joint + offset - measured`, angles wrapped.
 
-    The residual depends on the values of the joints, not on the pose. The mechanism gives these
-    values and their derivatives by the robot's parameters. The value of a driven joint is its
-    actuator reading. If readings are uncertain, true readings are unknowns of their pose, and this
-    kind relates them to the value that the encoder showed.
+    On a driven joint it is a noisy encoder.
 
     Parameters
     ----------
@@ -51,6 +55,7 @@ class JointSensor(Kind):
     sign: ClassVar[float] = 1.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         joints = (self.joints,) if isinstance(self.joints, str) else tuple(self.joints)
         if not joints or len(set(joints)) < len(joints):
             raise DataError(
@@ -58,10 +63,7 @@ class JointSensor(Kind):
             )
         if self.measures not in ("length", "angle"):
             raise DataError(f"the joints measure {self.measures!r}; use length or angle")
-        object.__setattr__(self, "joints", joints)
-        object.__setattr__(
-            self, "unknown", check_unknown(self.unknown, self.allowed_unknown, self.name)
-        )
+        set_fields(self, joints=joints)
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
@@ -84,42 +86,47 @@ class JointSensor(Kind):
         return self.joints
 
     @property
-    def setup_items(self) -> Mapping[str, tuple[Parameter, ...]]:
-        """One offset for each joint, if unknown."""
-        offsets = tuple(
-            Parameter(f"{joint}.{self.name}", self.dimension, 0.0, scope=self.scope)
+    def possible_setup(self) -> Mapping[str, setup.SetupItem]:
+        """One offset for each joint."""
+        offsets = (
+            setup.make_parameters(joint, (self.name,), self.dimension, scope=self.scope)
             for joint in self.joints
         )
-        return {"offset": offsets} if self.unknown else {}
+        return {"offset": setup.SetupItem(tuple(offset for (offset,) in offsets))}
 
-    def _evaluate(
-        self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
-    ) -> Evaluation:
-        residual = self.predict(joints, values) - measured
-        if self.dimension is Dimension.ANGLE:
-            residual = geometry.wrap_angle(residual)
-        m = len(self.joints)
-        by_twist = np.zeros((*residual.shape, 6))
-        by_joint = np.broadcast_to(np.eye(m), (*residual.shape, m))
-        by_offset = self.sign * by_joint if self.unknown else None
-        return Evaluation(residual, by_twist, by_offset, by_joint)
-
-    def predict(self, joints: FloatArray, values: FloatArray) -> FloatArray:
-        """Return the values (t, r, m) that the sensors show."""
+    def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
         offset = self.item_values(values, "offset")
-        return joints if offset is None else joints + self.sign * offset
+        shown = joints if offset is None else joints + self.sign * offset
+        m = len(self.joints)
+        by_joint = np.broadcast_to(np.eye(m), (*shown.shape, m))
+        by_offset = None if offset is None else self.sign * by_joint
+        return Evaluation(shown, np.zeros((*shown.shape, 6)), by_offset, by_joint)
 
-    def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
-        """Return offsets of zero: poses alone do not determine them, and they enter linearly."""
-        return self.nominal_values[None]
 
-    def measure(
-        self,
-        T: FloatArray,
-        noise: FloatArray,
-        nuisance: FloatArray | None = None,
-        joints: FloatArray | None = None,
-    ) -> FloatArray:
-        """Return columns (t, r, m) with noise added."""
-        true = np.zeros_like(noise) if joints is None else joints
-        return self.predict(true, self.values_or_nominal(nuisance)) + noise
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Locked(JointSensor):
+    """Locked joints. Residual: `joint - constant - slip`, with one unknown constant for each group
+    of rows.
+
+    The column is the slip of the lock, usually 0. Its noise is the play of the lock.
+
+    Parameters
+    ----------
+    See `JointSensor`; the constant is always unknown.
+    """
+
+    unknown: tuple[str, ...] = ("offset",)
+
+    name: ClassVar[str] = "locked"
+    scope: ClassVar[str] = "group"
+    sign: ClassVar[float] = -1.0
+
+    @classmethod
+    def examples(cls) -> tuple[Self, ...]:
+        """Return two joints at once."""
+        return (cls(joints=("q1", "q4")),)
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """The slip of each joint."""
+        return tuple(Column(f"{name}.slip", self.dimension) for name in self.joints)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kind `bearing`: two angles of a point from a station, measured by a theodolite or a camera."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -11,8 +10,8 @@ from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.geometry.alignment import solve_resection
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import Column
-from loopcal.measure.kinds.points.target_kind import TargetKind
+from loopcal.measure.kinds.points.target_kind import Prediction, TargetKind
+from loopcal.measure.kinds.rows import Column
 from loopcal.typing import FloatArray
 from loopcal.units import Dimension
 
@@ -43,7 +42,6 @@ class Bearing(TargetKind):
         Column("azimuth", Dimension.ANGLE),
         Column("elevation", Dimension.ANGLE),
     )
-    wraps: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -68,9 +66,7 @@ class Bearing(TargetKind):
             ),
         )
 
-    def predict(
-        self, x: FloatArray, values: FloatArray
-    ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
+    def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
         """Return both angles of points x (.., k, 3) and their derivatives."""
         a, b, c = x[..., 0], x[..., 1], x[..., 2]
         zero = np.zeros_like(a)
@@ -106,5 +102,4 @@ class Bearing(TargetKind):
         if "frame" not in self.unknown or len(angles) < 4:
             return self.nominal_values[None]
         frames = solve_resection(self.convert_to_rays(angles), points)
-        items = {"frame": setup.encode_frame(self.T_base_frame, frames)}
-        return self.assemble_values(items, len(frames))
+        return self.assemble_values({"frame": setup.encode_frame(self.T_base_frame, frames)})

@@ -11,22 +11,16 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.geometry.alignment import FLATNESS, solve_trilateration
-from loopcal.measure.array_checks import check_array
+from loopcal.measure.array_checks import check_array, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import Column
-from loopcal.measure.kinds.points.target_kind import (
-    TargetKind,
-    evaluate_offset,
-    find_nonpositive_rows,
-    measure_lengths,
-)
-from loopcal.parameters import Parameter
+from loopcal.measure.kinds.points.target_kind import LengthKind, Prediction
+from loopcal.measure.kinds.rows import Column
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Distance(TargetKind):
+class Distance(LengthKind):
     """Distance to a fixed point c. Residual: `|x - c| + offset - measured`, with slope `(x - c) /
     |x - c|`.
 
@@ -53,7 +47,7 @@ class Distance(TargetKind):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "anchor", check_array(self.anchor, "the anchor", (3,)))
+        set_fields(self, anchor=check_array(self.anchor, "the anchor", (3,)))
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:
@@ -66,30 +60,19 @@ class Distance(TargetKind):
             cls(targets=("a", "b"), places=pair, anchor=far, unknown=("targets", "anchor")),
         )
 
-    def make_item_parameters(self, name: str) -> tuple[Parameter, ...]:
-        """Return three parameters of the fixed point, or one of the offset."""
-        return (
-            setup.make_point_parameters(self.anchor_name, self.anchor)
-            if name == "anchor"
-            else self.make_offset_parameter()
-        )
+    @property
+    def possible_setup(self) -> Mapping[str, setup.SetupItem]:
+        """Also the fixed point."""
+        anchor = setup.make_points_item((self.anchor_name,), self.anchor[None])
+        return {**super().possible_setup, "anchor": anchor}
 
-    def predict(
-        self, x: FloatArray, values: FloatArray
-    ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
+    def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
         """Return distances (.., k, 1) and unit vectors."""
         anchor = self.item_values(values, "anchor")
-        offset, by_item = evaluate_offset(self, values)
-        reach = x - (self.anchor if anchor is None else anchor[..., None, :])
-        length, unit = measure_lengths(reach)
-        unit = unit[..., None, :]
-        if anchor is not None:
-            by_item["anchor"] = -unit
-        return length + offset, unit, by_item
-
-    def find_invalid_rows(self, measured: FloatArray) -> tuple[tuple[int, str], ...]:
-        """Return rows with a distance that is not above zero."""
-        return find_nonpositive_rows(measured)
+        if anchor is None:
+            return super().predict(x - self.anchor, values)
+        distance, unit, by_item = super().predict(x - anchor[..., None, :], values)
+        return distance, unit, {**by_item, "anchor": -unit}
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Return the fixed point by trilateration, with the targets at their stated places.
@@ -102,7 +85,7 @@ class Distance(TargetKind):
         _, _, points, distances = self.collect_points(T, measured)
         if "anchor" not in self.unknown or len(distances) < 4:
             return self.nominal_values[None]
-        inside = (points - self.T_base_frame[:3, 3]) @ self.T_base_frame[:3, :3]
+        inside = self.to_frame(points)
         with_offset = "offset" in self.unknown
         solutions = [
             solve_trilateration(inside, distances[:, 0], with_offset=flag)
@@ -110,9 +93,7 @@ class Distance(TargetKind):
         ]
         centers, offsets = (np.concatenate(arrays) for arrays in zip(*solutions, strict=True))
         side = self._is_on_stated_side(inside, centers)
-        return self.assemble_values(
-            {"anchor": centers[side], "offset": offsets[side, None]}, int(np.count_nonzero(side))
-        )
+        return self.assemble_values({"anchor": centers[side], "offset": offsets[side, None]})
 
     def _is_on_stated_side(self, points: FloatArray, centers: FloatArray) -> BoolArray:
         """Return which centers (k,) are on the stated side of the plane of all points (q, 3); all

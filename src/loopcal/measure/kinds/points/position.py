@@ -3,7 +3,6 @@
 measures spheres.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -17,8 +16,8 @@ from loopcal.geometry.alignment import (
     solve_least_squares,
 )
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import POSITION_COLUMNS, Column
-from loopcal.measure.kinds.points.target_kind import TargetKind
+from loopcal.measure.kinds.points.target_kind import Prediction, TargetKind
+from loopcal.measure.kinds.rows import POSITION_COLUMNS, Column
 from loopcal.typing import FloatArray
 
 
@@ -46,9 +45,7 @@ class Position(TargetKind):
             cls(targets=("a", "b", "c"), places=corners, unknown=("targets", "frame")),
         )
 
-    def predict(
-        self, x: FloatArray, values: FloatArray
-    ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
+    def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
         """Return the points themselves."""
         return x, np.eye(3), {}
 
@@ -75,6 +72,6 @@ class Position(TargetKind):
         if "frame" in self.unknown:
             frames, places = solve_frame_and_points(positions, moving, origin)
             items = {"frame": setup.encode_frame(self.T_base_frame, frames), "targets": places}
-            return self.assemble_values(items, len(frames))
+            return self.assemble_values(items)
         base = positions @ self.T_base_frame[:3, :3].T + self.T_base_frame[:3, 3]
         return solve_least_squares(moving.reshape(base.size, -1), (base - origin).ravel())[None]

@@ -10,12 +10,16 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import check_array, check_pose
+from loopcal.measure.array_checks import check_array, check_pose, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import Column, Evaluation, Kind, check_unknown
-from loopcal.parameters import Parameter
+from loopcal.measure.kinds.kind import Kind
+from loopcal.measure.kinds.rows import Column, Evaluation, InvalidRows
 from loopcal.typing import FloatArray
-from loopcal.units import Dimension
+
+Prediction = tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]
+"""The g columns of each target (.., k, g), their derivatives (.., k, g, 3) by its coordinates in
+the frame, and (.., k, g, w) by the setup items that only this kind has.
+"""
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -54,24 +58,21 @@ class TargetKind(Kind):
 
     allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "targets")
     per_target: ClassVar[tuple[Column, ...]]
-    wraps: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         targets = (self.targets,) if isinstance(self.targets, str) else tuple(self.targets)
         if not targets or len(set(targets)) < len(targets):
             raise DataError(
                 f"the targets are {', '.join(targets) or 'empty'}; name at least one, and each once"
             )
-        object.__setattr__(self, "targets", targets)
-        if self.places is not None:
-            places = check_array(
-                np.atleast_2d(self.places), "the places of the targets", (len(targets), 3)
-            )
-            object.__setattr__(self, "places", places)
-        object.__setattr__(self, "T_base_frame", check_pose(self.T_base_frame, "T_base_frame"))
-        object.__setattr__(
-            self, "unknown", check_unknown(self.unknown, self.allowed_unknown, self.name)
+        set_fields(
+            self, targets=targets, T_base_frame=check_pose(self.T_base_frame, "T_base_frame")
         )
+        if self.places is not None:
+            places = np.atleast_2d(self.places)
+            shape = (len(targets), 3)
+            set_fields(self, places=check_array(places, "the places of the targets", shape))
 
     def with_tool(self, T_platform_tool: FloatArray) -> Self:
         """Return the kind with its targets at the tool's origin, unless it states their places."""
@@ -98,121 +99,56 @@ class TargetKind(Kind):
         )
 
     @property
-    def setup_items(self) -> Mapping[str, tuple[Parameter, ...]]:
-        """Frame, targets and further items of the kind, if unknown."""
-        places = np.zeros((len(self.targets), 3)) if self.places is None else self.places
-        items: dict[str, tuple[Parameter, ...]] = {}
-        for name in self.unknown:
-            if name == "frame":
-                items[name] = setup.make_frame_parameters(self.frame, self.T_base_frame)
-            elif name == "targets":
-                items[name] = tuple(
-                    parameter
-                    for target, place in zip(self.targets, places, strict=True)
-                    for parameter in setup.make_point_parameters(target, place)
-                )
-            else:
-                items[name] = self.make_item_parameters(name)
-        return items
-
-    @property
     def target_columns(self) -> Mapping[str, tuple[int, ...]]:
         """The targets with the indices of their columns."""
         g = len(self.per_target)
         return {target: tuple(range(i * g, (i + 1) * g)) for i, target in enumerate(self.targets)}
 
-    def make_item_parameters(self, name: str) -> tuple[Parameter, ...]:
-        """Return the parameters of a setup item that only this kind has."""
-        raise NotImplementedError(name)
-
     @property
-    def references(self) -> Mapping[str, FloatArray]:
-        """The stated orientation of the frame."""
-        return {self.frame: self.T_base_frame[:3, :3]} if "frame" in self.unknown else {}
-
-    def locate_targets(self, T: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return targets x (.., k, 3) in the frame and their derivative (.., k, 3, 6 + u), at poses
-        T (.., 4, 4).
-        """
-        frame_values = self.item_values(values, "frame")
-        frame = setup.place_frame(self.T_base_frame, frame_values)
-        R, Q = T[..., None, :3, :3], np.swapaxes(frame[..., None, :3, :3], -1, -2)
-        arm = (R @ self.places_from(values)[..., None])[..., 0]
-        lever = arm + T[..., None, :3, 3] - frame[..., None, :3, 3]
-        identity = np.broadcast_to(np.eye(3), (*arm.shape, 3))
-        blocks = {"twist": Q @ np.concatenate([-geometry.hat(arm), identity], axis=-1)}
-        if frame_values is not None:
-            blocks["frame"] = (
-                Q
-                @ np.concatenate([geometry.hat(lever), -identity], axis=-1)
-                @ setup.linearize_frame(frame_values)[..., None, :, :]
-            )
-        if "targets" in self.unknown:
-            k = len(self.targets)
-            by_place = (Q @ R)[..., None, :] * np.eye(k)[:, None, :, None]
-            blocks["targets"] = by_place.reshape(*by_place.shape[:-4], k, 3, 3 * k)
-        return (Q @ lever[..., None])[..., 0], self.join_columns(blocks, lever.shape)
-
-    def places_from(self, values: FloatArray) -> FloatArray:
-        """Return the targets (.., k, 3) on the platform."""
-        places = self.item_values(values, "targets")
-        if places is not None:
-            return places.reshape(*places.shape[:-1], len(self.targets), 3)
-        return self.stated_places()
-
-    def stated_places(self) -> FloatArray:
-        """Return the stated places (k, 3); DataError where the kind has none."""
-        if self.places is None:
-            raise DataError(
-                f"the kind {self.name!r} has no places of its targets: use "
-                "kind.with_tool(robot.tool), or state `places`"
-            )
-        return self.places
+    def possible_setup(self) -> Mapping[str, setup.SetupItem]:
+        """Frame and targets; a kind adds the items that only it has."""
+        places = np.zeros((len(self.targets), 3)) if self.places is None else self.places
+        return {
+            "frame": setup.make_frame_item(self.frame, self.T_base_frame),
+            "targets": setup.make_points_item(self.targets, places),
+        }
 
     @abstractmethod
-    def predict(
-        self, x: FloatArray, values: FloatArray
-    ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
-        """Return the columns of targets x (.., k, 3) in the frame, and their derivatives.
+    def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
+        """Return the columns of targets x (.., k, 3) in the frame, and their derivatives."""
 
-        Returns
-        -------
-        predicted : (.., k, g). by_x : (.., k, g, 3).
-        by_item : setup item -> (.., k, g, w), for the items that only this kind has.
-        """
-
-    def _predict_columns(self, T: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return columns (.., m) and derivatives (.., m, 6 + u)."""
+    def _predict(self, T: FloatArray, values: FloatArray, joints: FloatArray) -> Evaluation:
         x, rows = self.locate_targets(T, values)
         predicted, by_x, by_item = self.predict(x, values)
         rows = by_x @ rows
         if by_item:
             rows = rows + self.join_columns(by_item, predicted.shape)
-        m = predicted.shape[-1] * predicted.shape[-2]
-        return predicted.reshape(*predicted.shape[:-2], m), rows.reshape(
-            *rows.shape[:-3], m, rows.shape[-1]
-        )
+        flat = (*predicted.shape[:-2], predicted.shape[-2] * predicted.shape[-1])
+        return self.split_columns(predicted.reshape(flat), rows.reshape(*flat, rows.shape[-1]))
 
-    def _evaluate(
-        self, T: FloatArray, measured: FloatArray, values: FloatArray, joints: FloatArray
-    ) -> Evaluation:
-        predicted, rows = self._predict_columns(T, values)
-        residual = predicted - measured
-        return self.split_columns(geometry.wrap_angle(residual) if self.wraps else residual, rows)
-
-    def measure(
-        self,
-        T: FloatArray,
-        noise: FloatArray,
-        nuisance: FloatArray | None = None,
-        joints: FloatArray | None = None,
-    ) -> FloatArray:
-        """Return columns (t, r, c) with noise added."""
-        return self._predict_columns(T, self.values_or_nominal(nuisance))[0] + noise
-
-    def make_offset_parameter(self) -> tuple[Parameter, ...]:
-        """Return the parameter of an offset of all readings of a session."""
-        return (Parameter(f"{self.name}.offset", Dimension.LENGTH, 0.0, scope="session"),)
+    def locate_targets(self, T: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return targets x (.., k, 3) in the frame and their derivative (.., k, 3, 6 + u), at poses
+        T (.., 4, 4).
+        """
+        k = len(self.targets)
+        of_frame, places = (self.item_values(values, name) for name in ("frame", "targets"))
+        frame = setup.place_frame(self.T_base_frame, of_frame)
+        if places is None:
+            p = self._stated_places()
+        else:
+            p = places.reshape(*places.shape[:-1], k, 3)
+        R, Q = T[..., None, :3, :3], np.swapaxes(frame[..., None, :3, :3], -1, -2)
+        arm = (R @ p[..., None])[..., 0]
+        lever = arm + T[..., None, :3, 3] - frame[..., None, :3, 3]
+        identity = np.broadcast_to(np.eye(3), (*arm.shape, 3))
+        blocks = {"twist": Q @ np.concatenate([-geometry.hat(arm), identity], axis=-1)}
+        if of_frame is not None:
+            by_twist = Q @ np.concatenate([geometry.hat(lever), -identity], axis=-1)
+            blocks["frame"] = by_twist @ setup.linearize_frame(of_frame)[..., None, :, :]
+        if places is not None:
+            by_place = (Q @ R)[..., None, :] * np.eye(k)[:, None, :, None]
+            blocks["targets"] = by_place.reshape(*by_place.shape[:-4], k, 3, 3 * k)
+        return (Q @ lever[..., None])[..., 0], self.join_columns(blocks, lever.shape)
 
     def collect_points(
         self, T: FloatArray, measured: FloatArray
@@ -226,21 +162,51 @@ class TargetKind(Kind):
         points : (q, 3) in the base. columns : (q, g) that were measured.
         """
         k = len(self.targets)
-        g = measured.shape[-1] // k
         moving = (T[:, None, :3, None, :3] * np.eye(k)[:, None, :, None]).reshape(-1, 3, 3 * k)
         origin = np.repeat(T[:, :3, 3], k, axis=0)
-        columns = measured.reshape(-1, g)
+        columns = measured.reshape(-1, len(self.per_target))
         complete = ~np.any(np.isnan(columns), axis=-1)
-        points = moving @ self.stated_places().ravel() + origin
+        points = moving @ self._stated_places().ravel() + origin
         return moving[complete], origin[complete], points[complete], columns[complete]
 
+    def to_frame(self, points: FloatArray) -> FloatArray:
+        """Return points (q, 3) of the base in the stated frame."""
+        return (points - self.T_base_frame[:3, 3]) @ self.T_base_frame[:3, :3]
 
-def evaluate_offset(kind: Kind, values: FloatArray) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Return the offset (.., 1, 1) of all readings (zero where known) and its derivative."""
-    offset = kind.item_values(values, "offset")
-    if offset is None:
-        return np.zeros((1, 1)), {}
-    return offset[..., None, :], {"offset": np.ones((1, 1, 1))}
+    def _stated_places(self) -> FloatArray:
+        if self.places is None:
+            raise DataError(
+                f"the kind {self.name!r} has no places of its targets: use "
+                "kind.with_tool(robot.tool), or state `places`"
+            )
+        return self.places
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class LengthKind(TargetKind):
+    """A kind that measures one length above 0 for each target, with a common offset."""
+
+    @property
+    def possible_setup(self) -> Mapping[str, setup.SetupItem]:
+        """Also the offset of all readings."""
+        return {**super().possible_setup, "offset": setup.make_offset_item(f"{self.name}.offset")}
+
+    def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
+        """Return lengths of vectors x (.., k, 3) plus the offset."""
+        length, unit = measure_lengths(x)
+        offset = self.item_values(values, "offset")
+        if offset is None:
+            return length, unit[..., None, :], {}
+        return length + offset[..., None, :], unit[..., None, :], {"offset": np.ones((1, 1, 1))}
+
+    def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
+        """Return rows with a length that is not above zero."""
+        sentence = (
+            "has a distance of {:.6g} m; a distance is above 0: correct it, or leave the cell "
+            "empty if nothing was measured"
+        )
+        wrong = np.argwhere(measured <= 0.0)
+        return tuple((int(i), sentence.format(measured[i, j])) for i, j in wrong)
 
 
 def measure_lengths(x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -248,13 +214,3 @@ def measure_lengths(x: FloatArray) -> tuple[FloatArray, FloatArray]:
     square = np.sum(x * x, axis=-1, keepdims=True)
     safe = np.sqrt(np.where(square > 0.0, square, 1.0))
     return np.where(square > 0.0, safe, 0.0), x / safe
-
-
-def find_nonpositive_rows(measured: FloatArray) -> tuple[tuple[int, str], ...]:
-    """Return rows (index, end of a sentence) of distances (r, c) that are zero or negative."""
-    wrong = np.argwhere(measured <= 0.0)
-    sentence = (
-        "has a distance of {:.6g} m; a distance is above 0: correct it, or leave the cell empty if "
-        "nothing was measured"
-    )
-    return tuple((int(i), sentence.format(measured[i, j])) for i, j in wrong)

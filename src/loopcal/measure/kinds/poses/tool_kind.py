@@ -10,10 +10,9 @@ import numpy as np
 from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.geometry.alignment import OCTAHEDRAL_ROTATIONS
-from loopcal.measure.array_checks import check_pose
+from loopcal.measure.array_checks import check_pose, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import Kind, check_unknown
-from loopcal.parameters import Parameter
+from loopcal.measure.kinds.kind import Kind
 from loopcal.typing import FloatArray
 
 
@@ -47,14 +46,11 @@ class ToolKind(Kind):
     allowed_unknown: ClassVar[tuple[str, ...]] = ("frame", "tool")
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "T_base_frame", check_pose(self.T_base_frame, "T_base_frame"))
-        object.__setattr__(
-            self, "unknown", check_unknown(self.unknown, self.allowed_unknown, self.name)
-        )
+        super().__post_init__()
+        set_fields(self, T_base_frame=check_pose(self.T_base_frame, "T_base_frame"))
         if self.T_platform_tool is not None:
-            object.__setattr__(
-                self, "T_platform_tool", check_pose(self.T_platform_tool, "T_platform_tool")
-            )
+            tool = check_pose(self.T_platform_tool, "T_platform_tool")
+            set_fields(self, T_platform_tool=tool)
 
     def with_tool(self, T_platform_tool: FloatArray) -> Self:
         """Return the kind with this tool (4, 4), unless it states one."""
@@ -66,50 +62,34 @@ class ToolKind(Kind):
         return self.T_platform_tool is not None
 
     @property
-    def setup_items(self) -> Mapping[str, tuple[Parameter, ...]]:
-        """Frame and tool, if unknown, with six parameters each."""
+    def possible_setup(self) -> Mapping[str, setup.SetupItem]:
+        """Frame and tool, with six parameters each."""
         tool = np.eye(4) if self.T_platform_tool is None else self.T_platform_tool
-        stated = {"frame": (self.frame, self.T_base_frame), "tool": ("tool", tool)}
-        return {name: setup.make_frame_parameters(*stated[name]) for name in self.unknown}
-
-    @property
-    def references(self) -> Mapping[str, FloatArray]:
-        """The stated orientations."""
-        stated = {
-            "frame": (self.frame, self.T_base_frame[:3, :3]),
-            "tool": ("tool", self._tool()[:3, :3]),
+        return {
+            "frame": setup.make_frame_item(self.frame, self.T_base_frame),
+            "tool": setup.make_frame_item("tool", tool),
         }
-        return dict(stated[name] for name in self.unknown)
 
-    def predict_tool(self, T: FloatArray, values: FloatArray | None = None) -> FloatArray:
-        """Return T_frame_tool (.., 4, 4) at platform poses T (.., 4, 4) and values (.., u) of the
-        nuisance parameters.
+    def locate_tool(self, T: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return T_frame_tool (.., 4, 4) at platform poses T (.., 4, 4), and the derivative
+        (.., 6, 6 + u) of its twist, in axes of the frame, by the platform twist and the values.
         """
-        frame, tool = self._frames(self.values_or_nominal(values))
-        return geometry.invert_pose(frame) @ (T @ tool)
-
-    def linearize_tool(self, T: FloatArray, values: FloatArray | None = None) -> FloatArray:
-        """Return the derivative (.., 6, 6 + u) of the tool's twist, in axes of the frame, by the
-        platform twist and the nuisance parameters.
-        """
-        values = self.values_or_nominal(values)
-        frame, tool = self._frames(values)
+        of_frame, of_tool = (self.item_values(values, name) for name in ("frame", "tool"))
+        frame = setup.place_frame(self.T_base_frame, of_frame)
+        tool = setup.place_frame(self.stated_tool, of_tool)
         Q = np.swapaxes(frame[..., :3, :3], -1, -2)
         arm = (T[..., :3, :3] @ tool[..., :3, 3:])[..., 0]
         blocks = {"twist": geometry.transport_matrix(arm, Q)}
-        frame_values = self.item_values(values, "frame")
-        if frame_values is not None:
+        if of_frame is not None:
             # a motion of the frame is the opposite motion of the tool in that frame
             lever = arm + T[..., :3, 3] - frame[..., :3, 3]
-            blocks["frame"] = -geometry.transport_matrix(lever, Q) @ setup.linearize_frame(
-                frame_values
-            )
-        tool_values = self.item_values(values, "tool")
-        if tool_values is not None:
-            blocks["tool"] = geometry.transport_matrix(
-                np.zeros(3), Q @ T[..., :3, :3]
-            ) @ setup.linearize_frame(tool_values)
-        return self.join_columns(blocks, (*T.shape[:-2], 6))
+            by_twist = -geometry.transport_matrix(lever, Q)
+            blocks["frame"] = by_twist @ setup.linearize_frame(of_frame)
+        if of_tool is not None:
+            by_twist = geometry.transport_matrix(np.zeros(3), Q @ T[..., :3, :3])
+            blocks["tool"] = by_twist @ setup.linearize_frame(of_tool)
+        rows = self.join_columns(blocks, (*T.shape[:-2], 6))
+        return geometry.invert_pose(frame) @ (T @ tool), rows
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Return 24 evenly spread orientations of the frame, with its origin where it is stated."""
@@ -117,14 +97,11 @@ class ToolKind(Kind):
             return self.nominal_values[None]
         stated = self.T_base_frame
         frames = geometry.make_pose(OCTAHEDRAL_ROTATIONS @ stated[:3, :3], stated[:3, 3])
-        return self.assemble_values({"frame": setup.encode_frame(stated, frames)}, len(frames))
+        return self.assemble_values({"frame": setup.encode_frame(stated, frames)})
 
-    def _frames(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return frame and tool (.., 4, 4)."""
-        frame = setup.place_frame(self.T_base_frame, self.item_values(values, "frame"))
-        return frame, setup.place_frame(self._tool(), self.item_values(values, "tool"))
-
-    def _tool(self) -> FloatArray:
+    @property
+    def stated_tool(self) -> FloatArray:
+        """The stated tool (4, 4); DataError where the kind has none."""
         if self.T_platform_tool is None:
             raise DataError(
                 f"the kind {self.name!r} has no tool: use kind.with_tool(robot.tool), or state "

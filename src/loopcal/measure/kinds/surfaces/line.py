@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kind `line`: points of the platform on a straight line, such as a ruler, an edge or a beam."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -9,7 +8,8 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import Column
+from loopcal.measure.kinds.points.target_kind import Prediction
+from loopcal.measure.kinds.rows import Column
 from loopcal.measure.kinds.surfaces.surface_kind import SurfaceKind
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
@@ -42,17 +42,14 @@ class Line(SurfaceKind):
         """Return a known line, and an unknown one."""
         return (cls(), cls(unknown=("surface",), along=np.array([0.6, 0.0, 0.8]), surface="ruler"))
 
-    def make_item_parameters(self, name: str) -> tuple[Parameter, ...]:
-        """Return two rotations and two shifts."""
-        shifts = tuple(
-            Parameter(f"{self.surface}.{axis}", Dimension.LENGTH, 0.0, scope="group")
-            for axis in ("a", "b")
+    @property
+    def surface_parameters(self) -> tuple[Parameter, ...]:
+        """Two rotations and two shifts."""
+        return self.make_parameters(("u", "v"), Dimension.ANGLE) + self.make_parameters(
+            ("a", "b"), Dimension.LENGTH
         )
-        return (*setup.make_direction_parameters(self.surface, "group"), *shifts)
 
-    def predict(
-        self, x: FloatArray, values: FloatArray
-    ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
+    def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
         """Return distances (.., k, 2) from the line along B."""
         surface = self.item_values(values, "surface")
         B, lever = setup.make_perpendicular_basis(self.along), x - self.through
@@ -79,4 +76,4 @@ class Line(SurfaceKind):
         R, _ = setup.rotate_basis(self.along, rotations)
         across = R @ setup.make_perpendicular_basis(self.along)
         shifts = (middle - self.through) @ across - gaps.mean(axis=0)
-        return self.assemble_values({"surface": np.concatenate([rotations, shifts])}, 1)
+        return self.assemble_values({"surface": np.concatenate([rotations, shifts])})

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kind `plane`: points of the platform on a plane, such as a probed bed or plate."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -9,7 +8,8 @@ import numpy as np
 
 from loopcal.geometry.alignment import solve_least_squares
 from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import Column
+from loopcal.measure.kinds.points.target_kind import Prediction
+from loopcal.measure.kinds.rows import Column
 from loopcal.measure.kinds.surfaces.surface_kind import SurfaceKind
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
@@ -46,14 +46,14 @@ class Plane(SurfaceKind):
             ),
         )
 
-    def make_item_parameters(self, name: str) -> tuple[Parameter, ...]:
-        """Return two rotations and a height."""
-        height = Parameter(f"{self.surface}.height", Dimension.LENGTH, 0.0, scope="group")
-        return (*setup.make_direction_parameters(self.surface, "group"), height)
+    @property
+    def surface_parameters(self) -> tuple[Parameter, ...]:
+        """Two rotations and a height."""
+        return self.make_parameters(("u", "v"), Dimension.ANGLE) + self.make_parameters(
+            ("height",), Dimension.LENGTH
+        )
 
-    def predict(
-        self, x: FloatArray, values: FloatArray
-    ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
+    def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
         """Return heights (.., k, 1) above the plane."""
         surface = self.item_values(values, "surface")
         lever = x - self.through
@@ -83,4 +83,4 @@ class Plane(SurfaceKind):
         n = np.array([normal if normal @ self.along >= 0.0 else -normal for normal in normals])
         height = n @ (middle - self.through) - gaps.mean()
         values = np.concatenate([setup.encode_direction(self.along, n), height[:, None]], axis=-1)
-        return self.assemble_values({"surface": values}, len(n))
+        return self.assemble_values({"surface": values})

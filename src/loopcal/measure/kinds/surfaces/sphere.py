@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kind `sphere`: points of the platform on a sphere, such as a probed master ball."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -9,9 +8,8 @@ import numpy as np
 
 from loopcal.errors import DataError
 from loopcal.geometry.alignment import solve_trilateration
-from loopcal.measure.kinds import setup_parameters as setup
-from loopcal.measure.kinds.kind import Column
-from loopcal.measure.kinds.points.target_kind import measure_lengths
+from loopcal.measure.kinds.points.target_kind import Prediction, measure_lengths
+from loopcal.measure.kinds.rows import Column
 from loopcal.measure.kinds.surfaces.surface_kind import SurfaceKind
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
@@ -54,23 +52,22 @@ class Sphere(SurfaceKind):
         far = np.array([1.5, -0.8, 1.1])
         return (cls(through=far), cls(unknown=("surface",), through=far, surface="ball"))
 
-    def make_item_parameters(self, name: str) -> tuple[Parameter, ...]:
-        """Return center and radius."""
-        radius = Parameter(f"{self.surface}.radius", Dimension.LENGTH, self.radius, scope="group")
-        return (*setup.make_point_parameters(self.surface, self.through, "group"), radius)
+    @property
+    def surface_parameters(self) -> tuple[Parameter, ...]:
+        """Center and radius."""
+        nominal = np.array([*self.through, self.radius])
+        return self.make_parameters(("x", "y", "z", "radius"), Dimension.LENGTH, nominal)
 
-    def predict(
-        self, x: FloatArray, values: FloatArray
-    ) -> tuple[FloatArray, FloatArray, Mapping[str, FloatArray]]:
+    def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
         """Return distances (.., k, 1) from the sphere."""
         surface = self.item_values(values, "surface")
         if surface is None:
-            length, unit = measure_lengths(x - self.through)
-            return length - self.radius, unit[..., None, :], {}
-        length, unit = measure_lengths(x - surface[..., None, :3])
+            distance, unit = measure_lengths(x - self.through)
+            return distance - self.radius, unit[..., None, :], {}
+        distance, unit = measure_lengths(x - surface[..., None, :3])
         unit = unit[..., None, :]
         by_surface = -np.concatenate([unit, np.ones_like(unit[..., :1])], axis=-1)
-        return length - surface[..., None, 3:], unit, {"surface": by_surface}
+        return distance - surface[..., None, 3:], unit, {"surface": by_surface}
 
     def guess_values(self, T: FloatArray, measured: FloatArray) -> FloatArray:
         """Return center and radius by trilateration: a distance from the center is a gap plus the
@@ -81,4 +78,4 @@ class Sphere(SurfaceKind):
             return self.nominal_values[None]
         centers, offsets = solve_trilateration(x, gaps[:, 0], with_offset=True)
         values = np.concatenate([centers, -offsets[:, None]], axis=-1)
-        return self.assemble_values({"surface": values}, len(centers))
+        return self.assemble_values({"surface": values})

@@ -5,15 +5,19 @@ The columns are gaps between point and surface. A gap is 0 where a probe just to
 correction for its ball and its deflection. Rows of one group share the parameters of the surface.
 """
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
 
-from loopcal.measure.array_checks import check_array, check_direction
+from loopcal.measure.array_checks import check_array, check_direction, set_fields
+from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.points.target_kind import TargetKind
+from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
+from loopcal.units import Dimension
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -47,23 +51,33 @@ class SurfaceKind(TargetKind):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(
-            self, "through", check_array(self.through, "the point of the surface", (3,))
-        )
-        object.__setattr__(
-            self, "along", check_direction(self.along, "the direction of the surface")
-        )
+        through = check_array(self.through, "the point of the surface", (3,))
+        along = check_direction(self.along, "the direction of the surface")
+        set_fields(self, through=through, along=along)
 
     @property
-    def references(self) -> Mapping[str, FloatArray]:
-        """The stated point and direction."""
-        if "surface" not in self.unknown:
-            return {}
-        return {f"{self.surface}.through": self.through, f"{self.surface}.along": self.along}
+    @abstractmethod
+    def surface_parameters(self) -> tuple[Parameter, ...]:
+        """The parameters of the surface; rows of one group share them."""
+
+    @property
+    def possible_setup(self) -> Mapping[str, setup.SetupItem]:
+        """Also the surface."""
+        stated = {f"{self.surface}.through": self.through, f"{self.surface}.along": self.along}
+        return {
+            **super().possible_setup,
+            "surface": setup.SetupItem(self.surface_parameters, stated),
+        }
+
+    def make_parameters(
+        self, names: tuple[str, ...], dimension: Dimension, nominal: FloatArray | None = None
+    ) -> tuple[Parameter, ...]:
+        """Return parameters of the surface with these names."""
+        return setup.make_parameters(self.surface, names, dimension, nominal, "group")
 
     def collect_contacts(
         self, T: FloatArray, measured: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return points (q, 3) in the frame, for targets at their stated places, and gaps."""
         _, _, points, gaps = self.collect_points(T, measured)
-        return (points - self.T_base_frame[:3, 3]) @ self.T_base_frame[:3, :3], gaps
+        return self.to_frame(points), gaps

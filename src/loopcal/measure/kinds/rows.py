@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows of a kind: their columns, residuals and derivatives, and rows that are invalid."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from loopcal.typing import BoolArray, FloatArray
+from loopcal.units import Dimension
+
+InvalidRows = tuple[tuple[int, str], ...]
+"""Index of each invalid row, and the end of a sentence that says why."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a measurement file: its name, and the dimension of its numbers."""
+
+    name: str
+    dimension: Dimension
+
+
+POSITION_COLUMNS = tuple(Column(name, Dimension.LENGTH) for name in ("x", "y", "z"))
+"""Columns of a position."""
+
+
+class Evaluation(NamedTuple):
+    """Residuals (predicted - measured) and their derivatives.
+
+    Components that were not measured are zero in all arrays.
+
+    Attributes
+    ----------
+    residual : (t, r, m) [SI]
+    jacobian : (t, r, m, 6)
+        By the platform twist (omega, v) in base axes; with an axis of poses before m where a row
+        compares several poses.
+    nuisance : (t, r, m, u) or None
+        By the nuisance parameters of the kind; None where it has none.
+    joints : (t, r, m, j) or None
+        By the values of the joints that the kind senses; None where it senses poses only.
+    """
+
+    residual: FloatArray
+    jacobian: FloatArray
+    nuisance: FloatArray | None = None
+    joints: FloatArray | None = None
+
+
+def list_rows(wrong: BoolArray, describe: Callable[[int], str]) -> InvalidRows:
+    """Return the rows of a mask (r,), each with its description."""
+    return tuple((int(i), describe(int(i))) for i in np.flatnonzero(wrong))
+
+
+def is_incomplete(columns: FloatArray) -> BoolArray:
+    """Return the rows of columns (.., c) in which some values are missing, but not all."""
+    missing = np.isnan(columns)
+    return np.any(missing, axis=-1) & ~np.all(missing, axis=-1)
