@@ -19,9 +19,9 @@ from loopcal.diagnose.conventions import (
     compare_conventions,
     list_interpretations,
     list_reading_interpretations,
+    misfit,
 )
-from loopcal.diagnose.conventions.interpretation_search import ALLOWED, BETTER
-from loopcal.diagnose.conventions.interpreted_data import InterpretedData
+from loopcal.diagnose.conventions.selection import ALLOWED, BETTER
 from loopcal.errors import DataError, LoopcalError
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.io import load_robot
@@ -367,20 +367,18 @@ def test_data_of_nothing_are_noted_after_few_readings_were_judged(monkeypatch) -
     )  # [m], as far as the machine moves
     data = changed(data, lambda values: values.__iadd__(noise))
     poses: list[int] = []
-    whole = InterpretedData.misfits
+    linearize = misfit._linearize
 
-    def counted(self: InterpretedData):
-        if not self.is_quick:
-            poses.append(self.data.n_poses)
-        return whole(self)
+    def counted(problem, data, effort, start):
+        if effort == misfit.THOROUGH:
+            poses.append(data.n_poses)
+        return linearize(problem, data, effort, start)
 
-    monkeypatch.setattr(InterpretedData, "misfits", counted)
+    monkeypatch.setattr(misfit, "_linearize", counted)
     found = compare_conventions(robot_of("linear-delta"), data)
     assert found.misfit > 100.0
     assert not found.is_refused
-    assert (
-        len(poses) <= 6
-    )  # the stated reading before and after blunders were left out, and refined; sizes
+    assert len(poses) <= 2  # the data as written, before and after far rows were excluded
 
 
 def test_too_few_rows_say_nothing() -> None:
@@ -419,9 +417,8 @@ def test_of_two_files_of_one_kind_the_one_that_is_written_otherwise_is_named() -
     readings = np.concatenate([data.readings[:8], 0.1 * data.readings[8:]])
     found = compare_conventions(robot, replace(data, observations=parts, readings=readings))
     assert times("readings", 10.0, source="b.csv").items() <= slips(found)[0].items()
-    unnamed = list_reading_interpretations(
-        replace(data, observations=parts), ("q1", "q2", "q3"), (Dimension.LENGTH,) * 3
-    )
+    nameless = tuple(replace(part, source="") for part in parts)
+    unnamed = list_reading_interpretations(replace(data, observations=nameless), robot.actuators)
     assert ("part 2 of the data", 10.0) in {
         (one.source, one.details.get("factor")) for one in unnamed
     }
@@ -529,7 +526,9 @@ def test_every_hypothesis_is_another_reading_in_the_same_shape() -> None:
                 assert way.shrinks == (way.details.get("factor", 1.0) < 1.0)
             seen.add(kind.name)
     assert seen == set(KINDS)
-    names, lengths = ("q1", "q2", "q3"), (Dimension.LENGTH,) * 3
-    data = measured("linear-delta", Position(), n=5)
-    ways = [way.key for way in list_reading_interpretations(data, names, lengths)]
+    data, robot = measured("linear-delta", Position(), n=5), robot_of("linear-delta")
+    ways = [
+        (way.slip, *way.details.items())
+        for way in list_reading_interpretations(data, robot.actuators)
+    ]
     assert len(set(ways)) == len(ways) == 6 + 1 + 3 + 3 + 1 + 2  # units, signs, pairs, order, rows

@@ -191,7 +191,7 @@ def _describe_motion(
     for name, frame in frames.items():
         if np.linalg.norm(_without_span([frame], moved)) <= SAME_MOTION * length:
             motion = np.linalg.lstsq(frame, moved, rcond=NO_MOTION)[0]
-            return _describe_frame_motion(name, motion, size)
+            return _describe_frame_motion(name, np.asarray(motion, dtype=np.float64), size)
     if np.linalg.norm(_without_span(list(frames.values()), moved)) <= SAME_MOTION * length:
         return report_finding("identifiability.both-frames-move")
     return None

@@ -20,17 +20,21 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.diagnose.conventions.interpretation_search import (
+from loopcal.diagnose.conventions.interpretations import Interpretation
+from loopcal.diagnose.conventions.misfit import (
+    Comparison,
+    compare_with_robot,
+    compute_quick_misfit,
+    exclude_far_rows,
+    refine_misfit,
+    select_reached,
+)
+from loopcal.diagnose.conventions.selection import (
     ALLOWED,
     BETTER,
-    find_best_interpretation,
+    Selection,
+    select_interpretation,
     shares_poses,
-)
-from loopcal.diagnose.conventions.interpretations import Interpretation
-from loopcal.diagnose.conventions.interpreted_data import (
-    InterpretedData,
-    compute_quick_misfit,
-    refine_misfit,
 )
 from loopcal.diagnose.conventions.setup_parameters import Contradiction, find_contradiction
 from loopcal.errors import DataError
@@ -176,39 +180,44 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
         The readings have another number of actuators.
     """
     check_actuators(data, robot)
-    free, known = select_free_parameters(robot), _with_known_readings(data)
+    free, known = select_free_parameters(robot), _select_known_readings(data)
     if known is None:
         return ConventionCheck(float("nan"))
-    sigma = data.reading_sigma
-    has_uncertain = sigma is not None and bool(np.any(np.isfinite(sigma) & (sigma > 0.0)))
     misfit = compute_quick_misfit(free, known)
     if misfit <= IMPLAUSIBLE:
         return ConventionCheck(misfit)
-    stated = InterpretedData(free, _thin_out(known))
-    misfit = stated.misfit()
-    if not misfit > IMPLAUSIBLE:
-        return ConventionCheck(misfit)
-    stated.exclude_far_rows()
-    misfit = min(misfit, stated.misfit(), refine_misfit(stated))
-    if not misfit > IMPLAUSIBLE:
-        return ConventionCheck(misfit, finding=_report_far_rows(stated))
-    against = find_contradiction(free, stated, misfit, BETTER)
-    if against is not None and against.misfit <= ALLOWED:
-        return _contradict(misfit, against)
-    sources = [rows.source for rows in data.observations if rows.source]
-    best = find_best_interpretation(free, stated, misfit, sources)
-    if best is not None:
-        return _refuse(stated, misfit, *best)
+    reach = select_reached(free, _thin_out(known), follow=True)
+    stated, against, misfit = None, None, np.inf
+    if reach.is_enough:
+        whole = compare_with_robot(free, reach.data)
+        if not whole.misfit > IMPLAUSIBLE:
+            return ConventionCheck(whole.misfit)
+        stated = exclude_far_rows(whole)
+        misfit = min(whole.misfit, refine_misfit(stated)[0])
+        if not misfit > IMPLAUSIBLE:
+            return ConventionCheck(misfit, finding=_report_far_rows(stated))
+        against = find_contradiction(stated, misfit, BETTER)
+    description = {
+        "robot": robot.name,
+        "misfit": misfit,
+        "residuals": () if stated is None else _rms_residuals(stated),
+        "reached": reach.n_reached if stated is None else None,
+        "poses": reach.n_tested,
+    }
+    if against is None or against.misfit > ALLOWED:
+        chosen = select_interpretation(free, _thin_out(known), stated, misfit)
+        if chosen is not None:
+            return _refuse(description, misfit, chosen)
     if against is not None:
         return _contradict(misfit, against)
-    if has_uncertain:
+    sigma = data.reading_sigma
+    if sigma is not None and bool(np.any(np.isfinite(sigma) & (sigma > 0.0))):
         return ConventionCheck(misfit)
-    finding = report_finding("conventions.unexplained", **_describe_stated(stated, misfit))
-    return ConventionCheck(misfit, finding=finding)
+    return ConventionCheck(misfit, finding=report_finding("conventions.unexplained", **description))
 
 
-def _with_known_readings(data: Measurements) -> Measurements | None:
-    """The poses all of whose readings exist and are believed; None where there is none."""
+def _select_known_readings(data: Measurements) -> Measurements | None:
+    """Return the poses all of whose readings exist and are believed; None where there is none."""
     if data.reading_sigma is None:
         return data
     known = np.isfinite(data.reading_sigma).all(axis=1) & np.isfinite(data.readings).all(axis=1)
@@ -216,8 +225,8 @@ def _with_known_readings(data: Measurements) -> Measurements | None:
 
 
 def _thin_out(data: Measurements) -> Measurements:
-    """At most `MOST_POSES` poses, in runs of neighbors spread over the data; all where rows share
-    more than their pose.
+    """Return at most `MOST_POSES` poses, in runs of neighbors spread over the data; all where rows
+    share more than their pose.
     """
     n = data.n_poses
     if n <= MOST_POSES or shares_poses(data):
@@ -226,25 +235,23 @@ def _thin_out(data: Measurements) -> Measurements:
     return data.take(np.unique(first[:, None] + np.arange(MOST_POSES // RUNS)))
 
 
-def _refuse(
-    stated: InterpretedData,
-    misfit: float,
-    best: InterpretedData,
-    least: float,
-    alternatives: tuple[Interpretation, ...],
-) -> ConventionCheck:
+def _refuse(description: dict[str, Any], misfit: float, chosen: Selection) -> ConventionCheck:
     """Refuse data that fit far better in another interpretation."""
-    assert best.applied is not None
+
+    def describe(one: Interpretation) -> dict[str, Any]:
+        return {"code": one.code, "source": one.source, **one.details}
+
+    one, alternatives = chosen.interpretation, chosen.alternatives
     finding = report_finding(
         "conventions.other-interpretation",
-        **_describe_stated(stated, misfit),
-        interpretation=_describe_slip(best.applied),
-        alternatives=tuple(_describe_slip(one) for one in alternatives),
-        other_misfit=least,
-        other_residuals=_rms_residuals(best),
-        is_consistent=least <= ALLOWED,
+        **description,
+        interpretation=describe(one),
+        alternatives=tuple(describe(other) for other in alternatives),
+        other_misfit=chosen.misfit,
+        other_residuals=_rms_residuals(chosen.comparison),
+        is_consistent=chosen.misfit <= ALLOWED,
     )
-    return ConventionCheck(misfit, best.applied, least, alternatives, finding)
+    return ConventionCheck(misfit, one, chosen.misfit, alternatives, finding)
 
 
 def _contradict(misfit: float, against: Contradiction) -> ConventionCheck:
@@ -258,13 +265,13 @@ def _contradict(misfit: float, against: Contradiction) -> ConventionCheck:
         names=against.names,
         misfit=misfit,
         other_misfit=against.misfit,
-        residuals=_rms_residuals(against.freed),
+        residuals=_rms_residuals(against.comparison),
         is_consistent=against.misfit <= ALLOWED,
     )
     return ConventionCheck(misfit, other_misfit=against.misfit, finding=finding)
 
 
-def _report_far_rows(stated: InterpretedData) -> Finding:
+def _report_far_rows(stated: Comparison) -> Finding:
     """Report the rows that do not fit the others, which fit; they stay in the data."""
     return report_finding(
         "conventions.rows-far-off",
@@ -274,38 +281,21 @@ def _report_far_rows(stated: InterpretedData) -> Finding:
     )
 
 
-def _describe_slip(one: Interpretation) -> dict[str, Any]:
-    """Code and data of an interpretation, for the data of a finding."""
-    return {"code": one.code, "source": one.source, **one.details}
-
-
-def _describe_stated(stated: InterpretedData, misfit: float) -> dict[str, Any]:
-    """Misfit of the data as written, or how few poses are reached."""
-    is_reached = stated.has_enough
-    return {
-        "robot": stated.free.robot.name,
-        "misfit": misfit,
-        "residuals": _rms_residuals(stated) if is_reached else (),
-        "reached": None if is_reached else stated.n_reached,
-        "poses": stated.n_tested,
-    }
-
-
-def _rms_residuals(interpreted: InterpretedData) -> tuple[Quantity, ...]:
-    """Root mean squares of the first interpretation's residuals by dimension, in units of the
-    robot's file, without far rows.
+def _rms_residuals(comparison: Comparison) -> tuple[Quantity, ...]:
+    """Return root mean squares of the first interpretation's residuals by dimension, in units of
+    the robot's file, without far rows.
     """
+    units = comparison.problem.free.robot.units
     square: dict[Dimension, list[FloatArray]] = {}
-    interpreted.misfits()
-    for s, r in zip(interpreted.problem.rows, interpreted.residuals(), strict=True):
+    for s, r in zip(comparison.problem.rows, comparison.residuals(), strict=True):
         present = np.einsum("rmm->rm", s.whitener[0]) != 0.0
         for j, column in enumerate(s.kind.noise_columns):
             square.setdefault(column.dimension, []).append(r.raw[0, present[:, j], j] ** 2)
     residuals = []
     for dimension, parts in square.items():
-        value = np.concatenate(parts)
-        if len(value):
-            symbol = interpreted.free.robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol)
-            rms = float(np.sqrt(value.mean())) / find_unit(symbol).factor_to_si
+        values = np.concatenate(parts)
+        if len(values):
+            symbol = units.get(dimension, DISPLAY_UNITS[dimension].symbol)
+            rms = float(np.sqrt(values.mean())) / find_unit(symbol).factor_to_si
             residuals.append(Quantity(rms, symbol))
     return tuple(residuals)

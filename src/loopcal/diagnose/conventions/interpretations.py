@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """List other interpretations of measurements: other units, orders, signs and columns.
 
-An interpretation is the data read in another way, in the same kinds: the values are written as the
-stated convention would write them, so that one evaluation judges all interpretations. The rules use
-what a kind declares (its columns with their dimensions, its orientation form, its targets); the
-zenith angle of a bearing is the only exception.
+An interpretation is a function from data to data of the same kinds: it writes the values as the
+stated convention would write them, so that one evaluation judges all interpretations. The rules
+(`RULES`, and `list_reading_interpretations`) use what a kind declares: its columns with their
+dimensions, its orientation form, its targets; the zenith angle of a bearing is the only exception.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.geometry.orientation_forms import OrientationForm, parse_orientation
 from loopcal.measure.kinds import Bearing, Component, Kind, Pose
 from loopcal.measure.measurements import Measurements
+from loopcal.mechanism import Actuator
 from loopcal.typing import BoolArray, FloatArray
 from loopcal.units import Dimension
 
@@ -29,16 +31,8 @@ DEGREES = 180.0 / np.pi
 FACTORS: Mapping[Dimension, tuple[float, ...]] = {
     Dimension.LENGTH: (1e3, 1e-3, 25.4, 1.0 / 25.4, 10.0, 0.1),
     Dimension.ANGLE: (
-        DEGREES,
-        1.0 / DEGREES,
-        1e3,
-        1e-3,
-        1e3 / DEGREES,
-        DEGREES / 1e3,
-        60.0,
-        1.0 / 60.0,
-        0.9,
-        1.0 / 0.9,
+        *(DEGREES, 1.0 / DEGREES, 1e3, 1e-3, 1e3 / DEGREES, DEGREES / 1e3),
+        *(60.0, 1.0 / 60.0, 0.9, 1.0 / 0.9),
     ),
 }
 """Factors by which the true values are larger than the written ones where a unit is wrong: m, mm,
@@ -47,6 +41,15 @@ um, cm, inch; rad, deg, mrad, arcmin, gon.
 
 SINGLE_COLUMN_FACTORS = (1e3, 1e-3, 25.4, 1.0 / 25.4, DEGREES, 1.0 / DEGREES, 0.9, 1.0 / 0.9)
 """Those of them that are also tested for single columns."""
+
+
+Change = Callable[[FloatArray], FloatArray]
+"""From written values (r, c), or readings (n, a), to those that the stated convention would write
+[SI].
+"""
+
+Slip = tuple[str, dict[str, Any], Change]
+"""Kind of a slip, what is read differently, and how."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,17 +62,19 @@ class Interpretation:
     details : what is read differently, such as quantity and factor.
     source : file or kind that it concerns; empty where it concerns all data.
     observation : index of the observations; None where the actuator readings are read differently.
-    values : measured values (r, c), or readings (n, a), as the stated convention would write them
-        [SI].
-    shrinks : whether values become smaller, so that they might no longer carry information.
+    change : of the measured values, row by row, or of the readings of all poses.
     """
 
     slip: str
     details: Mapping[str, Any]
     source: str
     observation: int | None
-    values: FloatArray
-    shrinks: bool = field(default=False, kw_only=True)
+    change: Change
+
+    @property
+    def shrinks(self) -> bool:
+        """Whether values become smaller, so that they might no longer carry information."""
+        return bool(self.details.get("factor", 1.0) < 1.0)
 
     @property
     def code(self) -> str:
@@ -81,131 +86,79 @@ class Interpretation:
         """The interpretation as a finding."""
         return report_finding(self.code, source=self.source, **self.details)
 
-    @property
-    def key(self) -> tuple[Any, ...]:
-        """Identity of the interpretation, for other rows of the same data."""
-        return (self.slip, self.source, *self.details.items())
-
     def __repr__(self) -> str:
         return f"<Interpretation: {self.finding}>"
-
-    def measured(self, data: Measurements) -> tuple[FloatArray, ...]:
-        """Return the measured values of every kind under this interpretation."""
-        return tuple(
-            self.values if i == self.observation else o.measured
-            for i, o in enumerate(data.observations)
-        )
 
     def apply(self, data: Measurements) -> Measurements:
         """Return the measurements under this interpretation; covariances stay as stated."""
         if self.observation is None:
-            return replace(data, readings=self.values)
-        pairs = zip(data.observations, self.measured(data), strict=True)
-        return replace(data, observations=tuple(replace(o, measured=values) for o, values in pairs))
+            return replace(data, readings=self.change(data.readings))
+        observations = list(data.observations)
+        rows = observations[self.observation]
+        observations[self.observation] = replace(rows, measured=self.change(rows.measured))
+        return replace(data, observations=tuple(observations))
 
 
-class _Reading(NamedTuple):
-    """Slip, details, values, and whether the values shrink."""
-
-    slip: str
-    details: dict[str, Any]
-    values: FloatArray
-    shrinks: bool = False
-
-
-class _OrientationColumns(NamedTuple):
-    """Columns of a kind that hold a whole orientation, and a position."""
-
-    form: OrientationForm
-    angles: list[int]
-    position: list[int]
-
-    def rotation(self, values: FloatArray) -> FloatArray:
-        return self.form.to_matrix(values[:, self.angles])
-
-    def write(
-        self, values: FloatArray, rotation: FloatArray, position: FloatArray | None = None
-    ) -> FloatArray:
-        """Return the columns with another rotation, and another position."""
-        changed = np.array(values)
-        changed[:, self.angles] = self.form.from_matrix(rotation)
-        if position is not None:
-            changed[:, self.position] = position
-        return changed
-
-
-def list_interpretations(
-    data: Measurements, sources: Sequence[str] = ()
-) -> Iterator[Interpretation]:
+def list_interpretations(data: Measurements) -> Iterator[Interpretation]:
     """Yield all other interpretations of measured values, the likelier slip of each family first.
 
     An interpretation that the kind itself rules out (a negative distance, an impossible tilt), or
     that changes no number, is omitted.
-
-    Parameters
-    ----------
-    data : as written. sources : origin of the rows of each of its observations, such as files;
-        default: not known.
     """
     several = len(data.observations) > 1
     for i, rows in enumerate(data.observations):
         if not len(rows):
             continue
-        unique = sum(other.kind.name == rows.kind.name for other in data.observations) == 1
-        source = ""
+        kind, measured, source = rows.kind, rows.measured, ""
         if several:
-            source = f"kind {rows.kind.name!r}" if unique else _source_of(i, data, sources)
-        for slip, details, values, shrinks in _interpret_kind(rows.kind, rows.measured):
-            meant = np.isfinite(values) | np.isnan(rows.measured)
-            same = np.allclose(values, rows.measured, rtol=1e-12, atol=0.0, equal_nan=True)
-            if meant.all() and not same and not rows.kind.find_invalid_rows(values):
-                yield Interpretation(slip, details, source, i, values, shrinks=shrinks)
+            unique = sum(other.kind.name == kind.name for other in data.observations) == 1
+            source = f"kind {kind.name!r}" if unique else _source_of(i, data)
+        for slip, details, change in (one for rule in RULES for one in rule(kind)):
+            values = change(measured)
+            meant = np.isfinite(values) | np.isnan(measured)
+            same = np.allclose(values, measured, rtol=1e-12, atol=0.0, equal_nan=True)
+            if meant.all() and not same and not kind.find_invalid_rows(values):
+                yield Interpretation(slip, details, source, i, change)
 
 
 def list_reading_interpretations(
-    data: Measurements,
-    names: tuple[str, ...],
-    dimensions: tuple[Dimension, ...],
-    sources: Sequence[str] = (),
+    data: Measurements, actuators: Sequence[Actuator]
 ) -> Iterator[Interpretation]:
-    """Yield all other interpretations of the readings of actuators with these names and dimensions;
-    see `list_interpretations`.
-    """
-    q = data.readings
-
-    def reading(slip: str, values: FloatArray, **details: Any) -> Interpretation:
-        return Interpretation(slip, details, "", None, values)
-
-    for source, poses in _sources_of_readings(data, sources):
-        for dimension in dict.fromkeys(dimensions):
-            chosen = poses[:, None] & np.array([d is dimension for d in dimensions])
+    """Yield all other interpretations of the readings of actuators; see `list_interpretations`."""
+    names = tuple(actuator.name for actuator in actuators)
+    every = list(range(len(names)))
+    for source, poses in _sources_of_readings(data):
+        for dimension in dict.fromkeys(actuator.dimension for actuator in actuators):
+            chosen = poses[:, None] & np.array([a.dimension is dimension for a in actuators])
             for factor in FACTORS.get(dimension, ()):
                 details = _unit_details("readings", dimension, factor)
-                values = np.where(chosen, factor * q, q)
-                yield Interpretation("unit", details, source, None, values, shrinks=factor < 1.0)
+                yield Interpretation("unit", details, source, None, _scale_where(chosen, factor))
+    slips: list[Slip] = []
     if len(names) > 1:
-        yield reading("reading-sign", -q, actuators=names)
-    for j, name in enumerate(names):
-        sign = np.where(np.arange(len(names)) == j, -1.0, 1.0)
-        yield reading("reading-sign", sign * q, actuators=(name,))
-    for a, b in combinations(range(len(names)), 2):
-        yield reading("swapped-readings", _swap(q, [a], [b]), actuators=(names[a], names[b]))
+        slips.append(("reading-sign", {"actuators": names}, _scale(every, -1.0)))
+    slips += [("reading-sign", {"actuators": (names[j],)}, _scale([j], -1.0)) for j in every]
+    slips += [
+        ("swapped-readings", {"actuators": (names[a], names[b])}, _permute([a, b], [b, a]))
+        for a, b in combinations(every, 2)
+    ]
     if len(names) > 2:
-        yield reading("reversed-readings", q[:, ::-1])
+        slips.append(("reversed-readings", {}, _permute(every, every[::-1])))
     for shift, neighbor in ((1, "above"), (-1, "below")):
-        yield reading("shifted-readings", np.roll(q, shift, axis=0), neighbor=neighbor)
+        slips.append(
+            ("shifted-readings", {"neighbor": neighbor}, partial(np.roll, shift=shift, axis=0))
+        )
+    yield from (Interpretation(slip, details, "", None, change) for slip, details, change in slips)
 
 
-def _source_of(i: int, data: Measurements, sources: Sequence[str]) -> str:
-    """Origin of the rows of an observation, different from those of the others."""
-    if len(sources) == len(data.observations) and sources.count(sources[i]) == 1:
+def _source_of(i: int, data: Measurements) -> str:
+    """Return the source of an observation, such as a file, different from those of the others."""
+    sources = [rows.source for rows in data.observations]
+    if sources[i] and sources.count(sources[i]) == 1:
         return sources[i]
     return f"part {i + 1} of the data"
 
 
-def _sources_of_readings(
-    data: Measurements, sources: Sequence[str]
-) -> Iterator[tuple[str, BoolArray]]:
+def _sources_of_readings(data: Measurements) -> Iterator[tuple[str, BoolArray]]:
     """Yield source and poses (n,): all of them, and those that only the rows of one source measure,
     where sources have separate poses.
     """
@@ -215,101 +168,143 @@ def _sources_of_readings(
         poses[rows.rows.ravel()] = True
     for i, poses in enumerate(measures & (measures.sum(axis=0) == 1)):
         if poses.any() and np.array_equal(poses, measures[i]) and len(measures) > 1:
-            yield _source_of(i, data, sources), poses
-
-
-def _interpret_kind(kind: Kind, values: FloatArray) -> Iterator[_Reading]:
-    """Yield the interpretations of a kind, family by family."""
-    for rule in (_units, _rotations, _signs, _swaps):
-        yield from rule(kind, values)
+            yield _source_of(i, data), poses
 
 
 def _unit_details(quantity: str, dimension: Dimension, factor: float) -> dict[str, Any]:
     return {"quantity": quantity, "dimension": dimension.value, "factor": factor}
 
 
-def _units(kind: Kind, values: FloatArray) -> Iterator[_Reading]:
+def _scale(columns: list[int], factor: float) -> Change:
+    """Return the change that multiplies columns by a factor."""
+
+    def change(values: FloatArray) -> FloatArray:
+        changed = np.array(values)
+        changed[:, columns] *= factor
+        return changed
+
+    return change
+
+
+def _scale_where(chosen: BoolArray, factor: float) -> Change:
+    """Return the change that multiplies chosen values (n, a) by a factor."""
+    return lambda values: np.where(chosen, factor * values, values)
+
+
+def _permute(columns: list[int], sources: list[int]) -> Change:
+    """Return the change that takes the values of columns from other columns."""
+
+    def change(values: FloatArray) -> FloatArray:
+        changed = np.array(values)
+        changed[:, columns] = values[:, sources]
+        return changed
+
+    return change
+
+
+def _list_units(kind: Kind) -> Iterator[Slip]:
     if not kind.changes_with_pose and not kind.sensed_joints:
         return  # gaps to a touched surface are 0 in every unit
-
-    def scaled(quantity: str, dimension: Dimension, chosen: BoolArray, factor: float) -> _Reading:
-        changed = np.where(chosen, factor * values, values)
-        return _Reading("unit", _unit_details(quantity, dimension, factor), changed, factor < 1.0)
-
-    for dimension, quantity in ((Dimension.LENGTH, "lengths"), (Dimension.ANGLE, "angles")):
-        chosen = np.array([column.dimension is dimension for column in kind.columns])
-        if chosen.any():
-            for factor in FACTORS[dimension]:
-                yield scaled(quantity, dimension, chosen, factor)
+    quantities = {Dimension.LENGTH: "lengths", Dimension.ANGLE: "angles"}
+    chosen = {
+        d: [i for i, column in enumerate(kind.columns) if column.dimension is d] for d in quantities
+    }
+    scalings = [
+        (quantities[d], d, columns, factor)
+        for d, columns in chosen.items()
+        if columns
+        for factor in FACTORS[d]
+    ]
     named = _columns_by_name(kind)
-    for name, columns in named.items():
-        dimension = kind.columns[columns[0]].dimension
-        if sum(kind.columns[other[0]].dimension is dimension for other in named.values()) > 1:
-            chosen = np.isin(np.arange(len(kind.columns)), columns)
-            for factor in FACTORS.get(dimension, ()):
-                if factor in SINGLE_COLUMN_FACTORS:
-                    yield scaled(name, dimension, chosen, factor)
+    dimensions = [kind.columns[columns[0]].dimension for columns in named.values()]
+    scalings += [
+        (name, d, columns, factor)
+        for (name, columns), d in zip(named.items(), dimensions, strict=True)
+        if dimensions.count(d) > 1
+        for factor in FACTORS.get(d, ())
+        if factor in SINGLE_COLUMN_FACTORS
+    ]
+    for quantity, d, columns, factor in scalings:
+        yield "unit", _unit_details(quantity, d, factor), _scale(columns, factor)
 
 
-def _rotations(kind: Kind, values: FloatArray) -> Iterator[_Reading]:
-    columns = _orientation_columns(kind)
-    if columns is None:
+def _list_rotations(kind: Kind) -> Iterator[Slip]:
+    whole = _orientation_columns(kind)
+    if whole is None:
         return
-    if len(columns.angles) == 4:
-        last = np.array(values)
-        last[:, columns.angles] = values[:, [columns.angles[i] for i in (3, 0, 1, 2)]]
-        yield _Reading("scalar-last", {}, last)
+    form, angles, position = whole
+
+    def rewrite(rotation: Change, move: Change | None = None) -> Change:
+        """Return the change to another rotation (r, 3, 3) and another position (r, 3)."""
+
+        def change(values: FloatArray) -> FloatArray:
+            changed = np.array(values)
+            changed[:, angles] = form.from_matrix(rotation(values))
+            if move is not None:
+                changed[:, position] = move(values)
+            return changed
+
+        return change
+
+    def back(values: FloatArray) -> FloatArray:
+        return np.swapaxes(form.to_matrix(values[:, angles]), -1, -2)
+
+    def read_as(name: str) -> Change:
+        return lambda values: parse_orientation(name).to_matrix(values[:, angles])
+
+    def mirror(sign: FloatArray) -> Change:
+        return rewrite(
+            lambda values: sign[:, None] * form.to_matrix(values[:, angles]) * sign,
+            lambda values: sign * values[:, position],
+        )
+
+    if len(angles) == 4:
+        yield "scalar-last", {}, _permute(angles, [angles[i] for i in (3, 0, 1, 2)])
     else:
         eulers = [f"euler-{order}" for order in geometry.EULER_ORDERS]
         for name in ("rotation-vector", "tilt-torsion", *eulers):
-            if name != columns.form.name:
-                rotation = parse_orientation(name).to_matrix(values[:, columns.angles])
-                changed = columns.write(values, rotation)
-                yield _Reading("orientation-form", {"form": name}, changed)
-    back = np.swapaxes(columns.rotation(values), -1, -2)
-    yield _Reading("inverted-rotations", {}, columns.write(values, back))
-    if columns.position:
-        position = -(back @ values[:, columns.position, None])[..., 0]
-        yield _Reading("inverted-poses", {}, columns.write(values, back, position))
+            if name != form.name:
+                yield "orientation-form", {"form": name}, rewrite(read_as(name))
+    yield "inverted-rotations", {}, rewrite(back)
+    if position:
+        inverse = rewrite(back, lambda v: -(back(v) @ v[:, position, None])[..., 0])
+        yield "inverted-poses", {}, inverse
         for k, axis in enumerate("xyz"):
-            mirror = np.where(np.arange(3) == k, -1.0, 1.0)
-            rotation = mirror[:, None] * columns.rotation(values) * mirror
-            changed = columns.write(values, rotation, mirror * values[:, columns.position])
-            yield _Reading("left-handed-frame", {"axis": axis}, changed)
+            yield (
+                "left-handed-frame",
+                {"axis": axis},
+                mirror(np.where(np.arange(3) == k, -1.0, 1.0)),
+            )
 
 
-def _signs(kind: Kind, values: FloatArray) -> Iterator[_Reading]:
+def _list_signs(kind: Kind) -> Iterator[Slip]:
     for name, columns in _columns_by_name(kind).items():
-        changed = np.array(values)
-        changed[:, columns] *= -1.0
-        yield _Reading("sign", {"column": name}, changed)
+        yield "sign", {"column": name}, _scale(columns, -1.0)
     angles = [i for i, column in enumerate(kind.columns) if column.dimension is Dimension.ANGLE]
     if len(angles) > 1:
-        changed = np.array(values)
-        changed[:, angles] *= -1.0
-        yield _Reading("angle-signs", {}, changed)
+        yield "angle-signs", {}, _scale(angles, -1.0)
     if isinstance(kind, Bearing):
-        changed = np.array(values)
-        changed[:, 1::2] = 0.5 * np.pi - values[:, 1::2]
-        yield _Reading("zenith-angles", {}, changed)
+        elevation = np.arange(len(kind.columns)) % 2 == 1
+        yield "zenith-angles", {}, lambda v: np.where(elevation, 0.5 * np.pi - v, v)
 
 
-def _swaps(kind: Kind, values: FloatArray) -> Iterator[_Reading]:
+def _list_swaps(kind: Kind) -> Iterator[Slip]:
     named = _columns_by_name(kind)
-    dimension = {c.name.rsplit(".", 1)[-1]: c.dimension for c in kind.columns}
-    if len(kind.target_columns) == 1 and kind.sensed_joints:
-        dimension = {c.name: c.dimension for c in kind.columns}
     for a, b in combinations(named, 2):
-        if dimension[a] is dimension[b]:
-            changed = _swap(values, named[a], named[b])
-            yield _Reading("swapped-columns", {"columns": (a, b)}, changed)
+        if kind.columns[named[a][0]].dimension is kind.columns[named[b][0]].dimension:
+            change = _permute([*named[a], *named[b]], [*named[b], *named[a]])
+            yield "swapped-columns", {"columns": (a, b)}, change
     for (a, first), (b, second) in combinations(kind.target_columns.items(), 2):
-        changed = _swap(values, first, second)
-        yield _Reading("swapped-targets", {"targets": (a, b)}, changed)
+        change = _permute([*first, *second], [*second, *first])
+        yield "swapped-targets", {"targets": (a, b)}, change
+
+
+RULES = (_list_units, _list_rotations, _list_signs, _list_swaps)
+"""From a kind to the slips of one family, the likelier families first."""
 
 
 def _columns_by_name(kind: Kind) -> dict[str, list[int]]:
-    """Columns of the same meaning in all targets, by name: x of every target."""
+    """Return columns of the same meaning in all targets, by name: x of every target."""
     named: dict[str, list[int]] = {}
     single = len(kind.target_columns) == 1
     for places in kind.target_columns.values():
@@ -319,29 +314,17 @@ def _columns_by_name(kind: Kind) -> dict[str, list[int]]:
     return named
 
 
-def _swap(
-    values: FloatArray, first: list[int] | tuple[int, ...], second: list[int] | tuple[int, ...]
-) -> FloatArray:
-    changed = np.array(values)
-    changed[:, [*first, *second]] = values[:, [*second, *first]]
-    return changed
-
-
-def _orientation_columns(kind: Kind) -> _OrientationColumns | None:
-    """Columns of a whole orientation; None for a kind without."""
+def _orientation_columns(kind: Kind) -> tuple[OrientationForm, list[int], list[int]] | None:
+    """Return form and columns of a whole orientation, and the columns of the position if there are
+    any; None for a kind without orientation.
+    """
     if isinstance(kind, Pose):
         n = len(kind.columns) - 3
-        return _OrientationColumns(kind.form, list(range(n)), [n, n + 1, n + 2])
-    if (
-        isinstance(kind, Component)
-        and kind.form is not None
-        and set(kind.form.columns) <= set(kind.components)
-    ):
-        index: Callable[[str], int] = kind.components.index
-        has_position = {"x", "y", "z"} <= set(kind.components)
-        return _OrientationColumns(
-            kind.form,
-            [index(n) for n in kind.form.columns],
-            [index(n) for n in "xyz"] if has_position else [],
-        )
-    return None
+        return kind.form, list(range(n)), [n, n + 1, n + 2]
+    if not isinstance(kind, Component) or kind.form is None:
+        return None
+    names = kind.components
+    if not set(kind.form.columns) <= set(names):
+        return None
+    position = [names.index(n) for n in "xyz"] if {"x", "y", "z"} <= set(names) else []
+    return kind.form, [names.index(n) for n in kind.form.columns], position

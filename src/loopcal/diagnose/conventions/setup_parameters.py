@@ -16,10 +16,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
-from loopcal.diagnose.conventions.interpreted_data import InterpretedData, refine_misfit
-from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.diagnose.conventions.misfit import (
+    Comparison,
+    compare_with_robot,
+    exclude_far_rows,
+    refine_misfit,
+)
+from loopcal.mechanism import Mechanism
 from loopcal.parameters import Parameter
 from loopcal.units import DISPLAY_UNITS, find_unit
 
@@ -38,17 +43,16 @@ FEWEST = 8
 """Smallest number of equations beyond the fitted parameters that supports a result."""
 
 
-@dataclass(frozen=True, eq=False)
-class Contradiction:
+class Contradiction(NamedTuple):
     """Stated setup parameters that the data contradict.
 
     Attributes
     ----------
-    freed : the measurements with these parameters estimated. misfit : the remaining misfit.
+    comparison : of the measurements with these parameters estimated. misfit : the remaining misfit.
     names : of the parameters. values : for each its name, estimate, stated value and certainty.
     """
 
-    freed: InterpretedData
+    comparison: Comparison
     misfit: float
     names: tuple[str, ...]
     values: tuple[dict[str, Any], ...]
@@ -68,42 +72,31 @@ class MovedSetups:
     times: float
 
 
-def find_contradiction(
-    free: FreeParameters, stated: InterpretedData, misfit: float, better: float
-) -> Contradiction | None:
+def find_contradiction(stated: Comparison, misfit: float, better: float) -> Contradiction | None:
     """Find stated setup parameters without which measurements fit far better.
 
     Parameters
     ----------
-    free, stated : the robot's parameters, and the measurements as written. misfit : of these.
-    better : factor by which the misfit must decrease.
+    stated : the measurements as written. misfit : of these. better : factor by which it must
+        decrease.
 
     Returns
     -------
     Contradiction or None
         Of the parameter that alone explains the misfit, or else of all stated ones.
     """
-    present = set(stated.nuisance.table.names)
-    names = tuple(one.name for one in stated.whole.stated_values if one.name in present)
-    if not names or not stated.has_enough:
+    present = set(stated.data.nuisance_parameters.table.names)
+    names = tuple(one.name for one in stated.data.stated_values if one.name in present)
+    if not names:
         return None
-    freed, least = _estimate_stated(free, stated, names)
-    if not least * better < misfit:
+    together = _estimate_stated(stated, names)
+    if not together.misfit * better < misfit:
         return None
-    options = [(names, freed, least)]
+    options = [together]
     if 1 < len(names) <= MOST_SINGLE:
-        single = [((name,), *_estimate_stated(free, stated, (name,))) for name in names]
-        options += [one for one in single if one[2] * better < misfit]
-    chosen, freed, least = min(options, key=lambda one: (len(one[0]), one[2]))
-    table = stated.nuisance.table
-    values = freed.values
-    shown = [
-        _compare_value(
-            free, table.entries[table.index(name)], float(values[freed.nuisance.table.index(name)])
-        )
-        for name in chosen
-    ]
-    return Contradiction(freed, least, chosen, tuple(shown))
+        single = [_estimate_stated(stated, (name,)) for name in names]
+        options += [one for one in single if one.misfit * better < misfit]
+    return min(options, key=lambda one: (len(one.names), one.misfit))
 
 
 def find_moved_setups(
@@ -135,27 +128,35 @@ def find_moved_setups(
     return MovedSetups(moved or names, kept / fitted)
 
 
-def _estimate_stated(
-    free: FreeParameters, stated: InterpretedData, names: tuple[str, ...]
-) -> tuple[InterpretedData, float]:
-    """The measurements with some stated parameters estimated, and their misfit."""
-    remaining = tuple(one for one in stated.whole.stated_values if one.name not in names)
-    freed = InterpretedData(free, replace(stated.whole, stated_values=remaining))
-    freed.misfits()
-    freed.exclude_far_rows()
-    return freed, min(freed.misfit(), refine_misfit(freed))
+def _estimate_stated(stated: Comparison, names: tuple[str, ...]) -> Contradiction:
+    """Compare the measurements with some stated parameters estimated."""
+    free, data = stated.problem.free, stated.data
+    remaining = tuple(one for one in data.stated_values if one.name not in names)
+    freed = replace(data, stated_values=remaining)
+    comparison = exclude_far_rows(compare_with_robot(free, freed))
+    misfit, estimates = refine_misfit(comparison)
+    before, after = data.nuisance_parameters.table, freed.nuisance_parameters.table
+    values = tuple(
+        _describe_value(
+            free.robot, before.entries[before.index(name)], float(estimates[after.index(name)])
+        )
+        for name in names
+    )
+    return Contradiction(comparison, misfit, names, values)
 
 
-def _compare_value(free: FreeParameters, entry: Parameter, value: float) -> dict[str, Any]:
-    """Estimate, stated value and certainty of a parameter, in the unit of the robot's file."""
-    symbol = free.robot.units.get(entry.dimension, DISPLAY_UNITS[entry.dimension].symbol)
+def _describe_value(robot: Mechanism, entry: Parameter, estimate: float) -> dict[str, Any]:
+    """Return estimate, stated value and certainty of a parameter, in the unit of the robot's
+    file.
+    """
+    symbol = robot.units.get(entry.dimension, DISPLAY_UNITS[entry.dimension].symbol)
     factor = find_unit(symbol).factor_to_si
     certainty = "fixed"
     if entry.free and entry.tolerance is not None:
         certainty = f"sd {entry.tolerance / factor:.3g} {symbol}"
     return {
         "name": entry.name,
-        "estimated": f"{value / factor:.4g} {symbol}",
+        "estimated": f"{estimate / factor:.4g} {symbol}",
         "stated": f"{entry.nominal / factor:.4g} {symbol}",
         "certainty": certainty,
     }
