@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.engine.householder import triangularize
+from loopcal.engine.householder import SMALLEST, triangularize
 from loopcal.engine.program import LENGTH, PITCH, Block, ClosureBlocks, Group, Program, Slot, State
 from loopcal.typing import FloatArray
 
@@ -40,7 +40,7 @@ def linearize(
                 *(chain.rows_of_slot(s) for s in group.slots),
                 *(chain.rows_of_joint(j) for j in range(chain.last)),
             )
-            rows, _ = triangularize(columns, len(unknown))
+            rows = triangularize(columns, len(unknown))[0] if unknown else columns
         rows = rows.transpose(3, 2, 0, 1).reshape(t, n, len(group.limbs), *rows.shape[:2])
         u = len(unknown)
         cuts = np.cumsum([u, len(program.freedoms), len(group.slots)])
@@ -97,8 +97,7 @@ def place_links(group: Group, e: FloatArray) -> PlacedLinks:
     for j in displaced:
         rotation[j] = matmul(nominal[j], exponential(move[j, :3]))
         slope[j] = matmul(nominal[j], left_jacobian(move[j, :3]))
-    plain = np.all(group.links[:, :, :3, :3] == np.eye(3), axis=(0, 2, 3))
-    rotates = tuple(j in displaced or not plain[j] for j in range(links))
+    rotates = tuple(j in displaced or not plain for j, plain in enumerate(group.has_plain_link))
     origin = transforms[:, :3, 3] + shift
     return PlacedLinks(nominal, rotation, slope, origin, pitch, length, rotates)
 
@@ -228,15 +227,15 @@ def dot(a: FloatArray, b: FloatArray) -> FloatArray:
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the cross product of (3, ..) and (3, ..)."""
     x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-    return np.stack(np.broadcast_arrays(x, y, z))
+    return np.stack((x, y, z))
 
 
 def exponential(w: FloatArray) -> FloatArray:
     """Return exp(hat(w)) by Rodrigues' formula, (3, ..) -> (3, 3, ..)."""
-    t = np.sqrt(dot(w, w))
-    # sinc(x) = sin(pi x) / (pi x), exact at zero; (1 - cos t) / t^2 = sinc(t / 2)^2 / 2
-    half = np.sinc(t / (2 * np.pi))
-    return _polynomial(w, np.sinc(t / np.pi), 0.5 * half * half)
+    # SMALLEST keeps sin(t) / t at one for no turn; (1 - cos t) / t^2 = (sin(t / 2) / (t / 2))^2 / 2
+    t = np.sqrt(dot(w, w) + SMALLEST)
+    half = np.sin(0.5 * t) / (0.5 * t)
+    return _polynomial(w, np.sin(t) / t, 0.5 * half * half)
 
 
 def left_jacobian(w: FloatArray) -> FloatArray:
@@ -251,9 +250,7 @@ def _polynomial(w: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
     """Return I + a hat(w) + b hat(w)^2 for (3, ..)."""
     x, y, z = w
     bx, by, bz, rest = b * x, b * y, b * z, 1.0 - b * dot(w, w)
-    rows = (
-        (rest + bx * x, bx * y - a * z, bx * z + a * y),
-        (bx * y + a * z, rest + by * y, by * z - a * x),
-        (bx * z - a * y, by * z + a * x, rest + bz * z),
-    )
-    return np.stack([np.stack(row) for row in rows])
+    ax, ay, az, bxy, bxz, byz = a * x, a * y, a * z, bx * y, bx * z, by * z
+    rows = (rest + bx * x, bxy - az, bxz + ay, bxy + az, rest + by * y, byz - ax)
+    last = (bxz - ay, byz + ax, rest + bz * z)
+    return np.stack((*rows, *last)).reshape(3, 3, *rest.shape)

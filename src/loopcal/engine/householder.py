@@ -12,6 +12,9 @@ import numpy as np
 
 from loopcal.typing import FloatArray
 
+SMALLEST = 1e-300
+"""Least divisor: far below every square of a length that matters, and without infinities."""
+
 
 def triangularize(matrix: FloatArray, columns: int) -> tuple[FloatArray, FloatArray]:
     """Return Q' matrix (r, c, batch), upper triangular in its first columns, and det Q' (batch,).
@@ -19,21 +22,20 @@ def triangularize(matrix: FloatArray, columns: int) -> tuple[FloatArray, FloatAr
     The determinant is +1 or -1.
     """
     m = matrix.copy()
-    sign = np.ones(m.shape[2:])
-    for j in range(min(columns, len(m) - 1)):
+    reflections = np.zeros((min(columns, len(m) - 1), *m.shape[2:]))
+    for j, alpha in enumerate(reflections):
         v = m[j:, j].copy()
-        norm = np.sqrt(np.add.reduce(v * v, axis=0))
-        alpha = -np.copysign(norm, v[0])
+        np.sqrt(np.add.reduce(v * v, axis=0), out=alpha)
+        np.copysign(alpha, -v[0], out=alpha)
         v[0] -= alpha
-        # v'v = 2 norm (norm + |v0|); a zero column keeps beta = 0 and stays as it is
-        vv = -alpha * v[0]
-        beta = np.divide(1.0, vv, out=np.zeros_like(vv), where=vv > 0)
+        # v'v = 2 |alpha| (|alpha| + |v0|); a zero column has v = 0 and stays as it is
+        beta = 1.0 / np.maximum(-alpha * v[0], SMALLEST)
         right = m[j:, j + 1 :]
         right -= v[:, None] * (beta * np.einsum("i...,ij...->j...", v, right))
         m[j, j] = alpha
         m[j + 1 :, j] = 0.0
-        sign = np.where(beta > 0, -sign, sign)
-    return m, sign
+    odd = np.add.reduce(reflections != 0.0, axis=0) % 2
+    return m, 1.0 - 2.0 * odd
 
 
 def back_substitute(upper: FloatArray, right: FloatArray) -> FloatArray:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -130,12 +131,12 @@ def _iterate(equations: _Equations, coordinates: FloatArray, max_iterations: int
                 closed = settled & ((now.residual <= 1e4 * RESIDUAL * size) | may_stay_open)
                 reason = np.where(broken, NOT_FINITE, np.where(closed, CONVERGED, STALLED))
                 status[alive[end]] = reason[end]
-                _store(done, alive[end], now.select(end))
+                _store(done, alive[end], now if end.all() else now.select(end))
+                if end.all():
+                    return done
                 keep = ~end
                 equations, now, alive = equations.select(keep), now.select(keep), alive[keep]
                 share, applied, at_rounding = share[keep], applied[keep], at_rounding[keep]
-                if not len(alive):
-                    return done
             fraction = share * np.minimum(1.0, 0.5 * size / np.maximum(now.length, 1e-300))
             length = fraction * now.length
             tiny = bool((length <= STEP * size).all())
@@ -194,8 +195,11 @@ class _Equations:
             demand = [slopes[..., list(program.freedoms)], residual[..., None]]
             lows.append(np.concatenate(demand, axis=2).transpose(1, 2, 0))
         missing = max(0, m - sum(map(len, lows)))
-        low = np.concatenate([*lows, np.zeros((missing, m + 1, N))])
-        inner = sum((np.add.reduce(top[:, -1] ** 2, axis=(0, 1)) for top in tops), np.zeros(N))
+        if missing:
+            lows.append(np.zeros((missing, m + 1, N)))
+        low = lows[0] if len(lows) == 1 else np.concatenate(lows)
+        used = [np.add.reduce(top[:, -1] ** 2, axis=(0, 1)) for top in tops if len(top)]
+        inner = sum(used, np.zeros(N))
         norm = np.sqrt(inner + np.add.reduce(low[:, m] ** 2, axis=0))
         if previous is not None and (norm <= RESIDUAL * program.size).all():
             zero = 0 * norm
@@ -203,7 +207,7 @@ class _Equations:
                 coordinates, 0 * previous.step, norm, norm, zero, previous.sign, previous.pivot
             )
         low, reflected = triangularize(low, m)
-        signs += [reflected, np.prod(np.sign(np.diagonal(low[:m, :m])), axis=-1)]
+        signs += [reflected, np.multiply.reduce(np.sign(np.diagonal(low[:m, :m])), axis=-1)]
         y = back_substitute(low[:m, :m], -low[:m, m:])[:, 0]
         reducible = np.sqrt(inner + np.add.reduce(low[:m, m] ** 2, axis=0))
         twist = np.zeros((6, N))
@@ -214,11 +218,8 @@ class _Equations:
             rest = top[:, -1] + np.add.reduce(top[:, u : u + m] * y[:, None], axis=1)
             turns.append(back_substitute(top[:, :u], -rest[:, None])[:, 0])
         step = np.concatenate([twist, *(turn.reshape(-1, N) for turn in turns)])
-        length, sign, pivot = (
-            self._length(twist, turns),
-            np.prod(signs, axis=0),
-            np.min(pivots, axis=0),
-        )
+        sign, pivot = reduce(np.multiply, signs), reduce(np.minimum, pivots)
+        length = self._length(twist, turns)
         return Iterate(coordinates, step, norm, reducible, length, sign, pivot)
 
     def _eliminate(
@@ -237,9 +238,10 @@ class _Equations:
             j = int(np.flatnonzero(group.actuator[:, 0] >= 0)[0])
             sigma = np.array(program.sigma)[group.actuator[j], None]
             columns.append(chain.rows_of_joint(j) * sigma)
-        rows, reflected = triangularize(chain.stack(*columns, chain.residual()), u)
+        rows = chain.stack(*columns, chain.residual())
         sign = pivot = np.ones(T.shape[-1])
         if u:
+            rows, reflected = triangularize(rows, u)
             diagonal = np.diagonal(rows[:u, :u])
             sign = np.prod(reflected * np.prod(np.sign(diagonal), axis=-1), axis=0)
             largest = np.maximum(np.abs(diagonal).max(axis=-1), 1e-300)
@@ -254,7 +256,8 @@ class _Equations:
     def _length(self, twist: FloatArray, turns: list[FloatArray]) -> FloatArray:
         """Return the length of a step [m]: its largest part, an angle times the robot's size."""
         size = self.program.size
-        length = np.maximum(np.abs(twist[:3]).max(axis=0) * size, np.abs(twist[3:]).max(axis=0))
+        parts = np.maximum.reduce(np.abs(twist).reshape(2, 3, -1), axis=1)
+        length = np.maximum(parts[0] * size, parts[1])
         for group, unknown, turn in zip(self.program.groups, self.unknown, turns, strict=True):
             for j, part in zip(unknown, turn, strict=True):
                 unit = size if group.joints[j : j + 1] == "R" else 1.0

@@ -12,6 +12,7 @@ together. The rod of a `distance` ending counts as joint J, whose value is added
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,12 @@ class Group:
     length: FloatArray
     slots: tuple[Slot, ...]
     columns: slice
+
+    @cached_property
+    def has_plain_link(self) -> tuple[bool, ...]:
+        """Whether no nominal link 0..J + 1 of the group turns."""
+        plain = np.all(self.links[:, :, :3, :3] == np.eye(3), axis=(0, 2, 3))
+        return tuple(plain.tolist())
 
     def unknown_joints(self, free: bool) -> list[int]:
         """Return the joints that closure determines: passive ones, and if `free` actuated ones."""

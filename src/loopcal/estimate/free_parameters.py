@@ -105,6 +105,7 @@ def select_free_parameters(robot: Mechanism) -> FreeParameters:
     places = np.flatnonzero(table.free)
     default = {Dimension.LENGTH: DEFAULT_TOLERANCE * robot.size}
     assumed = np.isnan(table.tolerance[places])
-    fallback = np.array([default.get(table.dimensions[i], DEFAULT_TOLERANCE) for i in places])
+    dimensions = table.dimensions
+    fallback = np.array([default.get(dimensions[i], DEFAULT_TOLERANCE) for i in places])
     tolerance = np.where(assumed, fallback, table.tolerance[places])
     return FreeParameters(robot, places, table.nominal[places], tolerance, assumed)

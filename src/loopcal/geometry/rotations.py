@@ -26,8 +26,12 @@ def stack_matrix(rows: tuple[tuple[FloatArray | float, ...], ...]) -> FloatArray
     -------
     stacked : (..., a, b)
     """
-    entries = np.broadcast_arrays(*(entry for row in rows for entry in row))
-    return np.stack(entries, axis=-1).reshape((*entries[0].shape, len(rows), len(rows[0])))
+    shape = np.broadcast_shapes(*{np.shape(entry) for row in rows for entry in row})
+    stacked = np.empty((*shape, len(rows), len(rows[0])))
+    for i, row in enumerate(rows):
+        for j, entry in enumerate(row):
+            stacked[..., i, j] = entry
+    return stacked
 
 
 def hat(vector: FloatArray) -> FloatArray:
@@ -45,15 +49,15 @@ def hat(vector: FloatArray) -> FloatArray:
     return stack_matrix(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
 
 
-def _polynomial(vector: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
+def _polynomial(vector: FloatArray, first: FloatArray | float, second: FloatArray) -> FloatArray:
     """Return `I + first hat(w) + second hat(w)^2`.
 
     Written out, it is three times faster than products of 3x3 matrices.
     """
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-    xy, xz, yz = second * x * y, second * x * z, second * y * z
-    xx, yy, zz = second * x * x, second * y * y, second * z * z
     ax, ay, az = first * x, first * y, first * z
+    bx, by, bz = second * x, second * y, second * z
+    xx, yy, zz, xy, xz, yz = bx * x, by * y, bz * z, bx * y, bx * z, by * z
     return stack_matrix(
         (
             (1.0 - yy - zz, xy - az, xz + ay),
@@ -143,9 +147,7 @@ def left_jacobian_inverse_so3(vector: FloatArray) -> FloatArray:
     """
     angle, square = _angle(vector)
     half = 0.5 * angle
-    return _polynomial(
-        vector, np.full_like(angle, -0.5), (1.0 - half * np.cos(half) / np.sin(half)) / square
-    )
+    return _polynomial(vector, -0.5, (1.0 - half * np.cos(half) / np.sin(half)) / square)
 
 
 def quaternion_to_matrix(quaternion: FloatArray) -> FloatArray:

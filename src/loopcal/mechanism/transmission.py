@@ -72,6 +72,8 @@ def term_derivatives(q: FloatArray, w: FloatArray) -> list[FloatArray]:
 
 def joints_from_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
     """Return the joint values (t, n, a) of readings q under terms tau (t | 1, a, 8)."""
+    if not tau[..., 2:].any():
+        return tau[:, None, :, 0] + split_readings(q, len(w))[0] * tau[:, None, :, 1]
     columns = term_derivatives(q, w)
     return sum(
         (columns[i] * tau[:, None, :, i] for i in range(1, len(TERMS))),
@@ -82,6 +84,8 @@ def joints_from_readings(q: FloatArray, tau: FloatArray, w: FloatArray) -> Float
 def joint_slopes(q: FloatArray, tau: FloatArray, w: FloatArray) -> FloatArray:
     """Return d joint / d reading (t, n, a)."""
     r, _ = split_readings(q, len(w))
+    if not tau[..., 2:7].any():
+        return np.broadcast_to(tau[:, None, :, 1], (max(len(tau), len(r)), *r.shape[1:]))
     turn = w * r
     _, gain, curve, sin1, cos1, sin2, cos2, _ = np.moveaxis(tau[:, None], -1, 0)
     first = w * (sin1 * np.cos(turn) - cos1 * np.sin(turn))
