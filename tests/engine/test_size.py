@@ -28,6 +28,7 @@ def test_the_engine_imports_numpy_and_the_array_types_only(root: Path):
         "__future__",
         "collections.abc",
         "dataclasses",
+        "functools",
         "typing",
         "loopcal.typing",
     }

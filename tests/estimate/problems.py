@@ -17,7 +17,7 @@ from loopcal.measure import (
     simulate,
 )
 from loopcal.mechanism import Mechanism, forward, inverse
-from loopcal.numerics.triangular_factor import empty_factor
+from loopcal.numerics.decomposition import empty_factor
 from loopcal.parameters import ParameterTable
 from tests import zoo
 

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from loopcal.engine import fold
-from loopcal.numerics.decomposition import decompose
-from loopcal.numerics.triangular_factor import empty_factor
+from loopcal.numerics.decomposition import decompose, empty_factor
 
 P, M, T = 7, 40, 3
 

@@ -146,8 +146,7 @@ class Chain:
             return (self.distance - (self.links.length + self.theta[-1]))[None]
         if self.group.ending == "ball":
             return self.gap[list(self.group.rows)]
-        # 2 tan(a/2) along the axis has the zero and the slope of the logarithm, and is safe up to
-        # half a turn
+        # 2 tan(a/2) along the axis: zero and slope as the logarithm's, and safe up to half a turn
         attachment = matmul(self.platform, self.links.rotation[self.last])
         R = matmul(attachment, np.swapaxes(self.tip_rotation, 0, 1))
         v = np.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
@@ -251,6 +250,6 @@ def _polynomial(w: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
     x, y, z = w
     bx, by, bz, rest = b * x, b * y, b * z, 1.0 - b * dot(w, w)
     ax, ay, az, bxy, bxz, byz = a * x, a * y, a * z, bx * y, bx * z, by * z
-    rows = (rest + bx * x, bxy - az, bxz + ay, bxy + az, rest + by * y, byz - ax)
-    last = (bxz - ay, byz + ax, rest + bz * z)
-    return np.stack((*rows, *last)).reshape(3, 3, *rest.shape)
+    first = (rest + bx * x, bxy - az, bxz + ay, bxy + az, rest + by * y)
+    last = (byz - ax, bxz - ay, byz + ax, rest + bz * z)
+    return np.stack(first + last).reshape(3, 3, *rest.shape)

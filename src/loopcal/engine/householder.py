@@ -14,6 +14,8 @@ from loopcal.typing import FloatArray
 
 SMALLEST = 1e-300
 """Least divisor: far below every square of a length that matters, and without infinities."""
+PART = 8
+"""Rows of a part of many rows that are folded, over their columns."""
 
 
 def triangularize(matrix: FloatArray, columns: int) -> tuple[FloatArray, FloatArray]:
@@ -53,10 +55,17 @@ def back_substitute(upper: FloatArray, right: FloatArray) -> FloatArray:
 def fold(factor: FloatArray, rows: FloatArray) -> FloatArray:
     """Return the triangular factor R with R'R = factor'factor + rows'rows.
 
-    The stack of both is triangularized by QR; neither product is formed. The signs of the rows of R
-    are arbitrary. A row of zeros changes nothing.
+    The stack of both is triangularized by QR, many rows in parts that fit the cache; no product is
+    formed. The signs of the rows of R are arbitrary. A row of zeros changes nothing.
 
     factor : (t, p, p) upper triangular. rows : (t | 1, m, p), whitened.
     """
-    shared = np.broadcast_to(rows, (factor.shape[0], *rows.shape[1:]))
-    return np.asarray(np.linalg.qr(np.concatenate([factor, shared], axis=1), mode="r"))
+    t, p = factor.shape[:2]
+    stack = [factor, np.broadcast_to(rows, (t, *rows.shape[1:]))]
+    height = PART * p
+    count = rows.shape[1] // height
+    if count > 1:
+        parts = stack[1][:, : count * height].reshape(t, count, height, p)
+        factors = np.asarray(np.linalg.qr(parts, mode="r"))
+        stack[1:] = factors.reshape(t, count * p, p), stack[1][:, count * height :]
+    return np.asarray(np.linalg.qr(np.concatenate(stack, axis=1), mode="r"))

@@ -101,8 +101,7 @@ def solve(
     T = np.broadcast_to(start.T, (t, n, 4, 4))[:, :, :3]
     begin = np.concatenate([a.reshape(t * n, -1) for a in (T, *joints)], axis=1).T
     chunks = []
-    for first in range(0, t * n, CHUNK):
-        rows = np.arange(first, min(first + CHUNK, t * n))
+    for rows in np.split(np.arange(t * n), range(CHUNK, t * n, CHUNK)):
         placed = [p.select(rows // n) for p in links]
         equations = _Equations(program, unknown, redundant, placed, task, rows)
         chunks.append(_iterate(equations, begin[:, rows], max_iterations))
@@ -130,11 +129,10 @@ def _iterate(equations: _Equations, coordinates: FloatArray, max_iterations: int
             if end.any():
                 closed = settled & ((now.residual <= 1e4 * RESIDUAL * size) | may_stay_open)
                 reason = np.where(broken, NOT_FINITE, np.where(closed, CONVERGED, STALLED))
-                status[alive[end]] = reason[end]
-                _store(done, alive[end], now if end.all() else now.select(end))
-                if end.all():
+                keep, status[alive[end]] = ~end, reason[end]
+                _store(done, alive[end], now.select(end) if keep.any() else now)
+                if not keep.any():
                     return done
-                keep = ~end
                 equations, now, alive = equations.select(keep), now.select(keep), alive[keep]
                 share, applied, at_rounding = share[keep], applied[keep], at_rounding[keep]
             fraction = share * np.minimum(1.0, 0.5 * size / np.maximum(now.length, 1e-300))
@@ -186,26 +184,21 @@ class _Equations:
         """
         program, m, N = self.program, len(self.program.freedoms), coordinates.shape[1]
         T, limbs = coordinates[:12].reshape(3, 4, N), _split_joints(program, coordinates)
-        limb_parts = zip(
-            *(self._eliminate(i, T, theta) for i, theta in enumerate(limbs)), strict=True
-        )
-        tops, lows, signs, pivots = (list(limb_part) for limb_part in limb_parts)
+        eliminated = [self._eliminate(i, T, theta) for i, theta in enumerate(limbs)]
+        tops, lows, signs, pivots = map(list, zip(*eliminated, strict=True))
         if self.task is not None:
             residual, slopes = self.task(T.transpose(2, 0, 1), self.rows)
             demand = [slopes[..., list(program.freedoms)], residual[..., None]]
             lows.append(np.concatenate(demand, axis=2).transpose(1, 2, 0))
-        missing = max(0, m - sum(map(len, lows)))
-        if missing:
+        if (missing := m - sum(map(len, lows))) > 0:
             lows.append(np.zeros((missing, m + 1, N)))
-        low = lows[0] if len(lows) == 1 else np.concatenate(lows)
-        used = [np.add.reduce(top[:, -1] ** 2, axis=(0, 1)) for top in tops if len(top)]
+        low = np.concatenate(lows) if len(lows) > 1 else lows[0]
+        used = (np.add.reduce(top[:, -1] ** 2, axis=(0, 1)) for top in tops if len(top))
         inner = sum(used, np.zeros(N))
         norm = np.sqrt(inner + np.add.reduce(low[:, m] ** 2, axis=0))
         if previous is not None and (norm <= RESIDUAL * program.size).all():
-            zero = 0 * norm
-            return Iterate(
-                coordinates, 0 * previous.step, norm, norm, zero, previous.sign, previous.pivot
-            )
+            still = previous._replace(step=0 * previous.step, length=0 * norm)
+            return still._replace(coordinates=coordinates, residual=norm, reducible=norm)
         low, reflected = triangularize(low, m)
         signs += [reflected, np.multiply.reduce(np.sign(np.diagonal(low[:m, :m])), axis=-1)]
         y = back_substitute(low[:m, :m], -low[:m, m:])[:, 0]
@@ -273,8 +266,8 @@ class _Equations:
         first = 6
         for theta, unknown in zip(_split_joints(self.program, out), self.unknown, strict=True):
             last = first + len(unknown) * theta.shape[1]
-            part = now.step[first:last].reshape(len(unknown), theta.shape[1], N)
-            theta[unknown] += fraction * part
+            if unknown:
+                theta[unknown] += fraction * now.step[first:last].reshape(-1, *theta.shape[1:])
             first = last
         return out
 
@@ -298,12 +291,8 @@ def _pack(program: Program, solved: Solved, shape: tuple[int, int]) -> State:
     """Return solved rows as a state with the axes (t, n)."""
     T = np.zeros((solved.coordinates.shape[1], 4, 4))
     T[:, :3], T[:, 3, 3] = solved.coordinates[:12].T.reshape(-1, 3, 4), 1.0
-    joints = tuple(
-        values.transpose(2, 1, 0).reshape(*shape, *_joint_shape(group)[::-1])
-        for group, values in zip(
-            program.groups, _split_joints(program, solved.coordinates), strict=True
-        )
-    )
+    limbs = _split_joints(program, solved.coordinates)
+    joints = tuple(a.transpose(2, 1, 0).reshape(*shape, *a.shape[1::-1]) for a in limbs)
     return State(
         T.reshape(*shape, 4, 4),
         joints,

@@ -65,9 +65,8 @@ class Group:
 
     @cached_property
     def has_plain_link(self) -> tuple[bool, ...]:
-        """Whether no nominal link 0..J + 1 of the group turns."""
-        plain = np.all(self.links[:, :, :3, :3] == np.eye(3), axis=(0, 2, 3))
-        return tuple(plain.tolist())
+        """Whether the nominal links 0..J + 1 do not turn in any limb."""
+        return tuple(np.all(self.links[:, :, :3, :3] == np.eye(3), axis=(0, 2, 3)).tolist())
 
     def unknown_joints(self, free: bool) -> list[int]:
         """Return the joints that closure determines: passive ones, and if `free` actuated ones."""

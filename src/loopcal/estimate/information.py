@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from loopcal import engine
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.poses.linearization import LinearizedPoses, linearize_at_readings
 from loopcal.estimate.problem import problem_of
@@ -25,8 +26,8 @@ from loopcal.measure import (
     whiten_rows,
 )
 from loopcal.mechanism import Mechanism
+from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.elimination import eliminate_from_factor
-from loopcal.numerics.triangular_factor import empty_factor, fold_rows
 from loopcal.typing import BoolArray, FloatArray
 
 
@@ -125,8 +126,8 @@ def instrument_factor(poses: ObservedPoses, measured: Measurements) -> FloatArra
     """
     local = measured.nuisance_parameters
     rows = observe_rows(poses, measured, local, local.values())
-    factor = fold_rows(empty_factor(1, len(local) + len(poses.free)), rows)
-    with_prior = fold_rows(factor, _prior_rows(local, len(poses.free)))
+    factor = engine.fold(empty_factor(1, len(local) + len(poses.free)), rows)
+    with_prior = engine.fold(factor, _prior_rows(local, len(poses.free)))
     return eliminate_from_factor(with_prior, len(local))
 
 

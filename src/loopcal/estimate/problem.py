@@ -22,6 +22,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from loopcal import engine
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.linearization import LeverageRows, Linearization
 from loopcal.estimate.nuisance.elimination import (
@@ -55,9 +56,9 @@ from loopcal.measure import (
     resolve_reading_sigma,
 )
 from loopcal.measure.whitening import compute_whitener
+from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
-from loopcal.numerics.triangular_factor import empty_factor, fold_rows
 from loopcal.typing import FloatArray, IntArray
 from loopcal.units import Dimension
 
@@ -320,7 +321,7 @@ class Problem:
         estimate = None
         if nuisance is not None and factors is not None and solution.nuisance is not None:
             estimate, rest = nuisance.eliminate(factors, solution.nuisance)
-            factor = fold_rows(factor, rest)
+            factor = engine.fold(factor, rest)
             equations = equations + nuisance.prior_count - estimate.elimination.rank
             slope = estimate.elimination.slope
             next_start = replace(next_start, nuisance=solution.nuisance, slope=slope)

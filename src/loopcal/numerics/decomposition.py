@@ -2,8 +2,9 @@
 """The decomposition of a triangular factor, from which everything about an estimate is read.
 
 Rows [A | b] of a linear least-squares problem are folded, block by block, into one triangular
-factor (`loopcal.numerics.triangular_factor`). Singular values, rank, solutions, filters and
-covariances come from the singular value decomposition of that factor. The product A'A is never
+factor (`loopcal.engine.fold`), whose memory is the number of columns squared and whose last
+diagonal entry is the norm of what no solution explains. Singular values, rank, solutions, filters
+and covariances come from the singular value decomposition of that factor. The product A'A is never
 formed: it would turn null directions of 1e-14 into 1e-7. Every array has a leading trial axis t.
 See docs/theory/estimation.md.
 """
@@ -304,6 +305,11 @@ class Decomposition:
         return part > NULL_COMPONENT**2
 
 
+def empty_factor(trials: int, parameters: int) -> FloatArray:
+    """Return the factor of no rows, zeros (t, p + 1, p + 1), into which rows are folded."""
+    return np.zeros((trials, parameters + 1, parameters + 1))
+
+
 def decompose(
     factor: FloatArray,
     rows: IntArray,
@@ -316,7 +322,7 @@ def decompose(
 
     Parameters
     ----------
-    factor : (t, p + 1, p + 1) upper triangular, see `loopcal.numerics.triangular_factor`.
+    factor : (t, p + 1, p + 1) upper triangular, see `loopcal.engine.fold`.
     rows : (t,) number of equations that were folded.
     about : (t, p), optional. With it the last column is read as a residual r at the deviation z =
         `about`, and the problem becomes the one for the total deviation: |A z_new - b| with b = A z

@@ -18,10 +18,10 @@ from functools import cached_property
 
 import numpy as np
 
-from loopcal.numerics.decomposition import NULL_COMPONENT
+from loopcal import engine
+from loopcal.numerics.decomposition import NULL_COMPONENT, empty_factor
 from loopcal.numerics.elimination import Elimination, eliminate_from_triangle
 from loopcal.numerics.elimination_tree import EliminationTree, Structure
-from loopcal.numerics.triangular_factor import empty_factor, fold_rows
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 SHORTEST_DIRECTION = 0.5
@@ -222,7 +222,7 @@ def eliminate_tree(factors: NodeFactors) -> tuple[TreeElimination, FloatArray]:
         left = done.rest[..., u:, :] if done.is_observable.all() else done.rest
         rows = left.reshape(factors.trials, -1, left.shape[-1])
         if structure.parent < 0:
-            rest = fold_rows(rest, rows)
+            rest = engine.fold(rest, rows)
         else:
             places = np.repeat(structure.parent_place, left.shape[2])
             arrays[structure.parent] = _fold(arrays[structure.parent], rows, places)

@@ -23,6 +23,7 @@ from math import comb
 
 import numpy as np
 
+from loopcal import engine
 from loopcal.errors import DataError
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.information import observe_poses, observe_rows
@@ -35,9 +36,8 @@ from loopcal.measure import (
     collect_nuisance_parameters,
     list_sensed_joints,
 )
-from loopcal.numerics.decomposition import Decomposition, decompose
+from loopcal.numerics.decomposition import Decomposition, decompose, empty_factor
 from loopcal.numerics.elimination import eliminate_from_factor
-from loopcal.numerics.triangular_factor import empty_factor, fold_rows
 from loopcal.planning.design import PriorInformation, divide_by_factor, factor_rows, is_allowed
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -151,10 +151,10 @@ def decompose_information(
     factor = empty_factor(1, o + p)
     allowed = groups.rows[is_allowed(groups.rows)]
     flat = np.concatenate([allowed.reshape(-1, o + p), groups.nuisance_prior])
-    factor = fold_rows(factor, np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)[None])
+    factor = engine.fold(factor, np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)[None])
     factor = eliminate_from_factor(factor, o)
     if measured is not None:
-        factor = fold_rows(factor, np.concatenate([measured, np.zeros((p, 1))], axis=1)[None])
+        factor = engine.fold(factor, np.concatenate([measured, np.zeros((p, 1))], axis=1)[None])
     return decompose(factor, np.full(1, len(flat)))
 
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from loopcal import engine
 from loopcal.errors import EstimationError, suggest_names
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.linearization import Linearization
@@ -25,7 +26,6 @@ from loopcal.estimate.start import Start
 from loopcal.findings import report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import RANK_TOLERANCE
-from loopcal.numerics.triangular_factor import fold_rows
 from loopcal.typing import FloatArray, IntArray
 
 PARALLEL = 1e-2
@@ -126,7 +126,7 @@ class WithPrior:
         rows = np.concatenate([slope, residual[..., None]], axis=2)
         return replace(
             measured,
-            factor=fold_rows(measured.factor, rows),
+            factor=engine.fold(measured.factor, rows),
             cost=measured.cost + (residual**2).sum(axis=1),
             equations=measured.equations + len(self.slope),
         )

@@ -17,13 +17,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from loopcal import engine
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.poses.linearization import KindRows
 from loopcal.measure import Measurements, NuisanceParameters, Observations, guess_nuisance_values
 from loopcal.numerics.elimination_tree import EliminationTree, build_tree
 from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
 from loopcal.numerics.tree_elimination import NodeFactors, TreeElimination, eliminate_tree
-from loopcal.numerics.triangular_factor import fold_rows
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -252,7 +252,7 @@ def fold_node_rows(
     """Fold rows into the factors of their nodes; return the machine's factor with its own rows."""
     plain = [_flat(part) for part in parts if part.structure < 0]
     if plain:
-        factor = fold_rows(factor, plain[0] if len(plain) == 1 else np.concatenate(plain, axis=1))
+        factor = engine.fold(factor, plain[0] if len(plain) == 1 else np.concatenate(plain, axis=1))
     if factors is None:
         return factor
     for structure in sorted({part.structure for part in parts if part.structure >= 0}):

@@ -30,9 +30,9 @@ from loopcal.estimate.poses.solution import PoseSolution
 from loopcal.estimate.poses.states import PoseStates, map_states
 from loopcal.estimate.start import Start, spread_states
 from loopcal.mechanism import forward_trials
+from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
-from loopcal.numerics.triangular_factor import empty_factor
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 

@@ -3,7 +3,8 @@
 
 With as many actuators as freedoms a pose needs all its readings, and their sigmas do not move it.
 Redundant readings contradict each other: the pose is where they fit best in units of their own
-sigma, and a reading that was not taken may not be needed at all. See docs/theory/uncertain-readings.md.
+sigma, and a reading that was not taken may not be needed at all. See
+docs/theory/uncertain-readings.md.
 """
 
 from __future__ import annotations

@@ -33,11 +33,10 @@ from loopcal.estimate.poses.linearization import KindRows, LinearizedPoses, line
 from loopcal.estimate.poses.solution import PoseEstimates, PoseSolution
 from loopcal.estimate.poses.states import PoseStates, map_states
 from loopcal.estimate.start import Start
-from loopcal.numerics.decomposition import NULL_COMPONENT
+from loopcal.numerics.decomposition import NULL_COMPONENT, empty_factor
 from loopcal.numerics.elimination import Elimination, eliminate_columns
 from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
 from loopcal.numerics.tree_elimination import NodeFactors, eliminate_tree
-from loopcal.numerics.triangular_factor import empty_factor
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 

@@ -25,8 +25,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.mechanism import Mechanism, Status, differentiate_pose, forward_trials
-from loopcal.numerics.decomposition import Decomposition, decompose
-from loopcal.numerics.triangular_factor import empty_factor
+from loopcal.numerics.decomposition import Decomposition, decompose, empty_factor
 from loopcal.papers.tsvd_2016.machines import Study
 from loopcal.papers.tsvd_2016.published import MM
 from loopcal.typing import BoolArray, FloatArray, IntArray
