@@ -174,7 +174,7 @@ def test_what_is_no_text_file_is_refused_as_robot_and_as_data(refused, case) -> 
 def test_an_absent_file_is_refused(refused) -> None:
     assert "this robot file does not exist" in refused("check robot.yaml")
     assert "this measurement file does not exist" in refused("calibrate hexapod-42 data.csv -o run")
-    assert "is not a run folder" in refused("validate run data.csv", data_csv=DATA)
+    assert "this run folder does not exist" in refused("validate run data.csv", data_csv=DATA)
 
 
 DATA_CASES = {
@@ -335,7 +335,10 @@ def test_a_byte_order_mark_is_accepted(tmp_path, capsys) -> None:
 
 
 USAGE_CASES = {
-    "unknown command": ("calibrat hexapod-42", "No such command 'calibrat'"),
+    "unknown command": (
+        "calibrat hexapod-42",
+        "'calibrat' is not a command (did you mean 'calibrate'?)",
+    ),
     "unknown option": ("check hexapod-42 --jsn", "No such option"),
     "missing argument": ("check", "Missing argument 'ROBOT'"),
     "limit without a unit": (

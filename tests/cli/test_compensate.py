@@ -99,7 +99,7 @@ def test_a_target_out_of_the_machines_limits_gives_exit_code_2_and_no_reading(ru
     (made / "targets.csv").write_text(TARGETS + UNREACHABLE)
     code, out, err = run("compensate run targets.csv")
     assert code == 2
-    assert "target 'high' outside the machine's limits: stroke of q1" in err
+    assert "target 'high': outside the machine's limits: stroke of q1" in err
     assert out.split("\n")[3].startswith("high,,,,,,,")
 
 
@@ -129,7 +129,7 @@ def test_bad_targets_are_refused_in_a_sentence(run, made, text, sentence) -> Non
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ("compensate nothing targets.csv", "this is not a run folder"),
+        ("compensate nothing targets.csv", "this run folder does not exist"),
         ("compensate run nothing.csv", "nothing.csv: this measurement file does not exist"),
         ("compensate run targets.csv --controller nobody", "nobody"),
         (

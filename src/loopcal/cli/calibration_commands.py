@@ -32,7 +32,7 @@ from loopcal.errors import DataError
 
 @click.command()
 @robot_argument
-@data_argument
+@data_argument("DATA...")
 @click.option("-o", "--output", required=True, type=FILE, help="Run folder to make.")
 @click.option(
     "--hold-out",
@@ -173,7 +173,7 @@ def _list_inputs(robot: str, data: Sequence[Path], prior: Path | None) -> dict[s
 
 @click.command()
 @click.argument("run", metavar="RUN", type=FILE)
-@data_argument
+@data_argument("DATA...")
 @limit_options
 @data_options
 @click.option(
@@ -320,7 +320,7 @@ def compensate(
     else:
         terminal.print_page([*view_compensation(result), "", f"Written to {output}"])
     return terminal.print_failures(
-        f"target {label!r} {with_hint(result.findings[i], hint_for)}"
+        f"target {label!r}: {with_hint(result.findings[i], hint_for)}"
         for i, label in enumerate(labels)
         if not result.usable[i]
     )

@@ -16,8 +16,9 @@ from importlib import import_module
 
 import click
 
+from loopcal.cli import terminal
 from loopcal.cli.hints import find_hint
-from loopcal.errors import LoopcalError
+from loopcal.errors import LoopcalError, suggest_names
 
 SECTIONS = {
     "Describe the robot": {
@@ -61,6 +62,16 @@ class SectionedGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import a command; None where there is none of this name."""
         return find_command(cmd_name)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command of the first word, or fail with the names of similar ones."""
+        names = self.list_commands(ctx)
+        if args[0] not in names and not args[0].startswith("-"):
+            similar = suggest_names(args[0], names)
+            ctx.fail(f"{args[0]!r} is not a command{similar}; see loopcal --help")
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the sections."""
@@ -148,7 +159,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _refuse(sentence: str, hint: str | None = None) -> int:
     """Print a sentence, and a hint where there is one, on standard error; return exit code 1."""
-    click.echo(f"loopcal: {' '.join(sentence.split())}", err=True)
+    terminal.print_message(f"loopcal: {' '.join(sentence.split())}")
     if hint:
-        click.echo(f"Hint: {hint}", err=True)
+        terminal.print_message(f"Hint: {hint}")
     return 1

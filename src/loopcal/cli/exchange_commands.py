@@ -301,7 +301,7 @@ def export(
     from loopcal.io.formats.import_export import choose_format, export_robot, load_source
     from loopcal.report.calibration_view import with_hint
 
-    target = choose_format(output, format_name)
+    target = choose_format(output, format_name, is_written=True)
     refuse_outputs((output,), (Path(source),), force)  # the file of --into may be corrected
     exported = export_robot(load_source(source), target, into)
     write_text(output, exported.text)

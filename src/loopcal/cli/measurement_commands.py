@@ -22,6 +22,7 @@ from loopcal.cli.instrument_options import (
 )
 from loopcal.cli.options import (
     FILE,
+    data_argument,
     data_options,
     force_option,
     is_given,
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @robot_argument
-@click.argument("data", metavar="[DATA]...", type=FILE, nargs=-1)
+@data_argument("[DATA]...", required=False)
 @click.option(
     "--poses", type=FILE, help="Instead of DATA: CSV file of poses that could be measured."
 )

@@ -23,13 +23,33 @@ Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 FILE = click.Path(path_type=Path)
 
 robot_argument = click.argument("robot", metavar="ROBOT")
-data_argument = click.argument("data", metavar="DATA...", type=FILE, nargs=-1, required=True)
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print one JSON document instead of text."
 )
 verbose_option = click.option(
     "-v", "--verbose", is_flag=True, help="Print all findings and tables, not only the summary."
 )
+
+
+def _check_data(_context: click.Context, _argument: click.Parameter, paths: Any) -> Any:
+    """Refuse a YAML file, such as a robot file, in place of measurements."""
+    for path in paths if isinstance(paths, tuple) else () if paths is None else (paths,):
+        if path.suffix in (".yaml", ".yml"):
+            raise DataError(f"{path} is a YAML file; give a measurement file (CSV)")
+    return paths
+
+
+def data_argument(metavar: str, required: bool = True) -> Decorator:
+    """Return the argument of measurement files."""
+    kind = {"type": FILE, "nargs": -1, "required": required}
+    return click.argument("data", metavar=metavar, callback=_check_data, **kind)
+
+
+def data_option(name: str, help_text: str, **kind: Any) -> Decorator:
+    """Return an option that takes a measurement file."""
+    return click.option(
+        name, type=FILE, metavar="DATA", callback=_check_data, help=help_text, **kind
+    )
 
 
 class Quantity(click.ParamType):  # pyright: ignore[reportMissingTypeArgument]  # generic since 8.4
@@ -185,11 +205,10 @@ def read_measurements(paths: Sequence[Path], robot: Mechanism, **allowed: bool) 
     from loopcal.io import load_measurements
     from loopcal.io.core.csv_table import read_robot_name
 
-    data = load_measurements(paths, robot, **allowed)
     for path in paths:
         stated = read_robot_name(path)
         if stated is not None and stated != robot.name:
             code = "workflow.robot-of-other-name"
             note = report_finding(code, file=str(path), stated=stated, used=robot.name)
             terminal.print_note(str(note))
-    return data
+    return load_measurements(paths, robot, **allowed)

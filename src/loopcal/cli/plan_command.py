@@ -23,6 +23,7 @@ from loopcal.cli.instrument_options import (
 )
 from loopcal.cli.options import (
     FILE,
+    data_option,
     force_option,
     is_given,
     json_option,
@@ -82,12 +83,7 @@ EXCLUDED_BY_PLANE_LINE = {
     metavar="N",
     help="Number of further poses for validation, drawn evenly.  [default: one for four]",
 )
-@click.option(
-    "--like",
-    type=FILE,
-    metavar="DATA",
-    help="Measurement file whose settings describe the instrument.",
-)
+@data_option("--like", "Measurement file whose settings describe the instrument.")
 @unknown_options
 @instrument_options
 @click.option(
@@ -108,12 +104,8 @@ EXCLUDED_BY_PLANE_LINE = {
     metavar="CSV",
     help="Poses to choose from; by default drawn from the workspace.",
 )
-@click.option(
-    "--measured",
-    type=FILE,
-    multiple=True,
-    metavar="DATA",
-    help="Measurements that exist already. May be given several times.",
+@data_option(
+    "--measured", "Measurements that exist already. May be given several times.", multiple=True
 )
 @constraint_options
 @click.option(
@@ -201,11 +193,6 @@ def _find_instrument(robot: Mechanism, like: Path | None, options: Mapping[str, 
 
     if like is None:
         return make_instrument(options)
-    if like.suffix in (".yaml", ".yml"):
-        raise DataError(
-            f"--like {like} is a YAML file; give the measurement file (CSV) whose settings it "
-            "contains"
-        )
     for name in DESCRIPTION:
         if is_given(name):
             raise DataError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+import textwrap
 import threading
 from collections.abc import Iterable
 from types import TracebackType
@@ -42,9 +43,16 @@ def print_json(document: Any) -> None:
     click.echo(to_json(document), nl=False)
 
 
+def print_message(text: str) -> None:
+    """Print a message on standard error: one line, which a terminal shows wrapped."""
+    if sys.stderr.isatty():
+        text = textwrap.fill(text, width(), break_long_words=False, break_on_hyphens=False)
+    click.echo(text, err=True)
+
+
 def print_note(text: str) -> None:
     """Print a note on standard error."""
-    click.echo(f"loopcal: note: {text}", err=True)
+    print_message(f"loopcal: note: {text}")
 
 
 def print_failures(failures: Iterable[Finding | str], shown: bool = False) -> int:
@@ -57,7 +65,7 @@ def print_failures(failures: Iterable[Finding | str], shown: bool = False) -> in
     sentences = [str(failure) for failure in failures]
     if not (shown and sys.stdout.isatty()):
         for sentence in sentences:
-            click.echo(f"loopcal: quality gate not met: {sentence}", err=True)
+            print_message(f"loopcal: quality gate not met: {sentence}")
     return 2 if sentences else 0
 
 

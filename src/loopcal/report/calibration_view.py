@@ -53,8 +53,8 @@ def view_calibration(
     blocks: list[Block] = [report.headline, *_view_errors(report)]
     shown = report.findings if verbose else report.top_findings
     blocks += ["", *format_list([(f.severity.value, with_hint(f, hint)) for f in shown])]
-    if len(shown) < len(report.findings):
-        blocks.append(f"  ({len(report.findings) - len(shown)} more findings in the full report)")
+    if more := len(report.findings) - len(shown):
+        blocks.append(f"  ({more} more finding{'' if more == 1 else 's'} in the full report)")
     blocks += ["", f"Next: {report.next_step}"]
     if advice := hint(report.next_step):
         blocks.append(f"Hint: {advice}")

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 CALIBRATION, VALIDATION, BOUND = COLORS[0], COLORS[1], COLORS[2]
 """Colors of calibration poses, of validation poses, and of the bound."""
 
+TICKS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
+"""Numbers on a logarithmic axis, times powers of ten."""
+
 
 def draw_plan(plan: Plan) -> Figure:
     """Draw the poses of a plan in pairs of controlled coordinates, with the path between them."""
@@ -75,49 +78,35 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
     candidates can beat.
     """
     from matplotlib.figure import Figure
-    from matplotlib.ticker import NullFormatter, ScalarFormatter
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     dimension = DIMENSIONS[curve.target]
     shown = find_unit(robot.units[dimension])
     figure = Figure(figsize=(6.4, 4.4), layout="constrained")
     axes: Any = figure.add_subplot(1, 1, 1)
-    axes.plot(
-        curve.numbers,
-        curve.values / shown.factor_to_si,
-        "o-",
-        color=CALIBRATION,
-        label=f"planned {curve.counted}",
-    )
-    axes.plot(
-        curve.numbers,
-        curve.bounds / shown.factor_to_si,
-        "--",
-        color=BOUND,
-        label=f"no choice of {curve.counted} is better",
-    )
+    for errors, line, color, label in (
+        (curve.values, "o-", CALIBRATION, f"planned {curve.counted}"),
+        (curve.bounds, "--", BOUND, f"no choice of {curve.counted} is better"),
+    ):
+        axes.plot(curve.numbers, errors / shown.factor_to_si, line, color=color, label=label)
     if curve.goal is not None:
         axes.axhline(
             curve.goal / shown.factor_to_si,
             color=VALIDATION,
             lw=1.0,
-            label=f"asked for: {curve.goal / shown.factor_to_si:.3g} {shown.symbol}",
+            label=f"goal: {curve.goal / shown.factor_to_si:.3g} {shown.symbol}",
         )
     axes.set_xscale("log")
     axes.set_yscale("log")
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(ScalarFormatter())
-        axis.set_minor_formatter(NullFormatter())
-    axes.set_xticks(curve.numbers, [str(n) for n in curve.numbers])
-    low, high = (
-        min(curve.bounds.min(), curve.goal or np.inf),
-        max(curve.values.max(), curve.goal or 0.0),
-    )
-    ticks = np.geomspace(low, high, 5) / shown.factor_to_si
-    axes.set_yticks(ticks, [f"{tick:.3g}" for tick in ticks])
+        axis.set_major_locator(LogLocator(subs=TICKS))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_locator(NullLocator())
     axes.set_xlabel(f"{curve.counted} for calibration [1]")
-    words = "pose error, turns times size" if curve.target == "pose" else f"{curve.target} error"
-    axes.set_ylabel(f"expected {words} (rms) [{shown.symbol}]")
-    axes.grid(visible=True, which="both", lw=0.3)
+    words = f"expected {curve.target} error (rms)"
+    words += ", rotations times robot size" if curve.target == "pose" else ""
+    axes.set_ylabel(f"{words} [{shown.symbol}]", fontsize=9)
+    axes.grid(visible=True, lw=0.3)
     axes.legend(frameon=False, fontsize=8)
     axes.set_title(
         f"{robot.name}: n = {curve.numbers[0]} to {curve.numbers[-1]} {curve.counted}", fontsize=10

@@ -74,7 +74,8 @@ def draw(robot: Mechanism, solution: Solution | None = None, row: int = 0) -> Fi
     _finish(space, above, low, high, length.symbol)
     where = "at home" if solution is None else f"at row {row}"
     figure.suptitle(_caption(robot, where, length.symbol), fontsize=10)
-    figure.legend(handles=_legend(), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
+    handles = _legend(robot)
+    figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
     return figure
 
 
@@ -145,7 +146,7 @@ def _strokes(robot: Mechanism, limbs: list[FloatArray], T: FloatArray) -> Iterat
 
 def _bodies(robot: Mechanism, top: FloatArray, foot: FloatArray, T: FloatArray) -> Iterator[Stroke]:
     """Yield platform, base, their frames, and the tool."""
-    yield Stroke(_outline(foot), {"color": "0.6", "lw": 1.0, "ls": ":"})
+    yield Stroke(_outline(foot), {"color": "0.6", "lw": 1.0, "ls": ":", "zorder": 0.5})
     yield Stroke(_outline(top), {"color": "0.25", "lw": 2.0})
     tool = T @ robot.tool
     yield Stroke(np.stack([T[:3, 3], tool[:3, 3]]), {"color": "0.25", "lw": 1.0})
@@ -171,9 +172,13 @@ def _dot(marker: str, edge: str, face: str, size: float = 5.0) -> dict[str, Any]
 
 
 def _label(space: Any, above: Any, limb: Stroke, name: str, middle: FloatArray) -> None:
-    """Write the name of a limb beside its foot, away from the center of the picture."""
+    """Write the name of a limb beside its foot: away from the center, or across the limb where that
+    points away from the center, too.
+    """
     foot = limb.points[0]
     away = foot[:2] - middle[:2]
+    if (limb.points[-1] - foot)[:2] @ away > 0.0:
+        away = np.array([-away[1], away[0]])
     distance = float(np.linalg.norm(away))
     place = tuple(np.array([20.0, 13.0]) * (away / distance if distance > 0 else [1.0, 1.0]))
     back = {"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.7}
@@ -188,7 +193,7 @@ def _label(space: Any, above: Any, limb: Stroke, name: str, middle: FloatArray) 
         color=limb.style["color"],
         bbox=back,
     )
-    space.text(*foot, f" {name}", fontsize=8, color=limb.style["color"])
+    space.text(*foot, f" {name}", fontsize=8, color=limb.style["color"], bbox=back, zorder=9)
 
 
 def _finish(space: Any, above: Any, low: FloatArray, high: FloatArray, symbol: str) -> None:
@@ -224,15 +229,21 @@ def _caption(robot: Mechanism, where: str, symbol: str) -> str:
     return f"{robot.name} {where}: {words}; lengths in {symbol}"
 
 
-def _legend() -> list[Any]:
+def _legend(robot: Mechanism) -> list[Any]:
+    """Return a handle for everything that the picture of a robot contains."""
     from matplotlib.lines import Line2D
 
-    rows: list[tuple[str, dict[str, Any]]] = [
-        ("axis of a revolute joint", {"color": "black", "lw": 1.2}),
-        ("guide of a sliding joint", {"color": "0.4", "lw": 1.0, "ls": (0, (4, 3))}),
-        ("rod", {"color": "0.4", "lw": 1.6}),
-        ("driven joint, filled", _dot("s", "0.4", "0.4")),
-        ("platform", {"color": "0.25", "lw": 2.0}),
-        ("tool", _dot("*", "black", "black", 8.0)),
+    limbs = robot.assembly.limbs
+    kinds = {joint.kind for limb in limbs for joint in limb.joints}
+    driven = {joint.kind for limb in limbs for joint in limb.joints if joint.actuator}
+    marker = "s" if "P" in driven else "o" if driven else "D"
+    has_rods = any(limb.ending == "distance" for limb in limbs)
+    rows: list[tuple[str, bool, dict[str, Any]]] = [
+        ("axis of a revolute joint", "R" in kinds, {"color": "black", "lw": 1.2}),
+        ("guide of a sliding joint", "P" in kinds, {"color": "0.4", "lw": 1.0, "ls": (0, (4, 3))}),
+        ("rod", has_rods, {"color": "0.4", "lw": 1.6}),
+        ("driven, filled", True, _dot(marker, "0.4", "0.4")),
+        ("platform", True, {"color": "0.25", "lw": 2.0}),
+        ("tool", True, _dot("*", "black", "black", 8.0)),
     ]
-    return [Line2D([], [], label=label, **style) for label, style in rows]
+    return [Line2D([], [], label=label, **style) for label, is_drawn, style in rows if is_drawn]

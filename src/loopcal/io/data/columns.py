@@ -7,6 +7,7 @@ column is one new entry there.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -222,7 +223,8 @@ def refuse_unknown_columns(table: Table, robot: Mechanism, kinds: Sequence[Kind]
         if name in known or find_open_column(name) is not None:
             continue
         hint = suggest_header(name, table.units[name], known) or suggest_names(name, known)
-        hint = hint or f"; allowed: {', '.join(sorted(known))}"
+        families = sorted({re.sub(r"\..*", ".*", known_name) for known_name in known})
+        hint = hint or f"; allowed: {', '.join(families)}"
         act = f"correct it, or call it '{NOTE} {name}' to ignore it"
         why = "" if kinds else " (this file states no kind, so it only gives the readings of poses)"
         raise table.header_error(f"column {name!r} is unknown{hint}; {act}{why}")

@@ -17,8 +17,8 @@ from loopcal.io.runs.run_folder import load_run_or_robot
 from loopcal.mechanism import Mechanism
 
 
-def choose_format(path: Path, name: str | None) -> Format:
-    """Return the format of this name, or the one with the ending of a file.
+def choose_format(path: Path, name: str | None, *, is_written: bool = False) -> Format:
+    """Return the format of this name, or the one with the ending of a file to read or to write.
 
     Raises
     ------
@@ -29,7 +29,10 @@ def choose_format(path: Path, name: str | None) -> Format:
     for one in FORMATS.values():
         if path.suffix.lower() in one.endings:
             return one
-    raise FileError(report_finding("files.format-unknown", formats=tuple(FORMATS)), path)
+    names = tuple(
+        one for one, known in FORMATS.items() if (known.write if is_written else known.read)
+    )
+    raise FileError(report_finding("files.format-unknown", formats=names), path)
 
 
 def build_imported_robot(path: Path, imported: Imported) -> Mechanism:

@@ -126,7 +126,8 @@ def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
     """
     path = as_path(path, "run folder")
     if not (path / RESULT).is_file():
-        sentence = f"this is not a run folder (it has no {RESULT})"
+        is_folder = f"is not a run folder (it has no {RESULT})"
+        sentence = f"this {is_folder if path.exists() else 'run folder does not exist'}"
         raise FileError(f"{sentence}; name a folder that a calibration wrote", path)
     try:
         result = json.loads(read_text(path / RESULT, "run result"))
