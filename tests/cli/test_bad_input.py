@@ -337,7 +337,7 @@ def test_a_byte_order_mark_is_accepted(tmp_path, capsys) -> None:
 USAGE_CASES = {
     "unknown command": (
         "calibrat hexapod-42",
-        "'calibrat' is not a command (did you mean 'calibrate'?)",
+        "'calibrat' is not a command (did you mean 'calibrate'",
     ),
     "unknown option": ("check hexapod-42 --jsn", "No such option"),
     "missing argument": ("check", "Missing argument 'ROBOT'"),

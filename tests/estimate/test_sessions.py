@@ -64,7 +64,7 @@ def fixed(data: Measurements, pattern: str, values: Mapping[str, float] | None =
     return local.with_nominal(local.values(values)).with_fixed(pattern)
 
 
-def right(fit, true: Mapping[str, float]):
+def assert_explained(fit, true: Mapping[str, float]):
     """A fit that explains the data, with these own unknowns within five standard deviations."""
     assert fit.converged
     assert fit.residual_test.p_value > USUAL
@@ -74,7 +74,7 @@ def right(fit, true: Mapping[str, float]):
         assert abs(fit.nuisance.estimate[i] - value) < 5 * fit.nuisance.sd[i], name
 
 
-def wrong(fit):
+def assert_contradicted(fit):
     """A fit whose residual says that something stated is not so."""
     assert fit.residual_test.p_value < UNLIKELY
     assert fit.residual_test.finding in fit.findings
@@ -95,7 +95,7 @@ def test_a_base_that_drifts_is_re_measured_in_every_session():
         options=FitOptions(nuisance=fixed(data, "morning.*", first)),
     )
     assert fit.rank == 42
-    right(fit, drift)
+    assert_explained(fit, drift)
     free = identify(hexapod(), data, LeastSquares())
     assert free.rank == 36
     frames = [
@@ -114,7 +114,9 @@ def test_a_base_that_drifts_is_re_measured_in_every_session():
     # 20 poses, five times over
     moved = geometry.log_so3(frames[1][:3, :3] @ frames[0][:3, :3].T)
     assert_allclose(moved, [0.0, 100 * URAD, 0.0], atol=5 * 20 * URAD)
-    wrong(identify(hexapod(), data, LeastSquares(), options=FitOptions(nuisance=fixed(data, "*"))))
+    assert_contradicted(
+        identify(hexapod(), data, LeastSquares(), options=FitOptions(nuisance=fixed(data, "*")))
+    )
 
 
 def test_a_station_that_was_moved_is_found_anew_and_not_taken_for_the_same():
@@ -127,9 +129,9 @@ def test_a_station_that_was_moved_is_found_anew_and_not_taken_for_the_same():
     data = seen(poses, sensor(theodolite, session=day), sensor(known), true=moved)
     fit = identify(hexapod(), data, LeastSquares())
     assert fit.rank == 39
-    right(fit, moved | {"left.frame.x": -1.5})
+    assert_explained(fit, moved | {"left.frame.x": -1.5})
     one = tuple(replace(o, session=np.full(len(o), "")) for o in data.observations)
-    wrong(identify(hexapod(), replace(data, observations=one), LeastSquares()))
+    assert_contradicted(identify(hexapod(), replace(data, observations=one), LeastSquares()))
 
 
 @cache
@@ -158,7 +160,7 @@ def test_a_prior_on_a_frame_stands_between_a_free_and_a_fixed_one_and_is_weighed
             fixed(data, "*", {"frame.x": 60 * UM}),
         )
     )
-    right(held, {"frame.x": 60 * UM})
+    assert_explained(held, {"frame.x": 60 * UM})
     assert np.isinf(free.standard_deviations).any()
     assert np.isfinite(held.standard_deviations).all()
     assert (known.standard_deviations <= held.standard_deviations * (1 + 1e-9)).all()
@@ -166,7 +168,7 @@ def test_a_prior_on_a_frame_stands_between_a_free_and_a_fixed_one_and_is_weighed
     assert (off < 5 * held.standard_deviations).all()
     # 60 um are thirty standard deviations of this one: a prior is a row like others, and its
     # residual counts
-    wrong(
+    assert_contradicted(
         identify(
             robot,
             data,
@@ -178,7 +180,7 @@ def test_a_prior_on_a_frame_stands_between_a_free_and_a_fixed_one_and_is_weighed
 
 def test_a_frame_fixed_where_it_is_not_is_found_out_where_the_machine_cannot_take_it_up():
     robot, _, data = printed()
-    right(
+    assert_explained(
         identify(
             robot,
             data,
@@ -187,7 +189,9 @@ def test_a_frame_fixed_where_it_is_not_is_found_out_where_the_machine_cannot_tak
         ),
         {},
     )
-    wrong(identify(robot, data, LeastSquares(), options=FitOptions(nuisance=fixed(data, "*"))))
+    assert_contradicted(
+        identify(robot, data, LeastSquares(), options=FitOptions(nuisance=fixed(data, "*")))
+    )
 
 
 def test_a_probe_s_offset_is_found_on_planes_and_a_wrong_one_is_found_out():
@@ -199,8 +203,8 @@ def test_a_probe_s_offset_is_found_on_planes_and_a_wrong_one_is_found_out():
     data = seen(hexapod_poses(60), sensor(Pose()), sensor(probe, group=group), true=true)
     fit = identify(hexapod(), data, LeastSquares())
     assert fit.rank == 42
-    right(fit, true)
-    wrong(
+    assert_explained(fit, true)
+    assert_contradicted(
         identify(
             hexapod(),
             data,
@@ -219,8 +223,8 @@ def test_a_tool_s_offset_is_found_and_a_wrong_one_is_found_out():
     data = seen(hexapod_poses(40), sensor(tool), sensor(balls), true=true)
     fit = identify(hexapod(), data, LeastSquares())
     assert fit.rank == 42
-    right(fit, true)
-    wrong(
+    assert_explained(fit, true)
+    assert_contradicted(
         identify(
             hexapod(),
             data,

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 
@@ -26,10 +27,14 @@ def one_of(findings: Iterable[Finding], code: str) -> Finding:
 @contextmanager
 def refused(
     code: str, error: type[LoopcalError] = EstimationError, **data: object
-) -> Iterator[None]:
-    """Expect an error made from the finding with this code and, among others, these data."""
+) -> Iterator[dict[str, Any]]:
+    """Expect an error made from the finding with this code and, among others, these data.
+
+    Yields a dictionary that receives all data.
+    """
+    received: dict[str, Any] = {}
     with pytest.raises(error) as caught:
-        yield
+        yield received
     assert caught.value.code == code, str(caught.value)
-    reported = caught.value.args[0].data
-    assert {name: reported[name] for name in data} == data
+    received.update(caught.value.args[0].data)
+    assert {name: received[name] for name in data} == data

@@ -13,7 +13,7 @@ from loopcal.io.robot.robot_file import find_robot_file
 from loopcal.mechanism import analyze_singularity, check_limits, workspace_ranges
 from loopcal.planning.candidates import check_listed_poses, draw_candidates
 from loopcal.planning.constraints import Constraints, LineOfSight
-from tests.planning.refusals import refuses
+from tests.findings.reported import refused
 
 STATION = np.array([0.5, -0.3, 0.6])
 
@@ -80,7 +80,7 @@ def test_a_workspace_that_the_constraints_leave_empty_is_refused_with_the_counts
     nobody_sees = Constraints(
         sight=LineOfSight(np.array([0.0, 0.0, -5.0]), np.array([0.0, 0.0, 1.0]), np.radians(20.0))
     )
-    with refuses("plan.workspace-excluded", MechanismError, allowed=0) as data:
+    with refused("plan.workspace-excluded", MechanismError, allowed=0) as data:
         draw_candidates(load_robot("hexapod-42"), nobody_sees, 200)
     assert "target-faces-away" in {reason["code"] for reason in data["reasons"]}
 
@@ -92,7 +92,7 @@ def test_home_that_breaks_a_constraint_is_refused_because_every_way_starts_there
         .replace("home: {z: 200}", "home: {z: 200, roll: 10}")
     )
     (tmp_path / "leaning.yaml").write_text(text)
-    with refuses("plan.home-excluded", MechanismError) as data:
+    with refused("plan.home-excluded", MechanismError) as data:
         draw_candidates(
             load_robot(tmp_path / "leaning.yaml"), Constraints(max_tilt=np.radians(5.0)), 50
         )
@@ -107,7 +107,7 @@ def test_poses_of_a_user_are_judged_and_the_others_said():
     found = check_listed_poses(robot, poses)
     assert len(found) == 1
     assert any("stroke" in dict(v.data).get("limit", "") for v in found.excluded)
-    with refuses("plan.listed-poses-excluded", MechanismError, total=1):
+    with refused("plan.listed-poses-excluded", MechanismError, total=1):
         check_listed_poses(robot, poses[1:])
 
 

@@ -18,8 +18,8 @@ from loopcal.planning.design import (
     evaluate_criterion,
     factor_design,
 )
+from tests.findings.reported import refused
 from tests.planning.polynomials import Array, Places, polynomial
-from tests.planning.refusals import refuses
 
 LEVELS = [np.linspace(-1.0, 1.0, 5)]
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)  # [rad, m]
@@ -90,7 +90,7 @@ def test_a_first_design_that_is_not_allowed_and_too_few_units_are_refused() -> N
         coordinate_exchange(
             parabola, np.array([[0.0], [np.nan], [1.0]]), LEVELS, D(), PriorInformation.none(3)
         )
-    with refuses("plan.design-too-small", needed=3):
+    with refused("plan.design-too-small", needed=3):
         coordinate_exchange(parabola, np.zeros((2, 1)), LEVELS, D(), PriorInformation.none(3))
 
 
@@ -100,7 +100,7 @@ def test_units_that_cannot_be_moved_apart_are_refused() -> None:
         rows[(which > 0) & (x[:, 0] != 0.0)] = np.nan
         return rows
 
-    with refuses("plan.design-singular", unknowns=3):
+    with refused("plan.design-singular", unknowns=3):
         coordinate_exchange(only_the_first, np.zeros((4, 1)), LEVELS, D(), PriorInformation.none(3))
 
 

@@ -10,8 +10,8 @@ from loopcal.planning.design.certified_design import (
     find_smallest_design,
     search_size,
 )
+from tests.findings.reported import refused
 from tests.planning.polynomials import polynomial, random_rows
-from tests.planning.refusals import refuses
 
 PARABOLA = polynomial(np.linspace(-1, 1, 21), 2)
 
@@ -57,9 +57,9 @@ def test_what_is_known_before_saves_units() -> None:
 
 
 def test_targets_out_of_reach_are_refused_with_the_best_that_is_possible() -> None:
-    with refuses("plan.target-impossible", size=12, available=12, target=0.001):
+    with refused("plan.target-impossible", size=12, available=12, target=0.001):
         find_smallest_design(random_rows(), 0.001, A(), PriorInformation.none(4))
-    with refuses("plan.target-impossible", size=5, available=12):
+    with refused("plan.target-impossible", size=5, available=12):
         find_smallest_design(random_rows(), 0.2, A(), PriorInformation.none(4), most=5)
 
 

@@ -18,8 +18,8 @@ from loopcal.planning.design import (
     find_observable_space,
 )
 from loopcal.planning.design.design_space import require_enough
+from tests.findings.reported import refused
 from tests.planning.polynomials import covariance, random_rows
-from tests.planning.refusals import refuses
 
 CLOSE = 1e-10  # relative: rounding of inverses of well-conditioned 6 x 6 matrices
 
@@ -117,11 +117,11 @@ def test_what_cannot_determine_the_unknowns_is_refused(
     n: int, rows: np.ndarray, code: str, data: dict
 ) -> None:
     start = PriorInformation.none(4, rows.shape[2] - 4)
-    with refuses(code, **data):
+    with refused(code, **data):
         require_enough(n, rows, start, find_observable_space(rows, start), repeats=False)
 
 
 def test_tolerances_as_prior_make_any_number_of_poses_enough() -> None:
     rows = random_rows()
     start = PriorInformation.from_tolerances(4)
-    require_enough(1, rows, start, find_observable_space(rows, start))
+    assert require_enough(1, rows, start, find_observable_space(rows, start)) is None

@@ -19,8 +19,8 @@ from loopcal.planning.design import (
     factor_design,
     fedorov_exchange,
 )
+from tests.findings.reported import refused
 from tests.planning.polynomials import grid, polynomial, random_rows
-from tests.planning.refusals import refuses
 
 L = np.random.default_rng(1).normal(size=(9, 4))
 
@@ -118,7 +118,7 @@ def test_units_that_cannot_determine_the_unknowns_together_are_refused() -> None
     rows[3:, 1] = rows[3:, 0]
     rows[4:, :, 2:] = rows[3, :, 2:]
     rows[5, :, 3] += 1.0
-    with refuses("plan.design-singular", chosen=2, available=6):
+    with refused("plan.design-singular", chosen=2, available=6):
         fedorov_exchange(rows, 2, D(), PriorInformation.none(4), starts=3)
 
 

@@ -18,7 +18,7 @@ from loopcal.planning.plane_line_groups import (
     eliminate_surfaces,
     linearize_surfaces,
 )
-from tests.planning.refusals import refuses
+from tests.findings.reported import refused
 
 MM = 1e-3
 
@@ -155,7 +155,7 @@ def test_settings_without_sense_are_refused_in_a_sentence(robot) -> None:
         given: dict[str, Any] = {"robot": robot, "points": 5, "sigma": MM} | settings
         with pytest.raises(EstimationError, match=words):
             PlaneLineGroups(**given)
-    with refuses("plan.surfaces-out-of-reach", points=5):
+    with refused("plan.surfaces-out-of-reach", points=5):
         PlaneLineGroups(robot, 5, MM, shortest=3.0).draw(1)
 
 

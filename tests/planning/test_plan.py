@@ -29,7 +29,7 @@ from loopcal.planning.pose_groups import (
 from loopcal.planning.pose_planning import plan_poses
 from loopcal.planning.problem import prepare_problem
 from loopcal.planning.sample_size import find_sample_size
-from tests.planning.refusals import refuses
+from tests.findings.reported import refused
 
 UM, URAD = 1e-6, 1e-6
 
@@ -200,7 +200,7 @@ def test_how_many_poses_reach_a_goal_and_below_how_many_none_can():
     plan = plan_poses(made)
     assert plan.errors.after.position <= goal
     assert plan.n_poses < 1.5 * needed.at_least
-    with refuses("plan.goal-unreachable", target="position", counted="poses") as data:
+    with refused("plan.goal-unreachable", target="position", counted="poses") as data:
         plan_poses(made.with_options(goal=0.05 * UM))
     assert data["goal"].value < data["bound"].value <= data["best"].value
 
@@ -214,7 +214,7 @@ def test_how_many_poses_reach_a_goal_and_below_how_many_none_can():
     ],
 )
 def test_demands_that_cannot_be_met_are_refused_with_the_reason(tracker, options, code, data):
-    with refuses(code, **data):
+    with refused(code, **data):
         plan_poses(tracker.with_options(**options))
 
 

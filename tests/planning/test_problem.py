@@ -19,7 +19,7 @@ from loopcal.planning import PlanOptions
 from loopcal.planning.problem import prepare_problem
 from loopcal.planning.result import round_shortfall
 from loopcal.planning.sample_size import find_sample_size
-from tests.planning.refusals import refuses
+from tests.findings.reported import refused
 
 UM, URAD = 1e-6, 1e-6
 FEW = PlanOptions(n_candidates=20)
@@ -70,7 +70,7 @@ def test_of_many_listed_poses_errors_are_predicted_all_over_the_list():
 
 @pytest.mark.parametrize("kind", ["locked", "joint", "inclination"])
 def test_an_instrument_that_tells_nothing_is_refused(kind):
-    with refuses("plan.nothing-observable", kinds=(kind,), parameters=9):
+    with refused("plan.nothing-observable", kinds=(kind,), parameters=9):
         prepare_problem(load_robot("linear-delta"), instrument_of(kind), FEW)
 
 
@@ -84,7 +84,7 @@ def test_equations_of_earlier_measurements_pay_for_their_own_set_up_first():
 
 def test_an_orientation_that_the_machine_does_not_have_cannot_be_asked_for():
     options = replace(FEW, goal=10 * URAD, target="orientation")
-    with refuses("plan.target-unobservable", target="orientation", robot="linear-delta"):
+    with refused("plan.target-unobservable", target="orientation", robot="linear-delta"):
         lc.plan(load_robot("linear-delta"), instrument_of("position"), options=options)
 
 

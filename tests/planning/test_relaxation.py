@@ -18,8 +18,8 @@ from loopcal.planning.design import (
     factor_design,
     relax_design,
 )
+from tests.findings.reported import refused
 from tests.planning.polynomials import Array, grid, polynomial, random_rows
-from tests.planning.refusals import refuses
 
 GAP = 1e-7
 MOMENTS = np.linalg.cholesky(
@@ -132,5 +132,5 @@ def test_units_that_are_not_allowed_have_no_weight() -> None:
 def test_weights_of_a_prediction_that_nothing_determines_are_refused() -> None:
     rows = random_rows()
     rows[:, :, 3] = 0.0
-    with refuses("plan.prediction-unobservable"):
+    with refused("plan.prediction-unobservable"):
         relax_design(rows, 5, I(np.array([[0.0, 0.0, 0.0, 1.0]])), PriorInformation.none(4))

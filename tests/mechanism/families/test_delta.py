@@ -112,16 +112,16 @@ def exact() -> tuple[Mechanism, Mechanism]:
 
 
 def test_three_and_six_rods_agree_in_readings_poses_and_common_slopes() -> None:
-    compare(*exact(), 1e-12)  # [m] and [m/m]: rounding times the condition of three rods, about 10
+    # [m] and [m/m]: rounding times the condition of three rods, about 10
+    assert_same_kinematics(*exact(), 1e-12)
 
 
 def test_the_files_of_three_and_six_rods_agree_to_the_nine_digits_of_an_offset() -> None:
-    compare(
-        robot("linear-delta"), robot("linear-delta-6"), 1e-8
-    )  # [m] 5e-10 in the offset, times slopes of up to 10 / m
+    # [m] 5e-10 in the offset, times slopes of up to 10 / m
+    assert_same_kinematics(robot("linear-delta"), robot("linear-delta-6"), 1e-8)
 
 
-def compare(three: Mechanism, six: Mechanism, atol: float) -> None:
+def assert_same_kinematics(three: Mechanism, six: Mechanism, atol: float) -> None:
     """Readings, poses and slopes that the two must share [m, m/m, m/rad]."""
     xyz = coordinates(three, 200, seed=5)
     q = inverse(three, xyz).q
