@@ -54,7 +54,6 @@ from loopcal.papers.cmm_constraint_2011.steps import (
     identify_from_rows,
     row_map,
 )
-from loopcal.papers.cmm_constraint_2011.study import present_results
 from loopcal.papers.cmm_constraint_2011.tables import Results, compute_pair_rank, compute_ranks
 from loopcal.papers.writing import page
 
@@ -253,7 +252,7 @@ def test_least_squares_errs_by_the_noise_and_map_by_less_where_noise_is_as_large
 
 @pytest.mark.slow
 def test_the_verdicts_are_these(results) -> None:
-    reproduction = present_results(results, 0, DRAWS)
+    reproduction = PAPERS["cmm-constraint-2011"].present(results, 0, DRAWS)
     judged = {v.claim: v.agrees for v in reproduction.verdicts}
     assert len(judged) == 20
     for words, agrees in (

@@ -3,8 +3,13 @@
 computed ones.
 
 One folder a paper: `published.yaml` (the printed numbers and statements, with their place),
-`steps.py` (what the paper does), `compare.py` (what agrees and what does not). A further paper is
-one more folder and its line in PAPERS. Nothing is imported before a paper is run.
+`text.yaml` (claims, captions, sentences), `steps.py` (what the paper does) and `study.py` with
+
+    compute(seed, trials, progress) -> results, with `results.printed` as read from published.yaml
+    present(results, seed) -> comparisons, tables, verdicts, figures
+
+A further paper is one more folder and its line in PAPERS. Nothing is imported before a paper is
+run.
 """
 
 from __future__ import annotations
@@ -12,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from loopcal.errors import DataError, suggest_names
 
@@ -30,7 +35,7 @@ class Paper:
     Attributes
     ----------
     name : on the command line. title, source : what it is and where it stands.
-    module : has `reproduce(seed, trials, progress) -> Reproduction`; imported when it is run.
+    module : of `compute` and `present`; imported when it is run.
     """
 
     name: str
@@ -57,7 +62,19 @@ class Paper:
             raise DataError(
                 f"seed {seed} with {trials} trials: give a seed of 0 or more, and 2 trials or more"
             )
-        return import_module(self.module).reproduce(seed, trials, progress or (lambda _: None))
+        compute = import_module(self.module).compute
+        return self.present(compute(seed, trials, progress or (lambda _: None)), seed, trials)
+
+    def present(self, results: Any, seed: int, trials: int) -> Reproduction:
+        """Return computed results as tables, verdicts and figures."""
+        from loopcal.papers.reproduction import Reproduction
+        from loopcal.papers.wording import read_wording
+
+        module = import_module(self.module)
+        about = read_wording(str(module.__file__)).about(source=results.printed.source)
+        settings = {"seed": seed, "trials": trials}
+        content = module.present(results, seed)
+        return Reproduction(self.name, self.title, self.source, about, settings, *content)
 
 
 PAPERS: Mapping[str, Paper] = {

@@ -75,6 +75,10 @@ class Figure:
     joined: bool = True
 
 
+Content = tuple[tuple[Comparison, ...], tuple[Table, ...], tuple[Verdict, ...], tuple[Figure, ...]]
+"""What a study shows: comparisons, further tables, verdicts, figures."""
+
+
 @dataclass(frozen=True)
 class Reproduction:
     """A repeated paper.

@@ -6,27 +6,37 @@ which the numbers are shown:
 
     about: paragraphs at the beginning of the page
     claims:
-      NAME: {claim: ..., where: place in the paper, evidence: sentence with {numbers}}
+      NAME: {claim: ..., where: place in the paper, agrees: [...], evidence: sentence}
     tables:
       NAME: {title: ..., columns: [...], formats: [...], note: ...}
     figures:
       NAME: {title: ..., x: label, y: label, caption: ..., log: y}
 
-A claim without `where` is not a statement of the paper but a check of our own. Braces hold numbers
-in the formats of `loopcal.findings.wording`.
+A claim without `where` is not a statement of the paper but a check of our own. `agrees` lists
+comparisons of the numbers with each other or with limits, such as "ratio < 1.1"; the claim agrees
+where all of them hold. A claim without comparisons is judged by its module. Braces hold numbers in
+the formats of `loopcal.findings.wording`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import operator
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from string import Formatter
+from typing import Any, Literal
+
+import numpy as np
 
 from loopcal.findings.wording import fill_template
 from loopcal.papers.printed import Cell, Comparison, Printed, Table
 from loopcal.papers.reproduction import OWN_CHECK, Figure, Series, Verdict
 from loopcal.typing import FloatArray
+
+RELATIONS: Mapping[str, Callable[[Any, Any], Any]] = {
+    "<": operator.lt, "<=": operator.le, "==": operator.eq, ">=": operator.ge, ">": operator.gt
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -47,20 +57,30 @@ class Wording:
         """Return the paragraphs at the beginning of the page."""
         return tuple(fill_template(text, **data) for text in self.paragraphs)
 
-    def judge(self, claim: str, agrees: bool | None, evidence: str = "", /, **data: Any) -> Verdict:
+    def judge(
+        self,
+        claim: str,
+        evidence: str = "",
+        /,
+        *,
+        agrees: bool | np.bool_ | Literal["by rule"] | None = "by rule",
+        **data: Any,
+    ) -> Verdict:
         """Return the verdict on a claim.
 
         Parameters
         ----------
-        claim : its name. agrees : whether the numbers bear it out; None where they cannot decide.
-        evidence : which of several texts `evidence_NAME` of the claim to use. data : the numbers.
+        claim : its name. evidence : which of several texts `evidence_NAME` of the claim to use.
+        agrees : whether the numbers support it; None where they cannot decide. By default the
+            comparisons of the claim decide. data : the numbers.
         """
         text = self.claims[claim]
-        key = f"evidence_{evidence}" if evidence else "evidence"
+        if agrees == "by rule":
+            agrees = all(compare_numbers(rule, data) for rule in text["agrees"])
         return Verdict(
             claim=fill_template(text["claim"], **data),
             agrees=None if agrees is None else bool(agrees),
-            why=fill_template(text[key], **data),
+            why=fill_template(text[f"evidence_{evidence}" if evidence else "evidence"], **data),
             where=text.get("where", OWN_CHECK),
             name=claim,
         )
@@ -136,6 +156,27 @@ class Wording:
         lines = levels or {}
         log = text.get("log", "y")
         return Figure(file_name or name, title, x, y, caption, tuple(series), lines, log)
+
+
+def compare_numbers(rule: str, data: Mapping[str, Any]) -> bool:
+    """Return whether a comparison holds for these data.
+
+    Examples
+    --------
+    >>> compare_numbers("ratio < 1.1", {"ratio": 1.0}), compare_numbers("a == b", {"a": 1, "b": 2})
+    (True, False)
+    """
+    left, relation, right = rule.split()
+    first, second = (_evaluate(side, data) for side in (left, right))
+    return bool(RELATIONS[relation](first, second))
+
+
+def _evaluate(term: str, data: Mapping[str, Any]) -> Any:
+    """Return a number, or the value of a name in the data, such as `best.formula` or `sd[full]`."""
+    try:
+        return float(term)
+    except ValueError:
+        return Formatter().get_field(term, (), data)[0]
 
 
 def read_wording(module: str) -> Wording:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from loopcal.papers import PAPERS
 from loopcal.papers.cmm_constraint_2011.cells import calibrate_grid
 from loopcal.papers.cmm_constraint_2011.fifty_points import LINES, calibrate_fifty
 from loopcal.papers.cmm_constraint_2011.figures import make_figures
@@ -29,29 +28,14 @@ from loopcal.papers.cmm_constraint_2011.published import read_published
 from loopcal.papers.cmm_constraint_2011.tables import Results, compute_ranks, make_tables
 from loopcal.papers.cmm_constraint_2011.verdicts import judge_claims
 from loopcal.papers.printed import Comparison, Printed
-from loopcal.papers.reproduction import Reproduction
+from loopcal.papers.reproduction import Content
 from loopcal.papers.wording import read_wording
 
 
-def reproduce(seed: int, trials: int, progress: Callable[[str], None]) -> Reproduction:
-    """Repeat the paper; see `loopcal.papers.Paper.run`."""
-    return present_results(compute(seed, trials, progress), seed, trials)
-
-
-def present_results(results: Results, seed: int, trials: int) -> Reproduction:
-    """Return the results as tables, figures and verdicts."""
-    paper = PAPERS["cmm-constraint-2011"]
-    return Reproduction(
-        paper=paper.name,
-        title=paper.title,
-        source=paper.source,
-        about=read_wording(__file__).about(source=results.printed.source),
-        settings={"seed": seed, "trials": trials},
-        comparisons=(_compare_counts(results), _compare_figure_5(results)),
-        tables=make_tables(results),
-        verdicts=judge_claims(results),
-        figures=make_figures(results, seed),
-    )
+def present(results: Results, seed: int) -> Content:
+    """Return the results as tables, verdicts and figures; `seed` is that of `compute`."""
+    comparisons = (_compare_counts(results), _compare_figure_5(results))
+    return comparisons, make_tables(results), judge_claims(results), make_figures(results, seed)
 
 
 def compute(seed: int, trials: int, progress: Callable[[str], None]) -> Results:

@@ -34,8 +34,6 @@ POSITION_ALIGNED = MEASURES.index("position, aligned [mm]")
 PARAMETERS_WITHOUT_GAUGE = MEASURES.index("parameters without gauge [mm]")
 SURE = 0.1
 """A ratio of two medians of some fifty machines, minus one, that is not significant."""
-NEARLY_ALL = 90.0
-"""Percentage of machines for which a statement must hold."""
 
 
 def judge_claims(results: Results) -> tuple[Verdict, ...]:
@@ -62,13 +60,13 @@ def _judge_independence(words: Wording, results: Results) -> Verdict:
     rows = results.study.optimized.rows.reshape(-1, 42)
     moved = rows @ list_gauge_directions(results.study.robot)[:6].T
     effect = np.abs(moved).max() / np.abs(rows).max()
-    return words.judge("independent", effect < 1e-9, effect=effect)
+    return words.judge("independent", effect=effect)
 
 
 def _judge_count(words: Wording, results: Results) -> Verdict:
     points, rank = compute_pair_rank(results.study)
     agrees = None if rank == points - 2 else rank == points - 1
-    return words.judge("counted", agrees, points=points, rank=rank)
+    return words.judge("counted", agrees=agrees, points=points, rank=rank)
 
 
 def _judge_least_squares(words: Wording, results: Results) -> Verdict:
@@ -77,7 +75,7 @@ def _judge_least_squares(words: Wording, results: Results) -> Verdict:
     unused = [r.singular_values[r.rank] / r.singular_values[0] for r in results.ranks]
     return words.judge(
         "least_squares",
-        ranks == [42],
+        agrees=ranks == [42],
         ranks=ranks,
         fewest=min(groups),
         most=max(groups),
@@ -92,7 +90,7 @@ def _judge_three_quarters(words: Wording, results: Results) -> Verdict:
     share = quiet.errors[LS][:, PARAMETERS] / quiet.errors[BEFORE][:, PARAMETERS]
     return words.judge(
         "three_quarters",
-        bool(np.mean(share) <= 0.25),
+        agrees=np.mean(share) <= 0.25,
         chance=100.0 * float(beta.cdf(0.25**2, 4.5, 16.5)),
         noise=quiet.noise / MM,
         mean=100.0 * (1.0 - share.mean()),
@@ -110,7 +108,6 @@ def _judge_improvement(words: Wording, results: Results) -> Verdict:
     ratios = [errors[key][1] * MM / c.noise for key, c in results.cells.items()]
     return words.judge(
         "better",
-        not worse,
         ratio=np.median(ratios),
         better=len(errors) - len(worse),
         count=len(errors),
@@ -124,7 +121,6 @@ def _judge_correlation(words: Wording, results: Results) -> Verdict:
     reduction = results.cells["1", "0.01"].compute_reduction(LS)
     return words.judge(
         "correlation",
-        all(r > 0.7 for r in ranks.values()),
         count=len(cells),
         ratios=len({c.ratio for c in cells}),
         ls=ranks[LS],
@@ -143,7 +139,7 @@ def _judge_figure_5(words: Wording, results: Results) -> tuple[Verdict, ...]:
     return (
         words.judge(
             "variances",
-            None if nearest.reading == VARIANCE else False,
+            agrees=None if nearest.reading == VARIANCE else False,
             nearest=nearest,
             deviations=texts[0],
             variances=texts[1],
@@ -151,7 +147,7 @@ def _judge_figure_5(words: Wording, results: Results) -> tuple[Verdict, ...]:
             root=np.sqrt(NOISE),
         ),
         words.judge(
-            "figure_5", literal.distance < 10.0, literal=texts[2], distance=nearest.distance
+            "figure_5", absolute=literal.distance, literal=texts[2], distance=nearest.distance
         ),
     )
 
@@ -160,10 +156,10 @@ def _judge_points(words: Wording, results: Results) -> tuple[Verdict, ...]:
     ten, one, free = (_find_arrangement(results, name) for name in (TEN, ONE, ANY))
     cost_ten, cost_one = (a.cell.compute_median(LS)[POSITION_ALIGNED] for a in (ten, one))
     return (
-        words.judge("exchange", ten.gain >= 3.0, ten=ten, one=one),
+        words.judge("exchange", ten=ten, one=one),
         words.judge(
             "one_plane",
-            cost_one < 1.5 * cost_ten,
+            agrees=cost_one < 1.5 * cost_ten,
             one=one,
             ten=ten,
             free=free,
@@ -180,14 +176,13 @@ def _judge_fifty(words: Wording, results: Results) -> tuple[Verdict, ...]:
     return (
         words.judge(
             "iterations",
-            one.within_five >= NEARLY_ALL,
             one=one.within_five,
             five=five.within_five,
             most=[int(f.iterations.max()) for f in results.fifties],
         ),
         words.judge(
             "full_poses",
-            None,
+            agrees=None,
             ls_one=_format_change(one, ABSOLUTE),
             ls_five=_format_change(five, ABSOLUTE),
             nominal_one=_format_change(one, AT_NOMINAL),
@@ -207,9 +202,9 @@ def _judge_arithmetic(words: Wording) -> tuple[Verdict, ...]:
     for name, given in read_published().table_4.items():
         low, high = given.possible
         verdicts.append(
-            words.judge("factor", given.follows, "", name=name, given=given, low=low, high=high)
+            words.judge("factor", agrees=given.follows, name=name, given=given, low=low, high=high)
         )
-    return (*verdicts, words.judge("conclusion", False))
+    return (*verdicts, words.judge("conclusion", agrees=False))
 
 
 def _judge_prior(words: Wording, results: Results) -> Verdict:
@@ -224,7 +219,7 @@ def _judge_prior(words: Wording, results: Results) -> Verdict:
     before, ls, prior = medians["0.01", "0.1"]
     return words.judge(
         "prior",
-        len(better) == len(cells) and not harmed,
+        harmed=len(harmed),
         sure=100 * SURE,
         better=len(better),
         count=len(cells),
@@ -243,7 +238,7 @@ def _judge_weights(words: Wording, results: Results) -> Verdict:
     }
     return words.judge(
         "weights",
-        position["printed"] < 1.1 * position["full"],
+        limit=1.1 * position["full"],
         position=position,
         parameters=parameters,
         less={name: 100.0 * (1.0 - position["full"] / p) for name, p in position.items()},
@@ -259,7 +254,6 @@ def _judge_forms(words: Wording, results: Results) -> Verdict:
     quietest = min(row[0] for row in forms.rows)
     return words.judge(
         "forms",
-        largest < 0.05 and forms.covariance < 1e-6,
         largest=largest,
         noise=max(row[0] for row in forms.rows),
         small=max(row[3] for row in forms.rows if row[0] == quietest),

@@ -10,7 +10,6 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.mechanism import Mechanism, inverse
-from loopcal.papers import PAPERS
 from loopcal.papers.hexapod_42 import noise_study, table_4_study
 from loopcal.papers.hexapod_42.noise_study import PRESUMED, STATED, Level, MethodResult, to_si
 from loopcal.papers.hexapod_42.published import (
@@ -34,7 +33,7 @@ from loopcal.papers.hexapod_42.steps import (
 from loopcal.papers.hexapod_42.table_4_study import Order, Outliers, write_rotation
 from loopcal.papers.hexapod_42.verdicts import TO_PRINTED, judge_claims
 from loopcal.papers.printed import Cell, Comparison, Printed, Table
-from loopcal.papers.reproduction import Figure, Reproduction, Series
+from loopcal.papers.reproduction import Content, Figure, Series
 from loopcal.papers.wording import read_wording
 from loopcal.typing import FloatArray
 
@@ -71,19 +70,14 @@ class Results:
     comparisons: Mapping[str, Comparison]
 
 
-def reproduce(seed: int, trials: int, progress: Callable[[str], None]) -> Reproduction:
-    """Repeat the paper; see `loopcal.papers.Paper.run`."""
-    paper, results = PAPERS["hexapod-42"], compute(seed, trials, progress)
-    return Reproduction(
-        paper=paper.name,
-        title=paper.title,
-        source=paper.source,
-        about=read_wording(__file__).about(source=results.printed.source),
-        settings={"seed": seed, "trials": trials},
-        comparisons=tuple(results.comparisons.values()),
-        tables=make_tables(results, trials),
-        verdicts=judge_claims(results),
-        figures=(_draw_figure_4(results), _draw_noise(results)),
+def present(results: Results, seed: int) -> Content:
+    """Return the results as tables, verdicts and figures; `seed` is that of `compute`."""
+    del seed
+    return (
+        tuple(results.comparisons.values()),
+        make_tables(results),
+        judge_claims(results),
+        (_draw_figure_4(results), _draw_noise(results)),
     )
 
 
@@ -180,9 +174,10 @@ def make_symmetric(robot: Mechanism, printed: Published) -> FloatArray:
     return table
 
 
-def make_tables(results: Results, trials: int) -> tuple[Table, ...]:
+def make_tables(results: Results) -> tuple[Table, ...]:
     """Return the tables beyond those of the paper."""
     words, printed = read_wording(__file__), results.printed
+    trials = len(results.levels[0].needed)
     runs = (results.exact, results.frozen, results.presumed, results.stated)
     figure_4: list[tuple[Cell, ...]] = [
         (str(k), *(float(run.integrated[k]) for run in runs)) for k in range(ITERATIONS + 1)

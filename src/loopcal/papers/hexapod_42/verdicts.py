@@ -40,14 +40,13 @@ def _judge_machine(results: Results) -> tuple[Verdict, ...]:
     return (
         words.judge(
             "symmetric",
-            second.agreeing == second.count,
             differing=second.count - second.agreeing,
             count=second.count,
             largest=second.largest,
         ),
         words.judge(
             "converges",
-            third.agreeing == third.count,
+            differing=third.count - third.agreeing,
             iterations=results.printed.iterations + 1,
             largest=third.largest,
         ),
@@ -76,7 +75,6 @@ def _judge_table_4(results: Results) -> tuple[Verdict, ...]:
     return (
         words.judge(
             "rotation",
-            best.formula == printed,
             printed=printed,
             count=len(results.orders),
             best=best,
@@ -85,14 +83,12 @@ def _judge_table_4(results: Results) -> tuple[Verdict, ...]:
         ),
         words.judge(
             "table_4",
-            bool(good.all()),
             row=ODD_POSE,
             agreeing=int(good.sum()),
             count=good.size,
         ),
         words.judge(
             "odd_row",
-            bool(bad.all()),
             row=ODD_POSE,
             differing=int((~bad).sum()),
             count=bad.size,
@@ -104,12 +100,11 @@ def _judge_table_4(results: Results) -> tuple[Verdict, ...]:
             degrees=without.degrees,
         ),
         words.judge(
-            "table_4_noise", best.position > noise_rms / 3.0, difference=best.position,
+            "table_4_noise", agrees=best.position > noise_rms / 3.0, difference=best.position,
             stated=noise_rms,
         ),
         words.judge(
             "rounding",
-            max(printed_errors.values()) < before,
             row=ODD_POSE,
             before=before,
             full=rounding["computed poses in full"],
@@ -128,7 +123,7 @@ def _judge_iteration(results: Results) -> tuple[Verdict, ...]:
     return (
         words.judge(
             "threshold",
-            all(run.count_needed(printed.threshold) == printed.iterations for run in runs),
+            agrees=all(run.count_needed(printed.threshold) == printed.iterations for run in runs),
             threshold=printed.threshold,
             iterations=printed.iterations,
             exact=results.exact.integrated,
@@ -136,7 +131,6 @@ def _judge_iteration(results: Results) -> tuple[Verdict, ...]:
         ),
         words.judge(
             "threshold_noise",
-            met == len(stated.needed),
             noise=printed.noise / MM,
             met=met,
             count=len(stated.needed),
@@ -160,24 +154,20 @@ def _judge_residuals(results: Results) -> tuple[Verdict, ...]:
     return (
         words.judge(
             "noise_size",
-            stated in holding,
             "" if holding else "none",
+            agrees=stated in holding,
             noise=results.printed.noise / MM,
             printed=sizes,
             holding=names,
             stated=stated.median,
         ),
         words.judge(
-            "residuals",
-            bool(explained.max() < 25.0),
-            least=explained.min(),
-            most=explained.max(),
-            random=100.0 * np.sqrt(0.7),
+            "residuals", least=explained.min(), most=explained.max(), random=100.0 * np.sqrt(0.7)
         ),
-        words.judge("milliradians", not within.all(), row=ODD_POSE),
+        words.judge("milliradians", agrees=not within.all(), row=ODD_POSE),
         words.judge(
             "mean_noise",
-            bool(np.all(np.abs(mean) < 4.0 * scatter / np.sqrt(len(noise)))),
+            agrees=bool(np.all(np.abs(mean) < 4.0 * scatter / np.sqrt(len(noise)))),
             lengths=lengths,
             angles=angles,
             scatter_mm=scatter[:3].max(),
@@ -192,12 +182,10 @@ def _judge_methods(results: Results) -> tuple[Verdict, ...]:
     words = read_wording(__file__)
     before, alone, together, prior = results.methods
     seven, ten = (next(row for row in results.poses if row[1] == n) for n in (7, 10))
-    improved_narrow, improved_wide = alone.narrow < before.narrow, alone.wide < before.wide
     condition = float(str(seven[3]))
     return (
         words.judge(
             "parameters_improve",
-            alone.parameters < before.parameters,
             alone=alone,
             before=before,
             prior=prior,
@@ -206,23 +194,16 @@ def _judge_methods(results: Results) -> tuple[Verdict, ...]:
             smaller_presumed=_count_smaller(results, PRESUMED),
             presumed=PRESUMED,
         ),
-        words.judge(
-            "positions_improve",
-            improved_narrow and improved_wide,
-            before=before,
-            alone=alone,
-            prior=prior,
-        ),
+        words.judge("positions_improve", before=before, alone=alone, prior=prior),
         words.judge(
             "leg_by_leg",
-            alone.parameters < 1.1 * together.parameters,
             ratio=alone.parameters / together.parameters,
             alone=alone,
             together=together,
         ),
         words.judge(
             "seven_poses",
-            bool(np.isfinite(condition)) and seven[2] is not None,
+            agrees=bool(np.isfinite(condition)) and seven[2] is not None,
             iterations=seven[2],
             seven=condition,
             ten=float(str(ten[3])),

@@ -7,9 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from loopcal.papers import PAPERS
 from loopcal.papers.printed import Comparison
-from loopcal.papers.reproduction import Reproduction
+from loopcal.papers.reproduction import Content
 from loopcal.papers.tsvd_2016.cases import Case, follow_ridge, measure_case, solve_case
 from loopcal.papers.tsvd_2016.draws import draw_machines
 from loopcal.papers.tsvd_2016.figures import make_figures
@@ -20,20 +19,10 @@ from loopcal.papers.tsvd_2016.verdicts import judge_claims
 from loopcal.papers.wording import read_wording
 
 
-def reproduce(seed: int, trials: int, progress: Callable[[str], None]) -> Reproduction:
-    """Repeat the paper; see `loopcal.papers.Paper.run`."""
-    paper, results = PAPERS["tsvd-2016"], compute(seed, trials, progress)
-    return Reproduction(
-        paper=paper.name,
-        title=paper.title,
-        source=paper.source,
-        about=read_wording(__file__).about(source=results.printed.source),
-        settings={"seed": seed, "trials": trials},
-        comparisons=(results.counts,),
-        tables=make_tables(results),
-        verdicts=judge_claims(results),
-        figures=make_figures(results),
-    )
+def present(results: Results, seed: int) -> Content:
+    """Return the results as tables, verdicts and figures; `seed` is that of `compute`."""
+    del seed
+    return (results.counts,), make_tables(results), judge_claims(results), make_figures(results)
 
 
 def compute(seed: int, trials: int, progress: Callable[[str], None]) -> Results:

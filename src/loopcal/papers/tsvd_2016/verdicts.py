@@ -59,7 +59,7 @@ def _judge_noise(words: Wording) -> Verdict:
     spread = 3.0 * np.sqrt(4.0 / 45.0 / shares.size) / (2.0 / np.sqrt(3.0))
     return words.judge(
         "noise",
-        np.abs(shares).max() <= 1.0 and abs(rms - 1.0 / np.sqrt(3.0)) < spread,
+        agrees=np.abs(shares).max() <= 1.0 and abs(rms - 1.0 / np.sqrt(3.0)) < spread,
         count=shares.size,
         length=largest[:3].max(),
         angle=largest[3:].max(),
@@ -77,7 +77,7 @@ def _judge_curves(words: Wording, results: Results) -> list[Verdict]:
             verdicts.append(
                 words.judge(
                     "u_shape",
-                    all(has_interior_minimum(curve) for curve in curves.values()),
+                    agrees=all(has_interior_minimum(curve) for curve in curves.values()),
                     name=draws.name,
                     error=error,
                     shapes=[_describe_curve(draws, a, i) for a in curves],
@@ -115,7 +115,7 @@ def _judge_gain(words: Wording, results: Results) -> Verdict:
             f"{draws.name} RE {_format_pair(ratio[0])}, TSVD {_format_pair(ratio[1])}{lost}"
         )
     return words.judge(
-        "slightly_better", agrees, trials=len(results.draws[0]), gains="; ".join(gains)
+        "slightly_better", agrees=agrees, trials=len(results.draws[0]), gains="; ".join(gains)
     )
 
 
@@ -130,7 +130,7 @@ def _judge_best(words: Wording, results: Results) -> Verdict:
         agrees &= all(bool((tsvd[:2] <= other[:2]).all()) for other in others)
         texts = (_format_errors(errors) for errors in (tsvd, ridge, prior))
         rows.append("{}: TSVD {}, RE {}, MAP {}".format(case.name, *texts))
-    return words.judge("tsvd_best", agrees, rows="; ".join(rows))
+    return words.judge("tsvd_best", agrees=agrees, rows="; ".join(rows))
 
 
 def _judge_five(words: Wording, results: Results) -> tuple[Verdict, ...]:
@@ -156,12 +156,14 @@ def _judge_five(words: Wording, results: Results) -> tuple[Verdict, ...]:
     return (
         words.judge(
             "ls_fails",
-            all(case.answers[LS].is_diverged for case in fives),
+            agrees=all(case.answers[LS].is_diverged for case in fives),
             steps=" and ".join(f"{case.normal_equations:.0e}" for case in fives),
             nulls="; ".join(nulls),
         ),
-        words.judge("five_unusable", not as_good, pairs="; ".join(pairs), many="; ".join(many)),
-        words.judge("no_solution", not as_good),
+        words.judge(
+            "five_unusable", agrees=not as_good, pairs="; ".join(pairs), many="; ".join(many)
+        ),
+        words.judge("no_solution", agrees=not as_good),
         _judge_six(words, results),
     )
 
@@ -177,7 +179,7 @@ def _judge_six(words: Wording, results: Results) -> Verdict:
             f"{draws.name} MAP {six:.3g} tolerances rms with six, {five:.3g} with five (raw LS "
             f"{raw_six:.2g} and {raw_five:.2g})"
         )
-    return words.judge("six_better", agrees, rows="; ".join(rows))
+    return words.judge("six_better", agrees=agrees, rows="; ".join(rows))
 
 
 def _judge_deviation(words: Wording, results: Results) -> Verdict:
@@ -193,7 +195,7 @@ def _judge_deviation(words: Wording, results: Results) -> Verdict:
             f"{name}: the largest parameter error of LS is {wrong[0]:.2g} mm at a position error "
             f"of {ls.errors[0]:.2g} mm, that of MAP {wrong[1]:.2g} mm at {prior.errors[0]:.2g} mm"
         )
-    return words.judge("deviate", agrees, rows="; ".join(rows))
+    return words.judge("deviate", agrees=agrees, rows="; ".join(rows))
 
 
 def _judge_speed(words: Wording, results: Results) -> Verdict:
@@ -206,7 +208,7 @@ def _judge_speed(words: Wording, results: Results) -> Verdict:
             f"{case.name}: LS {ls.needed}, RE {ridge.needed}, TSVD {tsvd.needed}, MAP "
             f"{case.answers[PRIOR].iterations}"
         )
-    return words.judge("faster", agrees, rows="; ".join(rows))
+    return words.judge("faster", agrees=agrees, rows="; ".join(rows))
 
 
 def _judge_lambda(words: Wording, results: Results) -> tuple[Verdict, ...]:
@@ -219,13 +221,13 @@ def _judge_lambda(words: Wording, results: Results) -> tuple[Verdict, ...]:
     return (
         words.judge(
             "lambda_range",
-            all(1e-5 * 0.5 <= value <= 1.0 for value in best.values()),
+            agrees=all(1e-5 * 0.5 <= value <= 1.0 for value in best.values()),
             best=", ".join(f"{name} {value:.2g}" for name, value in best.items()),
             by_steps=", ".join(f"{lam:.2g} after {count}" for count, lam, _ in results.steps),
         ),
         words.judge(
             "no_rule",
-            bool(np.min(list(ratios.values())) >= 1.0),
+            agrees=bool(np.min(list(ratios.values())) >= 1.0),
             chosen=", ".join(chosen),
             ratios="; ".join(f"{name} {_format_pair(ratio)}" for name, ratio in ratios.items()),
         ),
@@ -239,7 +241,7 @@ def _judge_k(words: Wording, results: Results) -> Verdict:
     }
     return words.judge(
         "k_near_j",
-        all(p - NEAR * p <= k < p for k, p in best.values()),
+        agrees=all(p - NEAR * p <= k < p for k, p in best.values()),
         rows=", ".join(f"{name} {k} of {p}" for name, (k, p) in best.items()),
     )
 
@@ -259,7 +261,6 @@ def _judge_own_checks(words: Wording, results: Results) -> tuple[Verdict, ...]:
     return (
         words.judge(
             "mixed_units",
-            min(parts) > 0.9,
             tripod=parts[0],
             tracker=parts[1],
             raw=_compute_condition(case),
@@ -267,13 +268,15 @@ def _judge_own_checks(words: Wording, results: Results) -> tuple[Verdict, ...]:
         ),
         words.judge(
             "map_better",
-            all((d.compute_ratio(PRIOR, m)[:2] < 1.0).all() for d in both for m in raw),
+            agrees=all((d.compute_ratio(PRIOR, m)[:2] < 1.0).all() for d in both for m in raw),
             rows="; ".join(rows),
             trials=len(tripod),
         ),
         words.judge(
             "map_near_best",
-            bool((near[tripod.name][0] < 1.05).all() and (near[tripod.name][1] < 1.15).all()),
+            agrees=bool(
+                (near[tripod.name][0] < 1.05).all() and (near[tripod.name][1] < 1.15).all()
+            ),
             tripod=texts[tripod.name],
             tracker=texts[tracker.name],
         ),
