@@ -32,3 +32,21 @@ class Progress(Protocol):
 
 def report_no_progress(_done: int, _total: int, _what: str, /) -> None:
     """Do nothing: the default callback of long work."""
+
+
+class StepCounter:
+    """Reports the steps of one task to a progress callback, one after the other.
+
+    Parameters
+    ----------
+    progress : the callback. total : number of steps.
+    """
+
+    def __init__(self, progress: Progress, total: int) -> None:
+        self.progress = progress
+        self._total, self._done = total, 0
+
+    def begin(self, what: str) -> None:
+        """Report that the next step begins."""
+        self.progress(self._done, self._total, what)
+        self._done += 1

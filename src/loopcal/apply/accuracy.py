@@ -148,16 +148,16 @@ def pose_uncertainty(
             raise EstimationError(
                 f"{name} is {value!r}; it must be one of {', '.join(map(repr, get_args(allowed)))}"
             )
-    known = fit.posterior if isinstance(fit, Identification) else fit
-    robot = known.robot
+    posterior = fit.posterior if isinstance(fit, Identification) else fit
+    robot = posterior.robot
     solution = poses if isinstance(poses, Solution) else inverse(robot, poses)
-    motions = find_frame_motions(known)
-    roots = _covariance_roots(known, motions, gauge)
+    motions = find_frame_motions(posterior)
+    roots = _covariance_roots(posterior, motions, gauge)
     blocks = []
     for first in range(0, len(solution.q), BLOCK):
         rows = np.arange(first, min(first + BLOCK, len(solution.q)))
         H = transport(robot, solution.T[rows], frame, point)
-        blocks.append(_covariance(known, solution.take(rows), roots, H))
+        blocks.append(_covariance(posterior, solution.take(rows), roots, H))
     T = np.where(solution.converged[:, None, None], solution.T, np.nan)
     excluded = motions.count if gauge == "left out" else 0
     reference = report_finding(
@@ -167,28 +167,30 @@ def pose_uncertainty(
 
 
 def _covariance_roots(
-    known: Posterior, motions: FrameMotions, gauge: Gauge
+    posterior: Posterior, motions: FrameMotions, gauge: Gauge
 ) -> tuple[FloatArray, FloatArray]:
     """Return directions times their standard deviations (p, r), and those of infinite variance
     (p, o), both in tolerances.
     """
-    directions = known.directions.copy()
+    directions = posterior.directions.copy()
     if gauge == "left out":
-        directions[:, ~known.determined] = motions.kept
-    infinite = np.isinf(known.variance)
-    return directions[:, ~infinite] * np.sqrt(known.variance[~infinite]), directions[:, infinite]
+        directions[:, ~posterior.determined] = motions.kept
+    infinite = np.isinf(posterior.variance)
+    return directions[:, ~infinite] * np.sqrt(posterior.variance[~infinite]), directions[
+        :, infinite
+    ]
 
 
 def _covariance(
-    known: Posterior, solution: Solution, roots: tuple[FloatArray, FloatArray], H: FloatArray
+    posterior: Posterior, solution: Solution, roots: tuple[FloatArray, FloatArray], H: FloatArray
 ) -> FloatArray:
     """Return the covariance (n, 6, 6) of poses.
 
     H (n, 6, 6) takes twists in base axes to the wanted point and axes.
     """
-    robot = known.robot
+    robot = posterior.robot
     S = differentiate_pose(robot, robot.values[None], solution.q[None], solution.state)
-    D = H @ (S.parameters[0][:, :, known.places] * known.unit)
+    D = H @ (S.parameters[0][:, :, posterior.places] * posterior.unit)
     finite, infinite = roots
     factors = [D @ finite]
     sigma = np.array([a.sigma or 0.0 for a in robot.actuators])

@@ -10,7 +10,6 @@ part remains, and the result states it for each target. See docs/theory/accuracy
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Literal, get_args
@@ -24,10 +23,10 @@ from loopcal.diagnose import twist_weights
 from loopcal.errors import DataError
 from loopcal.estimate.inference.posterior import Posterior
 from loopcal.estimate.result import Identification
-from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.mechanism import Mechanism, Solution, check_limits, forward, inverse, read_coordinates
-from loopcal.typing import BoolArray, FloatArray, Progress, report_no_progress
-from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
+from loopcal.typing import BoolArray, FloatArray, Progress, StepCounter, report_no_progress
+from loopcal.units import Dimension
 
 Mode = Literal["readings", "commands"]
 
@@ -37,9 +36,10 @@ SHOWN = 5
 ROUNDING = 1e-9
 """An error below this share of the robot's size (or this many radians) is rounding."""
 
-PASSES = 4
-"""Passes over all targets: the controller's answer, the best poses, the errors before, and the
-uncertainty."""
+PASSES, TASK = 4, "computing compensation"
+"""Passes over all targets (the controller's answer, the best poses, the errors before, and the
+uncertainty), and what progress calls them.
+"""
 
 REDUCED = 0.1
 """Share of its first value below which the fixed-point iteration must bring the distance to the
@@ -183,23 +183,24 @@ def compensate(
     DataError : unknown mode, no step, targets of another shape.
     """
     _check_settings(mode, steps)
-    known = fit.posterior if isinstance(fit, Identification) else fit
-    robot = known if isinstance(known, Mechanism) else known.robot
+    source = fit.posterior if isinstance(fit, Identification) else fit
+    robot = source if isinstance(source, Mechanism) else source.robot
     old = controller or robot.nominal
-    count = _PassCounter(progress, PASSES + (steps if mode == "commands" else 0))
+    count = StepCounter(progress, PASSES + (steps if mode == "commands" else 0))
+    count.begin(TASK)
     uncorrected = inverse(old, targets)
-    count()
     is_pose = np.shape(targets)[-2:] == (4, 4)
     wanted = np.reshape(targets, (-1, 4, 4)) if is_pose else uncorrected.T
+    count.begin(TASK)
     best = inverse(robot, targets)
-    count()
+    count.begin(TASK)
     start = _forward_start(robot, best)
     before = geometry.pose_difference(forward(robot, uncorrected.q, start).T, wanted)
-    count()
     if mode == "readings":
         result = _Iteration(best, None, np.zeros((1, len(wanted), 6)))
     else:
         result = _shift_commands(robot, old, uncorrected, best, steps, count)
+    count.begin(TASK)
     final = result.final
     not_compensable = geometry.pose_difference(best.T, wanted)
     return Compensation(
@@ -216,7 +217,7 @@ def compensate(
         not_compensable=not_compensable,
         residual_position=np.linalg.norm(result.distances[..., 3:], axis=2),
         residual_orientation=np.linalg.norm(result.distances[..., :3], axis=2),
-        uncertainty=None if isinstance(known, Mechanism) else pose_uncertainty(known, final),
+        uncertainty=None if isinstance(source, Mechanism) else pose_uncertainty(source, final),
         findings=_report_targets(robot, uncorrected, best, result, not_compensable),
     )
 
@@ -244,18 +245,6 @@ class _Iteration:
     distances: FloatArray
 
 
-class _PassCounter:
-    """Reports how many passes over all targets are done."""
-
-    def __init__(self, progress: Progress, total: int) -> None:
-        self._progress, self._total, self._done = progress, total, -1
-        self()
-
-    def __call__(self) -> None:
-        self._done += 1
-        self._progress(self._done, self._total, "computing compensation")
-
-
 def _forward_start(robot: Mechanism, best: Solution) -> Solution | None:
     """Return the start of forward solutions: the best poses where all converged, else home."""
     return best if best.converged.all() and robot.program.sigma is None else None
@@ -267,11 +256,11 @@ def _shift_commands(
     uncorrected: Solution,
     best: Solution,
     steps: int,
-    count: Callable[[], None],
+    count: StepCounter,
 ) -> _Iteration:
     """Shift commands until the machine goes to the best poses.
 
-    The shift is a twist, so no choice of angles is singular. `count` is called after each step.
+    The shift is a twist, so no choice of angles is singular. `count` receives the steps.
     """
     start = _forward_start(robot, best)
     solution = uncorrected
@@ -279,12 +268,12 @@ def _shift_commands(
     final = forward(robot, solution.q, start)
     distances = [geometry.pose_difference(final.T, best.T)]
     for _ in range(steps):
+        count.begin(TASK)
         moved = geometry.apply_twist(solution.T, -distances[-1])
         commands = read_coordinates(moved, controller.controlled)
         solution = inverse(controller, commands, solution if solution.converged.all() else None)
         final = forward(robot, solution.q, start)
         distances.append(geometry.pose_difference(final.T, best.T))
-        count()
     return _Iteration(final, commands, np.stack(distances))
 
 
@@ -318,16 +307,10 @@ def _report_targets(
                 report_finding(
                     "compensation.reached-in-part",
                     names=tuple(robot.controlled),
-                    position=_quantity(robot, float(position[i]), Dimension.LENGTH),
-                    orientation=_quantity(robot, float(angle[i]), Dimension.ANGLE),
+                    position=robot.to_quantity(float(position[i]), Dimension.LENGTH),
+                    orientation=robot.to_quantity(float(angle[i]), Dimension.ANGLE),
                 )
             )
         else:
             findings.append(report_finding("compensation.reached"))
     return tuple(findings)
-
-
-def _quantity(robot: Mechanism, value: float, dimension: Dimension) -> Quantity:
-    """Return an SI value in the unit of the robot's file."""
-    shown = find_unit(robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol))
-    return Quantity(value / shown.factor_to_si, shown.symbol)

@@ -67,11 +67,11 @@ def find_reused_rows(stored: Mapping[str, np.ndarray], data: Measurements) -> Fi
     for o in data.observations:
         rows = _content(data, o)
         reused = np.zeros(len(o), dtype=bool)
-        for name, known in stored.items():
+        for name, fitted in stored.items():
             if not name.startswith(f"{PREFIX}_") or name.split("_", 2)[2] != o.kind.name:
                 continue
-            if len(known) and known.shape[1] == rows.shape[1]:
-                reused |= _is_among(rows, known)
+            if len(fitted) and fitted.shape[1] == rows.shape[1]:
+                reused |= _is_among(rows, fitted)
         labels += [
             "/".join(data.labels[j] for j in np.ravel(o.rows[k])) for k in np.flatnonzero(reused)
         ]
@@ -97,13 +97,13 @@ def _content(data: Measurements, rows: Observations) -> FloatArray:
     return np.concatenate([data.readings[poses].reshape(len(rows), -1), rows.measured], axis=1)
 
 
-def _is_among(rows: FloatArray, known: FloatArray) -> BoolArray:
+def _is_among(rows: FloatArray, fitted: FloatArray) -> BoolArray:
     """Return which rows (r,) of one array (r, c) are among those (k >= 1, c) of another."""
     from scipy.spatial import KDTree
 
-    filled = np.where(np.isnan(known), 0.0, known)
+    filled = np.where(np.isnan(fitted), 0.0, fitted)
     limit = SAME * np.maximum(np.ptp(filled, axis=0), 1e-3 * np.abs(filled).max(axis=0))
     limit = np.where(limit > 0.0, limit, SAME)
-    scaled, stored = (np.nan_to_num(array / limit, nan=ABSENT) for array in (rows, known))
+    scaled, stored = (np.nan_to_num(array / limit, nan=ABSENT) for array in (rows, fitted))
     distance, _ = KDTree(stored).query(scaled, p=np.inf, distance_upper_bound=1.0)
     return np.isfinite(distance)

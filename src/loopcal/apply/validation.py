@@ -21,6 +21,7 @@ import numpy as np
 
 from loopcal.apply.noise_floor import NoiseFloor, compute_noise_floor
 from loopcal.apply.validation_findings import (
+    DIMENSIONS,
     QUANTITIES,
     check_limits,
     group_setup,
@@ -42,7 +43,7 @@ from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity
 from loopcal.measure import Measurements, check_actuators
 from loopcal.mechanism import Mechanism
-from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
+from loopcal.units import Unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,7 @@ class Validation:
         them.
     limit_position, limit_angle : limits [m], [rad] on the largest prediction error after
         calibration; None for no limit.
-    units : symbols of the units in which length and angle are shown.
+    units : of each quantity (position, orientation), in which it is shown.
     findings : limits that are exceeded (failures), and notes.
     alignment : names of frames, targets and surfaces: `kept` from the fit, `fitted` to these rows.
     kinds : prediction errors divided by sigma, of each kind and, last, of all.
@@ -75,7 +76,7 @@ class Validation:
     unreachable: tuple[str, ...]
     limit_position: float | None
     limit_angle: float | None
-    units: tuple[str, str]
+    units: Mapping[str, Unit]
     findings: tuple[Finding, ...] = ()
     alignment: Mapping[str, tuple[str, ...]] = field(
         default_factory=lambda: {"kept": (), "fitted": ()}
@@ -133,15 +134,11 @@ class Validation:
             "not compensable": self.not_compensable,
         }
 
-    def unit_of(self, quantity: str) -> str:
-        """Return the symbol of the unit in which position or orientation is shown."""
-        return self.units[QUANTITIES.index(quantity)]
-
     def __str__(self) -> str:
         """Return one line for each quantity, and the findings."""
         lines = [f"Validation on {len(self.poses)} rows (rms):"]
         for quantity in self.quantities:
-            shown = find_unit(self.unit_of(quantity))
+            shown = self.units[quantity]
             values = [
                 self.before.statistics(quantity).rms,
                 self.after.statistics(quantity).rms,
@@ -214,7 +211,7 @@ def validate(
     missed = compared.before.differences(rows, compared.reached)
     after, usable = compute_row_errors(rows, errors_after), compared.usable
     limits = {"position": limit_position, "orientation": limit_angle}
-    units = _display_units(robot)
+    units = dict(zip(QUANTITIES, map(robot.get_unit, DIMENSIONS), strict=True))
     left_out = ~usable & compared.predictable
     return Validation(
         poses=compared.rows,
@@ -280,10 +277,3 @@ def _keep_setup(values: Mapping[str, float], refit: Sequence[str]) -> dict[str, 
         for name, value in values.items()
         if not any(fnmatchcase(owner_of(name), pattern) for pattern in refit)
     }
-
-
-def _display_units(robot: Mechanism) -> tuple[str, str]:
-    length, angle = (
-        robot.units.get(d, DISPLAY_UNITS[d].symbol) for d in (Dimension.LENGTH, Dimension.ANGLE)
-    )
-    return length, angle

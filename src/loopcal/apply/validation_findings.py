@@ -19,10 +19,13 @@ from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
 from loopcal.typing import BoolArray
-from loopcal.units import find_unit
+from loopcal.units import Dimension, Unit
 
 QUANTITIES = ("position", "orientation")
 """Indices of errors that every validation shows."""
+
+DIMENSIONS = (Dimension.LENGTH, Dimension.ANGLE)
+"""Their dimensions."""
 
 FEW_ROWS = 5
 """Number of rows below which an error cannot be judged.
@@ -118,26 +121,26 @@ def check_limits(
     after: PoseErrors,
     poses: tuple[str, ...],
     limits: Mapping[str, float | None],
-    units: tuple[str, str],
+    units: Mapping[str, Unit],
 ) -> list[Finding]:
     """Report limits that the largest error exceeds, and limits on what no row measures."""
     findings = []
-    for (quantity, limit), symbol in zip(limits.items(), units, strict=True):
+    for quantity, limit in limits.items():
         if limit is None:
             continue
         values = getattr(after, quantity)
         if not np.isfinite(values).any():
             findings.append(report_finding("gates.limit-not-measured", quantity=quantity))
             continue
-        worst, factor = int(np.nanargmax(values)), find_unit(symbol).factor_to_si
+        worst, unit = int(np.nanargmax(values)), units[quantity]
         if values[worst] > limit:
             findings.append(
                 report_finding(
                     "gates.limit-exceeded",
                     quantity=quantity,
                     pose=poses[worst],
-                    error=Quantity(float(values[worst]) / factor, symbol),
-                    limit=Quantity(limit / factor, symbol),
+                    error=Quantity(float(values[worst]) / unit.factor_to_si, unit.symbol),
+                    limit=Quantity(limit / unit.factor_to_si, unit.symbol),
                 )
             )
     return findings

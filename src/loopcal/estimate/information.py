@@ -76,17 +76,19 @@ def observe_poses(
 
 
 def observe_rows(
-    poses: ObservedPoses, measured: Measurements, local: NuisanceParameters, values: FloatArray
+    poses: ObservedPoses, measured: Measurements, nuisance: NuisanceParameters, values: FloatArray
 ) -> FloatArray:
     """Return whitened rows (1, M, U + p + 1), [nuisance | machine | residual], of measurements.
 
-    `values` (U,) are those of the nuisance parameters `local`.
+    `values` (U,) are those of the nuisance parameters `nuisance`.
     """
-    at = poses.linearized
-    parts = evaluate_measurements(measured, at.T, values[None], local, at.joints)
-    rows = whiten_rows(parts, at.by_parameters, at.joints_by_parameters)
-    p, own = len(poses.free), len(local)
-    return np.concatenate([rows[..., p : p + own], rows[..., :p], rows[..., p + own :]], axis=-1)
+    linearized = poses.linearized
+    evaluated = evaluate_measurements(
+        measured, linearized.T, values[None], nuisance, linearized.joints
+    )
+    rows = whiten_rows(evaluated, linearized.by_parameters, linearized.joints_by_parameters)
+    p, u = len(poses.free), len(nuisance)
+    return np.concatenate([rows[..., p : p + u], rows[..., :p], rows[..., p + u :]], axis=-1)
 
 
 def collect_information(free: FreeParameters, data: Measurements) -> tuple[FloatArray, BoolArray]:
@@ -102,11 +104,11 @@ def collect_information(free: FreeParameters, data: Measurements) -> tuple[Float
     problem = problem_of(free, data)
     z = free.deviation(free.robot.values[None])
     start = problem.start(z)
-    at = problem.linearize(z, start)
+    linearization = problem.linearize(z, start)
     is_reached = np.ones(data.n_poses, dtype=bool)
-    if not np.isfinite(at.cost[0]):
+    if not np.isfinite(linearization.cost[0]):
         is_reached[problem.find_unreached(z, start)] = False
-    return at.factor, is_reached
+    return linearization.factor, is_reached
 
 
 def count_equations(robot: Mechanism, data: Measurements) -> int:
@@ -124,15 +126,15 @@ def instrument_factor(poses: ObservedPoses, measured: Measurements) -> FloatArra
 
     Its nuisance parameters are eliminated at their stated values.
     """
-    local = measured.nuisance_parameters
-    rows = observe_rows(poses, measured, local, local.values())
-    factor = engine.fold(empty_factor(1, len(local) + len(poses.free)), rows)
-    with_prior = engine.fold(factor, _prior_rows(local, len(poses.free)))
-    return eliminate_from_factor(with_prior, len(local))
+    nuisance = measured.nuisance_parameters
+    rows = observe_rows(poses, measured, nuisance, nuisance.values())
+    factor = engine.fold(empty_factor(1, len(nuisance) + len(poses.free)), rows)
+    with_prior = engine.fold(factor, _prior_rows(nuisance, len(poses.free)))
+    return eliminate_from_factor(with_prior, len(nuisance))
 
 
-def _prior_rows(local: NuisanceParameters, p: int) -> FloatArray:
+def _prior_rows(nuisance: NuisanceParameters, p: int) -> FloatArray:
     """Return rows (1, U, U + p + 1) of nuisance parameters with a tolerance; zero for others."""
-    known = local.table.free & ~np.isnan(local.table.tolerance)
-    weight = np.where(known, 1.0 / np.where(known, local.table.tolerance, 1.0), 0.0)
-    return np.concatenate([np.diag(weight), np.zeros((len(local), p + 1))], axis=1)[None]
+    has_prior = nuisance.table.free & ~np.isnan(nuisance.table.tolerance)
+    weight = np.where(has_prior, 1.0 / np.where(has_prior, nuisance.table.tolerance, 1.0), 0.0)
+    return np.concatenate([np.diag(weight), np.zeros((len(nuisance), p + 1))], axis=1)[None]

@@ -130,8 +130,8 @@ def merge_options(
         return FitOptions(method=method, loss=loss)
     check_type(options, FitOptions, "options", "such as FitOptions(noise='estimated')")
     shortcuts = {"method": method, "loss": loss}
-    given = {name: value for name, value in shortcuts.items() if value is not None}
-    return dataclasses.replace(options, **given) if given else options
+    stated = {name: value for name, value in shortcuts.items() if value is not None}
+    return dataclasses.replace(options, **stated) if stated else options
 
 
 def _check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:

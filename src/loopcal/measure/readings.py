@@ -17,7 +17,7 @@ from loopcal.measure.kinds import ActuatorReadings, Kind
 from loopcal.measure.measurements import Measurements
 from loopcal.mechanism import Mechanism, Solution, inverse
 from loopcal.typing import FloatArray
-from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
+from loopcal.units import Dimension
 
 LARGEST_SIGMA = 1e6
 """Largest finite sigma of a reading, in sizes of the robot or radians."""
@@ -202,9 +202,7 @@ def _check_sigma(robot: Mechanism, sigma: FloatArray) -> None:
         if np.any(wrong):
             pose, column = (int(i) for i in np.argwhere(wrong)[0])
             actuator = robot.actuators[column]
-            shown = find_unit(
-                robot.units.get(actuator.dimension, DISPLAY_UNITS[actuator.dimension].symbol)
-            )
+            shown = robot.get_unit(actuator.dimension)
             value = f"{sigma[pose, column] / shown.factor_to_si:.6g} {shown.symbol}"
             raise DataError(
                 f"the sigma {value} of the reading of {actuator.name} in row {pose + 1} {what}"

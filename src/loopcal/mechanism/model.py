@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 
 from loopcal.engine import Group, Program, State
 from loopcal.errors import MechanismError
-from loopcal.findings import Finding
+from loopcal.findings import Finding, Quantity
 from loopcal.mechanism.assembly import Actuator, Assembly, SharedMap
 from loopcal.mechanism.transmission import TERMS
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.units import Dimension
+from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
 
 SHOWN_ACTUATORS = 8
 """Actuators that `repr` names before it counts the others."""
@@ -168,6 +168,16 @@ class Mechanism:
     def actuators(self) -> tuple[Actuator, ...]:
         """Actuators in the order of the readings."""
         return self.assembly.actuators
+
+    def get_unit(self, dimension: Dimension) -> Unit:
+        """Return the unit in which values are shown: that of the robot file, or the usual one."""
+        symbol = self.units.get(dimension)
+        return DISPLAY_UNITS[dimension] if symbol is None else find_unit(symbol)
+
+    def to_quantity(self, value: float, dimension: Dimension) -> Quantity:
+        """Return a value [SI] in the unit in which it is shown."""
+        unit = self.get_unit(dimension)
+        return Quantity(value / unit.factor_to_si, unit.symbol)
 
     @property
     def freedoms(self) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ from loopcal.mechanism import Mechanism, Solution
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.planning.options import Target
 from loopcal.typing import FloatArray
-from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
+from loopcal.units import Dimension
 
 DIMENSIONS: dict[Target, Dimension] = {
     "pose": Dimension.LENGTH,
@@ -112,11 +112,5 @@ class ExpectedErrors:
         """Return the errors above 0 in the units of the robot's file."""
         pairs = ((self.position, Dimension.LENGTH), (self.orientation, Dimension.ANGLE))
         return tuple(
-            to_quantity(robot, value, dimension) for value, dimension in pairs if value > 0.0
+            robot.to_quantity(value, dimension) for value, dimension in pairs if value > 0.0
         )
-
-
-def to_quantity(robot: Mechanism, value: float, dimension: Dimension) -> Quantity:
-    """Return a number [SI] in the unit of the robot's file."""
-    symbol = robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol)
-    return Quantity(value / find_unit(symbol).factor_to_si, symbol)

@@ -18,7 +18,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.planning.design import DesignCurve, compute_design_curve, find_smallest_design
 from loopcal.planning.options import N_POSES, Target
-from loopcal.planning.prediction import DIMENSIONS, ExpectedErrors, to_quantity
+from loopcal.planning.prediction import DIMENSIONS, ExpectedErrors
 from loopcal.planning.problem import PlanningProblem, name_groups
 from loopcal.typing import FloatArray, IntArray, Progress, report_no_progress
 
@@ -79,7 +79,7 @@ class ErrorCurve:
             number=self.enough,
             counted=self.counted,
             target=self.target,
-            goal=to_quantity(robot, self.goal, DIMENSIONS[self.target]),
+            goal=robot.to_quantity(self.goal, DIMENSIONS[self.target]),
             at_least=self.at_least,
             candidates=self.n_candidates,
             decided_by_equations=bool(self.enough == self.numbers[0]),
@@ -136,7 +136,7 @@ def find_sample_size(
     assert goal is not None, "the caller has a goal"
     if not goal > 0.0 or not np.isfinite(goal):
         raise EstimationError(
-            f"the accuracy goal is {to_quantity(robot, goal, dimension)}; give a number above 0 "
+            f"the accuracy goal is {robot.to_quantity(goal, dimension)}; give a number above 0 "
             "with its unit, such as 20um"
         )
     criterion, prior, count = problem.build_criterion("I"), problem.prior, problem.n_candidates
@@ -152,12 +152,12 @@ def find_sample_size(
             report_finding(
                 "plan.goal-unreachable",
                 target=target,
-                goal=to_quantity(robot, goal, dimension),
+                goal=robot.to_quantity(goal, dimension),
                 number=most,
                 counted=problem.group_name,
                 candidates=count,
-                best=to_quantity(robot, float(np.sqrt(best.values[0])), dimension),
-                bound=to_quantity(robot, float(np.sqrt(best.bounds[0])), dimension),
+                best=robot.to_quantity(float(np.sqrt(best.values[0])), dimension),
+                bound=robot.to_quantity(float(np.sqrt(best.bounds[0])), dimension),
             )
         ) from None
     n = max(smallest.n, problem.min_groups)

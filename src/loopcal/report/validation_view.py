@@ -8,7 +8,6 @@ from loopcal.findings import Severity
 from loopcal.report.numbers import ROUNDING, format_number
 from loopcal.report.tables import Column, Table, word_column
 from loopcal.report.text_page import Block, format_list
-from loopcal.units import find_unit
 
 SIMILAR = 5e-3
 """Relative difference up to which two errors are called equal."""
@@ -30,13 +29,13 @@ def build_error_summary(validation: Validation, caption: str, with_before: bool 
             rows.append((name, (kind.before, kind.after, 1.0), "sigma"))
     else:
         for quantity in validation.quantities:
-            factor = find_unit(validation.unit_of(quantity)).factor_to_si
+            unit = validation.units[quantity]
             values = (
-                validation.before.statistics(quantity).rms / factor,
-                validation.after.statistics(quantity).rms / factor,
-                getattr(validation.noise_floor, quantity) / factor,
+                validation.before.statistics(quantity).rms / unit.factor_to_si,
+                validation.after.statistics(quantity).rms / unit.factor_to_si,
+                getattr(validation.noise_floor, quantity) / unit.factor_to_si,
             )
-            rows.append((quantity, values, validation.unit_of(quantity)))
+            rows.append((quantity, values, unit.symbol))
     cells = tuple(
         (name, *(format_number(x, 3) for x in values[0 if with_before else 1 :]), unit)
         for name, values, unit in rows
@@ -58,11 +57,10 @@ def build_error_statistics(validation: Validation, with_before: bool = True) -> 
     rows = []
     for name, error in errors.items():
         for quantity in validation.quantities:
-            statistics, symbol = error.statistics(quantity), validation.unit_of(quantity)
-            factor = find_unit(symbol).factor_to_si
+            statistics, unit = error.statistics(quantity), validation.units[quantity]
             numbers = (statistics.max, statistics.rms, statistics.mean, statistics.sd)
-            cells = (format_number(x / factor, 3) for x in numbers)
-            rows.append((name, quantity, str(statistics.count), *cells, symbol))
+            cells = (format_number(x / unit.factor_to_si, 3) for x in numbers)
+            rows.append((name, quantity, str(statistics.count), *cells, unit.symbol))
     numeric = (Column(title) for title in ("rows", "max", "rms", "mean", "sd"))
     columns = (word_column("error"), word_column("of"), *numeric, Column("unit", align="left"))
     return Table("Error statistics", columns, tuple(rows))
@@ -72,8 +70,7 @@ def is_fully_compensable(validation: Validation) -> bool:
     """Return whether the actuators can correct all of the measured error."""
     rest = validation.not_compensable
     return all(
-        rest.statistics(quantity).max / find_unit(validation.unit_of(quantity)).factor_to_si
-        < ROUNDING
+        rest.statistics(quantity).max / validation.units[quantity].factor_to_si < ROUNDING
         for quantity in validation.quantities
     )
 

@@ -30,7 +30,7 @@ from loopcal.findings.importance import sort_by_importance
 from loopcal.measure import Measurements
 from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism
-from loopcal.typing import Progress, report_no_progress
+from loopcal.typing import Progress, StepCounter, report_no_progress
 from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.calibration_report import CalibrationReport, describe_provenance
 from loopcal.workflow.data_split import split_data
@@ -38,8 +38,8 @@ from loopcal.workflow.data_split import split_data
 GREW = 1.1
 """Factor by which an error on held-out poses must grow to be a failure; less is their noise."""
 
-STEPS = 4
-"""Steps that the progress callback counts: model, fit, examination, suggestions."""
+STEPS = 5
+"""Steps that the progress callback counts: conventions, model, fit, examination, suggestions."""
 
 
 def calibrate(
@@ -77,6 +77,8 @@ def calibrate(
     options = CalibrationOptions() if options is None else options
     check_types(robot, data)
     check_type(options, CalibrationOptions, "options", "such as CalibrationOptions(hold_out=0.25)")
+    count = StepCounter(progress, STEPS)
+    count.begin("checking conventions")
     conventions = check_conventions(
         robot,
         data,
@@ -88,14 +90,13 @@ def calibrate(
     fitted = split.fitted
     if not fitted.n_rows:
         raise DataError("the data hold no measured value; fill in what the instrument showed")
-    count = _StepCounter(progress)
     result = _fit(robot, fitted, options, count)
     fit = result.fit
     held_out = split.held_out
     errors, impossible = _validate(fit, fitted if held_out is None else held_out, options)
-    count("examining the residuals")
+    count.begin("examining the residuals")
     examination = examine_fit(fit, fitted, progress) if fit.converged else None
-    count("looking for further measurements")
+    count.begin("looking for further measurements")
     suggestions = _suggest(fit, fitted)
     start = check_start_values(fit)
     findings = [
@@ -108,7 +109,7 @@ def calibrate(
         *(() if examination is None else examination.findings),
         *(() if result.choice is None else (result.choice.finding,)),
     ]
-    count("done")
+    count.begin("done")
     return CalibrationReport(
         options=options,
         split=split,
@@ -127,18 +128,6 @@ def calibrate(
     )
 
 
-class _StepCounter:
-    """Reports the steps of a calibration to the callback, one after the other."""
-
-    def __init__(self, progress: Progress) -> None:
-        self.progress = progress
-        self._done = 0
-
-    def __call__(self, what: str) -> None:
-        self.progress(self._done, STEPS, what)
-        self._done += 1
-
-
 @dataclass(frozen=True, eq=False)
 class _FitResult:
     """A fit, with the choice of its parameters and the comparison with an earlier calibration."""
@@ -149,14 +138,14 @@ class _FitResult:
 
 
 def _fit(
-    robot: Mechanism, data: Measurements, options: CalibrationOptions, count: _StepCounter
+    robot: Mechanism, data: Measurements, options: CalibrationOptions, count: StepCounter
 ) -> _FitResult:
     """Identify from the tolerances, or again with an earlier calibration as the prior."""
     excluded = tuple(p for p in options.fit.excluded_poses if p in data.labels)
     fit_options = replace(options.fit, excluded_poses=excluded)
-    count("choosing the parameters" if options.choose_model else "preparing")
+    count.begin("choosing the parameters" if options.choose_model else "preparing")
     if options.prior is not None:
-        count("fitting")
+        count.begin("fitting")
         fit, change = recalibrate(
             robot,
             data,
@@ -182,7 +171,7 @@ def _fit(
                 suggestions=describe_missing_equations(chosen, data) or "",
             )
         )
-    count(f"fitting {free} parameters")
+    count.begin(f"fitting {free} parameters")
     return _FitResult(identify(chosen, data, options=fit_options), choice=choice)
 
 

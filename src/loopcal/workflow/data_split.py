@@ -60,7 +60,7 @@ def split_data(
         is_held_out = [label in names for label in data.labels]
         if all(is_held_out):
             raise DataError("all poses of the data are held out; leave some to fit")
-        fitted = data.take([not held for held in is_held_out])
+        fitted = data.take([not chosen for chosen in is_held_out])
         return DataSplit(fitted, data.take(is_held_out), 0.0, seed)
     if not hold_out:
         return DataSplit(data, None, 0.0, seed)

@@ -45,8 +45,8 @@ def build_instrument(description: InstrumentDescription) -> Instrument:
     ------
     DataError : an unknown kind, frame or component, or a setting that belongs to none of the kinds.
     """
-    given = {"components": tuple(description.components), "orientation": description.orientation}
-    settings = {name: value for name, value in given.items() if value}
+    possible = {"components": tuple(description.components), "orientation": description.orientation}
+    settings = {name: value for name, value in possible.items() if value}
     sigma = {Dimension.LENGTH: description.sigma_position, Dimension.ANGLE: description.sigma_angle}
     sensors = []
     for i, name in enumerate(description.kinds):
@@ -95,10 +95,10 @@ def _name_unknown_frames(frames: Sequence[str], kind: object) -> tuple[str, ...]
             raise DataError(
                 f"{frame!r} is not a frame that can be unknown; allowed are base, tool, or both"
             )
-        known = [name for name in FRAMES[frame] if name in possible]
-        if not known:
+        names_of_frame = [name for name in FRAMES[frame] if name in possible]
+        if not names_of_frame:
             raise DataError(
                 f"this kind of measurement has no {frame} frame that could be unknown; remove it"
             )
-        names.append(known[0])
+        names.append(names_of_frame[0])
     return tuple(names)

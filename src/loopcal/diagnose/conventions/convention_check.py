@@ -43,7 +43,7 @@ from loopcal.findings import Finding, Quantity, Severity, report_finding
 from loopcal.measure import Measurements, check_actuators, check_targets_move, has_static_targets
 from loopcal.mechanism import Mechanism, forward
 from loopcal.typing import FloatArray
-from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
+from loopcal.units import Dimension
 
 IMPLAUSIBLE = 10.0
 """Misfit above which conventions are in doubt. Tolerances exceeded three times, and a noise stated
@@ -285,7 +285,7 @@ def _rms_residuals(comparison: Comparison) -> tuple[Quantity, ...]:
     """Return root mean squares of the first interpretation's residuals by dimension, in units of
     the robot's file, without far rows.
     """
-    units = comparison.problem.free.robot.units
+    robot = comparison.problem.free.robot
     square: dict[Dimension, list[FloatArray]] = {}
     for s, r in zip(comparison.problem.rows, comparison.residuals(), strict=True):
         present = np.einsum("rmm->rm", s.whitener[0]) != 0.0
@@ -295,7 +295,5 @@ def _rms_residuals(comparison: Comparison) -> tuple[Quantity, ...]:
     for dimension, parts in square.items():
         values = np.concatenate(parts)
         if len(values):
-            symbol = units.get(dimension, DISPLAY_UNITS[dimension].symbol)
-            rms = float(np.sqrt(values.mean())) / find_unit(symbol).factor_to_si
-            residuals.append(Quantity(rms, symbol))
+            residuals.append(robot.to_quantity(float(np.sqrt(values.mean())), dimension))
     return tuple(residuals)

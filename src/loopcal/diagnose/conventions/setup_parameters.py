@@ -26,7 +26,6 @@ from loopcal.diagnose.conventions.misfit import (
 )
 from loopcal.mechanism import Mechanism
 from loopcal.parameters import Parameter
-from loopcal.units import DISPLAY_UNITS, find_unit
 
 MOST_SINGLE = 12
 """Number of stated parameters up to which each is estimated alone, to find the wrong one."""
@@ -149,8 +148,8 @@ def _describe_value(robot: Mechanism, entry: Parameter, estimate: float) -> dict
     """Return estimate, stated value and certainty of a parameter, in the unit of the robot's
     file.
     """
-    symbol = robot.units.get(entry.dimension, DISPLAY_UNITS[entry.dimension].symbol)
-    factor = find_unit(symbol).factor_to_si
+    unit = robot.get_unit(entry.dimension)
+    symbol, factor = unit.symbol, unit.factor_to_si
     certainty = "fixed"
     if entry.free and entry.tolerance is not None:
         certainty = f"sd {entry.tolerance / factor:.3g} {symbol}"

@@ -20,7 +20,7 @@ from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism, Status, differentiate_pose, forward_trials
 from loopcal.typing import FloatArray
-from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
+from loopcal.units import Dimension
 
 GAIN = 1.1
 """Factor by which an expected error must become smaller to count as an improvement."""
@@ -115,6 +115,4 @@ def _quantities(
     """Return errors before and after in the unit of the robot's file; None where they are zero."""
     if not before > 0.0:
         return None
-    symbol = robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol)
-    factor = find_unit(symbol).factor_to_si
-    return Quantity(before / factor, symbol), Quantity(after / factor, symbol)
+    return robot.to_quantity(before, dimension), robot.to_quantity(after, dimension)

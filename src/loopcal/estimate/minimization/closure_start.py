@@ -76,8 +76,8 @@ def locate_measured_poses(problem: Problem) -> FloatArray | None:
         return None
     T = np.broadcast_to(robot.home, (t, r, 4, 4))
     for _ in range(STEPS):
-        at = rows.kind.evaluate(T, rows.measured)
-        solved = np.linalg.solve(at.jacobian, at.residual[..., None])[..., 0]
+        evaluation = rows.kind.evaluate(T, rows.measured)
+        solved = np.linalg.solve(evaluation.jacobian, evaluation.residual[..., None])[..., 0]
         step = -np.asarray(solved, dtype=np.float64)
         T = geometry.apply_twist(T, step)
         turn, shift = np.abs(step[..., :3]).max(), np.abs(step[..., 3:]).max()

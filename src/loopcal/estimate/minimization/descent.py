@@ -267,13 +267,13 @@ class _Candidate:
 
     def take(self, trials: IntArray) -> _Point:
         """Return the points of some trials."""
-        at = self.linearized
+        linearized = self.linearized
         return self.model.decompose(
             self.z[trials],
-            at.factor[trials],
-            at.cost[trials],
-            at.equations[trials],
-            at.next_start.take(trials),
+            linearized.factor[trials],
+            linearized.cost[trials],
+            linearized.equations[trials],
+            linearized.next_start.take(trials),
         )
 
 
@@ -312,9 +312,9 @@ class _FilteredDescent:
 
     def evaluate(self, point: _Point, step: FilteredStep, trials: IntArray) -> _Candidate:
         """Linearize at the deviations of the steps."""
-        at = self.problem.take(trials).linearize(step.deviation, point.start)
-        good = np.isfinite(at.cost) & np.isfinite(at.factor).all(axis=(1, 2))
-        return _Candidate(self, step.deviation, at, good)
+        linearized = self.problem.take(trials).linearize(step.deviation, point.start)
+        good = np.isfinite(linearized.cost) & np.isfinite(linearized.factor).all(axis=(1, 2))
+        return _Candidate(self, step.deviation, linearized, good)
 
     def judge(
         self, point: _Point, step: FilteredStep, candidate: _Candidate

@@ -47,14 +47,14 @@ def propose_step(
 ) -> FilteredStep:
     """Return the step from `deviation` (a, p) to the filtered solution, damped by mu (a,)."""
     s, c = decomposition.singular_values, decomposition.projections
-    now = decomposition.coordinates(deviation)
+    current = decomposition.coordinates(deviation)
     solution = decomposition.solution(penalty)
-    full = solution - now
+    full = solution - current
     curvature = _curvature(s, penalty)
-    new = now + curvature / (curvature + damping[:, None]) * full
+    new = current + curvature / (curvature + damping[:, None]) * full
     # differences of squares as products, so that a small decrease is not lost in a large sum
-    data = s * (now - new) * (s * (now + new) - 2.0 * c)
-    prior = _finite(penalty) * (now - new) * (now + new)
+    data = s * (current - new) * (s * (current + new) - 2.0 * c)
+    prior = _finite(penalty) * (current - new) * (current + new)
     reached = decomposition.deviation(new)
     return FilteredStep(
         deviation=reached,

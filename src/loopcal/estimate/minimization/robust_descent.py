@@ -92,10 +92,10 @@ def measure_block_distances(
     solution = problem.solve(z, fit.start, nuisance)
     square, degrees = np.zeros(count), np.zeros(count)
     for rows, kind in zip(problem.rows, problem.residuals(z, solution), strict=True):
-        of, present = member[rows.first_poses], rows.is_present[0]
+        blocks, present = member[rows.first_poses], rows.is_present[0]
         each = np.where(present, kind.whitened[0] ** 2, 0.0).sum(axis=1)
-        square += np.bincount(of, each, count)
-        degrees += np.bincount(of, present.sum(axis=1), count)
+        square += np.bincount(blocks, each, count)
+        degrees += np.bincount(blocks, present.sum(axis=1), count)
     return np.sqrt(square), degrees - problem.count_pose_directions(solution, member, count)
 
 

@@ -23,7 +23,7 @@ from loopcal.io.core.numbers import format_scaled
 from loopcal.io.data.columns import COMMANDED, NOTE, get_dimension
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
-from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
+from loopcal.units import Dimension
 
 if TYPE_CHECKING:
     from loopcal.apply.compensation import Compensation
@@ -66,17 +66,17 @@ def format_compensation(result: Compensation) -> str:
     """Return the result as CSV text, units in the header."""
     robot = result.robot
     if result.commands is None:
-        columns = [(a.name, _get_unit(robot, a.dimension)) for a in robot.actuators]
+        columns = [(a.name, robot.get_unit(a.dimension)) for a in robot.actuators]
         values = result.readings
     else:
         coordinates = result.controller.controlled
-        columns = [(COMMANDED + n, _get_unit(robot, get_dimension(n))) for n in coordinates]
+        columns = [(COMMANDED + n, robot.get_unit(get_dimension(n))) for n in coordinates]
         values = result.commands
     errors = {"before": result.before, "remaining": result.remaining}
     if result.uncertainty is not None:
         errors["U"] = result.uncertainty.expanded
     dimensions = (Dimension.LENGTH if name in "xyz" else Dimension.ANGLE for name in NAMES)
-    axes = [(n, _get_unit(robot, d)) for n, d in zip(NAMES, dimensions, strict=True)]
+    axes = [(n, robot.get_unit(d)) for n, d in zip(NAMES, dimensions, strict=True)]
     text = io.StringIO()
     write = csv.writer(text, lineterminator="\n").writerow
     header = ["pose", *(f"{name} [{unit}]" for name, unit in columns)]
@@ -94,11 +94,6 @@ def format_compensation(result: Compensation) -> str:
         ]
         write([label, *cells, str(result.findings[i])])
     return text.getvalue()
-
-
-def _get_unit(robot: Mechanism, dimension: Dimension) -> Unit:
-    """Return the unit of a dimension in the robot file."""
-    return find_unit(robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol))
 
 
 def _format_error(value: float) -> str:
