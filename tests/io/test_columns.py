@@ -6,8 +6,7 @@ import pytest
 
 from loopcal.io import load_robot
 from loopcal.io.core.csv_table import read_table
-from loopcal.io.data.column_types import TextColumn
-from loopcal.io.data.columns import find_open_column, is_context, list_columns
+from loopcal.io.data.columns import TextColumn, find_open_column, is_context, list_columns
 from loopcal.measure import Component, Pose
 
 ROBOT = load_robot("hexapod-42")

@@ -7,24 +7,24 @@ column is one new entry there.
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+import unicodedata
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from itertools import permutations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from loopcal.errors import suggest_names
-from loopcal.io.core.csv_table import Table, suggest_header
-from loopcal.io.data.column_types import (
-    TIME,
-    Column,
-    ContextColumn,
-    NumberColumn,
-    ProductColumn,
-    TextColumn,
-)
+from loopcal.io.core.csv_table import Table, quote_cell, suggest_header
+from loopcal.io.core.numbers import format_exact, format_scaled, parse_exact
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
-from loopcal.units import DISPLAY_UNITS, Dimension
+from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
 
 if TYPE_CHECKING:
     from loopcal.measure import Kind
@@ -35,6 +35,186 @@ LINK = ";"
 COMMANDED, MEASURED, SIGMA, COVARIANCE = "commanded.", "measured.", "sigma.", "cov."
 TEMPERATURE, NOTE = "temperature", "note"
 FIT, HELD_OUT = "fit", "held-out"
+"""Cells of the column `use`."""
+
+TIME = "time"
+Scales = Mapping[str, tuple[float, float]]
+TIME_UNITS: Scales = {"s": (1.0, 0.0), "ms": (1e-3, 0.0), "min": (60.0, 0.0), "h": (3600.0, 0.0)}
+TEMPERATURE_UNITS: Scales = {"degC": (1.0, 0.0), "K": (1.0, -273.15), "degF": (5 / 9, -160 / 9)}
+"""Unit -> factor and offset to seconds, or degrees Celsius."""
+
+ABSOLUTE_ZERO, ROUNDING = -273.15, 1e-9
+"""Lowest temperature, and the rounding of a conversion that is accepted below it [degC]."""
+
+
+@dataclass(frozen=True)
+class Column(ABC):
+    """A column of a measurement file, by its name in the header."""
+
+    name: str
+
+    @property
+    def header(self) -> str:
+        """Name, and unit in brackets where there is one."""
+        return self.name
+
+    @abstractmethod
+    def parse(self, table: Table) -> Any:
+        """Return the values of all rows (n,) of a table that has this column; raise FileError."""
+
+    @abstractmethod
+    def format(self, value: Any) -> str:
+        """Return the cell of a value."""
+
+
+@dataclass(frozen=True)
+class TextColumn(Column):
+    """A column of names; `choices` lists the allowed cells, none allow any text."""
+
+    choices: tuple[str, ...] = ()
+
+    def parse(self, table: Table) -> tuple[str, ...]:
+        """Return the cells in Unicode normal form C."""
+        cells = table.text(self.name)
+        for row, cell in enumerate(cells):
+            if self.choices and cell and cell not in self.choices:
+                allowed = " or ".join(self.choices)
+                sentence = f"column {self.name!r} is {cell!r}; write {allowed}, or leave it empty"
+                raise table.row_error(row, sentence)
+        return tuple(unicodedata.normalize("NFC", cell) for cell in cells)
+
+    def format(self, value: Any) -> str:
+        """Return the text, quoted where necessary."""
+        return quote_cell(str(value))
+
+
+@dataclass(frozen=True)
+class NumberColumn(Column):
+    """A column of numbers of a dimension, written in the unit `symbol`.
+
+    `allows_infinity` : the cell `inf` is allowed, for a reading that is not trusted.
+    """
+
+    dimension: Dimension
+    symbol: str
+    allows_infinity: bool = False
+
+    @property
+    def header(self) -> str:
+        """Name and unit."""
+        return f"{self.name} [{self.symbol}]"
+
+    def parse(self, table: Table) -> FloatArray:
+        """Return the values [SI], NaN where a cell is empty."""
+        if not self.allows_infinity:
+            return table.numbers(self.name, self.dimension)
+        cells = table.text(self.name)
+        infinite = np.array([cell == "inf" for cell in cells])
+        finite = ["" if cell == "inf" else cell for cell in cells]
+        factor = table.factor(self.name, self.dimension)
+        return np.where(infinite, np.inf, table.scaled(self.name, factor, finite))
+
+    def format(self, value: Any) -> str:
+        """Return a number [SI] in the unit; nothing for NaN."""
+        number = float(value)
+        if math.isnan(number):
+            return ""
+        if math.isinf(number):
+            return "inf"
+        return format_exact(number, find_unit(self.symbol).factor_to_si)
+
+
+@dataclass(frozen=True)
+class ProductColumn(Column):
+    """A column of covariances, whose unit is a product such as `[mm*mrad]`."""
+
+    dimensions: tuple[Dimension, Dimension]
+
+    @property
+    def symbols(self) -> tuple[str, ...]:
+        """Units of the two factors as they are written."""
+        return tuple(DISPLAY_UNITS[d].symbol for d in self.dimensions)
+
+    @property
+    def header(self) -> str:
+        """Name and unit."""
+        return f"{self.name} [{'*'.join(self.symbols)}]"
+
+    def parse(self, table: Table) -> FloatArray:
+        """Return the values [SI]; every row needs one."""
+        symbols = (table.units[self.name] or "").split("*")
+        if len(symbols) != 2:
+            sentence = f"column {self.name!r} needs two units, as in '{self.name} [mm*mrad]'"
+            raise table.header_error(sentence)
+        a, b = (
+            table.factor(self.name, dimension, symbol.strip())
+            for symbol, dimension in zip(symbols, self.dimensions, strict=True)
+        )
+        cells = enumerate(table.text(self.name))
+        numbers = [table.number(self.name, i, cell, empty=False) for i, cell in cells]
+        return np.array(numbers) * (a * b)
+
+    def format(self, value: Any) -> str:
+        """Return a covariance [SI] in the unit."""
+        factor = math.prod(find_unit(symbol).factor_to_si for symbol in self.symbols)
+        return format_scaled(float(value), factor)
+
+
+@dataclass(frozen=True)
+class ContextColumn(Column):
+    """Time or a temperature, which enter no equation: kept in seconds or degrees Celsius.
+
+    Without a unit, `time` holds dates and times of ISO 8601 (UTC where no offset is written), kept
+    as seconds since 1970-01-01 UTC.
+    """
+
+    @property
+    def units(self) -> Scales:
+        """Unit -> factor and offset."""
+        return TIME_UNITS if self.name == TIME else TEMPERATURE_UNITS
+
+    @property
+    def header(self) -> str:
+        """Name and unit."""
+        return f"{self.name} [{next(iter(self.units))}]"
+
+    def parse(self, table: Table) -> FloatArray:
+        """Return the values [s] or [degC], NaN where a cell is empty."""
+        symbol, cells = table.units[self.name], table.text(self.name)
+        if self.name == TIME and symbol is None:
+            return np.array([_parse_date(table, row, cell) for row, cell in enumerate(cells)])
+        if symbol is None or symbol not in self.units:
+            stated = "no unit" if symbol is None else f"the unit {symbol!r}"
+            allowed = ", ".join(f"[{s}]" for s in self.units)
+            raise table.header_error(f"column {self.name!r} has {stated}; write one of {allowed}")
+        factor, offset = self.units[symbol]
+        values = np.full(len(cells), np.nan)
+        for row, cell in enumerate(cells):
+            if not math.isnan(table.number(self.name, row, cell, empty=True)):
+                values[row] = parse_exact(cell, factor) + offset
+            if self.name != TIME and values[row] < ABSOLUTE_ZERO - ROUNDING:
+                sentence = f"column {self.name!r} is {cell} {symbol}, below absolute zero"
+                raise table.row_error(row, f"{sentence}; correct it, or leave the cell empty")
+        return values
+
+    def format(self, value: Any) -> str:
+        """Return the number [s] or [degC]; nothing for NaN."""
+        return "" if math.isnan(float(value)) else format_exact(float(value), 1.0)
+
+
+def _parse_date(table: Table, row: int, cell: str) -> float:
+    """Return seconds since 1970-01-01 UTC of a date and time."""
+    if not cell:
+        return math.nan
+    try:
+        moment = datetime.fromisoformat(cell)
+    except ValueError:
+        sentence = f"column 'time' is {cell!r}, but a date and time is needed, such as"
+        act = "or give the column a unit, as 'time [s]'"
+        raise table.row_error(row, f"{sentence} 2026-05-04T10:22:31; {act}") from None
+    return (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).timestamp()
+
+
 USE_COLUMN = TextColumn("use", (FIT, HELD_OUT))
 """What a pose is for; a plan fills it in before anything is measured, so that the choice does not
 depend on the results. A row that compares poses is held out with any of its poses.
@@ -59,7 +239,11 @@ class ColumnRule:
     match: Callable[[str], Column | None] = lambda _: None
 
 
-def _readings(robot: Mechanism, kinds: Sequence[Kind]) -> Iterable[Column]:
+def _number(name: str, dimension: Dimension) -> NumberColumn:
+    return NumberColumn(name, dimension, DISPLAY_UNITS[dimension].symbol)
+
+
+def _readings(robot: Mechanism, kinds: Sequence[Kind]) -> Iterable[NumberColumn]:
     del kinds
     for a in robot.actuators:
         yield NumberColumn(a.name, a.dimension, robot.units[a.dimension])
@@ -68,81 +252,50 @@ def _readings(robot: Mechanism, kinds: Sequence[Kind]) -> Iterable[Column]:
 def _commanded(robot: Mechanism, kinds: Sequence[Kind]) -> Iterable[Column]:
     del kinds
     for name in robot.controlled:
-        dimension = get_dimension(name)
-        yield NumberColumn(COMMANDED + name, dimension, DISPLAY_UNITS[dimension].symbol)
+        yield _number(COMMANDED + name, get_dimension(name))
 
 
 def _measured(robot: Mechanism, kinds: Sequence[Kind]) -> Iterable[Column]:
     for kind in kinds:
         for column in kind.columns:
-            symbol = DISPLAY_UNITS[column.dimension].symbol
-            yield NumberColumn(name_measured(column.name, robot), column.dimension, symbol)
+            yield _number(name_measured(column.name, robot), column.dimension)
 
 
 def _sigmas(robot: Mechanism, kinds: Sequence[Kind]) -> Iterable[Column]:
     for reading in _readings(robot, kinds):
-        assert isinstance(reading, NumberColumn)
-        name = SIGMA + reading.name
-        yield NumberColumn(name, reading.dimension, reading.symbol, allows_infinity=True)
+        yield replace(reading, name=SIGMA + reading.name, allows_infinity=True)
     for kind in kinds:
         for column in kind.noise_columns:
-            name = SIGMA + name_measured(column.name, robot)
-            yield NumberColumn(name, column.dimension, DISPLAY_UNITS[column.dimension].symbol)
+            yield _number(SIGMA + name_measured(column.name, robot), column.dimension)
 
 
 def _covariances(robot: Mechanism, kinds: Sequence[Kind]) -> Iterable[Column]:
     for kind in kinds:
-        for a in kind.noise_columns:
-            for b in kind.noise_columns:
-                if a is not b:
-                    name = name_covariance(a.name, b.name, robot)
-                    yield ProductColumn(name, (a.dimension, b.dimension))
-
-
-def _match_temperature(name: str) -> Column | None:
-    place = name.removeprefix(f"{TEMPERATURE}.")
-    return ContextColumn(name) if place not in ("", name) else None
+        for a, b in permutations(kind.noise_columns, 2):
+            yield ProductColumn(name_covariance(a.name, b.name, robot), (a.dimension, b.dimension))
 
 
 def _always(*columns: Column) -> Callable[[Mechanism, Sequence[Kind]], Iterable[Column]]:
     return lambda _robot, _kinds: columns
 
 
+def _text_rule(meaning: str, column: TextColumn) -> ColumnRule:
+    return ColumnRule(column.name, "", meaning, _always(column))
+
+
 RULES: tuple[ColumnRule, ...] = (
-    ColumnRule(
-        "pose",
-        "",
-        f"name of the pose; `a{LINK}b` in a row that compares two poses; rows are numbered "
-        "without it",
-        _always(TextColumn("pose")),
+    _text_rule(
+        f"name of the pose; `a{LINK}b` in a row that compares two poses; rows are numbered without "
+        "it",
+        TextColumn("pose"),
     ),
-    ColumnRule(
-        "use",
-        "",
-        f"`{FIT}` or `{HELD_OUT}`: what the pose is for; an empty cell means `{FIT}`",
-        _always(USE_COLUMN),
+    _text_rule(
+        f"`{FIT}` or `{HELD_OUT}`: what the pose is for; an empty cell means `{FIT}`", USE_COLUMN
     ),
-    ColumnRule(
-        "block",
-        "",
-        "poses of a block are never split between fit and validation",
-        _always(TextColumn("block")),
-    ),
-    ColumnRule(
-        "kind", "", "label of the kind, in files with several kinds", _always(TextColumn("kind"))
-    ),
-    ColumnRule(
-        "session",
-        "",
-        "rows of a session share unknown frames and targets",
-        _always(TextColumn("session")),
-    ),
-    ColumnRule(
-        "group",
-        "",
-        "rows of a group share a surface or the constant of a lock",
-        _always(TextColumn("group")),
-    ),
+    _text_rule("poses of a block are never split between fit and validation", TextColumn("block")),
+    _text_rule("label of the kind, in files with several kinds", TextColumn("kind")),
+    _text_rule("rows of a session share unknown frames and targets", TextColumn("session")),
+    _text_rule("rows of a group share a surface or the constant of a lock", TextColumn("group")),
     ColumnRule("ACTUATOR", "[mm] or [deg]", "reading of the actuator", _readings),
     ColumnRule(
         f"{COMMANDED}COORDINATE",
@@ -180,13 +333,13 @@ RULES: tuple[ColumnRule, ...] = (
         "[degC], [K] or [degF]",
         "temperature of the room, or of what PLACE names",
         _always(ContextColumn(TEMPERATURE)),
-        _match_temperature,
+        lambda name: ContextColumn(name) if is_context(name) else None,
     ),
     ColumnRule(
         f"{NOTE}...",
         "any",
         "a remark; ignored",
-        lambda _robot, _kinds: (),
+        _always(),
         lambda name: TextColumn(name) if name.startswith(NOTE) else None,
     ),
 )
@@ -208,7 +361,8 @@ def find_open_column(name: str) -> Column | None:
 
 def is_context(name: str) -> bool:
     """Return whether a column holds a time or a temperature."""
-    return name in (TIME, TEMPERATURE) or _match_temperature(name) is not None
+    place = name.removeprefix(f"{TEMPERATURE}.")
+    return name in (TIME, TEMPERATURE) or place not in ("", name)
 
 
 def read_context(table: Table) -> dict[str, FloatArray]:

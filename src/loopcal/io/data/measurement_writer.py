@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
 from loopcal.io.core.text_file import write_text
-from loopcal.io.data.column_types import Column, ContextColumn
 from loopcal.io.data.columns import (
     LINK,
     SIGMA,
     USE_COLUMN,
+    Column,
+    ContextColumn,
     list_columns,
     name_covariance,
     name_measured,

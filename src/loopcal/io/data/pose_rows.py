@@ -22,8 +22,7 @@ from loopcal.errors import suggest_names
 from loopcal.io.core.csv_table import Table, require_columns
 from loopcal.io.core.text_file import name_files
 from loopcal.io.core.yaml_file import Location, refuse_unknown_keys
-from loopcal.io.data.column_types import NumberColumn, TextColumn
-from loopcal.io.data.columns import COMMANDED, LINK, SIGMA, list_columns
+from loopcal.io.data.columns import COMMANDED, LINK, SIGMA, NumberColumn, TextColumn, list_columns
 from loopcal.io.robot.robot_file import load_robot
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray, IntArray

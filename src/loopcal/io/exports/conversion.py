@@ -28,8 +28,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.io.core.csv_table import quote_cell
 from loopcal.io.core.numbers import parse_finite
 from loopcal.io.core.text_file import as_path
-from loopcal.io.data.column_types import TIME
-from loopcal.io.data.columns import COVARIANCE, LINK, NOTE, SIGMA
+from loopcal.io.data.columns import COVARIANCE, LINK, NOTE, SIGMA, TIME
 from loopcal.io.data.measurement_file import FORMAT
 from loopcal.io.exports.export_lines import (
     Line,

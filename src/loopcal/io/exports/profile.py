@@ -22,8 +22,16 @@ from loopcal.errors import UnitError, suggest_names
 from loopcal.io.core.numbers import parse_finite
 from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import Location, YamlFile, read_yaml, refuse_unknown_keys
-from loopcal.io.data.column_types import TEMPERATURE_UNITS, TIME, TIME_UNITS
-from loopcal.io.data.columns import COVARIANCE, MEASURED, NOTE, SIGMA, is_context
+from loopcal.io.data.columns import (
+    COVARIANCE,
+    MEASURED,
+    NOTE,
+    SIGMA,
+    TEMPERATURE_UNITS,
+    TIME,
+    TIME_UNITS,
+    is_context,
+)
 from loopcal.io.data.kind_rows import SETTINGS
 from loopcal.io.data.kind_settings import list_kind_settings, read_kind
 from loopcal.io.robot.robot_file import check_format
