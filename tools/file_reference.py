@@ -7,12 +7,15 @@ around it is written by hand.
 """
 
 import dataclasses
+import inspect
 import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any, get_args
 
 from loopcal.io.core import file_reference
+from loopcal.io.core.records import get_field_types
 from loopcal.io.data.columns import RULES
 from loopcal.io.data.kind_rows import SETTINGS
 from loopcal.io.data.kind_settings import list_kind_settings
@@ -42,6 +45,32 @@ def table(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     )
 
 
+def summarize(record: type) -> str:
+    """Return the text of a record's docstring above its sections."""
+    text = file_reference.SECTION.split(inspect.cleandoc(record.__doc__ or ""))[0]
+    return file_reference.SI.sub("", " ".join(text.split()))
+
+
+def list_nested_records(record: type) -> tuple[type, ...]:
+    """Return the records that a record's keys hold, in order, each once."""
+    nested: dict[type, None] = {}
+
+    def walk(annotation: Any) -> Iterator[type]:
+        if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
+            yield annotation
+        for argument in get_args(annotation):
+            yield from walk(argument)
+
+    queue = [record]
+    while queue:
+        for hint in get_field_types(queue.pop(0)).values():
+            for inner in walk(hint):
+                if inner not in nested and inner is not record:
+                    nested[inner] = None
+                    queue.append(inner)
+    return tuple(nested)
+
+
 def record_table(record: type, without: Iterable[str] = ()) -> str:
     """Return the keys of a record, those left out that `without` names."""
     left = set(without)
@@ -68,7 +97,7 @@ def common_records() -> tuple[type, ...]:
     """Return the records that several families use."""
     seen: dict[type, int] = {}
     for family in FAMILIES.values():
-        for record in file_reference.list_nested_records(family):
+        for record in list_nested_records(family):
             seen[record] = seen.get(record, 0) + 1
     return tuple(record for record, count in seen.items() if count > 1)
 
@@ -78,21 +107,16 @@ def families() -> str:
     shared = [key.name for key in file_reference.list_keys(RobotRecord)]
     parts = []
     for name, family in FAMILIES.items():
-        own = [
-            record
-            for record in file_reference.list_nested_records(family)
-            if record not in common_records()
-        ]
+        own = [record for record in list_nested_records(family) if record not in common_records()]
         parts.append(
-            "### `family: "
-            f"{name}`\n\n{file_reference.summarize(family)}\n\n{record_table(family, shared)}"
+            f"### `family: {name}`\n\n{summarize(family)}\n\n{record_table(family, shared)}"
         )
         parts += [_nested(record) for record in own]
     return "\n".join(parts)
 
 
 def _nested(record: type) -> str:
-    name, summary = file_reference.name_record(record), file_reference.summarize(record)
+    name, summary = file_reference.name_record(record), summarize(record)
     return f"**{name}**: {summary}\n\n{record_table(record)}"
 
 
@@ -112,9 +136,7 @@ def kinds() -> str:
             ("setting", "meaning"),
             [(f"`{key}`", meanings.get(key, "")) for key in list_kind_settings(kind)],
         )
-        parts.append(
-            f"### `kind: {name}`\n\n{file_reference.summarize(kind)}\n\n{columns}\n{settings}"
-        )
+        parts.append(f"### `kind: {name}`\n\n{summarize(kind)}\n\n{columns}\n{settings}")
     return "\n".join(parts)
 
 

@@ -7,7 +7,7 @@ import dataclasses
 import inspect
 import re
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import MISSING, dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -63,12 +63,6 @@ def collect_meanings(record: type) -> dict[str, str]:
     return {name.removesuffix("_"): phrase for name, phrase in meanings.items()}
 
 
-def summarize(record: type) -> str:
-    """Return the text of a record's docstring above its sections."""
-    text = SECTION.split(inspect.cleandoc(record.__doc__ or ""))[0]
-    return SI.sub("", " ".join(text.split()))
-
-
 def name_record(record: type) -> str:
     """Return the name of a record in the file reference: `Pose` for `PoseRecord`."""
     return record.__name__.removesuffix("Record")
@@ -96,26 +90,6 @@ def describe_type(annotation: Any) -> str:
         return name_record(annotation)
     names = {str: "text", float: "number", int: "whole number", bool: "true or false"}
     return "anything" if annotation is Any else names.get(annotation, str(annotation))
-
-
-def list_nested_records(record: type) -> tuple[type, ...]:
-    """Return the records that a record's keys hold, in order, each once."""
-    nested: dict[type, None] = {}
-
-    def walk(annotation: Any) -> Iterator[type]:
-        if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
-            yield annotation
-        for argument in get_args(annotation):
-            yield from walk(argument)
-
-    queue = [record]
-    while queue:
-        for hint in get_field_types(queue.pop(0)).values():
-            for inner in walk(hint):
-                if inner not in nested and inner is not record:
-                    nested[inner] = None
-                    queue.append(inner)
-    return tuple(nested)
 
 
 def _parse_entries(doc: str) -> dict[str, str]:

@@ -18,7 +18,6 @@ from __future__ import annotations
 import dataclasses
 import typing
 from collections.abc import Mapping
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -29,8 +28,9 @@ from loopcal.errors import DataError, suggest_names
 from loopcal.io.core.numbers import format_scaled
 from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
+from loopcal.mechanism import PoseRecord
 from loopcal.typing import FloatArray
-from loopcal.units import DISPLAY_UNITS, EXAMPLES, Angle, Dimension, Length
+from loopcal.units import DISPLAY_UNITS, EXAMPLES, Dimension
 
 if TYPE_CHECKING:
     from loopcal.measure import Kind
@@ -45,24 +45,6 @@ SI_SYMBOLS = {Dimension.LENGTH: "m", Dimension.ANGLE: "rad", Dimension.RATIO: "1
 LENGTHS = Annotated[list[Any] | None, Dimension.LENGTH]
 LENGTH = Annotated[float | None, Dimension.LENGTH]
 NUMBERS = Annotated[list[Any] | None, Dimension.RATIO]
-
-
-@dataclass(frozen=True)
-class PlacedFrame:
-    """A pose in the settings: R = Rz(yaw) Ry(pitch) Rx(roll), missing values are zero."""
-
-    x: Length = 0.0
-    y: Length = 0.0
-    z: Length = 0.0
-    roll: Angle = 0.0
-    pitch: Angle = 0.0
-    yaw: Angle = 0.0
-
-    def to_matrix(self) -> FloatArray:
-        """Return T (4, 4)."""
-        angles = np.array([self.roll, self.pitch, self.yaw])
-        R = geometry.euler_to_matrix(angles, "xyz")
-        return geometry.make_pose(R, np.array([self.x, self.y, self.z]))
 
 
 def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Kind:
@@ -141,8 +123,12 @@ def format_kind(kind: Kind, noise: Mapping[str, float], tool: FloatArray) -> dic
     for field in dataclasses.fields(typing.cast(Any, kind)):
         if not field.init or (value := getattr(kind, field.name)) is None:
             continue
-        usual = tool if field.name == "T_platform_tool" else _get_default(field)
-        is_usual = usual is not None and bool(np.array_equal(value, usual))
+        usual = field.default
+        if field.name == "T_platform_tool":
+            usual = tool
+        elif field.default_factory is not dataclasses.MISSING:
+            usual = field.default_factory()
+        is_usual = usual is not dataclasses.MISSING and bool(np.array_equal(value, usual))
         if not is_usual or (not field.kw_only and isinstance(value, str | tuple)):
             texts[field.name] = _format_setting(field.name, value)
     if noise:
@@ -174,7 +160,7 @@ def _setting_type(name: str, annotation: Any) -> Any:
     text = str(annotation)
     if "ndarray" in text:
         if name.startswith("T_"):
-            return PlacedFrame | None
+            return PoseRecord | None
         return NUMBERS if name in DIRECTIONS else LENGTHS
     if annotation is float:
         return LENGTH
@@ -183,17 +169,10 @@ def _setting_type(name: str, annotation: Any) -> Any:
 
 def _to_setting(value: Any, kind: type[Kind], key: str) -> Any:
     """Return a setting as the field of the kind takes it."""
-    if isinstance(value, PlacedFrame):
-        return value.to_matrix()
+    if isinstance(value, PoseRecord):
+        return value.matrix
     is_single = isinstance(value, str) and "tuple" in str(list_kind_settings(kind)[key])
     return (value,) if is_single else value
-
-
-def _get_default(field: dataclasses.Field[Any]) -> Any:
-    """Return the default of a field, None where it has none."""
-    if field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    return None if field.default is dataclasses.MISSING else field.default
 
 
 def _format_setting(key: str, value: Any) -> str:
@@ -211,7 +190,7 @@ def _format_setting(key: str, value: Any) -> str:
 
 
 def _format_frame(T: FloatArray) -> str:
-    """Return a pose (4, 4) as text of a `PlacedFrame`."""
+    """Return a pose (4, 4) as text of a `PoseRecord`."""
     lengths = zip("xyz", T[:3, 3], strict=True)
     turns = zip(("roll", "pitch", "yaw"), geometry.matrix_to_euler(T[:3, :3], "xyz"), strict=True)
     texts = [f"{k}: {format_quantity(float(v) + 0.0, Dimension.LENGTH)}" for k, v in lengths]

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import make_dataclass
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
@@ -35,37 +35,17 @@ EXAMPLE = (
 )
 
 
-@dataclass(frozen=True)
-class KnownLength:
-    """Knowledge of a length."""
-
-    start: Length | None = None
-    sd: Length | None = None
-    fixed: bool = False
+def _make_record(quantity: Any) -> type:
+    """Return a record of the knowledge of a parameter of one dimension."""
+    number = quantity | None
+    fields = [("start", number, None), ("sd", number, None), ("fixed", bool, False)]
+    return make_dataclass("KnownParameter", fields, frozen=True)
 
 
-@dataclass(frozen=True)
-class KnownAngle:
-    """Knowledge of an angle."""
-
-    start: Angle | None = None
-    sd: Angle | None = None
-    fixed: bool = False
-
-
-@dataclass(frozen=True)
-class KnownRatio:
-    """Knowledge of a number without dimension."""
-
-    start: Ratio | None = None
-    sd: Ratio | None = None
-    fixed: bool = False
-
-
-RECORDS: dict[Dimension, type[KnownLength | KnownAngle | KnownRatio]] = {
-    Dimension.LENGTH: KnownLength,
-    Dimension.ANGLE: KnownAngle,
-    Dimension.RATIO: KnownRatio,
+RECORDS = {
+    Dimension.LENGTH: _make_record(Length),
+    Dimension.ANGLE: _make_record(Angle),
+    Dimension.RATIO: _make_record(Ratio),
 }
 
 
