@@ -188,7 +188,7 @@ def own_truth(
     """True values of the unknowns of an instrument, drawn evenly about the stated ones."""
     sensors = [sensor.assign_rows(poses) for sensor in looking.with_tool(robot).sensors]
     labels = tuple(map(str, range(poses)))
-    table = collect_nuisance_parameters(sensors, labels).table  # type: ignore[arg-type]
+    table = collect_nuisance_parameters(sensors, labels).table
     reach = np.array([REACH[p.dimension] for p in table.entries])
     drawn = rng.uniform(-reach, reach)
     drawn = np.where(

@@ -129,7 +129,9 @@ class PosePredictions:
     def residuals(self, observations: Sequence[Observations]) -> list[FloatArray]:
         """Return the prediction errors (r, m) of every kind."""
         return [
-            o.evaluate(self.T, self._setup_of(i, o), self._joints_of(o)).residual[0]
+            o.evaluate(
+                self.T, self._setup_of(i, o), o.kind.stack_joints(self.joints, o.rows)
+            ).residual[0]
             for i, o in enumerate(observations)
         ]
 
@@ -141,21 +143,18 @@ class PosePredictions:
         for i, o in enumerate(observations):
             setup = self._setup_of(i, o)
             zero = np.zeros((1, *o.present.shape))
-            expected = o.kind.measure(self.T[:, o.rows], zero, setup, self._joints_of(o))
-            evaluation = o.kind.evaluate(other.T[:, o.rows], expected, setup, other._joints_of(o))
+            expected = o.kind.measure(
+                self.T[:, o.rows], zero, setup, o.kind.stack_joints(self.joints, o.rows)
+            )
+            evaluation = o.kind.evaluate(
+                other.T[:, o.rows], expected, setup, o.kind.stack_joints(other.joints, o.rows)
+            )
             differences.append(evaluation.residual[0])
         return differences
 
     def _setup_of(self, i: int, o: Observations) -> FloatArray | None:
         """Setup parameters (1, r, u) of the rows of a kind."""
         return self.setup.select(i, self.values) if o.kind.nuisance_parameters else None
-
-    def _joints_of(self, o: Observations) -> FloatArray | None:
-        """Joint values (1, r, j) that a kind measures."""
-        names = o.kind.sensed_joints
-        if not names:
-            return None
-        return np.stack([self.joints[name][:, o.rows] for name in names], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)

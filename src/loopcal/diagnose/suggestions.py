@@ -236,11 +236,7 @@ def _measure_at(at: ObservedPoses, kind: Kind, sigma: dict[Dimension, float]) ->
     sensor = Sensor(kind.with_tool(robot.tool), noise).assign_rows(len(at.readings))
     rows, mounted = sensor.rows, sensor.kind
     assert rows is not None
-    joints = (
-        np.stack([at.joints[name][:, rows] for name in kind.sensed_joints], axis=-1)
-        if kind.sensed_joints
-        else None
-    )
+    joints = kind.stack_joints(at.joints, rows)
     zero = np.zeros((1, len(rows), len(kind.noise_columns)))
     measured = mounted.measure(at.T[:, rows], zero, None, joints)[0]
     observations = Observations.from_sigma(

@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopcal.errors import DataError
 from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters
 from loopcal.measure.observations import Observations
@@ -141,17 +140,7 @@ def _evaluate_kind(
     joints: Mapping[str, FloatArray],
 ) -> EvaluatedRows:
     kind = rows.kind
-    for name in kind.sensed_joints:
-        if name not in joints:
-            raise DataError(
-                f"the kind {kind.name!r} needs the values of joint {name!r}; pass them as `joints`"
-            )
-    joint_values = (
-        np.stack([joints[name][:, rows.rows] for name in kind.sensed_joints], axis=-1)
-        if kind.sensed_joints
-        else None
-    )
-    evaluation = rows.evaluate(T, values, joint_values)
+    evaluation = rows.evaluate(T, values, kind.stack_joints(joints, rows.rows))
     t, r, m = evaluation.residual.shape
     jacobian = evaluation.jacobian
     by_nuisance = np.zeros((t, r, m, len(nuisance)))

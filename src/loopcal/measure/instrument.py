@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import check_type, describe
+from loopcal.measure.array_checks import check_type, describe, set_fields
 from loopcal.measure.kinds import Kind
 from loopcal.measure.noise import Noise
 from loopcal.measure.observations import TextArray, check_labels, check_rows
@@ -113,7 +113,7 @@ class Instrument:
             raise DataError(
                 f"sensors: got {describe(self.sensors)}; give a tuple of sensors, such as (sensor,)"
             )
-        object.__setattr__(self, "sensors", tuple(self.sensors))
+        set_fields(self, sensors=tuple(self.sensors))
         if not self.sensors:
             raise DataError("an instrument needs at least one sensor: a kind and its noise")
         for sensor in self.sensors:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import check_array, check_type, describe
+from loopcal.measure.array_checks import check_array, check_type, describe, set_fields
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
 from loopcal.typing import FloatArray, IntArray
@@ -77,16 +77,11 @@ class Measurements:
                 rows, Observations, "observations", "such as loopcal.Observations.from_sigma(...)"
             )
             _check_poses(rows, n)
-        values = {
-            "readings": readings,
-            "block": block,
-            "labels": labels,
-            "observations": tuple(self.observations),
-        }
+        set_fields(self, readings=readings, block=block, labels=labels)
+        set_fields(self, observations=tuple(self.observations))
         if self.reading_sigma is not None:
-            values["reading_sigma"] = _check_reading_sigma(self.reading_sigma, readings, labels)
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+            sigma = _check_reading_sigma(self.reading_sigma, readings, labels)
+            set_fields(self, reading_sigma=sigma)
 
     def __repr__(self) -> str:
         n, a = self.readings.shape

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import check_array
+from loopcal.measure.array_checks import check_array, set_fields
 from loopcal.typing import FloatArray
 
 
@@ -41,7 +41,7 @@ class Gaussian(Noise):
     sd: FloatArray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "sd", _check_positive(self.sd, "the sigma of the noise"))
+        set_fields(self, sd=_check_positive(self.sd, "the sigma of the noise"))
 
     def __repr__(self) -> str:
         return f"Gaussian({self.sd.tolist()})"
@@ -65,7 +65,7 @@ class Uniform(Noise):
     limit: FloatArray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "limit", _check_positive(self.limit, "the limits of the noise"))
+        set_fields(self, limit=_check_positive(self.limit, "the limits of the noise"))
 
     def __repr__(self) -> str:
         return f"Uniform({self.limit.tolist()})"

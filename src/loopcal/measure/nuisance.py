@@ -21,7 +21,7 @@ from loopcal.typing import FloatArray, IntArray
 
 
 class LabelledRows(Protocol):
-    """Rows of a kind, measured or still to be simulated."""
+    """Rows of a kind: `Observations`, or a `Sensor` with explicit rows."""
 
     @property
     def kind(self) -> Kind:
@@ -29,7 +29,7 @@ class LabelledRows(Protocol):
         ...
 
     @property
-    def rows(self) -> IntArray:
+    def rows(self) -> IntArray | None:
         """(r,) or (r, l) poses."""
         ...
 
@@ -195,16 +195,18 @@ def collect_nuisance_parameters(
             scope: _list_owners(rows, scope, labels)
             for scope in {p.scope for p in kind.nuisance_parameters}
         }
-        keys = list(zip(*owners.values(), strict=True)) if owners else [()] * len(rows.rows)
-        names = {
-            key: _enter_all(entries, kind, dict(zip(owners, key, strict=True)))
-            for key in dict.fromkeys(keys)
-        }
+        keys = list(zip(*owners.values(), strict=True)) if owners else [()] * len(rows.session)
+        names = {}
+        for key in dict.fromkeys(keys):
+            owner = dict(zip(owners, key, strict=True))
+            names[key] = [
+                _enter(entries, p, owner[p.scope], kind) for p in kind.nuisance_parameters
+            ]
         order = {name: i for i, name in enumerate(entries)}
         used = {key: [order[name] for name in of_key] for key, of_key in names.items()}
         indices.append(
             np.array([used[key] for key in keys], dtype=np.intp).reshape(
-                len(rows.rows), len(kind.nuisance_parameters)
+                len(keys), len(kind.nuisance_parameters)
             )
         )
     for stated in stated_values:
@@ -221,17 +223,9 @@ def _list_owners(rows: LabelledRows, scope: str, labels: tuple[str, ...]) -> lis
         # a group belongs to its session, unless the session has no name
         pairs = zip(rows.session.tolist(), rows.group.tolist(), strict=True)
         return [".".join(name for name in pair if name) for pair in pairs]
-    if scope == "pose":
+    if scope == "pose" and rows.rows is not None:
         return [labels[int(i)] for i in rows.rows.reshape(len(rows.rows), -1)[:, 0]]
-    return [""] * len(rows.rows)
-
-
-def _enter_all(entries: dict[str, Parameter], kind: Kind, owner: Mapping[str, str]) -> list[str]:
-    """Enter all parameters of a kind for the owner of each scope, and return their full names."""
-    return [
-        _enter(entries, parameter, owner[parameter.scope], kind)
-        for parameter in kind.nuisance_parameters
-    ]
+    return [""] * len(rows.session)
 
 
 def _enter(entries: dict[str, Parameter], parameter: Parameter, owner: str, kind: Kind) -> str:
@@ -252,8 +246,8 @@ def _enter(entries: dict[str, Parameter], parameter: Parameter, owner: str, kind
 
 def _check_names(kind: Kind) -> None:
     names = [p.name for p in kind.nuisance_parameters]
-    if len(set(names)) < len(names):
-        repeated = next(name for name in names if names.count(name) > 1)
+    repeated = next((name for name in names if names.count(name) > 1), None)
+    if repeated is not None:
         raise DataError(
             f"the kind {kind.name!r} has two parameters called {repeated!r}; give frames, targets "
             "and surfaces different names"

@@ -3,13 +3,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import check_array, check_type, describe
+from loopcal.measure.array_checks import check_array, check_type, describe, set_fields
 from loopcal.measure.kinds import Evaluation, Kind
 from loopcal.measure.whitening import compute_whitener
 from loopcal.typing import BoolArray, FloatArray, IntArray
@@ -84,11 +84,8 @@ class Observations:
         measured = check_array(
             self.measured, f"measured values of kind {kind.name!r}", (r, c), allow_nan=True
         )
-        weight = check_array(
-            _broadcast(self.weight, (r,), "the weight", f"one number for each of {r} rows"),
-            "the weight",
-            (r,),
-        )
+        weights = _broadcast(self.weight, (r,), "the weight", f"one number for each of {r} rows")
+        weight = check_array(weights, "the weight", (r,))
         if np.any(weight < 0.0):
             i = int(np.flatnonzero(weight < 0.0)[0])
             raise DataError(
@@ -104,21 +101,14 @@ class Observations:
         W = compute_whitener(covariance, present, weight)
         for array in (rows, covariance, present, W):
             array.setflags(write=False)
-        values = {"rows": rows, "measured": measured, "covariance": covariance, "weight": weight}
-        values |= {
-            name: check_labels(getattr(self, name), r, name) for name in ("session", "group")
-        }
+        session, group = (check_labels(getattr(self, s), r, s) for s in ("session", "group"))
         context = {
             name: check_array(v, f"the context {name!r}", (r,), allow_nan=True)
             for name, v in self.context.items()
         }
-        for name, array in {
-            **values,
-            "context": context,
-            "present": present,
-            "whitener": W,
-        }.items():
-            object.__setattr__(self, name, array)
+        set_fields(self, rows=rows, measured=measured, covariance=covariance, weight=weight)
+        set_fields(self, session=session, group=group, context=context)
+        set_fields(self, present=present, whitener=W)
 
     @classmethod
     def from_sigma(
@@ -171,14 +161,8 @@ class Observations:
         sd = _broadcast(sigma, shape, "sigma", f"one number, or one for each of {names}")
         N = kind.linearize_noise(values)
         covariance = (N * (sd * sd)[:, None, :]) @ np.swapaxes(N, -1, -2)
-        return cls(
-            kind,
-            np.asarray(rows),
-            values,
-            covariance,
-            session=np.asarray(session),
-            group=np.asarray(group),
-        )
+        of_session, of_group = np.asarray(session), np.asarray(group)
+        return cls(kind, np.asarray(rows), values, covariance, session=of_session, group=of_group)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -218,16 +202,10 @@ class Observations:
     def take(self, keep: ArrayLike) -> Self:
         """Return the rows at these indices, or of this mask."""
         chosen = np.asarray(keep)
-        return replace(
-            self,
-            rows=self.rows[chosen],
-            measured=self.measured[chosen],
-            covariance=self.covariance[chosen],
-            weight=self.weight[chosen],
-            session=self.session[chosen],
-            group=self.group[chosen],
-            context={name: values[chosen] for name, values in self.context.items()},
-        )
+        names = ("rows", "measured", "covariance", "weight", "session", "group")
+        arrays: dict[str, Any] = {name: getattr(self, name)[chosen] for name in names}
+        context = {name: values[chosen] for name, values in self.context.items()}
+        return replace(self, context=context, **arrays)
 
     def with_weights(self, weight: ArrayLike) -> Self:
         """Return the same rows with other weights (r,)."""

@@ -151,7 +151,8 @@ def resolve_reading_sigma(robot: Mechanism, given: FloatArray | None, n: int) ->
     DataError
         If a sigma is negative, not a number, or finite but too large to mean anything; or if a
         reading of a robot with redundant actuators is exact. The poses of such a robot are free
-        and readings follow from them, so that no reading can be kept (docs/theory/uncertain-readings.md).
+        and readings follow from them, so that no reading can be kept; see
+        docs/theory/uncertain-readings.md.
     """
     stated = [actuator.sigma for actuator in robot.actuators]
     if given is None:

@@ -7,7 +7,6 @@ the true machine turns readings into true poses. The instrument measures these p
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,12 +14,11 @@ from numpy.typing import ArrayLike
 from loopcal.engine import State
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_array, check_type
-from loopcal.measure.instrument import Instrument
-from loopcal.measure.kinds import Kind
+from loopcal.measure.instrument import Instrument, Sensor
 from loopcal.measure.measurements import Measurements, broadcast_reading_sigma
 from loopcal.measure.noise import make_random_stream
 from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters
-from loopcal.measure.observations import Observations, TextArray
+from loopcal.measure.observations import Observations
 from loopcal.measure.readings import (
     list_sensed_joints,
     resolve_reading_sigma,
@@ -28,7 +26,7 @@ from loopcal.measure.readings import (
     solve_commanded_poses,
 )
 from loopcal.mechanism import Mechanism, Status, forward, forward_trials, solve_at_pose
-from loopcal.typing import BoolArray, FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray
 
 NOISE, TRUTH, READING = 0, 1, 2  # purposes of a trial's random streams
 
@@ -167,14 +165,13 @@ def simulate_trials(
     commanded = solve_commanded_poses(robot.nominal if controller is None else controller, poses)
     readings, n = commanded.q, len(commanded.q)
     assigned = Instrument(tuple(s.assign_rows(n) for s in instrument.with_tool(robot).sensors))
-    rows = [_RowsToMeasure(s.kind, s.assigned_rows, s.session, s.group) for s in assigned.sensors]
-    nuisance = collect_nuisance_parameters(rows, tuple(str(i + 1) for i in range(n)))
+    labels = tuple(str(i + 1) for i in range(n))
+    nuisance = collect_nuisance_parameters(assigned.sensors, labels)
     nuisance = nuisance.with_nominal(nuisance.values(nuisance_values))
     # Starting at the commanded pose keeps the true machine in the assembly mode of its controller.
     state = forward_trials(robot, values, readings[None], commanded.state)
     T = np.broadcast_to(state.T, (len(values), *state.T.shape[1:]))
-    reached = np.zeros(T.shape[:2], dtype=np.bool_)
-    reached[:] = state.status == Status.CONVERGED
+    reached = np.array(np.broadcast_to(state.status == Status.CONVERGED, T.shape[:2]))
     # Redundant actuators of a wrong geometry contradict each other: their true readings are those
     # of the reached pose.
     true = (
@@ -187,8 +184,8 @@ def simulate_trials(
     )
     noise = [_draw_noise(assigned, make_random_stream(seed, i, NOISE)) for i in range(len(values))]
     measured = tuple(
-        _measure_sensor(k, of_sensor, T, reached, joints, noise, nuisance)
-        for k, of_sensor in enumerate(rows)
+        _measure_sensor(k, sensor, T, reached, joints, noise, nuisance)
+        for k, sensor in enumerate(assigned.sensors)
     )
     recorded, sigma = _record_readings(robot, true, reading_sigma, len(values), seed)
     return Trials(
@@ -205,22 +202,13 @@ def simulate(
     nuisance_values: Mapping[str, float] | None = None,
     reading_sigma: ArrayLike | None = None,
 ) -> Measurements:
-    """Measure commanded poses on one machine.
+    """Measure commanded poses on one machine: trial 0 of `simulate_trials`.
 
     Parameters
     ----------
     robot : Mechanism
         The true machine, at its true values.
-    poses : (n, 4, 4) T_base_platform, or (n, c) controlled coordinates [SI]
-        As commanded.
-    instrument : Instrument
-    seed : int
-        The result is that of trial 0 of `simulate_trials`.
-    controller : Mechanism, optional
-        The geometry that turns poses into readings; default: the robot at its nominal values.
-    nuisance_values : name -> value [SI], optional
-        True values of setup parameters, such as `tracker.x`; default: nominal.
-    reading_sigma : optional
+    poses, instrument, seed, controller, nuisance_values, reading_sigma
         As for `simulate_trials`.
 
     Returns
@@ -234,15 +222,9 @@ def simulate(
         of the controller.
     """
     check_type(robot, Mechanism, "robot", "from loopcal.load_robot")
+    truth = robot.values[None]
     trials = simulate_trials(
-        robot,
-        robot.values[None],
-        poses,
-        instrument,
-        seed,
-        controller,
-        nuisance_values,
-        reading_sigma,
+        robot, truth, poses, instrument, seed, controller, nuisance_values, reading_sigma
     )
     failed = np.flatnonzero(~trials.reached[0])
     if len(failed):
@@ -283,27 +265,17 @@ def replace_measured_values(
             f"{robot.name} does not reach pose {data.labels[first]!r} with its readings "
             f"({nominal.explain(first)}); correct the readings"
         )
-    pairs = zip(instrument.sensors, data.observations, strict=True)
     sensors = tuple(
         replace(sensor, rows=rows.rows, session=rows.session, group=rows.group)
-        for sensor, rows in pairs
+        for sensor, rows in zip(instrument.sensors, data.observations, strict=True)
     )
     measured = simulate(robot, nominal.T, Instrument(sensors), seed, controller=robot.nominal)
     return replace(data, observations=measured.observations)
 
 
-class _RowsToMeasure(NamedTuple):
-    """A kind and its rows, before anything is measured."""
-
-    kind: Kind
-    rows: IntArray
-    session: TextArray
-    group: TextArray
-
-
 def _measure_sensor(
     k: int,
-    of_sensor: _RowsToMeasure,
+    sensor: Sensor,
     T: FloatArray,
     reached: BoolArray,
     joints: Mapping[str, FloatArray],
@@ -311,16 +283,11 @@ def _measure_sensor(
     nuisance: NuisanceParameters,
 ) -> FloatArray:
     """Return columns (t, r, c) of sensor k at true poses; NaN where these were not reached."""
-    kind, rows = of_sensor.kind, of_sensor.rows
+    kind, rows = sensor.kind, sensor.assigned_rows
     safe = np.where(reached[..., None, None], T, np.eye(4))
-    joint_values = (
-        np.stack([joints[name][:, rows] for name in kind.sensed_joints], axis=-1)
-        if kind.sensed_joints
-        else None
-    )
-    values = nuisance.select(k, nuisance.table.nominal[None]) if kind.nuisance_parameters else None
+    values = nuisance.select(k, nuisance.table.nominal[None])
     drawn = np.stack([of_trial[k] for of_trial in noise])
-    measured = kind.measure(safe[:, rows], drawn, values, joint_values)
+    measured = kind.measure(safe[:, rows], drawn, values, kind.stack_joints(joints, rows))
     complete = np.asarray(np.all(reached[:, rows].reshape(len(reached), len(rows), -1), axis=-1))
     return np.where(complete[..., None], measured, np.nan)
 
@@ -345,12 +312,8 @@ def _record_readings(
     resolved = resolve_reading_sigma(robot, given, true.shape[1])
     if resolved is None:
         return None, given
-    draws = np.stack(
-        [
-            make_random_stream(seed, trial, READING).standard_normal(resolved.shape)
-            for trial in range(trials)
-        ]
-    )
+    streams = (make_random_stream(seed, trial, READING) for trial in range(trials))
+    draws = np.stack([stream.standard_normal(resolved.shape) for stream in streams])
     present = np.isfinite(resolved)
     noise = np.where(present, resolved, 0.0) * draws
     return np.where(present, true + noise, np.nan), resolved

@@ -21,6 +21,10 @@ def compute_whitener(covariance: FloatArray, present: BoolArray, weight: FloatAr
     of C. Here they are replaced by those of the identity, which keeps the shape and gives the same
     factor for the other components.
 
+    The inverse is formed once, because each step of a fit multiplies residuals and Jacobians of all
+    rows by it, and numpy has no triangular solve of stacked blocks. It is accurate: blocks are
+    correlation matrices of a few components, whose pivots are bounded from below.
+
     Parameters
     ----------
     covariance : (r, m, m) [SI]

@@ -165,7 +165,7 @@ def _list_nuisance(mounted: Instrument, members: IntArray) -> NuisanceParameters
         replace(sensor, rows=rows).assign_rows(count)
         for sensor, rows in _assign_poses(mounted, members)
     )
-    return collect_nuisance_parameters(sensors, tuple(str(i) for i in range(count)))  # pyright: ignore[reportArgumentType]
+    return collect_nuisance_parameters(sensors, tuple(str(i) for i in range(count)))
 
 
 def _assign_poses(mounted: Instrument, members: IntArray) -> list[tuple[Sensor, IntArray]]:
@@ -189,11 +189,7 @@ def _linearize_block(
         values = (
             nuisance.select(i, nuisance.table.nominal[None]) if kind.nuisance_parameters else None
         )
-        joints = (
-            np.stack([observed.joints[name][:, rows] for name in kind.sensed_joints], axis=-1)
-            if kind.sensed_joints
-            else None
-        )
+        joints = kind.stack_joints(observed.joints, rows)
         noise = np.zeros((1, len(rows), len(kind.noise_columns)))
         measured = kind.measure(observed.T[:, rows], noise, values, joints)[0]
         # what is undefined there, such as the direction from a point to itself

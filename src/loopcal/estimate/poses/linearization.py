@@ -222,10 +222,9 @@ def evaluate_rows(
     T = np.broadcast_to(T, (len(trials), *T.shape[1:]))
     used = nuisance is not None and rows.nuisance.shape[1]
     own = nuisance[:, rows.nuisance] if nuisance is not None and used else None
-    names, joints = rows.kind.sensed_joints, None
-    if names:
-        observed = np.stack([poses.joints[name][:, rows.poses] for name in names], axis=-1)
-        joints = np.broadcast_to(observed, (len(trials), *observed.shape[1:]))
+    joints = rows.kind.stack_joints(poses.joints, rows.poses)
+    if joints is not None:
+        joints = np.broadcast_to(joints, (len(trials), *joints.shape[1:]))
     return rows.kind.evaluate(T, measured, own, joints), white
 
 

@@ -36,7 +36,7 @@ from loopcal.measure.kinds.rows import Column, Evaluation, InvalidRows
 from loopcal.measure.kinds.setup_parameters import SetupItem
 from loopcal.numerics.decomposition import without_rounding
 from loopcal.parameters import Parameter
-from loopcal.typing import BoolArray, FloatArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 from loopcal.units import Dimension
 
 
@@ -111,6 +111,19 @@ class Kind(ABC):
     def sensed_joints(self) -> tuple[str, ...]:
         """Names of the j joints, driven or passive, whose values the residual depends on."""
         return ()
+
+    def stack_joints(self, joints: Mapping[str, FloatArray], rows: IntArray) -> FloatArray | None:
+        """Return the values (.., r, j) of the sensed joints at the poses of rows (r,), from those
+        of all joints by name (.., n); None where it senses none. DataError if one is missing.
+        """
+        for name in self.sensed_joints:
+            if name not in joints:
+                raise DataError(
+                    f"the kind {self.name!r} needs the values of joint {name!r}; pass them as "
+                    "`joints`"
+                )
+        columns = [joints[name][..., rows] for name in self.sensed_joints]
+        return np.stack(columns, axis=-1) if columns else None
 
     @classmethod
     @abstractmethod
@@ -241,7 +254,7 @@ class Kind(ABC):
                 )
             joints = np.empty((1, 1, 0))
         filled = np.where(np.isnan(measured), self.placeholder, measured)
-        values = self._values_or_nominal(nuisance)
+        values = self.nominal_values[None, None] if nuisance is None else nuisance
         if len(values) > len(T):
             T = np.broadcast_to(T, (len(values), *T.shape[1:]))
         result = self._drop_rounding(self._evaluate(T, filled, values, joints))
@@ -286,8 +299,9 @@ class Kind(ABC):
         measured : (t, r, c) [SI]
             With `evaluate(T, measured).residual = -linearize_noise(measured) noise` to first order.
         """
-        values = self._values_or_nominal(nuisance)
-        return self._measure(T, noise, values, np.zeros_like(noise) if joints is None else joints)
+        values = self.nominal_values[None, None] if nuisance is None else nuisance
+        joints = np.zeros_like(noise) if joints is None else joints
+        return self._measure(T, noise, values, joints)
 
     def linearize_noise(self, measured: FloatArray) -> FloatArray:
         """Return the derivative (..., m, m) of the residuals by errors of the noise columns, up to
@@ -329,17 +343,12 @@ class Kind(ABC):
         """Which columns are angles."""
         return tuple(column.dimension is Dimension.ANGLE for column in self.columns)
 
-    def _values_or_nominal(self, nuisance: FloatArray | None) -> FloatArray:
-        """Return the given values, or the nominal ones (1, 1, u)."""
-        return self.nominal_values[None, None] if nuisance is None else nuisance
-
     def _drop_rounding(self, evaluation: Evaluation) -> Evaluation:
         """Return the evaluation with zeros where derivatives by nuisance parameters cancel, as
         those by the place of a target do between parallel poses.
 
-        The derivatives are compared with those by the platform twist. A meter is compared with a
-        radian there; the tolerance is so far below all that counts that the size of a machine does
-        not matter.
+        They are compared with derivatives by the platform twist. A meter is compared with a radian
+        there; the tolerance is so small that the size of a machine does not matter.
         """
         if evaluation.nuisance is None:
             return evaluation
