@@ -31,17 +31,7 @@ Ratio = Annotated[float, Dimension.RATIO]
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit: `SI value = value * factor_to_si`.
-
-    Parameters
-    ----------
-    symbol : str
-        As written in files, e.g. "mm".
-    dimension : Dimension
-        What it measures.
-    factor_to_si : float
-        Metres, radians or 1 per unit.
-    """
+    """A unit, with its symbol in files, e.g. "mm": `SI value = value * factor_to_si`."""
 
     symbol: str
     dimension: Dimension
@@ -67,6 +57,12 @@ UNITS: Mapping[str, Unit] = {
         Unit("arcsec", Dimension.ANGLE, math.pi / 648000.0),
         Unit("1", Dimension.RATIO, 1.0),
     )
+}
+
+SI_SYMBOLS: Mapping[Dimension, str] = {
+    Dimension.LENGTH: "m",
+    Dimension.ANGLE: "rad",
+    Dimension.RATIO: "1",
 }
 
 # Units of tables if the robot file states no others.
@@ -95,20 +91,12 @@ ARTICLES = {Dimension.LENGTH: "a length", Dimension.ANGLE: "an angle", Dimension
 def find_unit(symbol: str, dimension: Dimension | None = None) -> Unit:
     """Return the unit with this symbol.
 
-    Parameters
-    ----------
-    symbol : str
-        One of `symbols()`.
-    dimension : Dimension, optional
-        Refuse units of another dimension.
-
     Raises
     ------
     UnitError
-        Unknown symbol, or a unit of another dimension; the text lists the allowed ones.
+        Unknown symbol, or a unit of another than the given dimension; lists the allowed ones.
     """
-    known = UNITS.get(symbol)
-    allowed = list_symbols(dimension)
+    known, allowed = UNITS.get(symbol), list_symbols(dimension)
     if known is None:
         raise UnitError(
             f"unknown unit {symbol!r}{suggest_names(symbol, allowed)}; allowed are "
@@ -130,11 +118,8 @@ def parse_quantity(text: str, dimension: Dimension | None = None) -> float:
     UnitError
         Not a finite number, unit missing, unknown, or of another dimension.
     """
-    stripped = text.strip()
-    cut = len(stripped)
-    while cut > 0 and not _is_number(stripped[:cut]):
-        cut -= 1
-    example = EXAMPLES[dimension or Dimension.LENGTH]
+    stripped, example = text.strip(), EXAMPLES[dimension or Dimension.LENGTH]
+    cut = next((i for i in range(len(stripped), 0, -1) if _is_number(stripped[:i])), 0)
     if cut == 0:
         raise UnitError(f"{text!r} is not a number with a unit; write for example {example}")
     value, symbol = float(stripped[:cut]), stripped[cut:].strip()

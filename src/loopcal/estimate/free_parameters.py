@@ -15,7 +15,7 @@ from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
+from loopcal.units import Dimension, find_unit
 
 DEFAULT_TOLERANCE = 1e-3
 """Tolerance where none is stated: this share of the robot's size for lengths, this many radians for
@@ -96,7 +96,7 @@ class FreeParameters:
 
     def _symbol(self, dimension: Dimension) -> str:
         """Return the symbol of the unit in which the robot's file shows a dimension."""
-        return self.robot.units.get(dimension, DISPLAY_UNITS[dimension].symbol)
+        return self.robot.units[dimension]
 
 
 def select_free_parameters(robot: Mechanism) -> FreeParameters:

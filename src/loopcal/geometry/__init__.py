@@ -14,9 +14,7 @@ from loopcal.geometry.euler_angles import tilt_torsion_to_matrix as tilt_torsion
 from loopcal.geometry.euler_angles import wrap_angle as wrap_angle
 from loopcal.geometry.orientation_forms import OrientationForm as OrientationForm
 from loopcal.geometry.orientation_forms import parse_orientation as parse_orientation
-from loopcal.geometry.rigid_transforms import adjoint_matrix as adjoint_matrix
 from loopcal.geometry.rigid_transforms import apply_twist as apply_twist
-from loopcal.geometry.rigid_transforms import compose_poses as compose_poses
 from loopcal.geometry.rigid_transforms import invert_pose as invert_pose
 from loopcal.geometry.rigid_transforms import make_pose as make_pose
 from loopcal.geometry.rigid_transforms import pose_difference as pose_difference
@@ -27,5 +25,6 @@ from loopcal.geometry.rotations import left_jacobian_inverse_so3 as left_jacobia
 from loopcal.geometry.rotations import left_jacobian_so3 as left_jacobian_so3
 from loopcal.geometry.rotations import log_so3 as log_so3
 from loopcal.geometry.rotations import matrix_to_quaternion as matrix_to_quaternion
-from loopcal.geometry.rotations import project_to_rotation as project_to_rotation
+from loopcal.geometry.rotations import measure_rotation_error as measure_rotation_error
+from loopcal.geometry.rotations import project_to_rotations as project_to_rotations
 from loopcal.geometry.rotations import quaternion_to_matrix as quaternion_to_matrix

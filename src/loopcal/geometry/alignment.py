@@ -2,7 +2,8 @@
 """Alignment in closed form: frames, points and centers from points, poses, rays or lengths.
 
 These functions need no initial guess. They work on arrays in SI units. Problems that are quadratic
-in a rotation are solved over the whole rotation group by `minimize_over_rotations`.
+in a rotation are solved over the whole rotation group by `minimize_over_rotations`. The only one
+that scipy.spatial.transform could solve is `align_point_sets`, two lines on our projection.
 """
 
 from itertools import permutations, product
@@ -10,7 +11,7 @@ from itertools import permutations, product
 import numpy as np
 
 from loopcal.geometry.rigid_transforms import make_pose
-from loopcal.geometry.rotations import exp_so3, hat
+from loopcal.geometry.rotations import exp_so3, hat, project_to_rotations
 from loopcal.typing import FloatArray
 
 _SIGNED_PERMUTATIONS = [
@@ -47,14 +48,6 @@ def solve_least_squares(A: FloatArray, b: FloatArray) -> FloatArray:
     Singular values below `ALIGNMENT_TOLERANCE` times the largest count as zero.
     """
     return np.asarray(np.linalg.lstsq(A, b, rcond=ALIGNMENT_TOLERANCE)[0], dtype=float)
-
-
-def project_to_rotations(M: FloatArray) -> FloatArray:
-    """Return the rotations (.., 3, 3) nearest to matrices (.., 3, 3) in the Frobenius norm."""
-    U, _, V = np.linalg.svd(M)
-    sign = np.ones(M.shape[:-1])
-    sign[..., 2] = np.sign(np.linalg.det(U @ V))
-    return (U * sign[..., None, :]) @ V
 
 
 def align_point_sets(points: FloatArray, reference: FloatArray) -> FloatArray:
@@ -100,10 +93,10 @@ def minimize_over_rotations(H: FloatArray, g: FloatArray, count: int = 3) -> Flo
         damping = np.where(better[:, None, None], 0.1 * damping, 10.0 * damping)
         if np.abs(step).max() < 1e-9:
             break
-    return select_distinct_rotations(R[np.argsort(cost)])[:count]
+    return _select_distinct(R[np.argsort(cost)])[:count]
 
 
-def select_distinct_rotations(R: FloatArray) -> FloatArray:
+def _select_distinct(R: FloatArray) -> FloatArray:
     """Return those of the rotations (k, 3, 3) whose entries differ by more than 0.02 from all
     earlier ones.
     """

@@ -2,9 +2,11 @@
 """Orientation by three angles: the 24 Euler conventions, and tilt and torsion.
 
 Each has functions to and from a matrix and `rates`, the matrix E with `omega = E d(angles)`. Order
-names follow scipy: lower case turns about fixed axes ("xyz": first about x, then y, then z of the
-base, `R = Rz Ry Rx`), upper case about the moving ones ("XYZ": `R = Rx Ry Rz`). Angles are in the
-order of the letters.
+names, EULER_ORDERS, follow scipy: lower case turns about fixed axes ("xyz": first about x, then y,
+then z of the base, `R = Rz Ry Rx`), upper case about the moving ones ("XYZ": `R = Rx Ry Rz`). An
+unknown order raises DataError. Angles (..., 3) [rad] are in the order of the letters, rotations
+(..., 3, 3). These functions are not those of scipy.spatial.transform because of the rates, the
+leading axes, exact angles where two axes are parallel, and the time that its import takes.
 """
 
 import numpy as np
@@ -22,31 +24,12 @@ _GIMBAL = 1e-15
 
 
 def wrap_angle(angle: FloatArray | float) -> FloatArray:
-    """Return the angle plus full turns that lies in (-pi, pi].
-
-    Parameters
-    ----------
-    angle : (...) [rad]
-
-    Returns
-    -------
-    wrapped : (...) [rad]
-    """
+    """Return angles (...) plus full turns, in (-pi, pi] [rad]."""
     return np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
 
 
 def rotation_about_axis(angle: FloatArray | float, axis: int) -> FloatArray:
-    """Return the rotation about coordinate axis 0, 1 or 2.
-
-    Parameters
-    ----------
-    angle : (...) [rad]
-    axis : int
-
-    Returns
-    -------
-    rotation : (..., 3, 3)
-    """
+    """Return the rotations about coordinate axis 0, 1 or 2 by angles (...) [rad]."""
     c, s = np.cos(angle), np.sin(angle)
     if axis == 0:
         return stack_matrix(((1.0, 0.0, 0.0), (0.0, c, -s), (0.0, s, c)))
@@ -55,22 +38,22 @@ def rotation_about_axis(angle: FloatArray | float, axis: int) -> FloatArray:
     return stack_matrix(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
 
 
+def check_order(order: str) -> None:
+    """Refuse an order that is none of EULER_ORDERS; raises DataError."""
+    if order not in EULER_ORDERS:
+        raise DataError(
+            f"the Euler order {order!r} is not one of the 24: use {', '.join(_SEQUENCES)} for "
+            "rotations about fixed axes, or the same in capitals for rotations about the moving "
+            "axes"
+        )
+
+
 def _moving_axes(order: str) -> tuple[tuple[int, int, int], bool]:
     """Return the axes as a moving sequence, and whether the angles are in reverse (fixed axes).
 
     `Rz(c) Ry(b) Rx(a)` about fixed axes "xyz" is the same product as "ZYX" about moving ones.
-
-    Raises
-    ------
-    DataError
-        If the order is none of the 24.
     """
-    if order not in EULER_ORDERS:
-        raise DataError(
-            f"the Euler order {order!r} is not one of the 24: use {', '.join(_SEQUENCES)} for "
-            "rotations about fixed "
-            "axes, or the same in capitals for rotations about the moving axes"
-        )
+    check_order(order)
     axes = tuple("xyz".index(letter) for letter in order.lower())
     fixed = order.islower()
     first, second, third = axes[::-1] if fixed else axes
@@ -78,29 +61,11 @@ def _moving_axes(order: str) -> tuple[tuple[int, int, int], bool]:
 
 
 def euler_to_matrix(angles: FloatArray, order: str) -> FloatArray:
-    """Return the rotation of three Euler angles, e.g. `R = Rz(c) Ry(b) Rx(a)` for "xyz".
-
-    Parameters
-    ----------
-    angles : (..., 3) [rad]
-    order : str
-        One of `EULER_ORDERS`.
-
-    Returns
-    -------
-    rotation : (..., 3, 3)
-
-    Raises
-    ------
-    DataError
-        If the order is unknown.
-    """
+    """Return the rotation of three Euler angles, e.g. `R = Rz(c) Ry(b) Rx(a)` for "xyz"."""
     axes, fixed = _moving_axes(order)
     moving = angles[..., ::-1] if fixed else angles
-    first, second, third = (
-        rotation_about_axis(moving[..., i], axis) for i, axis in enumerate(axes)
-    )
-    return first @ second @ third
+    a, b, c = (rotation_about_axis(moving[..., i], axis) for i, axis in enumerate(axes))
+    return a @ b @ c
 
 
 def matrix_to_euler(rotation: FloatArray, order: str) -> FloatArray:
@@ -108,36 +73,17 @@ def matrix_to_euler(rotation: FloatArray, order: str) -> FloatArray:
 
     With `R = Ri(a1) Rj(a2) Rk(a3)` about moving axes, a1 and a2 come from arc tangents of entries
     of R, and a3 from `Ri(a1)' R = Rj(a2) Rk(a3)`. The angles reproduce R to rounding even if the
-    middle angle makes two axes parallel; the first moving angle is zero then.
-
-    Parameters
-    ----------
-    rotation : (..., 3, 3)
-    order : str
-        One of `EULER_ORDERS`.
-
-    Returns
-    -------
-    angles : (..., 3) [rad]
-        First and last in (-pi, pi]; the middle one in [-pi/2, pi/2] (three letters) or [0, pi]
-        (first letter repeated).
-
-    Raises
-    ------
-    DataError
-        If the order is unknown.
+    middle angle makes two axes parallel; the first moving angle is zero then. First and last angle
+    are in (-pi, pi], the middle one in [-pi/2, pi/2] (three letters) or [0, pi] (first letter
+    repeated).
     """
     (i, j, last), fixed = _moving_axes(order)
     k = 3 - i - j
     sign = 1.0 if (j - i) % 3 == 1 else -1.0
     if i == last:
-        sine, cosine, middle_cosine = (
-            rotation[..., j, i],
-            -sign * rotation[..., k, i],
-            rotation[..., i, i],
-        )
+        sine, cosine = rotation[..., j, i], -sign * rotation[..., k, i]
         regular = np.hypot(sine, cosine)
-        second = np.arctan2(regular, middle_cosine)
+        second = np.arctan2(regular, rotation[..., i, i])
     else:
         sine, cosine = -sign * rotation[..., j, k], rotation[..., k, k]
         regular = np.hypot(sine, cosine)
@@ -154,36 +100,31 @@ def matrix_to_euler(rotation: FloatArray, order: str) -> FloatArray:
 
 
 def euler_rates(angles: FloatArray, order: str) -> FloatArray:
-    """Return E with `omega = E d(angles)`, omega in the axes that the rotation maps to.
+    """Return E (..., 3, 3) with `omega = E d(angles)`, omega in the axes that the rotation maps to.
 
     About moving axes the columns are `ei`, `Ri(a1) ej`, `Ri(a1) Rj(a2) ek`. Singular if two axes
     are parallel.
-
-    Parameters
-    ----------
-    angles : (..., 3) [rad]
-    order : str
-        One of `EULER_ORDERS`.
-
-    Returns
-    -------
-    rates : (..., 3, 3)
-
-    Raises
-    ------
-    DataError
-        If the order is unknown.
     """
     (i, j, last), fixed = _moving_axes(order)
     moving = angles[..., ::-1] if fixed else angles
     turned = rotation_about_axis(moving[..., 0], i)
     both = turned @ rotation_about_axis(moving[..., 1], j)
-    columns = [
-        np.broadcast_to(np.eye(3)[i], turned.shape[:-1]),
-        turned[..., :, j],
-        both[..., :, last],
-    ]
+    first = np.broadcast_to(np.eye(3)[i], turned.shape[:-1])
+    columns = [first, turned[..., :, j], both[..., :, last]]
     return np.stack(columns[::-1] if fixed else columns, axis=-1)
+
+
+def euler_rates_inverse(angles: FloatArray, order: str) -> FloatArray:
+    """Return the inverse of `euler_rates`, `d(angles) = E^-1 omega`; huge if two axes are parallel.
+
+    The rows are cross products of the columns of E over its determinant, +-cos(a2) or +-sin(a2).
+    """
+    rates = euler_rates(angles, order)
+    first, second, third = (rates[..., :, i] for i in range(3))
+    rows = np.stack(
+        [np.cross(second, third), np.cross(third, first), np.cross(first, second)], axis=-2
+    )
+    return rows / _nonzero(np.sum(rows[..., 0, :] * first, axis=-1))[..., None, None]
 
 
 def _nonzero(divisor: FloatArray) -> FloatArray:
@@ -197,18 +138,7 @@ def tilt_torsion_to_matrix(
     """Return the rotation of azimuth, tilt and torsion: `R = Rz(phi) Ry(theta) Rz(psi - phi)`.
 
     The platform normal leans by theta towards the azimuth phi; psi rotates about the normal.
-
-    Parameters
-    ----------
-    phi, theta, psi : (...) [rad]
-
-    Returns
-    -------
-    rotation : (..., 3, 3)
-
-    References
-    ----------
-    I. A. Bonev, J. Ryu, "A new approach to orientation workspace analysis of 6-DOF parallel
+    Source: I. A. Bonev, J. Ryu, "A new approach to orientation workspace analysis of 6-DOF parallel
     manipulators", DOI 10.1016/S0094-114X(00)00032-X.
     """
     return (
@@ -221,65 +151,21 @@ def tilt_torsion_to_matrix(
 def matrix_to_tilt_torsion(rotation: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return azimuth, tilt and torsion of a rotation, the inverse of `tilt_torsion_to_matrix`.
 
-    At zero tilt phi is undefined and returned as zero; psi is defined.
-
-    Parameters
-    ----------
-    rotation : (..., 3, 3)
-
-    Returns
-    -------
-    phi, theta, psi : (...) [rad]
-        phi and psi in (-pi, pi], theta in [0, pi].
+    phi and psi are in (-pi, pi], theta in [0, pi]. At zero tilt phi is undefined and returned as
+    zero; psi is defined.
     """
     angles = matrix_to_euler(rotation, "ZYZ")
     phi, theta = angles[..., 0], angles[..., 1]
     return phi, theta, wrap_angle(phi + angles[..., 2])
 
 
-def euler_rates_inverse(angles: FloatArray, order: str) -> FloatArray:
-    """Return the inverse of `euler_rates`, `d(angles) = E^-1 omega`; huge if two axes are parallel.
-
-    The rows are cross products of the columns of E over its determinant, +-cos(a2) or +-sin(a2).
-
-    Parameters
-    ----------
-    angles : (..., 3) [rad]
-    order : str
-        One of `EULER_ORDERS`.
-
-    Returns
-    -------
-    inverse : (..., 3, 3)
-
-    Raises
-    ------
-    DataError
-        If the order is unknown.
-    """
-    rates = euler_rates(angles, order)
-    first, second, third = (rates[..., :, i] for i in range(3))
-    rows = np.stack(
-        [np.cross(second, third), np.cross(third, first), np.cross(first, second)], axis=-2
-    )
-    return rows / _nonzero(np.sum(rows[..., 0, :] * first, axis=-1))[..., None, None]
-
-
 def tilt_torsion_rates(
     phi: FloatArray | float, theta: FloatArray | float, psi: FloatArray | float
 ) -> FloatArray:
-    """Return E with `omega = E d(phi, theta, psi)`; singular at zero tilt.
+    """Return E (..., 3, 3) with `omega = E d(phi, theta, psi)`; singular at zero tilt.
 
-    Its columns are `ez - R ez`, `Rz(phi) ey`, `R ez`.
-
-    Parameters
-    ----------
-    phi, theta, psi : (...) [rad]
-        psi has no effect, since the torsion comes first; it makes all rates have equal arguments.
-
-    Returns
-    -------
-    rates : (..., 3, 3)
+    Its columns are `ez - R ez`, `Rz(phi) ey`, `R ez`. psi has no effect, since the torsion comes
+    first; it makes all rates have equal arguments.
     """
     cphi, sphi, ctheta, stheta = np.cos(phi), np.sin(phi), np.cos(theta), np.sin(theta)
     nx, ny, nz = cphi * stheta, sphi * stheta, ctheta + 0.0 * psi
@@ -294,15 +180,6 @@ def tilt_torsion_rates_inverse(
     With the normal n and its derivative e in theta, which with `Rz(phi) ey` are three orthogonal
     directions: `dphi = -e . omega / sin(theta)`, `dtheta = Rz(phi) ey . omega`, `dpsi = (n -
     tan(theta/2) e) . omega`. The first row alone is huge at zero tilt.
-
-    Parameters
-    ----------
-    phi, theta, psi : (...) [rad]
-        psi has no effect, as in `tilt_torsion_rates`.
-
-    Returns
-    -------
-    inverse : (..., 3, 3)
     """
     cphi, sphi, ctheta, stheta = np.cos(phi), np.sin(phi), np.cos(theta), np.sin(theta)
     half = np.tan(0.5 * theta) + 0.0 * psi

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rotations: exponential, logarithm, their derivatives, and quaternions.
 
-All functions work elementwise over leading axes. Half angles and the offset `_TINY` keep each
-formula free of 0/0, so that one expression is valid from zero to pi, without branches or series.
+All functions work elementwise over leading axes: vectors are (..., 3), rotation vectors in rad,
+rotations (..., 3, 3), quaternions (..., 4) with the scalar first. Half angles and the offset
+`_TINY` keep each formula free of 0/0, so that one expression is valid from zero to pi, without
+branches or series.
 """
 
 import numpy as np
@@ -15,17 +17,7 @@ _TINY = 1e-200
 
 
 def stack_matrix(rows: tuple[tuple[FloatArray | float, ...], ...]) -> FloatArray:
-    """Stack entries of equal shape (...) row by row into matrices.
-
-    Parameters
-    ----------
-    rows : nested tuple, a rows of b entries
-        Each entry (...); entries broadcast against each other.
-
-    Returns
-    -------
-    stacked : (..., a, b)
-    """
+    """Stack a rows of b entries, which broadcast against each other, into matrices (..., a, b)."""
     shape = np.broadcast_shapes(*{np.shape(entry) for row in rows for entry in row})
     stacked = np.empty((*shape, len(rows), len(rows[0])))
     for i, row in enumerate(rows):
@@ -35,16 +27,7 @@ def stack_matrix(rows: tuple[tuple[FloatArray | float, ...], ...]) -> FloatArray
 
 
 def hat(vector: FloatArray) -> FloatArray:
-    """Return the skew matrix of a vector: `hat(a) @ b = a x b`.
-
-    Parameters
-    ----------
-    vector : (..., 3)
-
-    Returns
-    -------
-    skew : (..., 3, 3), same unit
-    """
+    """Return the skew matrices (..., 3, 3) of vectors: `hat(a) @ b = a x b`."""
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
     return stack_matrix(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
 
@@ -78,14 +61,6 @@ def exp_so3(vector: FloatArray) -> FloatArray:
 
     `exp(w) = I + (sin t / t) hat(w) + (1 - cos t) / t^2 hat(w)^2`, `t = |w|`; the last factor is
     computed as `(sin(t/2) / (t/2))^2 / 2`, which does not cancel.
-
-    Parameters
-    ----------
-    vector : (..., 3) [rad]
-
-    Returns
-    -------
-    rotation : (..., 3, 3)
     """
     angle, _ = _angle(vector)
     half = np.sin(0.5 * angle) / (0.5 * angle)
@@ -97,14 +72,6 @@ def log_so3(rotation: FloatArray) -> FloatArray:
 
     With the quaternion `(w, v)`, `log = 2 atan2(|v|, w) v / |v|` is as accurate near pi as near
     zero. At exactly pi both signs of the axis are correct; one of them is returned.
-
-    Parameters
-    ----------
-    rotation : (..., 3, 3)
-
-    Returns
-    -------
-    vector : (..., 3) [rad]
     """
     quaternion = matrix_to_quaternion(rotation)
     vector = quaternion[..., 1:]
@@ -113,18 +80,10 @@ def log_so3(rotation: FloatArray) -> FloatArray:
 
 
 def left_jacobian_so3(vector: FloatArray) -> FloatArray:
-    """Return the derivative of the exponential.
+    """Return the derivative (..., 3, 3) of the exponential.
 
     To first order in `d`, `exp(w + d) = exp(J(w) d) exp(w)` with
     `J(w) = I + (1 - cos t) / t^2 hat(w) + (1 - sin t / t) / t^2 hat(w)^2`.
-
-    Parameters
-    ----------
-    vector : (..., 3) [rad]
-
-    Returns
-    -------
-    jacobian : (..., 3, 3)
     """
     angle, square = _angle(vector)
     half = np.sin(0.5 * angle) / (0.5 * angle)
@@ -132,18 +91,10 @@ def left_jacobian_so3(vector: FloatArray) -> FloatArray:
 
 
 def left_jacobian_inverse_so3(vector: FloatArray) -> FloatArray:
-    """Return the derivative of the logarithm.
+    """Return the derivative (..., 3, 3) of the logarithm.
 
     To first order in `d`, `log(exp(d) R) = log(R) + J^-1(log R) d` with
     `J^-1(w) = I - hat(w) / 2 + (1 - (t/2) cot(t/2)) / t^2 hat(w)^2`, regular for t < 2 pi.
-
-    Parameters
-    ----------
-    vector : (..., 3) [rad]
-
-    Returns
-    -------
-    inverse : (..., 3, 3)
     """
     angle, square = _angle(vector)
     half = 0.5 * angle
@@ -151,17 +102,7 @@ def left_jacobian_inverse_so3(vector: FloatArray) -> FloatArray:
 
 
 def quaternion_to_matrix(quaternion: FloatArray) -> FloatArray:
-    """Return the rotation of a quaternion; the quaternion is normalized first.
-
-    Parameters
-    ----------
-    quaternion : (..., 4)
-        Scalar first, any length but zero.
-
-    Returns
-    -------
-    rotation : (..., 3, 3)
-    """
+    """Return the rotation of a quaternion of any length but zero."""
     scale = np.sqrt(2.0 / np.sum(quaternion * quaternion, axis=-1))
     w, x, y, z = (scale * quaternion[..., i] for i in range(4))
     return stack_matrix(
@@ -174,22 +115,11 @@ def quaternion_to_matrix(quaternion: FloatArray) -> FloatArray:
 
 
 def matrix_to_quaternion(rotation: FloatArray) -> FloatArray:
-    """Return the unit quaternion of a rotation, scalar first and not negative.
+    """Return the unit quaternion of a rotation, its scalar not negative.
 
     The entries of `4 q q'` are sums of entries of R. The row with the largest diagonal is `q` times
-    a number that is never small; normalizing it gives `q`.
-
-    Parameters
-    ----------
-    rotation : (..., 3, 3)
-
-    Returns
-    -------
-    quaternion : (..., 4)
-
-    References
-    ----------
-    S. W. Shepperd, "Quaternion from rotation matrix", DOI 10.2514/3.55767b.
+    a number that is never small; normalizing it gives `q`. Source: S. W. Shepperd, "Quaternion from
+    rotation matrix", DOI 10.2514/3.55767b.
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (
         tuple(rotation[..., i, j] for j in range(3)) for i in range(3)
@@ -208,29 +138,26 @@ def matrix_to_quaternion(rotation: FloatArray) -> FloatArray:
     second = diagonal[2] >= diagonal[3]
     lower = np.maximum(diagonal[0], diagonal[1]) >= np.maximum(diagonal[2], diagonal[3])
     chosen = [
-        np.where(
-            lower, np.where(first, rows[0][j], rows[1][j]), np.where(second, rows[2][j], rows[3][j])
-        )
-        for j in range(4)
+        np.where(lower, np.where(first, a, b), np.where(second, c, d))
+        for a, b, c, d in zip(*rows, strict=True)
     ]
     scale = np.where(chosen[0] < 0.0, -1.0, 1.0) / np.sqrt(sum(entry * entry for entry in chosen))
     return np.stack([scale * entry for entry in chosen], axis=-1)
 
 
-def project_to_rotation(matrix: FloatArray) -> tuple[FloatArray, float]:
-    """Return the rotation nearest to a matrix, and how far the matrix is from a rotation.
+def measure_rotation_error(matrix: FloatArray) -> FloatArray:
+    """Return how far matrices (..., 3, 3) are from rotations, (...).
 
-    With the singular value decomposition M = U S V', the nearest rotation is U V' (Frobenius norm).
-
-    Parameters
-    ----------
-    matrix : (3, 3)
-
-    Returns
-    -------
-    rotation : (3, 3)
-    error : largest entry of |M M' - 1|; infinite for a reflection.
+    It is the largest entry of `|M M' - 1|`, infinite for a reflection.
     """
-    error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
-    U, _, Vt = np.linalg.svd(matrix)
-    return U @ Vt, float("inf") if np.linalg.det(matrix) < 0.0 else error
+    error = np.abs(matrix @ np.swapaxes(matrix, -1, -2) - np.eye(3)).max(axis=(-1, -2))
+    volume = np.sum(np.cross(matrix[..., 0], matrix[..., 1]) * matrix[..., 2], axis=-1)
+    return np.where(volume < 0.0, np.inf, error)
+
+
+def project_to_rotations(matrix: FloatArray) -> FloatArray:
+    """Return the rotations nearest to matrices (..., 3, 3) in the Frobenius norm."""
+    U, _, V = np.linalg.svd(matrix)
+    sign = np.ones(matrix.shape[:-1])
+    sign[..., 2] = np.sign(np.linalg.det(U @ V))
+    return (U * sign[..., None, :]) @ V

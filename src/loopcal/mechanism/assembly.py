@@ -16,7 +16,7 @@ from loopcal.errors import MechanismError
 from loopcal.mechanism.platform_coordinates import COORDINATES, check_coordinates
 from loopcal.parameters import Parameter
 from loopcal.typing import FloatArray
-from loopcal.units import Dimension
+from loopcal.units import SI_SYMBOLS, Dimension
 
 AXES = ("rx", "ry", "rz", "x", "y", "z")
 """Axes of a displacement in a link's own frame. `pitch` and `length` can be displaced too."""
@@ -57,6 +57,11 @@ class Joint:
     pitch: float = 0.0
     start: float = 0.0
     limits: tuple[float, float] | None = None
+
+    @property
+    def dimension(self) -> Dimension:
+        """Dimension of its value."""
+        return Dimension.ANGLE if self.kind == "R" else Dimension.LENGTH
 
 
 @dataclass(frozen=True)
@@ -280,19 +285,15 @@ def _check_freedoms(assembly: Assembly) -> None:
 
 def _check_ranges(assembly: Assembly) -> None:
     """Refuse strokes and limits whose low end is not below the high one."""
-    units = {Dimension.LENGTH: "m", Dimension.ANGLE: "rad"}
-    ranges = [
-        (f"stroke of {a.name} runs", a.stroke, units.get(a.dimension, ""))
-        for a in assembly.actuators
+    ranges = [(f"stroke of {a.name} runs", a.stroke, a.dimension) for a in assembly.actuators]
+    ranges += [
+        (f"limits of {limb.name}.{joint.name} run", joint.limits, joint.dimension)
+        for limb in assembly.limbs
+        for joint in limb.joints
     ]
-    for limb in assembly.limbs:
-        ranges += [
-            (f"limits of {limb.name}.{j.name} run", j.limits, "rad" if j.kind == "R" else "m")
-            for j in limb.joints
-        ]
-    for what, bounds, symbol in ranges:
+    for what, bounds, dimension in ranges:
         if bounds and not bounds[0] < bounds[1]:
             raise MechanismError(
-                f"the {what} from {bounds[0]:g} to {bounds[1]:g} {symbol}; the first value must be "
-                "smaller"
+                f"the {what} from {bounds[0]:g} to {bounds[1]:g} {SI_SYMBOLS[dimension]}; the "
+                "first value must be smaller"
             )

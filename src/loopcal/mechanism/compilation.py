@@ -26,13 +26,12 @@ from loopcal.mechanism.states import make_start
 from loopcal.mechanism.transmission import TERMS, harmonic_frequencies, nominal_terms
 from loopcal.parameters import ParameterTable
 from loopcal.typing import IntArray
-from loopcal.units import Dimension
+from loopcal.units import DISPLAY_UNITS, SI_SYMBOLS, Dimension
 
 DEFAULT_SIZE = 1.0
 """Characteristic length [m] of a mechanism whose lengths are all zero (a spherical one)."""
 POINT = 1e-9
 """Ratio of size and longest link below which all limbs begin and end in one point."""
-DEFAULT_UNITS = {Dimension.LENGTH: "mm", Dimension.ANGLE: "deg", Dimension.RATIO: "1"}
 
 
 def build(
@@ -76,7 +75,7 @@ def build(
         _map_slots(assembly, table, places, count),
         size,
         guess,
-        {**DEFAULT_UNITS, **(units or {})},
+        {d: unit.symbol for d, unit in DISPLAY_UNITS.items()} | dict(units or {}),
         tuple(_report_locked(assembly.limbs[i], j) for i in sorted(idle) for j in idle[i]),
         record,
     )
@@ -259,8 +258,8 @@ def _weigh_actuators(
 def _report_locked(limb: Limb, place: int) -> Finding:
     """Return the finding of a joint that moves nothing but its limb."""
     joint = limb.joints[place]
-    turns = joint.kind == "R"
-    value = Quantity(joint.start, "rad" if turns else "m")
+    turns = joint.dimension is Dimension.ANGLE
+    value = Quantity(joint.start, SI_SYMBOLS[joint.dimension])
     return report_finding(
         "mechanism.locked-joint", limb=limb.name, joint=joint.name, turns=turns, value=value
     )

@@ -34,7 +34,7 @@ from loopcal.mechanism.sensitivity import (
 )
 from loopcal.mechanism.states import Status, select_poses
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.units import Dimension
+from loopcal.units import SI_SYMBOLS
 
 COMPROMISE = 1e-9
 """Residual [m] of a converged row above which its redundant readings contradict each other."""
@@ -254,14 +254,13 @@ def jacobian(robot: Mechanism, readings: ArrayLike, start: Solution | None = Non
     solution = forward(robot, readings, start)
     values = robot.values[None]
     derivatives = differentiate_pose(robot, values, solution.q[None], solution.state)
-    units = {Dimension.LENGTH: "m", Dimension.ANGLE: "rad", Dimension.RATIO: "1"}
     return Jacobian(
         derivatives.parameters[0],
         robot.parameters.names,
-        tuple(units[d] for d in robot.parameters.dimensions),
+        tuple(SI_SYMBOLS[d] for d in robot.parameters.dimensions),
         derivatives.readings[0],
         tuple(a.name for a in robot.actuators),
-        tuple(units[a.dimension] for a in robot.actuators),
+        tuple(SI_SYMBOLS[a.dimension] for a in robot.actuators),
         solution,
     )
 
@@ -357,18 +356,16 @@ def _describe_argument(value: object) -> str:
 
 def _check_poses(T: FloatArray) -> None:
     """Refuse matrices that are not poses: name the first bad row and the reason."""
-    R = T[:, :3, :3]
-    finite = np.asarray(np.isfinite(T).all(axis=(1, 2)))
-    orthogonal = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2)) <= ROTATION
-    proper = orthogonal & (np.linalg.det(np.where(finite[:, None, None], R, np.eye(3))) > 0)
-    bottom = np.abs(T[:, 3] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=1) <= ROTATION
     # a row of NaN is marked in the solution, like readings that are NaN
-    wrong = np.flatnonzero(finite & ~(proper & bottom))
+    with np.errstate(invalid="ignore"):
+        bent = geometry.measure_rotation_error(T[:, :3, :3]) > ROTATION
+        bottom = np.abs(T[:, 3] - np.eye(4)[3]).max(axis=1) > ROTATION
+    wrong = np.flatnonzero(np.isfinite(T).all(axis=(1, 2)) & (bent | bottom))
     if len(wrong):
         row = int(wrong[0])
         reason = (
             "its last row is not 0 0 0 1"
-            if not bottom[row]
+            if bottom[row]
             else "its upper left 3 x 3 is not a rotation (R'R = I, det +1)"
         )
         raise DataError(

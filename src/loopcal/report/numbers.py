@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
+from loopcal.units import Dimension, Unit, find_unit
 
 if TYPE_CHECKING:
     from loopcal.mechanism import Mechanism
@@ -23,8 +23,7 @@ ABSENT = "-"
 
 def units_of(robot: Mechanism) -> dict[Dimension, Unit]:
     """Return the units in which the numbers of a robot are shown: those of its file."""
-    stated = {dimension: find_unit(symbol) for dimension, symbol in robot.units.items()}
-    return {**DISPLAY_UNITS, **stated}
+    return {dimension: find_unit(symbol) for dimension, symbol in robot.units.items()}
 
 
 def format_number(value: float, digits: int = 6) -> str:

@@ -23,7 +23,7 @@ from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.parameters import Parameter, ParameterTable
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import DISPLAY_UNITS, find_unit
+from loopcal.units import find_unit
 
 SMALLEST_EFFECT = 1e-7
 """Share of all that the machine does to a nuisance parameter below which a direction does not move
@@ -189,5 +189,5 @@ def _owners(names: Iterable[str]) -> list[str]:
 
 def _display_unit(robot: Mechanism, entry: Parameter) -> tuple[float, str]:
     """Return factor to SI and symbol of the unit in which a parameter is shown."""
-    symbol = robot.units.get(entry.dimension, DISPLAY_UNITS[entry.dimension].symbol)
+    symbol = robot.units[entry.dimension]
     return find_unit(symbol).factor_to_si, symbol

@@ -21,7 +21,7 @@ from loopcal.geometry import wrap_angle
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism, inverse
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import DISPLAY_UNITS, Dimension, find_unit
+from loopcal.units import Dimension, find_unit
 
 SAME_READING = 1e-6
 """Difference of readings, as a share of the robot's size or in radians, up to which they are the
@@ -167,7 +167,7 @@ def _describe_readings(
     described = []
     for pose, column in np.argwhere(chosen):
         actuator = robot.actuators[column]
-        symbol = robot.units.get(actuator.dimension, DISPLAY_UNITS[actuator.dimension].symbol)
+        symbol = robot.units[actuator.dimension]
         value = poses.readings[pose, column] / find_unit(symbol).factor_to_si
         described.append(
             {

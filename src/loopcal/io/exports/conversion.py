@@ -288,9 +288,11 @@ def _to_quaternion(cells: Sequence[str]) -> Row:
         if any(cells):
             raise Misfit("part of the rotation matrix is missing")
         return dict.fromkeys(QUATERNION, "")
-    R, error = geometry.project_to_rotation(np.array([float(c) for c in cells]).reshape(3, 3))
+    matrix = np.array([float(c) for c in cells]).reshape(3, 3)
+    error = float(geometry.measure_rotation_error(matrix))
     if error > ROTATION_ERROR:
         raise Misfit(f"the nine numbers are not a rotation matrix (error {error:.2g})")
+    R = geometry.project_to_rotations(matrix)
     quaternion = (repr(float(q)) for q in geometry.matrix_to_quaternion(R))
     return dict(zip(QUATERNION, quaternion, strict=True))
 

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from loopcal.engine import State
 from loopcal.errors import MechanismError
-from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.mechanism.batch_kinematics import compute_closure_sign
 from loopcal.mechanism.kinematics import Solution, inverse
 from loopcal.mechanism.model import Mechanism
 from loopcal.mechanism.states import compute_limb_frames
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import Dimension, find_unit
+from loopcal.units import Dimension
 
 MIN_DRAWS = 2000
 """Positions drawn before a workspace is called empty."""
@@ -63,9 +63,8 @@ def evaluate_limits(
             limb = robot.assembly.limbs[i]
             for j, joint in enumerate(limb.joints):
                 if joint.limits is not None:
-                    dimension = Dimension.ANGLE if joint.kind == "R" else Dimension.LENGTH
                     name, value = f"{limb.name}.{joint.name}", joints[:, :, k, j]
-                    limits.append(Limit(name, dimension, *joint.limits, value))
+                    limits.append(Limit(name, joint.dimension, *joint.limits, value))
     if any(limb.cones for limb in robot.assembly.limbs):
         limits += _evaluate_cones(robot, values, state)
     return tuple(limits)
@@ -91,10 +90,8 @@ def check_limits(
 
 def _report_exceeded(robot: Mechanism, limit: Limit, reached: float) -> Finding:
     """Return the finding of an exceeded limit, in the robot's display unit."""
-    unit = find_unit(robot.units[limit.dimension])
     value, low, high = (
-        Quantity(number / unit.factor_to_si, unit.symbol)
-        for number in (reached, limit.low, limit.high)
+        robot.to_quantity(number, limit.dimension) for number in (reached, limit.low, limit.high)
     )
     return report_finding("limits.exceeded", name=limit.name, value=value, low=low, high=high)
 

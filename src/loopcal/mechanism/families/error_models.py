@@ -155,7 +155,7 @@ def complete_errors(limb: PlacedLimb, spread: ErrorTolerances, offsets: bool = T
 
     for joint in limb.limb.joints:
         add_displacements(joint.name, KEPT_AXES[joint.kind])
-        add_offset(joint.actuator, Dimension.ANGLE if joint.kind == "R" else Dimension.LENGTH)
+        add_offset(joint.actuator, joint.dimension)
     if limb.limb.ending != "rigid":
         add_displacements(limb.limb.links[-1].name, AXES[3:])
     add_displacements("platform", AXES if limb.limb.ending == "rigid" else AXES[3:])
