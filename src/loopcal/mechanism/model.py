@@ -18,7 +18,7 @@ from loopcal.mechanism.assembly import Actuator, Assembly, SharedMap
 from loopcal.mechanism.transmission import TERMS
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.units import DISPLAY_UNITS, Dimension, Unit, find_unit
+from loopcal.units import Dimension, Unit, find_unit
 
 SHOWN_ACTUATORS = 8
 """Actuators that `repr` names before it counts the others."""
@@ -124,7 +124,7 @@ class Mechanism:
     program, slots : structure and parameter maps for the engine.
     size : characteristic length [m]; an angle times the size compares with a length.
     home_state : engine state of the home pose.
-    units : display unit of each dimension, as the robot file states them.
+    units : symbol of the display unit of every dimension.
     findings : remarks about the structure, such as locked joints or redundant constraints.
     """
 
@@ -171,8 +171,7 @@ class Mechanism:
 
     def get_unit(self, dimension: Dimension) -> Unit:
         """Return the unit in which values are shown: that of the robot file, or the usual one."""
-        symbol = self.units.get(dimension)
-        return DISPLAY_UNITS[dimension] if symbol is None else find_unit(symbol)
+        return find_unit(self.units[dimension])
 
     def to_quantity(self, value: float, dimension: Dimension) -> Quantity:
         """Return a value [SI] in the unit in which it is shown."""
