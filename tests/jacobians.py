@@ -204,19 +204,31 @@ def under_jax(package: str = "loopcal") -> Iterator[None]:
     at the end.
 
     What does not depend on the traced unknowns stays with numpy: it needs no derivative and no
-    compiling.
+    compiling. `stack_matrix` writes into an array, which jax does not allow, so it is replaced too.
     """
     import jax.numpy
+
+    from loopcal.geometry.rotations import stack_matrix
+
+    def stack(rows: tuple[tuple[ArrayLike, ...], ...]) -> ArrayLike:
+        entries = jax.numpy.broadcast_arrays(*(entry for row in rows for entry in row))
+        shape = (*entries[0].shape, len(rows), len(rows[0]))
+        return jax.numpy.stack(entries, axis=-1).reshape(shape)
 
     modules = [
         module
         for name, module in list(sys.modules.items())
         if (name == package or name.startswith(package + ".")) and getattr(module, "np", None) is np
     ]
+    stacking = [module for module in modules if hasattr(module, "stack_matrix")]
     for module in modules:
         vars(module)["np"] = _Either(np, jax.numpy)
+    for module in stacking:
+        vars(module)["stack_matrix"] = stack
     try:
         yield
     finally:
         for module in modules:
             vars(module)["np"] = np
+        for module in stacking:
+            vars(module)["stack_matrix"] = stack_matrix

@@ -30,7 +30,7 @@ from loopcal.io.core.records import read_record
 from loopcal.io.core.yaml_file import Location, YamlFile, refuse_unknown_keys
 from loopcal.mechanism import PoseRecord
 from loopcal.typing import FloatArray
-from loopcal.units import DISPLAY_UNITS, EXAMPLES, Dimension
+from loopcal.units import DISPLAY_UNITS, EXAMPLES, SI_SYMBOLS, Dimension
 
 if TYPE_CHECKING:
     from loopcal.measure import Kind
@@ -41,7 +41,6 @@ NOISE_UNITS = {
     Dimension.ANGLE: ("urad", 1e-6),
     Dimension.RATIO: ("1", 1.0),
 }
-SI_SYMBOLS = {Dimension.LENGTH: "m", Dimension.ANGLE: "rad", Dimension.RATIO: "1"}
 LENGTHS = Annotated[list[Any] | None, Dimension.LENGTH]
 LENGTH = Annotated[float | None, Dimension.LENGTH]
 NUMBERS = Annotated[list[Any] | None, Dimension.RATIO]
