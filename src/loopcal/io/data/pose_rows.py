@@ -57,15 +57,15 @@ class _FilePoses:
     """The poses of one file.
 
     `names` of each row; `first` row of each pose; `readings` and `sigma` (rows, a), NaN where a row
-    states none, None without such columns; `read` are the poses with readings in this file,
-    `unread` those whose readings were not taken.
+    states none; `read` are the poses with readings in this file, `unread` those whose readings were
+    not taken.
     """
 
     table: Table
     names: tuple[str, ...]
     first: dict[str, int]
-    readings: FloatArray | None
-    sigma: FloatArray | None
+    readings: FloatArray
+    sigma: FloatArray
     read: frozenset[str]
     unread: frozenset[str]
 
@@ -91,7 +91,7 @@ def read_pose_rows(tables: Sequence[Table], robot: Mechanism) -> PoseRows:
                 k, other_row = origin.setdefault(name, (i, row))
                 if (k, other_row) != (i, row):
                     _refuse_contradiction(file, row, files[k], other_row)
-            elif name not in read and file.readings is not None:
+            elif name not in read and has_readings(file.table, robot):
                 sentence = f"pose {name!r} has no readings in any file; add them in one"
                 raise file.table.row_error(row, sentence)
     if not origin:
@@ -101,7 +101,12 @@ def read_pose_rows(tables: Sequence[Table], robot: Mechanism) -> PoseRows:
         tuple(_find_members(file.table, row, cell, index) for row, cell in enumerate(file.names))
         for file in files
     )
-    readings, sigma = _gather(files, list(origin.values()), robot)
+    readings = np.stack([files[i].readings[row] for i, row in origin.values()])
+    sigma = None
+    if any(states_reading_noise(table, robot) for table in tables):
+        stated = np.stack([files[i].sigma[row] for i, row in origin.values()])
+        usual = [actuator.sigma or 0.0 for actuator in robot.actuators]
+        sigma = np.where(np.isnan(stated), usual, stated)
     return PoseRows(tuple(origin), readings, sigma, _number_blocks(files, list(origin)), members)
 
 
@@ -113,13 +118,16 @@ def has_readings(table: Table, robot: Mechanism) -> bool:
 
 def _read_file(table: Table, robot: Mechanism, several: bool) -> _FilePoses:
     """Read the poses of one file."""
+    from loopcal.measure import solve_commanded_readings
+
     if several and "pose" not in table.units:
         sentence = "files are joined by the names of poses, and this file names none"
         raise table.header_error(f"{sentence}; add a column 'pose'")
     names = TextColumn("pose").parse(table) if "pose" in table.units else table.pose_names()
     first = _find_first_rows(table, names)
+    blank = np.full((len(names), len(robot.actuators)), np.nan)
     if several and not has_readings(table, robot):
-        return _FilePoses(table, names, first, None, None, frozenset(), frozenset())
+        return _FilePoses(table, names, first, blank, blank, frozenset(), frozenset())
     controller = _load_controller(table, robot)
     columns = _reading_columns(table, robot, controller)
     rows = np.column_stack([column.parse(table) for column in columns])
@@ -144,8 +152,12 @@ def _read_file(table: Table, robot: Mechanism, several: bool) -> _FilePoses:
     unread = frozenset(name for name, row in first.items() if absent[row].all())
     read = frozenset(first) - unread
     if controller is not None:
-        chosen = {row: name for name, row in first.items() if name in read}
-        rows = _solve_commanded(table, controller, robot, rows, chosen)
+        chosen = [first[name] for name in first if name in read]
+        if chosen:
+            poses = tuple(names[row] for row in chosen)
+            with name_files(table.path):
+                blank[chosen] = solve_commanded_readings(controller, rows[chosen], poses)
+        rows = blank
     sigma = read_reading_sigma(table, robot, rows)
     return _FilePoses(
         table, names, first, rows, sigma, read, unread if may_be_absent else frozenset()
@@ -208,35 +220,16 @@ def _load_controller(table: Table, robot: Mechanism) -> Mechanism | None:
     return load_robot(beside if beside.exists() else str(name))
 
 
-def _solve_commanded(
-    table: Table,
-    controller: Mechanism,
-    robot: Mechanism,
-    coordinates: FloatArray,
-    rows: Mapping[int, str],
-) -> FloatArray:
-    """Return readings (rows, a) of the commanded coordinates (rows, c) of `rows`: row -> pose."""
-    from loopcal.measure import solve_commanded_readings
-
-    readings = np.full((len(coordinates), len(robot.actuators)), np.nan)
-    if rows:
-        given, names = coordinates[list(rows)], tuple(rows.values())
-        with name_files(table.path):
-            readings[list(rows)] = solve_commanded_readings(controller, given, names)
-    return readings
-
-
 def states_reading_noise(table: Table, robot: Mechanism) -> bool:
     """Return whether a file states the noise of its readings."""
     names = (SIGMA + actuator.name for actuator in robot.actuators)
     return READING_NOISE in table.settings.content or any(name in table.units for name in names)
 
 
-def read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) -> FloatArray | None:
+def read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) -> FloatArray:
     """Return the standard deviations (rows, a) [SI] of readings (rows, a).
 
-    They are NaN where the file states none for a reading, and infinite where it was not taken; None
-    where the file states none at all.
+    They are NaN where the file states none for a reading, and infinite where it was not taken.
 
     Raises
     ------
@@ -244,8 +237,6 @@ def read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) -> 
         An unknown actuator, a missing or wrong unit, a negative number, or an empty cell where no
         setting and no robot file states the noise.
     """
-    if not states_reading_noise(table, robot):
-        return None
     stated = _read_setting(table, robot)
     usual = [stated.get(actuator.name, np.nan) for actuator in robot.actuators]
     sigma = np.tile(usual, (len(readings), 1))
@@ -287,13 +278,10 @@ def _read_setting(table: Table, robot: Mechanism) -> dict[str, float]:
 
 def _refuse_contradiction(file: _FilePoses, row: int, other: _FilePoses, other_row: int) -> None:
     """Raise FileError where two files state different readings, or sigmas, of one pose."""
-    for what, here, there in (
-        ("readings", file.readings, other.readings),
-        ("sigma", file.sigma, other.sigma),
+    for what, a, b in (
+        ("readings", file.readings[row], other.readings[other_row]),
+        ("sigma", file.sigma[row], other.sigma[other_row]),
     ):
-        if here is None or there is None:
-            continue
-        a, b = here[row], there[other_row]
         same = np.isclose(a, b, rtol=RELATIVE_ROUNDING, atol=ABSOLUTE_ROUNDING, equal_nan=True)
         unstated = (np.isnan(a) | np.isnan(b)) & (what == "sigma")
         if not (same | unstated).all():
@@ -301,24 +289,6 @@ def _refuse_contradiction(file: _FilePoses, row: int, other: _FilePoses, other_r
             sentence = f"pose {file.names[row]!r} has other {what} here than in {place}"
             act = "correct them, or rename the pose in one of the files"
             raise file.table.row_error(row, f"{sentence}; {act}")
-
-
-def _gather(
-    files: Sequence[_FilePoses], origin: Sequence[tuple[int, int]], robot: Mechanism
-) -> tuple[FloatArray, FloatArray | None]:
-    """Return readings (n, a) and their sigma, of the robot file (else exact) where none is stated.
-
-    `origin` is file and row of each pose; sigma is None where no file states any.
-    """
-    blank = np.full(len(robot.actuators), np.nan)
-    readings = np.stack(
-        [blank if (r := files[i].readings) is None else r[row] for i, row in origin]
-    )
-    if all(file.sigma is None for file in files):
-        return readings, None
-    usual = np.array([actuator.sigma or 0.0 for actuator in robot.actuators])
-    sigma = np.stack([usual if (s := files[i].sigma) is None else s[row] for i, row in origin])
-    return readings, np.where(np.isnan(readings), np.inf, np.where(np.isnan(sigma), usual, sigma))
 
 
 def _number_blocks(files: Sequence[_FilePoses], labels: Sequence[str]) -> IntArray:
