@@ -74,31 +74,28 @@ class Table:
             return self.text("pose")
         return tuple(str(i + 1) for i in range(len(self.rows)))
 
-    def numbers(self, name: str, dimension: Dimension, empty: bool = True) -> FloatArray:
+    def numbers(
+        self, name: str, dimension: Dimension, empty: bool = True, infinite: bool = False
+    ) -> FloatArray:
         """Return a column (n,) [SI], NaN where a cell is empty.
 
         Parameters
         ----------
-        name : of the column. dimension : of its unit. empty : whether empty cells are allowed.
+        name : of the column. dimension : of its unit.
+        empty, infinite : whether empty cells, and cells `inf`, are allowed.
 
         Raises
         ------
         FileError
             No unit or one of another dimension, a cell that is not a finite number, or is empty.
         """
-        return self.scaled(name, self.factor(name, dimension), self.text(name), empty)
-
-    def scaled(
-        self, name: str, factor: float, cells: Sequence[str], empty: bool = True
-    ) -> FloatArray:
-        """Return cells (n,) of a column times `factor`; see `numbers`."""
-        values = [self.number(name, i, cell, empty) for i, cell in enumerate(cells)]
-        return np.array(
-            [
-                value if math.isnan(value) else parse_exact(cell, factor)
-                for value, cell in zip(values, cells, strict=True)
-            ]
-        )
+        factor, values = self.factor(name, dimension), []
+        for row, cell in enumerate(self.text(name)):
+            value = math.inf
+            if not infinite or cell != "inf":
+                value = self.number(name, row, cell, empty)
+            values.append(parse_exact(cell, factor) if math.isfinite(value) else value)
+        return np.array(values)
 
     def factor(self, name: str, dimension: Dimension, symbol: str | None = None) -> float:
         """Return SI per unit of a column, or of `symbol`, a factor of its unit; see `numbers`."""
@@ -112,7 +109,7 @@ class Table:
         except UnitError as error:
             raise self.header_error(f"column {name!r}: {error}") from None
 
-    def number(self, name: str, row: int, cell: str, empty: bool) -> float:
+    def number(self, name: str, row: int, cell: str, empty: bool = True) -> float:
         """Return one cell as a number, NaN for an empty one."""
         if not cell:
             if empty:

@@ -106,13 +106,7 @@ class NumberColumn(Column):
 
     def parse(self, table: Table) -> FloatArray:
         """Return the values [SI], NaN where a cell is empty."""
-        if not self.allows_infinity:
-            return table.numbers(self.name, self.dimension)
-        cells = table.text(self.name)
-        infinite = np.array([cell == "inf" for cell in cells])
-        finite = ["" if cell == "inf" else cell for cell in cells]
-        factor = table.factor(self.name, self.dimension)
-        return np.where(infinite, np.inf, table.scaled(self.name, factor, finite))
+        return table.numbers(self.name, self.dimension, infinite=self.allows_infinity)
 
     def format(self, value: Any) -> str:
         """Return a number [SI] in the unit; nothing for NaN."""
@@ -190,7 +184,7 @@ class ContextColumn(Column):
         factor, offset = self.units[symbol]
         values = np.full(len(cells), np.nan)
         for row, cell in enumerate(cells):
-            if not math.isnan(table.number(self.name, row, cell, empty=True)):
+            if not math.isnan(table.number(self.name, row, cell)):
                 values[row] = parse_exact(cell, factor) + offset
             if self.name != TIME and values[row] < ABSOLUTE_ZERO - ROUNDING:
                 sentence = f"column {self.name!r} is {cell} {symbol}, below absolute zero"
