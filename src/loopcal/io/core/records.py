@@ -14,6 +14,7 @@ import json
 import types
 import typing
 from collections.abc import Mapping
+from functools import cache
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from loopcal.errors import FileError, suggest_names
@@ -51,11 +52,11 @@ def read_record(
     ------
     FileError : the first value that does not fit, at its line.
     """
-    from pydantic import TypeAdapter, ValidationError
+    from pydantic import ValidationError
 
     scaled = _to_si(record, dict(content), file, units, location)
     try:
-        return TypeAdapter(record).validate_json(json.dumps(scaled), strict=True)
+        return _make_adapter(record).validate_json(json.dumps(scaled), strict=True)
     except ValidationError as error:
         raise _translate(error, file, content, location) from None
 
@@ -93,6 +94,14 @@ def get_field_types(record: type) -> dict[str, Any]:
     """Return key -> annotation of the fields that a record takes from a file."""
     hints = typing.get_type_hints(record, include_extras=True)
     return {_key(f.name): hints[f.name] for f in dataclasses.fields(record) if f.init}
+
+
+@cache
+def _make_adapter(record: type) -> Any:
+    """Return pydantic's reader of a record; cached, because making it takes as long as reading."""
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(record)
 
 
 def _key(name: str) -> str:

@@ -67,22 +67,22 @@ def has_measured_values(table: Table) -> bool:
     return any(key in table.settings.content for key in ("kind", "kinds"))
 
 
-def read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
+def read_kinds(table: Table, robot: Mechanism, several: bool = False) -> tuple[KindRows, ...]:
     """Return the kinds of a file, mounted on the robot's tool, with the indices of their rows.
+
+    One of `several` files may have none, and then only holds readings of poses.
 
     Raises
     ------
     FileError : settings or columns without a meaning.
     """
-    kinds = _read_kinds(table, robot)
+    if several and not has_measured_values(table):
+        refuse_unknown_keys(table.settings, list(table.settings.content), POSE_SETTINGS)
+        kinds: tuple[KindRows, ...] = ()
+    else:
+        kinds = _read_kinds(table, robot)
     refuse_unknown_columns(table, robot, [one.kind for one in kinds])
     return kinds
-
-
-def check_pose_file(table: Table, robot: Mechanism) -> None:
-    """Raise FileError for settings and columns that a file without measured values cannot have."""
-    refuse_unknown_keys(table.settings, list(table.settings.content), POSE_SETTINGS)
-    refuse_unknown_columns(table, robot, ())
 
 
 def read_observations(

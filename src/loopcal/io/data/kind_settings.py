@@ -19,6 +19,7 @@ import dataclasses
 import typing
 from collections.abc import Mapping
 from fnmatch import fnmatchcase
+from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -147,8 +148,9 @@ def format_quantity(value: float, dimension: Dimension) -> str:
     return f"{value!r} {SI_SYMBOLS[dimension]}"
 
 
+@cache
 def _make_record(kind: type[Kind]) -> type:
-    """Return a record of the settings of a kind; all of them may be left out."""
+    """Return a record of the settings of a kind (cached); all of them may be left out."""
     types = {name: _setting_type(name, a) for name, a in list_kind_settings(kind).items()}
     fields = [(name, annotation, None) for name, annotation in types.items()]
     return dataclasses.make_dataclass(f"{kind.__name__}Settings", fields, frozen=True)

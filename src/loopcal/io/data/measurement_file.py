@@ -24,13 +24,7 @@ from loopcal.findings import report_finding
 from loopcal.io.core.csv_table import Table, read_table, require_columns
 from loopcal.io.core.text_file import as_path, name_files
 from loopcal.io.data.columns import HELD_OUT, USE_COLUMN, get_dimension, read_context
-from loopcal.io.data.kind_rows import (
-    KindRows,
-    check_pose_file,
-    has_measured_values,
-    read_kinds,
-    read_observations,
-)
+from loopcal.io.data.kind_rows import KindRows, has_measured_values, read_kinds, read_observations
 from loopcal.io.data.nuisance_settings import read_known
 from loopcal.io.data.pose_rows import read_pose_rows
 from loopcal.io.robot.robot_file import check_format, require_robot
@@ -79,7 +73,7 @@ def load_measurements(
 
     require_robot(robot)
     tables = _read_tables(path)
-    kinds = [_read_kinds(table, robot, len(tables) > 1) for table in tables]
+    kinds = [read_kinds(table, robot, len(tables) > 1) for table in tables]
     if not any(kinds):
         sentence = "no file states a kind of measurement; write '# kind: ..' at the top of one"
         raise FileError(sentence, tables[0].path)
@@ -189,14 +183,6 @@ def _read_tables(path: Paths) -> tuple[Table, ...]:
         if not any(beside.samefile(other.path) for other in tables):
             tables.append(read_table(beside))
     return tuple(tables)
-
-
-def _read_kinds(table: Table, robot: Mechanism, several: bool) -> tuple[KindRows, ...]:
-    """Return the kinds of a file; none of one that only holds readings."""
-    if several and not has_measured_values(table):
-        check_pose_file(table, robot)
-        return ()
-    return read_kinds(table, robot)
 
 
 def _collect_pose_context(

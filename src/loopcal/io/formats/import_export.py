@@ -3,16 +3,16 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 
-from loopcal.errors import DataError, FileError, MechanismError
+from loopcal.errors import DataError, FileError
 from loopcal.findings import report_finding
 from loopcal.io.core.text_file import write_text
+from loopcal.io.core.yaml_file import parse_yaml
 from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.formats import FORMATS
 from loopcal.io.formats.program_format import Exported, ExportSource, Format, Imported
-from loopcal.io.robot.robot_file import load_robot
+from loopcal.io.robot.robot_file import build_robot, load_robot
 from loopcal.io.runs.run_folder import load_run_or_robot
 from loopcal.mechanism import Mechanism
 
@@ -42,13 +42,7 @@ def build_imported_robot(path: Path, imported: Imported) -> Mechanism:
     ------
     MechanismError : it cannot be built; with the name of the file that it came from.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        robot_file = Path(folder) / "robot.yaml"
-        write_text(robot_file, imported.robot_text)
-        try:
-            return load_robot(robot_file)
-        except MechanismError as error:
-            raise MechanismError(f"{path}: {str(error).removeprefix(f'{robot_file}: ')}") from error
+    return build_robot(parse_yaml(imported.robot_text, path, "robot file"))
 
 
 def save_imported(path: Path, imported: Imported, output: Path, data: Path | None) -> Mechanism:

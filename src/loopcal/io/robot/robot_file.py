@@ -72,7 +72,11 @@ def load_robot(source: str | Path) -> Mechanism:
     MechanismError : the described robot cannot be built; with its file.
     ArgumentTypeError : `source` is not a path or a name.
     """
-    file = read_yaml(find_robot_file(source), WHAT)
+    return build_robot(read_yaml(find_robot_file(source), WHAT))
+
+
+def build_robot(file: YamlFile) -> Mechanism:
+    """Build the robot that a robot file describes; raise as `load_robot`."""
     check_format(file, FORMAT)
     units = read_units(file)
     family = FAMILIES[_read_family(file, sorted(FAMILIES))]
@@ -82,9 +86,9 @@ def load_robot(source: str | Path) -> Mechanism:
         symbols = {dimension: one.symbol for dimension, one in units.items()}
         origin = RobotSource(file.path, remove_table(file), record)
         robot = build(_assemble(record, file), symbols, origin)
-    return (
-        robot.with_values(read_identified_values(file, robot)) if TABLE in file.content else robot
-    )
+    if TABLE not in file.content:
+        return robot
+    return robot.with_values(read_identified_values(file, robot))
 
 
 def save_robot(robot: Mechanism, path: str | Path, plus_minus: FloatArray | None = None) -> None:
