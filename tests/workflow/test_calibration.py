@@ -184,13 +184,17 @@ def test_a_wrong_argument_says_what_to_pass(arguments, word):
         ({"free_limb": "leg3"}, "workflow.free-limb-needs-prior"),
         ({"hold_out": 1.0}, None),
         ({"hold_out": 0.25, "held_out": ("1",)}, None),
-        ({"held_out": "1"}, None),
     ],
 )
 def test_options_that_contradict_each_other_are_refused(options, code):
     with pytest.raises(DataError) as refused:
         CalibrationOptions(**options)
     assert refused.value.code == code
+
+
+def test_labels_of_held_out_poses_are_a_sequence():
+    with pytest.raises(lc.ArgumentTypeError, match=r"held_out is the text '1'; .*\['1'\]"):
+        CalibrationOptions(held_out="1")
 
 
 def test_the_first_rule_of_the_verdict_decides():

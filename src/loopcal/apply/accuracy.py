@@ -30,7 +30,7 @@ from loopcal.mechanism import (
     differentiate_pose,
     forward,
     inverse,
-    sample_workspace,
+    resolve_poses,
 )
 from loopcal.typing import BoolArray, FloatArray
 
@@ -313,10 +313,7 @@ def accuracy_map(
     MechanismError : poses are to be drawn, and the robot states no workspace.
     """
     robot = (fit.posterior if isinstance(fit, Identification) else fit).robot
-    if isinstance(poses, int):
-        coordinates = sample_workspace(robot, poses, seed).coordinates
-    else:
-        coordinates = np.asarray(poses, dtype=np.float64)
+    coordinates = resolve_poses(robot, poses, seed)
     return AccuracyMap(
         names=robot.controlled,
         coordinates=coordinates,

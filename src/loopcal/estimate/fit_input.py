@@ -39,13 +39,8 @@ def exclude_poses(data: Measurements, excluded: Sequence[str]) -> Measurements:
 
     Raises
     ------
-    DataError : the data have no such pose, or a text was given instead of a sequence of labels.
+    DataError : the data have no such pose.
     """
-    if isinstance(excluded, str):
-        raise DataError(
-            f"the poses to exclude are the text {excluded!r}; give a sequence of labels, such as "
-            f"[{excluded!r}]"
-        )
     if not excluded:
         return data
     for label in excluded:

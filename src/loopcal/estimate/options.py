@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from loopcal.errors import EstimationError
+from loopcal.errors import ArgumentTypeError, EstimationError
 from loopcal.estimate.inference.prior import Prior
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import Method
@@ -94,12 +94,9 @@ class FitOptions:
             raise EstimationError(
                 f"rank_tolerance is {self.rank_tolerance}; it must be above 0 and below 1"
             )
-        if isinstance(self.excluded_poses, str):
-            raise EstimationError(
-                f"excluded_poses is the text {self.excluded_poses!r}; give a sequence of labels, "
-                f"such as [{self.excluded_poses!r}]"
-            )
-        object.__setattr__(self, "excluded_poses", tuple(self.excluded_poses))
+        object.__setattr__(
+            self, "excluded_poses", check_labels("excluded_poses", self.excluded_poses)
+        )
         if self.start is not None:
             start = np.array(self.start, dtype=np.float64)
             start.setflags(write=False)
@@ -132,6 +129,15 @@ def merge_options(
     shortcuts = {"method": method, "loss": loss}
     stated = {name: value for name, value in shortcuts.items() if value is not None}
     return dataclasses.replace(options, **stated) if stated else options
+
+
+def check_labels(option: str, labels: Sequence[str]) -> tuple[str, ...]:
+    """Return labels of poses as a tuple; raise ArgumentTypeError for a single text."""
+    if isinstance(labels, str):
+        raise ArgumentTypeError(
+            f"{option} is the text {labels!r}; give a sequence of labels, such as [{labels!r}]"
+        )
+    return tuple(labels)
 
 
 def _check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:

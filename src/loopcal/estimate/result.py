@@ -224,20 +224,11 @@ class Identification:
 
     def __str__(self) -> str:
         """Return the parameters as a table, the status and the findings."""
-        factor, symbols = self.free_parameters.display()
-        half = self.interval()
         width = max(len(name) for name in (*self.names, *self.nuisance.names))
         lines = [f"{'parameter':<{width}} {'nominal':>14} {'estimate':>14} {'+/- (95 %)':>12} unit"]
-        for i, name in enumerate(self.names):
-            decimals, shown = _format_half_width(half[i] / factor[i])
-            nominal, estimate = self.nominal[i] / factor[i], self.estimate[i] / factor[i]
-            lines.append(
-                f"{name:<{width}} {nominal:>14.{decimals}f} {estimate:>14.{decimals}f} {shown:>12} "
-                f"{symbols[i]}"
-            )
-        for entry in self.nuisance.rows(coverage_factor(self.residual_test)):
+        for entry in (*self._parameter_rows(), *self._nuisance_rows()):
             half_width = _format_half_width(entry["plus_minus"])
-            decimals, shown = half_width if entry["free"] else (6, "fixed")
+            decimals, shown = half_width if entry.get("free", True) else (6, "fixed")
             nominal, estimate = (f"{entry[key]:>14.{decimals}f}" for key in ("nominal", "estimate"))
             lines.append(
                 f"{entry['name']:<{width}} {nominal} {estimate} {shown:>12} {entry['unit']}"
@@ -257,11 +248,15 @@ class Identification:
         """The findings but the status."""
         return [f for f in self.findings if f.code != self.history.finding.code]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content for JSON; parameters in the units of the robot's file, the rest SI."""
+    def _nuisance_rows(self) -> list[dict[str, Any]]:
+        """Return one row for each nuisance parameter, with 95 % intervals."""
+        return self.nuisance.rows(coverage_factor(self.residual_test))
+
+    def _parameter_rows(self) -> list[dict[str, Any]]:
+        """Return one row for each parameter, in the units of the robot's file."""
         factor, symbols = self.free_parameters.display()
-        half, test = self.interval(), self.residual_test
-        parameters = [
+        half = self.interval()
+        return [
             {
                 "name": parameter.name,
                 "unit": symbols[i],
@@ -274,11 +269,15 @@ class Identification:
             }
             for i, parameter in enumerate(self.free_parameters.parameters)
         ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content for JSON; parameters in the units of the robot's file, the rest SI."""
+        test = self.residual_test
         return {
             "robot": self.robot.name,
             "method": repr(self.method),
-            "parameters": parameters,
-            "local": self.nuisance.rows(coverage_factor(test)),
+            "parameters": self._parameter_rows(),
+            "local": self._nuisance_rows(),
             "rank": self.rank,
             "condition": self.spectrum.condition,
             "singular_values": self.spectrum.singular_values,

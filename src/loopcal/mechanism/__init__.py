@@ -21,6 +21,7 @@ from loopcal.mechanism.analysis.workspace import WorkspaceSample as WorkspaceSam
 from loopcal.mechanism.analysis.workspace import check_limits as check_limits
 from loopcal.mechanism.analysis.workspace import draw_coordinates as draw_coordinates
 from loopcal.mechanism.analysis.workspace import evaluate_limits as evaluate_limits
+from loopcal.mechanism.analysis.workspace import resolve_poses as resolve_poses
 from loopcal.mechanism.analysis.workspace import sample_workspace as sample_workspace
 from loopcal.mechanism.analysis.workspace import workspace_ranges as workspace_ranges
 from loopcal.mechanism.assembly import AXES as AXES

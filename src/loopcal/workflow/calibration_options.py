@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from loopcal.errors import DataError
 from loopcal.estimate import FitOptions, Posterior
+from loopcal.estimate.options import check_labels
 from loopcal.findings import report_finding
 
 
@@ -51,12 +52,7 @@ class CalibrationOptions:
             raise DataError(
                 f"hold_out is {self.hold_out}; it is a share of the poses, from 0 to below 1"
             )
-        if isinstance(self.held_out, str):
-            raise DataError(
-                f"held_out is the text {self.held_out!r}; give a sequence of labels, such as "
-                f"[{self.held_out!r}]"
-            )
-        object.__setattr__(self, "held_out", tuple(self.held_out))
+        object.__setattr__(self, "held_out", check_labels("held_out", self.held_out))
         if self.hold_out and self.held_out:
             raise DataError(
                 f"hold_out is {self.hold_out} and held_out names {len(self.held_out)} poses; give "

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from loopcal.measure import (
@@ -16,7 +15,7 @@ from loopcal.measure import (
     sample_truth,
     simulate,
 )
-from loopcal.mechanism import Mechanism, sample_workspace
+from loopcal.mechanism import Mechanism, resolve_poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +51,7 @@ def simulate_measurements(
         strokes.
     """
     truth = draw_true_machine(robot, seed) if draw_errors else robot
-    if isinstance(poses, int):
-        targets = sample_workspace(truth.nominal, poses, seed).coordinates
-    else:
-        targets = np.asarray(poses, dtype=np.float64)
+    targets = resolve_poses(truth.nominal, poses, seed)
     data = simulate(truth, targets, instrument, seed, reading_sigma=reading_sigma)
     check_strokes(data, truth)
     return SimulatedMeasurements(data, truth)
@@ -94,6 +90,5 @@ def predict_noise_free(
     poses : (n, c) controlled coordinates [m, rad], or how many to draw from the workspace.
     seed : of the poses.
     """
-    if isinstance(poses, int):
-        poses = sample_workspace(robot, poses, seed).coordinates
-    return simulate(robot, poses, instrument, 0, robot, reading_sigma=reading_sigma)
+    targets = resolve_poses(robot, poses, seed)
+    return simulate(robot, targets, instrument, 0, robot, reading_sigma=reading_sigma)

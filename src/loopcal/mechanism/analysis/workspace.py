@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from loopcal.engine import State
 from loopcal.errors import MechanismError
@@ -178,6 +178,13 @@ def sample_workspace(
     return WorkspaceSample(
         coordinates, inverse(robot, coordinates), kept / tried, dict((+rejected).most_common())
     )
+
+
+def resolve_poses(robot: Mechanism, poses: ArrayLike | int, seed: int) -> FloatArray:
+    """Return coordinates (n, c) [m, rad]: those given, or a number of them from the workspace."""
+    if isinstance(poses, int):
+        return sample_workspace(robot, poses, seed).coordinates
+    return np.asarray(poses, dtype=np.float64)
 
 
 def workspace_ranges(robot: Mechanism) -> dict[str, tuple[float, float]]:
