@@ -133,10 +133,10 @@ class Compensation:
         return {
             "robot": self.robot.name,
             "mode": self.mode,
-            "labels": list(self.labels),
+            "labels": self.labels,
             "actuators": [a.name for a in self.robot.actuators],
             "readings": self.readings,
-            "coordinates": list(self.robot.controlled),
+            "coordinates": self.robot.controlled,
             "commands": self.commands,
             "before": self.before,
             "remaining": self.remaining,
@@ -146,7 +146,7 @@ class Compensation:
             "uncertainty": None if self.uncertainty is None else self.uncertainty.to_dict(),
             "reach": [r.value for r in self.reach],
             "sentences": [str(finding) for finding in self.findings],
-            "findings": [finding.to_dict() for finding in self.findings],
+            "findings": self.findings,
         }
 
 

@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.apply.noise_floor import NoiseFloor, compute_noise_floor
 from loopcal.apply.validation_findings import (
     DIMENSIONS,
     QUANTITIES,
@@ -41,9 +40,26 @@ from loopcal.diagnose import (
 from loopcal.errors import DataError, suggest_names
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity
-from loopcal.measure import Measurements, check_actuators
+from loopcal.measure import Measurements, Observations, check_actuators
 from loopcal.mechanism import Mechanism
-from loopcal.units import Unit
+from loopcal.units import Dimension, Unit
+
+
+@dataclass(frozen=True)
+class NoiseFloor:
+    """Expected rms of the prediction errors of an exact geometry, NaN for what no row measures.
+
+    floor^2 = mean over rows of sum over components sigma^2, with the length components for the
+    position and the angles for the orientation. The noise of uncertain joint readings is not part
+    of it, so with such readings the true floor is higher.
+
+    Attributes
+    ----------
+    position : [m]. orientation : [rad].
+    """
+
+    position: float
+    orientation: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,17 +171,17 @@ class Validation:
         """Return the result by name for JSON, SI."""
         named = ("before", "after", "commanded_before", "commanded_after", "not_compensable")
         return {
-            "poses": list(self.poses),
-            **{name: getattr(self, name).to_dict() for name in named},
-            "noise_floor": vars(self.noise_floor),
-            "failed": list(self.unreachable),
+            "poses": self.poses,
+            **{name: getattr(self, name) for name in named},
+            "noise_floor": self.noise_floor,
+            "failed": self.unreachable,
             "limit_position": self.limit_position,
             "limit_angle": self.limit_angle,
             "passed": self.passed,
             "reasons": [str(finding) for finding in self.failures],
             "notes": [str(f) for f in self.findings if f.severity is not Severity.FAILURE],
-            "findings": [finding.to_dict() for finding in self.findings],
-            "alignment": {name: list(names) for name, names in self.alignment.items()},
+            "findings": self.findings,
+            "alignment": self.alignment,
             "kinds": [vars(kind) for kind in self.kinds],
         }
 
@@ -222,7 +238,7 @@ def validate(
             rows, [m - r for m, r in zip(missed, errors_after, strict=True)]
         ),
         not_compensable=compute_row_errors(rows, missed),
-        noise_floor=compute_noise_floor(rows),
+        noise_floor=_compute_noise_floor(rows),
         unreachable=tuple(data.labels[i] for i in np.flatnonzero(left_out)),
         limit_position=limit_position,
         limit_angle=limit_angle,
@@ -277,3 +293,20 @@ def _keep_setup(values: Mapping[str, float], refit: Sequence[str]) -> dict[str, 
         for name, value in values.items()
         if not any(fnmatchcase(owner_of(name), pattern) for pattern in refit)
     }
+
+
+def _compute_noise_floor(rows: Sequence[Observations]) -> NoiseFloor:
+    """Return the noise floor of rows with their stated covariances."""
+    return NoiseFloor(_rms_noise(rows, Dimension.LENGTH), _rms_noise(rows, Dimension.ANGLE))
+
+
+def _rms_noise(rows: Sequence[Observations], dimension: Dimension) -> float:
+    """Return the root mean square over the rows that measure this dimension."""
+    squares = []
+    for o in rows:
+        chosen = np.array([column.dimension is dimension for column in o.kind.noise_columns])
+        present = o.present & chosen
+        variance = np.where(present, np.diagonal(o.covariance, axis1=1, axis2=2), 0.0)
+        squares.append(variance.sum(axis=1)[present.any(axis=1)])
+    square = np.concatenate(squares) if squares else np.zeros(0)
+    return float(np.sqrt(square.mean())) if len(square) else float("nan")
