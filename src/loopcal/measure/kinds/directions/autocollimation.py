@@ -24,6 +24,8 @@ class Autocollimation(AxisKind):
     optical axis and has the direction of the normal, towards the instrument. Angles are those of
     the mirror. An instrument that states angles of the reflected beam states twice these values.
 
+    Setup parameters [rad]: `frame.rx` to `frame.rz`, `mirror.u` and `mirror.v`.
+
     Parameters
     ----------
     normal : (3,)
@@ -38,6 +40,13 @@ class Autocollimation(AxisKind):
     DataError
         If the length of the normal is zero, the frame is not a pose, or `unknown` lists something
         else.
+
+    Examples
+    --------
+    >>> from loopcal.geometry import make_pose, rotation_about_axis
+    >>> T = make_pose(rotation_about_axis(0.01, 1), np.zeros(3))
+    >>> Autocollimation().measure(T[None, None], noise=np.zeros((1, 1, 2))).round(6)
+    array([[[0.01, 0.  ]]])
     """
 
     normal: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))

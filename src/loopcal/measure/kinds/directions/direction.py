@@ -26,6 +26,8 @@ class Direction(AxisKind):
     along the two vectors B. It equals the angle where that is small, and is unbounded where d is
     opposite to m.
 
+    Setup parameters [rad]: `frame.rx` to `frame.rz`, `axis.u` and `axis.v`.
+
     Parameters
     ----------
     axis : (3,)
@@ -39,6 +41,12 @@ class Direction(AxisKind):
     DataError
         If the length of the axis is zero, the frame is not a pose, or `unknown` lists something
         else.
+
+    Examples
+    --------
+    >>> kind = Direction(axis=np.array([0.0, 0.0, 1.0]))
+    >>> kind.measure(np.eye(4)[None, None], noise=np.zeros((1, 1, 2)))
+    array([[[0., 0., 1.]]])
     """
 
     axis: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))

@@ -20,6 +20,8 @@ class Inclination(DirectionKind):
     With the upward vertical d in axes of the sensor: `tilt_x = atan2(d_x, hypot(d_y, d_z))`,
     `tilt_y` likewise.
 
+    Setup parameters [rad]: `inclinometer.rx` to `inclinometer.rz`, `gravity.u` and `gravity.v`.
+
     Parameters
     ----------
     up : (3,)
@@ -36,6 +38,13 @@ class Inclination(DirectionKind):
     DataError
         If the length of the vertical is zero, the mounting is not a pose, or `unknown` lists
         something else.
+
+    Examples
+    --------
+    >>> from loopcal.geometry import make_pose, rotation_about_axis
+    >>> T = make_pose(rotation_about_axis(0.1, 0), np.zeros(3))
+    >>> Inclination().measure(T[None, None], noise=np.zeros((1, 1, 2))).round(6)
+    array([[[0. , 0.1]]])
     """
 
     up: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))

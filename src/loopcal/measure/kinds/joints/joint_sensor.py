@@ -28,6 +28,8 @@ class JointSensor(Kind):
 
     On a driven joint it is a noisy encoder.
 
+    Setup parameters: `NAME.joint` [m or rad], the offset of each joint.
+
     Parameters
     ----------
     joints : tuple of str
@@ -42,6 +44,12 @@ class JointSensor(Kind):
     ------
     DataError
         If no joint is named or one twice, or `unknown` lists something else.
+
+    Examples
+    --------
+    >>> kind = JointSensor(joints=("limb1.pin",), measures="angle", unknown=("offset",))
+    >>> [parameter.name for parameter in kind.nuisance_parameters]
+    ['limb1.pin.joint']
     """
 
     joints: tuple[str, ...] = ("q1",)
@@ -110,9 +118,17 @@ class Locked(JointSensor):
 
     The column is the slip of the lock, usually 0. Its noise is the play of the lock.
 
+    Setup parameters: `NAME.locked` [m or rad], the constant of each joint.
+
     Parameters
     ----------
     See `JointSensor`; the constant is always unknown.
+
+    Examples
+    --------
+    >>> kind = Locked(joints=("q1",))
+    >>> [column.name for column in kind.columns]
+    ['q1.slip']
     """
 
     unknown: tuple[str, ...] = ("offset",)

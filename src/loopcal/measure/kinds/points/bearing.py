@@ -23,6 +23,8 @@ class Bearing(TargetKind):
     Theodolite: `azimuth = atan2(y, x)`, `elevation = atan2(z, hypot(x, y))`. Camera, whose optical
     axis is z: `azimuth = atan2(x, z)`, `elevation = atan2(y, z)`.
 
+    Setup parameters: those of `Position`.
+
     Parameters
     ----------
     form : str
@@ -33,6 +35,12 @@ class Bearing(TargetKind):
     ------
     DataError
         As `TargetKind`, or for another form.
+
+    Examples
+    --------
+    >>> kind = Bearing(places=np.array([[1.0, 1.0, 0.0]]))
+    >>> kind.measure(np.eye(4)[None, None], noise=np.zeros((1, 1, 2))).round(6)
+    array([[[0.785398, 0.      ]]])
     """
 
     form: str = "theodolite"

@@ -24,6 +24,9 @@ class Distance(LengthKind):
     """Distance to a fixed point c. Residual: `|x - c| + offset - measured`, with slope `(x - c) /
     |x - c|`.
 
+    Setup parameters [m]: `anchor.x` to `anchor.z`, `target.x` to `target.z` of each target, and
+    `distance.offset`.
+
     Parameters
     ----------
     anchor : (3,) [m]
@@ -36,6 +39,12 @@ class Distance(LengthKind):
     ------
     DataError
         As `TargetKind`.
+
+    Examples
+    --------
+    >>> kind = Distance(anchor=np.array([0.0, 0.0, 2.0]), places=np.zeros((1, 3)))
+    >>> kind.measure(np.eye(4)[None, None], noise=np.zeros((1, 1, 1)))
+    array([[[2.]]])
     """
 
     anchor: FloatArray = field(default_factory=lambda: np.zeros(3))

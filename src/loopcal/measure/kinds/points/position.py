@@ -26,9 +26,20 @@ class Position(TargetKind):
     """Positions of one or several targets. Residual: `x_predicted - x_measured` in axes of the
     frame.
 
+    Setup parameters: `frame.rx` to `frame.rz` [rad], `frame.x` to `frame.z` [m], and `target.x`
+    to `target.z` [m] of each target.
+
     Parameters
     ----------
     See `TargetKind`; "frame" and "targets" may be unknown.
+
+    Examples
+    --------
+    >>> kind = Position(targets=("ball",), places=np.array([[0.0, 0.0, 0.1]]), unknown=("targets",))
+    >>> [parameter.name for parameter in kind.nuisance_parameters]
+    ['ball.x', 'ball.y', 'ball.z']
+    >>> kind.measure(np.eye(4)[None, None], noise=np.zeros((1, 1, 3)))
+    array([[[0. , 0. , 0.1]]])
     """
 
     name: ClassVar[str] = "position"

@@ -20,10 +20,20 @@ class Separation(LengthKind):
 
     A row names two poses. The frame does not matter.
 
+    Setup parameters [m]: `target.x` to `target.z` of each target, and `separation.offset`.
+
     Parameters
     ----------
     See `TargetKind`; "targets" and "offset" (the zero of the callipers, the width of a printed
     line) may be unknown.
+
+    Examples
+    --------
+    >>> kind = Separation(places=np.zeros((1, 3)))
+    >>> T = np.tile(np.eye(4), (1, 1, 2, 1, 1))
+    >>> T[0, 0, 1, :3, 3] = 3.0, 4.0, 0.0
+    >>> kind.measure(T, noise=np.zeros((1, 1, 1)))
+    array([[[5.]]])
     """
 
     name: ClassVar[str] = "separation"

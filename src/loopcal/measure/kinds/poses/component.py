@@ -45,6 +45,8 @@ class Component(ToolKind):
     normal's x and y [rad], with `d n = (Q omega) x n`; a sigma stated for theta and phi applies to
     these differences.
 
+    Setup parameters: those of `Pose`.
+
     Parameters
     ----------
     components : tuple of str
@@ -61,6 +63,14 @@ class Component(ToolKind):
     DataError
         If a component does not exist or is named twice, if angles have no declared orientation, or
         if phi is measured without theta.
+
+    Examples
+    --------
+    >>> kind = Component(("z", "psi"), "tilt-torsion", unknown=("frame",), frame="plate")
+    >>> [(column.name, column.dimension.value) for column in kind.columns]
+    [('z', 'length'), ('psi', 'angle')]
+    >>> [parameter.name for parameter in kind.nuisance_parameters]
+    ['plate.rx', 'plate.ry', 'plate.rz', 'plate.x', 'plate.y', 'plate.z']
     """
 
     components: tuple[str, ...] = ("z",)

@@ -33,6 +33,9 @@ class Pose(ToolKind):
     With r the rotation part, Q the rotation from base to frame and a the arm from platform origin
     to tool: `d r = J_left^-1(r) Q omega` and `d t = Q (v + omega x a)`.
 
+    Setup parameters: `frame.rx` to `frame.rz` [rad], `frame.x` to `frame.z` [m]; likewise
+    `tool.rx` to `tool.z`.
+
     Parameters
     ----------
     orientation : str
@@ -47,6 +50,14 @@ class Pose(ToolKind):
     ------
     DataError
         If the orientation form does not exist or a frame is not a pose.
+
+    Examples
+    --------
+    >>> from loopcal.geometry import make_pose, rotation_about_axis
+    >>> kind = Pose("euler-xyz", T_platform_tool=np.eye(4))
+    >>> T = make_pose(rotation_about_axis(0.1, 0), np.array([1.0, 2.0, 3.0]))
+    >>> kind.measure(T[None, None], noise=np.zeros((1, 1, 6))).round(6)
+    array([[[0.1, 0. , 0. , 1. , 2. , 3. ]]])
     """
 
     orientation: str = "rotation-vector"

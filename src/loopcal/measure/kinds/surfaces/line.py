@@ -24,9 +24,20 @@ class Line(SurfaceKind):
     R rotates the stated direction to the true one. An unknown line has four parameters for each
     group of rows: two rotations u, v and two shifts a, b along the rotated B.
 
+    Setup parameters: `line.u`, `line.v` [rad], `line.a` and `line.b` [m], and `target.x` to
+    `target.z` [m] of each target.
+
     Parameters
     ----------
     See `SurfaceKind`.
+
+    Examples
+    --------
+    >>> kind = Line(surface="ruler", unknown=("surface",))
+    >>> [column.name for column in kind.columns]
+    ['gap_a', 'gap_b']
+    >>> [parameter.name for parameter in kind.nuisance_parameters]
+    ['ruler.u', 'ruler.v', 'ruler.a', 'ruler.b']
     """
 
     surface: str = "line"

@@ -23,9 +23,21 @@ class Plane(SurfaceKind):
     An unknown plane has three parameters for each group of rows: two rotations u, v of the normal
     and the height above the stated point.
 
+    Setup parameters: `plane.u`, `plane.v` [rad] and `plane.height` [m], and `target.x` to
+    `target.z` [m] of each target.
+
     Parameters
     ----------
     See `SurfaceKind`.
+
+    Examples
+    --------
+    >>> kind = Plane(surface="bed", unknown=("surface",), places=np.zeros((1, 3)))
+    >>> [parameter.name for parameter in kind.nuisance_parameters]
+    ['bed.u', 'bed.v', 'bed.height']
+    >>> height = np.array([[[0.0, 0.0, 0.002]]])
+    >>> kind.evaluate(np.eye(4)[None, None], np.zeros((1, 1, 1)), height).residual
+    array([[[-0.002]]])
     """
 
     surface: str = "plane"

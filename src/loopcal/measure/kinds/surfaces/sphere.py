@@ -23,6 +23,9 @@ class Sphere(SurfaceKind):
     An unknown sphere has four parameters for each group of rows: its center and its radius, which
     includes that of the probe.
 
+    Setup parameters [m]: `sphere.x` to `sphere.z` and `sphere.radius`, and `target.x` to
+    `target.z` of each target.
+
     Parameters
     ----------
     radius : float [m]
@@ -33,6 +36,12 @@ class Sphere(SurfaceKind):
     ------
     DataError
         As `SurfaceKind`, and if the radius is not above zero.
+
+    Examples
+    --------
+    >>> kind = Sphere(through=np.array([0.0, 0.0, 0.5]), radius=0.1, places=np.zeros((1, 3)))
+    >>> kind.evaluate(np.eye(4)[None, None], np.zeros((1, 1, 1))).residual
+    array([[[0.4]]])
     """
 
     surface: str = "sphere"
