@@ -122,7 +122,9 @@ class Locked(JointSensor):
 
     Parameters
     ----------
-    See `JointSensor`; the constant is always unknown.
+    unknown : tuple of str
+        Always "offset": the constant of each joint.
+    Others: see `JointSensor`.
 
     Examples
     --------
