@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures drawn by matplotlib from data; a label has the same color in all figures of a paper."""
+"""Figures drawn by matplotlib from data; a label has the same color in all figures of a study."""
 
 from __future__ import annotations
 
@@ -10,19 +10,27 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from loopcal.papers.reproduction import Figure
 
-MARKERS = "osD^vPX"
+COLORS, MARKERS = 10, "osD^vPX"
 LEVEL = "0.35"
-"""Grey of a horizontal line."""
+"""Grey of a horizontal line that belongs to no series."""
+UNNAMED = "0.82"
+"""Grey of a series without a name in the legend."""
+DASHES = ("--", ":", "-.")
 LEGEND = 100
 """Characters that a row of the legend holds."""
 
 
-def styles(figures: Sequence[Figure]) -> dict[str, dict[str, Any]]:
-    """Return colour and marker of each label."""
-    labels = dict.fromkeys(series.label for figure in figures for series in figure.series)
+def choose_styles(figures: Sequence[Figure]) -> dict[str, dict[str, Any]]:
+    """Return color and marker of each named label; labels of one figure differ in color."""
+    chosen: dict[str, int] = {}
+    named = [[s.label for s in figure.series if s.is_named] for figure in figures]
+    for label in dict.fromkeys(label for labels in named for label in labels):
+        beside = {other for labels in named if label in labels for other in labels}
+        taken = {chosen[other] for other in beside if other in chosen}
+        chosen[label] = next((i for i in range(COLORS) if i not in taken), len(chosen) % COLORS)
     return {
-        label: {"color": f"C{i % 10}", "marker": MARKERS[i % len(MARKERS)]}
-        for i, label in enumerate(labels)
+        label: {"color": f"C{color}", "marker": MARKERS[i % len(MARKERS)]}
+        for i, (label, color) in enumerate(chosen.items())
     }
 
 
@@ -31,7 +39,7 @@ def png(figure: Figure, style: Mapping[str, Mapping[str, Any]]) -> bytes:
 
     Parameters
     ----------
-    figure : what to draw. style : of every label, see `styles`.
+    figure : what to draw. style : of every named label, see `choose_styles`.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
@@ -40,19 +48,23 @@ def png(figure: Figure, style: Mapping[str, Mapping[str, Any]]) -> bytes:
     canvas = Canvas(figsize=(7.2, 4.6), dpi=150, layout="constrained")
     FigureCanvasAgg(canvas)
     axes = canvas.add_subplot()
-    for series in figure.series:
+    for series in sorted(figure.series, key=lambda series: series.is_named):
+        if not series.is_named:
+            axes.plot(series.x, series.y, color=UNNAMED, linewidth=1.0, label=series.label)
+            continue
         axes.plot(
             series.x,
             series.y,
             label=series.label,
             markersize=5,
             linewidth=1.5 * figure.joined,
+            fillstyle="full" if figure.joined else "none",  # points on points stay visible
             **style[series.label],
         )
-    for label, value in figure.levels.items():
-        axes.axhline(value, color=LEVEL, linestyle="--", linewidth=1.2)
-        place = {"xycoords": ("axes fraction", "data"), "ha": "left", "va": "bottom"}
-        axes.annotate(label, (0.008, value), fontsize=8.5, color=LEVEL, **place)
+    for i, (label, value) in enumerate(figure.levels.items()):
+        related = next((style[s.label]["color"] for s in figure.series if s.label in label), LEVEL)
+        dashes = DASHES[i % len(DASHES)]
+        axes.axhline(value, color=related, linestyle=dashes, linewidth=1.4, label=label)
     if "x" in figure.log:
         axes.set_xscale("log")
     elif all(float(x).is_integer() for series in figure.series for x in series.x):
@@ -61,7 +73,7 @@ def png(figure: Figure, style: Mapping[str, Mapping[str, Any]]) -> bytes:
         axes.set_yscale("log")
     axes.set(title=figure.title, xlabel=figure.x_label, ylabel=figure.y_label)
     axes.grid(visible=True, color="0.9", linewidth=0.8)
-    longest = max(len(series.label) for series in figure.series)
+    longest = max(len(text) for text in axes.get_legend_handles_labels()[1])
     columns = max(1, min(6, LEGEND // (longest + 6)))  # a marker is as wide as some 6 characters
     canvas.legend(
         fontsize=8.5, loc="outside lower center", ncols=columns

@@ -44,11 +44,16 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Series:
-    """A line of a figure: points x, y."""
+    """A line of a figure: points x, y. A label that begins with _ is not in the legend."""
 
     label: str
     x: tuple[float, ...]
     y: tuple[float, ...]
+
+    @property
+    def is_named(self) -> bool:
+        """Whether the legend names the line."""
+        return not self.label.startswith("_")
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ def write_folder(
     FileError
         The folder is in use, or cannot be written.
     """
-    from loopcal.papers.drawing import png, styles
+    from loopcal.papers.drawing import choose_styles, png
 
     path = Path(path)
     refuse_used_folder(path, force)
@@ -74,7 +74,7 @@ def write_folder(
     for table in (found.summary(), *(c.table() for c in found.comparisons), *found.tables):
         files[f"tables/{table.name}.csv"] = csv_text(table).encode()
         files[f"tables/{table.name}.json"] = to_json(table.to_dict()).encode()
-    style = styles(found.figures)
+    style = choose_styles(found.figures)
     for figure in found.figures:
         files[f"figures/{figure.name}.png"] = png(figure, style)
     _write(path, files)

@@ -91,7 +91,6 @@ def _draw_history(case: Case, algorithm: str, unit: str) -> Figure:
     named = sorted(chosen, key=lambda i: -abs(reference[i]))[:NAMED]
     values = collect_history(case, algorithm)
     k = tuple(float(i) for i in range(len(values)))
-    # matplotlib leaves a label that begins with _ out of the legend
     lines = [
         Series(names[i] if i in named else f"_{names[i]}", k, tuple(map(float, values[:, i])))
         for i in (*named, *(i for i in chosen if i not in named))
@@ -103,8 +102,7 @@ def _draw_history(case: Case, algorithm: str, unit: str) -> Figure:
         None,
         f"figure_{number}_{algorithm.lower()}_{what}",
         number=number,
-        algorithm=algorithm,
-        setting=case.answers[algorithm].setting,
+        method=algorithm if algorithm == LS else f"{algorithm} ({case.answers[algorithm].setting})",
         what=what,
         unit=unit,
         case=case.name,
