@@ -130,6 +130,11 @@ class Comparison:
         return int(self.within.sum())
 
     @property
+    def differing(self) -> int:
+        """How many differ."""
+        return self.count - self.agreeing
+
+    @property
     def largest(self) -> float:
         """Largest difference, in the units of the table (which must have one)."""
         return float(np.abs(self.difference).max())

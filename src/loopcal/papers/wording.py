@@ -166,8 +166,8 @@ def compare_numbers(rule: str, data: Mapping[str, Any]) -> bool:
     >>> compare_numbers("ratio < 1.1", {"ratio": 1.0}), compare_numbers("a == b", {"a": 1, "b": 2})
     (True, False)
     """
-    left, relation, right = rule.split()
-    first, second = (_evaluate(side, data) for side in (left, right))
+    relation = next(word for word in rule.split() if word in RELATIONS)
+    first, second = (_evaluate(side.strip(), data) for side in rule.split(relation))
     return bool(RELATIONS[relation](first, second))
 
 

@@ -50,6 +50,11 @@ class FiftyPoints:
         """Percentage of the machines on which least squares converges within 5 iterations."""
         return 100.0 * float(np.mean((self.iterations <= 5) & self.converged))
 
+    @property
+    def most_iterations(self) -> int:
+        """Largest number of iterations of least squares."""
+        return int(self.iterations.max())
+
     def compute_median(self, method: str, frame: str) -> FloatArray:
         """Return medians (4,) over the machines."""
         return np.median(self.statistics[method, frame], axis=0)
