@@ -14,7 +14,7 @@ from benchmarks.harness import Metric, measure_ratio, time_in_turns
 from loopcal.diagnose import build_regularization_path, score_leave_one_out
 from loopcal.estimate import MAP, LeastSquares, identify, identify_trials
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.problem import problem_of
+from loopcal.estimate.problem_construction import problem_of
 from loopcal.io import load_robot
 from loopcal.measure import (
     Gaussian,

@@ -7,7 +7,7 @@ import pytest
 from loopcal.diagnose import build_regularization_path, score_leave_one_out
 from loopcal.estimate import MAP, LeastSquares, Ridge, TruncatedSVD, identify
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.problem import problem_of
+from loopcal.estimate.problem_construction import problem_of
 from tests.estimate.problems import hexapod, hexapod_data, tracker
 
 DATA = hexapod_data(14, instrument=tracker(20e-6, 100e-6))

@@ -21,7 +21,7 @@ from loopcal.errors import DataError, EstimationError
 from loopcal.estimate import MAP, FitOptions, Huber, LeastSquares, Tukey, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.methods.losses import block_limit
-from loopcal.estimate.problem import problem_of
+from loopcal.estimate.problem_construction import problem_of
 from loopcal.io import load_robot
 from loopcal.measure import (
     Component,

@@ -13,7 +13,7 @@ import loopcal.estimate.problem as problem_module
 from loopcal.estimate import LeastSquares, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import observe_poses, observe_rows
-from loopcal.estimate.problem import problem_of
+from loopcal.estimate.problem_construction import problem_of
 from loopcal.measure import Gaussian, Instrument, Plane, Sensor, simulate
 from loopcal.numerics.decomposition import NUISANCE_TOLERANCE, NULL_COMPONENT
 from loopcal.numerics.elimination_tree import EliminationTree, build_tree

@@ -14,7 +14,7 @@ from loopcal.estimate.poses.estimate import report_doubtful_readings
 from loopcal.estimate.poses.measured import measure_poses
 from loopcal.estimate.poses.states import PoseStates
 from loopcal.estimate.poses.uncertain import UncertainPoses
-from loopcal.estimate.problem import problem_of
+from loopcal.estimate.problem_construction import problem_of
 from loopcal.io import load_robot
 from loopcal.measure import (
     Component,

@@ -17,7 +17,7 @@ from loopcal.estimate import MAP, FitOptions, LeastSquares, identify, identify_t
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import observe_poses, observe_rows
 from loopcal.estimate.nuisance.elimination import NuisanceElimination
-from loopcal.estimate.problem import problem_of
+from loopcal.estimate.problem_construction import problem_of
 from loopcal.measure import (
     Gaussian,
     Instrument,

@@ -10,9 +10,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from loopcal.estimate.free_parameters import select_free_parameters
-from loopcal.estimate.linearization import Linearization
-from loopcal.estimate.problem import Problem, problem_of, problem_of_trials
-from loopcal.estimate.start import Start
+from loopcal.estimate.linearization import Linearization, Start
+from loopcal.estimate.problem import Problem
+from loopcal.estimate.problem_construction import problem_of, problem_of_trials
 from loopcal.measure import (
     Gaussian,
     Instrument,

@@ -12,7 +12,7 @@ from loopcal.estimate import identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.poses.linearization import coordinate_derivative
-from loopcal.estimate.problem import problem_of
+from loopcal.estimate.problem_construction import problem_of
 from loopcal.measure import (
     Instrument,
     Measurements,

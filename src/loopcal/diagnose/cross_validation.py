@@ -30,7 +30,7 @@ from loopcal.estimate.identification import identify
 from loopcal.estimate.methods.penalties import Method, Ridge, TruncatedSVD, adapt_method
 from loopcal.estimate.observation_rows import linked_blocks
 from loopcal.estimate.options import FitOptions, merge_options
-from loopcal.estimate.problem import problem_of
+from loopcal.estimate.problem_construction import problem_of
 from loopcal.measure import Measurements, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import decompose

@@ -23,6 +23,7 @@ from loopcal.estimate.free_parameters import FreeParameters, select_free_paramet
 from loopcal.estimate.inference.null_space import describe_null_space
 from loopcal.estimate.inference.posterior import compute_posterior
 from loopcal.estimate.inference.residual_test import ResidualTest, run_residual_test
+from loopcal.estimate.linearization import Start
 from loopcal.estimate.methods.losses import Loss
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Method, adapt_method
 from loopcal.estimate.methods.prior_conflict import PriorConflict, assess_prior_conflict
@@ -43,10 +44,10 @@ from loopcal.estimate.poses.estimate import (
     report_doubtful_readings,
     report_uneven_sigmas,
 )
-from loopcal.estimate.poses.solution import PoseSolution
-from loopcal.estimate.problem import Problem, problem_of, problem_of_trials
+from loopcal.estimate.poses.states import PoseSolution
+from loopcal.estimate.problem import Problem
+from loopcal.estimate.problem_construction import problem_of, problem_of_trials
 from loopcal.estimate.result import History, Identification, KindResiduals, Spectrum
-from loopcal.estimate.start import Start
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, Trials, fill_in_reading_sigma
 from loopcal.measure.array_checks import check_type

@@ -17,7 +17,7 @@ import numpy as np
 from loopcal import engine
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.poses.linearization import LinearizedPoses, linearize_at_readings
-from loopcal.estimate.problem import problem_of
+from loopcal.estimate.problem_construction import problem_of
 from loopcal.measure import (
     Measurements,
     NuisanceParameters,

@@ -1,22 +1,72 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The result of linearizing a problem at a deviation: everything that is known there."""
+"""The result of linearizing a problem at a deviation, and the warm start of the next linearization.
+
+A start belongs to the deviations at which it was made. It predicts poses and nuisance parameters at
+other deviations to first order. It only chooses where iterations begin: their results do not depend
+on it beyond rounding, as long as it is near.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from loopcal import engine, geometry
 from loopcal.estimate.nuisance.elimination import EliminatedNuisance
-from loopcal.estimate.poses.solution import PoseEstimates
-from loopcal.estimate.start import Start
+from loopcal.estimate.poses.states import PoseEstimates, PoseStates
+from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class Linearization:
+class Start(TrialBatch):
+    """Warm start of t trials.
+
+    Attributes
+    ----------
+    deviation : (t, p) where it was made.
+    nuisance : (t, U) values of the nuisance parameters [SI]. slope : (t, U, p) their change.
+    first_nuisance : (t, U) values with which the first linearization began.
+    poses : states (t, n) of all poses; None where every solution begins at home.
+    motion : (t, n, 6, p) change of the poses by the scaled parameters, in single precision because
+        it only chooses a start; None where poses are not predicted.
+    """
+
+    deviation: FloatArray
+    nuisance: FloatArray
+    slope: FloatArray
+    first_nuisance: FloatArray
+    poses: PoseStates | None = None
+    motion: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.deviation)
+
+    def predict_nuisance(self, deviation: FloatArray) -> FloatArray:
+        """Return the nuisance parameters (t, U) at deviations (t, p), to first order."""
+        change = deviation - self.deviation
+        return self.nuisance + np.matmul(self.slope, change[..., None])[..., 0]
+
+    def predict_states(self, deviation: FloatArray) -> engine.State | None:
+        """Return the states (t, n) at deviations (t, p), to first order; None to begin at home."""
+        if self.poses is None or self.motion is None:
+            return self.poses and self.poses.state
+        change = (deviation - self.deviation).astype(np.float32)
+        twist = np.matmul(self.motion, change[:, None, :, None])[..., 0].astype(np.float64)
+        return replace(self.poses.state, T=geometry.apply_twist(self.poses.state.T, twist))
+
+    def with_nuisance(self, values: FloatArray) -> Start:
+        """Return this start with other nuisance parameters (t, U), which do not move."""
+        values = np.broadcast_to(values, self.nuisance.shape)
+        return replace(
+            self, nuisance=values, first_nuisance=values, slope=np.zeros_like(self.slope)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization(TrialBatch):
     """A problem of t trials at deviations z, nuisance parameters and poses eliminated.
 
     Attributes
@@ -38,35 +88,6 @@ class Linearization:
     next_start: Start
     nuisance: EliminatedNuisance | None = None
     poses: PoseEstimates | None = None
-
-    def take(self, trials: IntArray) -> Linearization:
-        """Return some trials."""
-        return Linearization(
-            self.deviation[trials],
-            self.factor[trials],
-            self.cost[trials],
-            self.equations[trials],
-            self.next_start.take(trials),
-            self.nuisance and self.nuisance.take(trials),
-            self.poses and self.poses.take(trials),
-        )
-
-    @staticmethod
-    def join(parts: Sequence[Linearization]) -> Linearization:
-        """Return the trials of all parts, one after the other."""
-        if len(parts) == 1:
-            return parts[0]
-        nuisance = [part.nuisance for part in parts if part.nuisance is not None]
-        poses = [part.poses for part in parts if part.poses is not None]
-        return Linearization(
-            np.concatenate([part.deviation for part in parts]),
-            np.concatenate([part.factor for part in parts]),
-            np.concatenate([part.cost for part in parts]),
-            np.concatenate([part.equations for part in parts]),
-            Start.join([part.next_start for part in parts]),
-            EliminatedNuisance.join(nuisance) if nuisance else None,
-            PoseEstimates.join(poses) if poses else None,
-        )
 
 
 class LeverageRows(NamedTuple):

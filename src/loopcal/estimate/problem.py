@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-# size: the problem and how it is made from measurements
 """The least-squares problem of an identification, linearized by a pure function.
 
 A problem holds the free parameters of a robot, the whitened rows of every kind, the table of
@@ -18,56 +17,28 @@ docs/theory/uncertain-readings.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from loopcal import engine
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.linearization import LeverageRows, Linearization
-from loopcal.estimate.nuisance.elimination import (
-    NodeMembers,
-    NuisanceElimination,
-    fold_node_rows,
-    plan_elimination,
-)
+from loopcal.estimate.linearization import LeverageRows, Linearization, Start
+from loopcal.estimate.nuisance.elimination import NodeMembers, NuisanceElimination, fold_node_rows
 from loopcal.estimate.observation_rows import BLOCK, ObservationRows, Residuals, divide_poses
-from loopcal.estimate.poses.components import (
-    divide_components,
-    find_components,
-    group_components,
-    groups_of_nodes,
-)
-from loopcal.estimate.poses.coordinates import PoseCoordinates, ReadingCoordinates, TwistCoordinates
+from loopcal.estimate.poses.components import divide_components, group_components, groups_of_nodes
+from loopcal.estimate.poses.coordinates import PoseCoordinates, TwistCoordinates
 from loopcal.estimate.poses.exact import ExactPoses
 from loopcal.estimate.poses.initialization import first_poses
 from loopcal.estimate.poses.linearization import evaluate_rows, whiten
-from loopcal.estimate.poses.solution import PoseSolution
-from loopcal.estimate.poses.states import PoseStates
+from loopcal.estimate.poses.states import PoseSolution, PoseStates
 from loopcal.estimate.poses.uncertain import UncertainPoses
-from loopcal.estimate.start import Start
-from loopcal.measure import (
-    Measurements,
-    NuisanceParameters,
-    Trials,
-    collect_nuisance_parameters,
-    list_sensed_joints,
-    make_readings_kind,
-    resolve_reading_sigma,
-)
-from loopcal.measure.whitening import compute_whitener
+from loopcal.measure import Measurements, list_sensed_joints
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
 from loopcal.typing import FloatArray, IntArray
-from loopcal.units import Dimension
-
-POSE_CONTROL = Halving(attempts=10, stuck=1e-3)
-"""Control of the iteration to uncertain poses, which may lie at the end of their reach."""
-
-UNKNOWN_READING = 1e-3
-"""Unit of a reading that was not taken: this share of the robot's size, or this many radians. It
-has no row."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,17 +73,18 @@ class Problem:
     member: IntArray | None = None
     coordinates: PoseCoordinates | None = None
     located: FloatArray | None = None
-    poses: ExactPoses | UncertainPoses = field(init=False)
-    component_count: IntArray = field(init=False)
 
-    def __post_init__(self) -> None:
-        exact = self.coordinates is None or self.member is None
+    @cached_property
+    def poses(self) -> ExactPoses | UncertainPoses:
+        """Rows at the poses, which readings determine or which are estimated."""
+        return self._exact_poses() if self.coordinates is None else self._uncertain_poses()
+
+    @cached_property
+    def component_count(self) -> IntArray:
+        """(T | 1, components) residuals that are present."""
         n = self.readings.shape[1]
         member = np.zeros(n, dtype=np.int64) if self.member is None else self.member
-        count = _count_by_component(self.rows, member)
-        object.__setattr__(self, "component_count", count)
-        make = self._exact_poses if exact else self._uncertain_poses
-        object.__setattr__(self, "poses", make())
+        return _count_by_component(self.rows, member)
 
     def __len__(self) -> int:
         return len(self.trials)
@@ -125,7 +97,7 @@ class Problem:
     @property
     def is_uncertain(self) -> bool:
         """Whether readings are uncertain, so that poses are unknowns."""
-        return isinstance(self.poses, UncertainPoses)
+        return self.coordinates is not None
 
     @property
     def residual_count(self) -> IntArray:
@@ -149,10 +121,8 @@ class Problem:
         """Return the problem of some trials; this object where these are all of them."""
         if np.array_equal(trials, np.arange(len(self))):
             return self
-        other = object.__new__(Problem)
-        for name, value in vars(self).items():
-            object.__setattr__(other, name, value)
-        object.__setattr__(other, "trials", self.trials[trials])
+        other = replace(self, trials=self.trials[trials])
+        vars(other).update(poses=self.poses, component_count=self.component_count)
         return other
 
     def weighted(self, weight: FloatArray) -> Problem:
@@ -364,94 +334,6 @@ class Problem:
         return UncertainPoses(
             self.free, names, coordinates, member, blocks, groups, self.nuisance, is_needed
         )
-
-
-def problem_of(
-    free: FreeParameters, data: Measurements, local: NuisanceParameters | None = None
-) -> Problem:
-    """Return the problem of one machine's measurements.
-
-    Where readings have a sigma above 0, poses are unknowns, too. `local` are the nuisance
-    parameters of the measurements, default as stated there.
-    """
-    own = data.nuisance_parameters if local is None else local
-    rows = tuple(
-        ObservationRows(o.kind, o.rows, o.measured[None], o.whitener[None], places)
-        for o, places in zip(data.observations, own.indices, strict=True)
-        if len(o)
-    )
-    return make_problem(free, data.readings[None], data.reading_sigma, rows, 1, own, lambda _: data)
-
-
-def problem_of_trials(free: FreeParameters, trials: Trials) -> Problem:
-    """Return the problem of t simulated machines."""
-    sensors, first = trials.instrument.sensors, trials.trial(0)
-    local = collect_nuisance_parameters(first.observations, first.labels)
-    rows = []
-    for sensor, measured, places in zip(sensors, trials.measured, local.indices, strict=True):
-        kind = sensor.kind
-        present = kind.detect_present(measured)
-        N = kind.linearize_noise(measured)
-        covariance = (N * np.asarray(sensor.noise.sigma) ** 2) @ np.swapaxes(N, -1, -2)
-        t, r, m = present.shape
-        flat = np.broadcast_to(covariance, (t, r, m, m)).reshape(-1, m, m)
-        white = compute_whitener(flat, present.reshape(-1, m), np.ones(t * r)).reshape(t, r, m, m)
-        rows.append(ObservationRows(kind, sensor.assigned_rows, measured, white, places))
-    recorded = trials.readings[None] if trials.recorded is None else trials.recorded
-    return make_problem(
-        free, recorded, trials.reading_sigma, tuple(rows), len(trials), local, trials.trial
-    )
-
-
-def make_problem(
-    free: FreeParameters,
-    recorded: FloatArray,
-    sigma: FloatArray | None,
-    rows: tuple[ObservationRows, ...],
-    trials: int,
-    local: NuisanceParameters,
-    data: Callable[[int], Measurements],
-) -> Problem:
-    """Return the problem of observed rows at readings (t | 1, n, actuators) [SI].
-
-    `sigma` (n, actuators) [SI] of the readings; None where they are exact unless the robot states
-    the sigma of its actuators.
-    """
-    numbers, robot = np.arange(trials), free.robot
-    believed = resolve_reading_sigma(robot, sigma, recorded.shape[1])
-    if believed is None:
-        nuisance = plan_elimination(local, rows)
-        return Problem(free, recorded[:1], rows, numbers, nuisance, data)
-    every = (*rows, _reading_rows(free, recorded, believed))
-    names = list_sensed_joints(r.kind for r in every)
-    if robot.program.sigma is None:
-        unit = [robot.size if a.dimension is Dimension.LENGTH else 1.0 for a in robot.actuators]
-        scale = np.where(np.isinf(believed), UNKNOWN_READING * np.array(unit), believed)
-        coordinates: PoseCoordinates = ReadingCoordinates(free, scale, names)
-    else:
-        coordinates = TwistCoordinates(free, names)
-    member = find_components(recorded.shape[1], every, coordinates.freedoms)
-    nuisance = plan_elimination(local, rows, member)
-    return Problem(
-        free,
-        recorded,
-        every,
-        numbers,
-        nuisance,
-        data,
-        control=POSE_CONTROL,
-        sigma=believed,
-        member=member,
-        coordinates=coordinates,
-    )
-
-
-def _reading_rows(free: FreeParameters, recorded: FloatArray, sigma: FloatArray) -> ObservationRows:
-    """Return the rows of uncertain readings, (true - recorded) / sigma."""
-    is_row = np.isfinite(sigma) & (sigma > 0.0)
-    weight = np.where(is_row, 1.0 / np.where(is_row, sigma, 1.0), 0.0)
-    white = weight[None, :, :, None] * np.eye(sigma.shape[1])
-    return ObservationRows(make_readings_kind(free.robot), np.arange(len(sigma)), recorded, white)
 
 
 def _needed_poses(rows: Sequence[ObservationRows], n: int) -> np.ndarray:

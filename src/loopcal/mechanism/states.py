@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import fields
 from enum import IntEnum
 
 import numpy as np
@@ -12,6 +10,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.engine import LENGTH, PITCH, Group, Program, State
 from loopcal.mechanism.model import Mechanism
+from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray
 
 
@@ -51,38 +50,26 @@ def make_start(T: FloatArray, joints: tuple[FloatArray, ...]) -> State:
     return State(T, joints, none, zero, zero.astype(np.int64), none)
 
 
-def _map_arrays(make: Callable[..., np.ndarray], *states: State) -> State:
-    """Return the state whose every array is made from the same array of the given states."""
-    made = {}
-    for f in fields(State):
-        arrays = [getattr(s, f.name) for s in states]
-        if f.name == "joints":
-            made[f.name] = tuple(make(*group) for group in zip(*arrays, strict=True))
-        else:
-            made[f.name] = make(*arrays)
-    return State(**made)
-
-
 def select_rows(state: State, shape: tuple[int, int], trial: np.ndarray, pose: np.ndarray) -> State:
     """Return rows (trial, pose) of a state that broadcasts to `shape` = (t, n), as (rows, 1)."""
-    return _map_arrays(
+    return map_arrays(
         lambda a: np.broadcast_to(a, (*shape, *a.shape[2:]))[trial, pose][:, None], state
     )
 
 
 def select_poses(state: State, rows: np.ndarray) -> State:
     """Return poses `rows` (positions or a mask) of a state (t, n), all trials."""
-    return _map_arrays(lambda a: a[:, rows], state)
+    return map_arrays(lambda a: a[:, rows], state)
 
 
 def select_block(state: State, rows: tuple[slice, slice]) -> State:
     """Return a block of trials and poses of a state (t, n)."""
-    return _map_arrays(lambda a: a[rows], state)
+    return map_arrays(lambda a: a[rows], state)
 
 
 def join_states(*states: State) -> State:
     """Return states (t, n_i) one after the other, (t, sum n_i)."""
-    return _map_arrays(lambda *arrays: np.concatenate(arrays, axis=1), *states)
+    return map_arrays(lambda *arrays: np.concatenate(arrays, axis=1), *states)
 
 
 def replace_rows(state: State, trial: np.ndarray, pose: np.ndarray, new: State) -> State:
@@ -93,12 +80,12 @@ def replace_rows(state: State, trial: np.ndarray, pose: np.ndarray, new: State) 
         out[trial, pose] = b[:, 0]
         return out
 
-    return _map_arrays(replaced, state, new)
+    return map_arrays(replaced, state, new)
 
 
 def reshape_rows(state: State, t: int, n: int) -> State:
     """Return the rows of a state (t n, 1) as (t, n)."""
-    return _map_arrays(lambda a: a.reshape(t, n, *a.shape[2:]), state)
+    return map_arrays(lambda a: a.reshape(t, n, *a.shape[2:]), state)
 
 
 def driven_values(program: Program, state: State) -> FloatArray:

@@ -13,10 +13,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 RANK_TOLERANCE = 1e-11
@@ -63,19 +64,8 @@ def without_rounding(values: FloatArray, size: FloatArray) -> FloatArray:
     )
 
 
-PER_TRIAL = (
-    "singular_values",
-    "directions",
-    "projections",
-    "outside",
-    "rows",
-    "dual",
-    "unpenalized",
-)
-
-
 @dataclass(frozen=True)
-class Decomposition:
+class Decomposition(TrialBatch):
     """Singular value decomposition A diag(scale) = U diag(s) V' of folded rows [A | b].
 
     A deviation z has the coordinates y = V' (z / scale); in them the least-squares sum is sum (s_i
@@ -100,6 +90,8 @@ class Decomposition:
     dual : (t, p, p) inverse of V where V is oblique; None where it is V'.
     unpenalized : (t, p) directions of parameters that are never penalized; None without any.
     """
+
+    shared: ClassVar[tuple[str, ...]] = ("scale",)
 
     singular_values: FloatArray
     directions: FloatArray
@@ -227,21 +219,6 @@ class Decomposition:
         result = np.sqrt(np.matmul(self.directions**2, finite[:, :, None])[:, :, 0]) * self.scale
         return np.where(self._touched(infinite), np.inf, result) if infinite.any() else result
 
-    def take(self, trials: IntArray) -> Decomposition:
-        """Return the decomposition of some trials only (the same object where these are all)."""
-        if len(trials) == len(self.outside):
-            return self
-        return replace(self, **{name: array[trials] for name, array in self._per_trial().items()})
-
-    def put(self, trials: IntArray, other: Decomposition) -> Decomposition:
-        """Return this decomposition with some trials taken from another one."""
-        if len(trials) == len(self.outside):
-            return other
-        merged = {name: array.copy() for name, array in self._per_trial().items()}
-        for name, array in merged.items():
-            array[trials] = getattr(other, name)
-        return replace(self, **merged)
-
     def null_space(self, trial: int = 0) -> FloatArray:
         """Return a basis (p, d) of the scaled deviations that change no row, for one trial;
         orthonormal without `unpenalized`.
@@ -294,10 +271,6 @@ class Decomposition:
             self.outside / sigma**2,
         )
         return replace(self, singular_values=s, projections=c, outside=outside)
-
-    def _per_trial(self) -> dict[str, NDArray]:
-        """Arrays with the trial axis, by name."""
-        return {name: getattr(self, name) for name in PER_TRIAL if getattr(self, name) is not None}
 
     def _touched(self, infinite: BoolArray) -> BoolArray:
         """(t, p) which parameters have a part in the directions marked (t, p)."""

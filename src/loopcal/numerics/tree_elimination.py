@@ -12,9 +12,9 @@ over a whole cluster. See docs/theory/identification.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from loopcal import engine
 from loopcal.numerics.decomposition import NULL_COMPONENT, empty_factor
 from loopcal.numerics.elimination import Elimination, eliminate_from_triangle
 from loopcal.numerics.elimination_tree import EliminationTree, Structure
+from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 SHORTEST_DIRECTION = 0.5
@@ -95,13 +96,9 @@ class NodeSolution:
     solution: FloatArray
     unobservable: FloatArray
 
-    def take(self, trials: IntArray) -> NodeSolution:
-        """Return some trials."""
-        return NodeSolution(*(array[trials] for array in vars(self).values()))
-
 
 @dataclass(frozen=True, eq=False)
-class TreeElimination:
+class TreeElimination(TrialBatch):
     """U eliminated unknowns: their best values are a linear function of the machine's deviation.
 
     Attributes
@@ -113,6 +110,8 @@ class TreeElimination:
     is_unobservable : (a, U) unknowns with a part in an unobservable direction.
     nodes : the solution of every structure.
     """
+
+    shared: ClassVar[tuple[str, ...]] = ("tree",)
 
     tree: EliminationTree
     slope: FloatArray
@@ -160,44 +159,6 @@ class TreeElimination:
             own = root[:, :, : structure.unknowns.shape[1]]
             variance[:, structure.unknowns] = (own**2).sum(axis=-1)
         return variance
-
-    def take(self, trials: IntArray) -> TreeElimination:
-        """Return some trials."""
-        return TreeElimination(
-            self.tree,
-            self.slope[trials],
-            self.shift[trials],
-            self.rank[trials],
-            self.is_unobservable[trials],
-            tuple(node.take(trials) for node in self.nodes),
-        )
-
-    @staticmethod
-    def join(parts: Sequence[TreeElimination]) -> TreeElimination:
-        """Return the trials of all parts, one after the other."""
-        if len(parts) == 1:
-            return parts[0]
-
-        def joined(name: str) -> np.ndarray:
-            return np.concatenate([getattr(part, name) for part in parts])
-
-        nodes = tuple(
-            NodeSolution(
-                *(
-                    np.concatenate(arrays)
-                    for arrays in zip(*(vars(s).values() for s in one), strict=True)
-                )
-            )
-            for one in zip(*(part.nodes for part in parts), strict=True)
-        )
-        return TreeElimination(
-            parts[0].tree,
-            joined("slope"),
-            joined("shift"),
-            joined("rank"),
-            joined("is_unobservable"),
-            nodes,
-        )
 
 
 def eliminate_tree(factors: NodeFactors) -> tuple[TreeElimination, FloatArray]:

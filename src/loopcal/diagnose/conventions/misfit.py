@@ -22,7 +22,8 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.linearization import Linearization
 from loopcal.estimate.nuisance.elimination import plan_elimination
 from loopcal.estimate.observation_rows import ObservationRows, Residuals
-from loopcal.estimate.problem import Problem, problem_of
+from loopcal.estimate.problem import Problem
+from loopcal.estimate.problem_construction import problem_of
 from loopcal.measure import Measurements, NuisanceParameters
 from loopcal.measure.initial_values import guess_nuisance_values_batch
 from loopcal.mechanism import find_directly_reachable, forward, forward_trials

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.diagnose.fit_checks.influence import Influence, compute_influence
+from loopcal.estimate.linearization import Start
 from loopcal.estimate.minimization.robust_descent import estimate_scale_of
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
-from loopcal.estimate.start import Start
 from loopcal.numerics.decomposition import decompose
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 

@@ -26,7 +26,7 @@ from loopcal.diagnose.fit_checks.outlier_search import (
 )
 from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.observation_rows import linked_blocks
-from loopcal.estimate.problem import problem_of
+from loopcal.estimate.problem_construction import problem_of
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma

@@ -20,7 +20,7 @@ import numpy as np
 
 from loopcal.estimate.fit_input import exclude_poses
 from loopcal.estimate.inference.residual_test import SIGNIFICANCE
-from loopcal.estimate.problem import problem_of
+from loopcal.estimate.problem_construction import problem_of
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma

@@ -20,9 +20,8 @@ import numpy as np
 from loopcal import engine
 from loopcal.errors import EstimationError, suggest_names
 from loopcal.estimate.inference.posterior import Posterior
-from loopcal.estimate.linearization import Linearization
+from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.problem import Problem
-from loopcal.estimate.start import Start
 from loopcal.findings import report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.numerics.decomposition import RANK_TOLERANCE

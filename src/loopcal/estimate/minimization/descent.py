@@ -16,10 +16,9 @@ from typing import Protocol, Self
 import numpy as np
 
 from loopcal.errors import EstimationError
-from loopcal.estimate.linearization import Linearization
+from loopcal.estimate.linearization import Linearization, Start
 from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.minimization.filtered_step import FilteredStep, penalize, propose_step
-from loopcal.estimate.start import Start
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, decompose
 from loopcal.numerics.gauss_newton import ROUNDING, Damping, DescentStatus, minimize
 from loopcal.typing import BoolArray, FloatArray, IntArray

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopcal.estimate.inference.prior import Prior
+from loopcal.estimate.linearization import Start
 from loopcal.estimate.methods.losses import Huber, Loss, Tukey
 from loopcal.estimate.minimization.descent import Descent
 from loopcal.estimate.problem import Problem
-from loopcal.estimate.start import Start
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.typing import FloatArray, IntArray
 

@@ -24,6 +24,7 @@ from loopcal.measure import Measurements, NuisanceParameters, Observations, gues
 from loopcal.numerics.elimination_tree import EliminationTree, build_tree
 from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
 from loopcal.numerics.tree_elimination import NodeFactors, TreeElimination, eliminate_tree
+from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.parameters import ParameterTable
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
@@ -63,7 +64,7 @@ class NodeRows(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class EliminatedNuisance:
+class EliminatedNuisance(TrialBatch):
     """Nuisance parameters of t trials at the point of a linearization.
 
     Attributes
@@ -79,18 +80,6 @@ class EliminatedNuisance:
     def best(self) -> FloatArray:
         """(t, U) best values."""
         return self.values + self.elimination.shift
-
-    def take(self, trials: IntArray) -> EliminatedNuisance:
-        """Return some trials."""
-        return EliminatedNuisance(self.values[trials], self.elimination.take(trials))
-
-    @staticmethod
-    def join(parts: Sequence[EliminatedNuisance]) -> EliminatedNuisance:
-        """Return the trials of all parts, one after the other."""
-        values = np.concatenate([part.values for part in parts])
-        return EliminatedNuisance(
-            values, TreeElimination.join([part.elimination for part in parts])
-        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from loopcal.estimate.poses.solution import PoseEstimates
+from loopcal.estimate.poses.states import PoseEstimates
 from loopcal.estimate.problem import Problem
 from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.geometry import wrap_angle

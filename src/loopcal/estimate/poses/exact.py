@@ -10,6 +10,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.linearization import Start
 from loopcal.estimate.nuisance.elimination import (
     NodeMembers,
     NodeRows,
@@ -26,13 +27,12 @@ from loopcal.estimate.poses.linearization import (
     linearize_rows,
     locate_poses,
 )
-from loopcal.estimate.poses.solution import PoseSolution
-from loopcal.estimate.poses.states import PoseStates, map_states
-from loopcal.estimate.start import Start, spread_states
+from loopcal.estimate.poses.states import PoseSolution, PoseStates, spread_states
 from loopcal.mechanism import forward_trials
 from loopcal.numerics.decomposition import empty_factor
 from loopcal.numerics.gauss_newton import Halving
 from loopcal.numerics.tree_elimination import NodeFactors
+from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 
@@ -89,7 +89,7 @@ class ExactPoses:
             return np.where(ok.reshape(*ok.shape, *[1] * (new.ndim - 2)), new, before)
 
         motion = linearized.by_parameters.astype(np.float32)
-        state = map_states(kept, states.state, old.state)
+        state = map_arrays(kept, states.state, old.state)
         return PoseStates(state, old.q), np.broadcast_to(motion, (a, *motion.shape[1:]))
 
     def solve(

@@ -16,9 +16,9 @@ import numpy as np
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.poses.coordinates import stroke_of
 from loopcal.estimate.poses.measured import measure_poses, sum_squares_at
-from loopcal.estimate.poses.states import PoseStates, map_states
-from loopcal.estimate.start import spread_states
+from loopcal.estimate.poses.states import PoseStates, spread_states
 from loopcal.mechanism import Mechanism, Status, compute_readings, forward_trials, inverse
+from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 TRIED = 9
@@ -72,8 +72,8 @@ def _begin_at_measured(
     good = solution.converged
     chosen = (where[0][good], where[1][good])
     q = np.where(missing[chosen], solution.q[good], begin.q[chosen])
-    state = map_states(lambda array: array[0, good], solution.state)
-    return begin.put(chosen, PoseStates(state, q))
+    state = map_arrays(lambda array: array[0, good], solution.state)
+    return begin.put_poses(*chosen, PoseStates(state, q))
 
 
 def _begin_at_best_reading(
@@ -114,9 +114,9 @@ def _begin_at_best_reading(
     best = squares.argmin(axis=1)
     good = np.isfinite(squares.min(axis=1))
     pick = (np.arange(len(pose)) * count + best)[good]
-    chosen = map_states(lambda array: array[0, pick], state)
+    chosen = map_arrays(lambda array: array[0, pick], state)
     q = tried[np.flatnonzero(good), best[good]]
-    return begin.put((trial[good], pose[good]), PoseStates(chosen, q))
+    return begin.put_poses(trial[good], pose[good], PoseStates(chosen, q))
 
 
 def _fill_from_nearest(recorded: FloatArray, home: FloatArray) -> FloatArray:
@@ -151,5 +151,5 @@ def _solve_redundant(robot: Mechanism, begin: PoseStates) -> PoseStates:
         spread = is_known.reshape(*is_known.shape, *[1] * (solved.ndim - 2))
         return np.where(spread, solved[trial, pick], first)
 
-    placed = map_states(chosen, state, begin.state)
+    placed = map_arrays(chosen, state, begin.state)
     return PoseStates(replace(placed, status=np.zeros_like(placed.status)), begin.q)

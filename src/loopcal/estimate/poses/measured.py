@@ -17,7 +17,6 @@ import numpy as np
 from loopcal import engine, geometry
 from loopcal.estimate.observation_rows import ObservationRows
 from loopcal.estimate.poses.linearization import whiten
-from loopcal.estimate.poses.states import map_states
 from loopcal.mechanism import (
     Mechanism,
     Status,
@@ -26,6 +25,7 @@ from loopcal.mechanism import (
     read_coordinates,
 )
 from loopcal.numerics.gauss_newton import DescentStatus, FixedFactors, minimize
+from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 STEPS = 30
@@ -88,7 +88,7 @@ class _Point:
 
     def take(self, chosen: IntArray) -> _Point:
         """Return some poses."""
-        state = self.state and map_states(lambda array: array[:, chosen], self.state)
+        state = self.state and map_arrays(lambda array: array[:, chosen], self.state)
         return _Point(
             self.T[chosen], self.trial[chosen], self.number[chosen], self.cost[chosen], state
         )
@@ -114,7 +114,7 @@ class _FullStep:
 
     def take(self, chosen: np.ndarray) -> _FullStep:
         """Return some poses."""
-        state = self.state and map_states(lambda array: array[:, chosen], self.state)
+        state = self.state and map_arrays(lambda array: array[:, chosen], self.state)
         return _FullStep(
             self.T[chosen],
             self.twist[chosen],

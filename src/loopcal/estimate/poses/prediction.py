@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
-from loopcal.estimate.problem import make_problem
+from loopcal.estimate.problem_construction import make_problem
 from loopcal.measure import Measurements, NuisanceParameters, fill_in_reading_sigma
 from loopcal.mechanism import Mechanism, Solution, forward, make_solution
 from loopcal.parameters import ParameterTable

@@ -1,61 +1,85 @@
 # SPDX-License-Identifier: Apache-2.0
-"""States of the poses of many trials, with the joint values that belong to them."""
+"""Poses of a batch of trials: their states, and what solving for them gives."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from loopcal import engine
-from loopcal.typing import FloatArray, IntArray
+from loopcal.estimate.poses.linearization import LinearizedPoses
+from loopcal.numerics.trial_batch import TrialBatch, map_arrays
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class PoseStates:
+class PoseStates(TrialBatch):
     """Poses of a trials: states (a, n) and true readings q (a, n, actuators) [SI]."""
 
     state: engine.State
     q: FloatArray
 
-    def take(self, trials: IntArray) -> PoseStates:
-        """Return some trials."""
-        return PoseStates(map_states(lambda array: array[trials], self.state), self.q[trials])
-
-    def at_poses(self, poses: IntArray) -> PoseStates:
+    def take_poses(self, poses: IntArray) -> PoseStates:
         """Return some poses."""
-        return PoseStates(map_states(lambda array: array[:, poses], self.state), self.q[:, poses])
+        return map_arrays(lambda array: array[:, poses], self)
 
-    def put(
-        self, chosen: tuple[IntArray | slice, IntArray | slice], other: PoseStates
-    ) -> PoseStates:
-        """Return a copy in which the chosen (trials, poses) are those of another value."""
+    def put_poses(self, trials: IntArray, poses: IntArray, other: PoseStates) -> PoseStates:
+        """Return a copy in which k poses of given trials and numbers (k,) are other ones (k,)."""
 
         def replaced(old: np.ndarray, new: np.ndarray) -> np.ndarray:
             out = np.array(old)
-            out[chosen] = new
+            out[trials, poses] = new
             return out
 
-        return PoseStates(map_states(replaced, self.state, other.state), replaced(self.q, other.q))
+        return map_arrays(replaced, self, other)
 
     @staticmethod
-    def join(parts: Sequence[PoseStates], axis: int, order: IntArray | None = None) -> PoseStates:
-        """Return parts side by side along an axis, 0 trials or 1 poses, then in an order."""
-
-        def joined(*arrays: np.ndarray) -> np.ndarray:
-            whole = arrays[0] if len(arrays) == 1 else np.concatenate(arrays, axis=axis)
-            return whole if order is None else np.take(whole, order, axis=axis)
-
-        state = map_states(joined, *(part.state for part in parts))
-        return PoseStates(state, joined(*(part.q for part in parts)))
+    def join_poses(parts: Sequence[PoseStates], order: IntArray) -> PoseStates:
+        """Return the poses of all parts side by side, then in an order."""
+        return map_arrays(lambda *arrays: np.concatenate(arrays, axis=1)[:, order], *parts)
 
 
-def map_states(function: Callable[..., np.ndarray], *states: engine.State) -> engine.State:
-    """Return the state whose arrays are a function of the arrays of the given states."""
-    first, columns = states[0], range(len(states[0].joints))
-    joints = tuple(function(*(s.joints[g] for s in states)) for g in columns)
-    names = [f.name for f in dataclasses.fields(first) if f.name != "joints"]
-    arrays = {name: function(*(getattr(s, name) for s in states)) for name in names}
-    return engine.State(joints=joints, **arrays)
+def spread_states(state: engine.State, trials: int, poses: int) -> engine.State:
+    """Return a state (1, 1) or (1, n) as that of all trials and poses, without copying."""
+    return map_arrays(lambda a: np.broadcast_to(a, (trials, poses, *a.shape[2:])), state)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimates(TrialBatch):
+    """Poses of t trials that are unknown because readings are uncertain, where all rows fit best.
+
+    Attributes
+    ----------
+    states : (t, n) closed poses and true readings. is_reached : (t, n).
+    rank : (t, components) coordinates of poses that rows determine.
+    is_undetermined : (t, n) poses with a coordinate that no row determines; they stay where the
+        search began.
+    is_converged : (t,).
+    """
+
+    states: PoseStates
+    is_reached: BoolArray
+    rank: IntArray
+    is_undetermined: BoolArray
+    is_converged: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSolution:
+    """Poses and nuisance parameters of a trials at given deviations.
+
+    Attributes
+    ----------
+    nuisance : (a, U) values that fit best, or as given; None without any.
+    linearized : the poses of the only block; None where there are several, which are solved again
+        block by block.
+    states : (a, n) of the only block, for the next start; None as above.
+    estimates : of uncertain poses; None where readings are exact.
+    """
+
+    nuisance: FloatArray | None
+    linearized: LinearizedPoses | None = None
+    states: PoseStates | None = None
+    estimates: PoseEstimates | None = None

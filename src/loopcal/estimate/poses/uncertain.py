@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.linearization import Start
 from loopcal.estimate.nuisance.elimination import (
     NodeRows,
     NuisanceElimination,
@@ -30,13 +31,12 @@ from loopcal.estimate.observation_rows import PoseBlock
 from loopcal.estimate.poses.components import ComponentGroup, stack_rows
 from loopcal.estimate.poses.coordinates import PoseCoordinates
 from loopcal.estimate.poses.linearization import KindRows, LinearizedPoses, linearize_rows
-from loopcal.estimate.poses.solution import PoseEstimates, PoseSolution
-from loopcal.estimate.poses.states import PoseStates, map_states
-from loopcal.estimate.start import Start
+from loopcal.estimate.poses.states import PoseEstimates, PoseSolution, PoseStates
 from loopcal.numerics.decomposition import NULL_COMPONENT, empty_factor
 from loopcal.numerics.elimination import Elimination, eliminate_columns
 from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
 from loopcal.numerics.tree_elimination import NodeFactors, eliminate_tree
+from loopcal.numerics.trial_batch import map_arrays
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 
@@ -201,7 +201,7 @@ class UncertainPoses:
         for block in self.blocks:
             poses = solution.linearized
             if poses is None:
-                states = solution.states.at_poses(block.poses)
+                states = solution.states.take_poses(block.poses)
                 poses = self.coordinates.linearize(values, states, block.poses)
             yield block, poses
 
@@ -219,7 +219,7 @@ class UncertainPoses:
         assert start.poses is not None
         values, parts = self.free.values(z), []
         for block in self.blocks:
-            closed = self.coordinates.close(values, start.poses.at_poses(block.poses), True)
+            closed = self.coordinates.close(values, start.poses.take_poses(block.poses), True)
             poses = self.coordinates.linearize(values, closed, block.poses)
             if poses.is_lost(block.is_needed)[0]:
                 return None
@@ -255,7 +255,7 @@ class UncertainPoses:
         kept, solutions, closed, reached = [], [], [], []
         is_lost = np.zeros(a, dtype=bool)
         for block, groups in zip(self.blocks, self.groups, strict=True):
-            states = begin.at_poses(block.poses)
+            states = begin.take_poses(block.poses)
             solved = self.coordinates.close(values, states, is_still is None)
             if is_still is not None:
                 solved = _keep_still(solved, states, is_still[:, block.poses])
@@ -285,7 +285,7 @@ class UncertainPoses:
             self.nuisance.fold_priors(factors, nuisance)
         order = self._pose_order()
         return _Point(
-            states=PoseStates.join(closed, 1, order),
+            states=PoseStates.join_poses(closed, order),
             nuisance=nuisance,
             linearized=kept,
             is_reached=np.concatenate(reached, axis=1)[:, order],
@@ -416,6 +416,4 @@ def _keep_still(solved: PoseStates, before: PoseStates, is_still: BoolArray) -> 
     rows, poses = np.nonzero(is_still)
     if not len(rows):
         return solved
-    chosen = (rows, poses)
-    state = map_states(lambda array: array[chosen], before.state)
-    return solved.put(chosen, PoseStates(state, before.q[chosen]))
+    return solved.put_poses(rows, poses, map_arrays(lambda array: array[rows, poses], before))

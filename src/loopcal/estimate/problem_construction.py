@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Construction of a problem: from the measurements of one machine, or of many simulated ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from loopcal.estimate.free_parameters import FreeParameters
+from loopcal.estimate.nuisance.elimination import plan_elimination
+from loopcal.estimate.observation_rows import ObservationRows
+from loopcal.estimate.poses.components import find_components
+from loopcal.estimate.poses.coordinates import PoseCoordinates, ReadingCoordinates, TwistCoordinates
+from loopcal.estimate.problem import Problem
+from loopcal.measure import (
+    Measurements,
+    NuisanceParameters,
+    Trials,
+    collect_nuisance_parameters,
+    list_sensed_joints,
+    make_readings_kind,
+    resolve_reading_sigma,
+)
+from loopcal.measure.whitening import compute_whitener
+from loopcal.numerics.gauss_newton import Halving
+from loopcal.typing import FloatArray
+from loopcal.units import Dimension
+
+POSE_CONTROL = Halving(attempts=10, stuck=1e-3)
+"""Control of the iteration to uncertain poses, which may lie at the end of their reach."""
+
+UNKNOWN_READING = 1e-3
+"""Unit of a reading that was not taken: this share of the robot's size, or this many radians. It
+has no row."""
+
+
+def problem_of(
+    free: FreeParameters, data: Measurements, local: NuisanceParameters | None = None
+) -> Problem:
+    """Return the problem of one machine's measurements.
+
+    Where readings have a sigma above 0, poses are unknowns, too. `local` are the nuisance
+    parameters of the measurements, default as stated there.
+    """
+    own = data.nuisance_parameters if local is None else local
+    rows = tuple(
+        ObservationRows(o.kind, o.rows, o.measured[None], o.whitener[None], places)
+        for o, places in zip(data.observations, own.indices, strict=True)
+        if len(o)
+    )
+    return make_problem(free, data.readings[None], data.reading_sigma, rows, 1, own, lambda _: data)
+
+
+def problem_of_trials(free: FreeParameters, trials: Trials) -> Problem:
+    """Return the problem of t simulated machines."""
+    sensors, first = trials.instrument.sensors, trials.trial(0)
+    local = collect_nuisance_parameters(first.observations, first.labels)
+    rows = []
+    for sensor, measured, places in zip(sensors, trials.measured, local.indices, strict=True):
+        kind = sensor.kind
+        present = kind.detect_present(measured)
+        N = kind.linearize_noise(measured)
+        covariance = (N * np.asarray(sensor.noise.sigma) ** 2) @ np.swapaxes(N, -1, -2)
+        t, r, m = present.shape
+        flat = np.broadcast_to(covariance, (t, r, m, m)).reshape(-1, m, m)
+        white = compute_whitener(flat, present.reshape(-1, m), np.ones(t * r)).reshape(t, r, m, m)
+        rows.append(ObservationRows(kind, sensor.assigned_rows, measured, white, places))
+    recorded = trials.readings[None] if trials.recorded is None else trials.recorded
+    return make_problem(
+        free, recorded, trials.reading_sigma, tuple(rows), len(trials), local, trials.trial
+    )
+
+
+def make_problem(
+    free: FreeParameters,
+    recorded: FloatArray,
+    sigma: FloatArray | None,
+    rows: tuple[ObservationRows, ...],
+    trials: int,
+    local: NuisanceParameters,
+    data: Callable[[int], Measurements],
+) -> Problem:
+    """Return the problem of observed rows at readings (t | 1, n, actuators) [SI].
+
+    `sigma` (n, actuators) [SI] of the readings; None where they are exact unless the robot states
+    the sigma of its actuators.
+    """
+    numbers, robot = np.arange(trials), free.robot
+    believed = resolve_reading_sigma(robot, sigma, recorded.shape[1])
+    if believed is None:
+        nuisance = plan_elimination(local, rows)
+        return Problem(free, recorded[:1], rows, numbers, nuisance, data)
+    every = (*rows, _reading_rows(free, recorded, believed))
+    names = list_sensed_joints(r.kind for r in every)
+    if robot.program.sigma is None:
+        unit = [robot.size if a.dimension is Dimension.LENGTH else 1.0 for a in robot.actuators]
+        scale = np.where(np.isinf(believed), UNKNOWN_READING * np.array(unit), believed)
+        coordinates: PoseCoordinates = ReadingCoordinates(free, scale, names)
+    else:
+        coordinates = TwistCoordinates(free, names)
+    member = find_components(recorded.shape[1], every, coordinates.freedoms)
+    nuisance = plan_elimination(local, rows, member)
+    return Problem(
+        free,
+        recorded,
+        every,
+        numbers,
+        nuisance,
+        data,
+        control=POSE_CONTROL,
+        sigma=believed,
+        member=member,
+        coordinates=coordinates,
+    )
+
+
+def _reading_rows(free: FreeParameters, recorded: FloatArray, sigma: FloatArray) -> ObservationRows:
+    """Return the rows of uncertain readings, (true - recorded) / sigma."""
+    is_row = np.isfinite(sigma) & (sigma > 0.0)
+    weight = np.where(is_row, 1.0 / np.where(is_row, sigma, 1.0), 0.0)
+    white = weight[None, :, :, None] * np.eye(sigma.shape[1])
+    return ObservationRows(make_readings_kind(free.robot), np.arange(len(sigma)), recorded, white)

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Values of a batch of trials: frozen dataclasses whose arrays begin with an axis of trials."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, ClassVar, Self, TypeVar
+
+import numpy as np
+
+from loopcal.typing import IntArray
+
+Value = TypeVar("Value")
+
+
+def map_arrays(function: Callable[..., np.ndarray], *values: Value) -> Value:
+    """Return the value each array of which is a function of the same array of all given values.
+
+    Values are arrays, dataclasses and tuples of values, and anything else, which is taken from the
+    first one. What is None in one of them is None. A dataclass keeps the fields that it names in
+    `shared`.
+    """
+    if any(value is None for value in values):
+        return None  # type: ignore[return-value]
+    first: Any = values[0]
+    if isinstance(first, np.ndarray):
+        return function(*values)  # type: ignore[return-value]
+    if isinstance(first, tuple):
+        parts: Any = zip(*values, strict=True)  # type: ignore[call-overload]
+        return tuple(map_arrays(function, *part) for part in parts)  # type: ignore[return-value]
+    if is_dataclass(first):
+        shared = getattr(first, "shared", ())
+        names = [f.name for f in fields(first) if f.name not in shared]
+        made = {n: map_arrays(function, *(getattr(value, n) for value in values)) for n in names}
+        return replace(first, **made)  # type: ignore[type-var]
+    return first
+
+
+class TrialBatch:
+    """Base of frozen dataclasses whose arrays begin with an axis of t trials.
+
+    Attributes
+    ----------
+    shared : names of the fields that belong to no trial.
+    """
+
+    shared: ClassVar[tuple[str, ...]] = ()
+
+    def take(self, trials: IntArray) -> Self:
+        """Return some trials; this object where these are all of them."""
+        if np.array_equal(trials, np.arange(_count_trials(self))):
+            return self
+        return map_arrays(lambda array: array[trials], self)
+
+    def put(self, trials: IntArray, other: Self) -> Self:
+        """Return this value with some trials taken from another one."""
+        if np.array_equal(trials, np.arange(_count_trials(self))):
+            return other
+
+        def replaced(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+            out = np.array(old)
+            out[trials] = new
+            return out
+
+        return map_arrays(replaced, self, other)
+
+    @staticmethod
+    def join(parts: Sequence[Value]) -> Value:
+        """Return the trials of all parts, one after the other."""
+        if len(parts) == 1:
+            return parts[0]
+        return map_arrays(lambda *arrays: np.concatenate(arrays), *parts)
+
+
+def _count_trials(value: Any) -> int:
+    """Return the length of the first array of a dataclass."""
+    while is_dataclass(value):
+        shared = getattr(value, "shared", ())
+        value = next(getattr(value, f.name) for f in fields(value) if f.name not in shared)
+    return len(value)
