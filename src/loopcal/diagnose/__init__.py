@@ -3,39 +3,30 @@
 
 from loopcal.diagnose.conventions import IMPLAUSIBLE as IMPLAUSIBLE
 from loopcal.diagnose.conventions import ConventionCheck as ConventionCheck
-from loopcal.diagnose.conventions import Interpretation as Interpretation
-from loopcal.diagnose.conventions import MovedSetups as MovedSetups
 from loopcal.diagnose.conventions import check_conventions as check_conventions
 from loopcal.diagnose.conventions import compare_conventions as compare_conventions
 from loopcal.diagnose.conventions import find_moved_setups as find_moved_setups
 from loopcal.diagnose.cross_validation import CrossValidation as CrossValidation
-from loopcal.diagnose.cross_validation import LeaveOneOut as LeaveOneOut
 from loopcal.diagnose.cross_validation import build_regularization_path as build_regularization_path
 from loopcal.diagnose.cross_validation import cross_validate as cross_validate
 from loopcal.diagnose.cross_validation import score_leave_one_out as score_leave_one_out
 from loopcal.diagnose.fit_checks.all_checks import FitExamination as FitExamination
 from loopcal.diagnose.fit_checks.all_checks import examine_fit as examine_fit
-from loopcal.diagnose.fit_checks.correlations import CorrelatedGroup as CorrelatedGroup
 from loopcal.diagnose.fit_checks.correlations import (
     find_correlated_groups as find_correlated_groups,
 )
-from loopcal.diagnose.fit_checks.expected_errors import CalibrationGain as CalibrationGain
 from loopcal.diagnose.fit_checks.expected_errors import (
     estimate_calibration_gain as estimate_calibration_gain,
 )
-from loopcal.diagnose.fit_checks.outliers import Conflict as Conflict
-from loopcal.diagnose.fit_checks.outliers import Outlier as Outlier
 from loopcal.diagnose.fit_checks.outliers import OutlierCheck as OutlierCheck
 from loopcal.diagnose.fit_checks.outliers import find_outliers as find_outliers
 from loopcal.diagnose.fit_checks.reading_errors import ReadingError as ReadingError
 from loopcal.diagnose.fit_checks.reading_errors import (
     compute_reading_errors as compute_reading_errors,
 )
-from loopcal.diagnose.fit_checks.repeated_poses import LackOfFit as LackOfFit
 from loopcal.diagnose.fit_checks.repeated_poses import check_lack_of_fit as check_lack_of_fit
 from loopcal.diagnose.fit_checks.start_values import StartCheck as StartCheck
 from loopcal.diagnose.fit_checks.start_values import StartVerdict as StartVerdict
-from loopcal.diagnose.fit_checks.start_values import StoredAnswer as StoredAnswer
 from loopcal.diagnose.fit_checks.start_values import check_start_values as check_start_values
 from loopcal.diagnose.fit_checks.start_values import (
     compare_stored_geometry as compare_stored_geometry,
@@ -45,19 +36,14 @@ from loopcal.diagnose.frame_motions import FrameMotions as FrameMotions
 from loopcal.diagnose.frame_motions import find_frame_motions as find_frame_motions
 from loopcal.diagnose.frame_motions import twist_weights as twist_weights
 from loopcal.diagnose.identifiable_parameters import Identifiability as Identifiability
-from loopcal.diagnose.identifiable_parameters import (
-    ParameterIdentifiability as ParameterIdentifiability,
-)
 from loopcal.diagnose.identifiable_parameters import identifiability as identifiability
 from loopcal.diagnose.parameter_subset import IdentifiableSubset as IdentifiableSubset
-from loopcal.diagnose.parameter_subset import MergedParameter as MergedParameter
 from loopcal.diagnose.parameter_subset import ModelChoice as ModelChoice
 from loopcal.diagnose.parameter_subset import (
     choose_identifiable_subset as choose_identifiable_subset,
 )
 from loopcal.diagnose.parameter_subset import choose_model as choose_model
 from loopcal.diagnose.parameter_subset import nest_parameter_sets as nest_parameter_sets
-from loopcal.diagnose.prediction_errors import INDICES as INDICES
 from loopcal.diagnose.prediction_errors import KindErrors as KindErrors
 from loopcal.diagnose.prediction_errors import PoseErrors as PoseErrors
 from loopcal.diagnose.prediction_errors import PosePredictions as PosePredictions
@@ -67,7 +53,6 @@ from loopcal.diagnose.prediction_errors import compute_kind_errors as compute_ki
 from loopcal.diagnose.prediction_errors import compute_pose_errors as compute_pose_errors
 from loopcal.diagnose.prediction_errors import compute_row_errors as compute_row_errors
 from loopcal.diagnose.prediction_errors import predict_poses as predict_poses
-from loopcal.diagnose.suggestions import FurtherMeasurement as FurtherMeasurement
 from loopcal.diagnose.suggestions import MeasurementSuggestion as MeasurementSuggestion
 from loopcal.diagnose.suggestions import describe_missing_equations as describe_missing_equations
 from loopcal.diagnose.suggestions import suggest_measurements as suggest_measurements

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from loopcal.diagnose.fit_checks.influence import iterate_blocks
 from loopcal.diagnose.prediction_errors import (
     PoseErrors,
     compare_predictions,
@@ -207,37 +208,30 @@ def score_leave_one_out(
             "cross_validate"
         )
     z = free.deviation(robot.values[None])
-    at = problem.linearize(z, problem.start(z))
-    d = decompose(at.factor, at.equations, z)
-    used = tuple(
-        adapt_method(method, np.zeros(len(free), dtype=bool), "given") for method in methods
-    )
-    penalty = np.concatenate([method.penalty(d) for method in used])
+    linearization = problem.linearize(z, problem.start(z))
+    d = decompose(linearization.factor, linearization.equations, z)
+    stated = np.zeros(len(free), dtype=bool)
+    adapted = [adapt_method(method, stated, "given") for method in methods]
+    penalty = np.concatenate([method.penalty(d) for method in adapted])
     # 1 / (s^2 + penalty) and the coordinates y, both (k, p); zero for unused directions
     s, total = d.singular_values[0], d.singular_values[0] ** 2 + penalty
     used = (total > 0.0) & np.isfinite(total)
     weight = np.divide(1.0, total, out=np.zeros_like(total), where=used)
     y = weight * (s * d.projections[0])
-    member = np.unique(linked_blocks(data), return_inverse=True)[1]
-    parts = [part for block in problem.leverage_rows(at) for part in block]
-    block_of_row = np.concatenate(
-        [np.repeat(member[part.poses], part.rows.shape[1]) for part in parts]
-    )
-    A = np.concatenate([part.rows.reshape(-1, part.rows.shape[2]) for part in parts])
-    B, b = A[:, :-1] @ d.directions[0], A[:, :-1] @ z[0] - A[:, -1]
-    residual = b - y @ B.T
+    blocks, member = np.unique(linked_blocks(data), return_inverse=True)
     square = np.zeros(len(penalty))
-    for places in _blocks_by_size(block_of_row):
-        B_j = B[places]  # (u, m, p)
-        H = np.matmul(B_j[None] * weight[:, None, None, :], B_j.swapaxes(-1, -2)[None])
-        remaining = np.eye(places.shape[1]) - H
+    for _, A, r in iterate_blocks(problem, linearization, member, len(blocks)):
+        B = A @ d.directions[0]  # (blocks, m, p)
+        residual = A @ z[0] - r - np.moveaxis(B @ y.T, -1, 0)
+        H = np.matmul(B * weight[:, None, None, :], B.swapaxes(-1, -2))
+        remaining = np.eye(A.shape[1]) - H
         singular = np.linalg.det(remaining) <= 1e-12
-        remaining = np.where(singular[..., None, None], np.eye(places.shape[1]), remaining)
-        deleted = np.linalg.solve(remaining, residual[:, places][..., None])[..., 0]
+        remaining = np.where(singular[..., None, None], np.eye(A.shape[1]), remaining)
+        deleted = np.linalg.solve(remaining, residual[..., None])[..., 0]
         square += np.where(singular, np.inf, (deleted**2).sum(axis=2)).sum(axis=1)
-    dof = np.stack([d.filter_factors(row[None])[0].sum() for row in penalty])
+    dof = d.filter_factors(penalty).sum(axis=1)
     estimate = free.nominal + free.tolerance * (y @ d.directions[0].T)
-    return LeaveOneOut(tuple(methods), square / int(at.equations[0]), dof, estimate)
+    return LeaveOneOut(tuple(methods), square / int(linearization.equations[0]), dof, estimate)
 
 
 def build_regularization_path(data_scale: float, count: int, parameters: int) -> tuple[Method, ...]:
@@ -252,19 +246,14 @@ def build_regularization_path(data_scale: float, count: int, parameters: int) ->
 
 
 def _mean_square(robot: Mechanism, data: Measurements) -> float:
-    """Mean square of the whitened residuals of a robot; infinite where it cannot reach a pose."""
+    """Return the mean square of a robot's whitened residuals; infinite where it cannot reach a
+    pose.
+    """
     problem = problem_of(select_free_parameters(robot), data)
     z = problem.free.deviation(robot.values[None])
-    at = problem.linearize(z, problem.start(z))
-    equations, total = int(at.equations[0]), 0.0
-    solution = problem.solve(z, at.next_start)
-    for rows, residuals in zip(problem.rows, problem.residuals(z, solution), strict=True):
-        total += float(np.where(rows.is_present[0], residuals.whitened[0] ** 2, 0.0).sum())
+    linearization = problem.linearize(z, problem.start(z))
+    residuals = problem.residuals(z, problem.solve(z, linearization.next_start))
+    pairs = zip(problem.rows, residuals, strict=True)
+    total = sum(float((r.whitened[0] ** 2)[rows.is_present[0]].sum()) for rows, r in pairs)
+    equations = int(linearization.equations[0])
     return total / equations if np.isfinite(total) and equations else np.inf
-
-
-def _blocks_by_size(block_of_row: IntArray) -> list[IntArray]:
-    """Return the places (u, m) of the rows of blocks, those of equal size together."""
-    order = np.argsort(block_of_row, kind="stable")
-    _, first, sizes = np.unique(block_of_row[order], return_index=True, return_counts=True)
-    return [order[first[sizes == size][:, None] + np.arange(size)] for size in np.unique(sizes)]

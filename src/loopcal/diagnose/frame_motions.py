@@ -102,8 +102,8 @@ def twist_weights(robot: Mechanism) -> FloatArray:
 
 def probe_workspace(free: FreeParameters, joints: Iterable[str] = ()) -> ObservedPoses:
     """Return poses about home with evenly spread readings, without those out of reach."""
-    at = observe_poses(free, _probe_readings(free.robot), joints)
-    return observe_poses(free, at.readings[at.is_reached], joints)
+    poses = observe_poses(free, _probe_readings(free.robot), joints)
+    return observe_poses(free, poses.readings[poses.is_reached], joints)
 
 
 def interpret_combinations(
@@ -117,10 +117,10 @@ def interpret_combinations(
     """
     if not combinations:
         return combinations
-    at = probe_workspace(free)
-    if not len(at.readings):
+    poses = probe_workspace(free)
+    if not len(poses.readings):
         return combinations
-    motions, base, platform = _weigh_motions(free.robot, at.T[0], at.twists[0])
+    motions, base, platform = _weigh_motions(free.robot, poses.T[0], poses.twists[0])
     frames = {"platform": platform, "base": base}
     limit = NO_MOTION * float(np.linalg.norm(motions))
     interpreted = []

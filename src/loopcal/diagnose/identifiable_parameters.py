@@ -224,7 +224,7 @@ class Identifiability:
             findings.append(
                 report_finding("identifiability.gap", counted=counted, cut=cut, gap=self.gap)
             )
-        findings += [one.finding for one in (*self.unidentifiable, *self.weak)]
+        findings += [combination.finding for combination in (*self.unidentifiable, *self.weak)]
         if (more := rank - self.improved - len(self.weak)) > 0:
             findings.append(report_finding("identifiability.more-weak-directions", count=more))
         return (*findings, *self.free_parameters.findings())

@@ -107,6 +107,8 @@ class IdentifiableSubset:
     condition: float
     robot: Mechanism
 
+    JSON_FIELDS: ClassVar[tuple[str, ...]] = ("kept", "dropped", "condition")
+
     @property
     def findings(self) -> tuple[Finding, ...]:
         """The numbers of parameters, then every fixed parameter."""
@@ -121,10 +123,6 @@ class IdentifiableSubset:
 
     def __str__(self) -> str:
         return "\n".join(str(finding) for finding in self.findings)
-
-    def to_dict(self) -> dict[str, object]:
-        """Return names, replacements and the condition for JSON."""
-        return {"kept": self.kept, "dropped": self.dropped, "condition": self.condition}
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,7 +291,7 @@ def _free_only(robot: Mechanism, names: Sequence[str]) -> Mechanism:
 
 
 def _choose_fixed(free: FreeParameters, null: FloatArray) -> IntArray:
-    """Places (d,) of the parameters to fix, in the order of the robot's file."""
+    """Return the places (d,) of the parameters to fix, in the order of the robot's file."""
     columns = (null * _weights(free)[:, None]).T
     fixed: list[int] = []
     for _ in range(len(columns)):
@@ -307,7 +305,7 @@ def _choose_fixed(free: FreeParameters, null: FloatArray) -> IntArray:
 
 
 def _weights(free: FreeParameters) -> FloatArray:
-    """Weight (p,) with which each parameter is a candidate to be fixed."""
+    """Return the weight (p,) with which each parameter is a candidate to be fixed."""
     settable: set[str] = set()
     for link in free.robot.assembly.maps:
         addresses = (link.address,) if isinstance(link, LinearMap) else link.outputs
@@ -324,19 +322,13 @@ def _weights(free: FreeParameters) -> FloatArray:
 def _merge(
     free: FreeParameters, place: int, direction: FloatArray, kept: IntArray
 ) -> MergedParameter:
-    """Replacement of a parameter whose null direction (p,) is one at its own place and zero at the
-    other fixed ones.
+    """Return the replacement of a parameter whose null direction (p,) is one at its own place and
+    zero at the other fixed ones.
     """
     factor, symbols = free.display()
+    unit = free.tolerance / factor  # tolerances in the units of the robot's file
     chosen = kept[np.abs(direction[kept]) > NEGLIGIBLE]
-    # one unit of the parameter in tolerances, then each kept one back in its unit
-    changes = (
-        -direction[chosen]
-        * free.tolerance[chosen]
-        / factor[chosen]
-        * factor[place]
-        / free.tolerance[place]
-    )
+    changes = -direction[chosen] * unit[chosen] / unit[place]
     names = tuple(free.names[i] for i in chosen)
     units = tuple(symbols[i] for i in chosen)
     return MergedParameter(free.names[place], symbols[place], names, changes, units)

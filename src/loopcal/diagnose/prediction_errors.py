@@ -129,9 +129,7 @@ class PosePredictions:
     def residuals(self, observations: Sequence[Observations]) -> list[FloatArray]:
         """Return the prediction errors (r, m) of every kind."""
         return [
-            o.evaluate(
-                self.T, self._setup_of(i, o), o.kind.stack_joints(self.joints, o.rows)
-            ).residual[0]
+            o.evaluate(self.T, *self._inputs_of(i, o)).residual[0]
             for i, o in enumerate(observations)
         ]
 
@@ -141,20 +139,18 @@ class PosePredictions:
         """Return what every kind (r, m) would measure at the other poses minus at these."""
         differences = []
         for i, o in enumerate(observations):
-            setup = self._setup_of(i, o)
+            setup, joints = self._inputs_of(i, o)
             zero = np.zeros((1, *o.present.shape))
-            expected = o.kind.measure(
-                self.T[:, o.rows], zero, setup, o.kind.stack_joints(self.joints, o.rows)
-            )
-            evaluation = o.kind.evaluate(
-                other.T[:, o.rows], expected, setup, o.kind.stack_joints(other.joints, o.rows)
-            )
+            expected = o.kind.measure(self.T[:, o.rows], zero, setup, joints)
+            _, reached_joints = other._inputs_of(i, o)
+            evaluation = o.kind.evaluate(other.T[:, o.rows], expected, setup, reached_joints)
             differences.append(evaluation.residual[0])
         return differences
 
-    def _setup_of(self, i: int, o: Observations) -> FloatArray | None:
-        """Setup parameters (1, r, u) of the rows of a kind."""
-        return self.setup.select(i, self.values) if o.kind.nuisance_parameters else None
+    def _inputs_of(self, i: int, o: Observations) -> tuple[FloatArray | None, FloatArray | None]:
+        """Return setup parameters (1, r, u) and joint values (1, r, j) that a kind needs."""
+        setup = self.setup.select(i, self.values) if o.kind.nuisance_parameters else None
+        return setup, o.kind.stack_joints(self.joints, o.rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,18 +286,18 @@ def compute_pose_errors(position: FloatArray, orientation: FloatArray) -> PoseEr
         where not measured. Orientation components may be a rotation vector or differences of
         declared angles.
     """
-    first, second = _length(position), _length(orientation)
-    return PoseErrors(first, second, _balance(position), _balance(orientation))
-
-
-def join_errors(parts: Sequence[PoseErrors]) -> PoseErrors:
-    """Return the errors of several sets of rows as one set."""
     return PoseErrors(
-        *(
-            np.concatenate([np.zeros(0), *(getattr(part, index) for part in parts)])
-            for index in INDICES
-        )
+        _length(position), _length(orientation), _balance(position), _balance(orientation)
     )
+
+
+def join_errors(errors: Sequence[PoseErrors]) -> PoseErrors:
+    """Return the errors of several sets of rows as one set."""
+    joined = (
+        np.concatenate([np.zeros(0), *(getattr(rows, index) for rows in errors)])
+        for index in INDICES
+    )
+    return PoseErrors(*joined)
 
 
 def compute_kind_errors(
@@ -313,36 +309,30 @@ def compute_kind_errors(
     ----------
     observations : of every kind. before, after : residuals (r, m) [SI] of each.
     """
-    names = list(dict.fromkeys(o.kind.name for o in observations))
-    count = dict.fromkeys(names, 0)
-    square = {name: np.zeros(2) for name in names}
+    totals: dict[str, FloatArray] = {}
     for o, *residuals in zip(observations, before, after, strict=True):
-        count[o.kind.name] += int(o.present.sum())
-        square[o.kind.name] += [_whitened_square(o, residual) for residual in residuals]
-    errors = []
-    for name, members in [*((name, [name]) for name in names), ("all", names)]:
-        n = sum(count[member] for member in members)
-        total = np.sum([square[member] for member in members], axis=0)
-        first, last = np.sqrt(total / n) if n else (np.nan, np.nan)
-        errors.append(KindErrors(name, n, float(first), float(last)))
-    return tuple(errors)
-
-
-def _whitened_square(o: Observations, residual: FloatArray) -> float:
-    """Sum of squares of the whitened residuals (r, m) that are present."""
-    present = np.where(o.present, residual, 0.0)
-    return float(((o.whitener @ present[..., None]) ** 2).sum())
+        squares = [
+            ((o.whitener @ np.where(o.present, r, 0.0)[..., None]) ** 2).sum() for r in residuals
+        ]
+        total = totals.setdefault(o.kind.name, np.zeros(3))
+        total += [o.present.sum(), *squares]
+    totals["all"] = np.sum(list(totals.values()), axis=0)
+    return tuple(
+        KindErrors(
+            name, int(n), *(float(np.sqrt(square / n)) if n else np.nan for square in squares)
+        )
+        for name, (n, *squares) in totals.items()
+    )
 
 
 def _length(components: FloatArray) -> FloatArray:
-    """Root of the sum of squares of the measured components, NaN without any."""
-    present = np.isfinite(components)
-    square = np.where(present, components, 0.0) ** 2
-    return np.where(present.any(axis=1), np.sqrt(square.sum(axis=1)), np.nan)
+    """Return the root of the sum of squares of the measured components, NaN without any."""
+    length = np.sqrt(np.nansum(components**2, axis=1))
+    return np.where(np.isfinite(components).any(axis=1), length, np.nan)
 
 
 def _balance(components: FloatArray) -> FloatArray:
-    """Largest minus smallest measured component, NaN with fewer than two."""
+    """Return the largest minus the smallest measured component, NaN with fewer than two."""
     present = np.isfinite(components)
     high = np.where(present, components, -np.inf).max(axis=1, initial=-np.inf)
     low = np.where(present, components, np.inf).min(axis=1, initial=np.inf)
@@ -353,7 +343,7 @@ def _balance(components: FloatArray) -> FloatArray:
 def _explain_unreached(
     robot: Mechanism, predictable: BoolArray, before: BoolArray, after: BoolArray
 ) -> Finding:
-    """Why no pose is left: readings are missing, or one of the geometries does not reach it."""
+    """Return why no pose is left: readings are missing, or a geometry does not reach it."""
     poses, reached = len(predictable), int(before.sum())
     if not predictable.any():
         return report_finding("residuals.readings-missing", robot=robot.name, poses=poses)

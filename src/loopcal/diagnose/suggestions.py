@@ -92,7 +92,7 @@ class MeasurementSuggestion:
         names = self.combination.names
         if not self.measurements:
             return report_finding("identifiability.fix-one", names=names)
-        measurements = tuple(dict(vars(one)) for one in self.measurements)
+        measurements = tuple(dict(vars(measurement)) for measurement in self.measurements)
         return report_finding(
             "identifiability.measure-also", names=names, measurements=measurements, poses=POSES
         )
@@ -134,10 +134,12 @@ def suggest_measurements(
     # an observed direction must exceed the rounding of the existing rows, too
     floor, present = float(np.linalg.norm(factor, ord=2)), compute_remaining_sd(factor)
     joints = _passive_joints(free.robot)
-    at = _draw_scene(free, [name for name, _ in joints])
+    scene = _draw_scene(free, [name for name, _ in joints])
     for words, kind in _list_candidates(free.robot, joints):
         try:
-            X = instrument_factor(at, _measure_at(at, kind, SIGMA | (sigma or {})))[0, :-1, :-1]
+            X = instrument_factor(scene, _measure_at(scene, kind, SIGMA | (sigma or {})))[
+                0, :-1, :-1
+            ]
         except DataError:
             continue  # this kind has nothing to measure on this robot
         determined = _find_determined(X, B, floor)
@@ -145,10 +147,10 @@ def suggest_measurements(
             left = compute_remaining_sd(np.concatenate([factor, X]))
             better = determined & (left[leading] < IMPROVEMENT * present[leading])
             for i in np.flatnonzero(better):
-                one = FurtherMeasurement(words, kind.name, float(left[leading[i]]))
-                measurements[i].append(one)
+                measurement = FurtherMeasurement(words, kind.name, float(left[leading[i]]))
+                measurements[i].append(measurement)
     pairs = zip(combinations, measurements, strict=True)
-    return tuple(MeasurementSuggestion(combination, tuple(ones)) for combination, ones in pairs)
+    return tuple(MeasurementSuggestion(combination, tuple(chosen)) for combination, chosen in pairs)
 
 
 def describe_missing_equations(robot: Mechanism, data: Measurements) -> Finding | None:
@@ -166,19 +168,19 @@ def describe_missing_equations(robot: Mechanism, data: Measurements) -> Finding 
     if not 0 < len(suggestions) <= MOST_MISSING:
         return None
     common = [
-        one.words
-        for one in suggestions[0].measurements
-        if all(one.words in {m.words for m in other.measurements} for other in suggestions)
+        words
+        for words in (measurement.words for measurement in suggestions[0].measurements)
+        if all(words in {m.words for m in other.measurements} for other in suggestions)
     ]
     return report_finding(
         "identifiability.missing-equations",
-        combinations=tuple(dict(one.combination.finding.data) for one in suggestions),
+        combinations=tuple(dict(s.combination.finding.data) for s in suggestions),
         measurement=common[0] if common else None,
     )
 
 
 def _draw_scene(free: FreeParameters, joints: list[str]) -> ObservedPoses:
-    """Poses drawn from the workspace, or about home where none is stated."""
+    """Return poses drawn from the workspace, or about home where none is stated."""
     try:
         q = sample_workspace(free.robot, POSES, seed=0).solution.q
     except MechanismError:
@@ -187,7 +189,7 @@ def _draw_scene(free: FreeParameters, joints: list[str]) -> ObservedPoses:
 
 
 def _passive_joints(robot: Mechanism) -> list[tuple[str, str]]:
-    """Passive joints to which a sensor could be attached, with what it would measure."""
+    """Return passive joints to which a sensor could be attached, with what it would measure."""
     return [
         (f"{limb.name}.{joint.name}", "length" if joint.kind == "P" else "angle")
         for limb in robot.assembly.limbs
@@ -221,7 +223,7 @@ def _list_examples(kinds: Iterable[type[Kind]]) -> Iterator[tuple[str, Kind]]:
 
 
 def _describe_kind(kind: Kind) -> str:
-    """Noun phrase for a kind, with its nuisance parameters."""
+    """Return a noun phrase for a kind, with its nuisance parameters."""
     targets, unknown = getattr(kind, "targets", ()), list(kind.setup_items)
     if kind.description and not unknown:
         return kind.description
@@ -229,27 +231,28 @@ def _describe_kind(kind: Kind) -> str:
     return f"{words} ({list_names(unknown)} unknown)" if unknown else words
 
 
-def _measure_at(at: ObservedPoses, kind: Kind, sigma: dict[Dimension, float]) -> Measurements:
-    """Noiseless measurements of a kind at the scene."""
-    robot = at.free.robot
+def _measure_at(scene: ObservedPoses, kind: Kind, sigma: dict[Dimension, float]) -> Measurements:
+    """Return noiseless measurements of a kind at the scene."""
+    robot = scene.free.robot
     noise = Gaussian(np.array([sigma[column.dimension] for column in kind.noise_columns]))
-    sensor = Sensor(kind.with_tool(robot.tool), noise).assign_rows(len(at.readings))
+    sensor = Sensor(kind.with_tool(robot.tool), noise).assign_rows(len(scene.readings))
     rows, mounted = sensor.rows, sensor.kind
     assert rows is not None
-    joints = kind.stack_joints(at.joints, rows)
+    sensed = kind.stack_joints(scene.joints, rows)
     zero = np.zeros((1, len(rows), len(kind.noise_columns)))
-    measured = mounted.measure(at.T[:, rows], zero, None, joints)[0]
+    measured = mounted.measure(scene.T[:, rows], zero, None, sensed)[0]
     observations = Observations.from_sigma(
         mounted, rows, measured, noise.sigma, sensor.session, sensor.group
     )
-    return Measurements(robot.name, at.readings, (observations,))
+    return Measurements(robot.name, scene.readings, (observations,))
 
 
 def _find_determined(X: FloatArray, B: FloatArray, floor: float) -> BoolArray:
-    """Combinations (d,) that the rows X (p, p) separate from all others; `floor` is the size of the
-    existing rows.
+    """Return which combinations (d,) the rows X (p, p) separate from all others.
+
+    `floor` is the size of the existing rows.
     """
     _, s, vt = np.linalg.svd(X @ B.T)
     largest = max(float(np.linalg.norm(X, ord=2)), floor)
-    still_open = vt[s <= OBSERVED * largest] if largest > 0.0 else vt
-    return np.asarray(np.linalg.norm(still_open, axis=0) <= np.sqrt(OBSERVED))
+    undetermined = vt[s <= OBSERVED * largest] if largest > 0.0 else vt
+    return np.asarray(np.linalg.norm(undetermined, axis=0) <= np.sqrt(OBSERVED))

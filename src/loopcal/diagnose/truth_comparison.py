@@ -59,7 +59,7 @@ class TruthComparison:
             "identifiability.compared-with-truth",
             parameters=len(self.names),
             compared=len(self.names) - len(self.dropped),
-            excluded=tuple(dict(one.finding.data) for one in self.dropped),
+            excluded=tuple(dict(combination.finding.data) for combination in self.dropped),
         )
 
     def __repr__(self) -> str:

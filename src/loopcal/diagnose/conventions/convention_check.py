@@ -106,7 +106,7 @@ class ConventionCheck:
             "misfit": self.misfit,
             "interpretation": None if other is None else other.finding,
             "other_misfit": self.other_misfit,
-            "alternatives": [one.finding for one in self.alternatives],
+            "alternatives": [interpretation.finding for interpretation in self.alternatives],
             "refused": self.is_refused,
             "finding": self.finding,
         }
@@ -237,21 +237,17 @@ def _thin_out(data: Measurements) -> Measurements:
 
 def _refuse(description: dict[str, Any], misfit: float, chosen: Selection) -> ConventionCheck:
     """Refuse data that fit far better in another interpretation."""
-
-    def describe(one: Interpretation) -> dict[str, Any]:
-        return {"code": one.code, "source": one.source, **one.details}
-
-    one, alternatives = chosen.interpretation, chosen.alternatives
+    interpretation, alternatives = chosen.interpretation, chosen.alternatives
     finding = report_finding(
         "conventions.other-interpretation",
         **description,
-        interpretation=describe(one),
-        alternatives=tuple(describe(other) for other in alternatives),
+        interpretation=interpretation.describe(),
+        alternatives=tuple(other.describe() for other in alternatives),
         other_misfit=chosen.misfit,
         other_residuals=_rms_residuals(chosen.comparison),
         is_consistent=chosen.misfit <= ALLOWED,
     )
-    return ConventionCheck(misfit, one, chosen.misfit, alternatives, finding)
+    return ConventionCheck(misfit, interpretation, chosen.misfit, alternatives, finding)
 
 
 def _contradict(misfit: float, against: Contradiction) -> ConventionCheck:
@@ -292,8 +288,8 @@ def _rms_residuals(comparison: Comparison) -> tuple[Quantity, ...]:
         for j, column in enumerate(s.kind.noise_columns):
             square.setdefault(column.dimension, []).append(r.raw[0, present[:, j], j] ** 2)
     residuals = []
-    for dimension, parts in square.items():
-        values = np.concatenate(parts)
+    for dimension, squares in square.items():
+        values = np.concatenate(squares)
         if len(values):
             residuals.append(robot.to_quantity(float(np.sqrt(values.mean())), dimension))
     return tuple(residuals)

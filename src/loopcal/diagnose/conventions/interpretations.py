@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
+from itertools import chain, combinations
 from typing import Any
 
 import numpy as np
@@ -86,6 +86,10 @@ class Interpretation:
         """The interpretation as a finding."""
         return report_finding(self.code, source=self.source, **self.details)
 
+    def describe(self) -> dict[str, Any]:
+        """Return code, source and details, for the data of another finding."""
+        return {"code": self.code, "source": self.source, **self.details}
+
     def __repr__(self) -> str:
         return f"<Interpretation: {self.finding}>"
 
@@ -113,7 +117,7 @@ def list_interpretations(data: Measurements) -> Iterator[Interpretation]:
         if several:
             unique = sum(other.kind.name == kind.name for other in data.observations) == 1
             source = f"kind {kind.name!r}" if unique else _source_of(i, data)
-        for slip, details, change in (one for rule in RULES for one in rule(kind)):
+        for slip, details, change in chain.from_iterable(rule(kind) for rule in RULES):
             values = change(measured)
             meant = np.isfinite(values) | np.isnan(measured)
             same = np.allclose(values, measured, rtol=1e-12, atol=0.0, equal_nan=True)
@@ -126,7 +130,7 @@ def list_reading_interpretations(
 ) -> Iterator[Interpretation]:
     """Yield all other interpretations of the readings of actuators; see `list_interpretations`."""
     names = tuple(actuator.name for actuator in actuators)
-    every = list(range(len(names)))
+    columns = list(range(len(names)))
     for source, poses in _sources_of_readings(data):
         for dimension in dict.fromkeys(actuator.dimension for actuator in actuators):
             chosen = poses[:, None] & np.array([a.dimension is dimension for a in actuators])
@@ -135,14 +139,14 @@ def list_reading_interpretations(
                 yield Interpretation("unit", details, source, None, _scale_where(chosen, factor))
     slips: list[Slip] = []
     if len(names) > 1:
-        slips.append(("reading-sign", {"actuators": names}, _scale(every, -1.0)))
-    slips += [("reading-sign", {"actuators": (names[j],)}, _scale([j], -1.0)) for j in every]
+        slips.append(("reading-sign", {"actuators": names}, _scale(columns, -1.0)))
+    slips += [("reading-sign", {"actuators": (names[j],)}, _scale([j], -1.0)) for j in columns]
     slips += [
         ("swapped-readings", {"actuators": (names[a], names[b])}, _permute([a, b], [b, a]))
-        for a, b in combinations(every, 2)
+        for a, b in combinations(columns, 2)
     ]
     if len(names) > 2:
-        slips.append(("reversed-readings", {}, _permute(every, every[::-1])))
+        slips.append(("reversed-readings", {}, _permute(columns, columns[::-1])))
     for shift, neighbor in ((1, "above"), (-1, "below")):
         slips.append(
             ("shifted-readings", {"neighbor": neighbor}, partial(np.roll, shift=shift, axis=0))

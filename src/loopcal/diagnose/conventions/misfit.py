@@ -106,10 +106,10 @@ class Comparison:
     @cached_property
     def misfits(self) -> FloatArray:
         """(t,) to first order in the parameters; NaN with too few rows."""
-        at = self.linearization
-        if at is None:
+        linearization = self.linearization
+        if linearization is None:
             return np.full(len(self.problem), np.nan)
-        return _misfit_of_cost(_smallest_cost(at.factor), at.equations)
+        return _misfit_of_cost(_smallest_cost(linearization.factor), linearization.equations)
 
     @property
     def misfit(self) -> float:
@@ -118,11 +118,11 @@ class Comparison:
 
     def residuals(self) -> tuple[Residuals, ...]:
         """Return the residuals of every interpretation at the robot's values."""
-        at = self.linearization
-        assert at is not None
-        values = None if at.nuisance is None else at.nuisance.values
-        solution = self.problem.solve(at.deviation, at.next_start, values)
-        return self.problem.residuals(at.deviation, solution)
+        linearization = self.linearization
+        assert linearization is not None
+        values = None if linearization.nuisance is None else linearization.nuisance.values
+        solution = self.problem.solve(linearization.deviation, linearization.next_start, values)
+        return self.problem.residuals(linearization.deviation, solution)
 
 
 def select_reached(free: FreeParameters, data: Measurements, *, follow: bool = False) -> Reach:
@@ -166,7 +166,10 @@ def compare_with_robot(
     for i, o in enumerate(data.observations):
         if not len(o):
             continue
-        changes = [one.change if one.observation == i else np.array for one in interpretations]
+        changes = [
+            interpretation.change if interpretation.observation == i else np.array
+            for interpretation in interpretations
+        ]
         measured = np.stack([change(o.measured) for change in changes or [np.array]])
         # a row that another interpretation leaves without some of its residuals is absent there
         same = (o.kind.detect_present(measured) == o.present).all(axis=-1)
@@ -190,10 +193,10 @@ def exclude_far_rows(comparison: Comparison) -> Comparison:
 
     Return the same comparison where there are none, or where a misfit is not finite.
     """
-    at, problem, data = comparison.linearization, comparison.problem, comparison.data
-    if at is None or not np.isfinite(comparison.misfits).all():
+    linearization, problem, data = comparison.linearization, comparison.problem, comparison.data
+    if linearization is None or not np.isfinite(comparison.misfits).all():
         return comparison
-    pairs = zip(comparison.residuals(), _expected_sd(problem, at), strict=True)
+    pairs = zip(comparison.residuals(), _expected_sd(problem, linearization), strict=True)
     ratios = [_row_rms(residuals.whitened, sd) for residuals, sd in pairs]
     together = np.concatenate(ratios, axis=1)
     median = np.nanmedian(together, axis=1)
@@ -208,7 +211,7 @@ def exclude_far_rows(comparison: Comparison) -> Comparison:
         whitener = rows.take_trials(problem.trials)[1] * kept[..., None, None]
         kept_rows.append(replace(rows, whitener=whitener))
     problem = replace(problem, rows=tuple(kept_rows))
-    start = None if at.nuisance is None else at.nuisance.values
+    start = None if linearization.nuisance is None else linearization.nuisance.values
     if len(problem) == 1 and effort == THOROUGH:
         start = None  # far rows may have spoilt the guess
     return Comparison(
@@ -246,10 +249,12 @@ def compute_quick_misfit(free: FreeParameters, data: Measurements) -> float:
     problem = problem_of(free, data)
     z = free.deviation(free.robot.values[None])
     with np.errstate(all="ignore"):
-        at = problem.linearize(z, problem.start(z, seek=False))
-        if not np.isfinite(at.cost[0]):
+        linearization = problem.linearize(z, problem.start(z, seek=False))
+        if not np.isfinite(linearization.cost[0]):
             return np.inf
-        return float(_misfit_of_cost(_smallest_cost(at.factor), at.equations)[0])
+        return float(
+            _misfit_of_cost(_smallest_cost(linearization.factor), linearization.equations)[0]
+        )
 
 
 def refine_misfit(comparison: Comparison) -> tuple[float, FloatArray]:
@@ -258,16 +263,16 @@ def refine_misfit(comparison: Comparison) -> tuple[float, FloatArray]:
 
     The misfit to first order is returned where it is smaller.
     """
-    at, first = comparison.linearization, np.arange(1)
-    if at is None or not np.isfinite(comparison.misfit):
+    linearization, first = comparison.linearization, np.arange(1)
+    if linearization is None or not np.isfinite(comparison.misfit):
         return comparison.misfit, comparison.data.nuisance_parameters.values()
-    problem, at = comparison.problem.take(first), at.take(first)
-    z = at.deviation
+    problem, linearization = comparison.problem.take(first), linearization.take(first)
+    z = linearization.deviation
 
     def propose(point: _Point) -> _Step:
         p = problem.parameters
         prior = np.concatenate([np.eye(p), point.step.T], axis=1)
-        whole = engine.fold(point.at.factor, prior[None])[0]
+        whole = engine.fold(point.linearization.factor, prior[None])[0]
         direction = -np.linalg.solve(whole[:p, :p], whole[:p, p])[None]
         largest = np.abs(point.step + direction).max(initial=0.0)
         share = np.full((1, 1), float(largest <= LARGEST_STEP))
@@ -277,11 +282,13 @@ def refine_misfit(comparison: Comparison) -> tuple[float, FloatArray]:
         if not share.any():
             return point
         total = point.step + share * step.direction
-        return _Point(total, problem.linearize(z + total, point.at.next_start))
+        return _Point(total, problem.linearize(z + total, point.linearization.next_start))
 
-    end, _ = minimize_by_halving(_Point(np.zeros_like(z), at), propose, move, REFINEMENT)
-    values = np.zeros(0) if end.at.nuisance is None else end.at.nuisance.values[0]
-    refined = float(_misfit_of_cost(end.cost, end.at.equations)[0])
+    end, _ = minimize_by_halving(_Point(np.zeros_like(z), linearization), propose, move, REFINEMENT)
+    values = (
+        np.zeros(0) if end.linearization.nuisance is None else end.linearization.nuisance.values[0]
+    )
+    refined = float(_misfit_of_cost(end.cost, end.linearization.equations)[0])
     return min(comparison.misfit, refined), values
 
 
@@ -290,11 +297,11 @@ class _Point:
     """A step (1, p) from the robot's values in tolerances, and the linearization there."""
 
     step: FloatArray
-    at: Linearization
+    linearization: Linearization
 
     @property
     def cost(self) -> FloatArray:
-        return self.at.cost + (self.step**2).sum(axis=1)
+        return self.linearization.cost + (self.step**2).sum(axis=1)
 
 
 class _Step(NamedTuple):
@@ -343,16 +350,16 @@ def _guess_start(problem: Problem, data: Measurements, effort: Effort) -> FloatA
     )
 
 
-def _expected_sd(problem: Problem, at: Linearization) -> list[FloatArray]:
+def _expected_sd(problem: Problem, linearization: Linearization) -> list[FloatArray]:
     """Return the standard deviations (r, m) [1] of whitened residuals by tolerances and noise."""
     result = [np.ones(rows.whitener.shape[1:3]) for rows in problem.rows]
     first, p = np.arange(1), problem.parameters
-    blocks = problem.take(first).leverage_rows(at.take(first))
-    for block, parts in zip(problem.poses.blocks, blocks, strict=True):
-        for part in parts:
-            A = part.rows[..., -p - 1 : -1]
-            chosen = block.row_numbers[part.kind][part.numbers]
-            result[part.kind][chosen] = np.sqrt(1.0 + (A**2).sum(axis=-1))
+    blocks = problem.take(first).leverage_rows(linearization.take(first))
+    for block, rows_of_block in zip(problem.poses.blocks, blocks, strict=True):
+        for rows in rows_of_block:
+            A = rows.rows[..., -p - 1 : -1]
+            chosen = block.row_numbers[rows.kind][rows.numbers]
+            result[rows.kind][chosen] = np.sqrt(1.0 + (A**2).sum(axis=-1))
     return result
 
 

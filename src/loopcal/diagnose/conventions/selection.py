@@ -87,18 +87,21 @@ def select_interpretation(
     if not any(value <= ALLOWED for _, value in tested):
         tested += _test_readings(free, data, misfit)
 
-    def written(one: Interpretation) -> Measurements:
-        return data if one.observation is None or stated is None else stated.data
+    def written(interpretation: Interpretation) -> Measurements:
+        return data if interpretation.observation is None or stated is None else stated.data
 
     better = [
-        (one, value)
-        for one, value in tested
-        if value * BETTER < misfit and _is_informative(free, written(one), one, value)
+        (interpretation, value)
+        for interpretation, value in tested
+        if value * BETTER < misfit
+        and _is_informative(free, written(interpretation), interpretation, value)
     ]
     if not better:
         return None
     smallest = min(value for _, value in better)
-    best, *others = [one for one, value in better if value <= max(EQUALLY * smallest, 1.0)]
+    best, *others = [
+        interpretation for interpretation, value in better if value <= max(EQUALLY * smallest, 1.0)
+    ]
     comparison = _judge(free, best.apply(written(best)))
     if comparison is None:
         return None
@@ -142,7 +145,7 @@ def _test_readings(
     """Return interpretations of the readings that promise to fit far better, with their misfits."""
     robot, poses = free.robot, _select_few(data)
     listed = list(list_reading_interpretations(data, robot.actuators))
-    readings = np.stack([one.change(data.readings)[poses] for one in listed])
+    readings = np.stack([interpretation.change(data.readings)[poses] for interpretation in listed])
     reached = find_directly_reachable(
         robot, robot.values[None], readings.reshape(1, -1, readings.shape[-1])
     ).reshape(readings.shape[:2])
@@ -152,13 +155,21 @@ def _test_readings(
     order = np.sort(np.argsort(size)[:NEAREST]) if has_frames else np.arange(len(near))
     nearest = [listed[i] for i in near[order]]
     few = [
-        _judge(free, one.apply(data).take(poses), start[[i]])
-        for i, one in zip(order, nearest, strict=True)
+        _judge(free, interpretation.apply(data).take(poses), start[[i]])
+        for i, interpretation in zip(order, nearest, strict=True)
     ]
-    screened = np.array([np.inf if one is None else one.misfit for one in few])
+    screened = np.array(
+        [np.inf if interpretation is None else interpretation.misfit for interpretation in few]
+    )
     promising = [nearest[i] for i in _select_promising(screened, misfit)]
-    judged = [(one, _judge(free, one.apply(data))) for one in promising]
-    return [(one, comparison.misfit) for one, comparison in judged if comparison is not None]
+    judged = [
+        (interpretation, _judge(free, interpretation.apply(data))) for interpretation in promising
+    ]
+    return [
+        (interpretation, comparison.misfit)
+        for interpretation, comparison in judged
+        if comparison is not None
+    ]
 
 
 def _guess_frames(
@@ -206,17 +217,17 @@ def _select_promising(misfits: FloatArray, misfit: float) -> IntArray:
 
 
 def _is_informative(
-    free: FreeParameters, data: Measurements, one: Interpretation, misfit: float
+    free: FreeParameters, data: Measurements, interpretation: Interpretation, misfit: float
 ) -> bool:
     """Return whether values that shrink fit far better than a constant would: zeros fit every
     unit.
     """
-    if not one.shrinks:
+    if not interpretation.shrinks:
         return True
 
     def make_constant(values: FloatArray) -> FloatArray:
-        changed = one.change(values)
+        changed = interpretation.change(values)
         return np.where(changed != values, np.nanmedian(changed, axis=0), changed)
 
-    control = _judge(free, replace(one, change=make_constant).apply(data))
+    control = _judge(free, replace(interpretation, change=make_constant).apply(data))
     return control is None or not control.misfit < BETTER * misfit

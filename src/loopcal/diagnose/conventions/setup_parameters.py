@@ -85,7 +85,7 @@ def find_contradiction(stated: Comparison, misfit: float, better: float) -> Cont
         Of the parameter that alone explains the misfit, or else of all stated ones.
     """
     present = set(stated.data.nuisance_parameters.table.names)
-    names = tuple(one.name for one in stated.data.stated_values if one.name in present)
+    names = tuple(value.name for value in stated.data.stated_values if value.name in present)
     if not names:
         return None
     together = _estimate_stated(stated, names)
@@ -94,8 +94,8 @@ def find_contradiction(stated: Comparison, misfit: float, better: float) -> Cont
     options = [together]
     if 1 < len(names) <= MOST_SINGLE:
         single = [_estimate_stated(stated, (name,)) for name in names]
-        options += [one for one in single if one.misfit * better < misfit]
-    return min(options, key=lambda one: (len(one.names), one.misfit))
+        options += [option for option in single if option.misfit * better < misfit]
+    return min(options, key=lambda option: (len(option.names), option.misfit))
 
 
 def find_moved_setups(
@@ -130,7 +130,7 @@ def find_moved_setups(
 def _estimate_stated(stated: Comparison, names: tuple[str, ...]) -> Contradiction:
     """Compare the measurements with some stated parameters estimated."""
     free, data = stated.problem.free, stated.data
-    remaining = tuple(one for one in data.stated_values if one.name not in names)
+    remaining = tuple(value for value in data.stated_values if value.name not in names)
     freed = replace(data, stated_values=remaining)
     comparison = exclude_far_rows(compare_with_robot(free, freed))
     misfit, estimates = refine_misfit(comparison)

@@ -81,7 +81,7 @@ def compute_influence(
     u, p = len(weight), len(sd)
     leverage, distance, deleted = np.zeros(u), np.zeros(u), np.zeros(u)
     residuals, degrees = np.zeros(u, np.int64), np.zeros(u, np.int64)
-    for blocks, columns, r in _linearize_blocks(problem, linearization, member, u):
+    for blocks, columns, r in iterate_blocks(problem, linearization, member, u):
         # nuisance parameters come first, in units of their standard deviation
         A, nuisance = columns[..., -p:], columns[..., :-p]
         residual = r + A @ change
@@ -103,7 +103,7 @@ def compute_influence(
     return Influence(leverage, residuals, distance, degrees, deleted)
 
 
-def _linearize_blocks(
+def iterate_blocks(
     problem: Problem, linearization: Linearization, member: IntArray, count: int
 ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
     """Yield blocks of equal size together: numbers (b,), matrices (b, m, p), residuals (b, m).
@@ -112,10 +112,10 @@ def _linearize_blocks(
     """
     total = problem.count_leverage_rows(member, count)
     waiting: list[tuple[IntArray, FloatArray]] = []
-    for parts in problem.leverage_rows(linearization):
-        for part in parts:
-            blocks = np.repeat(member[part.poses], part.rows.shape[1])
-            waiting.append((blocks, part.rows.reshape(-1, part.rows.shape[2])))
+    for rows_of_block in problem.leverage_rows(linearization):
+        for rows in rows_of_block:
+            blocks = np.repeat(member[rows.poses], rows.rows.shape[1])
+            waiting.append((blocks, rows.rows.reshape(-1, rows.rows.shape[2])))
         if not waiting:
             continue
         block_of_row = np.concatenate([w[0] for w in waiting])

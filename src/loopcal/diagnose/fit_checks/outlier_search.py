@@ -133,9 +133,9 @@ def search_suspects(
         after = _exclude_farthest(refit, order, whole)
         if (after.excluded == last.excluded).all():
             return (last,)
-        again = [i for i, old in enumerate(fits) if (old.excluded == after.excluded).all()]
-        if again:
-            return tuple(fits[again[0] :])
+        repeated = [i for i, old in enumerate(fits) if (old.excluded == after.excluded).all()]
+        if repeated:
+            return tuple(fits[repeated[0] :])
         fits.append(after)
     return tuple(fits)
 
@@ -186,17 +186,17 @@ def list_suspected_in_turn(fits: tuple[PartialFit, ...]) -> list[BoolArray]:
 
 def _exclude_farthest(refit: Refit, order: IntArray, whole: PartialFit) -> PartialFit:
     """Exclude as many blocks of the order as possible without losing a direction, by bisection."""
-    good, bad, best = 0, len(order) + 1, whole
+    possible, impossible, best = 0, len(order) + 1, whole
     count = len(order)
-    while bad - good > 1:
+    while impossible - possible > 1:
         excluded = np.zeros_like(whole.excluded)
         excluded[order[:count]] = True
         fit = refit(excluded)
         if fit.determines_as_much(whole):
-            good, best = count, fit
+            possible, best = count, fit
         else:
-            bad = count
-        count = (good + bad) // 2
+            impossible = count
+        count = (possible + impossible) // 2
     return best
 
 

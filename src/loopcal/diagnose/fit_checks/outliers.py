@@ -117,7 +117,7 @@ class OutlierCheck:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """The summary, then every outlier and every conflict."""
-        details = [one.finding for one in (*self.outliers, *self.ambiguous)]
+        details = [result.finding for result in (*self.outliers, *self.ambiguous)]
         return (*self.summary, *details)
 
     def __repr__(self) -> str:
@@ -178,7 +178,7 @@ def find_outliers(
         groups = find_rivals(refit, end, whole, limit, progress)
     else:
         groups = list_suspected_in_turn(fits)
-    always = np.all([one.excluded for one in fits], axis=0)
+    always = np.all([partial.excluded for partial in fits], axis=0)
     ambiguous = np.any(groups, axis=0) if groups else np.zeros_like(always)
     p_value, ratio, influence = end.p_value(), np.sqrt(whole.ratio), end.influence
     outliers = tuple(
