@@ -350,7 +350,7 @@ def list_columns(robot: Mechanism, kinds: Sequence[Kind]) -> dict[str, Column]:
 
 def find_open_column(name: str) -> Column | None:
     """Return an open-ended column (a temperature, a remark) by its name; None for other names."""
-    return next((found for rule in RULES if (found := rule.match(name)) is not None), None)
+    return next((column for rule in RULES if (column := rule.match(name)) is not None), None)
 
 
 def is_context(name: str) -> bool:

@@ -81,14 +81,14 @@ def read_kinds(table: Table, robot: Mechanism, several: bool = False) -> tuple[K
         kinds: tuple[KindRows, ...] = ()
     else:
         kinds = _read_kinds(table, robot)
-    refuse_unknown_columns(table, robot, [one.kind for one in kinds])
+    refuse_unknown_columns(table, robot, [entry.kind for entry in kinds])
     return kinds
 
 
 def read_observations(
     table: Table,
     robot: Mechanism,
-    one: KindRows,
+    entry: KindRows,
     members: Sequence[tuple[int, ...]],
     context: Mapping[str, FloatArray],
     pose_context: Mapping[str, FloatArray],
@@ -97,7 +97,7 @@ def read_observations(
 
     Parameters
     ----------
-    table, robot, one : file, measured robot, and one of `read_kinds`.
+    table, robot, entry : file, measured robot, and one of `read_kinds`.
     members : the poses of each row of the file.
     context : name -> (rows,) times and temperatures of the file.
     pose_context : name -> (n,) those of the poses, for rows that state none.
@@ -109,9 +109,9 @@ def read_observations(
     """
     from loopcal.measure import Observations
 
-    one = _select_rows(table, one, members)
-    links, rows = one.kind.poses_per_row, one.rows
-    measured, covariance = _read_values(table, robot, one)
+    entry = _select_rows(table, entry, members)
+    links, rows = entry.kind.poses_per_row, entry.rows
+    measured, covariance = _read_values(table, robot, entry)
     poses = np.array([members[row] for row in rows], dtype=np.intp).reshape(-1, links)
     beside = {}
     for name in dict.fromkeys([*context, *pose_context]):
@@ -122,7 +122,7 @@ def read_observations(
             beside[name] = values
     with name_files(table.path):
         observations = Observations(
-            one.kind,
+            entry.kind,
             poses[:, 0] if links == 1 else poses,
             measured,
             covariance,
@@ -157,28 +157,30 @@ def _read_kinds(table: Table, robot: Mechanism) -> tuple[KindRows, ...]:
     for label, node in several.items():
         place = ("kinds", label)
         kind = read_kind(file, node, place).with_tool(robot.tool)
-        own = ["kind", "noise", *list_kind_settings(type(kind))]
-        refuse_unknown_keys(file, list(node), own, place)
+        allowed = ["kind", "noise", *list_kind_settings(type(kind))]
+        refuse_unknown_keys(file, list(node), allowed, place)
         noise, rows = read_noise(file, node, kind, place), np.flatnonzero(cells == label)
         kinds.append(KindRows(kind, noise, rows, place))
     return tuple(kinds)
 
 
-def _select_rows(table: Table, one: KindRows, members: Sequence[tuple[int, ...]]) -> KindRows:
+def _select_rows(table: Table, entry: KindRows, members: Sequence[tuple[int, ...]]) -> KindRows:
     """Return only the rows that measure: those of two poses, for a kind that compares poses."""
-    links = one.kind.poses_per_row
+    links = entry.kind.poses_per_row
     if links > 1 and "kind" not in table.units:
-        one = replace(one, rows=one.rows[[len(members[row]) > 1 for row in one.rows]])
-    for row in one.rows:
+        entry = replace(entry, rows=entry.rows[[len(members[row]) > 1 for row in entry.rows]])
+    for row in entry.rows:
         if (count := len(members[row])) != links:
-            sentence = f"this row names {count} poses, but the kind {one.kind.name!r} needs {links}"
+            sentence = (
+                f"this row names {count} poses, but the kind {entry.kind.name!r} needs {links}"
+            )
             raise table.row_error(int(row), f"{sentence}; correct the column 'pose'")
-    return one
+    return entry
 
 
-def _read_values(table: Table, robot: Mechanism, one: KindRows) -> tuple[FloatArray, FloatArray]:
+def _read_values(table: Table, robot: Mechanism, entry: KindRows) -> tuple[FloatArray, FloatArray]:
     """Return measured values (r, c) and the covariance (r, m, m) of their residuals [SI]."""
-    kind, rows = one.kind, one.rows
+    kind, rows = entry.kind, entry.rows
     known = list_columns(robot, [kind])
     names = [name_measured(column.name, robot) for column in kind.columns]
     require_columns(table, names, f"which the kind {kind.name!r} measures")
@@ -189,7 +191,7 @@ def _read_values(table: Table, robot: Mechanism, one: KindRows) -> tuple[FloatAr
     if kind.noise_columns == kind.columns:  # then a value that was not measured needs no sigma
         absent = np.isnan(measured)
     sigma = np.column_stack(
-        [_read_sigma(table, robot, one, i, absent[:, i]) for i in range(absent.shape[1])]
+        [_read_sigma(table, robot, entry, i, absent[:, i]) for i in range(absent.shape[1])]
     )
     covariance = sigma[:, :, None] * np.eye(sigma.shape[1]) * sigma[:, None, :]
     for i, a in enumerate(kind.noise_columns):
@@ -214,16 +216,16 @@ def _read_names(table: Table, name: str, rows: IntArray) -> NDArray[np.str_]:
 
 
 def _read_sigma(
-    table: Table, robot: Mechanism, one: KindRows, place: int, absent: BoolArray
+    table: Table, robot: Mechanism, entry: KindRows, place: int, absent: BoolArray
 ) -> FloatArray:
     """Return the standard deviations (r,) [SI] of one noise column, from its column or settings.
 
     An empty cell of a value that is `absent` (r,) gets the sigma of another row, without effect.
     """
-    column = one.kind.noise_columns[place]
+    column = entry.kind.noise_columns[place]
     name = SIGMA + name_measured(column.name, robot)
     if name not in table.units:
-        if column.name not in one.noise:
+        if column.name not in entry.noise:
             raise table.settings.error(
                 report_finding(
                     "files.noise-missing",
@@ -231,14 +233,14 @@ def _read_sigma(
                     example=f"noise: {{{column.name}: {EXAMPLES[column.dimension]}}}",
                     sigma=name,
                 ),
-                (*one.location, "noise"),
+                (*entry.location, "noise"),
             )
-        return np.full(len(one.rows), one.noise[column.name])
-    own = table.numbers(name, column.dimension)[one.rows]
-    sigma = np.where(np.isnan(own), one.noise.get(column.name, np.nan), own)
+        return np.full(len(entry.rows), entry.noise[column.name])
+    cells = table.numbers(name, column.dimension)[entry.rows]
+    sigma = np.where(np.isnan(cells), entry.noise.get(column.name, np.nan), cells)
     if (positive := sigma[sigma > 0]).size:
         sigma = np.where(absent & np.isnan(sigma), positive[0], sigma)
     for i in np.flatnonzero(~(sigma > 0)):
         sentence = f"column {name!r} is not positive; write a standard deviation"
-        raise table.row_error(int(one.rows[i]), sentence)
+        raise table.row_error(int(entry.rows[i]), sentence)
     return sigma

@@ -70,13 +70,13 @@ def read_kind(file: YamlFile, node: Mapping[str, Any], location: Location) -> Ki
         raise file.error(f"{sentence}; allowed: {known}", (*location, "kind"))
     kind = KINDS[name]
     record = _make_record(kind)
-    own = {key: node[key] for key in list_kind_settings(kind) if key in node}
-    values = vars(read_record(file, own, record, None, location))
-    given = {key: _to_setting(values[key], kind, key) for key in own}
+    settings = {key: node[key] for key in list_kind_settings(kind) if key in node}
+    values = vars(read_record(file, settings, record, None, location))
+    given = {key: _to_setting(values[key], kind, key) for key in settings}
     try:
         return kind(**given)
     except DataError as error:
-        raise file.error(f"{error}", (*location, next(iter(own), "kind"))) from None
+        raise file.error(f"{error}", (*location, next(iter(settings), "kind"))) from None
 
 
 def list_kind_settings(kind: type[Kind]) -> dict[str, Any]:

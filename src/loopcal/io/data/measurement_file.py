@@ -81,24 +81,27 @@ def load_measurements(
     context = [read_context(table) for table in tables]
     of_poses = _collect_pose_context(tables, kinds, poses.members, context, len(poses.labels))
     read = [
-        [read_observations(table, robot, one, members, beside, of_poses) for one in own]
-        for table, own, members, beside in zip(tables, kinds, poses.members, context, strict=True)
+        [read_observations(table, robot, entry, members, beside, of_poses) for entry in of_file]
+        for table, of_file, members, beside in zip(
+            tables, kinds, poses.members, context, strict=True
+        )
     ]
     settings = [
-        (table.settings, [rows for rows, _ in own]) for table, own in zip(tables, read, strict=True)
+        (table.settings, [rows for rows, _ in of_file])
+        for table, of_file in zip(tables, read, strict=True)
     ]
     with name_files(*(table.path for table in tables)):
         data = Measurements(
             robot.name,
             poses.readings,
-            tuple(rows for own in read for rows, _ in own),
+            tuple(rows for of_file in read for rows, _ in of_file),
             poses.block,
             poses.labels,
             poses.sigma,
             read_known(settings, poses.labels),
         )
         check_strokes(data, robot, allow=allow_outside_stroke)
-        places = [places for own in read for _, places in own]
+        places = [places for of_file in read for _, places in of_file]
         check_duplicates(data, allow=allow_duplicates, places=places)
     return data
 
@@ -161,14 +164,14 @@ def load_poses(path: str | Path, robot: Mechanism) -> FloatArray:
 def _read_tables(path: Paths) -> tuple[Table, ...]:
     """Read the files, and those that they name under `poses`."""
     given = path if isinstance(path, list | tuple) else [path]
-    paths = [as_path(one, WHAT) for one in given]
+    paths = [as_path(file, WHAT) for file in given]
     if not paths:
         raise DataError("no measurement file is given; name at least one")
     tables: list[Table] = []
-    for one in paths:
-        table = read_table(one)
-        if any(one.samefile(other.path) for other in tables):
-            raise FileError("this file is given twice; name it once", one)
+    for file in paths:
+        table = read_table(file)
+        if any(file.samefile(other.path) for other in tables):
+            raise FileError("this file is given twice; name it once", file)
         if "format" in table.settings.content:
             check_format(table.settings, FORMAT)
         tables.append(table)
@@ -194,12 +197,12 @@ def _collect_pose_context(
 ) -> dict[str, FloatArray]:
     """Return name -> (n,) times and temperatures of rows that only hold readings, else NaN."""
     of_poses: dict[str, FloatArray] = {}
-    for table, own, of_rows, beside in zip(tables, kinds, members, context, strict=True):
+    for table, of_file, of_rows, beside in zip(tables, kinds, members, context, strict=True):
         measuring = {
             int(row)
-            for one in own
-            for row in one.rows
-            if len(of_rows[row]) == one.kind.poses_per_row
+            for entry in of_file
+            for row in entry.rows
+            if len(of_rows[row]) == entry.kind.poses_per_row
         }
         for name, values in beside.items():
             for row, poses in enumerate(of_rows):
@@ -236,18 +239,19 @@ def load_instrument_to_plan(path: str | Path, robot: Mechanism) -> Instrument:
     table = read_table(path)
     kinds = read_kinds(table, robot)
     groups, poses = table.text("group"), table.pose_names()
-    apart = len({frozenset(poses[row] for row in one.rows) for one in kinds}) > 1
-    for one in kinds:
-        own = [
+    apart = len({frozenset(poses[row] for row in entry.rows) for entry in kinds}) > 1
+    for entry in kinds:
+        parameters = [
             parameter.name
-            for parameter in one.kind.nuisance_parameters
+            for parameter in entry.kind.nuisance_parameters
             if parameter.scope == "group"
         ]
-        if own and (apart or len({groups[row] for row in one.rows}) > 1):
-            is_surface = one.kind.name in {"plane", "line"}
+        if parameters and (apart or len({groups[row] for row in entry.rows}) > 1):
+            is_surface = entry.kind.name in {"plane", "line"}
             code = "files.surfaces-in-plan" if is_surface else "files.groups-in-plan"
             raise table.settings.error(
-                report_finding(code, kind=one.kind.name, parameters=tuple(own)), one.location
+                report_finding(code, kind=entry.kind.name, parameters=tuple(parameters)),
+                entry.location,
             )
     return _build_instrument(table, kinds)
 
@@ -267,12 +271,12 @@ def _build_instrument(table: Table, kinds: Sequence[KindRows]) -> Instrument:
     from loopcal.measure import Gaussian, Instrument, Sensor
 
     sensors = []
-    for one in kinds:
-        for column in one.kind.noise_columns:
-            if column.name not in one.noise:
+    for entry in kinds:
+        for column in entry.kind.noise_columns:
+            if column.name not in entry.noise:
                 example = f"noise: {{{column.name}: {EXAMPLES[column.dimension]}}}"
                 sentence = f"the settings state no noise of {column.name!r}; add '{example}'"
-                raise table.settings.error(sentence, (*one.location, "noise"))
-        sigma = np.array([one.noise[column.name] for column in one.kind.noise_columns])
-        sensors.append(Sensor(one.kind, Gaussian(sigma)))
+                raise table.settings.error(sentence, (*entry.location, "noise"))
+        sigma = np.array([entry.noise[column.name] for column in entry.kind.noise_columns])
+        sensors.append(Sensor(entry.kind, Gaussian(sigma)))
     return Instrument(tuple(sensors))

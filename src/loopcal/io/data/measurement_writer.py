@@ -82,8 +82,8 @@ def format_measurements(
     _refuse_names(data)
     known = list_columns(robot, [rows.kind for rows in data.observations])
     labels = _label_kinds([rows.kind for rows in data.observations])
-    parts = [_Part(*one, robot) for one in zip(labels, data.observations, strict=True)]
-    common, own = _split_reading_noise(data, robot)
+    parts = [_Part(*entry, robot) for entry in zip(labels, data.observations, strict=True)]
+    common, listed = _split_reading_noise(data, robot)
     lines = _format_settings(robot, [(p.label, p.rows.kind, p.common) for p in parts], remark)
     knowledge = format_known(data.stated_values, data.nuisance_parameters.table.entries)
     for key, text in (("unknowns", knowledge), ("reading_noise", common)):
@@ -94,7 +94,7 @@ def format_measurements(
     for name in ("session", "group"):
         names += [name] if any((getattr(p.rows, name) != "").any() for p in parts) else []
     names += ["kind"] if len(parts) > 1 else []
-    names += [a.name for a in robot.actuators] + [SIGMA + robot.actuators[i].name for i in own]
+    names += [a.name for a in robot.actuators] + [SIGMA + robot.actuators[i].name for i in listed]
     names += [name for part in parts for name in part.rows.context]
     names += [name for part in parts for name in part.columns]
     columns: list[Column] = [known.get(n, ContextColumn(n)) for n in dict.fromkeys(names)]
@@ -114,7 +114,7 @@ def format_measurements(
         pose = LINK.join(data.labels[pose] for pose in poses)
         cells = {"pose": pose, USE_COLUMN.name: (uses or {}).get(pose, ""), **values}
         if len(poses) == 1:
-            cells |= _reading_cells(data, robot, poses[0], own)
+            cells |= _reading_cells(data, robot, poses[0], listed)
         lines.append(",".join(c.format(cells[c.name]) if c.name in cells else "" for c in columns))
     return "\n".join(lines) + "\n"
 
@@ -168,13 +168,15 @@ def format_data_sheet(
 
     sensors = instrument.with_tool(robot).sensors
     rows = []
-    for one in (sensor.assign_rows(len(np.asarray(readings))) for sensor in sensors):
-        if one.rows is None:
+    for sensor in (sensor.assign_rows(len(np.asarray(readings))) for sensor in sensors):
+        if sensor.rows is None:
             continue
-        empty = np.full((len(one.rows), len(one.kind.columns)), np.nan)
-        sigma = one.noise.sigma
+        empty = np.full((len(sensor.rows), len(sensor.kind.columns)), np.nan)
+        sigma = sensor.noise.sigma
         rows.append(
-            Observations.from_sigma(one.kind, one.rows, empty, sigma, one.session, one.group)
+            Observations.from_sigma(
+                sensor.kind, sensor.rows, empty, sigma, sensor.session, sensor.group
+            )
         )
     data = Measurements(robot.name, np.asarray(readings), tuple(rows), labels=tuple(labels))
     return format_measurements(data, robot, uses=uses)
@@ -214,24 +216,24 @@ def _split_reading_noise(data: Measurements, robot: Mechanism) -> tuple[str, lis
     """
     if data.reading_sigma is None:
         return "", []
-    stated, own = [], []
+    stated, listed = [], []
     for i, actuator in enumerate(robot.actuators):
         values = np.unique(data.reading_sigma[~np.isnan(data.readings[:, i]), i])
         if len(values) == 1 and np.isfinite(values[0]):
             text = format_quantity(float(values[0]), actuator.dimension)
             stated.append(f"{actuator.name}: {text}")
         elif len(values):
-            own.append(i)
-    return f"{{{', '.join(stated)}}}", own
+            listed.append(i)
+    return f"{{{', '.join(stated)}}}", listed
 
 
-def _reading_cells(data: Measurements, robot: Mechanism, pose: int, own: Sequence[int]) -> Cells:
-    """Return block, readings and, of the actuators `own`, their noise."""
+def _reading_cells(data: Measurements, robot: Mechanism, pose: int, listed: Sequence[int]) -> Cells:
+    """Return block, readings and, of the actuators `listed`, their noise."""
     cells: Cells = {"block": int(data.block[pose])}
     for i, actuator in enumerate(robot.actuators):
         reading = float(data.readings[pose, i])
         cells[actuator.name] = reading
-        if i in own and data.reading_sigma is not None:
+        if i in listed and data.reading_sigma is not None:
             is_read = reading == reading  # noqa: PLR0124
             cells[SIGMA + actuator.name] = data.reading_sigma[pose, i] if is_read else float("nan")
     return cells

@@ -71,36 +71,37 @@ def read_known(
         if not isinstance(stated, dict):
             sentence = f"{KEY!r} must name parameters, as {KEY}: {{tracker.x: {{sd: 1 mm}}}}"
             raise file.error(sentence, (KEY,))
-        own: dict[str, tuple[StatedValue, YamlFile, Location]] = {}
+        of_file: dict[str, tuple[StatedValue, YamlFile, Location]] = {}
         entries = collect_nuisance_parameters(observations, labels).table.entries if stated else ()
         for pattern, node in stated.items():
             place = (KEY, pattern)
             matching = _match(file, entries, pattern)
-            own |= {k.name: (k, file, place) for k in _read_one(file, node, matching, place)}
-        for name, (one, _, place) in own.items():
-            if name in known and known[name][0] != one:
-                _, other, there = known[name]
-                line = f"{other.path}:{other.line(there)}"
+            of_file |= {k.name: (k, file, place) for k in _read_one(file, node, matching, place)}
+        for name, (value, _, place) in of_file.items():
+            if name in known and known[name][0] != value:
+                _, other, other_place = known[name]
+                line = f"{other.path}:{other.line(other_place)}"
                 sentence = f"parameter {name!r} is stated differently in {line}; state it once"
                 raise file.error(sentence, place)
-        known = own | known
-    return tuple(one for one, _, _ in known.values())
+        known = of_file | known
+    return tuple(value for value, _, _ in known.values())
 
 
 def format_known(known: Sequence[StatedValue], entries: Sequence[Parameter]) -> str:
     """Return the setting as text that `read_known` reads, for the parameters among `entries`."""
     dimensions = {entry.name: entry.dimension for entry in entries}
     texts = []
-    for one in known:
-        if one.name not in dimensions:
+    for value in known:
+        if value.name not in dimensions:
             continue
-        dimension = dimensions[one.name]
-        start = [] if one.nominal is None else [f"start: {format_quantity(one.nominal, dimension)}"]
-        if one.sd:
-            text = f"{{{', '.join([*start, f'sd: {format_quantity(one.sd, dimension)}'])}}}"
-        else:
-            text = f"{{{start[0]}, {FIXED}: true}}" if start else FIXED
-        texts.append(f"{json.dumps(one.name, ensure_ascii=False)}: {text}")
+        dimension = dimensions[value.name]
+        text = FIXED
+        if value.sd:
+            text = f"{{sd: {format_quantity(value.sd, dimension)}}}"
+        if value.nominal is not None:
+            start = f"start: {format_quantity(value.nominal, dimension)}"
+            text = f"{{{start}, {text[1:]}" if value.sd else f"{{{start}, {FIXED}: true}}"
+        texts.append(f"{json.dumps(value.name, ensure_ascii=False)}: {text}")
     return f"{{{', '.join(texts)}}}" if texts else ""
 
 

@@ -245,11 +245,11 @@ def read_reading_sigma(table: Table, robot: Mechanism, readings: FloatArray) -> 
         name = SIGMA + actuator.name
         if name not in table.units:
             continue
-        own = known[name].parse(table)
-        for row in np.flatnonzero(own < 0.0):
+        cells = known[name].parse(table)
+        for row in np.flatnonzero(cells < 0.0):
             sentence = f"column {name!r} is negative; write a standard deviation, 0 where exact"
             raise table.row_error(int(row), sentence)
-        sigma[:, i] = np.where(np.isnan(own), sigma[:, i], own)
+        sigma[:, i] = np.where(np.isnan(cells), sigma[:, i], cells)
         if actuator.sigma is None:
             for row in np.flatnonzero(np.isnan(sigma[:, i]) & ~np.isnan(readings[:, i])):
                 sentence = f"column {name!r} is empty, and no other noise of this reading is stated"

@@ -111,9 +111,9 @@ def list_headers(profile: Profile) -> dict[str, str | None]:
     names = [column.name for column in profile.kind.columns]
     first: dict[str, str | None] = {"pose": None}
     if len(profile.targets) < 2:
-        own = [profile.name_measured(name) for name in names]
-        others = {n: u for n, u in units.items() if n not in own}
-        return first | others | {n: units[n] for n in own}
+        measured = [profile.name_measured(name) for name in names]
+        others = {n: u for n, u in units.items() if n not in measured}
+        return first | others | {n: units[n] for n in measured}
     shared = {n: u for n, u in units.items() if not _belongs_to_target(n, profile)}
     values = list(dict.fromkeys(strip_target(name) for name in names))
     beside = [n for n in units if n not in shared and n not in values]

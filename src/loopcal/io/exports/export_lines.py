@@ -75,8 +75,8 @@ def read_lines(path: Path, profile: Profile) -> Lines:
         lines.skipped += 1
     if named and header is None:
         names, number = ", ".join(sorted(named)), first[0] if first else None
-        seen = f"; the first line is {' | '.join(first[1])!r}" if first else ""
-        sentence = f"no line names the columns {names} of {profile.file.path}{seen}"
+        shown = f"; the first line is {' | '.join(first[1])!r}" if first else ""
+        sentence = f"no line names the columns {names} of {profile.file.path}{shown}"
         raise FileError(f"{sentence}; correct the profile", path, number)
     return lines
 

@@ -209,8 +209,8 @@ def read_profile(path: str | Path) -> Profile:
     place = ("settings",)
     kind = read_kind(file, record.settings, place)
     allowed = [key for key in SETTINGS if key != "kinds"]
-    own = list_kind_settings(type(kind))
-    refuse_unknown_keys(file, list(record.settings), [*allowed, *own], place)
+    settings = list_kind_settings(type(kind))
+    refuse_unknown_keys(file, list(record.settings), [*allowed, *settings], place)
     if DELIMITERS[record.delimiter] == DECIMALS[record.decimal]:
         sentence = "a comma cannot be both the decimal mark and the separator; correct one"
         raise file.error(sentence, ("decimal",))
@@ -231,10 +231,12 @@ def _check_columns(profile: Profile) -> None:
     """Raise FileError for columns that a measurement file of this kind cannot have, or lacks."""
     file, kind, record = profile.file, profile.kind, profile.record
     several = len(profile.targets) > 1
-    own = list(dict.fromkeys(strip_target(c.name) if several else c.name for c in kind.columns))
-    own = own[-3:] if record.matrix else own
+    measured = list(
+        dict.fromkeys(strip_target(c.name) if several else c.name for c in kind.columns)
+    )
+    measured = measured[-3:] if record.matrix else measured
     dimensions = _list_dimensions(kind, several)
-    known = [*TEXTS, TIME, "temperature", *own, *(MEASURED + name for name in own)]
+    known = [*TEXTS, TIME, "temperature", *measured, *(MEASURED + name for name in measured)]
     noise = [n for n in dimensions if n.startswith((SIGMA, COVARIANCE))]
     noise += [SIGMA + name for name in record.readings]
     for name, source in record.columns.items():
@@ -252,8 +254,8 @@ def _check_columns(profile: Profile) -> None:
                 f"{name!r} is a reading and a measured column; {act}", ("readings", name)
             )
         _check_source(file, name, source, ("readings", name), {})
-    for name in own:
-        count = sum(one in record.columns for one in (name, MEASURED + name))
+    for name in measured:
+        count = sum(column in record.columns for column in (name, MEASURED + name))
         if count != 1:
             sentence = f"'columns' states {count} sources of {name!r}, but the kind {kind.name!r}"
             raise file.error(f"{sentence} needs one; correct it", ("columns",))

@@ -10,8 +10,8 @@ from loopcal.io.formats import delta_gcode, hangprinter, klipper, linuxcnc, para
 from loopcal.io.formats.program_format import Format
 
 FORMATS: Mapping[str, Format] = {
-    one.name: one
-    for one in (
+    entry.name: entry
+    for entry in (
         klipper.FORMAT,
         delta_gcode.MARLIN,
         delta_gcode.REPRAP,

@@ -120,10 +120,10 @@ def read_gcode(path: Path, one_in_a_line: bool = False) -> GcodeFile:
 
 def parse_gcode(lines: Iterable[str], path: Path, one_in_a_line: bool = False) -> GcodeFile:
     """Find the words; FileError for text that is not words, and for a letter that occurs twice."""
-    kept = tuple(lines)
+    complete = tuple(lines)
     words: dict[Name, Value] = {}
     commands: dict[str, tuple[int, int]] = {}
-    for i, line in enumerate(kept):
+    for i, line in enumerate(complete):
         for position, (command, letters, end, rest) in enumerate(_split_commands(line)):
             commands[command] = (i, end)
             if command not in READ:
@@ -140,21 +140,21 @@ def parse_gcode(lines: Iterable[str], path: Path, one_in_a_line: bool = False) -
                 if any(letter == other for other, *_ in letters[:k]):
                     raise FileError(f"{command} has {letter} twice; remove one", path, i + 1)
                 words[command, letter] = Value(line[start : start + length], i, start)
-    return GcodeFile(path, kept, words, commands)
+    return GcodeFile(path, complete, words, commands)
 
 
 def _split_commands(line: str) -> Iterator[tuple[str, list[tuple[str, int, int]], int, str]]:
     """Yield the commands of a line: name, words (letter, column, length), end, other text."""
     code = CHECKSUM.sub("", _blank_asides(line).rstrip()).translate(UPPER)
     front = FRONT.match(code)
-    at = front.end() if front is not None else 0
-    while (command := COMMAND.match(code, at)) is not None:
-        at, words = command.end(), []
-        while COMMAND.match(code, at) is None and (word := WORD.match(code, at)) is not None:
+    column = front.end() if front is not None else 0
+    while (command := COMMAND.match(code, column)) is not None:
+        column, words = command.end(), []
+        while not COMMAND.match(code, column) and (word := WORD.match(code, column)):
             words.append((word[1], word.start(2), len(word[2])))
-            at = word.end()
-        rest = "" if COMMAND.match(code, at) is not None else code[at:].strip()
-        yield command[1], words, len(code[:at].rstrip()), rest
+            column = word.end()
+        rest = "" if COMMAND.match(code, column) else code[column:].strip()
+        yield command[1], words, len(code[:column].rstrip()), rest
         if command[1] in WITH_TEXT:
             return
 

@@ -84,7 +84,7 @@ def export_robot(source: ExportSource, target: Format, into: Path | None) -> Exp
     FileError : the file to correct cannot be read, or is of another kind.
     """
     if target.write is None:
-        writable = ", ".join(name for name, one in FORMATS.items() if one.write is not None)
+        writable = ", ".join(name for name, known in FORMATS.items() if known.write is not None)
         raise DataError(f"loopcal cannot write the format {target.name}; it writes {writable}")
     if into is not None and not target.takes_file:
         raise DataError(report_finding("files.format-takes-no-file", format=target.name))

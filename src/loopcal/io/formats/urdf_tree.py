@@ -301,28 +301,28 @@ def _list_tree_joints(urdf: Urdf, ends: set[str]) -> tuple[GraphJoint, ...]:
             name = waiting[0].name
             sentence = f"joint {name!r} is carried by a link that a closure holds"
             raise urdf.error(f"{sentence}; close the loop at another joint", name)
-        for one in ready:
-            body = urdf.find_body(one.parent)
-            place = urdf.place_in_body(one.parent) @ one.origin
+        for joint in ready:
+            body = urdf.find_body(joint.parent)
+            place = urdf.place_in_body(joint.parent) @ joint.origin
             joints.append(
-                GraphJoint(one.name, one.kind, body, one.child, place, np.eye(4), one.axis)
+                GraphJoint(joint.name, joint.kind, body, joint.child, place, np.eye(4), joint.axis)
             )
-            bodies.add(one.child)
+            bodies.add(joint.child)
         waiting = [joint for joint in waiting if joint not in ready]
     return tuple(joints)
 
 
 def _build_pin(urdf: Urdf, first: str, second: str) -> GraphJoint:
     """Return the pin of two revolute joints whose child links coincide."""
-    one, other = urdf.joints[first], urdf.joints[second]
-    for joint in (one, other):
+    ends = urdf.joints[first], urdf.joints[second]
+    for joint in ends:
         if joint.kind != "R":
             sentence = f"closure joint {joint.name!r} is not revolute, but closures must be"
             raise urdf.error(f"{sentence}; correct it", joint.name)
-    if np.abs(one.axis - other.axis).max() > PARALLEL:
+    if np.abs(ends[0].axis - ends[1].axis).max() > PARALLEL:
         sentence = f"closure joints {first!r} and {second!r} have different axes"
         raise urdf.error(f"{sentence}; give them the same axis", second)
     (a, T_a), (b, T_b) = (
-        (urdf.find_body(j.parent), urdf.place_in_body(j.parent) @ j.origin) for j in (one, other)
+        (urdf.find_body(j.parent), urdf.place_in_body(j.parent) @ j.origin) for j in ends
     )
-    return GraphJoint(first, "R", a, b, T_a, T_b, one.axis, is_pin=True, far=second)
+    return GraphJoint(first, "R", a, b, T_a, T_b, ends[0].axis, is_pin=True, far=second)

@@ -83,7 +83,7 @@ def build_robot(file: YamlFile) -> Mechanism:
     content = {key: value for key, value in file.content.items() if key not in HEADER}
     with name_files(file.path):
         record = read_record(file, content, family, units)
-        symbols = {dimension: one.symbol for dimension, one in units.items()}
+        symbols = {dimension: unit.symbol for dimension, unit in units.items()}
         origin = RobotSource(file.path, remove_table(file), record)
         robot = build(_assemble(record, file), symbols, origin)
     if TABLE not in file.content:

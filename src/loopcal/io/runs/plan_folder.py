@@ -208,11 +208,13 @@ def format_surface_data(plan: SurfacePlan) -> str:
 
     robot = plan.robot
     observations = []
-    for one in plan.instrument.sensors:
-        assert one.rows is not None  # the plan states them
-        gaps = np.zeros((len(one.rows), len(one.kind.columns)))
-        sigma = one.noise.sigma
-        observations.append(Observations.from_sigma(one.kind, one.rows, gaps, sigma, "", one.group))
+    for sensor in plan.instrument.sensors:
+        assert sensor.rows is not None  # the plan states them
+        gaps = np.zeros((len(sensor.rows), len(sensor.kind.columns)))
+        sigma = sensor.noise.sigma
+        observations.append(
+            Observations.from_sigma(sensor.kind, sensor.rows, gaps, sigma, "", sensor.group)
+        )
     poses = plan.poses
     data = Measurements(robot.name, poses.readings, tuple(observations), labels=poses.labels)
     lines = format_measurements(data, robot).splitlines()
