@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import Any
 
 import loopcal
+from tools.markdown import format_table
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "api.md"
 
@@ -47,9 +48,8 @@ def write_page() -> str:
     parts = [HEAD]
     for package, heading in SECTIONS.items():
         names = sorted(loopcal.PUBLIC_NAMES[package], key=lambda name: (name.lower(), name))
-        lines = [f"\n## {heading}\n", "| name | purpose |", "|---|---|"]
-        lines += [f"| `{name}` | {describe_name(name)} |" for name in names]
-        parts.append("\n".join(lines) + "\n")
+        rows = [(f"`{name}`", describe_name(name)) for name in names]
+        parts.append(f"\n## {heading}\n\n{format_table(('name', 'purpose'), rows)}")
     return "".join(parts)
 
 
@@ -66,7 +66,7 @@ def describe_name(name: str) -> str:
     members = ""
     if isinstance(value, enum.EnumMeta):
         members = f" ({', '.join(value.__members__)})"
-    return sentence.replace("|", "\\|").rstrip(".") + members + "."
+    return sentence.rstrip(".") + members + "."
 
 
 def main() -> int:

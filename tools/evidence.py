@@ -19,12 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from tools.machine import describe_machine
+from tools.markdown import fill_blocks, format_table
 
 ROOT = Path(__file__).resolve().parent.parent
-BLOCK = re.compile(
-    r"(<!-- evidence: (?P<name>[\w-]+)\.(?P<table>[\w-]+) -->\n)(?P<body>.*?)(<!-- end -->)",
-    re.DOTALL,
-)
+BLOCK = r"evidence: (?P<name>[\w-]+)\.(?P<table>[\w-]+)"
 
 
 class EvidenceError(Exception):
@@ -71,13 +69,13 @@ def run_all(scripts: list[Path]) -> None:
     """
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    ordered = sorted(scripts, key=last_seconds, reverse=True)
+    ordered = sorted(scripts, key=read_seconds, reverse=True)
     with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
         for done in as_completed([pool.submit(run_script, script) for script in ordered]):
             done.result()
 
 
-def last_seconds(script: Path) -> float:
+def read_seconds(script: Path) -> float:
     """Return how long a script took when its JSON file was made; without one it counts as the
     longest.
     """
@@ -93,11 +91,10 @@ def render_table(table: dict[str, Any]) -> str:
     """Return a Markdown table; a missing value is a dash."""
     columns = table["columns"]
     formats = table.get("formats", [""] * len(columns))
-    lines = [columns, ["---"] * len(columns)]
-    for row in table["rows"]:
-        cells = zip(row, formats, strict=True)
-        lines.append(["-" if cell is None else format(cell, spec) for cell, spec in cells])
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    rows = (zip(row, formats, strict=True) for row in table["rows"])
+    return format_table(
+        columns, [["-" if x is None else format(x, spec) for x, spec in row] for row in rows]
+    )
 
 
 def fill_tables(text: str, folder: Path) -> str:
@@ -106,7 +103,7 @@ def fill_tables(text: str, folder: Path) -> str:
     EvidenceError where a block names a file or a table that is not there.
     """
 
-    def fill(match: re.Match[str]) -> str:
+    def write(match: re.Match[str]) -> str:
         path = folder / f"{match['name']}.json"
         if not path.exists():
             raise EvidenceError(
@@ -117,9 +114,9 @@ def fill_tables(text: str, folder: Path) -> str:
             raise EvidenceError(
                 f"{path} has no table {match['table']!r}; there are {', '.join(tables) or 'none'}"
             )
-        return match[1] + render_table(tables[match["table"]]) + match[5]
+        return render_table(tables[match["table"]])
 
-    return BLOCK.sub(fill, text)
+    return fill_blocks(text, BLOCK, write)
 
 
 def find_pages(root: Path) -> list[Path]:

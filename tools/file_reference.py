@@ -7,15 +7,12 @@ around it is written by hand.
 """
 
 import dataclasses
-import inspect
-import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, get_args
 
 from loopcal.io.core import file_reference
-from loopcal.io.core.records import get_field_types
 from loopcal.io.data.columns import RULES
 from loopcal.io.data.kind_rows import SETTINGS
 from loopcal.io.data.kind_settings import list_kind_settings
@@ -24,115 +21,70 @@ from loopcal.io.runs.run_folder import MADE_BY
 from loopcal.measure import KINDS, Column, Kind
 from loopcal.mechanism import FAMILIES, RobotRecord
 from loopcal.units import DISPLAY_UNITS, Dimension
+from tools.markdown import fill_blocks, format_table
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGE, EXPORTS = DOCS / "files.md", DOCS / "exports.md"
 EXAMPLES = DOCS.parent / "examples" / "exports"
-BLOCK = re.compile(
-    r"(<!-- made by tools.file_reference: (?P<name>[\w-]+) -->\n)(?P<body>.*?)(<!-- end -->)",
-    re.DOTALL,
-)
+BLOCK = r"made by tools.file_reference: (?P<name>[\w-]+)"
 
 
-def table(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table."""
-    lines = [headers, ["---"] * len(headers), *rows]
-    return (
-        "\n".join(
-            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
-        )
-        + "\n"
-    )
+def format_record(record: type, without: Iterable[str] = ()) -> str:
+    """Return the keys of a record but those that `without` names."""
+    excluded = set(without)
+    keys = [key for key in file_reference.list_keys(record) if key.name not in excluded]
+    if not any(key.meaning for key in keys):
+        phrases = (f"`{k.name}`: {k.holds}" + f" ({k.default})" * bool(k.default) for k in keys)
+        return "; ".join(phrases) + "\n"
+    rows = [(f"`{k.name}`", k.holds, k.default, k.meaning) for k in keys]
+    return format_table(("key", "holds", "default", "meaning"), rows)
 
 
-def summarize(record: type) -> str:
-    """Return the text of a record's docstring above its sections."""
-    text = file_reference.SECTION.split(inspect.cleandoc(record.__doc__ or ""))[0]
-    return file_reference.SI.sub("", " ".join(text.split()))
-
-
-def list_nested_records(record: type) -> tuple[type, ...]:
-    """Return the records that a record's keys hold, in order, each once."""
-    nested: dict[type, None] = {}
-
-    def walk(annotation: Any) -> Iterator[type]:
-        if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
-            yield annotation
-        for argument in get_args(annotation):
-            yield from walk(argument)
-
-    queue = [record]
-    while queue:
-        for hint in get_field_types(queue.pop(0)).values():
-            for inner in walk(hint):
-                if inner not in nested and inner is not record:
-                    nested[inner] = None
-                    queue.append(inner)
-    return tuple(nested)
-
-
-def record_table(record: type, without: Iterable[str] = ()) -> str:
-    """Return the keys of a record, those left out that `without` names."""
-    left = set(without)
-    found = [key for key in file_reference.list_keys(record) if key.name not in left]
-    if not any(key.meaning for key in found):
-        return (
-            "; ".join(
-                f"`{k.name}`: {k.holds}" + (f" ({k.default})" if k.default else "") for k in found
-            )
-            + "\n"
-        )
-    rows = [(f"`{k.name}`", k.holds, k.default, k.meaning) for k in found]
-    return table(("key", "holds", "default", "meaning"), rows)
-
-
-def common() -> str:
+def format_common() -> str:
     """Return what every robot file may say."""
-    parts = [record_table(RobotRecord)]
-    parts += [_nested(record) for record in common_records()]
+    parts = [format_record(RobotRecord)]
+    parts += [_format_nested(record) for record in list_common_records()]
     return "\n".join(parts)
 
 
-def common_records() -> tuple[type, ...]:
+def list_common_records() -> tuple[type, ...]:
     """Return the records that several families use."""
-    seen: dict[type, int] = {}
-    for family in FAMILIES.values():
-        for record in list_nested_records(family):
-            seen[record] = seen.get(record, 0) + 1
-    return tuple(record for record, count in seen.items() if count > 1)
+    nested = (list_nested_records(family) for family in FAMILIES.values())
+    counts = Counter(record for records in nested for record in records)
+    return tuple(record for record, count in counts.items() if count > 1)
 
 
-def families() -> str:
+def format_families() -> str:
     """Return the keys of every family, beside the common ones."""
     shared = [key.name for key in file_reference.list_keys(RobotRecord)]
-    parts = []
+    common, parts = list_common_records(), []
     for name, family in FAMILIES.items():
-        own = [record for record in list_nested_records(family) if record not in common_records()]
+        records = list_nested_records(family)
         parts.append(
-            f"### `family: {name}`\n\n{summarize(family)}\n\n{record_table(family, shared)}"
+            f"### `family: {name}`\n\n{summarize(family)}\n\n{format_record(family, shared)}"
         )
-        parts += [_nested(record) for record in own]
+        parts += [_format_nested(record) for record in records if record not in common]
     return "\n".join(parts)
 
 
-def _nested(record: type) -> str:
+def _format_nested(record: type) -> str:
     name, summary = file_reference.name_record(record), summarize(record)
-    return f"**{name}**: {summary}\n\n{record_table(record)}"
+    return f"**{name}**: {summary}\n\n{format_record(record)}"
 
 
-def kinds() -> str:
+def format_kinds() -> str:
     """Return columns and settings of every kind of measurement."""
     parts = []
     for name, kind in KINDS.items():
-        rows = dict.fromkeys(_example(one) for one in kind.examples())
-        columns = table(("settings", "columns", "noise is stated for"), rows)
+        rows = dict.fromkeys(_describe_example(one) for one in kind.examples())
+        columns = format_table(("settings", "columns", "noise is stated for"), rows)
         meanings = file_reference.collect_meanings(kind)
         if len(possible := kind.allowed_unknown) > 1:
             meanings["unknown"] = (
                 f"Which of {', '.join(f'`{p}`' for p in possible)} are unknown, and identified "
                 "with the robot"
             )
-        settings = table(
+        settings = format_table(
             ("setting", "meaning"),
             [(f"`{key}`", meanings.get(key, "")) for key in list_kind_settings(kind)],
         )
@@ -140,7 +92,7 @@ def kinds() -> str:
     return "\n".join(parts)
 
 
-def _example(kind: Kind) -> tuple[str, str, str]:
+def _describe_example(kind: Kind) -> tuple[str, str, str]:
     """Return settings, columns and noise columns of an example."""
     stated = []
     for field in dataclasses.fields(kind):  # type: ignore[arg-type]  # every kind is a dataclass
@@ -154,10 +106,10 @@ def _example(kind: Kind) -> tuple[str, str, str]:
                 f"`{field.name}: "
                 f"{value if isinstance(value, str) else '[' + ', '.join(value) + ']'}`"
             )
-    return ", ".join(stated), _columns(kind.columns), _columns(kind.noise_columns)
+    return ", ".join(stated), _describe_columns(kind.columns), _describe_columns(kind.noise_columns)
 
 
-def _columns(columns: Iterable[Column]) -> str:
+def _describe_columns(columns: Iterable[Column]) -> str:
     """Return columns with an example of their unit."""
     return " ".join(
         f"`{c.name}`"
@@ -166,61 +118,63 @@ def _columns(columns: Iterable[Column]) -> str:
     )
 
 
-def settings() -> str:
+def format_settings() -> str:
     """Return the settings of a measurement file."""
-    return table(("setting", "meaning"), [(f"`{key}`", words) for key, words in SETTINGS.items()])
+    return format_table(
+        ("setting", "meaning"), [(f"`{key}`", words) for key, words in SETTINGS.items()]
+    )
 
 
-def columns() -> str:
+def format_columns() -> str:
     """Return the columns of a measurement file."""
     rows = [(f"`{rule.pattern}`", rule.unit, rule.meaning) for rule in RULES]
-    return table(("column", "unit", "meaning"), rows)
+    return format_table(("column", "unit", "meaning"), rows)
 
 
-def provenance_keys() -> str:
+def format_provenance() -> str:
     """Return the keys of `made_by`."""
-    return table(("key", "meaning"), [(f"`{key}`", words) for key, words in MADE_BY.items()])
+    return format_table(("key", "meaning"), [(f"`{key}`", words) for key, words in MADE_BY.items()])
 
 
-def profile() -> str:
+def format_profile() -> str:
     """Return the keys of a profile of exports."""
-    return record_table(ProfileRecord)
+    return format_record(ProfileRecord)
 
 
-def profile_columns() -> str:
+def format_profile_columns() -> str:
     """Return the keys of a column in a profile."""
-    return record_table(ColumnSource)
+    return format_record(ColumnSource)
 
 
-def profile_example(name: str) -> Callable[[], str]:
+def format_example(name: str) -> Callable[[], str]:
     """Return what gives a profile of the examples."""
     return lambda: f"```yaml\n{(EXAMPLES / name).read_text('utf-8')}```\n"
 
 
 BLOCKS = {
-    "common": common,
-    "families": families,
-    "kinds": kinds,
-    "settings": settings,
-    "columns": columns,
-    "made-by": provenance_keys,
+    "common": format_common,
+    "families": format_families,
+    "kinds": format_kinds,
+    "settings": format_settings,
+    "columns": format_columns,
+    "made-by": format_provenance,
 }
-OF_EXPORTS = {"profile": profile, "profile-columns": profile_columns} | {
-    name: profile_example(f"{name}.yaml") for name in ("tracker-points", "six-dof", "cmm-spheres")
+EXPORT_BLOCKS = {"profile": format_profile, "profile-columns": format_profile_columns} | {
+    name: format_example(f"{name}.yaml") for name in ("tracker-points", "six-dof", "cmm-spheres")
 }
 
 
-def written(text: str) -> str:
-    """Return the page with every table made anew."""
-    every = BLOCKS | OF_EXPORTS
-    return BLOCK.sub(lambda m: f"{m[1]}{every[m['name']]()}{m[4]}", text)
+def fill_page(text: str) -> str:
+    """Return a page with all of its blocks written anew."""
+    writers = BLOCKS | EXPORT_BLOCKS
+    return fill_blocks(text, BLOCK, lambda block: writers[block["name"]]())
 
 
 def main() -> int:
     """Rewrite the pages."""
     for page in (PAGE, EXPORTS):
-        page.write_text(written(page.read_text("utf-8")), "utf-8")
-        print(f"written: {page.relative_to(DOCS.parent)}")
+        page.write_text(fill_page(page.read_text("utf-8")), "utf-8")
+        print(f"wrote {page.relative_to(DOCS.parent)}")
     return 0
 
 

@@ -13,7 +13,7 @@ from loopcal.findings import catalog
 from loopcal.findings.catalog import Entry
 from loopcal.findings.finding import Severity
 from loopcal.findings.wording import depends_on_data, fill_template
-from tools.file_reference import table
+from tools.markdown import format_table
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "findings.md"
@@ -41,34 +41,34 @@ data, an example is shown in quotation marks. The last columns are empty where t
 """
 
 
-def shown_text(entry: Entry) -> str:
+def describe_text(entry: Entry) -> str:
     """Return the text of an entry for the page: placeholders in italics, or an example."""
     if depends_on_data(entry.text):
         return f'"{entry.word_example()}"'
     return PLACEHOLDER.sub(lambda match: f"*{match['name'].replace('_', ' ')}*", entry.text)
 
 
-def page() -> str:
+def write_page() -> str:
     """Return docs/findings.md."""
     severities = [(f"`{severity.value}`", words) for severity, words in SEVERITIES.items()]
-    parts = [HEAD, table(("severity", "meaning"), severities)]
+    parts = [HEAD, format_table(("severity", "meaning"), severities)]
     for file in catalog.FILES:
         rows = [
             (
                 f"`{e.code}`",
                 e.severity.value,
-                shown_text(e),
+                describe_text(e),
                 e.when,
                 fill_template(e.action, **e.example),
             )
             for e in catalog.read_entries(file).values()
         ]
         parts.append(f"## {catalog.read_document(file)['title']}\n")
-        parts.append(table(("code", "severity", "text", "when", "what to do"), rows))
+        parts.append(format_table(("code", "severity", "text", "when", "what to do"), rows))
     return "\n".join(parts)
 
 
-def wording() -> str:
+def write_wording() -> str:
     """Return every text of the catalog, one a line: templates as they are, functions by example."""
     lines = [
         f"{e.code} [{e.severity.value}]: {e.word_example()}"
@@ -79,9 +79,9 @@ def wording() -> str:
 
 def main() -> None:
     """Write the page, and the wording where asked."""
-    PAGE.write_text(page(), "utf-8")
+    PAGE.write_text(write_page(), "utf-8")
     if "--wording" in sys.argv[1:]:
-        WORDING.write_text(wording(), "utf-8")
+        WORDING.write_text(write_wording(), "utf-8")
 
 
 if __name__ == "__main__":

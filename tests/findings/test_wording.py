@@ -10,7 +10,7 @@ from tools import findings_reference
 
 def test_every_text_of_the_catalog_is_the_pinned_one():
     pinned = findings_reference.WORDING.read_text("utf-8").splitlines()
-    worded = findings_reference.wording().splitlines()
+    worded = findings_reference.write_wording().splitlines()
     advice = "run `python -m tools.findings_reference --wording` and read its changes"
     assert set(worded) - set(pinned) == set(), advice
     assert worded == pinned, advice
@@ -22,7 +22,7 @@ def test_every_text_that_depends_on_its_data_has_an_example():
 
 
 def test_texts_are_one_paragraph_without_options_of_the_command_line():
-    for line in findings_reference.wording().splitlines():
+    for line in findings_reference.write_wording().splitlines():
         code, _, text = line.partition("]: ")
         assert text == " ".join(text.split()), code
         assert "--" not in text, code

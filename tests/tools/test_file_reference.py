@@ -12,17 +12,20 @@ from loopcal.measure import KINDS
 from loopcal.mechanism import FAMILIES
 from loopcal.mechanism.families.linear_delta import LinearDelta
 from tools import file_reference
+from tools.markdown import find_blocks
 
 PAGE = file_reference.PAGE.read_text("utf-8")
 
 
 def test_the_page_is_up_to_date() -> None:
-    assert file_reference.written(PAGE) == PAGE, "run `make docs`"
-    assert {m["name"] for m in file_reference.BLOCK.finditer(PAGE)} == set(file_reference.BLOCKS)
+    assert file_reference.fill_page(PAGE) == PAGE, "run `make docs`"
+    assert {m["name"] for m in find_blocks(PAGE, file_reference.BLOCK)} == set(
+        file_reference.BLOCKS
+    )
     exports = file_reference.EXPORTS.read_text("utf-8")
-    assert file_reference.written(exports) == exports, "run `make docs`"
-    assert {m["name"] for m in file_reference.BLOCK.finditer(exports)} == set(
-        file_reference.OF_EXPORTS
+    assert file_reference.fill_page(exports) == exports, "run `make docs`"
+    assert {m["name"] for m in find_blocks(exports, file_reference.BLOCK)} == set(
+        file_reference.EXPORT_BLOCKS
     )
 
 

@@ -17,6 +17,8 @@ from loopcal.cli.options import (
     FILE,
     data_argument,
     data_options,
+    file_option,
+    flag_option,
     force_option,
     json_option,
     limit_options,
@@ -29,11 +31,14 @@ from loopcal.cli.options import (
 )
 from loopcal.errors import DataError
 
+TAKEN_OPTIONS = ("limit_position", "limit_angle", "choose_model", "free_limb", "allow_still")
+"""Options of the command that options of the library have by the same name."""
+
 
 @click.command()
 @robot_argument
 @data_argument("DATA...")
-@click.option("-o", "--output", required=True, type=FILE, help="Run folder to make.")
+@file_option("-o", "--output", help="Run folder to make.", required=True)
 @click.option(
     "--hold-out",
     type=click.FloatRange(0, 1, max_open=True),
@@ -43,17 +48,15 @@ from loopcal.errors import DataError
     "those of data.split(hold_out=SHARE, seed=SEED) in Python.",
 )
 @fit_options
-@click.option(
+@flag_option(
     "--choose-model",
-    is_flag=True,
     help="Free only as many parameters as held-out predictions justify: offsets, then lengths, "
     "ideal, complete.",
 )
-@click.option(
+@file_option(
     "--prior",
-    type=FILE,
-    metavar="RUN",
     help="Run folder of an earlier calibration of this machine, which is used as the prior.",
+    metavar="RUN",
 )
 @click.option(
     "--free-limb",
@@ -72,11 +75,7 @@ def calibrate(
     data: tuple[Path, ...],
     output: Path,
     hold_out: float,
-    choose_model: bool,
     prior: Path | None,
-    free_limb: str | None,
-    limit_position: float | None,
-    limit_angle: float | None,
     seed: int,
     force: bool,
     verbose: bool,
@@ -121,13 +120,9 @@ def calibrate(
         hold_out,
         held_out,
         seed,
-        limit_position=limit_position,
-        limit_angle=limit_angle,
-        choose_model=choose_model,
         prior=None if prior is None else load_prior(prior, data),
-        free_limb=free_limb,
         check_conventions=not options["allow_implausible"],
-        allow_still=options["allow_still"],
+        **{name: options[name] for name in TAKEN_OPTIONS},
     )
     machine = load_robot(robot)
     refuse_run_folder(output, list(inputs.values()), force)
@@ -183,9 +178,7 @@ def _list_inputs(robot: str, data: Sequence[Path], prior: Path | None) -> dict[s
     help="Frame, target or surface that was moved since RUN, to be fitted to DATA again. May be "
     "given several times.",
 )
-@click.option(
-    "--allow-fitted-data", is_flag=True, help="Accept measurements that the run was fitted to."
-)
+@flag_option("--allow-fitted-data", help="Accept measurements that the run was fitted to.")
 @verbose_option
 @json_option
 def validate(
@@ -250,9 +243,7 @@ def validate(
 @click.command()
 @click.argument("run", metavar="RUN", type=FILE)
 @click.argument("targets", metavar="TARGETS", type=FILE)
-@click.option(
-    "-o", "--output", type=FILE, help="CSV file to write; without it the CSV text is printed."
-)
+@file_option("-o", "--output", help="CSV file to write; without it the CSV text is printed.")
 @click.option(
     "--mode",
     type=click.Choice(("readings", "commands")),

@@ -15,6 +15,7 @@ from loopcal.cli.options import (
     FILE,
     LENGTH,
     add_options,
+    file_option,
     force_option,
     format_option,
     json_option,
@@ -41,23 +42,18 @@ SHOWN = 20
 @click.command("import")
 @click.argument("file", metavar="FILE", type=FILE)
 @format_option(READ_FORMATS, "Format of FILE; by default chosen by the ending of its name.")
-@click.option(
-    "--profile",
-    type=FILE,
-    help="Instead of --format: how to read FILE, the export of an instrument.",
+@file_option(
+    "--profile", help="Instead of --format: how to read FILE, the export of an instrument."
 )
-@click.option(
+@file_option(
     "-o",
     "--output",
-    required=True,
-    type=FILE,
     help="Robot file to write, which names the robot; with --profile the measurement file.",
+    required=True,
 )
-@click.option("--data", type=FILE, help="Also write the measurements that FILE contains.")
-@click.option(
-    "--corrected",
-    type=FILE,
-    help="Also calibrate with them, and write FILE with the corrected numbers.",
+@file_option("--data", help="Also write the measurements that FILE contains.")
+@file_option(
+    "--corrected", help="Also calibrate with them, and write FILE with the corrected numbers."
 )
 @add_options(
     *(
@@ -77,10 +73,8 @@ SHOWN = 20
     help="Unit of lengths (linuxcnc).",
 )
 @click.option("--home-z", "home_height", type=LENGTH, help="Height of the home pose (linuxcnc).")
-@click.option(
-    "--closures",
-    type=FILE,
-    help="Loops that a URDF closes (urdf); by default FILE with the ending .yaml.",
+@file_option(
+    "--closures", help="Loops that a URDF closes (urdf); by default FILE with the ending .yaml."
 )
 @click.option(
     "--platform",
@@ -269,13 +263,12 @@ def _view_import(
 @click.command()
 @click.argument("source", metavar="RUN|ROBOT")
 @format_option(WRITTEN_FORMATS, "Format to write; by default chosen by the ending of -o.")
-@click.option(
+@file_option(
     "--into",
-    type=FILE,
-    metavar="FILE",
     help="File of the controller to correct; everything else in it stays as it is.",
+    metavar="FILE",
 )
-@click.option("-o", "--output", required=True, type=FILE, help="File to write.")
+@file_option("-o", "--output", help="File to write.", required=True)
 @force_option("the output file")
 @json_option
 def export(

@@ -21,9 +21,10 @@ from loopcal.cli.instrument_options import (
     unknown_options,
 )
 from loopcal.cli.options import (
-    FILE,
     data_argument,
     data_options,
+    file_option,
+    flag_option,
     force_option,
     is_given,
     json_option,
@@ -44,23 +45,17 @@ if TYPE_CHECKING:
 @click.command()
 @robot_argument
 @data_argument("[DATA]...", required=False)
-@click.option(
-    "--poses", type=FILE, help="Instead of DATA: CSV file of poses that could be measured."
-)
+@file_option("--poses", help="Instead of DATA: CSV file of poses that could be measured.")
 @draw_option
 @seed_option("the drawn poses")
 @unknown_options
-@click.option(
+@flag_option(
     "--reduce",
     "reduced",
-    is_flag=True,
     help="Also choose a smallest set of parameters, and show what the others are merged into.",
 )
-@click.option(
-    "-o",
-    "--output",
-    type=FILE,
-    help="With --reduce: robot file to write, with the other parameters fixed.",
+@file_option(
+    "-o", "--output", help="With --reduce: robot file to write, with the other parameters fixed."
 )
 @force_option("the output file")
 @instrument_options
@@ -164,23 +159,21 @@ def _write_subset(output: Path, subset: IdentifiableSubset) -> None:
 
 @click.command()
 @robot_argument
-@click.option("--poses", type=FILE, help="CSV file of commanded poses, one column per coordinate.")
+@file_option("--poses", help="CSV file of commanded poses, one column per coordinate.")
 @draw_option
-@click.option(
+@file_option(
     "--fill",
-    type=FILE,
-    metavar="SHEET",
     help="Instead of poses and instrument: data file of a plan, to be filled in.",
+    metavar="SHEET",
 )
-@click.option("-o", "--output", required=True, type=FILE, help="Measurement file to write.")
+@file_option("-o", "--output", help="Measurement file to write.", required=True)
 @instrument_options
 @sigma_reading_option
-@click.option(
+@flag_option(
     "--draw-errors",
-    is_flag=True,
     help="Draw the errors of the true machine from the tolerances of the robot file.",
 )
-@click.option("--truth", type=FILE, help="Also write the true machine, as a robot file.")
+@file_option("--truth", help="Also write the true machine, as a robot file.")
 @seed_option("poses, errors and noise")
 @force_option("an output file")
 @json_option

@@ -87,9 +87,19 @@ def add_options(*options: Decorator) -> Decorator:
     return decorate
 
 
+def file_option(*names: str, **kind: Any) -> Decorator:
+    """Return an option that takes the path of a file or folder."""
+    return click.option(*names, type=FILE, **kind)
+
+
+def flag_option(*names: str, help: str) -> Decorator:  # noqa: A002
+    """Return an option without a value."""
+    return click.option(*names, is_flag=True, help=help)
+
+
 def force_option(what: str) -> Decorator:
     """Return the option that lets a command replace what exists."""
-    return click.option("--force", is_flag=True, help=f"Replace {what} if it exists.")
+    return flag_option("--force", help=f"Replace {what} if it exists.")
 
 
 def seed_option(what: str) -> Decorator:

@@ -22,8 +22,9 @@ from loopcal.cli.instrument_options import (
     unknown_options,
 )
 from loopcal.cli.options import (
-    FILE,
     data_option,
+    file_option,
+    flag_option,
     force_option,
     is_given,
     json_option,
@@ -61,7 +62,7 @@ EXCLUDED_BY_PLANE_LINE = {
 
 @click.command()
 @robot_argument
-@click.option("-o", "--output", required=True, type=FILE, help="Folder to make.")
+@file_option("-o", "--output", help="Folder to make.", required=True)
 @click.option(
     "--poses", type=int, metavar="N", help="Number of poses for the calibration.  [default: 40]"
 )
@@ -98,11 +99,8 @@ EXCLUDED_BY_PLANE_LINE = {
     metavar="N",
     help="With --measure plane-line: number of points on each.  [default: 8]",
 )
-@click.option(
-    "--allowed",
-    type=FILE,
-    metavar="CSV",
-    help="Poses to choose from; by default drawn from the workspace.",
+@file_option(
+    "--allowed", help="Poses to choose from; by default drawn from the workspace.", metavar="CSV"
 )
 @data_option(
     "--measured", "Measurements that exist already. May be given several times.", multiple=True
@@ -114,9 +112,7 @@ EXCLUDED_BY_PLANE_LINE = {
     default=1000,
     help="Number of candidate poses to draw.",
 )
-@click.option(
-    "--curve", is_flag=True, help="Also compute the expected errors by the number of poses."
-)
+@flag_option("--curve", help="Also compute the expected errors by the number of poses.")
 @seed_option("all random choices")
 @force_option("the plan")
 @json_option
@@ -159,7 +155,6 @@ def plan(
         result = _plan_surfaces(
             machine, groups, points, options["sigma_position"], make_constraints(options), seed
         )
-        files = _write_surface_plan(output, result, _list_inputs(robot), seed, force)
         document = result.to_dict()
     else:
         if groups is not None or points is not None:
@@ -170,8 +165,9 @@ def plan(
 
         with terminal.ProgressBar() as progress:
             result = plan_poses(machine, instrument, options=plan_options, progress=progress)
-        files = _write_plan(output, result, _list_inputs(robot, like, allowed, measured), force)
         document = {"format": FORMAT, **result.to_dict()}
+    inputs = _list_inputs(robot, like, allowed, measured)
+    files = _write_plan(output, result, inputs, seed, force)
     if as_json:
         terminal.print_json(document)
         return
@@ -258,10 +254,7 @@ def _read_earlier(
 
 
 def _list_inputs(
-    robot: str,
-    like: Path | None = None,
-    allowed: Path | None = None,
-    measured: tuple[Path, ...] = (),
+    robot: str, like: Path | None, allowed: Path | None, measured: tuple[Path, ...]
 ) -> dict[str, Path]:
     """Return role -> file of everything that is read."""
     from loopcal.io.robot.robot_file import find_robot_file
@@ -271,30 +264,39 @@ def _list_inputs(
     return {role: path for role, path in files.items() if path is not None}
 
 
-def _write_plan(output: Path, result: Plan, inputs: Mapping[str, Path], force: bool) -> str:
+def _write_plan(
+    output: Path, result: Plan | SurfacePlan, inputs: Mapping[str, Path], seed: int, force: bool
+) -> str:
     """Write the folder of a plan; return its files in words."""
     from loopcal.io.runs.plan_folder import (
         DATA,
         SHEET,
         format_plan_data,
         format_sheet,
+        format_surface_data,
+        format_surface_sheet,
         write_plan_folder,
     )
     from loopcal.io.runs.run_folder import collect_provenance
+    from loopcal.planning import Plan
     from loopcal.planning.result import list_stops
     from loopcal.report.plan_drawing import draw_curve, draw_plan, save_figure
 
-    texts = {SHEET: format_sheet(result, list_stops(result)), DATA: format_plan_data(result)}
-    seeds = {"plan": result.options.seed}
-    document = result.to_dict() | {"made_by": collect_provenance(sys.argv, inputs, seeds)}
-    figures = {"plan.png": draw_plan(result)}
-    if result.curve is not None:
-        figures["curve.png"] = draw_curve(result.robot, result.curve)
+    figures = {}
+    if isinstance(result, Plan):
+        texts = {SHEET: format_sheet(result, list_stops(result)), DATA: format_plan_data(result)}
+        figures["plan.png"] = draw_plan(result)
+        if result.curve is not None:
+            figures["curve.png"] = draw_curve(result.robot, result.curve)
+    else:
+        texts = {SHEET: format_surface_sheet(result), DATA: format_surface_data(result)}
+    document = result.to_dict() | {"made_by": collect_provenance(sys.argv, inputs, {"plan": seed})}
     pictures = {
         name: functools.partial(save_figure, figure=figure) for name, figure in figures.items()
     }
     write_plan_folder(output, texts, document, pictures, force)
-    return "plan.csv for the measurement, measurements.csv to fill in, plan.json, pictures"
+    files = "plan.csv for the measurement, measurements.csv to fill in, plan.json"
+    return f"{files}, pictures" if pictures else files
 
 
 def _refuse_beside_plane_line() -> None:
@@ -327,22 +329,3 @@ def _plan_surfaces(
     )
     with terminal.ProgressBar() as progress:
         return plan_surfaces(robot, options, progress)
-
-
-def _write_surface_plan(
-    output: Path, result: SurfacePlan, inputs: Mapping[str, Path], seed: int, force: bool
-) -> str:
-    """Write the folder of a plan of surfaces; return its files in words."""
-    from loopcal.io.runs.plan_folder import (
-        DATA,
-        SHEET,
-        format_surface_data,
-        format_surface_sheet,
-        write_plan_folder,
-    )
-    from loopcal.io.runs.run_folder import collect_provenance
-
-    texts = {SHEET: format_surface_sheet(result), DATA: format_surface_data(result)}
-    document = result.to_dict() | {"made_by": collect_provenance(sys.argv, inputs, {"plan": seed})}
-    write_plan_folder(output, texts, document, {}, force)
-    return "plan.csv for the measurement, measurements.csv to fill in, plan.json"

@@ -11,7 +11,7 @@ import click
 
 from loopcal.cli import terminal
 from loopcal.cli.instrument_options import instrument_options, make_instrument
-from loopcal.cli.options import FILE, force_option, json_option, robot_argument
+from loopcal.cli.options import file_option, flag_option, force_option, json_option, robot_argument
 
 if TYPE_CHECKING:
     from loopcal.measure import Instrument
@@ -19,12 +19,8 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("family", metavar="FAMILY")
-@click.option(
-    "-o", "--output", required=True, type=FILE, help="Robot file to write; the robot gets its name."
-)
-@click.option(
-    "--measurements", type=FILE, help="Also write a measurement file with columns but no rows."
-)
+@file_option("-o", "--output", help="Robot file to write; the robot gets its name.", required=True)
+@file_option("--measurements", help="Also write a measurement file with columns but no rows.")
 @instrument_options
 @force_option("an output file")
 @json_option
@@ -82,18 +78,11 @@ def _format_template(robot_text: str, instrument: Instrument) -> str:
 
 @click.command()
 @robot_argument
-@click.option(
-    "--plot",
-    type=FILE,
-    metavar="FILE",
-    help="Draw the robot at home into FILE (.png, .svg or .pdf).",
+@file_option(
+    "--plot", help="Draw the robot at home into FILE (.png, .svg or .pdf).", metavar="FILE"
 )
 @force_option("the picture")
-@click.option(
-    "--expand",
-    is_flag=True,
-    help="Also show links, joints, transmissions, and how parameters enter.",
-)
+@flag_option("--expand", help="Also show links, joints, transmissions, and how parameters enter.")
 @json_option
 def check(robot: str, plot: Path | None, force: bool, expand: bool, as_json: bool) -> None:
     """Read ROBOT, a robot file or the name of a shipped robot, and show its actuators and

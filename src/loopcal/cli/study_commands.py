@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from loopcal.cli import terminal
-from loopcal.cli.options import FILE, json_option
+from loopcal.cli.options import file_option, flag_option, json_option
 
 if TYPE_CHECKING:
     from loopcal.papers.printed import Table as PrintedTable
@@ -25,12 +25,11 @@ HEADING = 18
 
 @click.command()
 @click.argument("paper", metavar="[PAPER]", required=False)
-@click.option(
+@file_option(
     "-o",
     "--output",
-    type=FILE,
-    metavar="FOLDER",
     help="Folder for a page, all tables (CSV, JSON) and figures (PNG).",
+    metavar="FOLDER",
 )
 @click.option("--seed", default=0, help="Seed of all random choices.")
 @click.option(
@@ -39,7 +38,7 @@ HEADING = 18
     metavar="N",
     help="Number of trials behind each statistical number.  [default: 50]",
 )
-@click.option("--force", is_flag=True, help="Replace an earlier result in FOLDER.")
+@flag_option("--force", help="Replace an earlier result in FOLDER.")
 @json_option
 def reproduce(
     paper: str | None,

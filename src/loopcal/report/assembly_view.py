@@ -13,8 +13,8 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.mechanism import Mechanism
-from loopcal.report.numbers import format_number, units_of
-from loopcal.report.tables import Column, Table, word_column
+from loopcal.report.numbers import ABSENT, format_in, format_number, units_of
+from loopcal.report.tables import Column, Table, build_table, word_column
 from loopcal.units import Dimension, Unit
 
 if TYPE_CHECKING:
@@ -69,38 +69,26 @@ def _build_joint_table(robot: Mechanism, units: Units) -> Table:
             value = _format(float(values[i][j]), units[dimension])
             driven = joint.actuator or ""
             rows.append((limb.name, joint.name, motion, driven, value, str(units[dimension])))
-    columns = (
-        word_column("limb"),
-        word_column("joint"),
-        word_column("motion"),
-        word_column("driven by"),
-        Column("at home"),
-        Column("unit", align="left"),
-    )
+    words = map(word_column, ("limb", "joint", "motion", "driven by"))
+    columns = (*words, Column("at home"), word_column("unit"))
     return Table("Joints", columns, tuple(rows))
 
 
 def _build_ending_table(robot: Mechanism, units: Units) -> Table:
     """Return how each limb ends at the platform."""
     length = units[Dimension.LENGTH]
-    rows = tuple(
+    return build_table(
+        "Limb ends",
+        robot.assembly.limbs,
+        (word_column("limb"), lambda limb: limb.name),
+        (word_column("ending"), lambda limb: limb.ending),
         (
-            limb.name,
-            limb.ending,
-            _format(limb.length, length) if limb.ending == "distance" else "-",
-            length.symbol if limb.ending == "distance" else "",
-            limb.actuator or "",
-        )
-        for limb in robot.assembly.limbs
+            Column("rod length"),
+            lambda limb: _format(limb.length, length) if limb.ending == "distance" else ABSENT,
+        ),
+        (word_column("unit"), lambda limb: length.symbol if limb.ending == "distance" else ""),
+        (word_column("driven by"), lambda limb: limb.actuator or ""),
     )
-    columns = (
-        word_column("limb"),
-        word_column("ending"),
-        Column("rod length"),
-        Column("unit", align="left"),
-        word_column("driven by"),
-    )
-    return Table("Limb ends", columns, rows)
 
 
 def _build_transmission_table(robot: Mechanism, units: Units) -> Table:
@@ -127,7 +115,7 @@ def _build_transmission_table(robot: Mechanism, units: Units) -> Table:
         word_column("drives", wraps=True),
         word_column("term"),
         Column("value"),
-        Column("unit", align="left"),
+        word_column("unit"),
     )
     return Table("Transmissions: from reading to joint value", columns, tuple(rows))
 
@@ -152,7 +140,7 @@ def _build_map_table(robot: Mechanism, units: Units) -> Table:
         word_column("parameter", wraps=True),
         word_column("changes", wraps=True),
         Column("by"),
-        Column("unit", align="left"),
+        word_column("unit"),
     )
     return Table("Maps: how parameters enter", columns, tuple(rows))
 
@@ -216,4 +204,4 @@ def _joint_dimension(robot: Mechanism, actuator: str) -> Dimension:
 
 def _format(value: float, unit: Unit) -> str:
     """Return a number in a unit."""
-    return format_number(value / unit.factor_to_si, DIGITS)
+    return format_in(unit, value, DIGITS)

@@ -11,18 +11,18 @@ from loopcal.estimate import Identification
 from loopcal.findings import Finding
 from loopcal.mechanism import Mechanism
 from loopcal.report.numbers import (
+    format_in,
     format_number,
     format_uncertainty,
     format_with_uncertainty,
     units_of,
 )
-from loopcal.report.tables import Column, Table, word_column
+from loopcal.report.tables import Column, Table, build_table, word_column
 from loopcal.report.text_page import Block, format_list
 from loopcal.report.validation_view import (
-    build_error_statistics,
     build_error_summary,
     describe_improvements,
-    is_fully_compensable,
+    view_error_statistics,
 )
 from loopcal.workflow import CalibrationReport
 
@@ -82,15 +82,7 @@ def _view_details(report: CalibrationReport, rows: Mapping[str, Any]) -> list[Bl
     blocks: list[Block] = []
     if rows["local"]:
         blocks.append(build_parameter_table("Setup parameters", rows["local"]))
-    blocks += [
-        "",
-        (
-            f"Iteration: {fit.status.name.lower().replace('_', ' ')} after "
-            f"{fit.history.iterations} steps; "
-            f"rank {fit.rank} of {len(fit.names)}."
-        ),
-        f"Chi-square {fit.chi_square:.5g} with {rows['degrees']:.4g} degrees of freedom.",
-    ]
+    blocks += ["", _describe_iteration(fit)]
     for suggestion in report.suggestions or ():
         blocks.append(f"Suggested measurement: {suggestion}")
     if report.model_choice is not None:
@@ -99,75 +91,58 @@ def _view_details(report: CalibrationReport, rows: Mapping[str, Any]) -> list[Bl
         blocks.append(build_reading_table(report.robot, report.reading_errors))
     errors = report.validation or report.fitted_errors
     if errors is not None:
-        blocks += [build_error_statistics(errors), *describe_improvements(errors)]
-        if is_fully_compensable(errors):
-            blocks.append("The actuators can correct all of the measured error.")
+        blocks += [*view_error_statistics(errors), *describe_improvements(errors)]
     return blocks
 
 
 def build_parameter_table(caption: str, rows: Iterable[Mapping[str, Any]]) -> Table:
     """Return identified parameters: rows of `Identification.to_dict()["parameters"]`."""
-    columns = (
-        word_column("name"),
-        Column("nominal"),
-        Column("estimate"),
-        Column("+/- (95 %)"),
-        Column("unit", align="left"),
+    return build_table(
+        caption,
+        rows,
+        (word_column("name"), lambda row: row["name"]),
+        *(
+            (Column(key), lambda row, key=key: format_with_uncertainty(row[key], row["plus_minus"]))
+            for key in ("nominal", "estimate")
+        ),
+        (
+            Column("+/- (95 %)"),
+            lambda row: format_uncertainty(row["plus_minus"]) if row.get("free", True) else "fixed",
+        ),
+        (word_column("unit"), lambda row: row["unit"]),
     )
-    cells = []
-    for row in rows:
-        half = row["plus_minus"]
-        values = (format_with_uncertainty(row[name], half) for name in ("nominal", "estimate"))
-        is_fixed = not row.get("free", True)
-        uncertainty = "fixed" if is_fixed else format_uncertainty(half)
-        cells.append((row["name"], *values, uncertainty, row["unit"]))
-    return Table(caption, columns, tuple(cells))
 
 
 def build_model_table(choice: ModelChoice) -> Table:
     """Return the comparison of parameter sets."""
-    columns = (word_column("free"), Column("parameters"), Column("score"), Column("+/-"))
-    rows = tuple(
-        (
-            candidate.name + (" (chosen)" if candidate is choice.chosen else ""),
-            str(len(candidate.parameters)),
-            format_number(candidate.validation.score, 4),
-            format_number(candidate.validation.standard_error, 2),
-        )
-        for candidate in choice.candidates
+    return build_table(
+        "Parameter sets, mean square error on held-out poses [sigma^2]",
+        choice.candidates,
+        (word_column("free"), lambda row: row.name + " (chosen)" * (row is choice.chosen)),
+        (Column("parameters"), lambda row: str(len(row.parameters))),
+        (Column("score"), lambda row: format_number(row.validation.score, 4)),
+        (Column("+/-"), lambda row: format_number(row.validation.standard_error, 2)),
     )
-    return Table("Parameter sets, mean square error on held-out poses [sigma^2]", columns, rows)
 
 
 def build_reading_table(robot: Mechanism, errors: Sequence[ReadingError]) -> Table:
     """Return recorded actuator readings minus the estimated ones."""
     units = units_of(robot)
-    rows = []
-    for error in errors:
-        reading, joint = units[error.reading_dimension], units[error.joint_dimension]
-        moved = (error.joint / joint.factor_to_si, error.largest / joint.factor_to_si)
-        rows.append(
-            (
-                error.name,
-                format_number(error.reading / reading.factor_to_si, 3),
-                reading.symbol,
-                *(format_number(value, 3) for value in moved),
-                joint.symbol,
-                error.pose,
-            )
-        )
-    columns = (
-        word_column("reading"),
-        Column("rms"),
-        Column("unit", align="left"),
-        Column("rms of the joint"),
-        Column("largest"),
-        Column("unit", align="left"),
-        word_column("at pose"),
-    )
     count = max(error.count for error in errors)
-    caption = f"Actuator readings, recorded minus estimated, of up to {count} poses"
-    return Table(caption, columns, tuple(rows))
+    return build_table(
+        f"Actuator readings, recorded minus estimated, of up to {count} poses",
+        errors,
+        (word_column("reading"), lambda row: row.name),
+        (Column("rms"), lambda row: format_in(units[row.reading_dimension], row.reading, 3)),
+        (word_column("unit"), lambda row: units[row.reading_dimension].symbol),
+        (
+            Column("rms of the joint"),
+            lambda row: format_in(units[row.joint_dimension], row.joint, 3),
+        ),
+        (Column("largest"), lambda row: format_in(units[row.joint_dimension], row.largest, 3)),
+        (word_column("unit"), lambda row: units[row.joint_dimension].symbol),
+        (word_column("at pose"), lambda row: row.pose),
+    )
 
 
 def view_fit(fit: Identification) -> list[Block]:
@@ -175,8 +150,14 @@ def view_fit(fit: Identification) -> list[Block]:
     rows = fit.to_dict()
     return [
         build_parameter_table(f"{fit.robot.name}: {len(fit.names)} parameters", rows["parameters"]),
-        (
-            f"Iteration: {fit.status.name.lower().replace('_', ' ')}; rank {fit.rank} of "
-            f"{len(fit.names)}; chi-square {fit.chi_square:.5g}."
-        ),
+        _describe_iteration(fit),
     ]
+
+
+def _describe_iteration(fit: Identification) -> str:
+    """Return how a fit ended, and its residuals in one number."""
+    return (
+        f"Iteration: {fit.status.name.lower().replace('_', ' ')} after {fit.history.iterations} "
+        f"steps; rank {fit.rank} of {len(fit.names)}.\nChi-square {fit.chi_square:.5g} with "
+        f"{fit.residual_test.degrees:.4g} degrees of freedom."
+    )

@@ -6,9 +6,14 @@ from __future__ import annotations
 from loopcal.findings import report_finding
 from loopcal.findings.wording import list_names
 from loopcal.report.numbers import format_number
-from loopcal.report.tables import Column, Table, word_column
+from loopcal.report.tables import Column, build_table, word_column
 from loopcal.report.text_page import Block
 from loopcal.workflow.identifiability_report import IdentifiabilityReport
+
+SD_MEANING = (
+    "sd / tolerance: standard deviation with the tolerances as a prior; 1 means that the data add "
+    "nothing."
+)
 
 
 def view_identifiability(report: IdentifiabilityReport) -> list[Block]:
@@ -19,25 +24,26 @@ def view_identifiability(report: IdentifiabilityReport) -> list[Block]:
     if report.suggestions:
         blocks.append(str(report_finding("identifiability.known-frames-assumed")))
     states = {"determined": "yes", "not at all": "no"}
-    rows = tuple(
-        (
-            parameter.name,
-            states.get(parameter.state) or f"only with {list_names(parameter.others)}",
-            f"{parameter.left:.2f}",
-        )
-        for parameter in analysis.parameters
-    )
-    columns = (word_column("name"), word_column("determined", wraps=True), Column("sd / tolerance"))
-    blocks.append(Table("Parameters", columns, rows))
-    blocks.append(
-        "sd / tolerance: standard deviation with the tolerances as a prior; 1 means that the data "
-        "add nothing."
-    )
-    indices = tuple(
-        (name, meaning, format_number(value, 3)) for name, value, meaning in analysis.indices.rows()
-    )
-    columns = (word_column("index"), word_column("meaning", wraps=True), Column("value"))
-    blocks.append(Table("Observability", columns, indices))
+    blocks += [
+        build_table(
+            "Parameters",
+            analysis.parameters,
+            (word_column("name"), lambda row: row.name),
+            (
+                word_column("determined", wraps=True),
+                lambda row: states.get(row.state) or f"only with {list_names(row.others)}",
+            ),
+            (Column("sd / tolerance"), lambda row: f"{row.left:.2f}"),
+        ),
+        SD_MEANING,
+        build_table(
+            "Observability",
+            analysis.indices.rows(),
+            (word_column("index"), lambda row: row[0]),
+            (word_column("meaning", wraps=True), lambda row: row[2]),
+            (Column("value"), lambda row: format_number(row[1], 3)),
+        ),
+    ]
     if report.subset is not None:
         blocks += ["", str(report.subset)]
     return blocks

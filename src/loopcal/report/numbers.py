@@ -33,6 +33,11 @@ def format_number(value: float, digits: int = 6) -> str:
     return f"{0.0 if abs(value) < ROUNDING else value:.{digits}g}"
 
 
+def format_in(unit: Unit, value: float, digits: int = 6) -> str:
+    """Return a number in SI as one in a unit, without its symbol."""
+    return format_number(float(value) / unit.factor_to_si, digits)
+
+
 def format_with_uncertainty(value: float, uncertainty: float, digits: int = 9) -> str:
     """Return a value to the third significant digit of its uncertainty.
 

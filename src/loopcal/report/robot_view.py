@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from loopcal.mechanism import Mechanism
-from loopcal.report.numbers import format_number, format_with_uncertainty, units_of
-from loopcal.report.tables import Column, Table, word_column
+from loopcal.report.numbers import format_in, format_number, format_with_uncertainty, units_of
+from loopcal.report.tables import Column, Table, build_table, word_column
 from loopcal.report.text_page import Block, format_list
 from loopcal.workflow.robot_inspection import RobotInspection
 
@@ -43,33 +43,29 @@ def _build_actuator_table(inspection: RobotInspection) -> Table:
         low, high = actuator.stroke or (NO_NUMBER, NO_NUMBER)
         low, high, home = (float(v) / unit.factor_to_si for v in (low, high, reading))
         at_home = format_with_uncertainty(home, RESOLUTION * (high - low), DIGITS)
-        cells = (format_number(low), format_number(high), at_home)
-        rows.append((actuator.name, *cells, str(unit)))
+        rows.append((actuator.name, format_number(low), format_number(high), at_home, str(unit)))
     numbers = (Column(title) for title in ("lowest", "highest", "at home"))
-    columns = (word_column("name"), *numbers, Column("unit", align="left"))
+    columns = (word_column("name"), *numbers, word_column("unit"))
     return Table("Actuators", columns, tuple(rows))
 
 
 def _build_parameter_table(robot: Mechanism) -> Table:
     """Return nominal and present values with tolerances."""
     units = units_of(robot)
-    rows = []
-    for parameter, value in zip(robot.parameters.entries, robot.values, strict=True):
-        unit = units[parameter.dimension]
-        tolerance = NO_NUMBER if parameter.tolerance is None else parameter.tolerance
-        nominal, present, tolerance = (
-            float(v) / unit.factor_to_si for v in (parameter.nominal, value, tolerance)
-        )
-        rows.append(
-            (
-                parameter.name,
-                format_number(nominal, DIGITS),
-                format_number(present, DIGITS),
-                format_number(tolerance, 3),
-                str(unit),
-                "free" if parameter.free else "fixed",
-            )
-        )
-    numbers = (Column(title) for title in ("nominal", "value", "tolerance (1 sd)"))
-    columns = (word_column("name"), *numbers, Column("unit", align="left"), word_column(""))
-    return Table("Parameters", columns, tuple(rows))
+    return build_table(
+        "Parameters",
+        zip(robot.parameters.entries, robot.values, strict=True),
+        (word_column("name"), lambda row: row[0].name),
+        (Column("nominal"), lambda row: format_in(units[row[0].dimension], row[0].nominal, DIGITS)),
+        (Column("value"), lambda row: format_in(units[row[0].dimension], row[1], DIGITS)),
+        (
+            Column("tolerance (1 sd)"),
+            lambda row: format_in(
+                units[row[0].dimension],
+                NO_NUMBER if row[0].tolerance is None else row[0].tolerance,
+                3,
+            ),
+        ),
+        (word_column("unit"), lambda row: str(units[row[0].dimension])),
+        (word_column(""), lambda row: "free" if row[0].free else "fixed"),
+    )

@@ -7,9 +7,9 @@ import csv
 import html
 import io
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
 
 GAP = 2
 """Blanks between two columns of text."""
@@ -18,6 +18,8 @@ NARROWEST = 12
 """Characters that a column of words keeps when a table is narrowed."""
 
 RULE = "─"
+
+Row = TypeVar("Row")
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,14 @@ class Table:
             cell.ljust(width) if column.align == "left" else cell.rjust(width)
             for cell, width, column in zip(cells, widths, self.columns, strict=True)
         ]
+
+
+def build_table(
+    caption: str, rows: Iterable[Row], *columns: tuple[Column, Callable[[Row], str]]
+) -> Table:
+    """Return a table from objects: each column with the function that gives its cell of a row."""
+    cells = tuple(tuple(cell_of(row) for _, cell_of in columns) for row in rows)
+    return Table(caption, tuple(column for column, _ in columns), cells)
 
 
 def _total(widths: Sequence[int]) -> int:

@@ -21,7 +21,7 @@ def build_error_summary(validation: Validation, caption: str, with_before: bool 
     """
     before = (Column("before"),) if with_before else ()
     numbers = (*before, Column("after" if with_before else "error"), Column("noise floor"))
-    columns = (word_column("error"), *numbers, Column("unit", align="left"))
+    columns = (word_column("error"), *numbers, word_column("unit"))
     rows = []
     if validation.has_several_kinds:
         for kind in validation.kinds:
@@ -43,7 +43,7 @@ def build_error_summary(validation: Validation, caption: str, with_before: bool 
     return Table(caption, columns, cells)
 
 
-def build_error_statistics(validation: Validation, with_before: bool = True) -> Table:
+def _build_error_statistics(validation: Validation, with_before: bool) -> Table:
     """Return maximum, rms, mean and standard deviation of every error.
 
     Errors after commanding are left out where they equal the prediction errors, because the
@@ -62,8 +62,16 @@ def build_error_statistics(validation: Validation, with_before: bool = True) -> 
             cells = (format_number(x / unit.factor_to_si, 3) for x in numbers)
             rows.append((name, quantity, str(statistics.count), *cells, unit.symbol))
     numeric = (Column(title) for title in ("rows", "max", "rms", "mean", "sd"))
-    columns = (word_column("error"), word_column("of"), *numeric, Column("unit", align="left"))
+    columns = (word_column("error"), word_column("of"), *numeric, word_column("unit"))
     return Table("Error statistics", columns, tuple(rows))
+
+
+def view_error_statistics(validation: Validation, with_before: bool = True) -> list[Block]:
+    """Return all statistics of the errors, and whether actuators can correct these."""
+    blocks: list[Block] = [_build_error_statistics(validation, with_before)]
+    if with_before and is_fully_compensable(validation):
+        blocks.append("The actuators can correct all of the measured error.")
+    return blocks
 
 
 def is_fully_compensable(validation: Validation) -> bool:
@@ -100,9 +108,7 @@ def view_validation(validation: Validation, with_before: bool, verbose: bool) ->
     if notes:
         blocks += ["", *format_list([(f.severity.value, str(f)) for f in notes])]
     if verbose:
-        blocks.append(build_error_statistics(validation, with_before))
-        if with_before and is_fully_compensable(validation):
-            blocks.append("The actuators can correct all of the measured error.")
+        blocks += view_error_statistics(validation, with_before)
     return blocks
 
 
