@@ -7,12 +7,15 @@ around it is written by hand.
 """
 
 import dataclasses
+import inspect
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any, get_args
 
 from loopcal.io.core import file_reference
+from loopcal.io.core.records import get_field_types
 from loopcal.io.data.columns import RULES
 from loopcal.io.data.kind_rows import SETTINGS
 from loopcal.io.data.kind_settings import list_kind_settings
@@ -27,6 +30,32 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGE, EXPORTS = DOCS / "files.md", DOCS / "exports.md"
 EXAMPLES = DOCS.parent / "examples" / "exports"
 BLOCK = r"made by tools.file_reference: (?P<name>[\w-]+)"
+
+
+def summarize(record: type) -> str:
+    """Return the text of a record's docstring above its sections."""
+    text = file_reference.SECTION.split(inspect.cleandoc(record.__doc__ or ""))[0]
+    return file_reference.SI.sub("", " ".join(text.split()))
+
+
+def list_nested_records(record: type) -> tuple[type, ...]:
+    """Return the records that a record's keys hold, in order, each once."""
+    nested: dict[type, None] = {}
+
+    def walk(annotation: Any) -> Iterator[type]:
+        if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
+            yield annotation
+        for argument in get_args(annotation):
+            yield from walk(argument)
+
+    queue = [record]
+    while queue:
+        for hint in get_field_types(queue.pop(0)).values():
+            for inner in walk(hint):
+                if inner not in nested and inner is not record:
+                    nested[inner] = None
+                    queue.append(inner)
+    return tuple(nested)
 
 
 def format_record(record: type, without: Iterable[str] = ()) -> str:
