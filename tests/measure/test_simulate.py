@@ -27,7 +27,7 @@ from loopcal.measure import (
     sample_truth,
     simulate,
     simulate_trials,
-    solve_commanded_readings,
+    solve_commanded_poses,
 )
 from loopcal.mechanism import inverse
 from loopcal.parameters import ParameterTable
@@ -61,7 +61,7 @@ def truth(robot):
 
 def test_commanded_poses_become_the_readings_of_the_controllers_geometry(robot, truth):
     assert_allclose(
-        solve_commanded_readings(robot, COMMANDED), inverse(robot, COMMANDED).q, atol=0.0
+        solve_commanded_poses(robot, COMMANDED).q, inverse(robot, COMMANDED).q, atol=0.0
     )
     assert_allclose(
         simulate(truth, COMMANDED, TRACKER, seed=1).readings, inverse(robot, COMMANDED).q, atol=0.0
@@ -152,7 +152,7 @@ def test_a_pose_the_controller_cannot_reach_is_named(robot):
         simulate(robot, far, TRACKER, seed=1)
     labels = tuple("abcdefghijklmnopqrst"[: len(far)])
     with pytest.raises(DataError, match="pose 'c'"):
-        solve_commanded_readings(robot, far, labels)
+        solve_commanded_poses(robot, far, labels)
 
 
 def test_a_machine_that_cannot_follow_is_absent_from_its_trial_only(robot):

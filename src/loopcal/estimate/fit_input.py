@@ -14,7 +14,7 @@ from loopcal.estimate.problem import Problem
 from loopcal.findings import report_finding
 from loopcal.measure import Measurements, check_actuators
 from loopcal.measure.array_checks import check_type
-from loopcal.measure.measurements import weight_reading_sigma
+from loopcal.measure.reading_sigma import weight_reading_sigma
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
 

@@ -13,8 +13,12 @@ from loopcal.measure.initial_values import guess_nuisance_values as guess_nuisan
 from loopcal.measure.initial_values import (
     guess_nuisance_values_batch as guess_nuisance_values_batch,
 )
+from loopcal.measure.instrument import Gaussian as Gaussian
 from loopcal.measure.instrument import Instrument as Instrument
+from loopcal.measure.instrument import Noise as Noise
 from loopcal.measure.instrument import Sensor as Sensor
+from loopcal.measure.instrument import Uniform as Uniform
+from loopcal.measure.instrument import make_random_stream as make_random_stream
 from loopcal.measure.kinds import KINDS as KINDS
 from loopcal.measure.kinds import ActuatorReadings as ActuatorReadings
 from loopcal.measure.kinds import Autocollimation as Autocollimation
@@ -35,21 +39,17 @@ from loopcal.measure.kinds import Position as Position
 from loopcal.measure.kinds import Separation as Separation
 from loopcal.measure.kinds import Sphere as Sphere
 from loopcal.measure.measurements import Measurements as Measurements
-from loopcal.measure.measurements import weight_reading_sigma as weight_reading_sigma
-from loopcal.measure.noise import Gaussian as Gaussian
-from loopcal.measure.noise import Noise as Noise
-from loopcal.measure.noise import Uniform as Uniform
-from loopcal.measure.noise import make_random_stream as make_random_stream
 from loopcal.measure.nuisance import NuisanceParameters as NuisanceParameters
 from loopcal.measure.nuisance import StatedValue as StatedValue
 from loopcal.measure.nuisance import collect_nuisance_parameters as collect_nuisance_parameters
 from loopcal.measure.observations import Observations as Observations
-from loopcal.measure.readings import fill_in_reading_sigma as fill_in_reading_sigma
+from loopcal.measure.reading_sigma import fill_in_reading_sigma as fill_in_reading_sigma
+from loopcal.measure.reading_sigma import resolve_reading_sigma as resolve_reading_sigma
+from loopcal.measure.reading_sigma import weight_reading_sigma as weight_reading_sigma
 from loopcal.measure.readings import list_sensed_joints as list_sensed_joints
 from loopcal.measure.readings import make_readings_kind as make_readings_kind
-from loopcal.measure.readings import resolve_reading_sigma as resolve_reading_sigma
 from loopcal.measure.readings import select_joint_values as select_joint_values
-from loopcal.measure.readings import solve_commanded_readings as solve_commanded_readings
+from loopcal.measure.readings import solve_commanded_poses as solve_commanded_poses
 from loopcal.measure.simulation import Trials as Trials
 from loopcal.measure.simulation import replace_measured_values as replace_measured_values
 from loopcal.measure.simulation import sample_truth as sample_truth

@@ -12,6 +12,7 @@ from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_array, check_type, describe, set_fields
 from loopcal.measure.nuisance import NuisanceParameters, StatedValue, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
+from loopcal.measure.reading_sigma import check_reading_sigma, weight_reading_sigma
 from loopcal.typing import FloatArray, IntArray
 
 
@@ -80,7 +81,7 @@ class Measurements:
         set_fields(self, readings=readings, block=block, labels=labels)
         set_fields(self, observations=tuple(self.observations))
         if self.reading_sigma is not None:
-            sigma = _check_reading_sigma(self.reading_sigma, readings, labels)
+            sigma = check_reading_sigma(self.reading_sigma, readings, labels)
             set_fields(self, reading_sigma=sigma)
 
     def __repr__(self) -> str:
@@ -226,40 +227,6 @@ class Measurements:
         )
 
 
-def weight_reading_sigma(sigma: FloatArray | None, weight: FloatArray) -> FloatArray | None:
-    """Return standard deviations (n, a) of readings whose squares count by a weight (n,).
-
-    A weight of 0 makes them infinite; exact readings stay exact.
-    """
-    if sigma is None:
-        return None
-    root = np.sqrt(weight)[:, None]
-    weighted = np.divide(sigma, root, out=np.full(sigma.shape, np.inf), where=root > 0.0)
-    return np.where(sigma == 0.0, 0.0, weighted)
-
-
-def broadcast_reading_sigma(sigma: ArrayLike, readings: FloatArray) -> FloatArray:
-    """Return standard deviations (n, a) of readings (n, a) from what broadcasts to them; DataError
-    where it does not fit.
-    """
-    try:
-        if np.iscomplexobj(sigma):
-            raise TypeError
-        given = np.asarray(sigma, dtype=float)
-    except (TypeError, ValueError):
-        raise DataError(
-            f"reading_sigma is {sigma!r}; give numbers, in metres and radians"
-        ) from None
-    try:
-        return np.array(np.broadcast_to(given, readings.shape))
-    except ValueError:
-        raise DataError(
-            f"reading_sigma has shape {given.shape}; give one number, or one for each of the "
-            f"{readings.shape[1]} actuators, or one for each of the {readings.shape[0]} x "
-            f"{readings.shape[1]} readings"
-        ) from None
-
-
 def _check_readings(readings: ArrayLike, uncertain: bool) -> FloatArray:
     """Return checked, read-only readings (n, a); NaN stands for a missing one and needs a sigma."""
     if isinstance(readings, str):
@@ -273,32 +240,6 @@ def _check_readings(readings: ArrayLike, uncertain: bool) -> FloatArray:
         if not uncertain and np.isnan(np.asarray(readings, dtype=float)).any():
             raise DataError(f"{error}, or reading_sigma = inf where it is missing") from None
         raise
-
-
-def _check_reading_sigma(
-    sigma: ArrayLike, readings: FloatArray, labels: tuple[str, ...]
-) -> FloatArray:
-    """Return checked, read-only standard deviations (n, a) of the readings."""
-    checked = broadcast_reading_sigma(sigma, readings)
-    for wrong, what in (
-        (
-            ~(checked >= 0.0),
-            "is not a standard deviation; give 0 (exact), a positive number, or infinity (missing)",
-        ),
-        (
-            np.isnan(readings) & np.isfinite(checked),
-            "belongs to a missing reading; give the reading, or infinity",
-        ),
-    ):
-        if np.any(wrong):
-            pose, column = (int(i) for i in np.argwhere(wrong)[0])
-            value = f"{checked[pose, column]:.6g}"
-            raise DataError(
-                f"pose {labels[pose]!r}: the sigma {value} [m or rad] of reading {column + 1} "
-                f"{what}"
-            )
-    checked.setflags(write=False)
-    return checked
 
 
 def _check_poses(rows: Observations, n: int) -> None:

@@ -14,17 +14,12 @@ from numpy.typing import ArrayLike
 from loopcal.engine import State
 from loopcal.errors import DataError
 from loopcal.measure.array_checks import check_array, check_type
-from loopcal.measure.instrument import Instrument, Sensor
-from loopcal.measure.measurements import Measurements, broadcast_reading_sigma
-from loopcal.measure.noise import make_random_stream
+from loopcal.measure.instrument import Instrument, Sensor, make_random_stream
+from loopcal.measure.measurements import Measurements
 from loopcal.measure.nuisance import NuisanceParameters, collect_nuisance_parameters
 from loopcal.measure.observations import Observations
-from loopcal.measure.readings import (
-    list_sensed_joints,
-    resolve_reading_sigma,
-    select_joint_values,
-    solve_commanded_poses,
-)
+from loopcal.measure.reading_sigma import broadcast_reading_sigma, resolve_reading_sigma
+from loopcal.measure.readings import list_sensed_joints, select_joint_values, solve_commanded_poses
 from loopcal.mechanism import Mechanism, Status, forward, forward_trials, solve_at_pose
 from loopcal.typing import BoolArray, FloatArray
 

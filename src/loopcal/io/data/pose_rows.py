@@ -118,7 +118,7 @@ def has_readings(table: Table, robot: Mechanism) -> bool:
 
 def _read_file(table: Table, robot: Mechanism, several: bool) -> _FilePoses:
     """Read the poses of one file."""
-    from loopcal.measure import solve_commanded_readings
+    from loopcal.measure import solve_commanded_poses
 
     if several and "pose" not in table.units:
         sentence = "files are joined by the names of poses, and this file names none"
@@ -156,7 +156,7 @@ def _read_file(table: Table, robot: Mechanism, several: bool) -> _FilePoses:
         if chosen:
             poses = tuple(names[row] for row in chosen)
             with name_files(table.path):
-                blank[chosen] = solve_commanded_readings(controller, rows[chosen], poses)
+                blank[chosen] = solve_commanded_poses(controller, rows[chosen], poses).q
         rows = blank
     sigma = read_reading_sigma(table, robot, rows)
     return _FilePoses(
