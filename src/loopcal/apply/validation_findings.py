@@ -21,7 +21,7 @@ from loopcal.mechanism import Mechanism
 from loopcal.typing import BoolArray
 from loopcal.units import Dimension, Unit
 
-QUANTITIES = ("position", "orientation")
+QUANTITIES: tuple[str, ...] = ("position", "orientation")
 """Indices of errors that every validation shows."""
 
 DIMENSIONS = (Dimension.LENGTH, Dimension.ANGLE)

@@ -126,12 +126,8 @@ def calibrate(
     )
     machine = load_robot(robot)
     refuse_run_folder(output, list(inputs.values()), force)
-    measurements = read_measurements(
-        data,
-        machine,
-        allow_outside_stroke=options["allow_outside_stroke"],
-        allow_duplicates=options["allow_duplicates"],
-    )
+    accepted = {name: options[name] for name in ("allow_outside_stroke", "allow_duplicates")}
+    measurements = read_measurements(data, machine, **accepted)
     with terminal.ProgressBar() as progress:
         report = calibrate_robot(machine, measurements, settings, progress)
     print_convention_note(report.conventions, data)
@@ -139,10 +135,8 @@ def calibrate(
     if as_json:
         terminal.print_json(build_document(report, inputs, sys.argv))
     else:
-        page = view_calibration(report, verbose, hint_for)
-        terminal.print_page(
-            [*page, "", f"Written to {output}: result.json, arrays.npz, robot.yaml"]
-        )
+        written = f"Written to {output}: result.json, arrays.npz, robot.yaml"
+        terminal.print_page([*view_calibration(report, verbose, hint_for), "", written])
     terminal.print_failures(report.failures, shown=not as_json)
     return report.exit_code
 

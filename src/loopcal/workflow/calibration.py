@@ -33,7 +33,7 @@ from loopcal.mechanism import Mechanism
 from loopcal.typing import Progress, StepCounter, report_no_progress
 from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.calibration_report import CalibrationReport, describe_provenance
-from loopcal.workflow.data_split import split_data
+from loopcal.workflow.data_split import DataSplit, split_data
 
 GREW = 1.1
 """Factor by which an error on held-out poses must grow to be a failure; less is their noise."""
@@ -87,45 +87,10 @@ def calibrate(
     )
     kept = exclude_poses(data, options.fit.excluded_poses)
     split = split_data(kept, options.hold_out, options.seed, options.held_out)
-    fitted = split.fitted
-    if not fitted.n_rows:
+    if not split.fitted.n_rows:
         raise DataError("the data hold no measured value; fill in what the instrument showed")
-    result = _fit(robot, fitted, options, count)
-    fit = result.fit
-    held_out = split.held_out
-    errors, impossible = _validate(fit, fitted if held_out is None else held_out, options)
-    count.begin("examining the residuals")
-    examination = examine_fit(fit, fitted, progress) if fit.converged else None
-    count.begin("looking for further measurements")
-    suggestions = _suggest(fit, fitted)
-    start = check_start_values(fit)
-    findings = [
-        *_report_conventions(conventions),
-        *_report_fit(fit),
-        *impossible,
-        *_report_validation(errors, held_out is not None),
-        *_report_freedoms(fit),
-        start.finding,
-        *(() if examination is None else examination.findings),
-        *(() if result.choice is None else (result.choice.finding,)),
-    ]
-    count.begin("done")
-    return CalibrationReport(
-        options=options,
-        split=split,
-        identification=fit,
-        start=start,
-        conventions=conventions,
-        validation=None if held_out is None else errors,
-        fitted_errors=errors if held_out is None else None,
-        findings=sort_by_importance(findings),
-        examination=examination,
-        suggestions=suggestions,
-        reading_errors=compute_reading_errors(fit, fitted),
-        model_choice=result.choice,
-        change=result.change,
-        provenance=describe_provenance(options),
-    )
+    result = _fit(robot, split.fitted, options, count)
+    return _report(result, split, conventions, options, count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +138,50 @@ def _fit(
         )
     count.begin(f"fitting {free} parameters")
     return _FitResult(identify(chosen, data, options=fit_options), choice=choice)
+
+
+def _report(
+    result: _FitResult,
+    split: DataSplit,
+    conventions: ConventionCheck,
+    options: CalibrationOptions,
+    count: StepCounter,
+) -> CalibrationReport:
+    """Validate and examine a fit, and return the report."""
+    fit, fitted, held_out = result.fit, split.fitted, split.held_out
+    errors, impossible = _validate(fit, fitted if held_out is None else held_out, options)
+    count.begin("examining the residuals")
+    examination = examine_fit(fit, fitted, count.progress) if fit.converged else None
+    count.begin("looking for further measurements")
+    suggestions = _suggest(fit, fitted)
+    start = check_start_values(fit)
+    findings = [
+        *_report_conventions(conventions),
+        *_report_fit(fit),
+        *impossible,
+        *_report_validation(errors, held_out is not None),
+        *_report_freedoms(fit),
+        start.finding,
+        *(() if examination is None else examination.findings),
+        *(() if result.choice is None else (result.choice.finding,)),
+    ]
+    count.begin("done")
+    return CalibrationReport(
+        options=options,
+        split=split,
+        identification=fit,
+        start=start,
+        conventions=conventions,
+        validation=None if held_out is None else errors,
+        fitted_errors=errors if held_out is None else None,
+        findings=sort_by_importance(findings),
+        examination=examination,
+        suggestions=suggestions,
+        reading_errors=compute_reading_errors(fit, fitted),
+        model_choice=result.choice,
+        change=result.change,
+        provenance=describe_provenance(options),
+    )
 
 
 def _validate(
