@@ -9,7 +9,7 @@ import pytest
 from loopcal.diagnose import choose_model, cross_validate, nest_parameter_sets
 from loopcal.diagnose.cross_validation import draw_folds
 from loopcal.errors import DataError, EstimationError
-from loopcal.estimate import LeastSquares, identify
+from loopcal.estimate import FitOptions, LeastSquares, identify
 from loopcal.io import load_robot
 from loopcal.measure import simulate
 from tests import zoo
@@ -86,3 +86,23 @@ def test_sets_that_are_not_nested_are_refused():
         choose_model(
             hexapod(), hexapod_data(30), {"a": ["leg1.length"], "b": ["leg2.length", "leg3.length"]}
         )
+
+
+def test_excluded_poses_are_neither_fitted_nor_predicted():
+    data = hexapod_data(30)
+    rows = data.observations[0]
+    measured = rows.measured.copy()
+    measured[4] += 0.1  # [rad], [m]
+    wrong = replace(data, observations=(replace(rows, measured=measured),))
+    options = FitOptions(method=LeastSquares(), excluded_poses=("5",))
+    found = cross_validate(hexapod(), wrong, options=options)
+    assert "5" not in found.poses
+    same = cross_validate(hexapod(), data, options=options)
+    np.testing.assert_allclose(found.fold, same.fold, rtol=1e-9)
+
+
+def test_nuisance_parameters_of_all_rows_are_refused_in_folds():
+    data = hexapod_data(30)
+    options = FitOptions(nuisance=data.nuisance_parameters)
+    with pytest.raises(EstimationError, match="does not support the option nuisance"):
+        cross_validate(hexapod(), data, options=options)

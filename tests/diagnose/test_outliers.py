@@ -17,7 +17,7 @@ from loopcal.diagnose.fit_checks.outlier_search import (
     search_suspects,
 )
 from loopcal.diagnose.fit_checks.outliers import _summarize
-from loopcal.errors import DataError, EstimationError
+from loopcal.errors import ArgumentTypeError, DataError, EstimationError
 from loopcal.estimate import MAP, FitOptions, Huber, LeastSquares, Tukey, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.methods.losses import block_limit
@@ -187,7 +187,7 @@ def test_what_cannot_be_left_out_or_weighed_is_refused():
     data = hexapod_data(20)
     with pytest.raises(DataError, match="no pose '99' to exclude"):
         identify(hexapod(), data, options=FitOptions(excluded_poses=("99",)))
-    with pytest.raises(EstimationError, match="give a sequence of labels"):
+    with pytest.raises(ArgumentTypeError, match="give a sequence of labels"):
         identify(hexapod(), data, options=FitOptions(excluded_poses="12"))
     with pytest.raises(EstimationError, match="Huber loss with constant 0"):
         Huber(0.0)
@@ -312,6 +312,19 @@ def test_noise_that_is_spread_over_all_rows_is_no_all_clear():
     assert fit.residual_test.failed
     assert found.outliers == found.ambiguous == ()
     assert [f.code for f in found.summary] == ["outliers.none-but-misfit"]
+
+
+def test_the_search_reports_its_progress():
+    robot, data = probed(12, {4: 1e-3})
+    reports: list[tuple[int, int, str]] = []
+    find_outliers(
+        identify(robot, data, LeastSquares()), data, progress=lambda *report: reports.append(report)
+    )
+    assert {what for _, _, what in reports} == {
+        "searching for outliers",
+        "comparing suspected poses with others",
+    }
+    assert all(0 <= done < total for done, total, _ in reports)
 
 
 def test_a_search_that_comes_back_to_where_it_was_is_not_settled_and_says_who_was_doubted():

@@ -209,27 +209,19 @@ def _permute(columns: list[int], sources: list[int]) -> Change:
 def _list_units(kind: Kind) -> Iterator[Slip]:
     if not kind.changes_with_pose and not kind.sensed_joints:
         return  # gaps to a touched surface are 0 in every unit
-    quantities = {Dimension.LENGTH: "lengths", Dimension.ANGLE: "angles"}
-    chosen = {
-        d: [i for i, column in enumerate(kind.columns) if column.dimension is d] for d in quantities
-    }
-    scalings = [
-        (quantities[d], d, columns, factor)
-        for d, columns in chosen.items()
-        if columns
-        for factor in FACTORS[d]
+    groups = [
+        (name, d, [i for i, column in enumerate(kind.columns) if column.dimension is d], FACTORS[d])
+        for d, name in ((Dimension.LENGTH, "lengths"), (Dimension.ANGLE, "angles"))
     ]
     named = _columns_by_name(kind)
     dimensions = [kind.columns[columns[0]].dimension for columns in named.values()]
-    scalings += [
-        (name, d, columns, factor)
-        for (name, columns), d in zip(named.items(), dimensions, strict=True)
-        if dimensions.count(d) > 1
-        for factor in FACTORS.get(d, ())
-        if factor in SINGLE_COLUMN_FACTORS
-    ]
-    for quantity, d, columns, factor in scalings:
-        yield "unit", _unit_details(quantity, d, factor), _scale(columns, factor)
+    for (name, columns), d in zip(named.items(), dimensions, strict=True):
+        if dimensions.count(d) > 1:
+            factors = tuple(f for f in FACTORS.get(d, ()) if f in SINGLE_COLUMN_FACTORS)
+            groups.append((name, d, columns, factors))
+    for name, d, columns, factors in groups:
+        for factor in factors if columns else ():
+            yield "unit", _unit_details(name, d, factor), _scale(columns, factor)
 
 
 def _list_rotations(kind: Kind) -> Iterator[Slip]:
@@ -274,11 +266,8 @@ def _list_rotations(kind: Kind) -> Iterator[Slip]:
         inverse = rewrite(back, lambda v: -(back(v) @ v[:, position, None])[..., 0])
         yield "inverted-poses", {}, inverse
         for k, axis in enumerate("xyz"):
-            yield (
-                "left-handed-frame",
-                {"axis": axis},
-                mirror(np.where(np.arange(3) == k, -1.0, 1.0)),
-            )
+            sign = np.where(np.arange(3) == k, -1.0, 1.0)
+            yield "left-handed-frame", {"axis": axis}, mirror(sign)
 
 
 def _list_signs(kind: Kind) -> Iterator[Slip]:

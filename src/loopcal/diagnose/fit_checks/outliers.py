@@ -158,7 +158,8 @@ def find_outliers(
     data = exclude_poses(fill_in_reading_sigma(fit.robot, data), fit.options.excluded_poses)
     problem = problem_of(fit.free_parameters, data)
     numbers, member = np.unique(linked_blocks(data), return_inverse=True)
-    labels = tuple(tuple(np.array(data.labels)[member == i].tolist()) for i in range(len(numbers)))
+    names = np.array(data.labels)
+    labels = tuple(tuple(names[member == i].tolist()) for i in range(len(numbers)))
     z = fit.free_parameters.deviation(fit.robot.values[None])
     start = problem.linearize(z, problem.start(z)).next_start
 
