@@ -34,8 +34,8 @@ docs: .venv/dev.stamp  ## rewrite the tables in the documentation from docs/evid
 bench: .venv/dev.stamp  ## benchmarks against the committed baseline; fails when one got worse
 	$(BIN)/python -m benchmarks.run --gate
 
-bench-update: .venv/dev.stamp  ## measure again and rewrite benchmarks/baseline.json
-	$(BIN)/python -m benchmarks.run --update
+bench-update: .venv/dev.stamp  ## measure again and rewrite benchmarks/baseline.json (REASON="another machine")
+	$(BIN)/python -m benchmarks.run --update --reason "$(REASON)"
 
 check: .venv/dev.stamp  ## lint, format, types, layers, sizes
 	$(BIN)/ruff check

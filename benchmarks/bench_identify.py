@@ -3,7 +3,6 @@
 trials and poses.
 """
 
-import statistics
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
@@ -117,8 +116,8 @@ def bench_trials() -> Metric:
         lambda: identify_trials(robot, trials, LeastSquares()),
         repeats=3,
     )
-    value = statistics.median(20 * a / b for a, b in zip(alone, together, strict=True))
-    note = f"{statistics.median(together) / TRIALS * 1e3:.3g} ms a fit"
+    value = 20 * min(alone) / min(together)
+    note = f"{min(together) / TRIALS * 1e3:.3g} ms a fit"
     return Metric("identify.stacked_speed_up", value, "1", "higher", 0.25, 1.5, note)
 
 

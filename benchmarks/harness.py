@@ -7,7 +7,6 @@ seconds do not.
 """
 
 import json
-import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -25,7 +24,8 @@ class Metric:
     value : the measured number
     unit : "1" for a ratio
     direction : which way is better
-    tolerance : worsening allowed against the baseline, relative (0.25 = a quarter)
+    tolerance : worsening allowed against the baseline, relative (0.25 = a quarter); None where the
+        limit alone decides, as for absolute times
     limit : bound that `value` must keep whatever the baseline says, or None
     note : absolute times and the like, for people
     """
@@ -34,7 +34,7 @@ class Metric:
     value: float
     unit: str = "1"
     direction: Literal["lower", "higher"] = "lower"
-    tolerance: float = 0.25
+    tolerance: float | None = 0.25
     limit: float | None = None
     note: str = ""
 
@@ -75,13 +75,34 @@ def measure_ratio(
     limit: float | None = None,
     direction: Literal["lower", "higher"] = "lower",
 ) -> Metric:
-    """Time `subject` and `reference` in turns; the value is the median over the rounds of subject /
-    reference.
+    """Time `subject` and `reference` in turns; the value is the ratio of their shortest times, since
+    other programs only lengthen a time.
     """
-    ours, theirs = time_in_turns(subject, reference, repeats=repeats)
-    value = statistics.median(a / b for a, b in zip(ours, theirs, strict=True))
-    note = f"{statistics.median(ours):.3g} s against {statistics.median(theirs):.3g} s"
-    return Metric(name, value, "1", direction, tolerance, limit, note)
+    ours, theirs = map(min, time_in_turns(subject, reference, repeats=repeats))
+    note = f"{ours:.3g} s against {theirs:.3g} s"
+    return Metric(name, ours / theirs, "1", direction, tolerance, limit, note)
+
+
+def measure_time(
+    name: str,
+    subject: Callable[[], object],
+    reference: Callable[[], object],
+    *,
+    limit: float,
+    unit: Literal["s", "ms"] = "s",
+    reference_name: str,
+    repeats: int,
+    tolerance: float,
+) -> list[Metric]:
+    """Time `subject` and `reference` in turns. The best absolute time has a limit, and the ratio of
+    the best times, `name` + `_of_` + `reference_name`, has a baseline.
+    """
+    ours, theirs = map(min, time_in_turns(subject, reference, repeats=repeats))
+    factor = 1.0 if unit == "s" else 1e3
+    note = f"best of {repeats}; {ours:.3g} s against {theirs:.3g} s"
+    ratio = Metric(f"{name}_of_{reference_name}", ours / theirs, tolerance=tolerance, note=note)
+    absolute = Metric(name, factor * ours, unit, tolerance=None, limit=limit, note="limit alone")
+    return [absolute, ratio]
 
 
 def find_faults(metric: Metric, baseline: dict[str, dict[str, Any]]) -> list[str]:
@@ -92,6 +113,8 @@ def find_faults(metric: Metric, baseline: dict[str, dict[str, Any]]) -> list[str
     faults = []
     if metric.limit is not None and metric.is_worse_than(metric.limit):
         faults.append(f"{shown}, its limit is {metric.limit:g}")
+    if metric.tolerance is None:
+        return faults
     if metric.name not in baseline:
         faults.append(
             f"{shown} and has no baseline; run `make bench-update` and commit "
@@ -119,11 +142,20 @@ def read_baseline(path: Path) -> dict[str, dict[str, Any]]:
     return json.loads(path.read_text(encoding="utf-8"))["metrics"] if path.is_file() else {}
 
 
-def write_baseline(path: Path, metrics: Sequence[Metric], machine: dict[str, str]) -> None:
-    """Merge metrics into the baseline file, which names the machine that wrote it last."""
-    merged = read_baseline(path)
+def write_baseline(
+    path: Path,
+    metrics: Sequence[Metric],
+    machine: dict[str, str],
+    reason: str = "",
+    is_complete: bool = False,
+) -> None:
+    """Merge metrics into the baseline file, which names the machine that wrote it last and why.
+
+    Where all metrics were measured (`is_complete`), others are removed.
+    """
+    merged = {} if is_complete else read_baseline(path)
     merged |= {
         metric.name: {k: v for k, v in asdict(metric).items() if k != "name"} for metric in metrics
     }
-    document = {"machine": machine, "metrics": dict(sorted(merged.items()))}
+    document = {"machine": machine, "reason": reason, "metrics": dict(sorted(merged.items()))}
     path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")

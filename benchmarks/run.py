@@ -5,7 +5,8 @@ or several.
 Run as `python -m benchmarks.run`, from the root. Names given as arguments choose files:
 `kinematics` stands for bench_kinematics.py. `--gate` exits 1 when a metric is beyond its limit or
 worse than the committed baseline by more than its tolerance; what fails is measured a second time
-first, since other programs may have been in the way. `--update` rewrites the baseline.
+first, since other programs may have been in the way. `--update` rewrites the baseline, with the
+machine and `--reason`.
 """
 
 import argparse
@@ -79,6 +80,9 @@ def main() -> int:
     action = parser.add_mutually_exclusive_group()
     action.add_argument("--gate", action="store_true", help="exit 1 when a metric got worse")
     action.add_argument("--update", action="store_true", help="write benchmarks/baseline.json")
+    parser.add_argument(
+        "--reason", default="", help="why the baseline changes, such as another machine; kept in it"
+    )
     options = parser.parse_args()
 
     baseline = read_baseline(BASELINE)
@@ -92,7 +96,7 @@ def main() -> int:
             show(metric, baseline)
         metrics += new
     if options.update:
-        write_baseline(BASELINE, metrics, machine)
+        write_baseline(BASELINE, metrics, machine, options.reason, not options.names)
         print(f"wrote {BASELINE.name}")
     if options.gate:
         faults = [fault for metric in metrics for fault in find_faults(metric, baseline)]

@@ -62,6 +62,20 @@ def test_updating_keeps_the_metrics_that_were_not_measured(tmp_path: Path) -> No
     assert json.loads(path.read_text("utf-8"))["machine"] == {"processor": "two"}
 
 
+def test_an_absolute_time_is_judged_by_its_limit_alone() -> None:
+    metric = Metric("first", 9.0, "ms", tolerance=None, limit=10.0)
+    assert harness.find_faults(metric, {}) == []
+    assert harness.find_faults(metric, {"first": {"value": 1.0}}) == []
+
+
+def test_a_complete_update_removes_old_metrics_and_states_its_reason(tmp_path: Path) -> None:
+    path = tmp_path / "baseline.json"
+    harness.write_baseline(path, [Metric("a", 1.0), Metric("b", 2.0)], {})
+    harness.write_baseline(path, [Metric("b", 3.0)], {}, "a new machine", is_complete=True)
+    assert list(harness.read_baseline(path)) == ["b"]
+    assert json.loads(path.read_text("utf-8"))["reason"] == "a new machine"
+
+
 def test_a_ratio_is_that_of_the_times() -> None:
     metric = harness.measure_ratio(
         "sleep", lambda: time.sleep(0.03), lambda: time.sleep(0.01), repeats=5
