@@ -9,17 +9,18 @@ import time
 from typing import Any
 
 from loopcal.mechanism import Mechanism
-from loopcal.papers.cmm_constraint_2011.cells import (
+from loopcal.papers.cmm_constraint_2011.calibrations import (
     BEFORE,
+    LINES,
     LS,
     METHODS,
     PRIOR,
     Cell,
     calibrate_cell,
+    calibrate_fifty,
     calibrate_grid,
     compute_rank_correlation,
 )
-from loopcal.papers.cmm_constraint_2011.fifty_points import LINES, calibrate_fifty
 from loopcal.papers.cmm_constraint_2011.layouts import (
     NOISE,
     ONE,

@@ -911,7 +911,7 @@ def report_tsvd_2016(name: str, five: bool) -> Report:
 
 def report_cmm_constraint_2011(groups: int, points: int, sweeps: int, trials: int) -> Report:
     """Plan points, draw machines, and calibrate them from planes and lines in the paper's form."""
-    from loopcal.papers.cmm_constraint_2011.cells import calibrate_cell
+    from loopcal.papers.cmm_constraint_2011.calibrations import calibrate_cell
     from loopcal.papers.cmm_constraint_2011.machines import (
         AXES,
         compute_spread,

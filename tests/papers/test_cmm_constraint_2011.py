@@ -18,16 +18,16 @@ from loopcal import geometry
 from loopcal.estimate import LeastSquares
 from loopcal.mechanism import forward, forward_trials
 from loopcal.papers import PAPERS
-from loopcal.papers.cmm_constraint_2011.cells import (
+from loopcal.papers.cmm_constraint_2011.calibrations import (
     BEFORE,
+    LINES,
     LS,
     PRIOR,
     calibrate_cell,
+    calibrate_fifty,
     calibrate_grid,
 )
-from loopcal.papers.cmm_constraint_2011.fifty_points import LINES, calibrate_fifty
 from loopcal.papers.cmm_constraint_2011.forms import compare_forms
-from loopcal.papers.cmm_constraint_2011.gauge import NAMES, list_gauge_directions, remove_gauge
 from loopcal.papers.cmm_constraint_2011.layouts import (
     ANY,
     ONE,
@@ -38,14 +38,17 @@ from loopcal.papers.cmm_constraint_2011.layouts import (
 )
 from loopcal.papers.cmm_constraint_2011.machines import (
     AXES,
+    GAUGE_NAMES,
     GROUPS,
     MEASURES,
     POINTS,
     Study,
     draw_true_machines,
     fit_motions,
+    list_gauge_directions,
     load_machine,
     plan_points,
+    remove_gauge,
 )
 from loopcal.papers.cmm_constraint_2011.published import MM, read_published
 from loopcal.papers.cmm_constraint_2011.steps import (
@@ -103,7 +106,7 @@ def test_printed_quotients_are_judged_with_their_rounding() -> None:
 
 def test_nine_directions_move_the_base_or_turn_the_platform_about_the_end_point(study) -> None:
     robot, at = study.robot, study.held_out.solution
-    assert len(NAMES) == 9
+    assert len(GAUGE_NAMES) == 9
     step = 1e-6
     for i, direction in enumerate(list_gauge_directions(robot)):
         T = forward(robot.with_values(robot.values + step * direction), at.q, at).T

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -191,6 +192,13 @@ class Comparison:
             lines.append(("", "difference", *marked))
         columns = ("", "", *self.columns)
         return Table(self.name, self.title, columns, tuple(lines), ("",) * len(columns), self.note)
+
+
+def read_content(module: str) -> dict[str, Any]:
+    """Return the content of the published.yaml beside a module (its `__file__`)."""
+    from loopcal.io.core.yaml_file import read_yaml
+
+    return read_yaml(Path(module).with_name("published.yaml"), "file of published numbers").content
 
 
 def last_digit(text: str) -> float:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from loopcal.papers.cmm_constraint_2011.cells import BEFORE, LS, METHODS, PRIOR
+from loopcal.papers.cmm_constraint_2011.calibrations import BEFORE, LS, METHODS, PRIOR
 from loopcal.papers.cmm_constraint_2011.layouts import NOISE, SET
 from loopcal.papers.cmm_constraint_2011.machines import (
     ABSOLUTE,

@@ -18,7 +18,7 @@ from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import collect_information
 from loopcal.measure import Line, Measurements, Observations, Plane
 from loopcal.mechanism import POSITION
-from loopcal.papers.cmm_constraint_2011.cells import METHODS
+from loopcal.papers.cmm_constraint_2011.calibrations import METHODS
 from loopcal.papers.cmm_constraint_2011.machines import Study, draw_true_machines
 from loopcal.papers.cmm_constraint_2011.published import MM
 from loopcal.papers.cmm_constraint_2011.steps import Layout, PaperRows, identify_from_rows

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopcal.papers.cmm_constraint_2011.cells import Cell, calibrate_cell
+from loopcal.papers.cmm_constraint_2011.calibrations import Cell, calibrate_cell
 from loopcal.papers.cmm_constraint_2011.machines import (
     GROUPS,
     MEASURES,

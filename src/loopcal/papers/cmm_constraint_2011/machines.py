@@ -14,8 +14,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.measure import make_random_stream
-from loopcal.mechanism import Mechanism, Solution, forward_trials, sample_workspace
-from loopcal.papers.cmm_constraint_2011.gauge import remove_gauge
+from loopcal.mechanism import POSITION, Mechanism, Solution, forward_trials, sample_workspace
 from loopcal.papers.cmm_constraint_2011.published import MM
 from loopcal.papers.cmm_constraint_2011.steps import Layout
 from loopcal.planning.design import D, MovedDesign, PriorInformation, coordinate_exchange
@@ -45,6 +44,20 @@ ABSOLUTE, AT_NOMINAL, ALIGNED = FRAMES = ("absolute", "gauge at nominal", "align
 """Placements of the base and the rotation of the platform, which plane and line do not determine:
 as the least deviation leaves them; with poses nearest to the nominal ones, which needs no truth;
 with poses nearest to the true ones.
+"""
+
+GAUGE_NAMES = tuple(
+    f"{what} {axis}"
+    for what in ("base shifted along", "base rotated about", "platform rotated about")
+    for axis in POSITION
+)
+"""The nine directions of the 42 parameters that plane and line cannot determine, k = x, y, z:
+
+    base shifted along k      db_i = k             the end point moves along k everywhere
+    base rotated about k      db_i = k x b_i       it rotates about the base's origin everywhere
+    platform rotated about k  dp_i = k x p_i       it does not move at all
+
+The first six move all points as one body, which changes no distance and no angle between them.
 """
 
 
@@ -202,3 +215,25 @@ def find_nearest_rotations(M: FloatArray) -> FloatArray:
     U, _, Vt = np.linalg.svd(M)
     U[..., 2] *= np.linalg.det(U @ Vt)[..., None]
     return U @ Vt
+
+
+def list_gauge_directions(robot: Mechanism) -> FloatArray:
+    """Return changes (9, p) of the parameters, see GAUGE_NAMES, [m per m] and [m per rad]."""
+    table = robot.parameters
+    names = [leg.name for leg in robot.assembly.limbs]
+    changes = np.zeros((9, len(table)))
+    for leg in names:
+        base, platform = (
+            [table.index(f"{leg}.{end}.{axis}") for axis in POSITION]
+            for end in ("base", "platform")
+        )
+        changes[0:3, base] = np.eye(3)
+        changes[3:6, base] = np.cross(np.eye(3), robot.values[base])
+        changes[6:9, platform] = np.cross(np.eye(3), robot.values[platform])
+    return changes
+
+
+def remove_gauge(robot: Mechanism, deviation: FloatArray) -> FloatArray:
+    """Return deviations (.., p) [m] without their part along the nine directions."""
+    basis = np.linalg.qr(list_gauge_directions(robot).T)[0]
+    return deviation - (deviation @ basis) @ basis.T

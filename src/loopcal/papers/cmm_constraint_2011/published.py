@@ -6,10 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
-from typing import Any
 
-from loopcal.papers.printed import last_digit
+from loopcal.papers.printed import last_digit, read_content
 
 MM = 1e-3
 
@@ -81,11 +79,7 @@ class Published:
 @cache
 def read_published() -> Published:
     """Read published.yaml."""
-    from loopcal.io.core.yaml_file import read_yaml
-
-    content: dict[str, Any] = read_yaml(
-        Path(__file__).with_name("published.yaml"), "file of published numbers"
-    ).content
+    content = read_content(__file__)
     return Published(
         source=content["source"],
         parameters=int(content["parameters"]),

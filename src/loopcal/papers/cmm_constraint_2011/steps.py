@@ -14,8 +14,8 @@ rows are correlated: noise dp of the points moves row i by B dp,
     d(d_i'd_1) = d_1'dp_i + d_i'dp_1 - (d_1 + d_i)'dp_0
 
 and the covariance of the rows is B S B'. The paper gives every row weight one. A'A is singular, see
-gauge.py: least squares here takes the smallest deviation along unobservable directions. Derivation,
-and why this equals surfaces as unknowns: docs/theory/constraint.md.
+GAUGE_NAMES in machines.py: least squares here takes the smallest deviation along unobservable
+directions. Derivation, and why this equals surfaces as unknowns: docs/theory/constraint.md.
 """
 
 from __future__ import annotations

@@ -7,8 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from loopcal.papers.cmm_constraint_2011.cells import calibrate_grid
-from loopcal.papers.cmm_constraint_2011.fifty_points import LINES, calibrate_fifty
+from loopcal.papers.cmm_constraint_2011.calibrations import LINES, calibrate_fifty, calibrate_grid
 from loopcal.papers.cmm_constraint_2011.figures import make_figures
 from loopcal.papers.cmm_constraint_2011.forms import compare_forms
 from loopcal.papers.cmm_constraint_2011.layouts import (

@@ -8,12 +8,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopcal.papers.cmm_constraint_2011.cells import BEFORE, LS, PRIOR, Cell
-from loopcal.papers.cmm_constraint_2011.fifty_points import FiftyPoints
+from loopcal.papers.cmm_constraint_2011.calibrations import BEFORE, LS, PRIOR, Cell, FiftyPoints
 from loopcal.papers.cmm_constraint_2011.forms import ERRORS, Forms
-from loopcal.papers.cmm_constraint_2011.gauge import NAMES, list_gauge_directions
 from loopcal.papers.cmm_constraint_2011.layouts import Arrangement, Candidate, list_printed
-from loopcal.papers.cmm_constraint_2011.machines import AXES, MEASURES, ROBOT, Study
+from loopcal.papers.cmm_constraint_2011.machines import (
+    AXES,
+    GAUGE_NAMES,
+    MEASURES,
+    ROBOT,
+    Study,
+    list_gauge_directions,
+)
 from loopcal.papers.cmm_constraint_2011.published import MM, Published
 from loopcal.papers.printed import Cell as Entry
 from loopcal.papers.printed import Table
@@ -62,7 +67,7 @@ class Results:
     Attributes
     ----------
     study : the ten groups. cells : Table 3, by (set, noise) as printed.
-    arrangements, candidates, weights : see layouts.py. fifties : see fifty_points.py.
+    arrangements, candidates, weights : see layouts.py. fifties : see calibrations.py.
     forms : see forms.py.
     """
 
@@ -161,7 +166,7 @@ def _list_gauge(words: Wording, study: Study) -> Table:
     largest = np.linalg.svd(rows, compute_uv=False)[0]
     g = list_gauge_directions(study.robot)
     effect = np.linalg.norm(rows @ g.T, axis=0) / np.linalg.norm(g, axis=1) / largest
-    table = [(name, MOTIONS[i // 3], float(effect[i])) for i, name in enumerate(NAMES)]
+    table = [(name, MOTIONS[i // 3], float(effect[i])) for i, name in enumerate(GAUGE_NAMES)]
     return words.table("gauge", table)
 
 

@@ -5,17 +5,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopcal.papers.cmm_constraint_2011.cells import (
+from loopcal.papers.cmm_constraint_2011.calibrations import (
     BEFORE,
     LS,
     METHODS,
     PRIOR,
+    STATISTICS,
+    FiftyPoints,
     compute_rank_correlation,
 )
-from loopcal.papers.cmm_constraint_2011.fifty_points import STATISTICS, FiftyPoints
-from loopcal.papers.cmm_constraint_2011.gauge import list_gauge_directions
 from loopcal.papers.cmm_constraint_2011.layouts import ANY, NOISE, ONE, SET, TEN, VARIANCE
-from loopcal.papers.cmm_constraint_2011.machines import ABSOLUTE, ALIGNED, AT_NOMINAL, MEASURES
+from loopcal.papers.cmm_constraint_2011.machines import (
+    ABSOLUTE,
+    ALIGNED,
+    AT_NOMINAL,
+    MEASURES,
+    list_gauge_directions,
+)
 from loopcal.papers.cmm_constraint_2011.published import MM, read_published
 from loopcal.papers.cmm_constraint_2011.tables import Results, compute_pair_rank
 from loopcal.papers.reproduction import Verdict

@@ -6,13 +6,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from loopcal.mechanism import Mechanism
-from loopcal.papers.printed import Printed
+from loopcal.papers.printed import Printed, read_content
 from loopcal.typing import FloatArray
 
 MM = 1e-3
@@ -31,7 +30,7 @@ class Published:
     """The printed tables and statements; see published.yaml."""
 
     source: str
-    statements: Mapping[str, Mapping[str, str]]
+    statements: Mapping[str, Any]
     nominal: Printed
     errors: Printed
     nominal_poses: Printed
@@ -66,28 +65,18 @@ class Published:
 @cache
 def read_published() -> Published:
     """Read published.yaml."""
-    from loopcal.io.core.yaml_file import read_yaml
-
-    content: dict[str, Any] = read_yaml(
-        Path(__file__).with_name("published.yaml"), "file of published numbers"
-    ).content
-    poses, fifth, sixth = content["table_4"], content["table_5"], content["table_6"]
-    return Published(
-        source=content["source"],
-        statements={
-            name: content[name]
-            for name in ("rotation", "threshold", "iterations", "noise", "poses")
-        },
-        nominal=Printed.parse(content["table_2"]),
-        errors=Printed.parse(content["table_3"]),
-        nominal_poses=Printed.parse(poses["PT"]),
-        measured_poses=Printed.parse(poses["PP"]),
-        pose_errors=Printed.parse(poses["E1"]),
-        parameter_errors_before=Printed.parse(fifth["before"]),
-        parameter_errors_after=Printed.parse(fifth["after"]),
-        pose_errors_before=Printed.parse(sixth["before"]),
-        pose_errors_after=Printed.parse(sixth["after"]),
-    )
+    content = read_content(__file__)
+    tables = {
+        "nominal": content["table_2"],
+        "errors": content["table_3"],
+        "nominal_poses": content["table_4"]["PT"],
+        "measured_poses": content["table_4"]["PP"],
+        "pose_errors": content["table_4"]["E1"],
+        **{f"parameter_errors_{when}": block for when, block in content["table_5"].items()},
+        **{f"pose_errors_{when}": block for when, block in content["table_6"].items()},
+    }
+    printed = {name: Printed.parse(block) for name, block in tables.items()}
+    return Published(source=content["source"], statements=content, **printed)
 
 
 def load_nominal_machine() -> Mechanism:

@@ -125,6 +125,11 @@ class Case:
         """Manipulator and measurement."""
         return f"{self.study.name}, {self.study.freedoms}-DOF"
 
+    @property
+    def unknowns(self) -> int:
+        """Number of parameters."""
+        return len(self.singular_values)
+
 
 def measure_case(name: str, seed: int) -> Study:
     """Measure one machine with drawn errors and the noise of Appendix 1."""

@@ -6,10 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
-from pathlib import Path
-from typing import Any
 
-from loopcal.papers.printed import Printed
+from loopcal.papers.printed import Printed, read_content
 from loopcal.typing import FloatArray
 
 MM = 1e-3
@@ -43,11 +41,7 @@ class Published:
 @cache
 def read_published() -> Published:
     """Read published.yaml."""
-    from loopcal.io.core.yaml_file import read_yaml
-
-    content: dict[str, Any] = read_yaml(
-        Path(__file__).with_name("published.yaml"), "file of published numbers"
-    ).content
+    content = read_content(__file__)
     return Published(
         source=content["source"],
         noise=Printed.parse(content["appendix_1"]),
