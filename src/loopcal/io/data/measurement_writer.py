@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,7 @@ from loopcal.io.data.measurement_file import FORMAT
 from loopcal.io.data.nuisance_settings import format_known
 from loopcal.io.robot.robot_file import require_robot
 from loopcal.mechanism import Mechanism
+from loopcal.typing import FloatArray
 
 if TYPE_CHECKING:
     from loopcal.measure import Instrument, Kind, Measurements, Observations
@@ -47,9 +48,6 @@ COMPARED = f"""\
 # A row of the kind {{}} compares two poses: name them in the column pose as a{LINK}b and leave its
 # readings empty. Each of these poses needs a row of its own with its readings."""
 """Remark of a template on a kind that compares poses."""
-
-Cells = dict[str, Any]
-"""Column -> value [SI] or text."""
 
 
 def save_measurements(
@@ -80,41 +78,41 @@ def format_measurements(
     """
     require_robot(robot)
     _refuse_names(data)
-    known = list_columns(robot, [rows.kind for rows in data.observations])
-    labels = _label_kinds([rows.kind for rows in data.observations])
-    parts = [_Part(*entry, robot) for entry in zip(labels, data.observations, strict=True)]
-    common, listed = _split_reading_noise(data, robot)
-    lines = _format_settings(robot, [(p.label, p.rows.kind, p.common) for p in parts], remark)
+    kinds = [rows.kind for rows in data.observations]
+    labels, known = _label_kinds(kinds), list_columns(robot, kinds)
+    tables = [_tabulate_rows(rows, robot) for rows in data.observations]
+    reading_noise, of_poses = _tabulate_poses(data, robot)
+    noise = [common for common, _ in tables]
+    lines = _format_settings(robot, list(zip(labels, kinds, noise, strict=True)), remark)
     knowledge = format_known(data.stated_values, data.nuisance_parameters.table.entries)
-    for key, text in (("unknowns", knowledge), ("reading_noise", common)):
+    for key, text in (("unknowns", knowledge), ("reading_noise", reading_noise)):
         lines += [f"# {key}: {text}"] if text else []
 
     names = ["pose", *([USE_COLUMN.name] if uses else [])]
     names += [*(["block"] if len(set(data.block.tolist())) < data.n_poses else [])]
     for name in ("session", "group"):
-        names += [name] if any((getattr(p.rows, name) != "").any() for p in parts) else []
-    names += ["kind"] if len(parts) > 1 else []
-    names += [a.name for a in robot.actuators] + [SIGMA + robot.actuators[i].name for i in listed]
-    names += [name for part in parts for name in part.rows.context]
-    names += [name for part in parts for name in part.columns]
+        is_stated = any((getattr(rows, name) != "").any() for rows in data.observations)
+        names += [name] if is_stated else []
+    names += [*(["kind"] if len(kinds) > 1 else []), *of_poses]
+    names += [name for rows in data.observations for name in rows.context]
+    names += [name for _, table in tables for name in table]
     columns: list[Column] = [known.get(n, ContextColumn(n)) for n in dict.fromkeys(names)]
     lines.append(",".join(column.header for column in columns))
 
-    measuring = {
-        int(poses[0])
-        for part in parts
-        if part.rows.kind.poses_per_row == 1
-        for poses, _ in part.cells()
-    }
-    rows: list[tuple[tuple[int, ...], Cells]] = [
-        ((pose,), {}) for pose in range(data.n_poses) if pose not in measuring
-    ]
-    rows += [(poses, {"kind": p.label, **cells}) for p in parts for poses, cells in p.cells()]
-    for poses, values in rows:
+    body: list[tuple[list[int], dict[str, Any]]] = []
+    for label, rows, (_, table) in zip(labels, data.observations, tables, strict=True):
+        for i in np.flatnonzero(rows.weight):  # rows of weight 0 are not written
+            cells = {name: values[i] for name, values in {**rows.context, **table}.items()}
+            cells |= {"kind": label, "session": rows.session[i], "group": rows.group[i]}
+            body.append((np.atleast_1d(rows.rows[i]).tolist(), cells))
+    measured = {poses[0] for poses, _ in body if len(poses) == 1}
+    body = [([pose], {}) for pose in range(data.n_poses) if pose not in measured] + body
+    for poses, cells in body:
         pose = LINK.join(data.labels[pose] for pose in poses)
-        cells = {"pose": pose, USE_COLUMN.name: (uses or {}).get(pose, ""), **values}
+        cells |= {"pose": pose, USE_COLUMN.name: (uses or {}).get(pose, "")}
         if len(poses) == 1:
-            cells |= _reading_cells(data, robot, poses[0], listed)
+            cells |= {name: values[poses[0]] for name, values in of_poses.items()}
+            cells["block"] = data.block[poses[0]]
         lines.append(",".join(c.format(cells[c.name]) if c.name in cells else "" for c in columns))
     return "\n".join(lines) + "\n"
 
@@ -209,82 +207,50 @@ def _refuse_names(data: Measurements) -> None:
         raise DataError(f"two poses are named {name!r}, but names must differ; rename one")
 
 
-def _split_reading_noise(data: Measurements, robot: Mechanism) -> tuple[str, list[int]]:
-    """Return the setting of reading noise, and the actuators whose noise needs a column.
+def _tabulate_poses(data: Measurements, robot: Mechanism) -> tuple[str, dict[str, FloatArray]]:
+    """Return the setting of reading noise, and column -> (n,) readings and other noise [SI].
 
-    An actuator whose noise is the same in all poses is in the setting.
+    The noise of an actuator is in the setting where it is the same in all poses.
     """
+    columns = {a.name: data.readings[:, i] for i, a in enumerate(robot.actuators)}
     if data.reading_sigma is None:
-        return "", []
-    stated, listed = [], []
+        return "", columns
+    stated = []
     for i, actuator in enumerate(robot.actuators):
-        values = np.unique(data.reading_sigma[~np.isnan(data.readings[:, i]), i])
+        sigma = np.where(np.isnan(data.readings[:, i]), np.nan, data.reading_sigma[:, i])
+        values = np.unique(sigma[~np.isnan(sigma)])
         if len(values) == 1 and np.isfinite(values[0]):
             text = format_quantity(float(values[0]), actuator.dimension)
             stated.append(f"{actuator.name}: {text}")
         elif len(values):
-            listed.append(i)
-    return f"{{{', '.join(stated)}}}", listed
+            columns[SIGMA + actuator.name] = sigma
+    return f"{{{', '.join(stated)}}}", columns
 
 
-def _reading_cells(data: Measurements, robot: Mechanism, pose: int, listed: Sequence[int]) -> Cells:
-    """Return block, readings and, of the actuators `listed`, their noise."""
-    cells: Cells = {"block": int(data.block[pose])}
-    for i, actuator in enumerate(robot.actuators):
-        reading = float(data.readings[pose, i])
-        cells[actuator.name] = reading
-        if i in listed and data.reading_sigma is not None:
-            is_read = reading == reading  # noqa: PLR0124
-            cells[SIGMA + actuator.name] = data.reading_sigma[pose, i] if is_read else float("nan")
-    return cells
-
-
-class _Part:
-    """Rows of one kind; noise that is `common` to all rows goes to the settings."""
-
-    def __init__(self, label: str, rows: Observations, robot: Mechanism) -> None:
-        self.label, self.rows = label, rows
-        kind = rows.kind
-        self.names = [name_measured(column.name, robot) for column in kind.columns]
-        noise = [name_measured(column.name, robot) for column in kind.noise_columns]
-        N = kind.linearize_noise(rows.measured)
-        half = np.linalg.solve(N, rows.covariance)
-        self.covariance = np.linalg.solve(N, np.swapaxes(half, -1, -2))
-        self.sigma = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
-        spread = np.abs(self.sigma - self.sigma[:1])
-        is_common = np.all(spread <= EQUAL * self.sigma[:1], axis=0).tolist()
-        self.common = {
-            c.name: float(self.sigma[0, i])
-            for i, c in enumerate(kind.noise_columns)
-            if is_common[i]
-        }
-        self.sigmas = {SIGMA + n: i for i, n in enumerate(noise) if not is_common[i]}
-        scale = self.sigma[:, :, None] * self.sigma[:, None, :]
-        related = np.any(np.abs(self.covariance) > EQUAL * scale, axis=0).tolist()
-        self.covariances = {
-            name_covariance(kind.noise_columns[a].name, kind.noise_columns[b].name, robot): (a, b)
-            for a in range(len(noise))
-            for b in range(a)
-            if related[a][b]
-        }
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """Names of the columns of measured values, and of noise that differs from row to row."""
-        return (*self.names, *self.sigmas, *self.covariances)
-
-    def cells(self) -> Iterator[tuple[tuple[int, ...], Cells]]:
-        """Yield poses and cells of each row that counts; rows of weight 0 are not written."""
-        rows = self.rows
-        for i, poses in enumerate(rows.rows):
-            if rows.weight[i] == 0.0:
-                continue
-            cells: Cells = dict(zip(self.names, rows.measured[i], strict=True))
-            cells |= {"session": rows.session[i], "group": rows.group[i]}
-            cells |= {name: values[i] for name, values in rows.context.items()}
-            cells |= {name: self.sigma[i, k] for name, k in self.sigmas.items()}
-            cells |= {name: self.covariance[i, a, b] for name, (a, b) in self.covariances.items()}
-            yield tuple(np.atleast_1d(poses).tolist()), cells
+def _tabulate_rows(
+    rows: Observations, robot: Mechanism
+) -> tuple[dict[str, float], dict[str, FloatArray]]:
+    """Return noise column -> sigma of all rows, and column -> (r,) of what differs [SI]."""
+    kind = rows.kind
+    names = [name_measured(column.name, robot) for column in kind.columns]
+    columns = dict(zip(names, rows.measured.T, strict=True))
+    N = kind.linearize_noise(rows.measured)
+    half = np.linalg.solve(N, rows.covariance)
+    covariance = np.linalg.solve(N, np.swapaxes(half, -1, -2))
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    is_common = np.all(np.abs(sigma - sigma[:1]) <= EQUAL * sigma[:1], axis=0)
+    is_related = np.any(np.abs(covariance) > EQUAL * sigma[:, :, None] * sigma[:, None, :], axis=0)
+    common = {}
+    for i, column in enumerate(kind.noise_columns):
+        if is_common[i]:
+            common[column.name] = float(sigma[0, i])
+        else:
+            columns[SIGMA + name_measured(column.name, robot)] = sigma[:, i]
+    for i, a in enumerate(kind.noise_columns):
+        for j, b in enumerate(kind.noise_columns[:i]):
+            if is_related[i, j]:
+                columns[name_covariance(a.name, b.name, robot)] = covariance[:, i, j]
+    return common, columns
 
 
 def _format_settings(
