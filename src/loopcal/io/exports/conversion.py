@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -43,65 +43,67 @@ Row = dict[str, str]
 """Column -> cell."""
 
 
-@dataclass
-class Rows:
-    """Rows in the order of their first lines."""
+def _join_rows(
+    lines: Sequence[tuple[Line, Row]], profile: Profile
+) -> tuple[list[Row], list[tuple[int, str]], tuple[Finding, ...]]:
+    """Return rows in the order of their first lines, lines that do not fit, and what rows lose."""
+    rows: list[Row] = []
+    misfits: list[tuple[int, str]] = []
+    readings: dict[str, Row] = {}
+    other_times = 0
+    unusual = find_unusual_lines([line for line, _ in lines])
+    for line, row in lines:
+        try:
+            if line.number in unusual:
+                raise Misfit(unusual[line.number])
+            shared, values = _split_row(row, profile)
+            if values:
+                _check_readings(shared, readings.get(row["pose"], {}), profile)
+        except Misfit as error:
+            misfits.append((line.number, str(error)))
+            continue
+        last = rows[-1] if rows else {}
+        if values:
+            stated = {n: shared[n] for n in profile.record.readings if shared[n]}
+            readings[row["pose"]] = stated | readings.get(row["pose"], {})
+        if not values or any(name in last for name in values) or not _agree(last, shared):
+            rows.append(shared | values)
+            continue
+        other_times += bool(last.get(TIME) and shared.get(TIME) and last[TIME] != shared[TIME])
+        added = {name: cell for name, cell in shared.items() if not last.get(name)}
+        rows[-1] = last | values | added
+    if not other_times:
+        return rows, misfits, ()
+    return rows, misfits, (report_finding("files.other-times", count=other_times),)
 
-    profile: Profile
-    rows: list[Row] = field(default_factory=list)
-    _readings: dict[str, Row] = field(default_factory=dict)
-    _other_times: int = 0
 
-    def add(self, row: Row) -> None:
-        """Add a line, as a row or to the last row of its pose.
+def _split_row(row: Row, profile: Profile) -> tuple[Row, Row]:
+    """Return the cells of a line that belong to its pose, and those of one of several targets.
 
-        Raises
-        ------
-        Misfit : an unknown target, or a reading that differs from an earlier line of the pose.
-        """
-        targets = self.profile.targets
-        if "target" not in row or not targets:
-            self.rows.append(row)
-            return
-        target = row["target"]
-        if target not in targets:
-            raise Misfit(f"the target {target!r} is not one of {', '.join(targets)}")
-        shared = {name: cell for name, cell in row.items() if name != "target"}
-        if len(targets) == 1:
-            self.rows.append(shared)
-            return
-        values = {
-            _add_target(name, target): shared.pop(name)
-            for name in list(shared)
-            if _belongs_to_target(name, self.profile)
-        }
-        self._check_readings(shared)
-        last = self.rows[-1] if self.rows else {}
-        if any(name in last for name in values) or not _agree(last, shared):
-            self.rows.append(shared | values)
-            return
-        if last.get(TIME) and shared.get(TIME):
-            self._other_times += last[TIME] != shared[TIME]
-        last.update(values)
-        last.update({name: cell for name, cell in shared.items() if not last.get(name)})
+    Raises
+    ------
+    Misfit : the target is unknown.
+    """
+    targets = profile.targets
+    if "target" not in row or not targets:
+        return row, {}
+    target = row["target"]
+    if target not in targets:
+        raise Misfit(f"the target {target!r} is not one of {', '.join(targets)}")
+    shared = {name: cell for name, cell in row.items() if name != "target"}
+    if len(targets) == 1:
+        return shared, {}
+    names = [name for name in shared if _belongs_to_target(name, profile)]
+    return shared, {_add_target(name, target): shared.pop(name) for name in names}
 
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """Differences between lines that a row does not keep."""
-        if not self._other_times:
-            return ()
-        return (report_finding("files.other-times", count=self._other_times),)
 
-    def _check_readings(self, row: Row) -> None:
-        """Raise Misfit for a reading that differs from an earlier line of this pose."""
-        known = self._readings.setdefault(row["pose"], {})
-        for name in self.profile.record.readings:
-            cell, before = row[name], known.get(name, "")
-            if cell and before and not _is_equal(cell, before):
-                sentence = f"{name!r} is {cell} here, but {before} in an earlier line of the pose"
-                raise Misfit(f"{sentence} {row['pose']!r}")
-            if cell and not before:
-                known[name] = cell
+def _check_readings(row: Row, known: Row, profile: Profile) -> None:
+    """Raise Misfit for a reading that differs from an earlier line of this pose."""
+    for name in profile.record.readings:
+        cell, before = row[name], known.get(name, "")
+        if cell and before and not _is_equal(cell, before):
+            sentence = f"{name!r} is {cell} here, but {before} in an earlier line of the pose"
+            raise Misfit(f"{sentence} {row['pose']!r}")
 
 
 def list_headers(profile: Profile) -> dict[str, str | None]:
@@ -189,31 +191,25 @@ def convert_export(path: str | Path, profile: Profile) -> Conversion:
     FileError : unreadable, without the header that the profile needs, or no line fits.
     """
     path = as_path(path, "export")
-    lines = read_lines(path, profile)
-    rows, fitting, misfits = Rows(profile), [], []
-    for line in lines.data:
+    lines, skipped = read_lines(path, profile)
+    fitting, misfits = [], []
+    for line in lines:
         try:
             check_count(line, profile.delimiter)
             fitting.append((line, _parse_row(line, profile)))
         except Misfit as error:
             misfits.append((line.number, str(error)))
-    unusual = find_unusual_lines([line for line, _ in fitting])
-    for line, row in fitting:
-        try:
-            if line.number in unusual:
-                raise Misfit(unusual[line.number])
-            rows.add(row)
-        except Misfit as error:
-            misfits.append((line.number, str(error)))
+    rows, others, findings = _join_rows(fitting, profile)
+    misfits += others
     misfits.sort()
-    if not rows.rows:
+    if not rows:
         if not misfits:
             raise FileError("the profile skips every line of this export; correct it", path)
         number, reason = misfits[0]
         sentence = f"no line of this export fits {profile.file.path}"
         raise FileError(f"{sentence}; reason for the first one: {reason}", path, number)
-    text = _format_file(path, profile, rows, misfits)
-    return Conversion(text, len(rows.rows), lines.skipped, tuple(misfits), rows.findings)
+    text = _format_file(path, profile, rows, misfits, findings)
+    return Conversion(text, len(rows), skipped, tuple(misfits), findings)
 
 
 def _parse_row(line: Line, profile: Profile) -> Row:
@@ -298,19 +294,23 @@ def _to_quaternion(cells: Sequence[str]) -> Row:
 
 
 def _format_file(
-    path: Path, profile: Profile, rows: Rows, misfits: Sequence[tuple[int, str]]
+    path: Path,
+    profile: Profile,
+    rows: Sequence[Row],
+    misfits: Sequence[tuple[int, str]],
+    findings: Sequence[Finding],
 ) -> str:
     """Return the text of the measurement file."""
     columns = list_headers(profile)
     lines = [" ".join(f"## converted from {path.name} by {profile.file.path.name}".split())]
     if misfits:
         lines.append(f"## lines that do not fit: {', '.join(str(number) for number, _ in misfits)}")
-    lines += [f"## {finding}" for finding in rows.findings]
+    lines += [f"## {finding}" for finding in findings]
     settings = {"format": FORMAT, **profile.record.settings}
     lines += [f"# {key}: {_format_setting(value)}" for key, value in settings.items()]
     headers = (f"{n} [{symbol}]" if symbol is not None else n for n, symbol in columns.items())
     lines.append(",".join(headers))
-    for i, row in enumerate(rows.rows, 1):
+    for i, row in enumerate(rows, 1):
         cells = {"pose": str(i), **row}
         # a target without a line has no covariance
         absent = ("0" if name.startswith(COVARIANCE) else "" for name in columns)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from loopcal.errors import FileError
@@ -39,16 +39,10 @@ class Line:
     header: Header | None
 
 
-@dataclass
-class Lines:
-    """Lines that may be rows, and the number of lines without data."""
+def read_lines(path: Path, profile: Profile) -> tuple[list[Line], int]:
+    """Return the lines of an export that may be rows, and the number of lines without data.
 
-    data: list[Line] = field(default_factory=list)
-    skipped: int = 0
-
-
-def read_lines(path: Path, profile: Profile) -> Lines:
-    """Split an export into cells; count headers and lines that the profile skips.
+    Headers and lines that the profile skips have no data.
 
     Raises
     ------
@@ -57,28 +51,29 @@ def read_lines(path: Path, profile: Profile) -> Lines:
     record = profile.record
     sources = [place for source in profile.columns.values() for place in source.places]
     named = {place for place in (*sources, *record.matrix) if isinstance(place, str)}
-    lines, header, first = Lines(), None, None
+    lines: list[Line] = []
+    header, first, skipped = None, None, 0
     text = _decode(path, profile).replace("\r\n", "\n").replace("\r", "\n")
     for number, line in enumerate(text.split("\n"), 1):
         is_comment = record.comment is not None and line.lstrip().startswith(record.comment)
         is_ignored = profile.ignored is not None and profile.ignored.search(line)
         if number <= record.skip or not line.strip() or is_comment or is_ignored:
-            lines.skipped += bool(line.strip())
+            skipped += bool(line.strip())
             continue
         cells = _split(line, profile.delimiter)
         if named and named <= set(cells):
             header = _parse_header(path, number, cells, named)
         elif not named or header is not None:
-            lines.data.append(Line(number, cells, header))
+            lines.append(Line(number, cells, header))
             continue
         first = first or (number, cells)
-        lines.skipped += 1
+        skipped += 1
     if named and header is None:
         names, number = ", ".join(sorted(named)), first[0] if first else None
         shown = f"; the first line is {' | '.join(first[1])!r}" if first else ""
         sentence = f"no line names the columns {names} of {profile.file.path}{shown}"
         raise FileError(f"{sentence}; correct the profile", path, number)
-    return lines
+    return lines, skipped
 
 
 def check_count(line: Line, delimiter: str | None) -> None:
