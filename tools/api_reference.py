@@ -45,12 +45,12 @@ shapes, units and errors. This page is made from the code by `make docs`.
 
 def write_page() -> str:
     """Return the text of the page."""
-    parts = [HEAD]
+    sections = [HEAD]
     for package, heading in SECTIONS.items():
         names = sorted(loopcal.PUBLIC_NAMES[package], key=lambda name: (name.lower(), name))
         rows = [(f"`{name}`", describe_name(name)) for name in names]
-        parts.append(f"\n## {heading}\n\n{format_table(('name', 'purpose'), rows)}")
-    return "".join(parts)
+        sections.append(f"\n## {heading}\n\n{format_table(('name', 'purpose'), rows)}")
+    return "".join(sections)
 
 
 def describe_name(name: str) -> str:

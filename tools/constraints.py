@@ -51,16 +51,16 @@ def freeze(python: str) -> list[str]:
 
 def main() -> int:
     """Write the constraints of every Python found; exit 1 when there is none."""
-    found = {minor: python for minor in MINORS if (python := find_python(minor))}
-    for minor, python in found.items():
+    pythons = {minor: python for minor in MINORS if (python := find_python(minor))}
+    for minor, python in pythons.items():
         header = f"# Versions of loopcal[dev] on Python {minor}, frozen by `make constraints`."
         path = ROOT / "constraints" / f"python{minor}.txt"
         path.write_text("\n".join([header, *freeze(python), ""]), encoding="utf-8")
         print(f"constraints: wrote {path.relative_to(ROOT)}")
-    missing = [minor for minor in MINORS if minor not in found]
+    missing = [minor for minor in MINORS if minor not in pythons]
     if missing:
         print(f"constraints: no Python {', '.join(missing)} found, left as it was")
-    return 0 if found else 1
+    return 0 if pythons else 1
 
 
 if __name__ == "__main__":

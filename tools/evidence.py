@@ -55,8 +55,12 @@ def run_script(script: Path) -> None:
     begin = time.perf_counter()
     document = collect(script)
     seconds = round(time.perf_counter() - begin, 1)
-    made = {"script": f"evidence/{script.name}", "seconds": seconds, "machine": describe_machine()}
-    write_json(ROOT / "docs" / "evidence" / f"{script.stem}.json", {"made": made, **document})
+    provenance = {
+        "script": f"evidence/{script.name}",
+        "seconds": seconds,
+        "machine": describe_machine(),
+    }
+    write_json(ROOT / "docs" / "evidence" / f"{script.stem}.json", {"made": provenance, **document})
     print(f"evidence: {script.stem} took {seconds} s", flush=True)
 
 

@@ -71,9 +71,9 @@ def format_record(record: type, without: Iterable[str] = ()) -> str:
 
 def format_common() -> str:
     """Return what every robot file may say."""
-    parts = [format_record(RobotRecord)]
-    parts += [_format_nested(record) for record in list_common_records()]
-    return "\n".join(parts)
+    sections = [format_record(RobotRecord)]
+    sections += [_format_nested(record) for record in list_common_records()]
+    return "\n".join(sections)
 
 
 def list_common_records() -> tuple[type, ...]:
@@ -86,14 +86,14 @@ def list_common_records() -> tuple[type, ...]:
 def format_families() -> str:
     """Return the keys of every family, beside the common ones."""
     shared = [key.name for key in file_reference.list_keys(RobotRecord)]
-    common, parts = list_common_records(), []
+    common, sections = list_common_records(), []
     for name, family in FAMILIES.items():
         records = list_nested_records(family)
-        parts.append(
+        sections.append(
             f"### `family: {name}`\n\n{summarize(family)}\n\n{format_record(family, shared)}"
         )
-        parts += [_format_nested(record) for record in records if record not in common]
-    return "\n".join(parts)
+        sections += [_format_nested(record) for record in records if record not in common]
+    return "\n".join(sections)
 
 
 def _format_nested(record: type) -> str:
@@ -103,9 +103,9 @@ def _format_nested(record: type) -> str:
 
 def format_kinds() -> str:
     """Return columns and settings of every kind of measurement."""
-    parts = []
+    sections = []
     for name, kind in KINDS.items():
-        rows = dict.fromkeys(_describe_example(one) for one in kind.examples())
+        rows = dict.fromkeys(_describe_example(example) for example in kind.examples())
         columns = format_table(("settings", "columns", "noise is stated for"), rows)
         meanings = file_reference.collect_meanings(kind)
         if len(possible := kind.allowed_unknown) > 1:
@@ -117,8 +117,8 @@ def format_kinds() -> str:
             ("setting", "meaning"),
             [(f"`{key}`", meanings.get(key, "")) for key in list_kind_settings(kind)],
         )
-        parts.append(f"### `kind: {name}`\n\n{summarize(kind)}\n\n{columns}\n{settings}")
-    return "\n".join(parts)
+        sections.append(f"### `kind: {name}`\n\n{summarize(kind)}\n\n{columns}\n{settings}")
+    return "\n".join(sections)
 
 
 def _describe_example(kind: Kind) -> tuple[str, str, str]:

@@ -51,7 +51,7 @@ def describe_text(entry: Entry) -> str:
 def write_page() -> str:
     """Return docs/findings.md."""
     severities = [(f"`{severity.value}`", words) for severity, words in SEVERITIES.items()]
-    parts = [HEAD, format_table(("severity", "meaning"), severities)]
+    sections = [HEAD, format_table(("severity", "meaning"), severities)]
     for file in catalog.FILES:
         rows = [
             (
@@ -63,9 +63,9 @@ def write_page() -> str:
             )
             for e in catalog.read_entries(file).values()
         ]
-        parts.append(f"## {catalog.read_document(file)['title']}\n")
-        parts.append(format_table(("code", "severity", "text", "when", "what to do"), rows))
-    return "\n".join(parts)
+        sections.append(f"## {catalog.read_document(file)['title']}\n")
+        sections.append(format_table(("code", "severity", "text", "when", "what to do"), rows))
+    return "\n".join(sections)
 
 
 def write_wording() -> str:

@@ -102,11 +102,11 @@ def _parse_three(text: str, option: str, dimension: Dimension | None) -> FloatAr
     """Return three numbers (3,), with units where they have a dimension."""
     import numpy as np
 
-    parts = text.split(",")
+    words = text.split(",")
     reason = ""
     try:
         numbers = [
-            float(part) if dimension is None else parse_quantity(part, dimension) for part in parts
+            float(word) if dimension is None else parse_quantity(word, dimension) for word in words
         ]
     except (UnitError, ValueError) as error:
         numbers, reason = [], f" ({error})"

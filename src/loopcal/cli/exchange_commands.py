@@ -213,13 +213,13 @@ def _make_import_options(source: Format, name: str, settings: dict[str, Any]) ->
     """Return the options of a format; DataError for one that it does not have."""
     from loopcal.io.formats.program_format import ImportOptions
 
-    given = {key: value for key, value in settings.items() if value is not None}
-    for key in given:
+    stated = {key: value for key, value in settings.items() if value is not None}
+    for key in stated:
         if key not in source.reads:
             raise DataError(
                 f"{name_option(key)} does not belong to the format {source.name}; leave it out"
             )
-    return ImportOptions(name, **given)
+    return ImportOptions(name, **stated)
 
 
 def _correct_file(
@@ -232,9 +232,9 @@ def _correct_file(
     from loopcal.io.formats.program_format import ExportSource
 
     fit = identify(robot, read_checked_measurements([data], robot))
-    written = export_robot(ExportSource(fit.robot), source, file)
-    write_text(output, written.text)
-    return fit, tuple(str(finding) for finding in written.findings)
+    exported = export_robot(ExportSource(fit.robot), source, file)
+    write_text(output, exported.text)
+    return fit, tuple(str(finding) for finding in exported.findings)
 
 
 def _view_import(

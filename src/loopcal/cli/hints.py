@@ -123,5 +123,5 @@ def _has_options(command: click.Command | None, hint: str) -> bool:
     """Return whether a command has every option in a hint; True where no command is known."""
     if command is None:
         return True
-    known = {name for parameter in command.params for name in parameter.opts}
-    return known.issuperset(OPTION.findall(hint))
+    options = {name for parameter in command.params for name in parameter.opts}
+    return options.issuperset(OPTION.findall(hint))

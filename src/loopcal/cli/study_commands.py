@@ -80,8 +80,9 @@ def reproduce(
     if as_json:
         terminal.print_json(result.to_dict())
         return
-    written = f"Written to {output}: page.md, tables, figures"
-    last = written if output else "Add -o FOLDER for all tables and figures."
+    last = "Add -o FOLDER for all tables and figures."
+    if output is not None:
+        last = f"Written to {output}: page.md, tables, figures"
     terminal.print_page([*_view_reproduction(result), "", last])
 
 

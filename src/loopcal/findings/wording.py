@@ -89,16 +89,16 @@ def _parse(template: str) -> tuple[tuple[str, str | None, str, str | None], ...]
 
 
 @cache
-def _split(parts: str) -> tuple[str, ...]:
-    """Return the parts between bars that are outside of braces."""
-    found, depth = [""], 0
-    for character in parts:
+def _split(text: str) -> tuple[str, ...]:
+    """Return the branches between bars that are outside of braces."""
+    branches, depth = [""], 0
+    for character in text:
         depth += {"{": 1, "}": -1}.get(character, 0)
         if character == "|" and depth == 0:
-            found.append("")
+            branches.append("")
         else:
-            found[-1] += character
-    return tuple(found)
+            branches[-1] += character
+    return tuple(branches)
 
 
 def _find_fields(template: str) -> Iterator[str]:
@@ -131,19 +131,19 @@ def _look_up(name: str, data: Mapping[str, Any]) -> Any:
 
 def _word_parts(value: Any, spec: str, data: Mapping[str, Any]) -> str:
     """Word a field that chooses or repeats templates."""
-    rule, _, rest = spec.partition("|")
-    parts = _split(rest)
+    rule, _, text = spec.partition("|")
+    branches = _split(text)
     if rule.startswith("each"):
-        return _word_rows(value, rule.removeprefix("each"), rest, data)
+        return _word_rows(value, rule.removeprefix("each"), text, data)
     if rule == "choose":
-        named = dict(part.split("=", 1) for part in parts[:-1])
-        return _fill(named.get(str(value), parts[-1]), data)
+        named = dict(part.split("=", 1) for part in branches[:-1])
+        return _fill(named.get(str(value), branches[-1]), data)
     if rule == "plural":
         is_first = (len(value) if isinstance(value, Sized) else value) == 1
     else:
         assert rule == "if", spec
         is_first = bool(value)
-    return _fill((*parts, "")[0 if is_first else 1], data)
+    return _fill((*branches, "")[0 if is_first else 1], data)
 
 
 def _word_rows(rows: Sequence[Any], joint: str, template: str, data: Mapping[str, Any]) -> str:
@@ -168,8 +168,8 @@ def _word(value: Any, spec: str) -> str:
     if spec == "sentence":
         return f"{value[0].upper()}{value[1:].rstrip('.')}."
     if spec.startswith("count "):
-        one, _, many = spec.removeprefix("count ").partition("/")
-        return f"{value} {one if value == 1 else many or one + 's'}"
+        singular, _, plural = spec.removeprefix("count ").partition("/")
+        return f"{value} {singular if value == 1 else plural or singular + 's'}"
     if isinstance(value, Quantity):
         return str(value)
     if spec == "" and isinstance(value, float):

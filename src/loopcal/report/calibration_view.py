@@ -51,9 +51,9 @@ def view_calibration(
     fit = report.identification
     rows = fit.to_dict()
     blocks: list[Block] = [report.headline, *_view_errors(report)]
-    shown = report.findings if verbose else report.top_findings
-    blocks += ["", *format_list([(f.severity.value, with_hint(f, hint)) for f in shown])]
-    if more := len(report.findings) - len(shown):
+    selected = report.findings if verbose else report.top_findings
+    blocks += ["", *format_list([(f.severity.value, with_hint(f, hint)) for f in selected])]
+    if more := len(report.findings) - len(selected):
         blocks.append(f"  ({more} more finding{'' if more == 1 else 's'} in the full report)")
     blocks += ["", f"Next: {report.next_step}"]
     if advice := hint(report.next_step):

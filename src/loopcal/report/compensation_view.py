@@ -21,12 +21,12 @@ def view_compensation(result: Compensation) -> list[Block]:
     length, angle = units[Dimension.LENGTH], units[Dimension.ANGLE]
     columns = [word_column("target"), word_column("status")]
     values = []
-    for rows, shown in ((slice(3, 6), length), (slice(0, 3), angle)):
+    for rows, unit in ((slice(3, 6), length), (slice(0, 3), angle)):
         for name, errors in (("before", result.before), ("after", result.remaining)):
-            columns.append(Column(name, shown.symbol))
+            columns.append(Column(name, unit.symbol))
             size = np.linalg.norm(errors[:, rows], axis=1)
-            rounding = ROUNDING * (result.robot.size if shown is length else 1.0)
-            values.append(np.where(size < rounding, 0.0, size) / shown.factor_to_si)
+            rounding = ROUNDING * (result.robot.size if unit is length else 1.0)
+            values.append(np.where(size < rounding, 0.0, size) / unit.factor_to_si)
     if result.uncertainty is not None:
         columns += [Column("U", length.symbol), Column("U", angle.symbol)]
         values += [

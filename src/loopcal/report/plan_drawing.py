@@ -65,9 +65,9 @@ def draw_plan(plan: Plan) -> Figure:
         frameon=False,
         fontsize=8,
     )
-    held = int(plan.poses.held_out.sum())
+    n_held_out = int(plan.poses.held_out.sum())
     figure.suptitle(
-        f"{plan.robot.name}: n = {plan.n_poses} poses for calibration, {held} for validation",
+        f"{plan.robot.name}: n = {plan.n_poses} poses for calibration, {n_held_out} for validation",
         fontsize=10,
     )
     return figure
@@ -81,20 +81,20 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     dimension = DIMENSIONS[curve.target]
-    shown = find_unit(robot.units[dimension])
+    unit = find_unit(robot.units[dimension])
     figure = Figure(figsize=(6.4, 4.4), layout="constrained")
     axes: Any = figure.add_subplot(1, 1, 1)
     for errors, line, color, label in (
         (curve.values, "o-", CALIBRATION, f"planned {curve.counted}"),
         (curve.bounds, "--", BOUND, f"no choice of {curve.counted} is better"),
     ):
-        axes.plot(curve.numbers, errors / shown.factor_to_si, line, color=color, label=label)
+        axes.plot(curve.numbers, errors / unit.factor_to_si, line, color=color, label=label)
     if curve.goal is not None:
         axes.axhline(
-            curve.goal / shown.factor_to_si,
+            curve.goal / unit.factor_to_si,
             color=VALIDATION,
             lw=1.0,
-            label=f"goal: {curve.goal / shown.factor_to_si:.3g} {shown.symbol}",
+            label=f"goal: {curve.goal / unit.factor_to_si:.3g} {unit.symbol}",
         )
     axes.set_xscale("log")
     axes.set_yscale("log")
@@ -105,7 +105,7 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
     axes.set_xlabel(f"{curve.counted} for calibration [1]")
     words = f"expected {curve.target} error (rms)"
     words += ", rotations times robot size" if curve.target == "pose" else ""
-    axes.set_ylabel(f"{words} [{shown.symbol}]", fontsize=9)
+    axes.set_ylabel(f"{words} [{unit.symbol}]", fontsize=9)
     axes.grid(visible=True, lw=0.3)
     axes.legend(frameon=False, fontsize=8)
     axes.set_title(

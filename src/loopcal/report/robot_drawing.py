@@ -117,15 +117,15 @@ def _strokes(robot: Mechanism, limbs: list[FloatArray], T: FloatArray) -> Iterat
                 yield Stroke(
                     points[j] + ends[:, None] * axis, {"color": color, "lw": 1.0, "ls": (0, (4, 3))}
                 )
-                at = points[j] + slid * axis
+                place = points[j] + slid * axis
             else:
-                at = points[j]
+                place = points[j]
                 yield Stroke(
-                    at + np.array([[-1.0], [1.0]]) * AXIS * robot.size * axis,
+                    place + np.array([[-1.0], [1.0]]) * AXIS * robot.size * axis,
                     {"color": "black", "lw": 1.2},
                 )
             yield Stroke(
-                at[None],
+                place[None],
                 _dot(
                     "s" if joint.kind == "P" else "o", color, face, 8.0 if joint.actuator else 5.0
                 ),

@@ -76,9 +76,9 @@ def view_error_statistics(validation: Validation, with_before: bool = True) -> l
 
 def is_fully_compensable(validation: Validation) -> bool:
     """Return whether the actuators can correct all of the measured error."""
-    rest = validation.not_compensable
+    errors = validation.not_compensable
     return all(
-        rest.statistics(quantity).max / validation.units[quantity].factor_to_si < ROUNDING
+        errors.statistics(quantity).max / validation.units[quantity].factor_to_si < ROUNDING
         for quantity in validation.quantities
     )
 

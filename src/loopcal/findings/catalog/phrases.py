@@ -142,13 +142,13 @@ def residual_ratio(data: Data) -> str:
 
 def other_measurements(data: Data) -> str:
     """Return the suggested measurements after the first."""
-    return list_names([one["words"] for one in data["measurements"][1:]], MOST_ALTERNATIVES)
+    return list_names([other["words"] for other in data["measurements"][1:]], MOST_ALTERNATIVES)
 
 
 def blocks(data: Data) -> str:
     """Return how many poses were tested, or sets of poses where poses share rows."""
-    one = "pose" if data["single_poses"] else "set of poses/sets of poses"
-    return fill_template(f"{{blocks:count {one}}}", **data)
+    noun = "pose" if data["single_poses"] else "set of poses/sets of poses"
+    return fill_template(f"{{blocks:count {noun}}}", **data)
 
 
 def stated_misfit(data: Data) -> str:
@@ -168,7 +168,7 @@ def interpretation(data: Data) -> str:
 
 def equally_good(data: Data) -> str:
     """Return interpretations in which the data fit as well."""
-    return list_names([find_entry(one["code"]).word(one) for one in data["alternatives"]], 2)
+    return list_names([find_entry(slip["code"]).word(slip) for slip in data["alternatives"]], 2)
 
 
 def correction(data: Data) -> str:
