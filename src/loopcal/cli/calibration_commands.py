@@ -92,7 +92,7 @@ def calibrate(
       calibrated                    use the result
       calibrated with reservations  usable; a warning affects its accuracy
       undecided                     no held-out poses, or too few
-      not calibrated                exit code 2; the run folder is written all the same
+      not calibrated                exit code 2; the run folder is still written
 
     "Not calibrated" means that the fit did not converge, the residuals contradict the stated noise,
     errors on held-out poses grew, or a limit is exceeded.

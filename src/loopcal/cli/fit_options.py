@@ -28,6 +28,7 @@ fit_options = add_options(
     click.option(
         "--lam",
         type=click.FloatRange(min=0),
+        metavar="WEIGHT",
         help="For ridge: weight of the penalty; by default chosen by cross-validation.",
     ),
     click.option(

@@ -104,7 +104,8 @@ def force_option(what: str) -> Decorator:
 
 def seed_option(what: str) -> Decorator:
     """Return the option for the seed of something random."""
-    return click.option("--seed", type=click.IntRange(min=0), default=1, help=f"Seed of {what}.")
+    kind = click.IntRange(min=0)
+    return click.option("--seed", type=kind, default=1, metavar="N", help=f"Seed of {what}.")
 
 
 def format_option(names: Sequence[str], help_text: str) -> Decorator:

@@ -75,8 +75,8 @@ EXCLUDED_BY_PLANE_LINE = {
     "--criterion",
     type=click.Choice(("I", "D")),
     default="I",
-    help="What the plan minimizes: I the mean predicted variance of poses, D the uncertainty of "
-    "the parameters.",
+    help="What the plan minimizes: the mean predicted variance of poses (I), or the uncertainty of "
+    "the parameters (D).",
 )
 @click.option(
     "--hold-out",
@@ -110,6 +110,7 @@ EXCLUDED_BY_PLANE_LINE = {
     "--candidates",
     type=click.IntRange(min=10),
     default=1000,
+    metavar="N",
     help="Number of candidate poses to draw.",
 )
 @flag_option("--curve", help="Also compute the expected errors by the number of poses.")

@@ -31,7 +31,7 @@ HEADING = 18
     help="Folder for a page, all tables (CSV, JSON) and figures (PNG).",
     metavar="FOLDER",
 )
-@click.option("--seed", default=0, help="Seed of all random choices.")
+@click.option("--seed", default=0, metavar="N", help="Seed of all random choices.")
 @click.option(
     "--trials",
     type=int,
