@@ -16,6 +16,7 @@ from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism.assembly import AXES, Address, Assembly, Limb, check_assembly
 from loopcal.mechanism.batch_kinematics import (
     compute_closure_sign,
+    count_equations,
     count_shared_drives,
     inverse_trials,
 )
@@ -305,11 +306,8 @@ def _find_home(robot: Mechanism) -> State:
         Too few controlled coordinates, or loops that cannot be closed.
     """
     program, values = robot.program, robot.values[None]
-    equations = sum(
-        len(g.limbs) * (len(g.rows) - len(g.unknown_joints(True))) for g in program.groups
-    )
     shared = count_shared_drives(program)
-    movable = len(program.freedoms) - equations - shared
+    movable = len(program.freedoms) - count_equations(program, free=True) - shared
     if len(robot.controlled) < movable:
         raise MechanismError(
             f"{robot.name} can be moved in {movable} freedoms or more, but names only "

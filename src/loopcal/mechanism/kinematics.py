@@ -178,16 +178,13 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
 
 def make_solution(robot: Mechanism, state: State, q: FloatArray) -> Solution:
     """Return the solution of a state (1, n) with readings (n, a)."""
-    columns = {}
-    for group, joints in zip(robot.program.groups, state.joints, strict=True):
-        for k, i in enumerate(group.limbs):
-            limb = robot.assembly.limbs[i]
-            for j, joint in enumerate(limb.joints):
-                columns[f"{limb.name}.{joint.name}"] = joints[0, :, k, j]
     names = name_passive_joints(robot)
-    passive = np.zeros((len(q), len(names)))
-    for i, name in enumerate(names):
-        passive[:, i] = columns[name]
+    place, passive = {name: i for i, name in enumerate(names)}, np.zeros((len(q), len(names)))
+    for group, joints in zip(robot.program.groups, state.joints, strict=True):
+        for k, limb in enumerate(robot.assembly.limbs[i] for i in group.limbs):
+            for j, joint in enumerate(limb.joints):
+                if joint.actuator is None:
+                    passive[:, place[f"{limb.name}.{joint.name}"]] = joints[0, :, k, j]
     return Solution(
         state.T[0],
         q,
@@ -272,12 +269,11 @@ def find_nearest_reachable(
     state = inverse_trials(robot, values, read_coordinates(T, robot.controlled), start)
     if len(robot.controlled) == 6 or set(robot.controlled) == set(robot.freedoms):
         return state
-    weight = np.array([robot.size] * 3 + [1.0] * 3)
     for _ in range(PROJECTION_STEPS):
         gap = geometry.pose_difference(state.T, np.broadcast_to(T, state.T.shape))
         slope = differentiate_by_coordinates(robot, values, state)
-        inverse_slope = np.linalg.pinv(slope * weight[:, None])
-        step = np.matmul(inverse_slope, (-gap * weight)[..., None])[..., 0]
+        inverse_slope = np.linalg.pinv(slope * robot.twist_scale[:, None])
+        step = np.matmul(inverse_slope, (-gap * robot.twist_scale)[..., None])[..., 0]
         step = np.where(np.isfinite(step), step, 0.0)
         moved = geometry.apply_twist(state.T, np.matmul(slope, step[..., None])[..., 0])
         target = read_coordinates(moved, robot.controlled)

@@ -43,7 +43,7 @@ def check_mobility(robot: Mechanism) -> Mechanism:
     program, home = robot.program, robot.home_state
     e = robot.slots(robot.values[None])[0]
     blocks = engine.linearize(program, e, driven_values(program, home), home)
-    scale = _scale_freedoms(robot)
+    scale = 1 / robot.twist_scale[list(program.freedoms)]
     A, Q = stack_platform_rows(blocks)[0, 0] * scale, stack_driven_columns(program, blocks)[0, 0]
     names = [AXES[f] for f in program.freedoms]
     _, s, V = np.linalg.svd(A, full_matrices=True)
@@ -88,11 +88,6 @@ def check_mobility(robot: Mechanism) -> Mechanism:
     return robot
 
 
-def _scale_freedoms(robot: Mechanism) -> FloatArray:
-    """Return the factors (m,) that make columns of the freedoms comparable: 1 / size for angles."""
-    return np.array([1 / robot.size if f < 3 else 1.0 for f in robot.program.freedoms])
-
-
 def _report_repeated(names: Sequence[str], count: int, motions: FloatArray) -> Finding:
     """Return the finding of closure equations that repeat others.
 
@@ -125,7 +120,7 @@ def refuse_uncontrolled(robot: Mechanism, state: engine.State) -> None:
     e, q = robot.slots(robot.values[None])[0], driven_values(program, state)
     rows = stack_platform_rows(engine.linearize(program, e, q, state, free=True))[0, 0]
     columns = _differentiate_controlled(robot, state.T[0, 0])
-    scale = _scale_freedoms(robot)
+    scale = 1 / robot.twist_scale[list(program.freedoms)]
     s = np.linalg.svd(np.concatenate([rows, columns]) * scale, compute_uv=False)
     if len(s) < len(scale) or (s <= RANK * s[0]).any():
         raise MechanismError(_word_dependent(robot, len(robot.controlled)))

@@ -169,6 +169,11 @@ class Mechanism:
         """Actuators in the order of the readings."""
         return self.assembly.actuators
 
+    @cached_property
+    def twist_scale(self) -> FloatArray:
+        """Factors (6,) that turn a twist into lengths: rotations times the size, translations."""
+        return np.repeat([self.size, 1.0], 3)
+
     def get_unit(self, dimension: Dimension) -> Unit:
         """Return the unit in which values are shown: that of the robot file, or the usual one."""
         return find_unit(self.units[dimension])

@@ -48,9 +48,8 @@ def solve_at_pose(
     values : (t | 1, p). begin : (t, n), whose joints select the branch of each limb.
     """
     e, tau = robot.slots(values)
-    freedoms, size = list(robot.program.freedoms), robot.size
+    freedoms, scale = list(robot.program.freedoms), robot.twist_scale
     target = np.array(T, dtype=np.float64).reshape(-1, 4, 4)
-    scale = np.array([size] * 3 + [1.0] * 3)
 
     def prescribe(current: FloatArray, rows: np.ndarray) -> tuple[FloatArray, FloatArray]:
         """Return the distance from the target pose and its slopes in the twist."""

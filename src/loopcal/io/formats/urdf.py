@@ -216,8 +216,8 @@ def _format_limb(
     tip: FloatArray = np.eye(4)
     path = orient_path(limb, graph.base)
     for joint in path:
-        forward = joint.one == body
-        place = pending @ (joint.T_one if forward else joint.T_other)
+        forward = joint.body_a == body
+        place = pending @ (joint.T_a if forward else joint.T_b)
         axis = joint.axis if forward else -joint.axis
         is_tip = joint is path[-1] and not turns
         if is_tip:
@@ -227,7 +227,7 @@ def _format_limb(
         if forward:
             name = f"tip, name: {json.dumps(joint.name)}" if is_tip else json.dumps(joint.name)
             errors.append(f"      - {{of: {name}, shift: [{_list_across(axis)}]}}")
-        pending = geometry.invert_pose(joint.T_other if forward else joint.T_one)
+        pending = geometry.invert_pose(joint.T_b if forward else joint.T_a)
         body = get_other_body(joint, body)
     last = path[-1]
     attach: FloatArray = geometry.invert_pose(pending @ T_body_frame)

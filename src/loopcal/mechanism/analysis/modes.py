@@ -129,8 +129,7 @@ def find_assembly_modes(
 
     def measure(state: State) -> FloatArray:
         home = np.broadcast_to(robot.home, state.T[0].shape)
-        distance = geometry.pose_difference(state.T[0], home)
-        return distance * np.repeat([robot.size, 1.0], 3)
+        return geometry.pose_difference(state.T[0], home) * robot.twist_scale
 
     def read(state: State) -> FloatArray:
         return np.tile(readings, (state.T.shape[1], 1))

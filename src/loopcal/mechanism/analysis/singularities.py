@@ -226,15 +226,12 @@ def _compute_margins(
 
     The state is (1, n).
     """
-    program, size = robot.program, robot.size
+    program = robot.program
     e, _ = robot.slots(robot.values[None])
     blocks = engine.linearize(program, e, driven_values(program, state), state)
-    per_freedom = np.array([1 / size if f < 3 else 1.0 for f in program.freedoms])
-    per_drive = np.array(
-        [1 / size if a.dimension is Dimension.ANGLE else 1.0 for a in robot.actuators]
-    )
-    A = stack_platform_rows(blocks)[0] * per_freedom
-    Q = stack_driven_columns(program, blocks)[0] * per_drive
+    turning = np.array([a.dimension is Dimension.ANGLE for a in robot.actuators])
+    A = stack_platform_rows(blocks)[0] / robot.twist_scale[list(program.freedoms)]
+    Q = stack_driven_columns(program, blocks)[0] / np.where(turning, robot.size, 1.0)
     good = np.isfinite(A).all(axis=(1, 2)) & np.isfinite(Q).all(axis=(1, 2))
     A, Q = np.where(good[:, None, None], A, 0.0), np.where(good[:, None, None], Q, 0.0)
     _, s, V = np.linalg.svd(A)

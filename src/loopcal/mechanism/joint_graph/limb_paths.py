@@ -15,10 +15,10 @@ import numpy as np
 
 from loopcal.errors import MechanismError
 from loopcal.findings import report_finding
+from loopcal.mechanism.assembly import AXES
 from loopcal.mechanism.joint_graph.loop_closure import GraphJoint, JointGraph
 from loopcal.typing import FloatArray
 
-FREEDOMS = ("rx", "ry", "rz", "x", "y", "z")
 MOTION = 1e-9
 """Smallest part of a motion that counts [m, rad]; rounding is below 1e-12."""
 
@@ -55,17 +55,17 @@ def find_limb_paths(graph: JointGraph, platform: str) -> LimbPaths:
     ------
     MechanismError : a limb branches, or no limbs join base and platform; a finding with the joints.
     """
-    found, refusal = [], None
+    candidates, refusal = [], None
     for values in graph.homes:
         try:
-            found.append(_find_at(replace(graph, values=values), platform))
+            candidates.append(_divide_at(replace(graph, values=values), platform))
         except MechanismError as error:
             refusal = refusal or error
-    if refusal is not None and not found:
+    if refusal is not None and not candidates:
         raise refusal
-    firmness = [one.graph.measure_firmness(platform) for one in found]
+    firmness = [paths.graph.measure_firmness(platform) for paths in candidates]
     limit = FIRM * max(firmness)
-    return next(one for one, value in zip(found, firmness, strict=True) if value >= limit)
+    return next(p for p, value in zip(candidates, firmness, strict=True) if value >= limit)
 
 
 def choose_coordinates(twists: FloatArray) -> list[str]:
@@ -75,7 +75,7 @@ def choose_coordinates(twists: FloatArray) -> list[str]:
     """
     chosen: list[str] = []
     for name in ("x", "y", "z", "rx", "ry", "rz"):
-        rows = twists[[FREEDOMS.index(n) for n in (*chosen, name)]]
+        rows = twists[[AXES.index(n) for n in (*chosen, name)]]
         s = np.linalg.svd(rows, compute_uv=False)
         if len(chosen) < twists.shape[1] and s[-1] > INDEPENDENT * np.abs(twists).max():
             chosen.append(name)
@@ -84,19 +84,19 @@ def choose_coordinates(twists: FloatArray) -> list[str]:
 
 def get_other_body(joint: GraphJoint, body: str) -> str:
     """Return the body at the other end of a joint."""
-    return joint.other if body == joint.one else joint.one
+    return joint.body_b if body == joint.body_a else joint.body_a
 
 
 def orient_path(path: Path, body: str) -> Path:
     """Return the joints of a limb, each pin as the body before it carries it."""
     oriented = []
     for joint in path:
-        oriented.append(joint.flip() if joint.is_pin and joint.one != body else joint)
+        oriented.append(joint.flip() if joint.is_pin and joint.body_a != body else joint)
         body = get_other_body(joint, body)
     return tuple(oriented)
 
 
-def _find_at(graph: JointGraph, platform: str) -> LimbPaths:
+def _divide_at(graph: JointGraph, platform: str) -> LimbPaths:
     """Return the limbs at one home pose."""
     freedoms = _list_freedoms(graph, platform)
     limbs = _find_complete_limbs(graph, platform)
@@ -118,16 +118,16 @@ def _list_freedoms(graph: JointGraph, platform: str) -> tuple[str, ...]:
     for near in graph.list_nearby():
         motion = near.twists(platform, near.places[platform][:3, 3]) @ near.motions()
         largest = np.maximum(largest, np.abs(motion).max(axis=1))
-    return tuple(name for name, size in zip(FREEDOMS, largest, strict=True) if size > MOTION)
+    return tuple(name for name, size in zip(AXES, largest, strict=True) if size > MOTION)
 
 
 def _find_complete_limbs(graph: JointGraph, platform: str) -> tuple[Path, ...] | None:
     """Return limbs that contain every body and joint; None where there are none."""
     left, limbs = list(graph.joints), []
-    for first in [joint for joint in graph.joints if graph.base in (joint.one, joint.other)]:
+    for first in [joint for joint in graph.joints if graph.base in (joint.body_a, joint.body_b)]:
         body, path = graph.base, [first]
         while (body := get_other_body(path[-1], body)) != platform:
-            onward = [j for j in graph.joints if j is not path[-1] and body in (j.one, j.other)]
+            onward = [j for j in graph.joints if j is not path[-1] and body in (j.body_a, j.body_b)]
             if len(onward) != 1 or body == graph.base:
                 return None
             path.append(onward[0])
@@ -153,17 +153,17 @@ def _find_driven_limbs(graph: JointGraph, platform: str) -> tuple[Path, ...] | N
 
 def _find_shortest_path(graph: JointGraph, first: GraphJoint, platform: str) -> Path | None:
     """Return the shortest path that begins with a joint on the base; None where there is none."""
-    if first.one != graph.base:
+    if first.body_a != graph.base:
         return None
     queue: list[Path] = [(first,)]
-    visited = {graph.base, first.other}
+    visited = {graph.base, first.body_b}
     while queue:
         path = queue.pop(0)
         body = _get_end(path, graph.base)
         if body == platform:
             return path
         for joint in graph.joints:
-            if body in (joint.one, joint.other):
+            if body in (joint.body_a, joint.body_b):
                 after = get_other_body(joint, body)
                 if after not in visited:
                     visited.add(after)
@@ -174,7 +174,7 @@ def _find_shortest_path(graph: JointGraph, first: GraphJoint, platform: str) -> 
 def _describe_branch(graph: JointGraph, platform: str) -> MechanismError:
     """Return the refusal, with the joints of the first body at which a limb branches."""
     for body in graph.bodies:
-        names = tuple(joint.name for joint in graph.joints if body in (joint.one, joint.other))
+        names = tuple(joint.name for joint in graph.joints if body in (joint.body_a, joint.body_b))
         if body not in (graph.base, platform) and len(names) > 2:
             return MechanismError(
                 report_finding("files.limb-branches", joints=names, body=body, platform=platform)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A mechanism as bodies and joints: a tree of joints from the base, and pins that close its loops.
 
-A pin turns about one axis that both bodies carry: T_one R(axis, q) = T_other.
+A pin turns about one axis that both bodies carry: T_a R(axis, q) = T_b.
 """
 
 from __future__ import annotations
@@ -31,34 +31,33 @@ NEAR, NEAR_RANGE = 4, 0.15
 
 @dataclass(frozen=True)
 class GraphJoint:
-    """A joint between two bodies: `T_one` moved by the joint is `T_other`, each (4, 4) in its body.
+    """A joint between two bodies: `T_a` moved by the joint is `T_b`, each (4, 4) in its body.
 
     Attributes
     ----------
-    kind : R or P. one, other : the bodies. axis : (3,) unit vector in the frame of the joint.
+    kind : R or P. body_a, body_b : the bodies. axis : (3,) unit vector in the frame of the joint.
     is_pin : whether it closes a loop; then `name` is its end on the first body, `far` on the other.
     """
 
     name: str
     kind: str
-    one: str
-    other: str
-    T_one: FloatArray
-    T_other: FloatArray
+    body_a: str
+    body_b: str
+    T_a: FloatArray
+    T_b: FloatArray
     axis: FloatArray
     is_pin: bool = False
     far: str = ""
 
     def flip(self) -> GraphJoint:
         """Return a pin as the other body carries it."""
-        ends = {"one": self.other, "other": self.one, "T_one": self.T_other, "T_other": self.T_one}
-        return replace(self, name=self.far, far=self.name, **ends)
+        swapped = replace(self, body_a=self.body_b, body_b=self.body_a, T_a=self.T_b, T_b=self.T_a)
+        return replace(swapped, name=self.far, far=self.name)
 
     def move(self, value: float) -> FloatArray:
         """Return the joint frame of the other body (4, 4) in the first body."""
-        if self.kind == "P":
-            return self.T_one @ geometry.make_pose(np.eye(3), value * self.axis)
-        return self.T_one @ geometry.make_pose(geometry.exp_so3(value * self.axis), np.zeros(3))
+        turn, shift = (value, 0.0) if self.kind == "R" else (0.0, value)
+        return self.T_a @ geometry.make_pose(geometry.exp_so3(turn * self.axis), shift * self.axis)
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ class JointGraph:
     @property
     def bodies(self) -> tuple[str, ...]:
         """All bodies, the base first."""
-        return (self.base, *(joint.other for joint in self.tree))
+        return (self.base, *(joint.body_b for joint in self.tree))
 
     @property
     def joints(self) -> tuple[GraphJoint, ...]:
@@ -94,35 +93,34 @@ class JointGraph:
         """Body -> T_base_body (4, 4)."""
         T = {self.base: np.eye(4)}
         for joint in self.tree:
-            T[joint.other] = T[joint.one] @ joint.move(self.values[joint.name])
+            T[joint.body_b] = T[joint.body_a] @ joint.move(self.values[joint.name])
         return T
 
     def twists(self, body: str, point: FloatArray) -> FloatArray:
         """Return twists (6, j) (omega, v of a point [m] of the body) of the joints of the tree."""
         T, columns = self.places, np.zeros((6, len(self.tree)))
-        index = {joint.other: i for i, joint in enumerate(self.tree)}
+        index = {joint.body_b: i for i, joint in enumerate(self.tree)}
         while body in index:
             i = index[body]
             joint = self.tree[i]
-            frame = T[joint.one] @ joint.T_one
+            frame = T[joint.body_a] @ joint.T_a
             axis = frame[:3, :3] @ joint.axis
             arm = np.cross(axis, point - frame[:3, 3])
             columns[:, i] = np.concatenate(
                 [axis, arm] if joint.kind == "R" else [np.zeros(3), axis]
             )
-            body = joint.one
+            body = joint.body_a
         return columns
 
     def linearize_closure(self) -> tuple[FloatArray, FloatArray]:
         """Return residuals (6 c,) [m, 1] of the c pins, and derivatives (6 c, j) by the tree."""
         T, residual, rows = self.places, [], []
         for pin in self.pins:
-            one, other = T[pin.one] @ pin.T_one, T[pin.other] @ pin.T_other
-            a, b = one[:3, :3] @ pin.axis, other[:3, :3] @ pin.axis
-            first, second = self.twists(pin.one, one[:3, 3]), self.twists(pin.other, other[:3, 3])
-            residual += [one[:3, 3] - other[:3, 3], a - b]
-            turn = -geometry.hat(a) @ first[:3] + geometry.hat(b) @ second[:3]
-            rows += [first[3:] - second[3:], turn]
+            frames = T[pin.body_a] @ pin.T_a, T[pin.body_b] @ pin.T_b
+            (p, q), (a, b) = (f[:3, 3] for f in frames), (f[:3, :3] @ pin.axis for f in frames)
+            A, B = self.twists(pin.body_a, p), self.twists(pin.body_b, q)
+            residual += [p - q, a - b]
+            rows += [A[3:] - B[3:], geometry.hat(b) @ B[:3] - geometry.hat(a) @ A[:3]]
         if not rows:
             return np.zeros(0), np.zeros((0, len(self.tree)))
         return np.concatenate(residual), np.concatenate(rows)
@@ -180,7 +178,7 @@ class JointGraph:
     def get_pin_angle(self, pin: GraphJoint) -> float:
         """Return the angle of a pin [rad]."""
         T = self.places
-        between = geometry.invert_pose(T[pin.one] @ pin.T_one) @ T[pin.other] @ pin.T_other
+        between = geometry.invert_pose(T[pin.body_a] @ pin.T_a) @ T[pin.body_b] @ pin.T_b
         return float(geometry.log_so3(between[:3, :3]) @ pin.axis)
 
 
@@ -197,12 +195,12 @@ def find_home(graph: JointGraph) -> JointGraph:
     for seed in range(STARTS):
         rng = np.random.default_rng(seed)
         spread = 0.0 if seed == 0 else SPREAD
-        one = graph.close({name: rng.uniform(-spread, spread) for name in graph.values})
-        if one is not None:
-            closed.append(one)
+        solution = graph.close({name: rng.uniform(-spread, spread) for name in graph.values})
+        if solution is not None:
+            closed.append(solution)
     if not closed:
         raise MechanismError("the loops do not close from any start; check the closures")
-    mobility = min(one.motions().shape[1] for one in closed)
-    regular = [one for one in closed if one.motions().shape[1] == mobility]
-    nearest = sorted(regular, key=lambda one: sum(value**2 for value in one.values.values()))
-    return replace(nearest[0], homes=tuple(one.values for one in nearest))
+    mobilities = [pose.motions().shape[1] for pose in closed]
+    regular = [pose for pose, m in zip(closed, mobilities, strict=True) if m == min(mobilities)]
+    nearest = sorted(regular, key=lambda pose: sum(value**2 for value in pose.values.values()))
+    return replace(nearest[0], homes=tuple(pose.values for pose in nearest))
