@@ -257,11 +257,11 @@ def _map_limb(program: Program, group: Group, k: int, slots: SlotMap) -> LimbMap
     unit = width == len(columns) and np.array_equal(slots.matrix[place][:, columns], np.eye(width))
     actuators = np.array([a for _, a, _ in drives], dtype=np.int64)
     return LimbMap(
-        place, _as_columns(columns), one_each and unit, tuple(drives), _as_columns(actuators)
+        place, as_columns(columns), one_each and unit, tuple(drives), as_columns(actuators)
     )
 
 
-def _as_columns(places: IntArray) -> Columns:
+def as_columns(places: IntArray) -> Columns:
     """Return consecutive places as a slice, which selects a view in place of a copy."""
     if len(places) and (np.diff(places) == 1).all():
         return slice(int(places[0]), int(places[-1]) + 1)

@@ -10,7 +10,7 @@ docs/theory/engine.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from loopcal import engine
 from loopcal.engine import Block, State
-from loopcal.mechanism.model import Columns, LimbMap, Mechanism
+from loopcal.mechanism.model import Columns, LimbMap, Mechanism, as_columns
 from loopcal.mechanism.states import is_closed, select_block
 from loopcal.mechanism.transmission import joint_slopes, joints_from_readings, term_derivatives
 from loopcal.typing import FloatArray
@@ -56,18 +56,15 @@ def differentiate_pose(
     PoseSensitivity; failed rows have NaN, rows of singular states infinities or NaN.
     """
     t, n = state.T.shape[:2]
-    freedoms = list(robot.program.freedoms)
+    # six freedoms are a view, not an index
+    freedoms = as_columns(np.array(robot.program.freedoms))
     parameters = np.zeros((t, n, 6, len(robot.parameters)))
     readings = np.zeros((t, n, 6, len(robot.actuators)))
     for rows, limbs in linearize_limbs(robot, values, q, state):
         by_parameter, by_reading = limbs.solve_platform()
-        if len(freedoms) == 6:
-            parameters[rows], readings[rows] = by_parameter, by_reading
-        else:
-            parameters[rows][:, :, freedoms] = by_parameter
-            readings[rows][:, :, freedoms] = by_reading
-    lost = ~is_closed(state.status)
-    parameters[lost], readings[lost] = np.nan, np.nan
+        parameters[rows][:, :, freedoms] = by_parameter
+        readings[rows][:, :, freedoms] = by_reading
+    parameters[~is_closed(state.status)] = readings[~is_closed(state.status)] = np.nan
     return PoseSensitivity(parameters, readings)
 
 
@@ -113,8 +110,7 @@ def differentiate_passive_joints(
             cut = moved.shape[-1]
             parameters[rows][:, :, places] = both[..., :cut]
             readings[rows][:, :, places] = both[..., cut:]
-    lost = ~is_closed(state.status)
-    parameters[lost], readings[lost] = np.nan, np.nan
+    parameters[~is_closed(state.status)] = readings[~is_closed(state.status)] = np.nan
     return PassiveSensitivity(names, parameters, readings)
 
 
@@ -171,8 +167,25 @@ def linearize_limbs(
         for j in range(0, n, poses):
             rows = slice(i, min(i + trials, t)), slice(j, min(j + poses, n))
             chosen_values, chosen_q = _select(values, rows[:1]), _select(q, rows)
-            block = select_block(state, rows)
-            yield rows, LinearizedLimbs(robot, chosen_values, chosen_q, block)
+            yield rows, _linearize_block(robot, chosen_values, chosen_q, select_block(state, rows))
+
+
+def _linearize_block(
+    robot: Mechanism, values: FloatArray, q: FloatArray, state: State
+) -> LinearizedLimbs:
+    """Linearize all limbs at the states of one block."""
+    slots, d = robot.slots, robot.program.n_displacements
+    e, tau = slots(values)
+    joints = joints_from_readings(q, tau, slots.frequency)
+    J = slots.jacobian(values)
+    return LinearizedLimbs(
+        robot,
+        engine.linearize(robot.program, e, joints, state),
+        J[:, :d],
+        J[:, d:].reshape(len(J), *slots.terms.shape, -1),
+        term_derivatives(q, slots.frequency),
+        joint_slopes(q, tau, slots.frequency),
+    )
 
 
 def _select(array: FloatArray, rows: tuple[slice, ...]) -> FloatArray:
@@ -181,19 +194,23 @@ def _select(array: FloatArray, rows: tuple[slice, ...]) -> FloatArray:
     return array[tuple(s if length > 1 else slice(None) for s, length in pairs)]
 
 
+@dataclass(frozen=True)
 class LinearizedLimbs:
-    """Linearized closure of a block of rows, limb by limb."""
+    """Linearized closure of a block of t trials and n poses, limb by limb.
 
-    def __init__(self, robot: Mechanism, values: FloatArray, q: FloatArray, state: State) -> None:
-        slots, self.robot, self.shape = robot.slots, robot, state.T.shape[:2]
-        e, tau = slots(values)
-        joints = joints_from_readings(q, tau, slots.frequency)
-        self.blocks = engine.linearize(robot.program, e, joints, state)
-        J = slots.jacobian(values)
-        self._of_slots = J[:, : slots.n_displacements]
-        self._of_terms = J[:, slots.n_displacements :].reshape(len(J), *slots.terms.shape, -1)
-        self._terms = term_derivatives(q, slots.frequency)
-        self._slope = joint_slopes(q, tau, slots.frequency)
+    Attributes
+    ----------
+    blocks : of the engine.
+    displacements_by_parameter : (t, d, p). terms_by_parameter : (t, a, 8, p).
+    joints_by_term : 8 arrays (t, n, a). joints_by_reading : (t, n, a).
+    """
+
+    robot: Mechanism
+    blocks: engine.ClosureBlocks
+    displacements_by_parameter: FloatArray
+    terms_by_parameter: FloatArray
+    joints_by_term: Sequence[FloatArray]
+    joints_by_reading: FloatArray
 
     def rows(self, blocks: tuple[Block, ...]) -> Iterator[LimbRows]:
         """Yield the rows of each limb in `blocks.closure` or `blocks.passive`."""
@@ -228,8 +245,8 @@ class LinearizedLimbs:
         weights = _weigh_rows(program, self.blocks)
         inverse = _invert(stack_platform_rows(self.blocks), weights)
         m = len(program.freedoms)
-        by_parameter = np.zeros((*self.shape, m, len(self.robot.parameters)))
-        by_reading = np.zeros((*self.shape, m, program.n_joints))
+        by_parameter = np.zeros((*inverse.shape[:2], m, len(self.robot.parameters)))
+        by_reading = np.zeros((*inverse.shape[:2], m, program.n_joints))
         first = 0
         for limb in self.rows(self.blocks.closure):
             for i in range(limb.A.shape[2]):
@@ -244,20 +261,20 @@ class LinearizedLimbs:
         right = block.E[:, :, k]
         if not limb.is_plain:
             t, n, r, width = right.shape
-            of_slots = self._of_slots[:, limb.displacements, limb.parameters]
+            of_slots = self.displacements_by_parameter[:, limb.displacements, limb.parameters]
             product = np.matmul(right.reshape(t, n * r, width), of_slots)
             right = product.reshape(t, n, r, of_slots.shape[-1])
         for j, a, terms in limb.drives:
             for i in terms:
-                slopes = self._of_terms[:, None, None, a, i, limb.parameters]
-                driven = block.Q[:, :, k, :, j] * self._terms[i][:, :, a, None]
+                slopes = self.terms_by_parameter[:, None, None, a, i, limb.parameters]
+                driven = block.Q[:, :, k, :, j] * self.joints_by_term[i][:, :, a, None]
                 right = right + driven[..., None] * slopes
         return right
 
     def _differentiate_by_readings(self, limb: LimbMap, block: Block, k: int) -> FloatArray:
         """Return d rows / d readings of limb k (t, n, r, ..)."""
         driven = block.Q[:, :, k][..., [j for j, *_ in limb.drives]]
-        return driven * self._slope[:, :, None, limb.readings]
+        return driven * self.joints_by_reading[:, :, None, limb.readings]
 
 
 def stack_platform_rows(blocks: engine.ClosureBlocks) -> FloatArray:
