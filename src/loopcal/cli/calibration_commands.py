@@ -105,17 +105,16 @@ def calibrate(
       loopcal calibrate robot.yaml poses.csv tracker.csv inclinometer.csv -o run
       loopcal calibrate hexapod-42 after-repair.csv -o run2 --prior run --free-limb leg3
     """  # noqa: D301
+    from loopcal import workflow
     from loopcal.io import load_robot
     from loopcal.io.data.measurement_file import read_held_out_poses
     from loopcal.io.runs.run_folder import build_document, load_prior, refuse_run_folder, save_run
     from loopcal.report.calibration_view import view_calibration
-    from loopcal.workflow import CalibrationOptions
-    from loopcal.workflow import calibrate as calibrate_robot
 
     held_out = read_held_out_poses(data)
     _refuse_two_choices(held_out, hold_out)
     inputs = _list_inputs(robot, data, prior)
-    settings = CalibrationOptions(
+    settings = workflow.CalibrationOptions(
         make_fit_options(options),
         hold_out,
         held_out,
@@ -129,7 +128,7 @@ def calibrate(
     accepted = {name: options[name] for name in ("allow_outside_stroke", "allow_duplicates")}
     measurements = read_measurements(data, machine, **accepted)
     with terminal.ProgressBar() as progress:
-        report = calibrate_robot(machine, measurements, settings, progress)
+        report = workflow.calibrate(machine, measurements, settings, progress)
     print_convention_note(report.conventions, data)
     save_run(output, report, inputs, sys.argv, force)
     if as_json:

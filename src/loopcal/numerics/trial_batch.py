@@ -48,14 +48,14 @@ class TrialBatch:
     shared: ClassVar[tuple[str, ...]] = ()
 
     def take(self, trials: IntArray) -> Self:
-        """Return some trials; this object where these are all of them."""
-        if np.array_equal(trials, np.arange(_count_trials(self))):
+        """Return the trials at these indices, or of this mask; this object where it is all."""
+        if self._are_all(trials):
             return self
         return map_arrays(lambda array: array[trials], self)
 
     def put(self, trials: IntArray, other: Self) -> Self:
         """Return this value with some trials taken from another one."""
-        if np.array_equal(trials, np.arange(_count_trials(self))):
+        if self._are_all(trials):
             return other
 
         def replaced(old: np.ndarray, new: np.ndarray) -> np.ndarray:
@@ -64,6 +64,11 @@ class TrialBatch:
             return out
 
         return map_arrays(replaced, self, other)
+
+    def _are_all(self, trials: IntArray) -> bool:
+        """Return whether these indices are those of all trials; a mask [False, True] is not."""
+        is_mask = trials.dtype == np.bool_
+        return not is_mask and np.array_equal(trials, np.arange(_count_trials(self)))
 
     @staticmethod
     def join(parts: Sequence[Value]) -> Value:

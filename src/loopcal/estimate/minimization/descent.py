@@ -21,6 +21,7 @@ from loopcal.estimate.methods.penalties import Method
 from loopcal.estimate.minimization.filtered_step import FilteredStep, penalize, propose_step
 from loopcal.numerics.decomposition import RANK_TOLERANCE, Decomposition, decompose
 from loopcal.numerics.gauss_newton import ROUNDING, Damping, DescentStatus, minimize
+from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 ACCEPTED_SHARE = 1e-4
@@ -193,9 +194,8 @@ def descend(
         first = problem.linearize(z, begin)
     good = np.isfinite(first.cost) & np.isfinite(first.factor).all(axis=(1, 2))
     factor = np.where(good[:, None, None], first.factor, 0.0)
-    point = model.decompose(
-        z, factor, np.where(good, first.cost, np.inf), first.equations, first.next_start
-    )
+    cost = np.where(good, first.cost, np.inf)
+    point = model.decompose(replace(first, deviation=z, factor=factor, cost=cost))
     largest = point.decomposition.singular_values[:, 0] ** 2
     deviations, costs = [z.copy()], [point.cost.copy()]
 
@@ -223,7 +223,7 @@ def descend(
 
 
 @dataclass(frozen=True, eq=False)
-class _Point:
+class _Point(TrialBatch):
     """Deviations z (a, p) with sums of squares (a,), decomposition, penalty and warm start."""
 
     z: FloatArray
@@ -237,43 +237,19 @@ class _Point:
         """(a,) 1 + |z|, with which lengths of steps are compared."""
         return 1.0 + np.linalg.norm(self.z, axis=1)
 
-    def take(self, trials: IntArray) -> _Point:
-        """Return some trials."""
-        return _Point(
-            self.z[trials],
-            self.cost[trials],
-            self.decomposition.take(trials),
-            self.penalty[trials],
-            self.start.take(trials),
-        )
-
-    def put(self, trials: IntArray, other: _Point) -> _Point:
-        """Return these points with some trials taken from others."""
-        z, cost, penalty = self.z.copy(), self.cost.copy(), self.penalty.copy()
-        z[trials], cost[trials], penalty[trials] = other.z, other.cost, other.penalty
-        decomposition = self.decomposition.put(trials, other.decomposition)
-        return _Point(z, cost, decomposition, penalty, self.start.put(trials, other.start))
-
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """The linearization at proposed deviations (a, p); decomposed where it is accepted."""
+    """The linearization at proposed deviations; decomposed where it is accepted."""
 
     model: _FilteredDescent
-    z: FloatArray
     linearized: Linearization
     is_valid: BoolArray
 
     def take(self, trials: IntArray) -> _Point:
         """Return the points of some trials."""
-        linearized = self.linearized
-        return self.model.decompose(
-            self.z[trials],
-            linearized.factor[trials],
-            linearized.cost[trials],
-            linearized.equations[trials],
-            linearized.next_start.take(trials),
-        )
+        needed = replace(self.linearized, nuisance=None, poses=None)  # the rest is not copied
+        return self.model.decompose(needed.take(trials))
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,16 +261,19 @@ class _FilteredDescent:
     tolerance: float
     control: StepControl
 
-    def decompose(
-        self, z: FloatArray, factor: FloatArray, cost: FloatArray, equations: IntArray, start: Start
-    ) -> _Point:
+    def decompose(self, linearized: Linearization) -> _Point:
         """Return the points of a linearization."""
-        p, method = self.problem.parameters, self.method
+        p, method, z = self.problem.parameters, self.method, linearized.deviation
         decomposition = decompose(
-            factor, equations, z, method.scale(p), self.tolerance, method.unpenalized(p)
+            linearized.factor,
+            linearized.equations,
+            z,
+            method.scale(p),
+            self.tolerance,
+            method.unpenalized(p),
         )
         penalty = np.array(method.penalty(decomposition), dtype=np.float64)
-        return _Point(z, cost, decomposition, penalty, start)
+        return _Point(z, linearized.cost, decomposition, penalty, linearized.next_start)
 
     def propose(self, point: _Point, damping: FloatArray) -> FilteredStep:
         """Return the damped steps."""
@@ -313,7 +292,7 @@ class _FilteredDescent:
         """Linearize at the deviations of the steps."""
         linearized = self.problem.take(trials).linearize(step.deviation, point.start)
         good = np.isfinite(linearized.cost) & np.isfinite(linearized.factor).all(axis=(1, 2))
-        return _Candidate(self, step.deviation, linearized, good)
+        return _Candidate(self, linearized, good)
 
     def judge(
         self, point: _Point, step: FilteredStep, candidate: _Candidate

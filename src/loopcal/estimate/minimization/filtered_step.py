@@ -14,11 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.numerics.decomposition import Decomposition
+from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import FloatArray
 
 
 @dataclass(frozen=True)
-class FilteredStep:
+class FilteredStep(TrialBatch):
     """A step of some trials towards the filtered solution.
 
     Attributes
@@ -36,10 +37,6 @@ class FilteredStep:
     full_length: FloatArray
     predicted: FloatArray
     change: FloatArray
-
-    def take(self, trials: np.ndarray) -> FilteredStep:
-        """Return some trials."""
-        return FilteredStep(*(array[trials] for array in vars(self).values()))
 
 
 def propose_step(

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trials are selected by indices or by a mask."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from loopcal.numerics.trial_batch import TrialBatch
+from loopcal.typing import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Values(TrialBatch):
+    """One array."""
+
+    array: FloatArray
+
+
+VALUES = Values(np.array([1.0, 2.0]))
+
+
+@pytest.mark.parametrize(
+    ("trials", "expected"),
+    [
+        ([0, 1], [1.0, 2.0]),
+        ([1], [2.0]),
+        ([False, True], [2.0]),  # equal to the indices [0, 1] as numbers
+        ([True, True], [1.0, 2.0]),
+    ],
+)
+def test_trials_are_selected_by_indices_or_by_a_mask(trials, expected) -> None:
+    assert VALUES.take(np.array(trials)).array.tolist() == expected
+
+
+def test_a_mask_replaces_the_trials_that_it_marks() -> None:
+    changed = VALUES.put(np.array([False, True]), Values(np.array([5.0])))
+    assert changed.array.tolist() == [1.0, 5.0]
