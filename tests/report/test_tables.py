@@ -4,7 +4,7 @@
 import pytest
 
 from loopcal.report.numbers import format_number, format_uncertainty, format_with_uncertainty
-from loopcal.report.tables import Column, Table, word_column
+from loopcal.report.tables import Column, Table, build_table, word_column
 from loopcal.report.text_page import render_text, wrap_text
 
 TABLE = Table(
@@ -22,6 +22,17 @@ def test_text_aligns_words_left_and_numbers_right():
         "position of the platform      0.05          1.25",
         "x & y                         12.5             -",
     ]
+
+
+def test_a_table_is_built_from_objects_by_the_cell_of_each_column():
+    table = build_table(
+        "Roots",
+        (1.0, 4.0),
+        (word_column("of"), lambda x: f"{x:g}"),
+        (Column("root"), lambda x: f"{x**0.5:.1f}"),
+    )
+    assert [column.title for column in table.columns] == ["of", "root"]
+    assert table.rows == (("1", "1.0"), ("4", "2.0"))
 
 
 @pytest.mark.parametrize("width", [40, 30])

@@ -27,10 +27,14 @@ CALIBRATION, VALIDATION, BOUND = COLORS[0], COLORS[1], COLORS[2]
 TICKS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 """Numbers on a logarithmic axis, times powers of ten."""
 
+WIDE = 3.0
+"""Ratio of its ends from which an axis has these numbers; a shorter one has even steps."""
+
 
 def draw_plan(plan: Plan) -> Figure:
     """Draw the poses of a plan in pairs of controlled coordinates, with the path between them."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     names = plan.robot.controlled
     columns = [
@@ -56,6 +60,8 @@ def draw_plan(plan: Plan) -> Figure:
         ):
             axes.plot(x[chosen], y[chosen], "o", color=color, ms=4.5, label=label, zorder=2)
         axes.set_xlabel(_label(plan.robot, names[i]) if j is not None else "step [1], home is 0")
+        if j is None:
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_ylabel(_label(plan.robot, names[i if j is None else j]))
         axes.grid(visible=True, lw=0.3)
     figure.legend(
@@ -78,7 +84,7 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
     candidates can beat.
     """
     from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
     dimension = DIMENSIONS[curve.target]
     unit = find_unit(robot.units[dimension])
@@ -98,8 +104,8 @@ def draw_curve(robot: Mechanism, curve: ErrorCurve) -> Figure:
         )
     axes.set_xscale("log")
     axes.set_yscale("log")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(LogLocator(subs=TICKS))
+    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        axis.set_major_locator(LogLocator(subs=TICKS) if high > WIDE * low else MaxNLocator(6))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_minor_locator(NullLocator())
     axes.set_xlabel(f"{curve.counted} for calibration [1]")

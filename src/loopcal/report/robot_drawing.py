@@ -172,13 +172,13 @@ def _dot(marker: str, edge: str, face: str, size: float = 5.0) -> dict[str, Any]
 
 
 def _label(space: Any, above: Any, limb: Stroke, name: str, middle: FloatArray) -> None:
-    """Write the name of a limb beside its foot: away from the center, or across the limb where that
+    """Write the name of a limb beside its foot: away from the center, or diagonally where the limb
     points away from the center, too.
     """
     foot = limb.points[0]
     away = foot[:2] - middle[:2]
     if (limb.points[-1] - foot)[:2] @ away > 0.0:
-        away = np.array([-away[1], away[0]])
+        away = np.array([away[0] - away[1], away[0] + away[1]])
     distance = float(np.linalg.norm(away))
     place = tuple(np.array([20.0, 13.0]) * (away / distance if distance > 0 else [1.0, 1.0]))
     back = {"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.7}
@@ -193,7 +193,7 @@ def _label(space: Any, above: Any, limb: Stroke, name: str, middle: FloatArray) 
         color=limb.style["color"],
         bbox=back,
     )
-    space.text(*foot, f" {name}", fontsize=8, color=limb.style["color"], bbox=back, zorder=9)
+    space.text(*foot, f"  {name}", fontsize=8, color=limb.style["color"], zorder=9)
 
 
 def _finish(space: Any, above: Any, low: FloatArray, high: FloatArray, symbol: str) -> None:
