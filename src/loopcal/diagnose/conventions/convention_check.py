@@ -186,7 +186,8 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
     misfit = compute_quick_misfit(free, known)
     if misfit <= IMPLAUSIBLE:
         return ConventionCheck(misfit)
-    reach = select_reached(free, _thin_out(known), follow=True)
+    thinned = _thin_out(known)
+    reach = select_reached(free, thinned, follow=True)
     stated, against, misfit = None, None, np.inf
     if reach.is_enough:
         whole = compare_with_robot(free, reach.data)
@@ -205,7 +206,7 @@ def compare_conventions(robot: Mechanism, data: Measurements) -> ConventionCheck
         "poses": reach.n_tested,
     }
     if against is None or against.misfit > ALLOWED:
-        chosen = select_interpretation(free, _thin_out(known), stated, misfit)
+        chosen = select_interpretation(free, thinned, stated, misfit)
         if chosen is not None:
             return _refuse(description, misfit, chosen)
     if against is not None:
