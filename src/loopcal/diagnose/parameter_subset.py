@@ -107,8 +107,6 @@ class IdentifiableSubset:
     condition: float
     robot: Mechanism
 
-    JSON_FIELDS: ClassVar[tuple[str, ...]] = ("kept", "dropped", "condition")
-
     @property
     def findings(self) -> tuple[Finding, ...]:
         """The numbers of parameters, then every fixed parameter."""
@@ -123,6 +121,10 @@ class IdentifiableSubset:
 
     def __str__(self) -> str:
         return "\n".join(str(finding) for finding in self.findings)
+
+    def to_dict(self) -> dict[str, object]:
+        """Return names, replacements and the condition for JSON."""
+        return {"kept": self.kept, "dropped": self.dropped, "condition": self.condition}
 
 
 @dataclass(frozen=True, eq=False)
