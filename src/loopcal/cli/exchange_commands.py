@@ -215,7 +215,7 @@ def _make_import_options(source: Format, name: str, settings: dict[str, Any]) ->
 
     stated = {key: value for key, value in settings.items() if value is not None}
     for key in stated:
-        if key not in source.reads:
+        if key not in source.read_options:
             raise DataError(
                 f"{name_option(key)} does not belong to the format {source.name}; leave it out"
             )

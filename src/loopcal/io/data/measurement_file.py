@@ -25,7 +25,7 @@ from loopcal.io.core.csv_table import Table, read_table, require_columns
 from loopcal.io.core.text_file import as_path, name_files
 from loopcal.io.data.columns import HELD_OUT, USE_COLUMN, get_dimension, read_context
 from loopcal.io.data.kind_rows import KindRows, has_measured_values, read_kinds, read_observations
-from loopcal.io.data.nuisance_settings import read_known
+from loopcal.io.data.nuisance_settings import read_stated_values
 from loopcal.io.data.pose_rows import read_pose_rows
 from loopcal.io.robot.robot_file import check_format, require_robot
 from loopcal.mechanism import Mechanism
@@ -98,7 +98,7 @@ def load_measurements(
             poses.block,
             poses.labels,
             poses.sigma,
-            read_known(settings, poses.labels),
+            read_stated_values(settings, poses.labels),
         )
         check_strokes(data, robot, allow=allow_outside_stroke)
         places = [places for of_file in read for _, places in of_file]

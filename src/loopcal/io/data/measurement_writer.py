@@ -24,7 +24,7 @@ from loopcal.io.data.columns import (
 )
 from loopcal.io.data.kind_settings import format_kind, format_quantity
 from loopcal.io.data.measurement_file import FORMAT
-from loopcal.io.data.nuisance_settings import format_known
+from loopcal.io.data.nuisance_settings import format_stated_values
 from loopcal.io.robot.robot_file import require_robot
 from loopcal.mechanism import Mechanism
 from loopcal.typing import FloatArray
@@ -84,7 +84,7 @@ def format_measurements(
     reading_noise, of_poses = _tabulate_poses(data, robot)
     noise = [common for common, _ in tables]
     lines = _format_settings(robot, list(zip(labels, kinds, noise, strict=True)), remark)
-    knowledge = format_known(data.stated_values, data.nuisance_parameters.table.entries)
+    knowledge = format_stated_values(data.stated_values, data.nuisance_parameters.table.entries)
     for key, text in (("unknowns", knowledge), ("reading_noise", reading_noise)):
         lines += [f"# {key}: {text}"] if text else []
 

@@ -49,7 +49,7 @@ RECORDS = {
 }
 
 
-def read_known(
+def read_stated_values(
     files: Sequence[tuple[YamlFile, Sequence[Observations]]], labels: tuple[str, ...]
 ) -> tuple[StatedValue, ...]:
     """Return the knowledge that files state of the setup parameters of their own rows.
@@ -87,8 +87,8 @@ def read_known(
     return tuple(value for value, _, _ in known.values())
 
 
-def format_known(known: Sequence[StatedValue], entries: Sequence[Parameter]) -> str:
-    """Return the setting as text that `read_known` reads, for the parameters among `entries`."""
+def format_stated_values(known: Sequence[StatedValue], entries: Sequence[Parameter]) -> str:
+    """Return the setting `unknowns` as text, for the parameters among `entries`."""
     dimensions = {entry.name: entry.dimension for entry in entries}
     texts = []
     for value in known:

@@ -308,5 +308,5 @@ FORMAT = Format(
     "samples of a hanging printer (JSON)",
     (),
     read,
-    reads=("sigma_line", "sigma_position"),
+    read_options=("sigma_line", "sigma_position"),
 )

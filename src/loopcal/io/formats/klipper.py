@@ -301,6 +301,6 @@ FORMAT = Format(
     (".cfg",),
     read,
     write,
-    reads=("sigma_height", "sigma_distance"),
+    read_options=("sigma_height", "sigma_distance"),
     stores_fit=True,
 )

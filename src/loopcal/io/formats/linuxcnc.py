@@ -242,5 +242,5 @@ FORMAT = Format(
     (".hal",),
     read,
     write,
-    reads=("length_unit", "home_height"),
+    read_options=("length_unit", "home_height"),
 )

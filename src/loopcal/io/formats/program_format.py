@@ -107,7 +107,7 @@ class Format:
     read : function that reads a file. write : function that writes a source, into an existing file
         (everything else in it stays as it is) or as a text of its own.
     takes_file : whether `write` can correct an existing file.
-    reads : options of `ImportOptions` that `read` uses.
+    read_options : options of `ImportOptions` that `read` uses.
     stores_fit : whether a file contains a geometry together with the measurements that its firmware
         fitted it to, so that `loopcal.diagnose` can compare the two.
     """
@@ -118,7 +118,7 @@ class Format:
     read: Callable[[Path, ImportOptions], Imported] | None = None
     write: Callable[[ExportSource, Path | None], Exported] | None = None
     takes_file: bool = True
-    reads: tuple[str, ...] = ()
+    read_options: tuple[str, ...] = ()
     stores_fit: bool = False
 
 

@@ -296,5 +296,10 @@ def _format_list(vector: Any) -> str:
 
 
 FORMAT = Format(
-    "urdf", "URDF with loop closures", (".urdf",), read, write, reads=("closures", "platform")
+    "urdf",
+    "URDF with loop closures",
+    (".urdf",),
+    read,
+    write,
+    read_options=("closures", "platform"),
 )
