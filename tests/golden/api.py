@@ -248,7 +248,7 @@ def own_truth(machine: Robot, sensors: Iterable[Any], n: int, seed: int) -> dict
     """Draw true setup values within 20 mm and 0.3 rad of the stated ones."""
     reach = {Dimension.LENGTH: 0.02, Dimension.ANGLE: 0.3}
     seeing = [s.assign_rows(n) for s in Instrument(tuple(sensors)).with_tool(machine).sensors]
-    table = collect_nuisance_parameters(seeing, tuple(map(str, range(n)))).table  # pyright: ignore[reportArgumentType]
+    table = collect_nuisance_parameters(seeing, tuple(map(str, range(n)))).table
     span = np.array([reach[p.dimension] for p in table.entries])
     drawn = np.random.default_rng(seed).uniform(-span, span)
     drawn = np.where([name.endswith("offset") for name in table.names], np.abs(drawn), drawn)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks of arrays that measurements and kinds store: float64, read-only, of a stated shape."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -86,6 +86,15 @@ def check_direction(value: ArrayLike, what: str) -> FloatArray:
     unit = vector / length
     # a vector of length 1 is kept bit by bit, so that files are written as they were read
     return vector if abs(length - 1.0) < 1e-15 else check_array(unit, what, (3,))
+
+
+def check_names(names: str | Iterable[str], what: str) -> tuple[str, ...]:
+    """Return names as a tuple; DataError where there is none, or one twice."""
+    given = (names,) if isinstance(names, str) else tuple(names)
+    if not given or len(set(given)) < len(given):
+        listed = ", ".join(given) or "empty"
+        raise DataError(f"the {what} are {listed}; name at least one, and each once")
+    return given
 
 
 def check_type(value: object, wanted: type, what: str, hint: str) -> None:

@@ -9,39 +9,16 @@ Kinds that use the same name share the parameter.
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from typing import Protocol, Self
+from typing import Self
 
 import numpy as np
 
 from loopcal.errors import DataError, suggest_names
+from loopcal.measure.instrument import Sensor
 from loopcal.measure.kinds import Kind
-from loopcal.measure.observations import TextArray
+from loopcal.measure.observations import Observations
 from loopcal.parameters import Parameter, ParameterTable
 from loopcal.typing import FloatArray, IntArray
-
-
-class LabelledRows(Protocol):
-    """Rows of a kind: `Observations`, or a `Sensor` with explicit rows."""
-
-    @property
-    def kind(self) -> Kind:
-        """The kind."""
-        ...
-
-    @property
-    def rows(self) -> IntArray | None:
-        """(r,) or (r, l) poses."""
-        ...
-
-    @property
-    def session(self) -> TextArray:
-        """(r,) sessions."""
-        ...
-
-    @property
-    def group(self) -> TextArray:
-        """(r,) groups."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -162,7 +139,7 @@ class NuisanceParameters:
 
 
 def collect_nuisance_parameters(
-    observations: Iterable[LabelledRows],
+    observations: Iterable[Observations | Sensor],
     labels: tuple[str, ...],
     stated_values: Iterable[StatedValue] = (),
 ) -> NuisanceParameters:
@@ -170,7 +147,7 @@ def collect_nuisance_parameters(
 
     Parameters
     ----------
-    observations : of `Measurements`, or anything with kind, rows, session and group.
+    observations : of `Measurements`, or sensors with explicit rows (`Sensor.assign_rows`).
     labels : names of the poses.
     stated_values : priors and fixed values, usually `Measurements.stated_values`; those of names
         that do not occur are ignored.
@@ -215,7 +192,7 @@ def collect_nuisance_parameters(
     return NuisanceParameters(ParameterTable(tuple(entries.values())), tuple(indices))
 
 
-def _list_owners(rows: LabelledRows, scope: str, labels: tuple[str, ...]) -> list[str]:
+def _list_owners(rows: Observations | Sensor, scope: str, labels: tuple[str, ...]) -> list[str]:
     """Return the owner of a parameter of this scope, row by row."""
     if scope == "session":
         return rows.session.tolist()

@@ -9,6 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from loopcal.measure.array_checks import check_direction, set_fields
+from loopcal.measure.kinds.camera_angles import convert_camera_angles, predict_camera_angles
 from loopcal.measure.kinds.directions.direction_kind import AxisKind
 from loopcal.measure.kinds.rows import Column, InvalidRows
 from loopcal.typing import FloatArray
@@ -76,20 +77,11 @@ class Autocollimation(AxisKind):
 
     def predict(self, d: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return both angles (.., 2) and their derivatives (.., 2, 3)."""
-        x, y, z = d[..., 0], d[..., 1], d[..., 2]
-        zero = np.zeros_like(x)
-        flat, up = x * x + z * z, y * y + z * z
-        slopes = [
-            np.stack([z / flat, zero, -x / flat], axis=-1),
-            np.stack([zero, z / up, -y / up], axis=-1),
-        ]
-        return np.stack([np.arctan2(x, z), np.arctan2(y, z)], axis=-1), np.stack(slopes, axis=-2)
+        return predict_camera_angles(d)
 
     def convert_to_directions(self, measured: FloatArray) -> tuple[FloatArray, ...]:
         """Return the normals of two angles, towards the instrument."""
-        x, y = np.tan(measured[..., 0]), np.tan(measured[..., 1])
-        d = np.stack([x, y, np.ones_like(x)], axis=-1)
-        return (d / np.linalg.norm(d, axis=-1, keepdims=True),)
+        return (convert_camera_angles(measured),)
 
     def find_invalid_rows(self, measured: FloatArray) -> InvalidRows:
         """Return rows whose mirror faces away from the instrument."""

@@ -14,7 +14,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import set_fields
+from loopcal.measure.array_checks import check_names, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.rows import Column, Evaluation
@@ -64,14 +64,9 @@ class JointSensor(Kind):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        joints = (self.joints,) if isinstance(self.joints, str) else tuple(self.joints)
-        if not joints or len(set(joints)) < len(joints):
-            raise DataError(
-                f"the joints are {', '.join(joints) or 'empty'}; name at least one, and each once"
-            )
+        set_fields(self, joints=check_names(self.joints, "joints"))
         if self.measures not in ("length", "angle"):
             raise DataError(f"the joints measure {self.measures!r}; use length or angle")
-        set_fields(self, joints=joints)
 
     @classmethod
     def examples(cls) -> tuple[Self, ...]:

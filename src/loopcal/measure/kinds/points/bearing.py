@@ -10,6 +10,7 @@ from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.geometry.alignment import solve_resection
 from loopcal.measure.kinds import setup_parameters as setup
+from loopcal.measure.kinds.camera_angles import convert_camera_angles, predict_camera_angles
 from loopcal.measure.kinds.points.target_kind import Prediction, TargetKind
 from loopcal.measure.kinds.rows import Column
 from loopcal.typing import FloatArray
@@ -76,29 +77,23 @@ class Bearing(TargetKind):
 
     def predict(self, x: FloatArray, values: FloatArray) -> Prediction:
         """Return both angles of points x (.., k, 3) and their derivatives."""
-        a, b, c = x[..., 0], x[..., 1], x[..., 2]
-        zero = np.zeros_like(a)
         if self.form == "camera":
-            across, up = a * a + c * c, b * b + c * c
-            angles = [np.arctan2(a, c), np.arctan2(b, c)]
-            first, second = [c / across, zero, -a / across], [zero, c / up, -b / up]
-        else:
-            flat = a * a + b * b
-            reach, level = flat + c * c, np.sqrt(flat)
-            angles = [np.arctan2(b, a), np.arctan2(c, level)]
-            first = [-b / flat, a / flat, zero]
-            second = [-a * c / (level * reach), -b * c / (level * reach), level / reach]
-        slopes = np.stack([np.stack(first, axis=-1), np.stack(second, axis=-1)], axis=-2)
-        return np.stack(angles, axis=-1), slopes, {}
+            return (*predict_camera_angles(x), {})
+        a, b, c = x[..., 0], x[..., 1], x[..., 2]
+        flat = a * a + b * b
+        reach, level = flat + c * c, np.sqrt(flat)
+        slopes = [
+            np.stack([-b / flat, a / flat, np.zeros_like(a)], axis=-1),
+            np.stack([-a * c / level, -b * c / level, level], axis=-1) / reach[..., None],
+        ]
+        angles = np.stack([np.arctan2(b, a), np.arctan2(c, level)], axis=-1)
+        return angles, np.stack(slopes, axis=-2), {}
 
     def convert_to_rays(self, measured: FloatArray) -> FloatArray:
         """Return the unit vectors (.., 3) of measured angles (.., 2)."""
-        azimuth, elevation = measured[..., 0], measured[..., 1]
         if self.form == "camera":
-            ray = np.stack([np.tan(azimuth), np.tan(elevation), np.ones_like(azimuth)], axis=-1)
-            # behind the camera the tangents belong to the opposite ray
-            ray = np.where((np.cos(azimuth) < 0.0)[..., None], -ray, ray)
-            return ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+            return convert_camera_angles(measured)
+        azimuth, elevation = measured[..., 0], measured[..., 1]
         level = np.cos(elevation)
         return np.stack(
             [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1

@@ -10,7 +10,7 @@ import numpy as np
 
 from loopcal import geometry
 from loopcal.errors import DataError
-from loopcal.measure.array_checks import check_array, check_pose, set_fields
+from loopcal.measure.array_checks import check_array, check_names, check_pose, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.kind import Kind
 from loopcal.measure.kinds.rows import Column, Evaluation, InvalidRows
@@ -61,11 +61,7 @@ class TargetKind(Kind):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        targets = (self.targets,) if isinstance(self.targets, str) else tuple(self.targets)
-        if not targets or len(set(targets)) < len(targets):
-            raise DataError(
-                f"the targets are {', '.join(targets) or 'empty'}; name at least one, and each once"
-            )
+        targets = check_names(self.targets, "targets")
         set_fields(
             self, targets=targets, T_base_frame=check_pose(self.T_base_frame, "T_base_frame")
         )

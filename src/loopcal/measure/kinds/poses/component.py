@@ -15,7 +15,7 @@ from loopcal import geometry
 from loopcal.errors import DataError
 from loopcal.geometry import OrientationForm
 from loopcal.geometry.alignment import align_point_sets
-from loopcal.measure.array_checks import set_fields
+from loopcal.measure.array_checks import check_names, set_fields
 from loopcal.measure.kinds import setup_parameters as setup
 from loopcal.measure.kinds.poses.tool_kind import ToolKind
 from loopcal.measure.kinds.rows import Column, Evaluation, InvalidRows, list_rows
@@ -94,9 +94,7 @@ class Component(ToolKind):
                     f"the component {name!r} does not exist; use {', '.join(self._coordinates)}"
                     f"{hint}"
                 )
-        if not self.components or len(set(self.components)) < len(self.components):
-            named = ", ".join(self.components) or "empty"
-            raise DataError(f"the components are {named}; name at least one, and each once")
+        check_names(self.components, "components")
         if self._has_azimuth and "theta" not in self.components:
             raise DataError(
                 "phi is measured without theta, but phi is not defined where theta is zero; "
