@@ -56,7 +56,7 @@ def transport_matrix(arm: FloatArray, rotation: FloatArray | None = None) -> Flo
     """
     turned = np.eye(3) if rotation is None else rotation
     lever = -(turned @ hat(arm))
-    transport = np.zeros((*lever.shape[:-2], 6, 6))
-    transport[..., :3, :3] = transport[..., 3:, 3:] = turned
-    transport[..., 3:, :3] = lever
-    return transport
+    turned = np.broadcast_to(turned, lever.shape)
+    # joined, not assigned: automatic derivatives put jax in the place of numpy
+    top = np.concatenate([turned, np.zeros_like(lever)], axis=-1)
+    return np.concatenate([top, np.concatenate([lever, turned], axis=-1)], axis=-2)
