@@ -15,7 +15,7 @@ from loopcal.findings import Finding, Quantity, report_finding
 from loopcal.mechanism import Mechanism
 from loopcal.parameters import Parameter
 from loopcal.typing import BoolArray, FloatArray, IntArray
-from loopcal.units import Dimension, find_unit
+from loopcal.units import Dimension
 
 DEFAULT_TOLERANCE = 1e-3
 """Tolerance where none is stated: this share of the robot's size for lengths, this many radians for
@@ -73,8 +73,8 @@ class FreeParameters:
         """Return the factor to SI (p,) and the symbol of the unit in which each one is shown: that
         of the robot's file.
         """
-        symbols = tuple(self._symbol(parameter.dimension) for parameter in self.parameters)
-        return np.array([find_unit(symbol).factor_to_si for symbol in symbols]), symbols
+        units = [self.robot.get_unit(parameter.dimension) for parameter in self.parameters]
+        return np.array([unit.factor_to_si for unit in units]), tuple(u.symbol for u in units)
 
     def findings(self) -> tuple[Finding, ...]:
         """Return a finding on default tolerances; nothing where all tolerances are stated."""
@@ -85,18 +85,13 @@ class FreeParameters:
         for dimension in Dimension:
             chosen = [p.dimension is dimension for p in self.parameters] & self.assumed
             if chosen.any():
-                symbol = self._symbol(dimension)
-                value = float(self.tolerance[chosen][0]) / find_unit(symbol).factor_to_si
-                assumed.append(Quantity(value, "" if symbol == "1" else symbol))
+                value = self.robot.to_quantity(float(self.tolerance[chosen][0]), dimension)
+                assumed.append(Quantity(value.value, "") if value.unit == "1" else value)
         return (
             report_finding(
                 "fit.default-tolerances", count=count, total=len(self), assumed=tuple(assumed)
             ),
         )
-
-    def _symbol(self, dimension: Dimension) -> str:
-        """Return the symbol of the unit in which the robot's file shows a dimension."""
-        return self.robot.units[dimension]
 
 
 def select_free_parameters(robot: Mechanism) -> FreeParameters:

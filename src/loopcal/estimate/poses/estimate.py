@@ -16,12 +16,12 @@ import numpy as np
 
 from loopcal.estimate.poses.states import PoseEstimates
 from loopcal.estimate.problem import Problem
-from loopcal.findings import Finding, Quantity, report_finding
+from loopcal.findings import Finding, report_finding
 from loopcal.geometry import wrap_angle
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism, inverse
 from loopcal.typing import BoolArray, FloatArray
-from loopcal.units import Dimension, find_unit
+from loopcal.units import Dimension
 
 SAME_READING = 1e-6
 """Difference of readings, as a share of the robot's size or in radians, up to which they are the
@@ -167,15 +167,8 @@ def _describe_readings(
     described = []
     for pose, column in np.argwhere(chosen):
         actuator = robot.actuators[column]
-        symbol = robot.units[actuator.dimension]
-        value = poses.readings[pose, column] / find_unit(symbol).factor_to_si
-        described.append(
-            {
-                "actuator": actuator.name,
-                "pose": poses.labels[pose],
-                "value": Quantity(float(value), symbol),
-            }
-        )
+        value = robot.to_quantity(float(poses.readings[pose, column]), actuator.dimension)
+        described.append({"actuator": actuator.name, "pose": poses.labels[pose], "value": value})
     return described
 
 
