@@ -947,8 +947,8 @@ def report_cmm_constraint_2011_surfaces(groups: int, points: int, noise: float) 
     )
 
     study = plan_points(load_machine(), groups, points, AXES, 0, 0)
-    q = study.layout.held(draw_true_machines(study.robot, 1e-3, 1, 0), noise, 0)
-    data = forms.measurements(study.layout, q[0], noise)
+    q = study.layout.solve_readings(draw_true_machines(study.robot, 1e-3, 1, 0), noise, 0)
+    data = forms.build_measurements(study.layout, q[0], noise)
     found = estimate.identify(
         study.robot, data, estimate.MAP(), options=estimate.FitOptions(rank_tolerance=forms.RANK)
     )

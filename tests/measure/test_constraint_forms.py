@@ -17,9 +17,14 @@ from loopcal.estimate import MAP, FitOptions, LeastSquares, identify
 from loopcal.estimate.free_parameters import select_free_parameters
 from loopcal.estimate.information import collect_information
 from loopcal.findings import Finding
-from loopcal.papers.cmm_constraint_2011.forms import RANK, covariance_difference, measurements
+from loopcal.papers.cmm_constraint_2011.forms import RANK, build_measurements, compare_covariances
 from loopcal.papers.cmm_constraint_2011.machines import draw_true_machines
-from loopcal.papers.cmm_constraint_2011.steps import Layout, PaperRows, identify_from_rows, row_map
+from loopcal.papers.cmm_constraint_2011.steps import (
+    Layout,
+    PaperRows,
+    identify_from_rows,
+    map_displacements,
+)
 from loopcal.planning.plane_line_groups import PlaneLineGroups, linearize_surfaces
 
 MM = 1e-3
@@ -39,11 +44,11 @@ def layout(planned) -> Layout:
 
 def exact(layout: Layout) -> np.ndarray:
     """Readings (1, n, 6) at which the machine as designed stands on its surfaces."""
-    return layout.held(layout.robot.parameters.nominal[None], 0.0, 0)
+    return layout.solve_readings(layout.robot.parameters.nominal[None], 0.0, 0)
 
 
 def test_a_plane_and_a_line_that_name_the_same_surface_share_its_direction(layout) -> None:
-    local = measurements(layout, exact(layout)[0], NOISE).nuisance_parameters
+    local = build_measurements(layout, exact(layout)[0], NOISE).nuisance_parameters
     names = {
         f"plane{g + 1}.held_z.{part}"
         for g in range(GROUPS)
@@ -54,7 +59,7 @@ def test_a_plane_and_a_line_that_name_the_same_surface_share_its_direction(layou
 
 
 def test_the_shared_surface_survives_a_measurement_file(layout, tmp_path) -> None:
-    data = measurements(layout, exact(layout)[0], NOISE)
+    data = build_measurements(layout, exact(layout)[0], NOISE)
     lc.save_measurements(data, tmp_path / "points.csv", layout.robot)
     read = lc.load_measurements(tmp_path / "points.csv", layout.robot)
     assert sorted(read.nuisance_parameters.table.names) == sorted(
@@ -66,14 +71,14 @@ def test_the_shared_surface_survives_a_measurement_file(layout, tmp_path) -> Non
 def test_rank_is_33_of_42_in_both_forms_and_the_nine_others_are_motions_of_base_and_platform(
     layout,
 ) -> None:
-    known = identifiability(layout.robot, measurements(layout, exact(layout)[0], NOISE))
+    known = identifiability(layout.robot, build_measurements(layout, exact(layout)[0], NOISE))
     assert known.rank == 33
     assert known.singular_values[32] > 1e6 * known.singular_values[33]
     motions = [c.meaning.data for c in known.unidentifiable if isinstance(c.meaning, Finding)]
     assert [m["frame"] for m in motions].count("base") == 6
     turns = [m for m in motions if m["frame"] == "platform" and m["motion"] == "rotation"]
     assert sum(m["through_origin"] for m in turns) == 3
-    rows, _ = PaperRows(layout, exact(layout), MM, NOISE).whitened(
+    rows, _ = PaperRows(layout, exact(layout), MM, NOISE).whiten(
         np.zeros((1, 42)), np.zeros(1, dtype=int)
     )
     s = np.linalg.svd(rows[0, :, :42], compute_uv=False)
@@ -82,10 +87,10 @@ def test_rank_is_33_of_42_in_both_forms_and_the_nine_others_are_motions_of_base_
 
 
 def test_the_papers_rows_are_what_no_motion_of_the_surfaces_changes(layout) -> None:
-    at, _, _ = layout.sloped(layout.robot.parameters.nominal[None], exact(layout))
+    at, _, _ = layout.linearize_points(layout.robot.parameters.nominal[None], exact(layout))
     each = np.eye(3 * POINTS).reshape(POINTS, 3, 3 * POINTS)
     F, A = linearize_surfaces(at[0], np.repeat(each[None], GROUPS, axis=0), np.full(GROUPS, 2))
-    B = row_map(*layout.levers)  # rows by points; A: held coordinates by points
+    B = map_displacements(*layout.levers)  # rows by points; A: held coordinates by points
     for g in range(GROUPS):
         held = np.linalg.lstsq(A[g].T, B[g].T, rcond=None)[0].T  # rows as sums of held coordinates
         np.testing.assert_allclose(held @ A[g], B[g], atol=1e-12)  # [m], they are
@@ -96,9 +101,9 @@ def test_the_papers_rows_are_what_no_motion_of_the_surfaces_changes(layout) -> N
 def test_both_forms_and_the_rows_of_planning_give_every_direction_the_same_variance(
     layout, planned
 ) -> None:
-    assert covariance_difference(layout, NOISE) < 1e-9  # relative, rounding by a condition of 1e4
+    assert compare_covariances(layout, NOISE) < 1e-9  # relative, rounding by a condition of 1e4
     free = select_free_parameters(layout.robot)
-    R = collect_information(free, measurements(layout, exact(layout)[0], MM))[0][0, :42, :42]
+    R = collect_information(free, build_measurements(layout, exact(layout)[0], MM))[0][0, :42, :42]
     rows = planned.linearize(planned.draw(GROUPS, 0)).reshape(-1, 42)
     np.testing.assert_allclose(rows.T @ rows, R.T @ R, atol=1e-9 * np.abs(R.T @ R).max())
 
@@ -110,7 +115,7 @@ def test_rows_of_planning_are_those_of_surfaces_as_unknowns_on_other_robots_too(
     design = planned.draw(8, 0)
     layout = Layout(robot, planned.place_points(design))
     free = select_free_parameters(robot)
-    R = collect_information(free, measurements(layout, exact(layout)[0], MM))[0][
+    R = collect_information(free, build_measurements(layout, exact(layout)[0], MM))[0][
         0, : len(free), : len(free)
     ]
     rows = planned.linearize(design).reshape(-1, len(free))
@@ -122,8 +127,8 @@ def test_both_forms_agree_with_lines_along_different_axes(planned) -> None:
     design = mixed.draw(GROUPS, 5)
     assert len(np.unique(design[:, 3])) > 1
     layout = Layout(mixed.robot, mixed.place_points(design))
-    assert len(measurements(layout, exact(layout)[0], NOISE).observations) > 2
-    assert covariance_difference(layout, NOISE) < 1e-9
+    assert len(build_measurements(layout, exact(layout)[0], NOISE).observations) > 2
+    assert compare_covariances(layout, NOISE) < 1e-9
 
 
 @pytest.mark.slow
@@ -132,16 +137,16 @@ def test_both_forms_give_the_same_estimate_up_to_what_is_not_linear(layout, meth
     truth = draw_true_machines(layout.robot, MM, 1, 3)
     unlike = []
     for noise in (NOISE, 10.0 * NOISE):
-        q = layout.held(truth, noise, 3)
+        q = layout.solve_readings(truth, noise, 3)
         problem = PaperRows(layout, q, MM, noise)
         paper = problem.values(identify_from_rows(problem, method, 1e-6).deviation)[0]
         found = identify(
             layout.robot,
-            measurements(layout, q[0], noise),
+            build_measurements(layout, q[0], noise),
             method,
             options=FitOptions(rank_tolerance=RANK, allow_fewer_equations=True),
         )
-        A = problem.whitened(np.zeros((1, 42)), np.zeros(1, dtype=int))[0][0, :, :42]
+        A = problem.whiten(np.zeros((1, 42)), np.zeros(1, dtype=int))[0][0, :, :42]
         unlike.append(float(np.linalg.norm(A @ (found.robot.values - paper) / MM)))
     assert unlike[0] < 0.02  # [sd] of all rows together
     assert unlike[1] < 0.2
@@ -152,7 +157,9 @@ def test_full_covariance_of_the_papers_rows_is_that_of_drawn_noise(layout) -> No
     d_1, d = layout.levers
     noise = np.random.default_rng(0).normal(size=(20000, 3 * POINTS)) * NOISE
     whitened = (
-        PaperRows(layout, exact(layout), MM, NOISE).whitener[0] @ row_map(d_1, d)[0] @ noise.T
+        PaperRows(layout, exact(layout), MM, NOISE).whitener[0]
+        @ map_displacements(d_1, d)[0]
+        @ noise.T
     )
     # an entry of a covariance of 20000 draws has sd sqrt(2 / 20000) = 0.01 on the diagonal; 5 sd
     np.testing.assert_allclose(np.cov(whitened), np.eye(POINTS - 2), atol=0.05)

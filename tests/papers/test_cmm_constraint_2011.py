@@ -53,9 +53,9 @@ from loopcal.papers.cmm_constraint_2011.machines import (
 from loopcal.papers.cmm_constraint_2011.published import MM, read_published
 from loopcal.papers.cmm_constraint_2011.steps import (
     PaperRows,
-    equations,
     identify_from_rows,
-    row_map,
+    linearize_products,
+    map_displacements,
 )
 from loopcal.papers.cmm_constraint_2011.tables import Results, compute_pair_rank, compute_ranks
 from loopcal.papers.writing import page
@@ -122,34 +122,34 @@ def test_nine_directions_move_the_base_or_turn_the_platform_about_the_end_point(
 
 def test_equation_17_is_the_slope_of_14_and_the_noise_map_that_by_the_points(study) -> None:
     layout, robot = study.layout, study.robot
-    q = layout.held(robot.parameters.nominal[None], 0.0, 0)
-    at, J, _ = layout.sloped(robot.parameters.nominal[None], q)
-    a, c = equations(at, J)
+    q = layout.solve_readings(robot.parameters.nominal[None], 0.0, 0)
+    at, J, _ = layout.linearize_points(robot.parameters.nominal[None], q)
+    a, c = linearize_products(at, J)
     np.testing.assert_allclose(c, 0.0, atol=1e-12)  # [m2], the points are exact
     step = 1e-6
     for place in (0, 5, 6, 40):
         moved = np.repeat(robot.parameters.nominal[None], 2, axis=0)
         moved[:, place] += step, -step
         x = forward_trials(robot, moved, q, layout.state).T[:, :, :3, 3].reshape(2, *at.shape[1:])
-        products = -equations(x, np.repeat(J, 2, axis=0))[1]
+        products = -linearize_products(x, np.repeat(J, 2, axis=0))[1]
         np.testing.assert_allclose(
             (products[0] - products[1]) / (2 * step), a[0, ..., place], atol=1e-8
         )  # [m2 per m]
     shift = 1e-7 * np.random.default_rng(0).normal(size=at.shape)
-    by_map = (row_map(*layout.levers) @ shift[0].reshape(GROUPS, -1, 1))[..., 0]
+    by_map = (map_displacements(*layout.levers) @ shift[0].reshape(GROUPS, -1, 1))[..., 0]
     np.testing.assert_allclose(
-        -equations(at + shift, J)[1][0], by_map, atol=1e-12
+        -linearize_products(at + shift, J)[1][0], by_map, atol=1e-12
     )  # [m2], second order of 1e-7
 
 
 def test_true_machines_stand_where_held_but_for_the_noise(study) -> None:
     truth = draw_true_machines(study.robot, MM, 2, 0)
-    q = study.layout.held(truth, 1e-4, 0)
+    q = study.layout.solve_readings(truth, 1e-4, 0)
     off = forward_trials(study.robot, truth, q, study.layout.state).T - study.layout.state.T
     noise = off[:, :, :3, 3] / 1e-4
     assert abs(noise.std() - 1.0) < 5.0 / np.sqrt(2 * noise.size)  # 5 sd of a sd
     np.testing.assert_allclose(off[:, :, :3, :3], 0.0, atol=1e-9)  # orientations as commanded
-    more = study.layout.held(draw_true_machines(study.robot, MM, 3, 0), 1e-4, 0)
+    more = study.layout.solve_readings(draw_true_machines(study.robot, MM, 3, 0), 1e-4, 0)
     np.testing.assert_allclose(
         more[:2], q, atol=1e-12
     )  # [m] a machine is the same however many there are
@@ -207,7 +207,7 @@ def test_large_absolute_errors_of_least_squares_are_where_the_gauge_was_put(stud
 
 def test_without_noise_all_that_can_be_known_is_found(study) -> None:
     truth = draw_true_machines(study.robot, 0.1 * MM, 2, 0)
-    problem = PaperRows(study.layout, study.layout.held(truth, 0.0, 0), MM, 1e-9)
+    problem = PaperRows(study.layout, study.layout.solve_readings(truth, 0.0, 0), MM, 1e-9)
     run = identify_from_rows(problem, LeastSquares(), 1e-6)
     assert (run.decomposition.rank == 33).all()
     values = problem.values(run.deviation)

@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 TEMPLATE = "page.md.j2"
 
 
-def page(found: Reproduction, made_by: Mapping[str, Any]) -> str:
+def page(reproduction: Reproduction, made_by: Mapping[str, Any]) -> str:
     """Return the page as Markdown.
 
     Parameters
     ----------
-    found : what to tell. made_by : see `loopcal.io.runs.run_folder.collect_provenance`.
+    reproduction : what to show. made_by : see `loopcal.io.runs.run_folder.collect_provenance`.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
@@ -45,18 +45,18 @@ def page(found: Reproduction, made_by: Mapping[str, Any]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(TEMPLATE).render(reproduction=found, made_by=made_by)
+    return environment.get_template(TEMPLATE).render(reproduction=reproduction, made_by=made_by)
 
 
 def write_folder(
-    path: str | Path, found: Reproduction, made_by: Mapping[str, Any], force: bool = False
+    path: str | Path, reproduction: Reproduction, made_by: Mapping[str, Any], force: bool = False
 ) -> Path:
     """Write a reproduction whole or not at all; return the folder.
 
     Parameters
     ----------
-    path : folder to make. found : what to write. made_by : where it comes from. force : replace an
-        earlier one.
+    path : folder to make. reproduction : what to write. made_by : where it comes from.
+    force : replace an earlier one.
 
     Raises
     ------
@@ -68,14 +68,18 @@ def write_folder(
     path = Path(path)
     refuse_used_folder(path, force)
     files: dict[str, bytes] = {
-        "page.md": page(found, made_by).encode(),
-        RESULT: to_json({"made_by": made_by, **found.to_dict()}).encode(),
+        "page.md": page(reproduction, made_by).encode(),
+        RESULT: to_json({"made_by": made_by, **reproduction.to_dict()}).encode(),
     }
-    for table in (found.summary(), *(c.table() for c in found.comparisons), *found.tables):
+    for table in (
+        reproduction.summary(),
+        *(c.table() for c in reproduction.comparisons),
+        *reproduction.tables,
+    ):
         files[f"tables/{table.name}.csv"] = csv_text(table).encode()
         files[f"tables/{table.name}.json"] = to_json(table.to_dict()).encode()
-    style = choose_styles(found.figures)
-    for figure in found.figures:
+    style = choose_styles(reproduction.figures)
+    for figure in reproduction.figures:
         files[f"figures/{figure.name}.png"] = png(figure, style)
     _write(path, files)
     return path

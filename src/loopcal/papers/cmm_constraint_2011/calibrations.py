@@ -88,7 +88,9 @@ def calibrate_cell(
         MAP has this sd.
     """
     truth = draw_true_machines(study.robot, sd, trials, seed, gauge_free)
-    problem = PaperRows(study.layout, study.layout.held(truth, noise, seed), sd, noise, weights)
+    problem = PaperRows(
+        study.layout, study.layout.solve_readings(truth, noise, seed), sd, noise, weights
+    )
     true = study.held_out.solve(truth)
     errors = {
         BEFORE: study.held_out.compute_errors(study.robot.parameters.nominal[None], truth, true)
@@ -172,7 +174,7 @@ def calibrate_fifty(study: Study, groups: int, seed: int, trials: int) -> FiftyP
     truth = draw_true_machines(study.robot, FIFTY_SD, trials, seed)
     problem = PaperRows(
         layout,
-        layout.held(truth, read_published().accuracy, seed),
+        layout.solve_readings(truth, read_published().accuracy, seed),
         FIFTY_SD,
         read_published().accuracy,
     )

@@ -53,7 +53,7 @@ def _draw_figure_4(results: Results) -> Figure:
 def _draw_figure_5(study: Study, seed: int) -> Figure:
     """Return position errors of single poses before and after."""
     truth = draw_true_machines(study.robot, SET * MM, 1, seed)
-    q = study.layout.held(truth, NOISE * MM, seed)
+    q = study.layout.solve_readings(truth, NOISE * MM, seed)
     problem = PaperRows(study.layout, q, SET * MM, NOISE * MM)
     true = study.held_out.solve(truth)
     machines = {BEFORE: study.robot.parameters.nominal[None]}

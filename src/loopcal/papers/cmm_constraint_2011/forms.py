@@ -50,8 +50,8 @@ class Forms:
     covariance: float
 
 
-def measurements(layout: Layout, q: FloatArray, sigma: float) -> Measurements:
-    """Points on planes and lines as measurements.
+def build_measurements(layout: Layout, q: FloatArray, sigma: float) -> Measurements:
+    """Return points on planes and lines as measurements.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def measurements(layout: Layout, q: FloatArray, sigma: float) -> Measurements:
     """
     number = np.arange(layout.points).reshape(layout.groups, -1)
     axis = np.abs(layout.levers[0]).argmax(axis=1)
-    found = []
+    observations = []
     for along in np.unique(axis):
         stated = {
             "unknown": ("surface",),
@@ -75,13 +75,15 @@ def measurements(layout: Layout, q: FloatArray, sigma: float) -> Measurements:
             number[axis == along],
             [f"plane{i + 1}" for i in np.flatnonzero(axis == along)],
         )
-        for kind, seen, gaps in (
+        for kind, touched, gaps in (
             (plane, np.delete(points, 1, axis=1), 1),
             (line, points[:, :2], 2),
         ):
-            held, group = np.zeros((seen.size, gaps)), np.repeat(groups, seen.shape[1])
-            found.append(Observations.from_sigma(kind, seen.ravel(), held, sigma, group=group))
-    return Measurements(layout.robot.name, q, tuple(found))
+            zeros, group = np.zeros((touched.size, gaps)), np.repeat(groups, touched.shape[1])
+            observations.append(
+                Observations.from_sigma(kind, touched.ravel(), zeros, sigma, group=group)
+            )
+    return Measurements(layout.robot.name, q, tuple(observations))
 
 
 def compare_forms(study: Study, seed: int) -> Forms:
@@ -89,47 +91,45 @@ def compare_forms(study: Study, seed: int) -> Forms:
     rows = []
     for noise in NOISES:
         truth = draw_true_machines(study.robot, ERRORS, 1, seed)
-        q = study.layout.held(truth, noise, seed)
+        q = study.layout.solve_readings(truth, noise, seed)
         problem = PaperRows(
             study.layout, q, select_free_parameters(study.robot).tolerance[0], noise
         )
         for name, method in METHODS.items():
             paper = problem.values(identify_from_rows(problem, method, 1e-6).deviation)[0]
-            data = measurements(study.layout, q[0], noise)
-            found = identify(study.robot, data, method, options=FitOptions(rank_tolerance=RANK))
-            unlike = float(np.abs(_in_sds(problem, found.robot.values - paper)).max())
-            rows.append((noise / MM, name, found.rank, unlike))
-    return Forms(tuple(rows), covariance_difference(study.layout, NOISES[0]))
+            data = build_measurements(study.layout, q[0], noise)
+            fit = identify(study.robot, data, method, options=FitOptions(rank_tolerance=RANK))
+            unlike = float(np.abs(_count_sds(problem, fit.robot.values - paper)).max())
+            rows.append((noise / MM, name, fit.rank, unlike))
+    return Forms(tuple(rows), compare_covariances(study.layout, NOISES[0]))
 
 
-def covariance_difference(layout: Layout, noise: float) -> float:
-    """Largest relative difference of the variances that both forms give any direction, on surfaces
-    reached exactly.
+def compare_covariances(layout: Layout, noise: float) -> float:
+    """Return the largest relative difference of the variances that both forms give any direction,
+    on surfaces reached exactly.
     """
     robot = layout.robot
-    q = layout.held(robot.parameters.nominal[None], 0.0, 0)
+    q = layout.solve_readings(robot.parameters.nominal[None], 0.0, 0)
     free = select_free_parameters(robot)
-    factor = collect_information(free, measurements(layout, q[0], noise))[0]
-    s, vt = _seen(PaperRows(layout, q, free.tolerance[0], noise))
+    factor = collect_information(free, build_measurements(layout, q[0], noise))[0]
+    s, vt = _decompose_rows(PaperRows(layout, q, free.tolerance[0], noise))
     ratio = np.linalg.svd(factor[0, : len(free), : len(free)] @ (vt.T / s), compute_uv=False)
     return float(np.abs(ratio**2 - 1.0).max())
 
 
-def _in_sds(problem: PaperRows, change: FloatArray) -> FloatArray:
-    """A change of the parameters (p,) [m] along the identifiable directions, in standard deviations
-    (rank,).
+def _count_sds(problem: PaperRows, change: FloatArray) -> FloatArray:
+    """Return a change of the parameters (p,) [m] along the identifiable directions, in standard
+    deviations (rank,).
     """
-    s, vt = _seen(problem)
+    s, vt = _decompose_rows(problem)
     return s * (vt @ change) / problem.sd
 
 
-def _seen(problem: PaperRows) -> tuple[FloatArray, FloatArray]:
-    """Singular values and directions of the paper's rows that count, of the first machine as
+def _decompose_rows(problem: PaperRows) -> tuple[FloatArray, FloatArray]:
+    """Return singular values and directions of the paper's rows that count, of the first machine as
     designed.
     """
-    A = problem.whitened(np.zeros((1, problem.parameters)), np.zeros(1, dtype=np.int64))[0][
-        0, :, :-1
-    ]
+    A = problem.whiten(np.zeros((1, problem.parameters)), np.zeros(1, dtype=np.int64))[0][0, :, :-1]
     _, s, vt = np.linalg.svd(A, full_matrices=False)
     kept = s > 1e-10 * s[0]
     return s[kept], vt[kept]

@@ -74,11 +74,11 @@ class HeldOutPoses:
     solution: Solution
 
     def solve(self, values: FloatArray) -> FloatArray:
-        """(t, n, 4, 4) of machines (t, p) at the readings."""
+        """Return the poses (t, n, 4, 4) of machines (t, p) at the readings."""
         return forward_trials(self.robot, values, self.solution.q[None], self.solution.state).T
 
     def align(self, T: FloatArray, true: FloatArray, frame: str) -> FloatArray:
-        """Poses (t, n, 4, 4) in one of FRAMES."""
+        """Return poses (t, n, 4, 4) in one of FRAMES."""
         if frame == ABSOLUTE:
             return T
         return fit_motions(
@@ -86,8 +86,8 @@ class HeldOutPoses:
         )
 
     def compute_twists(self, values: FloatArray, true: FloatArray, frame: str) -> FloatArray:
-        """Differences (t, n, 6) [rad, m], rotation first, of the poses of machines (t | 1, p) from
-        true ones (t, n, 4, 4).
+        """Return differences (t, n, 6) [rad, m], rotation first, of the poses of machines (t | 1,
+        p) from true ones (t, n, 4, 4).
 
         In one of FRAMES.
         """
@@ -96,22 +96,24 @@ class HeldOutPoses:
         )
 
     def compute_errors(self, values: FloatArray, truth: FloatArray, true: FloatArray) -> FloatArray:
-        """(t, 7) see MEASURES; values (t | 1, p) and truth (t, p) [m], true (t, n, 4, 4) the
-        `poses` of the truth.
+        """Return errors (t, 7), see MEASURES; values (t | 1, p) and truth (t, p) [m], true (t, n,
+        4, 4) the `poses` of the truth.
         """
         T = np.broadcast_to(self.solve(values), true.shape)
-        found = {}
+        errors = {}
         for frame in FRAMES:
             squares = np.mean(
                 geometry.pose_difference(self.align(T, true, frame), true) ** 2, axis=1
             )
-            found[frame] = [
+            errors[frame] = [
                 np.sqrt(squares[:, 3:].sum(axis=1)) / MM,
                 np.rad2deg(np.sqrt(squares[:, :3].sum(axis=1))),
             ]
         wrong = values - truth
         lengths = (np.linalg.norm(e, axis=1) / MM for e in (wrong, remove_gauge(self.robot, wrong)))
-        return np.stack([*found[ABSOLUTE], *found[ALIGNED], *lengths, found[AT_NOMINAL][0]], axis=1)
+        return np.stack(
+            [*errors[ABSOLUTE], *errors[ALIGNED], *lengths, errors[AT_NOMINAL][0]], axis=1
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,8 +198,8 @@ def draw_true_machines(
 
 
 def fit_motions(T: FloatArray, others: FloatArray) -> FloatArray:
-    """Poses (t, n, 4, 4) after the motion of the base and the turn of the platform that bring them
-    nearest to others.
+    """Return poses (t, n, 4, 4) after the motion of the base and the turn of the platform that
+    bring them nearest to others.
 
     Positions fix the base's motion (their least squares), then orientations the platform's turn
     (nearest rotations): what plane and line leave open, and nothing else.
@@ -211,7 +213,9 @@ def fit_motions(T: FloatArray, others: FloatArray) -> FloatArray:
 
 
 def find_nearest_rotations(M: FloatArray) -> FloatArray:
-    """Rotations (t, 3, 3) nearest to matrices (t, 3, 3), in the mean square of their entries."""
+    """Return the rotations (t, 3, 3) nearest to matrices (t, 3, 3), in the mean square of their
+    entries.
+    """
     U, _, Vt = np.linalg.svd(M)
     U[..., 2] *= np.linalg.det(U @ Vt)[..., None]
     return U @ Vt

@@ -39,7 +39,7 @@ from loopcal.mechanism import (
     forward_trials,
     inverse_trials,
 )
-from loopcal.typing import FloatArray, IntArray
+from loopcal.typing import BoolArray, FloatArray, IntArray
 
 Weights = Literal["printed", "distance", "single", "full"]
 """Rows as printed; divided by |d_1|, a distance from the plane; divided by their own sd; with their
@@ -89,10 +89,10 @@ class Layout:
     @cached_property
     def levers(self) -> tuple[FloatArray, FloatArray]:
         """d_1 (g, 3) and d_i (g, k - 2, 3) [m] as commanded."""
-        return levers(self.state.T[0, :, :3, 3].reshape(self.groups, -1, 3))
+        return compute_levers(self.state.T[0, :, :3, 3].reshape(self.groups, -1, 3))
 
-    def held(self, truth: FloatArray, sigma: float, seed: int) -> FloatArray:
-        """Readings (t, n, a) at which true machines (t, p) [SI] hold the coordinates of the
+    def solve_readings(self, truth: FloatArray, sigma: float, seed: int) -> FloatArray:
+        """Return readings (t, n, a) at which true machines (t, p) [SI] hold the coordinates of the
         measuring machine.
 
         The true end point stands where it was commanded to, but for Gaussian noise of `sigma` [m]
@@ -111,11 +111,11 @@ class Layout:
             self.robot, truth, inverse_trials(self.robot, truth, target, self.state)
         )
 
-    def sloped(
+    def linearize_points(
         self, values: FloatArray, q: FloatArray
-    ) -> tuple[FloatArray, FloatArray, np.ndarray]:
-        """Points (t, g, k, 3) [m], their slopes (t, g, k, 3, p), and which machines reach all of
-        them (t,).
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return points (t, g, k, 3) [m], their derivatives (t, g, k, 3, p), and which machines
+        reach all of them (t,).
         """
         state = forward_trials(self.robot, values, q, self.state)
         D = differentiate_pose(self.robot, values, q, state).parameters[:, :, 3:]
@@ -153,18 +153,18 @@ class PaperRows:
         """(g, k - 2, k - 2) what the rows of a group are multiplied by; made at the points as
         commanded.
         """
-        return whitener(*self.layout.levers, self.sigma, self.weights)
+        return build_whitener(*self.layout.levers, self.sigma, self.weights)
 
     def values(self, deviation: FloatArray) -> FloatArray:
-        """Parameters (t, p) [m] at deviations z (t, p)."""
+        """Return parameters (t, p) [m] at deviations z (t, p)."""
         return self.layout.robot.parameters.nominal + self.sd * deviation
 
-    def whitened(self, deviation: FloatArray, trials: IntArray) -> tuple[FloatArray, np.ndarray]:
-        """Rows (a, m, p + 1), [A | residual], of some machines at deviations (a, p), and which
-        machines reach all points.
+    def whiten(self, deviation: FloatArray, trials: IntArray) -> tuple[FloatArray, BoolArray]:
+        """Return rows (a, m, p + 1), [A | residual], of some machines at deviations (a, p), and
+        which machines reach all points.
         """
-        at, J, reached = self.layout.sloped(self.values(deviation), self.q[trials])
-        A, c = equations(at, J * self.sd)
+        points, J, reached = self.layout.linearize_points(self.values(deviation), self.q[trials])
+        A, c = linearize_products(points, J * self.sd)
         rows = self.whitener @ np.concatenate([A, -c[..., None]], axis=-1)
         return rows.reshape(len(trials), self.layout.equations, -1), reached
 
@@ -181,7 +181,7 @@ class PaperRows:
         return self._fold(np.zeros((len(self.q), self.parameters)), np.arange(len(self.q)))
 
     def _fold(self, deviation: FloatArray, trials: IntArray) -> tuple[FloatArray, FloatArray]:
-        rows, reached = self.whitened(deviation, trials)
+        rows, reached = self.whiten(deviation, trials)
         short = max(rows.shape[2] - rows.shape[1], 0)
         rows = np.concatenate([rows, np.zeros((len(rows), short, rows.shape[2]))], axis=1)
         factor = np.asarray(np.linalg.qr(np.where(reached[:, None, None], rows, 0.0), mode="r"))
@@ -200,25 +200,25 @@ def identify_from_rows(problem: PaperRows, method: Method, relative: float = 1e-
     return descend(rows, begin, method, StepControl(relative=relative))
 
 
-def levers(at: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """d_1 (.., 3) and d_i (.., k - 2, 3) of points (.., k, 3)."""
-    return at[..., 1, :] - at[..., 0, :], at[..., 2:, :] - at[..., :1, :]
+def compute_levers(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return d_1 (.., 3) and d_i (.., k - 2, 3) of points (.., k, 3)."""
+    return points[..., 1, :] - points[..., 0, :], points[..., 2:, :] - points[..., :1, :]
 
 
-def equations(at: FloatArray, J: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Equations (17): a (.., k - 2, p) and c (.., k - 2) of points (.., k, 3) [m] with slopes J
-    (.., k, 3, p).
+def linearize_products(points: FloatArray, J: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return equations (17): a (.., k - 2, p) and c (.., k - 2) of points (.., k, 3) [m] with
+    slopes J (.., k, 3, p).
     """
-    d_1, d = levers(at)
+    d_1, d = compute_levers(points)
     slope_1 = J[..., 1, :, :] - J[..., 0, :, :]
     slope = J[..., 2:, :, :] - J[..., :1, :, :]
     a = d @ slope_1 + (d_1[..., None, None, :] @ slope)[..., 0, :]
     return a, -(d @ d_1[..., None])[..., 0]
 
 
-def row_map(d_1: FloatArray, d: FloatArray) -> FloatArray:
-    """B (g, k - 2, 3 k): how displacements of the points (p_0, p_1, p_2 ..) move the rows d_i'd_1
-    of a group.
+def map_displacements(d_1: FloatArray, d: FloatArray) -> FloatArray:
+    """Return B (g, k - 2, 3 k): how displacements of the points (p_0, p_1, p_2 ..) move the rows
+    d_i'd_1 of a group.
     """
     g, r = d.shape[:2]
     B = np.zeros((g, r, r + 2, 3))
@@ -228,23 +228,23 @@ def row_map(d_1: FloatArray, d: FloatArray) -> FloatArray:
     return B.reshape(g, r, -1)
 
 
-def whitener(d_1: FloatArray, d: FloatArray, sigma: float, weights: Weights) -> FloatArray:
-    """W (g, k - 2, k - 2) for rows of points with noise of `sigma` [m] in x, y and z: S = sigma^2
-    1.
+def build_whitener(d_1: FloatArray, d: FloatArray, sigma: float, weights: Weights) -> FloatArray:
+    """Return W (g, k - 2, k - 2) for rows of points with noise of `sigma` [m] in x, y and z: S =
+    sigma^2 1.
 
     "printed": all rows alike, divided by the root mean square of their sds, so that a prior can be
     set against them.
     """
-    B = row_map(d_1, d)
-    one = np.broadcast_to(np.eye(d.shape[1]), (*d.shape[:2], d.shape[1]))
+    B = map_displacements(d_1, d)
+    unit = np.broadcast_to(np.eye(d.shape[1]), (*d.shape[:2], d.shape[1]))
     sd = sigma * np.linalg.norm(B, axis=2)
     if weights == "printed":
-        return one / np.sqrt(np.mean(sd**2))
+        return unit / np.sqrt(np.mean(sd**2))
     if weights == "distance":
         length = np.linalg.norm(d_1, axis=1)[:, None]
-        return one / (length * np.sqrt(np.mean((sd / length) ** 2)))[..., None]
+        return unit / (length * np.sqrt(np.mean((sd / length) ** 2)))[..., None]
     if weights == "single":
-        return one / sd[..., None]
+        return unit / sd[..., None]
     return np.asarray(
         np.linalg.inv(np.linalg.cholesky(sigma**2 * B @ np.swapaxes(B, 1, 2))), dtype=np.float64
     )

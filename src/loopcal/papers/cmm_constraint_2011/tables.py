@@ -127,13 +127,15 @@ def compute_pair_rank(study: Study) -> tuple[int, int]:
     The points are those commanded.
     """
     nominal = study.robot.parameters.nominal[None]
-    points, slopes, _ = study.layout.sloped(nominal, study.layout.held(nominal, 0.0, 0))
-    at, J = points[0, 0], slopes[0, 0]
-    plane = [0, *range(2, len(at))]
+    points, slopes, _ = study.layout.linearize_points(
+        nominal, study.layout.solve_readings(nominal, 0.0, 0)
+    )
+    group, J = points[0, 0], slopes[0, 0]
+    plane = [0, *range(2, len(group))]
     pairs = [(i, j) for i in plane for j in plane if i < j]
-    d_1, slope_1 = at[1] - at[0], J[1] - J[0]
-    rows = np.array([(at[i] - at[j]) @ slope_1 + d_1 @ (J[i] - J[j]) for i, j in pairs])
-    return len(at), int(np.linalg.matrix_rank(rows, rtol=1e-9))
+    d_1, slope_1 = group[1] - group[0], J[1] - J[0]
+    rows = np.array([(group[i] - group[j]) @ slope_1 + d_1 @ (J[i] - J[j]) for i, j in pairs])
+    return len(group), int(np.linalg.matrix_rank(rows, rtol=1e-9))
 
 
 def _list_given(words: Wording, study: Study) -> Table:

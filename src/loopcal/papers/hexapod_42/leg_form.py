@@ -120,8 +120,8 @@ def identify_per_leg(robot: Mechanism, data: Measurements, steps: int = 3) -> Pe
             )
         legs = LegForm.at(machine, solution)
         _check_members(robot, legs)
-        seen = observations.kind.evaluate(solution.T[None], observations.measured[None])
-        twists = -np.linalg.solve(seen.jacobian[0], seen.residual[0, :, :, None])[:, :, 0]
+        evaluated = observations.kind.evaluate(solution.T[None], observations.measured[None])
+        twists = -np.linalg.solve(evaluated.jacobian[0], evaluated.residual[0, :, :, None])[:, :, 0]
         values = values + legs.fit(twists)
         history.append(values.copy())
         conditions = legs.conditions

@@ -159,13 +159,13 @@ def compare_methods(study: Study, seed: int, trials: int) -> tuple[MethodResult,
     )
 
 
-def compare_poses(study: Study, threshold: float, seed: int, trials: int) -> list[tuple]:
+def compare_poses(study: Study, threshold: float, seed: int, trials: int) -> list[tuple[Cell, ...]]:
     """Return table rows for other numbers and ranges of poses."""
     sets = [("first of the paper", study.poses[:n]) for n in (7, 8, 9)]
     sets.append(("the paper's ten", study.poses))
     for name, counts in ((NARROW, (20, 40)), (WIDE, (10, 20, 40))):
         sets += [(f"drawn, {name}", draw_poses(name, n, seed)) for n in counts]
-    rows = []
+    rows: list[tuple[Cell, ...]] = []
     for name, poses in sets:
         other = Study(study.robot, study.truth, poses, study.order)
         exact = iterate(other, compute_actual_poses(other))

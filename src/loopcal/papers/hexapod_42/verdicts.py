@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -116,10 +116,15 @@ def _judge_residuals(words: Wording, results: Results) -> tuple[Verdict, ...]:
 def _judge_methods(words: Wording, results: Results) -> tuple[Verdict, ...]:
     before, alone, together, prior = results.methods
     seven, ten = (next(row for row in results.poses if row[1] == n) for n in (7, 10))
-    methods = {"before": before, "alone": alone, "together": together, "prior": prior}
+    methods: dict[str, Any] = {
+        "before": before,
+        "alone": alone,
+        "together": together,
+        "prior": prior,
+    }
     ratio, ratio_of_methods = (alone.parameters / m.parameters for m in (before, together))
     smaller = {limits: _count_smaller(results, limits) for limits in (STATED, PRESUMED)}
-    agrees = np.isfinite(seven[3]) and seven[2] is not None
+    agrees = np.isfinite(float(str(seven[3]))) and seven[2] is not None
     return (
         words.judge(
             "parameters_improve", ratio=ratio, smaller_stated=smaller[STATED],

@@ -177,7 +177,7 @@ def solve_case(measured: Study, progress: Callable[[str], None]) -> Case:
     )
 
 
-def space_lambdas(smallest: float) -> tuple[FloatArray, np.ndarray]:
+def space_lambdas(smallest: float) -> tuple[FloatArray, BoolArray]:
     """Return lambdas (s,) from the smallest singular value to 1, and which are equidistant."""
     intervals, ratios = (
         np.linspace(smallest, 1.0, EQUAL_INTERVALS),

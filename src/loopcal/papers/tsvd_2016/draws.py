@@ -7,13 +7,14 @@ which requires knowing the true machine. The library's methods choose theirs fro
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from loopcal.estimate import GCV, MAP, FitOptions, LeastSquares, Ridge, identify_trials
+from loopcal.estimate.methods.penalties import Method
 from loopcal.measure import make_random_stream
 from loopcal.papers.printed import Cell, Table
 from loopcal.papers.tsvd_2016.machines import (
@@ -86,34 +87,38 @@ class Draws:
         return len(self.ridge)
 
     def compute_median(self, method: str) -> FloatArray:
-        """(4,) medians over the machines."""
+        """Return medians (4,) over the machines."""
         return np.median(self.errors[method], axis=0)
 
     def compute_interval(self, method: str) -> FloatArray:
-        """(2, 4) bootstrap interval of the medians, 95 %."""
+        """Return the bootstrap interval (2, 4) of the medians, 95 %."""
         return _interval(np.median(_resampled(self.errors[method]), axis=1))
 
     def compute_ratio(self, method: str, other: str) -> FloatArray:
-        """(4,) ratio of medians, method over other."""
+        """Return the ratio (4,) of medians, method over other."""
         return self.compute_median(method) / self.compute_median(other)
 
     def compute_ratio_interval(self, method: str, other: str) -> FloatArray:
-        """(2, 4) bootstrap interval of the ratio of medians, the machines drawn in pairs, 95 %."""
+        """Return the bootstrap interval (2, 4) of the ratio of medians, the machines drawn in
+        pairs, 95 %.
+        """
         return _interval(
             np.median(_resampled(self.errors[method]), axis=1)
             / np.median(_resampled(self.errors[other]), axis=1)
         )
 
     def compute_curve(self, algorithm: str) -> FloatArray:
-        """(s, 4) medians over the machines at every setting of "RE" (LS, then rising lambda) or
-        "TSVD" (falling k).
+        """Return medians (s, 4) over the machines at every setting of "RE" (LS, then rising lambda)
+        or "TSVD" (falling k).
         """
         if algorithm == "TSVD":
             return np.median(self.truncated, axis=0)
         return np.concatenate([self.compute_median(RAW_LS)[None], np.median(self.ridge, axis=0)])
 
     def count_diverged(self, method: str) -> int:
-        """Number of machines for which the method diverged; their errors count as infinite."""
+        """Return the number of machines for which the method diverged; their errors count as
+        infinite.
+        """
         return int(np.isinf(self.errors[method][:, 0]).sum())
 
 
@@ -152,7 +157,7 @@ def draw_machines(
     return Draws(name, {method: errors[method] for method in METHODS}, LAMBDAS, ks, by_lambda, by_k)
 
 
-def run_whitened(measured: Study, methods: dict) -> dict[str, FloatArray]:
+def run_whitened(measured: Study, methods: Mapping[str, Method]) -> dict[str, FloatArray]:
     """Return errors (t, 4) of the library's methods: rows whitened, columns scaled by tolerance."""
     return {
         name: measured.compute_output_errors(

@@ -127,22 +127,24 @@ def linearize(
     robot, readings = study.robot, study.trials.readings[None]
     kind, measured = study.kind, study.trials.measured[0]
     shared = len(values) > 1 and bool((values == values[0]).all())
-    at = values[:1] if shared else values
-    state = forward_trials(robot, at, readings, study.commanded)
+    distinct = values[:1] if shared else values
+    state = forward_trials(robot, distinct, readings, study.commanded)
     reached = (state.status == Status.CONVERGED).all(axis=1)
     T = np.where(reached[:, None, None, None], state.T, np.eye(4))
     D = np.where(
-        reached[:, None, None, None], differentiate_pose(robot, at, readings, state).parameters, 0.0
+        reached[:, None, None, None],
+        differentiate_pose(robot, distinct, readings, state).parameters,
+        0.0,
     ) * list_scales(robot)
     if shared:
         T, reached = (
             np.broadcast_to(T, (len(values), *T.shape[1:])),
             np.broadcast_to(reached, len(values)),
         )
-    seen = kind.evaluate(T, measured[machine])
+    evaluated = kind.evaluate(T, measured[machine])
     raw = np.where([c.dimension is Dimension.LENGTH for c in kind.columns], 1.0 / MM, 1.0)
-    H = np.matmul(seen.jacobian * raw[:, None], D)
-    rows = np.concatenate([H, -(seen.residual * raw)[..., None]], axis=-1)
+    H = np.matmul(evaluated.jacobian * raw[:, None], D)
+    rows = np.concatenate([H, -(evaluated.residual * raw)[..., None]], axis=-1)
     rows = rows.reshape(len(values), -1, rows.shape[-1])
     factor = engine.fold(empty_factor(len(rows), rows.shape[-1] - 1), rows)
     return decompose(factor, np.full(len(values), rows.shape[1]), tolerance=0.0), reached

@@ -116,7 +116,7 @@ def factor_rows(rows: FloatArray) -> FloatArray:
 
 def divide_by_factor(rows: FloatArray, R: FloatArray) -> FloatArray:
     """Return X R^-1 for rows X (..., q) and a nonsingular triangular factor R (q, q)."""
-    from scipy.linalg.blas import dtrsm
+    from scipy.linalg.blas import dtrsm  # pyright: ignore[reportAttributeAccessIssue]
 
     flat = rows.reshape(-1, rows.shape[-1])
     # R' is lower triangular, and both transposes are already in the order of BLAS
