@@ -75,8 +75,9 @@ def measure_ratio(
     limit: float | None = None,
     direction: Literal["lower", "higher"] = "lower",
 ) -> Metric:
-    """Time `subject` and `reference` in turns; the value is the ratio of their shortest times, since
-    other programs only lengthen a time.
+    """Time `subject` and `reference` in turns; the value is the ratio of their shortest times.
+
+    Other programs only lengthen a time.
     """
     ours, theirs = map(min, time_in_turns(subject, reference, repeats=repeats))
     note = f"{ours:.3g} s against {theirs:.3g} s"

@@ -62,9 +62,14 @@ def differentiate_pose(
     readings = np.zeros((t, n, 6, len(robot.actuators)))
     for rows, limbs in linearize_limbs(robot, values, q, state):
         by_parameter, by_reading = limbs.solve_platform()
-        parameters[rows][:, :, freedoms] = by_parameter
-        readings[rows][:, :, freedoms] = by_reading
-    parameters[~is_closed(state.status)] = readings[~is_closed(state.status)] = np.nan
+        if len(freedoms) == 6:
+            parameters[rows], readings[rows] = by_parameter, by_reading
+        else:
+            parameters[rows][:, :, freedoms] = by_parameter
+            readings[rows][:, :, freedoms] = by_reading
+    lost = ~is_closed(state.status)
+    if lost.any():
+        parameters[lost], readings[lost] = np.nan, np.nan
     return PoseSensitivity(parameters, readings)
 
 
@@ -320,7 +325,7 @@ def _invert(A: FloatArray, weights: FloatArray | None) -> FloatArray:
     if weights is not None:
         A = A * weights[..., None]
     good = np.asarray(np.isfinite(A).all(axis=(-1, -2)))
-    safe = np.where(good[..., None, None], A, np.eye(*A.shape[-2:]))
+    safe = A if good.all() else np.where(good[..., None, None], A, np.eye(*A.shape[-2:]))
     if A.shape[-1] == A.shape[-2]:
         try:
             out = np.linalg.solve(safe, np.eye(A.shape[-1]))
@@ -328,5 +333,6 @@ def _invert(A: FloatArray, weights: FloatArray | None) -> FloatArray:
             out = np.linalg.pinv(safe)
     else:
         out = np.linalg.pinv(safe)
-    out = np.where(good[..., None, None], out, np.nan)
+    if not good.all():
+        out = np.where(good[..., None, None], out, np.nan)
     return out if weights is None else out * weights[..., None, :]

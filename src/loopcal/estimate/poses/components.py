@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.errors import EstimationError
-from loopcal.estimate.nuisance.elimination import NuisanceElimination
+from loopcal.estimate.nuisance.elimination import NuisanceElimination, spread_columns
 from loopcal.estimate.observation_rows import (
     ObservationRows,
     PoseBlock,
@@ -25,7 +25,7 @@ from loopcal.estimate.observation_rows import (
 )
 from loopcal.estimate.poses.linearization import KindRows
 from loopcal.findings import report_finding
-from loopcal.numerics.elimination_tree import connected_groups
+from loopcal.numerics.elimination_tree import EliminationTree, connected_groups
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 LARGEST = 2000
@@ -177,6 +177,22 @@ def stack_rows(
             where = (slice(None), component[:, None, None], at[2][:, :, None], columns)
             out[where] = kind.by_coordinates[:, rows, i]
     return out
+
+
+def spread_nuisance(
+    tree: EliminationTree, kinds: Sequence[KindRows | None], block: PoseBlock, group: ComponentGroup
+) -> list[KindRows | None]:
+    """Return the rows with nuisance columns at those of the paths of the group's components."""
+    width = tree.structures[group.structure].width
+    spread: list[KindRows | None] = []
+    for kind, observed, (rows, of, _, _) in zip(kinds, block.rows, group.rows, strict=True):
+        if kind is None or kind.by_nuisance is None:
+            spread.append(kind)
+            continue
+        columns = np.full(observed.nuisance.shape, width)
+        columns[rows] = tree.columns(group.nodes[of], observed.nuisance[rows])
+        spread.append(kind._replace(by_nuisance=spread_columns(kind.by_nuisance, columns, width)))
+    return spread
 
 
 def groups_of_nodes(

@@ -22,6 +22,7 @@ from loopcal.estimate.nuisance.elimination import (
 from loopcal.estimate.observation_rows import PoseBlock
 from loopcal.estimate.poses.linearization import (
     LinearizedPoses,
+    join_located,
     linearize_closure,
     linearize_poses,
     linearize_rows,
@@ -173,22 +174,12 @@ class ExactPoses:
         self, z: FloatArray, start: Start
     ) -> tuple[FloatArray, dict[str, FloatArray]] | None:
         """Return poses (n, 4, 4) and joints name -> (1, n) of one trial; None if one is lost."""
-        located = [
-            (block, self._locate(block, z, start.predict_states(z))) for block in self.blocks
-        ]
-        if any(poses.is_lost(block.is_needed)[0] for block, poses in located):
+        located = [self._locate(block, z, start.predict_states(z)) for block in self.blocks]
+        pairs = zip(self.blocks, located, strict=True)
+        if any(poses.is_lost(block.is_needed)[0] for block, poses in pairs):
             return None
-        T = np.concatenate([poses.T[0] for _, poses in located])[: self.count]
-        joints = {
-            name: np.concatenate(
-                [
-                    np.broadcast_to(poses.joints[name], poses.is_reached.shape)[0]
-                    for _, poses in located
-                ]
-            )[None, : self.count]
-            for name in self.names
-        }
-        return T, joints
+        parts = [(poses.T[0], poses) for poses in located]
+        return join_located(parts, self.names, np.arange(self.count))
 
     def _solve_for_nuisance(
         self, located: list[LinearizedPoses], values: FloatArray, trials: IntArray, control: Halving

@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-# size: the poses of uncertain readings, one algorithm
 """Poses at uncertain readings: errors in variables, every pose is estimated.
 
 A reading of stated sigma is a row like any other, (true - recorded) / sigma, and closure ties pose
@@ -21,16 +20,16 @@ import numpy as np
 
 from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.linearization import Start
-from loopcal.estimate.nuisance.elimination import (
-    NodeRows,
-    NuisanceElimination,
-    fold_node_rows,
-    spread_columns,
-)
+from loopcal.estimate.nuisance.elimination import NodeRows, NuisanceElimination, fold_node_rows
 from loopcal.estimate.observation_rows import PoseBlock
-from loopcal.estimate.poses.components import ComponentGroup, stack_rows
+from loopcal.estimate.poses.components import ComponentGroup, spread_nuisance, stack_rows
 from loopcal.estimate.poses.coordinates import PoseCoordinates
-from loopcal.estimate.poses.linearization import KindRows, LinearizedPoses, linearize_rows
+from loopcal.estimate.poses.linearization import (
+    KindRows,
+    LinearizedPoses,
+    join_located,
+    linearize_rows,
+)
 from loopcal.estimate.poses.states import PoseEstimates, PoseSolution, PoseStates
 from loopcal.numerics.decomposition import NULL_COMPONENT, empty_factor
 from loopcal.numerics.elimination import Elimination, eliminate_columns
@@ -224,14 +223,7 @@ class UncertainPoses:
             if poses.is_lost(block.is_needed)[0]:
                 return None
             parts.append((closed.state.T[0], poses))
-        order = self._pose_order()
-        joints = {
-            name: np.concatenate(
-                [np.broadcast_to(p.joints[name], p.is_reached.shape) for _, p in parts], axis=1
-            )[:, order]
-            for name in self.names
-        }
-        return np.concatenate([T for T, _ in parts])[order], joints
+        return join_located(parts, self.names, self._pose_order())
 
     def _evaluate(
         self,
@@ -361,28 +353,10 @@ class UncertainPoses:
         k, width = self.coordinates.freedoms, 0
         if with_nuisance and self.nuisance is not None and group.structure >= 0:
             width = self.nuisance.tree.structures[group.structure].width
-            kinds = self._spread_nuisance(kinds, block, group, width)
+            kinds = spread_nuisance(self.nuisance.tree, kinds, block, group)
         rows = stack_rows(group, kinds, k, width)
         squares = (rows[..., -1] ** 2).sum(axis=2)
         return _Eliminated(eliminate_columns(rows, group.poses.shape[1] * k), squares)
-
-    def _spread_nuisance(
-        self, kinds: Sequence[KindRows | None], block: PoseBlock, group: ComponentGroup, width: int
-    ) -> list[KindRows | None]:
-        """Return the rows with nuisance columns at those of the paths of the components."""
-        assert self.nuisance is not None
-        spread: list[KindRows | None] = []
-        for kind, observed, (rows, of, _, _) in zip(kinds, block.rows, group.rows, strict=True):
-            if kind is None or kind.by_nuisance is None:
-                spread.append(kind)
-                continue
-            columns = np.full(observed.nuisance.shape, width)
-            used = observed.nuisance[rows]
-            columns[rows] = self.nuisance.tree.columns(group.nodes[of], used)
-            spread.append(
-                kind._replace(by_nuisance=spread_columns(kind.by_nuisance, columns, width))
-            )
-        return spread
 
     def _paths(self, group: ComponentGroup) -> IntArray:
         """Return the nuisance parameters (C, w) of the paths of a group's components."""
