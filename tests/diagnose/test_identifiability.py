@@ -191,7 +191,7 @@ def test_what_it_reads_is_the_factor_of_a_fit_without_own_unknowns():
 
 
 def test_elimination_is_the_projection_onto_the_complement_even_of_columns_that_repeat():
-    from loopcal.numerics.elimination import eliminate_from_factor
+    from loopcal.numerics.column_elimination import eliminate_from_factor
 
     rng = np.random.default_rng(1)
     F, A = rng.normal(size=(20, 3)), rng.normal(size=(20, 4))

@@ -22,8 +22,8 @@ from loopcal.measure import (
     guess_nuisance_values,
     simulate,
 )
+from loopcal.numerics.column_elimination import eliminate_columns
 from loopcal.numerics.decomposition import ROUNDING, without_rounding
-from loopcal.numerics.elimination import eliminate_columns
 from tests import zoo
 from tests.estimate.problems import UM, URAD, hexapod, noise
 

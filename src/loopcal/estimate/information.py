@@ -26,8 +26,8 @@ from loopcal.measure import (
     whiten_rows,
 )
 from loopcal.mechanism import Mechanism
+from loopcal.numerics.column_elimination import eliminate_from_factor
 from loopcal.numerics.decomposition import empty_factor
-from loopcal.numerics.elimination import eliminate_from_factor
 from loopcal.typing import BoolArray, FloatArray
 
 

@@ -2,7 +2,7 @@
 """Elimination of all unknowns of an elimination tree, nodes of equal structure together.
 
 The rows of a node are [own | ancestors | A | r]. The node's own columns are eliminated by
-orthogonal projection (`loopcal.numerics.elimination`). What is left are rows of its parent, and
+orthogonal projection (`loopcal.numerics.column_elimination`). What is left are rows of its parent, and
 what is left of the roots are rows [A | r] of the machine. Columns are scaled by their length over
 all rows before anything is eliminated, so that a direction that inner unknowns explain in full is
 recognized as unobservable. The best values follow from the roots inwards. Among all best values
@@ -19,8 +19,8 @@ from typing import ClassVar
 import numpy as np
 
 from loopcal import engine
+from loopcal.numerics.column_elimination import Elimination, eliminate_from_triangle
 from loopcal.numerics.decomposition import NULL_COMPONENT, empty_factor
-from loopcal.numerics.elimination import Elimination, eliminate_from_triangle
 from loopcal.numerics.elimination_tree import EliminationTree, Structure
 from loopcal.numerics.trial_batch import TrialBatch
 from loopcal.typing import BoolArray, FloatArray, IntArray

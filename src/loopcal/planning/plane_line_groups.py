@@ -40,7 +40,7 @@ from loopcal.mechanism import (
     pose_from_coordinates,
     workspace_ranges,
 )
-from loopcal.numerics.elimination import eliminate_columns
+from loopcal.numerics.column_elimination import eliminate_columns
 from loopcal.planning.constraints import ConstraintChecker
 from loopcal.typing import BoolArray, FloatArray, IntArray
 

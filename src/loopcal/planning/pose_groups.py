@@ -36,8 +36,8 @@ from loopcal.measure import (
     collect_nuisance_parameters,
     list_sensed_joints,
 )
+from loopcal.numerics.column_elimination import eliminate_from_factor
 from loopcal.numerics.decomposition import Decomposition, decompose, empty_factor
-from loopcal.numerics.elimination import eliminate_from_factor
 from loopcal.planning.design import PriorInformation, divide_by_factor, factor_rows, is_allowed
 from loopcal.typing import BoolArray, FloatArray, IntArray
 

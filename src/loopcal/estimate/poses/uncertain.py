@@ -31,8 +31,8 @@ from loopcal.estimate.poses.linearization import (
     linearize_rows,
 )
 from loopcal.estimate.poses.states import PoseEstimates, PoseSolution, PoseStates
+from loopcal.numerics.column_elimination import Elimination, eliminate_columns
 from loopcal.numerics.decomposition import NULL_COMPONENT, empty_factor
-from loopcal.numerics.elimination import Elimination, eliminate_columns
 from loopcal.numerics.gauss_newton import Halving, minimize_by_halving
 from loopcal.numerics.tree_elimination import NodeFactors, eliminate_tree
 from loopcal.numerics.trial_batch import map_arrays
@@ -182,8 +182,8 @@ class UncertainPoses:
             kinds = self._linearize_kinds(block, poses, trials, solution.nuisance)
             parts = []
             for group in groups:
-                done = self._eliminate(block, group, kinds)
-                parts.append(NodeRows(group.structure, group.nodes, group.components, done.rest))
+                rest = self._eliminate(block, group, kinds)[0].rest
+                parts.append(NodeRows(group.structure, group.nodes, group.components, rest))
             yield parts, poses.is_lost(block.is_needed)
 
     def poses_of(self, block: PoseBlock, part: NodeRows) -> IntArray:
@@ -259,9 +259,8 @@ class UncertainPoses:
                 kept.append(poses)
             kinds = self._linearize_kinds(block, poses, problem.trials, nuisance, False)
             for group in groups:
-                done = self._eliminate(block, group, kinds, problem.solves_nuisance)
-                best = done.elimination
-                squares[:, group.components] = done.squares
+                best, before = self._eliminate(block, group, kinds, problem.solves_nuisance)
+                squares[:, group.components] = before
                 gain += best.explained.sum(axis=1)
                 rank[:, group.components] = best.rank
                 part = np.sqrt((best.unobservable**2).sum(axis=-2)) > NULL_COMPONENT
@@ -269,7 +268,7 @@ class UncertainPoses:
                 is_unobservable[:, numbers] = part.reshape(a, *group.poses.shape, k)
                 solutions.append((numbers, group, best.solution))
                 if factors is not None and group.structure >= 0:
-                    rows = NodeRows(group.structure, group.nodes, group.components, done.rest)
+                    rows = NodeRows(group.structure, group.nodes, group.components, best.rest)
                     fold_node_rows(empty_factor(0, 0), factors, [rows])
         cost = squares.sum(axis=1)
         if factors is not None and self.nuisance is not None and nuisance is not None:
@@ -348,15 +347,18 @@ class UncertainPoses:
         group: ComponentGroup,
         kinds: Sequence[KindRows | None],
         with_nuisance: bool = True,
-    ) -> _Eliminated:
-        """Eliminate the coordinates of a group's components from their stacked rows."""
+    ) -> tuple[Elimination, FloatArray]:
+        """Eliminate the coordinates of a group's components from their stacked rows.
+
+        Return also the sums of squares (a, C) before.
+        """
         k, width = self.coordinates.freedoms, 0
         if with_nuisance and self.nuisance is not None and group.structure >= 0:
             width = self.nuisance.tree.structures[group.structure].width
             kinds = spread_nuisance(self.nuisance.tree, kinds, block, group)
         rows = stack_rows(group, kinds, k, width)
         squares = (rows[..., -1] ** 2).sum(axis=2)
-        return _Eliminated(eliminate_columns(rows, group.poses.shape[1] * k), squares)
+        return eliminate_columns(rows, group.poses.shape[1] * k), squares
 
     def _paths(self, group: ComponentGroup) -> IntArray:
         """Return the nuisance parameters (C, w) of the paths of a group's components."""
@@ -367,19 +369,6 @@ class UncertainPoses:
     def _pose_order(self) -> IntArray:
         """Return the places (n,) of all poses among those of the blocks, one after the other."""
         return np.argsort(np.concatenate([block.poses for block in self.blocks]))
-
-
-@dataclass(frozen=True, eq=False)
-class _Eliminated:
-    """Components without their coordinates, and their sums of squares (a, C) before."""
-
-    elimination: Elimination
-    squares: FloatArray
-
-    @property
-    def rest(self) -> FloatArray:
-        """(a, C, height, w) rows left."""
-        return self.elimination.rest
 
 
 def _keep_still(solved: PoseStates, before: PoseStates, is_still: BoolArray) -> PoseStates:

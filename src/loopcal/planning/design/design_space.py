@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 
 from loopcal.errors import EstimationError
 from loopcal.findings import report_finding
+from loopcal.numerics.column_elimination import eliminate_from_triangle
 from loopcal.numerics.decomposition import RANK_TOLERANCE
-from loopcal.numerics.elimination import eliminate_from_triangle
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 
@@ -133,7 +133,7 @@ def find_observable_space(
 ) -> ObservableSpace:
     """Return the directions that all groups and the prior determine together.
 
-    The nuisance parameters are eliminated by `loopcal.numerics.elimination`. The remainder of the
+    The nuisance parameters are eliminated by `loopcal.numerics.column_elimination`. The remainder of the
     machine's columns is cut at `tolerance` times its largest singular value.
 
     Parameters
