@@ -62,11 +62,8 @@ def differentiate_pose(
     readings = np.zeros((t, n, 6, len(robot.actuators)))
     for rows, limbs in linearize_limbs(robot, values, q, state):
         by_parameter, by_reading = limbs.solve_platform()
-        if len(freedoms) == 6:
-            parameters[rows], readings[rows] = by_parameter, by_reading
-        else:
-            parameters[rows][:, :, freedoms] = by_parameter
-            readings[rows][:, :, freedoms] = by_reading
+        parameters[rows][:, :, freedoms] = by_parameter
+        readings[rows][:, :, freedoms] = by_reading
     lost = ~is_closed(state.status)
     if lost.any():
         parameters[lost], readings[lost] = np.nan, np.nan

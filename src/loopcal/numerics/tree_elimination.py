@@ -3,9 +3,9 @@
 
 The rows of a node are [own | ancestors | A | r]. The node's own columns are eliminated by
 orthogonal projection (`loopcal.numerics.column_elimination`). What is left are rows of its parent,
-and what is left of the roots are rows [A | r] of the machine. Columns are scaled by their length over
-all rows before anything is eliminated, so that a direction that inner unknowns explain in full is
-recognized as unobservable. The best values follow from the roots inwards. Among all best values
+and what is left of the roots are rows [A | r] of the machine. Columns are scaled by their length
+over all rows before anything is eliminated, so that a direction that inner unknowns explain in full
+is recognized as unobservable. The best values follow from the roots inwards. Among all best values
 those of smallest length in these units are returned: the result equals one dense pseudo-inverse
 over a whole cluster. See docs/theory/identification.md.
 """

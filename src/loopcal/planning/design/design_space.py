@@ -133,8 +133,8 @@ def find_observable_space(
 ) -> ObservableSpace:
     """Return the directions that all groups and the prior determine together.
 
-    The nuisance parameters are eliminated by `loopcal.numerics.column_elimination`. The remainder of
-    the machine's columns is cut at `tolerance` times its largest singular value.
+    The nuisance parameters are eliminated by `loopcal.numerics.column_elimination`. The remainder
+    of the machine's columns is cut at `tolerance` times its largest singular value.
 
     Parameters
     ----------
