@@ -67,7 +67,7 @@ def forward_trials(
     with np.errstate(invalid="ignore"):
         # an infinite reading turns into NaN, and the engine marks its row
         joints = joints_from_readings(q, tau, robot.slots.frequency)
-    begin = _clear_sign(robot, robot.home_state if start is None else start)
+    begin = _clear_sign(robot, start or robot.home_state)
     state = _clear_sign(robot, engine.solve(robot.program, e, joints, begin))
     wrong = _find_wrong_rows(robot, state, begin)
     if not wrong.any():
@@ -94,7 +94,7 @@ def inverse_trials(
 
     `compute_readings` gives the readings of the states.
     """
-    begin = robot.home_state if start is None else start
+    begin = start or robot.home_state
     if count_shared_drives(robot.program):
         return _inverse_with_shared_drives(robot, values, target, begin)
     e, _ = robot.slots(values)

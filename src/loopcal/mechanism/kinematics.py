@@ -124,7 +124,7 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
     ArgumentTypeError
         Not a robot, not numbers, or not a Solution.
     """
-    _check_robot(robot, "forward")
+    begin = _check_arguments("forward", robot, start)
     a = len(robot.actuators)
     readings = np.atleast_2d(_as_numbers(q, f"readings, numbers of shape (n, {a})"))
     if readings.ndim != 2 or readings.shape[1] not in (a, 2 * a):
@@ -133,7 +133,6 @@ def forward(robot: Mechanism, q: ArrayLike, start: Solution | None = None) -> So
             f"({', '.join(actuator.name for actuator in robot.actuators)}); give one reading for "
             "each"
         )
-    begin = None if start is None else _check_start(start)
     state = forward_trials(robot, robot.values[None], readings[None], begin)
     return make_solution(robot, state, readings[:, :a])
 
@@ -160,11 +159,11 @@ def inverse(robot: Mechanism, target: ArrayLike, start: Solution | None = None) 
     ArgumentTypeError
         Not a robot, not numbers, or not a Solution.
     """
-    _check_robot(robot, "inverse")
+    begin = _check_arguments("inverse", robot, start)
     c = len(robot.controlled)
     shapes = f"(n, 4, 4) poses or (n, {c}) coordinates ({', '.join(robot.controlled)})"
     wanted = _as_numbers(target, shapes)
-    values, begin = robot.values[None], None if start is None else _check_start(start)
+    values = robot.values[None]
     if wanted.ndim >= 2 and wanted.shape[-2:] == (4, 4):
         T = wanted.reshape(-1, 4, 4)
         _check_poses(T)
@@ -310,17 +309,15 @@ def differentiate_by_coordinates(robot: Mechanism, values: FloatArray, state: St
     return out
 
 
-def _check_robot(robot: object, function: str) -> None:
-    """Refuse anything but a Mechanism as the robot."""
+def _check_arguments(function: str, robot: object, start: object) -> State | None:
+    """Return the state of a start; refuse anything but a Mechanism and a Solution or None."""
     if not isinstance(robot, Mechanism):
         raise ArgumentTypeError(
             f"{function} needs a robot as returned by loopcal.load_robot, not "
             f"{_describe_argument(robot)}"
         )
-
-
-def _check_start(start: object) -> State:
-    """Return the state of a start; refuse anything but a Solution."""
+    if start is None:
+        return None
     if not isinstance(start, Solution):
         raise ArgumentTypeError(
             "start must be a Solution, as forward and inverse return it, not "

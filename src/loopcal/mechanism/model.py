@@ -231,7 +231,7 @@ class Mechanism:
                 f"{new.shape} were given; give one value for each"
             )
         if not np.isfinite(new).all():
-            bad = self.parameters.names[int(np.flatnonzero(~np.isfinite(new))[0])]
+            bad = self.parameters.names[int(np.argmin(np.isfinite(new)))]
             raise MechanismError(f"the value of {bad} is not finite; give a number")
         new.setflags(write=False)
         return replace(self, values=new)

@@ -6,6 +6,9 @@ is y = -A^-1 (E de/dp + Q dq/dp). The equations of a limb contain its own displa
 actuators only; its part of the right-hand side has few columns. Its eliminated joints follow from
 U dtheta + A y + E de + Q dq = 0. Rows are computed in blocks that fit the cache. Derivation:
 docs/theory/engine.md.
+
+Arguments are values (t | 1, p), readings q (t | 1, n, a) and the states (t, n) that they lead to.
+Failed rows have NaN.
 """
 
 from __future__ import annotations
@@ -47,13 +50,7 @@ def differentiate_pose(
 ) -> PoseSensitivity:
     """Differentiate the pose by the implicit function theorem, D = -A^-1 [E de/dp + Q dq/dp].
 
-    Parameters
-    ----------
-    values : (t | 1, p). q : (t | 1, n, a) readings. state : (t, n), converged rows.
-
-    Returns
-    -------
-    PoseSensitivity; failed rows have NaN, rows of singular states infinities or NaN.
+    Rows of singular states have infinities or NaN.
     """
     t, n = state.T.shape[:2]
     # six freedoms are a view, not an index
@@ -91,13 +88,7 @@ def differentiate_passive_joints(
 ) -> PassiveSensitivity:
     """Differentiate every passive joint in every parameter and reading.
 
-    Parameters
-    ----------
-    values : (t | 1, p). q : (t | 1, n, a) readings. state : (t, n), converged rows.
-
-    Returns
-    -------
-    PassiveSensitivity; a locked joint (one that only spins its limb) has zeros, failed rows NaN.
+    A locked joint (one that only spins its limb) has zeros.
     """
     names, (t, n) = name_passive_joints(robot), state.T.shape[:2]
     parameters = np.zeros((t, n, len(names), len(robot.parameters)))
@@ -156,12 +147,7 @@ class LimbRows(NamedTuple):
 def linearize_limbs(
     robot: Mechanism, values: FloatArray, q: FloatArray, state: State
 ) -> Iterator[tuple[tuple[slice, slice], LinearizedLimbs]]:
-    """Linearize all limbs at states (t, n), block by block; yields trials and poses of a block.
-
-    Parameters
-    ----------
-    values : (t | 1, p). q : (t | 1, n, a) readings.
-    """
+    """Linearize all limbs, block by block; yields the trials and poses of each block with it."""
     t, n = state.T.shape[:2]
     poses = max(min(n, BLOCK_ROWS), 1)
     trials = max(1, BLOCK_ROWS // poses)

@@ -71,11 +71,11 @@ class ErrorModel:
 
 def join_errors(models: Iterable[ErrorModel]) -> ErrorModel:
     """Return all parameters and maps of error models."""
-    parts = tuple(models)
+    joined = tuple(models)
     return ErrorModel(
-        tuple(parameter for part in parts for parameter in part.parameters),
-        tuple(entry for part in parts for entry in part.maps),
-        tuple(entry for part in parts for entry in part.shared),
+        tuple(parameter for model in joined for parameter in model.parameters),
+        tuple(entry for model in joined for entry in model.maps),
+        tuple(entry for model in joined for entry in model.shared),
     )
 
 

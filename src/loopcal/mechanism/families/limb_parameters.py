@@ -39,6 +39,8 @@ reading.
 """
 
 Tolerance = LengthTolerance | AngleTolerance | RatioTolerance | None
+Term = tuple[Dimension, float, Tolerance, str, float]
+"""Dimension, nominal value, tolerance, transmission term, and change of that term per unit."""
 
 
 def build_actuator(name: str, drive: Drive) -> Actuator:
@@ -63,7 +65,7 @@ def drive_errors(name: str, drive: Drive, turns: bool) -> ErrorModel:
     MechanismError
         A term that the drive does not have, or a harmonic without a period.
     """
-    known = _terms(drive, Dimension.ANGLE if turns else Dimension.LENGTH)
+    known = _list_terms(drive, Dimension.ANGLE if turns else Dimension.LENGTH)
     errors = []
     for term in drive.unknown:
         if term not in known:
@@ -83,13 +85,8 @@ def drive_errors(name: str, drive: Drive, turns: bool) -> ErrorModel:
     return join_errors(errors)
 
 
-def _terms(
-    drive: Drive, joint_dimension: Dimension
-) -> Mapping[str, tuple[Dimension, float, Tolerance, str, float]]:
-    """Return the terms of a drive by name.
-
-    Each has dimension, nominal value, tolerance, transmission term and the change of it per unit.
-    """
+def _list_terms(drive: Drive, joint_dimension: Dimension) -> Mapping[str, Term]:
+    """Return the terms of a drive by name."""
     tolerance = drive.angle if isinstance(drive, AngleDrive) else drive.length
     own: dict[str, tuple[Dimension, float, Tolerance, str, float]]
     if isinstance(drive, SpoolDrive):

@@ -4,6 +4,9 @@
 Frames: a limb carries a frame from the base to its tip. `at:` places a joint in it, as [x, y, z] or
 as a full pose, and `axis:` is a direction in the placed frame. With all joints at zero and no
 rotated placement, all axes are those of the base (of a copy: rotated with it).
+
+Records that differ in a dimension only are classes of their own, because the reader of files takes
+the unit of a number from its annotation.
 """
 
 from __future__ import annotations
