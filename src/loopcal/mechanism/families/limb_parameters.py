@@ -88,17 +88,16 @@ def drive_errors(name: str, drive: Drive, turns: bool) -> ErrorModel:
 def _list_terms(drive: Drive, joint_dimension: Dimension) -> Mapping[str, Term]:
     """Return the terms of a drive by name."""
     tolerance = drive.angle if isinstance(drive, AngleDrive) else drive.length
-    own: dict[str, tuple[Dimension, float, Tolerance, str, float]]
+    length, curve = Dimension.LENGTH, CURVE_OF_BUILDUP
+    terms: dict[str, Term] = {"offset": (joint_dimension, drive.offset, tolerance, "offset", 1.0)}
     if isinstance(drive, SpoolDrive):
-        own = {
-            "radius": (Dimension.LENGTH, drive.radius, drive.radii, "gain", 1.0),
-            "buildup": (Dimension.LENGTH, drive.buildup, drive.buildups, "curve", CURVE_OF_BUILDUP),
-        }
+        terms["radius"] = (length, drive.radius, drive.radii, "gain", 1.0)
+        terms["buildup"] = (length, drive.buildup, drive.buildups, "curve", curve)
     else:
-        own = {"gain": (Dimension.RATIO, drive.gain, drive.ratio, "gain", 1.0)}
-    offset = {"offset": (joint_dimension, drive.offset, tolerance, "offset", 1.0)}
-    periodic = ("backlash", *HARMONICS)
-    return offset | own | {term: (joint_dimension, 0.0, tolerance, term, 1.0) for term in periodic}
+        terms["gain"] = (Dimension.RATIO, drive.gain, drive.ratio, "gain", 1.0)
+    for term in ("backlash", *HARMONICS):
+        terms[term] = (joint_dimension, 0.0, tolerance, term, 1.0)
+    return terms
 
 
 def get_quantity(named: NamedParameter) -> tuple[Dimension, float]:
