@@ -25,8 +25,8 @@ def triangularize(matrix: FloatArray, columns: int) -> tuple[FloatArray, FloatAr
     """
     m = matrix.copy()
     reflections = np.zeros((min(columns, len(m) - 1), *m.shape[2:]))
-    for j, alpha in enumerate(reflections):
-        v = m[j:, j].copy()
+    for j in range(len(reflections)):
+        v, alpha = m[j:, j].copy(), reflections[j]
         np.sqrt(np.add.reduce(v * v, axis=0), out=alpha)
         np.copysign(alpha, -v[0], out=alpha)
         v[0] -= alpha
