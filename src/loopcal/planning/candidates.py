@@ -255,7 +255,7 @@ def _keep_reachable(
     home = np.broadcast_to(locate_home(robot), poses.shape)
     path = check_paths(checker, home, poses)
     counts = path.count_violations()
-    excluded.update(dict(mark_on_path(counts)))
+    excluded.update(mark_on_path(counts))
     if not path.allowed.any():
         raise MechanismError(
             report_finding("plan.home-isolated", robot=robot.name, reasons=list_reasons(counts))

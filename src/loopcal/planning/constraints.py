@@ -8,7 +8,7 @@ Many poses are checked at once; a violation is a code with numbers. Margins are 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -235,6 +235,6 @@ def list_reasons(counts: Mapping[Violation, int]) -> tuple[dict[str, Any], ...]:
     return tuple({**violation.to_dict(), "count": count} for violation, count in counts.items())
 
 
-def mark_on_path(counts: Mapping[Violation, int]) -> Iterable[tuple[Violation, int]]:
+def mark_on_path(counts: Mapping[Violation, int]) -> dict[Violation, int]:
     """Return counted violations as violations on the path from home."""
-    return [(replace(violation, on_path=True), count) for violation, count in counts.items()]
+    return {replace(violation, on_path=True): count for violation, count in counts.items()}

@@ -60,7 +60,7 @@ def _draw_curve(case: Case, algorithm: str) -> Figure:
         best=case.answers[algorithm].setting,
         diverged=int((~usable).sum()),
     )
-    return _set_log(figure, LOG[algorithm])
+    return replace(figure, log=LOG[algorithm])
 
 
 def _draw_medians(draws: Draws, algorithm: str) -> Figure:
@@ -77,7 +77,7 @@ def _draw_medians(draws: Draws, algorithm: str) -> Figure:
         setting=SETTING[algorithm],
         trials=len(draws),
     )
-    return _set_log(figure, LOG[algorithm])
+    return replace(figure, log=LOG[algorithm])
 
 
 def _draw_history(case: Case, algorithm: str, unit: str) -> Figure:
@@ -136,7 +136,3 @@ def _make_series(
 
 def _mark_prior(errors: FloatArray) -> Mapping[str, float]:
     return {f"MAP, {label}": float(errors[i]) for i, label in enumerate(LABELS)}
-
-
-def _set_log(figure: Figure, log: str) -> Figure:
-    return replace(figure, log=log)
