@@ -34,16 +34,16 @@ pose,q1 [mm],q2 [mm],q3 [mm],z [mm]
 """
 
 
-def heights_only(data_folder: Path) -> dict[str, dict[str, Any]]:
+def select_records_without_distances(data_folder: Path) -> dict[str, dict[str, Any]]:
     """Return the records without distances, by repository and file."""
     return {
         name: record
-        for name, record in every_record(data_folder).items()
+        for name, record in read_records(data_folder).items()
         if not record["distances"]
     }
 
 
-def every_record(data_folder: Path) -> dict[str, dict[str, Any]]:
+def read_records(data_folder: Path) -> dict[str, dict[str, Any]]:
     """Return all records, by repository and file."""
     found = json.loads(
         (data_folder / "delta_printers" / "real_delta_calibrations.json").read_text("utf-8")
@@ -51,8 +51,8 @@ def every_record(data_folder: Path) -> dict[str, dict[str, Any]]:
     return {f"{r['source']['repo']} {r['source']['path']}": r for r in found}
 
 
-def stored(record: dict[str, Any]) -> dict[str, float]:
-    """Return the firmware's answer by parameter name [mm, deg]."""
+def list_stored_geometry(record: dict[str, Any]) -> dict[str, float]:
+    """Return the geometry that the firmware stored, by parameter name [mm, deg]."""
     found = record["geometry_stored_in_config"]
     named = {"radius": found["radius"]}
     for i in range(3):
@@ -64,7 +64,7 @@ def stored(record: dict[str, Any]) -> dict[str, float]:
 
 
 def write_files(
-    record: dict[str, Any], folder: Path, stop_off: float = 0.0, sigma: str = "20 um"
+    record: dict[str, Any], folder: Path, stop_offset: float = 0.0, sigma: str = "20 um"
 ) -> None:
     """Write robot.yaml and heights.csv.
 
@@ -72,7 +72,7 @@ def write_files(
     ----------
     record : of the JSON file.
     folder : where to write.
-    stop_off : added to every end stop [mm], to start away from the answer.
+    stop_offset : added to every end stop [mm], to start the fit away from the stored geometry.
     sigma : standard deviation of the probe, with its unit.
     """
     found = record["geometry_stored_in_config"]
@@ -81,7 +81,7 @@ def write_files(
         radius=found["radius"],
         angles=found["angles"],
         arms=found["arms"],
-        stops=[stop + stop_off for stop in found["endstops"]],
+        stops=[stop + stop_offset for stop in found["endstops"]],
         fixed="[arm*.length]",
     )
     (folder / "robot.yaml").write_text(robot, "utf-8")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of the tables that commands print, to compare pages with programs by numbers."""
+"""Read the rows of printed tables, to compare pages with the output of commands."""
 
 
 def read_table_rows(text: str) -> list[list[str]]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bad input at the command line: exit code 1, one sentence on standard error, nothing written."""
+"""Bad input gives exit code 1 and one sentence on standard error; nothing is written."""
 
 from pathlib import Path
 
@@ -28,9 +28,9 @@ UNITS = "units: {length: mm, angle: deg}\n"
 
 
 @pytest.fixture
-def refused(tmp_path, monkeypatch, capsys):
-    """Run a command line in an empty folder with the given files; return the sentence with which it
-    is refused.
+def run_refused(tmp_path, monkeypatch, capsys):
+    """Run a command line in an empty folder with the given files; return the error
+    message.
     """
     monkeypatch.chdir(tmp_path)
 
@@ -103,26 +103,26 @@ ROBOT_CASES = {
 
 
 @pytest.mark.parametrize("case", ROBOT_CASES)
-def test_a_bad_robot_file_is_refused_with_its_line(refused, case) -> None:
+def test_invalid_robot_file_is_refused_with_its_line(run_refused, case) -> None:
     old, new, sentence = ROBOT_CASES[case]
     assert old in ROBOT
-    found = refused("check robot.yaml", robot_yaml=ROBOT.replace(old, new, 1))
+    found = run_refused("check robot.yaml", robot_yaml=ROBOT.replace(old, new, 1))
     assert sentence in found
     assert found.startswith("loopcal: robot.yaml:")
 
 
-def test_wrong_mobility_names_the_freedoms(refused) -> None:
+def test_freedom_without_actuator_is_named(run_refused) -> None:
     """All base centres in one point: the platform can turn about it, whatever the legs do."""
     lines = ROBOT.split("\n")
     start, end = lines.index("base:"), lines.index("platform:")
     text = "\n".join([*lines[: start + 1], *["  - [0, 0, 0]"] * 6, *lines[end:]])
     text = text.replace("lengths: 233.238076", "lengths: 234.07")
-    found = refused("check robot.yaml", robot_yaml=text)
+    found = run_refused("check robot.yaml", robot_yaml=text)
     assert "the platform can still move with every actuator locked" in found
     assert "rotation about" in found
 
 
-def test_too_few_freedoms_are_named_as_well(refused) -> None:
+def test_missing_freedom_is_named(run_refused) -> None:
     """A second limb that only slides along x takes y away from two motors."""
     limbs = [
         "  - name: a\n    ending: rigid\n    errors: [{of: s, shift: [y]}]",
@@ -141,13 +141,13 @@ def test_too_few_freedoms_are_named_as_well(refused) -> None:
         "controlled: [x, y]",
         "limbs:",
     ]
-    found = refused("check robot.yaml", robot_yaml="\n".join([*head, *limbs]))
+    found = run_refused("check robot.yaml", robot_yaml="\n".join([*head, *limbs]))
     assert "2 actuators" in found
     assert "only 1 of 2 freedoms" in found
     assert "translation along y" in found
 
 
-def test_a_home_outside_the_strokes_is_noted(tmp_path, capsys) -> None:
+def test_home_pose_outside_the_strokes_gives_a_warning(tmp_path, capsys) -> None:
     path = tmp_path / "robot.yaml"
     path.write_text(ROBOT.replace("lengths: 233.238076", "lengths: 500"))
     assert main(["check", str(path)]) == 0
@@ -165,16 +165,18 @@ FILE_CASES = {
 
 
 @pytest.mark.parametrize("case", FILE_CASES)
-def test_what_is_no_text_file_is_refused_as_robot_and_as_data(refused, case) -> None:
+def test_file_that_is_not_text_is_refused_as_robot_and_as_data(run_refused, case) -> None:
     content, sentence = FILE_CASES[case]
-    assert sentence in refused("check robot.yaml", robot_yaml=content)
-    assert sentence in refused("calibrate hexapod-42 data.csv -o run", data_csv=content)
+    assert sentence in run_refused("check robot.yaml", robot_yaml=content)
+    assert sentence in run_refused("calibrate hexapod-42 data.csv -o run", data_csv=content)
 
 
-def test_an_absent_file_is_refused(refused) -> None:
-    assert "this robot file does not exist" in refused("check robot.yaml")
-    assert "this measurement file does not exist" in refused("calibrate hexapod-42 data.csv -o run")
-    assert "this run folder does not exist" in refused("validate run data.csv", data_csv=DATA)
+def test_missing_file_is_refused(run_refused) -> None:
+    assert "this robot file does not exist" in run_refused("check robot.yaml")
+    assert "this measurement file does not exist" in run_refused(
+        "calibrate hexapod-42 data.csv -o run"
+    )
+    assert "this run folder does not exist" in run_refused("validate run data.csv", data_csv=DATA)
 
 
 DATA_CASES = {
@@ -236,9 +238,9 @@ DATA_CASES = {
     "command", ["calibrate hexapod-42 data.csv -o run", "identifiability hexapod-42 data.csv"]
 )
 @pytest.mark.parametrize("case", DATA_CASES)
-def test_a_bad_measurement_file_is_refused_with_its_line(refused, case, command) -> None:
+def test_invalid_measurement_file_is_refused_with_its_line(run_refused, case, command) -> None:
     old, new, sentence = DATA_CASES[case]
-    assert sentence in refused(command, data_csv=DATA.replace(old, new, 1))
+    assert sentence in run_refused(command, data_csv=DATA.replace(old, new, 1))
 
 
 POSES = "\n".join(line.rpartition(",")[0] for line in DATA.split("\n")[3:-1])
@@ -274,21 +276,19 @@ SEVERAL_CASES = {
     ["calibrate hexapod-42 {} -o run", "identifiability hexapod-42 {}", "validate hexapod-42 {}"],
 )
 @pytest.mark.parametrize("case", SEVERAL_CASES)
-def test_files_that_do_not_fit_together_are_refused_by_every_command(
-    refused, case, command
-) -> None:
+def test_inconsistent_files_are_refused_by_every_command(run_refused, case, command) -> None:
     poses, heights, sentence = SEVERAL_CASES[case]
-    assert sentence in refused(
+    assert sentence in run_refused(
         command.format("poses.csv heights.csv"), poses_csv=poses, heights_csv=heights
     )
 
 
-def test_an_export_of_which_no_line_fits_the_profile_is_refused(refused) -> None:
+def test_export_without_a_line_that_matches_the_profile_is_refused(run_refused) -> None:
     files = {
         "cmm_yaml": PROFILE,
         "export_txt": "Kugel;X;Y;Z;Ø\nA1;1,0;2,0;3,0;25\n".encode("latin-1"),
     }
-    found = refused("import export.txt --profile cmm.yaml -o data.csv", **files)
+    found = run_refused("import export.txt --profile cmm.yaml -o data.csv", **files)
     assert (
         "export.txt:2: no line of this export fits cmm.yaml; reason for the first one: the name "
         "'A1' "
@@ -296,24 +296,24 @@ def test_an_export_of_which_no_line_fits_the_profile_is_refused(refused) -> None
     )
 
 
-def test_fewer_equations_than_parameters_are_refused_with_both_numbers(refused) -> None:
-    found = refused("calibrate hexapod-42 data.csv -o run --method ls", data_csv=DATA)
+def test_too_few_equations_for_least_squares_are_refused_with_both_counts(run_refused) -> None:
+    found = run_refused("calibrate hexapod-42 data.csv -o run --method ls", data_csv=DATA)
     assert (
         "3 equations from 3 poses cannot determine 42 parameters. Measure at least 42 poses"
         in found
     )
 
 
-def test_fewer_equations_are_refused_by_default_too_unless_tolerances_are_asked_to_decide(
-    refused,
-) -> None:
-    found = refused("calibrate hexapod-42 data.csv -o run", data_csv=DATA)
+def test_too_few_equations_are_refused_by_default_with_a_hint_to_method_map(run_refused) -> None:
+    found = run_refused("calibrate hexapod-42 data.csv -o run", data_csv=DATA)
     assert "3 equations cannot determine 42 parameters" in found
     assert "Hint: use --method map" in found
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_every_kind_is_fitted_or_refused_in_a_sentence(tmp_path, monkeypatch, capsys, kind) -> None:
+def test_every_kind_is_calibrated_or_refused_with_a_message(
+    tmp_path, monkeypatch, capsys, kind
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["simulate", "hexapod-42", "--kind", kind, "-o", "data.csv"]) == 0
     capsys.readouterr()
@@ -324,7 +324,7 @@ def test_every_kind_is_fitted_or_refused_in_a_sentence(tmp_path, monkeypatch, ca
     assert all(line.startswith("loopcal: ") for line in err.splitlines())
 
 
-def test_a_byte_order_mark_is_accepted(tmp_path, capsys) -> None:
+def test_byte_order_mark_is_accepted(tmp_path, capsys) -> None:
     path = tmp_path / "robot.yaml"
     path.write_bytes(b"\xef\xbb\xbf" + ROBOT.encode())
     assert main(["check", str(path)]) == 0
@@ -359,19 +359,19 @@ USAGE_CASES = {
 
 
 @pytest.mark.parametrize("case", USAGE_CASES)
-def test_a_bad_command_line_is_refused(refused, case) -> None:
+def test_invalid_command_line_is_refused(run_refused, case) -> None:
     words, sentence = USAGE_CASES[case]
-    assert sentence in refused(words)
+    assert sentence in run_refused(words)
 
 
-def test_a_used_folder_is_refused_without_force(refused) -> None:
-    assert "this folder is not empty" in refused(
+def test_folder_with_other_files_is_refused_as_run_folder(run_refused) -> None:
+    assert "this folder is not empty" in run_refused(
         "calibrate hexapod-42 data.csv -o .", data_csv=DATA
     )
-    assert "something other than a run" in refused("calibrate hexapod-42 data.csv -o . --force")
+    assert "something other than a run" in run_refused("calibrate hexapod-42 data.csv -o . --force")
 
 
-def test_a_controller_that_is_not_there_is_refused(refused) -> None:
+def test_missing_controller_file_is_refused(run_refused) -> None:
     commanded = ",".join(
         f"commanded.{name}"
         for name in ("x [mm]", "y [mm]", "z [mm]", "roll [deg]", "pitch [deg]", "yaw [deg]")
@@ -379,13 +379,13 @@ def test_a_controller_that_is_not_there_is_refused(refused) -> None:
     text = DATA.replace(HEADER, f"pose,{commanded},z [mm]").replace(
         "# noise", "# controller: no.yaml\n# noise"
     )
-    assert "this robot file does not exist" in refused(
+    assert "this robot file does not exist" in run_refused(
         "calibrate hexapod-42 data.csv -o run", data_csv=text
     )
 
 
 @pytest.mark.parametrize("number", [LengthTolerance(sd=-2.9e-5), LengthTolerance(limits=-2.9e-5)])
-def test_tolerances_and_workspaces_are_told_with_their_units(number) -> None:
+def test_invalid_tolerance_or_workspace_is_reported_with_its_unit(number) -> None:
     with pytest.raises(MechanismError, match=r"the tolerance of base is -2.9e-05 m; it must"):
         standard_deviation(number, "base")
     with pytest.raises(MechanismError, match=r"the tolerance of tilt is 0 rad; it must"):
@@ -401,7 +401,7 @@ def test_tolerances_and_workspaces_are_told_with_their_units(number) -> None:
 
 
 @pytest.mark.parametrize(("stated", "noted"), [("other-robot", True), ("hexapod-42", False)])
-def test_another_robot_in_the_data_is_noted(tmp_path, capsys, stated, noted) -> None:
+def test_data_of_another_robot_give_a_note(tmp_path, capsys, stated, noted) -> None:
     data = tmp_path / "data.csv"
     data.write_text(f"# robot: {stated}\n{DATA}")
     for words in (

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands on the shipped hexapod: simulate, calibrate, validate, identifiability, with their
-files and exit codes.
-"""
+"""simulate, calibrate, validate, identifiability and check on shipped robots."""
 
 import json
 import shutil
@@ -35,19 +33,24 @@ def run(tmp_path, monkeypatch, capsys):
     return run
 
 
-def test_the_recipe_makes_the_shipped_measurements(run, tmp_path) -> None:
+def test_simulate_reproduces_the_shipped_measurements(run, tmp_path) -> None:
     assert run(SIMULATE)[0] == 0
-    made, shipped = (tmp_path / "again.csv").read_text(), (EXAMPLE / "measurements.csv").read_text()
-    assert [line for line in made.split("\n") if "," not in line] == [
+    simulated, shipped = (
+        (tmp_path / "again.csv").read_text(),
+        (EXAMPLE / "measurements.csv").read_text(),
+    )
+    assert [line for line in simulated.split("\n") if "," not in line] == [
         line for line in shipped.split("\n") if "," not in line
     ]
-    numbers = [np.loadtxt(text.split("\n"), delimiter=",", skiprows=7) for text in (made, shipped)]
+    numbers = [
+        np.loadtxt(text.split("\n"), delimiter=",", skiprows=7) for text in (simulated, shipped)
+    ]
     np.testing.assert_allclose(
         *numbers, rtol=0, atol=1e-10
     )  # [mm, deg]: rounding of another linear algebra library
 
 
-def test_calibrate_finds_the_true_machine_and_leaves_a_complete_run(run, tmp_path) -> None:
+def test_calibrate_estimates_the_truth_and_writes_a_complete_run_folder(run, tmp_path) -> None:
     code, out, err = run("calibrate hexapod-42 measurements.csv -o out/run --hold-out 0.25")
     assert code == 0, err
     assert "leg6.length" in out
@@ -75,7 +78,7 @@ def test_calibrate_finds_the_true_machine_and_leaves_a_complete_run(run, tmp_pat
     assert after < before / 15
 
 
-def test_json_is_one_document_on_standard_output_and_equals_the_runs(run, tmp_path) -> None:
+def test_calibrate_json_equals_the_result_in_the_run_folder(run, tmp_path) -> None:
     code, out, _ = run("calibrate hexapod-42 measurements.csv -o run --hold-out 0.25 --json")
     assert code == 0
     assert json.loads(out) == {
@@ -88,13 +91,13 @@ def test_json_is_one_document_on_standard_output_and_equals_the_runs(run, tmp_pa
 @pytest.mark.parametrize(
     "words", ["check hexapod-42", "identifiability hexapod-42 measurements.csv", SIMULATE]
 )
-def test_every_command_prints_json_and_nothing_else(run, words) -> None:
+def test_json_option_prints_one_document_and_nothing_else(run, words) -> None:
     code, out, err = run(f"{words} --json")
     assert (code, err) == (0, "")
     assert isinstance(json.loads(out, parse_constant=pytest.fail), dict)
 
 
-def test_quality_gates_that_are_not_met_give_exit_code_2_and_keep_the_run(run, tmp_path) -> None:
+def test_unmet_quality_gate_gives_exit_code_2_and_keeps_the_run(run, tmp_path) -> None:
     words = "calibrate hexapod-42 measurements.csv -o run --hold-out 0.25 --force --limit-position"
     assert run(f"{words} 0.02mm --limit-angle 0.01deg")[0] == 0
     code, _, err = run(f"{words} 0.1um")
@@ -103,13 +106,13 @@ def test_quality_gates_that_are_not_met_give_exit_code_2_and_keep_the_run(run, t
     assert (tmp_path / "run" / "result.json").exists()
 
 
-def test_a_gate_without_held_out_poses_is_refused(run) -> None:
+def test_position_limit_without_held_out_poses_is_refused(run) -> None:
     code, _, err = run("calibrate hexapod-42 measurements.csv -o run --limit-position 1mm")
     assert code == 1
     assert "Hint: add --hold-out 0.25" in err
 
 
-def test_validate_judges_a_run_by_other_measurements_only(run) -> None:
+def test_validate_needs_measurements_that_were_not_fitted(run) -> None:
     assert run("calibrate hexapod-42 measurements.csv -o run")[0] == 0
     code, _, err = run("validate run measurements.csv")
     assert code == 1
@@ -122,7 +125,7 @@ def test_validate_judges_a_run_by_other_measurements_only(run) -> None:
     assert json.loads(run("validate run again.csv --json")[1])["passed"] is True
 
 
-def test_a_calibration_can_start_from_a_corrected_robot_file(run) -> None:
+def test_calibration_from_a_corrected_robot_file_gives_the_same_estimate(run) -> None:
     assert run("calibrate hexapod-42 measurements.csv -o run")[0] == 0
     assert run("calibrate run/robot.yaml measurements.csv -o run2")[0] == 0
     first, second = load_run("run"), load_run("run2")
@@ -136,7 +139,7 @@ def test_a_calibration_can_start_from_a_corrected_robot_file(run) -> None:
 @pytest.mark.parametrize(
     "method", ["map", "ls", "ridge", "ridge --lam 0.5", "tsvd --keep 30", "tsvd"]
 )
-def test_other_methods_calibrate_too(run, method) -> None:
+def test_calibrate_accepts_every_method(run, method) -> None:
     # 30 of 42 directions leave more than the stated noise explains, and the exit code says so
     code = 2 if method == "tsvd --keep 30" else 0
     assert (
@@ -145,7 +148,7 @@ def test_other_methods_calibrate_too(run, method) -> None:
     )
 
 
-def test_poses_are_dropped_and_weighed_only_when_asked(run) -> None:
+def test_drop_excludes_poses_and_loss_is_reported(run) -> None:
     words = "calibrate hexapod-42 measurements.csv -o run --drop 3 --drop 7 --loss tukey --verbose"
     code, out, _ = run(words)
     assert code == 0
@@ -155,7 +158,7 @@ def test_poses_are_dropped_and_weighed_only_when_asked(run) -> None:
     assert "no pose '99'" in run("calibrate hexapod-42 measurements.csv -o run2 --drop 99")[2]
 
 
-def test_the_result_says_how_far_the_fit_can_be_trusted(run) -> None:
+def test_result_contains_outliers_expected_benefit_and_prior_conflict(run) -> None:
     code, out, _ = run("calibrate hexapod-42 measurements.csv -o run --verbose")
     assert code == 0
     assert "xpected error" in out
@@ -166,28 +169,28 @@ def test_the_result_says_how_far_the_fit_can_be_trusted(run) -> None:
     assert found["fit"]["prior_conflict"]["conflict"] is False
 
 
-def test_a_model_can_be_chosen(run) -> None:
+def test_choose_model_selects_the_ideal_model(run) -> None:
     code, out, _ = run("calibrate hexapod-42 measurements.csv -o run --choose-model --verbose")
     assert code == 0
     assert "ideal (chosen)" in out
     assert load_run("run").result["model_choice"]["chosen"] == "ideal"
 
 
-def test_noise_can_be_estimated_from_the_residual(run) -> None:
+def test_noise_estimated_from_the_residuals_is_reported(run) -> None:
     code, out, _ = run("calibrate hexapod-42 measurements.csv -o run --noise estimated")
     assert code == 0
     assert "noise" in out
     assert "estimated from the residual" in " ".join(out.split())
 
 
-def test_an_option_of_another_method_is_refused(run) -> None:
+def test_option_of_another_method_is_refused(run) -> None:
     assert (
         "--lam belongs to --method ridge"
         in run("calibrate hexapod-42 measurements.csv -o run --lam 1")[2]
     )
 
 
-def test_identifiability_names_what_heights_alone_cannot_tell(run) -> None:
+def test_heights_alone_cannot_determine_all_parameters(run) -> None:
     assert (
         "42 of 42 parameter combinations" in run("identifiability hexapod-42 measurements.csv")[1]
     )
@@ -209,7 +212,7 @@ def test_identifiability_without_data_draws_poses_from_the_workspace(run, robot)
     assert "parameter combinations" in out
 
 
-def test_check_shows_what_a_file_expands_into_in_its_units(run) -> None:
+def test_check_expand_shows_joints_and_parameters_in_file_units(run) -> None:
     out = run("check linear-delta --expand")[1]
     rows = [line.split() for line in out.splitlines()]
     assert ["arm3", "tower", "0", "105", "0"] in [row[:5] for row in rows]
@@ -223,8 +226,8 @@ def test_check_shows_what_a_file_expands_into_in_its_units(run) -> None:
 
 
 @pytest.mark.parametrize("name", ["five-bar", "3-rrr", "rotary-delta"])
-def test_joints_are_shown_where_they_stand_with_the_platform_at_home(run, name) -> None:
-    """Not where the search for home starts (`start:`), which differs by some degrees."""
+def test_check_expand_shows_joint_angles_at_the_home_pose(run, name) -> None:
+    """The angles differ from the start of the search for home (`start:`) by some degrees."""
     robot, out = load_robot(name), run(f"check {name} --expand")[1]
     shown = {
         tuple(row.split()[:2]): row.split()[-2]
@@ -241,7 +244,7 @@ def test_joints_are_shown_where_they_stand_with_the_platform_at_home(run, name) 
 
 
 @pytest.mark.parametrize("robot", sorted(list_shipped_robots()))
-def test_every_shipped_robot_expands_and_no_number_is_cut_short(run, robot) -> None:
+def test_check_expand_of_every_shipped_robot_truncates_no_number(run, robot) -> None:
     code, out, err = run(f"check {robot} --expand")
     assert (code, err) == (0, "")
     assert "…" not in out
@@ -249,7 +252,7 @@ def test_every_shipped_robot_expands_and_no_number_is_cut_short(run, robot) -> N
     assert {limb["name"] for limb in document["assembly"]["limbs"]}
 
 
-def test_drawn_errors_are_written_as_a_robot_file(run) -> None:
+def test_simulate_writes_the_drawn_errors_as_a_robot_file(run) -> None:
     words = "simulate hexapod-42 --poses poses.csv --draw-errors --truth drawn.yaml -o drawn.csv"
     assert run(words)[0] == 0
     drawn = load_robot("drawn.yaml")
@@ -257,7 +260,7 @@ def test_drawn_errors_are_written_as_a_robot_file(run) -> None:
     assert run("calibrate hexapod-42 drawn.csv -o run")[0] == 0
 
 
-def test_simulated_encoders_are_as_noisy_as_asked_and_their_file_says_so(run, tmp_path) -> None:
+def test_simulate_adds_the_requested_noise_to_readings_and_states_it(run, tmp_path) -> None:
     words = "simulate linear-delta --draw 30 --kind position --seed 4"
     assert (
         run(f"{words} -o exact.csv")[0]

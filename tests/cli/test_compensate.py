@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal compensate`, and `loopcal calibrate --prior`: files with units, exit codes, refusals in
-a sentence.
-"""
+"""`loopcal compensate` and `loopcal calibrate --prior`: files, exit codes and error messages."""
 
 import json
 import shutil
@@ -26,7 +24,7 @@ WANTED = np.array([[0, 0, 0.2, 0, 0, 0], [-0.02, 0.01, 0.21, *np.deg2rad([5, -3,
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def example_folder(tmp_path_factory):
     """A folder with the example's files and a run on its measurements."""
     folder = tmp_path_factory.mktemp("compensate")
     for path in EXAMPLE.iterdir():
@@ -37,10 +35,10 @@ def made(tmp_path_factory):
 
 
 @pytest.fixture
-def run(made, monkeypatch, capsys):
-    """Run a command line in that folder; return exit code, standard output and standard error."""
-    monkeypatch.chdir(made)
-    (made / "targets.csv").write_text(TARGETS)
+def run(example_folder, monkeypatch, capsys):
+    """Run a command line in the example folder; return exit code, standard output and standard error."""
+    monkeypatch.chdir(example_folder)
+    (example_folder / "targets.csv").write_text(TARGETS)
 
     def run(words: str) -> tuple[int, str, str]:
         code = main(words.split())
@@ -49,12 +47,12 @@ def run(made, monkeypatch, capsys):
     return run
 
 
-def test_readings_from_the_file_take_the_calibrated_robot_to_the_targets(run, made) -> None:
+def test_written_readings_move_the_calibrated_robot_to_the_targets(run, example_folder) -> None:
     code, out, err = run("compensate run targets.csv -o readings.csv")
     assert code == 0, err
     assert "home" in out
     assert "U = 2 x rms uncertainty: tool point, base axes, in the base frame" in out
-    table = read_table(made / "readings.csv")
+    table = read_table(example_folder / "readings.csv")
     q = np.column_stack([table.numbers(f"q{i}", Dimension.LENGTH) for i in range(1, 7)])
     np.testing.assert_allclose(
         q, inverse(load_robot("run/robot.yaml"), WANTED).q, rtol=0, atol=1e-15
@@ -63,11 +61,13 @@ def test_readings_from_the_file_take_the_calibrated_robot_to_the_targets(run, ma
     assert (table.numbers("note U x", Dimension.LENGTH) < 3e-6).all()  # [m], instrument 1 um
 
 
-def test_commands_lead_the_nominal_controller_to_the_same_readings(run, made) -> None:
+def test_written_commands_reach_the_targets_through_the_nominal_controller(
+    run, example_folder
+) -> None:
     code, out, err = run("compensate run targets.csv --mode commands --steps 4 -o commands.csv")
     assert code == 0, err
     assert "After step 4: at most" in out
-    table = read_table(made / "commands.csv")
+    table = read_table(example_folder / "commands.csv")
     commanded = [table.numbers(f"commanded.{n}", Dimension.LENGTH) for n in "xyz"]
     commanded += [
         table.numbers(f"commanded.{n}", Dimension.ANGLE) for n in ("roll", "pitch", "yaw")
@@ -78,7 +78,7 @@ def test_commands_lead_the_nominal_controller_to_the_same_readings(run, made) ->
     np.testing.assert_allclose(forward(calibrated, readings).T, wanted, rtol=0, atol=1e-12)
 
 
-def test_without_an_output_file_the_csv_text_is_printed_and_json_is_one_document(run) -> None:
+def test_compensate_without_an_output_file_prints_csv_or_json(run) -> None:
     code, out, _ = run("compensate run targets.csv")
     assert code == 0
     assert out.startswith("pose,q1 [mm],q2 [mm]")
@@ -89,14 +89,14 @@ def test_without_an_output_file_the_csv_text_is_printed_and_json_is_one_document
     assert np.shape(document["uncertainty"]["expanded"]) == (2, 6)
 
 
-def test_a_robot_file_has_no_uncertainties(run) -> None:
+def test_compensation_from_a_robot_file_has_no_uncertainty(run) -> None:
     code, out, _ = run("compensate truth.yaml targets.csv --json")
     assert code == 0
     assert json.loads(out)["uncertainty"] is None
 
 
-def test_a_target_out_of_the_machines_limits_gives_exit_code_2_and_no_reading(run, made) -> None:
-    (made / "targets.csv").write_text(TARGETS + UNREACHABLE)
+def test_target_outside_the_limits_gives_exit_code_2_and_no_reading(run, example_folder) -> None:
+    (example_folder / "targets.csv").write_text(TARGETS + UNREACHABLE)
     code, out, err = run("compensate run targets.csv")
     assert code == 2
     assert "target 'high': outside the machine's limits: stroke of q1" in err
@@ -118,8 +118,10 @@ def test_a_target_out_of_the_machines_limits_gives_exit_code_2_and_no_reading(ru
         ("pose\n", "has a header but no rows"),
     ],
 )
-def test_bad_targets_are_refused_in_a_sentence(run, made, text, sentence) -> None:
-    (made / "targets.csv").write_text(text)
+def test_invalid_target_file_is_refused_in_one_sentence(
+    run, example_folder, text, sentence
+) -> None:
+    (example_folder / "targets.csv").write_text(text)
     code, out, err = run("compensate run targets.csv")
     assert (code, out) == (1, "")
     assert sentence in err
@@ -144,44 +146,48 @@ def test_bad_targets_are_refused_in_a_sentence(run, made, text, sentence) -> Non
         ("calibrate hexapod-42 later.csv -o new --prior run --free-limb leg9", "no limb 'leg9'"),
     ],
 )
-def test_requests_that_make_no_sense_are_refused_in_a_sentence(
-    run, made, later, words, sentence
+def test_invalid_command_line_is_refused_in_one_sentence(
+    run, example_folder, later_data, words, sentence
 ) -> None:
     code, _, err = run(words)
     assert code == 1
     assert sentence in err
     assert err.count("\n") == 1 + err.count("\nHint: ")
-    assert not (made / "new").exists()
+    assert not (example_folder / "new").exists()
 
 
 @pytest.fixture(scope="module")
-def later(made):
+def later_data(example_folder):
     """Measurements of the same machine on another day."""
     words = "--sigma-position 0.001mm --sigma-angle 5urad --seed 7"
     main(
         [
             "simulate",
-            str(made / "truth.yaml"),
+            str(example_folder / "truth.yaml"),
             "--poses",
-            str(made / "poses.csv"),
+            str(example_folder / "poses.csv"),
             *words.split(),
             "-o",
-            str(made / "later.csv"),
+            str(example_folder / "later.csv"),
         ]
     )
-    return made / "later.csv"
+    return example_folder / "later.csv"
 
 
-def test_calibrate_with_a_prior_says_whether_the_machine_moved(run, later, made) -> None:
+def test_calibrate_with_a_prior_reports_whether_the_freed_limb_changed(
+    run, later_data, example_folder
+) -> None:
     code, out, err = run(
         "calibrate hexapod-42 later.csv -o second --prior run --free-limb leg3 --force"
     )
     assert code == 0, err
     assert out.startswith("Undecided: hexapod-42")
-    result = json.loads((made / "second" / "result.json").read_text())
+    result = json.loads((example_folder / "second" / "result.json").read_text())
     assert result["change"]["what"] == "leg3"
     assert result["change"]["moved"] is False
     assert set(result["made_by"]["inputs"]) == {"robot", "data", "prior"}
-    first, second = (np.load(made / name / "arrays.npz")["sd"] for name in ("run", "second"))
+    first, second = (
+        np.load(example_folder / name / "arrays.npz")["sd"] for name in ("run", "second")
+    )
     others = np.delete(np.arange(42), slice(14, 21))
     assert (second[others] < first[others]).all()

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Convention checks at the command line: slips are refused with the flag that overrides them, and
-frames of a run are used again.
-"""
+"""Convention checks on the command line, and setup frames that `validate` takes from a run."""
 
 import json
 
@@ -17,7 +15,7 @@ from loopcal.workflow import calibrate
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch, capsys):
+def folder_and_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
 
     def run(words: str) -> tuple[int, str, str]:
@@ -28,8 +26,8 @@ def here(tmp_path, monkeypatch, capsys):
     return tmp_path, run
 
 
-def saved(path, kind, n=9, seed=0, change=None, unknowns=None):
-    """Write what a hexapod within its tolerances shows."""
+def write_simulated_data(path, kind, n=9, seed=0, change=None, unknowns=None):
+    """Write simulated measurements of a hexapod within its tolerances."""
     robot = load_robot("hexapod-42")
     truth = robot.with_values(
         robot.values + 0.03e-3 * np.random.default_rng(0).standard_normal(len(robot.values))
@@ -49,20 +47,20 @@ def saved(path, kind, n=9, seed=0, change=None, unknowns=None):
 MOVED = "validation.setup-moved"
 
 
-def codes(result: tuple[int, str, str]) -> set[str]:
+def read_codes(result: tuple[int, str, str]) -> set[str]:
     """Return the codes of the findings in a JSON document of a command that succeeded."""
     code, out, _ = result
     assert code == 0
     return {finding["code"] for finding in json.loads(out)["findings"]}
 
 
-def metres(text: str) -> str:
+def state_lengths_in_meters(text: str) -> str:
     return text.replace("x [mm]", "x [m]").replace("y [mm]", "y [m]").replace("z [mm]", "z [m]")
 
 
-def test_a_slip_is_refused_in_one_sentence_and_overridden_by_its_flag(here) -> None:
-    folder, run = here
-    robot = saved(folder / "data.csv", Pose(), change=metres)
+def test_wrong_length_unit_is_refused_without_allow_implausible(folder_and_run) -> None:
+    folder, run = folder_and_run
+    robot = write_simulated_data(folder / "data.csv", Pose(), change=state_lengths_in_meters)
     for command in ("calibrate hexapod-42 data.csv -o run", "identifiability hexapod-42 data.csv"):
         code, out, err = run(command)
         assert (code, out) == (1, "")
@@ -78,8 +76,8 @@ def test_a_slip_is_refused_in_one_sentence_and_overridden_by_its_flag(here) -> N
     assert run("calibrate hexapod-42 data.csv -o run --allow-implausible")[0] in {0, 2}
 
 
-def test_a_target_that_no_pose_moves_is_refused_and_overridden_by_its_flag(here) -> None:
-    folder, run = here
+def test_target_that_never_moves_is_refused_without_allow_still(folder_and_run) -> None:
+    folder, run = folder_and_run
 
     def frozen(text: str) -> str:
         lines = text.splitlines()
@@ -95,7 +93,7 @@ def test_a_target_that_no_pose_moves_is_refused_and_overridden_by_its_flag(here)
             + "\n"
         )
 
-    saved(folder / "data.csv", Pose(), change=frozen)
+    write_simulated_data(folder / "data.csv", Pose(), change=frozen)
     code, out, err = run("calibrate hexapod-42 data.csv -o run")
     assert (code, out) == (1, "")
     assert "'pose' of kind 'pose' never moves: its readings stay within 0" in err
@@ -103,47 +101,49 @@ def test_a_target_that_no_pose_moves_is_refused_and_overridden_by_its_flag(here)
     assert run("identifiability hexapod-42 data.csv --allow-still --allow-implausible")[0] == 0
 
 
-def test_validate_uses_the_frame_that_the_run_found(here) -> None:
-    folder, run = here
+def test_validate_uses_the_frame_estimated_by_the_run(folder_and_run) -> None:
+    folder, run = folder_and_run
     placed = {"frame.x": 0.1, "frame.rz": 0.5}
-    saved(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)
-    saved(folder / "more.csv", Pose(unknown=("frame",)), 6, 1, unknowns=placed)
+    write_simulated_data(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)
+    write_simulated_data(folder / "more.csv", Pose(unknown=("frame",)), 6, 1, unknowns=placed)
     assert run("calibrate hexapod-42 data.csv -o run")[0] == 0
-    assert codes(run("validate run more.csv --json")) == {"validation.setup-kept"}
-    assert codes(run("validate run more.csv --refit frame --json")) == {"validation.setup-fitted"}
+    assert read_codes(run("validate run more.csv --json")) == {"validation.setup-kept"}
+    assert read_codes(run("validate run more.csv --refit frame --json")) == {
+        "validation.setup-fitted"
+    }
     code, _, err = run("validate run more.csv --refit tracker")
     assert code == 1
     assert "is called 'tracker'; the data have: frame" in err
 
 
-def test_a_frame_that_was_moved_since_the_fit_is_named_and_kept_for_both_errors(here) -> None:
-    folder, run = here
+def test_frame_moved_since_the_fit_is_reported_and_kept_for_both_errors(folder_and_run) -> None:
+    folder, run = folder_and_run
     placed = {"frame.x": 0.1, "frame.rz": 0.5}
-    saved(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)
-    saved(
+    write_simulated_data(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)
+    write_simulated_data(
         folder / "moved.csv", Pose(unknown=("frame",)), 6, 1, unknowns=placed | {"frame.x": 0.105}
     )
-    saved(folder / "one.csv", Pose(unknown=("frame",)), 1, 1, unknowns=placed | {"frame.x": 0.105})
+    write_simulated_data(
+        folder / "one.csv", Pose(unknown=("frame",)), 1, 1, unknowns=placed | {"frame.x": 0.105}
+    )
     assert run("calibrate hexapod-42 data.csv -o run")[0] == 0
     code, out, _ = run("validate run moved.csv")
     assert code == 0
     assert "Position error (rms): the same" in out  # 5 mm of the frame in both
     assert "Hint: use --refit frame" in out
-    assert MOVED in codes(run("validate run moved.csv --json"))
+    assert MOVED in read_codes(run("validate run moved.csv --json"))
     code, out, _ = run("validate run moved.csv --refit frame")
     assert code == 0
     assert "times smaller after calibration" in out
-    assert MOVED not in codes(run("validate run moved.csv --refit frame --json"))
+    assert MOVED not in read_codes(run("validate run moved.csv --refit frame --json"))
     # one pose cannot show it: six numbers, six unknowns
-    assert MOVED not in codes(run("validate run one.csv --json"))
+    assert MOVED not in read_codes(run("validate run one.csv --json"))
 
 
-def test_a_prior_or_a_fixed_coordinate_that_the_data_contradict_is_refused_by_its_name(
-    here,
-) -> None:
-    folder, run = here
+def test_prior_or_fixed_value_that_contradicts_the_data_is_refused_by_name(folder_and_run) -> None:
+    folder, run = folder_and_run
     placed = {"frame.x": 0.1, "frame.rz": 0.5}
-    saved(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)
+    write_simulated_data(folder / "data.csv", Pose(unknown=("frame",)), 20, 0, unknowns=placed)
     text = (folder / "data.csv").read_text()
 
     def said(statement: str) -> tuple[int, str, str]:

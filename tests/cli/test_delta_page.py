@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/delta-printers.md: its files are those of the example, and its commands give its numbers."""
+"""docs/delta-printers.md: its files equal those of the example; its commands print its numbers."""
 
 import json
 import re
@@ -16,14 +16,14 @@ from tests.cli.printed_tables import read_table_rows
 
 @pytest.fixture
 def page(root, tmp_path, monkeypatch) -> str:
-    """Work in a copy of the example's folder."""
+    """Work in a copy of the example's folder; return the text of the page."""
     for path in (root / "examples" / "delta-printer").iterdir():
         shutil.copy(path, tmp_path)
     monkeypatch.chdir(tmp_path)
     return (root / "docs" / "delta-printers.md").read_text("utf-8")
 
 
-def test_the_command_prints_the_numbers_of_the_page(page, capsys) -> None:
+def test_calibrate_prints_the_numbers_of_the_page(page, capsys) -> None:
     command = re.search(r"^loopcal (calibrate .*)$", page, re.MULTILINE)
     printed = re.search(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     assert command
@@ -41,7 +41,7 @@ def test_the_command_prints_the_numbers_of_the_page(page, capsys) -> None:
     assert f"{result['start']['before'] / result['start']['after']:.1f} times smaller" in page
 
 
-def test_the_robot_file_of_the_page_is_the_same_printer(page, tmp_path) -> None:
+def test_robot_file_of_the_page_equals_that_of_the_example(page, tmp_path) -> None:
     text = re.search(r"^```yaml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     assert text
     (tmp_path / "page.yaml").write_text(text[1])
@@ -51,7 +51,7 @@ def test_the_robot_file_of_the_page_is_the_same_printer(page, tmp_path) -> None:
     np.testing.assert_array_equal(ours.parameters.free, shipped.parameters.free)
 
 
-def test_the_truth_lies_in_the_intervals(page) -> None:
+def test_truth_lies_within_3_5_standard_deviations_of_the_estimate(page) -> None:
     assert main(["calibrate", "printer.yaml", "heights.csv", "-o", "run"]) == 0
     sd = np.load("run/arrays.npz")["sd"]
     free = load_robot("printer.yaml").parameters.free
@@ -59,25 +59,25 @@ def test_the_truth_lies_in_the_intervals(page) -> None:
     assert np.abs(errors).max() < 3.5  # six values, in standard deviations
 
 
-def test_a_robot_file_beyond_the_limit_of_the_page_ends_with_code_2(page, capsys) -> None:
+def test_robot_file_beyond_the_limit_of_the_page_gives_exit_code_2(page, capsys) -> None:
     command = re.search(r"^loopcal (validate .* --limit-position .*)$", page, re.MULTILINE)
     assert command
     assert main(command[1].split()) == 2
     assert "quality gate not met" in capsys.readouterr().err
 
 
-def test_a_list_of_points_determines_what_the_page_says(page, capsys) -> None:
+def test_identifiability_of_a_list_of_points_gives_the_values_of_the_page(page, capsys) -> None:
     command = re.search(r"^loopcal (identifiability .*)$", page, re.MULTILINE)
     assert command
     assert main(command[1].split()) == 0
-    left = _left(capsys.readouterr().out)
+    left = _read_relative_uncertainties(capsys.readouterr().out)
     assert {name: value for name, value in left.items() if "tower" in name} == {
         "tower1.angle": 0.26, "tower2.angle": 0.26,
         "tower1.stop": 0.05, "tower2.stop": 0.05, "tower3.stop": 0.05,
     }  # fmt: skip
 
 
-def test_thirteen_heights_leave_the_arms_where_they_were(page, tmp_path, capsys) -> None:
+def test_13_heights_hardly_determine_the_arm_lengths(page, tmp_path, capsys) -> None:
     lines = (tmp_path / "printer.yaml").read_text().splitlines(keepends=True)
     (tmp_path / "nine.yaml").write_text(
         "".join(line for line in lines if not line.startswith("fixed"))
@@ -86,10 +86,12 @@ def test_thirteen_heights_leave_the_arms_where_they_were(page, tmp_path, capsys)
     out = capsys.readouterr().out
     assert "9 of 9 parameter combinations" in out
     assert "0.92 to 0.94 of their tolerance" in " ".join(page.split())
-    assert {value for name, value in _left(out).items() if "arm" in name} == {0.92, 0.94}
+    assert {
+        value for name, value in _read_relative_uncertainties(out).items() if "arm" in name
+    } == {0.92, 0.94}
 
 
-def _left(out: str) -> dict[str, float]:
-    """The last column of the table of parameters."""
+def _read_relative_uncertainties(out: str) -> dict[str, float]:
+    """Return the last column of the table of parameters: sd divided by the tolerance."""
     rows = re.findall(r"^(\S+)\s+yes\s+(\d\.\d\d)$", out, re.MULTILINE)
     return {name: float(value) for name, value in rows}

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real delta printers as their owners would calibrate them: a robot file, a file of probed heights,
-one command.
+"""Calibration of real delta printers by a robot file, probed heights and one command.
 
 The reference is the geometry that the printers' own firmware stored. It was fitted to the same
 heights with equal weights.
@@ -15,7 +14,12 @@ from pathlib import Path
 import pytest
 
 from loopcal.cli import main
-from tests.cli.delta_printers import every_record, heights_only, stored, write_files
+from tests.cli.delta_printers import (
+    list_stored_geometry,
+    read_records,
+    select_records_without_distances,
+    write_files,
+)
 from tests.cli.printed_tables import read_table_rows
 from tests.io.formats.printers import printer_cfg
 
@@ -40,34 +44,36 @@ def calibrate(tmp_path, monkeypatch, capsys, data_folder):
     monkeypatch.chdir(tmp_path)
 
     def run(name: str, options: str = "", **files: float | str) -> tuple[str, dict]:
-        write_files(every_record(data_folder)[name], tmp_path, **files)  # type: ignore[arg-type]
+        write_files(read_records(data_folder)[name], tmp_path, **files)  # type: ignore[arg-type]
         assert main(f"{CALIBRATE} {options}".split()) == 0
         return capsys.readouterr().out, json.loads((tmp_path / "run" / "result.json").read_text())
 
     return run
 
 
-def test_every_record_of_heights_alone_is_in_the_list(data_folder) -> None:
-    assert sorted(heights_only(data_folder)) == sorted([*CALIBRATED, FACTORY_DEFAULT])
+def test_list_contains_every_record_without_distances(data_folder) -> None:
+    assert sorted(select_records_without_distances(data_folder)) == sorted(
+        [*CALIBRATED, FACTORY_DEFAULT]
+    )
 
 
-@pytest.mark.parametrize("stop_off", [0.0, 40.0, -40.0])
+@pytest.mark.parametrize("stop_offset", [0.0, 40.0, -40.0])
 @pytest.mark.parametrize("name", CALIBRATED)
-def test_wrong_stops_lead_back_to_the_answer_of_the_firmware(
-    calibrate, data_folder, name, stop_off
+def test_calibration_from_wrong_end_stops_gives_the_geometry_of_the_firmware(
+    calibrate, data_folder, name, stop_offset
 ) -> None:
-    out, result = calibrate(name, "--noise estimated", stop_off=stop_off)
-    answer = stored(every_record(data_folder)[name])
+    out, result = calibrate(name, "--noise estimated", stop_offset=stop_offset)
+    expected = list_stored_geometry(read_records(data_folder)[name])
     found = {row["name"]: row["estimate"] for row in result["fit"]["parameters"]}
-    assert sorted(found) == sorted(answer.keys() - {"tower3.angle"})
+    assert sorted(found) == sorted(expected.keys() - {"tower3.angle"})
     for parameter, value in found.items():
-        assert abs(value - answer[parameter]) < 2e-3, f"{parameter} [mm, deg]"
-    assert (result["start"]["verdict"] == "best") == (stop_off == 0.0)
+        assert abs(value - expected[parameter]) < 2e-3, f"{parameter} [mm, deg]"
+    assert (result["start"]["verdict"] == "best") == (stop_offset == 0.0)
     assert out.startswith("Undecided: printer, 6 parameters from 7 poses.")
 
 
-def test_the_command_works_as_typed_into_a_shell(tmp_path, data_folder) -> None:
-    write_files(heights_only(data_folder)[CALIBRATED[0]], tmp_path)
+def test_calibrate_runs_as_a_shell_command(tmp_path, data_folder) -> None:
+    write_files(select_records_without_distances(data_folder)[CALIBRATED[0]], tmp_path)
     command = [str(Path(sys.executable).parent / "loopcal"), *CALIBRATE.split()]
     done = subprocess.run(
         command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60
@@ -83,7 +89,7 @@ def test_the_command_works_as_typed_into_a_shell(tmp_path, data_folder) -> None:
     ]
 
 
-def test_a_factory_default_is_flagged_as_not_calibrated(calibrate, capsys) -> None:
+def test_factory_default_is_reported_as_not_calibrated(calibrate, capsys) -> None:
     _, result = calibrate(FACTORY_DEFAULT)
     assert result["start"]["verdict"] == "not calibrated"
     assert result["start"]["before"] / result["start"]["after"] > 5.0
@@ -94,12 +100,12 @@ def test_a_factory_default_is_flagged_as_not_calibrated(calibrate, capsys) -> No
     assert main(["validate", "run/robot.yaml", "heights.csv", "--limit-position", "0.1mm"]) == 0
 
 
-def test_a_probe_of_unknown_sigma_gives_no_verdict_on_the_nominal_geometry(calibrate) -> None:
+def test_unknown_sigma_gives_no_verdict_on_the_nominal_geometry(calibrate) -> None:
     _, result = calibrate(FACTORY_DEFAULT, "--noise estimated")
     assert result["start"]["verdict"] == "open"
 
 
-def test_one_degree_of_freedom_gives_intervals_only_with_the_sigma_of_the_probe(calibrate) -> None:
+def test_one_degree_of_freedom_gives_intervals_only_with_a_stated_sigma(calibrate) -> None:
     out, result = calibrate(CALIBRATED[2], "--noise estimated")
     assert result["fit"]["dof"] == pytest.approx(1.0)
     assert out.count("not given") == 6  # intervals
@@ -112,7 +118,7 @@ def test_one_degree_of_freedom_gives_intervals_only_with_the_sigma_of_the_probe(
         assert wide["plus_minus"] == pytest.approx(2 * narrow["plus_minus"], rel=1e-6)
 
 
-def test_a_geometry_from_heights_and_distances_is_not_the_best_for_heights_alone(calibrate) -> None:
+def test_geometry_fitted_to_distances_too_is_not_optimal_for_heights_alone(calibrate) -> None:
     """RazorCopter's firmware also used 12 distances; its heights alone give another geometry."""
     _, result = calibrate(WITH_DISTANCES, "--noise estimated")
     assert result["fit"]["rank"] == 6
@@ -122,23 +128,21 @@ def test_a_geometry_from_heights_and_distances_is_not_the_best_for_heights_alone
 
 
 @pytest.fixture
-def imported(tmp_path, monkeypatch, capsys, data_folder):
+def import_record(tmp_path, monkeypatch, capsys, data_folder):
     """Write a record as printer.cfg, import it, and return what was printed."""
     monkeypatch.chdir(tmp_path)
 
     def run(name: str, options: str = "") -> str:
-        (tmp_path / "printer.cfg").write_text(printer_cfg(every_record(data_folder)[name]), "utf-8")
+        (tmp_path / "printer.cfg").write_text(printer_cfg(read_records(data_folder)[name]), "utf-8")
         assert main(f"{IMPORT}{options}".split()) == 0
         return " ".join(capsys.readouterr().out.split())
 
     return run
 
 
-def test_import_reports_a_stored_geometry_that_is_not_the_optimum_of_the_firmwares_cost(
-    imported,
-) -> None:
+def test_import_reports_a_stored_geometry_that_is_not_optimal(import_record) -> None:
     """Two stored arms of this record differ from the optimum for its heights and distances."""
-    out = imported(WITH_DISTANCES)
+    out = import_record(WITH_DISTANCES)
     assert "the optimum of the firmware's" in out
     assert "0.6477 mm^2" in out
     assert "0.6160 mm^2" in out
@@ -146,10 +150,10 @@ def test_import_reports_a_stored_geometry_that_is_not_the_optimum_of_the_firmwar
     assert "arm3.length 215.7964 -> 215.6702" in out
 
 
-def test_the_page_has_the_numbers_of_the_real_printer(imported, capsys, root) -> None:
+def test_page_shows_the_numbers_of_the_real_printer(import_record, capsys, root) -> None:
     page = (root / "docs" / "delta-printers.md").read_text("utf-8")
     quoted = page.split("compares the numbers of these lines -->\n```text\n")[1].split("```")[0]
-    printed = imported(WITH_DISTANCES, " --sigma-height 0.05mm --sigma-distance 0.3mm")
+    printed = import_record(WITH_DISTANCES, " --sigma-height 0.05mm --sigma-distance 0.3mm")
     numbers = re.findall(r"\d+\.\d{4}", quoted)
     assert len(numbers) == 6
     assert re.findall(r"\d+\.\d{4}", printed) == numbers
@@ -172,13 +176,13 @@ def test_the_page_has_the_numbers_of_the_real_printer(imported, capsys, root) ->
     assert half["radius"] == pytest.approx(0.53, abs=0.005)
 
 
-def test_import_reports_a_factory_default_but_no_calibrated_printer(imported) -> None:
-    out = imported(FACTORY_DEFAULT)
+def test_import_reports_a_factory_default_but_not_a_calibrated_printer(import_record) -> None:
+    out = import_record(FACTORY_DEFAULT)
     assert "0.1179 mm^2" in out
     assert "0.0019 mm^2" in out
     assert "radius 161.7500 ->" in out
     for name in CALIBRATED:
-        assert "tored geometry is the optimum of the firmware's" in imported(name), name
+        assert "tored geometry is the optimum of the firmware's" in import_record(name), name
 
 
 @pytest.mark.parametrize(
@@ -191,11 +195,11 @@ def test_import_reports_a_factory_default_but_no_calibrated_printer(imported) ->
         (CALIBRATED[2], 6, 7.0),
     ],
 )
-def test_seven_heights_that_contradict_each_other_fail_and_no_height_is_named(
-    imported, capsys, name, height, times
+def test_seven_contradictory_heights_fail_without_naming_an_outlier(
+    import_record, capsys, name, height, times
 ) -> None:
     """Two printers as probed, and one with 0.3 mm, 15 times the noise, added to a height."""
-    imported(name)
+    import_record(name)
     lines = Path("probes.csv").read_text().split("\n")
     for i, line in enumerate(lines):
         if line.startswith(f"height{height},"):
@@ -212,15 +216,15 @@ def test_seven_heights_that_contradict_each_other_fail_and_no_height_is_named(
 
 
 @pytest.mark.parametrize("name", [*CALIBRATED, FACTORY_DEFAULT, WITH_DISTANCES])
-def test_nine_parameters_from_heights_alone_are_refused_with_a_suggested_measurement(
-    imported, capsys, tmp_path, data_folder, name
+def test_nine_parameters_from_heights_alone_are_refused_with_a_suggestion(
+    import_record, capsys, tmp_path, data_folder, name
 ) -> None:
-    imported(name)
+    import_record(name)
     text = (tmp_path / "printer.yaml").read_text()
     (tmp_path / "nine.yaml").write_text(
         "".join(s for s in text.splitlines(keepends=True) if not s.startswith("fixed"))
     )
-    write_files(every_record(data_folder)[name], tmp_path)
+    write_files(read_records(data_folder)[name], tmp_path)
     assert main(["identifiability", "nine.yaml", "heights.csv", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert (document["rank"], document["n_parameters"], document["n_equations"]) == (7, 9, 7)

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal import` and `loopcal export`: files of controllers in, corrected files out, nothing else
-in them changed.
-"""
+"""`loopcal import` and `loopcal export`: geometry and data of controller files."""
 
 import difflib
 import json
@@ -13,7 +11,7 @@ from loopcal.cli import main
 from loopcal.cli.exchange_commands import READ_FORMATS, WRITTEN_FORMATS
 from loopcal.io import load_measurements, load_robot
 from loopcal.io.formats import FORMATS
-from tests.cli.delta_printers import every_record, stored
+from tests.cli.delta_printers import list_stored_geometry, read_records
 from tests.io.formats.printers import printer_cfg
 
 FIRMWARE_CALIBRATED = (
@@ -32,12 +30,12 @@ def folder(tmp_path, monkeypatch):
 
 
 def run(command: str) -> int:
-    """Exit code of a command line."""
+    """Run a command line; return its exit code."""
     return main(command.split())
 
 
-def changed(before: str, after: str) -> list[str]:
-    """Lines that differ, as they are afterwards."""
+def list_changed_lines(before: str, after: str) -> list[str]:
+    """Return the lines of `after` that differ from `before`."""
     return [
         line[2:]
         for line in difflib.ndiff(before.splitlines(), after.splitlines())
@@ -46,12 +44,14 @@ def changed(before: str, after: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", sorted((*FIRMWARE_CALIBRATED, WITH_DISTANCES)))
-def test_a_printer_cfg_gives_its_geometry_and_every_probe(folder, data_folder, name) -> None:
-    record = every_record(data_folder)[name]
+def test_import_reads_the_geometry_and_every_probe_of_printer_cfg(
+    folder, data_folder, name
+) -> None:
+    record = read_records(data_folder)[name]
     (folder / "printer.cfg").write_text(printer_cfg(record))
     assert run("import printer.cfg -o printer.yaml --data data.csv") == 0
     robot = load_robot("printer.yaml")
-    for parameter, value in stored(record).items():
+    for parameter, value in list_stored_geometry(record).items():
         factor = np.pi / 180 if parameter.endswith("angle") else 1e-3
         assert robot.values[robot.parameters.index(parameter)] == pytest.approx(
             value * factor, abs=1e-12
@@ -70,10 +70,10 @@ def test_a_printer_cfg_gives_its_geometry_and_every_probe(folder, data_folder, n
 
 
 @pytest.mark.parametrize("name", FIRMWARE_CALIBRATED)
-def test_one_command_corrects_a_printer_whose_stops_are_far_off(
+def test_import_with_corrected_output_fixes_end_stops_20_mm_off(
     folder, capsys, data_folder, name
 ) -> None:
-    record = every_record(data_folder)[name]
+    record = read_records(data_folder)[name]
     text = printer_cfg(record, stop_off=20.0)
     (folder / "printer.cfg").write_text(text)
     assert run(ONE_COMMAND) == 0
@@ -81,14 +81,14 @@ def test_one_command_corrects_a_printer_whose_stops_are_far_off(
     corrected = (folder / "corrected.cfg").read_text()
     assert run("import corrected.cfg -o again.yaml") == 0
     again = load_robot("again.yaml")
-    for parameter, value in stored(record).items():
+    for parameter, value in list_stored_geometry(record).items():
         factor = np.pi / 180 if parameter.endswith("angle") else 1e-3
         assert abs(again.values[again.parameters.index(parameter)] / factor - value) < 2e-3, (
             f"{parameter} [mm, deg]"
         )
     # six numbers were identified, so at most six lines are others, all of them options of the
     # geometry
-    lines = changed(text, corrected)
+    lines = list_changed_lines(text, corrected)
     assert 3 <= len(lines) <= 6
     assert all(
         line.removeprefix("#*# ").startswith(("delta_radius", "angle", "position_endstop"))
@@ -101,8 +101,8 @@ def test_one_command_corrects_a_printer_whose_stops_are_far_off(
     )
 
 
-def test_the_chain_of_three_commands_reads_back_equal(folder, data_folder) -> None:
-    record = every_record(data_folder)[FIRMWARE_CALIBRATED[0]]
+def test_exported_printer_cfg_imports_with_the_calibrated_values(folder, data_folder) -> None:
+    record = read_records(data_folder)[FIRMWARE_CALIBRATED[0]]
     (folder / "printer.cfg").write_bytes(
         b"\xef\xbb\xbf" + printer_cfg(record, stop_off=5.0).replace("\n", "\r\n").encode()
     )
@@ -121,9 +121,11 @@ def test_the_chain_of_three_commands_reads_back_equal(folder, data_folder) -> No
     assert (folder / "twice.cfg").read_bytes() == after
 
 
-def test_json_and_csv_hold_every_parameter_with_its_interval(folder, capsys, data_folder) -> None:
+def test_exported_json_and_csv_contain_every_parameter_with_its_interval(
+    folder, capsys, data_folder
+) -> None:
     (folder / "printer.cfg").write_text(
-        printer_cfg(every_record(data_folder)[FIRMWARE_CALIBRATED[0]])
+        printer_cfg(read_records(data_folder)[FIRMWARE_CALIBRATED[0]])
     )
     assert run("import printer.cfg -o printer.yaml --data data.csv") == 0
     # the real printer's rows do not fit the sigma that the import states: exit code 2, and the run
@@ -146,8 +148,8 @@ def test_json_and_csv_hold_every_parameter_with_its_interval(folder, capsys, dat
         assert row["free"] == (row["name"] in half)
 
 
-def test_files_that_are_there_stay_without_force(folder, capsys, data_folder) -> None:
-    (folder / "printer.cfg").write_text(printer_cfg(every_record(data_folder)[WITH_DISTANCES]))
+def test_existing_file_is_replaced_only_with_force(folder, capsys, data_folder) -> None:
+    (folder / "printer.cfg").write_text(printer_cfg(read_records(data_folder)[WITH_DISTANCES]))
     (folder / "printer.yaml").write_text("mine")
     assert run("import printer.cfg -o printer.yaml") == 1
     assert "this file exists" in capsys.readouterr().err
@@ -186,7 +188,9 @@ def test_files_that_are_there_stay_without_force(folder, capsys, data_folder) ->
         ),
     ],
 )
-def test_bad_use_is_one_sentence(folder, capsys, command, sentence) -> None:
+def test_invalid_import_or_export_is_refused_in_one_sentence(
+    folder, capsys, command, sentence
+) -> None:
     assert run(command) == 1
     error = capsys.readouterr().err
     assert sentence in error
@@ -194,14 +198,14 @@ def test_bad_use_is_one_sentence(folder, capsys, command, sentence) -> None:
     assert list(folder.iterdir()) == []
 
 
-def test_commands_and_page_name_every_format(root) -> None:
+def test_page_and_commands_list_every_format(root) -> None:
     page = (root / "docs" / "formats.md").read_text()
     assert all(f"`{name}`" in page for name in FORMATS)
     assert {*READ_FORMATS} == {name for name, found in FORMATS.items() if found.read}
     assert {*WRITTEN_FORMATS} == {name for name, found in FORMATS.items() if found.write}
 
 
-def test_a_five_bar_goes_from_urdf_to_corrected_origins(folder, capsys, data_folder) -> None:
+def test_uncalibrated_five_bar_exports_to_the_same_urdf_file(folder, capsys, data_folder) -> None:
     source = data_folder / "urdf_closures" / "5bar_linkage" / "robot.urdf"
     assert run(f"import {source} -o five-bar.yaml") == 0
     assert (
@@ -212,13 +216,13 @@ def test_a_five_bar_goes_from_urdf_to_corrected_origins(folder, capsys, data_fol
     assert (folder / "same.urdf").read_bytes() == source.read_bytes()
 
 
-def test_heights_and_distances_give_the_optimum_of_the_firmwares_own_cost(
+def test_heights_and_distances_give_the_optimum_of_the_firmware_cost(
     folder, capsys, data_folder
 ) -> None:
     """With its weighting; two of the arms that this printer's firmware stored are not the optimum
     (cost 0.6477).
     """
-    record = every_record(data_folder)[WITH_DISTANCES]
+    record = read_records(data_folder)[WITH_DISTANCES]
     (folder / "printer.cfg").write_text(printer_cfg(record))
     sigma = 0.1 / np.sqrt(2 * len(record["distances"]) / len(record["heights"]))
     assert run(f"{ONE_COMMAND} --sigma-height {sigma}mm --sigma-distance 0.1mm --json") == 0
@@ -231,11 +235,15 @@ def test_heights_and_distances_give_the_optimum_of_the_firmwares_own_cost(
         "arm2.length": record["geometry_stored_in_config"]["arms"][1],
         "arm3.length": 215.6702,
     }
-    for name, value in {**stored(record), **best}.items():
+    for name, value in {**list_stored_geometry(record), **best}.items():
         if name in found:
             assert abs(found[name] - value) < 1e-3, f"{name} [mm, deg]"
     assert (
-        len(changed((folder / "printer.cfg").read_text(), (folder / "corrected.cfg").read_text()))
+        len(
+            list_changed_lines(
+                (folder / "printer.cfg").read_text(), (folder / "corrected.cfg").read_text()
+            )
+        )
         <= 9
     )
     assert run("import corrected.cfg -o again.yaml") == 0

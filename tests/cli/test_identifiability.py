@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal identifiability`: sentences, tables, the smaller robot file, JSON, and options that
-contradict each other.
-"""
+"""`loopcal identifiability`: text, JSON, reduced robot file and contradictory options."""
 
 import json
 
@@ -23,30 +21,30 @@ def run(tmp_path, monkeypatch, capsys):
     return run
 
 
-def test_five_of_six_coordinates_of_the_3_prs(run):
+def test_3_prs_without_psi_has_one_unidentifiable_combination(run):
     code, out, err = run("3-prs --measure x,y,z,phi,theta")
     assert (code, err) == (0, "")
     assert "determine 32 of 33 parameter combinations" in out
     document = json.loads(run("3-prs --measure x,y,z,phi,theta --json")[1])
-    (open_,) = document["unidentifiable"]
-    assert set(open_["names"]) == {"a1y", "a2y", "a3y"}
+    (combination,) = document["unidentifiable"]
+    assert set(combination["names"]) == {"a1y", "a2y", "a3y"}
     assert document["remedies"][0]["cures"][0]["words"] == "psi"
     states = {row["name"]: row["state"] for row in document["parameters"]}
     assert states["a2y"] == "together"
     assert [line.split()[0] for line in out.splitlines() if line.startswith("O")][-1] == "O5"
 
 
-def test_five_of_six_coordinates_of_the_tracker(run):
+def test_ru_pus_prs_without_psi_has_rank_24_of_25(run):
     document = json.loads(run("ru-pus-prs --measure x,y,z,phi,theta --json")[1])
     assert (document["rank"], document["n_parameters"]) == (24, 25)
 
 
 @pytest.mark.parametrize(("frames", "rank"), [("base", 36), ("tool", 36), ("base,tool", 30)])
-def test_unknown_frames_of_the_hexapod(run, frames, rank):
+def test_two_unknown_frames_reduce_the_rank_of_the_hexapod_by_twelve(run, frames, rank):
     assert json.loads(run(f"hexapod-42 --frames {frames} --json")[1])["rank"] == rank
 
 
-def test_the_reduced_file_is_written_and_whole(run, tmp_path):
+def test_reduce_writes_a_robot_file_with_identifiable_parameters_only(run, tmp_path):
     code, out, _ = run("hexapod-42 --frames base --reduce -o smaller.yaml")
     assert code == 0
     assert "36 of 42 parameters contain all information" in out
@@ -57,7 +55,7 @@ def test_the_reduced_file_is_written_and_whole(run, tmp_path):
     assert run("hexapod-42 --frames base --reduce -o smaller.yaml --force")[0] == 0
 
 
-def test_the_json_holds_all_of_it(run):
+def test_json_contains_combinations_suggestions_reduction_and_indices(run):
     document = json.loads(run("3-prs --measure x,y,z,phi,theta --reduce --json")[1])
     assert sorted(document["unidentifiable"][0]["names"]) == ["a1y", "a2y", "a3y"]
     assert document["remedies"][0]["cures"][0]["words"] == "psi"
@@ -82,15 +80,15 @@ def test_the_json_holds_all_of_it(run):
         ("3-prs -o smaller.yaml", "-o writes the robot of --reduce"),
     ],
 )
-def test_options_that_contradict_each_other_are_one_sentence(run, words, sentence):
+def test_contradictory_options_are_refused_in_one_sentence(run, words, sentence):
     code, out, err = run(words)
     assert (code, out) == (1, "")
     assert sentence in err
     assert err.count("\n") == 1
 
 
-def test_noisy_encoders_are_assumed_for_an_instrument_and_weaken_what_is_known(run):
-    """Readings of 1 mm beside positions of 10 um: every parameter is known worse, and none better."""  # noqa: E501
+def test_sigma_reading_reduces_the_singular_values(run):
+    """Readings with sigma 1 mm instead of exact ones, and positions with sigma 10 um."""
     words = "linear-delta --draw 20 --kind position --json"
     exact, noisy = (
         json.loads(run(words + more)[1])["singular_values"] for more in ("", " --sigma-reading 1mm")
@@ -115,7 +113,7 @@ def test_noisy_encoders_are_assumed_for_an_instrument_and_weaken_what_is_known(r
         ("--sigma-reading q1=5um,q2", "--sigma-reading 'q2' for q1: "),
     ],
 )
-def test_a_noise_of_readings_without_sense_is_one_sentence(run, words, sentence):
+def test_invalid_sigma_reading_is_refused_in_one_sentence(run, words, sentence):
     code, out, err = run(f"linear-delta --draw 5 {words}")
     assert (code, out) == (1, "")
     assert sentence in err

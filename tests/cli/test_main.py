@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line as a whole: help with examples, quick to start, one funnel for errors."""
+"""The command line as a whole: help texts, imports, error messages and exit codes."""
 
 import subprocess
 import sys
@@ -20,14 +20,14 @@ def test_help_lists_every_command(capsys) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_command_has_help_with_an_example_and_json(name, capsys) -> None:
+def test_help_of_every_command_has_an_example_and_the_option_json(name, capsys) -> None:
     assert main([name, "--help"]) == 0
     text = capsys.readouterr().out
     assert f"    loopcal {name} " in text
     assert "--json" in text
 
 
-def test_python_m_loopcal_is_the_command_line() -> None:
+def test_python_m_loopcal_runs_the_command_line() -> None:
     words = [sys.executable, "-m", "loopcal"]
     done = subprocess.run(
         [*words, "check", "no-such-robot"], capture_output=True, text=True, check=False
@@ -37,7 +37,7 @@ def test_python_m_loopcal_is_the_command_line() -> None:
     assert "no-such-robot" in done.stderr
 
 
-def test_nothing_heavy_is_imported_before_a_command_runs() -> None:
+def test_large_packages_are_not_imported_before_a_command_runs() -> None:
     code = "import sys, loopcal, loopcal.cli; print(*{'numpy', 'scipy', 'pydantic', 'ruamel', 'rich'} & set(sys.modules))"  # noqa: E501
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
@@ -60,7 +60,7 @@ def test_nothing_heavy_is_imported_before_a_command_runs() -> None:
         (click.UsageError("bad"), "loopcal: bad\n"),
     ],
 )
-def test_an_error_of_the_user_becomes_one_sentence_and_exit_code_1(
+def test_user_error_prints_one_sentence_and_gives_exit_code_1(
     monkeypatch, capsys, error, sentence
 ) -> None:
     def fail(*_args, **_kwargs):
@@ -74,13 +74,13 @@ def test_an_error_of_the_user_becomes_one_sentence_and_exit_code_1(
     assert err.strip().count("\n") == 0
 
 
-def test_a_mistake_of_our_own_is_not_hidden(monkeypatch) -> None:
+def test_programming_error_is_raised_with_its_traceback(monkeypatch) -> None:
     monkeypatch.setattr(robot_commands.check, "callback", lambda **_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(["check", "hexapod-42"])
 
 
-def test_a_reader_that_goes_away_causes_no_traceback() -> None:
+def test_closed_output_pipe_causes_no_traceback() -> None:
     code = "import sys; from loopcal.cli import main; sys.exit(main(['check', 'hexapod-42']))"
     with subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE

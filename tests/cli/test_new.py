@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal new` writes files that work as they are."""
+"""`loopcal new` writes robot files and measurement templates that work without changes."""
 
 import pytest
 
@@ -15,7 +15,7 @@ def _folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", sorted({*FAMILIES, *list_shipped_robots()}))
-def test_a_new_robot_of_every_family_closes_and_lists_its_keys(name) -> None:
+def test_new_robot_file_loads_and_lists_its_optional_keys(name) -> None:
     assert main(["new", name, "-o", "mine.yaml"]) == 0
     robot = load_robot("mine.yaml")
     assert robot.name == "mine"
@@ -25,12 +25,12 @@ def test_a_new_robot_of_every_family_closes_and_lists_its_keys(name) -> None:
     assert max(len(line) for line in text.split("\n") if line.startswith("#   ")) <= 120
 
 
-def test_a_name_that_yaml_would_read_as_a_number_is_quoted() -> None:
+def test_robot_name_that_looks_like_a_number_is_quoted() -> None:
     assert main(["new", "gough", "-o", "2.yaml"]) == 0
     assert load_robot("2.yaml").name == "2"
 
 
-def test_the_template_lacks_nothing_but_rows(tmp_path, capsys) -> None:
+def test_measurement_template_lacks_only_rows(tmp_path, capsys) -> None:
     words = "new linear-delta -o printer.yaml --measurements heights.csv --kind component --components z --sigma-position 20um"  # noqa: E501
     assert main(words.split()) == 0
     template = tmp_path / "heights.csv"
@@ -57,7 +57,7 @@ def test_the_template_lacks_nothing_but_rows(tmp_path, capsys) -> None:
     )
 
 
-def test_a_template_of_several_kinds_is_accepted_once_it_is_filled_in(tmp_path, capsys) -> None:
+def test_filled_in_template_of_two_kinds_is_accepted(tmp_path, capsys) -> None:
     words = "new gough -o robot.yaml --measurements data.csv --kind position,inclination --sigma-position 5um"  # noqa: E501
     assert main(words.split()) == 0
     text = (tmp_path / "data.csv").read_text()
@@ -89,7 +89,7 @@ def test_a_template_of_several_kinds_is_accepted_once_it_is_filled_in(tmp_path, 
     assert "'position' is named twice" in capsys.readouterr().err
 
 
-def test_files_that_are_there_stay_without_force(tmp_path, capsys) -> None:
+def test_existing_file_is_replaced_only_with_force(tmp_path, capsys) -> None:
     assert main(["new", "gough", "-o", "mine.yaml"]) == 0
     (tmp_path / "mine.yaml").write_text("mine")
     capsys.readouterr()
@@ -99,6 +99,6 @@ def test_files_that_are_there_stay_without_force(tmp_path, capsys) -> None:
     assert main(["new", "3-prs", "-o", "mine.yaml", "--force"]) == 0
 
 
-def test_an_unknown_family_is_refused_with_those_that_are_known(capsys) -> None:
+def test_unknown_family_is_refused(capsys) -> None:
     assert main(["new", "hexpod", "-o", "mine.yaml"]) == 1
     assert "neither a family nor a shipped robot" in capsys.readouterr().err

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of the user are never replaced without a word, and a command writes all of its files or
-none.
-"""
+"""Commands overwrite no file unasked, and write all of their files or none."""
 
 import os
 import shutil
@@ -38,57 +36,55 @@ def run(tmp_path, monkeypatch, capsys):
     return run
 
 
-def contents() -> dict[str, bytes]:
+def read_all_files() -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in Path().rglob("*") if path.is_file()}
 
 
-READ, TWO, THERE, FOLDER = (
+IS_INPUT, IS_NAMED_TWICE, EXISTS, NO_FOLDER = (
     "is also an input of this command",
     "two outputs",
     "this file exists",
     "folder nodir does not exist",
 )
 REFUSED = {
-    "simulate robot.yaml -o robot.yaml": READ,
-    "simulate robot.yaml -o robot.yaml --force": READ,
-    "simulate robot.yaml --poses pp.csv -o ./pp.csv --force": READ,
-    "simulate robot.yaml -o new.csv --truth robot.yaml --force": READ,
-    "simulate robot.yaml -o new.csv --truth ./new.csv": TWO,
-    "simulate robot.yaml -o old.csv": THERE,
-    "simulate robot.yaml -o new.csv --truth old.csv": THERE,
-    "simulate robot.yaml -o new.csv --truth nodir/t.yaml": FOLDER,
-    "compensate robot.yaml pp.csv -o pp.csv --force": READ,
-    "compensate robot.yaml pp.csv -o robot.yaml --force": READ,
-    "compensate robot.yaml pp.csv -o old.csv": THERE,
-    "check robot.yaml --plot old.png": THERE,
-    "identifiability robot.yaml data.csv --reduce -o robot.yaml --force": READ,
-    "export robot.yaml --format csv -o robot.yaml --force": READ,
-    "new gough -o a.yaml --measurements nodir/x.csv": FOLDER,
-    "new gough -o a.yaml --measurements a.yaml": TWO,
+    "simulate robot.yaml -o robot.yaml": IS_INPUT,
+    "simulate robot.yaml -o robot.yaml --force": IS_INPUT,
+    "simulate robot.yaml --poses pp.csv -o ./pp.csv --force": IS_INPUT,
+    "simulate robot.yaml -o new.csv --truth robot.yaml --force": IS_INPUT,
+    "simulate robot.yaml -o new.csv --truth ./new.csv": IS_NAMED_TWICE,
+    "simulate robot.yaml -o old.csv": EXISTS,
+    "simulate robot.yaml -o new.csv --truth old.csv": EXISTS,
+    "simulate robot.yaml -o new.csv --truth nodir/t.yaml": NO_FOLDER,
+    "compensate robot.yaml pp.csv -o pp.csv --force": IS_INPUT,
+    "compensate robot.yaml pp.csv -o robot.yaml --force": IS_INPUT,
+    "compensate robot.yaml pp.csv -o old.csv": EXISTS,
+    "check robot.yaml --plot old.png": EXISTS,
+    "identifiability robot.yaml data.csv --reduce -o robot.yaml --force": IS_INPUT,
+    "export robot.yaml --format csv -o robot.yaml --force": IS_INPUT,
+    "new gough -o a.yaml --measurements nodir/x.csv": NO_FOLDER,
+    "new gough -o a.yaml --measurements a.yaml": IS_NAMED_TWICE,
 }
 
 
 @pytest.mark.parametrize("words", REFUSED)
-def test_what_would_replace_or_lose_a_file_is_refused_before_anything_is_written(
-    run, words
-) -> None:
-    before = contents()
+def test_output_that_would_overwrite_a_file_is_refused_before_writing(run, words) -> None:
+    before = read_all_files()
     code, out, err = run(words)
     assert (code, out, err.count("\n")) == (1, "", 1 + err.count("\nHint: "))
     assert REFUSED[words] in err
-    assert contents() == before
+    assert read_all_files() == before
 
 
-def test_force_replaces_a_file_that_is_not_read(run) -> None:
+def test_force_replaces_a_file_that_is_not_an_input(run) -> None:
     assert run("simulate robot.yaml -o old.csv --force")[0] == 0
     assert Path("old.csv").read_text() != "mine\n"
     assert run("compensate robot.yaml pp.csv -o old.csv --force")[0] == 0
     assert "note status" in Path("old.csv").read_text()
 
 
-def test_a_run_that_is_read_is_not_replaced(run) -> None:
+def test_run_folder_used_as_input_is_not_replaced(run) -> None:
     assert run("calibrate robot.yaml data.csv -o run")[0] == 0
-    before = contents()
+    before = read_all_files()
     for words in (
         "run/robot.yaml data.csv -o run --force",
         "robot.yaml pp.csv -o run --force --prior run",
@@ -97,11 +93,11 @@ def test_a_run_that_is_read_is_not_replaced(run) -> None:
         assert code == 1
         assert "cannot be replaced" in err
     code, _, err = run("compensate run pp.csv -o run/robot.yaml --force")
-    assert (code, READ in err) == (1, True)
-    assert contents() == before
+    assert (code, IS_INPUT in err) == (1, True)
+    assert read_all_files() == before
 
 
-def test_what_is_no_file_is_not_replaced_even_by_force(run) -> None:
+def test_pipe_is_not_replaced_even_with_force(run) -> None:
     os.mkfifo("pipe")
     Path("link").symlink_to("pipe")
     for name in ("pipe", "link"):
@@ -119,13 +115,13 @@ def test_what_is_no_file_is_not_replaced_even_by_force(run) -> None:
     assert not Path("new.yaml").exists()
 
 
-def test_force_on_a_symbolic_link_writes_the_file_that_it_names(run) -> None:
+def test_force_on_a_symbolic_link_writes_its_target(run) -> None:
     Path("folder").mkdir()
     Path("folder/real.csv").write_text("mine\n")
     Path("link.csv").symlink_to("folder/real.csv")
     Path("new.csv").symlink_to("folder/later.csv")
     code, _, err = run("simulate robot.yaml -o link.csv")
-    assert (code, THERE in err) == (1, True)
+    assert (code, EXISTS in err) == (1, True)
     for link, real in (("link.csv", "folder/real.csv"), ("new.csv", "folder/later.csv")):
         assert run(f"simulate robot.yaml -o {link} --force")[0] == 0
         assert Path(link).is_symlink()
@@ -134,7 +130,7 @@ def test_force_on_a_symbolic_link_writes_the_file_that_it_names(run) -> None:
     assert sorted(path.name for path in Path("folder").iterdir()) == ["later.csv", "real.csv"]
 
 
-def test_links_that_end_nowhere_or_outside_any_folder_are_refused(run) -> None:
+def test_circular_and_broken_links_are_refused(run) -> None:
     Path("circle").symlink_to("circle")
     Path("lost").symlink_to("nodir/file")
     for name, sentence in (
@@ -168,18 +164,18 @@ radius: 50
 """
 
 
-def test_an_import_whose_calibration_fails_leaves_everything_as_it_was(run) -> None:
+def test_import_with_a_failed_calibration_changes_no_file(run) -> None:
     """Two heights are too few for the six parameters."""
     Path("printer.cfg").write_text(PRINTER)
-    before = contents()
+    before = read_all_files()
     for words in ("-o printer.yaml --data heights.csv", "-o old.csv --data heights.csv --force"):
         code, out, err = run(f"import printer.cfg {words} --corrected corrected.cfg")
         assert (code, out) == (1, "")
         assert "2 equations from 2 poses cannot determine" in err
-        assert contents() == before
+        assert read_all_files() == before
 
 
-def test_the_template_of_a_kind_that_compares_poses_says_how_they_are_named(run) -> None:
+def test_template_of_a_kind_that_compares_poses_explains_their_names(run) -> None:
     assert run("new gough -o a.yaml --measurements m.csv --kind separation")[0] == 0
     assert "name them in the column pose as a;b and leave its" in Path("m.csv").read_text()
     assert run("new gough -o b.yaml --measurements n.csv --kind position")[0] == 0

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`loopcal plan` as a user meets it: sheet, data file, calibration with the poses held out that the
-plan holds out.
-"""
+"""`loopcal plan`: sheet, data file, calibration with the planned held-out poses, refusals."""
 
 import csv
 import json
@@ -18,29 +16,29 @@ SMALL = ["--poses", "8", "--hold-out", "3", "--candidates", "24", "--kind", "pos
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
-    """Work in an empty folder."""
+def folder(tmp_path, monkeypatch):
+    """Work in an empty folder and return it."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
 def run(command: str) -> int:
-    """Run a command line."""
+    """Run a command line; return its exit code."""
     return main(command.split())
 
 
-def rows_of(path) -> list[dict[str, str]]:
-    """Rows of a CSV file without its remarks."""
+def read_rows(path) -> list[dict[str, str]]:
+    """Return the rows of a CSV file, without comment lines."""
     lines = [line for line in path.read_text("utf-8").splitlines() if not line.startswith("#")]
     return list(csv.DictReader(lines))
 
 
-def test_a_plan_is_measured_filled_in_and_calibrated_with_its_own_poses_held_out(here, capsys):
+def test_filled_in_plan_is_calibrated_with_its_held_out_poses(folder, capsys):
     assert main(["plan", "linear-delta", "-o", "plan", *SMALL, "--curve"]) == 0
     said = capsys.readouterr().out
     assert "8 poses of linear-delta for calibration and 3 for validation (position)" in said
     assert "Expected errors by number of poses" in said
-    assert {p.name for p in (here / "plan").iterdir()} == {
+    assert {p.name for p in (folder / "plan").iterdir()} == {
         "plan.csv", "measurements.csv", "plan.json", "plan.png", "curve.png",
     }  # fmt: skip
     assert (
@@ -52,9 +50,9 @@ def test_a_plan_is_measured_filled_in_and_calibrated_with_its_own_poses_held_out
     )
     assert run("calibrate linear-delta filled.csv -o run --limit-position 0.5mm") == 0
     assert "Error on 3 held-out rows" in capsys.readouterr().out
-    plan = json.loads((here / "plan" / "plan.json").read_text())
+    plan = json.loads((folder / "plan" / "plan.json").read_text())
     held = [pose["name"] for pose in plan["poses"] if pose["use"] == "held-out"]
-    result = json.loads((here / "run" / "result.json").read_text())
+    result = json.loads((folder / "run" / "result.json").read_text())
     assert result["split"]["held_out"] == held
     truth, found = load_robot("truth.yaml").values, load_robot("run/robot.yaml").values
     assert np.linalg.norm(found - truth) < 0.3 * np.linalg.norm(
@@ -62,11 +60,11 @@ def test_a_plan_is_measured_filled_in_and_calibrated_with_its_own_poses_held_out
     )
 
 
-def test_the_sheet_says_what_to_command_and_agrees_with_the_data_file(here):
+def test_sheet_states_commands_that_agree_with_the_data_file(folder):
     assert main(["plan", "hexapod-42", "-o", "plan", "--poses", "10", "--candidates", "30"]) == 0
     robot = load_robot("hexapod-42")
-    sheet = [row for row in rows_of(here / "plan" / "plan.csv") if row["use"] != "via"]
-    data = rows_of(here / "plan" / "measurements.csv")
+    sheet = [row for row in read_rows(folder / "plan" / "plan.csv") if row["use"] != "via"]
+    data = read_rows(folder / "plan" / "measurements.csv")
     assert [row["pose"] for row in sheet] == [row["pose"] for row in data]
     assert [row["use"] for row in sheet] == [row["use"] for row in data]
     assert [row["use"] for row in data].count("held-out") == 2
@@ -85,11 +83,11 @@ def test_the_sheet_says_what_to_command_and_agrees_with_the_data_file(here):
 
 
 @pytest.mark.slow
-def test_planes_and_lines_are_planned_held_filled_in_and_calibrated(here, capsys):
+def test_filled_in_plan_of_planes_and_lines_calibrates_the_robot(folder, capsys):
     ask = "plan hexapod-nategh-agheli -o plan --measure plane-line --groups 9 --points 6 --sigma-position 1um"  # noqa: E501
     assert run(ask) == 0
     assert "determine 33 parameter combinations" in capsys.readouterr().out
-    sheet = rows_of(here / "plan" / "plan.csv")
+    sheet = read_rows(folder / "plan" / "plan.csv")
     assert [row["role"] for row in sheet[:6]] == ["p0", "p1", "plane", "plane", "plane", "plane"]
     assert {(row["role"] == "p0", row["tolerance [mm]"]) for row in sheet} == {
         (True, ""),
@@ -109,21 +107,22 @@ def test_planes_and_lines_are_planned_held_filled_in_and_calibrated(here, capsys
     robot = load_robot("hexapod-nategh-agheli")
     truth = robot.with_values(sample_truth(robot, 1, 3)[0])
     commanded = [
-        pose["commanded"] for pose in json.loads((here / "plan" / "plan.json").read_text())["poses"]
+        pose["commanded"]
+        for pose in json.loads((folder / "plan" / "plan.json").read_text())["poses"]
     ]
     q = inverse(truth, np.array([list(pose.values()) for pose in commanded])).q * 1e3
     by_pose = {
         row["pose"]: [f"{value:.12g}" for value in values]
         for row, values in zip(sheet, q, strict=True)
     }
-    lines = (here / "plan" / "measurements.csv").read_text().splitlines()
+    lines = (folder / "plan" / "measurements.csv").read_text().splitlines()
     filled = [
         ",".join([*(c := line.split(","))[:3], *by_pose[c[0]], *c[9:]])
         if line[0].isdigit()
         else line
         for line in lines
     ]
-    (here / "filled.csv").write_text("\n".join(filled) + "\n")
+    (folder / "filled.csv").write_text("\n".join(filled) + "\n")
     assert load_measurements("filled.csv", robot).n_poses == 54
     assert run("calibrate hexapod-nategh-agheli filled.csv -o run") == 0
     # of these data nine motions of frames are unknown, but none of them changes a distance between
@@ -135,7 +134,7 @@ def test_planes_and_lines_are_planned_held_filled_in_and_calibrated(here, capsys
     assert np.abs(after - true).max() < 1e-6  # [m], a thousandth of a millimetre without noise
 
 
-def test_json_is_one_document_with_the_names_of_the_plan(here, capsys):
+def test_json_output_agrees_with_the_plan_file(folder, capsys):
     assert main(["plan", "linear-delta", "-o", "plan", *SMALL, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["n_poses"] == 8
@@ -144,11 +143,11 @@ def test_json_is_one_document_with_the_names_of_the_plan(here, capsys):
     assert document["format"] == 1
     assert 0.5 < document["efficiency"] <= 1.0
     assert document["expected"]["after"]["position"] < document["expected"]["before"]["position"]
-    written = json.loads((here / "plan" / "plan.json").read_text())
+    written = json.loads((folder / "plan" / "plan.json").read_text())
     assert document.items() <= written.items()
 
 
-def test_an_earlier_data_file_describes_the_instrument_and_counts_as_measured(here, capsys):
+def test_earlier_data_file_states_the_instrument_of_a_plan(folder, capsys):
     assert (
         run("simulate linear-delta --draw 12 --kind position --sigma-position 3um -o before.csv")
         == 0
@@ -160,16 +159,18 @@ def test_an_earlier_data_file_describes_the_instrument_and_counts_as_measured(he
         )
         == 0
     )
-    assert "noise: {x: 3 um, y: 3 um, z: 3 um}" in (here / "plan" / "measurements.csv").read_text()
+    assert (
+        "noise: {x: 3 um, y: 3 um, z: 3 um}" in (folder / "plan" / "measurements.csv").read_text()
+    )
     assert run("plan linear-delta -o other --poses 3 --like before.csv --kind pose") == 1
     assert "leave out --kind" in capsys.readouterr().err
 
 
-def test_surfaces_that_each_group_has_of_its_own_describe_no_instrument_to_plan_with(here, capsys):
+def test_data_file_with_a_surface_per_group_cannot_state_the_instrument(folder, capsys):
     settings = "# kind: plane\n# unknown: [surface]\n# noise: {gap: 1 um}\npose,group,q1 [mm],q2 [mm],q3 [mm],gap [mm]\n"  # noqa: E501
     for groups, code in ((("a", "b"), 1), (("a", "a"), 0)):
         text = settings + "".join(f"{i},{group},1,1,1,0\n" for i, group in enumerate(groups))
-        (here / "groups.csv").write_text(text)
+        (folder / "groups.csv").write_text(text)
         assert (
             run(
                 "plan linear-delta -o plan --poses 12 --hold-out 0 --candidates 40 --like "
@@ -177,7 +178,7 @@ def test_surfaces_that_each_group_has_of_its_own_describe_no_instrument_to_plan_
             )
             == code
         )
-    (here / "groups.csv").write_text(text.replace("1,a,", "1,b,"))
+    (folder / "groups.csv").write_text(text.replace("1,a,", "1,b,"))
     assert run("plan linear-delta -o other --like groups.csv") == 1
     assert "plan planes and lines" in capsys.readouterr().err
 
@@ -235,35 +236,33 @@ def test_surfaces_that_each_group_has_of_its_own_describe_no_instrument_to_plan_
         ("--like nothing.csv", "does not exist"),
     ],
 )
-def test_demands_that_cannot_be_met_are_refused_in_one_sentence_and_nothing_is_written(
-    here, capsys, words, said
-):
+def test_invalid_plan_options_are_refused_and_nothing_is_written(folder, capsys, words, said):
     assert run(f"plan linear-delta -o plan {words}") == 1
     captured = capsys.readouterr()
     assert said in captured.err
     assert captured.err.count("\n") == 1 + captured.err.count("\nHint: ")
     assert captured.out == ""
-    assert not (here / "plan").exists()
+    assert not (folder / "plan").exists()
 
 
-def test_a_plan_is_not_replaced_without_force_and_nothing_else_ever(here, capsys):
-    (here / "plan").mkdir()
-    (here / "plan" / "plan.json").write_text("{}")
+def test_force_replaces_a_plan_but_no_other_folder(folder, capsys):
+    (folder / "plan").mkdir()
+    (folder / "plan" / "plan.json").write_text("{}")
     assert main(["plan", "linear-delta", "-o", "plan", *SMALL]) == 1
     assert "--force" in capsys.readouterr().err
     assert main(["plan", "linear-delta", "-o", "plan", *SMALL, "--force"]) == 0
-    assert (here / "plan" / "measurements.csv").exists()
-    (here / "mine").mkdir()
-    (here / "mine" / "thesis.txt").write_text("x")
+    assert (folder / "plan" / "measurements.csv").exists()
+    (folder / "mine").mkdir()
+    (folder / "mine" / "thesis.txt").write_text("x")
     assert main(["plan", "linear-delta", "-o", "mine", *SMALL, "--force"]) == 1
     assert "something other than a plan" in capsys.readouterr().err
 
 
-def test_force_never_removes_what_was_measured_or_written_by_hand(here, capsys):
+def test_force_keeps_measured_values_and_files_of_the_user(folder, capsys):
     again = ["plan", "linear-delta", "-o", "plan", *SMALL, "--force"]
     assert main(again) == 0
     assert main(again) == 0
-    data = here / "plan" / "measurements.csv"
+    data = folder / "plan" / "measurements.csv"
     empty = data.read_text()
     filled = empty.replace(",,,", ",1.5,2.5,3.5", 1)
     data.write_text(filled)
@@ -274,19 +273,19 @@ def test_force_never_removes_what_was_measured_or_written_by_hand(here, capsys):
     assert "filled in or changed" in said
     assert data.read_text() == filled
     data.write_text(empty)
-    (here / "plan" / "notes.txt").write_text("leg 2 squeaks")
+    (folder / "plan" / "notes.txt").write_text("leg 2 squeaks")
     assert main(again) == 1
     assert "notes.txt" in capsys.readouterr().err
-    assert (here / "plan" / "notes.txt").read_text() == "leg 2 squeaks"
-    (here / "plan" / "notes.txt").unlink()
-    document = json.loads((here / "plan" / "plan.json").read_text())
+    assert (folder / "plan" / "notes.txt").read_text() == "leg 2 squeaks"
+    (folder / "plan" / "notes.txt").unlink()
+    document = json.loads((folder / "plan" / "plan.json").read_text())
     del document["files"]  # of a plan that tells nothing of its files, a sheet may be filled in
-    (here / "plan" / "plan.json").write_text(json.dumps(document))
+    (folder / "plan" / "plan.json").write_text(json.dumps(document))
     assert main(again) == 1
     assert data.read_text() == empty
 
 
-def test_a_second_plan_goes_on_where_the_first_was_measured(here, capsys):
+def test_second_plan_builds_on_the_measurements_of_the_first(folder, capsys):
     first = [
         "plan",
         "linear-delta",
@@ -324,21 +323,23 @@ def test_a_second_plan_goes_on_where_the_first_was_measured(here, capsys):
     )
     said = capsys.readouterr().out
     assert "Next: loopcal calibrate linear-delta one.csv two/measurements.csv -o run" in said
-    names = [row["pose"] for row in rows_of(here / "two" / "measurements.csv")]
+    names = [row["pose"] for row in read_rows(folder / "two" / "measurements.csv")]
     assert names == ["13", "14", "15"]
     # what the first plan promised of its 8 poses; the 4 that it holds out are not counted as known
-    promised = json.loads((here / "one" / "plan.json").read_text())["expected"]["after"]["position"]
-    known = json.loads((here / "two" / "plan.json").read_text())["expected"]["before"]["position"]
+    promised = json.loads((folder / "one" / "plan.json").read_text())["expected"]["after"][
+        "position"
+    ]
+    known = json.loads((folder / "two" / "plan.json").read_text())["expected"]["before"]["position"]
     assert known == pytest.approx(promised, rel=1e-3)
     assert run(fill.format("two", "two")) == 0
     assert run("calibrate linear-delta one.csv two.csv -o run") == 0
     assert "Error on 5 held-out rows" in capsys.readouterr().out
 
 
-def test_the_data_file_states_the_digits_of_the_sheet(here):
+def test_data_file_and_sheet_state_the_same_digits(folder):
     assert main(["plan", "hexapod-42", "-o", "plan", "--poses", "10", "--candidates", "30"]) == 0
-    sheet = [row for row in rows_of(here / "plan" / "plan.csv") if row["use"] != "via"]
-    data = rows_of(here / "plan" / "measurements.csv")
+    sheet = [row for row in read_rows(folder / "plan" / "plan.csv") if row["use"] != "via"]
+    data = read_rows(folder / "plan" / "measurements.csv")
     columns = [f"q{i} [mm]" for i in range(1, 7)]
     assert [[row[c] for c in columns] for row in data] == [
         [row[c] for c in columns] for row in sheet
@@ -348,7 +349,7 @@ def test_the_data_file_states_the_digits_of_the_sheet(here):
     assert "-0" not in cells
 
 
-def test_the_sheet_says_that_a_tilt_goes_straight_by_its_vector(here):
+def test_sheet_states_the_coordinates_of_straight_tilt_paths(folder):
     assert (
         main(
             ["plan", "3-prs", "-o", "plan", "--poses", "8", "--hold-out", "0", "--candidates", "30"]
@@ -357,19 +358,19 @@ def test_the_sheet_says_that_a_tilt_goes_straight_by_its_vector(here):
     )
     assert (
         "straight in z, theta*cos(phi), theta*sin(phi). Measure"
-        in (here / "plan" / "plan.csv").read_text()
+        in (folder / "plan" / "plan.csv").read_text()
     )
 
 
-def test_the_column_use_is_checked_and_not_overruled(here, capsys):
+def test_column_use_is_checked_and_excludes_hold_out(folder, capsys):
     assert main(["plan", "linear-delta", "-o", "plan", *SMALL]) == 0
     assert run("simulate linear-delta --fill plan/measurements.csv -o filled.csv") == 0
     assert run("calibrate linear-delta filled.csv -o run --hold-out 0.25") == 1
     assert "leave out --hold-out" in capsys.readouterr().err
-    text = (here / "filled.csv").read_text()
-    (here / "wrong.csv").write_text(text.replace(",held-out,", ",perhaps,", 1))
+    text = (folder / "filled.csv").read_text()
+    (folder / "wrong.csv").write_text(text.replace(",held-out,", ",perhaps,", 1))
     assert run("calibrate linear-delta wrong.csv -o run") == 1
     assert "'perhaps'; write fit or held-out" in capsys.readouterr().err
-    (here / "all.csv").write_text(text.replace(",fit,", ",held-out,"))
+    (folder / "all.csv").write_text(text.replace(",fit,", ",held-out,"))
     assert run("calibrate linear-delta all.csv -o run") == 1
     assert "leave some to fit" in capsys.readouterr().err

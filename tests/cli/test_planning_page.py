@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/planning.md: a new user gets from a robot file to a compensated machine by its commands
-alone.
-"""
+"""docs/planning.md: its commands and its Python code run as printed."""
 
 import re
 from pathlib import Path
@@ -15,15 +13,13 @@ from loopcal.io import load_robot
 
 @pytest.fixture
 def page(root, tmp_path, monkeypatch) -> str:
-    """Work in an empty folder."""
+    """Work in an empty folder; return the text of the page."""
     monkeypatch.chdir(tmp_path)
     return (root / "docs" / "planning.md").read_text("utf-8")
 
 
 @pytest.mark.slow
-def test_every_command_of_the_page_works_as_it_stands_and_the_machine_becomes_known(
-    page, capsys
-) -> None:
+def test_commands_of_the_page_run_and_calibrate_the_machine(page, capsys) -> None:
     commands = [
         line
         for block in re.findall(r"^```sh\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
@@ -53,7 +49,7 @@ def test_every_command_of_the_page_works_as_it_stands_and_the_machine_becomes_kn
     assert np.linalg.norm(found - truth) < 0.3 * np.linalg.norm(nominal - truth)
 
 
-def test_the_python_of_the_page_runs(page, capsys) -> None:
+def test_python_code_of_the_page_runs(page, capsys) -> None:
     block = re.search(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     assert block
     assert main(["new", "linear-delta", "-o", "printer.yaml"]) == 0

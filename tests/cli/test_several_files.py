@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands take several measurement files, and what these know of their instruments reaches every
-fit.
-"""
+"""Commands read several measurement files, with the unknowns and priors that the files state."""
 
 import json
 from dataclasses import replace
@@ -79,16 +77,17 @@ def folder(tmp_path, monkeypatch, data):
     return tmp_path
 
 
-def document(capsys, *words: str, code: int = 0):
+def run_json(capsys, *words: str, code: int = 0):
+    """Run a command with --json; return its document."""
     assert main([*words, "--json"]) == code
     return json.loads(capsys.readouterr().out)
 
 
 @pytest.mark.slow
-def test_any_division_into_files_gives_the_same_calibration(folder, capsys) -> None:
+def test_splitting_data_into_several_files_gives_the_same_calibration(folder, capsys) -> None:
     runs = {}
     for files in ("both.csv", "tracker.csv tilts.csv", "values.csv poses.csv tracker.csv"):
-        found = document(
+        found = run_json(
             capsys, "calibrate", "hexapod-42", *files.split(), "-o", files.split(".")[0]
         )
         runs[files] = np.array([p["estimate"] for p in found["fit"]["parameters"]])
@@ -111,13 +110,13 @@ def test_any_division_into_files_gives_the_same_calibration(folder, capsys) -> N
     assert main(["validate", "both", "poses.csv", "values.csv", "--allow-fitted-data"]) == 0
 
 
-def test_fixed_unknowns_and_priors_of_a_file_reach_identifiability(folder, capsys) -> None:
+def test_unknowns_stated_in_a_file_change_the_rank(folder, capsys) -> None:
     def rank(**changed: str) -> int:
         text = Path("tracker.csv").read_text()
         for unknowns in changed.values():
             text = text.replace("# kind: pose", f"# unknowns: {{{unknowns}}}\n# kind: pose", 1)
         Path("changed.csv").write_text(text)
-        return document(capsys, "identifiability", "hexapod-42", "changed.csv")["rank"]
+        return run_json(capsys, "identifiability", "hexapod-42", "changed.csv")["rank"]
 
     assert rank() == 36
     assert rank(known='"tracker.*": fixed') == 42
@@ -127,14 +126,14 @@ def test_fixed_unknowns_and_priors_of_a_file_reach_identifiability(folder, capsy
 
 
 @pytest.mark.slow
-def test_a_prior_of_a_file_reaches_the_fit_and_its_held_out_part(folder, capsys) -> None:
+def test_priors_stated_in_a_file_are_used_with_held_out_poses(folder, capsys) -> None:
     text = (
         Path("tracker.csv")
         .read_text()
         .replace("# kind: pose", f'# unknowns: {{{SD}, "*.tracker.z": fixed}}\n# kind: pose', 1)
     )
     Path("changed.csv").write_text(text)
-    found = document(
+    found = run_json(
         capsys,
         "calibrate",
         "hexapod-42",
@@ -153,7 +152,7 @@ def test_a_prior_of_a_file_reaches_the_fit_and_its_held_out_part(folder, capsys)
     assert found["validation"]["poses"]
 
 
-def test_what_is_known_survives_splits_and_the_file(data, tmp_path) -> None:
+def test_stated_values_survive_split_take_and_save(data, tmp_path) -> None:
     robot = load_robot("hexapod-42")
     known = replace(
         data,

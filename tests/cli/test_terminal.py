@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hints and importance name codes of the catalog; progress is shown late, and on terminals only."""
+"""Hints, order of findings, progress bar and width of the terminal."""
 
 import os
 import pty
@@ -27,24 +27,24 @@ print("end")
 """
 
 
-def test_hints_and_importance_name_codes_of_the_catalog():
+def test_hints_and_importance_use_codes_of_the_catalog():
     assert [code for code in (*HINTS, *IMPORTANCE) if code not in load_catalog()] == []
 
 
-def test_a_hint_names_the_poses_of_its_finding():
+def test_hint_names_the_poses_of_its_finding():
     step = report_finding("workflow.next-check-outliers", poses=("pose 6", "pose 9"))
     assert hint_for(step) == "use --drop 6 --drop 9, or --loss huber"
     assert hint_for(report_finding("workflow.next-use-result")) is None
 
 
-def test_a_hint_is_only_for_commands_that_have_its_options():
+def test_hint_is_shown_only_for_commands_with_its_options():
     code = "outliers.some"
     assert find_hint(code, calibrate) == "use --drop POSE, or --loss huber"
     assert find_hint(code, validate) is None
     assert find_hint("workflow.next-check-data", validate) is not None
 
 
-def test_a_change_of_a_freed_limb_has_no_hint_to_free_it():
+def test_change_of_a_freed_limb_has_no_hint_to_free_it():
     data = {"chi_square": 99.0, "degrees": 7.0, "p_value": 1e-9, "tried": False}
     data |= {"parameter": None, "change": None}
     machine, limb = (
@@ -55,13 +55,13 @@ def test_a_change_of_a_freed_limb_has_no_hint_to_free_it():
     assert hint_for(limb) is None
 
 
-def test_a_hint_stands_behind_its_finding():
+def test_hint_follows_its_finding():
     finding = report_finding("workflow.no-held-out-poses")
     assert with_hint(finding, hint_for).endswith(" (Hint: use --hold-out 0.25)")
     assert with_hint(finding, no_hint) == str(finding)
 
 
-def test_failures_come_first_and_infos_last():
+def test_findings_are_sorted_from_failure_to_info():
     info = report_finding("workflow.frame-freedoms", count=6, frames=("base",))
     warning = report_finding("workflow.no-held-out-poses")
     failure = report_finding("gates.limit-not-measured", quantity="position")
@@ -95,14 +95,14 @@ def test_long_work_shows_percentage_and_remaining_time_on_a_terminal():
     assert "0:00" in shown
 
 
-def test_short_work_and_work_without_a_terminal_shows_nothing():
+def test_progress_is_hidden_for_short_work_and_without_a_terminal():
     assert _run_on_terminal(1).split() == ["end"]
     words = [sys.executable, "-c", WORK, "8"]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("end\n", "")
 
 
-def test_the_width_without_a_terminal_is_80(monkeypatch):
+def test_width_without_a_terminal_is_80(monkeypatch):
     monkeypatch.delenv("COLUMNS", raising=False)
     monkeypatch.setattr(sys, "__stdout__", None)
     assert terminal.width() == 80

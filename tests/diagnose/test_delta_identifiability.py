@@ -19,7 +19,7 @@ from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import Imported, ImportOptions
 from loopcal.measure import Measurements, Observations
 from loopcal.mechanism import Mechanism
-from tests.cli.delta_printers import every_record
+from tests.cli.delta_printers import read_records
 from tests.io.formats.printers import printer_cfg
 
 SIX = ("radius", "tower1.angle", "tower2.angle", "tower1.stop", "tower2.stop", "tower3.stop")
@@ -34,7 +34,7 @@ Printer = tuple[Mechanism, Measurements]
 def printers(data_folder: Path, tmp_path_factory) -> dict[str, Printer]:
     """Every printer with nine free parameters of tolerance 1 mm or 1 degree, and its probes."""
     found = {}
-    for name, record in every_record(data_folder).items():
+    for name, record in read_records(data_folder).items():
         path = tmp_path_factory.mktemp("printer") / "printer.cfg"
         path.write_text(printer_cfg(record), "utf-8")
         read = klipper.read(path, ImportOptions("printer"))

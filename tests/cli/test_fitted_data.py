@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""At the command line: the fitted rows in another file are not taken for unseen ones."""
+"""`loopcal validate` recognizes fitted rows in another file and refuses them."""
 
 import shutil
 from pathlib import Path

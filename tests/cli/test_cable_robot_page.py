@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/cable-robots.md: its commands run on the example and give its numbers, and so does a real
-machine.
-"""
+"""docs/cable-robots.md: its commands give its numbers for the example and for a real machine."""
 
 import json
 import re
@@ -25,7 +23,7 @@ CALIBRATE = "calibrate robot.yaml samples.csv -o run --method ls"
 
 @pytest.fixture
 def page(root, tmp_path, monkeypatch) -> str:
-    """Work in a copy of the example's folder."""
+    """Work in a copy of the example's folder; return the text of the page."""
     for path in (root / "examples" / "cable-robot").iterdir():
         shutil.copy(path, tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -34,13 +32,13 @@ def page(root, tmp_path, monkeypatch) -> str:
 
 @pytest.fixture
 def folder(data_folder, tmp_path, monkeypatch) -> Path:
-    """Work beside the samples of a real machine."""
+    """Return a folder with the samples of a real machine, and work in it."""
     (tmp_path / "hp.json").write_text(samples_text(real(data_folder)), "utf-8")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-def test_the_commands_print_the_numbers_of_the_page_and_estimate_the_truth(page, capsys) -> None:
+def test_commands_print_the_numbers_of_the_page_and_estimate_the_truth(page, capsys) -> None:
     commands = re.findall(r"^loopcal (.*)$", page, re.MULTILINE)
     assert [command.split()[0] for command in commands] == ["import", "calibrate"]
     for command in commands:
@@ -68,13 +66,13 @@ def test_the_commands_print_the_numbers_of_the_page_and_estimate_the_truth(page,
     assert kept["reading_estimate"].shape == (45, 4)
 
 
-def test_the_truth_of_the_example_is_that_of_its_program(root) -> None:
+def test_truth_file_of_the_example_equals_the_simulated_machine(root) -> None:
     robot = load_robot(root / "examples" / "cable-robot" / "truth.yaml")
     assert robot.parameters.names == NAMES
     np.testing.assert_allclose(robot.values * 1e3, TRUTH, rtol=0, atol=1e-9)  # [mm]
 
 
-def test_import_writes_all_poses_and_reports_what_it_does_not_read(folder, capsys) -> None:
+def test_import_writes_all_poses_and_reports_ignored_rows(folder, capsys) -> None:
     assert main(REAL.split()) == 0
     out = " ".join(capsys.readouterr().out.split())
     assert "robot.yaml: 4 actuators, 21 parameters, 21 free" in out
@@ -91,7 +89,9 @@ def test_import_writes_all_poses_and_reports_what_it_does_not_read(folder, capsy
     ]
 
 
-def test_two_commands_give_the_numbers_of_the_page_for_a_real_machine(folder, capsys, root) -> None:
+def test_import_and_calibrate_give_the_page_numbers_for_a_real_machine(
+    folder, capsys, root
+) -> None:
     assert main(REAL.split()) == 0
     assert main(CALIBRATE.split()) == 0
     capsys.readouterr()
@@ -114,7 +114,7 @@ def test_two_commands_give_the_numbers_of_the_page_for_a_real_machine(folder, ca
             assert abs(row["estimate"] - other) < 1.05 * row["plus_minus"]
 
 
-def test_from_json_a_format_must_be_named(folder, capsys) -> None:
+def test_import_from_json_needs_the_option_format(folder, capsys) -> None:
     assert main(["import", "hp.json", "-o", "robot.yaml"]) == 1
     error = capsys.readouterr().err
     assert "cannot read it" in error

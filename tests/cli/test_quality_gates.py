@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A fit to a blundered cell: told in the exit code, and by no note contradicted."""
+"""Unmet quality gates of `loopcal calibrate`: exit code 2, with the reason in text and JSON."""
 
 import json
 import shutil
@@ -15,7 +15,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "hexapod-42"
 
 
 @pytest.fixture
-def blundered(tmp_path, monkeypatch) -> Path:
+def folder_with_wrong_cell(tmp_path, monkeypatch) -> Path:
     """Measurements of the example with rz of one fitted pose set to 12 degrees, in a folder of
     their own.
     """
@@ -31,14 +31,17 @@ def blundered(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def test_a_blundered_cell_is_told_and_widens_the_intervals(blundered, capsys) -> None:
+def test_wrong_cell_fails_the_quality_gate_and_widens_the_intervals(
+    folder_with_wrong_cell, capsys
+) -> None:
     assert main(["calibrate", "hexapod-42", "measurements.csv", "-o", "good"]) == 0
     assert main(["calibrate", "hexapod-42", "bad.csv", "-o", "bad"]) == 2
     out, err = capsys.readouterr()
     assert "loopcal: quality gate not met: The residuals" in err
     assert out[out.index("Written to good") :].count("Not calibrated: ") == 1
     good, bad = (
-        json.loads((blundered / name / "result.json").read_text()) for name in ("good", "bad")
+        json.loads((folder_with_wrong_cell / name / "result.json").read_text())
+        for name in ("good", "bad")
     )
     assert (good["passed"], good["reasons"]) == (True, [])
     assert (bad["passed"], bad["verdict"]) == (False, "not_calibrated")
@@ -52,7 +55,9 @@ def test_a_blundered_cell_is_told_and_widens_the_intervals(blundered, capsys) ->
     assert (wide > 5 * narrow).all()
 
 
-def test_errors_that_grew_on_unseen_poses_are_a_reason(blundered, capsys) -> None:
+def test_larger_errors_on_held_out_poses_fail_the_quality_gate(
+    folder_with_wrong_cell, capsys
+) -> None:
     code = main(["calibrate", "hexapod-42", "bad.csv", "-o", "run", "--hold-out", "0.25", "--json"])
     document = json.loads(capsys.readouterr().out)
     grown = [
@@ -69,13 +74,13 @@ def test_errors_that_grew_on_unseen_poses_are_a_reason(blundered, capsys) -> Non
 
 
 @pytest.mark.parametrize("hold_out", ["", "--hold-out 0.25"])
-def test_a_fit_that_reaches_none_of_its_poses_is_a_reason_and_not_a_user_error(
-    blundered, capsys, monkeypatch, hold_out
+def test_unreachable_poses_fail_the_quality_gate_without_a_user_error(
+    folder_with_wrong_cell, capsys, monkeypatch, hold_out
 ) -> None:
-    def astray(*_):
+    def raise_data_error(*_):
         raise DataError("the calibrated geometry cannot follow")
 
-    monkeypatch.setattr("loopcal.workflow.calibration.validate", astray)
+    monkeypatch.setattr("loopcal.workflow.calibration.validate", raise_data_error)
     assert (
         main(["calibrate", "hexapod-42", "measurements.csv", "-o", "run", *hold_out.split()]) == 2
     )
@@ -83,7 +88,7 @@ def test_a_fit_that_reaches_none_of_its_poses_is_a_reason_and_not_a_user_error(
     assert err.startswith("loopcal: quality gate not met: ")
     assert err.count("\n") == 1
     assert out.endswith("Written to run: result.json, arrays.npz, robot.yaml\n")
-    result = json.loads((blundered / "run" / "result.json").read_text())
+    result = json.loads((folder_with_wrong_cell / "run" / "result.json").read_text())
     assert result["passed"] is False
     (failure,) = [f for f in result["findings"] if f["severity"] == "failure"]
     assert failure["code"] == "gates.poses-unreachable"
