@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Conventions: slips are named by what fits instead, and true data pass, however far the robot is
-off.
+"""The convention check names the interpretation that fits wrongly written data, and accepts
+correct data of inaccurate robots.
 """
 
 import json
@@ -52,15 +52,17 @@ PAIR = np.array([[0.1, 0.0, 0.02], [-0.05, 0.08, 0.02]])
 
 
 @cache
-def robot_of(name: str):
+def load_cached_robot(name: str):
     return load_robot(name)
 
 
 @cache
-def measured(name: str, kind: Kind, n: int = 10, times: float = 1.0, seed: int = 0) -> Measurements:
-    """What a machine `times` its tolerances off shows, commanded by its nominal geometry."""
+def simulate_data(
+    name: str, kind: Kind, n: int = 10, times: float = 1.0, seed: int = 0
+) -> Measurements:
+    """Simulate a machine whose errors are `times` its tolerances, commanded by nominal geometry."""
     robot, noise = (
-        robot_of(name),
+        load_cached_robot(name),
         Gaussian(np.array([SIGMA[c.dimension] for c in kind.noise_columns])),
     )
     free = select_free_parameters(robot)
@@ -78,8 +80,8 @@ def measured(name: str, kind: Kind, n: int = 10, times: float = 1.0, seed: int =
     )
 
 
-def changed(data: Measurements, change) -> Measurements:
-    """The data with other values of their first kind."""
+def change_values(data: Measurements, change) -> Measurements:
+    """Apply `change` to the measured values of the first kind."""
     rows = data.observations[0]
     values = np.array(rows.measured)
     change(values)
@@ -100,7 +102,7 @@ def swapped(a, b):
     return change
 
 
-def turned(convert):
+def change_orientation(convert):
     def change(values):
         values[:, :3] = convert(values[:, :3])
 
@@ -120,8 +122,8 @@ def scalar_last(values):
     values[:, :4] = values[:, [1, 2, 3, 0]]
 
 
-def slips(check: ConventionCheck) -> list[dict]:
-    """The best interpretation and its alternatives, as kind of the slip and data."""
+def list_slips(check: ConventionCheck) -> list[dict]:
+    """Return the best interpretation and its alternatives as dictionaries."""
     best = () if check.interpretation is None else (check.interpretation,)
     return [
         {"slip": one.slip, **one.details, "source": one.source}
@@ -132,10 +134,10 @@ def slips(check: ConventionCheck) -> list[dict]:
 def has_slip(check: ConventionCheck, slip: str, **details) -> bool:
     """Whether this slip is among the interpretations."""
     wanted = {"slip": slip, **details}
-    return any(wanted.items() <= one.items() for one in slips(check))
+    return any(wanted.items() <= one.items() for one in list_slips(check))
 
 
-def times(quantity: str, factor, **more) -> dict:
+def unit_slip(quantity: str, factor, **more) -> dict:
     return {"slip": "unit", "quantity": quantity, "factor": factor, **more}
 
 
@@ -146,30 +148,39 @@ SLIPS = {
         "3-prs",
         FULL,
         scaled([0, 1, 2], 1e3),
-        times("angles", 1e-3),
+        unit_slip("angles", 1e-3),
     ),
     "another Euler order": (
         "hexapod-42",
         XYZ,
-        turned(lambda a: geometry.matrix_to_euler(geometry.euler_to_matrix(a, "xyz"), "zyx")),
+        change_orientation(
+            lambda a: geometry.matrix_to_euler(geometry.euler_to_matrix(a, "xyz"), "zyx")
+        ),
         {"slip": "orientation-form", "form": "euler-zyx"},
     ),
     "moving for fixed axes": (
         "hexapod-42",
         XYZ,
-        turned(lambda a: geometry.matrix_to_euler(geometry.euler_to_matrix(a, "xyz"), "XYZ")),
+        change_orientation(
+            lambda a: geometry.matrix_to_euler(geometry.euler_to_matrix(a, "xyz"), "XYZ")
+        ),
         {"slip": "orientation-form", "form": "euler-XYZ"},
     ),
     "a rotation vector for Euler angles": (
         "hexapod-42",
         XYZ,
-        turned(lambda a: geometry.log_so3(geometry.euler_to_matrix(a, "xyz"))),
+        change_orientation(lambda a: geometry.log_so3(geometry.euler_to_matrix(a, "xyz"))),
         {"slip": "orientation-form", "form": "rotation-vector"},
     ),
     "scalar last": ("hexapod-42", Pose("quaternion"), scalar_last, {"slip": "scalar-last"}),
     "a left-handed frame": ("hexapod-42", FULL, left_handed, {"slip": "left-handed-frame"}),
-    "one column in inches": ("hexapod-42", FULL, scaled([3], 1.0 / 25.4), times("x", 25.4)),
-    "gon for degrees": ("hexapod-42", FULL, scaled([0, 1, 2], 10.0 / 9.0), times("angles", 0.9)),
+    "one column in inches": ("hexapod-42", FULL, scaled([3], 1.0 / 25.4), unit_slip("x", 25.4)),
+    "gon for degrees": (
+        "hexapod-42",
+        FULL,
+        scaled([0, 1, 2], 10.0 / 9.0),
+        unit_slip("angles", 0.9),
+    ),
     "x and y swapped": (
         "linear-delta",
         Position(),
@@ -204,12 +215,12 @@ SLIPS = {
 
 
 @pytest.mark.parametrize("slip", SLIPS)
-def test_a_slip_is_refused_with_what_fits_instead(slip) -> None:
+def test_wrong_convention_is_refused_and_the_right_one_is_named(slip) -> None:
     name, kind, change, expected = SLIPS[slip]
-    data = changed(measured(name, kind), change)
-    found = compare_conventions(robot_of(name), data)
+    data = change_values(simulate_data(name, kind), change)
+    found = compare_conventions(load_cached_robot(name), data)
     assert found.is_refused, found
-    assert has_slip(found, **expected), slips(found)
+    assert has_slip(found, **expected), list_slips(found)
     assert found.misfit > IMPLAUSIBLE
     assert found.other_misfit < min(found.misfit / BETTER, ALLOWED)
     assert found.finding is not None
@@ -237,19 +248,17 @@ READINGS = {
 
 
 @pytest.mark.parametrize("slip", READINGS)
-def test_a_slip_of_the_readings_is_refused_with_what_fits_instead(slip) -> None:
+def test_wrong_reading_convention_is_refused_and_the_right_one_is_named(slip) -> None:
     name, change, expected = READINGS[slip]
-    data = measured(name, Position())
-    found = compare_conventions(robot_of(name), replace(data, readings=change(data.readings)))
-    assert expected.items() <= slips(found)[0].items(), found
+    data = simulate_data(name, Position())
+    found = compare_conventions(
+        load_cached_robot(name), replace(data, readings=change(data.readings))
+    )
+    assert expected.items() <= list_slips(found)[0].items(), found
 
 
-def test_at_full_size_no_true_data_are_refused_and_slips_are_named_wherever_they_are_seen(
-    root: Path,
-) -> None:
-    """Slips that leave the data plausible change what the robot does not do: the orientation of a
-    delta.
-    """
+def test_published_table_has_no_false_refusal_and_names_three_of_four_slips(root: Path) -> None:
+    """Undetected slips change what the robot cannot do, such as the orientation of a delta."""
     tables = json.loads((root / "docs" / "evidence" / "conventions.json").read_text("utf-8"))[
         "tables"
     ]
@@ -265,79 +274,79 @@ def test_at_full_size_no_true_data_are_refused_and_slips_are_named_wherever_they
     )
 
 
-def test_a_slip_is_seen_through_blunders() -> None:
+def test_wrong_unit_is_named_although_two_rows_are_outliers() -> None:
     """Two of twenty rows are 0.1 m off, and all lengths are in the wrong unit."""
-    data = changed(
-        measured("hexapod-42", Position(unknown=("frame",)), n=20), scaled(slice(None), 0.1)
+    data = change_values(
+        simulate_data("hexapod-42", Position(unknown=("frame",)), n=20), scaled(slice(None), 0.1)
     )
-    bad = changed(data, lambda values: values.__setitem__((slice(3, 5), 0), values[3:5, 0] + 0.01))
-    found = compare_conventions(robot_of("hexapod-42"), bad)
-    assert has_slip(found, **times("lengths", 10.0)), found
-
-
-def test_a_unit_is_named_where_a_constant_in_its_place_leaves_no_frame_to_be_found() -> None:
-    data = changed(
-        measured("linear-delta", Position(unknown=("frame",)), n=20), scaled(slice(None), 1e3)
+    bad = change_values(
+        data, lambda values: values.__setitem__((slice(3, 5), 0), values[3:5, 0] + 0.01)
     )
-    found = compare_conventions(robot_of("linear-delta"), data)
-    assert has_slip(found, **times("lengths", 1e-3)), found
+    found = compare_conventions(load_cached_robot("hexapod-42"), bad)
+    assert has_slip(found, **unit_slip("lengths", 10.0)), found
 
 
-def test_blunders_alone_are_left_to_their_own_check() -> None:
-    data = measured("hexapod-42", Position(unknown=("frame",)), n=20)
-    bad = changed(data, lambda values: values.__setitem__((slice(3, 5), 0), values[3:5, 0] + 0.1))
-    found = compare_conventions(robot_of("hexapod-42"), bad)
+def test_wrong_unit_is_named_although_the_frame_is_unknown() -> None:
+    data = change_values(
+        simulate_data("linear-delta", Position(unknown=("frame",)), n=20), scaled(slice(None), 1e3)
+    )
+    found = compare_conventions(load_cached_robot("linear-delta"), data)
+    assert has_slip(found, **unit_slip("lengths", 1e-3)), found
+
+
+def test_outliers_alone_are_reported_but_not_refused() -> None:
+    data = simulate_data("hexapod-42", Position(unknown=("frame",)), n=20)
+    bad = change_values(
+        data, lambda values: values.__setitem__((slice(3, 5), 0), values[3:5, 0] + 0.1)
+    )
+    found = compare_conventions(load_cached_robot("hexapod-42"), bad)
     assert not found.is_refused
     assert found.misfit < IMPLAUSIBLE  # without the two rows all is well
     assert found.finding is not None
     assert found.finding.code == "conventions.rows-far-off"
     assert found.finding.data == {"count": 2, "rows": 20, "poses": ("4", "5")}
-    assert compare_conventions(robot_of("hexapod-42"), data).finding is None
+    assert compare_conventions(load_cached_robot("hexapod-42"), data).finding is None
 
 
 WITH_EVERY_KIND = ("3-prs",)
 
 
-def every_case(kinds):
-    """Every shipped robot with the first kind, one of them with all."""
+def list_cases(kinds):
+    """Yield every shipped robot with the first kind, and one robot with all kinds."""
     for name in list_shipped_robots():
-        if robot_of(name).assembly.workspace:
+        if load_cached_robot(name).assembly.workspace:
             for kind in kinds if name in WITH_EVERY_KIND else kinds[:1]:
                 yield name, kind
 
 
-def test_true_data_of_robots_three_times_beyond_their_tolerances_pass() -> None:
-    """No draw may be refused; the misfit stays below the threshold but for angles that mean nothing
-    near zero tilt.
-    """
+def test_correct_data_of_robots_three_tolerances_off_are_accepted() -> None:
+    """No kind on any robot may even be doubtful."""
     known = [cls.examples()[0] for cls in KINDS.values()]
     count = 0
-    for name, kind in every_case(known):
+    for name, kind in list_cases(known):
         try:
-            data = measured(name, kind, times=3.0)
+            data = simulate_data(name, kind, times=3.0)
         except LoopcalError:
-            continue  # this kind has nothing to look at on this robot, or the robot cannot follow
+            continue  # this kind does not apply to this robot, or a pose is out of reach
         count += 1
-        assert not compare_conventions(robot_of(name), data).is_doubtful, (name, kind.name)
+        assert not compare_conventions(load_cached_robot(name), data).is_doubtful, (name, kind.name)
     assert count >= len(KINDS) + 6
 
 
 @pytest.mark.parametrize("name", ["3-prs", "linear-delta"])
-def test_true_data_of_a_robot_far_off_its_tolerances_are_not_refused(name) -> None:
-    """Forty tolerances off: implausible, all others are tried, and none fits far better."""
-    data = measured(name, Position(), times=40.0)
-    found = compare_conventions(robot_of(name), data)
+def test_correct_data_of_robots_forty_tolerances_off_are_doubtful_but_not_refused(name) -> None:
+    """All interpretations are tried, and none fits far better."""
+    data = simulate_data(name, Position(), times=40.0)
+    found = compare_conventions(load_cached_robot(name), data)
     assert found.is_doubtful
     assert not found.is_refused
     assert found.finding is not None
     assert found.finding.code == "conventions.unexplained"
 
 
-def test_heights_that_should_be_zero_are_no_evidence_of_a_unit() -> None:
-    """Every unit that makes them smaller fits better: a constant does so as well, and nothing is
-    refused.
-    """
-    robot = robot_of("linear-delta")
+def test_small_heights_are_not_taken_for_a_wrong_unit() -> None:
+    """Every unit that shrinks the heights fits better, but so does a constant."""
+    robot = load_cached_robot("linear-delta")
     flat = np.column_stack([np.random.default_rng(0).uniform(-0.05, 0.05, (20, 2)), np.zeros(20)])
     noise = Gaussian(np.array([1e-6]))
     free = select_free_parameters(robot)
@@ -357,15 +366,15 @@ def test_heights_that_should_be_zero_are_no_evidence_of_a_unit() -> None:
     assert not found.is_refused, found
 
 
-def test_data_of_nothing_are_noted_after_few_readings_were_judged(monkeypatch) -> None:
-    """Positions drawn at random in an unknown frame: all other ways are compared, none promises
-    anything, none is judged.
-    """
-    data = measured("linear-delta", Position(unknown=("frame",)), n=40)
+def test_random_data_are_not_refused_and_cost_at_most_two_thorough_linearizations(
+    monkeypatch,
+) -> None:
+    """Random positions in an unknown frame: no interpretation is promising enough to linearize."""
+    data = simulate_data("linear-delta", Position(unknown=("frame",)), n=40)
     noise = 0.02 * np.random.default_rng(0).standard_normal(
         (40, 3)
     )  # [m], as far as the machine moves
-    data = changed(data, lambda values: values.__iadd__(noise))
+    data = change_values(data, lambda values: values.__iadd__(noise))
     poses: list[int] = []
     linearize = misfit._linearize
 
@@ -375,23 +384,26 @@ def test_data_of_nothing_are_noted_after_few_readings_were_judged(monkeypatch) -
         return linearize(problem, data, effort, start)
 
     monkeypatch.setattr(misfit, "_linearize", counted)
-    found = compare_conventions(robot_of("linear-delta"), data)
+    found = compare_conventions(load_cached_robot("linear-delta"), data)
     assert found.misfit > 100.0
     assert not found.is_refused
     assert len(poses) <= 2  # the data as written, before and after far rows were excluded
 
 
-def test_too_few_rows_say_nothing() -> None:
-    data = changed(
-        measured("hexapod-42", Position(unknown=("frame",)), n=4), scaled([0, 1, 2], 1e3)
+def test_too_few_rows_give_no_misfit_and_no_refusal() -> None:
+    data = change_values(
+        simulate_data("hexapod-42", Position(unknown=("frame",)), n=4), scaled([0, 1, 2], 1e3)
     )
-    found = compare_conventions(robot_of("hexapod-42"), data)
+    found = compare_conventions(load_cached_robot("hexapod-42"), data)
     assert np.isnan(found.misfit)
     assert not found.is_refused
 
 
-def test_of_two_joined_instruments_the_one_in_the_wrong_unit_is_named() -> None:
-    robot, at = robot_of("hexapod-42"), sample_workspace(robot_of("hexapod-42"), 10, 1).coordinates
+def test_instrument_in_the_wrong_unit_is_named_among_two() -> None:
+    robot, at = (
+        load_cached_robot("hexapod-42"),
+        sample_workspace(load_cached_robot("hexapod-42"), 10, 1).coordinates,
+    )
     sensors = (
         Sensor(Position(), Gaussian(np.full(3, 1e-5))),
         Sensor(Inclination(), Gaussian(np.full(2, 5e-5))),
@@ -400,12 +412,12 @@ def test_of_two_joined_instruments_the_one_in_the_wrong_unit_is_named() -> None:
     tracker, level = data.observations
     level = replace(level, measured=level.measured * np.pi / 180.0)
     found = compare_conventions(robot, replace(data, observations=(tracker, level)))
-    expected = times("angles", pytest.approx(180.0 / np.pi), source="kind 'inclination'")
-    assert expected.items() <= slips(found)[0].items()
+    expected = unit_slip("angles", pytest.approx(180.0 / np.pi), source="kind 'inclination'")
+    assert expected.items() <= list_slips(found)[0].items()
 
 
-def test_of_two_files_of_one_kind_the_one_that_is_written_otherwise_is_named() -> None:
-    robot, data = robot_of("linear-delta"), measured("linear-delta", Position(), n=16)
+def test_file_in_the_wrong_unit_is_named_among_two_of_one_kind() -> None:
+    robot, data = load_cached_robot("linear-delta"), simulate_data("linear-delta", Position(), n=16)
     rows = data.observations[0]
     parts = (
         replace(rows.take(np.arange(8)), source="a.csv"),
@@ -413,10 +425,10 @@ def test_of_two_files_of_one_kind_the_one_that_is_written_otherwise_is_named() -
     )
     inches = replace(parts[1], measured=parts[1].measured / 25.4)
     found = compare_conventions(robot, replace(data, observations=(parts[0], inches)))
-    assert times("lengths", 25.4, source="b.csv").items() <= slips(found)[0].items()
+    assert unit_slip("lengths", 25.4, source="b.csv").items() <= list_slips(found)[0].items()
     readings = np.concatenate([data.readings[:8], 0.1 * data.readings[8:]])
     found = compare_conventions(robot, replace(data, observations=parts, readings=readings))
-    assert times("readings", 10.0, source="b.csv").items() <= slips(found)[0].items()
+    assert unit_slip("readings", 10.0, source="b.csv").items() <= list_slips(found)[0].items()
     nameless = tuple(replace(part, source="") for part in parts)
     unnamed = list_reading_interpretations(replace(data, observations=nameless), robot.actuators)
     assert ("part 2 of the data", 10.0) in {
@@ -424,9 +436,9 @@ def test_of_two_files_of_one_kind_the_one_that_is_written_otherwise_is_named() -
     }
 
 
-def test_what_is_absent_fixed_or_unread_neither_hides_a_slip_nor_looks_like_one() -> None:
-    robot, data = robot_of("linear-delta"), measured("linear-delta", Position())
-    wrong = changed(data, scaled([0, 1, 2], 1e3))
+def test_missing_values_and_fixed_parameters_do_not_change_the_convention_check() -> None:
+    robot, data = load_cached_robot("linear-delta"), simulate_data("linear-delta", Position())
+    wrong = change_values(data, scaled([0, 1, 2], 1e3))
     fixed = replace(
         robot,
         parameters=ParameterTable(tuple(replace(p, free=False) for p in robot.parameters.entries)),
@@ -437,30 +449,30 @@ def test_what_is_absent_fixed_or_unread_neither_hides_a_slip_nor_looks_like_one(
     for machine, some, slip in (
         (fixed, data, False),
         (fixed, wrong, True),
-        (robot, changed(data, lambda values: values.__setitem__(holes, np.nan)), False),
-        (robot, changed(wrong, lambda values: values.__setitem__(holes, np.nan)), True),
+        (robot, change_values(data, lambda values: values.__setitem__(holes, np.nan)), False),
+        (robot, change_values(wrong, lambda values: values.__setitem__(holes, np.nan)), True),
         (robot, replace(data, readings=readings, reading_sigma=sigma), False),
     ):
         found = compare_conventions(machine, some)
         assert found.is_refused == slip
-        assert has_slip(found, **times("lengths", 1e-3)) == slip
+        assert has_slip(found, **unit_slip("lengths", 1e-3)) == slip
     for nothing in (data.with_weights(np.zeros(10)), replace(data, observations=())):
         assert np.isnan(compare_conventions(robot, nothing).misfit)
 
 
-def test_large_data_are_judged_by_runs_of_neighbours_and_rows_one_off_are_seen_in_them() -> None:
-    data = measured("linear-delta", Position(), n=200)
+def test_shifted_rows_are_detected_in_large_data() -> None:
+    data = simulate_data("linear-delta", Position(), n=200)
     found = compare_conventions(
-        robot_of("linear-delta"), replace(data, readings=np.roll(data.readings, 1, axis=0))
+        load_cached_robot("linear-delta"), replace(data, readings=np.roll(data.readings, 1, axis=0))
     )
     assert has_slip(found, "shifted-readings", neighbor="below")
 
 
 @pytest.mark.slow
-def test_readings_that_the_robot_cannot_reach_are_explained() -> None:
-    data = measured("linear-delta", Position(), n=4)
+def test_wrong_unit_of_readings_is_named_when_no_pose_is_reachable() -> None:
+    data = simulate_data("linear-delta", Position(), n=4)
     found = compare_conventions(
-        robot_of("linear-delta"), replace(data, readings=data.readings * 1e3)
+        load_cached_robot("linear-delta"), replace(data, readings=data.readings * 1e3)
     )
     assert found.finding is not None
     assert (found.finding.data["reached"], found.finding.data["poses"]) == (0, 4)
@@ -468,7 +480,7 @@ def test_readings_that_the_robot_cannot_reach_are_explained() -> None:
 
 
 @pytest.mark.slow
-def test_the_published_table_names_its_own_euler_order() -> None:
+def test_published_hexapod_table_is_refused_in_its_printed_euler_order() -> None:
     """The hexapod study prints Rz(a) Ry(b) Rx(c), but its Table 4 was made with the angles in the
     opposite order.
     """
@@ -493,15 +505,15 @@ def test_the_published_table_names_its_own_euler_order() -> None:
     assert found.misfit > 100.0 * found.other_misfit
 
 
-def test_the_error_has_the_code_of_the_finding_and_can_be_overridden() -> None:
-    robot = robot_of("hexapod-42")
-    data = changed(measured("hexapod-42", FULL), scaled([3, 4, 5], 1e3))
+def test_refusal_has_the_code_of_its_finding_and_can_be_overridden() -> None:
+    robot = load_cached_robot("hexapod-42")
+    data = change_values(simulate_data("hexapod-42", FULL), scaled([3, 4, 5], 1e3))
     with pytest.raises(DataError, match="the unit in the header") as error:
         check_conventions(robot, data)
     assert error.value.code == "conventions.other-interpretation"
     assert np.isnan(check_conventions(robot, data, allow_implausible=True).misfit)
-    still = changed(
-        measured("hexapod-42", Position()),
+    still = change_values(
+        simulate_data("hexapod-42", Position()),
         lambda values: values.__setitem__(slice(1, None), values[0]),
     )
     with pytest.raises(DataError, match="never moves: its readings stay within 0 mm") as error:
@@ -509,12 +521,12 @@ def test_the_error_has_the_code_of_the_finding_and_can_be_overridden() -> None:
     assert error.value.code == "conventions.target-never-moves"
 
 
-def test_every_hypothesis_is_another_reading_in_the_same_shape() -> None:
+def test_every_interpretation_changes_the_values_and_keeps_their_shape() -> None:
     seen: set[str] = set()
     for cls in KINDS.values():
         for kind in cls.examples()[:2]:
             try:
-                data = measured("hexapod-42", kind, n=5)
+                data = simulate_data("hexapod-42", kind, n=5)
             except LoopcalError:
                 continue
             for way in list_interpretations(data):
@@ -526,7 +538,7 @@ def test_every_hypothesis_is_another_reading_in_the_same_shape() -> None:
                 assert way.shrinks == (way.details.get("factor", 1.0) < 1.0)
             seen.add(kind.name)
     assert seen == set(KINDS)
-    data, robot = measured("linear-delta", Position(), n=5), robot_of("linear-delta")
+    data, robot = simulate_data("linear-delta", Position(), n=5), load_cached_robot("linear-delta")
     ways = [
         (way.slip, *way.details.items())
         for way in list_reading_interpretations(data, robot.actuators)

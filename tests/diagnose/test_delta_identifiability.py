@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the probes of five real delta printers determine: rank and condition, intervals by stated
-sigmas, and chi-square.
+"""Identifiability of five real delta printers from their probes: rank, condition, intervals and
+chi-square.
 
-Conditions are of rows divided by one sigma and columns of 1 mm and 1 degree. The printers and what
-their firmware stored are described beside the records in LOOPCAL_DATA/delta_printers.
+Conditions are of rows divided by one sigma and columns of 1 mm and 1 degree. The records in
+LOOPCAL_DATA/delta_printers describe the printers and what their firmware stored.
 """
 
 from dataclasses import replace
@@ -22,10 +22,10 @@ from loopcal.mechanism import Mechanism
 from tests.cli.delta_printers import read_records
 from tests.io.formats.printers import printer_cfg
 
-SIX = ("radius", "tower1.angle", "tower2.angle", "tower1.stop", "tower2.stop", "tower3.stop")
+GEOMETRY = ("radius", "tower1.angle", "tower2.angle", "tower1.stop", "tower2.stop", "tower3.stop")
 ARMS = ("arm1.length", "arm2.length", "arm3.length")
 WITH_DISTANCES = "RazorCopter/Klipper_FLSUN_Q5 printer [Post-Calibration].cfg"
-UNIT = "tolerances: {radius: {sd: 1}, angles: {sd: 1}, arms: {sd: 1}, stops: {sd: 1}}\n"
+UNIT_TOLERANCES = "tolerances: {radius: {sd: 1}, angles: {sd: 1}, arms: {sd: 1}, stops: {sd: 1}}\n"
 
 Printer = tuple[Mechanism, Measurements]
 
@@ -44,18 +44,21 @@ def printers(data_folder: Path, tmp_path_factory) -> dict[str, Printer]:
             if not line.startswith("fixed")
         ]
         assert read.measurements is not None
-        found[name] = build_imported_robot(path, Imported("".join(lines) + UNIT)), read.measurements
+        found[name] = (
+            build_imported_robot(path, Imported("".join(lines) + UNIT_TOLERANCES)),
+            read.measurements,
+        )
     assert len(found) == 5
     return found
 
 
-def only(robot: Mechanism, *names: str) -> Mechanism:
-    """The robot with these parameters free."""
+def free_only(robot: Mechanism, *names: str) -> Mechanism:
+    """Return the robot with only these parameters free."""
     return replace(robot, parameters=robot.parameters.with_free(names))
 
 
 def with_sigmas(data: Measurements, height: float, distance: float) -> Measurements:
-    """The probes with other sigmas [m]."""
+    """Replace the sigmas of heights and distances [m]."""
     rows = [
         Observations.from_sigma(
             o.kind, o.rows, o.measured, height if o.kind.poses_per_row == 1 else distance
@@ -65,8 +68,8 @@ def with_sigmas(data: Measurements, height: float, distance: float) -> Measureme
     return replace(data, observations=tuple(rows))
 
 
-def heights(data: Measurements) -> Measurements:
-    """The heights alone."""
+def select_heights(data: Measurements) -> Measurements:
+    """Keep the heights only."""
     return replace(
         data, observations=tuple(o for o in data.observations if o.kind.poses_per_row == 1)
     )
@@ -74,30 +77,32 @@ def heights(data: Measurements) -> Measurements:
 
 def test_six_parameters_are_well_conditioned_from_seven_heights(printers):
     for name, (robot, data) in printers.items():
-        found = identifiability(only(robot, *SIX), heights(data))
+        found = identifiability(free_only(robot, *GEOMETRY), select_heights(data))
         assert found.rank == found.n_parameters == 6, name
         assert 6.0 < found.condition < 8.0, name
 
 
-def test_one_arm_more_is_some_thirty_times_worse(printers):
-    """Seven numbers from seven heights can be computed, and mean little."""
+def test_one_free_arm_makes_the_condition_about_thirty_times_worse(printers):
+    """Seven parameters from seven heights can be computed but are nearly meaningless."""
     first = []
     for name, (robot, data) in printers.items():
-        found = [identifiability(only(robot, *SIX, arm), heights(data)) for arm in ARMS]
+        found = [
+            identifiability(free_only(robot, *GEOMETRY, arm), select_heights(data)) for arm in ARMS
+        ]
         assert {one.rank for one in found} == {7}, name
         assert all(140.0 < one.condition < 480.0 for one in found), name
         first.append(found[0].condition)
     assert 185.0 < min(first) < max(first) < 320.0
 
 
-def test_nine_parameters_from_heights_alone_lack_two_and_distances_are_what_tells_them(printers):
+def test_heights_leave_two_of_nine_parameters_undetermined_and_distances_are_suggested(printers):
     for name, (robot, data) in printers.items():
-        found = identifiability(robot, heights(data))
+        found = identifiability(robot, select_heights(data))
         assert (found.rank, found.n_parameters, found.n_equations) == (7, 9, 7), name
         assert found.gap > 1e10, name  # the two singular values that are cut are rounding
-        open_names = [set(combination.names) for combination in found.unidentifiable]
-        assert len(open_names) == 2
-        assert all(names & set(ARMS) for names in open_names), name
+        unidentifiable = [set(combination.names) for combination in found.unidentifiable]
+        assert len(unidentifiable) == 2
+        assert all(names & set(ARMS) for names in unidentifiable), name
         for remedy in suggest_measurements(found):
             assert (
                 remedy.measurements[0].words
@@ -105,17 +110,17 @@ def test_nine_parameters_from_heights_alone_lack_two_and_distances_are_what_tell
             ), name
 
 
-def test_heights_with_twelve_distances_determine_all_nine(printers):
+def test_heights_and_twelve_distances_determine_nine_parameters(printers):
     robot, data = printers[WITH_DISTANCES]
     one = identifiability(robot, with_sigmas(data, 1e-3, 1e-3))
     assert one.rank == 9
     assert 44.0 < one.condition < 50.0
-    # a distance tells less than a height: what the figure is depends on their sigmas
+    # the condition depends on the ratio of sigmas: a distance constrains less than a height
     firmware = identifiability(robot, with_sigmas(data, 1e-3 / np.sqrt(2 * 12 / 7), 1e-3))
     assert 33.0 < firmware.condition < 38.0
 
 
-def test_probe_and_callipers_of_usual_sigmas_explain_the_residual_and_give_intervals(printers):
+def test_usual_sigmas_of_probe_and_callipers_explain_the_residuals(printers):
     """With 0.05 mm for the probe and 0.3 mm for callipers on plastic; with 0.02 and 0.1 mm,
     chi-square refuses.
     """
@@ -135,9 +140,9 @@ def test_probe_and_callipers_of_usual_sigmas_explain_the_residual_and_give_inter
     assert half["arm1.length"] > 5 * abs(217.6266 - 217.4260)
 
 
-def test_a_sigma_twice_as_large_makes_intervals_twice_as_wide_and_chi_square_a_quarter(printers):
+def test_doubled_sigma_doubles_intervals_and_quarters_chi_square(printers):
     name = next(n for n in printers if n.startswith("fzechert"))
-    robot, data = only(printers[name][0], *SIX), printers[name][1]
+    robot, data = free_only(printers[name][0], *GEOMETRY), printers[name][1]
     narrow, wide = (
         identify(robot, with_sigmas(data, sigma, 1.0), LeastSquares())
         for sigma in (0.01e-3, 0.02e-3)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be known: ranks of the hexapod, null directions at rounding level, and combinations in
-words.
+"""Identifiability: rank of the hexapod, null directions at rounding level, and unidentifiable
+combinations with their meaning.
 """
 
 import json
@@ -24,7 +24,7 @@ FRAMES = {(): 42, ("frame",): 36, ("tool",): 36, ("frame", "tool"): 30}
 
 
 def moved_frame(combination: Combination) -> str | None:
-    """The frame that a combination moves as a whole."""
+    """Return the frame of a rigid motion, or None for another combination."""
     meaning = combination.meaning
     return meaning.data.get("frame") if isinstance(meaning, Finding) else None
 
@@ -32,16 +32,18 @@ def moved_frame(combination: Combination) -> str | None:
 TURN_ABOUT_Z = {"frame": "platform", "motion": "rotation", "axis": "z", "through_origin": True}
 
 
-def positions() -> Instrument:
+def position_instrument() -> Instrument:
     return Instrument((Sensor(Component(("x", "y", "z")), noise(UM, UM, UM)),))
 
 
-def poses(*unknown: str) -> Instrument:
+def pose_instrument(*unknown: str) -> Instrument:
     return Instrument((Sensor(Pose(unknown=unknown), tracker().sensors[0].noise),))
 
 
-@pytest.mark.parametrize(("instrument", "rank"), [(None, 42), (five_dof(), 41), (positions(), 39)])
-def test_ranks_of_the_hexapod_are_those_of_the_measured_freedoms(instrument, rank):
+@pytest.mark.parametrize(
+    ("instrument", "rank"), [(None, 42), (five_dof(), 41), (position_instrument(), 39)]
+)
+def test_rank_of_the_hexapod_equals_the_count_of_measured_freedoms(instrument, rank):
     found = identifiability(hexapod(), hexapod_data(60, instrument=instrument))
     assert found.rank == rank
     assert len(found.unidentifiable) == 42 - rank
@@ -52,8 +54,8 @@ def test_ranks_of_the_hexapod_are_those_of_the_measured_freedoms(instrument, ran
 
 
 @pytest.mark.parametrize(("unknown", "rank"), FRAMES.items())
-def test_each_unknown_frame_costs_six_and_its_combinations_are_called_motions_of_it(unknown, rank):
-    found = identifiability(hexapod(), hexapod_data(60, instrument=poses(*unknown)))
+def test_unknown_frame_lowers_the_rank_by_six_rigid_motions_of_that_frame(unknown, rank):
+    found = identifiability(hexapod(), hexapod_data(60, instrument=pose_instrument(*unknown)))
     assert found.rank == rank
     moved = [moved_frame(c) for c in found.unidentifiable]
     assert moved.count("base") == (6 if "frame" in unknown else 0)
@@ -64,7 +66,7 @@ def test_each_unknown_frame_costs_six_and_its_combinations_are_called_motions_of
     ("kind", "rank"),
     [(Inclination(unknown=("gravity",)), 33), (Separation(), 33), (Position(), 39)],
 )
-def test_kinds_with_unknowns_and_kinds_that_link_poses_are_counted_too(kind, rank):
+def test_rank_of_kinds_with_setup_parameters_and_of_kinds_that_link_poses(kind, rank):
     sigma = noise(*[5 * UM] * len(kind.noise_columns))
     # a closed chain of neighbours and one of pairs further apart
     far = (
@@ -78,7 +80,7 @@ def test_kinds_with_unknowns_and_kinds_that_link_poses_are_counted_too(kind, ran
     assert found.rank == rank
 
 
-def test_torsion_that_is_not_measured_leaves_the_turn_of_the_platform_open():
+def test_unmeasured_torsion_leaves_platform_rotation_unidentifiable():
     found = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
     (turn,) = found.unidentifiable
     moved = dict(zip(turn.names, turn.changes, strict=True))
@@ -93,7 +95,7 @@ def test_torsion_that_is_not_measured_leaves_the_turn_of_the_platform_open():
     assert turn.meaning.data == TURN_ABOUT_Z
 
 
-def test_without_torsion_the_3_prs_knows_32_of_33_and_the_finding_names_its_three_balls():
+def test_3_prs_without_torsion_has_rank_32_of_33_and_names_three_balls():
     found = identifiability(load_robot("3-prs"), five_dof(), poses=36)
     (turn,) = found.unidentifiable
     assert (found.rank, found.n_parameters) == (32, 33)
@@ -106,14 +108,14 @@ def test_without_torsion_the_3_prs_knows_32_of_33_and_the_finding_names_its_thre
     assert "a1y, a2y and a3y, in equal parts" in str(found)
 
 
-def test_without_torsion_the_tracker_knows_24_of_25():
+def test_ru_pus_prs_without_torsion_has_rank_24():
     found = identifiability(load_robot("ru-pus-prs"), five_dof(), poses=36)
     (turn,) = found.unidentifiable
     assert found.rank == 24
     assert set(turn.names) == {"a1y", "a2x", "thU2z"}
 
 
-def test_each_parameter_is_judged_alone_and_with_its_partners():
+def test_each_parameter_has_a_state_and_the_parameters_of_its_combination():
     found = identifiability(load_robot("3-prs"), five_dof(), poses=36)
     verdict = {v.name: v for v in found.parameters}
     assert verdict["a2y"].state == "together"
@@ -121,19 +123,18 @@ def test_each_parameter_is_judged_alone_and_with_its_partners():
     assert {v.state for name, v in verdict.items() if name not in {"a1y", "a2y", "a3y"}} == {
         "determined"
     }
-    # two of three equal parts stay open to the prior: its share is at least the null vector's, 1 /
-    # sqrt 3
+    # the prior decides one direction of three equal parts: its share is at least 1 / sqrt 3
     assert 1 / np.sqrt(3) <= verdict["a2y"].left < 0.6
 
 
-def test_directions_known_no_better_than_their_tolerance_are_named_the_weakest_first():
+def test_weak_directions_are_listed_from_the_weakest():
     found = identifiability(load_robot("3-prs"), five_dof(), poses=36)
     assert [c.singular_value for c in found.weak] == sorted(found.singular_values[: found.rank])[:5]
-    assert found.improved + (found.rank - found.improved) == found.rank
+    assert found.improved == (found.singular_values > 1.0).sum() < found.rank
     assert [f.code for f in found.findings].count("fit.hardly-observable") == len(found.weak)
 
 
-def test_indices_are_those_of_the_definitions():
+def test_observability_indices_equal_their_definitions():
     A = np.random.default_rng(0).normal(size=(30, 5))
     s = np.asarray(np.linalg.svd(A, compute_uv=False), dtype=float)
     found = compute_observability(s, 5, 30)
@@ -148,7 +149,7 @@ def test_indices_are_those_of_the_definitions():
     assert "rows divided by sigma, columns multiplied by tolerance" in str(found)
 
 
-def test_combinations_span_the_null_space_and_each_has_a_parameter_of_its_own():
+def test_combinations_span_the_null_space():
     free = select_free_parameters(hexapod())
     null = np.linalg.qr(np.random.default_rng(0).standard_normal((42, 4))).Q
     found = describe_null_space(free, null)
@@ -160,7 +161,7 @@ def test_combinations_span_the_null_space_and_each_has_a_parameter_of_its_own():
     assert np.linalg.matrix_rank(z) == 4
 
 
-def test_the_print_is_short_and_the_json_has_the_attributes():
+def test_text_is_short_and_json_has_all_attributes():
     found = identifiability(hexapod(), hexapod_data(6))
     rank = found.findings[0]
     assert rank.code == "identifiability.rank"
@@ -176,7 +177,7 @@ def test_the_print_is_short_and_the_json_has_the_attributes():
     assert document["findings"][0]["code"] == "identifiability.rank"
 
 
-def test_what_it_reads_is_the_factor_of_a_fit_without_own_unknowns():
+def test_collected_factor_equals_the_factor_of_a_fit_without_setup_parameters():
     from loopcal.estimate.information import collect_information, observe_poses, observe_rows
 
     free, data = select_free_parameters(hexapod()), hexapod_data(30)
@@ -190,7 +191,7 @@ def test_what_it_reads_is_the_factor_of_a_fit_without_own_unknowns():
     assert reached.all()
 
 
-def test_elimination_is_the_projection_onto_the_complement_even_of_columns_that_repeat():
+def test_elimination_of_dependent_columns_is_the_projection_onto_their_complement():
     from loopcal.numerics.column_elimination import eliminate_from_factor
 
     rng = np.random.default_rng(1)
@@ -204,7 +205,7 @@ def test_elimination_is_the_projection_onto_the_complement_even_of_columns_that_
     np.testing.assert_allclose(R.T @ R, left.T @ left, atol=1e-12)  # [1] rounding
 
 
-def test_a_pose_out_of_reach_is_refused_with_its_name():
+def test_pose_out_of_reach_is_refused_with_its_name():
     data = hexapod_data(6)
     readings = data.readings.copy()
     readings[2, 0] += 5.0

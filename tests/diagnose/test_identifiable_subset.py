@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The smallest set of parameters: what the papers drop is dropped, nothing measured is lost, and
-the file loads again.
+"""The identifiable subset: it drops the parameters that the papers drop, keeps the rank, and its
+robot file loads again.
 """
 
 import json
@@ -21,8 +21,8 @@ from tests.estimate.problems import five_dof, hexapod, hexapod_data, tracker
 
 
 @pytest.fixture
-def with_line(tmp_path):
-    """A shipped robot with one more line in its file."""
+def load_with_line(tmp_path):
+    """Return a loader of a shipped robot with an additional line in its file."""
 
     def load(name: str, line: str):
         path = tmp_path / "robot.yaml"
@@ -32,31 +32,31 @@ def with_line(tmp_path):
     return load
 
 
-def called(*letters: str) -> set[str]:
-    """Names of all three chains, such as b1z for bz."""
+def name_parameters(*letters: str) -> set[str]:
+    """Return the names of all three chains, such as b1z, b2z and b3z for bz."""
     return {f"{name[:-1]}{chain}{name[-1]}" for chain in "123" for name in letters}
 
 
-def test_fourteen_natural_parameters_a_chain_reduce_to_eleven_by_dropping_bz_thbz_and_thcy(
-    with_line,
-):
-    robot = with_line("3-prs", "parameters: fourteen")
+def test_3_prs_with_fourteen_parameters_a_chain_drops_bz_thbz_and_thcy(load_with_line):
+    robot = load_with_line("3-prs", "parameters: fourteen")
     found = identifiability(robot, tracker(), poses=36)
     assert (found.rank, found.n_parameters) == (33, 42)
     smaller = choose_identifiable_subset(found)
-    assert {m.name for m in smaller.dropped} == called("bz", "thBz", "thCy")
+    assert {m.name for m in smaller.dropped} == name_parameters("bz", "thBz", "thCy")
     assert smaller.kept == load_robot("3-prs").parameters.names
     merged = {m.name: m for m in smaller.dropped}
     assert merged["b2z"].into == ("q2",)
     assert merged["b2z"].units == ("mm",)
     np.testing.assert_allclose(merged["b2z"].changes, [1.0], rtol=1e-9)
     assert merged["thB3z"].into == ()
-    assert {v.name for v in found.parameters if v.state == "not at all"} == called("thBz", "thCy")
+    assert {v.name for v in found.parameters if v.state == "not at all"} == name_parameters(
+        "thBz", "thCy"
+    )
 
 
-def test_twenty_seven_parameters_of_the_tracker_reduce_to_26_by_merging_two_turns(with_line):
+def test_ru_pus_prs_with_27_parameters_merges_two_rotations(load_with_line):
     found = identifiability(
-        with_line("ru-pus-prs", "parameters: twenty-seven"), tracker(), poses=36
+        load_with_line("ru-pus-prs", "parameters: twenty-seven"), tracker(), poses=36
     )
     (merged,) = choose_identifiable_subset(found).dropped
     assert found.rank == 26
@@ -70,7 +70,7 @@ def test_twenty_seven_parameters_of_the_tracker_reduce_to_26_by_merging_two_turn
 
 
 @pytest.mark.parametrize("unknown", [("frame",), ("tool",), ("frame", "tool")])
-def test_what_is_merged_moves_what_was_measured_as_its_replacement_does(unknown):
+def test_dropped_parameter_and_its_replacement_have_the_same_effect_on_rows(unknown):
     instrument = Instrument((Sensor(Pose(unknown=unknown), tracker().sensors[0].noise),))
     found = identifiability(hexapod(), hexapod_data(60, instrument=instrument))
     smaller = choose_identifiable_subset(found)
@@ -94,13 +94,13 @@ def test_what_is_merged_moves_what_was_measured_as_its_replacement_does(unknown)
         )  # [1] parts below 1e-6 are left out
 
 
-def test_a_full_set_stays_whole_and_says_so():
+def test_identifiable_set_is_not_reduced():
     smaller = choose_identifiable_subset(identifiability(hexapod(), hexapod_data(60)))
     assert smaller.dropped == ()
     assert [f.code for f in smaller.findings] == ["model.not-reducible"]
 
 
-def test_the_written_file_loads_keeps_its_comments_and_loses_nothing(tmp_path):
+def test_reduced_robot_file_loads_with_its_comments_and_full_rank(tmp_path):
     robot = load_robot("3-prs")
     found = identifiability(robot, five_dof(), poses=36)
     smaller = choose_identifiable_subset(found)
@@ -117,8 +117,8 @@ def test_the_written_file_loads_keeps_its_comments_and_loses_nothing(tmp_path):
     assert once_more.rank == once_more.n_parameters == 32
 
 
-def test_a_list_that_is_there_grows_and_identified_values_stay(with_line):
-    robot = with_line("hexapod-42", "fixed: [leg1.length,\n  'leg2.base.?']\n# the end")
+def test_reduced_robot_file_extends_the_fixed_list_and_keeps_identified_values(load_with_line):
+    robot = load_with_line("hexapod-42", "fixed: [leg1.length,\n  'leg2.base.?']\n# the end")
     robot = robot.with_values(robot.values * (1 + 1e-4))
     text = format_reduced_robot(robot, {"leg6.base.z": "1 mm of it counts as something"})
     assert text.count("fixed:") == 1
@@ -133,12 +133,12 @@ def test_a_list_that_is_there_grows_and_identified_values_stay(with_line):
     np.testing.assert_allclose(again.values, robot.values, rtol=1e-15)
 
 
-def test_a_robot_without_a_file_cannot_be_shortened():
+def test_robot_without_a_file_cannot_be_reduced():
     with pytest.raises(MechanismError, match="was not loaded from a robot file"):
         format_reduced_robot(hexapod(), {})
 
 
-def test_the_json_says_the_same():
+def test_json_lists_dropped_and_kept_parameters():
     smaller = choose_identifiable_subset(identifiability(load_robot("3-prs"), five_dof(), poses=36))
     document = json.loads(to_json(smaller.to_dict()))
     assert [m["name"] for m in document["dropped"]] == ["a3y"]  # the last of equal parameters
@@ -146,7 +146,7 @@ def test_the_json_says_the_same():
     assert len(document["kept"]) == 32
 
 
-def test_a_scene_marks_what_is_not_reached_and_leaves_no_number_that_is_none():
+def test_observed_poses_mark_unreached_poses_and_stay_finite():
     found = identifiability(hexapod(), hexapod_data(60))
     at = observe_poses(found.free_parameters, np.array([np.zeros(6), 9.0 * np.eye(6)[0]]))
     assert at.is_reached.tolist() == [True, False]

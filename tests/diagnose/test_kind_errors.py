@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of several kinds are compared in units of their sigma, and every number says from how many
-rows it is.
-"""
+"""Errors of several measurement kinds are compared in units of sigma, with the number of rows."""
 
 from dataclasses import replace
 
@@ -26,15 +24,18 @@ from tests.estimate.problems import UM, hexapod, hexapod_data, noise
 MM = 1e-3
 
 
-def rows(kind, count: int, sigma: float) -> Observations:
+def make_rows(kind, count: int, sigma: float) -> Observations:
     columns = len(kind.columns)
     return Observations.from_sigma(
         kind.with_tool(np.eye(4)), np.arange(count), np.zeros((count, columns)), sigma
     )
 
 
-def test_errors_are_divided_by_sigma_for_each_kind_and_summed_over_all():
-    heights, positions = rows(Component(("z",)), 4, 20 * UM), rows(Position(), 2, 300 * UM)
+def test_kind_errors_are_in_units_of_sigma_for_each_kind_and_for_all():
+    heights, positions = (
+        make_rows(Component(("z",)), 4, 20 * UM),
+        make_rows(Position(), 2, 300 * UM),
+    )
     measured = positions.measured.copy()
     measured[1, 2] = np.nan
     positions = replace(positions, measured=measured)
@@ -53,9 +54,9 @@ def test_errors_are_divided_by_sigma_for_each_kind_and_summed_over_all():
     assert every.after == pytest.approx(np.sqrt((4 * 1 + 5 * 4) / 9), rel=1e-12)
 
 
-def test_a_fit_that_follows_the_better_instrument_is_not_called_larger_for_the_worse_one():
-    """Ten heights of 20 um ask for the new stops, thirty positions of 1 mm are 0.1 mm off them, a
-    tenth of their sigma.
+def test_improvement_weights_each_instrument_by_its_sigma():
+    """Ten heights (sigma 20 um) fit the new stops; thirty positions (1 mm) fit the old ones,
+    0.1 mm away: a tenth of their sigma.
     """
     new = load_robot("linear-delta")
     stops = np.array([name.endswith("stop") for name in new.parameters.names])
@@ -77,14 +78,14 @@ def test_a_fit_that_follows_the_better_instrument_is_not_called_larger_for_the_w
     assert [k["kind"] for k in found.to_dict()["kinds"]] == ["component", "position", "all"]
 
 
-def test_every_error_says_of_how_many_rows_it_is_and_too_few_are_noted():
+def test_validation_counts_rows_of_each_quantity_and_reports_too_few():
     data = hexapod_data(12)
     pose = data.observations[0]
     measured = pose.measured.copy()
     lengths = np.array([name in "xyz" for name in (column.name for column in pose.kind.columns)])
     measured[np.ix_(np.arange(3, 12), lengths)] = (
         np.nan
-    )  # position of three rows, orientation of eleven, and a row of nothing
+    )  # position of three rows, orientation of eleven, and one empty row
     measured[11] = np.nan
     found = validate(hexapod(), replace(data, observations=(replace(pose, measured=measured),)))
     assert len(found.poses) == 11

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Leave-one-out of many filters from one linearisation against refits of the linear problem."""
+"""Leave-one-out scores of many methods from one linearization equal those of refits of the linear
+problem.
+"""
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ DATA = hexapod_data(14, instrument=tracker(20e-6, 100e-6))
 
 
 @pytest.mark.parametrize("method", [LeastSquares(), MAP(), Ridge(30.0)])
-def test_scores_are_those_of_refits_of_the_linear_problem(method):
+def test_leave_one_out_scores_equal_those_of_linear_refits(method):
     found = score_leave_one_out(hexapod(), DATA, (method,))
     problem = problem_of(select_free_parameters(hexapod()), DATA)
     at = problem.linearize(np.zeros((1, 42)), problem.start())
@@ -30,7 +32,7 @@ def test_scores_are_those_of_refits_of_the_linear_problem(method):
     assert found.score[0] == pytest.approx(total / 84, rel=1e-8)
 
 
-def test_a_whole_path_is_scored_and_its_ends_are_known():
+def test_regularization_path_runs_from_nominal_to_least_squares():
     fit = identify(hexapod(), DATA)
     methods = build_regularization_path(1.0, 40, 42)
     found = score_leave_one_out(fit.robot, DATA, methods)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cross-validation over blocks, and the simplest set of parameters that is enough."""
+"""Cross-validation over observation blocks, and the choice of the simplest sufficient set of
+parameters.
+"""
 
 from dataclasses import replace
 
@@ -16,15 +18,15 @@ from tests import zoo
 from tests.estimate.problems import UM, URAD, hexapod, hexapod_data, hexapod_poses, tracker
 
 
-def lengths_only(seed: int = 0):
-    """A hexapod whose legs alone are wrong."""
+def simulate_length_errors(seed: int = 0):
+    """Simulate a hexapod with errors of leg lengths only."""
     robot, truth = zoo.hexapod(), zoo.hexapod().values.copy()
     places = [i for i, name in enumerate(robot.parameters.names) if name.endswith("length")]
     truth[places] = zoo.hexapod_truth()[places]
     return simulate(robot.with_values(truth), hexapod_poses(30, seed), tracker(), seed)
 
 
-def test_every_pose_is_held_out_once_and_blocks_are_kept_together():
+def test_folds_hold_out_every_pose_once_and_keep_blocks_together():
     data = replace(hexapod_data(30), block=np.arange(30) // 3)
     parts = draw_folds(data, 5, 1)
     assert sorted(np.concatenate(parts)) == list(range(30))
@@ -36,7 +38,7 @@ def test_every_pose_is_held_out_once_and_blocks_are_kept_together():
         draw_folds(data, 11, 1)
 
 
-def test_unseen_poses_are_predicted_to_the_noise_and_worse_than_fitted_ones():
+def test_held_out_poses_are_predicted_to_the_noise_and_worse_than_fitted_ones():
     data = hexapod_data(40)
     found = cross_validate(hexapod(), data, LeastSquares())
     assert sorted(found.poses, key=int) == list(data.labels)
@@ -48,8 +50,8 @@ def test_unseen_poses_are_predicted_to_the_noise_and_worse_than_fitted_ones():
     assert (found.before_fold > 100.0).all()
 
 
-def test_a_machine_whose_lengths_alone_are_wrong_needs_no_other_parameters():
-    found = choose_model(hexapod(), lengths_only(), method=LeastSquares())
+def test_machine_with_length_errors_alone_needs_lengths_alone():
+    found = choose_model(hexapod(), simulate_length_errors(), method=LeastSquares())
     assert [c.name for c in found.candidates] == ["nothing", "lengths", "ideal"]
     assert found.chosen.name == "lengths"
     assert len(found.chosen.parameters) == 6
@@ -59,20 +61,20 @@ def test_a_machine_whose_lengths_alone_are_wrong_needs_no_other_parameters():
     assert "nothing" in str(found)
 
 
-def test_a_machine_with_all_errors_needs_all_parameters():
+def test_machine_with_all_errors_needs_all_parameters():
     found = choose_model(hexapod(), hexapod_data(30))
     assert found.chosen.name == "ideal"
     assert found.finding.code == "model.all-needed"
 
 
-def test_a_perfect_machine_seen_by_a_poor_instrument_is_left_alone():
+def test_perfect_machine_and_poor_instrument_give_no_parameters():
     data = simulate(zoo.hexapod(), hexapod_poses(30), tracker(100 * UM, 500 * URAD), 1)
     found = choose_model(hexapod(), data, method=LeastSquares())
     assert found.chosen.name == "nothing"
     assert found.finding.code == "model.nothing-gained"
 
 
-def test_sets_of_the_shipped_names():
+def test_nested_parameter_sets_of_the_3_prs():
     robot = load_robot("3-prs")
     assert list(nest_parameter_sets(robot)) == ["offsets", "lengths", "ideal", "complete"]
     sets = nest_parameter_sets(robot)
@@ -81,7 +83,7 @@ def test_sets_of_the_shipped_names():
     assert len(sets["complete"]) == 33
 
 
-def test_sets_that_are_not_nested_are_refused():
+def test_parameter_sets_that_are_not_nested_are_refused():
     with pytest.raises(EstimationError, match="'a' is not within 'b'"):
         choose_model(
             hexapod(), hexapod_data(30), {"a": ["leg1.length"], "b": ["leg2.length", "leg3.length"]}

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blunders: losses, leverage, leave-one-block-out by the shortcut, and names at a stated level for
-the whole family.
+"""Outliers: robust losses, leverage, leave-one-block-out without refits, and a false-alarm rate
+for the whole data set.
 """
 
 from dataclasses import replace
@@ -42,9 +42,9 @@ SIGMA = np.array([5 * URAD] * 3 + [UM] * 3)  # of `tracker`
 NAMED = ("4", "23", "11")
 
 
-def blundered(seed: int) -> tuple[Measurements, Measurements]:
-    """Forty poses, clean and with 5 % of the rows 20 sigma off in the norm of the row, and one row
-    of another run.
+def make_data_with_outliers(seed: int) -> tuple[Measurements, Measurements]:
+    """Return forty clean poses, and the same with two rows 20 sigma off and one row of another
+    machine.
     """
     clean = hexapod_data(40, seed)
     rows = clean.observations[0]
@@ -65,19 +65,19 @@ def blundered(seed: int) -> tuple[Measurements, Measurements]:
     return clean, replace(clean, observations=(replace(rows, measured=measured),))
 
 
-def rms(fit) -> float:
+def rms_error(fit) -> float:
     return float(np.sqrt(np.mean((fit.estimate - zoo.hexapod_truth()) ** 2)))
 
 
 @pytest.mark.parametrize("loss", [Huber(), Tukey()])
-def test_a_robust_fit_of_blunders_is_nearly_as_good_as_the_fit_of_clean_data(loss):
+def test_robust_fit_with_outliers_is_nearly_as_good_as_a_fit_of_clean_data(loss):
     clean, robust, plain = [], [], []
     for seed in range(6):
-        good, bad = blundered(seed)
-        clean.append(rms(identify(hexapod(), good)))
+        good, bad = make_data_with_outliers(seed)
+        clean.append(rms_error(identify(hexapod(), good)))
         fit = identify(hexapod(), bad, loss=loss)
-        robust.append(rms(fit))
-        plain.append(rms(identify(hexapod(), bad)))
+        robust.append(rms_error(fit))
+        plain.append(rms_error(identify(hexapod(), bad)))
         assert all(fit.pose_weights[int(name) - 1] < 0.5 for name in NAMED)
     ratio = np.sqrt(np.mean(np.square(robust)) / np.mean(np.square(clean)))
     assert ratio < 1.3
@@ -86,8 +86,8 @@ def test_a_robust_fit_of_blunders_is_nearly_as_good_as_the_fit_of_clean_data(los
 
 @pytest.mark.parametrize("loss", [None, Huber(), Tukey()])
 @pytest.mark.parametrize("method", [LeastSquares(), None])
-def test_blunders_are_named_in_words_and_nothing_is_dropped(loss, method):
-    _, bad = blundered(0)
+def test_outliers_are_named_but_not_excluded(loss, method):
+    _, bad = make_data_with_outliers(0)
     fit = identify(hexapod(), bad, method, loss=loss)
     found = find_outliers(fit, bad)
     assert set(found.names) == set(NAMED)
@@ -104,7 +104,7 @@ def test_blunders_are_named_in_words_and_nothing_is_dropped(loss, method):
 
 
 @pytest.mark.parametrize("method", [LeastSquares(), MAP()])
-def test_the_shortcut_is_the_residual_of_a_refit_without_the_block(method):
+def test_deleted_residual_equals_that_of_a_refit_without_the_block(method):
     # one linearisation: with it the shortcut is exact
     data, free = hexapod_data(12), select_free_parameters(hexapod())
     problem = problem_of(free, data)
@@ -144,7 +144,7 @@ def test_the_shortcut_is_the_residual_of_a_refit_without_the_block(method):
         assert found.leverage.sum() == pytest.approx(42.0)
 
 
-def test_the_false_alarm_of_clean_data_is_that_of_the_family():
+def test_false_alarm_rate_of_clean_data_sets_is_the_stated_one():
     robot, t, alarms = hexapod(), 200, 0
     measured = simulate_trials(robot, sample_truth(robot, t, 8), hexapod_poses(14), tracker(), 8)
     for i in range(t):
@@ -154,8 +154,8 @@ def test_the_false_alarm_of_clean_data_is_that_of_the_family():
     assert binom.ppf(0.0005, t, 0.05) <= alarms <= binom.ppf(0.9995, t, 0.05)
 
 
-def test_with_estimated_noise_the_scale_is_not_taken_from_the_blunders():
-    _, bad = blundered(1)
+def test_estimated_noise_is_not_inflated_by_outliers():
+    _, bad = make_data_with_outliers(1)
     claimed = bad.observations[0]
     sharp = replace(bad, observations=(replace(claimed, covariance=claimed.covariance / 9.0),))
     fit = identify(hexapod(), sharp, loss=Huber(), options=FitOptions(noise="estimated"))
@@ -164,14 +164,14 @@ def test_with_estimated_noise_the_scale_is_not_taken_from_the_blunders():
     assert set(found.names) == set(NAMED)
 
 
-def test_a_block_that_alone_determines_something_cannot_be_doubted():
+def test_blocks_are_not_testable_without_degrees_of_freedom():
     data = hexapod_data(7)  # 42 equations, 42 parameters
     found = find_outliers(identify(hexapod(), data, LeastSquares()), data)
     assert found.blocks == 0
     assert [f.code for f in found.summary] == ["outliers.not-testable"]
 
 
-def test_limits_of_blocks_are_as_rarely_exceeded_as_that_of_one_residual():
+def test_block_limit_has_the_exceedance_probability_of_a_single_residual():
     np.testing.assert_allclose(block_limit(1.345, np.array([1.0])), 1.345, rtol=1e-9)
     np.testing.assert_allclose(
         chi2.sf(block_limit(4.685, np.array([6.0])) ** 2, 6), chi2.sf(4.685**2, 1), rtol=1e-6
@@ -183,7 +183,7 @@ def test_limits_of_blocks_are_as_rarely_exceeded_as_that_of_one_residual():
     assert (np.diff(Tukey().weight(distance, one)) < 0.0).all()
 
 
-def test_what_cannot_be_left_out_or_weighed_is_refused():
+def test_unknown_excluded_poses_and_nonpositive_loss_constants_are_refused():
     data = hexapod_data(20)
     with pytest.raises(DataError, match="no pose '99' to exclude"):
         identify(hexapod(), data, options=FitOptions(excluded_poses=("99",)))
@@ -196,11 +196,9 @@ def test_what_cannot_be_left_out_or_weighed_is_refused():
 
 
 @pytest.mark.parametrize("frame", [(), ("frame",)])
-def test_the_distance_of_a_pose_set_aside_is_what_the_others_say_of_it_where_a_reading_is_missing(
-    frame,
-):
-    """Set aside, it stands where its own rows put it in the frame of the others, not where its
-    search began.
+def test_distance_of_an_excluded_pose_without_a_reading_equals_the_chi_square_loss(frame):
+    """The pose estimate of an excluded pose comes from its rows in the frame of the other poses,
+    not from the start of the iteration.
     """
     robot = load_robot("linear-delta")
     truth = robot.with_values(sample_truth(robot, 1, 3)[0])
@@ -219,7 +217,7 @@ def test_the_distance_of_a_pose_set_aside_is_what_the_others_say_of_it_where_a_r
         observations=(replace(rows, measured=measured),),
     )
     fit = identify(robot, data, LeastSquares(), loss=Tukey())
-    assert fit.pose_weights[7] < 0.5  # set aside in the first round
+    assert fit.pose_weights[7] < 0.5  # excluded in the first round
     found = find_outliers(fit, data)
     assert "8" in found.names
     others = tuple(name for name in found.names if name != "8")
@@ -227,17 +225,18 @@ def test_the_distance_of_a_pose_set_aside_is_what_the_others_say_of_it_where_a_r
         identify(robot, data, LeastSquares(), options=FitOptions(excluded_poses=names))
         for names in (others, found.names)
     )
-    # what is not linear over 0.1 mm
+    # [1] nonlinearity over 0.1 mm
     assert found.influence.distance[7] == pytest.approx(
         with_it.chi_square - without.chi_square, rel=1e-2
     )
 
 
-def probed(
+def probe_delta(
     points: int, off: dict[int, float], sigma: float = 20 * UM
 ) -> tuple[Mechanism, Measurements]:
-    """A delta printer's six parameters of geometry and heights (n,) at `points` of two rings, some
-    off by lengths [m].
+    """Return a delta printer with six free parameters and its heights at `points` of two rings.
+
+    `off` adds errors [m] to some heights.
     """
     robot = load_robot("linear-delta")
     names = ("radius", "tower1.angle", "tower2.angle", "tower1.stop", "tower2.stop", "tower3.stop")
@@ -262,9 +261,9 @@ def probed(
 
 
 @pytest.mark.parametrize("wrong", range(7))
-def test_with_one_degree_of_freedom_a_disagreement_is_told_and_nobody_is_blamed(wrong):
-    """All seven residuals are multiples of one number, so any height can be the wrong one."""
-    robot, data = probed(7, {wrong: 1e-3})
+def test_one_degree_of_freedom_reports_a_conflict_and_names_no_outlier(wrong):
+    """All seven residuals are multiples of one number, so each height may be the wrong one."""
+    robot, data = probe_delta(7, {wrong: 1e-3})
     fit = identify(robot, data, LeastSquares())
     found = find_outliers(fit, data)
     assert found.is_converged
@@ -280,8 +279,8 @@ def test_with_one_degree_of_freedom_a_disagreement_is_told_and_nobody_is_blamed(
     assert "outliers.conflict" in [f.code for f in examine_fit(fit, data).findings]
 
 
-def test_with_one_degree_of_freedom_and_unknown_noise_nothing_is_said_to_fit():
-    robot, data = probed(7, {3: 1e-3})
+def test_one_degree_of_freedom_with_unknown_noise_is_reported_as_untestable():
+    robot, data = probe_delta(7, {3: 1e-3})
     found = find_outliers(
         identify(robot, data, LeastSquares(), options=FitOptions(noise="estimated")), data
     )
@@ -289,33 +288,35 @@ def test_with_one_degree_of_freedom_and_unknown_noise_nothing_is_said_to_fit():
     assert [f.code for f in found.summary] == ["outliers.unknown-noise"]
 
 
-def test_with_degrees_of_freedom_to_spare_the_wrong_height_is_named():
-    robot, data = probed(12, {4: 1e-3})
+def test_wrong_height_is_named_with_enough_degrees_of_freedom():
+    robot, data = probe_delta(12, {4: 1e-3})
     found = find_outliers(identify(robot, data, LeastSquares()), data)
     assert found.names == ("5",)
     assert found.ambiguous == ()
 
 
-def test_two_wrong_heights_that_leave_nothing_to_check_the_others_are_not_named():
-    robot, data = probed(8, {0: 1e-3, 1: -1e-3})  # no single height explains both, and any two do
+def test_two_wrong_heights_of_eight_are_ambiguous():
+    robot, data = probe_delta(
+        8, {0: 1e-3, 1: -1e-3}
+    )  # no single height explains both, and any two do
     found = find_outliers(identify(robot, data, LeastSquares()), data)
     assert found.names == ()
     assert [f.code for f in found.summary] == ["outliers.ambiguous"]
 
 
-def test_noise_that_is_spread_over_all_rows_is_no_all_clear():
-    robot, data = probed(40, {}, 38 * UM)
+def test_misfit_of_all_rows_is_reported_although_no_outlier_is_named():
+    robot, data = probe_delta(40, {}, 38 * UM)
     rows = data.observations[0]
     data = replace(data, observations=(replace(rows, covariance=rows.covariance * (20 / 38) ** 2),))
     fit = identify(robot, data, LeastSquares())
-    found = find_outliers(fit, data, level=1e-9)  # so that none is named though all are too large
+    found = find_outliers(fit, data, level=1e-9)  # so low a level that no outlier is named
     assert fit.residual_test.failed
     assert found.outliers == found.ambiguous == ()
     assert [f.code for f in found.summary] == ["outliers.none-but-misfit"]
 
 
-def test_the_search_reports_its_progress():
-    robot, data = probed(12, {4: 1e-3})
+def test_outlier_search_reports_progress():
+    robot, data = probe_delta(12, {4: 1e-3})
     reports: list[tuple[int, int, str]] = []
     find_outliers(
         identify(robot, data, LeastSquares()), data, progress=lambda *report: reports.append(report)
@@ -327,8 +328,8 @@ def test_the_search_reports_its_progress():
     assert all(0 <= done < total for done, total, _ in reports)
 
 
-def test_a_search_that_comes_back_to_where_it_was_is_not_settled_and_says_who_was_doubted():
-    """Blocks 0 and 1 hide each other: each is doubted while the other is set aside."""
+def test_cyclic_outlier_search_is_not_converged_and_lists_its_suspects():
+    """Blocks 0 and 1 mask each other: each is suspected while the other is excluded."""
 
     def ask(aside: np.ndarray) -> PartialFit:
         distance = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
@@ -341,7 +342,7 @@ def test_a_search_that_comes_back_to_where_it_was_is_not_settled_and_says_who_wa
     assert [np.flatnonzero(state.excluded).tolist() for state in visited] == [[1], [0]]
     (group,) = list_suspected_in_turn(visited)
     assert np.flatnonzero(group).tolist() == [0, 1]
-    fit = identify(*probed(12, {}))
+    fit = identify(*probe_delta(12, {}))
     counts = {"outliers": 0, "ambiguous": 2, "blocks": 6}
     (finding,) = _summarize(fit, counts, 0.05, is_converged=False, single_poses=True)
     assert finding.code == "outliers.search-not-converged"

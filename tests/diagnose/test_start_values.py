@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a fit gained over its start, told apart from noise."""
+"""Comparison of the start values with the fit, in units of the noise."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from tests import zoo
 from tests.estimate.problems import hexapod, hexapod_data
 
 
-def test_a_start_at_the_truth_is_as_good_as_the_fit_within_the_noise() -> None:
+def test_start_at_the_truth_is_within_noise_of_the_fit() -> None:
     truth = hexapod().with_values(zoo.hexapod_truth())
     found = check_start_values(identify(truth, hexapod_data()))
     assert found.verdict is StartVerdict.WITHIN_NOISE
@@ -24,21 +24,21 @@ def test_a_start_at_the_truth_is_as_good_as_the_fit_within_the_noise() -> None:
 
 
 @pytest.mark.parametrize("noise", ["given", "estimated"])
-def test_a_nominal_start_is_not_calibrated(noise) -> None:
+def test_nominal_start_is_not_calibrated(noise) -> None:
     found = check_start_values(identify(hexapod(), hexapod_data(), options=FitOptions(noise=noise)))
     assert found.verdict is StartVerdict.NOT_CALIBRATED
     assert found.p_value < 1e-6
     assert found.before > 10 * found.after
 
 
-def test_the_fit_itself_is_the_best_start() -> None:
+def test_start_at_the_fit_is_the_best() -> None:
     first = identify(hexapod(), hexapod_data())
     assert check_start_values(identify(first.robot, hexapod_data())).verdict is StartVerdict.BEST
 
 
 @pytest.mark.parametrize("loss", [Huber(), Tukey()])
-def test_a_loss_does_not_make_the_nominal_start_look_calibrated(loss) -> None:
-    """Reweighting begins at its own last estimate, which is not the start that was given."""
+def test_nominal_start_is_not_calibrated_with_a_robust_loss(loss) -> None:
+    """Reweighting restarts from the last estimate; the verdict must use the given start."""
     fit = identify(hexapod(), hexapod_data(), loss=loss)
     assert check_start_values(fit).verdict is StartVerdict.NOT_CALIBRATED
     assert len(fit.history.cost) == fit.history.iterations + 1
@@ -50,10 +50,8 @@ def test_a_loss_does_not_make_the_nominal_start_look_calibrated(loss) -> None:
 
 
 @pytest.mark.parametrize("loss", [Huber(), Tukey()])
-def test_with_a_loss_every_step_is_counted_and_the_history_is_one_way_from_the_start(loss) -> None:
-    """The first descent is not weighted yet, so that the way begins as that of a fit without a
-    loss.
-    """
+def test_history_of_a_robust_fit_continues_that_of_the_plain_fit(loss) -> None:
+    """The first descent is unweighted, so its history equals that of a fit without a loss."""
     plain, fit = identify(hexapod(), hexapod_data()), identify(hexapod(), hexapod_data(), loss=loss)
     assert fit.history.iterations > plain.history.iterations
     assert len(fit.history.cost) == len(fit.history.estimate) == fit.history.iterations + 1
@@ -63,9 +61,7 @@ def test_with_a_loss_every_step_is_counted_and_the_history_is_one_way_from_the_s
     np.testing.assert_array_equal(fit.history.estimate[-1], fit.estimate)
 
 
-def test_with_a_loss_the_cost_of_the_start_is_weighted_as_that_of_the_fit_and_holds_the_prior() -> (
-    None
-):
+def test_start_cost_of_a_robust_fit_has_its_weights_and_the_prior() -> None:
     robot, data = hexapod(), hexapod_data()
     free = select_free_parameters(robot)
     spread = 0.1 * free.tolerance

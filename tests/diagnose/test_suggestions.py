@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What further measurement would help: the ones that must, must; those that cannot, do not."""
+"""Suggested measurements determine the unidentifiable combinations; others are not suggested."""
 
 import pytest
 
@@ -10,7 +10,7 @@ from loopcal.measure import KINDS, Instrument, Pose, Sensor
 from tests.estimate.problems import five_dof, hexapod, hexapod_data, tracker
 
 
-def test_torsion_is_what_the_3_prs_lacks():
+def test_torsion_is_suggested_for_the_3_prs_without_torsion():
     (remedy,) = suggest_measurements(identifiability(load_robot("3-prs"), five_dof(), poses=36))
     assert remedy.measurements[0].words == "psi"
     assert remedy.finding.code == "identifiability.measure-also"
@@ -18,8 +18,7 @@ def test_torsion_is_what_the_3_prs_lacks():
     assert remedy.finding.data["measurements"][0]["words"] == "psi"
     words = {cure.words for cure in remedy.measurements}
     assert "the pose" in words
-    # the length of the normal's path, heights and a point in the axis of the turn show nothing of
-    # it
+    # none of these measurements depends on a rotation about the platform's z axis
     assert not words & {
         "z",
         "x",
@@ -33,7 +32,7 @@ def test_torsion_is_what_the_3_prs_lacks():
 
 
 @pytest.mark.parametrize(("unknown", "datum"), [("frame", "the pose"), ("tool", "the pose")])
-def test_a_known_frame_is_what_an_unknown_one_lacks(unknown, datum):
+def test_known_frame_is_suggested_for_an_unknown_frame(unknown, datum):
     instrument = Instrument((Sensor(Pose(unknown=(unknown,)), tracker().sensors[0].noise),))
     found = suggest_measurements(
         identifiability(hexapod(), hexapod_data(60, instrument=instrument))
@@ -45,7 +44,7 @@ def test_a_known_frame_is_what_an_unknown_one_lacks(unknown, datum):
         assert "the pose (frame and tool unknown)" not in words
 
 
-def test_what_no_pose_depends_on_only_a_sensor_on_the_joint_could_tell(tmp_path):
+def test_joint_sensor_is_suggested_for_a_parameter_without_effect_on_poses(tmp_path):
     path = tmp_path / "robot.yaml"
     path.write_text(
         list_shipped_robots()["3-prs"].read_text("utf-8") + "parameters: fourteen\n", "utf-8"
@@ -59,11 +58,11 @@ def test_what_no_pose_depends_on_only_a_sensor_on_the_joint_could_tell(tmp_path)
     assert found["b1z"].finding.code == "identifiability.fix-one"
 
 
-def test_nothing_is_proposed_where_nothing_is_open():
+def test_identifiable_robot_has_no_suggestions():
     assert suggest_measurements(identifiability(hexapod(), hexapod_data(60))) == ()
 
 
-def test_every_cure_is_of_a_known_kind_and_leaves_less():
+def test_every_suggestion_has_a_known_kind_and_lowers_the_uncertainty():
     found = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
     before = {v.name: v.left for v in found.parameters}
     (remedy,) = suggest_measurements(found)
@@ -72,7 +71,7 @@ def test_every_cure_is_of_a_known_kind_and_leaves_less():
         assert cure.left < before[remedy.combination.names[0]]
 
 
-def test_a_robot_without_a_workspace_is_looked_at_about_home():
+def test_suggestions_of_a_robot_without_workspace_use_poses_about_home():
     found = identifiability(hexapod(), hexapod_data(60, instrument=five_dof()))
     assert not hexapod().assembly.workspace
     assert "psi" in {cure.words for cure in suggest_measurements(found)[0].measurements}
@@ -104,10 +103,8 @@ workspace: {x: [-60, 60], y: [-60, 60], z: [420, 530]}
 """
 
 
-def test_what_is_measured_in_full_already_is_no_remedy(tmp_path):
-    """Rounding in what a further instrument sees is no information: this platform never turns, and
-    full poses were measured.
-    """
+def test_quantities_measured_in_full_are_not_suggested(tmp_path):
+    """This platform never rotates and full poses were measured: rounding is no information."""
     path = tmp_path / "upu.yaml"
     path.write_text(TRANSLATIONAL)
     found = identifiability(load_robot(path), tracker(), poses=60)

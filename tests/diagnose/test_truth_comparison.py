@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters against a truth: what the data leave open is taken out, named, and does not count."""
+"""Comparison of parameters with a truth: unidentifiable combinations are removed from the error
+and named.
+"""
 
 import json
 
@@ -16,8 +18,8 @@ from tests import zoo
 from tests.estimate.problems import UM, URAD, hexapod, hexapod_data, hexapod_poses, noise
 
 
-def in_unknown_frame(n: int = 30, seed: int = 0):
-    """Poses of the true hexapod in a frame that nobody knows."""
+def simulate_in_unknown_frame(n: int = 30, seed: int = 0):
+    """Simulate poses of the true hexapod in an unknown frame."""
     truth = zoo.hexapod().with_values(zoo.hexapod_truth())
     kind = Pose(unknown=("frame",))
     sensor = Sensor(kind, noise(*[0.1 * URAD] * 3, *[0.02 * UM] * 3))
@@ -29,13 +31,13 @@ def in_unknown_frame(n: int = 30, seed: int = 0):
 
 @pytest.fixture(scope="module")
 def fit():
-    return identify(hexapod(), in_unknown_frame(), LeastSquares())
+    return identify(hexapod(), simulate_in_unknown_frame(), LeastSquares())
 
 
-def test_what_an_unknown_frame_leaves_open_is_projected_out_and_named(fit):
+def test_unidentifiable_combinations_are_removed_from_the_error_and_named(fit):
     found = compare_with_truth(fit, zoo.hexapod_truth())
     assert len(found.dropped) == 6
-    assert np.abs(found.raw).max() > 0.01e-3  # [m] the base may sit anywhere within the errors
+    assert np.abs(found.raw).max() > 0.01e-3  # [m] the base frame is free
     assert (
         np.abs(found.error).max() < 0.001e-3
     )  # [m] noise of 0.02 um and 0.1 urad, condition about 100
@@ -48,7 +50,7 @@ def test_what_an_unknown_frame_leaves_open_is_projected_out_and_named(fit):
     assert json.loads(to_json(found.to_dict()))["rms"] == pytest.approx(found.rms)
 
 
-def test_a_truth_moved_along_what_is_open_gives_the_same_error(fit):
+def test_truth_moved_along_the_null_space_gives_the_same_error(fit):
     known = fit.posterior
     rng = np.random.default_rng(0)
     open_ = known.directions[:, ~known.determined]
@@ -61,7 +63,7 @@ def test_a_truth_moved_along_what_is_open_gives_the_same_error(fit):
     )
 
 
-def test_where_all_is_determined_nothing_is_dropped():
+def test_error_of_an_identifiable_robot_is_the_plain_difference():
     fit = identify(hexapod(), hexapod_data(20), LeastSquares())
     found = compare_with_truth(fit, zoo.hexapod_truth())
     assert found.dropped == ()
@@ -73,15 +75,15 @@ def test_where_all_is_determined_nothing_is_dropped():
 @pytest.mark.parametrize(
     ("truth", "said"), [(np.zeros(41), r"shape \(41,\)"), (np.full(42, np.nan), "not finite")]
 )
-def test_a_truth_of_another_robot_is_refused(fit, truth, said):
+def test_truth_with_wrong_shape_or_nan_is_refused(fit, truth, said):
     with pytest.raises(
         EstimationError, match=f"{said}.*give 42 values for all parameters of 'hexapod'"
     ):
         compare_with_truth(fit, truth)
 
 
-def test_validation_keeps_the_frame_of_the_fit_or_says_after_which_best_fit_it_compares(fit):
-    others = in_unknown_frame(8, seed=5)
+def test_validation_keeps_the_frame_of_the_fit_unless_a_refit_is_requested(fit):
+    others = simulate_in_unknown_frame(8, seed=5)
     kept = validate(fit, others)
     assert kept.alignment == {"kept": ("frame",), "fitted": ()}
     by_name = validate(fit.robot, others, before=fit.initial, nuisance_values=fit.nuisance.values)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trials are selected by indices or by a mask."""
+"""Trials of a batch are selected by indices or by a mask."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from loopcal.typing import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Values(TrialBatch):
-    """One array."""
+    """A batch of a single array."""
 
     array: FloatArray
 
@@ -33,6 +33,6 @@ def test_trials_are_selected_by_indices_or_by_a_mask(trials, expected) -> None:
     assert VALUES.take(np.array(trials)).array.tolist() == expected
 
 
-def test_a_mask_replaces_the_trials_that_it_marks() -> None:
+def test_put_with_a_mask_replaces_the_marked_trials() -> None:
     changed = VALUES.put(np.array([False, True]), Values(np.array([5.0])))
     assert changed.array.tolist() == [1.0, 5.0]

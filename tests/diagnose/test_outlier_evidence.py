@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the committed evidence on wrong rows must show."""
+"""The committed evidence on outliers meets its acceptance limits."""
 
 import json
 
 from scipy.stats import binom
 
 
-def test_wrong_rows_are_named_and_cost_little_and_clean_data_are_left_alone(root) -> None:
+def test_outlier_evidence_meets_detection_accuracy_and_false_alarm_limits(root) -> None:
     tables = json.loads((root / "docs" / "evidence" / "blunders.json").read_text("utf-8"))["tables"]
     rows = {row[0]: row[1:] for row in tables["robust"]["rows"]}
     for name in ("Huber", "Tukey"):
