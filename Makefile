@@ -41,6 +41,7 @@ check: .venv/dev.stamp  ## lint, format, types, layers, sizes
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
+	$(BIN)/python -m tools.check_types
 	$(BIN)/lint-imports
 	$(BIN)/python -m tools.check_sizes
 

@@ -62,7 +62,7 @@ class FileError(LoopcalError):
     def __init__(self, sentence: object, path: str | Path, line: int | None = None) -> None:
         super().__init__(sentence, path, line)
         self.sentence = sentence
-        self.path = Path(path)
+        self.path: Path = Path(path)
         self.line = line
 
     def __str__(self) -> str:

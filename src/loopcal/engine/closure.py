@@ -108,6 +108,23 @@ class Chain:
     `residual` gives the rows of its ending, the `rows_of_` methods their derivatives.
     """
 
+    group: Group
+    links: PlacedLinks
+    theta: FloatArray
+    size: float
+    last: int
+    before: list[FloatArray]
+    axes: list[FloatArray]
+    origins: list[FloatArray]
+    platform: FloatArray
+    tip: FloatArray
+    tip_rotation: FloatArray
+    arm: FloatArray
+    gap: FloatArray
+    distance: FloatArray
+    direction: FloatArray
+    moment: FloatArray
+
     def __init__(
         self, group: Group, links: PlacedLinks, T: FloatArray, theta: FloatArray, size: float
     ) -> None:

@@ -74,6 +74,10 @@ class Damping:
     floor : (t,) damping after the first rejected step, at least.
     """
 
+    value: FloatArray
+    floor: FloatArray
+    growth: FloatArray
+
     def __init__(self, first: FloatArray, floor: FloatArray) -> None:
         self.value, self.floor = np.array(first), floor
         self.growth = np.full(len(self.value), 2.0)
@@ -91,6 +95,8 @@ class Damping:
 
 class FixedFactors:
     """Damping that is divided by ten after an accepted step and multiplied by ten otherwise."""
+
+    value: FloatArray
 
     def __init__(self, first: FloatArray) -> None:
         self.value = np.array(first)

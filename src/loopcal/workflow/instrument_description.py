@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -14,7 +14,7 @@ from loopcal.errors import DataError, suggest_names
 from loopcal.measure import KINDS, Gaussian, Instrument, Sensor
 from loopcal.units import Dimension
 
-FRAMES = {"base": ("frame",), "tool": ("tool", "targets")}
+FRAMES: Mapping[str, tuple[str, ...]] = {"base": ("frame",), "tool": ("tool", "targets")}
 """A frame that may be unknown -> the names that kinds have for it."""
 
 

@@ -86,6 +86,12 @@ class WithPrior:
     therefore removed from the rows of the prior.
     """
 
+    parameters: int
+    slope: FloatArray
+    center: FloatArray
+    constant: FloatArray
+    unknown: FloatArray
+
     def __init__(self, problem: Problem, prior: Prior) -> None:
         free = problem.free
         table = free.robot.parameters

@@ -79,6 +79,12 @@ class ReadingCoordinates:
     free : the free parameters. scale : (n, actuators) [SI]. names : joints that kinds look at.
     """
 
+    free: FreeParameters
+    scale: FloatArray
+    names: tuple[str, ...]
+    freedoms: int
+    longest: FloatArray
+
     def __init__(self, free: FreeParameters, scale: FloatArray, names: tuple[str, ...]) -> None:
         self.free, self.scale, self.names = free, scale, names
         self.freedoms = scale.shape[1]
@@ -119,6 +125,13 @@ class TwistCoordinates:
     EstimationError
         An actuator drives several limbs, so that the pose does not determine its reading.
     """
+
+    free: FreeParameters
+    names: tuple[str, ...]
+    places: list[int]
+    freedoms: int
+    scale: FloatArray
+    longest: FloatArray
 
     def __init__(self, free: FreeParameters, names: tuple[str, ...]) -> None:
         robot = free.robot

@@ -228,11 +228,11 @@ def _resolve(loc: tuple[str | int, ...], content: Any) -> tuple[Location, Any]:
     return tuple(location), node
 
 
-NUMBERS = {
+NUMBERS: Mapping[str, str] = {
     **dict.fromkeys(("float_type", "float_parsing"), "a number"),
     **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "a whole number"),
 }
-SHAPES = {
+SHAPES: Mapping[str, tuple[str, str]] = {
     **dict.fromkeys(("tuple_type", "list_type"), ("a list", "write it as [.., ..]")),
     **dict.fromkeys(
         ("dataclass_type", "dict_type", "dataclass_exact_type"),

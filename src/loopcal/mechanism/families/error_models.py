@@ -13,7 +13,7 @@ Derivation: docs/theory/parameters.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +23,7 @@ from loopcal.mechanism.families.limb_placement import PlacedLimb, map_displaceme
 from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 
-KEPT_AXES = {"R": ("rx", "ry", "x", "y"), "P": ("rx", "ry")}
+KEPT_AXES: Mapping[str, tuple[str, ...]] = {"R": ("rx", "ry", "x", "y"), "P": ("rx", "ry")}
 """Displacements of a link that its joint does not repeat."""
 
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,7 +37,7 @@ from loopcal.units import Dimension
 
 RIDGE_STEPS = (5, 10, 20, 50, 100)
 """Iterations of RE after which its curve over lambda is examined."""
-SIZES = {
+SIZES: Mapping[str, tuple[str, ...]] = {
     "3-PRS": ("platform_radius", "base_radius", "rod"),
     "RU-PUS-PRS": ("platform_radius", "base_radius", "rod", "post"),
 }

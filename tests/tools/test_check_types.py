@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The check of public types reports what pyright finds incomplete, and nothing else."""
+
+import pytest
+
+from tools.check_types import list_incomplete_types
+
+
+def symbol(name, known=True, ambiguous=False, message=None):
+    problems = [] if message is None else [{"message": message}]
+    return {
+        "name": name,
+        "isTypeKnown": known,
+        "isTypeAmbiguous": ambiguous,
+        "diagnostics": problems,
+    }
+
+
+def report(*symbols):
+    return {"typeCompleteness": {"symbols": list(symbols)}}
+
+
+def test_complete_types_are_not_reported():
+    assert list_incomplete_types(report(symbol("loopcal.identify"))) == []
+
+
+def test_unknown_and_ambiguous_types_are_reported_with_pyrights_words():
+    lines = list_incomplete_types(
+        report(
+            symbol("loopcal.identify", known=False, message='Type of "fit" is\nunknown'),
+            symbol("loopcal.Plan.quality", ambiguous=True),
+        )
+    )
+    assert lines == [
+        'loopcal.identify: Type of "fit" is unknown',
+        "loopcal.Plan.quality: its type is incomplete",
+    ]
+
+
+def test_types_of_the_program_are_left_to_click():
+    assert list_incomplete_types(report(symbol("loopcal.cli.options.Quantity", known=False))) == []
+
+
+def test_a_report_without_symbols_is_refused():
+    with pytest.raises(ValueError, match="no symbol of loopcal"):
+        list_incomplete_types(report())
