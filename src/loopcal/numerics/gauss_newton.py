@@ -177,15 +177,16 @@ def minimize(
             break
         current = point.take(active)
         step = model.propose(current, damping.value[active])
-        last = model.is_negligible(current, step)
-        if last.any():
+        is_last = model.is_negligible(current, step)
+        if is_last.any():
+            last, going = np.flatnonzero(is_last), np.flatnonzero(~is_last)
             status[active[last]] = DescentStatus.CONVERGED
             taken[active[last]] += 1
-            where = np.flatnonzero(last)
-            point = point.put(active[last], model.finish(current.take(where), step.take(last)))
-            active, step = active[~last], step.take(~last)
-            current = current.take(np.flatnonzero(~last))
-        if not active.size or i == iterations:
+            point = point.put(active[last], model.finish(current.take(last), step.take(last)))
+            if not going.size:
+                break
+            active, current, step = active[going], current.take(going), step.take(going)
+        if i == iterations:
             break
         candidate = model.evaluate(current, step, active)
         accepted, ratio = model.judge(current, step, candidate)
