@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark gate lets through what keeps its value, and nothing else."""
+"""The benchmark gate fails for metrics that worsen or exceed their limit, and for no others."""
 
 import json
 import time
@@ -24,24 +24,24 @@ BASELINE = {"fit": {"value": 4.0}}
         (9.0, "higher", 0),
     ],
 )
-def test_only_a_worsening_beyond_the_tolerance_fails(
+def test_metric_fails_only_if_it_worsens_beyond_its_tolerance(
     value: float, direction: str, faults: int
 ) -> None:
     metric = Metric("fit", value, direction=direction, tolerance=0.25)  # pyright: ignore[reportArgumentType]
     assert len(harness.find_faults(metric, BASELINE)) == faults
 
 
-def test_the_limit_holds_whatever_the_baseline_says() -> None:
+def test_metric_beyond_its_limit_fails_even_if_it_equals_the_baseline() -> None:
     (fault,) = harness.find_faults(Metric("fit", 4.0, limit=3.5), BASELINE)
     assert fault == "fit is 4, its limit is 3.5"
 
 
-def test_a_metric_without_baseline_fails_and_says_what_to_do() -> None:
+def test_metric_without_baseline_fails_with_advice() -> None:
     (fault,) = harness.find_faults(Metric("new", 1.0), BASELINE)
     assert "make bench-update" in fault
 
 
-def test_the_better_of_two_measurements_is_kept() -> None:
+def test_keep_better_returns_the_better_measurement() -> None:
     low, high = Metric("fit", 1.0), Metric("fit", 2.0)
     assert harness.keep_better(high, low) == harness.keep_better(low, high) == low
     low, high = (
@@ -51,7 +51,7 @@ def test_the_better_of_two_measurements_is_kept() -> None:
     assert harness.keep_better(high, low) == harness.keep_better(low, high) == high
 
 
-def test_updating_keeps_the_metrics_that_were_not_measured(tmp_path: Path) -> None:
+def test_partial_update_keeps_metrics_that_were_not_measured(tmp_path: Path) -> None:
     path = tmp_path / "baseline.json"
     harness.write_baseline(path, [Metric("a", 1.0), Metric("b", 2.0)], {"processor": "one"})
     harness.write_baseline(path, [Metric("b", 3.0)], {"processor": "two"})
@@ -62,13 +62,13 @@ def test_updating_keeps_the_metrics_that_were_not_measured(tmp_path: Path) -> No
     assert json.loads(path.read_text("utf-8"))["machine"] == {"processor": "two"}
 
 
-def test_an_absolute_time_is_judged_by_its_limit_alone() -> None:
+def test_metric_without_tolerance_is_compared_with_its_limit_only() -> None:
     metric = Metric("first", 9.0, "ms", tolerance=None, limit=10.0)
     assert harness.find_faults(metric, {}) == []
     assert harness.find_faults(metric, {"first": {"value": 1.0}}) == []
 
 
-def test_a_complete_update_removes_old_metrics_and_states_its_reason(tmp_path: Path) -> None:
+def test_complete_update_removes_old_metrics_and_stores_the_reason(tmp_path: Path) -> None:
     path = tmp_path / "baseline.json"
     harness.write_baseline(path, [Metric("a", 1.0), Metric("b", 2.0)], {})
     harness.write_baseline(path, [Metric("b", 3.0)], {}, "a new machine", is_complete=True)
@@ -76,7 +76,7 @@ def test_a_complete_update_removes_old_metrics_and_states_its_reason(tmp_path: P
     assert json.loads(path.read_text("utf-8"))["reason"] == "a new machine"
 
 
-def test_a_ratio_is_that_of_the_times() -> None:
+def test_measure_ratio_returns_the_ratio_of_the_times() -> None:
     metric = harness.measure_ratio(
         "sleep", lambda: time.sleep(0.03), lambda: time.sleep(0.01), repeats=5
     )

@@ -36,7 +36,7 @@ def example_folder(tmp_path_factory):
 
 @pytest.fixture
 def run(example_folder, monkeypatch, capsys):
-    """Run a command line in the example folder; return exit code, standard output and standard error."""
+    """Run a command line in the example folder; return exit code, standard output and error."""
     monkeypatch.chdir(example_folder)
     (example_folder / "targets.csv").write_text(TARGETS)
 

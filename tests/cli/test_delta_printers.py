@@ -69,6 +69,8 @@ def test_calibration_from_wrong_end_stops_gives_the_geometry_of_the_firmware(
     for parameter, value in found.items():
         assert abs(value - expected[parameter]) < 2e-3, f"{parameter} [mm, deg]"
     assert (result["start"]["verdict"] == "best") == (stop_offset == 0.0)
+    if stop_offset == 0.0:  # the firmware's geometry cannot be improved on its own heights
+        assert result["start"]["before"] / result["start"]["after"] == pytest.approx(1.0, abs=1e-3)
     assert out.startswith("Undecided: printer, 6 parameters from 7 poses.")
 
 
@@ -108,6 +110,7 @@ def test_unknown_sigma_gives_no_verdict_on_the_nominal_geometry(calibrate) -> No
 def test_one_degree_of_freedom_gives_intervals_only_with_a_stated_sigma(calibrate) -> None:
     out, result = calibrate(CALIBRATED[2], "--noise estimated")
     assert result["fit"]["dof"] == pytest.approx(1.0)
+    assert "noise.too-few-degrees" in {finding["code"] for finding in result["findings"]}
     assert out.count("not given") == 6  # intervals
     assert {row["plus_minus"] for row in result["fit"]["parameters"]} == {None}
     out, result = calibrate(CALIBRATED[2], "--force", sigma="0.02 mm")

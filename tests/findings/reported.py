@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What tests ask of findings: their codes, and which code refused an input."""
+"""Expectations about findings: which codes occur, and which code refuses an input."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The catalog and the code that reports from it agree."""
+"""The catalog of findings agrees with the code that reports them."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]+")
 
 
 @cache
-def modules() -> dict[str, ast.Module]:
-    """Return the syntax trees of the package, but of the catalog, by path."""
+def parse_modules() -> dict[str, ast.Module]:
+    """Return the syntax trees of the package without the catalog, by path."""
     paths = {p.relative_to(SOURCE).as_posix(): p for p in SOURCE.rglob("*.py")}
     return {
         name: ast.parse(path.read_text("utf-8"))
@@ -35,9 +35,9 @@ def modules() -> dict[str, ast.Module]:
     }
 
 
-def reports() -> Iterator[tuple[str, str, set[str]]]:
+def list_reported_findings() -> Iterator[tuple[str, str, set[str]]]:
     """Return place, code and names of data of every `report_finding` with a literal code."""
-    for name, tree in modules().items():
+    for name, tree in parse_modules().items():
         for node in ast.walk(tree):
             if not isinstance(node, ast.Call) or not node.args:
                 continue
@@ -51,17 +51,17 @@ def reports() -> Iterator[tuple[str, str, set[str]]]:
 CATALOG = load_catalog()
 
 
-def test_every_reported_code_is_in_the_catalog_with_exactly_its_data():
-    found = list(reports())
-    assert len(found) > 50
-    for place, code, given in found:
+def test_every_reported_code_is_in_the_catalog_with_the_same_fields():
+    reported = list(list_reported_findings())
+    assert len(reported) > 50
+    for place, code, given in reported:
         assert code in CATALOG, f"{place}: {code}"
         if "" not in given:  # with **data it is checked when it is reported
             assert given == CATALOG[code].fields, f"{place}: {code}"
 
 
 def test_every_code_of_the_catalog_is_used():
-    nodes = [node for tree in modules().values() for node in ast.walk(tree)]
+    nodes = [node for tree in parse_modules().values() for node in ast.walk(tree)]
     texts = {n.value for n in nodes if isinstance(n, ast.Constant) and isinstance(n.value, str)}
     # f"subject.{which}" makes any code of this subject
     begun = {n.values[0] for n in nodes if isinstance(n, ast.JoinedStr) and n.values}
@@ -74,18 +74,18 @@ def test_every_code_of_the_catalog_is_used():
     assert unused == []
 
 
-def test_codes_are_a_subject_and_a_name():
+def test_codes_consist_of_a_subject_and_a_name():
     assert [code for code in CATALOG if not re.fullmatch(r"[a-z]+\.[a-z0-9-]+", code)] == []
 
 
-def test_refusals_and_failures_say_what_to_do_in_their_text_or_beside_it():
+def test_refusals_and_failures_state_an_action():
     for entry in CATALOG.values():
         assert all(t.endswith(".") for t in (entry.when, entry.action) if t), entry.code
         if entry.severity in {Severity.REFUSAL, Severity.FAILURE}:
             assert entry.action or re.search(r"[.:;,] \w", entry.text), entry.code
 
 
-def test_the_subjects_of_a_file_are_those_of_its_codes():
+def test_each_catalog_file_contains_its_listed_subjects():
     for file, subjects in FILES.items():
         assert read_document(file).keys() == {"title", *subjects}
 
@@ -93,19 +93,19 @@ def test_the_subjects_of_a_file_are_those_of_its_codes():
 def test_every_phrase_is_used():
     texts = " ".join(entry.text for entry in CATALOG.values())
     functions = (name for name, value in vars(phrases).items() if inspect.isfunction(value))
-    own = [name for name in functions if getattr(phrases, name).__module__ == phrases.__name__]
-    assert [n for n in own if not n.startswith("_") and f"{{{n}()}}" not in texts] == []
+    defined = [name for name in functions if getattr(phrases, name).__module__ == phrases.__name__]
+    assert [n for n in defined if not n.startswith("_") and f"{{{n}()}}" not in texts] == []
 
 
-def test_the_page_of_findings_is_up_to_date():
+def test_findings_page_is_up_to_date():
     page = findings_reference.PAGE.read_text("utf-8")
     assert page == findings_reference.write_page(), "run `make docs`"
 
 
-def test_no_message_of_the_library_names_an_option_of_the_command_line():
+def test_no_message_of_the_library_names_a_command_line_option():
     named = {
         name
-        for name, tree in modules().items()
+        for name, tree in parse_modules().items()
         if not name.startswith("cli/")
         for node in ast.walk(tree)
         if isinstance(node, ast.Constant)
@@ -115,7 +115,7 @@ def test_no_message_of_the_library_names_an_option_of_the_command_line():
     assert named == set()
 
 
-def test_a_finding_is_text_for_people_and_data_for_programs():
+def test_finding_has_text_and_json_data():
     finding = report_finding(
         "fit.default-tolerances", count=3, total=42, assumed=(Quantity(0.19, "mm"),)
     )
@@ -128,14 +128,14 @@ def test_a_finding_is_text_for_people_and_data_for_programs():
     assert written["text"] == str(finding)
 
 
-def test_a_finding_with_missing_data_or_an_unknown_code_is_our_mistake():
+def test_finding_with_missing_data_or_an_unknown_code_raises_key_error():
     with pytest.raises(KeyError, match="total"):
         report_finding("fit.default-tolerances", count=3, assumed=())
     with pytest.raises(KeyError):
         report_finding("fit.unheard-of")
 
 
-def test_an_error_made_from_a_finding_has_its_code_and_its_text():
+def test_error_made_from_a_finding_has_its_code_and_text():
     error = EstimationError(report_finding("fit.no-measured-value"))
     assert error.code == "fit.no-measured-value"
     assert str(error).startswith("The data contain no usable measured value")

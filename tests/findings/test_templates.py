@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The formats of templates."""
+"""Templates of messages: formats, conditions and lists."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ LEGS = ({"leg": "a", "error": 0.12345}, {"leg": "b", "error": 2.0})
         ("{a:if|{b:if|both|one}|none}", {"a": 1, "b": 1}, "both"),
     ],
 )
-def test_a_template_becomes_a_sentence(template, data, sentence):
+def test_template_is_filled_with_formatted_data(template, data, sentence):
     assert fill_template(template, **data) == sentence
 
 
-def test_fields_of_optional_parts_belong_to_the_data_and_keys_of_rows_do_not():
+def test_list_fields_includes_conditional_fields_but_not_keys_of_rows():
     assert list_fields("{a.x}{b:if|{c[0]:list}|{d!r}} {legs:each|{leg}} {motion()}") == {
         *"abcd",
         "legs",
     }
 
 
-def test_only_templates_with_parts_or_phrases_depend_on_their_data():
+def test_only_templates_with_conditions_or_phrases_depend_on_data():
     assert depends_on_data("{n:if|some}")
     assert depends_on_data("{motion()}")
     assert not depends_on_data("{n:count pose} of {robot!r}")

@@ -8,7 +8,7 @@ from loopcal.findings.wording import depends_on_data
 from tools import findings_reference
 
 
-def test_every_text_of_the_catalog_is_the_pinned_one():
+def test_texts_of_the_catalog_equal_the_pinned_wording():
     pinned = findings_reference.WORDING.read_text("utf-8").splitlines()
     worded = findings_reference.write_wording().splitlines()
     advice = "run `python -m tools.findings_reference --wording` and read its changes"
@@ -21,7 +21,7 @@ def test_every_text_that_depends_on_its_data_has_an_example():
     assert [e.code for e in entries if depends_on_data(e.text) and not e.example] == []
 
 
-def test_texts_are_one_paragraph_without_options_of_the_command_line():
+def test_texts_are_one_paragraph_without_command_line_options():
     for line in findings_reference.write_wording().splitlines():
         code, _, text = line.partition("]: ")
         assert text == " ".join(text.split()), code

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of robots: every shipped one can be drawn, what is drawn lies where it is, and units
-stand on the axes.
-"""
+"""Pictures of robots: shipped robots, drawn positions, units on the axes, file formats."""
 
 from pathlib import Path
 
@@ -22,7 +20,7 @@ SHIPPED = sorted(path.stem for path in (Path(loopcal.__file__).parent / "robots"
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHIPPED)
-def test_every_shipped_robot_has_a_picture_with_units_on_its_axes(name):
+def test_picture_of_every_shipped_robot_has_units_on_its_axes(name):
     robot = load_robot(name)
     figure = draw(robot)
     space, above = figure.axes
@@ -34,7 +32,7 @@ def test_every_shipped_robot_has_a_picture_with_units_on_its_axes(name):
     assert {text.get_text() for text in above.texts} == {limb.name for limb in robot.assembly.limbs}
 
 
-def test_rods_run_from_base_to_platform_in_millimetres():
+def test_rods_are_drawn_from_base_to_platform_in_millimeters():
     robot = zoo.hexapod()
     above = draw(robot).axes[1]
     lines = [np.array(line.get_data()).T for line in above.lines]
@@ -45,7 +43,7 @@ def test_rods_run_from_base_to_platform_in_millimetres():
         )
 
 
-def test_a_pose_of_a_solution_moves_the_platform():
+def test_row_of_a_solution_sets_the_drawn_platform_pose():
     robot = zoo.hexapod()
     found = inverse(robot, np.array([[0.0, 0.0, 0.2, 0, 0, 0], [0.03, -0.02, 0.21, 0, 0, 0]]))
     figure = draw(robot, found, row=1)
@@ -54,13 +52,13 @@ def test_a_pose_of_a_solution_moves_the_platform():
     assert "at row 1" in figure.get_suptitle()
 
 
-def test_check_writes_the_picture(tmp_path, capsys):
+def test_check_with_plot_writes_the_picture(tmp_path, capsys):
     assert main(["check", "five-bar", "--plot", str(tmp_path / "five-bar.png")]) == 0
     assert (tmp_path / "five-bar.png").read_bytes().startswith(b"\x89PNG")
     assert "Picture:" in capsys.readouterr().out
 
 
-def test_a_format_that_cannot_be_written_is_refused(tmp_path):
+def test_unknown_picture_format_is_refused(tmp_path):
     with pytest.raises(
         FileError, match=r"written as '.docx'; use a name that ends in .png, .svg, .pdf"
     ):

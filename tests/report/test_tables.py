@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables and pages: one description, rendered as text, CSV and HTML, within the width."""
+"""Tables as text, CSV and HTML within a width, and the digits of numbers."""
 
 import pytest
 
@@ -24,7 +24,7 @@ def test_text_aligns_words_left_and_numbers_right():
     ]
 
 
-def test_a_table_is_built_from_objects_by_the_cell_of_each_column():
+def test_build_table_makes_one_row_per_object():
     table = build_table(
         "Roots",
         (1.0, 4.0),
@@ -36,14 +36,14 @@ def test_a_table_is_built_from_objects_by_the_cell_of_each_column():
 
 
 @pytest.mark.parametrize("width", [40, 30])
-def test_a_narrow_page_breaks_headings_and_words_but_no_number(width):
+def test_narrow_table_breaks_headings_and_words_but_no_number(width):
     lines = TABLE.to_text(width).split("\n")
     assert max(map(len, lines)) <= width
     text = " ".join(" ".join(lines).split())
     assert all(cell in text for cell in ("0.05", "1.25", "12.5", "[mm]"))
 
 
-def test_csv_and_html_hold_the_same_cells():
+def test_csv_and_html_contain_the_same_cells():
     assert TABLE.to_csv().splitlines()[0] == "of,rms [mm],largest [mm]"
     assert TABLE.to_csv().splitlines()[2] == "x & y,12.5,-"
     page = TABLE.to_html()
@@ -52,7 +52,7 @@ def test_csv_and_html_hold_the_same_cells():
     assert page.count("<tr>") == 3
 
 
-def test_paragraphs_wrap_and_keep_the_column_of_their_text():
+def test_wrapped_paragraphs_are_indented_and_commands_stay_on_one_line():
     wrapped = wrap_text("  warning  one two three four five six seven", 28)
     assert wrapped.split("\n")[1].startswith(" " * 11 + "four")
     command = "Next: loopcal calibrate a-long-name.yaml another-long-name.csv -o run"
@@ -73,11 +73,11 @@ def test_paragraphs_wrap_and_keep_the_column_of_their_text():
         (1.0, 0.009996, "1.0000"),
     ],
 )
-def test_three_digits_of_the_uncertainty_decide_those_of_the_value(value, uncertainty, shown):
+def test_uncertainty_decides_the_digits_of_the_value(value, uncertainty, shown):
     assert format_with_uncertainty(value, uncertainty) == shown
 
 
-def test_uncertainties_and_plain_numbers():
+def test_formats_of_uncertainties_and_numbers_cover_nan_infinity_and_zero():
     assert format_uncertainty(0.0051234) == "0.00512"
     assert format_uncertainty(float("inf")) == "unknown"
     assert format_uncertainty(float("nan")) == "not given"

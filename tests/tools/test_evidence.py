@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables in the documentation come from docs/evidence/*.json, and say what these files say."""
+"""Tables in the documentation are generated from docs/evidence/*.json and agree with it."""
 
 import json
 from pathlib import Path
@@ -15,14 +15,14 @@ TABLE = {
 }
 
 
-def test_a_missing_value_is_shown_as_a_dash() -> None:
+def test_missing_value_is_shown_as_a_dash() -> None:
     assert (
         evidence.render_table(TABLE)
         == "| step | median [mm] |\n| --- | --- |\n| 1 | 0.31 |\n| 2 | - |\n"
     )
 
 
-def test_a_block_is_made_anew_and_the_text_around_it_kept(tmp_path: Path) -> None:
+def test_fill_tables_replaces_the_block_and_keeps_the_text_around_it(tmp_path: Path) -> None:
     evidence.write_json(tmp_path / "recovery.json", {"tables": {"steps": TABLE}})
     page = "before\n<!-- evidence: recovery.steps -->\nold\n<!-- end -->\nafter\n"
     filled = evidence.fill_tables(page, tmp_path)
@@ -46,7 +46,7 @@ def test_a_block_is_made_anew_and_the_text_around_it_kept(tmp_path: Path) -> Non
         ),
     ],
 )
-def test_a_page_that_asks_for_evidence_that_is_not_there_is_named_in_one_sentence(
+def test_missing_evidence_is_reported_with_its_page(
     block: str, sentence: str, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     folder, page = tmp_path / "docs" / "evidence", tmp_path / "docs" / "page.md"
@@ -59,7 +59,7 @@ def test_a_page_that_asks_for_evidence_that_is_not_there_is_named_in_one_sentenc
     assert page.read_text() == f"<!-- evidence: {block} -->\n<!-- end -->\n"
 
 
-def test_not_a_number_is_refused_and_leaves_the_old_file(tmp_path: Path) -> None:
+def test_nan_is_refused_and_the_old_file_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     evidence.write_json(path, {"value": 1})
     with pytest.raises(ValueError, match="JSON compliant"):
@@ -72,7 +72,7 @@ def test_tables_in_the_pages_agree_with_the_evidence_files(root: Path) -> None:
 
 
 @pytest.mark.evidence
-def test_every_evidence_file_comes_from_a_script_and_names_its_machine(root: Path) -> None:
+def test_every_evidence_file_has_a_script_and_states_its_processor(root: Path) -> None:
     written = {path.stem: path for path in (root / "docs" / "evidence").glob("*.json")}
     assert set(written) == {path.stem for path in (root / "evidence").glob("*.py")}
     for path in written.values():

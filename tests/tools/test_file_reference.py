@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/files.md and docs/exports.md say what the code reads and writes."""
+"""docs/files.md and docs/exports.md describe what the code reads and writes."""
 
 import json
 import re
@@ -17,7 +17,7 @@ from tools.markdown import find_blocks
 PAGE = file_reference.PAGE.read_text("utf-8")
 
 
-def test_the_page_is_up_to_date() -> None:
+def test_pages_are_up_to_date() -> None:
     assert file_reference.fill_page(PAGE) == PAGE, "run `make docs`"
     assert {m["name"] for m in find_blocks(PAGE, file_reference.BLOCK)} == set(
         file_reference.BLOCKS
@@ -29,14 +29,14 @@ def test_the_page_is_up_to_date() -> None:
     )
 
 
-def test_every_family_and_kind_is_there() -> None:
+def test_every_family_and_kind_has_a_section() -> None:
     for name in FAMILIES:
         assert f"### `family: {name}`\n" in PAGE
     for name in KINDS:
         assert f"### `kind: {name}`\n" in PAGE
 
 
-def test_keys_come_with_what_they_hold_and_what_it_means() -> None:
+def test_keys_have_type_default_and_description() -> None:
     found = {key.name: key for key in reference.list_keys(LinearDelta)}
     assert found["radius"] == reference.Key(
         "radius", "length", "0", "horizontal distance of a rod's ends with the nozzle in the center"
@@ -46,7 +46,7 @@ def test_keys_come_with_what_they_hold_and_what_it_means() -> None:
     assert found["name"].default == "needed"
 
 
-def test_every_key_of_a_run_is_described(tmp_path, monkeypatch, root) -> None:
+def test_every_key_of_a_run_folder_is_described(tmp_path, monkeypatch, root) -> None:
     monkeypatch.chdir(root / "examples" / "hexapod-42")
     assert (
         main(

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real cable robot: 44 rows of motor angles of four lines, nine poses known, 35 that nobody
-measured.
+"""A real cable robot: 44 rows of motor angles of four lines, at 9 known and 35 unknown poses.
 
 The samples and the anchors that the machine's builders published are described beside the data in
-LOOPCAL_DATA/cable_robot. Every optimum is held against a reference that has all poses as explicit
+LOOPCAL_DATA/cable_robot. Every optimum is compared with a reference that has all poses as explicit
 unknowns and shares no code with `identify`.
 """
 
@@ -50,8 +49,8 @@ ANCHORS = [i for i, name in enumerate(NAMES) if "anchor" in name]
 BUILDUPS = [i for i, name in enumerate(NAMES) if "buildup" in name]
 
 
-def imported(folder: Path, found: dict[str, Any], sigma: float) -> Imported:
-    """The samples as loopcal reads them, one sigma [mm] for lines and positions."""
+def import_samples(folder: Path, found: dict[str, Any], sigma: float) -> Imported:
+    """Import the samples with one sigma [mm] for lines and positions."""
     path = folder / "samples.json"
     path.write_text(samples_text(found), "utf-8")
     return hangprinter.read(
@@ -59,15 +58,17 @@ def imported(folder: Path, found: dict[str, Any], sigma: float) -> Imported:
     )
 
 
-def machine(folder: Path, found: dict[str, Any], sigma: float) -> tuple[Mechanism, Measurements]:
-    """The robot and its measurements."""
-    read = imported(folder, found, sigma)
+def build_machine(
+    folder: Path, found: dict[str, Any], sigma: float
+) -> tuple[Mechanism, Measurements]:
+    """Return the robot and its measurements."""
+    read = import_samples(folder, found, sigma)
     assert read.measurements is not None
     return build_imported_robot(folder / "samples.json", read), read.measurements
 
 
-def start_of(robot: Mechanism) -> np.ndarray:
-    """The reference's start [mm]: where loopcal starts."""
+def get_start(robot: Mechanism) -> np.ndarray:
+    """Return the start values of the reference [mm]: the nominal values of the robot."""
     return robot.values * 1e3
 
 
@@ -80,44 +81,44 @@ def samples(data_folder: Path) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def printer(samples, tmp_path_factory) -> tuple[Mechanism, Measurements]:
     """The real machine before calibration, and what was measured."""
-    return machine(tmp_path_factory.mktemp("real"), samples, SIGMA)
+    return build_machine(tmp_path_factory.mktemp("real"), samples, SIGMA)
 
 
 @pytest.fixture(scope="module")
 def fit(printer) -> Identification:
-    """Its least-squares fit."""
+    """The least-squares fit of the real machine."""
     robot, data = printer
     return identify(robot, data, LeastSquares())
 
 
 @pytest.fixture(scope="module")
-def answer(samples, printer) -> Reference:
-    """The same by the reference."""
-    return reference(samples, SIGMA, SIGMA, start_of(printer[0]))
+def reference_fit(samples, printer) -> Reference:
+    """The fit of the same samples by the reference."""
+    return reference(samples, SIGMA, SIGMA, get_start(printer[0]))
 
 
-def test_the_optimum_is_that_of_all_poses_as_explicit_unknowns(fit, answer):
+def test_estimate_and_covariance_agree_with_the_reference(fit, reference_fit):
     assert fit.names == NAMES
     assert fit.converged
     assert fit.rank == 21
-    assert answer.dof == 50
+    assert reference_fit.dof == 50
     assert fit.residual_test.dof == pytest.approx(50.0)
-    assert fit.chi_square == pytest.approx(answer.chi_square, rel=1e-6)
+    assert fit.chi_square == pytest.approx(reference_fit.chi_square, rel=1e-6)
     # the sigmas of the robot file have seven digits
-    assert (np.abs(fit.estimate * 1e3 - answer.values) / answer.sd).max() < 1e-5
-    np.testing.assert_allclose(fit.standard_deviations * 1e3, answer.sd, rtol=1e-5)
-    correlation = fit.covariance * 1e6 / np.outer(answer.sd, answer.sd)
-    expected = answer.covariance / np.outer(answer.sd, answer.sd)
+    assert (np.abs(fit.estimate * 1e3 - reference_fit.values) / reference_fit.sd).max() < 1e-5
+    np.testing.assert_allclose(fit.standard_deviations * 1e3, reference_fit.sd, rtol=1e-5)
+    correlation = fit.covariance * 1e6 / np.outer(reference_fit.sd, reference_fit.sd)
+    expected = reference_fit.covariance / np.outer(reference_fit.sd, reference_fit.sd)
     np.testing.assert_allclose(correlation, expected, rtol=0, atol=1e-5)
     assert fit.poses is not None
     np.testing.assert_allclose(
-        fit.poses.poses[:, :3, 3] * 1e3, answer.poses, rtol=0, atol=1e-4
+        fit.poses.poses[:, :3, 3] * 1e3, reference_fit.poses, rtol=0, atol=1e-4
     )  # [mm]
 
 
 def distance_from_published(fit: Identification) -> tuple[np.ndarray, float]:
-    """How far published coordinates lie from those found: each in its standard deviation (12,), and
-    all together squared.
+    """Return published minus estimated anchor coordinates: each divided by its standard deviation
+    (12,), and their joint chi-square.
     """
     at = [fit.names.index(f"{line}.anchor.{axis}") for line in "ABCD" for axis in "xyz"]
     off = fit.estimate[at] - np.ravel(PUBLISHED) * 1e-3
@@ -126,7 +127,7 @@ def distance_from_published(fit: Identification) -> tuple[np.ndarray, float]:
     )
 
 
-def test_published_anchors_agree_one_by_one_and_not_together(fit, printer):
+def test_published_anchors_agree_individually_but_not_jointly(fit, printer):
     """Chi-square of 12 is below 32.9 in 99.9 % of cases; the published anchors belong to another
     model of the spools.
     """
@@ -154,11 +155,11 @@ def test_published_anchors_agree_one_by_one_and_not_together(fit, printer):
     assert half[[0, 9, 10]].max() < 5.0  # [mm]
 
 
-def test_the_residual_is_a_third_of_a_millimetre_and_fits_the_stated_sigmas(fit, answer, printer):
+def test_residuals_agree_with_the_stated_sigmas_and_the_reference(fit, reference_fit, printer):
     # chi-square of 50 degrees of freedom is between 32.4 and 71.4 in 95 % of data
     assert 32.4 < fit.chi_square < 71.4
     assert not fit.residual_test.failed
-    rms = np.sqrt((answer.lines**2).mean(axis=0))
+    rms = np.sqrt((reference_fit.lines**2).mean(axis=0))
     assert rms.max() < 0.35  # [mm]
     (readings,) = (part for part in fit.residuals if part.kind == "readings")
     assert readings.raw.shape == (44, 4)
@@ -172,12 +173,12 @@ def test_the_residual_is_a_third_of_a_millimetre_and_fits_the_stated_sigmas(fit,
         )  # [rad]
         # the reference's are of a line at the slope of its spool, ours of the whole difference
         assert error.joint * 1e3 == pytest.approx(rms[i], rel=1e-4)
-        assert abs(error.largest) * 1e3 == pytest.approx(np.abs(answer.lines[:, i]).max(), rel=1e-3)
+        assert abs(error.largest) * 1e3 == pytest.approx(
+            np.abs(reference_fit.lines[:, i]).max(), rel=1e-3
+        )
 
 
-def test_errors_of_readings_leave_out_dropped_poses_and_are_none_where_readings_are_exact(
-    printer, fit
-):
+def test_reading_errors_exclude_dropped_poses_and_need_pose_estimates(printer, fit):
     robot, data = printer
     errors = compute_reading_errors(
         identify(robot, data, LeastSquares(), options=FitOptions(excluded_poses=["sample19"])), data
@@ -188,7 +189,7 @@ def test_errors_of_readings_leave_out_dropped_poses_and_are_none_where_readings_
     assert compute_reading_errors(replace(fit, poses=None), data) is None
 
 
-def test_no_row_is_doubted_and_a_wrong_motor_angle_is(printer, fit):
+def test_only_a_wrong_motor_angle_is_reported_as_an_outlier(printer, fit):
     robot, data = printer
     examined = examine_fit(fit, data).outliers
     assert examined.outliers == ()
@@ -206,8 +207,8 @@ def test_no_row_is_doubted_and_a_wrong_motor_angle_is(printer, fit):
     assert named[0].degrees == 1  # four lines, three freedoms
 
 
-def test_rows_of_a_file_in_which_nothing_was_measured_are_no_degrees_of_freedom(printer, fit):
-    """A file has a row for every pose, with empty cells where nobody measured: they count nowhere."""  # noqa: E501
+def test_rows_with_empty_cells_add_no_degrees_of_freedom(printer, fit):
+    """A file has a row for every pose, with empty cells where nothing was measured."""
     robot, data = printer
     (seen,) = data.observations
     cells = np.full((44, 3), np.nan)
@@ -230,7 +231,7 @@ def test_rows_of_a_file_in_which_nothing_was_measured_are_no_degrees_of_freedom(
     assert 0.7 < estimated.scale < 1.3
 
 
-def test_no_start_far_off_changes_the_optimum(printer, fit):
+def test_start_values_60_mm_off_give_the_same_estimate(printer, fit):
     robot, data = printer
     rng = np.random.default_rng(3)
     for _ in range(3):
@@ -251,19 +252,22 @@ MODELS = (
     (("ABC", "D"), 4),
     (tuple("ABCD"), 4),
 )
-"""Of the spools: groups of lines that share a build-up, and how many radii; in the order of the
-page's table.
+"""Models of the spools, in the order of the table in docs/cable-robots.md: groups of lines that
+share a build-up, and number of radii.
 """
 
 
 @pytest.fixture(scope="module")
-def models(samples, tmp_path_factory) -> dict[tuple[tuple[str, ...], int], Identification]:
-    """The fit by each model of the spools."""
+def fits(samples, tmp_path_factory) -> dict[tuple[tuple[str, ...], int], Identification]:
+    """The fit for each model of the spools."""
     folder = tmp_path_factory.mktemp("models")
-    return {model: identify(*spools(samples, folder, *model), LeastSquares()) for model in MODELS}
+    return {
+        model: identify(*build_machine_with_spools(samples, folder, *model), LeastSquares())
+        for model in MODELS
+    }
 
 
-def test_the_models_of_the_spools_fit_as_the_page_says(models, root):
+def test_fits_of_the_spool_models_give_the_numbers_of_the_page(fits, root):
     page = (root / "docs" / "cable-robots.md").read_text("utf-8")
     rows = re.findall(
         r"^\| (?:one|four) \| .*? \| (\d+) \| (\S+) \| (\d+) \+/- (\d+) \| (\S+) \|$",
@@ -271,7 +275,7 @@ def test_the_models_of_the_spools_fit_as_the_page_says(models, root):
         re.MULTILINE,
     )
     assert len(rows) == len(MODELS)
-    for (count, chi_square, height, half, joint), fit in zip(rows, models.values(), strict=True):
+    for (count, chi_square, height, half, joint), fit in zip(rows, fits.values(), strict=True):
         D = fit.names.index("D.anchor.z")
         assert len(fit.names) == int(count)
         assert fit.chi_square == pytest.approx(
@@ -285,7 +289,7 @@ def test_the_models_of_the_spools_fit_as_the_page_says(models, root):
             assert distance_from_published(fit)[1] == pytest.approx(float(joint), abs=0.6)
 
 
-def test_the_build_up_of_d_differs_and_no_more_is_asked_for(models):
+def test_data_support_a_separate_build_up_for_line_d_only(fits):
     """By how much chi-square falls; noise is below 3.84 (1 parameter), 5.99 (2), 7.81 (3) in 95 %,
     10.8 (1) in 99.9 % of cases.
 
@@ -294,8 +298,8 @@ def test_the_build_up_of_d_differs_and_no_more_is_asked_for(models):
     """
 
     def fall(small: Any, large: Any) -> float:
-        after = models[large]
-        return (models[small].chi_square - after.chi_square) / (
+        after = fits[large]
+        return (fits[small].chi_square - after.chi_square) / (
             after.chi_square / after.residual_test.dof
         )
 
@@ -304,7 +308,7 @@ def test_the_build_up_of_d_differs_and_no_more_is_asked_for(models):
     assert fall((("ABC", "D"), 1), (tuple("ABCD"), 1)) < 5.99  # A, B and C do not
     assert fall((("ABC", "D"), 1), (("ABC", "D"), 4)) < 7.81  # nor is a radius for each asked for
     assert fall((("ABCD",), 4), (("ABC", "D"), 4)) > 10.0  # with a radius for each D differs, too
-    shared, own = models[("ABC", "D"), 1], models[tuple("ABCD"), 1]
+    shared, own = fits[("ABC", "D"), 1], fits[tuple("ABCD"), 1]
     values, half = (
         {n: v * 1e3 for n, v in zip(shared.names, x, strict=True)}
         for x in (shared.estimate, 1.96 * shared.standard_deviations)
@@ -322,11 +326,11 @@ def test_the_build_up_of_d_differs_and_no_more_is_asked_for(models):
     assert narrower["B.anchor.x"] < 0.7
 
 
-def test_the_published_anchors_are_those_of_one_build_up_and_four_radii(models):
+def test_published_anchors_agree_only_with_one_build_up_and_four_radii(fits):
     """95 % of chi-square of 12 are below 21.0."""
     together = {
         model: distance_from_published(fit)[1]
-        for model, fit in models.items()
+        for model, fit in fits.items()
         if not fit.residual_test.failed
     }
     assert min(together, key=together.__getitem__) == (("ABCD",), 4)
@@ -334,12 +338,13 @@ def test_the_published_anchors_are_those_of_one_build_up_and_four_radii(models):
     assert all(d > 26.2 for model, d in together.items() if model != (("ABCD",), 4))  # 99 %
 
 
-def test_lengths_at_zero_may_be_the_distances_to_the_origin_unless_three_build_ups_are_one(models):
-    """Four parameters that the motors' zero would say already: 95 % of noise is below 9.5, 99.9 %
-    below 18.5.
+def test_lengths_at_zero_equal_anchor_distances_only_with_four_build_ups(fits):
+    """If the motors are zero at the origin, the lengths are no free parameters.
+
+    Chi-square of these 4 conditions is below 9.5 in 95 % and below 18.5 in 99.9 % of cases.
     """
     cost, height = {}, {}
-    for model, fit in models.items():
+    for model, fit in fits.items():
         limbs = [
             fit.names.index(f"{line}.{what}")
             for line in "ABCD"
@@ -362,14 +367,14 @@ def test_lengths_at_zero_may_be_the_distances_to_the_origin_unless_three_build_u
     assert cost[("ABC", "D"), 1] == pytest.approx(23.1, abs=0.3)
 
 
-def spools(
+def build_machine_with_spools(
     samples: dict[str, Any], folder: Path, buildups: tuple[str, ...], radii: int
 ) -> tuple[Mechanism, Measurements]:
-    """The machine with a build-up for each group of lines, and one spool radius or four."""
+    """Return the machine with a build-up for each group of lines, and one spool radius or four."""
     guess = [
         75.0 + (1e-3 * i if radii == 4 else 0.0) for i in range(4)
     ]  # radii that differ are parameters of their own
-    read = imported(folder, samples | {"spool_r_in_origin_first_guess": guess}, SIGMA)
+    read = import_samples(folder, samples | {"spool_r_in_origin_first_guess": guess}, SIGMA)
     lines = read.robot_text.splitlines(keepends=True)
     own = {line.split("name: ")[1][0]: line for line in lines if ".buildup" in line}
     maps = {name: line[line.index("maps: [") + 7 : line.rindex("]")] for name, line in own.items()}
@@ -386,31 +391,32 @@ def spools(
     return build_imported_robot(folder / "samples.json", Imported(text)), read.measurements
 
 
-def test_a_stretch_of_the_lines_by_their_forces_is_not_seen(samples, printer, answer):
-    """41 rows of forces beside 44 rows of motor angles: at no shift of the rows do they explain
-    what is left.
+def test_stretch_of_the_lines_by_their_forces_is_not_significant(samples, printer, reference_fit):
+    """The file has 41 rows of forces for 44 rows of motor angles; every shift is tried.
 
-    The stiffness in the file asks for 0.5e-4 per newton; the four build-ups leave -0.2e-4 to
-    0.2e-4.
+    The stiffness in the file corresponds to 0.5e-4 per newton. The fit with four build-ups gives
+    -0.2e-4 to 0.2e-4.
     """
     force = np.array(samples["force_samp"])
-    length = paid_out(samples, 76.0, np.zeros(4)) + answer.values[3:16:4]
+    length = paid_out(samples, 76.0, np.zeros(4)) + reference_fit.values[3:16:4]
     for shift in range(4):
         rows = np.tile(force.mean(axis=0), (44, 1))
         rows[shift : shift + len(force)] = force
-        found = reference(samples, SIGMA, SIGMA, start_of(printer[0]), stretch=1e-4 * rows * length)
+        found = reference(
+            samples, SIGMA, SIGMA, get_start(printer[0]), stretch=1e-4 * rows * length
+        )
         assert abs(found.values[21]) < 2.0 * found.sd[21]
-        assert answer.chi_square - found.chi_square < 3.84
+        assert reference_fit.chi_square - found.chi_square < 3.84
         assert 0.5 - abs(found.values[21]) > 2.0 * found.sd[21]
 
 
-def test_anchors_do_not_hang_on_what_sigma_the_known_positions_are_given(samples, printer, answer):
+def test_anchors_depend_little_on_the_sigma_of_known_positions(samples, printer, reference_fit):
     for position in (0.3, 1.2):
-        other = reference(samples, SIGMA, position, start_of(printer[0]))
-        assert np.abs((other.values - answer.values) / answer.sd)[ANCHORS].max() < 1.0
+        other = reference(samples, SIGMA, position, get_start(printer[0]))
+        assert np.abs((other.values - reference_fit.values) / reference_fit.sd)[ANCHORS].max() < 1.0
 
 
-def test_without_a_known_pose_seven_directions_are_the_frame_and_the_scale(printer, fit):
+def test_without_known_poses_seven_combinations_are_unidentifiable(printer, fit):
     _, data = printer
     alone = data.take(np.arange(9, 44))
     found = identifiability(fit.robot, replace(alone, observations=()))
@@ -426,10 +432,8 @@ def test_without_a_known_pose_seven_directions_are_the_frame_and_the_scale(print
     assert told["spool.radius"].startswith("distances between two poses")
 
 
-def test_known_positions_at_the_edge_are_worth_more_than_high_ones(printer, fit):
-    """Predicted: three of the unknown poses measured where the fit puts them, in half of a 95 %
-    interval [mm].
-    """
+def test_known_positions_at_the_edge_reduce_uncertainty_more_than_high_ones(printer, fit):
+    """Predict the 95 % intervals if three (or all) of the unknown poses had been measured [mm]."""
     data = printer[1]
     (seen,) = data.observations
     assert fit.poses is not None
@@ -454,27 +458,27 @@ def test_known_positions_at_the_edge_are_worth_more_than_high_ones(printer, fit)
     np.testing.assert_allclose(half_of(np.arange(9, 44)), [9.5, 9.4, 8.8, 10.9], rtol=0.02)
 
 
-def test_the_examples_truth_lies_in_its_intervals(tmp_path, root):
+def test_truth_of_the_example_lies_within_its_intervals(tmp_path, root):
     found = json.loads((root / "examples" / "cable-robot" / "samples.json").read_text("utf-8"))
-    robot, data = machine(tmp_path, found, 0.5)
+    robot, data = build_machine(tmp_path, found, 0.5)
     fit = identify(robot, data, LeastSquares())
     assert not fit.residual_test.failed
     off = (fit.estimate * 1e3 - TRUTH) / (fit.standard_deviations * 1e3)
     assert (
         np.abs(off).max() < 3.1
     )  # the largest of 21 standard normal numbers is below 3.1 in 96 % of cases
-    answer = reference(found, 0.5, 0.5, start_of(robot))
-    np.testing.assert_allclose(fit.estimate * 1e3, answer.values, rtol=0, atol=1e-4)  # [mm]
+    reference_fit = reference(found, 0.5, 0.5, get_start(robot))
+    np.testing.assert_allclose(fit.estimate * 1e3, reference_fit.values, rtol=0, atol=1e-4)  # [mm]
 
 
-def test_the_example_is_what_its_program_makes(root):
+def test_example_file_equals_the_simulated_samples(root):
     assert (root / "examples" / "cable-robot" / "samples.json").read_text("utf-8") == samples_text(
         example()
     )
 
 
 @pytest.mark.evidence
-def test_over_forty_machines_intervals_hold_the_truth_as_often_as_stated(tmp_path):
+def test_intervals_of_40_machines_contain_the_truth_as_often_as_stated(tmp_path):
     """Errors by their covariance add up to chi-square of 40 * 21 = 840; the stated sigma of lines
     is 1 to 5 % too large.
 
@@ -484,7 +488,7 @@ def test_over_forty_machines_intervals_hold_the_truth_as_often_as_stated(tmp_pat
     """
     held, total = np.zeros(21, dtype=int), 0.0
     for seed in range(40):
-        robot, data = machine(tmp_path, example(seed), 0.5)
+        robot, data = build_machine(tmp_path, example(seed), 0.5)
         fit = identify(robot, data, LeastSquares())
         assert fit.converged
         error = fit.estimate - TRUTH * 1e-3

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The calibration workflow: one call gives what the command prints."""
+"""`calibrate`: verdict, findings, held-out poses, JSON document and refused options."""
 
 import json
 import shutil
@@ -38,7 +38,7 @@ def report(robot, data):
     return calibrate(robot, data, CalibrationOptions(hold_out=0.25))
 
 
-def test_a_good_calibration_has_a_verdict_errors_at_the_noise_floor_and_a_next_step(report):
+def test_good_calibration_reaches_the_noise_floor_and_has_a_next_step(report):
     assert report.verdict is Verdict.CALIBRATED
     assert (report.exit_code, report.failures) == (0, ())
     assert report.next_step.code == "workflow.next-use-result"
@@ -51,13 +51,13 @@ def test_a_good_calibration_has_a_verdict_errors_at_the_noise_floor_and_a_next_s
     assert report.fitted_errors is None
 
 
-def test_text_and_repr_fit_on_a_screen(report):
+def test_text_and_repr_have_fewer_than_20_lines(report):
     for text in (str(report), repr(report)):
         assert len(text.splitlines()) < 20
         assert text.startswith("Calibrated: hexapod-42, 42 parameters from 30 poses.")
 
 
-def test_the_json_document_holds_the_verdict_and_every_finding(report):
+def test_json_document_contains_the_verdict_and_every_finding(report):
     document = json.loads(to_json(report.to_dict()))
     assert document["verdict"] == "calibrated"
     assert len(document["findings"]) == len(report.findings)
@@ -102,14 +102,14 @@ def test_without_held_out_poses_the_verdict_is_undecided(robot, data):
     assert report.fitted_errors is not None
 
 
-def test_too_few_held_out_poses_leave_it_undecided(robot, data):
+def test_too_few_held_out_poses_give_an_undecided_verdict(robot, data):
     report = calibrate(robot, data, CalibrationOptions(held_out=("1", "2", "3")))
     assert report.verdict is Verdict.UNDECIDED
     few = next(f for f in report.findings if f.code == "workflow.few-held-out-poses")
     assert few.data == {"count": 3, "needed": 5}
 
 
-def test_an_exceeded_limit_is_a_failure(robot, data):
+def test_exceeded_limit_gives_the_verdict_not_calibrated(robot, data):
     report = calibrate(robot, data, CalibrationOptions(hold_out=0.25, limit_position=1e-7))
     assert report.verdict is Verdict.NOT_CALIBRATED
     assert report.exit_code == 2
@@ -117,7 +117,7 @@ def test_an_exceeded_limit_is_a_failure(robot, data):
     assert report.next_step.code == "workflow.next-measure-more"
 
 
-def test_an_outlier_gives_a_failure_of_the_noise_and_is_the_next_thing_to_check(robot, data):
+def test_outlier_gives_the_verdict_not_calibrated_and_is_the_next_step(robot, data):
     rows = data.observations[0]
     measured = np.array(rows.measured)
     measured[4, 3] += 1e-3  # [m], 1000 sigma
@@ -128,7 +128,7 @@ def test_an_outlier_gives_a_failure_of_the_noise_and_is_the_next_thing_to_check(
     assert report.next_step.data["poses"] == (f"pose {data.labels[4]}",)
 
 
-def test_motions_of_frames_are_one_harmless_finding(robot):
+def test_gauge_freedom_of_frames_is_one_finding_of_severity_info(robot):
     sensor = Sensor(Pose(unknown=("frame",)), Gaussian(np.array([5e-6] * 3 + [1e-6] * 3)))
     truth = robot.with_values(sample_truth(robot, 1, 5)[0])
     poses = lc.sample_workspace(robot, 40, 3).coordinates
@@ -141,7 +141,7 @@ def test_motions_of_frames_are_one_harmless_finding(robot):
     assert report.verdict is Verdict.CALIBRATED
 
 
-def test_combinations_that_change_poses_are_a_reservation(robot, data):
+def test_unidentifiable_combinations_give_a_warning(robot, data):
     rows = data.observations[0]
     measured = np.array(rows.measured)
     measured[:, :] = np.nan
@@ -149,14 +149,14 @@ def test_combinations_that_change_poses_are_a_reservation(robot, data):
     heights = replace(data, observations=(replace(rows, measured=measured),))
     fit = replace(CalibrationOptions().fit, method=MAP())
     report = calibrate(robot, heights, CalibrationOptions(fit=fit, hold_out=0.25))
-    (open_,) = [f for f in report.findings if f.code == "workflow.undetermined-combinations"]
-    assert open_.severity is Severity.WARNING
+    (undetermined,) = [f for f in report.findings if f.code == "workflow.undetermined-combinations"]
+    assert undetermined.severity is Severity.WARNING
     (frames,) = [f for f in report.findings if f.code == "workflow.frame-freedoms"]
-    assert open_.data["count"] + frames.data["count"] == 42 - 30
+    assert undetermined.data["count"] + frames.data["count"] == 42 - 30
     assert report.verdict in (Verdict.RESERVATIONS, Verdict.NOT_CALIBRATED)
 
 
-def test_progress_is_reported_from_nothing_to_all(robot, data):
+def test_progress_is_reported_from_zero_to_the_total(robot, data):
     steps = []
     calibrate(robot, data, progress=lambda done, total, what: steps.append((done, total, what)))
     assert steps[0][0] == 0
@@ -172,7 +172,7 @@ def test_progress_is_reported_from_nothing_to_all(robot, data):
         ((hexapod(), hexapod_data(4), 0.25), "CalibrationOptions"),
     ],
 )
-def test_a_wrong_argument_says_what_to_pass(arguments, word):
+def test_wrong_argument_type_is_refused_with_advice(arguments, word):
     with pytest.raises(lc.ArgumentTypeError, match=word):
         calibrate(*arguments)
 
@@ -186,18 +186,18 @@ def test_a_wrong_argument_says_what_to_pass(arguments, word):
         ({"hold_out": 0.25, "held_out": ("1",)}, None),
     ],
 )
-def test_options_that_contradict_each_other_are_refused(options, code):
+def test_contradictory_options_are_refused(options, code):
     with pytest.raises(DataError) as refused:
         CalibrationOptions(**options)
     assert refused.value.code == code
 
 
-def test_labels_of_held_out_poses_are_a_sequence():
+def test_held_out_poses_as_a_single_text_are_refused():
     with pytest.raises(lc.ArgumentTypeError, match=r"held_out is the text '1'; .*\['1'\]"):
         CalibrationOptions(held_out="1")
 
 
-def test_the_first_rule_of_the_verdict_decides():
+def test_most_severe_finding_decides_the_verdict():
     failure = report_finding("gates.limit-not-measured", quantity="position")
     undecided = report_finding("workflow.no-held-out-poses")
     warning = report_finding("workflow.undetermined-combinations", count=1, names=("leg1.length",))
@@ -226,7 +226,7 @@ def test_measurements_made_in_python_are_checked_for_wrong_conventions(robot, da
     assert np.isnan(unchecked.conventions.misfit)
 
 
-def test_poses_out_of_reach_are_listed_without_held_out_poses(robot, data) -> None:
+def test_unreachable_poses_are_reported_without_held_out_poses(robot, data) -> None:
     readings = data.readings.copy()
     readings[3] += np.array([0.9, -0.4, 0.9, -0.4, 0.9, -0.4])  # [m]
     fit = lc.FitOptions(excluded_poses=[data.labels[3]])
