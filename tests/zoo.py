@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small robots, data and truths that the tests share. Lengths in metres, angles in radians.
+"""Small robots and true parameter values that the tests share. Lengths in meters, angles in
+radians.
 
-A robot here is a function without arguments (cached), so that a test names what it needs and pays
-for it once.
+A robot is a cached function without arguments: a test names the robot and builds it once.
 """
 
 from collections.abc import Iterable
@@ -146,7 +146,7 @@ def nategh_poses(rng: np.random.Generator, n: int = 18) -> Array:
         np.array([-0.1, -0.1, 0.65, -0.2, -0.2, -0.2]),
         np.array([0.1, 0.1, 0.95, 0.2, 0.2, 0.2]),
     )
-    return poses_of(rng.uniform(low, high, (n, 6)))
+    return make_poses(rng.uniform(low, high, (n, 6)))
 
 
 def gough(
@@ -174,7 +174,7 @@ def gough_values(base: Array, platform: Array, lengths: Array) -> Array:
     return np.column_stack([base, platform, lengths]).ravel()
 
 
-def poses_of(coordinates: Array) -> Array:
+def make_poses(coordinates: Array) -> Array:
     """Poses (n, 4, 4) of x, y, z, roll, pitch, yaw (n, 6) [m, rad]."""
     return geometry.make_pose(
         geometry.euler_to_matrix(coordinates[:, 3:], "xyz"), coordinates[:, :3]
@@ -228,7 +228,7 @@ def five_bar() -> Mechanism:
             Link("pin", np.eye(4)),
         ),
     )
-    return build(assembled("five-bar", limbs, ("x", "y"), ("x", "y"), place((0.0, 0.25, 0.0))))
+    return build(assemble("five-bar", limbs, ("x", "y"), ("x", "y"), place((0.0, 0.25, 0.0))))
 
 
 @cache
@@ -260,7 +260,7 @@ def planar_rrr() -> Mechanism:
                 Link("corner", place(corner)),
             )
         )
-    return build(assembled("3-RRR", tuple(limbs), ("rz", "x", "y"), ("x", "y", "yaw"), np.eye(4)))
+    return build(assemble("3-RRR", tuple(limbs), ("rz", "x", "y"), ("x", "y", "yaw"), np.eye(4)))
 
 
 # --- a tripod machine head: passive joints, three controlled coordinates of six
@@ -320,15 +320,15 @@ def three_prs() -> Mechanism:
 
 
 @cache
-def menagerie() -> Mechanism:
-    """Six limbs, no two alike: rigid, ball and distance endings behind R, P and screw joints, free
-    or driven.
+def mixed_hexapod() -> Mechanism:
+    """A hexapod of six different limbs: rigid, ball and distance endings; R, P and screw joints,
+    passive or driven.
     """
-    return build(menagerie_assembly())
+    return build(mixed_hexapod_assembly())
 
 
 @cache
-def menagerie_assembly(seed: int = 7) -> Assembly:
+def mixed_hexapod_assembly(seed: int = 7) -> Assembly:
     """Axes and offsets are random about the legs of a hexapod, so that nothing is zero by symmetry."""  # noqa: E501
     rng = np.random.default_rng(seed)
     home = geometry.make_pose(
@@ -356,7 +356,9 @@ def menagerie_assembly(seed: int = 7) -> Assembly:
                 f"q{i + 1}",
             )
         )
-    return assembled("menagerie", tuple(limbs), AXES, ("x", "y", "z", "roll", "pitch", "yaw"), home)
+    return assemble(
+        "mixed_hexapod", tuple(limbs), AXES, ("x", "y", "z", "roll", "pitch", "yaw"), home
+    )
 
 
 def random_limb(
@@ -436,14 +438,14 @@ def _motion(joint: Joint) -> Array:
     return place((0, 0, joint.pitch * joint.start), (0, 0, joint.start))
 
 
-def assembled(
+def assemble(
     name: str,
     limbs: tuple[Limb, ...],
     freedoms: tuple[str, ...],
     controlled: tuple[str, ...],
     home: Array,
 ) -> Assembly:
-    """An assembly whose every link axis, pitch and rod length is a parameter, and every
+    """Return an assembly with a parameter for every link axis, pitch, rod length, and
     transmission offset and gain.
     """
     driven = [(m, j.kind) for limb in limbs for m, j in ((j.actuator, j) for j in limb.joints) if m]
@@ -451,7 +453,7 @@ def assembled(
     actuators = tuple(
         Actuator(m, Dimension.ANGLE if k == "R" else Dimension.LENGTH) for m, k in sorted(driven)
     )
-    addresses = [a for limb in limbs for a in addresses_of(limb)]
+    addresses = [a for limb in limbs for a in list_addresses(limb)]
     addresses += [
         Address(a.name, "transmission", term) for a in actuators for term in ("offset", "gain")
     ]
@@ -467,8 +469,8 @@ def assembled(
     )
 
 
-def addresses_of(limb: Limb) -> Iterable[Address]:
-    """Every number of a limb that a parameter may move."""
+def list_addresses(limb: Limb) -> Iterable[Address]:
+    """Yield every number of a limb that a parameter may change."""
     for link in (*limb.links, limb.attachment):
         yield from (Address(limb.name, link.name, axis) for axis in AXES)
     yield from (
@@ -492,10 +494,8 @@ def place(point: Iterable[float], turn: Iterable[float] = (0.0, 0.0, 0.0)) -> Ar
     )
 
 
-def scaled(assembly: Assembly, s: float) -> Assembly:
-    """The same mechanism with every length multiplied by s (parameters at nominal zero or of pure
-    links only).
-    """
+def scale_lengths(assembly: Assembly, s: float) -> Assembly:
+    """Multiply every length by s. Parameters must be zero or belong to links."""
 
     def grown(link: Link) -> Link:
         T = np.array(link.transform)
@@ -520,10 +520,8 @@ def scaled(assembly: Assembly, s: float) -> Assembly:
     return replace(assembly, limbs=tuple(limb_of(limb) for limb in assembly.limbs), home=home)
 
 
-def relocated(assembly: Assembly, G: Array) -> Assembly:
-    """The same mechanism with its base standing elsewhere: first links and home multiplied by G (4,
-    4) from the left.
-    """
+def move_base(assembly: Assembly, G: Array) -> Assembly:
+    """Move the base: multiply first links and home by G (4, 4) from the left."""
 
     def limb_of(limb: Limb) -> Limb:
         first = replace(limb.links[0], transform=G @ limb.links[0].transform)

@@ -18,7 +18,8 @@ def engine(request) -> ModuleType:
 
 
 @pytest.fixture(
-    scope="session", params=["menagerie", "three_prs", "hexapod", "delta", "five_bar", "planar_rrr"]
+    scope="session",
+    params=["mixed_hexapod", "three_prs", "hexapod", "delta", "five_bar", "planar_rrr"],
 )
 def some(request) -> Case:
     """One mechanism after another: six, three and two freedoms, all endings, with and without

@@ -103,7 +103,7 @@ def compiled(letters, ending, chosen, slots, size):
 
 
 @pytest.mark.parametrize(
-    "robot", ["menagerie", "three_prs", "hexapod", "delta", "five_bar", "planar_rrr"]
+    "robot", ["mixed_hexapod", "three_prs", "hexapod", "delta", "five_bar", "planar_rrr"]
 )
 def test_every_displacement_and_joint_moves_the_mechanism_as_linearized(engine, robot):
     some = case(getattr(zoo, robot)(), n=2)
@@ -139,7 +139,7 @@ def test_every_displacement_and_joint_moves_the_mechanism_as_linearized(engine, 
         assert_close_columns(analytic[row], independent_slopes(some, state, row), unit)
 
 
-@pytest.mark.parametrize("robot", ["menagerie", "hexapod"])
+@pytest.mark.parametrize("robot", ["mixed_hexapod", "hexapod"])
 def test_free_actuators_follow_the_platform_as_linearized(engine, robot):
     some = case(getattr(zoo, robot)(), n=2)
     p = some.program
@@ -174,7 +174,7 @@ def assert_close_columns(found, reference, unit):
 
 
 def test_the_blocks_of_a_trial_do_not_depend_on_the_others_bit_for_bit(engine):
-    some = case(zoo.menagerie(), t=3)
+    some = case(zoo.mixed_hexapod(), t=3)
     state = engine.solve(some.program, some.e, some.q, some.home)
     together = engine.linearize(some.program, some.e, some.q, state)
     for i in range(3):
@@ -187,7 +187,7 @@ def test_the_blocks_of_a_trial_do_not_depend_on_the_others_bit_for_bit(engine):
 
 
 def test_rows_that_failed_do_not_stop_the_others(engine):
-    some = case(zoo.menagerie())
+    some = case(zoo.mixed_hexapod())
     q = np.array(some.q)
     q[0, 2] = np.nan
     state = engine.solve(some.program, some.e, q, some.home)

@@ -72,7 +72,7 @@ def test_a_converged_state_is_a_fixed_point(engine, some):
 
 
 def test_free_joints_come_back_from_the_pose(engine):
-    for robot in (zoo.menagerie(), zoo.hexapod()):
+    for robot in (zoo.mixed_hexapod(), zoo.hexapod()):
         one = case(robot)
         one = replace(
             one, q=one.home_q + 0.1 * (one.q - one.home_q)
@@ -89,7 +89,7 @@ def test_free_joints_come_back_from_the_pose(engine):
         assert_allclose(back.T, state.T, atol=1e-14)
 
 
-@pytest.mark.parametrize("robot", ["menagerie", "three_prs", "delta"])
+@pytest.mark.parametrize("robot", ["mixed_hexapod", "three_prs", "delta"])
 def test_seven_trials_in_one_call_equal_seven_calls_bit_for_bit(engine, robot):
     some = case(getattr(zoo, robot)(), t=7)
     together = engine.solve(some.program, some.e, some.q, some.home)
@@ -99,7 +99,7 @@ def test_seven_trials_in_one_call_equal_seven_calls_bit_for_bit(engine, robot):
 
 
 def test_trials_that_share_readings_equal_trials_with_their_own(engine):
-    some = case(zoo.menagerie(), t=3)
+    some = case(zoo.mixed_hexapod(), t=3)
     shared = engine.solve(some.program, some.e, some.q[:1], some.home)
     own = engine.solve(some.program, some.e, np.repeat(some.q[:1], 3, axis=0), some.home)
     assert_same(shared, own)
@@ -122,7 +122,7 @@ def test_the_order_of_rows_does_not_matter_bit_for_bit(engine, some):
 
 
 def test_thousands_of_rows_equal_a_few_alone_bit_for_bit(engine):
-    some = case(zoo.menagerie(), n=6000)
+    some = case(zoo.mixed_hexapod(), n=6000)
     together = engine.solve(some.program, some.e, some.q, some.home)
     for r in (0, 2047, 2048, 4095, 4096, 5999):
         assert_same(
@@ -143,7 +143,7 @@ def test_failing_rows_are_marked_and_leave_the_others_alone(engine, some):
 
 
 def test_displacements_that_are_not_finite_mark_their_trial(engine):
-    some = case(zoo.menagerie(), t=3)
+    some = case(zoo.mixed_hexapod(), t=3)
     e = np.array(some.e)
     e[1, 5] = np.nan
     state = engine.solve(some.program, e, some.q, some.home)
@@ -217,7 +217,7 @@ def test_orientation_changes_sign_with_the_mirrored_mode(engine):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_random_limbs_of_every_kind_close(engine, seed):
-    robot = build(zoo.menagerie_assembly(seed))
+    robot = build(zoo.mixed_hexapod_assembly(seed))
     some = case(robot, n=4, seed=seed)
     small = some.home_q + 0.3 * (some.q - some.home_q)
     state = engine.solve(some.program, some.e, small, some.home)
@@ -226,7 +226,7 @@ def test_random_limbs_of_every_kind_close(engine, seed):
 
 
 def test_slots_of_the_menagerie_cover_every_place_of_a_limb():
-    program = zoo.menagerie().program
+    program = zoo.mixed_hexapod().program
     assert {g.ending for g in program.groups} == {"rigid", "ball", "distance"}
     for group in program.groups:
         expected = {
@@ -236,7 +236,7 @@ def test_slots_of_the_menagerie_cover_every_place_of_a_limb():
     assert (
         len(unit_of_displacements(program))
         == program.n_displacements
-        == len(zoo.menagerie().parameters) - 12
+        == len(zoo.mixed_hexapod().parameters) - 12
     )
 
 

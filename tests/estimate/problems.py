@@ -60,7 +60,7 @@ def hexapod_poses(n: int, seed: int = 0) -> np.ndarray:
     """Random poses (n, 4, 4) of the 42-parameter hexapod: +-40 mm about z = 200 mm, +-0.25 rad."""
     rng = np.random.default_rng(seed)
     middle, half = np.array([0, 0, 0.2, 0, 0, 0]), np.array([0.04, 0.04, 0.03, 0.25, 0.25, 0.25])
-    return zoo.poses_of(middle + rng.uniform(-1.0, 1.0, (n, 6)) * half)
+    return zoo.make_poses(middle + rng.uniform(-1.0, 1.0, (n, 6)) * half)
 
 
 def hexapod_data(n: int = 30, seed: int = 0, instrument: Instrument | None = None) -> Measurements:

@@ -78,7 +78,7 @@ def test_without_repeats_or_with_a_loss_nothing_is_claimed():
 
 def test_correlated_parameters_are_grouped_in_words():
     # small tilts: a leg's length and the heights of its ends act alike
-    flat = zoo.poses_of(
+    flat = zoo.make_poses(
         np.random.default_rng(0).uniform(-1, 1, (30, 6)) * [0.01, 0.01, 0.01, 0.05, 0.05, 0.05]
         + [0, 0, 0.2, 0, 0, 0]
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All 24 Euler conventions, tilt and torsion, and their rates."""
+"""All 24 Euler conventions, and tilt and torsion, with their rates."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ any_angles = st.lists(st.one_of(turn, quarter), min_size=3, max_size=3).map(np.a
 @pytest.mark.parametrize("order", geometry.EULER_ORDERS)
 @given(angles=any_angles)
 @settings(max_examples=40)  # of each of 24 orders
-def test_every_order_agrees_with_scipy_and_comes_back_even_where_axes_are_parallel(order, angles):
+def test_every_euler_order_agrees_with_scipy_and_round_trips_with_parallel_axes(order, angles):
     R = geometry.euler_to_matrix(angles, order)
     assert_allclose(R, Rotation.from_euler(order, angles).as_matrix(), atol=ROUNDING)
     assert_allclose(
@@ -32,7 +32,7 @@ def test_every_order_agrees_with_scipy_and_comes_back_even_where_axes_are_parall
 @pytest.mark.parametrize("order", geometry.EULER_ORDERS)
 @given(first=turn, third=turn, middle=st.floats(0.05, 0.95))
 @settings(max_examples=20)  # of each of 24 orders
-def test_regular_angles_come_back_as_they_were(order, first, third, middle):
+def test_regular_euler_angles_round_trip(order, first, third, middle):
     repeated = order[0] == order[2]
     second = np.pi * middle if repeated else np.pi * (middle - 0.5)
     angles = np.array([first, second, third])
@@ -44,7 +44,7 @@ def test_regular_angles_come_back_as_they_were(order, first, third, middle):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("order", geometry.EULER_ORDERS)
-def test_euler_rates_are_the_derivative_and_their_inverse_its_inverse(order):
+def test_euler_rates_are_the_derivative_and_have_the_stated_inverse(order):
     angles = np.array([0.4, 0.7, -2.1])
     base = geometry.euler_to_matrix(angles, order).T
 
@@ -58,7 +58,7 @@ def test_euler_rates_are_the_derivative_and_their_inverse_its_inverse(order):
     assert_allclose(product, np.eye(3), atol=ROUNDING)
 
 
-def test_seed_002_reads_roll_pitch_yaw_as_fixed_xyz():
+def test_roll_pitch_yaw_are_rotations_about_fixed_x_y_z():
     a, b, g = 0.3, -0.2, 0.9
     ca, sa, cb, sb, cg, sg = np.cos(a), np.sin(a), np.cos(b), np.sin(b), np.cos(g), np.sin(g)
     R = np.array([[cg, -sg, 0], [sg, cg, 0], [0, 0, 1]]) @ [[cb, 0, sb], [0, 1, 0], [-sb, 0, cb]]
@@ -68,7 +68,7 @@ def test_seed_002_reads_roll_pitch_yaw_as_fixed_xyz():
     assert_allclose(geometry.euler_rates(np.array([a, b, g]), "xyz"), rates, atol=ROUNDING)
 
 
-def test_an_unknown_order_is_refused_with_the_allowed_ones():
+def test_unknown_euler_order_is_refused_with_the_allowed_ones():
     with pytest.raises(DataError, match="'xxz' is not one of the 24: use xyz"):
         geometry.euler_to_matrix(np.zeros(3), "xxz")
     with pytest.raises(DataError, match="'Xyz'"):
@@ -76,7 +76,7 @@ def test_an_unknown_order_is_refused_with_the_allowed_ones():
 
 
 @given(phi=turn, theta=st.floats(1e-3, np.pi - 1e-3), psi=turn)
-def test_tilt_and_torsion_comes_back(phi, theta, psi):
+def test_tilt_and_torsion_round_trip(phi, theta, psi):
     back = geometry.matrix_to_tilt_torsion(geometry.tilt_torsion_to_matrix(phi, theta, psi))
     assert_allclose(
         geometry.wrap_angle(np.array(back) - [phi, theta, psi]), np.zeros(3), atol=5e-12
@@ -84,14 +84,14 @@ def test_tilt_and_torsion_comes_back(phi, theta, psi):
 
 
 @given(phi=turn, theta=st.floats(-200.0, -3.0).map(lambda e: 10.0**e), psi=st.floats(-3.1, 3.1))
-def test_torsion_and_tilt_stay_exact_as_the_tilt_vanishes(phi, theta, psi):
+def test_tilt_and_torsion_stay_exact_at_vanishing_tilt(phi, theta, psi):
     R = geometry.tilt_torsion_to_matrix(phi, theta, psi)
     back = geometry.matrix_to_tilt_torsion(R)
     assert_allclose(back[1:], [theta, psi], atol=ROUNDING)
     assert_allclose(geometry.tilt_torsion_to_matrix(*back), R, atol=ROUNDING)
 
 
-def test_at_zero_tilt_the_azimuth_is_zero_and_the_torsion_the_turn_about_the_normal():
+def test_zero_tilt_has_zero_azimuth_and_torsion_equal_to_the_rotation():
     assert_allclose(
         geometry.matrix_to_tilt_torsion(geometry.rotation_about_axis(0.3, 2)),
         (0.0, 0.0, 0.3),
@@ -113,7 +113,7 @@ def test_tilt_torsion_matrix_has_the_printed_entries():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("theta", [0.02, 0.6, 2.8])
-def test_tilt_torsion_rates_are_the_derivative_and_their_inverse_its_inverse(theta):
+def test_tilt_torsion_rates_are_the_derivative_and_have_the_stated_inverse(theta):
     angles = np.array([2.4, theta, -0.8])
     base = geometry.tilt_torsion_to_matrix(*angles).T
 
@@ -128,7 +128,7 @@ def test_tilt_torsion_rates_are_the_derivative_and_their_inverse_its_inverse(the
 
 
 @given(st.floats(-50.0, 50.0))
-def test_wrapped_angles_are_the_same_turn_within_half_a_turn(x):
+def test_wrapped_angle_is_the_same_angle_between_minus_pi_and_pi(x):
     wrapped = geometry.wrap_angle(x)
     assert -np.pi < wrapped <= np.pi
     assert_allclose(
@@ -136,5 +136,5 @@ def test_wrapped_angles_are_the_same_turn_within_half_a_turn(x):
     )  # [1], ulps of 50 rad
 
 
-def test_half_a_turn_wraps_to_plus_pi():
+def test_minus_pi_wraps_to_plus_pi():
     assert geometry.wrap_angle(np.array([np.pi, -np.pi])).tolist() == [np.pi, np.pi]

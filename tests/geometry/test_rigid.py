@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses form a group; updates, differences and the maps of twists agree with it."""
+"""Poses form a group; twists, pose differences and transport matrices agree with it."""
 
 import numpy as np
 import pytest
@@ -26,12 +26,12 @@ def test_poses_form_a_group(a, b, c):
 
 
 @given(poses, poses)
-def test_the_difference_is_the_update_that_leads_from_one_pose_to_the_other(a, b):
+def test_pose_difference_is_the_twist_from_one_pose_to_the_other(a, b):
     assert_allclose(geometry.apply_twist(b, geometry.pose_difference(a, b)), a, atol=ROUNDING)
 
 
 @pytest.mark.slow
-def test_transport_is_the_derivative_of_a_tool_pose_in_another_frame():
+def test_transport_matrix_is_the_derivative_of_a_tool_pose_in_another_frame():
     rng = np.random.default_rng(1)
     T_base_platform, T_platform_tool, T_base_frame = geometry.apply_twist(
         np.eye(4), rng.normal(size=(3, 6))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exponential, logarithm, their Jacobians and quaternions, near zero, near pi and between."""
+"""Exponential, logarithm, their Jacobians and quaternions: near zero, near pi and between."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def test_exponential_is_a_rotation_and_agrees_with_scipy(w):
 
 
 @given(vector)
-def test_logarithm_undoes_the_exponential_from_zero_to_pi(w):
+def test_logarithm_inverts_the_exponential_from_zero_to_pi(w):
     back = geometry.log_so3(geometry.exp_so3(w))
     # Turning a matrix to a vector cannot be better than its entries: a few ulps of 1, at every
     # angle.
@@ -51,7 +51,7 @@ def test_small_angles_keep_their_relative_accuracy(n, exponent):
 
 
 @given(unit)
-def test_at_pi_the_logarithm_is_one_of_the_two_vectors(n):
+def test_logarithm_at_pi_is_one_of_the_two_rotation_vectors(n):
     back = geometry.log_so3(2.0 * np.outer(n, n) - np.eye(3))
     assert_allclose(np.linalg.norm(back), np.pi, atol=ROUNDING)
     assert_allclose(
@@ -59,7 +59,7 @@ def test_at_pi_the_logarithm_is_one_of_the_two_vectors(n):
     )  # [1], the square root of the diagonal
 
 
-def test_zero_gives_the_identity_and_back_exactly():
+def test_zero_rotation_gives_the_exact_identity():
     assert np.array_equal(geometry.exp_so3(np.zeros(3)), np.eye(3))
     assert np.array_equal(geometry.log_so3(np.eye(3)), np.zeros(3))
     assert np.array_equal(geometry.left_jacobian_so3(np.zeros(3)), np.eye(3))
@@ -67,7 +67,7 @@ def test_zero_gives_the_identity_and_back_exactly():
 
 
 @given(vector)
-def test_the_inverse_of_the_left_jacobian_is_its_inverse(w):
+def test_left_jacobian_times_its_inverse_is_the_identity(w):
     product = geometry.left_jacobian_so3(w) @ geometry.left_jacobian_inverse_so3(w)
     assert_allclose(
         product, np.eye(3), atol=2e-14
@@ -105,7 +105,7 @@ def test_inverse_left_jacobian_is_the_derivative_of_the_logarithm(size):
 
 
 @given(vector, st.sampled_from([-3.0, 1.0, 0.1]))
-def test_quaternions_go_both_ways_whatever_their_length_and_sign(w, length):
+def test_quaternions_of_any_length_and_sign_round_trip(w, length):
     R = geometry.exp_so3(w)
     q = geometry.matrix_to_quaternion(R)
     assert q[0] >= 0.0
@@ -115,7 +115,7 @@ def test_quaternions_go_both_ways_whatever_their_length_and_sign(w, length):
     assert_allclose(np.abs(q @ scipy_q), 1.0, atol=ROUNDING)
 
 
-def test_a_row_alone_equals_the_row_in_a_batch_with_any_leading_axes():
+def test_single_rotation_equals_the_same_rotation_in_a_batch():
     w = np.random.default_rng(3).normal(size=(2, 5, 3))
     batch = geometry.exp_so3(w)
     assert batch.shape == (2, 5, 3, 3)

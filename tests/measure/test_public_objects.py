@@ -41,7 +41,7 @@ def instrument():
 @pytest.fixture(scope="module")
 def poses():
     middle = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
-    return zoo.poses_of(np.random.default_rng(0).uniform(-0.02, 0.02, (40, 6)) + middle)
+    return zoo.make_poses(np.random.default_rng(0).uniform(-0.02, 0.02, (40, 6)) + middle)
 
 
 def test_every_public_object_prints_on_a_screen(robot, instrument, poses):
@@ -112,7 +112,7 @@ def test_the_text_of_measurements_counts_poses_and_rows(robot, instrument, poses
             "robot: got the text 'hexapod-42'; give Mechanism, from loopcal.load_robot",
         ),
         (
-            lambda: simulate(zoo.hexapod(), zoo.poses_of(np.zeros((1, 6))), "pose", 1),  # type: ignore[arg-type]
+            lambda: simulate(zoo.hexapod(), zoo.make_poses(np.zeros((1, 6))), "pose", 1),  # type: ignore[arg-type]
             ArgumentTypeError,
             "instrument: got the text 'pose'; give Instrument",
         ),

@@ -135,7 +135,7 @@ def generic():
         np.array([-0.1, -0.1, 0.65, -0.3, -0.3, -0.3]),
         np.array([0.1, 0.1, 0.95, 0.3, 0.3, 0.3]),
     )
-    return zoo.poses_of(rng.uniform(low, high, (len(ALL), 6)))
+    return zoo.make_poses(rng.uniform(low, high, (len(ALL), 6)))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -146,7 +146,7 @@ def test_the_rank_of_a_kind_is_what_counting_says(robot, generic, name):
 
 def test_planes_and_perpendicular_lines_touched_at_poses_on_them_tell_33(robot):
     rng = np.random.default_rng(4)
-    turns = zoo.poses_of(rng.uniform(-0.3, 0.3, (180, 6)))[:, :3, :3]
+    turns = zoo.make_poses(rng.uniform(-0.3, 0.3, (180, 6)))[:, :3, :3]
     points, seen, first = [], [], 0
     for axis in np.eye(3):
         for touched, kind in (

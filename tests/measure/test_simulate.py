@@ -34,7 +34,7 @@ from loopcal.parameters import ParameterTable
 from tests import zoo
 
 SIGMA = np.array([5e-6, 5e-6, 5e-6, 1e-6, 1e-6, 1e-6])
-COMMANDED = zoo.poses_of(
+COMMANDED = zoo.make_poses(
     np.random.default_rng(4).uniform(-1.0, 1.0, (12, 6)) * [0.01, 0.01, 0.01, 0.05, 0.05, 0.05]
     + [0, 0, 0.2, 0, 0, 0]
 )

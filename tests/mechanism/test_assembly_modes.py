@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All modes: 40 of Dietmaier's hexapod, those of known machines, and the choice of one by `start`."""  # noqa: E501
+"""Assembly modes and working modes: 40 of Dietmaier's hexapod, those of known robots, and
+selection by `start`.
+"""
 
 from dataclasses import replace
 
@@ -44,7 +46,7 @@ DIETMAIER_PLATFORM = (
 DIETMAIER_LENGTHS = (1.0, 0.645275, 1.086284, 1.503439, 1.281933, 0.771071)
 
 
-def dietmaier():
+def build_dietmaier_hexapod():
     home = PoseRecord(z=0.8, roll=0.3, pitch=0.2, yaw=0.5)
     record = Gough(
         "dietmaier",
@@ -58,11 +60,11 @@ def dietmaier():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
-def test_dietmaiers_hexapod_has_forty_modes(seed):
-    found = find_assembly_modes(dietmaier(), np.zeros(6), seed=seed)
+def test_dietmaier_hexapod_has_forty_assembly_modes(seed):
+    found = find_assembly_modes(build_dietmaier_hexapod(), np.zeros(6), seed=seed)
     assert len(found) == 40
     assert found.solution.residual.max() < 1e-12  # of legs of length 1
-    for T in found.solution.T:  # closure once more, plainly
+    for T in found.solution.T:  # closure in closed form
         legs = np.array(DIETMAIER_PLATFORM) @ T[:3, :3].T + T[:3, 3] - DIETMAIER_BASE
         assert_allclose(np.linalg.norm(legs, axis=1), DIETMAIER_LENGTHS, atol=1e-13)
     assert found.starts_since_new >= 8192
@@ -77,7 +79,7 @@ def test_dietmaiers_hexapod_has_forty_modes(seed):
         (zoo.nategh, (0.03, -0.02, 0.8, 0.1, -0.05, 0.15), 16, 8),
     ],
 )
-def test_hexapods_with_plane_base_and_platform_have_as_many_modes_above_as_below(
+def test_planar_hexapods_have_equal_counts_of_modes_above_and_below_the_base(
     robot, coordinates, modes, above
 ):
     machine = robot()
@@ -86,13 +88,13 @@ def test_hexapods_with_plane_base_and_platform_have_as_many_modes_above_as_below
     assert (len(found), int((found.solution.T[:, 2, 3] > 0).sum())) == (modes, above)
     assert (
         np.abs(found.solution.T - at.T).max(axis=(1, 2)).min() < 1e-9
-    )  # the pose it came from is among them
+    )  # the original pose is among them
 
 
 @pytest.mark.parametrize(
     ("name", "modes"), [("five-bar", 2), ("linear-delta", 2), ("rotary-delta", 2), ("cable-4", 1)]
 )
-def test_known_machines_have_as_many_assembly_modes_as_spheres_or_circles_meet(name, modes):
+def test_known_robots_have_the_counted_assembly_modes(name, modes):
     robot = load_robot(name)
     at = inverse(robot, robot.home[None])
     assert len(find_assembly_modes(robot, at.q[0], patience=4096)) == modes
@@ -101,24 +103,24 @@ def test_known_machines_have_as_many_assembly_modes_as_spheres_or_circles_meet(n
 @pytest.mark.parametrize(
     ("name", "modes"), [("five-bar", 4), ("3-rrr", 8), ("rotary-delta", 8), ("3-prs", 8)]
 )
-def test_each_limb_with_one_drive_doubles_the_working_modes(name, modes):
+def test_each_driven_limb_doubles_the_working_modes(name, modes):
     robot = load_robot(name)
     target = inverse(robot, robot.home[None])
-    home = find_working_modes(robot, np.array([target_of(robot)]))
+    home = find_working_modes(robot, np.array([home_coordinates(robot)]))
     assert len(home) == modes
     assert np.abs(home.solution.q - target.q).max(axis=1).min() < 1e-9  # [rad, m]
 
 
-def target_of(robot):
+def home_coordinates(robot):
     return read_coordinates(robot.home, robot.controlled)
 
 
-def test_start_chooses_the_mode():
+def test_start_selects_the_assembly_and_working_mode():
     robot = load_robot("five-bar")
-    modes = find_working_modes(robot, target_of(robot))
+    modes = find_working_modes(robot, home_coordinates(robot))
     for row in range(len(modes)):
         one = modes.solution.take(np.array([row]))
-        near = inverse(robot, target_of(robot) + np.array([0.005, -0.005]), start=one)
+        near = inverse(robot, home_coordinates(robot) + np.array([0.005, -0.005]), start=one)
         assert np.abs(near.q - one.q).max() < 0.1
     q = modes.solution.q[0]
     both = find_assembly_modes(robot, q)
@@ -127,29 +129,29 @@ def test_start_chooses_the_mode():
         assert_allclose(forward(robot, q[None], start=one).T, one.T, atol=1e-12)
 
 
-def test_readings_that_allow_no_pose_have_no_modes():
+def test_unreachable_readings_have_no_assembly_modes():
     found = find_assembly_modes(load_robot("linear-delta"), [5.0, -5.0, 0.0], patience=2048)
     assert len(found) == 0
     assert "0 modes" in str(found)
 
 
-def test_a_platform_that_is_free_to_move_is_said():
+def test_incomplete_search_for_modes_is_refused():
     with pytest.raises(MechanismError, match="still new ones"):
-        find_assembly_modes(dietmaier(), np.zeros(6), patience=4096, max_starts=2048)
+        find_assembly_modes(build_dietmaier_hexapod(), np.zeros(6), patience=4096, max_starts=2048)
 
 
-def test_a_wrong_number_of_readings_is_refused():
+def test_wrong_number_of_readings_is_refused_for_assembly_modes():
     with pytest.raises(DataError, match="3 readings were given"):
         find_assembly_modes(zoo.hexapod(), np.zeros(3))
 
 
 @pytest.mark.parametrize("stroke", [None, (5.0, 11.0)])
-def test_working_modes_have_readings_within_a_turn_and_start_with_the_one_at_home(stroke):
+def test_working_modes_are_within_half_a_turn_and_ordered_by_distance_from_home(stroke):
     assembly = zoo.five_bar().assembly
     robot = build(
         replace(assembly, actuators=tuple(replace(a, stroke=stroke) for a in assembly.actuators))
     )
-    found = find_working_modes(robot, target_of(robot))
+    found = find_working_modes(robot, home_coordinates(robot))
     low, high = stroke or (-np.pi, np.pi)
     home = inverse(robot, robot.home[None]).q[0]
     middle = (low + high) / 2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limbs judged one by one, closure equations that repeat others, and mechanisms without a length."""  # noqa: E501
+"""Limbs are checked one by one; redundant closure equations; mechanisms without any length."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -9,23 +9,23 @@ import pytest
 from numpy.testing import assert_allclose
 
 from loopcal.errors import MechanismError
-from loopcal.geometry import invert_pose as back
+from loopcal.geometry import invert_pose
 from loopcal.mechanism import Joint, Limb, Link, build, find_assembly_modes, forward, inverse
 from tests import zoo
 
 HOME = zoo.place((0.01, -0.02, 0.25), (0.05, -0.08, 0.1))
 
 
-def through(name, frames, joints, corner):
-    """A rigid limb whose joints stand in these frames [base] at home, joint values zero."""
+def make_rigid_limb(name, frames, joints, corner):
+    """Return a rigid limb with joints in these frames [base] at home, at joint values of zero."""
     attachment = zoo.place(corner)
     ends = [np.eye(4), *frames, HOME @ attachment]
-    links = tuple(Link(f"link{i}", back(a) @ b) for i, (a, b) in enumerate(pairwise(ends)))
+    links = tuple(Link(f"link{i}", invert_pose(a) @ b) for i, (a, b) in enumerate(pairwise(ends)))
     return Limb(name, links, joints, "rigid", Link("attachment", attachment))
 
 
 def leg_frame(i):
-    """Frame at a leg's foot with z along the leg, and the leg's length."""
+    """Return the frame at a leg's foot, with z along the leg, and the leg's length."""
     foot, end = zoo.HEXAPOD_BASE[i] * zoo.MM, HOME @ zoo.place(zoo.HEXAPOD_PLATFORM[i] * zoo.MM)
     z = (end[:3, 3] - foot) / np.linalg.norm(end[:3, 3] - foot)
     x = np.cross((0.3, 1.0, 0.2), z)
@@ -38,7 +38,7 @@ def leg_frame(i):
 ABOUT_X, ABOUT_Y = zoo.place((0, 0, 0), (0, np.pi / 2, 0)), zoo.place((0, 0, 0), (-np.pi / 2, 0, 0))
 
 
-def sps(i, apart=0.0):
+def make_sps_leg(i, apart=0.0):
     """Leg RRR-P-RRR; its base axes meet in a point unless `apart` [m]."""
     F, length = leg_frame(i)
     top = F @ zoo.place((0, 0, length))
@@ -54,10 +54,10 @@ def sps(i, apart=0.0):
         Joint(f"j{n}", k, f"q{i + 1}" if k == "P" else None)
         for n, k in enumerate("RRRPRRR", start=1)
     )
-    return through(f"leg{i + 1}", frames, joints, zoo.HEXAPOD_PLATFORM[i] * zoo.MM)
+    return make_rigid_limb(f"leg{i + 1}", frames, joints, zoo.HEXAPOD_PLATFORM[i] * zoo.MM)
 
 
-def universal(i, loose):
+def make_rrrprr_leg(i, loose):
     """Leg RRRPRR with its third axis along the slide; `loose`: the axis behind the slide is along
     it too, else askew.
     """
@@ -71,31 +71,31 @@ def universal(i, loose):
         Joint(f"j{n}", k, f"q{i + 1}" if k == "P" else None)
         for n, k in enumerate("RRRPRR", start=1)
     )
-    return through(f"leg{i + 1}", frames, joints, zoo.HEXAPOD_PLATFORM[i] * zoo.MM)
+    return make_rigid_limb(f"leg{i + 1}", frames, joints, zoo.HEXAPOD_PLATFORM[i] * zoo.MM)
 
 
-def machine(limbs, controlled=("x", "y", "z", "roll", "pitch", "yaw")):
-    return zoo.assembled("machine", tuple(limbs), zoo.AXES, controlled, HOME)
+def make_assembly(limbs, controlled=("x", "y", "z", "roll", "pitch", "yaw")):
+    return zoo.assemble("machine", tuple(limbs), zoo.AXES, controlled, HOME)
 
 
 @pytest.mark.parametrize("odd", [0, 3])
-def test_a_limb_with_its_own_geometry_is_judged_on_its_own_in_any_order(odd):
-    limbs = [sps(i, 0.02 if i == odd else 0.0) for i in range(6)]
+def test_underdetermined_limb_is_named_in_any_order_of_limbs(odd):
+    limbs = [make_sps_leg(i, 0.02 if i == odd else 0.0) for i in range(6)]
     said = set()
     for shift in range(6):
         with pytest.raises(
             MechanismError, match=f"limb 'leg{odd + 1}' has 7 joints, but 6 closure equations"
         ) as error:
-            build(machine(np.roll(np.array(limbs, dtype=object), shift)))
+            build(make_assembly(np.roll(np.array(limbs, dtype=object), shift)))
         said.add(str(error.value))
     assert len(said) == 1
 
 
-def test_the_order_of_limbs_that_differ_in_rank_changes_nothing():
-    limbs = [universal(i, loose=i == 2) for i in range(5)]
+def test_limb_order_does_not_change_poses_or_the_locked_joint():
+    limbs = [make_rrrprr_leg(i, loose=i == 2) for i in range(5)]
     orders = [(0, 1, 2, 3, 4), (2, 0, 1, 3, 4), (4, 3, 1, 0, 2)]
     robots = [
-        build(machine([limbs[i] for i in order], ("x", "y", "z", "roll", "pitch")))
+        build(make_assembly([limbs[i] for i in order], ("x", "y", "z", "roll", "pitch")))
         for order in orders
     ]
     target = np.array([[0.012, -0.018, 0.252, 0.06, -0.07]])
@@ -122,22 +122,22 @@ def test_the_order_of_limbs_that_differ_in_rank_changes_nothing():
         }
 
 
-def test_what_the_note_says_of_a_held_joint_is_true():
-    limbs = [universal(i, loose=i == 2) for i in range(5)]
-    robot = build(machine(limbs, ("x", "y", "z", "roll", "pitch")))
+def test_locked_joint_keeps_its_reported_start_value():
+    limbs = [make_rrrprr_leg(i, loose=i == 2) for i in range(5)]
+    robot = build(make_assembly(limbs, ("x", "y", "z", "roll", "pitch")))
     joint = robot.findings[0].data["joint"]
     turned = replace(
         limbs[2],
         joints=tuple(replace(j, start=0.4) if j.name == joint else j for j in limbs[2].joints),
     )
-    other = build(machine([*limbs[:2], turned, *limbs[3:]], ("x", "y", "z", "roll", "pitch")))
+    other = build(make_assembly([*limbs[:2], turned, *limbs[3:]], ("x", "y", "z", "roll", "pitch")))
     assert other.findings[0].data["joint"] == joint
     assert other.findings[0].data["value"] == (0.4, "rad")
     q = inverse(robot, np.array([[0.012, -0.018, 0.252, 0.06, -0.07]])).q
     assert_allclose(forward(other, q).T, forward(robot, q).T, atol=1e-11)
 
 
-def planar(freedoms):
+def build_planar_3rrr(freedoms):
     """A planar 3-RRR, every limb pinned rigidly to the platform."""
     limbs = []
     for i, angle in enumerate(np.deg2rad((90.0, 210.0, 330.0)), start=1):
@@ -155,11 +155,11 @@ def planar(freedoms):
             Joint("wrist", "R", start=-0.5),
         )
         limbs.append(Limb(f"arm{i}", links, joints, "rigid", Link("corner", zoo.place(0.06 * out))))
-    return build(zoo.assembled("3-RRR", tuple(limbs), freedoms, ("x", "y", "yaw"), np.eye(4)))
+    return build(zoo.assemble("3-RRR", tuple(limbs), freedoms, ("x", "y", "yaw"), np.eye(4)))
 
 
-def test_a_planar_machine_with_all_six_freedoms_is_solved_like_one_with_three_and_told():
-    whole, flat = planar(zoo.AXES), planar(("rz", "x", "y"))
+def test_planar_robot_with_six_freedoms_is_solved_and_reported_as_redundant():
+    whole, flat = build_planar_3rrr(zoo.AXES), build_planar_3rrr(("rz", "x", "y"))
     assert flat.findings == ()
     (finding,) = whole.findings
     assert finding.code == "mechanism.repeated-equations"
@@ -169,7 +169,7 @@ def test_a_planar_machine_with_all_six_freedoms_is_solved_like_one_with_three_an
     found = found.take(found.converged)
     assert len(found.q) > 200
     again = forward(whole, found.q)
-    # the determinant of closure that is not square has no sign: it once told rows apart at random
+    # the closure matrix is not square, so its determinant must not select a mode by its sign
     assert again.converged.all()
     assert_allclose(again.T, found.T, atol=1e-11)
     assert (again.state.closure_sign == 0).all()
@@ -179,17 +179,17 @@ def test_a_planar_machine_with_all_six_freedoms_is_solved_like_one_with_three_an
     assert (modes[0].solution.state.closure_sign == 0).all()
 
 
-def test_equations_that_repeat_others_are_told_where_no_choice_of_freedoms_leaves_them_out():
+def test_redundant_equations_are_reported_when_no_freedoms_avoid_them():
     turned = zoo.place((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
-    whole = planar(zoo.AXES)
-    assembly = zoo.relocated(whole.assembly, turned)
+    whole = build_planar_3rrr(zoo.AXES)
+    assembly = zoo.move_base(whole.assembly, turned)
     robot = build(replace(assembly, parameters=(), maps=(), controlled=("x", "y", "yaw")))
     (finding,) = robot.findings
     assert finding.code == "mechanism.repeated-equations"
     assert finding.data == {"count": 6, "freedoms": ()}
 
 
-def spherical():
+def build_spherical_3rrr():
     """Spherical 3-RRR, every frame at the origin: axes 60 degrees apart along each arm."""
     limbs = []
     for i in range(3):
@@ -212,11 +212,11 @@ def spherical():
             Limb(f"arm{i + 1}", (*links, Link("hand", np.eye(4))), joints, "rigid", Link("on", tip))
         )
     freedoms, wanted = ("rx", "ry", "rz"), ("roll", "pitch", "yaw")
-    return build(zoo.assembled("wrist", tuple(limbs), freedoms, wanted, np.eye(4)))
+    return build(zoo.assemble("wrist", tuple(limbs), freedoms, wanted, np.eye(4)))
 
 
-def test_a_spherical_machine_without_any_length_has_the_size_of_a_metre():
-    robot = spherical()
+def test_spherical_robot_without_lengths_has_a_size_of_one_meter():
+    robot = build_spherical_3rrr()
     assert robot.size == 1.0
     asked = np.random.default_rng(1).uniform(-0.2, 0.2, (50, 3))
     found = inverse(robot, asked)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inverse and forward kinematics over whole workspaces: closed, back where they came from, and
-never an exception.
+"""Inverse and forward kinematics over whole workspaces: closure, round trips, marked failures
+instead of exceptions.
 """
 
 from typing import Any
@@ -18,11 +18,11 @@ from loopcal.mechanism import Status, build, forward, forward_trials, inverse, j
 from tests import zoo
 from tests.engine.cases import driven, spread
 
-ALL = ["menagerie", "three_prs", "hexapod", "nategh", "delta", "five_bar", "planar_rrr"]
-BOXES = {
+ROBOT_NAMES = ["mixed_hexapod", "three_prs", "hexapod", "nategh", "delta", "five_bar", "planar_rrr"]
+WORKSPACES = {
     "hexapod": ([-0.04, -0.04, 0.17, -0.24, -0.24, -0.24], [0.04, 0.04, 0.23, 0.24, 0.24, 0.24]),
     "nategh": ([-0.1, -0.1, 0.65, -0.2, -0.2, -0.2], [0.1, 0.1, 0.95, 0.2, 0.2, 0.2]),
-    "menagerie": (
+    "mixed_hexapod": (
         [0.007, -0.023, 0.247, 0.03, -0.10, 0.08],
         [0.013, -0.017, 0.253, 0.07, -0.06, 0.12],
     ),
@@ -33,25 +33,23 @@ BOXES = {
 }
 
 
-def sampled(name, n, seed=7):
-    """A robot and n solutions of its inverse kinematics all over its workspace, those within the
-    strokes.
-    """
-    robot, (low, high) = getattr(zoo, name)(), BOXES[name]
+def sample_inverse(name, n, seed=7):
+    """Return a robot, n inverse solutions across its workspace, and which are within strokes."""
+    robot, (low, high) = getattr(zoo, name)(), WORKSPACES[name]
     sol = inverse(robot, np.random.default_rng(seed).uniform(low, high, (n, len(low))))
     strokes = np.array([a.stroke or (-np.inf, np.inf) for a in robot.actuators]).T
     inside = ((sol.q >= strokes[0]) & (sol.q <= strokes[1])).all(axis=1)
     return robot, sol, inside
 
 
-def gap_of(robot, T, reference):
-    """Distance of poses as a fraction of the robot's size, a rotation vector counting as such (n,)."""  # noqa: E501
+def relative_pose_distance(robot, T, reference):
+    """Distance of poses (n,): position in sizes of the robot, rotation in radians."""
     return np.linalg.norm(
         geometry.pose_difference(T, reference) / np.array([1.0] * 3 + [robot.size] * 3), axis=1
     )
 
 
-def condition(robot, state):
+def closure_condition(robot, state):
     """Condition of the closure's Jacobian, rows in the size of the robot, columns per radian and
     per size (n,).
     """
@@ -63,32 +61,36 @@ def condition(robot, state):
     )
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_forward_leads_back_to_within_rounding_times_the_condition(name):
-    robot, sol, _ = sampled(name, 500)
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_forward_after_inverse_is_exact_to_rounding_times_the_condition(name):
+    robot, sol, _ = sample_inverse(name, 500)
     assert_array_equal(sol.status, Status.CONVERGED)
     assert sol.residual.max() <= 1e-13 * robot.size
     back = forward(robot, sol.q)
     assert_array_equal(back.status, Status.CONVERGED)
     assert back.residual.max() <= 1e-13 * robot.size
-    assert (gap_of(robot, back.T, sol.T) <= 1e-14 * condition(robot, sol.state)).all()
+    assert (
+        relative_pose_distance(robot, back.T, sol.T) <= 1e-14 * closure_condition(robot, sol.state)
+    ).all()
 
 
 @pytest.mark.parametrize("name", ["delta"])
-def test_forward_started_from_an_inverse_solution_stays_in_its_mode(name):
-    robot, sol, _ = sampled(name, 20)
+def test_forward_started_from_an_inverse_solution_keeps_its_mode(name):
+    robot, sol, _ = sample_inverse(name, 20)
     assert_array_equal(forward(robot, sol.q, start=sol).status, Status.CONVERGED)
 
 
 @pytest.mark.parametrize("name", ["hexapod", "delta"])
-def test_a_hundred_thousand_rows_from_home_come_back_or_say_that_they_are_in_another_mode(name):
-    robot, sol, inside = sampled(name, 100_000)
+def test_rows_solved_from_home_return_or_are_marked_as_another_mode(name):
+    robot, sol, inside = sample_inverse(name, 100_000)
     assert_array_equal(sol.status, Status.CONVERGED)
     assert inside.mean() > 0.5
     target, back = sol.T[inside], forward(robot, sol.q[inside])
     assert np.isin(back.status, (Status.CONVERGED, Status.OTHER_MODE)).all()
     assert back.residual.max() <= 1e-13 * robot.size
-    home = (back.status == Status.CONVERGED) & (gap_of(robot, back.T, target) < 1e-9)
+    home = (back.status == Status.CONVERGED) & (
+        relative_pose_distance(robot, back.T, target) < 1e-9
+    )
     assert home.mean() >= 0.999
     # the rest are true solutions of the same readings in another mode: their inverse gives the
     # readings back
@@ -97,18 +99,18 @@ def test_a_hundred_thousand_rows_from_home_come_back_or_say_that_they_are_in_ano
         assert_allclose(again.q, sol.q[inside][~home], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["menagerie", "three_prs", "nategh", "five_bar", "planar_rrr"])
-def test_thousands_of_rows_from_home_come_back(name):
-    robot, sol, _ = sampled(name, 3000)
+@pytest.mark.parametrize("name", ["mixed_hexapod", "three_prs", "nategh", "five_bar", "planar_rrr"])
+def test_rows_solved_from_home_return(name):
+    robot, sol, _ = sample_inverse(name, 3000)
     back = forward(robot, sol.q)
-    home = (back.status == Status.CONVERGED) & (gap_of(robot, back.T, sol.T) < 1e-9)
+    home = (back.status == Status.CONVERGED) & (relative_pose_distance(robot, back.T, sol.T) < 1e-9)
     assert home.mean() >= 0.999
     closed = np.isin(back.status, (Status.CONVERGED, Status.OTHER_MODE))
     assert (back.residual[closed] <= 1e-13 * robot.size).all()
 
 
 @pytest.mark.parametrize("name", ["hexapod", "delta"])
-def test_any_readings_within_the_strokes_close_or_are_marked(name):
+def test_random_readings_within_the_strokes_close_or_are_marked(name):
     robot = getattr(zoo, name)()
     stroke = np.array([a.stroke for a in robot.actuators]).T
     sol = forward(
@@ -119,7 +121,7 @@ def test_any_readings_within_the_strokes_close_or_are_marked(name):
     assert (sol.residual[sol.status == Status.UNREACHABLE] > 1e-9 * robot.size).all()
 
 
-def test_unreachable_and_broken_rows_are_marked_and_the_others_untouched():
+def test_unreachable_and_nan_rows_are_marked_and_do_not_change_other_rows():
     robot = zoo.hexapod()
     q = np.zeros((5, 6))
     q[1, 0], q[2, 3], q[3, 0], q[4] = 2.0, np.nan, np.inf, 0.01
@@ -137,11 +139,11 @@ def test_unreachable_and_broken_rows_are_marked_and_the_others_untouched():
     assert_array_equal(inverse(robot, np.full((1, 4, 4), np.nan)).status, Status.NOT_FINITE)
 
 
-def test_every_status_has_its_entry_in_the_catalog():
+def test_every_kinematics_status_is_in_the_catalog_of_findings():
     assert all(status.code in load_catalog() for status in Status)
 
 
-def test_wrong_shapes_are_one_clear_sentence():
+def test_wrong_shapes_of_readings_and_targets_are_refused():
     with pytest.raises(
         DataError, match=r"5 readings a row were given, but hexapod has 6 actuators \(q1, q2"
     ):
@@ -153,27 +155,27 @@ def test_wrong_shapes_are_one_clear_sentence():
         inverse(zoo.delta(), np.zeros((2, 5)))
 
 
-def test_a_start_chooses_the_mode():
+def test_start_selects_the_assembly_mode():
     robot = zoo.delta()
     sol = forward(robot, np.full((1, 3), 0.2))
     upper = np.array(sol.T)
     upper[0, 2, 3] += 0.6
-    mirrored = forward(robot, np.full((1, 3), 0.2), start=inverse_from(robot, sol, upper))
+    mirrored = forward(robot, np.full((1, 3), 0.2), start=move_solution(robot, sol, upper))
     assert mirrored.T[0, 2, 3] > sol.T[0, 2, 3] + 0.3
     assert mirrored.status[0] == Status.CONVERGED
 
 
-def inverse_from(robot, sol, T):
-    """The solution with its platform put elsewhere and the orientation of the mirrored mode."""
+def move_solution(robot, sol, T):
+    """Move the platform of a solution and reverse its closure sign."""
     from dataclasses import replace
 
     state = replace(sol.state, T=T[None], closure_sign=-sol.state.closure_sign)
     return replace(sol, T=T, state=state)
 
 
-@pytest.mark.parametrize("name", ["hexapod", "menagerie", "delta"])
-def test_seven_trials_in_one_call_equal_seven_calls_bit_for_bit(name):
-    robot, sol, _ = sampled(name, 20)
+@pytest.mark.parametrize("name", ["hexapod", "mixed_hexapod", "delta"])
+def test_trials_in_one_call_equal_single_calls_bit_for_bit(name):
+    robot, sol, _ = sample_inverse(name, 20)
     values = robot.values + np.random.default_rng(1).normal(size=(7, len(robot.parameters))) * 1e-4
     together = forward_trials(robot, values, sol.q[None])
     for i in range(7):
@@ -184,8 +186,8 @@ def test_seven_trials_in_one_call_equal_seven_calls_bit_for_bit(name):
         assert_array_equal(together.T[i], one.T)
 
 
-def test_the_order_of_rows_does_not_matter_bit_for_bit():
-    robot, sol, _ = sampled("three_prs", 20)
+def test_row_order_does_not_change_results_bit_for_bit():
+    robot, sol, _ = sample_inverse("three_prs", 20)
     order = np.random.default_rng(2).permutation(20)
     assert_array_equal(forward(robot, sol.q).T[order], forward(robot, sol.q[order]).T)
 
@@ -194,28 +196,28 @@ coordinate = st.floats(0.0, 1.0)
 
 
 @pytest.mark.parametrize(
-    "name", ["menagerie", "three_prs", "hexapod", "delta", "five_bar", "planar_rrr"]
+    "name", ["mixed_hexapod", "three_prs", "hexapod", "delta", "five_bar", "planar_rrr"]
 )
 def test_forward_after_inverse_is_the_identity(name):
-    robot, (low, high) = getattr(zoo, name)(), (np.array(side) for side in BOXES[name])
+    robot, (low, high) = getattr(zoo, name)(), (np.array(side) for side in WORKSPACES[name])
 
     @settings(max_examples=25)
     @given(st.lists(coordinate, min_size=len(low), max_size=len(low)))
-    def holds(part):
+    def check(part):
         sol = inverse(robot, low + np.array(part) * (high - low))
         assert_allclose(geometry.pose_difference(forward(robot, sol.q).T, sol.T), 0.0, atol=1e-12)
 
-    holds()
+    check()
 
 
 @settings(max_examples=20)
 @given(st.floats(0.01, 100.0))
-def test_units_scale_out(s):
-    small = build(zoo.scaled(zoo.menagerie_assembly(), s))
-    assert_allclose(small.size, s * zoo.menagerie().size, rtol=1e-12)
+def test_poses_scale_with_the_unit_of_length(s):
+    small = build(zoo.scale_lengths(zoo.mixed_hexapod_assembly(), s))
+    assert_allclose(small.size, s * zoo.mixed_hexapod().size, rtol=1e-12)
     lengths = np.array([s if a.dimension.value == "length" else 1.0 for a in small.actuators])
-    q = inverse(zoo.menagerie(), zoo.menagerie().home[None]).q + 0.002
-    one, other = forward(zoo.menagerie(), q), forward(small, q * lengths)
+    q = inverse(zoo.mixed_hexapod(), zoo.mixed_hexapod().home[None]).q + 0.002
+    one, other = forward(zoo.mixed_hexapod(), q), forward(small, q * lengths)
     assert one.status[0] == other.status[0] == Status.CONVERGED
     assert_allclose(other.T[0, :3, :3], one.T[0, :3, :3], atol=1e-12)
     assert_allclose(other.T[0, :3, 3] / s, one.T[0, :3, 3], atol=1e-12)
@@ -223,12 +225,12 @@ def test_units_scale_out(s):
 
 @settings(max_examples=20)
 @given(st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6))
-def test_readings_do_not_depend_on_where_the_base_stands(twist):
+def test_readings_do_not_depend_on_the_pose_of_the_base(twist):
     G = geometry.apply_twist(np.eye(4), np.array(twist))
-    here, there = zoo.hexapod(), build(zoo.relocated(zoo.hexapod().assembly, G))
-    _, sol, _ = sampled("hexapod", 5)
-    assert_allclose(inverse(there, G @ sol.T).q, sol.q, atol=1e-14)
-    assert_allclose(forward(there, sol.q).T, G @ forward(here, sol.q).T, atol=1e-12)
+    original, moved = zoo.hexapod(), build(zoo.move_base(zoo.hexapod().assembly, G))
+    _, sol, _ = sample_inverse("hexapod", 5)
+    assert_allclose(inverse(moved, G @ sol.T).q, sol.q, atol=1e-14)
+    assert_allclose(forward(moved, sol.q).T, G @ forward(original, sol.q).T, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -240,7 +242,7 @@ def test_readings_do_not_depend_on_where_the_base_stands(twist):
         (np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0.2, 1]]), "last row"),
     ],
 )
-def test_a_matrix_that_is_no_pose_is_refused(matrix, words):
+def test_matrix_that_is_not_a_pose_is_refused(matrix, words):
     with pytest.raises(DataError, match=words):
         inverse(zoo.hexapod(), matrix[None])
 
@@ -257,12 +259,12 @@ NO_ROBOT: Any = "hexapod"
         (lambda robot: forward(robot, np.zeros(6), start=NO_ROBOT), "Solution"),
     ],
 )
-def test_an_argument_of_a_wrong_type_is_refused_with_what_to_pass(call, words):
+def test_argument_of_a_wrong_type_is_refused_with_the_expected_type(call, words):
     with pytest.raises(ArgumentTypeError, match=words):
         call(zoo.hexapod())
 
 
-def test_the_jacobian_is_labelled_and_is_the_derivative_of_the_poses():
+def test_jacobian_has_labels_and_is_the_derivative_of_the_poses():
     robot = zoo.hexapod()
     q = np.array([[0.01, -0.02, 0.0, 0.015, 0.0, 0.01], [0.0, 0.01, 0.0, 0.0, -0.01, 0.0]])
     found = jacobian(robot, q)
@@ -280,7 +282,7 @@ def test_the_jacobian_is_labelled_and_is_the_derivative_of_the_poses():
         found.of("leg9")
 
 
-def test_robots_and_results_print_on_a_screen():
+def test_repr_of_robots_and_results_is_short():
     robot = zoo.hexapod()
     solution = forward(robot, np.zeros((3, 6)))
     for text in (repr(robot), repr(solution), repr(jacobian(robot, np.zeros((3, 6))))):

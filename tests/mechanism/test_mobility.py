@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mechanisms that cannot work are refused when they are built, each with one sentence that says
-what to mend.
-"""
+"""Mechanisms that cannot work are refused when they are built, with the correction to make."""
 
 from dataclasses import replace
 
@@ -15,26 +13,26 @@ from loopcal.units import Dimension
 from tests import zoo
 
 
-def bare(assembly, **changes):
-    """The assembly without parameters, changed."""
+def strip_parameters(assembly, **changes):
+    """Return the assembly without parameters and with these changes."""
     return replace(assembly, parameters=(), maps=(), shared=(), **changes)
 
 
-HEXAPOD = bare(zoo.hexapod().assembly)
-PRS = bare(zoo.three_prs().assembly)
+HEXAPOD = strip_parameters(zoo.hexapod().assembly)
+PRS = strip_parameters(zoo.three_prs().assembly)
 
 
-def with_limb(assembly, i, **changes):
+def change_limb(assembly, i, **changes):
     limbs = list(assembly.limbs)
     limbs[i] = replace(limbs[i], **changes)
     return replace(assembly, limbs=tuple(limbs))
 
 
-def five_legs():
+def make_five_legs():
     return replace(HEXAPOD, limbs=HEXAPOD.limbs[:5], actuators=HEXAPOD.actuators[:5])
 
 
-def a_rod_too_many():
+def add_fixed_rod():
     """Six driven legs and a seventh rod of fixed length."""
     rod = replace(
         HEXAPOD.limbs[0], name="rod", actuator=None, attachment=HEXAPOD.limbs[3].attachment
@@ -43,8 +41,8 @@ def a_rod_too_many():
     return replace(HEXAPOD, limbs=(*HEXAPOD.limbs, replace(rod, length=float(np.linalg.norm(gap)))))
 
 
-def regular():
-    """Platform similar to the base and not turned: the singular hexapod."""
+def make_singular_hexapod():
+    """Return a hexapod whose platform is similar and parallel to the base: it is singular."""
     base = zoo.HEXAPOD_BASE * zoo.MM
     limbs = tuple(
         replace(
@@ -57,24 +55,24 @@ def regular():
     return replace(HEXAPOD, limbs=limbs)
 
 
-WRONG = {
+INVALID_ASSEMBLIES = {
     "five legs": (
-        five_legs,
+        make_five_legs,
         (
             r"hexapod: at home the platform can still move with every actuator locked "
             r"\((rotation|translation) .*5 of 6 freedoms"
         ),
     ),
-    "similar base and platform": (regular, r"at home the platform can still move"),
+    "similar base and platform": (make_singular_hexapod, r"at home the platform can still move"),
     "a rod too many": (
-        a_rod_too_many,
+        add_fixed_rod,
         r"hexapod is over-constrained: it has 6 actuators, but .* only 5 of 6 freedoms",
     ),
     "a coordinate too few": (
         lambda: replace(PRS, controlled=("z",)),
         r"3-PRS can be moved in 3 freedoms or more, but names only 1 controlled coordinates",
     ),
-    "a coordinate nobody moves": (
+    "a coordinate that cannot be controlled": (
         lambda: replace(PRS, controlled=("z", "x", "psi")),
         r"cannot be set independently at home",
     ),
@@ -87,15 +85,15 @@ WRONG = {
         r"'w' is not a freedom of a platform; allowed are rx, ry",
     ),
     "an unknown ending": (
-        lambda: with_limb(PRS, 0, ending="magnet"),
+        lambda: change_limb(PRS, 0, ending="magnet"),
         r"limb 'limb1' ends in 'magnet'; allowed endings are rigid, ball, distance",
     ),
     "a link too few": (
-        lambda: with_limb(PRS, 0, links=PRS.limbs[0].links[:2]),
+        lambda: change_limb(PRS, 0, links=PRS.limbs[0].links[:2]),
         r"limb 'limb1' has 2 joints and 2 links; give one link more than joints",
     ),
     "two limbs of one name": (
-        lambda: with_limb(PRS, 1, name="limb1"),
+        lambda: change_limb(PRS, 1, name="limb1"),
         r"two limbs are called 'limb1'; give each its own name",
     ),
     "an actuator twice": (
@@ -108,8 +106,8 @@ WRONG = {
         ),
         r"actuator 'spare' drives 0 joints; let it drive one",
     ),
-    "a joint driven by nobody": (
-        lambda: with_limb(HEXAPOD, 2, actuator="q9"),
+    "a joint with an unknown actuator": (
+        lambda: change_limb(HEXAPOD, 2, actuator="q9"),
         r"(actuator 'q3' drives 0 joints|driven by 'q9')",
     ),
     "an actuator that is not listed": (
@@ -118,7 +116,7 @@ WRONG = {
     ),
     "legs that are too short": (
         lambda: replace(
-            with_limb(HEXAPOD, 0, actuator=None, length=0.01),
+            change_limb(HEXAPOD, 0, actuator=None, length=0.01),
             actuators=HEXAPOD.actuators[1:],
             controlled=("x", "y", "z", "phi", "theta"),
         ),
@@ -127,15 +125,15 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_what_cannot_work_is_refused_in_one_sentence(case):
-    make, sentence = WRONG[case]
+@pytest.mark.parametrize("case", INVALID_ASSEMBLIES)
+def test_invalid_mechanism_is_refused_in_one_sentence(case):
+    make, sentence = INVALID_ASSEMBLIES[case]
     with pytest.raises(MechanismError, match=sentence) as error:
         build(make())
     assert "\n" not in str(error.value)
 
 
-def test_a_parameter_mapped_onto_nothing_is_refused():
+def test_parameter_with_an_unknown_address_is_refused():
     parameter = Parameter("a", Dimension.LENGTH, 0.0)
     for address in (
         Address("leg1", "knee", "x"),
@@ -150,12 +148,12 @@ def test_a_parameter_mapped_onto_nothing_is_refused():
             build(wrong)
 
 
-def test_a_serial_arm_alone_is_a_mechanism_too():
+def test_serial_arm_is_a_valid_mechanism():
     limb = Limb(
         "arm", (Link("base", np.eye(4)), Link("upper", zoo.place((0.3, 0, 0))), Link("lower", zoo.place((0.2, 0, 0)))),  # noqa: E501
         (Joint("a", "R", "q1", start=0.3), Joint("b", "R", "q2", start=0.8)), "ball", Link("hand", np.eye(4)),  # noqa: E501
     )  # fmt: skip
     robot = build(
-        zoo.assembled("arm", (limb,), ("x", "y"), ("x", "y"), zoo.place((0.35, 0.25, 0.0)))
+        zoo.assemble("arm", (limb,), ("x", "y"), ("x", "y"), zoo.place((0.35, 0.25, 0.0)))
     )
     assert robot.home_state.status[0, 0] == 0

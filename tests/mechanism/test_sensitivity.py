@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How poses follow parameters and readings: derivatives, their batch, and what can be known of 42
-and 33 parameters.
+"""Derivatives of poses by parameters and readings: values, batches, and ranks with 42 and 33
+parameters.
 """
 
 from dataclasses import replace
@@ -15,12 +15,12 @@ from loopcal.parameters import Parameter
 from loopcal.units import Dimension
 from tests import zoo
 from tests.jacobians import check_jacobian
-from tests.mechanism.test_kinematics import sampled
+from tests.mechanism.test_kinematics import sample_inverse
 
 RANK = 1e-10  # relative; the smallest true singular values are above 1e-6, null ones below 1e-13
 
 
-def hexapod_legs(jnp, values, q, T, twist):
+def hexapod_closure(jnp, values, q, T, twist):
     """Plain closure of a hexapod (6,): |t + R p - b| - length - reading."""
     legs = values.reshape(6, 7)
     w = twist[:3]
@@ -30,7 +30,7 @@ def hexapod_legs(jnp, values, q, T, twist):
     return jnp.sqrt((gap**2).sum(axis=1)) - legs[:, 6] - q
 
 
-def delta_arms(jnp, values, q, T, twist):
+def delta_closure(jnp, values, q, T, twist):
     """Plain closure of a linear delta (3,): distance of the nozzle from each carriage, less the
     arm.
     """
@@ -43,14 +43,14 @@ def delta_arms(jnp, values, q, T, twist):
     return jnp.sqrt(((T[:3, 3] + twist[3:] - carriage) ** 2).sum(axis=1)) - arm
 
 
-def noisy(robot, size=2e-4, seed=1, t=1):
+def perturb_values(robot, size=2e-4, seed=1, t=1):
     return robot.values + np.random.default_rng(seed).normal(size=(t, len(robot.parameters))) * size
 
 
-@pytest.mark.parametrize(("name", "legs"), [("hexapod", hexapod_legs), ("delta", delta_arms)])
-def test_sensitivity_of_the_families_agrees_with_differences_and_jax(name, legs, jax):
-    robot, sol, _ = sampled(name, 4)
-    values, q = noisy(robot), sol.q[None]
+@pytest.mark.parametrize(("name", "legs"), [("hexapod", hexapod_closure), ("delta", delta_closure)])
+def test_pose_derivatives_of_families_agree_with_differences_and_jax(name, legs, jax):
+    robot, sol, _ = sample_inverse(name, 4)
+    values, q = perturb_values(robot), sol.q[None]
     state = forward_trials(robot, values, q)
     found = differentiate_pose(robot, values, q, state)
     free = list(robot.program.freedoms)
@@ -85,9 +85,9 @@ def test_sensitivity_of_the_families_agrees_with_differences_and_jax(name, legs,
         assert_allclose(both[row][free], -np.linalg.solve(F, G), atol=1e-11)
 
 
-@pytest.mark.parametrize("name", ["menagerie", "three_prs", "five_bar", "planar_rrr"])
-def test_sensitivity_of_any_mechanism_agrees_with_differences(name):
-    robot, sol, _ = sampled(name, 1)
+@pytest.mark.parametrize("name", ["mixed_hexapod", "three_prs", "five_bar", "planar_rrr"])
+def test_pose_derivatives_of_any_mechanism_agree_with_differences(name):
+    robot, sol, _ = sample_inverse(name, 1)
     values, q = robot.values[None], sol.q[None]
     state = forward_trials(robot, values, q, start=sol.state)
     found = differentiate_pose(robot, values, q, state)
@@ -105,10 +105,10 @@ def test_sensitivity_of_any_mechanism_agrees_with_differences(name):
     )  # fmt: skip
 
 
-def test_transmission_terms_enter_the_pose_with_their_slopes():
-    robot = with_harmonics(zoo.hexapod())
-    _, sol, _ = sampled("hexapod", 3)
-    values, q = noisy(robot, 1e-4), sol.q[None]
+def test_pose_derivatives_by_transmission_terms_agree_with_differences():
+    robot = add_harmonics(zoo.hexapod())
+    _, sol, _ = sample_inverse("hexapod", 3)
+    values, q = perturb_values(robot, 1e-4), sol.q[None]
     state = forward_trials(robot, values, q)
     found = differentiate_pose(robot, values, q, state)
     both = np.concatenate([found.parameters[0][..., 42:], found.readings[0]], axis=-1)
@@ -130,7 +130,7 @@ def test_transmission_terms_enter_the_pose_with_their_slopes():
     )
 
 
-def with_harmonics(robot):
+def add_harmonics(robot):
     """The same robot whose first two actuators have every transmission term as a parameter, on a 5
     mm screw.
     """
@@ -154,9 +154,9 @@ def with_harmonics(robot):
     )
 
 
-def test_trials_agree_with_single_calls_up_to_the_rounding_of_numpy_matmul():
-    robot, sol, _ = sampled("three_prs", 6)
-    values, q = noisy(robot, 1e-4, t=7), sol.q[None]
+def test_pose_derivatives_of_stacked_trials_equal_single_trials_to_rounding():
+    robot, sol, _ = sample_inverse("three_prs", 6)
+    values, q = perturb_values(robot, 1e-4, t=7), sol.q[None]
     state = forward_trials(robot, values, q)
     together = differentiate_pose(robot, values, q, state)
     for i in range(7):
@@ -167,7 +167,7 @@ def test_trials_agree_with_single_calls_up_to_the_rounding_of_numpy_matmul():
         assert_array_equal(together.readings[i], alone.readings[0])
 
 
-def test_failed_rows_hold_no_numbers_and_do_not_stop_the_others():
+def test_failed_rows_have_nan_derivatives_and_do_not_change_other_rows():
     robot, q = zoo.hexapod(), np.zeros((1, 3, 6))
     q[0, 1, 2] = np.nan
     values = robot.values[None]
@@ -176,17 +176,17 @@ def test_failed_rows_hold_no_numbers_and_do_not_stop_the_others():
     assert np.isfinite(found.parameters[0, [0, 2]]).all()
 
 
-# --- what can be known: frames that are not known are six extra columns each
+# --- identifiability: an unknown frame is six additional columns
 # -----------------------------------------
 
 
-def scaled_matrix(name, n=40):
+def scaled_sensitivities(name, n=40):
     """Sensitivities of n poses, angles in sizes of the robot; columns for the unknown base and tool
     frame beside them.
     """
-    robot, sol, _ = sampled(name, n)
-    state = forward_trials(robot, noisy(robot, 1e-4), sol.q[None], start=sol.state)
-    D = differentiate_pose(robot, noisy(robot, 1e-4), sol.q[None], state).parameters[0]
+    robot, sol, _ = sample_inverse(name, n)
+    state = forward_trials(robot, perturb_values(robot, 1e-4), sol.q[None], start=sol.state)
+    D = differentiate_pose(robot, perturb_values(robot, 1e-4), sol.q[None], state).parameters[0]
     T, eye, zero = state.T[0], np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3, 3))
     base = np.concatenate(
         [
@@ -206,7 +206,7 @@ def scaled_matrix(name, n=40):
     return D * rows * columns / robot.size, base * rows / robot.size, tool * rows / robot.size, T
 
 
-def rank_beside(matrix, *unknown):
+def rank_without(matrix, *unknown):
     """Rank of the parameters once the unknown columns are projected out, and all singular values."""  # noqa: E501
     flat = matrix.reshape(-1, matrix.shape[-1])
     if unknown:
@@ -217,8 +217,8 @@ def rank_beside(matrix, *unknown):
 
 
 @pytest.mark.parametrize(("name", "count"), [("hexapod", 42), ("nategh", 42), ("three_prs", 33)])
-def test_each_unknown_frame_costs_six_parameters(name, count):
-    D, base, tool, _ = scaled_matrix(name)
+def test_each_unknown_frame_lowers_the_rank_by_six(name, count):
+    D, base, tool, _ = scaled_sensitivities(name)
     assert D.shape[-1] == count
     for unknown, rank in (
         ((), count),
@@ -226,17 +226,17 @@ def test_each_unknown_frame_costs_six_parameters(name, count):
         ((tool,), count - 6),
         ((base, tool), count - 12),
     ):
-        found, s = rank_beside(D, *unknown)
+        found, s = rank_without(D, *unknown)
         assert found == rank
         assert (s[rank:] < 1e-13).all()  # null to rounding; from J'J it would be 1e-7
         assert s[rank - 1] > 1e-7
 
 
 @pytest.mark.parametrize(("name", "count"), [("hexapod", 42), ("three_prs", 33)])
-def test_torsion_costs_one_parameter_and_orientation_three(name, count):
-    D, _, _, T = scaled_matrix(name)
+def test_rank_drops_by_one_without_torsion_and_by_three_without_orientation(name, count):
+    D, _, _, T = scaled_sensitivities(name)
     normal = T[:, :3, 2]
     across = np.linalg.svd(normal[:, None, :])[2][:, 1:]
     tilt = np.einsum("nij,njp->nip", across, D[:, :3])
-    assert rank_beside(np.concatenate([tilt, D[:, 3:]], axis=1))[0] == count - 1
-    assert rank_beside(D[:, 3:])[0] == count - 3
+    assert rank_without(np.concatenate([tilt, D[:, 3:]], axis=1))[0] == count - 1
+    assert rank_without(D[:, 3:])[0] == count - 3

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Distance from singularities: against closed forms, in words, and along paths that meet them."""
+"""Distance from singularities: closed forms, findings, and paths through singularities."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from loopcal.mechanism import (
 from tests import zoo
 
 
-def test_the_margin_of_a_hexapod_is_that_of_its_plucker_lines():
+def test_singularity_margin_of_a_hexapod_is_that_of_its_plucker_lines():
     robot, T = zoo.hexapod(), zoo.nategh_poses(np.random.default_rng(0), 5)
     T[:, 2, 3] -= 0.6
     found = analyze_singularity(robot, T)
@@ -36,7 +36,7 @@ def test_the_margin_of_a_hexapod_is_that_of_its_plucker_lines():
     )  # a rod pushes along itself, whatever the pose
 
 
-def test_a_hexapod_turned_by_a_right_angle_can_turn_freely():
+def test_hexapod_rotated_by_90_degrees_is_singular():
     # Fichter's singularity: a symmetric platform turned by 90 degrees about its normal
     found = analyze_singularity(
         zoo.hexapod(),
@@ -48,7 +48,7 @@ def test_a_hexapod_turned_by_a_right_angle_can_turn_freely():
     assert found.explain(0).code == "singularity.distance"
 
 
-def test_a_path_through_a_singularity_warns_once_near_it_and_where_the_sign_changes():
+def test_path_through_a_singularity_warns_near_it_and_at_the_sign_change():
     robot = load_robot("hexapod-42")
     path = np.zeros((41, 6))
     path[:, 2], path[:, 5] = 0.2, np.linspace(0.0, 2.0, 41)
@@ -63,7 +63,7 @@ def test_a_path_through_a_singularity_warns_once_near_it_and_where_the_sign_chan
     assert not trace_singularity(robot, coordinates=path[:20]).warnings
 
 
-def test_a_path_that_cannot_go_on_says_where():
+def test_unreachable_step_of_a_path_is_reported():
     robot = zoo.delta()
     path = np.zeros((12, 3))
     path[:, 2], path[:, 0] = 0.1, np.linspace(0.0, 0.6, 12)
@@ -73,7 +73,7 @@ def test_a_path_that_cannot_go_on_says_where():
     assert (lost, "singularity.path-not-reached") in warnings
 
 
-def test_readings_and_coordinates_of_one_path_agree():
+def test_margins_of_a_path_agree_for_readings_and_coordinates():
     robot = zoo.planar_rrr()
     path = np.linspace(0.0, 1.0, 10)[:, None] * np.array([0.02, 0.01, 0.1])
     there = trace_singularity(robot, coordinates=path, medians=(1.0, 1.0))
@@ -82,7 +82,7 @@ def test_readings_and_coordinates_of_one_path_agree():
     assert (again.closure_sign == there.closure_sign).all()
 
 
-def test_an_outstretched_crank_moves_nothing():
+def test_outstretched_crank_is_reported_as_a_weak_actuator():
     # crank of 0.2 m and rod of 0.3 m in one line: the drive's row of closure vanishes
     robot = load_robot("five-bar")
     reach = 0.4999 * np.array([np.cos(1.0), np.sin(1.0)]) + [-0.075, 0.0]
@@ -92,14 +92,14 @@ def test_an_outstretched_crank_moves_nothing():
     assert found.explain(0).data["actuator"] == "left"
 
 
-def test_without_a_workspace_home_is_the_measure():
+def test_median_margin_without_a_workspace_is_that_of_home():
     robot = zoo.planar_rrr()
     assert compute_median_margins(robot)[0] == pytest.approx(
         analyze_singularity(robot, robot.home[None], (1.0, 1.0)).margin[0], abs=1e-12
     )
 
 
-def test_redundant_drives_have_a_margin_and_no_sign():
+def test_redundant_actuators_have_a_margin_but_no_closure_sign():
     found = analyze_singularity(load_robot("cable-4"), load_robot("cable-4").home[None])
     assert found.margin[0] > 0.5
     assert found.closure_sign[0] == 0
@@ -108,6 +108,6 @@ def test_redundant_drives_have_a_margin_and_no_sign():
 @pytest.mark.parametrize(
     "given", [{}, {"readings": np.zeros((2, 6)), "coordinates": np.zeros((2, 6))}]
 )
-def test_a_path_is_readings_or_coordinates(given):
+def test_path_with_both_or_neither_of_readings_and_coordinates_is_refused(given):
     with pytest.raises(DataError, match="not both or neither"):
         trace_singularity(zoo.hexapod(), **given)

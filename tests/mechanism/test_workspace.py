@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Positions drawn from a workspace: even, inside every stroke, the same for a seed; an empty
-workspace is said.
+"""Samples of a workspace: even distribution, within every stroke, reproducible by seed; an empty
+workspace is refused.
 """
 
 from dataclasses import replace
@@ -15,7 +15,7 @@ from loopcal.mechanism import build, forward, sample_workspace
 from tests import zoo
 
 
-def test_positions_are_inside_ranges_and_strokes_and_forward_leads_back():
+def test_samples_are_within_ranges_and_strokes_and_round_trip():
     robot = load_robot("hexapod-42")
     found = sample_workspace(robot, 300, seed=1)
     low, high = np.array([robot.assembly.workspace[name] for name in robot.controlled]).T
@@ -28,7 +28,7 @@ def test_positions_are_inside_ranges_and_strokes_and_forward_leads_back():
     assert all(name.startswith("stroke of q") for name in found.rejected)
 
 
-def test_a_seed_gives_the_same_positions_and_another_one_others():
+def test_seed_determines_the_samples():
     robot = zoo.delta()
     assert_array_equal(
         sample_workspace(robot, 50, seed=3).coordinates,
@@ -40,7 +40,7 @@ def test_a_seed_gives_the_same_positions_and_another_one_others():
     ).all()
 
 
-def test_tilt_is_even_over_the_cap():
+def test_sampled_tilt_is_uniform_over_the_spherical_cap():
     robot = load_robot("3-prs")
     found = sample_workspace(robot, 4000, seed=0)
     theta = found.coordinates[:, robot.controlled.index("theta")]
@@ -52,25 +52,25 @@ def test_tilt_is_even_over_the_cap():
     assert abs(np.quantile(share, 0.1) - 0.1) < 4 * np.sqrt(0.09 / 4000)
 
 
-def test_an_empty_workspace_is_said_with_its_reason():
-    robot = with_workspace({"x": (5.0, 6.0), "y": (-0.08, 0.08), "z": (0.0, 0.2)})
+def test_empty_workspace_is_refused_with_its_reason():
+    robot = build_delta_with_workspace({"x": (5.0, 6.0), "y": (-0.08, 0.08), "z": (0.0, 0.2)})
     with pytest.raises(
         MechanismError, match=r"is empty: 0 of .* reason: the loops cannot be closed"
     ):
         sample_workspace(robot, 10)
-    robot = with_workspace(
+    robot = build_delta_with_workspace(
         {"x": (-0.08, 0.08), "y": (-0.08, 0.08), "z": (0.0, 0.2)}, stroke=(0.9, 1.0)
     )
     with pytest.raises(MechanismError, match="reason: stroke of q1 is exceeded"):
         sample_workspace(robot, 10)
 
 
-def test_a_range_that_is_missing_is_named():
+def test_missing_range_of_a_workspace_is_named():
     with pytest.raises(MechanismError, match="states no workspace for y"):
-        sample_workspace(with_workspace({"x": (-0.1, 0.1), "z": (0.0, 0.1)}), 10)
+        sample_workspace(build_delta_with_workspace({"x": (-0.1, 0.1), "z": (0.0, 0.1)}), 10)
 
 
-def with_workspace(ranges, stroke=None):
+def build_delta_with_workspace(ranges, stroke=None):
     assembly = replace(zoo.delta().assembly, workspace=ranges)
     if stroke:
         assembly = replace(

@@ -143,7 +143,7 @@ def test_names_may_hold_anything(name):
 
 
 def test_a_target_that_no_pose_moves_is_named():
-    T = zoo.poses_of(np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)))
+    T = zoo.make_poses(np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)))
     kind = Position(targets=("a", "b"), places=0.1 * np.eye(3)[:2])
     noise = 1e-5 * np.random.default_rng(1).normal(size=(1, 8, 6))
     measured = kind.measure(T[None], noise)[0]
@@ -178,7 +178,7 @@ FOLLOWING = [
 @pytest.mark.parametrize("kind", FOLLOWING, ids=lambda kind: kind.name)
 def test_readings_that_never_move_are_refused_in_every_kind_that_follows_the_robot(kind):
     kind = kind.with_tool(np.eye(4))
-    T = zoo.poses_of(
+    T = zoo.make_poses(
         np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)) + np.array([0, 0, 0, 0.1, 0.1, 0.0])
     )
     noise = 1e-6 * np.random.default_rng(1).normal(size=(1, 8, len(kind.noise_columns)))
@@ -214,7 +214,7 @@ def test_poses_in_one_plane_are_told_what_they_leave_open_or_refused_in_a_senten
     found, refused = None, ""
     try:
         found = identifiability(
-            robot, simulate(robot, zoo.poses_of(flat), Instrument((sensor,)), 0)
+            robot, simulate(robot, zoo.make_poses(flat), Instrument((sensor,)), 0)
         )
     except LoopcalError as error:
         refused = str(error)
@@ -230,7 +230,7 @@ def test_poses_in_one_plane_are_told_what_they_leave_open_or_refused_in_a_senten
 
 @pytest.mark.parametrize("kind", [Plane(places=POINT), Line(places=POINT), JointSensor()])
 def test_touched_surfaces_and_joints_may_stay_where_they_are(kind):
-    T = zoo.poses_of(np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)))
+    T = zoo.make_poses(np.random.default_rng(0).uniform(-0.1, 0.1, (8, 6)))
     rows = Observations.from_sigma(kind, np.arange(8), np.zeros((8, len(kind.columns))), 1e-5)
     data = Measurements("toy", np.arange(8.0)[:, None], (rows,))
     assert check_targets_move(data, T) is None

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mechanisms of random structure, closed by construction: joints at random places about random
-axes, all at zero at home.
+"""Mechanisms of random structure, closed by construction: random joint frames and axes, all joint
+values zero at home.
 """
 
 import numpy as np
@@ -23,8 +23,7 @@ from loopcal.units import Dimension
 
 Array = NDArray[np.float64]
 PASSIVE = {"rigid": 6, "ball": 3, "distance": 1}
-"""Rows of closure; a limb with that many passive joints less c takes c freedoms from the platform.
-"""
+"""Closure equations of each ending. A limb with c passive joints fewer constrains c freedoms."""
 
 
 def random_mechanism(seed: int, limbs: int) -> Limbs:
@@ -58,7 +57,7 @@ def expected_rank(record: Limbs) -> int:
     return total
 
 
-def wander(machine: Mechanism, n: int, seed: int) -> tuple[State, Array]:
+def sample_near_home(machine: Mechanism, n: int, seed: int) -> tuple[State, Array]:
     """States (1, m) near home, at most 0.3 rad and 60 mm away in each reading, and their readings
     (1, m, a).
     """
@@ -138,5 +137,5 @@ def _point(values: Array | tuple[float, ...]) -> Point:
     return x, y, z
 
 
-def built(record: Limbs) -> Mechanism:
+def build_mechanism(record: Limbs) -> Mechanism:
     return build(record.expand())

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What poses and parameters share in the tests of families: scaled sensitivities, ranks with their
-gap, known frames.
+"""Scaled sensitivities, measured rows, unknown frames and ranks that the tests of families share.
 
 Angles count as lengths at 200 mm per radian, in rows and columns. Ranks come from the singular
-values of the stacked matrix, never from its normal equations, and a rank without a gap below it
-fails.
+values of the stacked matrix, never from its normal equations. A rank without a gap below it fails.
 """
 
 from collections.abc import Sequence
@@ -17,10 +15,10 @@ from loopcal.mechanism import Mechanism, Solution, differentiate_pose, inverse
 from loopcal.units import Dimension
 
 Array = NDArray[np.float64]
-ARM = 0.2  # [m/rad]
+METERS_PER_RADIAN = 0.2  # [m/rad]
 
 
-def coordinates(robot: Mechanism, n: int, seed: int) -> Array:
+def random_coordinates(robot: Mechanism, n: int, seed: int) -> Array:
     """Random controlled coordinates (n, c) in the workspace [m, rad]; those without a range stay
     zero.
     """
@@ -33,7 +31,7 @@ def coordinates(robot: Mechanism, n: int, seed: int) -> Array:
 
 def scaled_sensitivity(robot: Mechanism, solution: Solution) -> Array:
     """(n, 6, p) platform twist per parameter, all lengths [m / m]."""
-    return scaled(
+    return scale_angles(
         robot,
         differentiate_pose(robot, robot.values[None], solution.q[None], solution.state).parameters[
             0
@@ -41,33 +39,39 @@ def scaled_sensitivity(robot: Mechanism, solution: Solution) -> Array:
     )
 
 
-def scaled(robot: Mechanism, D: Array) -> Array:
+def scale_angles(robot: Mechanism, D: Array) -> Array:
     """A sensitivity (.., 6, p) with all angles as lengths."""
     columns = np.array(
-        [1.0 if d is Dimension.LENGTH else 1 / ARM for d in robot.parameters.dimensions]
+        [
+            1.0 if d is Dimension.LENGTH else 1 / METERS_PER_RADIAN
+            for d in robot.parameters.dimensions
+        ]
     )
-    return D * np.array([ARM] * 3 + [1.0] * 3)[:, None] * columns
+    return D * np.array([METERS_PER_RADIAN] * 3 + [1.0] * 3)[:, None] * columns
 
 
-def perturbed(robot: Mechanism, size: float, seed: int) -> Mechanism:
+def perturb(robot: Mechanism, size: float, seed: int) -> Mechanism:
     """Parameters moved at random by `size` [m], angles by size / 200 mm [rad]: no axis stays
     parallel to another.
     """
     rng = np.random.default_rng(seed)
     scale = np.array(
-        [1.0 if d is Dimension.LENGTH else 1 / ARM for d in robot.parameters.dimensions]
+        [
+            1.0 if d is Dimension.LENGTH else 1 / METERS_PER_RADIAN
+            for d in robot.parameters.dimensions
+        ]
     )
     return robot.with_values(robot.values + size * scale * rng.standard_normal(len(robot.values)))
 
 
-def solved(robot: Mechanism, n: int = 80, seed: int = 3) -> Solution:
+def solve_random_poses(robot: Mechanism, n: int = 80, seed: int = 3) -> Solution:
     """Random poses of the workspace, all closed."""
-    solution = inverse(robot, coordinates(robot, n, seed))
+    solution = inverse(robot, random_coordinates(robot, n, seed))
     assert solution.converged.all()
     return solution
 
 
-def measured(D: Array, T: Array, what: str) -> Array:
+def select_measured_rows(D: Array, T: Array, what: str) -> Array:
     """Rows of a measurement: full, positions, orientation, or 5-dof (no rotation about the
     platform's normal).
     """
@@ -90,7 +94,7 @@ def frame_columns(T: Array, base: bool, tool: bool) -> Array:
     if base:
         block = np.zeros((n, 6, 6))
         block[:, :3, :3] = np.eye(3)
-        block[:, 3:, :3] = -geometry.hat(T[:, :3, 3]) / ARM
+        block[:, 3:, :3] = -geometry.hat(T[:, :3, 3]) / METERS_PER_RADIAN
         block[:, 3:, 3:] = np.eye(3)
         found.append(block)
     if tool:
@@ -113,30 +117,32 @@ def rank(rows: Array, tolerance: float = 1e-12, gap: float = 1e3) -> int:
     return kept
 
 
-def ranks(
+def ranks_by_measurement(
     robot: Mechanism, kinds: Sequence[str], seed: int = 3, n: int = 80, **limits: float
 ) -> list[int]:
     """Ranks of several kinds of measurement, frames known."""
-    solution = solved(robot, n, seed)
+    solution = solve_random_poses(robot, n, seed)
     D = scaled_sensitivity(robot, solution)
-    return [rank(measured(D, solution.T, kind), **limits) for kind in kinds]
+    return [rank(select_measured_rows(D, solution.T, kind), **limits) for kind in kinds]
 
 
 FRAMES = ((True, False), (False, True), (True, True))
 """Unknown: base, tool, both."""
 
 
-def told_apart(
+def ranks_with_unknown_frames(
     robot: Mechanism, kind: str, frames: Sequence[tuple[bool, bool]] = FRAMES, n: int = 80
 ) -> list[int]:
     """Parameters determined beside unknown frames: rank of all columns less the rank of the frames'
     own.
     """
-    solution = solved(robot, n)
+    solution = solve_random_poses(robot, n)
     D, found = scaled_sensitivity(robot, solution), []
     for base, tool in frames:
-        F = measured(frame_columns(solution.T, base, tool), solution.T, kind)
-        found.append(rank(np.concatenate([measured(D, solution.T, kind), F], axis=2)) - rank(F))
+        F = select_measured_rows(frame_columns(solution.T, base, tool), solution.T, kind)
+        found.append(
+            rank(np.concatenate([select_measured_rows(D, solution.T, kind), F], axis=2)) - rank(F)
+        )
     return found
 
 

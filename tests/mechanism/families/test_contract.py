@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every robot that comes with loopcal must do. A new file in src/loopcal/robots is picked up
-by itself.
-"""
+"""Contract of every shipped robot. A new file in src/loopcal/robots is included automatically."""
 
 from functools import cache
 from pathlib import Path
@@ -23,19 +21,19 @@ from loopcal.mechanism import (
 )
 from loopcal.units import Dimension
 from tests.jacobians import check_jacobian
-from tests.mechanism.families.ranks import coordinates as random_coordinates
+from tests.mechanism.families.ranks import random_coordinates
 
 ROBOTS = tuple(list_shipped_robots())
 
 
 @cache
-def robot(name: str) -> Mechanism:
+def load_cached_robot(name: str) -> Mechanism:
     return load_robot(name)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_it_closes_at_home_where_its_file_says(name: str) -> None:
-    machine = robot(name)
+def test_shipped_robot_closes_at_the_home_pose_of_its_file(name: str) -> None:
+    machine = load_cached_robot(name)
     assert machine.home_state.residual.max() <= 1e-12 * machine.size
     home = machine.assembly.home
     read = [read_coordinates(T, machine.controlled) for T in (machine.home, home)]
@@ -46,8 +44,8 @@ def test_it_closes_at_home_where_its_file_says(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_its_file_says_what_people_need(name: str) -> None:
-    machine = robot(name)
+def test_shipped_robot_file_states_source_workspace_strokes_and_tolerances(name: str) -> None:
+    machine = load_cached_robot(name)
     assert machine.name == name
     assert machine.assembly.source
     assert set(machine.assembly.workspace) <= set(machine.controlled)
@@ -57,8 +55,8 @@ def test_its_file_says_what_people_need(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_forward_undoes_inverse_in_the_workspace(name: str) -> None:
-    machine = robot(name)
+def test_forward_kinematics_inverts_inverse_kinematics_in_the_workspace(name: str) -> None:
+    machine = load_cached_robot(name)
     wanted = random_coordinates(machine, 1000, seed=11)
     there = inverse(machine, wanted)
     back = forward(machine, there.q)
@@ -72,8 +70,8 @@ def test_forward_undoes_inverse_in_the_workspace(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
-def test_ten_thousand_random_rows_converge_and_the_others_say_why(name: str) -> None:
-    machine = robot(name)
+def test_random_rows_converge_or_state_why_not(name: str) -> None:
+    machine = load_cached_robot(name)
     there = inverse(machine, random_coordinates(machine, 10_000, seed=12))
     back = forward(machine, there.q)
     assert (there.converged & back.converged).mean() >= 0.999
@@ -83,8 +81,8 @@ def test_ten_thousand_random_rows_converge_and_the_others_say_why(name: str) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
-def test_its_sensitivities_are_the_derivatives_of_its_forward_kinematics(name: str) -> None:
-    machine = robot(name)
+def test_sensitivities_are_the_derivatives_of_forward_kinematics(name: str) -> None:
+    machine = load_cached_robot(name)
     there = inverse(machine, random_coordinates(machine, 3, seed=13))
     assert there.converged.all()
     q, values = compute_readings(machine, machine.values[None], there.state), machine.values
@@ -127,7 +125,7 @@ def test_its_sensitivities_are_the_derivatives_of_its_forward_kinematics(name: s
     )
 
 
-def test_every_robot_has_its_row_in_the_documentation() -> None:
+def test_documentation_lists_every_robot_with_its_parameter_count() -> None:
     """| name | family | .. | parameters | ..; the table has no others."""
     page = (Path(__file__).parents[3] / "docs" / "robots.md").read_text("utf-8")
     table = page[page.index("| name | family |") :].split("\n\n")[0]
@@ -137,4 +135,4 @@ def test_every_robot_has_its_row_in_the_documentation() -> None:
     ]
     assert sorted(row[0] for row in rows) == sorted(ROBOTS)
     for name, _, _, _, parameters, _ in rows:
-        assert int(parameters) == len(robot(name).parameters), name
+        assert int(parameters) == len(load_cached_robot(name).parameters), name

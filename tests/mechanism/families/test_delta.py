@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The delta with three rods and the one with six: alike where they must be, and what only the six
-can do.
-"""
+"""Deltas with three and with six rods: where they agree, and what only six rods can model."""
 
 from functools import cache
 
@@ -31,27 +29,27 @@ from loopcal.mechanism.families.limb_records import (
 )
 from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.families.linear_delta import LinearDelta
-from tests.mechanism.families.ranks import coordinates
+from tests.mechanism.families.ranks import random_coordinates
 
 Array = NDArray[np.float64]
 
 
 @cache
-def robot(name: str) -> Mechanism:
+def load_cached_robot(name: str) -> Mechanism:
     return load_robot(name)
 
 
 @cache
-def uneven() -> Mechanism:
-    """Six rods, each of its own length, joints displaced: the platform tilts by milliradians."""
-    machine = robot("linear-delta-6")
+def build_uneven_delta() -> Mechanism:
+    """Return a delta with six unequal rods and displaced joints: its platform tilts."""
+    machine = load_cached_robot("linear-delta-6")
     rng = np.random.default_rng(4)
     return machine.with_values(
         machine.values + machine.parameters.tolerance * rng.standard_normal(len(machine.values))
     )
 
 
-def slopes(machine: Mechanism, q: Array) -> tuple[Array, Array]:
+def position_derivatives(machine: Mechanism, q: Array) -> tuple[Array, Array]:
     """d position (n, 3, p) and (n, 3, a)."""
     solution = forward(machine, q)
     found = differentiate_pose(machine, machine.values[None], q[None], solution.state)
@@ -64,8 +62,8 @@ PLACE = Workspace(x=(-0.06, 0.06), y=(-0.06, 0.06), z=(0.0, 0.25))
 
 
 @cache
-def exact() -> tuple[Mechanism, Mechanism]:
-    """Both of one geometry to the last digit, as no file with nine digits gives it."""
+def build_equal_deltas() -> tuple[Mechanism, Mechanism]:
+    """Return deltas of three and six rods with equal geometry to the last digit."""
     angles = tuple(np.deg2rad((210.0, 330.0, 90.0)).tolist())
     three = LinearDelta(
         name="three",
@@ -111,24 +109,26 @@ def exact() -> tuple[Mechanism, Mechanism]:
     return build(three.expand()), build(six.expand())
 
 
-def test_three_and_six_rods_agree_in_readings_poses_and_common_slopes() -> None:
+def test_three_and_six_rods_agree_in_readings_poses_and_common_derivatives() -> None:
     # [m] and [m/m]: rounding times the condition of three rods, about 10
-    assert_same_kinematics(*exact(), 1e-12)
+    assert_same_kinematics(*build_equal_deltas(), 1e-12)
 
 
-def test_the_files_of_three_and_six_rods_agree_to_the_nine_digits_of_an_offset() -> None:
+def test_robot_files_of_three_and_six_rods_agree_to_nine_digits() -> None:
     # [m] 5e-10 in the offset, times slopes of up to 10 / m
-    assert_same_kinematics(robot("linear-delta"), robot("linear-delta-6"), 1e-8)
+    assert_same_kinematics(
+        load_cached_robot("linear-delta"), load_cached_robot("linear-delta-6"), 1e-8
+    )
 
 
 def assert_same_kinematics(three: Mechanism, six: Mechanism, atol: float) -> None:
     """Readings, poses and slopes that the two must share [m, m/m, m/rad]."""
-    xyz = coordinates(three, 200, seed=5)
+    xyz = random_coordinates(three, 200, seed=5)
     q = inverse(three, xyz).q
     np.testing.assert_allclose(inverse(six, xyz).q, q, rtol=0, atol=atol)
     pose = forward(six, q)
     np.testing.assert_allclose(pose.T, forward(three, q).T, rtol=0, atol=atol)
-    (D, J), (E, K) = slopes(three, q), slopes(six, q)
+    (D, J), (E, K) = position_derivatives(three, q), position_derivatives(six, q)
     np.testing.assert_allclose(K, J, rtol=0, atol=atol)
     # in the six a rod's length is one of two, and its height does not depend on radius and rod: the
     # firmware's offset stop + sqrt(arm^2 - radius^2) does
@@ -146,9 +146,9 @@ def assert_same_kinematics(three: Mechanism, six: Mechanism, atol: float) -> Non
     np.testing.assert_allclose(outwards, D[..., index("radius")], rtol=0, atol=atol)
 
 
-def test_uneven_rods_tilt_the_platform_and_the_position_is_still_reached() -> None:
-    machine = uneven()
-    xyz = coordinates(machine, 500, seed=6)
+def test_uneven_rods_tilt_the_platform_but_reach_the_position() -> None:
+    machine = build_uneven_delta()
+    xyz = random_coordinates(machine, 500, seed=6)
     there = inverse(machine, xyz)
     assert there.converged.all()
     np.testing.assert_allclose(there.T[:, :3, 3], xyz, rtol=0, atol=1e-12)  # [m]
@@ -163,9 +163,9 @@ def test_uneven_rods_tilt_the_platform_and_the_position_is_still_reached() -> No
     np.testing.assert_allclose(back.T, there.T, rtol=0, atol=1e-12)
 
 
-def test_a_row_does_not_depend_on_its_neighbours() -> None:
-    machine = uneven()
-    xyz = coordinates(machine, 40, seed=7)
+def test_row_of_inverse_kinematics_does_not_depend_on_other_rows() -> None:
+    machine = build_uneven_delta()
+    xyz = random_coordinates(machine, 40, seed=7)
     together = inverse(machine, xyz)
     for row in (0, 17, 39):
         alone = inverse(machine, xyz[row : row + 1])
@@ -173,18 +173,18 @@ def test_a_row_does_not_depend_on_its_neighbours() -> None:
         np.testing.assert_array_equal(alone.T[0], together.T[row])
 
 
-def test_the_nearest_reachable_pose_keeps_a_pose_that_is_reachable() -> None:
-    machine = uneven()
-    there = inverse(machine, coordinates(machine, 20, seed=8))
+def test_reachable_pose_of_an_uneven_delta_is_kept() -> None:
+    machine = build_uneven_delta()
+    there = inverse(machine, random_coordinates(machine, 20, seed=8))
     again = inverse(machine, there.T)
     np.testing.assert_allclose(again.T, there.T, rtol=0, atol=1e-10)
 
 
-def test_a_place_out_of_reach_is_marked() -> None:
-    assert not inverse(uneven(), np.array([[0.4, 0.0, 0.1]])).converged[0]
+def test_unreachable_position_is_marked() -> None:
+    assert not inverse(build_uneven_delta(), np.array([[0.4, 0.0, 0.1]])).converged[0]
 
 
 @pytest.mark.parametrize("name", ["linear-delta", "linear-delta-6"])
-def test_the_carriages_stand_above_the_nozzle(name: str) -> None:
-    machine = robot(name)
+def test_carriages_are_above_the_nozzle_at_home(name: str) -> None:
+    machine = load_cached_robot(name)
     assert all((joints[..., 0] > machine.home[2, 3]).all() for joints in machine.home_state.joints)

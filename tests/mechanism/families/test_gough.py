@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hexapods: columns against the leg equation, legs as rods and as chains, the screw against another
-program, ranks.
+"""Hexapods: sensitivities against the leg equation, rod legs and chain legs, screws against
+genhexkins, ranks.
 """
 
 import json
@@ -29,26 +29,26 @@ from loopcal.mechanism.families.gough import Gough, GoughCones
 from loopcal.mechanism.families.hexapod_legs import Screw
 from tests import zoo
 from tests.mechanism.families.ranks import (
-    perturbed,
+    perturb,
     rank,
-    ranks,
+    ranks_by_measurement,
+    ranks_with_unknown_frames,
     scaled_sensitivity,
-    solved,
-    told_apart,
+    solve_random_poses,
 )
 
 Array = NDArray[np.float64]
-KINDS = ("full", "5-dof", "positions", "orientation")
+MEASUREMENTS = ("full", "5-dof", "positions", "orientation")
 
 
-def points(array: Array) -> tuple[tuple[float, float, float], ...]:
+def to_points(array: Array) -> tuple[tuple[float, float, float], ...]:
     return tuple((float(x), float(y), float(z)) for x, y, z in array)
 
 
 ROD = Gough(
     name="hexapod",
-    base=points(zoo.HEXAPOD_BASE * zoo.MM),
-    platform=points(zoo.HEXAPOD_PLATFORM * zoo.MM),
+    base=to_points(zoo.HEXAPOD_BASE * zoo.MM),
+    platform=to_points(zoo.HEXAPOD_PLATFORM * zoo.MM),
     lengths=zoo.HEXAPOD_LENGTH * zoo.MM,
     home=PoseRecord(z=0.2),
     workspace=Workspace(
@@ -64,11 +64,11 @@ CHAIN = replace(ROD, legs="ups")
 
 
 @cache
-def robot(record: Gough) -> Mechanism:
+def build_cached_robot(record: Gough) -> Mechanism:
     return build(record.expand())
 
 
-def moved(machine: Mechanism) -> Mechanism:
+def with_published_errors(machine: Mechanism) -> Mechanism:
     """With the published errors of all 42 parameters, a thousand times their size would be 50 mm:
     use ten times, 0.5 mm.
     """
@@ -82,10 +82,10 @@ ORDER = np.concatenate([7 * leg + np.array([0, 1, 2, 4, 5, 6, 3]) for leg in ran
 # --- the 42 parameters
 # -----------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("record", [ROD, CHAIN], ids=["rod", "ups"])
-def test_columns_are_those_of_the_leg_equation(record: Gough) -> None:
+def test_sensitivities_equal_those_of_the_leg_equation(record: Gough) -> None:
     """u . dt + (R p x u) . omega = dl + u . db - u . R dp, six legs: D = J^-1 G."""
-    machine = moved(robot(record))
-    solution = solved(machine)
+    machine = with_published_errors(build_cached_robot(record))
+    solution = solve_random_poses(machine)
     D = differentiate_pose(
         machine, machine.values[None], solution.q[None], solution.state
     ).parameters[0]
@@ -103,11 +103,14 @@ def test_columns_are_those_of_the_leg_equation(record: Gough) -> None:
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
-def test_rods_and_chains_agree_in_names_pose_residual_and_sensitivities() -> None:
-    rod, chain = moved(robot(ROD)), moved(robot(CHAIN))
+def test_rod_legs_and_chain_legs_agree_in_poses_and_sensitivities() -> None:
+    rod, chain = (
+        with_published_errors(build_cached_robot(ROD)),
+        with_published_errors(build_cached_robot(CHAIN)),
+    )
     assert rod.parameters.names == chain.parameters.names
     np.testing.assert_array_equal(rod.parameters.nominal, chain.parameters.nominal)
-    one = solved(rod)
+    one = solve_random_poses(rod)
     two = inverse(chain, one.T)
     assert two.converged.all()
     np.testing.assert_allclose(two.q, one.q, rtol=0, atol=1e-12)  # [m]
@@ -125,9 +128,9 @@ def test_rods_and_chains_agree_in_names_pose_residual_and_sensitivities() -> Non
     np.testing.assert_allclose(D[1].readings, D[0].readings, rtol=0, atol=1e-12 * max(size, 1.0))
 
 
-def test_ranks_of_the_42_parameters() -> None:
+def test_ranks_of_the_ideal_hexapod_by_measurement() -> None:
     for record in (ROD, CHAIN):
-        assert ranks(robot(record), KINDS) == [42, 41, 39, 36]
+        assert ranks_by_measurement(build_cached_robot(record), MEASUREMENTS) == [42, 41, 39, 36]
 
 
 @pytest.mark.parametrize(
@@ -140,17 +143,19 @@ def test_ranks_of_the_42_parameters() -> None:
         ("positions", True, False, 33),
     ],
 )
-def test_unknown_frames_cost_the_42_parameters_what_they_add(
+def test_unknown_frames_lower_the_rank_of_the_ideal_hexapod(
     kind: str, base: bool, tool: bool, expected: int
 ) -> None:
     for record in (ROD, CHAIN):
-        assert told_apart(robot(record), kind, [(base, tool)]) == [expected]
+        assert ranks_with_unknown_frames(build_cached_robot(record), kind, [(base, tool)]) == [
+            expected
+        ]
 
 
 # --- complete models
 # -------------------------------------------------------------------------------------------------
 COMPLETE = replace(CHAIN, error_model="complete")
-REAL = replace(COMPLETE, spherical="axes")
+COMPLETE_AXES = replace(COMPLETE, spherical="axes")
 
 
 @pytest.mark.parametrize(
@@ -158,37 +163,48 @@ REAL = replace(COMPLETE, spherical="axes")
     [
         (COMPLETE, 0.0, [48, 47, 45]),
         (COMPLETE, 2e-3, [84, 83, 81]),
-        (REAL, 0.0, [66, 65, 63]),
-        (REAL, 4e-3, [138, 137, 135]),
+        (COMPLETE_AXES, 0.0, [66, 65, 63]),
+        (COMPLETE_AXES, 4e-3, [138, 137, 135]),
     ],
     ids=["perfect balls, nominal", "perfect balls, moved", "nominal", "moved"],
 )
-def test_ranks_of_the_complete_model(record: Gough, size: float, expected: list[int]) -> None:
+def test_ranks_of_the_complete_hexapod_by_measurement(
+    record: Gough, size: float, expected: list[int]
+) -> None:
     # moved by 2 mm and 10 mrad (4 mm, 20 mrad): at smaller errors the last directions sink into
     # rounding
-    assert ranks(perturbed(robot(record), size, seed=5), KINDS[:3], n=150) == expected
+    assert (
+        ranks_by_measurement(
+            perturb(build_cached_robot(record), size, seed=5), MEASUREMENTS[:3], n=150
+        )
+        == expected
+    )
 
 
-def test_each_unknown_frame_costs_the_complete_model_six() -> None:
-    machine = perturbed(robot(REAL), 4e-3, seed=5)
-    assert told_apart(machine, "full", n=150) == [132, 132, 126]
+def test_each_unknown_frame_lowers_the_rank_of_the_complete_hexapod_by_six() -> None:
+    machine = perturb(build_cached_robot(COMPLETE_AXES), 4e-3, seed=5)
+    assert ranks_with_unknown_frames(machine, "full", n=150) == [132, 132, 126]
 
 
 @pytest.mark.parametrize(
-    ("record", "size", "expected"), [(REAL, 0.0, 60), (REAL, 4e-3, 132)], ids=["nominal", "moved"]
+    ("record", "size", "expected"),
+    [(COMPLETE_AXES, 0.0, 60), (COMPLETE_AXES, 4e-3, 132)],
+    ids=["nominal", "moved"],
 )
-def test_orientation_alone_costs_the_complete_model_six(
+def test_orientation_alone_lowers_the_rank_of_the_complete_hexapod_by_six(
     record: Gough, size: float, expected: int
 ) -> None:
     # the moves of base and tool, three each, turn nothing: 66 - 6, 138 - 6
-    assert ranks(perturbed(robot(record), size, seed=5), ["orientation"], n=150) == [expected]
+    assert ranks_by_measurement(
+        perturb(build_cached_robot(record), size, seed=5), ["orientation"], n=150
+    ) == [expected]
 
 
-def test_the_complete_model_moves_the_42_parameters_along() -> None:
+def test_complete_model_spans_the_sensitivities_of_the_ideal_model() -> None:
     """What the 42 can do, the complete model can: its columns span theirs."""
-    solution = solved(robot(ROD))
-    small = scaled_sensitivity(robot(ROD), solution)
-    machine = robot(REAL)
+    solution = solve_random_poses(build_cached_robot(ROD))
+    small = scaled_sensitivity(build_cached_robot(ROD), solution)
+    machine = build_cached_robot(COMPLETE_AXES)
     large = scaled_sensitivity(machine, inverse(machine, solution.T))
     assert rank(np.concatenate([large, small], axis=2)) == rank(large) == 66
 
@@ -220,7 +236,9 @@ def test_the_complete_model_moves_the_42_parameters_along() -> None:
         ),
     ],
 )
-def test_what_a_form_cannot_carry_is_refused_with_the_way_out(record: Gough, sentence: str) -> None:
+def test_unsupported_options_of_a_hexapod_are_refused_with_the_alternative(
+    record: Gough, sentence: str
+) -> None:
     with pytest.raises(MechanismError, match=sentence):
         record.expand()
 
@@ -252,7 +270,7 @@ def genhexkins(data_folder: Path) -> tuple[dict[str, Array], Array, Array]:
     )
 
 
-def folded(geometry: dict[str, Array], T: Array) -> NDArray[np.bool_]:
+def is_folded(geometry: dict[str, Array], T: Array) -> NDArray[np.bool_]:
     """Where the platform's joint axis has turned past a quarter turn from the base's, seen along
     the leg, (n, 6).
     """
@@ -276,13 +294,13 @@ def screw_hexapod(geometry: dict[str, Array], fold: NDArray[np.bool_], home: Arr
     x, y, z = home[:3, 3]
     roll, pitch, yaw = rigid.matrix_to_euler(home[:3, :3], "xyz")
     axes = (
-        points(geometry["base_joint_axis"]),
-        points(geometry["platform_joint_axis"] * sign[:, None]),
+        to_points(geometry["base_joint_axis"]),
+        to_points(geometry["platform_joint_axis"] * sign[:, None]),
     )
     record = Gough(
         name="genhexkins",
-        base=points(geometry["base"]),
-        platform=points(geometry["platform"]),
+        base=to_points(geometry["base"]),
+        platform=to_points(geometry["platform"]),
         legs="ups",
         screw=Screw(tuple(LEAD * sign), *axes),
         home=PoseRecord(x, y, z, roll, pitch, yaw),
@@ -290,11 +308,11 @@ def screw_hexapod(geometry: dict[str, Array], fold: NDArray[np.bool_], home: Arr
     return build(record.expand())
 
 
-def test_the_screw_gives_all_strut_lengths_and_poses_of_genhexkins(
+def test_screw_legs_agree_with_strut_lengths_and_poses_of_genhexkins(
     genhexkins: tuple[dict[str, Array], Array, Array],
 ) -> None:
     geometry, T, struts = genhexkins
-    patterns, place = np.unique(folded(geometry, T), axis=0, return_inverse=True)
+    patterns, place = np.unique(is_folded(geometry, T), axis=0, return_inverse=True)
     checked = 0
     for i, pattern in enumerate(patterns):
         rows = np.flatnonzero(place.reshape(-1) == i)
@@ -319,26 +337,30 @@ def test_the_screw_gives_all_strut_lengths_and_poses_of_genhexkins(
     assert checked == 200
 
 
-def test_a_screw_without_lead_is_a_plain_leg() -> None:
+def test_screw_without_lead_equals_a_plain_leg() -> None:
     axes = ((0.0, 0.0, 1.0),) * 6, ((1.0, 0.0, 0.0),) * 6
-    machine, plain = robot(replace(CHAIN, screw=Screw(0.0, *axes))), robot(CHAIN)
-    one = solved(plain, 20)
+    machine, plain = (
+        build_cached_robot(replace(CHAIN, screw=Screw(0.0, *axes))),
+        build_cached_robot(CHAIN),
+    )
+    one = solve_random_poses(plain, 20)
     np.testing.assert_allclose(inverse(machine, one.T).q, one.q, rtol=0, atol=1e-12)  # [m]
 
 
-def test_the_screw_adds_its_lead_for_each_turn_of_the_upper_joint_about_the_leg() -> None:
+def test_screw_adds_its_lead_for_each_turn_of_the_upper_joint() -> None:
     """length + reading = |t + R p - b| + lead a / (2 pi), a from the lower axis to the upper one
     about the leg.
     """
     lead, low, high = 0.004, np.array([1.0, 0.0, 0.0]), np.array([0.6, 0.8, 0.0])
-    machine = robot(
+    machine = build_cached_robot(
         replace(
-            CHAIN, screw=Screw(lead, points(np.tile(low, (6, 1))), points(np.tile(high, (6, 1))))
+            CHAIN,
+            screw=Screw(lead, to_points(np.tile(low, (6, 1))), to_points(np.tile(high, (6, 1)))),
         )
     )
-    solution = solved(machine, 30)
+    solution = solve_random_poses(machine, 30)
     for T, q in zip(solution.T, solution.q, strict=True):
-        v = T[:3, 3] + machine_points(ROD.platform) @ T[:3, :3].T - machine_points(ROD.base)
+        v = T[:3, 3] + to_array(ROD.platform) @ T[:3, :3].T - to_array(ROD.base)
         length = np.linalg.norm(v, axis=1)
         s, upper = v / length[:, None], T[:3, :3] @ high
         across = np.cross(s, low)  # with low's part across s, a right-handed frame about s
@@ -348,12 +370,12 @@ def test_the_screw_adds_its_lead_for_each_turn_of_the_upper_joint_about_the_leg(
         )  # [m]
 
 
-def machine_points(listed: tuple[tuple[float, float, float], ...]) -> Array:
+def to_array(listed: tuple[tuple[float, float, float], ...]) -> Array:
     return np.array(listed)
 
 
-def test_a_leg_that_leans_too_far_from_its_direction_at_home_is_told() -> None:
-    machine = robot(replace(ROD, cones=GoughCones(base=0.1, platform=0.3)))
+def test_inclination_limit_of_a_leg_is_reported() -> None:
+    machine = build_cached_robot(replace(ROD, cones=GoughCones(base=0.1, platform=0.3)))
     q = inverse(machine, np.array([[0.0, 0, 0.2, 0, 0, 0], [0.1, 0, 0.2, 0, 0, 0]]))
     allowed, why = check_limits(machine, machine.values[None], q.q[None], q.state)
     assert allowed.tolist() == [[True, False]]

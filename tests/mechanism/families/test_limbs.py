@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mechanisms written limb by limb: the same machine in another hand, random structures, drives,
-refusals.
+"""Mechanisms described limb by limb: the same robot in another description, random structures,
+actuators, refusals.
 """
 
 from dataclasses import replace
@@ -40,8 +40,13 @@ from loopcal.mechanism.families.limb_records import (
 )
 from loopcal.mechanism.families.limbs import Limbs
 from loopcal.mechanism.families.three_prs import ThreePrs
-from tests.mechanism.families.random_limbs import built, expected_rank, random_mechanism, wander
-from tests.mechanism.families.ranks import rank, scaled, solved
+from tests.mechanism.families.random_limbs import (
+    build_mechanism,
+    expected_rank,
+    random_mechanism,
+    sample_near_home,
+)
+from tests.mechanism.families.ranks import rank, scale_angles, solve_random_poses
 
 TRIPOD = """
 format: 1
@@ -78,11 +83,11 @@ NAMES = {
 }  # fmt: skip
 
 
-def test_a_tripod_in_thirty_lines_is_the_3_prs(tmp_path: Path) -> None:
+def test_tripod_described_by_limbs_equals_the_3_prs(tmp_path: Path) -> None:
     path = tmp_path / "tripod.yaml"
     path.write_text(TRIPOD)
     written, twin = load_robot(path), build(TWIN.expand())
-    solution = solved(written)
+    solution = solve_random_poses(written)
     D = differentiate_pose(
         written, written.values[None], solution.q[None], solution.state
     ).parameters[0]
@@ -115,26 +120,24 @@ RANDOM = (
 
 
 @cache
-def random_robot(limbs: int, seed: int) -> Mechanism:
-    return built(random_mechanism(seed, limbs))
+def build_random_robot(limbs: int, seed: int) -> Mechanism:
+    return build_mechanism(random_mechanism(seed, limbs))
 
 
-def test_there_are_more_than_fifty_random_limbs() -> None:
+def test_random_mechanisms_have_at_least_fifty_limbs() -> None:
     assert sum(limbs for limbs, _ in RANDOM) >= 50
 
 
 @pytest.mark.parametrize(("limbs", "seed"), RANDOM)
-def test_the_complete_model_of_a_random_mechanism_has_the_rank_of_the_counting_rule(
-    limbs: int, seed: int
-) -> None:
+def test_rank_of_a_random_complete_model_follows_the_counting_rule(limbs: int, seed: int) -> None:
     """Places and axes are random, so nothing needs perturbing; kept singular values are above 1e-10
     of the largest.
     """
-    record, machine = random_mechanism(seed, limbs), random_robot(limbs, seed)
-    state, q = wander(machine, 400, seed)
+    record, machine = random_mechanism(seed, limbs), build_random_robot(limbs, seed)
+    state, q = sample_near_home(machine, 400, seed)
     assert state.T.shape[1] >= 40  # six rows each, for at most 142 parameters
     D = differentiate_pose(machine, machine.values[None], q, state).parameters[0, :150]
-    assert rank(scaled(machine, D), tolerance=1e-10) == expected_rank(record)
+    assert rank(scale_angles(machine, D), tolerance=1e-10) == expected_rank(record)
     offsets = len(machine.actuators)
     free = sum(
         j.actuated is None
@@ -152,7 +155,7 @@ def test_the_complete_model_of_a_random_mechanism_has_the_rank_of_the_counting_r
     )
 
 
-# --- what a file may say
+# --- what a file may contain
 # ---------------------------------------------------------------------------------------------
 SLIDER = Limbs(  # two rods from driven slides to a point in the plane
     name="slider",
@@ -173,11 +176,11 @@ SLIDER = Limbs(  # two rods from driven slides to a point in the plane
 )
 
 
-def with_limb(**changes: object) -> Limbs:
+def change_limb(**changes: object) -> Limbs:
     return replace(SLIDER, limbs=(replace(SLIDER.limbs[0], **changes),))  # type: ignore[arg-type]
 
 
-def test_copies_turn_places_and_axes_and_number_the_names() -> None:
+def test_copies_of_a_limb_are_rotated_and_numbered() -> None:
     machine = build(SLIDER.expand())
     assert [limb.name for limb in machine.assembly.limbs] == ["rod1", "rod2"]
     assert [a.name for a in machine.actuators] == ["q1", "q2"]
@@ -187,7 +190,7 @@ def test_copies_turn_places_and_axes_and_number_the_names() -> None:
     np.testing.assert_allclose(second[:3, [2, 3]].T, [[-1, 0, 0], [0, 0.3, 0]], atol=1e-15)
 
 
-def test_a_spool_pays_out_its_radius_and_what_it_builds_up() -> None:
+def test_spool_length_includes_radius_and_buildup() -> None:
     """length = offset + r q + b q^2 / (4 pi)."""
     spool = SpoolDrive(
         "angle",
@@ -210,7 +213,7 @@ def test_a_spool_pays_out_its_radius_and_what_it_builds_up() -> None:
     np.testing.assert_allclose(left, slide[:, 0], rtol=0, atol=1e-12)  # [m]
 
 
-def test_a_named_parameter_moves_all_that_it_is_mapped_onto() -> None:
+def test_named_parameter_changes_all_elements_of_its_maps() -> None:
     """A radius common to both slides, and a turn of the frame that they stand on: 0.3 m arm along y
     of the placed frame.
     """
@@ -222,7 +225,7 @@ def test_a_named_parameter_moves_all_that_it_is_mapped_onto() -> None:
     assert machine.parameters.names[-2:] == ("radius", "turn")
     values = machine.values.copy()
     values[machine.parameters.index("radius")] = 0.31
-    wider = with_limb(chain=(replace(SLIDER.limbs[0].chain[0], at=(0.31, 0.0, 0.0)),))
+    wider = change_limb(chain=(replace(SLIDER.limbs[0].chain[0], at=(0.31, 0.0, 0.0)),))
     xy = np.array([[-0.02, -0.08], [-0.06, -0.01]])
     np.testing.assert_allclose(
         inverse(machine.with_values(values), xy).q, inverse(build(wider.expand()), xy).q, atol=1e-12
@@ -238,7 +241,7 @@ def test_a_named_parameter_moves_all_that_it_is_mapped_onto() -> None:
     )
 
 
-def test_joints_made_of_others_move_like_them() -> None:
+def test_universal_joint_and_slide_equal_a_rod() -> None:
     """A rod written as universal joint, slide and ball is the distance between its ends."""
     chain = (
         # along x while both angles are zero; at home it points from (0.3, 0, 0) to (0, 0, 0.4)
@@ -266,9 +269,9 @@ def test_joints_made_of_others_move_like_them() -> None:
     )  # [m]
 
 
-def test_limits_and_cones_of_a_file_are_told() -> None:
+def test_exceeded_joint_limits_and_cones_are_reported() -> None:
     chain = (replace(SLIDER.limbs[0].chain[0], limits=(-1.0, 0.45)),)
-    machine = build(with_limb(chain=chain, cones=(RodCone("tip", "-x", 0.9),)).expand())
+    machine = build(change_limb(chain=chain, cones=(RodCone("tip", "-x", 0.9),)).expand())
     # the first slide goes up with y, as long as its rod lies across; the rods lean more where the
     # point comes near them
     solution = inverse(machine, np.array([[-0.05, -0.05], [-0.05, 0.1], [0.02, -0.05]]))
@@ -280,13 +283,13 @@ def test_limits_and_cones_of_a_file_are_told() -> None:
     assert why[0, 2].data["name"] == "inclination of rod1 at its tip"
 
 
-CASES = {
+INVALID_RECORDS = {
     "branch": (
         replace(SLIDER, limbs=(*SLIDER.limbs, replace(SLIDER.limbs[0], name="branch", on="rod"))),
         "limb 'branch' starts on limb 'rod': loopcal has no limbs that branch from limbs",
     ),
     "end on a limb": (
-        with_limb(to="elbow"),
+        change_limb(to="elbow"),
         "limb 'rod' ends on 'elbow': loopcal has no limbs that branch",
     ),
     "nothing unknown": (
@@ -310,26 +313,28 @@ CASES = {
         "unknown sin1, but no period",
     ),
     "no such element": (
-        with_limb(errors=(Shifts("hinge", ("x",)),)),
+        change_limb(errors=(Shifts("hinge", ("x",)),)),
         "'rod1' has no 'hinge'; it has P1, tip, platform",
     ),
     "length of no rod": (
-        with_limb(errors=(Shifts("P1", ("length",)),)),
+        change_limb(errors=(Shifts("P1", ("length",)),)),
         "'length' belongs to a rod",
     ),
     "rod of a ball": (
-        with_limb(ending="ball"),
+        change_limb(ending="ball"),
         "ends ball and states a length, drive or cone of a rod",
     ),
     "tilt alone": (
-        with_limb(chain=(Revolute("R"),), actuated="q", errors=(Tilts("R1", ("rx",), alone=True),)),
+        change_limb(
+            chain=(Revolute("R"),), actuated="q", errors=(Tilts("R1", ("rx",), alone=True),)
+        ),
         "which only a slide allows",
     ),
     "axis zero": (
-        with_limb(chain=(Prismatic("P", axis=(0.0, 0.0, 0.0), actuated="q"),)),
+        change_limb(chain=(Prismatic("P", axis=(0.0, 0.0, 0.0), actuated="q"),)),
         "state a direction",
     ),
-    "no copies": (with_limb(copies=Copies(0)), "has 0 copies"),
+    "no copies": (change_limb(copies=Copies(0)), "has 0 copies"),
     "unknown owner": (
         replace(SLIDER, parameters=(NamedLength("r", 0.1, (MapEntry("arm", "P1", "x"),)),)),
         "'r' is mapped onto 'arm', which is not there; known are rod, q1, q2",
@@ -337,9 +342,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_what_cannot_be_is_told_in_a_sentence(case: str) -> None:
-    record, sentence = CASES[case]
+@pytest.mark.parametrize("case", INVALID_RECORDS)
+def test_invalid_limb_record_is_refused_in_one_sentence(case: str) -> None:
+    record, sentence = INVALID_RECORDS[case]
     if case == "wrong drive":
         record = replace(
             record, limbs=(replace(record.limbs[0], errors=(Shifts("rod", ("length",)),)),)
@@ -350,7 +355,7 @@ def test_what_cannot_be_is_told_in_a_sentence(case: str) -> None:
     assert "\n" not in str(found.value)
 
 
-def test_a_joint_of_an_unknown_kind_is_told_with_its_line(tmp_path: Path) -> None:
+def test_unknown_joint_kind_is_reported_with_its_line(tmp_path: Path) -> None:
     path = tmp_path / "wrong.yaml"
     path.write_text(TRIPOD.replace("joint: R", "joint: Q"))
     with pytest.raises(LoopcalError, match=r"wrong.yaml:13: .*'Q'"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What people add to a file of the family `limbs`, or leave out of it, or mistype."""
+"""Changes to files of the family `limbs`: additions, omissions and typing errors."""
 
 from pathlib import Path
 
@@ -15,7 +15,9 @@ LIMBS = tuple(
 )
 
 
-def changed(tmp_path: Path, name: str, *changes: tuple[str, str], more: str = "") -> Mechanism:
+def load_changed_robot(
+    tmp_path: Path, name: str, *changes: tuple[str, str], more: str = ""
+) -> Mechanism:
     """A shipped robot with pieces of its text replaced, and more of it."""
     text = find_robot_file(name).read_text()
     for old, new in changes:
@@ -29,11 +31,14 @@ def changed(tmp_path: Path, name: str, *changes: tuple[str, str], more: str = ""
 # --- the complete model beside named unknowns
 # ------------------------------------------------------------------------
 @pytest.mark.parametrize("name", LIMBS)
-def test_every_shipped_file_also_loads_with_the_complete_model(tmp_path: Path, name: str) -> None:
+def test_shipped_limbs_files_load_with_the_complete_model(tmp_path: Path, name: str) -> None:
     """What the file names keeps its name and tolerance; a drive has one offset; nothing stands
     there twice.
     """
-    ideal, complete = load_robot(name), changed(tmp_path, name, more="error_model: complete")
+    ideal, complete = (
+        load_robot(name),
+        load_changed_robot(tmp_path, name, more="error_model: complete"),
+    )
     assert set(ideal.parameters.names) <= set(complete.parameters.names)
     assert len(complete.parameters) > len(ideal.parameters)
     for actuator in complete.actuators:
@@ -42,13 +47,11 @@ def test_every_shipped_file_also_loads_with_the_complete_model(tmp_path: Path, n
     assert np.linalg.matrix_rank(matrix) == len(complete.parameters)
 
 
-def test_a_named_error_about_another_axis_than_the_one_of_its_name_takes_none_away(
-    tmp_path: Path,
-) -> None:
+def test_named_error_about_another_axis_keeps_the_error_of_that_name(tmp_path: Path) -> None:
     """A motor about y has the own axes z, x, y: `motor.x` of the file is its second, so the first
     stays, as `.own`.
     """
-    machine = changed(
+    machine = load_changed_robot(
         tmp_path, "rotary-delta", ("shift: [x, y, z]", "shift: [x]"), more="error_model: complete"
     )
     moved = {
@@ -61,12 +64,12 @@ def test_a_named_error_about_another_axis_than_the_one_of_its_name_takes_none_aw
     }  # fmt: skip
 
 
-# --- left out or mistyped
+# --- omitted or misspelled
 # --------------------------------------------------------------------------------------------
-def refused(tmp_path: Path, name: str, *changes: tuple[str, str], more: str = "") -> str:
+def read_refusal(tmp_path: Path, name: str, *changes: tuple[str, str], more: str = "") -> str:
     """The one sentence that a changed file is refused with."""
     with pytest.raises(LoopcalError) as found:
-        changed(tmp_path, name, *changes, more=more)
+        load_changed_robot(tmp_path, name, *changes, more=more)
     assert "\n" not in str(found.value)
     return str(found.value)
 
@@ -96,14 +99,14 @@ FREEDOMS = {
 
 
 @pytest.mark.parametrize("case", FREEDOMS)
-def test_freedoms_and_coordinates_are_named_once_and_not_left_out(
+def test_missing_or_duplicate_freedoms_and_coordinates_are_refused(
     tmp_path: Path, case: str
 ) -> None:
     change, sentence = FREEDOMS[case]
-    assert sentence in refused(tmp_path, "five-bar", change)
+    assert sentence in read_refusal(tmp_path, "five-bar", change)
 
 
-TYPED = {
+INVALID_VALUES = {
     "rod without length": (
         ("    length: 480\n", ""),
         "limb 'arm' ends in a rod that no drive moves, of length 0 m; it needs a positive `length:`",  # noqa: E501
@@ -134,15 +137,15 @@ TYPED = {
 }
 
 
-@pytest.mark.parametrize("case", TYPED)
-def test_lengths_ranges_and_drives_that_cannot_be_are_told_in_a_sentence(
+@pytest.mark.parametrize("case", INVALID_VALUES)
+def test_invalid_lengths_ranges_and_actuators_are_refused_in_one_sentence(
     tmp_path: Path, case: str
 ) -> None:
-    change, sentence = TYPED[case]
-    assert sentence in refused(tmp_path, "rotary-delta", change)
+    change, sentence = INVALID_VALUES[case]
+    assert sentence in read_refusal(tmp_path, "rotary-delta", change)
 
 
-def test_a_mistyped_drive_is_told_before_that_nothing_is_unknown(tmp_path: Path) -> None:
+def test_misspelled_actuator_is_reported_before_missing_parameters(tmp_path: Path) -> None:
     text = find_robot_file("rotary-delta").read_text().replace("actuated: q", "actuated: w")
     start, end = text.index("    errors:"), text.index("home:")
     path = tmp_path / "silent.yaml"
@@ -151,7 +154,7 @@ def test_a_mistyped_drive_is_told_before_that_nothing_is_unknown(tmp_path: Path)
         load_robot(path)
 
 
-def test_a_file_without_limbs_is_told_so(tmp_path: Path) -> None:
+def test_file_without_limbs_is_refused(tmp_path: Path) -> None:
     text = find_robot_file("rotary-delta").read_text()
     path = tmp_path / "none.yaml"
     path.write_text(text[: text.index("limbs:\n")] + "limbs: []\n" + text[text.index("home:") :])
@@ -164,7 +167,7 @@ def test_a_file_without_limbs_is_told_so(tmp_path: Path) -> None:
 
 # --- named parameters and their maps
 # ---------------------------------------------------------------------------------
-def named(kind: str, onto: str) -> str:
+def parameter_text(kind: str, onto: str) -> str:
     """A parameter `p` of a kind, mapped once."""
     return f"parameters: [{{name: p, {kind}: 1, tolerance: {{sd: 1}}, maps: [{{{onto}}}]}}]"
 
@@ -211,9 +214,9 @@ MAPS = {
 
 
 @pytest.mark.parametrize("case", MAPS)
-def test_a_map_between_unlike_units_is_refused(tmp_path: Path, case: str) -> None:
+def test_map_between_incompatible_units_is_refused(tmp_path: Path, case: str) -> None:
     (kind, onto), sentence = MAPS[case]
-    assert sentence in refused(tmp_path, "rotary-delta", more=named(kind, onto))
+    assert sentence in read_refusal(tmp_path, "rotary-delta", more=parameter_text(kind, onto))
 
 
 @pytest.mark.parametrize(
@@ -227,22 +230,29 @@ def test_a_map_between_unlike_units_is_refused(tmp_path: Path, case: str) -> Non
         ("ratio", "limb: q1, element: transmission, axis: gain"),
     ],
 )
-def test_a_map_between_like_units_is_taken(tmp_path: Path, kind: str, onto: str) -> None:
-    assert "p" in changed(tmp_path, "rotary-delta", more=named(kind, onto)).parameters.names
+def test_map_between_compatible_units_is_accepted(tmp_path: Path, kind: str, onto: str) -> None:
+    assert (
+        "p"
+        in load_changed_robot(
+            tmp_path, "rotary-delta", more=parameter_text(kind, onto)
+        ).parameters.names
+    )
 
 
-def test_a_spools_radius_may_be_named(tmp_path: Path) -> None:
+def test_spool_radius_can_be_a_named_parameter(tmp_path: Path) -> None:
     """The gain of an angle that moves a length is a length, per radian."""
-    more = named("length", "limb: a, element: transmission, axis: gain")
-    assert "p" in changed(tmp_path, "cable-4", more=more).parameters.names
+    more = parameter_text("length", "limb: a, element: transmission, axis: gain")
+    assert "p" in load_changed_robot(tmp_path, "cable-4", more=more).parameters.names
 
 
-def test_a_lead_is_the_advance_in_one_turn_also_in_a_map(tmp_path: Path) -> None:
+def test_mapped_lead_is_the_advance_per_turn(tmp_path: Path) -> None:
     """A lead that grows by a parameter is the lead that the joint states."""
-    machine = changed(tmp_path, "rotary-delta", more=named("length", ON_ARM + "lead"))
+    machine = load_changed_robot(
+        tmp_path, "rotary-delta", more=parameter_text("length", ON_ARM + "lead")
+    )
     values = machine.values.copy()
     values[machine.parameters.index("p")] += 0.003  # [m], in one turn
-    stated = changed(tmp_path, "rotary-delta", ("axis: y,", "axis: y, lead: 3,"))
+    stated = load_changed_robot(tmp_path, "rotary-delta", ("axis: y,", "axis: y, lead: 3,"))
     xyz = np.array([[0.05, -0.08, -0.45], [-0.1, 0.02, -0.5]])
     there, twin = inverse(machine.with_values(values), xyz), inverse(stated, xyz)
     np.testing.assert_allclose(there.q, twin.q, rtol=0, atol=1e-12)  # [rad]

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""3-PRS and RU-PUS-PRS: columns against the error models written out by hand, ranks, null
-directions.
+"""3-PRS and RU-PUS-PRS: sensitivities against derivations by hand, ranks, null directions.
 
-The formulas here are those of docs/theory/tripods.md, from the loops |v_i| = l_i, v_i . r_i = 0 and
-so on, and share no code with the package.
+The formulas are those of docs/theory/tripods.md, from the loops |v_i| = l_i, v_i . r_i = 0 and so
+on. They share no code with the package.
 """
 
 from dataclasses import replace
@@ -19,14 +18,14 @@ from loopcal.mechanism import Mechanism, PoseRecord, Workspace, build, different
 from loopcal.mechanism.families.ru_pus_prs import LEFT_OUT, RuPusPrs
 from loopcal.mechanism.families.three_prs import ThreePrs
 from tests.mechanism.families.ranks import (
-    measured,
     null_vector,
-    perturbed,
+    perturb,
     rank,
-    ranks,
+    ranks_by_measurement,
+    ranks_with_unknown_frames,
     scaled_sensitivity,
-    solved,
-    told_apart,
+    select_measured_rows,
+    solve_random_poses,
 )
 
 Array = NDArray[np.float64]
@@ -49,18 +48,18 @@ RU_PUS_PRS = RuPusPrs(
     home=PoseRecord(z=0.6),
     workspace=Workspace(**TILTS),
 )
-KINDS = ("full", "5-dof", "positions", "orientation")
+MEASUREMENTS = ("full", "5-dof", "positions", "orientation")
 EX, EY, EZ = np.eye(3)
 
 
 @cache
-def robot(record: ThreePrs | RuPusPrs) -> Mechanism:
+def build_cached_robot(record: ThreePrs | RuPusPrs) -> Mechanism:
     return build(record.expand())
 
 
 # --- the error models by hand
 # ----------------------------------------------------------------------------------------
-def spin(angle: float) -> Array:
+def rotation_about_z(angle: float) -> Array:
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
@@ -73,7 +72,7 @@ def sphere_row(
     """
     v = N + R @ a - b - q * EZ
     w = v / np.linalg.norm(v)
-    slopes = {tags["l"]: 1.0} | guided(w, R, q, Z, tags)
+    slopes = {tags["l"]: 1.0} | guide_derivatives(w, R, q, Z, tags)
     return np.concatenate([np.cross(R @ a, w), w]), slopes
 
 
@@ -84,21 +83,21 @@ def hinge_row(
     dr = (Z dthC) x r.
     """
     v = N + R @ a - b - q * EZ
-    slopes = guided(r, R, q, Z, tags)
+    slopes = guide_derivatives(r, R, q, Z, tags)
     for axis in "xyz":
         if f"thC{axis}" in tags:
             slopes[tags[f"thC{axis}"]] = -float(v @ np.cross(Z @ np.eye(3)["xyz".index(axis)], r))
     return np.concatenate([np.cross(R @ a, r), r]), slopes
 
 
-def guided(w: Array, R: Array, q: float, Z: Array, tags: dict[str, str]) -> dict:
+def guide_derivatives(w: Array, R: Array, q: float, Z: Array, tags: dict[str, str]) -> dict:
     """What centres, offset and guide contribute along w."""
     found = {tags["q"]: w @ EZ, tags["thBx"]: -q * (w @ Z @ EY), tags["thBy"]: q * (w @ Z @ EX)}
     found |= {tags[f"b{axis}"]: w @ Z @ np.eye(3)["xyz".index(axis)] for axis in "xy"}
     return found | {tags[f"a{axis}"]: -w @ R @ Z @ np.eye(3)["xyz".index(axis)] for axis in "xyz"}
 
 
-def tags(i: int, joint: str) -> dict[str, str]:
+def parameter_names(i: int, joint: str) -> dict[str, str]:
     """The paper's names of the parameters of chain i."""
     keys = (
         "ax",
@@ -119,8 +118,8 @@ def three_prs_rows(N: Array, R: Array, q: Array) -> list[tuple[Array, dict]]:
     """The six loops of the 3-PRS."""
     found = []
     for i in range(3):
-        Z = spin(2 * np.pi / 3 * i)
-        a, b, names = Z @ [0.2, 0, 0], Z @ [0.35, 0, 0], tags(i + 1, "xz")
+        Z = rotation_about_z(2 * np.pi / 3 * i)
+        a, b, names = Z @ [0.2, 0, 0], Z @ [0.35, 0, 0], parameter_names(i + 1, "xz")
         found.append(sphere_row(N, R, a, b, q[i], Z, names))
         found.append(hinge_row(N, R, a, b, q[i], Z, Z @ EY, names))
     return found
@@ -140,9 +139,9 @@ def ru_pus_prs_rows(N: Array, R: Array, q: Array) -> list[tuple[Array, dict]]:
     }
     post |= {"thU2x": -u1 @ R @ np.cross(EX, EY), "thU2z": -u1 @ R @ np.cross(EZ, EY)}
     return [
-        sphere_row(N, R, a1, b1, q[0], eye, tags(1, "")),
-        sphere_row(N, R, a2, b2, q[1], eye, tags(2, "")),
-        hinge_row(N, R, a2, b2, q[1], eye, EX, tags(2, "yz")),
+        sphere_row(N, R, a1, b1, q[0], eye, parameter_names(1, "")),
+        sphere_row(N, R, a2, b2, q[1], eye, parameter_names(2, "")),
+        hinge_row(N, R, a2, b2, q[1], eye, EX, parameter_names(2, "yz")),
         (np.concatenate([zero, N / np.linalg.norm(N)]), {"r": 1.0}),
         # the pivot along n = y: its turn about x tips the post sideways, that about z leaves N
         # where it is
@@ -156,31 +155,31 @@ def ru_pus_prs_rows(N: Array, R: Array, q: Array) -> list[tuple[Array, dict]]:
     ]
 
 
-def by_hand(rows: list[tuple[Array, dict]], names: tuple[str, ...]) -> Array:
+def sensitivities_by_hand(rows: list[tuple[Array, dict]], names: tuple[str, ...]) -> Array:
     """D = J^-1 G (6, p), twist (rotation, translation) per parameter."""
     J = np.stack([row for row, _ in rows])
     G = np.array([[slopes.get(name, 0.0) for name in names] for _, slopes in rows])
     return np.asarray(np.linalg.solve(J, G), dtype=float)
 
 
-CASES = {
+MODELS = {
     "3-PRS": (THREE_PRS, three_prs_rows),
     "RU-PUS-PRS, 25": (RU_PUS_PRS, ru_pus_prs_rows),
     "RU-PUS-PRS, 27": (replace(RU_PUS_PRS, parameters="twenty-seven"), ru_pus_prs_rows),
 }
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_columns_are_those_of_the_error_model_written_out(case: str) -> None:
-    record, rows = CASES[case]
-    machine = robot(record)
-    solution = solved(machine)
+@pytest.mark.parametrize("case", MODELS)
+def test_sensitivities_equal_the_error_model_derived_by_hand(case: str) -> None:
+    record, rows = MODELS[case]
+    machine = build_cached_robot(record)
+    solution = solve_random_poses(machine)
     D = differentiate_pose(
         machine, machine.values[None], solution.q[None], solution.state
     ).parameters[0]
     expected = np.stack(
         [
-            by_hand(rows(T[:3, 3], T[:3, :3], q), machine.parameters.names)
+            sensitivities_by_hand(rows(T[:3, 3], T[:3, :3], q), machine.parameters.names)
             for T, q in zip(solution.T, solution.q, strict=True)
         ]
     )
@@ -194,7 +193,7 @@ def cross_matrix(w: Array | Complex) -> Complex:
     return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]], dtype=complex)
 
 
-def turned(w: Array | Complex) -> Complex:
+def rotation_series(w: Array | Complex) -> Complex:
     """exp of small angles as its series, which takes complex numbers; 0.1^12 / 12! is far below
     rounding.
     """
@@ -222,34 +221,39 @@ class Loops:
     def limb(
         self, i: int, N: Complex, R: Complex, q: float, Z: Array, hinge: Array | None
     ) -> list[complex]:
-        guide = turned(self.vector(f"thB{i}"))
+        guide = rotation_series(self.vector(f"thB{i}"))
         s = Z @ guide @ EZ
         v = N + R @ Z @ self.vector(f"a{i}") - Z @ self.vector(f"b{i}") - (self.of[f"q{i}"] + q) * s
         found = [np.sqrt(v @ v) - self.of[f"l{i}"]]
         if hinge is not None:
-            r = Z @ guide @ turned(self.vector(f"thC{i}") - self.vector(f"thB{i}")) @ hinge
+            r = Z @ guide @ rotation_series(self.vector(f"thC{i}") - self.vector(f"thB{i}")) @ hinge
             found.append(v @ r)
         return found
 
     def three_prs(self, N: Complex, R: Complex, pivot: complex, q: Array) -> Complex:
         """Six, and one that holds the pivot the machine does not have."""
-        limbs = [self.limb(i + 1, N, R, q[i], spin(2 * np.pi / 3 * i), EY) for i in range(3)]
+        limbs = [
+            self.limb(i + 1, N, R, q[i], rotation_about_z(2 * np.pi / 3 * i), EY) for i in range(3)
+        ]
         return np.array([*limbs[0], *limbs[1], *limbs[2], pivot])
 
     def ru_pus_prs(self, N: Complex, R: Complex, pivot: complex, q: Array) -> Complex:
         """Seven: three of the limbs, the post's end, the cross of its universal joint."""
         eye, c, s = np.eye(3), np.cos(pivot), np.sin(pivot)
-        post = turned(self.vector("thO")) @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-        u1, u2 = post @ turned(self.vector("thU1")) @ EX, R @ turned(self.vector("thU2")) @ EY
+        post = rotation_series(self.vector("thO")) @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        u1, u2 = (
+            post @ rotation_series(self.vector("thU1")) @ EX,
+            R @ rotation_series(self.vector("thU2")) @ EY,
+        )
         limbs = [*self.limb(1, N, R, q[0], eye, None), *self.limb(2, N, R, q[1], eye, EX)]
         return np.array([*limbs, *(N - self.of["r"] * post @ EZ), u1 @ u2])
 
     def pivot(self, N: Array) -> float:
-        x, _, z = (turned(self.vector("thO")).T @ N).real
+        x, _, z = (rotation_series(self.vector("thO")).T @ N).real
         return float(np.arctan2(x, z))
 
 
-def by_closure(
+def sensitivities_by_complex_steps(
     kind: str, names: tuple[str, ...], values: Array, T: Array, q: Array
 ) -> tuple[Array, Array]:
     """Residuals (7,) and D (6, p) of the loops by complex steps, which have no truncation and no
@@ -274,21 +278,19 @@ def by_closure(
 
 
 @pytest.mark.parametrize("size", [1e-3, 1e-2])
-@pytest.mark.parametrize("case", CASES)
-def test_columns_at_moved_parameters_are_those_of_the_closure_written_out(
-    case: str, size: float
-) -> None:
+@pytest.mark.parametrize("case", MODELS)
+def test_sensitivities_at_perturbed_parameters_equal_complex_steps(case: str, size: float) -> None:
     # [m] and angles of 5 (50) mrad: centres, guides, joints and post all displaced, also against
     # each other
-    record, rows = CASES[case]
-    machine = perturbed(robot(record), size, seed=11)
-    solution = solved(machine, 40)
+    record, rows = MODELS[case]
+    machine = perturb(build_cached_robot(record), size, seed=11)
+    solution = solve_random_poses(machine, 40)
     D = differentiate_pose(
         machine, machine.values[None], solution.q[None], solution.state
     ).parameters[0]
     kind, names = rows.__name__.removesuffix("_rows"), machine.parameters.names
     found = [
-        by_closure(kind, names, machine.values, T, q)
+        sensitivities_by_complex_steps(kind, names, machine.values, T, q)
         for T, q in zip(solution.T, solution.q, strict=True)
     ]
     expected = np.stack([slopes for _, slopes in found])
@@ -299,20 +301,22 @@ def test_columns_at_moved_parameters_are_those_of_the_closure_written_out(
     np.testing.assert_allclose(D, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_both_derivations_by_hand_agree_at_nominal_parameters(case: str) -> None:
-    record, rows = CASES[case]
-    machine = robot(record)
-    solution = solved(machine, 20)
+@pytest.mark.parametrize("case", MODELS)
+def test_hand_derivation_and_complex_steps_agree_at_nominal_parameters(case: str) -> None:
+    record, rows = MODELS[case]
+    machine = build_cached_robot(record)
+    solution = solve_random_poses(machine, 20)
     names = machine.parameters.names
     for T, q in zip(solution.T, solution.q, strict=True):
-        _, slopes = by_closure(rows.__name__.removesuffix("_rows"), names, machine.values, T, q)
-        expected = by_hand(rows(T[:3, 3], T[:3, :3], q), names)
+        _, slopes = sensitivities_by_complex_steps(
+            rows.__name__.removesuffix("_rows"), names, machine.values, T, q
+        )
+        expected = sensitivities_by_hand(rows(T[:3, 3], T[:3, :3], q), names)
         np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
-def test_the_declared_names_are_eleven_a_chain_and_twenty_five() -> None:
-    names = robot(THREE_PRS).parameters.names
+def test_parameter_names_of_3_prs_and_ru_pus_prs() -> None:
+    names = build_cached_robot(THREE_PRS).parameters.names
     assert len(names) == 33
     assert names[:11] == (
         "a1x",
@@ -327,25 +331,29 @@ def test_the_declared_names_are_eleven_a_chain_and_twenty_five() -> None:
         "thC1x",
         "thC1z",
     )
-    names = robot(RU_PUS_PRS).parameters.names
+    names = build_cached_robot(RU_PUS_PRS).parameters.names
     assert len(names) == 25
-    assert set(robot(CASES["RU-PUS-PRS, 27"][0]).parameters.names) - set(names) == set(LEFT_OUT)
+    assert set(build_cached_robot(MODELS["RU-PUS-PRS, 27"][0]).parameters.names) - set(
+        names
+    ) == set(LEFT_OUT)
     assert names[-5:] == ("r", "thOx", "thU1y", "thU2x", "thU2z")
 
 
-# --- what can be told apart
+# --- identifiability
 # ------------------------------------------------------------------------------------------
-def test_ranks_of_the_3_prs_are_33_and_lose_one_without_torsion_and_three_without_angles() -> None:
-    assert ranks(robot(THREE_PRS), KINDS) == [33, 32, 30, 27]
+def test_ranks_of_the_3_prs_by_measurement() -> None:
+    assert ranks_by_measurement(build_cached_robot(THREE_PRS), MEASUREMENTS) == [33, 32, 30, 27]
 
 
-def test_an_unknown_frame_costs_the_3_prs_six_parameters_and_two_cost_twelve() -> None:
-    assert told_apart(robot(THREE_PRS), "full") == [27, 27, 21]
+def test_each_unknown_frame_lowers_the_rank_of_the_3_prs_by_six() -> None:
+    assert ranks_with_unknown_frames(build_cached_robot(THREE_PRS), "full") == [27, 27, 21]
     # the frame's own turn about the normal hides nothing new: 32 - 6
-    assert told_apart(robot(THREE_PRS), "5-dof", [(True, False)]) == [26]
+    assert ranks_with_unknown_frames(build_cached_robot(THREE_PRS), "5-dof", [(True, False)]) == [
+        26
+    ]
 
 
-def test_an_unknown_frame_costs_the_tracker_the_motions_that_its_parameters_can_follow() -> None:
+def test_unknown_frame_lowers_the_rank_of_the_ru_pus_prs_by_motions_it_can_follow() -> None:
     """A frame costs as many as it has motions that a change of the parameters repeats; by counting.
 
     Base, 5 (20): all moves and turns but the one about z, for the twenty-five leave out the post's
@@ -354,27 +362,33 @@ def test_an_unknown_frame_costs_the_tracker_the_motions_that_its_parameters_can_
     would shift the universal joint on the platform, which has no parameter. Both, 8 (17): the sum.
     Without torsion one less where the tool is known, none where its turn about the normal is lost.
     """
-    machine = robot(RU_PUS_PRS)
-    assert told_apart(machine, "full") == [20, 22, 17]
-    assert told_apart(machine, "5-dof") == [19, 22, 17]
-    assert told_apart(robot(CASES["RU-PUS-PRS, 27"][0]), "full") == [20, 23, 17]
+    machine = build_cached_robot(RU_PUS_PRS)
+    assert ranks_with_unknown_frames(machine, "full") == [20, 22, 17]
+    assert ranks_with_unknown_frames(machine, "5-dof") == [19, 22, 17]
+    assert ranks_with_unknown_frames(build_cached_robot(MODELS["RU-PUS-PRS, 27"][0]), "full") == [
+        20,
+        23,
+        17,
+    ]
 
 
-def test_without_torsion_the_3_prs_cannot_see_its_three_balls_turned_together() -> None:
-    machine = robot(THREE_PRS)
-    solution = solved(machine)
-    found = null_vector(measured(scaled_sensitivity(machine, solution), solution.T, "5-dof"))
+def test_null_vector_of_the_3_prs_without_torsion_rotates_three_balls() -> None:
+    machine = build_cached_robot(THREE_PRS)
+    solution = solve_random_poses(machine)
+    found = null_vector(
+        select_measured_rows(scaled_sensitivity(machine, solution), solution.T, "5-dof")
+    )
     expected = np.isin(machine.parameters.names, ("a1y", "a2y", "a3y")) / np.sqrt(3)
     np.testing.assert_allclose(
         np.abs(found @ expected), 1.0, atol=1e-9
     )  # rounding over the next singular value, 4e-5
 
 
-def test_fourteen_natural_parameters_a_chain_reduce_to_the_eleven_by_dropping_three() -> None:
-    machine = robot(replace(THREE_PRS, parameters="fourteen"))
+def test_fourteen_parameters_a_chain_have_the_rank_of_eleven() -> None:
+    machine = build_cached_robot(replace(THREE_PRS, parameters="fourteen"))
     names = machine.parameters.names
     assert len(names) == 42
-    solution = solved(machine)
+    solution = solve_random_poses(machine)
     D = scaled_sensitivity(machine, solution)
     assert rank(D) == 33
     dropped = [
@@ -389,11 +403,11 @@ def test_fourteen_natural_parameters_a_chain_reduce_to_the_eleven_by_dropping_th
         np.testing.assert_allclose(column, twin, rtol=0, atol=1e-14 * np.abs(D).max())
     kept = np.array([name not in dropped for name in names])
     assert rank(D[..., kept]) == 33
-    assert tuple(np.array(names)[kept]) == robot(THREE_PRS).parameters.names
+    assert tuple(np.array(names)[kept]) == build_cached_robot(THREE_PRS).parameters.names
 
 
-def test_a_tilted_guide_does_not_turn_the_joint_on_the_carriage() -> None:
-    machine = robot(THREE_PRS)
+def test_tilted_guide_does_not_rotate_the_joint_on_the_carriage() -> None:
+    machine = build_cached_robot(THREE_PRS)
     # 0.1 rad, far beyond first order: the hinge stays along y of its chain
     values = machine.values.copy()
     values[machine.parameters.index("thB1x")] = 0.1
@@ -406,24 +420,24 @@ def test_a_tilted_guide_does_not_turn_the_joint_on_the_carriage() -> None:
     )
 
 
-def test_twenty_seven_parameters_of_the_tracker_have_rank_26_because_pivot_and_first_axis_turn_alike() -> (  # noqa: E501
-    None
-):
-    machine = robot(CASES["RU-PUS-PRS, 27"][0])
-    solution = solved(machine)
+def test_twenty_seven_parameters_of_the_ru_pus_prs_have_rank_26() -> None:
+    machine = build_cached_robot(MODELS["RU-PUS-PRS, 27"][0])
+    solution = solve_random_poses(machine)
     D = scaled_sensitivity(machine, solution)
     assert rank(D) == 26
     names = machine.parameters
     pivot, first = D[..., names.index("thOz")], D[..., names.index("thU1z")]
     np.testing.assert_allclose(pivot, first, rtol=0, atol=1e-14 * np.abs(D).max())
     # leaving out thOz alone keeps 26; the declared twenty-five leave out thU1z as well
-    assert ranks(robot(RU_PUS_PRS), ("full", "5-dof")) == [25, 24]
+    assert ranks_by_measurement(build_cached_robot(RU_PUS_PRS), ("full", "5-dof")) == [25, 24]
 
 
-def test_without_torsion_the_tracker_cannot_see_its_two_balls_turned_together() -> None:
-    machine = robot(RU_PUS_PRS)
-    solution = solved(machine)
-    found = null_vector(measured(scaled_sensitivity(machine, solution), solution.T, "5-dof"))
+def test_null_vector_of_the_ru_pus_prs_without_torsion_rotates_two_balls() -> None:
+    machine = build_cached_robot(RU_PUS_PRS)
+    solution = solve_random_poses(machine)
+    found = null_vector(
+        select_measured_rows(scaled_sensitivity(machine, solution), solution.T, "5-dof")
+    )
     found *= np.sign(found[machine.parameters.index("a1y")])
     # mostly a1y = a2x, and a small angle of the second axis on the platform
     assert found[machine.parameters.index("a1y")] == pytest.approx(
@@ -433,20 +447,20 @@ def test_without_torsion_the_tracker_cannot_see_its_two_balls_turned_together() 
     assert set(largest) == {"a1y", "a2x", "thU2z"}
 
 
-def test_a_model_of_points_refuses_joints_of_axes() -> None:
+def test_ideal_model_refuses_spherical_joints_of_axes() -> None:
     with pytest.raises(MechanismError, match="state error_model: complete"):
         replace(THREE_PRS, spherical="axes").expand()
 
 
-def test_a_rod_too_short_is_told_in_words() -> None:
+def test_rod_too_short_is_refused_with_both_lengths() -> None:
     with pytest.raises(
         MechanismError, match="rod of chain1 is 100 mm long, but its ball is 150 mm"
     ):
         replace(THREE_PRS, rod=0.1).expand()
 
 
-def test_the_origin_of_the_trackers_platform_stays_where_it_is() -> None:
-    solution = solved(robot(RU_PUS_PRS))
+def test_platform_origin_of_the_ru_pus_prs_does_not_move() -> None:
+    solution = solve_random_poses(build_cached_robot(RU_PUS_PRS))
     np.testing.assert_allclose(
         solution.T[:, :3, 3], [[0, 0, 0.6]] * len(solution.T), atol=1e-12
     )  # [m] rounding

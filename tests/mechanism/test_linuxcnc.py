@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kinematics against numbers that LinuxCNC's genhexkins and lineardeltakins printed (see the data's
-README).
+"""Kinematics agree with numbers printed by LinuxCNC's genhexkins and lineardeltakins (see the
+README of the data).
 """
 
 import csv
@@ -16,34 +16,34 @@ from loopcal.mechanism.families.linear_delta import LinearDelta
 from tests import zoo
 
 
-def columns(path, names):
+def read_columns(path, names):
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     return np.array([[float(row[name]) for name in names.split()] for row in rows])
 
 
 @pytest.fixture(scope="module")
-def oracles(data_folder):
+def oracle_folder(data_folder):
     return data_folder / "kinematics_oracles"
 
 
 @pytest.fixture(scope="module")
-def hexapod(oracles):
-    """The hexapod, its 200 poses, their strut lengths and the poses that genhexkins found back;
-    lengths in its unit.
+def hexapod(oracle_folder):
+    """Return the hexapod, 200 poses, their strut lengths, and the poses that genhexkins computed
+    from these lengths, in the unit of genhexkins.
     """
-    geometry = json.loads((oracles / "genhexkins_geometry.json").read_text("utf-8"))
+    geometry = json.loads((oracle_folder / "genhexkins_geometry.json").read_text("utf-8"))
     robot = zoo.gough(
         "genhexkins", np.array(geometry["base"]), np.array(geometry["platform"]), 0.0, 20.0
     )
-    path = oracles / "genhexkins_default_200poses.csv"
+    path = oracle_folder / "genhexkins_default_200poses.csv"
     degrees = np.array([1.0, 1.0, 1.0, *[np.pi / 180] * 3])
-    put_in = zoo.poses_of(columns(path, "x y z a_deg b_deg c_deg") * degrees)
-    found = zoo.poses_of(columns(path, "fk_x fk_y fk_z fk_a fk_b fk_c") * degrees)
-    return robot, put_in, columns(path, "L0 L1 L2 L3 L4 L5"), found
+    given_poses = zoo.make_poses(read_columns(path, "x y z a_deg b_deg c_deg") * degrees)
+    found = zoo.make_poses(read_columns(path, "fk_x fk_y fk_z fk_a fk_b fk_c") * degrees)
+    return robot, given_poses, read_columns(path, "L0 L1 L2 L3 L4 L5"), found
 
 
-def test_genhexkins_gives_the_same_strut_lengths(hexapod):
+def test_strut_lengths_agree_with_genhexkins(hexapod):
     robot, poses, lengths, _ = hexapod
     sol = inverse(robot, poses)
     assert_array_equal(sol.status, Status.CONVERGED)
@@ -51,7 +51,7 @@ def test_genhexkins_gives_the_same_strut_lengths(hexapod):
     assert_allclose(sol.q, lengths, rtol=0, atol=1e-9)  # its poses are printed to 1e-10
 
 
-def test_forward_kinematics_of_genhexkins_lengths_find_its_poses(hexapod):
+def test_poses_of_genhexkins_lengths_agree_with_genhexkins(hexapod):
     robot, poses, lengths, found = hexapod
     sol = forward(robot, inverse(robot, poses).q)
     assert_array_equal(sol.status, Status.CONVERGED)
@@ -63,16 +63,16 @@ def test_forward_kinematics_of_genhexkins_lengths_find_its_poses(hexapod):
     )  # its own iteration stops there
 
 
-def test_lineardeltakins_gives_the_same_carriages_and_poses(oracles):
+def test_carriages_and_poses_agree_with_lineardeltakins(oracle_folder):
     # its carriages are counted upwards; R 130.25 and L 269 are its defaults, towers at 90, 210 and
     # 330 degrees
     record = LinearDelta(
         name="lineardeltakins", radius=130.25, angles=tuple(np.deg2rad((90.0, 210.0, 330.0)).tolist()), arms=269.0,  # noqa: E501
         stops=-float(np.sqrt(269.0**2 - 130.25**2)), readings="height", home=PoseRecord(z=50.0),
     )  # fmt: skip
-    robot, path = build(record.expand()), oracles / "lineardeltakins_default_200poses.csv"
+    robot, path = build(record.expand()), oracle_folder / "lineardeltakins_default_200poses.csv"
     points, carriages, found = (
-        columns(path, names) for names in ("x y z", "j0 j1 j2", "fk_x fk_y fk_z")
+        read_columns(path, names) for names in ("x y z", "j0 j1 j2", "fk_x fk_y fk_z")
     )
     sol = inverse(robot, points)
     assert len(points) == 200

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How passive joints follow parameters and readings, against differences."""
+"""Derivatives of passive joints by parameters and readings agree with differences."""
 
 import numpy as np
 import pytest
@@ -17,10 +17,10 @@ from loopcal.mechanism.families.gough import Gough
 from loopcal.units import Dimension
 from tests import zoo
 from tests.jacobians import check_jacobian
-from tests.mechanism.test_kinematics import sampled
+from tests.mechanism.test_kinematics import sample_inverse
 
 
-def ups():
+def build_ups_hexapod():
     record = Gough(
         name="ups",
         base=tuple(map(tuple, (zoo.HEXAPOD_BASE * zoo.MM).tolist())),
@@ -33,9 +33,9 @@ def ups():
     return build(record.expand(), record=record)
 
 
-@pytest.mark.parametrize("name", ["menagerie", "three_prs", "planar_rrr"])
-def test_passive_joints_follow_parameters_and_readings_as_differences_say(name):
-    robot, sol, _ = sampled(name, 1)
+@pytest.mark.parametrize("name", ["mixed_hexapod", "three_prs", "planar_rrr"])
+def test_passive_joint_derivatives_agree_with_differences(name):
+    robot, sol, _ = sample_inverse(name, 1)
     values, q = robot.values[None], sol.q[None]
     state = forward_trials(robot, values, q, start=sol.state)
     found = differentiate_passive_joints(robot, values, q, state)
@@ -56,7 +56,7 @@ def test_passive_joints_follow_parameters_and_readings_as_differences_say(name):
         return np.concatenate(
             [
                 at.joints[g][:, 0, k, : len(robot.program.groups[g].joints)][
-                    :, passive(robot, limb)
+                    :, list_passive_joints(robot, limb)
                 ]
                 for limb, g, k in by_limb
             ],
@@ -70,14 +70,14 @@ def test_passive_joints_follow_parameters_and_readings_as_differences_say(name):
     )  # fmt: skip
 
 
-def passive(robot, limb):
+def list_passive_joints(robot, limb):
     return [
         j for j, joint in enumerate(robot.assembly.limbs[limb].joints) if joint.actuator is None
     ]
 
 
-def test_blocks_of_rows_change_nothing():
-    robot = ups()
+def test_passive_joint_derivatives_do_not_depend_on_row_blocks():
+    robot = build_ups_hexapod()
     q = np.random.default_rng(0).uniform(-0.01, 0.01, (1, 700, 6))
     values = robot.values[None]
     state = forward_trials(robot, values, q)
@@ -89,8 +89,8 @@ def test_blocks_of_rows_change_nothing():
     assert make_solution(robot, state, q[0]).passive_names == whole.names
 
 
-def test_failed_rows_hold_no_numbers():
-    robot, q = ups(), np.zeros((1, 2, 6))
+def test_failed_rows_have_nan_derivatives_of_passive_joints():
+    robot, q = build_ups_hexapod(), np.zeros((1, 2, 6))
     q[0, 1, 2] = np.nan
     found = differentiate_passive_joints(
         robot, robot.values[None], q, forward_trials(robot, robot.values[None], q)
@@ -99,9 +99,8 @@ def test_failed_rows_hold_no_numbers():
     assert np.isnan(found.parameters[0, 1]).all()
 
 
-def test_a_driven_slide_does_not_make_the_joint_below_it_a_spinning_one():
-    # once the slide was taken at zero, where a universal joint turns nothing, and both its axes
-    # were held
-    robot = ups()
+def test_ups_legs_have_no_locked_joint():
+    # regression: at slide length zero the universal joint had no effect and both axes were locked
+    robot = build_ups_hexapod()
     assert robot.findings == ()
     assert_array_equal([g.locked for g in robot.program.groups], [(False, False, False)])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every robot that comes with loopcal, 1e5 random rows inside its strokes: each returns to its
-mode, or it is said why not.
+"""Forward kinematics of every shipped robot: 1e5 random rows within its strokes return to their
+assembly mode, or the result states why not.
 
-A new file in src/loopcal/robots is picked up by itself.
+A new file in src/loopcal/robots is included automatically.
 """
 
 from collections.abc import Iterator
@@ -24,54 +24,52 @@ FAR = 20.0  # times the workspace: no machine reaches all of it
 
 
 @cache
-def robot(name: str) -> Mechanism:
+def load_cached_robot(name: str) -> Mechanism:
     return load_robot(name)
 
 
-def drawn(machine: Mechanism, rng: np.random.Generator, n: int, wide: float = 1.0) -> Array:
-    """Random controlled coordinates (n, c), evenly in ranges of the workspace widened about their
-    middle.
-    """
+def draw_coordinates(
+    machine: Mechanism, rng: np.random.Generator, n: int, wide: float = 1.0
+) -> Array:
+    """Draw coordinates (n, c) evenly from the workspace, widened `wide` times about its middle."""
     low, high = np.array([machine.assembly.workspace[name] for name in machine.controlled]).T
     middle, half = (low + high) / 2, (high - low) / 2
     return middle + wide * half * rng.uniform(-1.0, 1.0, (n, len(low)))
 
 
-def inside(machine: Mechanism, q: Array) -> NDArray[np.bool_]:
-    """Rows whose readings are within every stroke."""
+def is_within_strokes(machine: Mechanism, q: Array) -> NDArray[np.bool_]:
+    """Return the rows whose readings are within every stroke."""
     low, high = np.array([a.stroke for a in machine.actuators]).T
     return ((q >= low) & (q <= high)).all(axis=1)
 
 
-def rows_inside(machine: Mechanism, seed: int) -> Iterator[Solution]:
+def generate_reachable_rows(machine: Mechanism, seed: int) -> Iterator[Solution]:
     """Blocks of solutions inside strokes, 1e5 rows in all; at least half of the workspace must be."""  # noqa: E501
     rng, found, tried = np.random.default_rng(seed), 0, 0
     while found < ROWS:
-        there = inverse(machine, drawn(machine, rng, BLOCK))
+        there = inverse(machine, draw_coordinates(machine, rng, BLOCK))
         tried += BLOCK
         some = there.take(
-            np.flatnonzero(there.converged & inside(machine, there.q))[: ROWS - found]
+            np.flatnonzero(there.converged & is_within_strokes(machine, there.q))[: ROWS - found]
         )
         found += len(some.q)
         assert found >= 0.5 * min(tried, ROWS)
         yield some
 
 
-def returned(there: Solution, back: Solution) -> NDArray[np.bool_]:
-    """Rows that came back to where they were."""
+def has_returned(there: Solution, back: Solution) -> NDArray[np.bool_]:
+    """Return the rows that converged to their original pose."""
     # [rad, m] Newton stops below 1e-13 of the size; the rest is the condition of the mechanism
     return back.converged & (np.abs(geometry.pose_difference(back.T, there.T)).max(axis=1) < 1e-8)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
-def test_a_hundred_thousand_rows_inside_the_strokes_return_to_their_mode_and_the_rest_say_why(
-    name: str,
-) -> None:
-    machine, total, home = robot(name), 0, 0
-    for there in rows_inside(machine, seed=20):
+def test_rows_within_the_strokes_return_to_their_mode_or_state_why_not(name: str) -> None:
+    machine, total, home = load_cached_robot(name), 0, 0
+    for there in generate_reachable_rows(machine, seed=20):
         back = forward(machine, there.q)
-        good = returned(there, back)
+        good = has_returned(there, back)
         total, home = total + len(good), home + int(good.sum())
         elsewhere = np.flatnonzero(~good & back.converged)
         if len(elsewhere):
@@ -86,10 +84,10 @@ def test_a_hundred_thousand_rows_inside_the_strokes_return_to_their_mode_and_the
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_what_cannot_be_reached_is_marked_and_never_raised(name: str) -> None:
-    machine = robot(name)
-    there = inverse(machine, drawn(machine, np.random.default_rng(21), 500, wide=FAR))
-    # a row called closed is closed, whatever was asked for
+def test_unreachable_coordinates_are_marked_without_an_exception(name: str) -> None:
+    machine = load_cached_robot(name)
+    there = inverse(machine, draw_coordinates(machine, np.random.default_rng(21), 500, wide=FAR))
+    # a converged row is closed, for any target
     assert there.residual[there.converged].max(initial=0.0) <= 1e-9 * machine.size
     for row in np.flatnonzero(~there.converged)[:20]:
         assert Status(int(there.status[row])) is not Status.CONVERGED
@@ -98,8 +96,8 @@ def test_what_cannot_be_reached_is_marked_and_never_raised(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
-def test_readings_beyond_all_strokes_and_nonsense_are_marked_and_never_raised(name: str) -> None:
-    machine = robot(name)
+def test_readings_beyond_strokes_or_not_finite_are_marked_without_an_exception(name: str) -> None:
+    machine = load_cached_robot(name)
     low, high = np.array([a.stroke for a in machine.actuators]).T
     q = np.random.default_rng(22).uniform(
         low - 3 * (high - low), high + 3 * (high - low), (100, len(low))
@@ -110,7 +108,7 @@ def test_readings_beyond_all_strokes_and_nonsense_are_marked_and_never_raised(na
     assert np.isfinite(back.T[back.converged]).all()
     if len(machine.actuators) == len(
         machine.controlled
-    ):  # lines that contradict each other leave a residual
+    ):  # contradicting readings of redundant actuators leave a residual
         assert back.residual[back.converged].max(initial=0.0) <= 1e-9 * machine.size
     for row in np.flatnonzero(~back.converged):
         assert back.explain(int(row))

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Redundant actuators with the pose given: readings and passive joints follow it and the
-parameters, against differences.
+"""Redundant actuators at a given pose: derivatives of readings and passive joints agree with
+differences.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ from tests import zoo
 from tests.jacobians import check_jacobian
 
 
-def planar_with_four_arms():
+def build_planar_robot_with_four_arms():
     """A planar platform on four arms with two passive joints each, all lengths and offsets
     parameters.
     """
@@ -35,12 +35,12 @@ def planar_with_four_arms():
         joints = (Joint("motor", "R", f"q{i}", start=2.2), Joint("elbow", "R", start=1.7))
         limbs.append(Limb(f"arm{i}", links, joints, "ball", Link("corner", zoo.place(0.06 * axis))))
     return build(
-        zoo.assembled("4-RRR", tuple(limbs), ("rz", "x", "y"), ("x", "y", "yaw"), np.eye(4))
+        zoo.assemble("4-RRR", tuple(limbs), ("rz", "x", "y"), ("x", "y", "yaw"), np.eye(4))
     )
 
 
-def standing(robot, seed=0):
-    """Values (1, p), a pose (1, 1, 4, 4), and the state and readings there."""
+def solve_example_pose(robot, seed=0):
+    """Return values (1, p), a pose (1, 1, 4, 4), and the state and readings at this pose."""
     rng = np.random.default_rng(seed)
     values = robot.values[None] + 1e-3 * rng.standard_normal((1, len(robot.values)))
     T = zoo.place((0.01, -0.02, 0.0), (0, 0, 0.1))[None, None]
@@ -49,18 +49,18 @@ def standing(robot, seed=0):
     return values, T, state, q
 
 
-def test_every_limb_closes_at_the_pose_given():
-    robot = planar_with_four_arms()
-    values, T, state, q = standing(robot)
+def test_every_limb_closes_at_the_given_pose():
+    robot = build_planar_robot_with_four_arms()
+    values, T, state, q = solve_example_pose(robot)
     assert_allclose(state.T, T, atol=1e-14)  # [m], [rad]
     assert state.residual.max() < 1e-12 * robot.size
-    there = forward(robot.with_values(values[0]), q[0])
-    assert_allclose(there.T, T[0], atol=1e-11)  # [m]: readings that agree lead back
+    solution = forward(robot.with_values(values[0]), q[0])
+    assert_allclose(solution.T, T[0], atol=1e-11)  # [m]: consistent readings give the same pose
 
 
-def test_readings_and_passive_joints_follow_pose_and_parameters_as_differences_say():
-    robot = planar_with_four_arms()
-    values, T, state, q = standing(robot)
+def test_reading_and_passive_joint_derivatives_at_a_pose_agree_with_differences():
+    robot = build_planar_robot_with_four_arms()
+    values, T, state, q = solve_example_pose(robot)
     found = differentiate_at_pose(robot, values, q, state)
     p, freedoms = values.shape[1], robot.program.freedoms
     moved = np.zeros((3, 6))
@@ -90,9 +90,9 @@ def test_readings_and_passive_joints_follow_pose_and_parameters_as_differences_s
     )
 
 
-def test_along_consistent_readings_pose_and_readings_say_the_same():
-    robot = planar_with_four_arms()
-    values, _, state, q = standing(robot)
+def test_derivatives_by_pose_and_by_readings_agree():
+    robot = build_planar_robot_with_four_arms()
+    values, _, state, q = solve_example_pose(robot)
     found = differentiate_at_pose(robot, values, q, state)
     by_reading = differentiate_passive_joints(robot, values, q, state)
     turned = (

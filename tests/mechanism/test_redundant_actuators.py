@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""More actuators than freedoms: the pose is the least-squares one, each reading weighed by its own
-standard deviation.
-"""
+"""More actuators than freedoms: the pose is the weighted least-squares solution of the readings."""
 
 from dataclasses import replace
 
@@ -26,7 +24,7 @@ from tests import zoo
 from tests.jacobians import check_jacobian
 
 
-def cable_robot(sigmas=None):
+def load_cable_robot(sigmas=None):
     """The shipped four-line robot, its encoders with these standard deviations."""
     assembly = load_robot("cable-4").assembly
     if sigmas is None:
@@ -41,7 +39,7 @@ def cable_robot(sigmas=None):
     )
 
 
-def line_lengths(robot, q):
+def compute_line_lengths(robot, q):
     """Length of each line at readings q (a,), from the assembly's own numbers."""
     terms = [a.terms for a in robot.actuators]
     driven = np.array(
@@ -53,16 +51,16 @@ def line_lengths(robot, q):
     return driven + np.array([limb.length for limb in robot.assembly.limbs])
 
 
-def points(robot):
-    """Anchors and where the lines meet the platform (k, 3), from the assembly's own numbers."""
+def list_attachment_points(robot):
+    """Return anchors and attachment points (k, 3) from the numbers of the assembly."""
     anchors = np.array([limb.links[-1].transform[:3, 3] for limb in robot.assembly.limbs])
     return anchors, np.array([limb.attachment.transform[:3, 3] for limb in robot.assembly.limbs])
 
 
-def best_position(robot, q, sigmas):
+def solve_position_by_scipy(robot, q, sigmas):
     """Position that minimises the weighted sum of squared length errors, by scipy."""
-    anchors, attached = points(robot)
-    lengths = line_lengths(robot, q)
+    anchors, attached = list_attachment_points(robot)
+    lengths = compute_line_lengths(robot, q)
 
     def misfit(x):
         return (np.linalg.norm(x + attached - anchors, axis=1) - lengths) / sigmas
@@ -71,8 +69,8 @@ def best_position(robot, q, sigmas):
 
 
 @pytest.mark.parametrize("sigmas", [(1.0, 1.0, 1.0, 1.0), (1.0, 5.0, 0.2, 2.0)])
-def test_contradicting_readings_give_the_pose_of_least_squares(sigmas):
-    robot = cable_robot(tuple(1e-3 * s for s in sigmas))
+def test_contradicting_readings_give_the_least_squares_pose(sigmas):
+    robot = load_cable_robot(tuple(1e-3 * s for s in sigmas))
     rng = np.random.default_rng(2)
     asked = np.array([robot.home[:3, 3]]) + rng.uniform(-0.1, 0.1, (5, 3))
     q = inverse(robot, asked).q
@@ -84,22 +82,22 @@ def test_contradicting_readings_give_the_pose_of_least_squares(sigmas):
         # scipy stops at about the square root of rounding in x, the gap being millimetres
         assert_allclose(
             sol.T[i, :3, 3],
-            best_position(robot, row, np.array(sigmas) * gains),
+            solve_position_by_scipy(robot, row, np.array(sigmas) * gains),
             atol=1e-7 * robot.size,
         )
     assert (sol.residual > 1e-6).all()
 
 
-def test_consistent_readings_leave_nothing_open():
-    robot = cable_robot((1e-3, 5e-3, 2e-4, 2e-3))
+def test_consistent_readings_leave_no_residual():
+    robot = load_cable_robot((1e-3, 5e-3, 2e-4, 2e-3))
     asked = np.array([robot.home[:3, 3]]) + np.random.default_rng(3).uniform(-0.1, 0.1, (20, 3))
     sol = forward(robot, inverse(robot, asked).q)
     assert_allclose(sol.T[:, :3, 3], asked, atol=1e-12)
     assert sol.residual.max() <= 1e-12
 
 
-def test_poses_follow_readings_as_linearized():
-    robot = cable_robot((1e-3, 5e-3, 2e-4, 2e-3))
+def test_pose_derivatives_by_redundant_readings_agree_with_differences():
+    robot = load_cable_robot((1e-3, 5e-3, 2e-4, 2e-3))
     q = inverse(robot, np.array([robot.home[:3, 3]]) + 0.05).q
     values = robot.values[None]
 
@@ -120,7 +118,7 @@ def test_poses_follow_readings_as_linearized():
     )
 
 
-def hexapod_with_seven_legs():
+def build_hexapod_with_seven_legs():
     """The small hexapod with a seventh driven leg from the middle of the base."""
     assembly = zoo.hexapod().assembly
     foot, corner = zoo.place((0.0, 0.0, 0.0)), zoo.place((0.02, 0.03, 0.0))
@@ -133,8 +131,8 @@ def hexapod_with_seven_legs():
     )
 
 
-def test_a_wrong_local_minimum_far_from_home_is_left_or_marked():
-    robot = hexapod_with_seven_legs()
+def test_local_minimum_far_from_home_is_left_or_marked():
+    robot = build_hexapod_with_seven_legs()
     reach = np.array([0.12, 0.12, 0.12, 1.2, 1.2, 1.2])
     asked = (
         np.array([0, 0, 0.2, 0, 0, 0]) + np.random.default_rng(0).uniform(-1, 1, (600, 6)) * reach
@@ -142,8 +140,7 @@ def test_a_wrong_local_minimum_far_from_home_is_left_or_marked():
     found = inverse(robot, asked)
     found = found.take(found.converged)
     again = forward(robot, found.q)
-    # readings agree with each other here: what stays open is a minimum beside the pose they came
-    # from
+    # the readings are consistent, so a residual belongs to a local minimum beside the true pose
     assert again.residual[again.converged].max() < 1e-2 * robot.size
     right = np.abs(again.T - found.T).max(axis=(1, 2)) < 1e-9
     assert 0.85 < right.mean() < 1
@@ -152,8 +149,8 @@ def test_a_wrong_local_minimum_far_from_home_is_left_or_marked():
         assert again.explain(row).code != "kinematics.closed"
 
 
-def test_a_gap_of_contradicting_readings_is_not_called_closed():
-    robot = cable_robot((1e-3, 1e-3, 1e-3, 1e-3))
+def test_contradicting_readings_are_reported_as_a_compromise():
+    robot = load_cable_robot((1e-3, 1e-3, 1e-3, 1e-3))
     q = inverse(robot, robot.home[None, :3, 3]).q
     fits, apart = forward(robot, q), forward(robot, q * [1.002, 1, 1, 1])
     assert fits.explain(0).code == "kinematics.closed"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Of what a machine can reach, the inverse of a pose takes the nearest."""
+"""The inverse kinematics of an unreachable pose returns the nearest reachable one."""
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -7,16 +7,16 @@ from numpy.testing import assert_allclose, assert_array_equal
 from loopcal import geometry
 from loopcal.mechanism import Status, inverse, read_coordinates
 from tests import zoo
-from tests.mechanism.test_kinematics import sampled
+from tests.mechanism.test_kinematics import sample_inverse
 
 
-def cost(robot, T, target):
+def squared_distance(robot, T, target):
     """|log(R R*')|^2 size^2 + |t - t*|^2 (n,) [m^2]."""
     gap = geometry.pose_difference(T, target) * np.array([robot.size] * 3 + [1.0] * 3)
     return (gap**2).sum(axis=1)
 
 
-def targets(n=20):
+def make_unreachable_poses(n=20):
     """Poses near a 3-PRS's workspace, off in all six directions by up to 2 cm and 0.05 rad."""
     rng = np.random.default_rng(5)
     values = rng.uniform([0.66, -np.pi, 0.1], [0.74, np.pi, 0.5], (n, 3))
@@ -24,39 +24,40 @@ def targets(n=20):
     return geometry.apply_twist(T, rng.uniform(-1, 1, (n, 6)) * np.array([0.05] * 3 + [0.02] * 3))
 
 
-def test_the_nearest_pose_of_a_3_prs_has_no_slope_left():
-    robot, target = zoo.three_prs(), targets()
+def test_nearest_pose_of_a_3_prs_minimizes_the_distance():
+    robot, target = zoo.three_prs(), make_unreachable_poses()
     sol = inverse(robot, target)
     assert_array_equal(sol.status, Status.CONVERGED)
     found = read_coordinates(sol.T, robot.controlled)
-    best, h = cost(robot, sol.T, target), 1e-5
+    best, h = squared_distance(robot, sol.T, target), 1e-5
     for i in range(3):
         ahead, behind = (
-            cost(robot, inverse(robot, found + s * h * np.eye(3)[i]).T, target) for s in (1, -1)
+            squared_distance(robot, inverse(robot, found + s * h * np.eye(3)[i]).T, target)
+            for s in (1, -1)
         )
         # slope against curvature: how far along this coordinate the minimum still is
         assert (np.abs(ahead - behind) / (ahead + behind - 2 * best) * h / 2 < 1e-6).all()
         assert (np.minimum(ahead, behind) >= best).all()
 
 
-def test_a_reachable_pose_is_its_own_nearest():
-    robot, sol, _ = sampled("three_prs", 20)
+def test_reachable_pose_is_its_own_nearest_pose():
+    robot, sol, _ = sample_inverse("three_prs", 20)
     back = inverse(robot, sol.T)
     assert_allclose(geometry.pose_difference(back.T, sol.T), 0.0, atol=1e-11)
     assert_allclose(back.q, sol.q, atol=1e-11)
 
 
-def test_a_machine_with_fewer_freedoms_ignores_what_it_has_not():
+def test_delta_ignores_the_orientation_of_a_target_pose():
     robot = zoo.delta()
-    T = zoo.poses_of(np.array([[0.02, -0.03, 0.08, 0.3, 0.2, 0.1]]))
+    T = zoo.make_poses(np.array([[0.02, -0.03, 0.08, 0.3, 0.2, 0.1]]))
     sol = inverse(robot, T)
     assert_array_equal(sol.status, Status.CONVERGED)
     assert_allclose(sol.T[0, :3, 3], T[0, :3, 3], atol=1e-14)
     assert_allclose(sol.T[0, :3, :3], np.eye(3))
 
 
-def test_a_hexapod_reaches_the_pose_itself():
-    _, sol, _ = sampled("hexapod", 20)
+def test_hexapod_reaches_the_target_pose_exactly():
+    _, sol, _ = sample_inverse("hexapod", 20)
     assert_allclose(
         geometry.pose_difference(inverse(zoo.hexapod(), sol.T).T, sol.T), 0.0, atol=1e-15
     )

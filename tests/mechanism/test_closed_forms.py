@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kinematics against a published table and against closed forms."""
+"""Kinematics agree with a published table and with closed forms."""
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -29,46 +29,49 @@ WITHOUT_LENGTH_ERRORS = 1  # row A2 of the table is the same machine without its
 FIRST_ERROR = 0.058938
 
 
-def commanded():
+def commanded_poses():
     rows = np.array([line.split()[:6] for line in TABLE_4.strip().splitlines()], dtype=float)
-    return zoo.poses_of(rows * np.array([zoo.MM] * 3 + [np.pi / 180] * 3))
+    return zoo.make_poses(rows * np.array([zoo.MM] * 3 + [np.pi / 180] * 3))
 
 
-def reached(truth):
+def compute_reached_poses(truth):
     robot = zoo.hexapod()
-    sol = forward(robot.with_values(truth), inverse(robot, commanded()).q)
+    sol = forward(robot.with_values(truth), inverse(robot, commanded_poses()).q)
     assert_array_equal(sol.status, Status.CONVERGED)
     return np.concatenate(
         [sol.T[:, :3, 3] / zoo.MM, geometry.matrix_to_euler(sol.T[:, :3, :3], "xyz")], axis=1
     )
 
 
-def test_table_4_is_met_to_one_unit_of_the_last_digit():
+def test_reached_poses_equal_table_4_to_one_unit_of_the_last_digit():
     printed = [line.split()[6:] for line in TABLE_4.strip().splitlines()]
     units = np.array([[10.0 ** -len(text.partition(".")[2]) for text in row] for row in printed])
     nominal = zoo.hexapod().values.reshape(6, 7)
     truth = zoo.hexapod_truth().reshape(6, 7)
-    found = reached(truth.ravel())
-    found[WITHOUT_LENGTH_ERRORS] = reached(np.column_stack([truth[:, :6], nominal[:, 6]]).ravel())[
-        WITHOUT_LENGTH_ERRORS
-    ]
+    found = compute_reached_poses(truth.ravel())
+    found[WITHOUT_LENGTH_ERRORS] = compute_reached_poses(
+        np.column_stack([truth[:, :6], nominal[:, 6]]).ravel()
+    )[WITHOUT_LENGTH_ERRORS]
     off = np.abs(found - np.array(printed, dtype=float)) / units
     assert off.max() <= 1.0
     assert np.delete(off > 0.5, WITHOUT_LENGTH_ERRORS, axis=0).sum() <= 2
 
 
-def test_the_first_error_is_the_published_one():
+def test_largest_pose_error_is_the_published_one():
     target = np.concatenate(
-        [commanded()[:, :3, 3] / zoo.MM, geometry.matrix_to_euler(commanded()[:, :3, :3], "xyz")],
+        [
+            commanded_poses()[:, :3, 3] / zoo.MM,
+            geometry.matrix_to_euler(commanded_poses()[:, :3, :3], "xyz"),
+        ],
         axis=1,
     )
-    error = reached(zoo.hexapod_truth()) - target
+    error = compute_reached_poses(zoo.hexapod_truth()) - target
     integrated = np.linalg.norm(error[:, :3], axis=1) + np.linalg.norm(error[:, 3:], axis=1)
     assert round(integrated.max(), 6) == FIRST_ERROR
 
 
-def test_a_hexapods_legs_are_distances_between_their_centres():
-    poses = commanded()
+def test_hexapod_leg_lengths_are_distances_between_joint_centers():
+    poses = commanded_poses()
     legs = (
         poses[:, None, :3, 3]
         + zoo.HEXAPOD_PLATFORM * zoo.MM @ poses[:, :3, :3].swapaxes(1, 2)
@@ -78,7 +81,7 @@ def test_a_hexapods_legs_are_distances_between_their_centres():
     assert_allclose(inverse(zoo.hexapod(), poses).q, lengths, rtol=0, atol=1e-15)
 
 
-def test_a_3_prs_meets_its_closed_form_with_the_parasitic_motion():
+def test_3_prs_poses_agree_with_the_closed_form_of_the_parasitic_motion():
     # N = (a/2)(1 - cos theta)(-cos 2 phi, sin 2 phi), zero torsion; q from the right triangle of
     # rod and carriage
     rng = np.random.default_rng(2)
@@ -100,13 +103,13 @@ def test_a_3_prs_meets_its_closed_form_with_the_parasitic_motion():
     )
 
 
-def test_passive_joints_of_a_3_prs_are_its_rods_swings():
+def test_passive_joints_of_a_3_prs_are_the_rod_angles():
     sol = inverse(zoo.three_prs(), np.array([[0.7, 0.0, 0.0]]))
     assert sol.passive_names == ("limb1.pin", "limb2.pin", "limb3.pin")
     assert_allclose(np.cos(sol.passive), (zoo.PRS_A - zoo.PRS_B) / zoo.PRS_L, atol=1e-14)
 
 
-def test_a_linear_deltas_nozzle_hangs_below_its_carriages():
+def test_linear_delta_readings_agree_with_the_closed_form():
     robot = zoo.delta()
     points = np.random.default_rng(3).uniform([-0.08, -0.08, 0.0], [0.08, 0.08, 0.2], (50, 3))
     record = robot.record
@@ -119,7 +122,7 @@ def test_a_linear_deltas_nozzle_hangs_below_its_carriages():
     assert_allclose(inverse(robot, points).q, drop, rtol=0, atol=1e-14)
 
 
-def test_a_five_bar_is_two_triangles():
+def test_five_bar_readings_agree_with_two_triangles():
     points = np.random.default_rng(4).uniform([-0.05, 0.2], [0.05, 0.28], (20, 2))
     sol = inverse(zoo.five_bar(), points)
     for k, (pivot, crank, rod, side) in enumerate([(-0.07, 0.1, 0.22, 1), (0.07, 0.15, 0.2, -1)]):
