@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses that may be measured: every constraint is kept to, reaches to the boundary, and what was
-refused is counted.
-"""
+"""Candidates satisfy all constraints; excluded ones are counted by reason."""
 
 import numpy as np
 import pytest
@@ -19,7 +17,7 @@ STATION = np.array([0.5, -0.3, 0.6])
 
 
 @pytest.fixture(scope="module")
-def strict():
+def constrained():
     """Candidates of a hexapod under every constraint at once."""
     sight = LineOfSight(STATION, np.array([0.0, 0.0, 2.0]), np.radians(60.0), 0.1, 2.0)
     return draw_candidates(
@@ -27,13 +25,13 @@ def strict():
     )
 
 
-def test_every_candidate_keeps_to_every_constraint_as_computed_anew(strict):
-    robot, T = strict.checker.robot, strict.solution.T
-    assert strict.solution.converged.all()
-    assert check_limits(robot, robot.values[None], strict.solution.q[None], strict.solution.state)[
-        0
-    ].all()
-    near = analyze_singularity(robot, strict.coordinates)
+def test_every_candidate_satisfies_every_constraint(constrained):
+    robot, T = constrained.checker.robot, constrained.solution.T
+    assert constrained.solution.converged.all()
+    assert check_limits(
+        robot, robot.values[None], constrained.solution.q[None], constrained.solution.state
+    )[0].all()
+    near = analyze_singularity(robot, constrained.coordinates)
     assert (near.ratio >= 0.6).all()
     assert (near.drive_ratio >= 0.6).all()
     tilt = np.arccos(T[:, 2, 2])
@@ -44,14 +42,18 @@ def test_every_candidate_keeps_to_every_constraint_as_computed_anew(strict):
     assert np.linalg.norm(to_station, axis=1).min() >= 0.1
 
 
-def test_what_is_refused_is_counted_by_its_reason(strict):
-    assert {"tilt-exceeded", "target-faces-away"} <= {v.code for v in strict.excluded}
-    assert any(dict(v.data).get("max_tilt_deg") == pytest.approx(12.0) for v in strict.excluded)
-    assert sum(strict.excluded.values()) == strict.n_drawn - len(strict)
-    found = strict.report()
+def test_excluded_candidates_are_counted_by_reason(constrained):
+    assert {"tilt-exceeded", "target-faces-away"} <= {v.code for v in constrained.excluded}
+    assert any(
+        dict(v.data).get("max_tilt_deg") == pytest.approx(12.0) for v in constrained.excluded
+    )
+    assert sum(constrained.excluded.values()) == constrained.n_drawn - len(constrained)
+    found = constrained.report()
     assert found.code == "plan.candidates"
-    assert (found.data["allowed"], found.data["total"]) == (len(strict), strict.n_drawn)
-    assert sum(reason["count"] for reason in found.data["reasons"]) == strict.n_drawn - len(strict)
+    assert (found.data["allowed"], found.data["total"]) == (len(constrained), constrained.n_drawn)
+    assert sum(reason["count"] for reason in found.data["reasons"]) == constrained.n_drawn - len(
+        constrained
+    )
 
 
 @pytest.mark.parametrize("name", ["hexapod-42", "linear-delta"])
@@ -69,14 +71,14 @@ def test_many_candidates_lie_at_the_boundary_of_the_workspace(name):
     assert ((found.coordinates >= low - 1e-9) & (found.coordinates <= high + 1e-9)).all()
 
 
-def test_commanded_coordinates_have_few_digits(strict):
-    millimetres = strict.coordinates[:, :3] * 1e3
+def test_coordinates_of_candidates_are_rounded(constrained):
+    millimetres = constrained.coordinates[:, :3] * 1e3
     assert_allclose(millimetres, np.round(millimetres, 3), atol=1e-9)
-    degrees = np.degrees(strict.coordinates[:, 3:])
+    degrees = np.degrees(constrained.coordinates[:, 3:])
     assert_allclose(degrees, np.round(degrees, 4), atol=1e-9)
 
 
-def test_a_workspace_that_the_constraints_leave_empty_is_refused_with_the_counts():
+def test_workspace_without_an_allowed_pose_is_refused_with_the_counts():
     nobody_sees = Constraints(
         sight=LineOfSight(np.array([0.0, 0.0, -5.0]), np.array([0.0, 0.0, 1.0]), np.radians(20.0))
     )
@@ -85,7 +87,7 @@ def test_a_workspace_that_the_constraints_leave_empty_is_refused_with_the_counts
     assert "target-faces-away" in {reason["code"] for reason in data["reasons"]}
 
 
-def test_home_that_breaks_a_constraint_is_refused_because_every_way_starts_there(tmp_path):
+def test_home_pose_that_violates_a_constraint_is_refused(tmp_path):
     text = (
         find_robot_file("hexapod-42")
         .read_text("utf-8")
@@ -101,7 +103,7 @@ def test_home_that_breaks_a_constraint_is_refused_because_every_way_starts_there
     assert reason["max_tilt_deg"] == pytest.approx(5.0)
 
 
-def test_poses_of_a_user_are_judged_and_the_others_said():
+def test_listed_poses_outside_the_limits_are_excluded_with_the_reason():
     robot = load_robot("hexapod-42")
     poses = np.array([[0.0, 0.0, 0.2, 0.0, 0.0, 0.0], [0.0, 0.0, 0.9, 0.0, 0.0, 0.0]])
     found = check_listed_poses(robot, poses)
@@ -125,6 +127,6 @@ def test_poses_of_a_user_are_judged_and_the_others_said():
         ),
     ],
 )
-def test_numbers_that_cannot_be_are_refused(make, said):
+def test_invalid_constraints_are_refused(make, said):
     with pytest.raises(DataError, match=said):
         make()

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ways between poses: straight, followed closely, refused where anything breaks on them; and a
-short order of visiting.
-"""
+"""Paths between poses are interpolated and checked, and poses are put into a short order."""
 
 from itertools import permutations
 
@@ -26,9 +24,7 @@ from loopcal.planning.path import (
 
 @pytest.fixture(scope="module")
 def hexapod(tmp_path_factory):
-    """Candidates of a hexapod whose legs do not go in far, so that some straight ways leave the
-    strokes.
-    """
+    """Candidates of a hexapod with short strokes, so that some straight paths leave the strokes."""
     path = tmp_path_factory.mktemp("robot") / "short.yaml"
     path.write_text(
         find_robot_file("hexapod-42")
@@ -38,10 +34,8 @@ def hexapod(tmp_path_factory):
     return draw_candidates(load_robot(path), Constraints(min_margin=0.3), 120, seed=1)
 
 
-def _fine(found, start, end, steps):
-    """Limits, margin and closure sign of a path at many more places than `check_paths`
-    checks.
-    """
+def _check_path_finely(found, start, end, steps):
+    """Return limits, margin and closure sign of a path at more places than `check_paths` checks."""
     robot = found.checker.robot
     share = np.linspace(0.0, 1.0, steps)
     x = interpolate_path(
@@ -55,22 +49,20 @@ def _fine(found, start, end, steps):
     return inside, margin, path.closure_sign
 
 
-def test_ways_that_are_allowed_break_nothing_at_five_times_as_many_places(hexapod):
+def test_allowed_paths_satisfy_the_constraints_at_finer_steps(hexapod):
     rng = np.random.default_rng(2)
     edge = hexapod.coordinates[~hexapod.is_uniform]
     pairs = rng.integers(0, len(edge), (60, 2))
     verdict = check_paths(hexapod.checker, edge[pairs[:, 0]], edge[pairs[:, 1]])
     assert verdict.allowed.sum() > 30
     for a, b in pairs[verdict.allowed][:2]:
-        inside, margin, sign = _fine(hexapod, edge[a], edge[b], 150)
+        inside, margin, sign = _check_path_finely(hexapod, edge[a], edge[b], 150)
         assert inside.all()
         assert margin.min() > 0.3 - 1e-3
         assert (sign == hexapod.checker.closure_sign).all()
 
 
-def test_a_way_that_leaves_the_strokes_between_two_allowed_poses_is_refused_with_the_reason(
-    hexapod,
-):
+def test_path_that_leaves_the_strokes_is_refused_with_the_reason(hexapod):
     rng = np.random.default_rng(2)
     edge = hexapod.coordinates[~hexapod.is_uniform]
     pairs = rng.integers(0, len(edge), (60, 2))
@@ -79,12 +71,12 @@ def test_a_way_that_leaves_the_strokes_between_two_allowed_poses_is_refused_with
     assert len(refused)
     assert all("stroke" in dict(verdict.violations[i].data)["limit"] for i in refused)
     a, b = pairs[refused[0]]
-    inside, *_ = _fine(hexapod, edge[a], edge[b], 100)
+    inside, *_ = _check_path_finely(hexapod, edge[a], edge[b], 100)
     assert inside[[0, -1]].all()
     assert not inside.all()
 
 
-def test_a_way_through_a_singularity_is_refused():
+def test_path_through_a_singularity_is_refused():
     robot = load_robot("five-bar")
     checker = build_checker(robot, Constraints(min_margin=0.0))
     home = locate_home(robot)
@@ -96,7 +88,7 @@ def test_a_way_through_a_singularity_is_refused():
     assert verdict.violations[0] is not None
 
 
-def test_a_tilted_way_goes_the_shorter_way_round_and_through_zero_tilt():
+def test_tilt_path_takes_the_shorter_azimuth_or_passes_zero_tilt():
     robot = load_robot("3-prs")
     names = robot.controlled
     start, end = np.zeros((2, 1, len(names)))
@@ -113,7 +105,7 @@ def test_a_tilted_way_goes_the_shorter_way_round_and_through_zero_tilt():
     )
 
 
-def test_the_order_is_the_shortest_of_all_for_few_poses():
+def test_order_of_few_poses_is_within_5_percent_of_the_shortest():
     rng = np.random.default_rng(0)
     exact = 0
     for _ in range(10):
@@ -121,8 +113,8 @@ def test_the_order_is_the_shortest_of_all_for_few_poses():
         cost = np.linalg.norm(points[1:, None] - points[None, 1:], axis=2)
         begin = np.linalg.norm(points[1:] - points[0], axis=1)
         order, length = find_short_order(cost, begin)
-        ways = np.array(list(permutations(range(7))))
-        lengths = begin[ways[:, 0]] + cost[ways[:, :-1], ways[:, 1:]].sum(axis=1)
+        orders = np.array(list(permutations(range(7))))
+        lengths = begin[orders[:, 0]] + cost[orders[:, :-1], orders[:, 1:]].sum(axis=1)
         assert sorted(order) == list(range(7))
         assert_allclose(length, begin[order[0]] + cost[order[:-1], order[1:]].sum(), rtol=1e-12)
         assert length <= 1.05 * lengths.min()  # 2-opt from seven beginnings: within a few per cent
@@ -130,7 +122,7 @@ def test_the_order_is_the_shortest_of_all_for_few_poses():
     assert exact >= 7
 
 
-def test_every_way_of_an_order_is_allowed_and_home_stands_where_none_is(hexapod):
+def test_ordered_poses_have_allowed_paths_or_pass_the_home_pose(hexapod):
     rng = np.random.default_rng(2)
     edge = hexapod.coordinates[~hexapod.is_uniform]
     pairs = rng.integers(0, len(edge), (60, 2))
@@ -147,7 +139,7 @@ def test_every_way_of_an_order_is_allowed_and_home_stands_where_none_is(hexapod)
     assert visit.length < 0.9 * plain
 
 
-def test_a_way_ends_with_the_readings_of_its_end(hexapod):
+def test_path_ends_with_the_readings_of_its_last_pose(hexapod):
     robot = hexapod.checker.robot
     x = hexapod.coordinates[:5]
     home = np.broadcast_to(locate_home(robot), x.shape)

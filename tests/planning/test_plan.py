@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plans: rows are those of the estimator, what is predicted comes true, planned poses beat drawn
-ones, nonsense is refused.
-"""
+"""Plans: rows, expected errors, held-out poses, sample size, pose pairs and refused options."""
 
 from dataclasses import replace
 from math import comb
@@ -34,26 +32,26 @@ from tests.findings.reported import refused
 UM, URAD = 1e-6, 1e-6
 
 
-def instrument_of(kind: str, sigma: float = 10 * UM, **settings) -> lc.Instrument:
-    """One kind with one sigma."""
+def build_instrument(kind: str, sigma: float = 10 * UM, **settings) -> lc.Instrument:
+    """Return an instrument of one kind with one sigma."""
     made = KINDS[kind](**settings)
     return lc.Instrument((lc.Sensor(made, lc.Gaussian(np.full(len(made.noise_columns), sigma))),))
 
 
 @pytest.fixture(scope="module")
-def tracker():
-    """A hexapod to be seen by a laser tracker that measures whole poses."""
+def tracker_problem():
+    """Planning for a hexapod and a laser tracker that measures full poses."""
     return prepare_problem(
         load_robot("hexapod-42"),
-        instrument_of("pose", 10 * UM),
+        build_instrument("pose", 10 * UM),
         PlanOptions(n_candidates=80, seed=1),
     )
 
 
 @pytest.fixture(scope="module")
-def found(tracker):
+def planned(tracker_problem):
     """A plan of twelve poses."""
-    return plan_poses(tracker.with_options(n_poses=12, hold_out=5))
+    return plan_poses(tracker_problem.with_options(n_poses=12, hold_out=5))
 
 
 @pytest.mark.parametrize(
@@ -65,9 +63,9 @@ def found(tracker):
         ("hexapod-42", "plane", {"unknown": ("surface",)}),
     ],
 )
-def test_rows_of_units_are_those_that_identification_folds(name, kind, settings):
+def test_rows_of_pose_groups_equal_those_of_identification(name, kind, settings):
     robot = load_robot(name)
-    free, seen_by = select_free_parameters(robot), instrument_of(kind, **settings)
+    free, seen_by = select_free_parameters(robot), build_instrument(kind, **settings)
     q = sample_workspace(robot, 30, seed=2).solution.q
     members = list_groups(len(q), seen_by, np.random.default_rng(0))
     if members.shape[1] > 1:  # as a sensor looks that is told nothing: each with the next
@@ -83,7 +81,9 @@ def test_rows_of_units_are_those_that_identification_folds(name, kind, settings)
         ]
     )
     ours = factor_design(
-        rows[None], PriorInformation.none(len(free), len(units.nuisance)), _all(free, units)
+        rows[None],
+        PriorInformation.none(len(free), len(units.nuisance)),
+        _keep_all_directions(free, units),
     )
     theirs = collect_information(free, data)[0][0, :-1, :-1]
     theirs = np.concatenate([theirs, np.eye(len(free))])
@@ -96,8 +96,8 @@ def test_rows_of_units_are_those_that_identification_folds(name, kind, settings)
     )
 
 
-def _all(free, units):
-    """Every direction of the machine, and those of the own unknowns."""
+def _keep_all_directions(free, units):
+    """Return all directions of machine and nuisance parameters."""
     from loopcal.planning.design import find_observable_space
 
     return find_observable_space(
@@ -105,13 +105,13 @@ def _all(free, units):
     )
 
 
-def test_what_is_predicted_comes_true(tracker, found):
-    robot, trials = tracker.robot, 40
+def test_predicted_error_agrees_with_simulated_calibrations(tracker_problem, planned):
+    robot, trials = tracker_problem.robot, 40
     truth = sample_truth(robot, trials, seed=5)
-    fitted = found.poses.coordinates[~found.poses.held_out]
-    measured = lc.simulate_trials(robot, truth, fitted, found.instrument, seed=6)
+    fitted = planned.poses.coordinates[~planned.poses.held_out]
+    measured = lc.simulate_trials(robot, truth, fitted, planned.instrument, seed=6)
     estimates = lc.identify_trials(robot, measured, method=lc.MAP()).values
-    q = tracker.candidates.solution.q[tracker.candidates.is_uniform]
+    q = tracker_problem.candidates.solution.q[tracker_problem.candidates.is_uniform]
     errors = []
     for true, estimate in zip(truth, estimates, strict=True):
         a, b = (lc.forward(robot.with_values(values), q).T[:, :3, 3] for values in (true, estimate))
@@ -119,15 +119,15 @@ def test_what_is_predicted_comes_true(tracker, found):
     rms = np.sqrt(np.mean(errors))
     # mean of 40 squares that are dominated by a dozen directions: relative sd about sqrt(2 / (40 *
     # 12)) = 0.065 of the square
-    assert rms == pytest.approx(found.errors.after.position, rel=0.12)
+    assert rms == pytest.approx(planned.errors.after.position, rel=0.12)
 
 
-def test_planned_poses_predict_better_than_drawn_ones_and_the_certificate_is_near_one(found):
-    before, random, after = found.errors.before, found.errors.random, found.errors.after
+def test_planned_poses_beat_random_ones_with_an_efficiency_above_90_percent(planned):
+    before, random, after = planned.errors.before, planned.errors.random, planned.errors.after
     assert after.position < 0.85 * random.position < before.position
-    assert 0.9 < found.quality.efficiency <= 1.0
-    assert set(found.quality.figures) == {"D", "I", "A", "E"}
-    by_code = {finding.code: finding.data for finding in found.findings}
+    assert 0.9 < planned.quality.efficiency <= 1.0
+    assert set(planned.quality.figures) == {"D", "I", "A", "E"}
+    by_code = {finding.code: finding.data for finding in planned.findings}
     assert by_code["plan.poses"]["fitted"] == 12
     assert by_code["plan.poses"]["held_out"] == 5
     assert by_code["plan.certificate"]["shortfall"] < 10.0
@@ -135,59 +135,61 @@ def test_planned_poses_predict_better_than_drawn_ones_and_the_certificate_is_nea
     assert 0.0 < by_code["plan.expected-errors"]["reduction"] < 1.0
 
 
-def test_a_plan_is_plain_english_on_one_screen(found):
-    lines = str(found).splitlines()
+def test_text_of_a_plan_has_fewer_than_24_lines_of_sentences(planned):
+    lines = str(planned).splitlines()
     assert lines[0] == "12 poses of hexapod-42 for calibration and 5 for validation (pose)."
     assert len(lines) < 24
     assert all(line.endswith(".") for line in lines)
-    for value in (found, found.poses, found.options, found.quality, found.errors):
+    for value in (planned, planned.poses, planned.options, planned.quality, planned.errors):
         assert len(repr(value)) < 600
 
 
-def test_poses_to_judge_by_are_others_than_those_fitted_and_lie_inside(found, tracker):
-    poses = found.poses
-    assert found.n_poses == 12
+def test_held_out_poses_differ_from_fitted_ones_and_are_uniform_candidates(
+    planned, tracker_problem
+):
+    poses = planned.poses
+    assert planned.n_poses == 12
     assert poses.held_out.sum() == 5
     assert len(np.unique(poses.coordinates, axis=0)) == 17
-    uniform = tracker.candidates.coordinates[tracker.candidates.is_uniform]
+    uniform = tracker_problem.candidates.coordinates[tracker_problem.candidates.is_uniform]
     for pose in poses.coordinates[poses.held_out]:
         assert (np.abs(uniform - pose).max(axis=1) == 0.0).any()
 
 
-def test_a_plan_is_the_same_for_the_same_seed():
+def test_same_seed_gives_the_same_plan():
     options = PlanOptions(n_poses=4, hold_out=2, n_candidates=20, seed=4)
-    small = prepare_problem(load_robot("linear-delta"), instrument_of("position"), options)
+    small = prepare_problem(load_robot("linear-delta"), build_instrument("position"), options)
     one, other = (plan_poses(small) for _ in range(2))
     np.testing.assert_array_equal(one.poses.coordinates, other.poses.coordinates)
     np.testing.assert_array_equal(one.poses.held_out, other.poses.held_out)
 
 
-def test_number_and_criterion_are_short_for_options():
-    robot, seen_by = load_robot("linear-delta"), instrument_of("position")
+def test_number_and_criterion_arguments_equal_the_options():
+    robot, seen_by = load_robot("linear-delta"), build_instrument("position")
     short = lc.plan(robot, seen_by, 4, "D", lc.PlanOptions(n_candidates=20, hold_out=0))
     options = lc.PlanOptions(n_poses=4, criterion="D", n_candidates=20, hold_out=0)
     long = lc.plan(robot, seen_by, options=options)
     assert short.to_dict() == long.to_dict()
 
 
-def test_poses_measured_already_are_taken_into_account(tracker, found):
-    robot = tracker.robot
-    fitted = found.poses.coordinates[~found.poses.held_out]
-    data = lc.simulate(robot, fitted, found.instrument, seed=3)
+def test_earlier_measurements_reduce_the_expected_error(tracker_problem, planned):
+    robot = tracker_problem.robot
+    fitted = planned.poses.coordinates[~planned.poses.held_out]
+    data = lc.simulate(robot, fitted, planned.instrument, seed=3)
     options = PlanOptions(n_poses=2, hold_out=2, measured=data, n_candidates=30, seed=2)
-    more = lc.plan(robot, instrument_of("pose", 10 * UM), options=options).errors
+    more = lc.plan(robot, build_instrument("pose", 10 * UM), options=options).errors
     assert more.before is not None
     # nothing new was measured yet: what is known now is what the first plan promised, on other
     # poses of the workspace
-    assert more.before.position == pytest.approx(found.errors.after.position, rel=0.15)
+    assert more.before.position == pytest.approx(planned.errors.after.position, rel=0.15)
     assert more.after.position < more.before.position
 
 
-def test_how_many_poses_reach_a_goal_and_below_how_many_none_can():
+def test_sample_size_reaches_the_goal_and_has_a_lower_bound():
     goal = 15 * UM
     made = prepare_problem(
         load_robot("linear-delta"),
-        instrument_of("position", 20 * UM),
+        build_instrument("position", 20 * UM),
         PlanOptions(goal=goal, target="position", hold_out=10, n_candidates=60),
     )
     needed = find_sample_size(made)
@@ -213,9 +215,11 @@ def test_how_many_poses_reach_a_goal_and_below_how_many_none_can():
         ({"n_poses": 5000, "hold_out": 0}, "plan.too-few-candidates", {"requested": 5000}),
     ],
 )
-def test_demands_that_cannot_be_met_are_refused_with_the_reason(tracker, options, code, data):
+def test_impossible_numbers_of_poses_are_refused_with_the_reason(
+    tracker_problem, options, code, data
+):
     with refused(code, **data):
-        plan_poses(tracker.with_options(**options))
+        plan_poses(tracker_problem.with_options(**options))
 
 
 @pytest.mark.parametrize(
@@ -226,57 +230,57 @@ def test_demands_that_cannot_be_met_are_refused_with_the_reason(tracker, options
         ({"n_poses": 10, "criterion": "G"}, "allowed are I .* and D"),
     ],
 )
-def test_numbers_and_names_that_cannot_be_are_refused(tracker, options, message):
+def test_invalid_plan_options_are_refused(tracker_problem, options, message):
     with pytest.raises(EstimationError, match=message):
-        plan_poses(tracker.with_options(**options))
+        plan_poses(tracker_problem.with_options(**options))
 
 
-def test_a_number_and_a_goal_exclude_each_other():
+def test_number_of_poses_and_goal_exclude_each_other():
     with pytest.raises(DataError, match="give one of them"):
         PlanOptions(n_poses=8, goal=1e-5)
 
 
 @pytest.fixture(scope="module")
-def callipers():
-    """A delta of which distances between places are measured."""
+def caliper_problem():
+    """Planning for a delta and distances between positions."""
     options = PlanOptions(n_candidates=80)
-    return prepare_problem(load_robot("linear-delta"), instrument_of("separation"), options)
+    return prepare_problem(load_robot("linear-delta"), build_instrument("separation"), options)
 
 
-def test_kinds_that_compare_poses_are_planned_in_pairs(callipers):
-    found = plan_poses(callipers.with_options(n_poses=24, hold_out=4))
-    groups, held_out = found.poses.groups, found.poses.held_out
+def test_kinds_that_compare_poses_are_planned_in_pairs(caliper_problem):
+    planned = plan_poses(caliper_problem.with_options(n_poses=24, hold_out=4))
+    groups, held_out = planned.poses.groups, planned.poses.held_out
     judged = {i for pair in groups[held_out[groups].all(axis=1)] for i in pair}
-    by_code = {finding.code: finding.data for finding in found.findings}
-    content = {"fitted": 12, "held_out": 2, "counted": "pairs", "poses": len(found.poses)}
+    by_code = {finding.code: finding.data for finding in planned.findings}
+    content = {"fitted": 12, "held_out": 2, "counted": "pairs", "poses": len(planned.poses)}
     assert content.items() <= by_code["plan.poses"].items()
     assert by_code["plan.certificate"]["counted"] == "pairs"
-    assert by_code["plan.certificate"]["candidates"] == found.quality.n_candidates
+    assert by_code["plan.certificate"]["candidates"] == planned.quality.n_candidates
     assert by_code["plan.frames-undetermined"]["frames"] == ("base",)
-    assert found.quality.n_candidates == comb(len(callipers.candidates) - len(judged), 2)
+    assert planned.quality.n_candidates == comb(len(caliper_problem.candidates) - len(judged), 2)
     assert groups.shape[1] == 2
     held = held_out[groups]
     assert (held.all(axis=1) | ~held.any(axis=1)).all()
     assert held.all(axis=1).sum() == 2
     with pytest.raises(EstimationError, match="in multiples of 2"):
-        plan_poses(callipers.with_options(n_poses=25))
+        plan_poses(caliper_problem.with_options(n_poses=25))
 
 
-def test_no_choice_of_pairs_beats_what_is_said_of_pairs_not_even_all_pairs_of_few_poses(callipers):
-    members = callipers.groups.members
-    assert len(members) == comb(len(callipers.candidates), 2)
+def test_lower_bound_on_pairs_holds_for_all_pairs_of_twelve_poses(caliper_problem):
+    members = caliper_problem.groups.members
+    assert len(members) == comb(len(caliper_problem.candidates), 2)
     # twelve poses with all their 66 pairs, the best of some that are drawn
     poses, rng, tried = np.unique(members), np.random.default_rng(0), []
     for few in (rng.choice(poses, 12, replace=False) for _ in range(300)):
         chosen = np.flatnonzero(np.isin(members, few).all(axis=1))
-        tried.append((callipers.predict_errors(chosen), len(chosen)))
+        tried.append((caliper_problem.predict_errors(chosen), len(chosen)))
     reached, pairs = min(tried, key=lambda one: one[0].position if one[0] else np.inf)
-    goal = callipers.with_options(goal=reached.position, target="position")
+    goal = caliper_problem.with_options(goal=reached.position, target="position")
     needed = find_sample_size(goal)
     assert needed.at_least is not None
     # were each pair counted as two poses, twelve poses would contradict what is said
     assert 12 < 2 * needed.at_least <= 2 * pairs == 132
-    finding = needed.report(callipers.robot)
+    finding = needed.report(caliper_problem.robot)
     assert finding.code == "plan.goal-reached"
     numbers = {"number": needed.enough, "at_least": needed.at_least, "candidates": len(members)}
     assert ({"counted": "pairs", "decided_by_equations": False} | numbers).items() <= (
@@ -285,8 +289,8 @@ def test_no_choice_of_pairs_beats_what_is_said_of_pairs_not_even_all_pairs_of_fe
     assert needed.to_dict()["counted"] == "pairs"
 
 
-def test_of_many_poses_the_candidate_pairs_are_different_and_tell_more_than_as_many_drawn():
-    robot, seen_by = load_robot("linear-delta"), instrument_of("separation")
+def test_candidate_pairs_are_distinct_and_better_than_random_pairs():
+    robot, seen_by = load_robot("linear-delta"), build_instrument("separation")
     free, q = select_free_parameters(robot), sample_workspace(robot, 400, seed=2).solution.q
     mounted = seen_by.with_tool(robot)
     ours = linearize_candidate_groups(free, mounted, q, np.random.default_rng(3))
@@ -306,23 +310,24 @@ def test_of_many_poses_the_candidate_pairs_are_different_and_tell_more_than_as_m
     assert best[0] > best[1]
 
 
-def test_a_weak_certificate_is_called_weak(found):
-    weak = replace(found, quality=replace(found.quality, efficiency=0.4))
+def test_low_efficiency_is_reported_as_a_weak_certificate(planned):
+    weak = replace(planned, quality=replace(planned.quality, efficiency=0.4))
     finding = next(f for f in weak.findings if f.code == "plan.weak-certificate")
     assert finding.data["shortfall"] == pytest.approx(60.0)
-    assert "plan.weak-certificate" not in {f.code for f in found.findings}
+    assert "plan.weak-certificate" not in {f.code for f in planned.findings}
 
 
-def test_an_instrument_with_rows_of_its_own_is_refused():
+def test_instrument_with_stated_rows_is_refused():
     sensor = lc.Sensor(lc.Pose(), lc.Gaussian(np.full(6, UM)), rows=np.arange(3))
     with pytest.raises(DataError, match="leave out the rows"):
         lc.plan(load_robot("hexapod-42"), lc.Instrument((sensor,)))
 
 
-def test_an_unknown_frame_changes_nothing_of_what_is_expected_before():
+def test_unknown_frame_does_not_increase_the_error_expected_before():
     robot, options = load_robot("3-prs"), PlanOptions(n_candidates=30)
     known, unknown = (
-        prepare_problem(robot, instrument_of("pose", unknown=u), options) for u in ((), ("frame",))
+        prepare_problem(robot, build_instrument("pose", unknown=u), options)
+        for u in ((), ("frame",))
     )
     nothing = np.zeros(0, dtype=int)
     before, hidden = known.predict_errors(nothing), unknown.predict_errors(nothing)
@@ -335,9 +340,9 @@ def test_an_unknown_frame_changes_nothing_of_what_is_expected_before():
     assert 0.0 < hidden.position <= before.position * (1 + 1e-9)
 
 
-def test_stated_tolerances_are_the_only_prior():
+def test_prior_has_a_row_for_every_stated_tolerance():
     free = select_free_parameters(load_robot("hexapod-42"))
     q = sample_workspace(free.robot, 4, seed=1).solution.q
-    units = linearize_groups(free, instrument_of("pose"), q, np.arange(4)[:, None])
+    units = linearize_groups(free, build_instrument("pose"), q, np.arange(4)[:, None])
     assert len(combine_prior(free, units).rows) >= 42
     assert not free.assumed.any()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Formulas of exchange and their derivatives against making every design anew."""
+"""Scores of swaps and additions, and derivatives by weights, agree with recomputed designs."""
 
 import numpy as np
 import pytest
@@ -13,30 +13,38 @@ from loopcal.planning.design.scoring import (
     score_additions,
     score_swaps,
 )
-from tests.planning.polynomials import Array, random_rows
+from tests.planning.design_problems import Array, draw_rows
 
 CRITERIA = (D(), A(), I(np.random.default_rng(1).normal(size=(9, 4)), 3))
 CASES = [
-    (criterion, own, prior) for criterion in CRITERIA for own in (0, 2) for prior in (False, True)
+    (criterion, nuisance, prior)
+    for criterion in CRITERIA
+    for nuisance in (0, 2)
+    for prior in (False, True)
 ]
 NAMES = [
-    f"{criterion.name}-own{own}-{'prior' if prior else 'none'}" for criterion, own, prior in CASES
+    f"{criterion.name}-nuisance{nuisance}-{'prior' if prior else 'none'}"
+    for criterion, nuisance, prior in CASES
 ]
 
 
-def ready(criterion: Criterion, own: int, prior: bool) -> tuple[Scoring, Array]:
+def build_random_scoring(criterion: Criterion, nuisance: int, prior: bool) -> tuple[Scoring, Array]:
     """A random problem's scoring and rows."""
-    rows = random_rows(own=own)
-    start = PriorInformation.from_tolerances(4, own) if prior else PriorInformation.none(4, own)
+    rows = draw_rows(nuisance=nuisance)
+    start = (
+        PriorInformation.from_tolerances(4, nuisance)
+        if prior
+        else PriorInformation.none(4, nuisance)
+    )
     scoring = build_scoring(rows, 0.5, criterion, start, find_observable_space(rows, start))
     return scoring, scoring.scale_rows(rows)
 
 
-@pytest.mark.parametrize(("criterion", "own", "prior"), CASES, ids=NAMES)
-def test_the_gain_of_every_swap_is_that_of_the_new_design(
-    criterion: Criterion, own: int, prior: bool
+@pytest.mark.parametrize(("criterion", "nuisance", "prior"), CASES, ids=NAMES)
+def test_gain_of_every_swap_equals_that_of_the_new_design(
+    criterion: Criterion, nuisance: int, prior: bool
 ) -> None:
-    scoring, X = ready(criterion, own, prior)
+    scoring, X = build_random_scoring(criterion, nuisance, prior)
     chosen = np.array([0, 3, 4, 7, 9])
     R = scoring.factor(X[chosen])
     terms = compute_swap_terms(scoring, R, X)
@@ -49,11 +57,11 @@ def test_the_gain_of_every_swap_is_that_of_the_new_design(
         )  # in logs: rounding of well-conditioned 6 x 6 systems
 
 
-@pytest.mark.parametrize(("criterion", "own", "prior"), CASES, ids=NAMES)
-def test_the_gain_of_every_addition_is_that_of_the_new_design(
-    criterion: Criterion, own: int, prior: bool
+@pytest.mark.parametrize(("criterion", "nuisance", "prior"), CASES, ids=NAMES)
+def test_gain_of_every_addition_equals_that_of_the_new_design(
+    criterion: Criterion, nuisance: int, prior: bool
 ) -> None:
-    scoring, X = ready(criterion, own, prior)
+    scoring, X = build_random_scoring(criterion, nuisance, prior)
     R = scoring.factor(X[:4])
     anew = [
         scoring.score(scoring.factor(np.concatenate([X[:4], X[k : k + 1]]))) - scoring.score(R)
@@ -65,10 +73,10 @@ def test_the_gain_of_every_addition_is_that_of_the_new_design(
 
 
 @pytest.mark.parametrize("criterion", CRITERIA, ids=lambda criterion: criterion.name)
-def test_a_swap_is_exact_where_the_design_without_the_unit_is_singular(
+def test_swap_is_exact_if_the_design_without_the_candidate_is_singular(
     criterion: Criterion,
 ) -> None:
-    scoring, X = ready(criterion, 0, False)
+    scoring, X = build_random_scoring(criterion, 0, False)
     R = scoring.factor(X[:2])  # four equations for four unknowns
     terms = compute_swap_terms(scoring, R, X)
     gains = score_swaps(terms, 0)
@@ -79,11 +87,11 @@ def test_a_swap_is_exact_where_the_design_without_the_unit_is_singular(
     assert gains[1] < -15.0  # the same unit twice leaves two directions open, to rounding
 
 
-@pytest.mark.parametrize(("criterion", "own", "prior"), CASES, ids=NAMES)
-def test_derivatives_by_weights_agree_with_differences(
-    criterion: Criterion, own: int, prior: bool
+@pytest.mark.parametrize(("criterion", "nuisance", "prior"), CASES, ids=NAMES)
+def test_derivatives_by_weights_agree_with_finite_differences(
+    criterion: Criterion, nuisance: int, prior: bool
 ) -> None:
-    scoring, X = ready(criterion, own, prior)
+    scoring, X = build_random_scoring(criterion, nuisance, prior)
     w = np.random.default_rng(3).uniform(0.3, 0.8, len(X))
 
     def score(weights: Array) -> float:

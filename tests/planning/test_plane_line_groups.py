@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Groups of points on a plane and a perpendicular line as designs: where they lie, what they tell,
-what is not allowed.
-"""
+"""Pose groups on a plane and a perpendicular line: geometry, derivatives, rank and refusals."""
 
 from dataclasses import replace
 from typing import Any
@@ -28,18 +26,18 @@ def robot() -> Mechanism:
     return lc.load_robot("hexapod-nategh-agheli")
 
 
-def points(planned: PlaneLineGroups, design: np.ndarray) -> np.ndarray:
+def compute_tool_origins(planned: PlaneLineGroups, design: np.ndarray) -> np.ndarray:
     """Tool origins (u, k, 3) of designs."""
     x = planned.place_points(design)
     T = inverse(planned.robot, x.reshape(-1, x.shape[2])).T @ planned.robot.tool
     return T[:, :3, 3].reshape(*x.shape[:2], 3)
 
 
-def test_points_lie_in_a_plane_and_on_a_line_across_it_inside_the_workspace(robot) -> None:
+def test_points_lie_on_a_plane_and_a_perpendicular_line_in_the_workspace(robot) -> None:
     planned = PlaneLineGroups(robot, 7, MM)
     design = planned.draw(12, 1)
     assert {int(axis) for axis in design[:, 3]} == {0, 1, 2}
-    at = points(planned, design)
+    at = compute_tool_origins(planned, design)
     for x, axis in zip(at, design[:, 3].astype(int), strict=True):
         lever = x - x[0]
         along = np.eye(3)[axis]
@@ -52,18 +50,18 @@ def test_points_lie_in_a_plane_and_on_a_line_across_it_inside_the_workspace(robo
     assert (at < high + 1e-9).all()
 
 
-def test_with_a_tool_it_is_the_tool_that_follows_plane_and_line(robot) -> None:
+def test_tool_point_lies_on_plane_and_line(robot) -> None:
     tool = np.eye(4)
     tool[:3, 3] = 0.02, -0.03, 0.05
     assembly = replace(robot.assembly, tool=tool)
     planned = PlaneLineGroups(replace(robot, assembly=assembly), 5, MM, ("z",))
-    lever = points(planned, planned.draw(3, 0))
+    lever = compute_tool_origins(planned, planned.draw(3, 0))
     lever = lever - lever[:, :1]
     np.testing.assert_allclose(lever[:, 2:, 2], 0.0, atol=1e-9)  # [m]
     np.testing.assert_allclose(lever[:, 1, :2], 0.0, atol=1e-9)
 
 
-def test_slopes_are_those_of_the_forward_kinematics(robot) -> None:
+def test_derivatives_of_points_agree_with_the_forward_kinematics(robot) -> None:
     planned = PlaneLineGroups(robot, 5, MM, ("x",))
     design = planned.draw(1, 3)
     q = inverse(robot, planned.place_points(design)[0])
@@ -81,17 +79,17 @@ def test_slopes_are_those_of_the_forward_kinematics(robot) -> None:
         )  # [m per tolerance], central differences of 1e-3
 
 
-def test_moving_a_surface_moves_its_rows_as_its_columns_say(robot) -> None:
+def test_derivatives_by_surfaces_agree_with_small_rotations(robot) -> None:
     planned, axis = PlaneLineGroups(robot, 6, MM), np.arange(3)
     design = planned.draw(3, 5)
     design[:, 3] = axis
-    at = points(planned, design)
+    at = compute_tool_origins(planned, design)
     F, A = linearize_surfaces(
         at, np.repeat(np.eye(3)[None, None], 3, axis=0).repeat(6, axis=1), axis
     )
-    told, shown = eliminate_surfaces(F, A)
-    assert shown.all()
-    assert told.shape == (3, 4, 3)
+    rows, is_determined = eliminate_surfaces(F, A)
+    assert is_determined.all()
+    assert rows.shape == (3, 4, 3)
     turn = 1e-6
     for g in range(3):
         n, t_1, t_2 = (np.eye(3)[(g + j) % 3] for j in range(3))
@@ -117,7 +115,7 @@ def test_rank_is_33_of_42_for_1_to_30_groups(robot) -> None:
         assert s[33] < 1e-13 * s[0]  # rounding
 
 
-def test_too_short_a_line_and_poses_out_of_reach_are_not_allowed(robot) -> None:
+def test_short_line_and_unreachable_poses_are_not_allowed(robot) -> None:
     planned = PlaneLineGroups(robot, 5, MM, ("z",))
     design = planned.draw(2, 0)
     design[1, planned.names.index("p1.along")] = design[1, 2] + 0.9 * planned.shortest
@@ -126,9 +124,7 @@ def test_too_short_a_line_and_poses_out_of_reach_are_not_allowed(robot) -> None:
     assert np.isnan(planned.linearize(design)).all()
 
 
-def test_where_every_point_is_in_reach_groups_are_drawn_once_and_no_line_is_too_short(
-    monkeypatch,
-) -> None:
+def test_groups_in_reach_are_drawn_in_one_call_with_long_enough_lines(monkeypatch) -> None:
     planned, rows, calls = (
         PlaneLineGroups(lc.load_robot("linear-delta"), 8, MM),
         PlaneLineGroups.linearize,
@@ -145,7 +141,7 @@ def test_where_every_point_is_in_reach_groups_are_drawn_once_and_no_line_is_too_
     assert np.abs(np.delete(design, 3, axis=1)).max() <= 1.0
 
 
-def test_settings_without_sense_are_refused_in_a_sentence(robot) -> None:
+def test_invalid_group_settings_are_refused(robot) -> None:
     for settings, words in (
         ({"points": 3}, "at least 4"),
         ({"sigma": 0.0}, "above 0"),
@@ -160,7 +156,7 @@ def test_settings_without_sense_are_refused_in_a_sentence(robot) -> None:
 
 
 @pytest.mark.slow
-def test_one_sweep_of_coordinate_exchange_makes_the_sd_at_least_three_times_smaller(robot) -> None:
+def test_one_sweep_of_coordinate_exchange_reduces_the_sd_threefold(robot) -> None:
     planned = PlaneLineGroups(robot, 10, MM, ("z",))
     first = planned.draw(10, 3)
     found = coordinate_exchange(

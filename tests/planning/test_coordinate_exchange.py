@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Coordinate exchange: known designs, moves that are not allowed, poses of a hexapod."""
+"""Coordinate exchange: known designs, forbidden levels and poses of a hexapod."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from loopcal.planning.design import (
     factor_design,
 )
 from tests.findings.reported import refused
-from tests.planning.polynomials import Array, Places, polynomial
+from tests.planning.design_problems import Array, Places, polynomial_rows
 
 LEVELS = [np.linspace(-1.0, 1.0, 5)]
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)  # [rad, m]
@@ -27,7 +27,7 @@ SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)  # [rad, m]
 
 def parabola(_: Places, x: Array) -> Array:
     """Rows of 1, x, x^2."""
-    return polynomial(x[:, 0], 2)
+    return polynomial_rows(x[:, 0], 2)
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ def parabola(_: Places, x: Array) -> Array:
     [(D(), [-1, -1, -1, -1, 0, 0, 0, 0, 1, 1, 1, 1]), (A(), [-1] * 3 + [0] * 6 + [1] * 3)],
 )
 @pytest.mark.parametrize("seed", range(4))
-def test_any_start_ends_at_the_known_design_of_a_parabola(
+def test_every_start_converges_to_the_known_design_of_a_parabola(
     criterion: Criterion, best: list[float], seed: int
 ) -> None:
     begin = np.random.default_rng(seed).uniform(-1, 1, (12, 1))
@@ -44,13 +44,13 @@ def test_any_start_ends_at_the_known_design_of_a_parabola(
     np.testing.assert_array_equal(found.rows, parabola(np.arange(12), found.design))
 
 
-def test_a_start_with_all_units_at_one_place_is_moved_apart() -> None:
+def test_points_that_start_at_one_place_are_separated() -> None:
     found = coordinate_exchange(parabola, np.zeros((6, 1)), LEVELS, D(), PriorInformation.none(3))
     assert found.history[0] == -np.inf
     np.testing.assert_allclose(np.sort(found.design[:, 0]), [-1, -1, 0, 0, 1, 1], atol=1e-12)
 
 
-def test_levels_that_are_not_allowed_are_never_taken() -> None:
+def test_forbidden_levels_are_never_chosen() -> None:
     def half(which: Places, x: Array) -> Array:
         rows = parabola(which, x)
         rows[(x[:, 0] < -0.9) & (which % 2 == 0)] = np.nan
@@ -61,7 +61,7 @@ def test_levels_that_are_not_allowed_are_never_taken() -> None:
     assert (found.design[1::2, 0] < -0.9).any()
 
 
-def test_rows_are_asked_for_all_units_and_levels_of_a_coordinate_at_once() -> None:
+def test_rows_of_all_levels_of_a_coordinate_are_evaluated_in_one_call() -> None:
     asked = []
 
     def counted(which: Places, x: Array) -> Array:
@@ -77,7 +77,7 @@ def test_rows_are_asked_for_all_units_and_levels_of_a_coordinate_at_once() -> No
     assert sum(asked) == found.evaluated
 
 
-def test_a_coordinate_without_levels_stays() -> None:
+def test_coordinate_without_levels_is_not_changed() -> None:
     begin = np.random.default_rng(0).uniform(-1, 1, (6, 2))
     found = coordinate_exchange(
         parabola, begin, [*LEVELS, np.zeros(0)], D(), PriorInformation.none(3)
@@ -85,7 +85,7 @@ def test_a_coordinate_without_levels_stays() -> None:
     np.testing.assert_array_equal(found.design[:, 1], begin[:, 1])
 
 
-def test_a_first_design_that_is_not_allowed_and_too_few_units_are_refused() -> None:
+def test_forbidden_first_design_and_too_few_points_are_refused() -> None:
     with pytest.raises(EstimationError, match="group 1 of the first design is not allowed"):
         coordinate_exchange(
             parabola, np.array([[0.0], [np.nan], [1.0]]), LEVELS, D(), PriorInformation.none(3)
@@ -94,7 +94,7 @@ def test_a_first_design_that_is_not_allowed_and_too_few_units_are_refused() -> N
         coordinate_exchange(parabola, np.zeros((2, 1)), LEVELS, D(), PriorInformation.none(3))
 
 
-def test_units_that_cannot_be_moved_apart_are_refused() -> None:
+def test_design_that_stays_singular_is_refused() -> None:
     def only_the_first(which: Places, x: Array) -> Array:
         rows = parabola(which, x)
         rows[(which > 0) & (x[:, 0] != 0.0)] = np.nan
@@ -104,12 +104,12 @@ def test_units_that_cannot_be_moved_apart_are_refused() -> None:
         coordinate_exchange(only_the_first, np.zeros((4, 1)), LEVELS, D(), PriorInformation.none(3))
 
 
-def test_poses_of_a_hexapod_move_to_where_its_parameters_show() -> None:
+def test_exchange_of_hexapod_poses_halves_the_parameter_uncertainty() -> None:
     free = select_free_parameters(load_robot("hexapod-42"))
     drawn = sample_workspace(free.robot, 200, 0).coordinates
     middle, half = drawn.mean(axis=0), 0.5 * np.ptp(drawn, axis=0)
 
-    def rows_of(_: Places, x: Array) -> Array:
+    def linearize(_: Places, x: Array) -> Array:
         at = inverse(free.robot, x)
         rows = (
             observe_poses(free, np.where(at.converged[:, None], at.q, 0.0)).twists[0]
@@ -120,14 +120,16 @@ def test_poses_of_a_hexapod_move_to_where_its_parameters_show() -> None:
     levels = [
         m + h * np.array([-1.0, -0.5, 0.0, 0.5, 1.0]) for m, h in zip(middle, half, strict=True)
     ]
-    found = coordinate_exchange(rows_of, drawn[:20], levels, D(), PriorInformation.none(len(free)))
+    found = coordinate_exchange(
+        linearize, drawn[:20], levels, D(), PriorInformation.none(len(free))
+    )
     before, after = (
         evaluate_criterion(
             A(),
             factor_design(rows, PriorInformation.none(len(free)), found.space),
             found.space.machine,
         )
-        for rows in (rows_of(np.arange(20), drawn[:20]), found.rows)
+        for rows in (linearize(np.arange(20), drawn[:20]), found.rows)
     )
     assert (np.diff(found.history) >= 0.0).all()
     assert (

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Certified designs of shipped robots: near the bound, and no worse than the best of twenty
-exchange starts.
-"""
+"""Certified designs are near the efficiency bound and no worse than twenty exchange starts."""
 
 import json
 from pathlib import Path
@@ -24,7 +22,7 @@ from loopcal.planning.design import (
     factor_design,
     fedorov_exchange,
 )
-from tests.planning.polynomials import Array, random_rows
+from tests.planning.design_problems import Array, draw_rows
 
 SIGMA = np.array([5e-5] * 3 + [1e-5] * 3)  # [rad, m]
 
@@ -37,7 +35,7 @@ def pose_rows(robot: str, count: int, components: slice = slice(0, 6)) -> Array:
 
 
 @pytest.mark.slow
-def test_twenty_of_a_thousand_full_poses_of_a_hexapod_are_certified_to_95_percent() -> None:
+def test_efficiency_of_20_out_of_1000_hexapod_poses_exceeds_95_percent() -> None:
     rows = pose_rows("hexapod-42", 1000)
     start = PriorInformation.none(rows.shape[2])
     found = choose_design(rows, 20, D(), start)
@@ -55,7 +53,7 @@ def test_twenty_of_a_thousand_full_poses_of_a_hexapod_are_certified_to_95_percen
 @pytest.mark.parametrize(
     ("robot", "components"), [("hexapod-42", slice(3, 6)), ("3-prs", slice(0, 6))]
 )
-def test_a_certified_design_is_no_worse_than_the_best_of_twenty_starts(
+def test_certified_design_is_no_worse_than_the_best_of_20_exchange_starts(
     robot: str, components: slice
 ) -> None:
     rows = pose_rows(robot, 250, components)
@@ -68,7 +66,7 @@ def test_a_certified_design_is_no_worse_than_the_best_of_twenty_starts(
     assert 0.9 < found.relaxed.efficiency(best.value) <= found.efficiency + 1e-6
 
 
-def test_tolerances_as_prior_give_the_design_of_the_cut_directions_once_the_data_say_more() -> None:
+def test_tolerance_prior_changes_the_design_only_for_coarse_data() -> None:
     cut, prior = PriorInformation.none(42), PriorInformation.from_tolerances(42)
     kept = []
     for precision in (1.0, 1e3):
@@ -91,8 +89,8 @@ def test_tolerances_as_prior_give_the_design_of_the_cut_directions_once_the_data
     assert 0.98 < kept[1] < 1.02
 
 
-def test_a_design_for_a_prediction_predicts_better_than_one_for_the_determinant() -> None:
-    rows = random_rows(N=60, machine=6, seed=2)
+def test_design_by_criterion_i_predicts_better_than_by_criterion_d() -> None:
+    rows = draw_rows(N=60, machine=6, seed=2)
     L = np.random.default_rng(3).normal(size=(4, 6)) * np.array([9.0, 3.0, 1.0, 0.3, 0.1, 0.03])
     start = PriorInformation.none(6)
     wanted = I(L, 4)
@@ -104,8 +102,8 @@ def test_a_design_for_a_prediction_predicts_better_than_one_for_the_determinant(
 
 
 @pytest.mark.parametrize("criterion", [D(), A()], ids=["D", "A"])
-def test_the_efficiency_is_a_promise_below_one_and_repeats_only_help(criterion: D | A) -> None:
-    rows = random_rows(N=30)
+def test_efficiency_is_at_most_one_and_repeats_do_not_worsen_the_design(criterion: D | A) -> None:
+    rows = draw_rows(N=30)
     once, often = (
         choose_design(rows, 7, criterion, PriorInformation.none(4), repeats=repeats)
         for repeats in (False, True)
@@ -115,22 +113,22 @@ def test_the_efficiency_is_a_promise_below_one_and_repeats_only_help(criterion: 
     assert compute_efficiency(criterion, once.design.value, often.design.value, 4) <= 1.0 + 1e-9
 
 
-def test_the_same_seed_gives_the_same_design() -> None:
-    rows = random_rows(N=80, machine=6)
+def test_same_seed_gives_the_same_design() -> None:
+    rows = draw_rows(N=80, machine=6)
     first, second = (
         choose_design(rows, 9, D(), PriorInformation.none(6), seed=4) for _ in range(2)
     )
     np.testing.assert_array_equal(first.design.chosen, second.design.chosen)
 
 
-def test_all_candidates_can_be_asked_for() -> None:
-    found = choose_design(random_rows(), 12, D(), PriorInformation.none(4))
+def test_design_of_all_candidates_has_efficiency_one() -> None:
+    found = choose_design(draw_rows(), 12, D(), PriorInformation.none(4))
     np.testing.assert_array_equal(found.design.chosen, np.arange(12))
     assert found.efficiency == pytest.approx(1.0, abs=1e-9)
 
 
-def test_a_design_begun_with_fewer_units_is_filled_up() -> None:
-    rows = random_rows(N=30)
+def test_incomplete_first_design_is_completed() -> None:
+    rows = draw_rows(N=30)
     found = choose_design(
         rows,
         7,
@@ -142,7 +140,7 @@ def test_a_design_begun_with_fewer_units_is_filled_up() -> None:
 
 
 @pytest.mark.evidence
-def test_evidence_certified_designs_of_shipped_robots(root: Path) -> None:
+def test_evidence_certified_designs_are_no_worse_than_exchange(root: Path) -> None:
     path = root / "docs" / "evidence" / "plan_designs.json"
     if not path.is_file():
         pytest.skip("docs/evidence/plan_designs.json is made by `make evidence`")
@@ -155,7 +153,7 @@ def test_evidence_certified_designs_of_shipped_robots(root: Path) -> None:
         assert row[:3] != ["hexapod-42", "full pose", "D"] or row[certified] >= 0.95
 
 
-def test_units_that_tell_nothing_leave_what_is_known_before() -> None:
+def test_candidates_without_information_leave_the_prior_unchanged() -> None:
     found = choose_design(np.zeros((6, 2, 3)), 2, D(), PriorInformation.from_tolerances(3))
     assert found.efficiency == 1.0
     assert found.design.value == pytest.approx(0.0, abs=1e-12)  # log det of the unit matrix

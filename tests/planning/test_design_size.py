@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How many units: monotone curves, the smallest size for a target, and what no size can reach."""
+"""Size of designs: monotone values, the smallest size for a target, unreachable targets."""
 
 import numpy as np
 import pytest
@@ -11,15 +11,15 @@ from loopcal.planning.design.certified_design import (
     search_size,
 )
 from tests.findings.reported import refused
-from tests.planning.polynomials import polynomial, random_rows
+from tests.planning.design_problems import draw_rows, polynomial_rows
 
-PARABOLA = polynomial(np.linspace(-1, 1, 21), 2)
+PARABOLA = polynomial_rows(np.linspace(-1, 1, 21), 2)
 
 
 @pytest.mark.parametrize("criterion", [D(), A()], ids=["D", "A"])
-def test_more_units_are_never_worse_and_none_beats_its_bound(criterion: Criterion) -> None:
+def test_larger_designs_are_better_and_stay_within_their_bounds(criterion: Criterion) -> None:
     found = compute_design_curve(
-        random_rows(N=30), (12, 4, 6, 5, 9, 9), criterion, PriorInformation.none(4), perturbations=2
+        draw_rows(N=30), (12, 4, 6, 5, 9, 9), criterion, PriorInformation.none(4), perturbations=2
     )
     sign = 1.0 if isinstance(criterion, D) else -1.0
     np.testing.assert_array_equal(found.sizes, [4, 5, 6, 9, 12])
@@ -27,7 +27,7 @@ def test_more_units_are_never_worse_and_none_beats_its_bound(criterion: Criterio
     assert (sign * found.values <= sign * found.bounds + 1e-12).all()
 
 
-def test_a_known_number_of_points_for_a_known_sum_of_variances() -> None:
+def test_smallest_design_for_criterion_a_has_the_known_size() -> None:
     # With weights 1/4, 1/2, 1/4 of n points the sum of the variances is 8 / n: 0.4 takes 20 points
     # and no fewer.
     found = find_smallest_design(
@@ -38,7 +38,7 @@ def test_a_known_number_of_points_for_a_known_sum_of_variances() -> None:
     assert found.certified.design.value == pytest.approx(0.4, rel=1e-9)
 
 
-def test_the_determinant_asked_for_is_reached_by_the_smallest_number() -> None:
+def test_smallest_design_for_criterion_d_has_the_known_size() -> None:
     target = np.log(4 / 27 * 30**3) - 1e-9  # thirty points, ten at each end and in the middle
     found = find_smallest_design(
         PARABOLA, target, D(), PriorInformation.none(3), most=200, repeats=True, perturbations=2
@@ -46,8 +46,8 @@ def test_the_determinant_asked_for_is_reached_by_the_smallest_number() -> None:
     assert found.n == 30
 
 
-def test_what_is_known_before_saves_units() -> None:
-    rows = random_rows(N=60)
+def test_earlier_measurements_reduce_the_design_size() -> None:
+    rows = draw_rows(N=60)
     alone = find_smallest_design(rows, 0.1, A(), PriorInformation.none(4), perturbations=2)
     helped = find_smallest_design(
         rows, 0.1, A(), PriorInformation.none(4).with_rows(rows[:10]), perturbations=2
@@ -56,15 +56,15 @@ def test_what_is_known_before_saves_units() -> None:
     assert helped.n < alone.n
 
 
-def test_targets_out_of_reach_are_refused_with_the_best_that_is_possible() -> None:
+def test_unreachable_target_is_refused_with_the_largest_possible_size() -> None:
     with refused("plan.target-impossible", size=12, available=12, target=0.001):
-        find_smallest_design(random_rows(), 0.001, A(), PriorInformation.none(4))
+        find_smallest_design(draw_rows(), 0.001, A(), PriorInformation.none(4))
     with refused("plan.target-impossible", size=5, available=12):
-        find_smallest_design(random_rows(), 0.2, A(), PriorInformation.none(4), most=5)
+        find_smallest_design(draw_rows(), 0.2, A(), PriorInformation.none(4), most=5)
 
 
 @pytest.mark.parametrize("growth", [0.1, 1.0, 5.0])
-def test_the_smallest_size_is_found_however_values_grow(growth: float) -> None:
+def test_search_finds_the_smallest_size_in_few_evaluations(growth: float) -> None:
     asked: list[int] = []
 
     def value(n: int) -> float:

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a choice of poses is made from: where errors are predicted, what was measured before, and
-what tells nothing.
-"""
+"""Input of a plan: prediction poses, earlier measurements and the observable parameters."""
 
 from dataclasses import replace
 
@@ -25,20 +23,22 @@ UM, URAD = 1e-6, 1e-6
 FEW = PlanOptions(n_candidates=20)
 
 
-def instrument_of(kind: str, sigma: float = 10 * UM, **settings) -> lc.Instrument:
-    """One kind with one sigma."""
+def build_instrument(kind: str, sigma: float = 10 * UM, **settings) -> lc.Instrument:
+    """Return an instrument of one kind with one sigma."""
     made = KINDS[kind](**settings)
     return lc.Instrument((lc.Sensor(made, lc.Gaussian(np.full(len(made.noise_columns), sigma))),))
 
 
-def test_where_errors_are_predicted_depends_neither_on_the_line_of_sight_nor_on_the_candidates():
+def test_prediction_poses_depend_neither_on_constraints_nor_on_candidates():
     robot, sight = (
         load_robot("hexapod-42"),
         lc.LineOfSight(np.array([0.5, -0.3, 0.6]), np.array([0.0, 0.0, 1.0]), np.radians(60.0)),
     )
     free, other, narrow = (
         prepare_problem(
-            robot, instrument_of("pose"), PlanOptions(constraints=constraints, n_candidates=count)
+            robot,
+            build_instrument("pose"),
+            PlanOptions(constraints=constraints, n_candidates=count),
         )
         for constraints, count in (
             (lc.Constraints(), 30),
@@ -51,11 +51,11 @@ def test_where_errors_are_predicted_depends_neither_on_the_line_of_sight_nor_on_
     assert len(free.prediction) == 200
 
 
-def test_of_many_listed_poses_errors_are_predicted_all_over_the_list():
+def test_prediction_poses_are_spread_over_a_long_list_of_poses():
     robot = load_robot("linear-delta")
     listed = sample_workspace(robot, 260, seed=3).coordinates
     listed = listed[np.lexsort(listed.T[::-1])]
-    made = prepare_problem(robot, instrument_of("position"), PlanOptions(allowed_poses=listed))
+    made = prepare_problem(robot, build_instrument("position"), PlanOptions(allowed_poses=listed))
     free = select_free_parameters(robot)
     twists = observe_poses(free, lc.inverse(robot, listed[200:]).q).twists[0, :, 3:]
     # the instrument determines all nine parameters: nothing is projected out of the prediction
@@ -69,28 +69,30 @@ def test_of_many_listed_poses_errors_are_predicted_all_over_the_list():
 
 
 @pytest.mark.parametrize("kind", ["locked", "joint", "inclination"])
-def test_an_instrument_that_tells_nothing_is_refused(kind):
+def test_instrument_without_information_is_refused(kind):
     with refused("plan.nothing-observable", kinds=(kind,), parameters=9):
-        prepare_problem(load_robot("linear-delta"), instrument_of(kind), FEW)
+        prepare_problem(load_robot("linear-delta"), build_instrument(kind), FEW)
 
 
-def test_equations_of_earlier_measurements_pay_for_their_own_set_up_first():
+def test_earlier_equations_are_counted_less_their_setup_parameters():
     robot = load_robot("linear-delta")
     poses = sample_workspace(robot, 5, seed=3).coordinates
-    before = lc.simulate(robot, poses, instrument_of("position", unknown=("frame",)), seed=1)
-    made = prepare_problem(robot, instrument_of("position"), replace(FEW, measured=before))
+    before = lc.simulate(robot, poses, build_instrument("position", unknown=("frame",)), seed=1)
+    made = prepare_problem(robot, build_instrument("position"), replace(FEW, measured=before))
     assert made.n_earlier_equations == 15 - 6
 
 
-def test_an_orientation_that_the_machine_does_not_have_cannot_be_asked_for():
+def test_orientation_goal_for_a_robot_without_rotation_is_refused():
     options = replace(FEW, goal=10 * URAD, target="orientation")
     with refused("plan.target-unobservable", target="orientation", robot="linear-delta"):
-        lc.plan(load_robot("linear-delta"), instrument_of("position"), options=options)
+        lc.plan(load_robot("linear-delta"), build_instrument("position"), options=options)
 
 
-def test_where_equations_decide_the_number_of_poses_the_finding_says_so():
+def test_finding_states_that_equations_decide_the_number_of_poses():
     options = replace(FEW, goal=100 * UM, target="position")
-    made = prepare_problem(load_robot("linear-delta"), instrument_of("position", 0.1 * UM), options)
+    made = prepare_problem(
+        load_robot("linear-delta"), build_instrument("position", 0.1 * UM), options
+    )
     found = find_sample_size(made)
     assert found.enough == 3
     finding = found.report(made.robot)
@@ -99,22 +101,22 @@ def test_where_equations_decide_the_number_of_poses_the_finding_says_so():
     assert finding.data["decided_by_equations"]
 
 
-def test_what_a_certificate_leaves_open_is_rounded_up():
+def test_efficiency_shortfall_is_rounded_up():
     assert [round_shortfall(share) for share in (0.99965, 1.0, 0.5)] == [0.1, 0.0, 50.0]
 
 
-def test_poses_get_names_that_were_not_measured_yet():
+def test_planned_poses_get_unused_names():
     robot = load_robot("linear-delta")
     poses = sample_workspace(robot, 12, seed=3).coordinates
-    before = lc.simulate(robot, poses, instrument_of("position"), seed=1)
+    before = lc.simulate(robot, poses, build_instrument("position"), seed=1)
     options = PlanOptions(
         n_poses=3, hold_out=0, measured=before, n_candidates=20, used_names=("14", "p3")
     )
-    found = lc.plan(robot, instrument_of("position"), options=options)
+    found = lc.plan(robot, build_instrument("position"), options=options)
     assert found.poses.labels == ("15", "16", "17")
 
 
-def test_readings_are_stated_as_finely_in_metres_as_in_millimetres(tmp_path):
+def test_planned_readings_are_rounded_to_a_nanometer_in_files_in_meters(tmp_path):
     (tmp_path / "metres.yaml").write_text(
         "format: 1\nfamily: linear-delta\nname: metres\nunits: {length: m, angle: deg}\nradius: "
         "0.105\n"
@@ -125,7 +127,7 @@ def test_readings_are_stated_as_finely_in_metres_as_in_millimetres(tmp_path):
     )
     robot = load_robot(tmp_path / "metres.yaml")
     options = replace(FEW, n_poses=4, hold_out=0)
-    found = lc.plan(robot, instrument_of("position"), options=options)
+    found = lc.plan(robot, build_instrument("position"), options=options)
     exact = lc.inverse(found.robot, found.poses.coordinates).q
     assert (
         np.abs(found.poses.readings - exact).max() <= 0.51e-9

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Are planned poses worth it? Few machines here; twenty seeds in `make evidence`
-(evidence/planned.py).
+"""Accuracy after calibration with planned and with random poses.
+
+Few machines here; `make evidence` (evidence/planned.py) uses twenty seeds.
 """
 
 import json
@@ -29,7 +30,7 @@ chance of 2 %.
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ONE_OF_EACH, ids=lambda case: case.robot)
-def test_machines_calibrated_at_planned_poses_are_better_than_at_as_many_random_poses(case):
+def test_planned_poses_give_smaller_errors_than_as_many_random_poses(case):
     study = prepare_study(case, FEW, MACHINES, POSES, candidates=200)
     found = [
         (e, study.target_error(e.position, e.orientation))
@@ -45,19 +46,19 @@ def test_machines_calibrated_at_planned_poses_are_better_than_at_as_many_random_
         assert rms / expected == pytest.approx(1.0, abs=4.0 / np.sqrt(2 * error.size * 9) + 0.05)
 
 
-def test_errors_that_fall_with_the_root_of_the_number_of_poses_are_matched_by_that_law():
+def test_equal_number_of_poses_is_interpolated_by_the_square_root_law():
     numbers = (8, 16, 64)
     errors = [1.0 / np.sqrt(n) for n in numbers]
     assert find_equal_number(numbers, errors, 1.0 / np.sqrt(30.0)) == pytest.approx(30.0, rel=1e-12)
     assert find_equal_number(numbers, errors, errors[0]) == pytest.approx(8.0, rel=1e-12)
 
 
-def test_a_rise_by_chance_does_not_make_more_poses_count_as_worse():
+def test_random_increase_of_the_error_does_not_change_the_equal_number():
     assert find_equal_number((8, 16, 32), [2.0, 1.0, 1.1], 1.0) == pytest.approx(16.0, rel=1e-12)
 
 
 @pytest.mark.parametrize("error", [1.1, 0.1])
-def test_an_error_that_no_number_of_poses_had_is_matched_by_none(error):
+def test_error_outside_the_measured_range_has_no_equal_number(error):
     assert find_equal_number((8, 16, 64), [1.0, 0.7, 0.35], error) is None
 
 
@@ -70,7 +71,7 @@ def tables(root):
 
 
 @pytest.mark.evidence
-def test_planned_poses_are_better_than_random_ones_on_every_robot_at_every_number(tables):
+def test_planned_poses_have_smaller_errors_on_every_robot_at_every_number(tables):
     rows = tables["accuracy"]["rows"]
     assert {(row[0], row[1]) for row in rows} == {(case.robot, case.measured) for case in CASES}
     for *_, position, other, orientation, turned, better in rows:
@@ -80,7 +81,7 @@ def test_planned_poses_are_better_than_random_ones_on_every_robot_at_every_numbe
 
 
 @pytest.mark.evidence
-def test_at_least_a_quarter_of_the_poses_is_saved_and_theory_foresees_how_many(tables):
+def test_plan_saves_a_quarter_of_the_poses_as_predicted(tables):
     for _, _, n, equal, saved, predicted, boundary, *ratios in tables["saving"]["rows"]:
         assert saved > 25.0
         # medians of 100 machines with 9 or more degrees of freedom: 3 % of an error, 6 % of a
@@ -92,7 +93,7 @@ def test_at_least_a_quarter_of_the_poses_is_saved_and_theory_foresees_how_many(t
 
 
 @pytest.mark.evidence
-def test_a_plan_saves_poses_at_any_noise_and_no_more_where_tolerances_tell_more(tables):
+def test_plan_saves_poses_at_any_noise_and_fewer_at_high_noise(tables):
     for _, _, n, *numbers in tables["noise"]["rows"]:
         assert min(numbers) > n
         # 3 %: interpolation, and the last percent of efficiency that a plan does not look for

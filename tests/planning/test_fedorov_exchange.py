@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fedorov exchange finds the designs that are known, and on small problems the best of all."""
+"""Fedorov exchange finds the known designs, and the best of all subsets of small problems."""
 
 from itertools import combinations
 
@@ -20,15 +20,15 @@ from loopcal.planning.design import (
     fedorov_exchange,
 )
 from tests.findings.reported import refused
-from tests.planning.polynomials import grid, polynomial, random_rows
+from tests.planning.design_problems import draw_rows, make_grid, polynomial_rows
 
 L = np.random.default_rng(1).normal(size=(9, 4))
 
 
-def test_six_points_for_a_parabola_are_the_ends_and_the_middle_twice_each() -> None:
-    x = grid()
+def test_six_points_for_a_parabola_are_the_ends_and_the_middle_twice() -> None:
+    x = make_grid()
     found = fedorov_exchange(
-        polynomial(x, 2), 6, D(), PriorInformation.none(3), starts=3, repeats=True
+        polynomial_rows(x, 2), 6, D(), PriorInformation.none(3), starts=3, repeats=True
     )
     np.testing.assert_allclose(x[found.chosen], [-1, -1, 0, 0, 1, 1], atol=1e-12)
     assert found.value == pytest.approx(
@@ -36,20 +36,26 @@ def test_six_points_for_a_parabola_are_the_ends_and_the_middle_twice_each() -> N
     )  # det of weights 1/3 each, times 6^3
 
 
-def test_four_points_for_a_cubic_are_the_zeros_of_the_derivative_of_legendres_polynomial() -> None:
-    x = grid(extra=1 / np.sqrt(5))
-    found = fedorov_exchange(polynomial(x, 3), 4, D(), PriorInformation.none(4), starts=3)
+def test_four_points_for_a_cubic_are_the_known_ones() -> None:
+    x = make_grid(extra=1 / np.sqrt(5))
+    found = fedorov_exchange(polynomial_rows(x, 3), 4, D(), PriorInformation.none(4), starts=3)
     np.testing.assert_allclose(
         x[found.chosen], [-1, -1 / np.sqrt(5), 1 / np.sqrt(5), 1], atol=1e-12
     )
 
 
 @pytest.mark.parametrize("criterion", [D(), A(), I(L, 3)], ids=lambda criterion: criterion.name)
-@pytest.mark.parametrize("own", [0, 2])
+@pytest.mark.parametrize("nuisance", [0, 2])
 @pytest.mark.parametrize("prior", [False, True])
-def test_the_best_of_all_subsets_is_found(criterion: Criterion, own: int, prior: bool) -> None:
-    rows = random_rows(own=own)
-    start = PriorInformation.from_tolerances(4, own) if prior else PriorInformation.none(4, own)
+def test_exchange_finds_the_best_of_all_subsets(
+    criterion: Criterion, nuisance: int, prior: bool
+) -> None:
+    rows = draw_rows(nuisance=nuisance)
+    start = (
+        PriorInformation.from_tolerances(4, nuisance)
+        if prior
+        else PriorInformation.none(4, nuisance)
+    )
     found = fedorov_exchange(rows, 5, criterion, start, starts=20)
 
     def value(chosen: tuple[int, ...]) -> float:
@@ -64,14 +70,16 @@ def test_the_best_of_all_subsets_is_found(criterion: Criterion, own: int, prior:
     )
 
 
-def test_history_grows_and_ends_at_the_value() -> None:
-    found = fedorov_exchange(polynomial(grid(), 3), 9, D(), PriorInformation.none(4), starts=4)
+def test_history_increases_and_ends_at_the_value() -> None:
+    found = fedorov_exchange(
+        polynomial_rows(make_grid(), 3), 9, D(), PriorInformation.none(4), starts=4
+    )
     assert (np.diff(found.history) > 0.0).all()
     assert found.value == found.history[-1] == max(found.values)
 
 
-def test_the_same_seed_gives_the_same_design_and_more_starts_keep_the_first() -> None:
-    rows = random_rows(N=40)
+def test_same_seed_gives_the_same_design_and_the_same_first_starts() -> None:
+    rows = draw_rows(N=40)
     few, again, more = (
         fedorov_exchange(rows, 6, D(), PriorInformation.none(4), seed=5, starts=k)
         for k in (3, 3, 6)
@@ -80,8 +88,8 @@ def test_the_same_seed_gives_the_same_design_and_more_starts_keep_the_first() ->
     assert more.values[:3] == few.values
 
 
-def test_units_that_are_not_allowed_and_units_twice_are_never_chosen() -> None:
-    rows = random_rows(N=20)
+def test_forbidden_and_repeated_candidates_are_never_chosen() -> None:
+    rows = draw_rows(N=20)
     rows[::2, 1, 2] = np.nan
     for found in (
         fedorov_exchange(rows, 8, D(), PriorInformation.none(4), starts=5),
@@ -91,26 +99,26 @@ def test_units_that_are_not_allowed_and_units_twice_are_never_chosen() -> None:
         assert len(set(found.chosen.tolist())) == 8
 
 
-def test_starts_that_leave_directions_open_find_the_few_units_that_close_them() -> None:
-    rows = random_rows(N=60)
+def test_singular_start_finds_the_few_candidates_that_are_needed() -> None:
+    rows = draw_rows(N=60)
     rows[:57, :, 3] = 0.0  # only the last three show the fourth parameter
     found = fedorov_exchange(rows, 3, D(), PriorInformation.none(4), starts=4)
     assert (found.chosen >= 57).any()
     assert np.isfinite(found.value)
 
 
-def test_what_was_measured_already_is_not_measured_again() -> None:
-    x = grid()
-    rows = polynomial(x, 2)
+def test_design_complements_earlier_measurements() -> None:
+    x = make_grid()
+    rows = polynomial_rows(x, 2)
     ends = PriorInformation.none(3).with_rows(
-        np.repeat(polynomial(np.array([-1.0, 1.0]), 2), 3, axis=0)
+        np.repeat(polynomial_rows(np.array([-1.0, 1.0]), 2), 3, axis=0)
     )
     found = fedorov_exchange(rows, 3, D(), ends, starts=3, repeats=True)
     np.testing.assert_allclose(x[found.chosen], 0.0, atol=1e-12)
 
 
-def test_units_that_cannot_determine_the_unknowns_together_are_refused() -> None:
-    rows = random_rows(N=6)
+def test_exchange_that_stays_singular_is_refused() -> None:
+    rows = draw_rows(N=6)
     rows[:3, :, 2:] = (
         0.0  # three units show two unknowns only, the others the other two, by one row of use each
     )
@@ -122,11 +130,11 @@ def test_units_that_cannot_determine_the_unknowns_together_are_refused() -> None
         fedorov_exchange(rows, 2, D(), PriorInformation.none(4), starts=3)
 
 
-def test_the_worst_direction_is_a_figure_only() -> None:
+def test_criterion_e_is_refused_for_an_exchange() -> None:
     with pytest.raises(EstimationError, match="choose D, I or A"):
-        fedorov_exchange(random_rows(), 5, E(), PriorInformation.none(4))
+        fedorov_exchange(draw_rows(), 5, E(), PriorInformation.none(4))
 
 
-def test_an_exchange_without_a_start_is_refused() -> None:
+def test_exchange_without_a_start_is_refused() -> None:
     with pytest.raises(EstimationError, match="give 1 or more"):
-        fedorov_exchange(random_rows(), 5, D(), PriorInformation.none(4), starts=0)
+        fedorov_exchange(draw_rows(), 5, D(), PriorInformation.none(4), starts=0)

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Criteria and directions against the textbook's matrices; what cannot be planned is refused with
-the reason.
-"""
+"""Criteria and observable directions agree with textbook covariances; refusals give the reason."""
 
 import numpy as np
 import pytest
@@ -19,22 +17,26 @@ from loopcal.planning.design import (
 )
 from loopcal.planning.design.design_space import require_enough
 from tests.findings.reported import refused
-from tests.planning.polynomials import covariance, random_rows
+from tests.planning.design_problems import compute_covariance, draw_rows
 
 CLOSE = 1e-10  # relative: rounding of inverses of well-conditioned 6 x 6 matrices
 
 
-@pytest.mark.parametrize("own", [0, 2])
+@pytest.mark.parametrize("nuisance", [0, 2])
 @pytest.mark.parametrize("prior", [False, True])
-def test_criteria_are_those_of_the_covariance_with_the_own_unknowns_eliminated(
-    own: int, prior: bool
+def test_criteria_equal_those_of_the_covariance_of_machine_parameters(
+    nuisance: int, prior: bool
 ) -> None:
-    rows = random_rows(own=own)
-    start = PriorInformation.from_tolerances(4, own) if prior else PriorInformation.none(4, own)
+    rows = draw_rows(nuisance=nuisance)
+    start = (
+        PriorInformation.from_tolerances(4, nuisance)
+        if prior
+        else PriorInformation.none(4, nuisance)
+    )
     L = np.random.default_rng(1).normal(size=(9, 4))
     space = find_observable_space(rows, start)
     factor = factor_design(rows[:5], start, space)
-    C = covariance(rows[:5], start.rows, own)
+    C = compute_covariance(rows[:5], start.rows, nuisance)
     expected = {
         D(): -np.linalg.slogdet(C)[1],
         A(): np.trace(C),
@@ -47,8 +49,8 @@ def test_criteria_are_those_of_the_covariance_with_the_own_unknowns_eliminated(
         )
 
 
-def test_directions_that_own_unknowns_imitate_are_left_out_and_change_no_criterion() -> None:
-    rows = random_rows(own=2)
+def test_directions_confounded_with_nuisance_parameters_are_excluded() -> None:
+    rows = draw_rows(nuisance=2)
     rows[..., 3] = (
         rows[..., 0] - 2.0 * rows[..., 4]
     )  # parameters 1 and 2 together, 1 to 2, do what a frame does
@@ -59,18 +61,18 @@ def test_directions_that_own_unknowns_imitate_are_left_out_and_change_no_criteri
     np.testing.assert_allclose(space.machine.T @ np.array([0.0, 1.0, 2.0, 0.0]), 0.0, atol=CLOSE)
     # With parameter 1 fixed instead, 0, 2 and 3 stand for z0, z2 - 2 z1 and z3, which no choice of
     # the frame changes.
-    expected = covariance(np.delete(rows[:6], 3, axis=2), np.zeros((0, 5)), 2)
-    told = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, -2.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-    np.testing.assert_allclose(told @ space.machine @ space.machine.T, told, atol=1e-12)
+    expected = compute_covariance(np.delete(rows[:6], 3, axis=2), np.zeros((0, 5)), 2)
+    determined = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, -2.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(determined @ space.machine @ space.machine.T, determined, atol=1e-12)
     factor = factor_design(rows[:6], start, space)
     C = space.machine @ np.linalg.inv(factor.T @ factor) @ space.machine.T
     np.testing.assert_allclose(
-        told @ C @ told.T, expected, rtol=1e-8
+        determined @ C @ determined.T, expected, rtol=1e-8
     )  # relative: rounding times a condition of 10^3
 
 
-def test_rows_already_measured_count_the_same_as_rows_of_the_design() -> None:
-    rows = random_rows(own=1)
+def test_earlier_rows_count_the_same_as_rows_of_the_design() -> None:
+    rows = draw_rows(nuisance=1)
     none = PriorInformation.none(4, 1)
     space = find_observable_space(rows, none)
     before = none.with_rows(rows[:3])
@@ -83,8 +85,8 @@ def test_rows_already_measured_count_the_same_as_rows_of_the_design() -> None:
     )
 
 
-def test_efficiency_is_the_share_of_poses_that_the_best_design_would_need() -> None:
-    rows = random_rows()
+def test_design_has_half_the_efficiency_of_its_twofold_repetition() -> None:
+    rows = draw_rows()
     start = PriorInformation.none(4)
     space = find_observable_space(rows, start)
     once, twice = (factor_design(np.repeat(rows, k, axis=0), start, space) for k in (1, 2))
@@ -95,8 +97,8 @@ def test_efficiency_is_the_share_of_poses_that_the_best_design_would_need() -> N
         )
 
 
-def test_a_design_that_leaves_a_direction_open_has_the_worst_value() -> None:
-    rows = random_rows()
+def test_singular_design_has_the_worst_criterion_value() -> None:
+    rows = draw_rows()
     start = PriorInformation.none(4)
     space = find_observable_space(rows, start)
     factor = factor_design(rows[:1], start, space)
@@ -107,13 +109,13 @@ def test_a_design_that_leaves_a_direction_open_has_the_worst_value() -> None:
 @pytest.mark.parametrize(
     ("n", "rows", "code", "data"),
     [
-        (2, random_rows(own=1), "plan.design-too-small", {"needed": 3}),
-        (13, random_rows(), "plan.too-few-candidates", {"available": 12}),
+        (2, draw_rows(nuisance=1), "plan.design-too-small", {"needed": 3}),
+        (13, draw_rows(), "plan.too-few-candidates", {"available": 12}),
         (5, np.full((3, 2, 4), np.nan), "plan.no-candidate-allowed", {"total": 3}),
         (5, np.zeros((6, 2, 4)), "plan.no-direction-observable", {}),
     ],
 )
-def test_what_cannot_determine_the_unknowns_is_refused(
+def test_design_that_cannot_determine_the_parameters_is_refused(
     n: int, rows: np.ndarray, code: str, data: dict
 ) -> None:
     start = PriorInformation.none(4, rows.shape[2] - 4)
@@ -121,7 +123,7 @@ def test_what_cannot_determine_the_unknowns_is_refused(
         require_enough(n, rows, start, find_observable_space(rows, start), repeats=False)
 
 
-def test_tolerances_as_prior_make_any_number_of_poses_enough() -> None:
-    rows = random_rows()
+def test_any_number_of_poses_is_enough_with_a_tolerance_prior() -> None:
+    rows = draw_rows()
     start = PriorInformation.from_tolerances(4)
     assert require_enough(1, rows, start, find_observable_space(rows, start)) is None
