@@ -44,6 +44,13 @@ def test_two_unknown_frames_reduce_the_rank_of_the_hexapod_by_twelve(run, frames
     assert json.loads(run(f"hexapod-42 --frames {frames} --json")[1])["rank"] == rank
 
 
+def test_json_gives_the_reason_for_a_number_that_is_not_finite(run):
+    """Nothing is cut at full rank: the gap of the singular values is infinite."""
+    document = json.loads(run("hexapod-42 --json")[1])
+    assert document["gap"] is None
+    assert document["nulls"]["gap"].startswith("infinite")
+
+
 def test_reduce_writes_a_robot_file_with_identifiable_parameters_only(run, tmp_path):
     code, out, _ = run("hexapod-42 --frames base --reduce -o smaller.yaml")
     assert code == 0

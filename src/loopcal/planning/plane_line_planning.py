@@ -29,7 +29,6 @@ from loopcal.planning.design import (
 from loopcal.planning.path import check_paths, locate_home
 from loopcal.planning.plane_line_groups import AXIS, PlaneLineGroups
 from loopcal.planning.result import PlannedPoses
-from loopcal.serialization import to_json
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
 SWEEPS = 3
@@ -170,7 +169,7 @@ class SurfacePlan:
             "sigma": self.options.sigma,
             "seed": self.options.seed,
             "poses": poses,
-            "findings": to_json(self.findings),
+            "findings": self.findings,
         }
 
 

@@ -17,7 +17,6 @@ from loopcal.planning.path import locate_home
 from loopcal.planning.prediction import ExpectedErrors
 from loopcal.planning.problem import name_groups
 from loopcal.planning.sample_size import ErrorCurve
-from loopcal.serialization import to_json
 from loopcal.typing import BoolArray, FloatArray, IntArray
 
 WEAK = 0.5
@@ -255,7 +254,7 @@ class Plan:
             else [],
             "curve": None if self.curve is None else self.curve.to_dict(),
             "notes": [str(note) for note in self.notes],
-            "findings": to_json(self.findings),
+            "findings": self.findings,
         }
 
 

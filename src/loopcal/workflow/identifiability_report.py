@@ -16,7 +16,7 @@ from loopcal.diagnose import (
 )
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
-from loopcal.serialization import to_json
+from loopcal.serialization import json_fields
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +36,8 @@ class IdentifiabilityReport:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report by name for JSON."""
-        document = {**to_json(self.analysis), "remedies": to_json(self.suggestions)}
-        return document if self.subset is None else {**document, "reduction": to_json(self.subset)}
+        document = {**json_fields(self.analysis), "remedies": self.suggestions}
+        return document if self.subset is None else {**document, "reduction": self.subset}
 
 
 def analyze_identifiability(
