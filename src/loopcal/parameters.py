@@ -59,6 +59,10 @@ class ParameterTable:
     def __len__(self) -> int:
         return len(self.entries)
 
+    def __repr__(self) -> str:
+        shown = ", ".join(self.names[:6]) + ", .." * (len(self) > 6)
+        return f"<ParameterTable: {len(self)} parameters ({shown})>"
+
     @cached_property
     def _places(self) -> dict[str, int]:
         return {entry.name: i for i, entry in enumerate(self.entries)}

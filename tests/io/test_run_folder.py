@@ -72,6 +72,16 @@ def test_what_is_no_run_is_refused(tmp_path) -> None:
         read_run_folder(tmp_path / "run")
 
 
+def test_a_damaged_run_names_the_missing_files(tmp_path) -> None:
+    write(tmp_path / "run")
+    (tmp_path / "run" / "arrays.npz").unlink()
+    with pytest.raises(FileError, match=r"damaged: arrays\.npz missing; restore it, or repeat"):
+        read_run_folder(tmp_path / "run")
+    (tmp_path / "run" / "robot.yaml").unlink()
+    with pytest.raises(FileError, match=r"arrays\.npz and robot\.yaml missing"):
+        read_run_folder(tmp_path / "run")
+
+
 def test_json_has_null_and_a_reason_where_a_number_is_not_finite() -> None:
     text = to_json(
         {

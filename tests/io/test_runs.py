@@ -56,7 +56,7 @@ def test_measurements_of_a_run_are_refused_after_a_change_and_without_files(
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lc.load_robot, "path of a robot file .* not a Mechanism"),
+        (lc.load_robot, "path of a robot file .* not Mechanism"),
         (lambda robot: lc.load_measurements(robot, robot), "path of a measurement file"),
         (lambda _: lc.load_measurements(DATA, "hexapod-42"), r"robot is needed .*load_robot"),  # type: ignore
         (lambda _: lc.save_robot("robot.yaml", "out.yaml"), r"robot is needed .*load_robot"),  # type: ignore

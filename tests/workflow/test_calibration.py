@@ -14,6 +14,7 @@ from loopcal.cli import main
 from loopcal.errors import DataError
 from loopcal.estimate import MAP
 from loopcal.findings import Severity, report_finding
+from loopcal.io import load_run, save_run
 from loopcal.io.core.json_text import to_json
 from loopcal.measure import Gaussian, Instrument, Pose, Sensor, sample_truth, simulate
 from loopcal.workflow import CalibrationOptions, Verdict, calibrate, split_data
@@ -64,6 +65,35 @@ def test_json_document_contains_the_verdict_and_every_finding(report):
     assert all(set(f) == {"code", "severity", "data", "text"} for f in document["findings"])
     assert len(document["split"]["held_out"]) == 10
     assert document["passed"] is True
+
+
+def test_dictionary_of_a_report_has_only_json_values(report):
+    assert json.loads(json.dumps(report.to_dict(), allow_nan=False)) == report.to_dict()
+
+
+def test_parts_of_a_report_and_its_run_folder_print_on_a_screen(report, tmp_path):
+    run = load_run(save_run(tmp_path / "run", report))
+    assert repr(run).endswith("run': hexapod-42, calibrated>")
+    assert repr(report.validation) == str(report.validation)
+    for value in (run, report.validation, report.examination, report.robot.parameters):
+        assert len(repr(value)) < 800
+        assert len(repr(value).splitlines()) < 20
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda robot, data: lc.identifiability(data, robot), "robot: got a Measurements"),
+        (lambda robot, _data: lc.identifiability(robot, "data.csv"), "data: got the text"),
+        (lambda _robot, data: lc.validate("run", data), "robot: got the text 'run'"),
+        (lambda robot, _data: lc.plan(robot, "position"), "instrument: got the text 'position'"),
+        (lambda _robot, _data: lc.CalibrationOptions(hold_out="0.25"), "hold_out: got the text"),
+        (lambda _robot, _data: lc.load_robot(3), "not int; pass text or a Path"),
+    ],
+)
+def test_argument_of_the_wrong_type_says_what_to_pass(call, words, report, data):
+    with pytest.raises(lc.ArgumentTypeError, match=words):
+        call(report.robot, data)
 
 
 def test_python_and_command_line_hold_out_the_same_poses(data, tmp_path, monkeypatch, capsys):

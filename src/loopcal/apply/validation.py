@@ -38,6 +38,7 @@ from loopcal.diagnose import (
     compute_row_errors,
 )
 from loopcal.errors import DataError, suggest_names
+from loopcal.estimate.fit_input import check_types
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, Severity
 from loopcal.measure import Measurements, Observations, check_actuators
@@ -167,6 +168,8 @@ class Validation:
             )
         return "\n".join([*lines, *(f"{f.severity.value}: {f}" for f in self.findings)])
 
+    __repr__ = __str__
+
     def to_dict(self) -> dict[str, Any]:
         """Return the result by name for JSON, SI."""
         named = ("before", "after", "commanded_before", "commanded_after", "not_compensable")
@@ -215,6 +218,7 @@ def validate(
     DataError : the data belong to another robot, contain no row, or every pose is unreachable.
     """
     robot = fit.robot if isinstance(fit, Identification) else fit
+    check_types(robot, data)
     old = before or (fit.initial if isinstance(fit, Identification) else fit.nominal)
     check_actuators(data, robot)
     values_before, values = _choose_setup(fit, before, nuisance_values_before, nuisance_values)

@@ -14,6 +14,7 @@ import numpy as np
 
 from loopcal.diagnose.frame_motions import interpret_combinations
 from loopcal.errors import EstimationError
+from loopcal.estimate.fit_input import check_types
 from loopcal.estimate.free_parameters import FreeParameters, select_free_parameters
 from loopcal.estimate.inference.null_space import (
     Combination,
@@ -24,6 +25,7 @@ from loopcal.estimate.inference.null_space import (
 from loopcal.estimate.information import collect_information, count_equations
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Instrument, Measurements, check_actuators, simulate
+from loopcal.measure.array_checks import check_type
 from loopcal.mechanism import Mechanism, sample_workspace
 from loopcal.numerics.decomposition import NULL_COMPONENT, RANK_TOLERANCE, Decomposition, decompose
 from loopcal.serialization import json_fields
@@ -263,8 +265,10 @@ def identifiability(
         Poses are to be drawn, but the robot states no workspace.
     """
     if isinstance(data, Instrument):
+        check_type(robot, Mechanism, "robot", "as from load_robot('hexapod-42')")
         coordinates = sample_workspace(robot, poses, seed).coordinates
         data = simulate(robot, coordinates, data, seed=0, controller=robot)
+    check_types(robot, data)
     check_actuators(data, robot)
     free = select_free_parameters(robot)
     if not len(free):

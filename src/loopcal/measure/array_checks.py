@@ -104,7 +104,8 @@ def check_type(value: object, wanted: type, what: str, hint: str) -> None:
     ----------
     value : of the argument. wanted : its class. what : its name. hint : how to obtain one.
     """
-    if not isinstance(value, wanted):
+    accepted = (float, int) if wanted is float else wanted
+    if not isinstance(value, accepted):
         raise ArgumentTypeError(f"{what}: got {describe(value)}; give {wanted.__name__}, {hint}")
 
 

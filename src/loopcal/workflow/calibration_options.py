@@ -10,6 +10,7 @@ from loopcal.errors import DataError
 from loopcal.estimate import FitOptions, Posterior
 from loopcal.estimate.options import check_labels
 from loopcal.findings import report_finding
+from loopcal.measure.array_checks import check_type
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ class CalibrationOptions:
     allow_still: bool = False
 
     def __post_init__(self) -> None:
+        check_type(self.hold_out, float, "hold_out", "such as 0.25")
         if not 0.0 <= self.hold_out < 1.0:
             raise DataError(
                 f"hold_out is {self.hold_out}; it is a share of the poses, from 0 to below 1"

@@ -22,6 +22,7 @@ from loopcal.diagnose import (
 from loopcal.estimate import Change, Identification
 from loopcal.findings import Finding, Severity
 from loopcal.mechanism import Mechanism
+from loopcal.serialization import to_json
 from loopcal.typing import FloatArray
 from loopcal.workflow.calibration_options import CalibrationOptions
 from loopcal.workflow.data_split import DataSplit
@@ -155,7 +156,14 @@ class CalibrationReport:
         return {**fit.arrays(), "initial": fit.initial.values, **rows}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result by name for JSON, SI."""
+        """Return the result as JSON values by name, SI: dictionaries, lists, numbers and text.
+
+        A number that is not finite becomes None.
+        """
+        return to_json(self.contents())
+
+    def contents(self) -> dict[str, Any]:
+        """Return the results by name, as objects; `to_dict` turns them into JSON values."""
         optional = {
             "change": self.change,
             "model_choice": self.model_choice,

@@ -38,6 +38,10 @@ class FitExamination:
         "findings": "findings",
     }
 
+    def __repr__(self) -> str:
+        names = ", ".join(finding.code for finding in self.findings) or "none"
+        return f"<FitExamination: findings: {names}>"
+
     @property
     def findings(self) -> tuple[Finding, ...]:
         """All findings, the most important ones first."""

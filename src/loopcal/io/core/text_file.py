@@ -21,7 +21,7 @@ def as_path(path: Any, what: str) -> Path:
     ArgumentTypeError : anything else, such as a robot; `what` says what the file should be.
     """
     if not isinstance(path, (str, os.PathLike)):
-        sentence = f"the path of a {what} is needed here, not a {type(path).__name__}"
+        sentence = f"the path of a {what} is needed here, not {type(path).__name__}"
         raise ArgumentTypeError(f"{sentence}; pass text or a Path")
     return Path(path)
 

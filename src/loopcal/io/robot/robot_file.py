@@ -123,7 +123,7 @@ def get_source(robot: Mechanism) -> RobotSource:
 def require_robot(robot: Any) -> None:
     """Raise ArgumentTypeError where a robot is needed, but something else is given."""
     if not isinstance(robot, Mechanism):
-        sentence = f"a robot is needed here, not a {type(robot).__name__}"
+        sentence = f"a robot is needed here, not {type(robot).__name__}"
         raise ArgumentTypeError(f"{sentence}; pass the result of load_robot(path)")
 
 

@@ -131,13 +131,21 @@ def read_run_folder(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
         raise FileError(f"{sentence}; name a folder that a calibration wrote", path)
     try:
         result = json.loads(read_text(path / RESULT, "run result"))
-        with np.load(path / ARRAYS, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError) as error:
-        raise FileError(f"this run folder is damaged ({error}); repeat the run", path) from error
+    except ValueError as error:
+        sentence = f"this run folder is damaged: {RESULT} is not valid JSON ({error})"
+        raise FileError(f"{sentence}; repeat the calibration", path) from error
     if not isinstance(result, dict) or result.get("format", 0) > FORMAT:
         sentence = f"this run has a newer format than {FORMAT}"
         raise FileError(f"{sentence}; use a newer loopcal, or repeat the run", path)
+    if missing := [name for name in (ARRAYS, ROBOT) if not (path / name).is_file()]:
+        sentence = f"this run folder is damaged: {' and '.join(missing)} missing"
+        raise FileError(f"{sentence}; restore it, or repeat the calibration", path)
+    try:
+        with np.load(path / ARRAYS, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, EOFError) as error:
+        sentence = f"this run folder is damaged: {ARRAYS} cannot be read ({error})"
+        raise FileError(f"{sentence}; repeat the calibration", path) from error
     return result, arrays
 
 
@@ -161,6 +169,12 @@ class Run:
     nuisance_values: Mapping[str, float] = field(default_factory=dict)
     initial_nuisance_values: Mapping[str, float] = field(default_factory=dict)
     arrays: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+
+    def __repr__(self) -> str:
+        verdict = (
+            f", {self.result['verdict'].replace('_', ' ')}" if "verdict" in self.result else ""
+        )
+        return f"<Run {str(self.path)!r}: {self.robot.name}{verdict}>"
 
     @property
     def held_out(self) -> tuple[str, ...]:
@@ -245,7 +259,7 @@ def build_document(
     """Return the content of result.json; see `save_run`."""
     files = {role: as_path(file, "input") for role, file in (inputs or {}).items()}
     provenance = collect_provenance(command, files, report.provenance.seeds)
-    return {"made_by": provenance, **report.to_dict()}
+    return {"made_by": provenance, **report.contents()}
 
 
 def load_run(path: str | Path) -> Run:
