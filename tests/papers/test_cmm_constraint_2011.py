@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration from planes and perpendicular lines repeated: the paper's equations, its claims, and
-the same on many machines.
+"""Calibration from planes and perpendicular lines: equations, claims of the paper, many machines.
 
-The small version below draws 6 machines, leaves out sweeps of the exchange, and holds wide bounds;
-those of the tests marked `evidence` are over 200.
+The small version below draws 6 machines, uses fewer sweeps of the exchange, and has wide bounds.
+The tests marked `evidence` use 200 machines.
 """
 
 import json
@@ -91,7 +90,7 @@ def results(study) -> Results:
     )  # fmt: skip
 
 
-def test_printed_quotients_are_judged_with_their_rounding() -> None:
+def test_printed_quotients_are_compared_within_their_rounding() -> None:
     given = read_published().table_4
     assert [name for name, g in given.items() if not g.follows] == ["orientation, mean"]
     low, high = given["orientation, mean"].possible
@@ -104,7 +103,7 @@ def test_printed_quotients_are_judged_with_their_rounding() -> None:
     assert [round(g.reduction) for g in read_published().figure_5.values() if g.before] == [83, 87]
 
 
-def test_nine_directions_move_the_base_or_turn_the_platform_about_the_end_point(study) -> None:
+def test_nine_gauge_directions_are_motions_of_base_and_platform(study) -> None:
     robot, at = study.robot, study.held_out.solution
     assert len(GAUGE_NAMES) == 9
     step = 1e-6
@@ -120,7 +119,7 @@ def test_nine_directions_move_the_base_or_turn_the_platform_about_the_end_point(
     assert np.abs(rows @ list_gauge_directions(robot).T).max() < 1e-13 * np.abs(rows).max()
 
 
-def test_equation_17_is_the_slope_of_14_and_the_noise_map_that_by_the_points(study) -> None:
+def test_equation_17_and_the_noise_map_are_derivatives_of_equation_14(study) -> None:
     layout, robot = study.layout, study.robot
     q = layout.solve_readings(robot.parameters.nominal[None], 0.0, 0)
     at, J, _ = layout.linearize_points(robot.parameters.nominal[None], q)
@@ -142,7 +141,7 @@ def test_equation_17_is_the_slope_of_14_and_the_noise_map_that_by_the_points(stu
     )  # [m2], second order of 1e-7
 
 
-def test_true_machines_stand_where_held_but_for_the_noise(study) -> None:
+def test_true_machines_reach_the_planned_poses_within_the_noise(study) -> None:
     truth = draw_true_machines(study.robot, MM, 2, 0)
     q = study.layout.solve_readings(truth, 1e-4, 0)
     off = forward_trials(study.robot, truth, q, study.layout.state).T - study.layout.state.T
@@ -155,9 +154,7 @@ def test_true_machines_stand_where_held_but_for_the_noise(study) -> None:
     )  # [m] a machine is the same however many there are
 
 
-def test_alignment_takes_out_motions_of_the_base_and_turns_of_the_platform_and_nothing_else(
-    study,
-) -> None:
+def test_alignment_removes_base_motions_and_platform_rotations_only(study) -> None:
     true = study.held_out.solution.T[None]
     base = geometry.make_pose(
         geometry.exp_so3(np.array([0.1, -0.2, 0.3])), np.array([0.3, 0.1, -0.2])
@@ -170,15 +167,13 @@ def test_alignment_takes_out_motions_of_the_base_and_turns_of_the_platform_and_n
     )  # [m] that is no motion of the base
 
 
-def test_what_nothing_tells_moves_absolute_errors_and_neither_those_at_nominal_nor_those_aligned(
-    study,
-) -> None:
+def test_gauge_changes_absolute_errors_but_not_nominal_or_aligned_ones(study) -> None:
     truth = draw_true_machines(study.robot, 0.1 * MM, 1, 0)
     true = study.held_out.solve(truth)
     values = study.robot.parameters.nominal[None]
-    here = study.held_out.compute_errors(values, truth, true)[0]
-    assert here[NOMINAL] == pytest.approx(
-        here[ABSOLUTE_POSITION], rel=1e-9
+    initial = study.held_out.compute_errors(values, truth, true)[0]
+    assert initial[NOMINAL] == pytest.approx(
+        initial[ABSOLUTE_POSITION], rel=1e-9
     )  # as designed it is at nominal already
     step = 1e-5  # of a direction that has length one
     for direction in list_gauge_directions(study.robot):
@@ -186,15 +181,15 @@ def test_what_nothing_tells_moves_absolute_errors_and_neither_those_at_nominal_n
             values + step * direction / np.linalg.norm(direction), truth, true
         )[0]
         # second order: some 1e-5 of the step, which is 0.01 mm
-        assert moved[NOMINAL] == pytest.approx(here[NOMINAL], abs=1e-6)
-        assert moved[ALIGNED] == pytest.approx(here[ALIGNED], abs=1e-6)
+        assert moved[NOMINAL] == pytest.approx(initial[NOMINAL], abs=1e-6)
+        assert moved[ALIGNED] == pytest.approx(initial[ALIGNED], abs=1e-6)
     base = list_gauge_directions(study.robot)[0]  # 1 m along x
     shifted = study.held_out.compute_errors(values + 1e-2 * base, truth, true)[0]
-    assert shifted[ABSOLUTE_POSITION] == pytest.approx(10.0, abs=here[ABSOLUTE_POSITION])  # [mm]
-    assert shifted[ALIGNED] == pytest.approx(here[ALIGNED], abs=1e-6)
+    assert shifted[ABSOLUTE_POSITION] == pytest.approx(10.0, abs=initial[ABSOLUTE_POSITION])  # [mm]
+    assert shifted[ALIGNED] == pytest.approx(initial[ALIGNED], abs=1e-6)
 
 
-def test_large_absolute_errors_of_least_squares_are_where_the_gauge_was_put(study) -> None:
+def test_large_absolute_errors_of_least_squares_come_from_the_gauge(study) -> None:
     """The same answers, moved along what no row tells to where poses are nearest to those as
     designed.
     """
@@ -205,7 +200,7 @@ def test_large_absolute_errors_of_least_squares_are_where_the_gauge_was_put(stud
     assert ls[NOMINAL] < 1.5 * np.hypot(ls[ALIGNED], before[ABSOLUTE_POSITION])
 
 
-def test_without_noise_all_that_can_be_known_is_found(study) -> None:
+def test_noise_free_data_give_the_true_machine_up_to_the_gauge(study) -> None:
     truth = draw_true_machines(study.robot, 0.1 * MM, 2, 0)
     problem = PaperRows(study.layout, study.layout.solve_readings(truth, 0.0, 0), MM, 1e-9)
     run = identify_from_rows(problem, LeastSquares(), 1e-6)
@@ -216,7 +211,7 @@ def test_without_noise_all_that_can_be_known_is_found(study) -> None:
     assert errors[:, MEASURES.index("position [mm]")].min() > 1e-3  # the base is not
 
 
-def test_true_errors_without_gauge_have_none(study) -> None:
+def test_gauge_free_errors_have_no_gauge_component(study) -> None:
     errors = (
         draw_true_machines(study.robot, MM, 4, 0, is_gauge_free=True)
         - study.robot.parameters.nominal
@@ -227,7 +222,7 @@ def test_true_errors_without_gauge_have_none(study) -> None:
     np.testing.assert_allclose(remove_gauge(study.robot, errors), errors, atol=1e-15)
 
 
-def test_points_of_a_plane_and_its_line_give_two_equations_less(study) -> None:
+def test_points_of_a_plane_and_its_line_give_two_equations_fewer(study) -> None:
     assert compute_pair_rank(study) == (10, 8)
 
 
@@ -239,9 +234,7 @@ def test_rank_is_33_for_1_to_30_planes(results) -> None:
 
 
 @pytest.mark.slow
-def test_least_squares_errs_by_the_noise_and_map_by_less_where_noise_is_as_large_as_errors(
-    results,
-) -> None:
+def test_map_has_smaller_errors_than_least_squares_at_high_noise(results) -> None:
     for (given, _), c in results.cells.items():
         assert c.failed == 0
         ratio = c.compute_median(LS)[ALIGNED] * MM / c.noise
@@ -254,7 +247,7 @@ def test_least_squares_errs_by_the_noise_and_map_by_less_where_noise_is_as_large
 
 
 @pytest.mark.slow
-def test_the_verdicts_are_these(results) -> None:
+def test_claims_have_the_expected_verdicts(results) -> None:
     reproduction = PAPERS["cmm-constraint-2011"].present(results, 0, DRAWS)
     judged = {v.claim: v.agrees for v in reproduction.verdicts}
     assert len(judged) == 20
@@ -298,7 +291,7 @@ def test_the_verdicts_are_these(results) -> None:
     )
 
 
-def test_75_per_cent_is_no_matter_of_luck() -> None:
+def test_gauge_share_of_random_errors_follows_a_beta_distribution() -> None:
     """The share of nine of 42 directions in a squared norm is Beta(9/2, 33/2)."""
     drawn = np.random.default_rng(0).normal(size=(200_000, 42))
     share = np.mean(np.sum(drawn[:, :9] ** 2, axis=1) <= 0.25**2 * np.sum(drawn**2, axis=1))
@@ -307,14 +300,14 @@ def test_75_per_cent_is_no_matter_of_luck() -> None:
     assert abs(share - chance) < 5.0 * np.sqrt(chance / 200_000)  # 5 sd, binomial
 
 
-def test_the_same_seed_gives_the_same_numbers(study) -> None:
+def test_same_seed_gives_the_same_numbers(study) -> None:
     first, again, more = (calibrate_cell(study, MM, 1e-5, 3, trials) for trials in (2, 2, 3))
     for method in (BEFORE, LS, PRIOR):
         np.testing.assert_array_equal(first.errors[method], again.errors[method])
         np.testing.assert_allclose(more.errors[method][:2], first.errors[method], rtol=1e-6)
 
 
-def test_the_page_of_the_documentation_names_every_module_and_no_missing_one() -> None:
+def test_page_lists_exactly_the_modules_of_the_study() -> None:
     folder = ROOT / "src" / "loopcal" / "papers" / "cmm_constraint_2011"
     named = set(re.findall(r"`(\w+\.(?:py|yaml))`", DOC.read_text("utf-8")))
     assert named == {path.name for path in folder.iterdir() if path.suffix in {".py", ".yaml"}} - {
@@ -323,13 +316,13 @@ def test_the_page_of_the_documentation_names_every_module_and_no_missing_one() -
     assert "cmm-constraint-2011" in PAPERS
 
 
-def evidence() -> dict:
+def load_evidence() -> dict:
     return json.loads((ROOT / "docs" / "evidence" / "cmm_constraint.json").read_text("utf-8"))
 
 
 @pytest.mark.evidence
-def test_evidence_coordinate_exchange_gains_at_least_three_times_from_each_of_five_starts() -> None:
-    rows = evidence()["tables"]["exchange"]["rows"]
+def test_evidence_coordinate_exchange_gains_threefold_from_five_starts() -> None:
+    rows = load_evidence()["tables"]["exchange"]["rows"]
     assert len(rows) == 5
     assert all(gain >= 3.0 for _, _, _, gain, _, _ in rows)
     assert all(cost <= 40.0 for *_, cost in rows if cost is not None)
@@ -337,8 +330,8 @@ def test_evidence_coordinate_exchange_gains_at_least_three_times_from_each_of_fi
 
 
 @pytest.mark.evidence
-def test_evidence_least_squares_errs_by_the_noise_and_map_never_by_more() -> None:
-    document = evidence()
+def test_evidence_map_errors_do_not_exceed_those_of_least_squares() -> None:
+    document = load_evidence()
     assert document["draws"] >= 200
     for given, noise, before, ls, prior, *_, failed in document["tables"]["table_3"]["rows"]:
         assert failed == 0
@@ -352,8 +345,8 @@ def test_evidence_least_squares_errs_by_the_noise_and_map_never_by_more() -> Non
 
 
 @pytest.mark.evidence
-def test_evidence_the_covariance_of_the_rows_is_worth_a_sixth_and_independence_nothing() -> None:
-    rows = {words: numbers for words, *numbers in evidence()["tables"]["weights"]["rows"]}
+def test_evidence_row_covariance_reduces_errors_by_a_sixth() -> None:
+    rows = {words: numbers for words, *numbers in load_evidence()["tables"]["weights"]["rows"]}
     share = {words: numbers[4] for words, numbers in rows.items()}
     assert share["with their covariance"] == pytest.approx(0.84, abs=0.04)
     assert share["divided by the distance d_1"] == pytest.approx(0.93, abs=0.04)
@@ -367,10 +360,8 @@ def test_evidence_the_covariance_of_the_rows_is_worth_a_sixth_and_independence_n
 
 
 @pytest.mark.evidence
-def test_evidence_absolute_errors_of_least_squares_hang_on_the_gauge_and_aligned_ones_on_the_data() -> (  # noqa: E501
-    None
-):
-    tables = evidence()["tables"]
+def test_evidence_gauge_changes_absolute_errors_and_not_aligned_ones() -> None:
+    tables = load_evidence()["tables"]
     columns = tables["table_3"]["columns"]
     loud = dict(
         zip(
@@ -405,10 +396,8 @@ def test_evidence_absolute_errors_of_least_squares_hang_on_the_gauge_and_aligned
 
 
 @pytest.mark.evidence
-def test_evidence_figure_5_comes_near_where_the_gauge_is_out_and_parameters_do_not_where_it_is_in() -> (  # noqa: E501
-    None
-):
-    rows = evidence()["tables"]["readings"]["rows"]
+def test_evidence_figure_5_is_reproduced_only_without_the_gauge() -> None:
+    rows = load_evidence()["tables"]["readings"]["rows"]
     printed, results = rows[0][3:], {tuple(row[:3]): row[3:] for row in rows[1:]}
     for reading in (("gauge-free", "absolute"), ("all 42", "aligned"), ("gauge-free", "aligned")):
         assert np.abs(np.subtract(results["standard deviation", *reading], printed)).max() < 20.0
@@ -416,5 +405,5 @@ def test_evidence_figure_5_comes_near_where_the_gauge_is_out_and_parameters_do_n
     assert all(
         numbers[0] < 0.0 for (reading, *_), numbers in results.items() if reading == "variance"
     )
-    ranks = evidence()["tables"]["correlation"]["rows"]
+    ranks = load_evidence()["tables"]["correlation"]["rows"]
     assert all(cells == 12 and ratios == 6 and rank > 0.7 for _, rank, cells, ratios in ranks)

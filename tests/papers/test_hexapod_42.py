@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The 42-parameter hexapod study repeated: what agrees with print, what does not, and that each
-judgement is computed.
+"""The 42-parameter hexapod study: which published numbers and claims are confirmed.
 
-Statistics are over 20 drawings (seed 0). Their bounds are written out beside them, and hold for
-seeds 0 to 6 too: a root mean square over 20 drawings of few independent directions is sure to some
-15 %.
+Statistics are over 20 drawings (seed 0). Their bounds are written beside them and hold for seeds 0
+to 6 too. A root mean square over 20 drawings of few independent directions has an uncertainty of
+some 15 %.
 """
 
 import re
@@ -73,14 +72,14 @@ def test_only_the_order_rz_ry_rx_with_alpha_about_x_fits_table_4(results) -> Non
     assert printed.rotation == pytest.approx(7.1e-4, rel=0.05)
 
 
-def test_row_a2_and_no_other_is_named_an_outlier(results) -> None:
+def test_row_a2_is_the_only_outlier(results) -> None:
     assert results.outliers.labels == ("A2",)
     without = next(o for o in results.outliers.first if o.label == "A2")
     assert 1e-3 < without.p_value < 1.0 - 1e-3
     assert all(o.p_value < 1e-9 for o in results.outliers.first if o.label != "A2")
 
 
-def test_noise_free_steps_are_those_of_the_paper(results) -> None:
+def test_noise_free_steps_agree_with_the_paper(results) -> None:
     for run, second in (
         (results.exact, 2e-8),
         (results.frozen, 3e-6),
@@ -96,7 +95,7 @@ def test_noise_free_steps_are_those_of_the_paper(results) -> None:
     )
 
 
-def test_with_the_stated_noise_the_rule_is_never_met_and_parameters_get_worse(results) -> None:
+def test_stated_noise_prevents_the_stopping_rule_and_worsens_parameters(results) -> None:
     stated = next(level for level in results.levels if level.limits == STATED)
     assert not np.isfinite(stated.needed).any()
     assert 6e-4 < stated.median[3] < 1.2e-3  # [mm + rad]; 7.6e-4 to 9.5e-4 over seeds 0 to 6
@@ -109,9 +108,7 @@ def test_with_the_stated_noise_the_rule_is_never_met_and_parameters_get_worse(re
     assert 0.008 < alone.wide < 0.03  # [mm]
 
 
-def test_leg_by_leg_has_2_4_times_the_standard_deviation_of_all_legs_weighted_together(
-    results,
-) -> None:
+def test_per_leg_fit_has_2_4_times_the_standard_deviation_of_the_joint_fit(results) -> None:
     study, sd = results.study, to_si(STATED) / np.sqrt(3.0)
     legs, actual = LegForm.at(study.robot, study.commanded), compute_actual_poses(study)
     unit = np.eye(60).reshape(60, 10, 6) * sd  # exact to first order: each of 60 noises on its own
@@ -126,7 +123,7 @@ def test_leg_by_leg_has_2_4_times_the_standard_deviation_of_all_legs_weighted_to
     assert rms[0] / rms[1] == pytest.approx(2.4, abs=0.1)
 
 
-def test_tables_5_and_6_fit_noise_a_thousand_times_smaller_than_stated(results) -> None:
+def test_tables_5_and_6_imply_noise_1000_times_smaller_than_stated(results) -> None:
     sizes = compute_published_sizes(results.printed)
     np.testing.assert_allclose(sizes, [3.04e-7, 9.1e-10, 2.39e-4, 7.2e-7], rtol=0.01)
     presumed = next(level for level in results.levels if level.limits == PRESUMED)
@@ -137,9 +134,7 @@ def test_tables_5_and_6_fit_noise_a_thousand_times_smaller_than_stated(results) 
             assert not level.contains(sizes)
 
 
-def test_table_6_holds_residuals_of_this_problem_and_a_shift_of_all_poses_leaves_none(
-    results,
-) -> None:
+def test_table_6_contains_residuals_and_a_common_shift_leaves_none(results) -> None:
     study = results.study
     legs = LegForm.at(study.truth, forward(study.truth, study.commanded.q, study.commanded))
     actual = compute_actual_poses(study)
@@ -156,7 +151,7 @@ def test_table_6_holds_residuals_of_this_problem_and_a_shift_of_all_poses_leaves
     assert explained(np.tile(offset, (10, 1))).min() > 1.0 - 1e-3
 
 
-def test_rounding_of_table_4_spoils_the_papers_own_method(results) -> None:
+def test_method_of_the_paper_fails_for_the_rounded_poses_of_table_4(results) -> None:
     rows = {row[0]: row[2] for row in results.rounding}
     assert rows["Table 4 as printed"] == pytest.approx(2.6, rel=0.05)  # [mm]
     assert rows["without row A2"] > rows["not calibrated"]
@@ -164,7 +159,7 @@ def test_rounding_of_table_4_spoils_the_papers_own_method(results) -> None:
     assert rows["computed poses in full"] < 1e-8
 
 
-def test_the_steps_and_simulated_trials_draw_the_same_noise(results) -> None:
+def test_steps_and_simulated_trials_draw_the_same_noise(results) -> None:
     made, study = simulate_stated_noise(results.study, 3, 2), results.study
     for trial in range(2):
         ours = (
@@ -177,18 +172,18 @@ def test_the_steps_and_simulated_trials_draw_the_same_noise(results) -> None:
         )  # [rad, m] rounding
 
 
-def test_iterations_without_end_are_said_to_be_none(results) -> None:
+def test_unreachable_threshold_gives_no_iteration_count(results) -> None:
     assert iterate(results.study, compute_actual_poses(results.study), 2).count_needed(0.0) is None
 
 
-def test_more_and_wider_poses_help_more_than_the_stated_noise_hurts(results) -> None:
+def test_40_wide_poses_reduce_the_error_tenfold_at_the_stated_noise(results) -> None:
     rows = {(row[0], row[1]): row for row in results.poses}
     assert all(row[2] == 2 for row in rows.values())
     assert 0.004 < rows["drawn, wide", 40][4] < 0.012  # [mm]; 0.0058 to 0.0074 over seeds 0 to 6
     assert rows["drawn, wide", 40][4] < rows["the paper's ten", 10][4] / 10.0
 
 
-def test_the_verdicts_are_these(results) -> None:
+def test_claims_have_the_expected_verdicts(results) -> None:
     judged = {v.name: v.agrees for v in judge_claims(results)}
     assert len(judged) == 17
     assert {name for name, agrees in judged.items() if agrees} == {
@@ -201,7 +196,7 @@ def test_the_verdicts_are_these(results) -> None:
     }
 
 
-def test_a_verdict_follows_what_is_computed(results) -> None:
+def test_verdict_changes_with_the_computed_results(results) -> None:
     wrong = results.orders[1:]
     changed = Results(
         **{
@@ -213,14 +208,14 @@ def test_a_verdict_follows_what_is_computed(results) -> None:
     assert claim.agrees
 
 
-def test_the_same_seed_gives_the_same_reproduction() -> None:
+def test_same_seed_gives_the_same_reproduction() -> None:
     first, again = (PAPERS["hexapod-42"].run(7, 2) for _ in range(2))
     assert first.to_dict() == again.to_dict()
     other = PAPERS["hexapod-42"].run(8, 2)
     assert first.to_dict()["tables"] != other.to_dict()["tables"]
 
 
-def test_the_page_of_the_documentation_names_every_module_and_no_missing_one() -> None:
+def test_page_lists_exactly_the_modules_of_the_study() -> None:
     folder = Path(__file__).parents[2] / "src" / "loopcal" / "papers" / "hexapod_42"
     named = set(re.findall(r"`(\w+\.(?:py|yaml))`", DOC.read_text("utf-8")))
     assert named == {path.name for path in folder.iterdir() if path.suffix in {".py", ".yaml"}} - {

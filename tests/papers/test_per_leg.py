@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The per-leg variant of the 42-parameter hexapod study, on its own ten poses."""
+"""Per-leg identification of the 42-parameter hexapod study, at the ten poses of the study."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ PAPER_POSES = np.array(
 ) * np.array([MM, MM, MM, 1, 1, 1])
 
 
-def test_noise_free_steps_and_conditions_are_those_of_the_study():
+def test_noise_free_steps_and_conditions_agree_with_the_study():
     truth = zoo.hexapod().with_values(zoo.hexapod_truth())
     data = simulate(truth, PAPER_POSES, tracker(1e-15, 1e-15), 0)
     found = identify_per_leg(hexapod(), data, steps=3)
@@ -41,7 +41,7 @@ def test_noise_free_steps_and_conditions_are_those_of_the_study():
     np.testing.assert_allclose(found.conditions, [5822, 3501, 4924, 4570, 3385, 4683], rtol=0.01)
 
 
-def test_each_leg_alone_is_less_efficient_than_all_legs_weighted_together():
+def test_per_leg_fit_has_larger_errors_than_the_joint_fit():
     robot = hexapod()
     trials = simulate_trials(
         robot, sample_truth(robot, 12, 0), hexapod_poses(15), tracker(1e-6, 1e-6), 0

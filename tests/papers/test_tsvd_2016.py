@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LS, RE and TSVD on two parallel manipulators repeated: the paper's steps, its claims, and the
-same on many machines.
+"""LS, RE and TSVD on two parallel manipulators: steps, claims of the paper, many machines.
 
-The small version below draws 10 machines; its bounds are wide, because a median of ten is sure to
-some 20 %. The tests marked `evidence` hold the bounds at full size.
+The small version below draws 10 machines. Its bounds are wide, because a median of ten has an
+uncertainty of some 20 %. The tests marked `evidence` check the bounds at full size.
 """
 
 import json
@@ -84,7 +83,7 @@ def results() -> Results:
     return compute(0, DRAWS, lambda _: None)
 
 
-def identification_matrix(measured: Study) -> np.ndarray:
+def compute_identification_matrix(measured: Study) -> np.ndarray:
     """H (216, p) in mm and rad by central differences of the forward kinematics."""
     robot, step = measured.robot, 1e-4
     nominal, scale = robot.parameters.nominal, list_scales(robot)
@@ -124,7 +123,7 @@ def test_appendix_1_is_read_as_printed() -> None:
     assert (np.abs(read_published().noise_si) <= LIMITS).all()
 
 
-def test_poses_errors_and_range_are_as_stated() -> None:
+def test_poses_parameter_errors_and_output_range_agree_with_the_paper() -> None:
     robot = load_machine("3-PRS")
     z, phi, theta = list_measured_poses(robot).T
     assert len(z) == 36
@@ -142,9 +141,9 @@ def test_poses_errors_and_range_are_as_stated() -> None:
 
 
 @pytest.mark.parametrize("name", ["3-PRS", "RU-PUS-PRS"])
-def test_a_step_is_that_of_the_printed_formulas(name) -> None:
+def test_first_step_agrees_with_the_printed_formulas(name) -> None:
     measured = measure_machines(name, draw_true_values(load_machine(name), 1, 0), AppendixNoise())
-    H, p, lam, k = identification_matrix(measured), len(measured.robot.parameters), 0.01, 15
+    H, p, lam, k = compute_identification_matrix(measured), len(measured.robot.parameters), 0.01, 15
     kind, T = (
         measured.kind,
         forward_trials(
@@ -172,7 +171,7 @@ def test_a_step_is_that_of_the_printed_formulas(name) -> None:
     np.testing.assert_allclose(results.singular_values[0], s, rtol=1e-5, atol=1e-8)
 
 
-def test_ridge_in_every_step_is_a_filter_that_forgets_lambda() -> None:
+def test_repeated_ridge_steps_reduce_the_effect_of_lambda() -> None:
     robot = load_machine("3-PRS")
     small = robot.values + 1e-2 * (
         draw_true_values(robot, 1, 0) - robot.values
@@ -199,7 +198,7 @@ def test_exact_measurements_give_the_true_parameters() -> None:
     )  # [m, rad], rounding times 1 / 4e-4
 
 
-def test_tsvd_with_all_singular_values_is_ls_and_settings_do_not_disturb_each_other(tripod) -> None:
+def test_tsvd_with_all_singular_values_equals_ls_in_a_batch_of_settings(tripod) -> None:
     both = iterate(
         tripod, np.concatenate([penalize_none(33), penalize_truncated(np.array([33, 22]), 33)])
     )
@@ -212,14 +211,14 @@ def test_tsvd_with_all_singular_values_is_ls_and_settings_do_not_disturb_each_ot
     )
 
 
-def test_lambda_runs_from_the_smallest_singular_value_to_1_in_equal_intervals_and_ratios() -> None:
+def test_lambdas_up_to_1_have_equal_intervals_and_equal_ratios() -> None:
     lambdas, equal = space_lambdas(1e-4)
     assert (lambdas[0], lambdas[-1]) == (1e-4, 1.0)
     assert np.ptp(np.diff(lambdas[equal])) < 1e-12
     assert np.ptp(np.diff(np.log(np.r_[lambdas[0], lambdas[~equal], 1.0]))) < 1e-12
 
 
-def test_without_psi_the_numbers_are_the_same_otherwise(tripod) -> None:
+def test_measurements_without_psi_keep_the_other_five_coordinates(tripod) -> None:
     np.testing.assert_array_equal(
         tripod.five.trials.measured[0], tripod.trials.measured[0][..., :5]
     )
@@ -229,7 +228,7 @@ def test_without_psi_the_numbers_are_the_same_otherwise(tripod) -> None:
 
 
 @pytest.mark.slow
-def test_5_dof_measurement_leaves_one_combination_open_and_nothing_else(results) -> None:
+def test_5_dof_measurement_leaves_one_combination_unidentifiable(results) -> None:
     for name, p, parameters in (
         ("3-PRS", 33, {"a1y", "a2y", "a3y"}),
         ("RU-PUS-PRS", 25, {"a1y", "a2x", "thU2z"}),
@@ -260,14 +259,14 @@ def test_tsvd_needs_fewest_iterations_and_ridge_most(results) -> None:
 
 
 @pytest.mark.slow
-def test_the_bottom_of_ridge_wanders_with_the_iterations(results) -> None:
+def test_best_lambda_of_ridge_increases_with_the_iterations(results) -> None:
     lambdas = [lam for _, lam, _ in results.steps]
     assert lambdas == sorted(lambdas)
     assert lambdas[-1] > 5.0 * lambdas[0]
 
 
 @pytest.mark.slow
-def test_on_drawn_machines_map_is_better_than_raw_methods_at_their_best(results) -> None:
+def test_map_has_smaller_errors_than_raw_methods_on_drawn_machines(results) -> None:
     for drawn in results.draws:
         for method in (RAW_LS, RAW_RE, RAW_TSVD):
             assert (drawn.compute_ratio(PRIOR, method)[:2] < 1.1).all()
@@ -279,7 +278,7 @@ def test_on_drawn_machines_map_is_better_than_raw_methods_at_their_best(results)
 
 
 @pytest.mark.slow
-def test_identified_parameters_deviate_though_poses_do_not(results) -> None:
+def test_least_squares_parameters_deviate_although_poses_do_not(results) -> None:
     ls, prior = (results.find_case("3-PRS", 6).answers[m].errors for m in (WHITENED, PRIOR))
     assert ls[0] < 0.01  # [mm]
     assert ls[3] > 10.0  # [tolerances]
@@ -287,7 +286,7 @@ def test_identified_parameters_deviate_though_poses_do_not(results) -> None:
 
 
 @pytest.mark.slow
-def test_the_verdicts_are_these(results) -> None:
+def test_claims_have_the_expected_verdicts(results) -> None:
     judged = [(v.name, v.claim, v.agrees) for v in judge_claims(results)]
     assert len(judged) == 19
     curves = {claim.rsplit("Here: ", 1)[1]: ok for name, claim, ok in judged if name == "u_shape"}
@@ -311,7 +310,7 @@ def test_the_verdicts_are_these(results) -> None:
 
 
 @pytest.mark.slow
-def test_numbers_of_tables_and_figures_are_finite_or_said_to_be_missing(results) -> None:
+def test_numbers_of_tables_and_figures_are_finite(results) -> None:
     for table in make_tables(results):
         cells = [cell for row in table.rows for cell in row if isinstance(cell, float)]
         assert table.name in {"table_5", "table_6"} or np.isfinite(cells).all(), table.name
@@ -322,7 +321,7 @@ def test_numbers_of_tables_and_figures_are_finite_or_said_to_be_missing(results)
     assert results.counts.within.all()
 
 
-def test_a_minimum_inside_is_lower_than_both_ends() -> None:
+def test_interior_minimum_is_lower_than_both_ends() -> None:
     assert has_interior_minimum(np.array([2.0, 1.0, 2.0]))
     assert not has_interior_minimum(np.array([1.0, 1.0, 2.0]))
     assert not has_interior_minimum(np.array([1.04, 1.0, 2.0]))
@@ -330,7 +329,7 @@ def test_a_minimum_inside_is_lower_than_both_ends() -> None:
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_numbers() -> None:
+def test_same_seed_gives_the_same_numbers() -> None:
     from loopcal.papers.tsvd_2016.draws import draw_machines
 
     first, again, more = (draw_machines("3-PRS", 3, n) for n in (2, 2, 3))
@@ -339,7 +338,7 @@ def test_the_same_seed_gives_the_same_numbers() -> None:
         np.testing.assert_allclose(more.errors[method][:2], first.errors[method], rtol=1e-6)
 
 
-def test_the_page_of_the_documentation_names_every_module_and_no_missing_one() -> None:
+def test_page_lists_exactly_the_modules_of_the_study() -> None:
     folder = ROOT / "src" / "loopcal" / "papers" / "tsvd_2016"
     named = set(re.findall(r"`(\w+\.(?:py|yaml))`", DOC.read_text("utf-8")))
     assert {n for n in named if not n.endswith("_draws.py")} == {
@@ -348,36 +347,36 @@ def test_the_page_of_the_documentation_names_every_module_and_no_missing_one() -
     assert "tsvd-2016" in PAPERS
 
 
-def evidence(name: str) -> dict:
+def load_evidence(name: str) -> dict:
     return json.loads((ROOT / "docs" / "evidence" / f"{name}.json").read_text("utf-8"))
 
 
-def column(document: dict, table: str, number: int) -> dict[str, float]:
+def read_column(document: dict, table: str, number: int) -> dict[str, float]:
     return {row[0]: row[number] for row in document["tables"][table]["rows"]}
 
 
 @pytest.mark.evidence
 def test_evidence_map_is_better_than_raw_methods_and_near_gcv_and_hindsight() -> None:
-    document = evidence("three_prs_draws")
+    document = load_evidence("three_prs_draws")
     assert document["draws"] >= 100
     for ratio, low, high in ((1, 2, 3), (4, 5, 6)):  # position, angle
         for method in (RAW_LS, RAW_RE, RAW_TSVD):
-            assert column(document, "ratios", high)[f"MAP over {method}"] < 1.0
-        assert column(document, "ratios", ratio)[f"MAP over {CROSS}"] < 1.05
-        assert column(document, "ratios", ratio)[f"MAP over {HINDSIGHT}"] < 1.15
+            assert read_column(document, "ratios", high)[f"MAP over {method}"] < 1.0
+        assert read_column(document, "ratios", ratio)[f"MAP over {CROSS}"] < 1.05
+        assert read_column(document, "ratios", ratio)[f"MAP over {HINDSIGHT}"] < 1.15
         assert (
-            column(document, "ratios", low)[f"MAP over {HINDSIGHT}"] >= 1.0
+            read_column(document, "ratios", low)[f"MAP over {HINDSIGHT}"] >= 1.0
         )  # nothing beats hindsight
 
 
 @pytest.mark.evidence
-def test_evidence_curves_of_the_3_prs_are_u_shaped_and_5_dof_costs_nothing() -> None:
-    document = evidence("three_prs_draws")
+def test_evidence_curves_of_the_3_prs_are_u_shaped_and_5_dof_is_as_accurate() -> None:
+    document = load_evidence("three_prs_draws")
     assert all(
         inside for algorithm in document["minimum_inside"].values() for inside in algorithm.values()
     )
     for number in (1, 3):  # position, angle
-        medians = column(document, "medians", number)
+        medians = read_column(document, "medians", number)
         assert medians[RAW_FIVE] == pytest.approx(medians[RAW_LS], rel=0.02)
         assert medians[WHITENED_FIVE] == pytest.approx(medians["whitened LS"], rel=0.05)
         assert medians[PRIOR_FIVE] == pytest.approx(medians[PRIOR], rel=0.1)
@@ -385,10 +384,10 @@ def test_evidence_curves_of_the_3_prs_are_u_shaped_and_5_dof_costs_nothing() -> 
 
 @pytest.mark.evidence
 def test_evidence_curves_of_the_ru_pus_prs_are_u_shaped_in_angle_only() -> None:
-    document = evidence("ru_pus_prs_draws")
+    document = load_evidence("ru_pus_prs_draws")
     for algorithm in ("RE", "TSVD"):
         inside = document["minimum_inside"][algorithm]
         assert inside["phi and theta [deg]"]
         assert not inside["position [mm]"]
     for method in (RAW_LS, RAW_RE, RAW_TSVD):
-        assert column(document, "ratios", 4)[f"MAP over {method}"] < 1.0
+        assert read_column(document, "ratios", 4)[f"MAP over {method}"] < 1.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The frame that every repeated paper shares: printed numbers, comparisons, pages, the command."""
+"""What all repeated papers share: printed numbers, comparisons, pages, folders, the command."""
 
 import csv
 import json
@@ -17,7 +17,7 @@ from loopcal.papers.writing import page, write_folder
 MADE_BY = {"command": ["loopcal", "reproduce", "small"], "versions": {"loopcal": "1", "numpy": "2"}}
 
 
-def small() -> Reproduction:
+def build_reproduction() -> Reproduction:
     printed = Printed.parse({"A": "0.12 -3E-05", "B": "7 1.50"})
     comparison = Comparison(
         "one", "Table 1", ("x [mm]", "y [mm]"), printed, np.array([[0.125, -2e-5], [9.0, 1.5]])
@@ -53,20 +53,20 @@ def small() -> Reproduction:
     )
 
 
-def test_a_number_agrees_within_one_unit_of_its_last_printed_digit() -> None:
-    comparison = small().comparisons[0]
+def test_number_agrees_within_one_unit_of_its_last_printed_digit() -> None:
+    comparison = build_reproduction().comparisons[0]
     np.testing.assert_array_equal(comparison.step, [[0.01, 1e-5], [1.0, 0.01]])
     np.testing.assert_array_equal(comparison.within, [[True, True], [False, True]])
     assert (comparison.agreeing, comparison.count, comparison.largest) == (3, 4, 2.0)
 
 
-def test_published_numbers_stay_text_as_printed() -> None:
-    rows = small().comparisons[0].table().rows
+def test_published_numbers_are_shown_as_printed() -> None:
+    rows = build_reproduction().comparisons[0].table().rows
     assert [row[2] for row in rows] == ["0.12", "-3E-05", "7", "1.50"]
 
 
-def test_the_page_shows_published_beside_computed_and_marks_what_differs() -> None:
-    text = page(small(), MADE_BY)
+def test_page_shows_published_and_computed_numbers_and_marks_differences() -> None:
+    text = page(build_reproduction(), MADE_BY)
     assert (
         "| B | published | 7 | 1.50 |\n|  | computed | 9.0 | 1.500 |\n|  | difference | "
         "**2.0e+00** | 0 |" in text
@@ -80,8 +80,8 @@ def test_the_page_shows_published_beside_computed_and_marks_what_differs() -> No
     assert "(figures/curve.png)" in text
 
 
-def test_a_folder_holds_page_tables_and_figures_and_is_not_overwritten_unasked(tmp_path) -> None:
-    folder = write_folder(tmp_path / "a" / "out", small(), MADE_BY)
+def test_folder_contains_page_tables_and_figures_and_needs_force(tmp_path) -> None:
+    folder = write_folder(tmp_path / "a" / "out", build_reproduction(), MADE_BY)
     names = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
     assert names == {"page.md", "result.json", "figures/curve.png"} | {
         f"tables/{name}.{end}" for name in ("one", "extra", "summary") for end in ("csv", "json")
@@ -95,14 +95,14 @@ def test_a_folder_holds_page_tables_and_figures_and_is_not_overwritten_unasked(t
             ["r", "3.0"],
         ]
     with pytest.raises(FileError, match="not empty"):
-        write_folder(folder, small(), MADE_BY)
+        write_folder(folder, build_reproduction(), MADE_BY)
     (folder / "old").touch()
-    write_folder(folder, small(), MADE_BY, force=True)
+    write_folder(folder, build_reproduction(), MADE_BY, force=True)
     assert not (folder / "old").exists()
     assert [p.name for p in folder.parent.iterdir()] == ["out"]
 
 
-def test_an_unknown_paper_and_impossible_sizes_are_refused() -> None:
+def test_unknown_paper_and_invalid_seed_or_trials_are_refused() -> None:
     with pytest.raises(DataError, match="hexapod-42"):
         paper("hexapod")
     for seed, trials in ((-1, 5), (0, 1)):
@@ -110,23 +110,21 @@ def test_an_unknown_paper_and_impossible_sizes_are_refused() -> None:
             PAPERS["hexapod-42"].run(seed, trials)
 
 
-def test_every_paper_is_named_as_it_is_registered() -> None:
+def test_every_paper_has_its_registered_name_a_title_and_a_source() -> None:
     assert all(
         isinstance(one, Paper) and name == one.name and one.title and one.source
         for name, one in PAPERS.items()
     )
 
 
-def test_the_command_lists_papers(capsys) -> None:
+def test_reproduce_lists_papers(capsys) -> None:
     assert main(["reproduce"]) == 0
     assert "hexapod-42" in capsys.readouterr().out
     assert main(["reproduce", "--json"]) == 0
     assert [p["name"] for p in json.loads(capsys.readouterr().out)["papers"]] == list(PAPERS)
 
 
-def test_the_command_refuses_an_unknown_paper_and_a_used_folder_in_one_sentence(
-    capsys, tmp_path
-) -> None:
+def test_reproduce_refuses_an_unknown_paper_and_a_used_folder(capsys, tmp_path) -> None:
     assert main(["reproduce", "hexapod42"]) == 1
     assert capsys.readouterr().err.startswith("loopcal: 'hexapod42' is not a paper")
     (tmp_path / "mine.txt").touch()
@@ -137,9 +135,7 @@ def test_the_command_refuses_an_unknown_paper_and_a_used_folder_in_one_sentence(
 
 
 @pytest.mark.slow
-def test_the_command_repeats_a_paper_and_writes_the_same_document_that_it_prints(
-    capsys, tmp_path
-) -> None:
+def test_reproduce_writes_the_document_that_it_prints(capsys, tmp_path) -> None:
     folder = tmp_path / "out"
     assert main(["reproduce", "hexapod-42", "--trials", "2", "-o", str(folder), "--json"]) == 0
     out, err = capsys.readouterr()
