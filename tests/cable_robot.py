@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cable robots with poses nobody measured: the shipped example made anew, and an estimator that
-shares nothing with loopcal's.
+"""Cable robots with unmeasured poses: the samples of the shipped example, and an independent
+estimator.
 
 The reference has every pose as three explicit unknowns and is solved densely by scipy. With anchors
 a_k, lengths at zero c_k, spool radius r, gear g, line moved for line unwound s_k and build-up b_k,
@@ -51,8 +51,8 @@ LINE, POSITION = 0.5, 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
-    """What the reference finds. values, sd : (21,) in the order of `NAMES` [mm] (22 with a
+class ReferenceSolution:
+    """Result of the reference estimator. values, sd : (21,) in the order of `NAMES` [mm] (22 with a
     stretch). poses : (N, 3).
 
     lines : (N, 4) residuals of the lines [mm]. positions : (K, 3). chi_square, dof, covariance : of
@@ -73,38 +73,38 @@ class Reference:
         return np.sqrt(np.diag(self.covariance))
 
 
-def real(data_folder: Path) -> dict[str, Any]:
+def load_real_samples(data_folder: Path) -> dict[str, Any]:
     """The samples of a real machine."""
     return json.loads((data_folder / "cable_robot" / "hp_mark_adjusted.json").read_text("utf-8"))
 
 
-def share(found: dict[str, Any]) -> tuple[float, Array]:
+def gear_and_line_ratios(found: dict[str, Any]) -> tuple[float, Array]:
     """Gear g, and line moved for line unwound (4,)."""
     gear = found["motor_gear_teeth"] / found["spool_gear_teeth"]
     return gear, np.array(found["lines_per_spool"]) / np.array(found["mechanical_advantage"])
 
 
-def paid_out(found: dict[str, Any], radius: float, buildup: Array) -> Array:
+def compute_paid_out(found: dict[str, Any], radius: float, buildup: Array) -> Array:
     """Line paid out at the motor angles (N, 4) [mm]."""
-    gear, s = share(found)
+    gear, s = gear_and_line_ratios(found)
     turn = gear * np.radians(found["motor_pos_samp"])
     return s * (radius * turn - buildup * turn**2 / 4)
 
 
-def motor_angles(
+def compute_motor_angles(
     found: dict[str, Any], radius: float, buildup: Array, paid: Array
 ) -> tuple[Array, Array]:
     """Motor angles (N, 4) [rad] that pay out this much, and the line's change per radian there."""
-    gear, s = share(found)
+    gear, s = gear_and_line_ratios(found)
     # r t - b t^2 / 4 = u has the root t = 2 u / (r + sqrt(r^2 - b u)), and dt/du = 1 / sqrt(r^2 - b
     # u)
     root = np.sqrt(radius**2 - buildup * paid / s)
     return 2 * (paid / s) / (radius + root) / gear, root * gear * s
 
 
-def reference(
+def solve_reference(
     found: dict[str, Any], line: float, position: float, start: Array, stretch: Array | None = None
-) -> Reference:
+) -> ReferenceSolution:
     """Solve densely for 21 parameters and all poses.
 
     Parameters
@@ -116,7 +116,7 @@ def reference(
     """
     known, measured = np.array(found["xyz_of_samp"]), np.radians(found["motor_pos_samp"])
     n, k, p21 = len(measured), len(known), 21 + (stretch is not None)
-    gear, s = share(found)
+    gear, s = gear_and_line_ratios(found)
     sigma = line / (np.array(found["spool_r_in_origin_first_guess"]) * gear * s)  # [rad]
     first = np.concatenate([start, np.zeros(p21 - 21), _first_poses(found, start).ravel()])
     more = np.zeros((n, 4)) if stretch is None else stretch
@@ -126,7 +126,7 @@ def reference(
         apart = p[p21:].reshape(-1, 1, 3) - a
         length = np.linalg.norm(apart, axis=2)
         factor = p[21] if stretch is not None else 0.0
-        angles, slope = motor_angles(found, r, b, length - c - factor * more)
+        angles, slope = compute_motor_angles(found, r, b, length - c - factor * more)
         return angles, slope, apart / length[..., None]
 
     def residual(p: Array) -> Array:
@@ -152,7 +152,7 @@ def reference(
     done = least_squares(residual, first, jac=cast(Any, jacobian), **options)
     inverse = np.linalg.inv(np.linalg.qr(done.jac, mode="r"))
     angles, positions = np.split(done.fun, [4 * n])
-    return Reference(
+    return ReferenceSolution(
         done.x[:p21],
         (inverse @ inverse.T)[:p21, :p21],
         done.x[p21:].reshape(-1, 3),
@@ -175,7 +175,7 @@ def _first_poses(found: dict[str, Any], start: Array) -> Array:
     """
     known = np.array(found["xyz_of_samp"])
     a, c, r, b = _split(start)
-    lengths = c + paid_out(found, r, b)
+    lengths = c + compute_paid_out(found, r, b)
     free = [
         least_squares(
             lambda x, want=want: np.linalg.norm(x - a, axis=1) - want, [0.0, 0.0, 400.0]
@@ -185,7 +185,7 @@ def _first_poses(found: dict[str, Any], start: Array) -> Array:
     return np.concatenate([known, free])
 
 
-def example(seed: int = 11) -> dict[str, Any]:
+def simulate_example(seed: int = 11) -> dict[str, Any]:
     """Samples of the example's machine: 9 known poses, 8 of them on the bed, and 36 unknown ones;
     with noise.
     """
@@ -207,11 +207,11 @@ def example(seed: int = 11) -> dict[str, Any]:
     }
     a, c, r, b = _split(TRUTH)
     paid = np.linalg.norm(poses[:, None] - a, axis=2) - c + LINE * rng.standard_normal((45, 4))
-    angles, _ = motor_angles(found, r, b, paid)
+    angles, _ = compute_motor_angles(found, r, b, paid)
     return found | {"motor_pos_samp": np.round(np.degrees(angles), 2).tolist()}
 
 
-def samples_text(found: dict[str, Any]) -> str:
+def format_samples(found: dict[str, Any]) -> str:
     """The file, one row of numbers on a line."""
     rows = [f'  "{key}": {_rows(value)}' for key, value in found.items()]
     return "{\n" + ",\n".join(rows) + "\n}\n"

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every test relies on: one BLAS thread, 64-bit jax, reproducible hypothesis, the outside
-data, and strictness.
+"""Settings and fixtures of all tests: one BLAS thread, 64-bit jax, reproducible hypothesis,
+reference data.
 
-Under LOOPCAL_STRICT=1 a skip is a failure, so that nothing is left out in silence where everything
-should be there.
+Under LOOPCAL_STRICT=1 a skipped test is a failure, so that no test is left out unnoticed.
 """
 
 import os

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one Jacobian checker of the whole test suite: central differences with an error bound, and
-automatic derivatives.
+"""The Jacobian checker of the test suite: central differences with an error bound, and automatic
+derivatives.
 
-A difference proves as much as its own error allows, so the step is chosen by the smallest bound
-(truncation seen between neighbouring steps, plus rounding), the bound is part of the tolerance, and
-a bound too large to prove anything fails the test. The automatic derivative comes from jax: either
-from a function written for it, or from our own source run with jax.numpy in the place of numpy
-(`under_jax`), which leaves the derivative independent of ours.
+The step of a difference has the smallest bound of truncation (the change between neighboring
+steps) plus rounding. The bound is part of the tolerance, and a bound too large to be useful fails
+the test. The automatic derivative comes from jax: from a function written for it, or from
+loopcal's source with jax.numpy in place of numpy (`under_jax`), which is independent of loopcal's
+derivatives.
 """
 
 import sys
@@ -171,9 +171,7 @@ def automatic_derivative(
 
 
 class _Either:
-    """A module of numpy whose functions are those of jax where an argument is jax's, else numpy's
-    own.
-    """
+    """A numpy module whose functions are jax's if an argument is a jax array, else numpy's."""
 
     def __init__(self, plain: ModuleType, traced: ModuleType) -> None:
         self._plain, self._traced = plain, traced

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The error tree: one base, texts with their place."""
+"""Error classes: one base class, messages with file and line, similar names."""
 
 import inspect
 
@@ -9,7 +9,7 @@ from loopcal import errors
 from loopcal.errors import FileError, LoopcalError, suggest_names
 
 
-def test_every_error_of_the_tree_is_a_loopcal_error() -> None:
+def test_every_error_class_is_a_loopcal_error() -> None:
     classes = [
         c for _, c in inspect.getmembers(errors, inspect.isclass) if issubclass(c, Exception)
     ]
@@ -20,12 +20,12 @@ def test_every_error_of_the_tree_is_a_loopcal_error() -> None:
 @pytest.mark.parametrize(
     ("line", "text"), [(7, "robot.yaml:7: bad key"), (None, "robot.yaml: bad key")]
 )
-def test_a_file_error_names_path_and_line(line: int | None, text: str) -> None:
+def test_file_error_names_path_and_line(line: int | None, text: str) -> None:
     error = FileError("bad key", "robot.yaml", line)
     assert str(error) == text
     assert (str(error.path), error.line) == ("robot.yaml", line)
 
 
-def test_nearest_names_close_names_only() -> None:
+def test_only_similar_names_are_suggested() -> None:
     assert suggest_names("lenght", ["length", "angle"]) == " (did you mean 'length'?)"
     assert suggest_names("zzz", ["length", "angle"]) == ""

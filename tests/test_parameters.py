@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of unknowns knows its names and keeps its numbers to itself."""
+"""The parameter table: names, columns, read-only arrays."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ TABLE = ParameterTable(
 )
 
 
-def test_a_table_lists_its_columns_in_order():
+def test_parameter_table_lists_its_columns_in_order():
     assert len(TABLE) == 3
     assert TABLE.names == ("leg1.base.x", "leg1.base.y", "tower1.angle")
     assert TABLE.dimensions == (Dimension.LENGTH, Dimension.LENGTH, Dimension.ANGLE)
@@ -27,29 +27,29 @@ def test_a_table_lists_its_columns_in_order():
     assert_array_equal(TABLE.free, [True, True, False])
 
 
-def test_arrays_of_a_table_are_read_only():
+def test_parameter_table_arrays_are_read_only():
     for array in (TABLE.nominal, TABLE.tolerance, TABLE.free):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
 
 
-def test_a_parameter_is_found_by_name():
+def test_index_of_a_parameter_is_its_place():
     assert TABLE.index("leg1.base.y") == 1
 
 
-def test_a_wrong_name_is_answered_with_the_nearest():
+def test_unknown_parameter_is_refused_with_similar_names():
     with pytest.raises(
         MechanismError, match=r"unknown parameter 'leg1.base.z'; similar names are leg1.base.[xy]"
     ):
         TABLE.index("leg1.base.z")
 
 
-def test_a_name_used_twice_is_refused():
+def test_duplicate_parameter_is_refused():
     with pytest.raises(MechanismError, match=r"duplicate parameter 'leg1\.base\.x'"):
         ParameterTable((TABLE.entries[0], TABLE.entries[0]))
 
 
-def test_only_frees_the_chosen_and_fixes_the_rest():
+def test_with_free_frees_only_the_named_parameters():
     chosen = TABLE.with_free(["tower1.angle"])
     assert_array_equal(chosen.free, [False, False, True])
     assert_array_equal(TABLE.free, [True, True, False])

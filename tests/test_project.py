@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The promises that the repository makes about itself: sizes, layers, licences, and what its pages
-say.
-"""
+"""Rules of the repository: sizes, layers, licenses, and consistent documentation."""
 
 import re
 import subprocess
@@ -12,15 +10,14 @@ import pytest
 
 from tools import check_sizes
 
-# Folders that exist on one machine only; put together here so that this file does not hold them
-# itself.
+# Folders that exist on one machine only; assembled here so that this file does not contain them.
 MACHINE_PATH = re.compile(
     "|".join(f"(?<![\\w.])/{name}/" for name in ("work", "root", "tmp", "home", "Users"))
 )
 
 
 @pytest.fixture(scope="module")
-def tracked(root: Path) -> list[Path]:
+def repository_files(root: Path) -> list[Path]:
     """Return the files that belong to the repository: committed, or new and not ignored."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     names = subprocess.run(
@@ -35,24 +32,24 @@ def test_changelog_has_an_unreleased_section(root: Path) -> None:
     )
 
 
-def test_no_file_and_no_function_is_too_long(root: Path) -> None:
+def test_no_file_function_or_folder_exceeds_its_size_limit(root: Path) -> None:
     assert check_sizes.check_folders(root) == []
 
 
-def test_a_long_function_is_reported_unless_a_reason_stands_beside_it() -> None:
+def test_long_function_is_reported_unless_a_reason_is_given() -> None:
     body = "    x = 1\n" * check_sizes.FUNCTION_LIMIT
     assert len(check_sizes.check_text("a.py", "def f():\n" + body)) == 1
     assert check_sizes.check_text("a.py", "# size: a table\ndef f():\n" + body) == []
     assert check_sizes.check_text("a.py", "def f():  # size: a table\n" + body) == []
 
 
-def test_a_long_file_is_reported_unless_a_reason_stands_on_top() -> None:
+def test_long_file_is_reported_unless_a_reason_is_given() -> None:
     lines = "x = 1\n" * (check_sizes.FILE_LIMIT + 1)
     assert len(check_sizes.check_text("a.py", lines)) == 1
     assert check_sizes.check_text("a.py", "# size: generated\n" + lines) == []
 
 
-def test_every_package_has_its_layer(root: Path) -> None:
+def test_every_package_has_a_layer(root: Path) -> None:
     settings = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))
     contract = settings["tool"]["importlinter"]["contracts"][0]
     layers = set(re.findall(r"\w+", " ".join(contract["layers"]))) | set(
@@ -64,13 +61,13 @@ def test_every_package_has_its_layer(root: Path) -> None:
     assert modules | packages <= layers
 
 
-def test_every_package_has_an_init_file_so_that_the_linters_see_it(root: Path) -> None:
+def test_every_package_has_an_init_file(root: Path) -> None:
     folders = {path.parent for path in (root / "src" / "loopcal").rglob("*.py")}
     assert [folder.name for folder in folders if not (folder / "__init__.py").is_file()] == []
 
 
 @pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md"])
-def test_every_make_command_in_the_pages_exists(root: Path, page: str) -> None:
+def test_every_make_command_in_documentation_exists(root: Path, page: str) -> None:
     targets = set(re.findall(r"^([a-z-]+):", (root / "Makefile").read_text("utf-8"), re.MULTILINE))
     named = set(
         re.findall(
@@ -81,7 +78,7 @@ def test_every_make_command_in_the_pages_exists(root: Path, page: str) -> None:
     assert named <= targets
 
 
-def test_the_list_of_decisions_is_complete(root: Path) -> None:
+def test_list_of_decisions_is_complete(root: Path) -> None:
     folder = root / "docs" / "decisions"
     listed = re.findall(
         r"^\| \[\d\d\]\(([^)]+)\)", (folder / "README.md").read_text("utf-8"), re.MULTILINE
@@ -91,8 +88,10 @@ def test_the_list_of_decisions_is_complete(root: Path) -> None:
     )
 
 
-def test_links_between_the_pages_lead_somewhere(root: Path, tracked: list[Path]) -> None:
-    pages = [path for path in tracked if path.suffix == ".md"]
+def test_links_between_pages_lead_to_existing_files(
+    root: Path, repository_files: list[Path]
+) -> None:
+    pages = [path for path in repository_files if path.suffix == ".md"]
     links = [
         (page, link)
         for page in pages
@@ -105,9 +104,9 @@ def test_links_between_the_pages_lead_somewhere(root: Path, tracked: list[Path])
     ] == []
 
 
-def test_no_tracked_file_holds_a_path_of_one_machine(root: Path, tracked: list[Path]) -> None:
+def test_no_file_contains_a_path_of_one_machine(root: Path, repository_files: list[Path]) -> None:
     found = []
-    for path in tracked:
+    for path in repository_files:
         try:
             text = path.read_text("utf-8")
         except UnicodeDecodeError:
@@ -116,15 +115,17 @@ def test_no_tracked_file_holds_a_path_of_one_machine(root: Path, tracked: list[P
     assert found == []
 
 
-def test_every_python_file_states_its_licence_first(root: Path, tracked: list[Path]) -> None:
+def test_every_python_file_begins_with_its_license(
+    root: Path, repository_files: list[Path]
+) -> None:
     spdx = "# SPDX-License-Identifier: Apache-2.0\n"
-    files = [path for path in tracked if path.suffix == ".py"]
+    files = [path for path in repository_files if path.suffix == ".py"]
     assert [
         str(f.relative_to(root)) for f in files if not f.read_text("utf-8").startswith(spdx)
     ] == []
 
 
-def test_every_path_of_the_architecture_exists(root: Path) -> None:
+def test_every_path_in_the_architecture_page_exists(root: Path) -> None:
     text = (root / "ARCHITECTURE.md").read_text("utf-8")
     task_table = text[text.index("| task | place |") :]
     named = set(re.findall(r"`([\w/]+(?:\.py|/))`", task_table))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The public names of the package: each exists, is documented, and is imported when first used."""
+"""Public names of the package: each exists, is documented, and is imported on first use."""
 
 import ast
 import inspect
@@ -18,14 +18,14 @@ def test_every_public_name_exists(name) -> None:
     assert name in dir(loopcal)
 
 
-def test_an_unknown_name_lists_the_public_ones() -> None:
+def test_unknown_attribute_lists_the_public_names() -> None:
     with pytest.raises(
         AttributeError, match=r"no attribute 'calibrate_all'; public names are .*identify"
     ):
         _ = loopcal.calibrate_all
 
 
-def test_importing_the_package_imports_no_numpy() -> None:
+def test_importing_loopcal_does_not_import_numpy() -> None:
     code = "import sys, loopcal; print('numpy' in sys.modules)"
     assert (
         subprocess.run(
@@ -35,7 +35,7 @@ def test_importing_the_package_imports_no_numpy() -> None:
     )
 
 
-def test_type_checkers_see_the_same_names() -> None:
+def test_imports_for_type_checkers_equal_the_public_names() -> None:
     imports = [
         node
         for node in ast.walk(ast.parse(inspect.getsource(loopcal)))
@@ -47,5 +47,5 @@ def test_type_checkers_see_the_same_names() -> None:
     }
 
 
-def test_the_page_of_the_api_is_up_to_date() -> None:
+def test_api_page_is_up_to_date() -> None:
     assert api_reference.PAGE.read_text("utf-8") == api_reference.write_page(), "run `make docs`"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""README.md: its Python runs, its first half hour runs, and it names every command."""
+"""README.md: its Python example and its command lines run, and it lists every command."""
 
 import re
 import shutil
@@ -17,12 +17,12 @@ README = (Path(__file__).resolve().parent.parent / "README.md").read_text("utf-8
 
 @pytest.fixture(autouse=True)
 def _folder(tmp_path, monkeypatch, root) -> None:
-    """Work where nothing is but the examples."""
+    """Work in a folder that contains the examples only."""
     shutil.copytree(root / "examples", tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
 
 
-def test_the_python_example_runs_and_improves_the_robot(tmp_path, capsys) -> None:
+def test_python_example_of_the_readme_runs_and_improves_the_robot(tmp_path, capsys) -> None:
     block = re.search(r"^```python\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
     assert block
     assert (
@@ -38,7 +38,7 @@ def test_the_python_example_runs_and_improves_the_robot(tmp_path, capsys) -> Non
     assert "42 of 42 parameter combinations" in capsys.readouterr().out
 
 
-def test_every_line_of_the_first_half_hour_works_as_it_stands(capsys) -> None:
+def test_every_command_of_the_first_half_hour_runs(capsys) -> None:
     part = README[README.index("## The first half hour") : README.index("## Status")]
     lines = [
         line
@@ -52,6 +52,6 @@ def test_every_line_of_the_first_half_hour_works_as_it_stands(capsys) -> None:
         assert capsys.readouterr().err == ""
 
 
-def test_the_table_of_commands_is_complete() -> None:
+def test_table_of_commands_is_complete() -> None:
     listed = set(re.findall(r"^\| `loopcal ([a-z]+)", README, re.MULTILINE))
     assert listed == set(commands.list_commands(click.Context(commands)))

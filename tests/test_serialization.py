@@ -15,35 +15,35 @@ from loopcal.serialization import INFINITE, UNDEFINED, json_fields, to_json
 from loopcal.units import Dimension
 
 
-class Ending(IntEnum):
+class Status(IntEnum):
     CONVERGED = 0
 
 
 @dataclass(frozen=True)
-class Inner:
+class Record:
     rank: int = 3
     sd: np.ndarray = field(default_factory=lambda: np.array([1.0, np.inf, np.nan]))
     _cache: object = None
 
 
 @dataclass(frozen=True)
-class Chosen:
+class WithTable:
     JSON_FIELDS: ClassVar = {"rank": "inner.rank", "status": "status"}
-    inner: Inner = field(default_factory=Inner)
-    status: Ending = Ending.CONVERGED
+    inner: Record = field(default_factory=Record)
+    status: Status = Status.CONVERGED
 
 
 @dataclass(frozen=True)
-class Own:
+class WithMethod:
     a: float = 1.0
 
     def to_dict(self) -> dict[str, object]:
         return {**json_fields(self), "twice": 2.0 * self.a}
 
 
-def test_dataclasses_arrays_enums_paths_and_mappings_become_json():
+def test_dataclasses_arrays_enums_paths_and_mappings_are_written_as_json():
     document = {
-        "inner": Inner(),
+        "inner": Record(),
         Dimension.LENGTH: (np.float64(0.5), np.int64(2), np.bool_(True)),
         "where": Path("a/b"),
         "nothing": None,
@@ -60,17 +60,17 @@ def test_dataclasses_arrays_enums_paths_and_mappings_become_json():
     json.dumps(written, allow_nan=False)
 
 
-def test_a_class_chooses_its_keys_by_a_table_or_by_a_method():
-    assert to_json(Chosen()) == {"rank": 3, "status": "converged"}
-    assert to_json([Own(2.0)]) == [{"a": 2.0, "twice": 4.0}]
+def test_json_keys_come_from_a_table_or_a_method_of_the_class():
+    assert to_json(WithTable()) == {"rank": 3, "status": "converged"}
+    assert to_json([WithMethod(2.0)]) == [{"a": 2.0, "twice": 4.0}]
 
 
-def test_quantities_and_severities_of_findings_are_json():
+def test_quantities_and_severities_are_written_as_json():
     assert to_json(Quantity(0.19, "mm")) == {"value": 0.19, "unit": "mm"}
     assert to_json(Severity.WARNING) == "warning"
     assert set(Finding.__dataclass_fields__) == {"code", "severity", "data"}
 
 
-def test_what_has_no_json_form_is_named_by_its_path():
+def test_value_without_a_json_form_is_refused_with_its_path():
     with pytest.raises(TypeError, match="parts/1: complex"):
         to_json({"parts": [1.0, 2.0 + 1.0j]})

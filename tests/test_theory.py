@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pages of docs/theory: those that the code cites exist, links lead somewhere, and their
-examples hold.
+"""Pages of docs/theory: pages cited by code exist, links are valid, and examples give the printed
+output.
 """
 
 import doctest
@@ -23,7 +23,7 @@ def anchors(text: str) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-def test_every_page_that_the_code_cites_exists() -> None:
+def test_every_theory_page_cited_by_code_exists() -> None:
     files = (ROOT / "src").rglob("*.py")
     cited = {
         name
@@ -34,13 +34,13 @@ def test_every_page_that_the_code_cites_exists() -> None:
     assert sorted(cited - {page.name for page in PAGES}) == []
 
 
-def test_every_page_is_in_the_index() -> None:
+def test_every_theory_page_is_in_the_index() -> None:
     index = TEXTS[ROOT / "docs" / "README.md"]
     assert [page.name for page in PAGES if f"(theory/{page.name})" not in index] == []
 
 
 @pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.name)
-def test_every_link_leads_to_a_page_and_a_heading_of_it(page: Path) -> None:
+def test_every_link_leads_to_an_existing_page_and_heading(page: Path) -> None:
     wrong = []
     for link in re.findall(r"\]\(([^)\s]+)\)", FENCED.sub("", TEXTS[page])):
         if link.startswith("http"):
@@ -52,7 +52,7 @@ def test_every_link_leads_to_a_page_and_a_heading_of_it(page: Path) -> None:
     assert wrong == []
 
 
-def test_every_cited_key_is_in_the_list_of_references() -> None:
+def test_citations_and_list_of_references_agree() -> None:
     known = set(re.findall(r"^- \*\*\[(\w+)\]\*\*", TEXTS[THEORY / "references.md"], re.MULTILINE))
     cited = {
         key
@@ -66,7 +66,7 @@ def test_every_cited_key_is_in_the_list_of_references() -> None:
 @pytest.mark.parametrize(
     "page", [page for page in PAGES if EXAMPLE.search(TEXTS[page])], ids=lambda page: page.name
 )
-def test_the_examples_of_a_page_give_what_it_says(page: Path) -> None:
+def test_examples_of_a_theory_page_give_the_printed_output(page: Path) -> None:
     source = "\n".join(EXAMPLE.findall(TEXTS[page]))
     example = doctest.DocTestParser().get_doctest(source, {}, page.name, str(page), 0)
     report: list[str] = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Units: factors to SI, and refusals that list what is allowed."""
+"""Units: factors to SI, and refusals with the allowed units."""
 
 import math
 
@@ -23,7 +23,7 @@ from loopcal.units import Dimension, find_unit, list_symbols, parse_quantity
         ("10nm", 1e-8),
     ],
 )
-def test_a_quantity_is_its_number_times_the_factor_of_its_unit(text: str, value: float) -> None:
+def test_quantity_is_its_number_times_the_factor_of_its_unit(text: str, value: float) -> None:
     assert parse_quantity(text) == pytest.approx(value, rel=4e-16)  # one rounding of the product
 
 
@@ -39,7 +39,7 @@ def test_a_quantity_is_its_number_times_the_factor_of_its_unit(text: str, value:
         ("1_0mm", "unknown unit"),
     ],
 )
-def test_a_bad_quantity_is_refused_with_what_is_allowed(text: str, message: str) -> None:
+def test_invalid_quantity_is_refused_with_the_allowed_units(text: str, message: str) -> None:
     with pytest.raises(UnitError, match=message):
         parse_quantity(text, Dimension.LENGTH)
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Uncertainty of poses: the law of propagation, what is infinite and what is not, frames, maps, and
-Monte Carlo.
+"""Uncertainty of poses: covariance propagation, unobservable directions, frames, maps over the
+workspace, and Monte Carlo.
 """
 
 from dataclasses import replace
@@ -19,7 +19,7 @@ from loopcal.measure import sample_truth, simulate
 from loopcal.mechanism import forward, inverse, sample_workspace
 from tests.estimate.problems import five_dof, hexapod, hexapod_data, hexapod_poses, tracker
 
-WHERE = hexapod_poses(5, seed=11)
+TEST_POSES = hexapod_poses(5, seed=11)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def fit_5():
     return identify(hexapod(), hexapod_data(instrument=five_dof()), LeastSquares())
 
 
-def slopes(function, at, steps):
+def difference_poses(function, at, steps):
     """Central differences of poses, as twists (n, 6, p) in base axes at the platform's origin."""
     columns = []
     for i, h in enumerate(steps):
@@ -42,7 +42,7 @@ def slopes(function, at, steps):
     return np.stack(columns, axis=-1)
 
 
-def test_a_posterior_holds_the_covariance_of_its_fit(fit):
+def test_posterior_has_the_covariance_of_its_fit(fit):
     known = fit.posterior
     spread = known.unit[:, None] * known.directions * np.sqrt(known.variance)
     np.testing.assert_allclose(
@@ -50,17 +50,19 @@ def test_a_posterior_holds_the_covariance_of_its_fit(fit):
     )  # rounding
 
 
-def test_the_covariance_is_that_of_poses_by_finite_differences(fit):
-    q = inverse(fit.robot, WHERE).q
-    D = slopes(lambda e: forward(fit.robot.with_values(e), q).T, fit.estimate, np.full(42, 1e-6))
+def test_pose_covariance_agrees_with_finite_differences(fit):
+    q = inverse(fit.robot, TEST_POSES).q
+    D = difference_poses(
+        lambda e: forward(fit.robot.with_values(e), q).T, fit.estimate, np.full(42, 1e-6)
+    )
     expected = D @ fit.covariance @ D.swapaxes(1, 2)
-    found = pose_uncertainty(fit, WHERE, point="platform").covariance
+    found = pose_uncertainty(fit, TEST_POSES, point="platform").covariance
     np.testing.assert_allclose(
         found, expected, rtol=0, atol=1e-6 * np.abs(expected).max()
     )  # differences of 1 um steps
 
 
-def test_noise_of_the_readings_is_added_where_actuators_have_a_sigma(fit):
+def test_reading_noise_adds_to_the_pose_covariance(fit):
     sigma = np.array([1, 2, 3, 4, 5, 6]) * 1e-7
     robot = fit.robot
     actuators = tuple(replace(a, sigma=s) for a, s in zip(robot.actuators, sigma, strict=True))
@@ -68,25 +70,25 @@ def test_noise_of_the_readings_is_added_where_actuators_have_a_sigma(fit):
         fit.posterior, robot=replace(robot, assembly=replace(robot.assembly, actuators=actuators))
     )
     more = (
-        pose_uncertainty(noisy, WHERE, point="platform").covariance
-        - pose_uncertainty(fit, WHERE, point="platform").covariance
+        pose_uncertainty(noisy, TEST_POSES, point="platform").covariance
+        - pose_uncertainty(fit, TEST_POSES, point="platform").covariance
     )
-    q = inverse(robot, WHERE[:1]).q
-    J = slopes(lambda x: forward(robot, x).T, q[0], np.full(6, 1e-6))[0]
+    q = inverse(robot, TEST_POSES[:1]).q
+    J = difference_poses(lambda x: forward(robot, x).T, q[0], np.full(6, 1e-6))[0]
     np.testing.assert_allclose(
         more[0], (J * sigma**2) @ J.T, rtol=0, atol=1e-6 * np.abs(more[0]).max()
     )
 
 
-def test_at_the_tool_the_turn_of_the_platform_acts_on_an_arm(fit):
+def test_tool_uncertainty_includes_platform_rotation_times_the_lever_arm(fit):
     known, T_platform_tool = fit.posterior, np.eye(4)
     T_platform_tool[:3, 3] = [0.0, 0.0, 0.3]
     robot = replace(known.robot, assembly=replace(known.robot.assembly, tool=T_platform_tool))
     here, there = (
-        pose_uncertainty(replace(known, robot=robot), WHERE, point=point)
+        pose_uncertainty(replace(known, robot=robot), TEST_POSES, point=point)
         for point in ("platform", "tool")
     )
-    arm = WHERE[:, :3, 2] * 0.3
+    arm = TEST_POSES[:, :3, 2] * 0.3
     move = np.concatenate([-geometry.hat(arm), np.broadcast_to(np.eye(3), (5, 3, 3))], axis=2)
     expected = move @ here.covariance @ move.swapaxes(1, 2)
     np.testing.assert_allclose(
@@ -96,36 +98,36 @@ def test_at_the_tool_the_turn_of_the_platform_acts_on_an_arm(fit):
     assert "platform origin" in here.frame
 
 
-def test_lengths_of_errors_do_not_depend_on_the_axes(fit):
-    base, platform = (pose_uncertainty(fit, WHERE, frame) for frame in ("base", "platform"))
+def test_size_of_pose_uncertainty_does_not_depend_on_the_axes(fit):
+    base, platform = (pose_uncertainty(fit, TEST_POSES, frame) for frame in ("base", "platform"))
     np.testing.assert_allclose(base.position, platform.position, rtol=1e-9)
     np.testing.assert_allclose(base.orientation, platform.orientation, rtol=1e-9)
     assert "platform axes" in platform.frame
     assert np.array_equal(base.expanded, 2 * base.sd)
 
 
-def test_without_torsion_only_the_turn_about_the_normal_is_infinite(fit_5):
-    found = pose_uncertainty(fit_5, WHERE, "platform", gauge="infinite", point="platform")
+def test_uncertainty_without_torsion_is_infinite_about_the_normal_only(fit_5):
+    found = pose_uncertainty(fit_5, TEST_POSES, "platform", gauge="infinite", point="platform")
     assert np.array_equal(
         np.isinf(found.sd), np.tile([False, False, True, False, False, False], (5, 1))
     )
-    in_base = pose_uncertainty(fit_5, WHERE, "base", gauge="infinite", point="platform")
+    in_base = pose_uncertainty(fit_5, TEST_POSES, "base", gauge="infinite", point="platform")
     assert np.isinf(
         in_base.sd[:, :3]
     ).all()  # tilted poses: the normal has a part along each axis of the base
     np.testing.assert_allclose(in_base.position, found.position, rtol=1e-9)
 
 
-def test_the_turn_about_the_normal_is_a_turn_of_the_platform_frame_and_left_out_by_name(fit_5):
-    found = pose_uncertainty(fit_5, WHERE)
+def test_rotation_of_the_platform_frame_is_left_out_and_reported(fit_5):
+    found = pose_uncertainty(fit_5, TEST_POSES)
     assert np.isfinite(found.sd).all()
     assert found.reference.code == "accuracy.frame"
     assert found.reference.data["frames"] == ("platform",)
     assert found.reference.data["count"] == 1
 
 
-def base_motion_unknown(fit, extra=None):
-    """The fit's posterior, but nothing known of where the base is (nor of the parameter `extra`)."""  # noqa: E501
+def make_base_unobservable(fit, extra=None):
+    """Return the fit's posterior with an unobservable base frame (and parameter `extra`)."""
     base = fit.estimate.reshape(6, 7)[:, :3]
     known = np.zeros((42, 6))
     for leg, b in enumerate(base):
@@ -144,35 +146,35 @@ def base_motion_unknown(fit, extra=None):
     )
 
 
-def test_an_unknown_place_of_the_base_is_found_as_six_motions_of_the_base(fit):
+def test_unknown_base_gives_six_rigid_motions_of_the_base_frame(fit):
     if fit.names[:3] != ("leg1.base.x", "leg1.base.y", "leg1.base.z"):
         pytest.fail("this test counts on the order of the hexapod's parameters")
-    known = base_motion_unknown(fit)
+    known = make_base_unobservable(fit)
     motions = find_frame_motions(known)
     assert (motions.count, motions.frames) == (6, ("base",))
     assert np.abs(motions.kept).max() < 1e-9
-    assert np.isfinite(pose_uncertainty(known, WHERE).sd).all()
-    assert np.isinf(pose_uncertainty(known, WHERE, gauge="infinite").sd).all()
+    assert np.isfinite(pose_uncertainty(known, TEST_POSES).sd).all()
+    assert np.isinf(pose_uncertainty(known, TEST_POSES, gauge="infinite").sd).all()
 
 
-def test_what_is_no_motion_of_a_frame_stays_infinite(fit):
-    known = base_motion_unknown(fit, extra=fit.names.index("leg2.length"))
+def test_unobservable_leg_length_keeps_infinite_uncertainty(fit):
+    known = make_base_unobservable(fit, extra=fit.names.index("leg2.length"))
     assert find_frame_motions(known).count == 6
-    assert np.isinf(pose_uncertainty(known, WHERE).sd).all()
+    assert np.isinf(pose_uncertainty(known, TEST_POSES).sd).all()
 
 
-def test_a_frame_known_from_its_prior_alone_is_left_out_too(fit):
-    known = base_motion_unknown(fit)
+def test_frame_known_from_its_prior_alone_is_left_out(fit):
+    known = make_base_unobservable(fit)
     with_prior = replace(known, variance=np.where(known.determined, known.variance, 1.0))
     left_out, kept = (
-        pose_uncertainty(with_prior, WHERE, gauge=g) for g in ("left out", "infinite")
+        pose_uncertainty(with_prior, TEST_POSES, gauge=g) for g in ("left out", "infinite")
     )
-    np.testing.assert_allclose(left_out.sd, pose_uncertainty(known, WHERE).sd, rtol=1e-9)
+    np.testing.assert_allclose(left_out.sd, pose_uncertainty(known, TEST_POSES).sd, rtol=1e-9)
     assert (kept.position > 5 * left_out.position).all()
 
 
-def test_poses_out_of_reach_have_no_uncertainty(fit):
-    far = WHERE[:2].copy()
+def test_unreachable_poses_have_nan_uncertainty(fit):
+    far = TEST_POSES[:2].copy()
     far[1, 2, 3] = np.nan
     found = pose_uncertainty(fit, far)
     assert np.isfinite(found.sd[0]).all()
@@ -180,20 +182,20 @@ def test_poses_out_of_reach_have_no_uncertainty(fit):
     assert np.isnan(found.T[1]).all()
 
 
-def test_options_that_do_not_exist_are_refused(fit):
+def test_unknown_frame_option_is_refused(fit):
     with pytest.raises(
         EstimationError, match="frame is 'world'; it must be one of 'base', 'platform'"
     ):
-        pose_uncertainty(fit, WHERE, "world")  # pyright: ignore[reportArgumentType]
+        pose_uncertainty(fit, TEST_POSES, "world")  # pyright: ignore[reportArgumentType]
 
 
-def test_the_map_shows_extrapolation():
+def test_accuracy_map_marks_extrapolated_poses():
     robot = load_robot("hexapod-42")
     truth = robot.with_values(sample_truth(robot, 1, 5)[0])
     everywhere = sample_workspace(robot, 30, 1).coordinates
     middle = everywhere.mean(axis=0)
     maps = []
-    for share in (1.0, 0.2):  # poses all over the workspace, and in the middle fifth of it
+    for share in (1.0, 0.2):  # measured poses in the whole workspace, and in its middle fifth
         data = simulate(truth, middle + share * (everywhere - middle), tracker(), 1)
         maps.append(
             accuracy_map(identify(robot, data, LeastSquares()), data.readings, poses=200, seed=2)
@@ -206,10 +208,8 @@ def test_the_map_shows_extrapolation():
     assert narrow.to_dict()["extrapolated"] == int(narrow.extrapolated.sum())
 
 
-def bounds(trials, numbers):
-    """Interval of sample sd / sd that all of `numbers` sample sds leave with a probability of at
-    most 1e-3 (Bonferroni).
-    """
+def chi_interval(trials, numbers):
+    """Return the interval of sample sd / sd for `numbers` samples at level 1e-3 (Bonferroni)."""
     tail = 1e-3 / (2 * numbers)
     return np.sqrt(chi2.ppf([tail, 1 - tail], trials) / trials)
 
@@ -224,7 +224,7 @@ def bounds(trials, numbers):
         ("linear-delta", MAP()),
     ],
 )
-def test_predicted_errors_of_pose_are_those_of_simulated_calibrations(name, method):
+def test_predicted_pose_errors_agree_with_simulated_calibrations(name, method):
     robot, trials = load_robot(name), 300
     measured, judged = (
         sample_workspace(robot, n, seed).coordinates for n, seed in ((40, 1), (6, 9))
@@ -242,10 +242,10 @@ def test_predicted_errors_of_pose_are_those_of_simulated_calibrations(name, meth
     )
     assert [(done, total) for done, total, _ in reports] == [(0, trials), (250, trials)]
     ratio = found.ratio[np.isfinite(found.ratio)]
-    low, high = bounds(found.trials, len(ratio))
+    low, high = chi_interval(found.trials, len(ratio))
     assert (found.trials, found.failed) == (trials, 0)
     assert len(ratio) == (18 if name == "linear-delta" else 36)
     # one trial's decomposition stands for all: 3 % for truths that differ by their tolerances
     assert ratio.min() > 0.97 * low
     assert ratio.max() < 1.03 * high
-    assert (ratio / 1.5).min() < 0.97 * low  # a prediction 50 % too large is found
+    assert (ratio / 1.5).min() < 0.97 * low  # a prediction 50 % too large would fail

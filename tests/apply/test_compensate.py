@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compensation: the identified machine goes where it should, as far as it has actuators for that,
-and says what stays.
+"""Compensation: commands that make the identified robot reach its targets, as far as its actuators
+allow, and the remaining errors.
 """
 
 import numpy as np
@@ -16,8 +16,8 @@ from tests.estimate.problems import hexapod, hexapod_data, hexapod_poses
 ROBOTS = ("hexapod-42", "3-prs", "linear-delta", "ru-pus-prs", "five-bar")
 
 
-def calibrated(name, seed=1):
-    """A robot with true errors of its tolerances, or of 0.1 mm and 0.1 mrad."""
+def make_identified_robot(name, seed=1):
+    """Return a robot with random errors of its tolerances (default 0.1 mm and 0.1 mrad)."""
     robot = load_robot(name)
     spread = np.nan_to_num(robot.parameters.tolerance, nan=1e-4)
     return robot.with_values(
@@ -26,8 +26,8 @@ def calibrated(name, seed=1):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_readings_take_the_controlled_coordinates_to_their_targets(name):
-    robot = calibrated(name)
+def test_compensated_readings_reach_the_controlled_coordinates(name):
+    robot = make_identified_robot(name)
     targets = sample_workspace(robot, 20, 2).coordinates
     found = compensate(robot, targets)
     reached = forward(robot, found.readings).T
@@ -38,8 +38,8 @@ def test_readings_take_the_controlled_coordinates_to_their_targets(name):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_shifted_commands_lead_to_the_same_readings(name):
-    robot = calibrated(name)
+def test_compensated_commands_give_the_compensated_readings(name):
+    robot = make_identified_robot(name)
     targets = sample_workspace(robot, 20, 2).coordinates
     best, found = compensate(robot, targets), compensate(robot, targets, "commands", steps=6)
     assert found.commands is not None
@@ -52,17 +52,17 @@ def test_shifted_commands_lead_to_the_same_readings(name):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_each_step_of_the_fixed_point_leaves_less_than_a_tenth(name):
-    robot = calibrated(name)
+def test_each_fixed_point_step_reduces_the_error_tenfold(name):
+    robot = make_identified_robot(name)
     found = compensate(robot, sample_workspace(robot, 20, 2).coordinates, "commands", steps=3)
     left = found.residual_position + robot.size * found.residual_orientation
     assert left.shape == (4, 20)
     assert (left[1:] < 0.1 * left[:-1] + 1e-12).all()  # [m]
 
 
-def test_a_machine_with_six_actuators_is_compensated_in_full():
+def test_hexapod_is_compensated_in_full():
     robot, targets = (
-        calibrated("hexapod-42"),
+        make_identified_robot("hexapod-42"),
         sample_workspace(load_robot("hexapod-42"), 10, 3).solution.T,
     )
     found = compensate(robot, targets)
@@ -71,8 +71,8 @@ def test_a_machine_with_six_actuators_is_compensated_in_full():
     np.testing.assert_allclose(found.remaining, 0, atol=1e-12)
 
 
-def test_what_a_tripod_has_no_actuator_for_stays_and_no_reading_makes_it_smaller():
-    robot = calibrated("3-prs")
+def test_remaining_error_of_a_tripod_is_the_minimum_over_readings():
+    robot = make_identified_robot("3-prs")
     targets = sample_workspace(load_robot("3-prs"), 10, 3).solution.T
     found = compensate(robot, targets)
     assert set(found.reach) == {Reach.IN_PART}
@@ -90,15 +90,17 @@ def test_what_a_tripod_has_no_actuator_for_stays_and_no_reading_makes_it_smaller
         assert (distance(found.readings + step) > here).all()
 
 
-def test_commands_do_not_fail_at_zero_tilt_where_the_azimuth_has_no_meaning():
+def test_compensated_commands_converge_at_zero_tilt():
     found = compensate(
-        calibrated("3-prs"), [[0.7, 0.0, 0.0], [0.7, 2.0, 0.0], [0.7, -1.0, 1e-9]], "commands"
+        make_identified_robot("3-prs"),
+        [[0.7, 0.0, 0.0], [0.7, 2.0, 0.0], [0.7, -1.0, 1e-9]],
+        "commands",
     )
     assert found.usable.all()
     assert found.residual_orientation[-1].max() < 1e-9  # [rad]
 
 
-def test_targets_out_of_reach_or_beyond_the_strokes_are_named():
+def test_targets_out_of_reach_or_beyond_strokes_are_reported():
     robot = load_robot("hexapod-42")
     targets = [
         [0, 0, 0.2, 0, 0, 0],
@@ -114,8 +116,8 @@ def test_targets_out_of_reach_or_beyond_the_strokes_are_named():
     assert found.findings[3].code == "compensation.unreachable"
 
 
-def test_a_target_that_fails_does_not_disturb_the_others():
-    robot = calibrated("hexapod-42")
+def test_failed_target_does_not_change_other_targets():
+    robot = make_identified_robot("hexapod-42")
     good = sample_workspace(robot, 4, 3).coordinates
     alone = compensate(robot, good, "commands")
     mixed = compensate(robot, np.vstack([good, np.full(6, np.nan)]), "commands")
@@ -123,7 +125,7 @@ def test_a_target_that_fails_does_not_disturb_the_others():
     assert mixed.reach[4] is Reach.UNREACHABLE
 
 
-def test_an_identification_also_gives_the_uncertainty_of_each_target():
+def test_compensation_from_a_fit_gives_the_uncertainty_of_each_target():
     fit = identify(hexapod(), hexapod_data(), LeastSquares())
     found = compensate(fit, hexapod_poses(4, seed=5))
     assert found.uncertainty is not None
@@ -132,7 +134,7 @@ def test_an_identification_also_gives_the_uncertainty_of_each_target():
     assert found.to_dict()["uncertainty"]["frame"].startswith("tool point, base axes")
 
 
-def test_bad_requests_are_refused():
+def test_invalid_compensation_arguments_are_refused():
     robot = load_robot("3-prs")
     with pytest.raises(DataError, match="mode is 'poses'; it must be 'readings' or 'commands'"):
         compensate(robot, [[0.7, 0, 0]], "poses")  # pyright: ignore[reportArgumentType]
@@ -143,7 +145,7 @@ def test_bad_requests_are_refused():
 
 
 @pytest.mark.parametrize(("mode", "passes"), [("readings", 4), ("commands", 7)])
-def test_progress_counts_the_passes_over_all_targets(mode, passes) -> None:
+def test_compensation_progress_counts_passes_over_all_targets(mode, passes) -> None:
     reports = []
     robot = hexapod()
     compensate(robot, robot.home[None], mode, progress=lambda *report: reports.append(report))

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows that a run was fitted to are known again in other files, orders and units, and repeats are
-not taken for them.
+"""Validation detects rows that were used in the fit, also in other files, orders and units;
+repeated measurements are accepted.
 """
 
 from dataclasses import replace
@@ -19,8 +19,8 @@ STORED = collect_fitted_rows(FITTED)
 OTHER = hexapod_data(20, 1)
 
 
-def joined(*parts: Measurements) -> Measurements:
-    """Poses of several measurements of one kind as one set."""
+def join_measurements(*parts: Measurements) -> Measurements:
+    """Join measurements of one kind."""
     readings = np.concatenate([part.readings for part in parts])
     rows = [part.observations[0] for part in parts]
     measured = np.concatenate([one.measured for one in rows])
@@ -34,7 +34,7 @@ def joined(*parts: Measurements) -> Measurements:
     return Measurements(parts[0].robot_name, readings, (one,))
 
 
-def test_a_part_of_the_collect_fitted_rows_is_refused_in_another_order_and_after_rounding() -> None:
+def test_subset_of_fitted_rows_is_refused_in_another_order_and_after_rounding() -> None:
     some = FITTED.take(np.array([7, 3, 11, 0]))
     rows = some.observations[0]
     again = replace(some, observations=(replace(rows, measured=rows.measured * (1.0 + 1e-12)),))
@@ -45,7 +45,7 @@ def test_a_part_of_the_collect_fitted_rows_is_refused_in_another_order_and_after
         assert refused.value.args[0].data["count"] == refused.value.args[0].data["total"] == 4
 
 
-def test_repeats_and_other_rows_are_unseen() -> None:
+def test_repeated_and_new_measurements_are_accepted() -> None:
     rows = FITTED.observations[0]
     sigma = np.sqrt(np.einsum("rii->ri", rows.covariance))
     noise = (
@@ -61,14 +61,14 @@ def test_repeats_and_other_rows_are_unseen() -> None:
     assert find_reused_rows({}, FITTED) is None
 
 
-def test_few_collect_fitted_rows_among_unseen_ones_are_named() -> None:
-    found = find_reused_rows(STORED, joined(FITTED.take(np.arange(3)), OTHER))
+def test_few_fitted_rows_among_new_ones_are_reported() -> None:
+    found = find_reused_rows(STORED, join_measurements(FITTED.take(np.arange(3)), OTHER))
     assert found is not None
     assert found.severity is Severity.WARNING
     assert found.data == {"count": 3, "total": 23, "poses": ("1", "2", "3")}
 
 
-def test_poses_that_were_left_out_of_the_fit_are_unseen() -> None:
+def test_poses_excluded_from_the_fit_are_accepted() -> None:
     assert (
         find_reused_rows(collect_fitted_rows(FITTED, ("1", "2")), FITTED.take(np.arange(2))) is None
     )
@@ -82,7 +82,7 @@ def test_poses_that_were_left_out_of_the_fit_are_unseen() -> None:
     )
 
 
-def test_absent_values_agree_with_absent_ones_only() -> None:
+def test_missing_values_match_missing_values_only() -> None:
     rows = FITTED.observations[0]
     holes = np.array(rows.measured)
     holes[:, 0] = np.nan

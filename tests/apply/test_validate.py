@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Validation: the indices, the two errors told apart, and quality gates."""
+"""Validation: error indices, predicted and commanded errors, moved setups, and quality gates."""
 
 import json
 from dataclasses import replace
@@ -26,24 +26,24 @@ from tests.estimate.problems import (
 MM = 1e-3
 
 
-def tracker_in_frame() -> Instrument:
-    """Full poses in a frame that is not known."""
+def make_tracker_in_unknown_frame() -> Instrument:
+    """Return an instrument of full poses in an unknown frame."""
     return Instrument(
         (Sensor(Pose(unknown=("frame",)), Gaussian(np.array([5e-6] * 3 + [1e-6] * 3))),)
     )
 
 
 @pytest.fixture(scope="module")
-def parts():
+def split_data():
     return hexapod_data(40).split(hold_out=0.25, seed=1)
 
 
 @pytest.fixture(scope="module")
-def validation(parts):
-    return validate(identify(hexapod(), parts[0]), parts[1])
+def validation(split_data):
+    return validate(identify(hexapod(), split_data[0]), split_data[1])
 
 
-def test_indices_are_the_formulas():
+def test_error_indices_equal_their_formulas():
     errors = compute_pose_errors(np.array([[3.0, 0.0, -4.0]]) * MM, np.array([[2e-3, 0.0, 0.0]]))
     assert errors.position[0] == pytest.approx(5 * MM)
     assert errors.orientation[0] == pytest.approx(2e-3)
@@ -51,7 +51,7 @@ def test_indices_are_the_formulas():
     assert errors.orientation_balance[0] == pytest.approx(2e-3)
 
 
-def test_what_was_not_measured_has_no_index():
+def test_unmeasured_quantities_have_no_error_index():
     heights = compute_pose_errors(
         np.array([[np.nan, np.nan, 1.0], [np.nan, np.nan, np.nan]]) * MM, np.zeros((2, 0))
     )
@@ -63,7 +63,7 @@ def test_what_was_not_measured_has_no_index():
     assert heights.statistics("orientation").count == 0
 
 
-def test_calibration_brings_held_out_poses_to_the_noise(validation):
+def test_errors_of_held_out_poses_are_at_the_noise_after_calibration(validation):
     assert len(validation.poses) == 10
     assert validation.before.statistics("position").rms > 0.02 * MM
     assert (
@@ -72,7 +72,7 @@ def test_calibration_brings_held_out_poses_to_the_noise(validation):
     assert validation.improvement() > 10.0
 
 
-def test_with_an_actuator_for_every_freedom_commanding_is_as_good_as_predicting(validation):
+def test_commanded_errors_of_a_hexapod_equal_predicted_errors(validation):
     assert validation.not_compensable.position.max() < 1e-12
     np.testing.assert_allclose(
         validation.commanded_after.position, validation.after.position, rtol=1e-9
@@ -82,7 +82,7 @@ def test_with_an_actuator_for_every_freedom_commanding_is_as_good_as_predicting(
     )
 
 
-def test_what_has_no_actuator_stays_as_not_compensable():
+def test_errors_without_an_actuator_are_not_compensable():
     robot = with_tolerance(zoo.three_prs(), 0.1 * MM)
     rng = np.random.default_rng(0)
     truth = robot.with_values(robot.values + rng.uniform(-0.05, 0.05, len(robot.values)) * MM)
@@ -102,10 +102,10 @@ def test_what_has_no_actuator_stays_as_not_compensable():
     )
 
 
-def test_gates_pass_and_fail_with_a_sentence(parts):
-    fit = identify(hexapod(), parts[0])
-    assert validate(fit, parts[1], limit_position=0.01 * MM, limit_angle=1e-4).passed
-    failed = validate(fit, parts[1], limit_position=1e-7, limit_angle=1e-4)
+def test_exceeded_limit_fails_with_quantity_and_limit(split_data):
+    fit = identify(hexapod(), split_data[0])
+    assert validate(fit, split_data[1], limit_position=0.01 * MM, limit_angle=1e-4).passed
+    failed = validate(fit, split_data[1], limit_position=1e-7, limit_angle=1e-4)
     assert not failed.passed
     (failure,) = failed.failures
     assert failure.code == "gates.limit-exceeded"
@@ -114,7 +114,7 @@ def test_gates_pass_and_fail_with_a_sentence(parts):
     assert failure.data["limit"].unit == "mm"
 
 
-def test_a_gate_on_what_was_not_measured_is_not_met():
+def test_limit_on_an_unmeasured_quantity_fails():
     robot = zoo.delta()
     found = validate(robot, probed_heights(robot, bed(8)), limit_angle=1e-3)
     (failure,) = found.failures
@@ -122,17 +122,17 @@ def test_a_gate_on_what_was_not_measured_is_not_met():
     assert failure.data == {"quantity": "orientation"}
 
 
-def test_rows_without_weight_are_left_out_and_no_row_is_refused(parts):
-    weight = np.ones(parts[1].n_poses)
+def test_rows_of_weight_zero_are_left_out_and_no_rows_are_refused(split_data):
+    weight = np.ones(split_data[1].n_poses)
     weight[0] = 0.0
-    fewer = validate(hexapod(), parts[1].with_weights(weight))
-    assert len(fewer.poses) == parts[1].n_poses - 1
+    fewer = validate(hexapod(), split_data[1].with_weights(weight))
+    assert len(fewer.poses) == split_data[1].n_poses - 1
     with pytest.raises(DataError) as error:
-        validate(hexapod(), parts[1].with_weights(0.0 * weight))
+        validate(hexapod(), split_data[1].with_weights(0.0 * weight))
     assert error.value.code == "residuals.no-rows-to-predict"
 
 
-def test_the_table_names_every_error_and_the_json_every_pose(validation):
+def test_text_names_every_error_and_json_every_pose(validation):
     assert "noise floor" in str(validation)
     assert list(validation.errors()) == [
         "predicted before",
@@ -146,7 +146,7 @@ def test_the_table_names_every_error_and_the_json_every_pose(validation):
     assert len(document["after"]["position"]["rows"]) == len(document["poses"])
 
 
-def test_a_geometry_that_went_astray_is_told_from_readings_that_no_geometry_reaches():
+def test_diverged_geometry_and_unreachable_readings_have_different_errors():
     robot, data = hexapod(), hexapod_data(4)
     legs = np.array([name.endswith("length") for name in robot.parameters.names])
     astray = robot.with_values(np.where(legs, 0.2, 1.0) * robot.values)
@@ -160,13 +160,13 @@ def test_a_geometry_that_went_astray_is_told_from_readings_that_no_geometry_reac
     assert error.value.code == "residuals.poses-out-of-reach"
 
 
-def sizes_if_moved(*moved, base=1.0, by=50.0, left=30):
-    """Sizes of errors that stay large while one of `moved` is kept."""
+def make_error_size(*moved, base=1.0, by=50.0, left=30):
+    """Return a function whose error stays large while one of `moved` is kept."""
     return lambda refit: (by if set(moved) - set(refit) else base, left)
 
 
-def test_of_several_kept_frames_the_moved_ones_are_named():
-    found = find_moved_setups(("trk", "tool", "probe"), sizes_if_moved("trk", "probe"))
+def test_moved_setups_are_named():
+    found = find_moved_setups(("trk", "tool", "probe"), make_error_size("trk", "probe"))
     assert found is not None
     assert found.names == ("trk", "probe")
     assert found.times == pytest.approx(50.0)
@@ -177,15 +177,15 @@ def test_of_several_kept_frames_the_moved_ones_are_named():
     assert either.names == ("trk", "tool")
 
 
-def test_nothing_is_said_of_frames_where_errors_are_noise_alike_or_rows_are_few():
-    assert find_moved_setups((), sizes_if_moved()) is None
-    assert find_moved_setups(("trk",), sizes_if_moved("trk", by=2.5, base=0.5)) is None
-    assert find_moved_setups(("trk",), sizes_if_moved("trk", by=50.0, base=20.0)) is None
-    assert find_moved_setups(("trk",), sizes_if_moved("trk", left=7)) is None
+def test_moved_setups_need_large_differing_errors_and_enough_rows():
+    assert find_moved_setups((), make_error_size()) is None
+    assert find_moved_setups(("trk",), make_error_size("trk", by=2.5, base=0.5)) is None
+    assert find_moved_setups(("trk",), make_error_size("trk", by=50.0, base=20.0)) is None
+    assert find_moved_setups(("trk",), make_error_size("trk", left=7)) is None
 
 
-def test_what_is_not_known_of_the_geometry_before_is_noted_as_found_from_these_rows():
-    instrument = tracker_in_frame()
+def test_setup_parameters_fitted_for_the_earlier_geometry_are_reported():
+    instrument = make_tracker_in_unknown_frame()
     fit = identify(hexapod(), hexapod_data(20, 0, instrument))
     more = hexapod_data(8, 1, instrument)
     known = dict(fit.nuisance.values)

@@ -11,7 +11,7 @@ import pytest
 
 from loopcal.cli import main
 from loopcal.io import load_measurements, load_robot
-from tests.cable_robot import NAMES, TRUTH, real, samples_text
+from tests.cable_robot import NAMES, TRUTH, format_samples, load_real_samples
 from tests.cli.printed_tables import read_table_rows
 
 REAL = (
@@ -33,7 +33,7 @@ def page(root, tmp_path, monkeypatch) -> str:
 @pytest.fixture
 def folder(data_folder, tmp_path, monkeypatch) -> Path:
     """Return a folder with the samples of a real machine, and work in it."""
-    (tmp_path / "hp.json").write_text(samples_text(real(data_folder)), "utf-8")
+    (tmp_path / "hp.json").write_text(format_samples(load_real_samples(data_folder)), "utf-8")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

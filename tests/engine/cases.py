@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mechanisms as the engine sees them, and their closure written down a second time, plainly, one
-limb at a time.
+"""Mechanisms as the engine receives them, and their closure written independently, one limb at a
+time.
 """
 
 from collections.abc import Callable
@@ -33,15 +33,13 @@ class Case:
     @property
     def home_q(self) -> Array:
         """Joint values (1, 1, a) at home."""
-        return driven(self.program, self.home)
+        return actuated_joint_values(self.program, self.home)
 
 
-def case(robot: Mechanism, t: int = 1, n: int = 5, seed: int = 1) -> Case:
-    """Random displacements of about 1e-3 of the size, joint values within some hundredths of it
-    from home.
-    """
+def make_case(robot: Mechanism, t: int = 1, n: int = 5, seed: int = 1) -> Case:
+    """Draw displacements of about 1e-3 and joint values within 0.03 to 0.05 of home, in sizes."""
     rng, p = np.random.default_rng(seed), robot.program
-    e = rng.normal(size=(t, p.n_displacements)) * 1e-3 * unit_of_displacements(p)
+    e = rng.normal(size=(t, p.n_displacements)) * 1e-3 * displacement_units(p)
     if p.freedoms == (2, 3, 4):
         # closure of orientation is asked for about z alone; what tilts out of the plane bends its
         # column by tilt^2 / 12
@@ -51,11 +49,11 @@ def case(robot: Mechanism, t: int = 1, n: int = 5, seed: int = 1) -> Case:
     step = np.array(
         [0.03 * p.size if a.dimension.value == "length" else 0.05 for a in robot.actuators]
     )
-    q = driven(p, robot.home_state) + rng.uniform(-1, 1, (t, n, p.n_joints)) * step
+    q = actuated_joint_values(p, robot.home_state) + rng.uniform(-1, 1, (t, n, p.n_joints)) * step
     return Case(robot.name, p, e, q, robot.home_state)
 
 
-def driven(program: Program, state: State) -> Array:
+def actuated_joint_values(program: Program, state: State) -> Array:
     """Values of the actuated joints (t, n, a)."""
     q = np.zeros((*state.T.shape[:2], program.n_joints))
     for group, joints in zip(program.groups, state.joints, strict=True):
@@ -65,8 +63,8 @@ def driven(program: Program, state: State) -> Array:
     return q
 
 
-def unit_of_displacements(program: Program) -> Array:
-    """What counts as one for each displacement: a radian, or the size of the robot [m]."""
+def displacement_units(program: Program) -> Array:
+    """Return the unit of each displacement: a radian, or the size of the robot [m]."""
     unit = np.ones(program.n_displacements)
     for group in program.groups:
         own = [1.0 if s.axis < 3 else program.size for s in group.slots]
@@ -74,7 +72,7 @@ def unit_of_displacements(program: Program) -> Array:
     return unit
 
 
-def unknowns(program: Program, state: State, free: bool = False) -> Array:
+def unknown_joint_values(program: Program, state: State, free: bool = False) -> Array:
     """Joints that closure determines (t, n, u): group by group, limb by limb."""
     parts = [
         joints[..., group.unknown_joints(free)].reshape(*state.T.shape[:2], -1)
@@ -83,7 +81,7 @@ def unknowns(program: Program, state: State, free: bool = False) -> Array:
     return np.concatenate(parts, axis=-1)
 
 
-def motion(program: Program, state: State, of: State, free: bool = False) -> Array:
+def measure_motion(program: Program, state: State, of: State, free: bool = False) -> Array:
     """Change (t, n, m + u) of the platform (as a twist, its freedoms only) and of the unknown
     joints since `of`.
     """
@@ -91,7 +89,11 @@ def motion(program: Program, state: State, of: State, free: bool = False) -> Arr
         ..., list(program.freedoms)
     ]
     return np.concatenate(
-        [twist, unknowns(program, state, free) - unknowns(program, of, free)], axis=-1
+        [
+            twist,
+            unknown_joint_values(program, state, free) - unknown_joint_values(program, of, free),
+        ],
+        axis=-1,
     )
 
 
@@ -111,7 +113,7 @@ def pose_demand(
     return task
 
 
-# --- closure once more, for numpy or jax, one row and one limb at a time
+# --- independent closure for numpy or jax, one row and one limb at a time
 # ---------------------------------------------
 
 
@@ -136,7 +138,7 @@ def homogeneous(xp: ModuleType, R: Any, t: Any) -> Any:
     return xp.concatenate([xp.concatenate([R, t[..., None]], axis=-1), last], axis=-2)
 
 
-def limb_rows(
+def limb_residual(
     xp: ModuleType, group: Group, k: int, size: float, T: Any, theta: Any, own: Any
 ) -> Any:
     """Closure residual of limb k: T (4, 4), joint values theta (J + 1,), the limb's own
@@ -179,7 +181,7 @@ def limb_rows(
     return xp.concatenate([size * skew, gap])[np.array(group.rows)]
 
 
-def open_by(program: Program, state: State, e: Array) -> Array:
+def closure_gap(program: Program, state: State, e: Array) -> Array:
     """Norm of the plain closure residual (t, n) [m]."""
     t, n = state.T.shape[:2]
     out = np.zeros((t, n))
@@ -187,16 +189,18 @@ def open_by(program: Program, state: State, e: Array) -> Array:
         for k in range(len(group.limbs)):
             for i, r in np.ndindex(t, n):
                 own = e[min(i, len(e) - 1), group.columns].reshape(len(group.limbs), -1)[k]
-                rows = limb_rows(np, group, k, program.size, state.T[i, r], joints[i, r, k], own)
+                rows = limb_residual(
+                    np, group, k, program.size, state.T[i, r], joints[i, r, k], own
+                )
                 out[i, r] = np.hypot(out[i, r], np.linalg.norm(rows))
     return out
 
 
-# --- what the blocks of `linearize` say, solved row by row
+# --- blocks of `linearize`, solved row by row
 # -----------------------------------------------------------
 
 
-def spread(program: Program, parts: tuple[Block, ...]) -> tuple[Array, Array, Array]:
+def stack_dense_rows(program: Program, parts: tuple[Block, ...]) -> tuple[Array, Array, Array]:
     """Rows of all limbs, one after the other, against freedoms, displacements and joint values: (t,
     n, c, m | s | a).
     """
@@ -219,12 +223,12 @@ def spread(program: Program, parts: tuple[Block, ...]) -> tuple[Array, Array, Ar
     return np.concatenate(A, axis=2), np.concatenate(E, axis=2), np.concatenate(Q, axis=2)
 
 
-def slopes(program: Program, blocks: Any, free: bool = False) -> Array:
+def dense_derivatives(program: Program, blocks: Any, free: bool = False) -> Array:
     """d (platform, unknown joints) / d (displacements, joint values): (t, n, m + u, s + a).
 
     With `free`, / d (platform, displacements): (t, n, m + u, m + s).
     """
-    A, E, Q = spread(program, blocks.closure)
+    A, E, Q = stack_dense_rows(program, blocks.closure)
     m = len(program.freedoms)
     right = np.concatenate([E, Q], axis=-1)
     if free:

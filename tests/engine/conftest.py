@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The engine under test, a fixture of every test in this folder: another engine is accepted by
-adding it here.
+"""Fixtures of the engine tests: the engine under test (add another engine here), and example
+mechanisms.
 """
 
 import importlib
@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 
 from tests import zoo
-from tests.engine.cases import Case, case
+from tests.engine.cases import Case, make_case
 
 
 @pytest.fixture(scope="session", params=["loopcal.engine"])
@@ -21,8 +21,6 @@ def engine(request) -> ModuleType:
     scope="session",
     params=["mixed_hexapod", "three_prs", "hexapod", "delta", "five_bar", "planar_rrr"],
 )
-def some(request) -> Case:
-    """One mechanism after another: six, three and two freedoms, all endings, with and without
-    passive joints.
-    """
-    return case(getattr(zoo, request.param)())
+def case(request) -> Case:
+    """Mechanisms of six, three and two freedoms, all endings, with and without passive joints."""
+    return make_case(getattr(zoo, request.param)())

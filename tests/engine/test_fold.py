@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`fold` folds rows into a triangular factor as one QR of all of them would."""
+"""`fold` adds rows to a triangular factor and gives the factor of one QR of all rows."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def rows():
     return np.random.default_rng(5).normal(size=(3, 40, 7)) * 10.0 ** np.arange(-3, 4)
 
 
-def test_blocks_of_rows_give_the_factor_of_all_rows(engine, rows):
+def test_folding_blocks_gives_the_factor_of_all_rows(engine, rows):
     factor = np.zeros((3, 7, 7))
     for part in np.split(rows, [11, 12, 30], axis=1):
         factor = engine.fold(factor, part)
@@ -28,7 +28,7 @@ def test_blocks_of_rows_give_the_factor_of_all_rows(engine, rows):
     )  # columns of length one, 40 rows
 
 
-def test_absent_rows_are_rows_of_zeros(engine, rows):
+def test_rows_of_zeros_equal_missing_rows(engine, rows):
     kept = rows.copy()
     kept[:, 5:9] = 0.0
     a = engine.fold(np.zeros((3, 7, 7)), kept)
@@ -37,7 +37,7 @@ def test_absent_rows_are_rows_of_zeros(engine, rows):
     assert_allclose(np.abs(a / scale), np.abs(b / scale), atol=1e-14)
 
 
-def test_null_directions_stay_at_rounding_and_not_at_its_root(engine, rows):
+def test_null_directions_have_singular_values_at_rounding(engine, rows):
     rows[..., 6] = rows[..., 5] * 2 - rows[..., 4]
     scaled = rows / np.linalg.norm(rows, axis=1, keepdims=True)
     factor = engine.fold(engine.fold(np.zeros((3, 7, 7)), scaled[:, :20]), scaled[:, 20:])
@@ -45,13 +45,13 @@ def test_null_directions_stay_at_rounding_and_not_at_its_root(engine, rows):
     assert (s[:, -1] <= 1e-14 * s[:, 0]).all()
 
 
-def test_trials_do_not_depend_on_each_other_bit_for_bit(engine, rows):
+def test_folded_trials_equal_single_trials_bit_for_bit(engine, rows):
     together = engine.fold(np.zeros((3, 7, 7)), rows)
     for i in range(3):
         assert_array_equal(together[i], engine.fold(np.zeros((1, 7, 7)), rows[i : i + 1])[0])
 
 
-def test_trials_may_share_rows(engine, rows):
+def test_trials_can_share_rows(engine, rows):
     shared = engine.fold(np.zeros((2, 7, 7)), rows[:1])
     assert_array_equal(shared[0], shared[1])
     assert_allclose(gram(shared[0]), gram(rows[0]), rtol=1e-12)

@@ -10,13 +10,13 @@ import ast
 from pathlib import Path
 
 
-def test_the_engine_has_at_most_five_files_and_850_lines(root: Path):
+def test_engine_has_at_most_five_files_and_850_lines(root: Path):
     files = sorted((root / "src" / "loopcal" / "engine").glob("*.py"))
     assert len(files) <= 5
     assert sum(len(file.read_text("utf-8").splitlines()) for file in files) <= 850
 
 
-def test_the_engine_imports_numpy_and_the_array_types_only(root: Path):
+def test_engine_imports_numpy_only(root: Path):
     found = set()
     for file in (root / "src" / "loopcal" / "engine").glob("*.py"):
         for node in ast.walk(ast.parse(file.read_text("utf-8"))):

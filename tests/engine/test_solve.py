@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `solve` promises: closed loops or a mark, and for every row the same bits whatever stands
-beside it.
+"""`solve` returns closed loops or marks the row, and each row is bit for bit independent of the
+other rows.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +14,13 @@ from loopcal import geometry
 from loopcal.engine.program import EXHAUSTED, NOT_FINITE, STALLED, Slot  # what all engines share
 from loopcal.mechanism import build
 from tests import zoo
-from tests.engine.cases import case, driven, open_by, pose_demand, unit_of_displacements
+from tests.engine.cases import (
+    actuated_joint_values,
+    closure_gap,
+    displacement_units,
+    make_case,
+    pose_demand,
+)
 
 CLOSED = 1e-13  # of the robot's size: a hundred roundings of a coordinate
 FIELDS = ("T", "status", "residual", "iterations", "closure_sign")
@@ -28,17 +34,17 @@ def assert_same(a, b):
         assert_array_equal(x, y)
 
 
-def rows_of(state, trials, rows):
+def take_rows(state, trials, rows):
     """Chosen trials and rows of a state."""
     pick = {field: getattr(state, field)[trials][:, rows] for field in FIELDS}
     return replace(state, joints=tuple(j[trials][:, rows] for j in state.joints), **pick)
 
 
-def test_every_row_converges_and_its_loops_are_closed(engine, some):
-    state = engine.solve(some.program, some.e, some.q, some.home)
+def test_every_row_converges_to_closed_loops(engine, case):
+    state = engine.solve(case.program, case.e, case.q, case.home)
     assert_array_equal(state.status, engine.CONVERGED)
-    assert state.residual.max() <= CLOSED * some.program.size
-    assert open_by(some.program, state, some.e).max() <= CLOSED * some.program.size
+    assert state.residual.max() <= CLOSED * case.program.size
+    assert closure_gap(case.program, state, case.e).max() <= CLOSED * case.program.size
     assert_allclose(
         state.T[..., :3, :3] @ state.T[..., :3, :3].swapaxes(-1, -2),
         np.broadcast_to(np.eye(3), (1, 5, 3, 3)),
@@ -47,33 +53,33 @@ def test_every_row_converges_and_its_loops_are_closed(engine, some):
     assert state.iterations.max() <= 10
 
 
-def test_actuated_joints_hold_the_values_asked_for(engine, some):
-    state = engine.solve(some.program, some.e, some.q, some.home)
-    assert_array_equal(driven(some.program, state), some.q)
+def test_actuated_joints_have_the_given_values(engine, case):
+    state = engine.solve(case.program, case.e, case.q, case.home)
+    assert_array_equal(actuated_joint_values(case.program, state), case.q)
 
 
-def test_the_platform_moves_in_its_freedoms_only(engine, some):
-    state = engine.solve(some.program, some.e, some.q, some.home)
-    others = [i for i in range(6) if i not in some.program.freedoms]
+def test_platform_moves_in_its_freedoms_only(engine, case):
+    state = engine.solve(case.program, case.e, case.q, case.home)
+    others = [i for i in range(6) if i not in case.program.freedoms]
     assert_allclose(
-        geometry.pose_difference(state.T, np.broadcast_to(some.home.T, state.T.shape))[..., others],
+        geometry.pose_difference(state.T, np.broadcast_to(case.home.T, state.T.shape))[..., others],
         0.0,
         atol=1e-16,
     )
 
 
-def test_a_converged_state_is_a_fixed_point(engine, some):
-    state = engine.solve(some.program, some.e, some.q, some.home)
-    again = engine.solve(some.program, some.e, some.q, state)
+def test_converged_state_is_a_fixed_point(engine, case):
+    state = engine.solve(case.program, case.e, case.q, case.home)
+    again = engine.solve(case.program, case.e, case.q, state)
     assert_allclose(
         again.T, state.T, atol=2e-14
     )  # [1] and [m]: rounding times the condition of these robots
     assert again.iterations.max() <= 2
 
 
-def test_free_joints_come_back_from_the_pose(engine):
+def test_solving_for_a_pose_recovers_the_actuated_joints(engine):
     for robot in (zoo.mixed_hexapod(), zoo.hexapod()):
-        one = case(robot)
+        one = make_case(robot)
         one = replace(
             one, q=one.home_q + 0.1 * (one.q - one.home_q)
         )  # near enough for the working mode of home
@@ -84,148 +90,148 @@ def test_free_joints_come_back_from_the_pose(engine):
         )
         assert_array_equal(back.status, engine.CONVERGED)
         assert_allclose(
-            driven(one.program, back), one.q, atol=1e-13
+            actuated_joint_values(one.program, back), one.q, atol=1e-13
         )  # [m, rad] rounding times a condition near 10
         assert_allclose(back.T, state.T, atol=1e-14)
 
 
 @pytest.mark.parametrize("robot", ["mixed_hexapod", "three_prs", "delta"])
-def test_seven_trials_in_one_call_equal_seven_calls_bit_for_bit(engine, robot):
-    some = case(getattr(zoo, robot)(), t=7)
-    together = engine.solve(some.program, some.e, some.q, some.home)
+def test_solved_trials_equal_single_trials_bit_for_bit(engine, robot):
+    case = make_case(getattr(zoo, robot)(), t=7)
+    together = engine.solve(case.program, case.e, case.q, case.home)
     for i in range(7):
-        alone = engine.solve(some.program, some.e[i : i + 1], some.q[i : i + 1], some.home)
-        assert_same(rows_of(together, [i], slice(None)), alone)
+        alone = engine.solve(case.program, case.e[i : i + 1], case.q[i : i + 1], case.home)
+        assert_same(take_rows(together, [i], slice(None)), alone)
 
 
-def test_trials_that_share_readings_equal_trials_with_their_own(engine):
-    some = case(zoo.mixed_hexapod(), t=3)
-    shared = engine.solve(some.program, some.e, some.q[:1], some.home)
-    own = engine.solve(some.program, some.e, np.repeat(some.q[:1], 3, axis=0), some.home)
+def test_trials_with_shared_readings_equal_trials_with_copies(engine):
+    case = make_case(zoo.mixed_hexapod(), t=3)
+    shared = engine.solve(case.program, case.e, case.q[:1], case.home)
+    own = engine.solve(case.program, case.e, np.repeat(case.q[:1], 3, axis=0), case.home)
     assert_same(shared, own)
 
 
-def test_a_row_does_not_depend_on_its_neighbours_bit_for_bit(engine, some):
-    together = engine.solve(some.program, some.e, some.q, some.home)
-    for r in range(some.q.shape[1]):
-        alone = engine.solve(some.program, some.e, some.q[:, [r]], some.home)
-        assert_same(rows_of(together, [0], [r]), alone)
+def test_row_equals_the_same_row_solved_alone_bit_for_bit(engine, case):
+    together = engine.solve(case.program, case.e, case.q, case.home)
+    for r in range(case.q.shape[1]):
+        alone = engine.solve(case.program, case.e, case.q[:, [r]], case.home)
+        assert_same(take_rows(together, [0], [r]), alone)
 
 
-def test_the_order_of_rows_does_not_matter_bit_for_bit(engine, some):
+def test_row_order_does_not_change_the_solution_bit_for_bit(engine, case):
     order = np.array([3, 1, 4, 0, 2])
-    together = engine.solve(some.program, some.e, some.q, some.home)
+    together = engine.solve(case.program, case.e, case.q, case.home)
     assert_same(
-        rows_of(together, [0], order),
-        engine.solve(some.program, some.e, some.q[:, order], some.home),
+        take_rows(together, [0], order),
+        engine.solve(case.program, case.e, case.q[:, order], case.home),
     )
 
 
-def test_thousands_of_rows_equal_a_few_alone_bit_for_bit(engine):
-    some = case(zoo.mixed_hexapod(), n=6000)
-    together = engine.solve(some.program, some.e, some.q, some.home)
+def test_rows_of_a_large_batch_equal_single_rows_bit_for_bit(engine):
+    case = make_case(zoo.mixed_hexapod(), n=6000)
+    together = engine.solve(case.program, case.e, case.q, case.home)
     for r in (0, 2047, 2048, 4095, 4096, 5999):
         assert_same(
-            rows_of(together, [0], [r]),
-            engine.solve(some.program, some.e, some.q[:, [r]], some.home),
+            take_rows(together, [0], [r]),
+            engine.solve(case.program, case.e, case.q[:, [r]], case.home),
         )
 
 
-def test_failing_rows_are_marked_and_leave_the_others_alone(engine, some):
-    bad = np.repeat(some.q, 2, axis=1)
+def test_rows_not_finite_are_marked_and_do_not_change_other_rows(engine, case):
+    bad = np.repeat(case.q, 2, axis=1)
     bad[:, 1, 0], bad[:, 3, -1], bad[:, 5, 0], bad[:, 7, :] = np.nan, np.inf, -np.inf, np.nan
-    state = engine.solve(some.program, some.e, bad, some.home)
+    state = engine.solve(case.program, case.e, bad, case.home)
     assert_array_equal(state.status[0, [1, 3, 5, 7]], NOT_FINITE)
     good = [0, 2, 4, 6, 8, 9]
     assert_same(
-        rows_of(state, [0], good), engine.solve(some.program, some.e, bad[:, good], some.home)
+        take_rows(state, [0], good), engine.solve(case.program, case.e, bad[:, good], case.home)
     )
 
 
-def test_displacements_that_are_not_finite_mark_their_trial(engine):
-    some = case(zoo.mixed_hexapod(), t=3)
-    e = np.array(some.e)
+def test_displacements_not_finite_mark_their_trial(engine):
+    case = make_case(zoo.mixed_hexapod(), t=3)
+    e = np.array(case.e)
     e[1, 5] = np.nan
-    state = engine.solve(some.program, e, some.q, some.home)
+    state = engine.solve(case.program, e, case.q, case.home)
     assert_array_equal(state.status[1], NOT_FINITE)
     assert_array_equal(state.status[[0, 2]], engine.CONVERGED)
 
 
-def test_unreachable_rows_are_marked_with_the_gap_that_stays(engine, some):
-    far = np.repeat(some.home_q, 4, axis=1)
+def test_unreachable_rows_are_marked_with_their_residual(engine, case):
+    far = np.repeat(case.home_q, 4, axis=1)
     far += (
-        np.where(np.arange(some.program.n_joints) == 0, 1.0, 0.0)
-        * some.program.size
+        np.where(np.arange(case.program.n_joints) == 0, 1.0, 0.0)
+        * case.program.size
         * np.array([3.0, -3.0, 30.0, 1e6])[:, None]
     )
-    state = engine.solve(some.program, some.e, far, some.home)
-    if some.name in ("five-bar", "3-RRR"):  # a crank that turns by a metre of radians is somewhere
+    state = engine.solve(case.program, case.e, far, case.home)
+    if case.name in ("five-bar", "3-RRR"):  # a crank can turn by any angle
         assert np.isin(state.status, [engine.CONVERGED, STALLED, EXHAUSTED, NOT_FINITE]).all()
         return
     lost = state.status != engine.CONVERGED
-    closed = open_by(some.program, state, some.e)
-    assert (closed[~lost] <= CLOSED * some.program.size).all()
+    closed = closure_gap(case.program, state, case.e)
+    assert (closed[~lost] <= CLOSED * case.program.size).all()
     assert lost[0, 2:].all()
-    assert (state.residual[lost & np.isfinite(state.residual)] > 1e-6 * some.program.size).all()
+    assert (state.residual[lost & np.isfinite(state.residual)] > 1e-6 * case.program.size).all()
 
 
-def test_a_rod_of_no_length_is_not_an_exception(engine):
-    some = case(zoo.hexapod())
-    T = np.array(some.home.T)
+def test_rod_of_zero_length_is_marked_without_an_exception(engine):
+    case = make_case(zoo.hexapod())
+    T = np.array(case.home.T)
     T[0, 0, :3, 3] = zoo.HEXAPOD_BASE[0] * zoo.MM - zoo.HEXAPOD_PLATFORM[0] * zoo.MM
-    state = engine.solve(some.program, 0 * some.e, some.q, replace(some.home, T=T))
+    state = engine.solve(case.program, 0 * case.e, case.q, replace(case.home, T=T))
     assert_array_equal(state.status, NOT_FINITE)
 
 
-def test_a_singular_start_is_not_an_exception(engine):
+def test_singular_start_raises_no_exception(engine):
     # platform congruent to the base, all legs parallel: three freedoms are free
     base = zoo.HEXAPOD_BASE * zoo.MM
-    some = case(zoo.gough("regular", base, 0.6 * base[[1, 0, 3, 2, 5, 4]], 0.3, 0.3))
-    links = np.array(some.program.groups[0].links)
+    case = make_case(zoo.gough("regular", base, 0.6 * base[[1, 0, 3, 2, 5, 4]], 0.3, 0.3))
+    links = np.array(case.program.groups[0].links)
     links[:, 1] = links[:, 0]
-    program = replace(some.program, groups=(replace(some.program.groups[0], links=links),))
-    state = engine.solve(program, 0 * some.e, np.full((1, 2, 6), 0.01), some.home)
+    program = replace(case.program, groups=(replace(case.program.groups[0], links=links),))
+    state = engine.solve(program, 0 * case.e, np.full((1, 2, 6), 0.01), case.home)
     assert state.status.shape == (1, 2)
     assert (state.status != engine.CONVERGED).all() or np.isfinite(state.T).all()
 
 
-def test_too_few_steps_are_said(engine, some):
-    state = engine.solve(some.program, some.e, some.q, some.home, max_iterations=1)
+def test_exhausted_iterations_are_marked(engine, case):
+    state = engine.solve(case.program, case.e, case.q, case.home, max_iterations=1)
     assert_array_equal(state.status, EXHAUSTED)
     assert_array_equal(state.iterations, 1)
 
 
-def test_arguments_are_left_alone(engine, some):
-    e, q, T = np.array(some.e), np.array(some.q), np.array(some.home.T)
-    engine.solve(some.program, some.e, some.q, some.home)
-    assert_array_equal(some.e, e)
-    assert_array_equal(some.q, q)
-    assert_array_equal(some.home.T, T)
+def test_solve_does_not_change_its_arguments(engine, case):
+    e, q, T = np.array(case.e), np.array(case.q), np.array(case.home.T)
+    engine.solve(case.program, case.e, case.q, case.home)
+    assert_array_equal(case.e, e)
+    assert_array_equal(case.q, q)
+    assert_array_equal(case.home.T, T)
 
 
-def test_orientation_changes_sign_with_the_mirrored_mode(engine):
+def test_mirrored_assembly_mode_has_the_opposite_closure_sign(engine):
     # a linear delta's nozzle above its carriages is the mirrored mode; between the two lies a
     # singularity
-    some = case(zoo.delta())
-    T = np.array(some.home.T)
+    case = make_case(zoo.delta())
+    T = np.array(case.home.T)
     T[0, 0, 2, 3] += 2 * 0.24  # [m] from below to above the carriages
-    above = engine.solve(some.program, some.e, some.q, replace(some.home, T=T))
-    below = engine.solve(some.program, some.e, some.q, some.home)
+    above = engine.solve(case.program, case.e, case.q, replace(case.home, T=T))
+    below = engine.solve(case.program, case.e, case.q, case.home)
     assert_array_equal(above.status, engine.CONVERGED)
     assert_array_equal(above.closure_sign, -below.closure_sign)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_random_limbs_of_every_kind_close(engine, seed):
+def test_random_limbs_of_every_kind_converge(engine, seed):
     robot = build(zoo.mixed_hexapod_assembly(seed))
-    some = case(robot, n=4, seed=seed)
-    small = some.home_q + 0.3 * (some.q - some.home_q)
-    state = engine.solve(some.program, some.e, small, some.home)
+    case = make_case(robot, n=4, seed=seed)
+    small = case.home_q + 0.3 * (case.q - case.home_q)
+    state = engine.solve(case.program, case.e, small, case.home)
     assert_array_equal(state.status, engine.CONVERGED)
-    assert open_by(some.program, state, some.e).max() <= CLOSED * some.program.size
+    assert closure_gap(case.program, state, case.e).max() <= CLOSED * case.program.size
 
 
-def test_slots_of_the_menagerie_cover_every_place_of_a_limb():
+def test_mixed_hexapod_has_displacements_at_every_element_of_a_limb():
     program = zoo.mixed_hexapod().program
     assert {g.ending for g in program.groups} == {"rigid", "ball", "distance"}
     for group in program.groups:
@@ -234,16 +240,16 @@ def test_slots_of_the_menagerie_cover_every_place_of_a_limb():
         }
         assert expected <= set(group.slots)
     assert (
-        len(unit_of_displacements(program))
+        len(displacement_units(program))
         == program.n_displacements
         == len(zoo.mixed_hexapod().parameters) - 12
     )
 
 
-def test_four_threads_obtain_the_same_bits(engine, some):
+def test_four_threads_give_equal_results_bit_for_bit(engine, case):
     def run(_: int) -> tuple[np.ndarray, ...]:
-        state = engine.solve(some.program, some.e, some.q, some.home)
-        blocks = engine.linearize(some.program, some.e, some.q, state)
+        state = engine.solve(case.program, case.e, case.q, case.home)
+        blocks = engine.linearize(case.program, case.e, case.q, state)
         arrays = [a for b in (*blocks.closure, *blocks.passive) for a in (b.U, b.A, b.E, b.Q)]
         return state.T, *state.joints, state.residual, state.status, *arrays
 

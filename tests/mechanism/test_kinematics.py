@@ -16,7 +16,7 @@ from loopcal.errors import ArgumentTypeError, DataError
 from loopcal.findings.catalog import load_catalog
 from loopcal.mechanism import Status, build, forward, forward_trials, inverse, jacobian
 from tests import zoo
-from tests.engine.cases import driven, spread
+from tests.engine.cases import actuated_joint_values, stack_dense_rows
 
 ROBOT_NAMES = ["mixed_hexapod", "three_prs", "hexapod", "nategh", "delta", "five_bar", "planar_rrr"]
 WORKSPACES = {
@@ -54,8 +54,8 @@ def closure_condition(robot, state):
     per size (n,).
     """
     e, _ = robot.slots(robot.values[None])
-    blocks = engine.linearize(robot.program, e, driven(robot.program, state), state)
-    A = spread(robot.program, blocks.closure)[0][0]
+    blocks = engine.linearize(robot.program, e, actuated_joint_values(robot.program, state), state)
+    A = stack_dense_rows(robot.program, blocks.closure)[0][0]
     return np.linalg.cond(
         A / np.array([robot.size if f < 3 else 1.0 for f in robot.program.freedoms])
     )

@@ -30,12 +30,12 @@ from loopcal.mechanism import Mechanism
 from tests.cable_robot import (
     NAMES,
     TRUTH,
-    Reference,
-    example,
-    paid_out,
-    real,
-    reference,
-    samples_text,
+    ReferenceSolution,
+    compute_paid_out,
+    format_samples,
+    load_real_samples,
+    simulate_example,
+    solve_reference,
 )
 
 PUBLISHED = [
@@ -52,7 +52,7 @@ BUILDUPS = [i for i, name in enumerate(NAMES) if "buildup" in name]
 def import_samples(folder: Path, found: dict[str, Any], sigma: float) -> Imported:
     """Import the samples with one sigma [mm] for lines and positions."""
     path = folder / "samples.json"
-    path.write_text(samples_text(found), "utf-8")
+    path.write_text(format_samples(found), "utf-8")
     return hangprinter.read(
         path, ImportOptions("printer", sigma_line=sigma * 1e-3, sigma_position=sigma * 1e-3)
     )
@@ -75,7 +75,7 @@ def get_start(robot: Mechanism) -> np.ndarray:
 @pytest.fixture(scope="module")
 def samples(data_folder: Path) -> dict[str, Any]:
     """The real samples."""
-    return real(data_folder)
+    return load_real_samples(data_folder)
 
 
 @pytest.fixture(scope="module")
@@ -92,9 +92,9 @@ def fit(printer) -> Identification:
 
 
 @pytest.fixture(scope="module")
-def reference_fit(samples, printer) -> Reference:
+def reference_fit(samples, printer) -> ReferenceSolution:
     """The fit of the same samples by the reference."""
-    return reference(samples, SIGMA, SIGMA, get_start(printer[0]))
+    return solve_reference(samples, SIGMA, SIGMA, get_start(printer[0]))
 
 
 def test_estimate_and_covariance_agree_with_the_reference(fit, reference_fit):
@@ -398,11 +398,11 @@ def test_stretch_of_the_lines_by_their_forces_is_not_significant(samples, printe
     -0.2e-4 to 0.2e-4.
     """
     force = np.array(samples["force_samp"])
-    length = paid_out(samples, 76.0, np.zeros(4)) + reference_fit.values[3:16:4]
+    length = compute_paid_out(samples, 76.0, np.zeros(4)) + reference_fit.values[3:16:4]
     for shift in range(4):
         rows = np.tile(force.mean(axis=0), (44, 1))
         rows[shift : shift + len(force)] = force
-        found = reference(
+        found = solve_reference(
             samples, SIGMA, SIGMA, get_start(printer[0]), stretch=1e-4 * rows * length
         )
         assert abs(found.values[21]) < 2.0 * found.sd[21]
@@ -412,7 +412,7 @@ def test_stretch_of_the_lines_by_their_forces_is_not_significant(samples, printe
 
 def test_anchors_depend_little_on_the_sigma_of_known_positions(samples, printer, reference_fit):
     for position in (0.3, 1.2):
-        other = reference(samples, SIGMA, position, get_start(printer[0]))
+        other = solve_reference(samples, SIGMA, position, get_start(printer[0]))
         assert np.abs((other.values - reference_fit.values) / reference_fit.sd)[ANCHORS].max() < 1.0
 
 
@@ -467,14 +467,14 @@ def test_truth_of_the_example_lies_within_its_intervals(tmp_path, root):
     assert (
         np.abs(off).max() < 3.1
     )  # the largest of 21 standard normal numbers is below 3.1 in 96 % of cases
-    reference_fit = reference(found, 0.5, 0.5, get_start(robot))
+    reference_fit = solve_reference(found, 0.5, 0.5, get_start(robot))
     np.testing.assert_allclose(fit.estimate * 1e3, reference_fit.values, rtol=0, atol=1e-4)  # [mm]
 
 
 def test_example_file_equals_the_simulated_samples(root):
-    assert (root / "examples" / "cable-robot" / "samples.json").read_text("utf-8") == samples_text(
-        example()
-    )
+    assert (root / "examples" / "cable-robot" / "samples.json").read_text(
+        "utf-8"
+    ) == format_samples(simulate_example())
 
 
 @pytest.mark.evidence
@@ -488,7 +488,7 @@ def test_intervals_of_40_machines_contain_the_truth_as_often_as_stated(tmp_path)
     """
     held, total = np.zeros(21, dtype=int), 0.0
     for seed in range(40):
-        robot, data = build_machine(tmp_path, example(seed), 0.5)
+        robot, data = build_machine(tmp_path, simulate_example(seed), 0.5)
         fit = identify(robot, data, LeastSquares())
         assert fit.converged
         error = fit.estimate - TRUTH * 1e-3

@@ -17,30 +17,32 @@ from loopcal.io.data.measurement_writer import save_measurements
 from loopcal.io.formats import hangprinter
 from loopcal.io.formats.import_export import build_imported_robot
 from loopcal.io.formats.program_format import ImportOptions
-from tests.cable_robot import NAMES, TRUTH, example, paid_out, samples_text
+from tests.cable_robot import NAMES, TRUTH, compute_paid_out, format_samples, simulate_example
 
 
 def read(folder, found: dict, **reading: Any):
     path = folder / "samples.json"
-    path.write_text(samples_text(found), "utf-8")
+    path.write_text(format_samples(found), "utf-8")
     imported = hangprinter.read(path, ImportOptions("printer", **reading))
     return build_imported_robot(path, imported), imported
 
 
 def test_the_robot_has_four_anchors_lengths_one_spool_radius_and_four_buildups(tmp_path) -> None:
-    robot, _ = read(tmp_path, example())
+    robot, _ = read(tmp_path, simulate_example())
     assert robot.parameters.names == NAMES
     assert robot.parameters.free.all()
     assert not np.isnan(robot.parameters.tolerance).any()
 
 
 def test_spools_of_other_radii_have_parameters_of_their_own(tmp_path) -> None:
-    robot, _ = read(tmp_path, example() | {"spool_r_in_origin_first_guess": [60, 60, 60, 50]})
+    robot, _ = read(
+        tmp_path, simulate_example() | {"spool_r_in_origin_first_guess": [60, 60, 60, 50]}
+    )
     assert {"spoolA-B-C.radius", "spoolD.radius"} <= set(robot.parameters.names)
 
 
 def test_known_poses_are_measured_and_the_others_keep_their_readings(tmp_path) -> None:
-    found = example()
+    found = simulate_example()
     _, imported = read(tmp_path, found, sigma_position=0.6e-3)
     data = imported.measurements
     assert data is not None
@@ -55,7 +57,7 @@ def test_known_poses_are_measured_and_the_others_keep_their_readings(tmp_path) -
 
 
 def test_sigma_of_a_line_becomes_that_of_its_motor(tmp_path) -> None:
-    robot, _ = read(tmp_path, example(), sigma_line=0.6e-3)
+    robot, _ = read(tmp_path, simulate_example(), sigma_line=0.6e-3)
     gear = 18 / 240
     expected = 0.6e-3 / (60e-3 * gear * np.array([0.5, 0.5, 0.5, 0.25]))  # [rad]
     found = [actuator.sigma or np.nan for actuator in robot.assembly.actuators]
@@ -66,7 +68,7 @@ def test_line_that_builds_up_is_paid_out_as_the_spools_say(tmp_path) -> None:
     """At the poses that the readings of the true machine reach, lines are as long as the closed
     form of the spools says.
     """
-    found = example()
+    found = simulate_example()
     robot, _ = read(tmp_path, found)
     true = robot.with_values(TRUTH * 1e-3)
     targets = np.zeros((12, 3))
@@ -75,13 +77,13 @@ def test_line_that_builds_up_is_paid_out_as_the_spools_say(tmp_path) -> None:
     at = inverse(true, targets)
     limbs = TRUTH[:16].reshape(4, 4)
     length = np.linalg.norm(targets[:, None] * 1e3 - limbs[:, :3], axis=2)
-    paid = paid_out(found | {"motor_pos_samp": np.degrees(at.q)}, TRUTH[16], TRUTH[17:])
+    paid = compute_paid_out(found | {"motor_pos_samp": np.degrees(at.q)}, TRUTH[16], TRUTH[17:])
     np.testing.assert_allclose(limbs[:, 3] + paid, length, rtol=0, atol=1e-7)  # [mm]
     np.testing.assert_allclose(forward(true, at.q).T[:, :3, 3], targets, rtol=0, atol=1e-9)  # [m]
 
 
 def test_anchors_start_exactly_from_known_poses_without_noise_and_buildup(tmp_path) -> None:
-    found = example()
+    found = simulate_example()
     anchors = np.array([[10.0, -1500, -90], [1200, 700, -120], [-1250, 650, -100], [5, 5, 2200]])
     known = np.array(found["xyz_of_samp"])
     moved = np.linalg.norm(known[:, None] - anchors, axis=2) - np.linalg.norm(anchors, axis=1)
@@ -96,7 +98,7 @@ def test_anchors_start_exactly_from_known_poses_without_noise_and_buildup(tmp_pa
 
 def test_stated_anchors_are_taken(tmp_path) -> None:
     anchors = [[0, -1500, -90], [1200, 700, -120], [-1250, 650, -100], [0, 0, 2200]]
-    robot, _ = read(tmp_path, example() | {"anchors": anchors, "xyz_of_samp": [[0, 0, 0]]})
+    robot, _ = read(tmp_path, simulate_example() | {"anchors": anchors, "xyz_of_samp": [[0, 0, 0]]})
     np.testing.assert_allclose(
         robot.values[:16].reshape(4, 4)[:, :3] * 1e3, anchors, rtol=0, atol=1e-9
     )
@@ -104,7 +106,7 @@ def test_stated_anchors_are_taken(tmp_path) -> None:
 
 def test_with_stated_anchors_no_pose_need_be_known(tmp_path) -> None:
     anchors = [[0, -1500, -90], [1200, 700, -120], [-1250, 650, -100], [0, 0, 2200]]
-    robot, imported = read(tmp_path, example() | {"anchors": anchors, "xyz_of_samp": []})
+    robot, imported = read(tmp_path, simulate_example() | {"anchors": anchors, "xyz_of_samp": []})
     assert imported.measurements is not None
     assert imported.measurements.n_rows == 0
     save_measurements(imported.measurements, tmp_path / "samples.csv", robot, "")
@@ -125,7 +127,9 @@ def test_what_a_robot_file_cannot_say_is_told(tmp_path) -> None:
         "force_samp": [[1, 2, 3, 4]] * 41,
         "colour": "red",
     }
-    _, imported = read(tmp_path, example() | more | {"line_lengths_when_at_origin": [1, 2, 3, 4]})
+    _, imported = read(
+        tmp_path, simulate_example() | more | {"line_lengths_when_at_origin": [1, 2, 3, 4]}
+    )
     notes = " | ".join(map(str, imported.findings))
     assert "41 rows of line forces are not read" in notes
     assert "with 45 rows of motor angles" in notes
@@ -162,12 +166,12 @@ def test_what_a_robot_file_cannot_say_is_told(tmp_path) -> None:
 )
 def test_bad_samples_are_refused_in_one_sentence(tmp_path, change, sentence) -> None:
     with pytest.raises(FileError) as refused:
-        read(tmp_path, example() | change)
+        read(tmp_path, simulate_example() | change)
     assert sentence in str(refused.value)
 
 
 def test_known_poses_in_the_plane_of_the_origin_are_refused_with_the_remedy(tmp_path) -> None:
-    found = example()
+    found = simulate_example()
     flat = [[x, y, 0.0] for x, y, _ in found["xyz_of_samp"][:8]]
     with pytest.raises(FileError, match=r"poses at several heights .*or add the key 'anchors'"):
         read(tmp_path, found | {"xyz_of_samp": flat})
