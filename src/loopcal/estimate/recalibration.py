@@ -30,6 +30,7 @@ from loopcal.findings import Finding, report_finding
 from loopcal.findings.catalog.phrases import MACHINE
 from loopcal.measure import Measurements
 from loopcal.mechanism import Mechanism
+from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.typing import FloatArray, Progress, report_no_progress
 
 MOST_TRIED = 60
@@ -147,9 +148,7 @@ def assess_change(
         code = "prior.change-not-observable" if degrees < 1.0 else "prior.change-not-converged"
         finding = report_finding(code, subject=subject)
         return Change(subject, names, change, gain, degrees, np.nan, None, finding)
-    from scipy.special import chdtrc
-
-    p_value = float(chdtrc(degrees, gain))
+    p_value = float(compute_chi_square_tail(degrees, gain))
     moved = p_value < SIGNIFICANCE
     result = {"subject": subject, "chi_square": gain, "degrees": degrees, "p_value": p_value}
     if moved:

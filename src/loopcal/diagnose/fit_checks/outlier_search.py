@@ -20,6 +20,7 @@ from loopcal.estimate.linearization import Start
 from loopcal.estimate.minimization.robust_descent import estimate_scale_of
 from loopcal.estimate.problem import Problem
 from loopcal.estimate.result import Identification
+from loopcal.numerics.chi_square import compute_chi_square_quantile, compute_chi_square_tail
 from loopcal.numerics.decomposition import decompose
 from loopcal.typing import BoolArray, FloatArray, IntArray, Progress, report_no_progress
 
@@ -57,11 +58,8 @@ class PartialFit:
 
     def p_value(self) -> FloatArray:
         """Return (u,) the probability of a larger distance; 1 where there is no test."""
-        from scipy.special import chdtrc
-
-        degrees = self.influence.degrees
-        tail = chdtrc(np.maximum(degrees, 1), self.influence.distance / self.scale**2)
-        return np.where(degrees > 0, tail, 1.0)
+        statistic = self.influence.distance / self.scale**2
+        return compute_chi_square_tail(self.influence.degrees, statistic)
 
     def determines_as_much(self, whole: PartialFit) -> bool:
         """Return whether the fitted blocks determine as many directions as all blocks do, and the
@@ -152,8 +150,6 @@ def find_rivals(
     With i back in the fit, excluding block j lowers chi-square by d_j^2, and excluding i after that
     by at least d_i^2 - d_j^2; so only a j whose d_j^2 comes near d_i^2 can replace i.
     """
-    from scipy.special import chdtri
-
     groups: list[BoolArray] = []
     suspects = np.flatnonzero(end.excluded)
     suspects = suspects[np.argsort(-end.ratio[suspects], kind="stable")][:MOST_COMPARED]
@@ -163,7 +159,7 @@ def find_rivals(
         excluded[i] = False
         back = refit(excluded)
         square = back.influence.distance / back.scale**2
-        far = float(chdtri(max(int(end.influence.degrees[i]), 1), limit))
+        far = float(compute_chi_square_quantile(max(int(end.influence.degrees[i]), 1), limit))
         group = np.zeros_like(excluded)
         near = ~end.excluded & (back.p_value() < limit) & (square > square[i] - far)
         for j in np.flatnonzero(near):

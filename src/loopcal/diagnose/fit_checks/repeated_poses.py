@@ -24,6 +24,7 @@ from loopcal.estimate.problem_construction import problem_of
 from loopcal.estimate.result import Identification
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, fill_in_reading_sigma
+from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.typing import IntArray
 
 SAME_READING = 1e-9
@@ -132,12 +133,10 @@ def _untested(
 
 def _lack_findings(ratio: float, p_value: float, scale: float, degrees: int) -> tuple[Finding, ...]:
     """Return the result of the test, and a repeatability that contradicts the stated sigma."""
-    from scipy.special import chdtrc
-
     findings = [report_finding("residuals.explained")]
     if p_value < LEVEL:
         findings = [report_finding("residuals.lack-of-fit", ratio=float(np.sqrt(ratio)))]
-    tail = float(chdtrc(degrees, scale**2 * degrees))
+    tail = float(compute_chi_square_tail(degrees, scale**2 * degrees))
     if tail < SIGNIFICANCE:
         findings.append(report_finding("residuals.repeatability-larger", scale=scale))
     if tail > 1.0 - SIGNIFICANCE:

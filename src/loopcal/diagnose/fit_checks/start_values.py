@@ -28,6 +28,7 @@ from loopcal.estimate.inference.residual_test import FEWEST_DEGREES, SIGNIFICANC
 from loopcal.findings import Finding, report_finding
 from loopcal.measure import Measurements, Observations
 from loopcal.mechanism import Mechanism
+from loopcal.numerics.chi_square import compute_chi_square_tail
 
 NO_GAIN = 1e-3
 """Share of the start's cost below which a gain is rounding: the last digits of a file."""
@@ -155,10 +156,10 @@ def _gain_p_value(fit: Identification, gain: float, last: float) -> float:
     """Probability of a larger gain by noise alone: by the stated noise where it is consistent, else
     by that of the residuals.
     """
-    from scipy.special import chdtrc, fdtrc
+    from scipy.special import fdtrc
 
     if _is_noise_consistent(fit):
-        return float(chdtrc(fit.rank, gain))
+        return float(compute_chi_square_tail(fit.rank, gain))
     if fit.residual_test.dof < 1.0 or last <= 0.0:
         return float("nan")
     return float(

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopcal.findings import Finding, report_finding
+from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import FloatArray
 
@@ -124,9 +125,7 @@ def run_residual_test(
         intervals = dof >= FEWEST_DEGREES
         scale = float(np.sqrt(left / dof)) if dof > 0 else np.nan
     elif converged and not weighted:
-        from scipy.special import chdtrc
-
-        p_value = float(chdtrc(degrees, chi_square)) if degrees > 0 else np.nan
+        p_value = float(compute_chi_square_tail(degrees, chi_square)) if degrees > 0 else np.nan
         if p_value < SIGNIFICANCE:
             scale = max(1.0, float(np.sqrt(chi_square / degrees)))
     return ResidualTest(

@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from loopcal.errors import EstimationError
+from loopcal.numerics.chi_square import compute_chi_square_quantile
 from loopcal.typing import FloatArray
 
 LARGEST = 8.0
@@ -90,9 +91,10 @@ def block_limit(single: float, degrees: FloatArray) -> FloatArray:
     single : limit of one normal residual, in standard deviations. degrees : (u,) residuals of each
         block.
     """
-    from scipy.special import chdtri, ndtr
+    from scipy.special import ndtr
 
-    return np.sqrt(chdtri(np.maximum(degrees, 1.0), 2.0 * float(ndtr(-single))))
+    exceedance = 2.0 * float(ndtr(-single))
+    return np.sqrt(compute_chi_square_quantile(np.maximum(degrees, 1.0), exceedance))
 
 
 def _check_constant(name: str, constant: float) -> None:

@@ -25,6 +25,7 @@ from loopcal.estimate.free_parameters import FreeParameters
 from loopcal.estimate.inference.residual_test import SIGNIFICANCE
 from loopcal.estimate.methods.regularization_rules import MarginalLikelihood
 from loopcal.findings import Finding, report_finding
+from loopcal.numerics.chi_square import compute_chi_square_tail
 from loopcal.numerics.decomposition import Decomposition
 from loopcal.typing import FloatArray
 
@@ -49,7 +50,7 @@ class InflatedTolerances:
         """Return the factor (t,)."""
         rescaled = decomposition.divided(estimate_excess_noise(decomposition))
         statistic, degrees = compute_prior_statistic(rescaled)
-        rejected = _exceedance(degrees, statistic) < SIGNIFICANCE
+        rejected = compute_chi_square_tail(degrees, statistic) < SIGNIFICANCE
         inflation = np.ones_like(statistic)
         if rejected.any():
             lam = MarginalLikelihood()(rescaled.take(np.flatnonzero(rejected)))
@@ -130,7 +131,7 @@ def assess_prior_conflict(
     )
     penalized = np.isfinite(penalty[0]) & (penalty[0] > 0.0)
     inflation = float(sigma / np.sqrt(penalty[0][penalized][0])) if penalized.any() else np.nan
-    p_value = float(_exceedance(np.array([degrees]), np.array([statistic]))[0])
+    p_value = float(compute_chi_square_tail(degrees, statistic))
     order = np.argsort(-np.abs(deviation))
     far = [i for i in order if abs(deviation[i]) > FAR and not free.assumed[i]][:NAMED]
     return PriorConflict(
@@ -165,12 +166,5 @@ def estimate_excess_noise(decomposition: Decomposition) -> FloatArray:
     It is 1 unless that part is larger than the noise beyond doubt.
     """
     left = (decomposition.rows - decomposition.rank).astype(np.float64)
-    larger = _exceedance(left, decomposition.unexplained) < SIGNIFICANCE
+    larger = compute_chi_square_tail(left, decomposition.unexplained) < SIGNIFICANCE
     return np.sqrt(np.where(larger, decomposition.unexplained / np.maximum(left, 1.0), 1.0))
-
-
-def _exceedance(degrees: FloatArray, statistic: FloatArray) -> FloatArray:
-    """Return the probability (t,) of a larger chi-square; 1 without a degree of freedom."""
-    from scipy.special import chdtrc
-
-    return np.where(degrees > 0.0, chdtrc(np.where(degrees > 0.0, degrees, 1.0), statistic), 1.0)

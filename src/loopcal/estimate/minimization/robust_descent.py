@@ -19,6 +19,7 @@ from loopcal.estimate.linearization import Start
 from loopcal.estimate.methods.losses import Huber, Loss, Tukey
 from loopcal.estimate.minimization.descent import Descent
 from loopcal.estimate.problem import Problem
+from loopcal.numerics.chi_square import compute_chi_square_quantile
 from loopcal.numerics.gauss_newton import DescentStatus
 from loopcal.typing import FloatArray, IntArray
 
@@ -104,10 +105,8 @@ def estimate_scale_of(distance: FloatArray, degrees: FloatArray) -> float:
 
     It is the median of d over the median of the chi distribution with the block's degrees.
     """
-    from scipy.special import chdtri
-
     is_tested = degrees > 0.0
-    ratio = distance[is_tested] / np.sqrt(chdtri(degrees[is_tested], 0.5))
+    ratio = distance[is_tested] / np.sqrt(compute_chi_square_quantile(degrees[is_tested], 0.5))
     middle = float(np.median(ratio)) if len(ratio) else 1.0
     return middle if middle > 0.0 else 1.0
 

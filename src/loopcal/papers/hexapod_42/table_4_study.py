@@ -11,6 +11,7 @@ import numpy as np
 from loopcal import geometry
 from loopcal.estimate import MAP, LeastSquares, identify
 from loopcal.mechanism import Mechanism, forward, inverse
+from loopcal.numerics.chi_square import compute_chi_square_quantile
 from loopcal.papers.hexapod_42.published import MM, Published
 from loopcal.papers.hexapod_42.steps import Study, compute_actual_poses, iterate, to_measurements
 from loopcal.papers.printed import Cell
@@ -106,8 +107,6 @@ def search_outliers(study: Study, printed: Published, measured: FloatArray) -> O
     of each printed number) by a chi-square of its 6 equations if it belongs to the same machine.
     The pose with the largest drop is removed while that drop is too large at LEVEL over all poses.
     """
-    from scipy.special import chdtri
-
     sigma = printed.measured_poses.unit * UNITS / np.sqrt(12.0)
     data = to_measurements(study, measured, sigma)
     keep, labels, rounds = np.arange(len(measured)), [], []
@@ -122,7 +121,8 @@ def search_outliers(study: Study, printed: Published, measured: FloatArray) -> O
             fits.append(ReducedFit(data.labels[pose], *numbers, whole - check.chi_square))
         rounds.append(tuple(fits))
         worst = int(np.argmax([fit.drop for fit in fits]))
-        if fits[worst].drop <= chdtri(6, LEVEL / len(keep)) or fits[worst].degrees < 6:
+        largest = float(compute_chi_square_quantile(6, LEVEL / len(keep)))
+        if fits[worst].drop <= largest or fits[worst].degrees < 6:
             return Outliers(tuple(labels), rounds[0], rounds[-1])
         labels.append(fits[worst].label)
         keep = np.delete(keep, worst)

@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The chi-square distribution: tail probabilities and quantiles.
+
+scipy.special is imported when a function is called, so that `import loopcal` does not pay for it.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from loopcal.typing import FloatArray
+
+
+def compute_chi_square_tail(degrees: ArrayLike, statistic: ArrayLike) -> FloatArray:
+    """Return the probability that chi-square exceeds a statistic; 1 without a degree of freedom.
+
+    Parameters
+    ----------
+    degrees : degrees of freedom. statistic : sum of squares [1]. Both broadcast.
+    """
+    from scipy.special import chdtrc
+
+    degrees = np.asarray(degrees, dtype=float)
+    tail = chdtrc(np.where(degrees > 0.0, degrees, 1.0), statistic)
+    return np.where(degrees > 0.0, tail, 1.0)
+
+
+def compute_chi_square_quantile(degrees: ArrayLike, probability: ArrayLike) -> FloatArray:
+    """Return the statistic that chi-square exceeds with a probability.
+
+    Parameters
+    ----------
+    degrees : degrees of freedom, above 0. probability : of a larger value [1]. Both broadcast.
+    """
+    from scipy.special import chdtri
+
+    return np.asarray(chdtri(degrees, probability), dtype=float)
