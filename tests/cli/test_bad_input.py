@@ -246,7 +246,7 @@ def test_invalid_measurement_file_is_refused_with_its_line(run_refused, case, co
 POSES = "\n".join(line.rpartition(",")[0] for line in DATA.split("\n")[3:-1])
 HEIGHTS = "# kind: component\n# components: [z]\n# noise: {z: 1 um}\npose,z [mm]\na,200\nb,201.1\n"
 SEVERAL_CASES = {
-    "a pose that is not there": (POSES, HEIGHTS + "d,203\n", "heights.csv:7: unknown pose 'd'"),
+    "a missing pose": (POSES, HEIGHTS + "d,203\n", "heights.csv:7: unknown pose 'd'"),
     "other readings": (
         POSES,
         DATA.replace("b,1,1", "b,1,2"),

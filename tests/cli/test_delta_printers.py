@@ -21,7 +21,7 @@ from tests.cli.delta_printers import (
     write_files,
 )
 from tests.cli.printed_tables import read_table_rows
-from tests.io.formats.printers import printer_cfg
+from tests.io.formats.printers import format_printer_cfg
 
 # The heights-only records of the folder; a test below compares this list with the folder.
 CALIBRATED = (
@@ -136,7 +136,9 @@ def import_record(tmp_path, monkeypatch, capsys, data_folder):
     monkeypatch.chdir(tmp_path)
 
     def run(name: str, options: str = "") -> str:
-        (tmp_path / "printer.cfg").write_text(printer_cfg(read_records(data_folder)[name]), "utf-8")
+        (tmp_path / "printer.cfg").write_text(
+            format_printer_cfg(read_records(data_folder)[name]), "utf-8"
+        )
         assert main(f"{IMPORT}{options}".split()) == 0
         return " ".join(capsys.readouterr().out.split())
 

@@ -12,7 +12,7 @@ from loopcal.cli.exchange_commands import READ_FORMATS, WRITTEN_FORMATS
 from loopcal.io import load_measurements, load_robot
 from loopcal.io.formats import FORMATS
 from tests.cli.delta_printers import list_stored_geometry, read_records
-from tests.io.formats.printers import printer_cfg
+from tests.io.formats.printers import format_printer_cfg
 
 FIRMWARE_CALIBRATED = (
     "cupsster/FLSUN-SR---Klipper-Config Configuration/printer.cfg",
@@ -48,7 +48,7 @@ def test_import_reads_the_geometry_and_every_probe_of_printer_cfg(
     folder, data_folder, name
 ) -> None:
     record = read_records(data_folder)[name]
-    (folder / "printer.cfg").write_text(printer_cfg(record))
+    (folder / "printer.cfg").write_text(format_printer_cfg(record))
     assert run("import printer.cfg -o printer.yaml --data data.csv") == 0
     robot = load_robot("printer.yaml")
     for parameter, value in list_stored_geometry(record).items():
@@ -74,7 +74,7 @@ def test_import_with_corrected_output_fixes_end_stops_20_mm_off(
     folder, capsys, data_folder, name
 ) -> None:
     record = read_records(data_folder)[name]
-    text = printer_cfg(record, stop_off=20.0)
+    text = format_printer_cfg(record, stop_offset=20.0)
     (folder / "printer.cfg").write_text(text)
     assert run(ONE_COMMAND) == 0
     out = capsys.readouterr().out
@@ -104,7 +104,7 @@ def test_import_with_corrected_output_fixes_end_stops_20_mm_off(
 def test_exported_printer_cfg_imports_with_the_calibrated_values(folder, data_folder) -> None:
     record = read_records(data_folder)[FIRMWARE_CALIBRATED[0]]
     (folder / "printer.cfg").write_bytes(
-        b"\xef\xbb\xbf" + printer_cfg(record, stop_off=5.0).replace("\n", "\r\n").encode()
+        b"\xef\xbb\xbf" + format_printer_cfg(record, stop_offset=5.0).replace("\n", "\r\n").encode()
     )
     assert run("import printer.cfg -o printer.yaml --data data.csv --sigma-height 50um") == 0
     assert run("calibrate printer.yaml data.csv -o run --noise estimated") == 0
@@ -125,7 +125,7 @@ def test_exported_json_and_csv_contain_every_parameter_with_its_interval(
     folder, capsys, data_folder
 ) -> None:
     (folder / "printer.cfg").write_text(
-        printer_cfg(read_records(data_folder)[FIRMWARE_CALIBRATED[0]])
+        format_printer_cfg(read_records(data_folder)[FIRMWARE_CALIBRATED[0]])
     )
     assert run("import printer.cfg -o printer.yaml --data data.csv") == 0
     # the real printer's rows do not fit the sigma that the import states: exit code 2, and the run
@@ -149,7 +149,9 @@ def test_exported_json_and_csv_contain_every_parameter_with_its_interval(
 
 
 def test_existing_file_is_replaced_only_with_force(folder, capsys, data_folder) -> None:
-    (folder / "printer.cfg").write_text(printer_cfg(read_records(data_folder)[WITH_DISTANCES]))
+    (folder / "printer.cfg").write_text(
+        format_printer_cfg(read_records(data_folder)[WITH_DISTANCES])
+    )
     (folder / "printer.yaml").write_text("mine")
     assert run("import printer.cfg -o printer.yaml") == 1
     assert "this file exists" in capsys.readouterr().err
@@ -223,7 +225,7 @@ def test_heights_and_distances_give_the_optimum_of_the_firmware_cost(
     (cost 0.6477).
     """
     record = read_records(data_folder)[WITH_DISTANCES]
-    (folder / "printer.cfg").write_text(printer_cfg(record))
+    (folder / "printer.cfg").write_text(format_printer_cfg(record))
     sigma = 0.1 / np.sqrt(2 * len(record["distances"]) / len(record["heights"]))
     assert run(f"{ONE_COMMAND} --sigma-height {sigma}mm --sigma-distance 0.1mm --json") == 0
     document = json.loads(capsys.readouterr().out)

@@ -20,7 +20,7 @@ from loopcal.io.formats.program_format import Imported, ImportOptions
 from loopcal.measure import Measurements, Observations
 from loopcal.mechanism import Mechanism
 from tests.cli.delta_printers import read_records
-from tests.io.formats.printers import printer_cfg
+from tests.io.formats.printers import format_printer_cfg
 
 GEOMETRY = ("radius", "tower1.angle", "tower2.angle", "tower1.stop", "tower2.stop", "tower3.stop")
 ARMS = ("arm1.length", "arm2.length", "arm3.length")
@@ -36,7 +36,7 @@ def printers(data_folder: Path, tmp_path_factory) -> dict[str, Printer]:
     found = {}
     for name, record in read_records(data_folder).items():
         path = tmp_path_factory.mktemp("printer") / "printer.cfg"
-        path.write_text(printer_cfg(record), "utf-8")
+        path.write_text(format_printer_cfg(record), "utf-8")
         read = klipper.read(path, ImportOptions("printer"))
         lines = [
             line

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every column of the registry reads back what it writes."""
+"""Every registered column reads the values that it writes."""
 
 import numpy as np
 import pytest
@@ -11,11 +11,11 @@ from loopcal.measure import Component, Pose
 
 ROBOT = load_robot("hexapod-42")
 COLUMNS = list_columns(ROBOT, [Component(("z",)), Pose("quaternion")])
-OPEN = ("temperature.bed", "note of the day")
+OPEN_ENDED = ("temperature.bed", "note of the day")
 
 
-@pytest.mark.parametrize("name", [*COLUMNS, *OPEN])
-def test_a_column_reads_back_what_it_writes(tmp_path, name) -> None:
+@pytest.mark.parametrize("name", [*COLUMNS, *OPEN_ENDED])
+def test_column_reads_the_values_that_it_writes(tmp_path, name) -> None:
     column = COLUMNS.get(name) or find_open_column(name)
     assert column is not None
     is_text = isinstance(column, TextColumn)

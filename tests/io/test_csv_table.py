@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CSV tables: units in the header, settings in front or beside, one sentence with the line for each
-mistake.
-"""
+"""CSV tables: units in the header, settings in table or sidecar, errors with their line."""
 
 import math
 
@@ -36,7 +34,7 @@ def read_all(path):
     )
 
 
-def test_columns_come_in_si_with_nan_for_what_was_not_measured(tmp_path) -> None:
+def test_columns_are_read_in_si_units_with_nan_for_empty_cells(tmp_path) -> None:
     path = write(tmp_path, GOOD)
     readings, angles = read_all(path)
     assert readings.tolist() == pytest.approx([0.2335, 0.2345], rel=4e-16)
@@ -48,14 +46,12 @@ def test_columns_come_in_si_with_nan_for_what_was_not_measured(tmp_path) -> None
     assert (table.header_line, table.lines) == (4, (5, 8))
 
 
-def test_a_byte_order_mark_and_windows_line_ends_are_accepted(tmp_path) -> None:
+def test_byte_order_mark_and_windows_line_ends_are_accepted(tmp_path) -> None:
     path = write(tmp_path, b"\xef\xbb\xbf" + GOOD.replace("\n", "\r\n").encode())
     assert read_all(path)[0].tolist() == pytest.approx([0.2335, 0.2345], rel=4e-16)
 
 
-def test_a_sidecar_holds_the_settings_and_makes_comments_of_what_begins_with_a_hash(
-    tmp_path,
-) -> None:
+def test_settings_are_read_from_a_sidecar_file(tmp_path) -> None:
     path = write(
         tmp_path,
         GOOD.replace("# kind: pose", "# measured on a cold day").replace(
@@ -103,7 +99,7 @@ def test_a_sidecar_holds_the_settings_and_makes_comments_of_what_begins_with_a_h
         ),
     ],
 )
-def test_a_mistake_is_one_sentence_with_its_line(
+def test_invalid_table_is_refused_in_one_sentence_with_its_line(
     tmp_path, old: str, new: str, line: int | None, message: str
 ) -> None:
     path = write(tmp_path, GOOD.replace(old, new, 1))
@@ -113,35 +109,33 @@ def test_a_mistake_is_one_sentence_with_its_line(
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_not_utf8_is_refused_with_its_line(tmp_path) -> None:
+def test_file_that_is_not_utf8_is_refused_with_its_line(tmp_path) -> None:
     with pytest.raises(FileError, match=r"not UTF-8 text .byte 0xb5.; save it as UTF-8") as caught:
         read_table(write(tmp_path, GOOD.replace("mrad", "µrad").encode("latin-1")))
     assert caught.value.line == 4
 
 
-def test_a_folder_is_refused(tmp_path) -> None:
+def test_folder_is_refused(tmp_path) -> None:
     with pytest.raises(FileError, match="this is a folder, but a measurement file is needed"):
         read_table(tmp_path)
 
 
-def test_a_robot_file_of_the_same_name_is_no_sidecar(tmp_path) -> None:
+def test_robot_file_of_the_same_name_is_not_a_sidecar(tmp_path) -> None:
     path = write(tmp_path, GOOD)
     (tmp_path / "data.yaml").write_text("format: 1\nfamily: gough\n")
     assert read_table(path).settings.content["kind"] == "pose"
 
 
-@pytest.mark.parametrize("beside", ["kind: component\n", "noise: {x: 1 mm}\n"])
-def test_settings_in_front_and_beside_are_refused(tmp_path, beside) -> None:
+@pytest.mark.parametrize("sidecar", ["kind: component\n", "noise: {x: 1 mm}\n"])
+def test_settings_in_both_table_and_sidecar_are_refused(tmp_path, sidecar) -> None:
     path = write(tmp_path, GOOD)
-    (tmp_path / "data.yaml").write_text(beside)
+    (tmp_path / "data.yaml").write_text(sidecar)
     with pytest.raises(FileError, match=r"at the top of this file and in data.yaml; remove one"):
         read_table(path)
 
 
-@pytest.mark.parametrize("beside", ["title: a plot\n", "- a\n- list\n", "not: [yaml\n", ""])
-def test_some_other_yaml_file_of_the_same_name_does_not_matter_to_settings_in_front(
-    tmp_path, beside
-) -> None:
+@pytest.mark.parametrize("sidecar", ["title: a plot\n", "- a\n- list\n", "not: [yaml\n", ""])
+def test_unrelated_yaml_file_of_the_same_name_is_ignored(tmp_path, sidecar) -> None:
     path = write(tmp_path, GOOD)
-    (tmp_path / "data.yaml").write_text(beside)
+    (tmp_path / "data.yaml").write_text(sidecar)
     assert read_table(path).settings.content["kind"] == "pose"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exports of instruments become measurement files as a profile says, and no line goes unseen."""
+"""Exports of instruments are converted by a profile, and every skipped line is reported."""
 
 import json
 from pathlib import Path
@@ -29,7 +29,7 @@ def robot():
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_examples_are_imported_and_fit_the_robot_they_were_invented_for_within_their_noise(
+def test_imported_examples_agree_with_the_robot_within_their_noise(
     tmp_path, monkeypatch, capsys, robot, name
 ) -> None:
     """A wrong sign, order, unit or scalar place would leave residuals of thousands of sigma."""
@@ -57,7 +57,7 @@ def test_the_examples_are_imported_and_fit_the_robot_they_were_invented_for_with
     assert white @ white > 0.2 * degrees
 
 
-def test_the_digits_of_numbers_stay_as_they_are_and_what_is_missing_stays_empty() -> None:
+def test_digits_of_numbers_and_empty_cells_are_kept() -> None:
     text = convert_export(
         EXAMPLES / "cmm-spheres.csv", read_profile(EXAMPLES / "cmm-spheres.yaml")
     ).text
@@ -80,14 +80,14 @@ settings: {kind: position, noise: {x: 1 um, y: 1 um, z: 1 um}}
 EXPORT = "Liste\nName;X;Y;Z\nP1;1,5;2;3\n\nP2;4;5;6e-1\n"
 
 
-def converted(folder, export: str | bytes = EXPORT, profile: str = PROFILE):
+def convert(folder, export: str | bytes = EXPORT, profile: str = PROFILE):
     (folder / "profile.yaml").write_text(profile, encoding="utf-8")
     raw = export if isinstance(export, bytes) else export.encode()
     (folder / "export.txt").write_bytes(raw)
     return convert_export(folder / "export.txt", read_profile(folder / "profile.yaml"))
 
 
-def rows_of(text: str) -> list[str]:
+def read_rows(text: str) -> list[str]:
     return [line for line in text.rstrip("\n").split("\n") if not line.startswith("#")][1:]
 
 
@@ -101,28 +101,28 @@ def rows_of(text: str) -> list[str]:
     ],
 )
 def test_line_ends_byte_order_marks_and_quotes_make_no_difference(tmp_path, raw) -> None:
-    assert rows_of(converted(tmp_path, raw).text) == ["P1,1.5,2,3", "P2,4,5,6e-1"]
+    assert read_rows(convert(tmp_path, raw).text) == ["P1,1.5,2,3", "P2,4,5,6e-1"]
 
 
-def test_an_encoding_can_be_stated(tmp_path) -> None:
+def test_stated_encoding_is_used(tmp_path) -> None:
     named = PROFILE.replace("from: Name", "from: Prüfpunkt").replace(
         "decimal", "encoding: utf-16\ndecimal"
     )
-    text = converted(
+    text = convert(
         tmp_path,
         EXPORT.replace("Name", "Prüfpunkt").replace("P1", "Fläche 1").encode("utf-16"),
         named,
     ).text
-    assert rows_of(text)[0] == "Fläche 1,1.5,2,3"
+    assert read_rows(text)[0] == "Fläche 1,1.5,2,3"
 
 
-def test_names_with_commas_quotes_and_number_signs_stay_names(tmp_path, robot) -> None:
+def test_names_with_commas_quotes_and_number_signs_are_kept(tmp_path, robot) -> None:
     name = 'a,b "c" #1'
     export = EXPORT.replace("P1", '"a,b ""c"" #1"')
     names = '"a,b ""c"" #1"'
     readings = "pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm]\n"
     (tmp_path / "poses.csv").write_text(f"{readings}{names},0,0,0,0,0,0\nP2,1,1,1,1,1,1\n")
-    (tmp_path / "data.csv").write_text(converted(tmp_path, export).text)
+    (tmp_path / "data.csv").write_text(convert(tmp_path, export).text)
     data = load_measurements([tmp_path / "poses.csv", tmp_path / "data.csv"], robot)
     assert data.labels == (name, "P2")
     np.testing.assert_array_equal(
@@ -130,9 +130,9 @@ def test_names_with_commas_quotes_and_number_signs_stay_names(tmp_path, robot) -
     )
 
 
-def test_lines_that_do_not_fit_are_listed_and_named_in_the_file(tmp_path) -> None:
+def test_lines_that_do_not_fit_are_listed_in_result_and_file(tmp_path) -> None:
     export = EXPORT + "P3;1;2\nP4;1;two;3\n;1;2;3\nP5;1.234,5;2;3\nP;6;1;2;3\nP7;1;2;3\n"
-    found = converted(tmp_path, export)
+    found = convert(tmp_path, export)
     assert found.rows == 3
     assert [line for line, _ in found.misfits] == [6, 7, 8, 9, 10]
     reasons = " / ".join(reason for _, reason in found.misfits)
@@ -145,7 +145,7 @@ def test_lines_that_do_not_fit_are_listed_and_named_in_the_file(tmp_path) -> Non
     )
 
 
-def test_rotation_matrices_become_quaternions(tmp_path) -> None:
+def test_rotation_matrices_are_converted_to_quaternions(tmp_path) -> None:
     R = geometry.exp_so3(np.random.default_rng(2).normal(size=(3, 3)))
     lines = [
         ";".join([f"P{i}", *(f"{v:.5f}" for v in r.ravel()), "1", "2", "3"])
@@ -157,24 +157,24 @@ matrix: [2, 3, 4, 5, 6, 7, 8, 9, 10]
 columns: {pose: {from: 1}, x: {from: 11, unit: mm}, y: {from: 12, unit: mm}, z: {from: 13, unit: mm}}
 settings: {kind: pose, orientation: quaternion}
 """  # noqa: E501
-    found = converted(tmp_path, "\n".join([*lines, broken]), profile)
+    found = convert(tmp_path, "\n".join([*lines, broken]), profile)
     assert [reason for _, reason in found.misfits] == [
         "the nine numbers are not a rotation matrix (error 3)"
     ]
-    cells = np.array([row.split(",") for row in rows_of(found.text)])
+    cells = np.array([row.split(",") for row in read_rows(found.text)])
     read = geometry.quaternion_to_matrix(cells[:, 1:5].astype(float))
     np.testing.assert_allclose(read, R, atol=1e-5)  # the five decimals of the export
 
 
-def test_targets_with_lines_of_their_own_share_a_row_and_repeats_get_another(tmp_path) -> None:
+def test_lines_of_several_targets_share_a_row_and_repeats_get_another(tmp_path) -> None:
     profile = PROFILE.replace(
         "{from: Name}", "{from: Name, match: '(?P<pose>P.)-(?P<target>.)'}"
     ).replace(
         "kind: position, noise: {x: 1 um, y: 1 um, z: 1 um}", "kind: position, targets: [a, b]"
     )
     lines = ["P1-a;1;1;1", "P1-b;2;2;2", "P1-b;2;2;3", "P2-b;3;3;3", "P2-c;3;3;3"]
-    found = converted(tmp_path, "Name;X;Y;Z\n" + "\n".join(lines), profile)
-    assert rows_of(found.text) == ["P1,1,1,1,2,2,2", "P1,,,,2,2,3", "P2,,,,3,3,3"]
+    found = convert(tmp_path, "Name;X;Y;Z\n" + "\n".join(lines), profile)
+    assert read_rows(found.text) == ["P1,1,1,1,2,2,2", "P1,,,,2,2,3", "P2,,,,3,3,3"]
     assert found.misfits == ((6, "the target 'c' is not one of a, b"),)
 
 
@@ -185,7 +185,7 @@ BAD_EXPORTS = {
     "another header": ("A;B;C\n1;2;3\n", ("export.txt:1: no line names the columns Name, X, Y, "
                                          "Z.*the first line is 'A . B . C'")),
     "other separators": (EXPORT.replace(";", "\t"), "no line names the columns"),
-    "numbers of another country": (
+    "decimal points instead of commas": (
         "Name;X;Y;Z\nP1;1.5;2.5;3\n",
         ("export.txt:2: no line of this export fits .*profile.yaml; reason for the first one: "
          "'1.5' is "
@@ -199,18 +199,16 @@ BAD_EXPORTS = {
 
 
 @pytest.mark.parametrize("case", BAD_EXPORTS)
-def test_an_export_that_the_profile_does_not_fit_is_refused_with_its_first_line_and_the_reason(
-    tmp_path, case
-) -> None:
+def test_export_that_does_not_fit_the_profile_is_refused_with_the_reason(tmp_path, case) -> None:
     export, message = BAD_EXPORTS[case]
     with pytest.raises(FileError, match=message) as caught:
-        converted(tmp_path, export)
+        convert(tmp_path, export)
     assert "\n" not in str(caught.value)
 
 
 BAD_PROFILES = {
     "no delimiter": ("delimiter: semicolon\n", "", None, "no key 'delimiter'"),
-    "an unknown one": ("semicolon", "pipe", 2, "'delimiter' is 'pipe'; allowed: 'comma'"),
+    "an unknown delimiter": ("semicolon", "pipe", 2, "'delimiter' is 'pipe'; allowed: 'comma'"),
     "a comma for two things": (
         "semicolon",
         "comma",
@@ -218,29 +216,34 @@ BAD_PROFILES = {
         "a comma cannot be both the decimal mark and the separator",
     ),
     "an unknown key": ("decimal", "decimals", 3, "unknown key 'decimals'.*did you mean 'decimal'"),
-    "a column that is none": (
+    "an unknown column": (
         "  z:",
         "  zz:",
         8,
         "'zz' is not a column of measurement files of the kind 'position'",
     ),
-    "a column forgotten": ("  z: {from: Z, unit: mm}\n", "", 4, "states 0 sources of 'z'"),
+    "a missing column": ("  z: {from: Z, unit: mm}\n", "", 4, "states 0 sources of 'z'"),
     "no unit": ("from: Z, unit: mm", "from: Z", 8, "'z' has no unit"),
-    "a unit that is none": (
+    "an unknown unit": (
         "from: Z, unit: mm",
         "from: Z, unit: mmm",
         8,
         "'mmm' is not a unit.*did you mean 'mm'",
     ),
-    "a unit of text": ("from: Name", "from: Name, unit: mm", 5, "'pose' is text and has no unit"),
-    "a place that is none": (
+    "a unit of a text column": (
+        "from: Name",
+        "from: Name, unit: mm",
+        5,
+        "'pose' is text and has no unit",
+    ),
+    "an invalid column number": (
         "from: Z",
         "from: 0",
         8,
         "0 is neither a name in the export's header nor a place",
     ),
-    "no place": ("{from: Z, unit: mm}", "Z", 8, "'columns.z' is the text 'Z'"),
-    "a pattern that is none": (
+    "no source": ("{from: Z, unit: mm}", "Z", 8, "'columns.z' is the text 'Z'"),
+    "an invalid pattern": (
         "from: Name",
         "from: Name, match: '('",
         5,
@@ -252,7 +255,7 @@ BAD_PROFILES = {
         5,
         "this pattern finds no pose",
     ),
-    "targets that nothing tells": (
+    "targets without a pattern": (
         "position,",
         "position, targets: [a, b],",
         5,
@@ -264,7 +267,7 @@ BAD_PROFILES = {
         9,
         "is not a kind of measurement .did you mean 'position'",
     ),
-    "an encoding that is none": (
+    "an unknown encoding": (
         "decimal",
         "encoding: utf-99\ndecimal",
         3,
@@ -280,20 +283,20 @@ BAD_PROFILES = {
 
 
 @pytest.mark.parametrize("case", BAD_PROFILES)
-def test_a_profile_without_sense_is_refused_at_its_line(tmp_path, case) -> None:
+def test_invalid_profile_is_refused_with_its_line(tmp_path, case) -> None:
     old, new, line, message = BAD_PROFILES[case]
     assert old in PROFILE
     with pytest.raises(FileError, match=message) as caught:
-        converted(tmp_path, EXPORT, PROFILE.replace(old, new, 1))
+        convert(tmp_path, EXPORT, PROFILE.replace(old, new, 1))
     assert caught.value.line == line
     assert "\n" not in str(caught.value)
 
 
-def test_options_that_do_not_go_with_a_profile_and_files_that_are_there_are_refused(
+def test_format_with_a_profile_and_existing_output_are_refused(
     tmp_path, monkeypatch, capsys
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    converted(tmp_path)
+    convert(tmp_path)
     words = ["import", "export.txt", "--profile", "profile.yaml", "-o", "data.csv"]
     assert main([*words, "--format", "klipper"]) == 1
     assert "--format has no effect with --profile" in capsys.readouterr().err

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several measurement files as one set: poses joined by name, each file with its own units,
-settings and noise.
+"""Several measurement files are joined by the names of poses.
+
+Each file has its own units, settings and noise.
 """
 
 import numpy as np
@@ -45,7 +46,7 @@ def robot():
 
 
 @pytest.fixture
-def files(tmp_path):
+def write_files(tmp_path):
     def write(**texts: str):
         paths = [tmp_path / f"{name}.csv" for name in texts]
         for path, text in zip(paths, texts.values(), strict=True):
@@ -55,8 +56,8 @@ def files(tmp_path):
     return write
 
 
-def test_a_table_of_poses_and_the_files_of_two_instruments_are_one_set(files, robot) -> None:
-    data = load_measurements(files(poses=POSES, heights=HEIGHTS, tilts=TILTS), robot)
+def test_table_of_poses_and_files_of_two_instruments_are_joined(write_files, robot) -> None:
+    data = load_measurements(write_files(poses=POSES, heights=HEIGHTS, tilts=TILTS), robot)
     assert data.labels == ("a", "b", 'c, "third" #1', "λ1", "d")
     np.testing.assert_array_equal(data.readings[:, 0], [0.0, 0.001, 0.002, 0.003, 0.004])
     heights, tilts = data.observations
@@ -69,9 +70,9 @@ def test_a_table_of_poses_and_the_files_of_two_instruments_are_one_set(files, ro
     np.testing.assert_array_equal(tilts.measured[:, 1], [1e-4, 2e-4])
 
 
-def test_the_order_of_files_changes_nothing_but_the_order_of_poses(files, robot) -> None:
-    there = files(poses=POSES, heights=HEIGHTS, tilts=TILTS)
-    one, other = (load_measurements(order, robot) for order in (there, there[::-1]))
+def test_order_of_files_changes_only_the_order_of_poses(write_files, robot) -> None:
+    paths = write_files(poses=POSES, heights=HEIGHTS, tilts=TILTS)
+    one, other = (load_measurements(order, robot) for order in (paths, paths[::-1]))
     assert sorted(one.labels) == sorted(other.labels)
     for a, b in zip(one.observations, other.observations[::-1], strict=True):
         assert [one.labels[i] for i in a.rows] == [other.labels[i] for i in b.rows]
@@ -79,13 +80,13 @@ def test_the_order_of_files_changes_nothing_but_the_order_of_poses(files, robot)
         np.testing.assert_array_equal(one.readings[a.rows], other.readings[b.rows])
 
 
-def test_a_file_may_name_its_table_of_poses(files, robot) -> None:
-    _, heights = files(poses=POSES, heights="# poses: poses.csv\n" + HEIGHTS)
+def test_file_names_its_table_of_poses(write_files, robot) -> None:
+    _, heights = write_files(poses=POSES, heights="# poses: poses.csv\n" + HEIGHTS)
     assert load_measurements(heights, robot).n_poses == 4
     assert list(list_measurement_files(heights)) == ["data", "poses"]
 
 
-def test_a_table_of_commanded_poses_may_stand_apart_and_in_other_units(files, robot) -> None:
+def test_commanded_poses_are_read_from_another_file_in_other_units(write_files, robot) -> None:
     names = [
         f"commanded.{name}"
         for name in ("x [mm]", "y [mm]", "z [m]", "roll [deg]", "pitch [deg]", "yaw [mrad]")
@@ -93,7 +94,7 @@ def test_a_table_of_commanded_poses_may_stand_apart_and_in_other_units(files, ro
     poses = f"pose,{','.join(names)}\na,0,0,0.2,0,0,0\nb,0,0,0.2011,0,0,0\n"
     again = poses.replace("z [m]", "z [mm]").replace("0.2011", "201.1").replace("0.2,", "200,")
     heights = HEIGHTS.split('"c', maxsplit=1)[0]
-    data = load_measurements(files(poses=poses, heights=heights, again=again), robot)
+    data = load_measurements(write_files(poses=poses, heights=heights, again=again), robot)
     assert data.labels == ("a", "b")
     np.testing.assert_allclose(
         data.readings[0], 0, atol=1e-8
@@ -102,19 +103,19 @@ def test_a_table_of_commanded_poses_may_stand_apart_and_in_other_units(files, ro
         LoopcalError, match=r"again.csv:3: pose 'b' has other readings here than in .*poses.csv:3"
     ):
         load_measurements(
-            files(poses=poses, heights=heights, again=again.replace("201.1", "201.2")), robot
+            write_files(poses=poses, heights=heights, again=again.replace("201.1", "201.2")), robot
         )
 
 
-def test_rows_that_compare_poses_may_stand_apart_from_the_poses(files, robot) -> None:
+def test_rows_that_compare_poses_are_read_from_another_file(write_files, robot) -> None:
     lengths = (
         "# kind: separation\n# noise: {separation: 2 um}\npose,separation [mm]\na;b,1.2\nb;λ1,2.4\n"
     )
-    data = load_measurements(files(poses=POSES, lengths=lengths), robot)
+    data = load_measurements(write_files(poses=POSES, lengths=lengths), robot)
     assert data.observations[0].rows.tolist() == [[0, 1], [1, 3]]
 
 
-def test_files_of_any_two_instruments_give_what_one_file_gives(tmp_path, robot) -> None:
+def test_two_files_of_two_instruments_equal_one_file(tmp_path, robot) -> None:
     poses = np.random.default_rng(3).uniform([-20, -20, 190], [20, 20, 210], (5, 3)) * 1e-3
     T = np.tile(np.eye(4), (5, 1, 1))
     T[:, :3, 3] = poses
@@ -159,14 +160,14 @@ REFUSED = {
         {"poses": POSES, "tilts": TILTS.replace("b,.001", "b,.0011")},
         (r"tilts.csv:4: pose 'b' has other readings here than in .*poses.csv:3"),
     ),
-    "readings nowhere": ({"poses": POSES, "heights": HEIGHTS.replace("λ1", "e")}, (r"heights.csv:8: "  # noqa: E501
+    "no readings of a pose": ({"poses": POSES, "heights": HEIGHTS.replace("λ1", "e")}, (r"heights.csv:8: "  # noqa: E501
                                                                                   r"unknown pose "
                                                                                   r"'e'")),
     "no names": ({"poses": POSES, "heights": HEIGHTS.replace("pose,z", "note,z")}, ("this file "
                                                                                    "names none")),
     "no kind at all": ({"poses": POSES, "more": POSES.replace("a,0", "f,0")}, ("no file states a "
                                                                               "kind")),
-    "a kind forgotten": (
+    "no kind for measured columns": (
         {"poses": POSES, "heights": HEIGHTS.replace("# kind: component\n# components: [z]\n# "
                                                     "noise: {z: 1 um}\n", "")},
         (r"heights.csv:1: column 'z' is unknown.*states no kind"),
@@ -201,7 +202,7 @@ REFUSED = {
     "an empty file": ({"poses": POSES, "heights": "\n"}, ("heights.csv: this measurement file is "
                                                          "empty")),
     "a header alone": ({"poses": POSES, "heights": HEIGHTS[: HEIGHTS.index("b,")]}, "heights.csv:4: .* a header but no rows"),  # noqa: E501
-    "a table of poses that is not there": (NO_POSES, (r"heights.csv:1: 'poses' names .*p.csv")),
+    "a missing table of poses": (NO_POSES, (r"heights.csv:1: 'poses' names .*p.csv")),
     "a frame stated twice": (
         {"poses": POSES,
          "mo": SPLIT.format("x").replace("# frame", "# unknowns: {x.tracker.x: fixed}\n# frame") + "a,200\nb,201\n",  # noqa: E501
@@ -212,25 +213,23 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_files_that_do_not_fit_together_are_refused_with_their_places(files, robot, case) -> None:
+def test_inconsistent_files_are_refused_with_their_lines(write_files, robot, case) -> None:
     texts, message = REFUSED[case]
     with pytest.raises(LoopcalError, match=message) as caught:
-        load_measurements(files(**texts), robot)
+        load_measurements(write_files(**texts), robot)
     assert "\n" not in str(caught.value)
 
 
-def test_a_file_given_twice_is_refused(files, robot) -> None:
-    (path,) = files(data=HEIGHTS)
+def test_file_given_twice_is_refused(write_files, robot) -> None:
+    (path,) = write_files(data=HEIGHTS)
     with pytest.raises(LoopcalError, match="this file is given twice"):
         load_measurements([path, path.parent / "." / path.name], robot)
     with pytest.raises(LoopcalError, match="no measurement file is given"):
         load_measurements([], robot)
 
 
-def test_names_are_joined_whatever_their_unicode_form_line_ends_and_byte_order_mark(
-    files, robot
-) -> None:
-    poses, heights = files(poses=POSES.replace("λ1", "é"), heights=HEIGHTS)
+def test_names_are_joined_in_any_unicode_form_and_line_end(write_files, robot) -> None:
+    poses, heights = write_files(poses=POSES.replace("λ1", "é"), heights=HEIGHTS)
     heights.write_bytes(
         b"\xef\xbb\xbf" + HEIGHTS.replace("λ1", "e\u0301").replace("\n", "\r\n").encode()
     )
@@ -239,12 +238,12 @@ def test_names_are_joined_whatever_their_unicode_form_line_ends_and_byte_order_m
     assert data.observations[0].rows.tolist() == [1, 0, 2, 3]
 
 
-def test_a_setting_names_the_session_of_a_whole_file(files, robot) -> None:
+def test_setting_session_applies_to_the_whole_file(write_files, robot) -> None:
     monday, tuesday = (
         SPLIT.format("monday") + "a,200\nb,201\n",
         SPLIT.format("tuesday") + "λ1,203\n",
     )
-    data = load_measurements(files(poses=POSES, mo=monday, tu=tuesday), robot)
+    data = load_measurements(write_files(poses=POSES, mo=monday, tu=tuesday), robot)
     assert [set(rows.session.tolist()) for rows in data.observations] == [{"monday"}, {"tuesday"}]
     assert {name.split(".")[0] for name in data.nuisance_parameters.table.names} == {
         "monday",

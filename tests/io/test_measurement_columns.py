@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sessions, groups, what is known of frames, noise of readings, times and temperatures come back to
-the last bit.
+"""Columns of measurement files are read exactly as saved.
+
+Sessions, groups, stated unknowns, noise of readings, times and temperatures.
 """
 
 import numpy as np
@@ -50,8 +51,8 @@ def write(folder, text: str):
     return path
 
 
-def random_measurements(robot, seed: int) -> Measurements:
-    """Everything a file can hold, in numbers that use all bits of a double."""
+def draw_measurements(robot, seed: int) -> Measurements:
+    """Return measurements with everything that a file can contain; numbers use all bits."""
     draw = np.random.default_rng(seed)
     tracker = Position(targets=("ball",), unknown=("frame", "targets"), frame="tracker").with_tool(
         robot.tool
@@ -90,8 +91,8 @@ def random_measurements(robot, seed: int) -> Measurements:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_every_column_comes_back_to_the_last_bit(tmp_path, robot, seed) -> None:
-    data = random_measurements(robot, seed)
+def test_every_column_is_read_exactly_as_saved(tmp_path, robot, seed) -> None:
+    data = draw_measurements(robot, seed)
     save_measurements(data, tmp_path / "data.csv", robot)
     again = load_measurements(tmp_path / "data.csv", robot)
     assert again.labels == data.labels
@@ -111,7 +112,7 @@ def test_every_column_comes_back_to_the_last_bit(tmp_path, robot, seed) -> None:
 
 
 @pytest.mark.parametrize("factor", [1.0, 1e-3, 1e-6, 0.0254, np.pi / 180, np.pi / 648000])
-def test_any_double_is_written_so_that_it_is_read_as_itself(factor) -> None:
+def test_every_double_is_read_exactly_as_written(factor) -> None:
     draw = np.random.default_rng(1)
     values = np.concatenate(
         [draw.normal(size=500) * 10.0 ** draw.integers(-15, 6, 500), [0.0, 1.0, 1e-3, 5e-324]]
@@ -120,7 +121,7 @@ def test_any_double_is_written_so_that_it_is_read_as_itself(factor) -> None:
     assert format_exact(0.2, 1e-3) == "200"
 
 
-def test_known_unknowns_are_patterns_with_units_and_stay_with_every_part(tmp_path, robot) -> None:
+def test_stated_unknowns_match_patterns_and_are_kept_in_subsets(tmp_path, robot) -> None:
     data = load_measurements(write(tmp_path, TEXT), robot)
     table = data.take([0, 1]).nuisance_parameters.table
     entry = {e.name: e for e in table.entries}
@@ -137,7 +138,7 @@ def test_known_unknowns_are_patterns_with_units_and_stay_with_every_part(tmp_pat
     ].tolerance == 0.002
 
 
-KNOWN_CASES = {
+STATEMENT_CASES = {
     "no such unknown": (
         "ball.x: fixed",
         "ball.q: fixed",
@@ -149,10 +150,14 @@ KNOWN_CASES = {
         "start: 12 mrad",
         "start': 'mrad' is a unit of angle",
     ),
-    "a sigma of nothing": ("sd: 1 mm", "sd: 0 mm", "the standard deviation is 0 mm"),
+    "a sigma of zero": ("sd: 1 mm", "sd: 0 mm", "the standard deviation is 0 mm"),
     "a start alone": ("start: 12 mm, sd: 1 mm", "start: 12 mm", "state either 'sd' or 'fixed"),
-    "fixed and not": ("sd: 1 mm", "sd: 1 mm, fixed: true", "state either 'sd' or 'fixed"),
-    "a wish": ("ball.x: fixed", "ball.x: free", "'free' does not state knowledge.*write 'fixed'"),
+    "fixed and with sd": ("sd: 1 mm", "sd: 1 mm, fixed: true", "state either 'sd' or 'fixed"),
+    "an unknown statement": (
+        "ball.x: fixed",
+        "ball.x: free",
+        "'free' does not state knowledge.*write 'fixed'",
+    ),
     "a misspelt key": (
         "sd: 1 mm",
         "sd: 1 mm, stat: 3 mm",
@@ -163,11 +168,9 @@ KNOWN_CASES = {
 }
 
 
-@pytest.mark.parametrize("case", KNOWN_CASES)
-def test_a_statement_about_unknowns_without_sense_is_refused_at_its_line(
-    tmp_path, robot, case
-) -> None:
-    old, new, message = KNOWN_CASES[case]
+@pytest.mark.parametrize("case", STATEMENT_CASES)
+def test_invalid_statement_about_unknowns_is_refused_with_its_line(tmp_path, robot, case) -> None:
+    old, new, message = STATEMENT_CASES[case]
     assert old in TEXT
     with pytest.raises(LoopcalError, match=message) as caught:
         load_measurements(write(tmp_path, TEXT.replace(old, new, 1)), robot)
@@ -185,9 +188,7 @@ c,2,2,2,2,2,2,inf,202.2
 """
 
 
-def test_noise_of_readings_is_read_and_an_empty_cell_is_a_reading_not_taken(
-    tmp_path, robot
-) -> None:
+def test_noise_of_readings_is_read_and_an_empty_cell_is_a_missing_reading(tmp_path, robot) -> None:
     data = load_measurements(write(tmp_path, READINGS), robot)
     assert data.reading_sigma is not None
     np.testing.assert_allclose(
@@ -215,7 +216,7 @@ def test_noise_of_readings_is_read_and_an_empty_cell_is_a_reading_not_taken(
         (",7,", ",,", (r"data.csv:6: column 'sigma.q6' is empty, and no other noise")),
     ],
 )
-def test_noise_of_readings_without_sense_is_refused(tmp_path, robot, old, new, message) -> None:
+def test_invalid_noise_of_readings_is_refused(tmp_path, robot, old, new, message) -> None:
     with pytest.raises(LoopcalError, match=message):
         load_measurements(write(tmp_path, READINGS.replace(old, new, 1)), robot)
 
@@ -230,7 +231,7 @@ b,,,,1,1,1,1,1,1,201.1
 """  # noqa: E501
 
 
-def test_times_and_temperatures_are_kept_through_every_part(tmp_path, robot) -> None:
+def test_times_and_temperatures_are_kept_in_subsets(tmp_path, robot) -> None:
     data = load_measurements(write(tmp_path, CONTEXT), robot)
     np.testing.assert_array_equal(
         data.observations[0].context["time"], [1777890151.5, 1777890152.0, np.nan]
@@ -248,7 +249,7 @@ def test_times_and_temperatures_are_kept_through_every_part(tmp_path, robot) -> 
     }
 
 
-def test_what_stands_beside_a_pose_is_taken_by_its_rows_in_other_files(tmp_path, robot) -> None:
+def test_temperature_of_a_pose_applies_to_its_rows_in_other_files(tmp_path, robot) -> None:
     rows = "\n".join(
         f"{name},{t},{q},{q},{q},{q},{q},{q}"
         for name, t, q in (("a", 20, 0), ("b", 22, 1), ("c", "", 2))
@@ -279,17 +280,13 @@ def test_what_stands_beside_a_pose_is_taken_by_its_rows_in_other_files(tmp_path,
         (",20.5,", ",warm,", "column 'temperature' is 'warm', but a number"),
     ],
 )
-def test_times_and_temperatures_without_sense_are_refused(
-    tmp_path, robot, old, new, message
-) -> None:
+def test_invalid_times_and_temperatures_are_refused(tmp_path, robot, old, new, message) -> None:
     with pytest.raises(LoopcalError, match=message):
         load_measurements(write(tmp_path, CONTEXT.replace(old, new, 1)), robot)
 
 
 @pytest.mark.parametrize("name", ["a;b", "two\nlines", " a", ""])
-def test_a_name_that_a_file_cannot_hold_is_refused_before_anything_is_written(
-    tmp_path, robot, name
-) -> None:
+def test_pose_name_that_cannot_be_written_is_refused_before_writing(tmp_path, robot, name) -> None:
     data = Measurements(robot.name, np.zeros((1, 6)), (), labels=(name,))
     with pytest.raises(DataError, match="cannot be written: names"):
         save_measurements(data, tmp_path / "data.csv", robot)
@@ -299,12 +296,12 @@ def test_a_name_that_a_file_cannot_hold_is_refused_before_anything_is_written(
     assert not (tmp_path / "data.csv").exists()
 
 
-def test_a_quote_that_is_not_closed_is_refused_at_its_line(tmp_path, robot) -> None:
+def test_unclosed_quote_is_refused_with_its_line(tmp_path, robot) -> None:
     with pytest.raises(LoopcalError, match=r"data.csv:8: not valid CSV.*quotes"):
         load_measurements(write(tmp_path, TEXT.replace("a,monday", '"a,monday')), robot)
 
 
-def test_a_file_to_fill_in_holds_the_poses_and_becomes_measurements(tmp_path, robot) -> None:
+def test_filled_in_data_sheet_is_read_as_measurements(tmp_path, robot) -> None:
     readings = np.random.default_rng(4).uniform(-0.02, 0.02, (3, 6))
     tracker = Sensor(Position(), Gaussian(np.full(3, 5e-6)), session=np.array("monday"))
     text = format_data_sheet(robot, Instrument((tracker,)), readings, ("p1", "p2", "p3"))

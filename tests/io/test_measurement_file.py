@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurement files: every kind comes back as it was written, and every mistake is one sentence
-with its line.
-"""
+"""Measurement files of every kind are read as saved; errors are reported with their line."""
 
 import numpy as np
 import pytest
@@ -40,7 +38,7 @@ def poses():
     return generator.uniform(low, high, (6, 6)) * np.repeat([1e-3, np.pi / 180], 3)
 
 
-def sensor(kind) -> Sensor:
+def build_sensor(kind) -> Sensor:
     return Sensor(kind, Gaussian(np.linspace(1e-6, 2e-6, len(kind.noise_columns))))
 
 
@@ -60,10 +58,8 @@ def assert_same(data, again) -> None:
         )  # the writer's EQUAL
 
 
-def measured_by(robot, poses, kind) -> Measurements:
-    """Rows of any kind: numbers that no kind doubts, each pose (or each pair of neighbours) seen
-    once.
-    """
+def make_measurements(robot, poses, kind) -> Measurements:
+    """Return rows of a kind with values that it accepts, one for each pose or pair of neighbors."""
     generator = np.random.default_rng(11)
     links = np.arange(len(poses) - kind.poses_per_row + 1)[:, None] + np.arange(kind.poses_per_row)
     values = generator.uniform(0.1, 0.2, (len(links), len(kind.columns)))
@@ -78,10 +74,8 @@ def measured_by(robot, poses, kind) -> Measurements:
 
 
 @pytest.mark.parametrize("kind", EXAMPLES, ids=IDS)
-def test_measurements_of_every_kind_come_back_as_they_were_written(
-    tmp_path, robot, poses, kind
-) -> None:
-    data = measured_by(robot, poses, kind)
+def test_measurements_of_every_kind_are_read_as_saved(tmp_path, robot, poses, kind) -> None:
+    data = make_measurements(robot, poses, kind)
     save_measurements(data, tmp_path / "data.csv", robot, "a test")
     loaded = load_measurements(tmp_path / "data.csv", robot)
     assert_same(data, loaded)
@@ -95,16 +89,22 @@ def test_measurements_of_every_kind_come_back_as_they_were_written(
         assert same, field
 
 
-def test_several_kinds_share_a_file(tmp_path, robot, poses) -> None:
+def test_several_kinds_in_one_file_are_read_as_saved(tmp_path, robot, poses) -> None:
     instrument = Instrument(
-        (sensor(Component(("z",))), sensor(Pose("quaternion")), sensor(Component(("x", "z"))))
+        (
+            build_sensor(Component(("z",))),
+            build_sensor(Pose("quaternion")),
+            build_sensor(Component(("x", "z"))),
+        )
     )
     data = simulate(robot, poses, instrument, seed=1)
     save_measurements(data, tmp_path / "data.csv", robot)
     assert_same(data, load_measurements(tmp_path / "data.csv", robot))
 
 
-def test_frame_tool_repeats_absence_and_correlated_noise_come_back(tmp_path, robot, poses) -> None:
+def test_frame_tool_repeats_gaps_and_correlated_noise_are_read_as_saved(
+    tmp_path, robot, poses
+) -> None:
     frame = np.array([[0, -1, 0, 0.1], [1, 0, 0, -0.2], [0, 0, 1, 0.03], [0, 0, 0, 1.0]])
     kind = Pose("euler-ZYX", T_base_frame=frame, T_platform_tool=np.linalg.inv(frame))
     data = simulate(robot, poses, Instrument((Sensor(kind, Gaussian(np.full(6, 1e-6))),)), seed=1)
@@ -131,7 +131,7 @@ def test_frame_tool_repeats_absence_and_correlated_noise_come_back(tmp_path, rob
 
 
 @pytest.mark.parametrize("kind", EXAMPLES, ids=IDS)
-def test_a_template_lacks_only_the_rows(tmp_path, robot, poses, kind) -> None:
+def test_template_lacks_only_rows(tmp_path, robot, poses, kind) -> None:
     path = tmp_path / "data.csv"
     instrument = Instrument(
         (
@@ -144,7 +144,7 @@ def test_a_template_lacks_only_the_rows(tmp_path, robot, poses, kind) -> None:
     path.write_text(format_template(robot, instrument))
     with pytest.raises(LoopcalError, match="a header but no rows"):
         load_measurements(path, robot)
-    save_measurements(measured_by(robot, poses, kind), tmp_path / "full.csv", robot)
+    save_measurements(make_measurements(robot, poses, kind), tmp_path / "full.csv", robot)
     full, template = (tmp_path / "full.csv").read_text(), path.read_text()
     head = template[: template.index("\n# Add one row") + 1]
     assert full.startswith(head)
@@ -170,7 +170,7 @@ def write(folder, text: str):
     return path
 
 
-def test_commanded_coordinates_become_readings_of_the_controller(tmp_path, robot) -> None:
+def test_commanded_coordinates_are_converted_by_the_controller(tmp_path, robot) -> None:
     names = "commanded.x [mm],commanded.y [mm],commanded.z [mm],commanded.roll [deg],commanded.pitch [deg],commanded.yaw [deg]"  # noqa: E501
     text = GOOD.replace(HEADER, f"pose,{names},z [mm]").replace("a,0,0,0,0,0,0", "a,0,0,200,0,0,0")
     text = text.replace("b,1,1,1,1,1,1", "b,0,0,200,0,0,5")
@@ -214,7 +214,9 @@ def test_commanded_coordinates_become_readings_of_the_controller(tmp_path, robot
         ("201.1", "nan", 6, "column 'z' is 'nan', which is not finite"),
     ],
 )
-def test_a_mistake_is_one_sentence_with_its_line(tmp_path, robot, old, new, line, message) -> None:
+def test_invalid_file_is_refused_in_one_sentence_with_its_line(
+    tmp_path, robot, old, new, line, message
+) -> None:
     path = write(tmp_path, GOOD.replace(old, new, 1))
     with pytest.raises(LoopcalError, match=message) as caught:
         load_measurements(path, robot)
@@ -222,7 +224,7 @@ def test_a_mistake_is_one_sentence_with_its_line(tmp_path, robot, old, new, line
     assert "\n" not in str(caught.value)
 
 
-def test_readings_outside_the_stroke_and_duplicates_need_to_be_allowed(tmp_path, robot) -> None:
+def test_readings_outside_the_stroke_and_duplicates_are_refused_by_default(tmp_path, robot) -> None:
     path = write(tmp_path, GOOD.replace("b,1,", "b,90,"))
     with pytest.raises(DataError, match=r"data.csv: pose 'b': q1 reads 90 mm"):
         load_measurements(path, robot)
@@ -252,9 +254,7 @@ def test_poses_are_read_in_the_order_of_the_robots_coordinates(tmp_path, robot) 
     )
 
 
-def test_noise_is_stated_by_pattern_and_the_last_that_means_a_column_counts(
-    tmp_path, robot
-) -> None:
+def test_last_matching_noise_pattern_applies_to_a_column(tmp_path, robot) -> None:
     text = (
         GOOD.replace("[z]", "[z, x]")
         .replace("z: 1 um", '"*": 2 um, z: 1 um')

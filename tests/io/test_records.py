@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""YAML files and records: SI out, and one sentence with the line for everything that does not fit."""  # noqa: E501
+"""YAML files and records: values in SI units, and errors in one sentence with their line."""  # noqa: E501
 
 import math
 from dataclasses import dataclass
@@ -65,7 +65,7 @@ def read(text: str) -> Robot:
     return read_record(file, content, Robot, read_units(file))
 
 
-def test_numbers_are_scaled_to_si_and_defaults_are_not() -> None:
+def test_numbers_are_converted_to_si_units_and_defaults_are_not() -> None:
     robot = read(GOOD)
     assert isinstance(robot.leg, RodLegs)
     assert robot.leg.base == ((0.001, 0.002, 0.003), (1e-6, 0.002, 0.003))
@@ -113,7 +113,7 @@ def test_numbers_are_scaled_to_si_and_defaults_are_not() -> None:
         (GOOD, "- 1\n- 2\n", None, "contains no 'key: value' lines"),
     ],
 )
-def test_what_does_not_fit_is_one_sentence_with_its_line(
+def test_invalid_record_is_refused_in_one_sentence_with_its_line(
     old: str, new: str, line: int | None, message: str
 ) -> None:
     with pytest.raises(FileError, match=message) as caught:
@@ -122,7 +122,7 @@ def test_what_does_not_fit_is_one_sentence_with_its_line(
     assert "\n" not in str(caught.value)
 
 
-def test_a_byte_order_mark_is_accepted_and_does_not_shift_lines(tmp_path) -> None:
+def test_byte_order_mark_is_accepted_and_does_not_shift_lines(tmp_path) -> None:
     path = tmp_path / "robot.yaml"
     path.write_bytes(b"\xef\xbb\xbf" + GOOD.encode())
     assert read_yaml(path, "robot file").content["name"] == "h"
@@ -139,7 +139,7 @@ def test_a_byte_order_mark_is_accepted_and_does_not_shift_lines(tmp_path) -> Non
         (b"a: 1\nb: \0\n", 2, "zero byte"),
     ],
 )
-def test_bytes_that_are_no_text_are_refused(
+def test_file_that_is_not_text_is_refused(
     tmp_path, content: bytes, line: int | None, message: str
 ) -> None:
     path = tmp_path / "robot.yaml"
@@ -149,7 +149,7 @@ def test_bytes_that_are_no_text_are_refused(
     assert caught.value.line == line
 
 
-def test_a_folder_and_an_absent_file_are_refused(tmp_path) -> None:
+def test_folder_and_missing_file_are_refused(tmp_path) -> None:
     with pytest.raises(FileError, match="this is a folder, but a robot file is needed"):
         read_yaml(tmp_path, "robot file")
     with pytest.raises(FileError, match="this robot file does not exist"):

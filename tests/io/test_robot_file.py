@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robot files: shipped robots load, corrected files add one table and nothing else, mistakes name
-their line.
-"""
+"""Robot files: shipped robots, corrected files with identified values, errors with their line."""
 
 import numpy as np
 import pytest
@@ -35,14 +33,12 @@ def test_every_shipped_robot_loads_and_states_its_source() -> None:
         assert np.array_equal(loaded.values, loaded.parameters.nominal)
 
 
-def test_saving_the_nominal_robot_gives_its_file_back_byte_for_byte(tmp_path, robot) -> None:
+def test_saved_nominal_robot_equals_its_file_byte_for_byte(tmp_path, robot) -> None:
     save_robot(robot, tmp_path / "copy.yaml")
     assert (tmp_path / "copy.yaml").read_text() == HEXAPOD
 
 
-def test_identified_values_are_applied_and_deleting_the_table_restores_the_nominal(
-    tmp_path, robot
-) -> None:
+def test_identified_table_is_applied_and_deleting_it_restores_the_nominal(tmp_path, robot) -> None:
     path = tmp_path / "corrected.yaml"
     truth = robot.values + np.random.default_rng(3).normal(0.0, 1e-4, len(robot.values))
     save_robot(robot.with_values(truth), path, np.full(len(truth), 2.5e-7))
@@ -62,7 +58,7 @@ def test_identified_values_are_applied_and_deleting_the_table_restores_the_nomin
     assert np.array_equal(load_robot(path).values, robot.values)
 
 
-def test_a_table_in_the_middle_of_a_file_is_replaced_not_repeated(tmp_path, robot) -> None:
+def test_identified_table_in_the_middle_of_a_file_is_replaced(tmp_path, robot) -> None:
     table = "identified:\n  - {name: leg1.base.x, value: 121, +/-: null, unit: mm}\n# the legs\nlegs: rod\n"  # noqa: E501
     loaded = load_robot(write(tmp_path, HEXAPOD.replace("legs: rod\n", table)))
     assert loaded.values[0] == pytest.approx(0.121, rel=2e-16)
@@ -73,12 +69,12 @@ def test_a_table_in_the_middle_of_a_file_is_replaced_not_repeated(tmp_path, robo
     assert np.array_equal(load_robot(tmp_path / "again.yaml").values, loaded.values)
 
 
-def test_what_is_not_determined_is_written_as_null(tmp_path, robot) -> None:
+def test_infinite_uncertainty_is_written_as_null(tmp_path, robot) -> None:
     save_robot(robot, tmp_path / "r.yaml", np.full(len(robot.values), np.inf))
     assert "+/-: null" in (tmp_path / "r.yaml").read_text()
 
 
-def test_a_robot_that_came_from_no_file_cannot_be_saved(tmp_path, robot) -> None:
+def test_robot_without_a_file_cannot_be_saved(tmp_path, robot) -> None:
     with pytest.raises(MechanismError, match="was not loaded from a robot file"):
         save_robot(build(robot.assembly), tmp_path / "r.yaml")
     assert list(tmp_path.iterdir()) == []
@@ -108,7 +104,7 @@ def test_a_robot_that_came_from_no_file_cannot_be_saved(tmp_path, robot) -> None
         ("legs: rod", "legs: pole", "'legs' is 'pole'.*; allowed: 'rod'"),
     ],
 )
-def test_a_mistake_in_a_robot_file_names_its_line(
+def test_error_in_a_robot_file_is_reported_with_its_line(
     tmp_path, old: str, new: str, message: str
 ) -> None:
     assert old in HEXAPOD
@@ -137,7 +133,9 @@ def test_a_mistake_in_a_robot_file_names_its_line(
         ("5", "this row is not a mapping; write"),
     ],
 )
-def test_a_mistake_in_the_identified_table_names_its_line(tmp_path, row: str, message: str) -> None:
+def test_error_in_the_identified_table_is_reported_with_its_line(
+    tmp_path, row: str, message: str
+) -> None:
     text = f"{HEXAPOD}identified:\n  - {row}\n"
     with pytest.raises(FileError, match=message) as caught:
         load_robot(write(tmp_path, text))
@@ -146,8 +144,8 @@ def test_a_mistake_in_the_identified_table_names_its_line(tmp_path, row: str, me
 
 def test_parameters_are_fixed_by_name_or_pattern(tmp_path) -> None:
     table = load_robot(write(tmp_path, HEXAPOD + "fixed: [leg1.base.x, leg*.length]\n")).parameters
-    held = [name for name, free in zip(table.names, table.free, strict=True) if not free]
-    assert held == ["leg1.base.x", *(f"leg{i}.length" for i in range(1, 7))]
+    fixed = [name for name, free in zip(table.names, table.free, strict=True) if not free]
+    assert fixed == ["leg1.base.x", *(f"leg{i}.length" for i in range(1, 7))]
     record = load_robot(tmp_path / "robot.yaml").record.record
     assert build(record.assembly()).parameters == table  # the same robot without its file
     with pytest.raises(
@@ -158,7 +156,7 @@ def test_parameters_are_fixed_by_name_or_pattern(tmp_path) -> None:
         load_robot(write(tmp_path, HEXAPOD + "fixed: [leg1.base.q]\n"))
 
 
-def test_a_robot_that_cannot_be_built_names_its_file(tmp_path) -> None:
+def test_robot_that_cannot_be_built_is_reported_with_its_file(tmp_path) -> None:
     path = write(tmp_path, HEXAPOD.replace("  - [120, 140, 0]\n", ""))
     with pytest.raises(
         LoopcalError, match=r"robot.yaml: hexapod-42 has 5 base and 6 platform centers"
@@ -166,7 +164,7 @@ def test_a_robot_that_cannot_be_built_names_its_file(tmp_path) -> None:
         load_robot(path)
 
 
-def test_a_robot_that_is_nowhere_lists_the_shipped_ones() -> None:
+def test_unknown_robot_name_is_refused_with_the_shipped_ones() -> None:
     with pytest.raises(
         FileError, match=r"does not exist .did you mean 'hexapod-42'.*shipped robots: .*hexapod-42"
     ):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run folders: whole or absent, never over something else, JSON without NaN."""
+"""Run folders are written completely or not at all, and only over other run folders."""
 
 import json
 import math
@@ -22,7 +22,7 @@ def write(folder, force: bool = False, value: float = 1.5):
     return write_run_folder(folder, {"value": value}, {"a": np.arange(3.0)}, "name: h\n", force)
 
 
-def test_what_is_written_is_read_back(tmp_path) -> None:
+def test_run_folder_is_read_as_written(tmp_path) -> None:
     folder = write(tmp_path / "deep" / "run")
     result, arrays = read_run_folder(folder)
     assert result == {"format": 1, "value": 1.5}
@@ -31,7 +31,7 @@ def test_what_is_written_is_read_back(tmp_path) -> None:
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["run"]
 
 
-def test_a_run_is_replaced_only_with_force(tmp_path) -> None:
+def test_run_folder_is_replaced_only_with_force(tmp_path) -> None:
     write(tmp_path / "run")
     with pytest.raises(FileError, match="not empty"):
         write(tmp_path / "run", value=2.5)
@@ -41,7 +41,7 @@ def test_a_run_is_replaced_only_with_force(tmp_path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
 
 
-def test_force_does_not_replace_what_is_not_a_run(tmp_path) -> None:
+def test_force_replaces_only_run_folders(tmp_path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(FileError, match="something other than a run"):
         write(tmp_path, force=True)
@@ -49,18 +49,18 @@ def test_force_does_not_replace_what_is_not_a_run(tmp_path) -> None:
         write(tmp_path / "thesis.tex", force=True)
 
 
-def test_an_empty_folder_is_used(tmp_path) -> None:
+def test_empty_folder_is_used(tmp_path) -> None:
     (tmp_path / "run").mkdir()
     assert read_run_folder(write(tmp_path / "run"))[0]["value"] == 1.5
 
 
-def test_nothing_is_left_when_writing_fails(tmp_path) -> None:
+def test_failed_write_leaves_no_files(tmp_path) -> None:
     with pytest.raises(ValueError, match="Object arrays"):
         write_run_folder(tmp_path / "run", {}, {"a": np.array([object()])}, "")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_no_run_is_refused(tmp_path) -> None:
+def test_folder_that_is_not_a_run_is_refused(tmp_path) -> None:
     with pytest.raises(FileError, match="not a run folder"):
         read_run_folder(tmp_path)
     write(tmp_path / "run")
@@ -72,7 +72,7 @@ def test_what_is_no_run_is_refused(tmp_path) -> None:
         read_run_folder(tmp_path / "run")
 
 
-def test_a_damaged_run_names_the_missing_files(tmp_path) -> None:
+def test_damaged_run_is_refused_with_its_missing_files(tmp_path) -> None:
     write(tmp_path / "run")
     (tmp_path / "run" / "arrays.npz").unlink()
     with pytest.raises(FileError, match=r"damaged: arrays\.npz missing; restore it, or repeat"):
@@ -82,7 +82,7 @@ def test_a_damaged_run_names_the_missing_files(tmp_path) -> None:
         read_run_folder(tmp_path / "run")
 
 
-def test_json_has_null_and_a_reason_where_a_number_is_not_finite() -> None:
+def test_json_has_null_with_a_reason_for_numbers_that_are_not_finite() -> None:
     text = to_json(
         {
             "rows": [{"sd": math.inf}, {"sd": np.float64(0.5)}],
@@ -97,7 +97,7 @@ def test_json_has_null_and_a_reason_where_a_number_is_not_finite() -> None:
     assert document["nulls"]["rows/0/sd"].startswith("infinite")
 
 
-def test_a_run_says_how_it_was_made(tmp_path) -> None:
+def test_provenance_contains_inputs_and_versions(tmp_path) -> None:
     data = tmp_path / "data.csv"
     data.write_bytes(b"abc")
     origin = collect_provenance(["loopcal", "calibrate"], {"data": data}, {"split": 1})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run is a value that continues where the calibration ended; wrong arguments say what to pass."""
+"""A loaded run has the robots, result and measurements of the saved calibration."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ def calibrated():
     return robot, lc.calibrate(robot, data, lc.CalibrationOptions(hold_out=0.25))
 
 
-def test_a_saved_report_is_read_back_as_a_run(tmp_path, calibrated) -> None:
+def test_saved_report_is_loaded_as_a_run(tmp_path, calibrated) -> None:
     robot, report = calibrated
     lc.save_run(tmp_path / "run", report, {"data": DATA}, ["a test"])
     run = lc.load_run(tmp_path / "run")
@@ -38,9 +38,7 @@ def test_a_saved_report_is_read_back_as_a_run(tmp_path, calibrated) -> None:
     assert caught.value.code == "files.folder-in-use"
 
 
-def test_measurements_of_a_run_are_refused_after_a_change_and_without_files(
-    tmp_path, calibrated
-) -> None:
+def test_changed_or_missing_measurements_of_a_run_are_refused(tmp_path, calibrated) -> None:
     _, report = calibrated
     copy = tmp_path / "data.csv"
     copy.write_bytes(DATA.read_bytes())
@@ -63,6 +61,6 @@ def test_measurements_of_a_run_are_refused_after_a_change_and_without_files(
         (lc.load_run, "path of a run folder"),
     ],
 )
-def test_an_argument_of_a_wrong_type_says_what_to_pass(calibrated, call, words) -> None:
+def test_wrong_argument_type_is_refused_with_advice(calibrated, call, words) -> None:
     with pytest.raises(ArgumentTypeError, match=words):
         call(calibrated[0])

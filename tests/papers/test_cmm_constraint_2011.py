@@ -190,9 +190,7 @@ def test_gauge_changes_absolute_errors_but_not_nominal_or_aligned_ones(study) ->
 
 
 def test_large_absolute_errors_of_least_squares_come_from_the_gauge(study) -> None:
-    """The same answers, moved along what no row tells to where poses are nearest to those as
-    designed.
-    """
+    """Move the same estimates along the gauge directions to the poses nearest to nominal."""
     loud = calibrate_cell(study, 0.01 * MM, 0.1 * MM, 0, DRAWS)
     before, ls = loud.compute_median(BEFORE), loud.compute_median(LS)
     assert ls[ABSOLUTE_POSITION] > 10.0 * ls[NOMINAL]

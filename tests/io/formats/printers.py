@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records of real delta printers as the printer.cfg that their firmware would have: our own lines
-around their numbers.
-"""
+"""Records of real delta printers as printer.cfg: our own lines around the numbers of the firmware."""
 
 from typing import Any
 
@@ -33,13 +31,13 @@ SAVED = """
 """
 
 
-def printer_cfg(record: dict[str, Any], stop_off: float = 0.0) -> str:
+def format_printer_cfg(record: dict[str, Any], stop_offset: float = 0.0) -> str:
     """Return the text; tower a's numbers in the main part, the others saved, and Klipper's defaults
     left out.
 
     Parameters
     ----------
-    record : of LOOPCAL_DATA/delta_printers. stop_off : added to every end stop [mm].
+    record : of LOOPCAL_DATA/delta_printers. stop_offset : added to every end stop [mm].
     """
     found = record["geometry_stored_in_config"]
     text = HEAD.format(radius=found["radius"])
@@ -54,7 +52,7 @@ def printer_cfg(record: dict[str, Any], stop_off: float = 0.0) -> str:
         if k == 2:
             step = f"rotation_distance: {rotation!r}\nmicrosteps: 4\nfull_steps_per_rotation: 400\ngear_ratio: 80:40"  # noqa: E501
         text += STEPPER.format(axis=axis, k=k, step=step)
-        stop = f"position_endstop = {found['endstops'][k] + stop_off:.6f}"
+        stop = f"position_endstop = {found['endstops'][k] + stop_offset:.6f}"
         lines = [f"angle = {found['angles'][k]:.6f}", f"arm_length = {found['arms'][k]:.6f}", stop]
         if k == 0:
             text += "\n".join(line.replace(" = ", ": ") for line in lines) + "\n"
@@ -68,23 +66,23 @@ def printer_cfg(record: dict[str, Any], stop_off: float = 0.0) -> str:
         + SAVED
         + saved
         + "#*# [delta_calibrate]\n"
-        + _probed(record)
+        + _format_probes(record)
     )
 
 
-def _probed(record: dict[str, Any]) -> str:
+def _format_probes(record: dict[str, Any]) -> str:
     lines = []
     for name, rows in (("height", record["heights"]), ("manual_height", record["manual_heights"])):
         for i, row in enumerate(rows):
             lines += [
                 f"{name}{i} = {row['z_mm']}",
-                f"{name}{i}_pos = {_steps(row['stable_steps'])}",
+                f"{name}{i}_pos = {_format_steps(row['stable_steps'])}",
             ]
     for i, row in enumerate(record["distances"]):
         lines.append(f"distance{i} = {row['d_mm']}")
-        lines += [f"distance{i}_pos{n} = {_steps(row[f'stable_steps_{n}'])}" for n in (1, 2)]
+        lines += [f"distance{i}_pos{n} = {_format_steps(row[f'stable_steps_{n}'])}" for n in (1, 2)]
     return "".join(f"#*# {line}\n" for line in lines)
 
 
-def _steps(steps: list[float]) -> str:
+def _format_steps(steps: list[float]) -> str:
     return ",".join(f"{value:.3f}" for value in steps)

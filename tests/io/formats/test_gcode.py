@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""M665 and M666 of Marlin and RepRapFirmware: read, written, written into a file, and what they do
-not share.
-"""
+"""M665 and M666 of Marlin and RepRapFirmware: import, export, correction of a file, refusals."""
 
 import math
 from pathlib import Path
@@ -31,7 +29,7 @@ echo:  M851 X0.00 Y0.00 Z-1.50 ; (mm)
 """
 
 
-def imported(folder: Path, name: str, text: str) -> Mechanism:
+def import_robot(folder: Path, name: str, text: str) -> Mechanism:
     path = folder / f"{name}.g"
     path.write_text(text)
     read = FORMATS[name].read
@@ -45,51 +43,51 @@ def export_robot(robot: Mechanism, name: str, into: Path | None = None) -> str:
     return write(ExportSource(robot), into).text
 
 
-def value(robot: Mechanism, name: str) -> float:
-    """In mm or degrees."""
+def get_value(robot: Mechanism, name: str) -> float:
+    """Return the value of a parameter in mm or degrees."""
     found = float(robot.values[robot.parameters.index(name)])
     return math.degrees(found) if name.endswith("angle") else found * 1e3
 
 
 def test_reprap_stops_are_the_homed_height_plus_the_adjustments(tmp_path) -> None:
-    robot = imported(tmp_path, "reprap", REPRAP)
-    assert [value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx(
+    robot = import_robot(tmp_path, "reprap", REPRAP)
+    assert [get_value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx(
         [302.0, 301.3, 301.2]
     )
-    assert [value(robot, f"tower{k}.angle") for k in (1, 2, 3)] == pytest.approx(
+    assert [get_value(robot, f"tower{k}.angle") for k in (1, 2, 3)] == pytest.approx(
         [209.9, 330.2, 90.0]
     )
-    assert [value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx(
+    assert [get_value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx(
         [269.1, 269.2, 269.3]
     )
-    assert value(robot, "radius") == pytest.approx(130.25)
+    assert get_value(robot, "radius") == pytest.approx(130.25)
 
 
 def test_marlin_stops_are_the_height_less_the_adjustments_and_the_probe(tmp_path) -> None:
-    robot = imported(tmp_path, "marlin", MARLIN)
-    assert [value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx(
+    robot = import_robot(tmp_path, "marlin", MARLIN)
+    assert [get_value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx(
         [302.0, 301.5, 301.75]
     )
-    assert [value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx(
+    assert [get_value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx(
         [269.1, 269.2, 269.0]
     )
 
 
 @pytest.mark.parametrize(("name", "text"), [("reprap", REPRAP), ("marlin", MARLIN)])
-def test_a_file_whose_numbers_are_already_these_stays_byte_for_byte(tmp_path, name, text) -> None:
-    robot = imported(tmp_path, name, text)
+def test_file_with_the_same_numbers_is_unchanged(tmp_path, name, text) -> None:
+    robot = import_robot(tmp_path, name, text)
     assert export_robot(robot, name, tmp_path / f"{name}.g") == text
 
 
 @pytest.mark.parametrize(("name", "text"), [("reprap", REPRAP), ("marlin", MARLIN)])
-def test_corrected_words_read_back_equal_and_nothing_else_changes(tmp_path, name, text) -> None:
-    robot = imported(tmp_path, name, text)
+def test_corrected_words_are_read_as_written_and_other_lines_are_kept(tmp_path, name, text) -> None:
+    robot = import_robot(tmp_path, name, text)
     shift = 1e-3 * np.random.default_rng(3).uniform(-1, 1, len(robot.values))
     shift[robot.parameters.index("tower3.angle")] = 0.0
     robot = robot.with_values(robot.values + shift)
     for into in (tmp_path / f"{name}.g", None):
         written = export_robot(robot, name, into)
-        again = imported(tmp_path, name, written)
+        again = import_robot(tmp_path, name, written)
         # six decimals are written; two such numbers make a stop [mm, deg]
         np.testing.assert_allclose(again.values, robot.values, rtol=0, atol=9e-9)
         if into is not None:
@@ -106,21 +104,21 @@ def test_corrected_words_read_back_equal_and_nothing_else_changes(tmp_path, name
             into.write_text(text)
 
 
-def test_the_two_firmwares_say_the_same_printer_with_opposite_signs(tmp_path) -> None:
-    robot = imported(tmp_path, "reprap", REPRAP)
+def test_marlin_and_reprap_state_adjustments_with_opposite_signs(tmp_path) -> None:
+    robot = import_robot(tmp_path, "reprap", REPRAP)
     marlin = export_robot(robot, "marlin")
     assert "M666 X0.000000 " not in marlin
     assert (
         "M666 X-0.800000 Y-0.100000 Z-0.000000" in marlin
         or "M666 X-0.800000 Y-0.100000 Z0.000000" in marlin
     )
-    again = imported(tmp_path, "marlin", marlin)
+    again = import_robot(tmp_path, "marlin", marlin)
     np.testing.assert_allclose(again.values, robot.values, rtol=0, atol=2e-9)
 
 
-def test_a_word_that_is_not_there_is_added_before_the_comment(tmp_path) -> None:
+def test_missing_word_is_added_before_the_comment(tmp_path) -> None:
     text = "M665 L250 R130 H300 ; ours\r\n"
-    robot = imported(tmp_path, "reprap", text)
+    robot = import_robot(tmp_path, "reprap", text)
     shift = 1e-3 * np.eye(10)[1]
     save_robot(robot.with_values(robot.values + shift), tmp_path / "other.yaml")
     moved = load_robot(tmp_path / "other.yaml")
@@ -181,9 +179,9 @@ def test_a_word_that_is_not_there_is_added_before_the_comment(tmp_path) -> None:
         ),
     ],
 )
-def test_bad_files_are_refused_with_their_line(tmp_path, name, text, sentence) -> None:
+def test_invalid_gcode_is_refused_with_its_line(tmp_path, name, text, sentence) -> None:
     with pytest.raises(FileError, match=sentence):
-        imported(tmp_path, name, text)
+        import_robot(tmp_path, name, text)
 
 
 @pytest.mark.parametrize(
@@ -197,19 +195,19 @@ def test_bad_files_are_refused_with_their_line(tmp_path, name, text, sentence) -
         'M117 M665 L1 R1 H1\nM550 P"M665 R7"\nM665 L 269.1 R 130.25 H 300\nM666 X.5\n',
     ],
 )
-def test_a_command_is_read_to_its_end_however_it_is_written(tmp_path, text) -> None:
-    robot = imported(tmp_path, "reprap", text)
-    assert [value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx(
+def test_commands_in_any_notation_are_read_completely(tmp_path, text) -> None:
+    robot = import_robot(tmp_path, "reprap", text)
+    assert [get_value(robot, f"tower{k}.stop") for k in (1, 2, 3)] == pytest.approx(
         [300.5, 300.0, 300.0]
     )
-    assert [value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx([269.1] * 3)
-    assert value(robot, "radius") == pytest.approx(130.25)
+    assert [get_value(robot, f"arm{k}.length") for k in (1, 2, 3)] == pytest.approx([269.1] * 3)
+    assert get_value(robot, "radius") == pytest.approx(130.25)
     assert export_robot(robot, "reprap", tmp_path / "reprap.g") == text
 
 
-def test_words_are_corrected_and_added_where_they_belong_and_checksums_follow(tmp_path) -> None:
+def test_corrected_and_added_words_update_the_checksum(tmp_path) -> None:
     text = "N1 m665 L269 R130 H300 M666 Y0.25*99 ; ours\n"
-    robot = imported(tmp_path, "reprap", text)
+    robot = import_robot(tmp_path, "reprap", text)
     shift = 1e-3 * np.eye(len(robot.values))[robot.parameters.index("radius")]
     shift = (
         shift + np.deg2rad(0.5) * np.eye(len(robot.values))[robot.parameters.index("tower1.angle")]

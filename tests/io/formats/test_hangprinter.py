@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of a hanging printer: anchors from known poses, spools in the robot file, poses nobody
-measured, and bad files.
-"""
+"""Samples of a hanging printer: anchors, spools, known and unknown poses, refusals."""
 
 import json
 from typing import Any
@@ -27,21 +25,21 @@ def read(folder, found: dict, **reading: Any):
     return build_imported_robot(path, imported), imported
 
 
-def test_the_robot_has_four_anchors_lengths_one_spool_radius_and_four_buildups(tmp_path) -> None:
+def test_robot_has_four_anchors_lengths_and_buildups_and_one_spool_radius(tmp_path) -> None:
     robot, _ = read(tmp_path, simulate_example())
     assert robot.parameters.names == NAMES
     assert robot.parameters.free.all()
     assert not np.isnan(robot.parameters.tolerance).any()
 
 
-def test_spools_of_other_radii_have_parameters_of_their_own(tmp_path) -> None:
+def test_spool_with_another_radius_has_its_own_parameter(tmp_path) -> None:
     robot, _ = read(
         tmp_path, simulate_example() | {"spool_r_in_origin_first_guess": [60, 60, 60, 50]}
     )
     assert {"spoolA-B-C.radius", "spoolD.radius"} <= set(robot.parameters.names)
 
 
-def test_known_poses_are_measured_and_the_others_keep_their_readings(tmp_path) -> None:
+def test_known_poses_become_rows_and_all_poses_keep_their_readings(tmp_path) -> None:
     found = simulate_example()
     _, imported = read(tmp_path, found, sigma_position=0.6e-3)
     data = imported.measurements
@@ -56,7 +54,7 @@ def test_known_poses_are_measured_and_the_others_keep_their_readings(tmp_path) -
     assert data.labels[8:10] == ("known9", "sample10")
 
 
-def test_sigma_of_a_line_becomes_that_of_its_motor(tmp_path) -> None:
+def test_sigma_of_a_line_is_converted_to_its_motor(tmp_path) -> None:
     robot, _ = read(tmp_path, simulate_example(), sigma_line=0.6e-3)
     gear = 18 / 240
     expected = 0.6e-3 / (60e-3 * gear * np.array([0.5, 0.5, 0.5, 0.25]))  # [rad]
@@ -64,10 +62,8 @@ def test_sigma_of_a_line_becomes_that_of_its_motor(tmp_path) -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-6)  # seven digits are written
 
 
-def test_line_that_builds_up_is_paid_out_as_the_spools_say(tmp_path) -> None:
-    """At the poses that the readings of the true machine reach, lines are as long as the closed
-    form of the spools says.
-    """
+def test_inverse_kinematics_agree_with_the_closed_form_of_the_spools(tmp_path) -> None:
+    """Compute line lengths from the readings by the closed form and from the poses."""
     found = simulate_example()
     robot, _ = read(tmp_path, found)
     true = robot.with_values(TRUTH * 1e-3)
@@ -82,7 +78,7 @@ def test_line_that_builds_up_is_paid_out_as_the_spools_say(tmp_path) -> None:
     np.testing.assert_allclose(forward(true, at.q).T[:, :3, 3], targets, rtol=0, atol=1e-9)  # [m]
 
 
-def test_anchors_start_exactly_from_known_poses_without_noise_and_buildup(tmp_path) -> None:
+def test_estimated_anchors_are_exact_without_noise_and_buildup(tmp_path) -> None:
     found = simulate_example()
     anchors = np.array([[10.0, -1500, -90], [1200, 700, -120], [-1250, 650, -100], [5, 5, 2200]])
     known = np.array(found["xyz_of_samp"])
@@ -96,7 +92,7 @@ def test_anchors_start_exactly_from_known_poses_without_noise_and_buildup(tmp_pa
     )  # [mm], condition 1e3 of lengths of 1e3 mm
 
 
-def test_stated_anchors_are_taken(tmp_path) -> None:
+def test_stated_anchors_are_used(tmp_path) -> None:
     anchors = [[0, -1500, -90], [1200, 700, -120], [-1250, 650, -100], [0, 0, 2200]]
     robot, _ = read(tmp_path, simulate_example() | {"anchors": anchors, "xyz_of_samp": [[0, 0, 0]]})
     np.testing.assert_allclose(
@@ -104,7 +100,7 @@ def test_stated_anchors_are_taken(tmp_path) -> None:
     )
 
 
-def test_with_stated_anchors_no_pose_need_be_known(tmp_path) -> None:
+def test_stated_anchors_need_no_known_pose(tmp_path) -> None:
     anchors = [[0, -1500, -90], [1200, 700, -120], [-1250, 650, -100], [0, 0, 2200]]
     robot, imported = read(tmp_path, simulate_example() | {"anchors": anchors, "xyz_of_samp": []})
     assert imported.measurements is not None
@@ -120,7 +116,7 @@ def test_with_stated_anchors_no_pose_need_be_known(tmp_path) -> None:
     )  # 21 less six of the frame and one of the scale
 
 
-def test_what_a_robot_file_cannot_say_is_told(tmp_path) -> None:
+def test_keys_that_are_not_read_are_reported(tmp_path) -> None:
     more = {
         "springKPerUnitLength": 2e4,
         "mover_weight": 2.0,
@@ -164,13 +160,13 @@ def test_what_a_robot_file_cannot_say_is_told(tmp_path) -> None:
         ({"xyz_of_samp": [[0, 0, 0]]}, "the 1 known poses do not determine the anchor of line A"),
     ],
 )
-def test_bad_samples_are_refused_in_one_sentence(tmp_path, change, sentence) -> None:
+def test_invalid_samples_are_refused_in_one_sentence(tmp_path, change, sentence) -> None:
     with pytest.raises(FileError) as refused:
         read(tmp_path, simulate_example() | change)
     assert sentence in str(refused.value)
 
 
-def test_known_poses_in_the_plane_of_the_origin_are_refused_with_the_remedy(tmp_path) -> None:
+def test_known_poses_in_one_plane_are_refused_with_a_suggestion(tmp_path) -> None:
     found = simulate_example()
     flat = [[x, y, 0.0] for x, y, _ in found["xyz_of_samp"][:8]]
     with pytest.raises(FileError, match=r"poses at several heights .*or add the key 'anchors'"):
@@ -181,7 +177,7 @@ def test_known_poses_in_the_plane_of_the_origin_are_refused_with_the_remedy(tmp_
     ("text", "sentence"),
     [("{\n  [", r"samples.json:2: not valid JSON"), ("[1]", "'motor_pos_samp'")],
 )
-def test_what_is_no_file_of_samples_is_refused(tmp_path, text, sentence) -> None:
+def test_file_without_samples_is_refused(tmp_path, text, sentence) -> None:
     path = tmp_path / "samples.json"
     path.write_text(text)
     with pytest.raises(FileError, match=sentence):

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Klipper's printer.cfg: which option counts, Klipper's defaults, options that are not there yet,
-and bad files.
-"""
+"""Klipper's printer.cfg: precedence of options, defaults, added options, refusals."""
 
 import numpy as np
 import pytest
@@ -42,7 +40,7 @@ def read(folder, text: str):
     return build_imported_robot(path, klipper.read(path, ImportOptions("printer")))
 
 
-def test_defaults_are_those_of_klipper_and_the_main_part_hides_the_saved_one(tmp_path) -> None:
+def test_options_are_read_from_main_part_saved_block_and_defaults(tmp_path) -> None:
     (tmp_path / "printer.cfg").write_text(SHORT + SAVED)
     found = klipper.parse_geometry(read_config(tmp_path / "printer.cfg"))
     assert found.radius == 130.0
@@ -52,7 +50,7 @@ def test_defaults_are_those_of_klipper_and_the_main_part_hides_the_saved_one(tmp
 
 
 @pytest.mark.parametrize("text", [SHORT, SHORT + SAVED, SHORT.rstrip("\n"), SHORT + "\n\n"])
-def test_numbers_that_were_left_out_are_added_to_the_saved_block(tmp_path, text) -> None:
+def test_missing_options_are_added_to_the_saved_block(tmp_path, text) -> None:
     robot = read(tmp_path, text)
     moved = robot.with_values(
         robot.values
@@ -72,7 +70,7 @@ def test_numbers_that_were_left_out_are_added_to_the_saved_block(tmp_path, text)
     assert written.count("[stepper_b]") == 2
 
 
-def test_an_arm_that_kept_its_length_is_written_where_its_default_moved(tmp_path) -> None:
+def test_unchanged_arm_is_written_if_its_default_changed(tmp_path) -> None:
     robot = read(tmp_path, SHORT)
     values = robot.values.copy()
     values[robot.parameters.index("arm1.length")] += 1e-3
@@ -80,7 +78,7 @@ def test_an_arm_that_kept_its_length_is_written_where_its_default_moved(tmp_path
     np.testing.assert_allclose(read(tmp_path, written).values, values, rtol=0, atol=1e-9)
 
 
-def test_without_a_file_a_block_to_paste_is_written(tmp_path) -> None:
+def test_export_without_a_file_gives_a_block_to_paste(tmp_path) -> None:
     robot = read(tmp_path, SHORT)
     block = klipper.write(ExportSource(robot), None).text
     assert block.startswith("#*# <------")
@@ -123,13 +121,13 @@ def test_without_a_file_a_block_to_paste_is_written(tmp_path) -> None:
         (("[stepper_c]\n", SAVED + "[tmc]\n"), ":19: this line below SAVE_CONFIG"),
     ],
 )
-def test_bad_files_are_refused_in_one_sentence(tmp_path, change, sentence) -> None:
+def test_invalid_printer_cfg_is_refused_in_one_sentence(tmp_path, change, sentence) -> None:
     with pytest.raises(FileError, match=sentence):
         read(tmp_path, SHORT.replace(*change))
 
 
 @pytest.mark.parametrize("ratio", ["80", "80:0", "a:b", "1:2:3"])
-def test_gear_ratios_that_are_none_are_refused(tmp_path, ratio) -> None:
+def test_invalid_gear_ratio_is_refused(tmp_path, ratio) -> None:
     (tmp_path / "printer.cfg").write_text(
         SHORT.replace("microsteps: 16", f"microsteps: 16\ngear_ratio: {ratio}")
     )
@@ -137,7 +135,7 @@ def test_gear_ratios_that_are_none_are_refused(tmp_path, ratio) -> None:
         klipper.get_step_distance(read_config(tmp_path / "printer.cfg"), "stepper_a")
 
 
-def test_steps_of_geared_motors(tmp_path) -> None:
+def test_step_distance_includes_the_gear_ratio(tmp_path) -> None:
     (tmp_path / "printer.cfg").write_text(
         SHORT.replace("microsteps: 16", "microsteps: 16\ngear_ratio: 57:11, 2:1")
     )

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LinuxCNC's genhexkins settings: against numbers that LinuxCNC's own code printed, read,
-corrected, and bad files.
-"""
+"""LinuxCNC's genhexkins settings: agreement with LinuxCNC's own code, import, export, refusals."""
 
 import json
 from pathlib import Path
@@ -26,8 +24,8 @@ PINS = {
 }
 
 
-def hal(geometry: dict, lead: float = 0.0, lift: float = 0.0) -> str:
-    """The settings as a HAL file."""
+def format_hal(geometry: dict, lead: float = 0.0, lift: float = 0.0) -> str:
+    """Return the settings as the text of a HAL file."""
     lines = ["# ours", "loadrt genhexkins", "setp stepgen.0.maxvel 1"]
     for pin, name in PINS.items():
         for n, point in enumerate(geometry[name]):
@@ -54,10 +52,10 @@ def geometry(data_folder) -> dict:
 
 @pytest.mark.parametrize("lift", [0.0, 7.5])
 @pytest.mark.parametrize(("lead", "oracle"), [(0.0, "default"), (4.0, "screwlead4")])
-def test_strut_lengths_are_those_of_linuxcnc(
+def test_strut_lengths_agree_with_linuxcnc(
     tmp_path, data_folder, geometry, lead, oracle, lift
 ) -> None:
-    robot = read(tmp_path, hal(geometry, lead, lift), home_height=0.020)
+    robot = read(tmp_path, format_hal(geometry, lead, lift), home_height=0.020)
     table = np.genfromtxt(
         data_folder / "kinematics_oracles" / f"genhexkins_{oracle}_200poses.csv",
         delimiter=",",
@@ -85,8 +83,8 @@ def test_strut_lengths_are_those_of_linuxcnc(
     assert off.max() < 1e-12  # [m]
 
 
-def test_a_calibrated_hexapod_reads_back_equal_and_nothing_else_changes(tmp_path, geometry) -> None:
-    text = hal(geometry, 4.0, 7.5)
+def test_corrected_pins_are_read_as_written_and_other_lines_are_kept(tmp_path, geometry) -> None:
+    text = format_hal(geometry, 4.0, 7.5)
     robot = read(tmp_path, text)
     names = robot.parameters.names
     shift = 1e-4 * np.random.default_rng(1).uniform(-1, 1, len(names))
@@ -111,10 +109,10 @@ def test_a_calibrated_hexapod_reads_back_equal_and_nothing_else_changes(tmp_path
     assert "HOME_OFFSET of [JOINT_0]" in said[0]
 
 
-def test_an_unchanged_hexapod_leaves_the_file_alone_and_lines_of_its_own_read_back(
+def test_unchanged_hexapod_keeps_the_file_and_new_lines_are_read_as_written(
     tmp_path, geometry
 ) -> None:
-    text = hal(geometry).rstrip("\n")
+    text = format_hal(geometry).rstrip("\n")
     robot = read(tmp_path, text)
     assert linuxcnc.write(ExportSource(robot), tmp_path / "hexapod.hal").text == text
     np.testing.assert_array_equal(
@@ -122,9 +120,9 @@ def test_an_unchanged_hexapod_leaves_the_file_alone_and_lines_of_its_own_read_ba
     )
 
 
-def test_a_pin_that_was_left_at_zero_is_added(tmp_path, geometry) -> None:
+def test_missing_pin_is_added(tmp_path, geometry) -> None:
     text = "".join(
-        line for line in hal(geometry).splitlines(keepends=True) if ".base.0.z" not in line
+        line for line in format_hal(geometry).splitlines(keepends=True) if ".base.0.z" not in line
     )
     robot = read(tmp_path, text)
     values = robot.values.copy()
@@ -133,13 +131,13 @@ def test_a_pin_that_was_left_at_zero_is_added(tmp_path, geometry) -> None:
     assert written == text + "setp genhexkins.base.0.z 0.25\n"
 
 
-def test_the_shipped_hexapod_says_that_its_lengths_have_no_pin() -> None:
+def test_export_reports_strut_lengths_without_a_pin() -> None:
     found = linuxcnc.write(ExportSource(load_robot("hexapod-42")), None)
     assert "strut 0 is 233.238076 mm long at reading zero" in "\n".join(map(str, found.findings))
 
 
-def test_screws_of_several_leads_are_refused(tmp_path, geometry) -> None:
-    robot = read(tmp_path, hal(geometry, 4.0))
+def test_screws_with_different_leads_are_refused(tmp_path, geometry) -> None:
+    robot = read(tmp_path, format_hal(geometry, 4.0))
     source = robot.record
     assert isinstance(source, robot_file.RobotSource)
     (tmp_path / "two.yaml").write_text(
@@ -162,8 +160,12 @@ def test_screws_of_several_leads_are_refused(tmp_path, geometry) -> None:
         (("", ""), {"length_unit": None}, "a HAL file states no unit of length"),
     ],
 )
-def test_bad_files_are_refused_in_one_sentence(
+def test_invalid_hal_file_is_refused_in_one_sentence(
     tmp_path, geometry, change, options, sentence
 ) -> None:
     with pytest.raises(FileError, match=sentence):
-        read(tmp_path, hal(geometry).replace(*change) if change[0] else hal(geometry), **options)
+        read(
+            tmp_path,
+            format_hal(geometry).replace(*change) if change[0] else format_hal(geometry),
+            **options,
+        )

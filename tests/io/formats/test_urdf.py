@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""URDF with loop closures: what is in the two public files, agreement with the tree's own
-kinematics, origins out.
-"""
+"""URDF with loop closures: two public files, agreement with the tree, corrected origins."""
 
 import re
 from pathlib import Path
@@ -35,7 +33,7 @@ def read(files) -> dict[str, tuple[Imported, Mechanism]]:
 
 
 @pytest.mark.parametrize("name", COUNTS)
-def test_bodies_joints_loops_and_mobility_are_right_and_printed(files, read, name) -> None:
+def test_counts_of_bodies_joints_loops_and_mobility_are_reported(files, read, name) -> None:
     bodies, joints, loops, mobility = COUNTS[name]
     assert 3 * (bodies - 1) - 2 * joints == mobility
     assert joints - (bodies - 1) == loops
@@ -46,7 +44,7 @@ def test_bodies_joints_loops_and_mobility_are_right_and_printed(files, read, nam
 
 
 @pytest.mark.parametrize("name", COUNTS)
-def test_the_loops_are_closed_at_home(read, name) -> None:
+def test_loops_are_closed_at_the_home_pose(read, name) -> None:
     robot = read[name][1]
     found = inverse(robot, robot.home[None])
     assert found.residual[0] < 1e-12  # [m]
@@ -55,10 +53,8 @@ def test_the_loops_are_closed_at_home(read, name) -> None:
 
 
 @pytest.mark.parametrize("name", COUNTS)
-def test_poses_are_those_of_the_tree_with_its_loops_closed(files, read, name) -> None:
-    """The tree's joints closed by Newton on all of its loops, the branches too, against the limbs
-    of the robot file.
-    """
+def test_poses_agree_with_the_tree_after_closing_its_loops(files, read, name) -> None:
+    """The reference closes all loops of the tree by Newton's method, branches included."""
     robot, tree = read[name][1], urdf_tree.read(files[name])
     body, frame = tree.find_body(FRAME[name]), tree.place_in_body(FRAME[name])
     loops = urdf_tree.read_joint_graph(tree, files[name].with_name("robot.yaml"))
@@ -73,7 +69,7 @@ def test_poses_are_those_of_the_tree_with_its_loops_closed(files, read, name) ->
 
 
 @pytest.mark.parametrize("name", COUNTS)
-def test_an_unchanged_robot_leaves_the_file_byte_for_byte(files, read, name) -> None:
+def test_unchanged_robot_keeps_the_file_byte_for_byte(files, read, name) -> None:
     assert (
         urdf.write(ExportSource(read[name][1]), files[name]).text.encode()
         == files[name].read_bytes()
@@ -81,8 +77,8 @@ def test_an_unchanged_robot_leaves_the_file_byte_for_byte(files, read, name) -> 
 
 
 @pytest.mark.parametrize("name", COUNTS)
-def test_only_attributes_of_origins_change(files, read, name) -> None:
-    robot = moved(read[name][1])
+def test_export_changes_only_attributes_of_origins(files, read, name) -> None:
+    robot = perturb(read[name][1])
     before, after = files[name].read_text(), urdf.write(ExportSource(robot), files[name]).text
     changed = [
         (a, b) for a, b in zip(before.splitlines(), after.splitlines(), strict=True) if a != b
@@ -93,8 +89,8 @@ def test_only_attributes_of_origins_change(files, read, name) -> None:
         assert a.strip().startswith("<origin")
 
 
-def test_corrected_origins_read_back_as_the_same_machine(tmp_path, files, read) -> None:
-    robot = moved(read[FIVE_BAR][1])
+def test_corrected_origins_are_read_as_the_same_machine(tmp_path, files, read) -> None:
+    robot = perturb(read[FIVE_BAR][1])
     (tmp_path / "robot.urdf").write_text(urdf.write(ExportSource(robot), files[FIVE_BAR]).text)
     (tmp_path / "robot.yaml").write_text(files[FIVE_BAR].with_name("robot.yaml").read_text())
     again = build_imported_robot(
@@ -108,23 +104,23 @@ def test_corrected_origins_read_back_as_the_same_machine(tmp_path, files, read) 
     np.testing.assert_allclose(other.T, one.T, rtol=0, atol=1e-10)  # [m, 1]
 
 
-def moved(robot: Mechanism) -> Mechanism:
-    """With every parameter off by up to a millimetre or a milliradian."""
+def perturb(robot: Mechanism) -> Mechanism:
+    """Change every parameter by up to a millimeter or a milliradian."""
     shift = 1e-3 * np.random.default_rng(1).uniform(-1, 1, len(robot.values))
     return robot.with_values(robot.values + shift)
 
 
-def test_a_limb_that_branches_is_refused_with_its_joints(files) -> None:
+def test_branching_limb_is_refused_with_its_joints(files) -> None:
     with pytest.raises(FileError, match=r"joints .* meet in '.*', so a limb branches from a limb"):
         urdf.read(files[DELTA], ImportOptions("delta", platform="transmission_connecting_rod"))
 
 
-def test_a_urdf_needs_a_file_to_be_corrected(read) -> None:
+def test_export_to_urdf_needs_a_file_to_correct(read) -> None:
     with pytest.raises(DataError, match=r"name the URDF to correct"):
         urdf.write(ExportSource(read[FIVE_BAR][1]), None)
 
 
-def test_another_machine_is_not_corrected(tmp_path, files, read) -> None:
+def test_urdf_of_another_machine_is_refused(tmp_path, files, read) -> None:
     (tmp_path / "other.urdf").write_text(
         files[FIVE_BAR].read_text().replace('xyz="0.1000', 'xyz="0.2000')
     )
@@ -167,7 +163,7 @@ JOINT = '<joint name="a" type="revolute"><origin xyz="0 0 1"/><parent link="base
         ),
     ],
 )
-def test_bad_files_are_refused_in_one_sentence(tmp_path, text, sentence) -> None:
+def test_invalid_urdf_is_refused_in_one_sentence(tmp_path, text, sentence) -> None:
     (tmp_path / "a.urdf").write_text(text)
     with pytest.raises(FileError, match=sentence):
         urdf.read(tmp_path / "a.urdf", ImportOptions("a"))
@@ -186,7 +182,7 @@ def test_bad_files_are_refused_in_one_sentence(tmp_path, text, sentence) -> None
         ("closed_loop: []\ntype: []\nname_mot: [z]\n", ":3: the motor 'z' is not a movable joint"),
     ],
 )
-def test_bad_closures_are_refused_in_one_sentence(tmp_path, closures, sentence) -> None:
+def test_invalid_closures_are_refused_in_one_sentence(tmp_path, closures, sentence) -> None:
     (tmp_path / "a.urdf").write_text(
         "<robot><link name='base'/><link name='arm'/>\n" + JOINT + "</robot>"
     )

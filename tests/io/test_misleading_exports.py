@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exports that look right and are not: cells cut in two, other headers further down, targets that
-contradict each other.
-"""
+"""Exports with hidden errors: split cells, later headers, contradictory targets, wrong units."""
 
 import json
 import re
@@ -42,13 +40,13 @@ READINGS = (
 )
 
 
-def converted(folder, export: str, profile: str):
+def convert(folder, export: str, profile: str):
     (folder / "profile.yaml").write_text(profile, encoding="utf-8")
     (folder / "export.txt").write_text(export, encoding="utf-8")
     return convert_export(folder / "export.txt", read_profile(folder / "profile.yaml"))
 
 
-def table(text: str) -> list[str]:
+def read_table_lines(text: str) -> list[str]:
     return [line for line in text.rstrip("\n").split("\n") if not line.startswith("#")]
 
 
@@ -88,38 +86,36 @@ def table(text: str) -> list[str]:
         ("Name;X;Y;Z;Note\nP1;1;2;3\nP2;1;2;3;good\n", "semicolon", {}, 2),
     ],
 )
-def test_a_line_with_other_cells_than_the_header_is_no_row(
+def test_line_with_another_number_of_cells_than_the_header_is_skipped(
     tmp_path, export, delimiter, misfits, rows
 ) -> None:
-    found = converted(tmp_path, export, BY_NAME.replace("comma", delimiter))
+    found = convert(tmp_path, export, BY_NAME.replace("comma", delimiter))
     assert (found.rows, [line for line, _ in found.misfits]) == (rows, list(misfits))
     assert all(
         part in reason for (_, reason), part in zip(found.misfits, misfits.values(), strict=True)
     )
 
 
-def test_without_a_header_a_line_with_other_cells_than_most_is_no_row(tmp_path) -> None:
-    found = converted(tmp_path, "1,1,2,3\n2,1,5,2,5,3,5\n3,1,2,3,\n4,1,2,\n", BY_PLACE)
+def test_line_with_another_number_of_cells_than_most_is_skipped(tmp_path) -> None:
+    found = convert(tmp_path, "1,1,2,3\n2,1,5,2,5,3,5\n3,1,2,3,\n4,1,2,\n", BY_PLACE)
     assert found.misfits == ((2, "it has 7 cells, but most lines have 4"),)
-    assert table(found.text)[1:] == ["1,1,2,3", "3,1,2,3", "4,1,2,"]
+    assert read_table_lines(found.text)[1:] == ["1,1,2,3", "3,1,2,3", "4,1,2,"]
 
 
-def test_below_another_header_columns_are_read_by_that_one(tmp_path) -> None:
-    found = converted(
+def test_later_header_applies_to_the_lines_below_it(tmp_path) -> None:
+    found = convert(
         tmp_path, "Name,X,Y,Z\n1,1,2,3\nName,X,Y,Z\n2,4,5,6\nZ,Y,R,X,Name\n9,8,0,7,3\n", BY_NAME
     )
-    assert table(found.text)[1:] == ["1,1,2,3", "2,4,5,6", "3,7,8,9"]
+    assert read_table_lines(found.text)[1:] == ["1,1,2,3", "2,4,5,6", "3,7,8,9"]
     assert (found.passed, found.misfits) == (3, ())
 
 
-def test_a_later_header_that_names_a_column_twice_is_refused(tmp_path) -> None:
+def test_later_header_with_a_duplicate_column_is_refused(tmp_path) -> None:
     with pytest.raises(FileError, match=r"export.txt:3: duplicate column 'X'"):
-        converted(tmp_path, "Name,X,Y,Z\n1,1,2,3\nName,X,X,Y,Z\n", BY_NAME)
+        convert(tmp_path, "Name,X,Y,Z\n1,1,2,3\nName,X,X,Y,Z\n", BY_NAME)
 
 
-def test_sigma_covariance_and_remarks_of_each_target_stay_with_it_and_calibrate_reads_them(
-    tmp_path,
-) -> None:
+def test_sigma_covariance_and_notes_are_kept_for_each_target(tmp_path) -> None:
     more = "sigma.x: {from: S, unit: um}\n  cov.x.y: {from: C, unit: um*um}\n  note rms: {from: R}"
     profile = TARGETS.replace("MORE", more).replace("settings:", READINGS)
     lines = [
@@ -127,8 +123,8 @@ def test_sigma_covariance_and_remarks_of_each_target_stay_with_it_and_calibrate_
         "P1_b;1,6;2;3;5;2;r2;0;0;0;0;0;0",
         "P2_b;1,7;2;3;6;3;r3;1;0;0;0;0;0",
     ]
-    found = converted(tmp_path, "Name;X;Y;Z;S;C;R;J1;J2;J3;J4;J5;J6\n" + "\n".join(lines), profile)
-    header, *rows = table(found.text)
+    found = convert(tmp_path, "Name;X;Y;Z;S;C;R;J1;J2;J3;J4;J5;J6\n" + "\n".join(lines), profile)
+    header, *rows = read_table_lines(found.text)
     cells = [dict(zip(header.split(","), row.split(","), strict=True)) for row in rows]
     assert (found.rows, found.misfits) == (2, ())
     assert (cells[0]["sigma.a.x [um]"], cells[0]["sigma.b.x [um]"], cells[1]["sigma.a.x [um]"]) == (
@@ -144,7 +140,7 @@ def test_sigma_covariance_and_remarks_of_each_target_stay_with_it_and_calibrate_
     assert sigma[0] == pytest.approx([4e-6, 2e-6, 2e-6, 5e-6, 2e-6, 2e-6])  # [m]
 
 
-def test_a_target_without_a_line_needs_no_sigma(tmp_path) -> None:
+def test_target_without_a_line_needs_no_sigma(tmp_path) -> None:
     profile = TARGETS.replace("MORE", "sigma.x: {from: S, unit: um}").replace("settings:", READINGS)
     profile = profile.replace('"*": 2 um', '"*.y": 2 um, "*.z": 2 um')
     lines = [
@@ -153,7 +149,7 @@ def test_a_target_without_a_line_needs_no_sigma(tmp_path) -> None:
         "P2_b;1,7;2;3;6;1;0;0;0;0;0",
     ]
     (tmp_path / "data.csv").write_text(
-        converted(tmp_path, "Name;X;Y;Z;S;J1;J2;J3;J4;J5;J6\n" + "\n".join(lines), profile).text
+        convert(tmp_path, "Name;X;Y;Z;S;J1;J2;J3;J4;J5;J6\n" + "\n".join(lines), profile).text
     )
     data = load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"))
     rows = data.observations[0]
@@ -166,11 +162,11 @@ def test_a_target_without_a_line_needs_no_sigma(tmp_path) -> None:
         load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"))
 
 
-def test_a_target_that_gives_the_pose_another_reading_is_no_row(tmp_path) -> None:
+def test_target_line_with_other_readings_is_skipped(tmp_path) -> None:
     profile = TARGETS.replace("MORE", "").replace("settings:", READINGS)
     lines = ["P1_a;1;2;3;7,0;0;0;0;0;0", "P1_b;1;2;3;7,00;0;0;0;0;0", "P2_a;1;2;3;8;0;0;0;0;0", "P2_b;1;2;3;9;0;0;0;0;0",  # noqa: E501
              "P1_b;1;2;4;6;0;0;0;0;0"]  # fmt: skip
-    found = converted(tmp_path, "Name;X;Y;Z;J1;J2;J3;J4;J5;J6\n" + "\n".join(lines), profile)
+    found = convert(tmp_path, "Name;X;Y;Z;J1;J2;J3;J4;J5;J6\n" + "\n".join(lines), profile)
     assert found.misfits == (
         (5, "'q1' is 9 here, but 8 in an earlier line of the pose 'P2'"),
         (6, "'q1' is 6 here, but 7.0 in an earlier line of the pose 'P1'"),
@@ -178,9 +174,7 @@ def test_a_target_that_gives_the_pose_another_reading_is_no_row(tmp_path) -> Non
     assert found.rows == 2
 
 
-def test_targets_at_another_temperature_have_rows_of_their_own_and_another_time_is_told(
-    tmp_path,
-) -> None:
+def test_targets_at_another_temperature_get_separate_rows(tmp_path) -> None:
     more = "temperature: {from: T, unit: degC}\n  time: {from: When}"
     lines = [
         "P1_a;1;2;3;20;2026-05-04T10:00:00",
@@ -188,10 +182,10 @@ def test_targets_at_another_temperature_have_rows_of_their_own_and_another_time_
         "P2_a;1;2;3;20;",
         "P2_b;1;2;3;21;",
     ]
-    found = converted(
+    found = convert(
         tmp_path, "Name;X;Y;Z;T;When\n" + "\n".join(lines), TARGETS.replace("MORE", more)
     )
-    assert table(found.text) == [
+    assert read_table_lines(found.text) == [
         "pose,temperature [degC],time,a.x [mm],a.y [mm],a.z [mm],b.x [mm],b.y [mm],b.z [mm]",
         "P1,20,2026-05-04T10:00:00,1,2,3,1,2,3",
         "P2,20,,1,2,3,,,",
@@ -201,35 +195,35 @@ def test_targets_at_another_temperature_have_rows_of_their_own_and_another_time_
     assert f"## {found.findings[0]}\n" in found.text
 
 
-def test_missing_numbers_are_compared_by_value_and_missing_words_by_their_letters(tmp_path) -> None:
+def test_missing_values_are_compared_as_numbers_and_missing_words_as_text(tmp_path) -> None:
     profile = BY_NAME.replace("columns:", "missing: [-999.0, 0, 'n/a']\ncolumns:", 1)
-    found = converted(
+    found = convert(
         tmp_path, "Name,X,Y,Z\n0.5,-999.0000,-999,0.000\nP2,n/a,1,-9.99e2\nP3,-99,1e-9,2\n", profile
     )
-    assert table(found.text)[1:] == ["0.5,,,", "P2,,1,", "P3,-99,1e-9,2"]
+    assert read_table_lines(found.text)[1:] == ["0.5,,,", "P2,,1,", "P3,-99,1e-9,2"]
     comma = profile.replace("comma", "semicolon\ndecimal: comma").replace("-999.0", "'-999,0'")
-    assert table(converted(tmp_path, "Name;X;Y;Z\nP1;-999,00;0,0;3,5\n", comma).text)[1:] == [
-        "P1,,,3.5"
-    ]
+    assert read_table_lines(convert(tmp_path, "Name;X;Y;Z\nP1;-999,00;0,0;3,5\n", comma).text)[
+        1:
+    ] == ["P1,,,3.5"]
 
 
 @pytest.mark.parametrize(
     "cell", ["1_0", "\uff11.5", "nan", "inf", "1.5D+3", "\u22121.5", "0x1f", "1 234"]
 )
-def test_what_only_looks_like_a_number_is_none(tmp_path, cell) -> None:
-    found = converted(tmp_path, f"Name,X,Y,Z\nP1,1,2,3\nP2,{cell},2,3\n", BY_NAME)
+def test_cell_that_only_resembles_a_number_is_skipped(tmp_path, cell) -> None:
+    found = convert(tmp_path, f"Name,X,Y,Z\nP1,1,2,3\nP2,{cell},2,3\n", BY_NAME)
     assert found.misfits == ((3, f"{cell!r} is not a number for 'x'"),)
 
 
-def test_missing_cells_of_a_rotation_matrix_are_missing(tmp_path) -> None:
+def test_missing_cells_of_a_rotation_matrix_give_empty_orientation_cells(tmp_path) -> None:
     profile = """delimiter: semicolon
 missing: -999
 matrix: [2, 3, 4, 5, 6, 7, 8, 9, 10]
 columns: {pose: {from: 1}, x: {from: 11, unit: mm}, y: {from: 12, unit: mm}, z: {from: 13, unit: mm}}
 settings: {kind: pose, orientation: quaternion}
 """  # noqa: E501
-    found = converted(tmp_path, "P1;" + "-999.0;" * 9 + "1;2;3\n", profile)
-    assert table(found.text)[1:] == ["P1,,,,,1,2,3"]
+    found = convert(tmp_path, "P1;" + "-999.0;" * 9 + "1;2;3\n", profile)
+    assert read_table_lines(found.text)[1:] == ["P1,,,,,1,2,3"]
 
 
 JOINT = """delimiter: comma
@@ -242,14 +236,17 @@ settings: {kind: joint, joints: [q1], noise: {"*": 2 um}}
 """
 
 
-def test_a_joint_that_is_read_and_measured_has_two_columns(tmp_path) -> None:
-    found = converted(tmp_path, "Name,B1,J1,S\n1,5,7,3\n", JOINT)
-    assert table(found.text) == ["pose,sigma.measured.q1 [um],q1 [mm],measured.q1 [mm]", "1,3,7,5"]
+def test_joint_with_reading_and_measurement_has_two_columns(tmp_path) -> None:
+    found = convert(tmp_path, "Name,B1,J1,S\n1,5,7,3\n", JOINT)
+    assert read_table_lines(found.text) == [
+        "pose,sigma.measured.q1 [um],q1 [mm],measured.q1 [mm]",
+        "1,3,7,5",
+    ]
     with pytest.raises(
         FileError,
         match=r"'q1' is a reading and a measured column; name the measured one 'measured.q1'",
     ):
-        converted(tmp_path, "Name,B1,J1\n1,5,7\n", JOINT.replace("  measured.q1", "  q1"))
+        convert(tmp_path, "Name,B1,J1\n1,5,7\n", JOINT.replace("  measured.q1", "  q1"))
 
 
 BAD = {
@@ -260,7 +257,7 @@ BAD = {
                                                                             "of 'x'")),
     "one unit for a covariance": ("  z:", "  cov.x.y: {from: C, unit: mm}\n  z:", 7, ("'mm' is not "
                                                                                      "a unit")),
-    "a sigma of nothing": ("  z:", "  sigma.w: {from: C, unit: mm}\n  z:", 7, ("'sigma.w' is not a "
+    "an unknown sigma": ("  z:", "  sigma.w: {from: C, unit: mm}\n  z:", 7, ("'sigma.w' is not a "
                                                                               "column .*did you "
                                                                               "mean 'sigma")),
     "another unit in the header": ("from: X, unit: mm", '"from": "X [m]", unit: mm', 5, ("header is "  # noqa: E501
@@ -268,36 +265,36 @@ BAD = {
     "degrees in the header": ("from: X, unit: mm", '"from": "X (°)", unit: mm', 5, ("write the "
                                                                                     "unit "
                                                                                    "deg")),
-    "readings of nothing": ("settings", "readings:\nsettings", 8, "'readings' is empty"),
-    "nothing for missing": ("delimiter", "missing: [null]\ndelimiter", 2, ("'missing entry 1' is "
+    "no readings": ("settings", "readings:\nsettings", 8, "'readings' is empty"),
+    "an empty missing value": ("delimiter", "missing: [null]\ndelimiter", 2, ("'missing entry 1' is "
                                                                           "empty")),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_profile_that_would_fail_later_is_refused_at_its_line(tmp_path, case) -> None:
+def test_profile_with_wrong_units_or_encoding_is_refused_with_its_line(tmp_path, case) -> None:
     old, new, line, message = BAD[case]
     assert old in BY_NAME
     with pytest.raises(FileError, match=message) as caught:
-        converted(tmp_path, "Name,X,Y,Z\n1,1,2,3\n", BY_NAME.replace(old, new, 1))
+        convert(tmp_path, "Name,X,Y,Z\n1,1,2,3\n", BY_NAME.replace(old, new, 1))
     assert caught.value.line == line
 
 
 @pytest.mark.parametrize("word", ["null", "true", "No", "a"])
-def test_settings_that_yaml_would_take_for_something_else_are_quoted(tmp_path, word) -> None:
+def test_setting_that_yaml_would_convert_is_quoted(tmp_path, word) -> None:
     profile = BY_NAME.replace("settings: {", f"settings: {{session: '{word}', poses: poses.csv, ")
     (tmp_path / "poses.csv").write_text(
         "pose,q1 [mm],q2 [mm],q3 [mm],q4 [mm],q5 [mm],q6 [mm]\n1,0,0,0,0,0,0\n"
     )
-    (tmp_path / "data.csv").write_text(converted(tmp_path, "Name,X,Y,Z\n1,1,2,3\n", profile).text)
+    (tmp_path / "data.csv").write_text(convert(tmp_path, "Name,X,Y,Z\n1,1,2,3\n", profile).text)
     data = load_measurements(tmp_path / "data.csv", load_robot("hexapod-42"))
     assert data.observations[0].session.tolist() == [word]
 
 
-def test_the_command_tells_what_targets_say_differently(tmp_path, monkeypatch, capsys) -> None:
+def test_import_reports_targets_with_different_times(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     lines = "Name;X;Y;Z;When\nP1_a;1;2;3;2026-05-04\nP1_b;1;2;3;2026-05-05\n"
-    converted(tmp_path, lines, TARGETS.replace("MORE", "time: {from: When}"))
+    convert(tmp_path, lines, TARGETS.replace("MORE", "time: {from: When}"))
     assert main(["import", "export.txt", "--profile", "profile.yaml", "-o", "data.csv"]) == 0
     assert "note: 1 line of further targets state another time" in capsys.readouterr().out
     assert (
@@ -362,7 +359,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_a_measurement_file_of_another_program_is_refused_with_what_helps(tmp_path, case) -> None:
+def test_measurement_file_of_another_program_is_refused_with_advice(tmp_path, case) -> None:
     content, message = REFUSED[case]
     (tmp_path / "data.csv").write_bytes(content)
     robot = load_robot("hexapod-42")
@@ -371,7 +368,7 @@ def test_a_measurement_file_of_another_program_is_refused_with_what_helps(tmp_pa
     assert "\n" not in str(caught.value)
 
 
-def test_zero_kelvin_is_cold_enough(tmp_path) -> None:
+def test_temperature_of_zero_kelvin_is_accepted(tmp_path) -> None:
     (tmp_path / "data.csv").write_text(
         FRONT + ROWS.replace("[degC]", "[degF]").replace(",20,2,", ",-459.67,2,")
     )
