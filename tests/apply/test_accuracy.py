@@ -84,18 +84,18 @@ def test_tool_uncertainty_includes_platform_rotation_times_the_lever_arm(fit):
     known, T_platform_tool = fit.posterior, np.eye(4)
     T_platform_tool[:3, 3] = [0.0, 0.0, 0.3]
     robot = replace(known.robot, assembly=replace(known.robot.assembly, tool=T_platform_tool))
-    here, there = (
+    at_platform, at_tool = (
         pose_uncertainty(replace(known, robot=robot), TEST_POSES, point=point)
         for point in ("platform", "tool")
     )
     arm = TEST_POSES[:, :3, 2] * 0.3
     move = np.concatenate([-geometry.hat(arm), np.broadcast_to(np.eye(3), (5, 3, 3))], axis=2)
-    expected = move @ here.covariance @ move.swapaxes(1, 2)
+    expected = move @ at_platform.covariance @ move.swapaxes(1, 2)
     np.testing.assert_allclose(
-        there.covariance[:, 3:, 3:], expected, rtol=0, atol=1e-10 * expected.max()
+        at_tool.covariance[:, 3:, 3:], expected, rtol=0, atol=1e-10 * expected.max()
     )
-    assert "tool point" in there.frame
-    assert "platform origin" in here.frame
+    assert "tool point" in at_tool.frame
+    assert "platform origin" in at_platform.frame
 
 
 def test_size_of_pose_uncertainty_does_not_depend_on_the_axes(fit):

@@ -15,10 +15,10 @@ from loopcal.io.core.json_text import to_json
 from loopcal.measure import Gaussian, Instrument, Pose, Sensor, simulate
 from tests import zoo
 from tests.estimate.problems import (
-    bed,
+    bed_points,
     hexapod,
     hexapod_data,
-    probed_heights,
+    simulate_heights,
     tracker,
     with_tolerance,
 )
@@ -116,7 +116,7 @@ def test_exceeded_limit_fails_with_quantity_and_limit(split_data):
 
 def test_limit_on_an_unmeasured_quantity_fails():
     robot = zoo.delta()
-    found = validate(robot, probed_heights(robot, bed(8)), limit_angle=1e-3)
+    found = validate(robot, simulate_heights(robot, bed_points(8)), limit_angle=1e-3)
     (failure,) = found.failures
     assert failure.code == "gates.limit-not-measured"
     assert failure.data == {"quantity": "orientation"}

@@ -18,7 +18,7 @@ from loopcal.io import load_robot
 from loopcal.io.core.json_text import to_json
 from loopcal.measure import Component, Inclination, Instrument, Pose, Position, Sensor, Separation
 from loopcal.numerics.decomposition import decompose
-from tests.estimate.problems import UM, five_dof, folded, hexapod, hexapod_data, noise, tracker
+from tests.estimate.problems import UM, five_dof, fold_rows, hexapod, hexapod_data, noise, tracker
 
 FRAMES = {(): 42, ("frame",): 36, ("tool",): 36, ("frame", "tool"): 30}
 
@@ -183,7 +183,7 @@ def test_collected_factor_equals_the_factor_of_a_fit_without_setup_parameters():
     free, data = select_free_parameters(hexapod()), hexapod_data(30)
     none = data.nuisance_parameters
     rows = observe_rows(observe_poses(free, data.readings), data, none, none.values())
-    expected = decompose(folded(rows), np.full(1, 180)).singular_values
+    expected = decompose(fold_rows(rows), np.full(1, 180)).singular_values
     factor, reached = collect_information(free, data)
     np.testing.assert_allclose(
         decompose(factor, np.full(1, 180)).singular_values, expected, rtol=1e-11
@@ -198,7 +198,7 @@ def test_elimination_of_dependent_columns_is_the_projection_onto_their_complemen
     F, A = rng.normal(size=(20, 3)), rng.normal(size=(20, 4))
     F = np.concatenate([F, F[:, :1] - 2 * F[:, 1:2]], axis=1)
     factor = eliminate_from_factor(
-        folded(np.concatenate([F, A, rng.normal(size=(20, 1))], axis=1)[None]), 4
+        fold_rows(np.concatenate([F, A, rng.normal(size=(20, 1))], axis=1)[None]), 4
     )
     left = A - F @ (np.linalg.pinv(F) @ A)
     R = factor[0, :4, :4]

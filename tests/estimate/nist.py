@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reader of the NIST StRD files for nonlinear regression, and the models they describe.
+"""Reader of the NIST StRD files for nonlinear regression, and their models.
 
-Source: https://www.itl.nist.gov/div898/strd/nls/nls_main.shtml (public domain). The models are
-written once, for real and complex numbers alike: derivatives come from a complex step, which has no
+Source: https://www.itl.nist.gov/div898/strd/nls/nls_main.shtml (public domain). The models work
+for real and complex numbers alike: derivatives come from a complex step, which has no
 cancellation.
 """
 
@@ -30,7 +30,7 @@ class Certified:
     x: np.ndarray
 
 
-def read(path: Path) -> Certified:
+def read_data_set(path: Path) -> Certified:
     """Read one .dat file by its line patterns."""
     lines = path.read_text("ascii").splitlines()
     parameters, residual_sum, degrees = [], None, None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tests of the estimators share: linear rows, instruments and measured robots."""
+"""Triangular factors, instruments and measured robots that the tests of estimation share."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ from tests import zoo
 MM, UM, URAD = 1e-3, 1e-6, 1e-6
 
 
-def folded(rows: np.ndarray) -> np.ndarray:
+def fold_rows(rows: np.ndarray) -> np.ndarray:
     """Triangular factor (t, p + 1, p + 1) of rows [A | b] (t, m, p + 1)."""
     return fold(empty_factor(len(rows), rows.shape[-1] - 1), rows)
 
@@ -35,23 +35,23 @@ def noise(*sigma: float) -> Gaussian:
 
 
 def tracker(sigma_position: float = UM, sigma_angle: float = 5 * URAD) -> Instrument:
-    """Full poses [m, rad]."""
+    """Return an instrument of full poses with these sigmas [m, rad]."""
     return Instrument((Sensor(Pose(), noise(*[sigma_angle] * 3, *[sigma_position] * 3)),))
 
 
 def five_dof() -> Instrument:
-    """Position and the two angles of the normal; torsion is not measured."""
+    """Return an instrument of position and the two angles of the normal, without torsion."""
     kind = Component(("x", "y", "z", "phi", "theta"), "tilt-torsion")
     return Instrument((Sensor(kind, noise(UM, UM, UM, 5 * URAD, 5 * URAD)),))
 
 
 def probe(sigma: float = 5 * UM) -> Instrument:
-    """Heights only."""
+    """Return an instrument of heights only."""
     return Instrument((Sensor(Component(("z",)), noise(sigma)),))
 
 
 def with_tolerance(robot: Mechanism, tolerance: float) -> Mechanism:
-    """The robot with one tolerance [SI] for all parameters."""
+    """Return the robot with one tolerance [SI] for all parameters."""
     entries = tuple(replace(p, tolerance=tolerance) for p in robot.parameters.entries)
     return replace(robot, parameters=ParameterTable(entries))
 
@@ -64,7 +64,7 @@ def hexapod_poses(n: int, seed: int = 0) -> np.ndarray:
 
 
 def hexapod_data(n: int = 30, seed: int = 0, instrument: Instrument | None = None) -> Measurements:
-    """Measurements of the true hexapod."""
+    """Simulate measurements of the true hexapod."""
     truth = zoo.hexapod().with_values(zoo.hexapod_truth())
     return simulate(truth, hexapod_poses(n, seed), instrument or tracker(), seed)
 
@@ -74,7 +74,7 @@ def hexapod() -> Mechanism:
     return with_tolerance(zoo.hexapod(), 0.035e-3)
 
 
-def probed_heights(
+def simulate_heights(
     truth: Mechanism, grid: np.ndarray, seed: int = 0, sigma: float = 5 * UM
 ) -> Measurements:
     """Heights (z alone) of a restricted robot commanded by its nominal geometry to x, y, z (n, 3)
@@ -88,7 +88,7 @@ def probed_heights(
     return Measurements(truth.name, readings, (rows,))
 
 
-def bed(n: int, seed: int = 0, top: float = 0.0) -> np.ndarray:
+def bed_points(n: int, seed: int = 0, top: float = 0.0) -> np.ndarray:
     """Random points (n, 3) over the bed of the delta, up to `top` above it [m]."""
     rng = np.random.default_rng(seed)
     return np.column_stack([rng.uniform(-0.07, 0.07, (n, 2)), rng.uniform(0.0, 1.0, n) * top])

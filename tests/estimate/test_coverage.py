@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Are the error bars true? A few hundred fits here; thousands in `make evidence`
+"""Coverage of 95 % intervals in a few hundred fits; `make evidence` runs thousands
 (evidence/coverage.py).
 """
 
@@ -10,40 +10,40 @@ import pytest
 
 from evidence.coverage import CASES, FITS, judge
 
-FEW = 240
-TRUE = [case for case in CASES if case.noise == 1.0]
+FEW_FITS = 240
+CORRECT_NOISE_CASES = [case for case in CASES if case.noise == 1.0]
 """Cases whose stated noise is the true one."""
 
 
-def band(p, n, sigmas=4.0):
+def binomial_band(p, n, sigmas=4.0):
     """Half-width of the binomial band around p for n independent draws."""
     return sigmas * np.sqrt(p * (1 - p) / n)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", TRUE, ids=lambda case: case.name)
-def test_a_95_percent_interval_holds_the_truth_in_95_percent_of_few_fits(case):
-    found = judge(case, FEW)
+@pytest.mark.parametrize("case", CORRECT_NOISE_CASES, ids=lambda case: case.name)
+def test_95_percent_intervals_contain_the_truth_in_95_percent_of_few_fits(case):
+    found = judge(case, FEW_FITS)
     # intervals of one fit are correlated: the band is that of as many draws as there are fits, at
     # four standard deviations
-    assert found["coverage"] == pytest.approx(0.95, abs=band(0.95, FEW))
-    assert found["rejected"] == pytest.approx(0.05, abs=band(0.05, FEW))
+    assert found["coverage"] == pytest.approx(0.95, abs=binomial_band(0.95, FEW_FITS))
+    assert found["rejected"] == pytest.approx(0.05, abs=binomial_band(0.05, FEW_FITS))
     # relative error of an rms of FEW fits with 60 correlated values each, as if only the fits were
     # independent
-    assert found["pose_spread"] == pytest.approx(1.0, abs=4.0 / np.sqrt(2 * FEW))
+    assert found["pose_spread"] == pytest.approx(1.0, abs=4.0 / np.sqrt(2 * FEW_FITS))
 
 
 @pytest.mark.slow
-def test_intervals_of_noise_stated_half_as_large_as_it_is_fail():
+def test_intervals_fail_if_the_stated_noise_is_half_the_true_noise():
     (case,) = (case for case in CASES if case.noise == 2.0)
-    found = judge(case, FEW)
+    found = judge(case, FEW_FITS)
     # half the width: a normal value lies within 0.98 sd in 67 % of the draws
-    assert found["coverage"] == pytest.approx(0.673, abs=band(0.673, FEW))
+    assert found["coverage"] == pytest.approx(0.673, abs=binomial_band(0.673, FEW_FITS))
     assert found["rejected"] > 0.99
 
 
 @pytest.fixture(scope="module")
-def table(root):
+def coverage_table(root):
     path = root / "docs" / "evidence" / "coverage.json"
     if not path.exists():
         pytest.skip("docs/evidence/coverage.json is made by `make evidence`")
@@ -51,9 +51,9 @@ def table(root):
 
 
 @pytest.mark.evidence
-@pytest.mark.parametrize("case", TRUE, ids=lambda case: case.name)
-def test_thousands_of_fits_cover_the_truth_as_often_as_they_say(table, case):
-    fits, coverage, _, rejected, spread = table[case.name]
+@pytest.mark.parametrize("case", CORRECT_NOISE_CASES, ids=lambda case: case.name)
+def test_published_coverage_agrees_with_the_stated_level(coverage_table, case):
+    fits, coverage, _, rejected, spread = coverage_table[case.name]
     assert fits >= 0.999 * FITS
     assert coverage == pytest.approx(95.0, abs=1.5)
     assert rejected == pytest.approx(5.0, abs=1.0)
@@ -61,8 +61,8 @@ def test_thousands_of_fits_cover_the_truth_as_often_as_they_say(table, case):
 
 
 @pytest.mark.evidence
-def test_doubled_noise_is_found_and_its_intervals_fail(table):
+def test_published_coverage_of_doubled_noise_fails(coverage_table):
     (case,) = (case for case in CASES if case.noise == 2.0)
-    _, coverage, _, rejected, _ = table[case.name]
+    _, coverage, _, rejected, _ = coverage_table[case.name]
     assert rejected > 99.0
     assert coverage < 75.0

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The descent: independence of trials, the total deviation, and endings that are never silent."""
+"""The descent: independence of trials, penalty on the total deviation, and a status for every
+ending.
+"""
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from loopcal.estimate.fit_findings import report_status
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Ridge
 from loopcal.estimate.minimization.descent import FunctionProblem, StepControl, descend
 from loopcal.numerics.gauss_newton import DescentStatus
-from tests.estimate.problems import folded
+from tests.estimate.problems import fold_rows
 
 
 class Exponentials:
@@ -23,7 +25,7 @@ class Exponentials:
         decay = np.exp(-(1.0 + b) * self.x)
         residual = (1.0 + a) * decay + c - self.y[trials]
         columns = [decay, -(1.0 + a) * self.x * decay, np.ones_like(decay)]
-        return folded(np.stack([*columns, residual], axis=2)), (residual**2).sum(axis=1)
+        return fold_rows(np.stack([*columns, residual], axis=2)), (residual**2).sum(axis=1)
 
 
 class Circle:
@@ -35,7 +37,7 @@ class Circle:
         x, y = 1.0 + deviation[:, 0], deviation[:, 1]
         length = np.hypot(x, y)
         row = np.stack([x / length, y / length, length - 2.0], axis=1)[:, None, :]
-        return folded(row), (length - 2.0) ** 2
+        return fold_rows(row), (length - 2.0) ** 2
 
 
 class Unreachable:
@@ -48,12 +50,12 @@ class Unreachable:
         return np.tile(np.array([[1.0, 1.0], [0.0, 0.0]]), (len(deviation), 1, 1)), cost
 
 
-def problem_of(functions):
+def make_problem(functions):
     """The problem that functions of this module define."""
     return FunctionProblem(functions.parameters, functions.evaluate, functions.equations)
 
 
-def noisy(t: int) -> np.ndarray:
+def noisy_exponentials(t: int) -> np.ndarray:
     rng = np.random.default_rng(4)
     x = np.linspace(0.0, 3.0, 25)
     truth = rng.uniform(-0.5, 0.5, (t, 3, 1))
@@ -62,42 +64,42 @@ def noisy(t: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("method", [LeastSquares(), MAP(), Ridge(0.01)])
-def test_trials_stacked_equal_trials_alone_bit_for_bit(method):
-    y = noisy(7)
-    together = descend(problem_of(Exponentials(y)), np.zeros((7, 3)), method)
+def test_descent_of_stacked_trials_equals_single_trials_bit_for_bit(method):
+    y = noisy_exponentials(7)
+    together = descend(make_problem(Exponentials(y)), np.zeros((7, 3)), method)
     assert (together.status == DescentStatus.CONVERGED).all()
     for i in range(7):
-        alone = descend(problem_of(Exponentials(y[i : i + 1])), np.zeros((1, 3)), method)
+        alone = descend(make_problem(Exponentials(y[i : i + 1])), np.zeros((1, 3)), method)
         assert np.array_equal(together.deviation[i], alone.deviation[0])
         assert together.iterations[i] == alone.iterations[0]
         assert together.cost[i] == alone.cost[0]
 
 
-def test_ridge_minimises_the_sum_of_squares_plus_the_penalty_on_the_total_deviation():
-    y = noisy(1)
-    fit = descend(problem_of(Exponentials(y)), np.zeros((1, 3)), Ridge(0.3))
+def test_ridge_minimizes_squares_plus_penalty_on_the_total_deviation():
+    y = noisy_exponentials(1)
+    fit = descend(make_problem(Exponentials(y)), np.zeros((1, 3)), Ridge(0.3))
     factor, _ = Exponentials(y).evaluate(fit.deviation, np.array([0]))
     gradient = factor[0, :3, :3].T @ factor[0, :3, 3] + 0.3 * fit.deviation[0]
     np.testing.assert_allclose(gradient, 0.0, atol=1e-8)
 
 
-def test_the_answer_does_not_depend_on_the_start():
-    y = noisy(1)
-    a = descend(problem_of(Exponentials(y)), np.zeros((1, 3)), MAP())
-    b = descend(problem_of(Exponentials(y)), np.array([[2.0, 1.5, -1.0]]), MAP())
+def test_minimum_does_not_depend_on_the_start():
+    y = noisy_exponentials(1)
+    a = descend(make_problem(Exponentials(y)), np.zeros((1, 3)), MAP())
+    b = descend(make_problem(Exponentials(y)), np.array([[2.0, 1.5, -1.0]]), MAP())
     np.testing.assert_allclose(a.deviation, b.deviation, atol=1e-7)
 
 
-def test_least_squares_takes_the_smallest_total_deviation_where_nothing_is_known():
-    fit = descend(problem_of(Circle()), np.array([[0.4, 0.9]]), LeastSquares())
+def test_least_squares_takes_the_smallest_deviation_in_the_null_space():
+    fit = descend(make_problem(Circle()), np.array([[0.4, 0.9]]), LeastSquares())
     assert fit.status[0] == DescentStatus.CONVERGED
     assert fit.decomposition.rank[0] == 1
     np.testing.assert_allclose(fit.deviation, [[1.0, 0.0]], atol=1e-6)
 
 
-def test_too_few_iterations_are_said():
+def test_exhausted_iterations_are_reported():
     fit = descend(
-        problem_of(Exponentials(noisy(1))),
+        make_problem(Exponentials(noisy_exponentials(1))),
         np.zeros((1, 3)),
         LeastSquares(),
         StepControl(iterations=1),
@@ -107,34 +109,34 @@ def test_too_few_iterations_are_said():
     assert finding.code == "fit.out-of-iterations"
 
 
-def test_a_trial_that_fails_at_its_start_is_marked_and_the_others_go_on():
-    y = noisy(3)
+def test_trial_with_a_bad_start_is_marked_and_does_not_change_others():
+    y = noisy_exponentials(3)
     y[1, 4] = np.nan
-    fit = descend(problem_of(Exponentials(y)), np.zeros((3, 3)), LeastSquares())
+    fit = descend(make_problem(Exponentials(y)), np.zeros((3, 3)), LeastSquares())
     assert fit.status.tolist() == [
         DescentStatus.CONVERGED,
         DescentStatus.BAD_START,
         DescentStatus.CONVERGED,
     ]
-    alone = descend(problem_of(Exponentials(y[2:])), np.zeros((1, 3)), LeastSquares())
+    alone = descend(make_problem(Exponentials(y[2:])), np.zeros((1, 3)), LeastSquares())
     assert np.array_equal(fit.deviation[2], alone.deviation[0])
 
 
-def test_a_wall_on_every_side_is_said():
-    fit = descend(problem_of(Unreachable()), np.zeros((1, 1)), LeastSquares())
+def test_descent_without_a_finite_step_is_reported():
+    fit = descend(make_problem(Unreachable()), np.zeros((1, 1)), LeastSquares())
     assert fit.status[0] == DescentStatus.NO_DESCENT
 
 
-def test_noise_free_rows_converge_to_rounding():
+def test_noise_free_rows_converge_to_rounding_error():
     x = np.linspace(0.0, 3.0, 25)
     y = (1.2 * np.exp(-0.7 * x) + 0.1)[None]
-    fit = descend(problem_of(Exponentials(y)), np.zeros((1, 3)), LeastSquares())
+    fit = descend(make_problem(Exponentials(y)), np.zeros((1, 3)), LeastSquares())
     assert fit.status[0] == DescentStatus.CONVERGED
     np.testing.assert_allclose(fit.deviation, [[0.2, -0.3, 0.1]], atol=1e-12)
     assert fit.iterations[0] <= 6
     assert len(fit.cost_history) == fit.iterations[0] + 1
 
 
-def test_every_ending_has_a_finding():
+def test_every_descent_status_has_a_finding():
     endings = [status for status in DescentStatus if status is not DescentStatus.RUNNING]
     assert len({report_status(status, 3).code for status in endings}) == len(endings)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A fit that did not converge, or left what was known of the robot, promises nothing."""
+"""Fits that did not converge or left their tolerances state no noise, no intervals and no prior."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ ONE_STEP = StepControl(iterations=1)
 
 @pytest.mark.parametrize("method", [LeastSquares(), MAP(), None])
 @pytest.mark.parametrize("noise", ["given", "estimated"])
-def test_a_fit_that_did_not_converge_says_nothing_of_the_noise_and_gives_no_interval(method, noise):
+def test_fit_without_convergence_has_no_noise_test_and_no_intervals(method, noise):
     data = hexapod_data(12)
     rows = data.observations[0]
     # with sigmas a hundred times too large even the first step leaves less than noise explains
@@ -37,14 +37,14 @@ def test_a_fit_that_did_not_converge_says_nothing_of_the_noise_and_gives_no_inte
         assert check_start_values(fit).finding.code == "residuals.start-not-comparable"
 
 
-def test_a_fit_that_did_not_converge_cannot_be_a_prior():
+def test_fit_without_convergence_cannot_be_a_prior():
     with refused("prior.no-uncertainty"):
         prior_from(
             identify(hexapod(), hexapod_data(12), options=FitOptions(control=ONE_STEP)).posterior
         )
 
 
-def test_an_estimate_far_outside_its_stated_tolerance_is_named_with_the_remedy():
+def test_estimate_far_outside_its_tolerance_is_reported():
     robot, data = hexapod(), hexapod_data(12)
     place = robot.parameters.names.index("leg1.length")
     entries = list(robot.parameters.entries)

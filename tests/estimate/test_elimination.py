@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nested elimination of own unknowns is the dense one over whole clusters, at a cost that grows
-with the number of groups.
+"""Nested elimination of setup parameters equals dense elimination, at a cost linear in the number
+of groups.
 """
 
 from dataclasses import dataclass
@@ -76,7 +76,7 @@ def random_problem(rng, unseen):
     )
 
 
-def folded(problem, tree):
+def fold_problem(problem, tree):
     """The factors of a problem, its rows folded in two blocks; the rows without unknowns are left
     out.
     """
@@ -95,7 +95,7 @@ def folded(problem, tree):
     return factors
 
 
-def dense(problem, tree):
+def eliminate_dense(problem, tree):
     """Best values, their variance, what is open, rank, and the rows left, by one pseudo-inverse for
     each cluster.
     """
@@ -125,15 +125,15 @@ def dense(problem, tree):
 
 
 @pytest.mark.parametrize("unseen", [0, 1, 2])
-def test_nested_elimination_is_the_dense_one_whatever_is_unseen(unseen):
+def test_nested_elimination_equals_dense_elimination_with_unobservable_directions(unseen):
     deep = 0
     for seed in range(60):
         problem = random_problem(np.random.default_rng(seed), unseen)
         if not problem.free.any():
             continue
         tree = problem.tree
-        best, variance, open_, rank, left = dense(problem, tree)
-        found, rest = eliminate_tree(folded(problem, tree))
+        best, variance, open_, rank, left = eliminate_dense(problem, tree)
+        found, rest = eliminate_tree(fold_problem(problem, tree))
         assert found.rank[0] == rank, seed
         assert (found.is_unobservable[0] == open_).all(), seed
         # each unknown in the unit of its own column: 1e-9 is rounding times the worst condition of
@@ -158,10 +158,10 @@ def test_nested_elimination_is_the_dense_one_whatever_is_unseen(unseen):
     assert deep > 30, "too few of the problems are nested at all"
 
 
-def test_rows_in_units_of_their_standard_deviations_are_orthonormal():
+def test_whitened_nuisance_columns_are_orthonormal():
     problem = random_problem(np.random.default_rng(8), 0)
     tree = problem.tree
-    found, _ = eliminate_tree(folded(problem, tree))
+    found, _ = eliminate_tree(fold_problem(problem, tree))
     assert len(tree.structures) > 2
     assert not found.is_unobservable.any()
     whitened = np.zeros_like(problem.F)
@@ -176,7 +176,7 @@ def test_rows_in_units_of_their_standard_deviations_are_orthonormal():
     )
 
 
-def test_what_the_leaves_take_up_whole_is_not_taken_for_seen():
+def test_offset_absorbed_by_leaf_unknowns_is_unobservable():
     # ten groups with a height each and one offset that all of them share: only sums of the two are
     # measured
     rng, G = np.random.default_rng(0), 10
@@ -185,17 +185,17 @@ def test_what_the_leaves_take_up_whole_is_not_taken_for_seen():
     sets = [[i, G] for i in range(G)]
     problem = Problem(np.ones(G + 1, dtype=bool), ["group"] * G + ["machine"], sets, F, rng.normal(size=(5 * G, 3)),  # noqa: E501
                       np.repeat(np.arange(G), 5))  # fmt: skip
-    found, rest = eliminate_tree(folded(problem, problem.tree))
+    found, rest = eliminate_tree(fold_problem(problem, problem.tree))
     assert found.rank[0] == G
     assert found.is_unobservable.all()
-    best, _, _, _, left = dense(problem, problem.tree)
+    best, _, _, _, left = eliminate_dense(problem, problem.tree)
     assert_allclose(found.shift[0], best[:, -1], rtol=0, atol=1e-12)
     assert_allclose(
         rest[0].T @ rest[0], left.T @ left, rtol=0, atol=1e-12 * np.abs(left.T @ left).max()
     )
 
 
-def nested(scopes, sets):
+def nest_groups(scopes, sets):
     return build_tree(
         np.ones(len(scopes), dtype=bool),
         scopes,
@@ -203,12 +203,12 @@ def nested(scopes, sets):
     )
 
 
-def test_groups_are_nested_in_their_session_and_sessions_in_what_they_share():
+def test_groups_are_nested_in_sessions_and_sessions_in_the_machine():
     scopes = ["machine"] + 2 * (["session"] * 2 + ["group"] * 3)
     sets = [
         [0, 1 + 5 * day, 2 + 5 * day, 3 + 5 * day + group] for day in range(2) for group in range(3)
     ]
-    found = nested(scopes, sets)
+    found = nest_groups(scopes, sets)
     assert [(len(structure), *structure.path.shape[1:]) for structure in found.structures] == [
         (1, 1),
         (2, 3),
@@ -219,18 +219,18 @@ def test_groups_are_nested_in_their_session_and_sessions_in_what_they_share():
     assert found.columns(found.node[[9]], np.array([[0, 6, 7, 9]])).tolist() == [[3, 1, 2, 0]]
 
 
-def test_many_targets_are_nested_in_the_frame_from_which_they_are_seen():
+def test_targets_are_nested_in_the_frame_that_measures_them():
     scopes = ["session"] * 6 + ["machine"] * 60
-    found = nested(scopes, [[*range(6), *range(6 + 3 * i, 9 + 3 * i)] for i in range(20)])
+    found = nest_groups(scopes, [[*range(6), *range(6 + 3 * i, 9 + 3 * i)] for i in range(20)])
     assert [structure.path.shape for structure in found.structures] == [(1, 6), (20, 9)]
 
 
-def test_unknowns_of_two_scopes_that_every_row_uses_are_one_node():
-    found = nested(["session"] * 6 + ["machine"] * 3, [list(range(9))])
+def test_unknowns_of_two_scopes_used_by_every_row_share_a_node():
+    found = nest_groups(["session"] * 6 + ["machine"] * 3, [list(range(9))])
     assert [structure.path.tolist() for structure in found.structures] == [[list(range(9))]]
 
 
-def test_without_free_unknowns_there_is_nothing_to_nest():
+def test_elimination_tree_without_free_unknowns_is_empty():
     found = build_tree(np.zeros(3, dtype=bool), ["group"] * 3, np.array([[0, 0], [0, 1], [0, 2]]))
     assert found.structures == ()
     eliminated, rest = eliminate_tree(NodeFactors(found, 2, 4))
@@ -238,7 +238,7 @@ def test_without_free_unknowns_there_is_nothing_to_nest():
     assert not rest.any()
 
 
-def probed(groups, per_group=6, seed=1):
+def simulate_probed_planes(groups, per_group=6, seed=1):
     """A hexapod that probes planes, in turn; all share the offset of one probe."""
     n = groups * per_group
     group = np.array([f"plate{i % groups}" for i in range(n)])
@@ -253,7 +253,7 @@ def probed(groups, per_group=6, seed=1):
     )
 
 
-def fold_of(data):
+def linearize_nominal(data):
     """Factor of one fold at the nominal machine, own unknowns from where they are stated, and
     these.
     """
@@ -264,7 +264,7 @@ def fold_of(data):
     return at.factor[0], at.nuisance
 
 
-def test_planes_that_share_a_probe_cost_twice_as_much_where_there_are_twice_as_many(monkeypatch):
+def test_cost_of_planes_that_share_a_probe_is_linear_in_their_number(monkeypatch):
     counted, add = {"rows": 0, "kept": 0, "widest": 0}, NodeFactors.add
 
     def counting(self, structure, rows, places):
@@ -278,7 +278,7 @@ def test_planes_that_share_a_probe_cost_twice_as_much_where_there_are_twice_as_m
     found = []
     for groups in (5, 10, 20):
         counted.update(rows=0, kept=0, widest=0)
-        _, own = fold_of(probed(groups))
+        _, own = linearize_nominal(simulate_probed_planes(groups))
         # three numbers of a plane, three of the probe, the machine, the residual; dense it were 3 *
         # groups + 46
         assert counted["widest"] == 3 + 3 + 42 + 1
@@ -291,8 +291,8 @@ def test_planes_that_share_a_probe_cost_twice_as_much_where_there_are_twice_as_m
 
 
 @pytest.mark.parametrize("held", [False, True])
-def test_planes_and_the_probe_they_share_give_the_joint_solution(held):
-    data = probed(6, per_group=15)
+def test_planes_that_share_a_probe_give_the_joint_solution(held):
+    data = simulate_probed_planes(6, per_group=15)
     free = select_free_parameters(hexapod())
     local = (
         data.nuisance_parameters.with_prior("plate[0-3].*", 1e-3).with_prior("probe.x", 1e-4)
@@ -322,18 +322,18 @@ def test_planes_and_the_probe_they_share_give_the_joint_solution(held):
     assert len(at.nuisance.elimination.tree.structures) > 1
 
 
-def test_groups_whose_rows_come_in_several_blocks_are_folded_as_whole(monkeypatch):
-    data = probed(7)
-    whole = fold_of(data)[0]
+def test_groups_split_over_row_blocks_give_the_same_factor(monkeypatch):
+    data = simulate_probed_planes(7)
+    whole = linearize_nominal(data)[0]
     monkeypatch.setattr(problem_module, "BLOCK", 5)
-    parts = fold_of(data)[0]
+    parts = linearize_nominal(data)[0]
     assert_allclose(
         parts.T @ parts, whole.T @ whole, rtol=0, atol=1e-10 * np.abs(whole.T @ whole).max()
     )
 
 
-def test_a_fit_with_planes_that_share_a_probe_finds_it():
-    data = probed(12, per_group=10)
+def test_fit_of_planes_that_share_a_probe_converges():
+    data = simulate_probed_planes(12, per_group=10)
     fit = identify(hexapod(), data, LeastSquares())
     assert fit.converged
     assert fit.residual_test.p_value > 1e-3

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every kind alone finds the machine up to what it cannot see, says what that is, and its error
-bars are true.
+"""Every measurement kind alone: it recovers the robot up to its gauge freedom, reports what it
+cannot determine, and has correct intervals.
 
-The cases are the examples of the registry, so a new kind is in at once; `make evidence` runs all
-settings at full size (evidence/kinds.py), here are those with most unknowns.
+The cases are the examples of the registry, so a new kind is included automatically. `make
+evidence` runs all settings at full size (evidence/kinds.py); these tests run those with most
+unknowns.
 """
 
 import json
@@ -57,17 +58,21 @@ EXACT = 1e-9
 through conditions of 1e3
 to 1e4."""
 
-STILL = {"direction", "inclination", "autocollimation", "joint", "locked"}
+KINDS_BLIND_ON_A_DELTA = {"direction", "inclination", "autocollimation", "joint", "locked"}
 """What the platform of a delta, which does not turn, and its driven joints, whose values are the
 readings, cannot show.
 """
 
-RECOVERED = [
+RECOVERED_CASES = [
     case
     for case in with_most_unknowns()
-    if case.robot != "linear-delta" or case.kind.name not in STILL
+    if case.robot != "linear-delta" or case.kind.name not in KINDS_BLIND_ON_A_DELTA
 ]
-BLIND = [case for case in with_most_unknowns(("linear-delta",)) if case.kind.name in STILL]
+BLIND_CASES = [
+    case
+    for case in with_most_unknowns(("linear-delta",))
+    if case.kind.name in KINDS_BLIND_ON_A_DELTA
+]
 
 RANKS = {
     "pose": 30, "component": 30, "position": 30, "bearing": 30, "distance": 30, "separation": 30, "plane": 30, "line": 36,  # noqa: E501
@@ -86,8 +91,8 @@ def test_every_registered_kind_has_a_case_on_every_robot():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", RECOVERED, ids=str)
-def test_a_machine_is_recovered_from_noise_free_rows_of_one_kind_up_to_its_gauge(case):
+@pytest.mark.parametrize("case", RECOVERED_CASES, ids=str)
+def test_noise_free_rows_of_one_kind_recover_the_robot_up_to_its_gauge(case):
     found = recover(case)
     assert not found.refused
     assert found.machine == 0, "only motions of frames stay open"
@@ -99,8 +104,8 @@ def test_a_machine_is_recovered_from_noise_free_rows_of_one_kind_up_to_its_gauge
         assert found.rank == RANKS[case.kind.name]
 
 
-@pytest.mark.parametrize("case", BLIND, ids=str)
-def test_what_a_kind_cannot_show_of_a_delta_is_said(case):
+@pytest.mark.parametrize("case", BLIND_CASES, ids=str)
+def test_kinds_blind_on_a_delta_have_rank_zero_and_a_finding(case):
     robot = machine(case)
     data = simulate(
         robot,
@@ -115,22 +120,22 @@ def test_what_a_kind_cannot_show_of_a_delta_is_said(case):
     assert identifiability(robot, data).rank == 0
 
 
-def pooled(found: list[Coverage], what: str) -> float:
-    """Share of the intervals of all kinds that hold the truth."""
+def pool_coverage(found: list[Coverage], what: str) -> float:
+    """Return the share of the intervals of all kinds that contain the truth."""
     return float(np.concatenate([getattr(one, what).ravel() for one in found]).mean())
 
 
 @pytest.mark.slow
-def test_95_percent_intervals_hold_the_truth_of_a_hexapod_and_the_unknowns_of_every_kind():
+def test_intervals_of_a_hexapod_and_setup_parameters_have_95_percent_coverage():
     found = [cover(case, 10) for case in with_most_unknowns(("hexapod-42",))]
     total = sum(one.fits for one in found)
     assert total == 10 * len(found), "every fit converged"
     for what in ("directions", "parameters", "own"):
-        assert pooled(found, what) == pytest.approx(0.95, abs=band(total)), what
+        assert pool_coverage(found, what) == pytest.approx(0.95, abs=band(total)), what
 
 
 @pytest.mark.slow
-def test_intervals_of_noise_stated_half_as_large_as_it_is_fail():
+def test_coverage_is_too_low_if_the_stated_noise_is_half_the_true_noise():
     case = next(case for case in cases() if case.kind.name == "position")
     found = cover(case, 60, Loud)
     # half the width: a normal value lies within 0.98 sd in 67 % of the draws; the prior holds the
@@ -140,25 +145,25 @@ def test_intervals_of_noise_stated_half_as_large_as_it_is_fail():
 
 STATION = geometry.make_pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
 POINT = np.array([[0.03, -0.02, 0.05]])
-FIVE = (
+FIVE_KINDS = (
     Position(places=POINT, unknown=("frame",)),
     Inclination(unknown=("gravity", "mounting")),
     Bearing(places=POINT, T_base_frame=STATION, unknown=("frame",), frame="station"),
     Separation(places=POINT),
     Plane(places=POINT, unknown=("surface",)),
 )
-DRAWS, MOST = 20, 17
+MACHINES, MINIMUM_WINS = 20, 17
 """Machines, and in how many of them the better one of two equals is better: 17 or more of 20 in
 0.13 % of all cases.
 """
 
 
-def judged(kinds):
+def compute_variances_and_errors(kinds):
     """Variances predicted and squares of errors made (DRAWS,), parameters in tolerances, for
     machines all alike.
     """
     robot = load_robot("hexapod-42")
-    truth = sample_truth(robot, DRAWS, SEED)
+    truth = sample_truth(robot, MACHINES, SEED)
     # 5 um and 5 urad: angles tell as much as lengths on a machine of this size
     looking = Instrument(
         tuple(Sensor(kind, Gaussian(np.full(len(kind.noise_columns), 5e-6))) for kind in kinds)
@@ -174,17 +179,17 @@ def judged(kinds):
 
 
 @pytest.mark.slow
-def test_a_weighted_fit_of_five_kinds_beats_each_of_them_alone():
-    predicted, made = judged(FIVE)
-    for kind in FIVE:
-        alone, worse = judged((kind,))
+def test_weighted_fit_of_five_kinds_is_better_than_each_kind_alone():
+    predicted, made = compute_variances_and_errors(FIVE_KINDS)
+    for kind in FIVE_KINDS:
+        alone, worse = compute_variances_and_errors((kind,))
         assert (predicted < alone).all(), kind.name
-        assert np.count_nonzero(made < worse) >= MOST, kind.name
+        assert np.count_nonzero(made < worse) >= MINIMUM_WINS, kind.name
         assert made.mean() < worse.mean(), kind.name
 
 
 THREE = np.array([[0.1, 0.0, 0.02], [-0.06, 0.1, 0.03], [-0.05, -0.1, 0.01]])
-FRAMED = (
+KINDS_WITH_FRAMES = (
     Position(targets=("a", "b", "c"), places=THREE, unknown=("frame", "targets")),
     Pose(unknown=("frame", "tool")),
     Bearing(places=POINT, unknown=("frame",)),
@@ -193,8 +198,8 @@ FRAMED = (
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", FRAMED, ids=lambda kind: kind.name)
-def test_a_frame_anywhere_gives_the_machine_of_the_known_frame_up_to_its_gauge(kind):
+@pytest.mark.parametrize("kind", KINDS_WITH_FRAMES, ids=lambda kind: kind.name)
+def test_unknown_frame_gives_the_robot_of_the_known_frame_up_to_its_gauge(kind):
     robot = load_robot("hexapod-42")
     truth = robot.with_values(sample_truth(robot, 1, SEED)[0])
     poses, elsewhere = (
@@ -224,7 +229,7 @@ def test_a_frame_anywhere_gives_the_machine_of_the_known_frame_up_to_its_gauge(k
         assert pose_error(fit.robot, known.robot, elsewhere, ("base", "platform")) < EXACT, seed
 
 
-def locked_at(truth, joint, constant, rng, n=12):
+def find_locked_coordinates(truth, joint, constant, rng, n=12):
     """Coordinates z, phi, theta (n, 3) at which a passive joint of a true 3-PRS has this value;
     theta is sought.
     """
@@ -253,7 +258,7 @@ def locked_at(truth, joint, constant, rng, n=12):
     return np.column_stack([z, phi, at])[there][:n]
 
 
-def test_joints_locked_at_constants_nobody_knows_recover_a_tripod_up_to_its_frames():
+def test_joints_locked_at_unknown_values_recover_a_tripod_up_to_its_frames():
     robot, rng = load_robot("3-prs"), np.random.default_rng(SEED)
     truth = robot.with_values(sample_truth(robot, 1, SEED)[0])
     joints = inverse(truth, np.array([[0.7, 0.0, 0.1]])).passive_names
@@ -262,7 +267,7 @@ def test_joints_locked_at_constants_nobody_knows_recover_a_tripod_up_to_its_fram
     for i, joint in enumerate(joints):
         for k, constant in enumerate(np.quantile(usual[:, i], [0.3, 0.5, 0.7])):
             constants[f"at{k}.{joint}.locked"] = constant
-            coordinates.append(locked_at(truth, joint, constant, rng))
+            coordinates.append(find_locked_coordinates(truth, joint, constant, rng))
         kind = Locked(joints=(joint,), measures="angle")
         group = np.repeat(["at0", "at1", "at2"], 12)
         sensors.append(
@@ -291,7 +296,7 @@ def test_joints_locked_at_constants_nobody_knows_recover_a_tripod_up_to_its_fram
 
 
 @pytest.fixture(scope="module")
-def tables(root):
+def evidence_tables(root):
     path = root / "docs" / "evidence" / "kinds.json"
     if not path.exists():
         pytest.skip("docs/evidence/kinds.json is made by `make evidence`")
@@ -299,19 +304,19 @@ def tables(root):
 
 
 @pytest.mark.evidence
-def test_every_setting_of_every_kind_recovers_what_it_sees_on_every_robot(tables):
-    assert len(tables["recovery"]) == len(cases(("linear-delta",)))
-    for row in tables["recovery"]:
+def test_published_recovery_of_every_kind_and_robot_is_exact(evidence_tables):
+    assert len(evidence_tables["recovery"]) == len(cases(("linear-delta",)))
+    for row in evidence_tables["recovery"]:
         assert all(error is None or error < EXACT for error in row[2::2]), row[0]
-    refused = [row[0] for row in tables["recovery"] if None in row[1::2]]
+    refused = [row[0] for row in evidence_tables["recovery"] if None in row[1::2]]
     assert refused == ["component, c a b"], (
         "angles of euler-ZXZ are none where a delta does not turn"
     )
 
 
 @pytest.mark.evidence
-def test_coverage_of_every_kind_lies_in_its_band_and_that_of_doubled_noise_does_not(tables):
-    *true, loud = tables["coverage"]
+def test_published_coverage_of_every_kind_is_within_its_band(evidence_tables):
+    *true, loud = evidence_tables["coverage"]
     assert len(true) == len(ROBOTS) * len(KINDS)
     for robot, setting, fits, *shares in true:
         assert fits == FITS, setting

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identification: truth found, uncertainty stated, what cannot be known named, bad requests
-refused.
-"""
+"""Identification: estimates, uncertainties, unidentifiable combinations, and refused requests."""
 
 import json
 from dataclasses import replace
@@ -27,13 +25,13 @@ from loopcal.measure import sample_truth, simulate, simulate_trials
 from loopcal.mechanism import forward
 from tests import zoo
 from tests.estimate.problems import (
-    bed,
+    bed_points,
     five_dof,
     hexapod,
     hexapod_data,
     hexapod_poses,
     probe,
-    probed_heights,
+    simulate_heights,
     tracker,
     with_tolerance,
 )
@@ -52,7 +50,7 @@ def fit(data):
     return identify(hexapod(), data, LeastSquares())
 
 
-def test_the_true_parameters_lie_within_their_uncertainty(fit):
+def test_true_parameters_are_within_their_uncertainty(fit):
     pull = (fit.estimate - zoo.hexapod_truth()) / fit.standard_deviations
     assert fit.converged
     assert fit.rank == 42
@@ -62,7 +60,7 @@ def test_the_true_parameters_lie_within_their_uncertainty(fit):
     assert fit.residual_test.dof == 30 * 6 - 42
 
 
-def test_the_corrected_robot_carries_the_estimate(fit):
+def test_corrected_robot_has_the_estimate(fit):
     assert np.array_equal(fit.robot.values, fit.estimate)
     assert np.array_equal(fit.initial.values, zoo.hexapod().values)
     assert np.array_equal(fit.plus_minus, fit.interval())
@@ -84,7 +82,7 @@ def test_exact_poses_of_the_nategh_hexapod_are_recovered_quadratically():
 
 
 @pytest.mark.parametrize("method", [LeastSquares(), MAP()])
-def test_beginning_from_closure_leads_to_the_same_estimate(data, method):
+def test_closure_start_gives_the_same_estimate(data, method):
     a, b = (
         identify(hexapod(), data, method),
         identify(hexapod(), data, method, options=FitOptions(begin="closure")),
@@ -93,7 +91,7 @@ def test_beginning_from_closure_leads_to_the_same_estimate(data, method):
     assert a.chi_square == pytest.approx(b.chi_square, rel=1e-9)
 
 
-def test_beginning_from_closure_changes_nothing_where_poses_are_not_measured_in_full():
+def test_closure_start_is_not_used_for_incomplete_poses():
     heights = hexapod_data(60, instrument=probe())
     a = identify(hexapod(), heights, MAP())
     b = identify(hexapod(), heights, MAP(), options=FitOptions(begin="closure"))
@@ -101,13 +99,13 @@ def test_beginning_from_closure_changes_nothing_where_poses_are_not_measured_in_
     assert codes_of(b.findings) - codes_of(a.findings) == {"poses.closure-start-incomplete-poses"}
 
 
-def test_that_uncertain_readings_cannot_begin_from_closure_is_noted(data):
+def test_closure_start_is_not_used_for_uncertain_readings(data):
     few = replace(data.take(np.arange(10)), reading_sigma=2e-6)
     fit = identify(hexapod(), few, MAP(), options=FitOptions(begin="closure"))
     assert "poses.closure-start-uncertain-readings" in codes_of(fit.findings)
 
 
-def test_leaving_poses_out_by_weight_equals_removing_them(data):
+def test_weight_zero_equals_removing_the_poses(data):
     weight = np.ones(data.n_poses)
     weight[[3, 17, 29]] = 0.0
     by_weight = identify(hexapod(), data.with_weights(weight), LeastSquares())
@@ -119,13 +117,13 @@ def test_leaving_poses_out_by_weight_equals_removing_them(data):
     assert by_weight.residual_test.dof == removed.residual_test.dof
 
 
-def test_the_order_of_poses_changes_rounding_only(data, fit):
+def test_order_of_poses_changes_rounding_only(data, fit):
     order = np.random.default_rng(0).permutation(data.n_poses)
     shuffled = identify(hexapod(), data.take(order), LeastSquares())
     np.testing.assert_allclose(shuffled.estimate, fit.estimate, rtol=0, atol=1e-12)  # [m]
 
 
-def test_blocks_of_poses_change_rounding_only(data, fit, monkeypatch):
+def test_block_size_of_poses_changes_rounding_only(data, fit, monkeypatch):
     monkeypatch.setattr(problem_module, "BLOCK", 7)
     blocked = identify(hexapod(), data, LeastSquares())
     np.testing.assert_allclose(blocked.estimate, fit.estimate, rtol=0, atol=1e-12)  # [m]
@@ -136,7 +134,7 @@ def test_blocks_of_poses_change_rounding_only(data, fit, monkeypatch):
 @pytest.mark.parametrize(
     ("method", "begin"), [(LeastSquares(), "kinematics"), (MAP(), "kinematics"), (MAP(), "closure")]
 )
-def test_stacked_trials_equal_single_ones_bit_for_bit(method, begin):
+def test_identified_trials_equal_single_fits_bit_for_bit(method, begin):
     robot = hexapod()
     trials = simulate_trials(robot, sample_truth(robot, 7, 1), hexapod_poses(15), tracker(), 2)
     together = identify_trials(robot, trials, method, options=FitOptions(begin=begin))
@@ -150,7 +148,7 @@ def test_stacked_trials_equal_single_ones_bit_for_bit(method, begin):
         )
 
 
-def test_a_trial_out_of_reach_is_marked_and_leaves_the_others_alone():
+def test_unreachable_trial_is_marked_and_does_not_change_others():
     robot = hexapod()
     truth = sample_truth(robot, 3, 1)
     trials = simulate_trials(robot, truth, hexapod_poses(15), tracker(), 2)
@@ -165,7 +163,7 @@ def test_a_trial_out_of_reach_is_marked_and_leaves_the_others_alone():
     )
 
 
-def test_map_is_ridge_one_and_pulls_towards_nominal(data, fit):
+def test_map_equals_ridge_one_and_reduces_uncertainty(data, fit):
     posterior, ridge = identify(hexapod(), data, MAP()), identify(hexapod(), data, Ridge(1.0))
     np.testing.assert_allclose(posterior.estimate, ridge.estimate, rtol=0, atol=1e-15)
     assert (posterior.standard_deviations < fit.standard_deviations).all()
@@ -173,13 +171,13 @@ def test_map_is_ridge_one_and_pulls_towards_nominal(data, fit):
     assert posterior.residual_test.degrees == 180
 
 
-def test_truncation_at_full_rank_is_least_squares(data, fit):
+def test_truncation_at_full_rank_equals_least_squares(data, fit):
     np.testing.assert_allclose(
         identify(hexapod(), data, TruncatedSVD(42)).estimate, fit.estimate, rtol=0, atol=1e-15
     )
 
 
-def test_fixed_parameters_stay_and_have_no_uncertainty(data):
+def test_fixed_parameters_keep_their_values_without_uncertainty(data):
     robot = hexapod()
     names = [n for n in robot.parameters.names if not n.startswith("leg4")]
     some = replace(robot, parameters=robot.parameters.with_free(names))
@@ -192,7 +190,7 @@ def test_fixed_parameters_stay_and_have_no_uncertainty(data):
     assert fit.residual_test.finding.code == "noise.residuals-too-large"
 
 
-def test_what_the_data_cannot_tell_is_named_has_infinite_uncertainty_and_stays_nearest_to_nominal():
+def test_unidentifiable_combination_is_named_and_has_infinite_uncertainty():
     robot, data = hexapod(), hexapod_data(30, instrument=five_dof())
     fit = identify(robot, data, LeastSquares())
     assert fit.rank == 41
@@ -218,7 +216,7 @@ def test_what_the_data_cannot_tell_is_named_has_infinite_uncertainty_and_stays_n
     assert identify(robot, data, MAP()).standard_deviations.max() < 0.035 * MM
 
 
-def test_missing_tolerances_are_assumed_aloud(data):
+def test_assumed_tolerances_are_reported(data):
     fit = identify(zoo.hexapod(), data, LeastSquares())
     assumed = one_of(fit.findings, "fit.default-tolerances").data
     assert (assumed["count"], assumed["total"]) == (42, 42)
@@ -226,9 +224,7 @@ def test_missing_tolerances_are_assumed_aloud(data):
     assert "fit.default-tolerances" not in codes_of(stated)
 
 
-def test_fewer_equations_than_parameters_are_refused_unless_asked_for_or_a_prior_fills_the_gap(
-    data,
-):
+def test_too_few_equations_are_refused_without_a_prior_or_the_option(data):
     few = data.take(np.arange(5))
     with refused("fit.too-few-equations", equations=30, poses=5, unknowns=42, poses_needed=7):
         identify(hexapod(), few, LeastSquares())
@@ -241,11 +237,11 @@ def test_fewer_equations_than_parameters_are_refused_unless_asked_for_or_a_prior
     assert np.isfinite(identify(hexapod(), few, MAP()).standard_deviations).all()
 
 
-def test_few_degrees_of_freedom_give_no_intervals_unless_sigma_is_given():
+def test_few_degrees_of_freedom_give_intervals_only_with_given_sigma():
     robot = with_tolerance(zoo.delta(), 1e-3)
     six = [n for n in robot.parameters.names if "arm" not in n and "angle" not in n][:6]
     some = replace(robot, parameters=robot.parameters.with_free(six))
-    data = probed_heights(robot, bed(len(six) + 1))
+    data = simulate_heights(robot, bed_points(len(six) + 1))
     estimated, given = (
         identify(some, data, LeastSquares(), options=FitOptions(noise="estimated")),
         identify(some, data, LeastSquares()),
@@ -277,7 +273,7 @@ def test_estimated_noise_scales_the_uncertainty(data):
     assert given.residual_test.finding.code == "noise.residuals-too-large"
 
 
-def test_poses_out_of_reach_are_refused_by_name_and_ignored_without_weight(data):
+def test_unreachable_poses_are_refused_by_name_unless_their_weight_is_zero(data):
     readings = data.readings.copy()
     readings[4] = -0.2  # [m]
     broken = replace(data, readings=readings)
@@ -290,7 +286,7 @@ def test_poses_out_of_reach_are_refused_by_name_and_ignored_without_weight(data)
     np.testing.assert_allclose(found.estimate, expected.estimate, rtol=0, atol=1e-12)
 
 
-def test_an_iteration_cut_short_says_so(data):
+def test_fit_stopped_by_the_iteration_limit_is_reported(data):
     fit = identify(
         hexapod(), data, LeastSquares(), options=FitOptions(control=StepControl(iterations=0))
     )
@@ -299,7 +295,7 @@ def test_an_iteration_cut_short_says_so(data):
     assert "did not converge" in str(fit)
 
 
-def test_a_start_far_off_converges_to_the_same_answer(data, fit):
+def test_distant_start_converges_to_the_same_estimate(data, fit):
     start = zoo.hexapod().values + np.random.default_rng(1).uniform(-5 * MM, 5 * MM, 42)
     far = identify(hexapod(), data, LeastSquares(), options=FitOptions(start=start))
     assert far.converged
@@ -308,7 +304,7 @@ def test_a_start_far_off_converges_to_the_same_answer(data, fit):
     )  # [m] 1e-3 of the smallest sd
 
 
-def test_rows_of_weight_zero_alone_and_no_free_parameter_are_refused(data):
+def test_missing_rows_missing_parameters_and_unknown_noise_are_refused(data):
     with refused("fit.no-measured-value"):
         identify(hexapod(), data.with_weights(np.zeros(30)), LeastSquares())
     fixed = replace(hexapod(), parameters=hexapod().parameters.with_free([]))
@@ -318,7 +314,7 @@ def test_rows_of_weight_zero_alone_and_no_free_parameter_are_refused(data):
         identify(hexapod(), data, LeastSquares(), options=FitOptions(noise="guessed"))  # pyright: ignore[reportArgumentType]
 
 
-def test_the_printed_table_and_the_json_name_every_parameter(fit):
+def test_text_and_json_name_every_parameter(fit):
     text = str(fit)
     assert all(name in text for name in fit.names)
     assert "Rank 42 of 42" in text

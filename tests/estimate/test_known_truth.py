@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Methods judged where the truth is known; full size in `make evidence` (evidence/known_truth.py,
-evidence/narrow_prior.py).
+"""Methods compared with the known truth; `make evidence` runs the full size
+(evidence/known_truth.py, evidence/narrow_prior.py).
 """
 
 import json
@@ -13,7 +13,7 @@ from evidence import known_truth, narrow_prior
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["hexapod-42", "linear-delta"])  # the tripods take longer
-def test_the_default_method_does_not_make_the_median_machine_worse(name):
+def test_default_method_does_not_make_the_median_robot_worse(name):
     found = known_truth.cell(name, known_truth.NOISE["100 um, 500 urad"], machines=12)
     medians = {title: np.median(error) for title, error in found.items()}
     assert medians["default"] < 1.05 * medians["before"]
@@ -23,7 +23,7 @@ def test_the_default_method_does_not_make_the_median_machine_worse(name):
 
 
 @pytest.mark.slow
-def test_tolerances_stated_ten_times_too_small_are_named_and_cost_little():
+def test_tolerances_ten_times_too_small_are_reported_and_cost_little():
     found = narrow_prior.judge("3-prs", 10.0, machines=12)
     assert found["conflict named"] == 1.0
     assert found["default"] < 1.2 * found["least squares"]
@@ -32,7 +32,7 @@ def test_tolerances_stated_ten_times_too_small_are_named_and_cost_little():
     )  # the case that must fail: a prior believed blindly
 
 
-def rows_of(root, name, table):
+def read_evidence_rows(root, name, table):
     path = root / "docs" / "evidence" / f"{name}.json"
     if not path.exists():
         pytest.skip(f"{path.name} is made by `make evidence`")
@@ -40,8 +40,8 @@ def rows_of(root, name, table):
 
 
 @pytest.mark.evidence
-def test_the_default_is_not_worse_than_before_in_the_median_of_any_cell(root):
-    rows = rows_of(root, "known_truth", "median_error_um")
+def test_published_median_errors_of_the_default_are_not_worse_than_before(root):
+    rows = read_evidence_rows(root, "known_truth", "median_error_um")
     assert len(rows) == len(known_truth.ROBOTS) * len(known_truth.NOISE)
     default = 3 + list(known_truth.METHODS).index("default")
     for row in rows:
@@ -49,8 +49,8 @@ def test_the_default_is_not_worse_than_before_in_the_median_of_any_cell(root):
 
 
 @pytest.mark.evidence
-def test_narrow_tolerances_are_named_and_the_default_stays_within_a_fifth_of_least_squares(root):
-    for robot, factor, *_, ratio, named in rows_of(root, "narrow_prior", "narrow"):
+def test_published_errors_with_narrow_tolerances_are_near_least_squares(root):
+    for robot, factor, *_, ratio, named in read_evidence_rows(root, "narrow_prior", "narrow"):
         assert ratio < 1.2, (robot, factor)
         # at the true tolerances the test may reject one fit in a thousand
         assert named == 100.0 if factor > 1 else named < 10.0, (robot, factor)

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Certified nonlinear regression: our descent against the values and standard errors that NIST
-certifies.
+"""Certified nonlinear regression: the descent agrees with the values and standard errors of NIST.
 
-Pass marks: 6 matching digits for values and 4 for standard errors, from both official starts;
-Lanczos1 2 for standard errors, because its residuals are rounding of its own printed data (sum of
-squares 1.4e-25).
+Pass marks: 6 matching digits for values and 4 for standard errors, from both official starts.
+Lanczos1 needs 2 for standard errors, because its residuals are the rounding of its printed data
+(sum of squares 1.4e-25).
 """
 
 import sys
@@ -16,11 +15,17 @@ import pytest
 from loopcal.estimate.methods.penalties import LeastSquares
 from loopcal.estimate.minimization.descent import FunctionProblem, StepControl, descend
 from loopcal.numerics.gauss_newton import DescentStatus
-from tests.estimate.nist import MODELS, Certified, matching_digits, read, residual_and_jacobian
-from tests.estimate.problems import folded
+from tests.estimate.nist import (
+    MODELS,
+    Certified,
+    matching_digits,
+    read_data_set,
+    residual_and_jacobian,
+)
+from tests.estimate.problems import fold_rows
 
 # [1] the starts are so far off that genuine directions sink to the rank tolerance used for robots
-NO_CUT = 1e-15
+NO_RANK_TOLERANCE = 1e-15
 
 
 class Regression:
@@ -42,16 +47,20 @@ class Regression:
             cost = np.array([residual @ residual])
         if not np.isfinite(rows).all():
             return np.zeros((1, self.parameters + 1, self.parameters + 1)), np.array([np.inf])
-        return folded(rows[None]), cost
+        return fold_rows(rows[None]), cost
 
 
-def score(certified: Certified, start: np.ndarray) -> tuple[float, float, int, str]:
+def score_fit(certified: Certified, start: np.ndarray) -> tuple[float, float, int, str]:
     """Fit and return matching digits of values and of standard errors, accepted steps, status."""
     problem = Regression(certified, start)
     control = StepControl(iterations=2000, relative=1e-8)
     function = FunctionProblem(problem.parameters, problem.evaluate, problem.equations)
     fit = descend(
-        function, np.zeros((1, problem.parameters)), LeastSquares(), control, tolerance=NO_CUT
+        function,
+        np.zeros((1, problem.parameters)),
+        LeastSquares(),
+        control,
+        tolerance=NO_RANK_TOLERANCE,
     )
     errors = fit.decomposition.standard_deviations(fit.penalty, fit.cost / certified.degrees)[
         0
@@ -67,21 +76,21 @@ def score(certified: Certified, start: np.ndarray) -> tuple[float, float, int, s
 @pytest.fixture(scope="module")
 def scores(data_folder: Path) -> dict[tuple[str, int], tuple[float, float, int, str]]:
     """Matching digits of every set from both starts."""
-    sets = [read(path) for path in sorted((data_folder / "nist").glob("*.dat"))]
+    sets = [read_data_set(path) for path in sorted((data_folder / "nist").glob("*.dat"))]
     assert {c.name for c in sets} == set(MODELS)
-    return {(c.name, i + 1): score(c, c.starts[i]) for c in sets for i in range(2)}
+    return {(c.name, i + 1): score_fit(c, c.starts[i]) for c in sets for i in range(2)}
 
 
 @pytest.mark.parametrize("name", sorted(MODELS))
 @pytest.mark.parametrize("start", [1, 2])
-def test_values_match_to_6_digits_and_standard_errors_to_4(scores, name, start):
+def test_nist_values_match_to_6_digits_and_standard_errors_to_4(scores, name, start):
     values, errors, _, status = scores[name, start]
     assert status == "CONVERGED"
     assert values >= 6.0
     assert errors >= (2.0 if name == "Lanczos1" else 4.0)
 
 
-def test_the_table_of_matching_digits_is_printed(scores, capsys):
+def test_matching_digits_of_every_nist_data_set_are_printed(scores, capsys):
     lines = ["", "NIST StRD: matching digits", f"{'set':<10} start  values  std. errors  steps"]
     lines += [
         f"{name:<10} {i:>5}  {v:>6.1f}  {e:>11.1f}  {n:>5}"

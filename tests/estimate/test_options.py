@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options, arguments and rows that make no sense are refused with what is allowed."""
+"""Invalid options, arguments and rows are refused with the allowed values."""
 
 from dataclasses import replace
 
@@ -34,30 +34,30 @@ from tests.findings.reported import one_of, refused
         ("damping", -1.0),
     ],
 )
-def test_step_control(name, value) -> None:
+def test_invalid_step_control_is_refused(name, value) -> None:
     with pytest.raises(EstimationError, match=name):
         StepControl(**{name: value})
 
 
-def test_truncation_at_no_integer() -> None:
+def test_truncation_rank_that_is_not_an_integer_is_refused() -> None:
     with pytest.raises(EstimationError, match="integer"):
         TruncatedSVD(2.5)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("method", ["ls", LeastSquares])
-def test_a_method_that_is_no_instance(method) -> None:
+def test_method_that_is_not_an_instance_is_refused(method) -> None:
     with pytest.raises(EstimationError, match=r"LeastSquares\(\)"):
         identify(hexapod(), hexapod_data(), method)
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1.0, np.nan])
-def test_rank_tolerance(tolerance) -> None:
+def test_rank_tolerance_outside_zero_and_one_is_refused(tolerance) -> None:
     with pytest.raises(EstimationError, match="above 0 and below 1"):
         identify(hexapod(), hexapod_data(), options=FitOptions(rank_tolerance=tolerance))
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_huge_reading_is_named() -> None:
+def test_huge_measured_value_is_refused_with_its_pose() -> None:
     data = hexapod_data()
     (pose,) = data.observations
     values = pose.measured.copy()
@@ -66,7 +66,7 @@ def test_a_huge_reading_is_named() -> None:
         identify(hexapod(), replace(data, observations=(replace(pose, measured=values),)))
 
 
-def test_fewer_equations_than_parameters_say_what_rests_on_tolerances() -> None:
+def test_directions_determined_by_tolerances_alone_are_counted() -> None:
     fit = identify(hexapod(), hexapod_data(5))
     few = one_of(fit.findings, "fit.few-equations")
     assert few.data == {"equations": 30, "parameters": 42, "directions": 12}
@@ -81,12 +81,12 @@ def test_fewer_equations_than_parameters_say_what_rests_on_tolerances() -> None:
         ({"rank_tolerance": 2.0}, "above 0 and below 1"),
     ],
 )
-def test_options_are_checked_when_they_are_made(given, words) -> None:
+def test_options_are_checked_on_construction(given, words) -> None:
     with pytest.raises(EstimationError, match=words):
         FitOptions(**given)
 
 
-def test_options_show_what_differs_from_the_default_and_keep_copies() -> None:
+def test_repr_of_options_shows_changed_values_and_options_copy_arrays() -> None:
     start = np.zeros(3)
     options = FitOptions(LeastSquares(), noise="estimated", excluded_poses=["6"], start=start)
     start[0] = 1.0
@@ -109,7 +109,7 @@ def test_method_and_loss_override_the_options() -> None:
         identify(hexapod(), data, options={"noise": "given"})  # pyright: ignore[reportArgumentType]
 
 
-def test_a_wrong_type_of_robot_or_data_says_what_to_pass() -> None:
+def test_wrong_argument_type_is_refused_with_the_expected_type() -> None:
     with pytest.raises(ArgumentTypeError, match=r"robot: got the text 'hexapod-42'; .*load_robot"):
         identify("hexapod-42", hexapod_data())  # pyright: ignore[reportArgumentType]
     with pytest.raises(ArgumentTypeError, match=r"data: got the text 'a.csv'; .*load_measurements"):
@@ -122,7 +122,7 @@ def test_a_wrong_type_of_robot_or_data_says_what_to_pass() -> None:
         FitOptions(excluded_poses="12")
 
 
-def test_trials_and_recalibration_refuse_options_that_they_do_not_support() -> None:
+def test_unsupported_options_of_trials_and_recalibration_are_refused() -> None:
     robot = hexapod()
     trials = simulate_trials(robot, sample_truth(robot, 2, 1), hexapod_poses(15), tracker(), 2)
     with pytest.raises(EstimationError, match="does not support the option loss"):

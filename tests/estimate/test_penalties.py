@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Methods as filter factors on one decomposition: identities to 1e-12, and rules that choose for
-themselves.
+"""Methods as filter factors on one decomposition: identities to 1e-12, and rules that choose
+lambda or the rank.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ from loopcal.errors import EstimationError
 from loopcal.estimate.methods.penalties import MAP, LeastSquares, Ridge, TruncatedSVD
 from loopcal.estimate.methods.regularization_rules import GCV, MarginalLikelihood, TruncationGCV
 from loopcal.numerics.decomposition import decompose
-from tests.estimate.problems import folded
+from tests.estimate.problems import fold_rows
 
 P, M, T = 6, 50, 4
 
@@ -25,7 +25,7 @@ def rows() -> np.ndarray:
 def estimate(rows: np.ndarray, method) -> np.ndarray:
     """Deviation (t, p) that the method finds for linear rows [A | b]."""
     d = decompose(
-        folded(rows),
+        fold_rows(rows),
         np.full(len(rows), rows.shape[1]),
         scale=method.scale(P),
         unpenalized=method.unpenalized(P),
@@ -33,7 +33,7 @@ def estimate(rows: np.ndarray, method) -> np.ndarray:
     return d.deviation(d.solution(method.penalty(d)))
 
 
-def stacked(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def solve_with_penalty_rows(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Solve the least-squares problem with the penalty written as extra rows."""
     return np.stack(
         [
@@ -47,25 +47,29 @@ def stacked(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
     )
 
 
-def test_ridge_equals_the_penalty_written_as_extra_rows(rows):
+def test_ridge_equals_least_squares_with_penalty_rows(rows):
     np.testing.assert_allclose(
-        estimate(rows, Ridge(2.5)), stacked(rows, np.full(P, 2.5)), rtol=1e-12
+        estimate(rows, Ridge(2.5)), solve_with_penalty_rows(rows, np.full(P, 2.5)), rtol=1e-12
     )
 
 
-def test_one_lambda_per_parameter_equals_extra_rows_of_different_weight(rows):
+def test_ridge_with_lambda_per_parameter_equals_penalty_rows(rows):
     lam = np.array([1.0, 0.1, 20.0, 3.0, 1e-3, 5.0])
-    np.testing.assert_allclose(estimate(rows, Ridge(tuple(lam))), stacked(rows, lam), rtol=1e-12)
+    np.testing.assert_allclose(
+        estimate(rows, Ridge(tuple(lam))), solve_with_penalty_rows(rows, lam), rtol=1e-12
+    )
 
 
-def test_a_parameter_with_lambda_zero_is_not_held_back(rows):
+def test_parameter_with_lambda_zero_is_unpenalized(rows):
     lam = np.array([1.0, 0.0, 20.0, 3.0, 0.0, 5.0])
     method = Ridge(tuple(lam))
     d = decompose(
-        folded(rows), np.full(T, M), scale=method.scale(P), unpenalized=method.unpenalized(P)
+        fold_rows(rows), np.full(T, M), scale=method.scale(P), unpenalized=method.unpenalized(P)
     )
     penalty = method.penalty(d)
-    np.testing.assert_allclose(d.deviation(d.solution(penalty)), stacked(rows, lam), rtol=1e-12)
+    np.testing.assert_allclose(
+        d.deviation(d.solution(penalty)), solve_with_penalty_rows(rows, lam), rtol=1e-12
+    )
     for r, c in zip(rows, d.covariance(penalty), strict=True):
         np.testing.assert_allclose(
             c @ (r[:, :P].T @ r[:, :P] + np.diag(lam)), np.eye(P), atol=1e-12
@@ -73,9 +77,9 @@ def test_a_parameter_with_lambda_zero_is_not_held_back(rows):
     assert method.required_equations(P) == 2
     # all alike: the plain method
     assert np.array_equal(estimate(rows, Ridge((0.0,) * P)), estimate(rows, LeastSquares()))
-    plain = decompose(folded(rows), np.full(T, M))
+    plain = decompose(fold_rows(rows), np.full(T, M))
     np.testing.assert_allclose(
-        decompose(folded(rows), np.full(T, M), unpenalized=method.unpenalized(P))
+        decompose(fold_rows(rows), np.full(T, M), unpenalized=method.unpenalized(P))
         .plain()
         .singular_values,
         plain.singular_values,
@@ -83,18 +87,18 @@ def test_a_parameter_with_lambda_zero_is_not_held_back(rows):
     )
 
 
-def test_an_unseen_parameter_with_lambda_zero_stays_unknown_and_leaves_the_others_alone(rows):
+def test_unobservable_unpenalized_parameters_have_infinite_uncertainty(rows):
     rows = rows.copy()
     rows[:, :, 4] = rows[:, :, 1]
     flat = np.array([False, True, False, False, True, False])
-    d = decompose(folded(rows), np.full(T, M), unpenalized=flat)
+    d = decompose(fold_rows(rows), np.full(T, M), unpenalized=flat)
     assert d.unpenalized is not None
     penalty = np.where(d.unpenalized, np.where(d.used, 0.0, np.inf), 1.0)
     sd = d.standard_deviations(penalty)
     assert np.isinf(sd[:, flat]).all()
     assert np.isfinite(sd[:, ~flat]).all()
     np.testing.assert_allclose(
-        d.deviation(d.solution(penalty)), stacked(rows, 1.0 - flat), rtol=1e-10
+        d.deviation(d.solution(penalty)), solve_with_penalty_rows(rows, 1.0 - flat), rtol=1e-10
     )
     V, variance, seen = d.knowledge(penalty)
     np.testing.assert_allclose(V.T @ V, np.eye(P), atol=1e-12)
@@ -106,20 +110,20 @@ def test_an_unseen_parameter_with_lambda_zero_stays_unknown_and_leaves_the_other
 
 
 @pytest.mark.parametrize("steps", [1, 2, 7])
-def test_ridge_in_every_step_is_another_filter_that_tends_to_least_squares(rows, steps):
+def test_iterated_ridge_has_the_filter_of_the_formula(rows, steps):
     lam = 3.0
     A, b = rows[0, :, :P], rows[0, :, P]
     z = np.zeros(P)
     for _ in range(steps):
         z = z + np.linalg.solve(A.T @ A + lam * np.eye(P), A.T @ (b - A @ z))
-    d = decompose(folded(rows[:1]), np.array([M]))
+    d = decompose(fold_rows(rows[:1]), np.array([M]))
     f = 1.0 - (lam / (d.singular_values**2 + lam)) ** steps
     np.testing.assert_allclose(
         z, d.deviation(f * d.projections / d.singular_values)[0], rtol=1e-12, atol=1e-14
     )
 
 
-def test_map_is_ridge_one_on_columns_scaled_by_their_spread(rows):
+def test_map_on_scaled_columns_equals_ridge_with_inverse_squares(rows):
     spread = np.array([0.5, 2.0, 1.0, 3.0, 0.1, 1.0])
     scaled = rows.copy()
     scaled[:, :, :P] *= spread
@@ -129,25 +133,25 @@ def test_map_is_ridge_one_on_columns_scaled_by_their_spread(rows):
     )
 
 
-def test_map_is_ridge_with_lambda_one(rows):
+def test_map_equals_ridge_with_lambda_one(rows):
     np.testing.assert_allclose(estimate(rows, MAP()), estimate(rows, Ridge(1.0)), rtol=1e-15)
 
 
-def test_truncation_at_full_rank_and_ridge_at_zero_are_least_squares(rows):
+def test_full_truncation_and_ridge_zero_equal_least_squares(rows):
     expected = estimate(rows, LeastSquares())
     np.testing.assert_array_equal(estimate(rows, TruncatedSVD(P)), expected)
     np.testing.assert_allclose(estimate(rows, Ridge(0.0)), expected, rtol=1e-15)
 
 
 def test_truncation_projects_the_least_squares_solution_onto_the_strongest_directions(rows):
-    d = decompose(folded(rows), np.full(T, M))
+    d = decompose(fold_rows(rows), np.full(T, M))
     strongest = d.directions[:, :, :3]
     expected = strongest @ (strongest.swapaxes(-1, -2) @ estimate(rows, LeastSquares())[:, :, None])
     np.testing.assert_allclose(estimate(rows, TruncatedSVD(3)), expected[:, :, 0], rtol=1e-12)
 
 
-def test_filter_factors_are_the_formulas(rows):
-    d = decompose(folded(rows), np.full(T, M))
+def test_filter_factors_equal_their_formulas(rows):
+    d = decompose(fold_rows(rows), np.full(T, M))
     s2 = d.singular_values**2
     np.testing.assert_allclose(d.filter_factors(Ridge(0.7).penalty(d)), s2 / (s2 + 0.7), rtol=1e-15)
     np.testing.assert_array_equal(
@@ -157,27 +161,27 @@ def test_filter_factors_are_the_formulas(rows):
 
 
 def test_posterior_covariance_of_map_is_the_inverse_information(rows):
-    d = decompose(folded(rows), np.full(T, M))
+    d = decompose(fold_rows(rows), np.full(T, M))
     covariance = d.covariance(MAP().penalty(d))
     for r, c in zip(rows, covariance, strict=True):
         np.testing.assert_allclose(c @ (r[:, :P].T @ r[:, :P] + np.eye(P)), np.eye(P), atol=1e-12)
 
 
-def test_eliminating_unknowns_by_projection_equals_solving_for_all_of_them_at_once(rows):
+def test_elimination_by_projection_equals_the_joint_solution(rows):
     joint = estimate(rows, LeastSquares())[:, :4]
     local, rest = rows[:, :, 4:P], np.concatenate([rows[:, :, :4], rows[:, :, P:]], axis=2)
     q = np.linalg.qr(local).Q
     projected = rest - q @ (q.swapaxes(-1, -2) @ rest)
-    d = decompose(folded(projected), np.full(T, M - 2))
+    d = decompose(fold_rows(projected), np.full(T, M - 2))
     np.testing.assert_allclose(d.deviation(d.solution(np.zeros((T, 4)))), joint, rtol=1e-12)
 
 
-def test_gcv_is_at_its_minimum(rows):
+def test_gcv_lambda_minimizes_the_criterion(rows):
     rows = rows.copy()
     rows[:, :, P] += rows[:, :, :P] @ np.full(
         P, 0.3
-    )  # something to find, so that the minimum is inside
-    d = decompose(folded(rows), np.full(T, M))
+    )  # a signal, so that the minimum is in the interior
+    d = decompose(fold_rows(rows), np.full(T, M))
 
     def criterion(lam):
         penalty = np.broadcast_to(lam[:, None], (T, P))
@@ -188,16 +192,16 @@ def test_gcv_is_at_its_minimum(rows):
         assert np.all(criterion(lam) <= criterion(lam * factor) * (1 + 1e-9))
 
 
-def test_marginal_likelihood_finds_the_prior_variance_that_made_the_data():
+def test_marginal_likelihood_recovers_the_prior_variance():
     rng = np.random.default_rng(8)
     a = rng.standard_normal((1, 4000, 400))
     b = a @ (0.05 * rng.standard_normal((400, 1))) + rng.standard_normal((1, 4000, 1))
-    d = decompose(folded(np.concatenate([a, b], axis=2)), np.array([4000]))
+    d = decompose(fold_rows(np.concatenate([a, b], axis=2)), np.array([4000]))
     # lam = 1 / 0.05^2 = 400; its standard error from 400 unknowns is about 400 sqrt(2 / 400) = 28
     assert MarginalLikelihood()(d)[0] == pytest.approx(400.0, abs=4 * 28)
 
 
-def test_rules_choose_for_each_trial_on_its_own(rows):
+def test_rules_choose_for_each_trial_separately(rows):
     together = estimate(rows, Ridge(GCV()))
     alone = np.concatenate([estimate(rows[i : i + 1], Ridge(GCV())) for i in range(T)])
     np.testing.assert_array_equal(together, alone)
@@ -215,6 +219,6 @@ def test_rules_choose_for_each_trial_on_its_own(rows):
         (lambda: Ridge((1.0, 2.0)).scale(3), "2 values of lam for 3"),
     ],
 )
-def test_impossible_settings_are_refused(make, words):
+def test_invalid_method_settings_are_refused(make, words):
     with pytest.raises(EstimationError, match=words):
         make()

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An earlier calibration as the prior of the next: nothing lost, nothing invented, and what moved
-is found.
-"""
+"""An earlier calibration as prior: equal to a joint fit, and changes are detected."""
 
 from dataclasses import replace
 
@@ -23,7 +21,7 @@ from tests.findings.reported import refused
 LEG3 = slice(14, 21)
 
 
-def both(a, b):
+def join_measurements(a, b):
     """Two sets of measurements as one."""
     rows = replace(b.observations[0], rows=b.observations[0].rows + a.n_poses)
     return replace(
@@ -35,11 +33,11 @@ def both(a, b):
     )
 
 
-def test_first_one_then_the_other_is_both_together():
+def test_sequential_fits_with_a_prior_equal_the_joint_fit():
     a, b = hexapod_data(20, seed=1), hexapod_data(15, seed=2)
     first = identify(hexapod(), a, LeastSquares())
     then = identify(hexapod(), b, options=FitOptions(prior=prior_from(first.posterior)))
-    together = identify(hexapod(), both(a, b), LeastSquares())
+    together = identify(hexapod(), join_measurements(a, b), LeastSquares())
     # the first was linearised at its own estimate, which differs from the last by its sd: relative
     # errors of 1e-4
     np.testing.assert_allclose(
@@ -52,7 +50,7 @@ def test_first_one_then_the_other_is_both_together():
     )
 
 
-def test_fewer_poses_than_parameters_are_enough_with_a_prior():
+def test_fewer_poses_than_parameters_suffice_with_a_prior():
     first = identify(hexapod(), hexapod_data(20, seed=1), LeastSquares())
     fit = identify(
         hexapod(), hexapod_data(2, seed=2), options=FitOptions(prior=prior_from(first.posterior))
@@ -61,7 +59,7 @@ def test_fewer_poses_than_parameters_are_enough_with_a_prior():
     assert (fit.standard_deviations <= first.standard_deviations * (1 + 1e-6)).all()
 
 
-def test_freed_parameters_leave_the_marginal_distribution_of_the_others():
+def test_prior_without_some_parameters_is_the_marginal_of_the_others():
     first = identify(hexapod(), hexapod_data(20, seed=1), LeastSquares())
     names = limb_parameters(first.robot, "leg3")
     B = prior_from(first.posterior).without(names).rows * first.tolerance
@@ -77,7 +75,7 @@ def test_freed_parameters_leave_the_marginal_distribution_of_the_others():
     )
 
 
-def test_what_was_unknown_stays_unknown_until_it_is_measured():
+def test_prior_does_not_determine_what_the_earlier_fit_did_not():
     first = identify(hexapod(), hexapod_data(20, seed=1, instrument=five_dof()), LeastSquares())
     prior = prior_from(first.posterior)
     assert prior.rows.shape == (41, 42)
@@ -90,14 +88,14 @@ def test_what_was_unknown_stays_unknown_until_it_is_measured():
     assert identify(hexapod(), hexapod_data(10, seed=2), options=FitOptions(prior=prior)).rank == 42
 
 
-def test_a_run_keeps_the_posterior():
+def test_arrays_of_a_run_keep_the_posterior():
     first = identify(hexapod(), hexapod_data(20, seed=1), LeastSquares())
     back = posterior_from_arrays(first.robot, first.arrays())
     assert np.array_equal(prior_from(back).rows, prior_from(first.posterior).rows)
     assert back.names == first.names
 
 
-def repaired(shift, seed=2, n=12):
+def simulate_repaired(shift, seed=2, n=12):
     """Measurements of the true hexapod with other values in leg 3."""
     truth = zoo.hexapod_truth().copy()
     truth[LEG3] += shift
@@ -106,9 +104,9 @@ def repaired(shift, seed=2, n=12):
     ), truth
 
 
-def test_a_limb_that_moved_is_found_and_the_others_are_kept():
+def test_moved_limb_is_detected_and_other_limbs_keep_their_prior():
     first = identify(hexapod(), hexapod_data(30, seed=1), LeastSquares())
-    data, truth = repaired([0, 0, 0, 0, 0, 0, 0.05e-3])
+    data, truth = simulate_repaired([0, 0, 0, 0, 0, 0, 0.05e-3])
     fit, change = recalibrate(hexapod(), data, first.posterior, "leg3")
     assert change.moved
     assert change.finding.code == "prior.machine-changed"
@@ -129,31 +127,33 @@ def test_a_limb_that_moved_is_found_and_the_others_are_kept():
 
 
 @pytest.mark.slow
-def test_whether_a_limb_moved_is_judged_at_the_stated_level():
+def test_false_alarm_rate_of_a_moved_limb_is_the_stated_one():
     # chi-square of the change over 100 repetitions of both calibrations without any change: mean 7,
     # sd of the mean sqrt(2 * 7 / 100) = 0.37; bounds at 4.5 sd. At 5 % level: binomial(100, 0.05),
     # more than 15 has probability 4e-5
     found = []
     for seed in range(100):
         first = identify(hexapod(), hexapod_data(15, seed=1000 + seed), LeastSquares())
-        found.append(recalibrate(hexapod(), repaired(0.0, seed)[0], first.posterior, "leg3")[1])
+        found.append(
+            recalibrate(hexapod(), simulate_repaired(0.0, seed)[0], first.posterior, "leg3")[1]
+        )
     assert {c.degrees for c in found} == {7.0}
     values = np.array([c.chi_square for c in found])
     assert abs(values.mean() - 7) < 4.5 * 0.37
     assert (values > chi2.ppf(0.95, 7)).sum() <= 15
 
 
-def test_without_a_limb_it_is_said_whether_the_machine_changed():
+def test_recalibration_without_a_limb_tests_the_whole_machine():
     first = identify(hexapod(), hexapod_data(30, seed=1), LeastSquares())
     _, same = recalibrate(hexapod(), hexapod_data(20, seed=2), first.posterior)
     assert same.moved is False
     assert same.degrees == 42
     assert same.finding.code == "prior.machine-unchanged"
-    _, other = recalibrate(hexapod(), repaired(0.02e-3)[0], first.posterior)
+    _, other = recalibrate(hexapod(), simulate_repaired(0.02e-3)[0], first.posterior)
     assert other.moved
 
 
-def test_a_posterior_of_another_robot_or_without_uncertainty_is_refused():
+def test_posterior_of_another_robot_or_without_uncertainty_is_refused():
     first = identify(hexapod(), hexapod_data(20, seed=1), LeastSquares())
     entries = hexapod().parameters.entries
     fixed = replace(

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stated tolerances against the data: conflict named, the default freed from it, nothing
-invented held back.
+"""Stated tolerances that contradict the data: the conflict is reported, and the default method
+inflates them.
 """
 
 from dataclasses import replace
@@ -22,7 +22,7 @@ from loopcal.numerics.decomposition import decompose
 from loopcal.parameters import ParameterTable
 from tests import zoo
 from tests.estimate.problems import (
-    folded,
+    fold_rows,
     hexapod,
     hexapod_data,
     hexapod_poses,
@@ -31,20 +31,20 @@ from tests.estimate.problems import (
 )
 from tests.findings.reported import one_of, refused
 
-WEAK = tracker(20e-6, 100e-6)  # a prior of 35 um matters to an instrument this poor
+COARSE_TRACKER = tracker(20e-6, 100e-6)  # a prior of 35 um matters to an instrument this poor
 
 
-def trials(t: int, seed: int = 3):
+def simulate_hexapods(t: int, seed: int = 3):
     robot = hexapod()
     return robot, simulate_trials(
-        robot, sample_truth(robot, t, seed), hexapod_poses(20), WEAK, seed
+        robot, sample_truth(robot, t, seed), hexapod_poses(20), COARSE_TRACKER, seed
     )
 
 
-def test_the_statistic_is_the_priors_part_of_the_sum_of_squares():
+def test_prior_statistic_is_the_share_of_the_prior_in_the_sum_of_squares():
     rng = np.random.default_rng(0)
     A, b = rng.standard_normal((9, 3)) * [30.0, 1.0, 0.1], rng.standard_normal(9)
-    d = decompose(folded(np.column_stack([A, b])[None]), np.array([9]))
+    d = decompose(fold_rows(np.column_stack([A, b])[None]), np.array([9]))
     z = d.deviation(d.solution(np.ones((1, 3))))[0]
     w = np.linalg.eigvalsh(
         A.T @ A @ np.linalg.inv(np.eye(3) + A.T @ A)
@@ -54,19 +54,19 @@ def test_the_statistic_is_the_priors_part_of_the_sum_of_squares():
     assert statistic[0] == pytest.approx(z @ z * w.sum() / (w**2).sum(), rel=1e-12)
 
 
-def test_well_seen_it_is_the_part_within_the_range_of_the_joint_form_of_data_and_prior():
+def test_prior_statistic_of_precise_data_equals_the_joint_quadratic_form():
     rng = np.random.default_rng(0)
     A = 1e4 * rng.standard_normal((9, 3))
     b = A @ rng.standard_normal(3) + rng.standard_normal(9)
-    d = decompose(folded(np.column_stack([A, b])[None]), np.array([9]))
+    d = decompose(fold_rows(np.column_stack([A, b])[None]), np.array([9]))
     statistic, degrees = compute_prior_statistic(d)
     whole = b @ np.linalg.solve(np.eye(9) + A @ A.T, b)
     assert statistic[0] == pytest.approx(whole - d.outside[0], rel=1e-6)
     assert degrees[0] == pytest.approx(3.0)
 
 
-def test_true_tolerances_are_hardly_ever_doubted():
-    robot, measured = trials(300)
+def test_correct_tolerances_are_rarely_inflated():
+    robot, measured = simulate_hexapods(300)
     found = identify_trials(robot, measured)
     held = identify_trials(robot, measured, MAP())
     # at the level 1e-3 three of 300 are allowed: P(binomial(300, 1e-3) > 3) = 3e-4
@@ -75,8 +75,8 @@ def test_true_tolerances_are_hardly_ever_doubted():
 
 
 @pytest.mark.parametrize("narrow", [3.0, 10.0])
-def test_too_narrow_a_prior_is_named_and_the_default_is_not_held_by_it(narrow):
-    robot, measured = trials(40)
+def test_narrow_tolerances_are_reported_and_inflated_by_the_default_method(narrow):
+    robot, measured = simulate_hexapods(40)
     believed = with_tolerance(robot, 0.035e-3 / narrow)
     named = [identify(believed, measured.trial(i)).prior_conflict for i in range(5)]
     for conflict in named:
@@ -96,8 +96,8 @@ def test_too_narrow_a_prior_is_named_and_the_default_is_not_held_by_it(narrow):
     assert error(None) < error(MAP())
 
 
-def test_a_parameter_without_a_tolerance_is_not_held_back_and_the_others_are():
-    robot, data = hexapod(), hexapod_data(20, instrument=WEAK)
+def test_parameters_without_a_tolerance_are_unpenalized():
+    robot, data = hexapod(), hexapod_data(20, instrument=COARSE_TRACKER)
     entries = tuple(
         replace(p, tolerance=None if "length" in p.name else p.tolerance)
         for p in robot.parameters.entries
@@ -122,7 +122,7 @@ def test_a_parameter_without_a_tolerance_is_not_held_back_and_the_others_are():
     )
 
 
-def test_without_any_tolerance_the_default_is_least_squares():
+def test_default_method_without_tolerances_is_least_squares():
     data = hexapod_data(20)
     a, b = identify(zoo.hexapod(), data), identify(zoo.hexapod(), data, LeastSquares())
     np.testing.assert_allclose(a.estimate, b.estimate, rtol=0, atol=1e-14)
@@ -131,11 +131,11 @@ def test_without_any_tolerance_the_default_is_least_squares():
         identify(zoo.hexapod(), data.take(np.arange(5)))
 
 
-def test_an_estimated_sigma_weighs_the_prior_as_the_true_one_would():
+def test_estimated_sigma_weights_the_prior_like_the_true_sigma():
     robot = hexapod()
-    measured = simulate_trials(robot, sample_truth(robot, 1, 5), hexapod_poses(60), WEAK, 5).trial(
-        0
-    )
+    measured = simulate_trials(
+        robot, sample_truth(robot, 1, 5), hexapod_poses(60), COARSE_TRACKER, 5
+    ).trial(0)
     claimed = measured.observations[0]
     sharp = replace(
         measured, observations=(replace(claimed, covariance=claimed.covariance / 25.0),)
@@ -149,8 +149,8 @@ def test_an_estimated_sigma_weighs_the_prior_as_the_true_one_would():
     assert np.abs((found.estimate - expected.estimate) / expected.standard_deviations).max() < 0.3
 
 
-def test_a_sigma_that_is_too_small_does_not_pass_for_a_narrow_prior():
-    robot, measured = trials(1)
+def test_too_small_sigma_is_not_reported_as_narrow_tolerances():
+    robot, measured = simulate_hexapods(1)
     claimed = measured.trial(0).observations[0]
     sharp = replace(
         measured.trial(0), observations=(replace(claimed, covariance=claimed.covariance / 25.0),)
@@ -161,8 +161,8 @@ def test_a_sigma_that_is_too_small_does_not_pass_for_a_narrow_prior():
     assert fit.residual_test.finding.code == "noise.residuals-too-large"
 
 
-def test_the_factor_by_rule_is_never_below_one():
-    robot, measured = trials(10)
+def test_inflation_factor_is_at_least_one():
+    robot, measured = simulate_hexapods(10)
     wide = with_tolerance(robot, 0.35e-3)
     assert np.array_equal(
         identify_trials(wide, measured).values, identify_trials(wide, measured, MAP()).values

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames and offsets of sessions: drift, moved stations, priors, probes and tools; a wrong value
-that is fixed is found out.
+"""Frames and offsets of sessions: drift, moved stations, priors, probes and tools; a wrong fixed
+value is detected.
 
-One frame alone can be wrong without a trace where the machine's own frame is free; each case here
-has what contradicts it.
+A single wrong frame leaves no trace if the robot's own frame is free. Each case here has data that
+contradict it.
 """
 
 from collections.abc import Mapping
@@ -36,19 +36,19 @@ from tests.estimate.problems import hexapod, hexapod_poses
 UM, URAD = 1e-6, 1e-6
 SIGMA = 5 * UM
 POINT = np.array([[0.03, -0.02, 0.05]])
-UNLIKELY, USUAL = 1e-6, 1e-3
+REJECTED_P_VALUE, ACCEPTED_P_VALUE = 1e-6, 1e-3
 """p-values of a fit that is wrong, and of one that is right: one seed in a thousand would fail."""
 
 
-def sensor(kind, **labels):
+def make_sensor(kind, **labels):
     sigma = [
         SIGMA if column.dimension.value == "length" else 5 * URAD for column in kind.noise_columns
     ]
     return Sensor(kind, Gaussian(np.array(sigma)), **labels)
 
 
-def seen(poses, *sensors, true):
-    """What a true hexapod shows."""
+def simulate_measurements(poses, *sensors, true):
+    """Simulate measurements of the true hexapod."""
     return simulate(
         zoo.hexapod().with_values(zoo.hexapod_truth()),
         poses,
@@ -58,16 +58,16 @@ def seen(poses, *sensors, true):
     )
 
 
-def fixed(data: Measurements, pattern: str, values: Mapping[str, float] | None = None):
-    """The unknowns of the data, some at these values and kept there."""
+def fix_setup(data: Measurements, pattern: str, values: Mapping[str, float] | None = None):
+    """Return the setup parameters of the data, those of the pattern fixed at these values."""
     local = collect_nuisance_parameters(data.observations, data.labels)
     return local.with_nominal(local.values(values)).with_fixed(pattern)
 
 
 def assert_explained(fit, true: Mapping[str, float]):
-    """A fit that explains the data, with these own unknowns within five standard deviations."""
+    """Assert that a fit explains the data, with these setup parameters within 5 sd."""
     assert fit.converged
-    assert fit.residual_test.p_value > USUAL
+    assert fit.residual_test.p_value > ACCEPTED_P_VALUE
     for name, value in true.items():
         i = fit.nuisance.names.index(name)
         assert np.isfinite(fit.nuisance.sd[i])
@@ -75,24 +75,24 @@ def assert_explained(fit, true: Mapping[str, float]):
 
 
 def assert_contradicted(fit):
-    """A fit whose residual says that something stated is not so."""
-    assert fit.residual_test.p_value < UNLIKELY
+    """Assert that the residuals reject what was stated."""
+    assert fit.residual_test.p_value < REJECTED_P_VALUE
     assert fit.residual_test.finding in fit.findings
     assert not fit.residual_test.intervals or fit.residual_test.sigma_scale > 1.0
 
 
-def test_a_base_that_drifts_is_re_measured_in_every_session():
+def test_drift_of_the_base_is_estimated_for_every_session():
     day = np.repeat(["morning", "noon", "evening"], 20)
     poses, kind = hexapod_poses(60), Pose(unknown=("frame",))
     drift = {"noon.frame.x": 40 * UM, "evening.frame.x": 90 * UM, "evening.frame.ry": 100 * URAD}
-    data = seen(poses, sensor(kind, session=day), true=drift)
+    data = simulate_measurements(poses, make_sensor(kind, session=day), true=drift)
     # the first session says where the base is, the others how far it has drifted since
     first = {"morning.frame.x": 0.0, "morning.frame.ry": 0.0}
     fit = identify(
         hexapod(),
         data,
         LeastSquares(),
-        options=FitOptions(nuisance=fixed(data, "morning.*", first)),
+        options=FitOptions(nuisance=fix_setup(data, "morning.*", first)),
     )
     assert fit.rank == 42
     assert_explained(fit, drift)
@@ -115,18 +115,20 @@ def test_a_base_that_drifts_is_re_measured_in_every_session():
     moved = geometry.log_so3(frames[1][:3, :3] @ frames[0][:3, :3].T)
     assert_allclose(moved, [0.0, 100 * URAD, 0.0], atol=5 * 20 * URAD)
     assert_contradicted(
-        identify(hexapod(), data, LeastSquares(), options=FitOptions(nuisance=fixed(data, "*")))
+        identify(hexapod(), data, LeastSquares(), options=FitOptions(nuisance=fix_setup(data, "*")))
     )
 
 
-def test_a_station_that_was_moved_is_found_anew_and_not_taken_for_the_same():
+def test_moved_station_needs_a_frame_for_each_session():
     day = np.repeat(["left", "right"], 50)
     station = geometry.make_pose(np.eye(3), np.array([-1.5, -0.8, 0.1]))
     theodolite = Bearing(places=POINT, T_base_frame=station, unknown=("frame",))
     poses = np.concatenate([hexapod_poses(50), hexapod_poses(50, 3)])
     moved = {"right.frame.x": 1.4, "right.frame.y": -1.1, "right.frame.rz": 2.0}
     known = Position(places=POINT)
-    data = seen(poses, sensor(theodolite, session=day), sensor(known), true=moved)
+    data = simulate_measurements(
+        poses, make_sensor(theodolite, session=day), make_sensor(known), true=moved
+    )
     fit = identify(hexapod(), data, LeastSquares())
     assert fit.rank == 39
     assert_explained(fit, moved | {"left.frame.x": -1.5})
@@ -135,7 +137,7 @@ def test_a_station_that_was_moved_is_found_anew_and_not_taken_for_the_same():
 
 
 @cache
-def printed():
+def simulate_delta():
     """A delta, whose base has no frame of its own to take up a wrong one, seen by a tracker."""
     robot = lc.load_robot("linear-delta")
     truth = robot.with_values(
@@ -143,21 +145,21 @@ def printed():
         + np.where(robot.parameters.free, 0.5, 0.0) * np.nan_to_num(robot.parameters.tolerance)
     )
     data = simulate(
-        truth, sample_workspace(robot, 40, 5).coordinates, Instrument((sensor(Position(places=POINT, unknown=("frame",))),)), 1,  # noqa: E501
+        truth, sample_workspace(robot, 40, 5).coordinates, Instrument((make_sensor(Position(places=POINT, unknown=("frame",))),)), 1,  # noqa: E501
         nuisance_values={"frame.x": 60 * UM},
     )  # fmt: skip
     return robot, truth, data
 
 
-def test_a_prior_on_a_frame_stands_between_a_free_and_a_fixed_one_and_is_weighed():
-    robot, truth, data = printed()
+def test_prior_on_a_frame_is_between_a_free_and_a_fixed_frame():
+    robot, truth, data = simulate_delta()
     local = collect_nuisance_parameters(data.observations, data.labels)
     free, held, known = (
         identify(robot, data, LeastSquares(), options=FitOptions(nuisance=one))
         for one in (
             local,
             local.with_prior("frame.*", 50 * UM),
-            fixed(data, "*", {"frame.x": 60 * UM}),
+            fix_setup(data, "*", {"frame.x": 60 * UM}),
         )
     )
     assert_explained(held, {"frame.x": 60 * UM})
@@ -178,29 +180,31 @@ def test_a_prior_on_a_frame_stands_between_a_free_and_a_fixed_one_and_is_weighed
     )
 
 
-def test_a_frame_fixed_where_it_is_not_is_found_out_where_the_machine_cannot_take_it_up():
-    robot, _, data = printed()
+def test_wrong_fixed_frame_of_a_delta_is_detected():
+    robot, _, data = simulate_delta()
     assert_explained(
         identify(
             robot,
             data,
             LeastSquares(),
-            options=FitOptions(nuisance=fixed(data, "*", {"frame.x": 60 * UM})),
+            options=FitOptions(nuisance=fix_setup(data, "*", {"frame.x": 60 * UM})),
         ),
         {},
     )
     assert_contradicted(
-        identify(robot, data, LeastSquares(), options=FitOptions(nuisance=fixed(data, "*")))
+        identify(robot, data, LeastSquares(), options=FitOptions(nuisance=fix_setup(data, "*")))
     )
 
 
-def test_a_probe_s_offset_is_found_on_planes_and_a_wrong_one_is_found_out():
+def test_probe_offset_is_estimated_on_planes_and_a_wrong_one_is_detected():
     probe = Plane(
         unknown=("surface", "targets"), targets=("probe",), places=np.array([[0.0, 0.0, 0.06]])
     )
     group = np.array([f"plate{i % 3}" for i in range(60)])
     true = {"probe.x": 2e-3, "probe.y": -1e-3, "probe.z": 0.0615}
-    data = seen(hexapod_poses(60), sensor(Pose()), sensor(probe, group=group), true=true)
+    data = simulate_measurements(
+        hexapod_poses(60), make_sensor(Pose()), make_sensor(probe, group=group), true=true
+    )
     fit = identify(hexapod(), data, LeastSquares())
     assert fit.rank == 42
     assert_explained(fit, true)
@@ -209,18 +213,20 @@ def test_a_probe_s_offset_is_found_on_planes_and_a_wrong_one_is_found_out():
             hexapod(),
             data,
             LeastSquares(),
-            options=FitOptions(nuisance=fixed(data, "probe.*", true | {"probe.x": 2.2e-3})),
+            options=FitOptions(nuisance=fix_setup(data, "probe.*", true | {"probe.x": 2.2e-3})),
         )
     )
 
 
-def test_a_tool_s_offset_is_found_and_a_wrong_one_is_found_out():
+def test_tool_offset_is_estimated_and_a_wrong_one_is_detected():
     true = {"tool.z": 0.12, "tool.rx": 0.01, "tool.y": 1e-3}
     tool = Pose(
         unknown=("tool",), T_platform_tool=geometry.make_pose(np.eye(3), np.array([0.0, 0.0, 0.1]))
     )
     balls = Position(targets=("a", "b", "c"), places=0.1 * np.eye(3))
-    data = seen(hexapod_poses(40), sensor(tool), sensor(balls), true=true)
+    data = simulate_measurements(
+        hexapod_poses(40), make_sensor(tool), make_sensor(balls), true=true
+    )
     fit = identify(hexapod(), data, LeastSquares())
     assert fit.rank == 42
     assert_explained(fit, true)
@@ -229,6 +235,6 @@ def test_a_tool_s_offset_is_found_and_a_wrong_one_is_found_out():
             hexapod(),
             data,
             LeastSquares(),
-            options=FitOptions(nuisance=fixed(data, "tool.*", true | {"tool.y": 1.1e-3})),
+            options=FitOptions(nuisance=fix_setup(data, "tool.*", true | {"tool.y": 1.1e-3})),
         )
     )

@@ -9,7 +9,7 @@ from loopcal.estimate import identify
 from loopcal.measure import sample_truth, simulate, simulate_trials
 from loopcal.papers.hexapod_42.leg_form import identify_per_leg
 from tests import zoo
-from tests.estimate.problems import bed, hexapod, hexapod_poses, probed_heights, tracker
+from tests.estimate.problems import bed_points, hexapod, hexapod_poses, simulate_heights, tracker
 
 MM = 1e-3
 # Table 4 of the study: the ten commanded poses (x, y, z [mm], roll, pitch, yaw [rad]).
@@ -57,4 +57,4 @@ def test_per_leg_fit_has_larger_errors_than_the_joint_fit():
 def test_data_that_are_not_full_poses_are_refused():
     robot = zoo.delta()
     with pytest.raises(EstimationError, match="full poses"):
-        identify_per_leg(robot, probed_heights(robot, bed(8)))
+        identify_per_leg(robot, simulate_heights(robot, bed_points(8)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A problem has no state: what it returns depends on its arguments alone, to the last bit."""
+"""A problem has no state: its results depend on its arguments alone, bit for bit."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -37,22 +37,22 @@ PROBE = Plane(
 POSES = 24
 
 
-def sensor(kind, **seen) -> Sensor:
-    """Let a kind look with one micrometer, or microradian, of noise."""
+def make_sensor(kind, **seen) -> Sensor:
+    """Return a sensor with one micrometer, or microradian, of noise."""
     return Sensor(kind, Gaussian(np.full(len(kind.noise_columns), UM)), **seen)
 
 
-def measured(*sensors: Sensor, sigma: float | None = None, **given) -> Problem:
-    """The problem of a wrong hexapod."""
+def make_problem(*sensors: Sensor, sigma: float | None = None, **given) -> Problem:
+    """Return the problem of a hexapod with errors."""
     truth = hexapod().with_values(zoo.hexapod_truth())
     instrument = Instrument(sensors)
     data = simulate(truth, hexapod_poses(POSES), instrument, 1, reading_sigma=sigma, **given)
     return problem_of(select_free_parameters(hexapod()), data)
 
 
-def trials(sigma: float | None) -> Problem:
-    """The problem of three hexapods that are measured in an unknown frame."""
-    instrument = Instrument((sensor(TRACKER),))
+def make_trial_problem(sigma: float | None) -> Problem:
+    """Return the problem of three hexapods measured in an unknown frame."""
+    instrument = Instrument((make_sensor(TRACKER),))
     truth = sample_truth(hexapod(), 3, 2)
     data = simulate_trials(
         hexapod(),
@@ -66,34 +66,36 @@ def trials(sigma: float | None) -> Problem:
     return problem_of_trials(select_free_parameters(hexapod()), data)
 
 
-def sessions(sigma: float | None = None) -> Problem:
+def make_session_problem(sigma: float | None = None) -> Problem:
     """Frames of three sessions, and planes of four groups that share a probe."""
     day = np.repeat(["monday", "tuesday", "friday"], POSES // 3)
     plate = np.array([f"plate{i % 4}" for i in range(POSES)])
-    return measured(
-        sensor(Pose(unknown=("frame",)), session=day), sensor(PROBE, group=plate), sigma=sigma
+    return make_problem(
+        make_sensor(Pose(unknown=("frame",)), session=day),
+        make_sensor(PROBE, group=plate),
+        sigma=sigma,
     )
 
 
 LINKS = np.array([[i, (i + 7) % POSES] for i in range(6)])
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {
-    "exact readings": lambda: measured(sensor(Pose())),
-    "frame and targets unknown": lambda: measured(sensor(TRACKER), nuisance_values=FRAME),
-    "sessions and groups": sessions,
-    "uncertain readings": lambda: measured(sensor(Pose()), sigma=2 * UM),
-    "uncertain readings, linked poses": lambda: measured(
-        sensor(Pose()), sensor(Separation(), rows=LINKS), sigma=2 * UM
+    "exact readings": lambda: make_problem(make_sensor(Pose())),
+    "frame and targets unknown": lambda: make_problem(make_sensor(TRACKER), nuisance_values=FRAME),
+    "sessions and groups": make_session_problem,
+    "uncertain readings": lambda: make_problem(make_sensor(Pose()), sigma=2 * UM),
+    "uncertain readings, linked poses": lambda: make_problem(
+        make_sensor(Pose()), make_sensor(Separation(), rows=LINKS), sigma=2 * UM
     ),
-    "uncertain readings, sessions and groups": lambda: sessions(2 * UM),
-    "trials": lambda: trials(None),
-    "trials, uncertain readings": lambda: trials(2 * UM),
+    "uncertain readings, sessions and groups": lambda: make_session_problem(2 * UM),
+    "trials": lambda: make_trial_problem(None),
+    "trials, uncertain readings": lambda: make_trial_problem(2 * UM),
 }
 
 
 @dataclass(frozen=True)
 class Call:
-    """One linearization and what else is read from it."""
+    """One linearization, with its solution, residuals and leverage rows."""
 
     problem: Problem
     z: np.ndarray
@@ -103,13 +105,13 @@ class Call:
         at = self.problem.linearize(self.z, self.start)
         solution = self.problem.solve(self.z, at.next_start)
         residuals = self.problem.residuals(self.z, solution)
-        found = [*arrays_of(at), *(r.whitened for r in residuals)]
+        found = [*list_arrays(at), *(r.whitened for r in residuals)]
         one = np.arange(1)
         blocks = self.problem.take(one).leverage_rows(at.take(one))
         return [*found, *(part.rows for block in blocks for part in block)]
 
 
-def arrays_of(at: Linearization) -> list[np.ndarray]:
+def list_arrays(at: Linearization) -> list[np.ndarray]:
     """The arrays of a linearization."""
     found = [at.factor, at.cost, at.equations, at.next_start.nuisance]
     if at.nuisance is not None:
@@ -120,7 +122,7 @@ def arrays_of(at: Linearization) -> list[np.ndarray]:
     return found
 
 
-def calls_of(problem: Problem) -> list[Call]:
+def list_calls(problem: Problem) -> list[Call]:
     """Linearizations at three points, from the first start and from a warm one."""
     t, p = len(problem), problem.parameters
     nominal = np.zeros((t, p))
@@ -139,8 +141,8 @@ def assert_same(found: list[np.ndarray], expected: list[np.ndarray]) -> None:
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_equal_arguments_give_equal_bits_in_any_order_and_from_threads(name):
-    calls = calls_of(PROBLEMS[name]())
+def test_equal_arguments_give_equal_bits_in_any_order_and_in_threads(name):
+    calls = list_calls(PROBLEMS[name]())
     expected = [call() for call in calls]
     for i in np.random.default_rng(1).permutation(2 * len(calls)) % len(calls):
         assert_same(calls[i](), expected[i])
@@ -150,7 +152,7 @@ def test_equal_arguments_give_equal_bits_in_any_order_and_from_threads(name):
 
 
 @pytest.mark.parametrize("name", ["trials", "trials, uncertain readings"])
-def test_a_trial_is_linearized_among_others_as_alone(name):
+def test_linearized_trial_equals_the_same_trial_alone(name):
     problem = PROBLEMS[name]()
     z = np.random.default_rng(3).normal(0.0, 0.3, (3, 42))
     start = problem.start(z)
@@ -163,7 +165,7 @@ def test_a_trial_is_linearized_among_others_as_alone(name):
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_the_start_changes_the_result_by_rounding_only(name):
+def test_start_changes_the_linearization_by_rounding_only(name):
     problem = PROBLEMS[name]()
     z = np.full((len(problem), 42), 0.05)
     first = problem.linearize(z, problem.start(z))
@@ -174,7 +176,7 @@ def test_the_start_changes_the_result_by_rounding_only(name):
     assert_allclose(again.cost, first.cost, rtol=1e-9)
 
 
-def test_rows_by_an_unknown_frame_are_the_same_whatever_was_linearized_before():
+def test_leverage_rows_do_not_depend_on_earlier_linearizations():
     """Rows by the machine had a norm of 46.7 instead of 8.3 before the first linearization.
 
     They were read with the frame's nominal values and without its elimination, because both were

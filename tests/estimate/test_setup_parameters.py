@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Unknown frames, targets, surfaces, linked poses and joint sensors in the fit."""
+"""Setup parameters (frames, targets, surfaces), linked poses and joint sensors in the fit."""
 
 import tracemalloc
 
@@ -47,23 +47,23 @@ TRUE = {
 }  # fmt: skip
 
 
-class Silent(Gaussian):
-    """Noise that is stated but does not come."""
+class NoNoise(Gaussian):
+    """Noise of a stated sigma whose draws are zero."""
 
     def draw(self, generator, n):
         return np.zeros((n, len(self.sd)))
 
 
-def seen_by(kind, noise: type[Gaussian] = Silent, sigma=UM):
+def make_sensor(kind, noise: type[Gaussian] = NoNoise, sigma=UM):
     return Sensor(kind, noise(np.full(len(kind.noise_columns), sigma)))
 
 
-def true_of(*kinds):
+def true_setup_values(*kinds):
     names = {parameter.name for kind in kinds for parameter in kind.nuisance_parameters}
     return {name: value for name, value in TRUE.items() if name in names}
 
 
-def machine(name, n):
+def make_machine(name, n):
     """A nominal robot, true values within its tolerances, and poses."""
     if name == "hexapod":
         return hexapod(), zoo.hexapod_truth(), hexapod_poses(n)
@@ -71,8 +71,8 @@ def machine(name, n):
     return robot, sample_truth(robot, 1, 3)[0], sample_workspace(robot, n, 5).coordinates
 
 
-def largest(errors, size):
-    """The largest error, lengths as a share of the robot's size."""
+def largest_error(errors, size):
+    """Return the largest error, lengths as a share of the robot's size."""
     found = [
         np.abs(values[np.isfinite(values)])
         for values in (errors.position / size, errors.orientation)
@@ -80,15 +80,17 @@ def largest(errors, size):
     return float(np.concatenate(found).max())
 
 
-def mixed_data(seed=1, noise: type[Gaussian] = Gaussian):
+def simulate_mixed_data(seed=1, noise: type[Gaussian] = Gaussian):
     """Poses in a known frame and targets in an unknown one."""
-    instrument = Instrument((seen_by(Pose(), noise), seen_by(TRACKER, noise)))
+    instrument = Instrument((make_sensor(Pose(), noise), make_sensor(TRACKER, noise)))
     truth = hexapod().with_values(zoo.hexapod_truth())
-    return simulate(truth, hexapod_poses(30), instrument, seed, nuisance_values=true_of(TRACKER))
+    return simulate(
+        truth, hexapod_poses(30), instrument, seed, nuisance_values=true_setup_values(TRACKER)
+    )
 
 
-def test_the_projected_solution_is_the_joint_one():
-    data, free = mixed_data(), select_free_parameters(hexapod())
+def test_solution_after_elimination_equals_the_joint_solution():
+    data, free = simulate_mixed_data(), select_free_parameters(hexapod())
     problem = problem_of(free, data)
     z = free.deviation(hexapod().values[None])
     linearized = problem.linearize(z, problem.start(z))
@@ -107,8 +109,8 @@ def test_the_projected_solution_is_the_joint_one():
     assert linearized.equations[0] == len(stacked) - len(local)
 
 
-def test_standard_deviations_are_those_of_the_joint_problem():
-    data = mixed_data()
+def test_standard_deviations_equal_those_of_the_joint_problem():
+    data = simulate_mixed_data()
     fit = identify(hexapod(), data, LeastSquares())
     free = select_free_parameters(fit.robot)
     at = observe_poses(free, data.readings)
@@ -121,28 +123,28 @@ def test_standard_deviations_are_those_of_the_joint_problem():
     assert_allclose(fit.standard_deviations, sd[len(fit.nuisance) :] * free.tolerance, rtol=1e-3)
 
 
-def test_a_fit_in_an_unknown_frame_is_that_in_the_known_frame_up_to_gauge():
+def test_fit_in_an_unknown_frame_equals_that_in_a_known_frame_up_to_its_gauge():
     truth = hexapod().with_values(zoo.hexapod_truth())
     unknown = simulate(
         truth,
         hexapod_poses(40),
-        Instrument((seen_by(TRACKER),)),
+        Instrument((make_sensor(TRACKER),)),
         1,
-        nuisance_values=true_of(TRACKER),
+        nuisance_values=true_setup_values(TRACKER),
     )
     first = identify(hexapod(), unknown, LeastSquares())
-    known = simulate(truth, hexapod_poses(40), Instrument((seen_by(Pose()),)), 1)
+    known = simulate(truth, hexapod_poses(40), Instrument((make_sensor(Pose()),)), 1)
     second = identify(hexapod(), known, LeastSquares())
     assert (first.rank, second.rank) == (30, 42)
     others = simulate(
         truth,
         hexapod_poses(12, seed=7),
-        Instrument((seen_by(TRACKER),)),
+        Instrument((make_sensor(TRACKER),)),
         2,
-        nuisance_values=true_of(TRACKER),
+        nuisance_values=true_setup_values(TRACKER),
     )
-    assert largest(validate(first, others).after, 0.2) < 1e-9
-    assert largest(validate(second.robot, others).after, 0.2) < 1e-9
+    assert largest_error(validate(first, others).after, 0.2) < 1e-9
+    assert largest_error(validate(second.robot, others).after, 0.2) < 1e-9
     assert_allclose(second.estimate, truth.values, rtol=0, atol=1e-9 * 0.2)
     assert all({"frame", "a", "b", "c"} & set(c.nuisance) for c in first.unidentifiable)
     assert np.isinf(first.nuisance.sd).all()
@@ -151,19 +153,19 @@ def test_a_fit_in_an_unknown_frame_is_that_in_the_known_frame_up_to_gauge():
     assert validate(second.robot, others).findings[0].code == "validation.setup-fitted"
 
 
-def test_intervals_of_machine_and_frame_hold_the_truth():
+def test_intervals_of_robot_and_frame_contain_the_truth():
     robot = lc.load_robot("linear-delta")
     kind = Position(places=POINT, unknown=("frame", "targets"))
     truths, fits = sample_truth(robot, 60, 11), []
     inside = []
     for i, truth in enumerate(truths):
-        instrument = Instrument((seen_by(kind, Gaussian, 20 * UM),))
+        instrument = Instrument((make_sensor(kind, Gaussian, 20 * UM),))
         data = simulate(
             robot.with_values(truth),
             sample_workspace(robot, 30, i).coordinates,
             instrument,
             i,
-            nuisance_values=true_of(kind),
+            nuisance_values=true_setup_values(kind),
         )
         fit = identify(robot, data, MAP())
         fits.append(fit)
@@ -192,23 +194,25 @@ def test_intervals_of_machine_and_frame_hold_the_truth():
 
 
 @pytest.mark.parametrize("block", [16, 512])
-def test_rows_that_link_poses_and_joint_sensors_are_fitted_in_blocks_as_whole(monkeypatch, block):
+def test_linked_poses_and_joint_sensors_are_fitted_with_any_block_size(monkeypatch, block):
     monkeypatch.setattr(problem_module, "BLOCK", block)
-    robot, truth, poses = machine("3-prs", 40)
+    robot, truth, poses = make_machine("3-prs", 40)
     passive = lc.inverse(robot, poses[:1]).passive_names[0]
     far = Sensor(
         Separation(places=POINT),
         Gaussian(np.full(1, UM)),
         rows=np.stack([np.arange(20), np.arange(20, 40)], axis=1),
     )
-    joint = seen_by(JointSensor(joints=(passive,), measures="angle", unknown=("offset",)), Gaussian)
-    instrument = Instrument((far, joint, seen_by(Pose(unknown=("frame",)), Gaussian)))
+    joint = make_sensor(
+        JointSensor(joints=(passive,), measures="angle", unknown=("offset",)), Gaussian
+    )
+    instrument = Instrument((far, joint, make_sensor(Pose(unknown=("frame",)), Gaussian)))
     data = simulate(
         robot.with_values(truth),
         poses,
         instrument,
         2,
-        nuisance_values={**true_of(Pose(unknown=("frame",))), f"{passive}.joint": 0.01},
+        nuisance_values={**true_setup_values(Pose(unknown=("frame",))), f"{passive}.joint": 0.01},
     )
     fit = identify(robot, data)
     assert fit.converged
@@ -221,7 +225,7 @@ def test_rows_that_link_poses_and_joint_sensors_are_fitted_in_blocks_as_whole(mo
     )  # linked poses are one block
 
 
-def test_sessions_have_frames_of_their_own_and_are_eliminated_one_by_one():
+def test_each_session_has_its_own_frame_and_elimination_cluster():
     truth = hexapod().with_values(zoo.hexapod_truth())
     day = np.repeat([f"day{i}" for i in range(8)], 10)
     kind = Pose(unknown=("frame",))
@@ -239,7 +243,7 @@ def test_sessions_have_frames_of_their_own_and_are_eliminated_one_by_one():
 
 
 @pytest.mark.slow
-def test_memory_stays_flat_in_the_number_of_sessions():
+def test_memory_hardly_grows_with_the_number_of_sessions():
     def peak(sessions):
         day = np.repeat([f"day{i}" for i in range(sessions)], 8)
         sensor = Sensor(Pose(unknown=("frame",)), Gaussian(np.full(6, UM)), session=day)
@@ -256,10 +260,10 @@ def test_memory_stays_flat_in_the_number_of_sessions():
     assert peak(128) < 1.5 * peak(64) + 128 * 49**2 * 8
 
 
-def test_priors_and_fixed_unknowns_are_kept_to():
-    data = mixed_data()
+def test_priors_and_fixed_setup_parameters_are_respected():
+    data = simulate_mixed_data()
     local = collect_nuisance_parameters(data.observations, data.labels)
-    true = local.values(true_of(TRACKER))
+    true = local.values(true_setup_values(TRACKER))
     fixed = identify(
         hexapod(), data, options=FitOptions(nuisance=local.with_nominal(true).with_fixed("*"))
     )
@@ -278,14 +282,14 @@ def test_priors_and_fixed_unknowns_are_kept_to():
     )
 
 
-def test_noise_is_estimated_where_null_directions_hold_a_part_of_the_residual():
+def test_noise_is_estimated_in_an_unknown_frame():
     truth = hexapod().with_values(zoo.hexapod_truth())
     data = simulate(
         truth,
         hexapod_poses(40),
-        Instrument((seen_by(TRACKER, Gaussian),)),
+        Instrument((make_sensor(TRACKER, Gaussian),)),
         1,
-        nuisance_values=true_of(TRACKER),
+        nuisance_values=true_setup_values(TRACKER),
     )
     fit = identify(hexapod(), data, options=FitOptions(noise="estimated"))
     assert fit.converged
@@ -293,14 +297,14 @@ def test_noise_is_estimated_where_null_directions_hold_a_part_of_the_residual():
     assert fit.residual_test.sigma_scale == pytest.approx(1.0, abs=0.16)
 
 
-def test_trials_with_unknown_frames_are_identified_as_each_alone():
+def test_trials_with_unknown_frames_equal_single_fits():
     robot = hexapod()
-    instrument = Instrument((seen_by(TRACKER, Gaussian),))
+    instrument = Instrument((make_sensor(TRACKER, Gaussian),))
     truths = np.stack(
         [zoo.hexapod_truth(), robot.values + 0.5 * (zoo.hexapod_truth() - robot.values)]
     )
     trials = simulate_trials(
-        robot, truths, hexapod_poses(30), instrument, 3, nuisance_values=true_of(TRACKER)
+        robot, truths, hexapod_poses(30), instrument, 3, nuisance_values=true_setup_values(TRACKER)
     )
     found = identify_trials(robot, trials, MAP())
     for i in range(2):
@@ -309,7 +313,7 @@ def test_trials_with_unknown_frames_are_identified_as_each_alone():
         assert_allclose(found.values[i], alone.robot.values, rtol=0, atol=1e-10)
 
 
-def test_starts_are_sought_once_for_all_trials_that_an_instrument_looks_at(monkeypatch):
+def test_setup_start_values_are_computed_once_for_all_trials(monkeypatch):
     sought = []
     begin = NuisanceElimination.start_values
     monkeypatch.setattr(
@@ -320,28 +324,28 @@ def test_starts_are_sought_once_for_all_trials_that_an_instrument_looks_at(monke
     robot = lc.load_robot("linear-delta")
     kind = Position(places=POINT, unknown=("frame",))
     trials = simulate_trials(
-        robot, sample_truth(robot, 5, 1), sample_workspace(robot, 20, 1).coordinates, Instrument((seen_by(kind, Gaussian),)), 1,  # noqa: E501
-        nuisance_values=true_of(kind),
+        robot, sample_truth(robot, 5, 1), sample_workspace(robot, 20, 1).coordinates, Instrument((make_sensor(kind, Gaussian),)), 1,  # noqa: E501
+        nuisance_values=true_setup_values(kind),
     )  # fmt: skip
     assert identify_trials(robot, trials, MAP()).converged.all()
     assert len(sought) == 1
 
 
-def test_a_known_instrument_has_no_unknowns():
+def test_instrument_in_a_known_frame_has_no_setup_parameters():
     fit = identify(hexapod(), hexapod_data(20, instrument=tracker()))
     assert len(fit.nuisance) == 0
     assert fit.to_dict()["local"] == []
 
 
-def test_the_command_line_calibrates_from_a_tracker_in_an_unknown_frame(tmp_path):
+def test_command_line_calibrates_with_a_tracker_in_an_unknown_frame(tmp_path):
     robot = lc.load_robot("hexapod-42")
     truth = robot.with_values(sample_truth(robot, 1, 3)[0])
     data = simulate(
         truth,
         sample_workspace(robot, 40, 5).coordinates,
-        Instrument((seen_by(TRACKER, Gaussian),)),
+        Instrument((make_sensor(TRACKER, Gaussian),)),
         1,
-        nuisance_values=true_of(TRACKER),
+        nuisance_values=true_setup_values(TRACKER),
     )
     path = tmp_path / "tracker.csv"
     lc.save_measurements(data, path, robot)

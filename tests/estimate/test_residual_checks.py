@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pure error of repeats, lack of fit, correlated groups, and the advice not to calibrate."""
+"""Checks of the residuals: pure error of repeats, lack of fit, correlated parameters, and the
+expected gain.
+"""
 
 from dataclasses import replace
 
@@ -22,14 +24,14 @@ from tests.estimate.problems import (
 )
 
 
-def repeats(seed: int, times: int = 3, instrument=None, poses: int = 12):
+def simulate_repeats(seed: int, times: int = 3, instrument=None, poses: int = 12):
     truth = zoo.hexapod().with_values(zoo.hexapod_truth())
     again = np.repeat(hexapod_poses(poses, seed), times, axis=0)
     return simulate(truth, again, instrument or tracker(), seed)
 
 
-def test_pure_error_is_the_spread_within_the_groups():
-    data = repeats(0)
+def test_pure_error_is_the_spread_within_groups_of_repeats():
+    data = simulate_repeats(0)
     found = check_lack_of_fit(identify(hexapod(), data, LeastSquares()), data)
     sigma = np.array([5 * URAD] * 3 + [UM] * 3)
     groups = (data.observations[0].measured / sigma).reshape(12, 3, 6)
@@ -43,10 +45,10 @@ def test_pure_error_is_the_spread_within_the_groups():
     assert found.is_explained
 
 
-def test_a_right_model_is_hardly_ever_blamed_and_the_true_sigma_does_not_matter():
+def test_lack_of_fit_is_rarely_reported_for_a_correct_model_with_wrong_sigma():
     blamed = 0
     for seed in range(60):
-        data = repeats(seed)
+        data = simulate_repeats(seed)
         claimed = data.observations[0]
         wrong = replace(data, observations=(replace(claimed, covariance=claimed.covariance / 9.0),))
         found = check_lack_of_fit(identify(hexapod(), wrong, LeastSquares()), wrong)
@@ -55,8 +57,8 @@ def test_a_right_model_is_hardly_ever_blamed_and_the_true_sigma_does_not_matter(
     assert blamed <= 4  # P(binomial(60, 0.01) > 4) = 3e-4
 
 
-def test_something_else_than_geometry_is_told_from_noise():
-    data = repeats(1)
+def test_repeatable_error_outside_the_model_is_reported_as_lack_of_fit():
+    data = simulate_repeats(1)
     rows = data.observations[0]
     warm = np.array(rows.measured)
     warm[:, 5] += 5 * UM * np.sin(300.0 * data.readings[:, 0])  # the same in all repeats of a pose
@@ -67,16 +69,16 @@ def test_something_else_than_geometry_is_told_from_noise():
     assert found.sigma_scale == pytest.approx(1.0, abs=0.2)
 
 
-def test_without_repeats_or_with_a_loss_nothing_is_claimed():
+def test_lack_of_fit_is_undecided_without_repeats_or_with_a_loss():
     data = hexapod_data(20)
     found = check_lack_of_fit(identify(hexapod(), data), data)
     assert found.is_explained is None
     assert [f.code for f in found.findings] == ["residuals.no-repeats"]
-    again = repeats(2)
+    again = simulate_repeats(2)
     assert check_lack_of_fit(identify(hexapod(), again, loss=Tukey()), again).is_explained is None
 
 
-def test_correlated_parameters_are_grouped_in_words():
+def test_correlated_parameters_are_grouped_and_named():
     # small tilts: a leg's length and the heights of its ends act alike
     flat = zoo.make_poses(
         np.random.default_rng(0).uniform(-1, 1, (30, 6)) * [0.01, 0.01, 0.01, 0.05, 0.05, 0.05]
@@ -97,7 +99,7 @@ def test_correlated_parameters_are_grouped_in_words():
     assert find_correlated_groups(fit, strong=1.0) == ()
 
 
-def test_an_instrument_coarser_than_the_tolerances_is_advised_against():
+def test_calibration_with_a_coarse_instrument_is_not_worthwhile():
     good, poor = hexapod_data(20), hexapod_data(20, instrument=tracker(2 * MM, 10e-3))
     fine = estimate_calibration_gain(identify(hexapod(), good), good)
     assert fine.is_worthwhile
@@ -112,7 +114,7 @@ def test_an_instrument_coarser_than_the_tolerances_is_advised_against():
     )
 
 
-def test_what_tolerances_allow_before_is_what_drawn_machines_do():
+def test_expected_error_before_calibration_agrees_with_drawn_robots():
     data, robot = hexapod_data(20), hexapod()
     expected = estimate_calibration_gain(identify(robot, data), data)
     from loopcal.mechanism import forward
@@ -125,7 +127,7 @@ def test_what_tolerances_allow_before_is_what_drawn_machines_do():
     assert np.sqrt(np.mean(square)) == pytest.approx(expected.position_before, rel=0.1)
 
 
-def test_without_tolerances_no_gain_is_predicted():
+def test_gain_without_tolerances_is_undecided():
     data = hexapod_data(20)
     assert estimate_calibration_gain(identify(zoo.hexapod(), data), data).is_worthwhile is None
     assert estimate_calibration_gain(

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robots and reference solutions for uncertain readings: every pose and reading an explicit
-unknown, solved by scipy.
+"""Robots and dense reference solutions for uncertain readings: every pose and reading is an
+explicit unknown of scipy.
 """
 
 from dataclasses import replace
@@ -17,13 +17,13 @@ from loopcal.parameters import ParameterTable
 from tests import zoo
 from tests.estimate.problems import UM, hexapod_poses, noise, with_tolerance
 
-STEP = 1e-2
+DIFFERENCE_STEP = 1e-2
 """Of the differences, in tolerances and sigmas: what is left of third order is 1e-4 of what
 closure's curvature does.
 """
 
 
-def seven_legs(sigma: float = 2 * UM) -> Mechanism:
+def build_hexapod_with_seven_legs(sigma: float = 2 * UM) -> Mechanism:
     """The hexapod with a seventh driven leg from the middle of its base, and seven parameters more:
     49.
     """
@@ -55,13 +55,13 @@ def seven_legs(sigma: float = 2 * UM) -> Mechanism:
     return with_tolerance(build(made), 0.035e-3)
 
 
-def only(robot: Mechanism, names: tuple[str, ...]) -> Mechanism:
-    """The robot with these parameters free."""
+def free_only(robot: Mechanism, names: tuple[str, ...]) -> Mechanism:
+    """Return the robot with only these parameters free."""
     entries = tuple(replace(p, free=p.name.endswith(names)) for p in robot.parameters.entries)
     return replace(robot, parameters=ParameterTable(entries))
 
 
-def ups_hexapod() -> Mechanism:
+def build_ups_hexapod() -> Mechanism:
     """The hexapod with the joints of its legs, so that sensors can look at them."""
     base, platform = (
         tuple(map(tuple, (a * zoo.MM).tolist())) for a in (zoo.HEXAPOD_BASE, zoo.HEXAPOD_PLATFORM)
@@ -77,7 +77,7 @@ def ups_hexapod() -> Mechanism:
     return with_tolerance(build(record.expand(), record=record), 0.035e-3)
 
 
-def measured_hexapod(
+def simulate_hexapod(
     n: int, sigma: ArrayLike | None, seed: int = 0, sensors: tuple[Sensor, ...] = ()
 ) -> Measurements:
     """The true hexapod at n poses, its readings noisy; measured in full, or by the sensors given."""  # noqa: E501
@@ -88,7 +88,9 @@ def measured_hexapod(
     )
 
 
-def dense(robot: Mechanism, data: Measurements, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def solve_dense(
+    robot: Mechanism, data: Measurements, sigma: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Estimate and covariance [SI] of the free parameters, every true reading an unknown beside
     them (as many actuators as freedoms); poses by forward kinematics, derivatives by differences,
     covariance by the whole problem's.
@@ -115,9 +117,11 @@ def dense(robot: Mechanism, data: Measurements, sigma: np.ndarray) -> tuple[np.n
         return np.concatenate([*parts, (q - data.readings)[:, seen] / sigma[seen]], axis=1)
 
     def jacobian(x):
-        moved = np.concatenate([x + STEP * np.eye(len(x)), x - STEP * np.eye(len(x))])
+        moved = np.concatenate(
+            [x + DIFFERENCE_STEP * np.eye(len(x)), x - DIFFERENCE_STEP * np.eye(len(x))]
+        )
         plus, minus = np.split(rows(moved), 2)
-        return ((plus - minus) / (2 * STEP)).T
+        return ((plus - minus) / (2 * DIFFERENCE_STEP)).T
 
     x = np.zeros(p + int(moving.sum()))
     fit = least_squares(

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses with missing readings: found from any full measurement, never by a long search."""
+"""Poses with missing readings: they start from any full measurement, in a bounded number of
+evaluations.
+"""
 
 from dataclasses import replace
 
@@ -32,7 +34,7 @@ from loopcal.numerics.gauss_newton import Halving
 from tests.estimate.problems import UM, noise
 
 
-def measured(name, sensors, n, seed, share=0.0, sigma=20 * UM):
+def simulate_with_missing_readings(name, sensors, n, seed, share=0.0, sigma=20 * UM):
     """A robot, a true one, and measurements of n poses with this share of the readings not taken."""  # noqa: E501
     robot = load_robot(name)
     truth = robot.with_values(sample_truth(robot, 1, seed)[0])
@@ -46,12 +48,12 @@ def measured(name, sensors, n, seed, share=0.0, sigma=20 * UM):
     return (
         robot,
         truth,
-        without(data, np.random.default_rng(seed).random(data.readings.shape) < share),
+        remove_readings(data, np.random.default_rng(seed).random(data.readings.shape) < share),
     )
 
 
-def without(data: Measurements, lost: np.ndarray) -> Measurements:
-    """The measurements with readings (n, a) not taken."""
+def remove_readings(data: Measurements, lost: np.ndarray) -> Measurements:
+    """Return the measurements without the readings `lost` (n, a)."""
     assert data.reading_sigma is not None
     return replace(
         data,
@@ -61,9 +63,9 @@ def without(data: Measurements, lost: np.ndarray) -> Measurements:
 
 
 @pytest.fixture
-def counted(monkeypatch):
-    """How often poses are looked at, and how often one is followed along a path."""
-    count = {"looks": 0, "followed": 0}
+def evaluation_counter(monkeypatch):
+    """Count evaluations of poses, and poses that are followed along a path."""
+    count = {"evaluations": 0, "followed": 0}
 
     def counting(owner, attribute, word):
         original = getattr(owner, attribute)
@@ -74,14 +76,14 @@ def counted(monkeypatch):
 
         monkeypatch.setattr(owner, attribute, wrapped)
 
-    counting(UncertainPoses, "_evaluate", "looks")
+    counting(UncertainPoses, "_evaluate", "evaluations")
     counting(trials_module, "_follow_path", "followed")
     return count
 
 
 ANCHORS = ((0.9, 0.1, 1.0), (-0.5, 0.8, 1.1), (-0.4, -0.9, 0.9))
 
-FULL = {
+FULL_MEASUREMENTS = {
     "a position of a delta robot": ("linear-delta", (Sensor(Position(), noise(UM, UM, UM)),)),
     "two coordinates of a planar robot": (
         "five-bar",
@@ -106,9 +108,9 @@ FULL = {
 }
 
 
-@pytest.mark.parametrize("said", FULL)
-def test_rows_that_tell_all_freedoms_of_the_platform_give_its_pose(said):
-    robot, sensors = FULL[said]
+@pytest.mark.parametrize("case", FULL_MEASUREMENTS)
+def test_rows_that_determine_all_freedoms_give_the_pose(case):
+    robot, sensors = FULL_MEASUREMENTS[case]
     robot = load_robot(robot)
     found = inverse(robot, sample_workspace(robot, 6, 1).coordinates)
     data = simulate(robot, found.T, Instrument(sensors), 0, reading_sigma=20 * UM)
@@ -127,7 +129,7 @@ def test_rows_that_tell_all_freedoms_of_the_platform_give_its_pose(said):
     assert known.tolist() == [True, True, False, True, False, False]
 
 
-PARTIAL = {
+PARTIAL_READINGS = {
     "linear-delta, positions": ("linear-delta", (Sensor(Position(), noise(*[10 * UM] * 3)),), 0.1),
     "linear-delta, x and y": (
         "linear-delta",
@@ -138,29 +140,29 @@ PARTIAL = {
 }
 
 
-@pytest.mark.parametrize("said", PARTIAL)
-def test_missing_readings_are_found_in_few_looks_and_nothing_is_followed(said, counted):
-    name, sensors, share = PARTIAL[said]
+@pytest.mark.parametrize("case", PARTIAL_READINGS)
+def test_missing_readings_are_estimated_in_few_evaluations_without_paths(case, evaluation_counter):
+    name, sensors, share = PARTIAL_READINGS[case]
     for seed in range(3):
-        robot, _, data = measured(name, sensors, 30, seed, share)
-        counted.update(looks=0, followed=0)
+        robot, _, data = simulate_with_missing_readings(name, sensors, 30, seed, share)
+        evaluation_counter.update(evaluations=0, followed=0)
         fit = identify(robot, data)
         assert fit.converged
         assert fit.chi_square < 2.0 * fit.residual_test.dof
         assert (
-            counted["looks"] < 60
-        )  # some ten folds of two to four looks; 559 and more without a bound of the step
-        assert counted["followed"] == 0
+            evaluation_counter["evaluations"] < 60
+        )  # some ten folds of two to four evaluations; 559 and more without a bound of the step
+        assert evaluation_counter["followed"] == 0
 
 
-def test_a_missing_reading_is_that_of_the_branch_on_which_the_machine_is_built():
+def test_missing_reading_is_estimated_in_the_working_mode_of_home():
     for seed in range(4):
-        robot, truth, data = measured(
+        robot, truth, data = simulate_with_missing_readings(
             "linear-delta", (Sensor(Position(), noise(*[10 * UM] * 3)),), 20, seed
         )
         lost = np.zeros(data.readings.shape, dtype=bool)
         lost[7, 0] = True
-        fit = identify(robot, without(data, lost))
+        fit = identify(robot, remove_readings(data, lost))
         assert fit.poses is not None
         true = inverse(truth, sample_workspace(robot, 20, seed).coordinates).q[7, 0]
         assert fit.poses.readings[7, 0] == pytest.approx(
@@ -169,11 +171,13 @@ def test_a_missing_reading_is_that_of_the_branch_on_which_the_machine_is_built()
         assert not any("branch" in note or "stroke" in note for note in map(str, fit.findings))
 
 
-def test_a_reading_found_outside_its_stroke_or_on_another_branch_is_told():
-    robot, _, data = measured("linear-delta", (Sensor(Position(), noise(*[10 * UM] * 3)),), 20, 0)
+def test_reading_outside_its_stroke_or_in_another_working_mode_is_reported():
+    robot, _, data = simulate_with_missing_readings(
+        "linear-delta", (Sensor(Position(), noise(*[10 * UM] * 3)),), 20, 0
+    )
     lost = np.zeros(data.readings.shape, dtype=bool)
     lost[7, 0] = lost[9, 2] = True
-    fit = identify(robot, without(data, lost))
+    fit = identify(robot, remove_readings(data, lost))
     assert fit.poses is not None
     assert report_doubtful_readings(fit.robot, fit.poses) == ()
     found = fit.poses.readings.copy()
@@ -198,15 +202,17 @@ def test_a_reading_found_outside_its_stroke_or_on_another_branch_is_told():
 
 
 @pytest.mark.parametrize("name", ["linear-delta", "3-rrr", "hexapod-42"])
-def test_from_random_starts_the_search_is_bounded_and_never_ends_higher_than_it_began(
-    name, counted
+def test_pose_search_from_random_starts_is_bounded_and_never_increases_cost(
+    name, evaluation_counter
 ):
     size = 6 if name == "hexapod-42" else 2
     kind = Pose() if name == "hexapod-42" else Component(("x", "y"))
-    robot, _, data = measured(name, (Sensor(kind, noise(*[10 * UM] * size)),), 12, 5)
+    robot, _, data = simulate_with_missing_readings(
+        name, (Sensor(kind, noise(*[10 * UM] * size)),), 12, 5
+    )
     lost = np.zeros(data.readings.shape, dtype=bool)
     lost[:, 0] = True
-    data = without(data, lost)
+    data = remove_readings(data, lost)
     problem = problem_of(select_free_parameters(robot), data)
     assert isinstance(problem.poses, UncertainPoses)
     stroke = np.array([a.stroke for a in robot.actuators], dtype=float)
@@ -215,20 +221,22 @@ def test_from_random_starts_the_search_is_bounded_and_never_ends_higher_than_it_
         readings = data.readings.copy()
         readings[:, 0] = stroke[0, 0] + (stroke[0, 1] - stroke[0, 0]) * rng.random(len(readings))
         reached = find_directly_reachable(robot, robot.values[None], readings[None])[0]
-        readings = np.where(reached[:, None], readings, robot_home(robot))
+        readings = np.where(reached[:, None], readings, home_readings(robot))
         begin = PoseStates(forward(robot, readings).state, readings[None])
         start = replace(problem.start(z), poses=begin)
         at_once = replace(problem, control=Halving(steps=0))
         first = at_once.linearize(z, start)
         assert np.isfinite(first.cost).all()
-        counted.update(looks=0, followed=0)
+        evaluation_counter.update(evaluations=0, followed=0)
         last = problem.linearize(z, start)
-        assert counted["looks"] <= 1 + problem.control.steps * (problem.control.attempts + 1)
-        assert counted["followed"] == 0
+        assert evaluation_counter["evaluations"] <= 1 + problem.control.steps * (
+            problem.control.attempts + 1
+        )
+        assert evaluation_counter["followed"] == 0
         assert np.isfinite(last.cost).all()
         assert last.cost[0] <= first.cost[0]
 
 
-def robot_home(robot):
+def home_readings(robot):
     """Readings (a,) of the home pose."""
     return inverse(robot, robot.home[None]).q[0]

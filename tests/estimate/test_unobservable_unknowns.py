@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Unknowns that rows see by rounding alone are not seen: nothing moves them, and they move nothing."""  # noqa: E501
+"""Unknowns with derivatives at rounding level are unobservable: they keep their values and change
+no result.
+"""
 
 from dataclasses import replace
 
@@ -31,7 +33,9 @@ POSES = 40
 LINKS = np.array([[i, (i + k) % POSES] for k in (1, 7) for i in range(POSES)])
 
 
-def parallel(unknown: tuple[str, ...], truth: np.ndarray | None = None) -> Measurements:
+def simulate_parallel_poses(
+    unknown: tuple[str, ...], truth: np.ndarray | None = None
+) -> Measurements:
     """Poses of one orientation, measured in full and by distances between them, in which the place
     of a target cancels.
     """
@@ -45,14 +49,17 @@ def parallel(unknown: tuple[str, ...], truth: np.ndarray | None = None) -> Measu
     )
 
 
-def linearized(data: Measurements) -> Linearization:
+def linearize_nominal(data: Measurements) -> Linearization:
     """The problem at the nominal robot."""
     problem, z = problem_of(select_free_parameters(hexapod()), data), np.zeros((1, 42))
     return problem.linearize(z, problem.start(z))
 
 
-def test_a_target_that_cancels_stays_where_it_was_and_changes_nothing_of_the_machine():
-    known, unknown = linearized(parallel(())), linearized(parallel(("targets",)))
+def test_target_that_cancels_keeps_its_value_and_does_not_change_the_factor():
+    known, unknown = (
+        linearize_nominal(simulate_parallel_poses(())),
+        linearize_nominal(simulate_parallel_poses(("targets",))),
+    )
     assert unknown.nuisance is not None
     assert int(unknown.nuisance.elimination.rank[0]) == 0
     assert_array_equal(unknown.nuisance.values[0], 0.0)
@@ -62,8 +69,8 @@ def test_a_target_that_cancels_stays_where_it_was_and_changes_nothing_of_the_mac
     np.testing.assert_allclose(gram, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
-def test_starts_are_not_sought_along_what_is_rounding():
-    data = parallel(("targets",))
+def test_start_values_are_not_estimated_from_rounding():
+    data = simulate_parallel_poses(("targets",))
     T = np.tile(hexapod().home, (POSES, 1, 1))
     T[:, :3, 3] += np.random.default_rng(0).uniform(-0.03, 0.03, (POSES, 3))
     T[:, :3, :3] += np.random.default_rng(1).uniform(-2e-16, 2e-16, (POSES, 3, 3))
@@ -71,12 +78,12 @@ def test_starts_are_not_sought_along_what_is_rounding():
 
 
 @pytest.mark.parametrize("sigma", [None, UM])
-def test_a_fit_begins_where_a_target_is_not_seen_and_ends_where_it_is_hardly(sigma):
+def test_fit_converges_from_an_unobservable_to_a_weakly_observable_target(sigma):
     """The true machine turns by up to 0.2 mrad where it is told to keep its orientation: that sees
     the target, at last.
     """
     truth = zoo.hexapod_truth()
-    data = parallel(("targets",), truth)
+    data = simulate_parallel_poses(("targets",), truth)
     if sigma is not None:
         draws = np.random.default_rng(2).standard_normal(data.readings.shape)
         data = replace(data, readings=data.readings + sigma * draws, reading_sigma=sigma)
@@ -88,7 +95,7 @@ def test_a_fit_begins_where_a_target_is_not_seen_and_ends_where_it_is_hardly(sig
     assert np.abs(fit.nuisance.estimate / fit.nuisance.sd).max() < 4.0
 
 
-def test_a_column_that_the_poses_take_up_whole_leaves_zeros():
+def test_column_absorbed_by_the_poses_is_eliminated_to_zero():
     rng = np.random.default_rng(0)
     free = rng.standard_normal((1, 5, 12, 3)) * np.array([1.0, 1e3, 1e-3])
     whole, other = free @ rng.standard_normal((3, 1)), rng.standard_normal((1, 5, 12, 2))
@@ -98,7 +105,7 @@ def test_a_column_that_the_poses_take_up_whole_leaves_zeros():
     assert_array_equal(done.rank, 3)
 
 
-def test_a_point_on_the_axis_of_a_pose_s_move_does_not_see_it():
+def test_point_on_the_axis_of_a_motion_has_zero_derivative():
     rng = np.random.default_rng(3)
     point, turn = rng.standard_normal((50, 3)), rng.standard_normal((50, 3))
     move = np.concatenate([turn, -np.cross(turn, point)], axis=1)[None, :, :, None]
@@ -113,7 +120,7 @@ def test_a_point_on_the_axis_of_a_pose_s_move_does_not_see_it():
     )  # 1e-15 of rounding in 1e-9
 
 
-def test_rounding_is_told_from_a_small_derivative_and_what_is_not_finite_stays():
+def test_rounding_is_set_to_zero_but_small_and_nonfinite_values_are_kept():
     size = np.array([1e6, 1e6, 0.0, 1.0, np.inf])
     values = np.array([0.5e6 * ROUNDING, 2e6 * ROUNDING, 1e-300, np.nan, 1.0])
     assert_array_equal(without_rounding(values, size), [0.0, *values[1:]])

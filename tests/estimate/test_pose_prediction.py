@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Validation of poses by readings that are believed to different degrees: each counts as far as the
-data say.
-"""
+"""Prediction of poses from readings of different sigmas: each reading counts by its sigma."""
 
 from dataclasses import replace
 
@@ -32,7 +30,7 @@ def cable():
     )
 
 
-def changed(data, sigma, off, pose=2, line=0):
+def change_reading(data, sigma, off, pose=2, line=0):
     """The measurements with one reading off [rad] and of another sigma [rad]."""
     readings, stated = data.readings.copy(), data.reading_sigma.copy()
     readings[pose, line] += off
@@ -41,10 +39,10 @@ def changed(data, sigma, off, pose=2, line=0):
 
 
 @pytest.mark.parametrize(("sigma", "off"), [(1e3, 50.0), (np.inf, 50.0), (np.inf, np.nan)])
-def test_a_line_that_is_hardly_believed_leaves_the_pose_to_the_other_three(cable, sigma, off):
+def test_line_with_a_large_sigma_does_not_affect_the_predicted_pose(cable, sigma, off):
     robot, positions, data = cable
     usual = validate(robot, data, before=robot)
-    found = validate(robot, changed(data, sigma, off), before=robot)
+    found = validate(robot, change_reading(data, sigma, off), before=robot)
     assert found.poses == usual.poses
     assert found.unreachable == ()
     assert found.findings == usual.findings
@@ -53,7 +51,7 @@ def test_a_line_that_is_hardly_believed_leaves_the_pose_to_the_other_three(cable
         np.delete(error, 2), np.delete(usual.after.position, 2), atol=1e-6
     )  # [m]: two ways to solve the same
     assert error[2] < 10 * MM  # three lines; 50 rad of the fourth are metres
-    at, told = predict_from_readings(robot, changed(data, sigma, off))
+    at, told = predict_from_readings(robot, change_reading(data, sigma, off))
     assert told.all()
     assert_allclose(at.T[2, :3, 3], positions[2], atol=10 * MM)
     assert_allclose(
@@ -61,9 +59,9 @@ def test_a_line_that_is_hardly_believed_leaves_the_pose_to_the_other_three(cable
     )  # [rad]: three lines agree
 
 
-def test_a_pose_that_too_few_believed_lines_hold_is_left_out_and_named(cable):
+def test_pose_with_too_few_readings_is_left_out_and_reported(cable):
     robot, _, data = cable
-    two = changed(changed(data, np.inf, np.nan), np.inf, np.nan, line=2)
+    two = change_reading(change_reading(data, np.inf, np.nan), np.inf, np.nan, line=2)
     found = validate(robot, two, before=robot)
     assert found.poses == ("1", "2", "4", "5", "6", "7", "8")
     assert found.unreachable == ()
@@ -71,7 +69,7 @@ def test_a_pose_that_too_few_believed_lines_hold_is_left_out_and_named(cable):
     assert tuple(missing.data["names"]) == ("pose 3",)
 
 
-def test_equal_sigmas_predict_as_the_robot_does(cable):
+def test_equal_sigmas_predict_the_forward_kinematics(cable):
     robot, _, data = cable
     found, _ = predict_from_readings(robot, data)
     assert_allclose(found.T, forward(robot, data.readings).T, atol=0)
@@ -83,7 +81,7 @@ def test_equal_sigmas_predict_as_the_robot_does(cable):
 
 
 @pytest.mark.parametrize("name", ["cable-4", "linear-delta"])
-def test_where_no_pose_has_its_readings_it_is_they_that_are_missed(name):
+def test_validation_without_any_readings_is_refused(name):
     robot = load_robot(name)
     data = simulate(
         robot,
